@@ -1,0 +1,131 @@
+"""What a dataset is, on the host: cameras, views, points and which views are held out.
+
+Conventions of the whole project
+    camera      OpenCV: x right, y down, z forward; `world_to_camera` is row-major [3, 4]
+    pixels      pixel (0, 0) has its centre at (0.5, 0.5)
+    quaternions (w, x, y, z)
+    lengths     scene units; screen quantities in pixels
+    colours     as the image files store them, in [0, 1]
+"""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.errors import DataError
+
+Floats = NDArray[np.floating]
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera: image size, focal lengths and principal point, in pixels."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+    def resized(self, width: int, height: int) -> "Camera":
+        """Return the camera of the same photograph resampled to another size."""
+        sx, sy = width / self.width, height / self.height
+        return Camera(width, height, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy)
+
+    def downscaled(self, factor: float) -> "Camera":
+        """Return the camera after dividing the image size by `factor`, rounded to whole pixels."""
+        if factor == 1:
+            return self
+        return self.resized(max(1, round(self.width / factor)), max(1, round(self.height / factor)))
+
+
+@dataclass(frozen=True)
+class View:
+    """One posed photograph.  `name` is unique in its scene: the path below the image folder."""
+
+    name: str
+    camera: Camera
+    world_to_camera: Floats  # [3, 4] float64
+    image_path: Path
+    mask_path: Path | None = None
+
+    @property
+    def position(self) -> Floats:
+        """Camera centre in world coordinates, [3]."""
+        rotation, translation = self.world_to_camera[:, :3], self.world_to_camera[:, 3]
+        return -rotation.T @ translation
+
+
+@dataclass(frozen=True)
+class PointCloud:
+    """Sparse coloured points."""
+
+    positions: Floats  # [M, 3] float32, scene units
+    colours: Floats  # [M, 3] float32, in [0, 1]
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A posed set of photographs, with the split that every stage uses."""
+
+    path: Path
+    views: tuple[View, ...]
+    train: tuple[int, ...]  # indices into `views`
+    test: tuple[int, ...]
+    points: PointCloud | None
+    extent: float  # radius of the training cameras, scene units
+
+    def split(self, name: str) -> tuple[View, ...]:
+        """Return the views of `train`, `test` or `all`."""
+        if name == "all":
+            return self.views
+        return tuple(self.views[i] for i in (self.train if name == "train" else self.test))
+
+    def downscaled(self, factor: float) -> "Scene":
+        """Return the scene with every image divided by `factor`."""
+        if factor == 1:
+            return self
+        views = tuple(replace(v, camera=v.camera.downscaled(factor)) for v in self.views)
+        return replace(self, views=views)
+
+
+def make_scene(path: Path, views: list[View], test: set[int], points: PointCloud | None) -> Scene:
+    """Check `views`, order the split and measure the extent.
+
+    Raises DataError when there is no view, when names repeat or when a pose is not finite.
+    """
+    if not views:
+        raise DataError(f"{path}: the dataset holds no images; expected at least one posed image")
+    seen: set[str] = set()
+    for view in views:
+        if view.name in seen:
+            raise DataError(f"{path}: two images are called '{view.name}'; names must differ")
+        seen.add(view.name)
+        if not np.isfinite(view.world_to_camera).all():
+            raise DataError(f"{path}: the pose of '{view.name}' is not finite; remove that image or mend its pose")
+    train = tuple(i for i in range(len(views)) if i not in test)
+    if not train:
+        raise DataError(f"{path}: every image is held out for testing; raise scene.holdout or add images")
+    extent = camera_extent([views[i] for i in train])
+    return Scene(path, tuple(views), train, tuple(sorted(test)), points, extent)
+
+
+def camera_extent(views: list[View]) -> float:
+    """Radius of the cameras: 1.1 x the largest distance of a camera centre from their mean (3DGS, Kerbl et al. 2023)."""
+    centres = np.stack([v.position for v in views])
+    radius = 1.1 * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
+    return radius if radius > 0 else 1.0
+
+
+def every_nth(names: list[str], holdout: int) -> set[int]:
+    """Indices of the names that are held out: every `holdout`-th in order of name, starting with the first."""
+    if holdout <= 0:
+        return set()
+    order = sorted(range(len(names)), key=lambda i: names[i])
+    return set(order[::holdout])
