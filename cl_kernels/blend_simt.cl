@@ -1,0 +1,122 @@
+/* Blending for GPUs: the same maths as blend_wide.cl (splat.h) with one item per pixel going forward and one item per
+ * splat going backward.  Compiled with LANES = 1. */
+#include "splat.h"
+
+#define PIXELS (TILE * TILE)
+#define BATCH PIXELS  // splats staged together: one for each item to fetch
+
+/* One work-group = one tile, one item = one pixel.  Local memory: BATCH * 64 bytes.  Deterministic. */
+__kernel __attribute__((reqd_work_group_size(PIXELS, 1, 1)))
+void blend_forward(
+    __global const uint *restrict tile_offset,  // [T+1]
+    __global const uint *restrict tile_pairs,   // [P] front to back inside a tile
+    __global const uint *restrict pair_splat,   // [P]
+    __global const float *restrict splats,      // [N,RECORD]
+    __constant float *restrict background,      // [3]
+    __constant camera_t *restrict camera,       // [1]
+    __global float *restrict image,             // [3,tiles_y*TILE,tiles_x*TILE]
+    __global float *restrict transmittance,     // [tiles_y*TILE,tiles_x*TILE]
+    __global uint *restrict tile_last)          // [T] one past the last pair that any pixel blends
+{
+    __local float batch[BATCH][RECORD];
+    __local uint open;  // pixels of the tile that still want splats
+    const uint item = get_local_id(0), tile = get_group_id(0);
+    const uint tile_x = tile % camera->tiles_x, tile_y = tile / camera->tiles_x;
+    const uint column = tile_x * TILE + item % TILE, line = tile_y * TILE + item / TILE;
+    const uint width = camera->tiles_x * TILE, plane = width * camera->tiles_y * TILE;
+    const float pixel = column + 0.5f, row = line + 0.5f;
+    const uint first = tile_offset[tile], end = tile_offset[tile + 1];
+
+    pixels_t p = {1.0f, 0.0f, 0.0f, 0.0f};
+    uint begin = first;
+    bool unfinished = true;
+    for (; begin < end && unfinished; begin += BATCH) {
+        if (item == 0)
+            open = 0;
+        if (begin + item < end) {
+            const uint splat = pair_splat[tile_pairs[begin + item]];
+            for (uint k = 0; k < RECORD; k++)
+                batch[item][k] = splats[(size_t)splat * RECORD + k];
+        }
+        barrier(CLK_LOCAL_MEM_FENCE);
+        const uint length = end - begin < BATCH ? end - begin : BATCH;
+        for (uint j = 0; j < length && p.t > 0.0f; j++) {
+            float splat[RECORD];
+            for (uint k = 0; k < RECORD; k++)
+                splat[k] = batch[j][k];
+            blend(&p, splat_at_row(splat, row), pixel, splat + SPLAT_RED);
+        }
+        if (p.t > 0.0f)
+            atomic_inc(&open);
+        barrier(CLK_LOCAL_MEM_FENCE);
+        unfinished = open > 0;
+        barrier(CLK_LOCAL_MEM_FENCE);
+    }
+
+    if (item == 0)
+        tile_last[tile] = begin < end ? begin : end;
+    const bool inside = (column < camera->width) & (line < camera->height);
+    const uint at = line * width + column;
+    const float t = magnitude(p.t);
+    image[at] = inside ? p.red + t * background[0] : 0.0f;
+    image[plane + at] = inside ? p.green + t * background[1] : 0.0f;
+    image[2 * plane + at] = inside ? p.blue + t * background[2] : 0.0f;
+    transmittance[at] = inside ? t : 0.0f;
+}
+
+/* One item owns one splat of a batch and the tile's pixels pass it one after another: at step s item i meets pixel
+ * s - i, which item i - 1 met the step before, so every pixel sees its splats front to back.  No atomics, no sums
+ * across items.  Local memory: PIXELS * 20 bytes.  Deterministic. */
+__kernel __attribute__((reqd_work_group_size(SPLAT_GROUP, 1, 1)))
+void blend_backward(
+    __global const uint *restrict tile_offset,  // [T+1]
+    __global const uint *restrict tile_pairs,   // [P] front to back inside a tile
+    __global const uint *restrict pair_splat,   // [P]
+    __global const float *restrict splats,      // [N,RECORD]
+    __constant camera_t *restrict camera,       // [1]
+    __global const float *restrict image,       // [3,tiles_y*TILE,tiles_x*TILE]
+    __global const float *restrict grad_image,  // [3,tiles_y*TILE,tiles_x*TILE]
+    __global const uint *restrict tile_last,    // [T]
+    __global float *restrict pair_moments)      // [P,RECORD] in emission order
+{
+    __local grad_pixels_t pixels[PIXELS];
+    const uint item = get_local_id(0), tile = get_group_id(0);
+    const uint tile_x = tile % camera->tiles_x, tile_y = tile / camera->tiles_x;
+    const uint width = camera->tiles_x * TILE, plane = width * camera->tiles_y * TILE;
+    for (uint i = item; i < PIXELS; i += SPLAT_GROUP) {
+        const uint at = (tile_y * TILE + i / TILE) * width + tile_x * TILE + i % TILE;
+        grad_pixels_t p;
+        p.t = 1.0f;
+        p.red = grad_image[at];
+        p.green = grad_image[plane + at];
+        p.blue = grad_image[2 * plane + at];
+        p.rest = p.red * image[at] + p.green * image[plane + at] + p.blue * image[2 * plane + at];
+        pixels[i] = p;
+    }
+
+    const uint end = tile_offset[tile + 1], last = tile_last[tile];
+    for (uint begin = tile_offset[tile]; begin < end; begin += SPLAT_GROUP) {
+        const bool owns = begin + item < end, active = begin + item < last;
+        const uint pair = owns ? tile_pairs[begin + item] : 0;
+        float splat[RECORD] = {0.0f};
+        moments_t m = {0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f};
+        if (active)
+            for (uint k = 0; k < RECORD; k++)
+                splat[k] = splats[(size_t)pair_splat[pair] * RECORD + k];
+        barrier(CLK_LOCAL_MEM_FENCE);
+        if (begin < last)  // uniform: a batch that no pixel reached only writes zeros
+            for (uint step = 0; step < PIXELS + SPLAT_GROUP - 1; step++) {
+                const uint i = step - item;  // wraps to a huge number before the first pixel arrives
+                if (active && i < PIXELS) {
+                    const float pixel = tile_x * TILE + i % TILE + 0.5f, row = tile_y * TILE + i / TILE + 0.5f;
+                    grad_pixels_t p = pixels[i];
+                    blend_backward_step(&p, splat_at_row(splat, row), pixel, splat + SPLAT_RED, &m);
+                    pixels[i] = p;
+                }
+                barrier(CLK_LOCAL_MEM_FENCE);
+            }
+        if (owns)
+            vstore16((float16)(m.power, m.x, m.y, m.xx, m.xy, m.yy, m.red, m.green, m.blue,
+                               0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f), pair, pair_moments);
+    }
+}

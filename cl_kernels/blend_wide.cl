@@ -1,0 +1,159 @@
+/* Blending for CPUs: one item = one tile, LANES pixels of a row at a time, two rows together so that their chains of
+ * transmittance overlap.  Kerbl et al. 2023, eq. 3; the maths is in splat.h. */
+#include "splat.h"
+
+#define COLUMNS (TILE / LANES)  // vectors per tile row
+#define SEGMENT 128             // splats of a tile copied together, so that its rows read them from the nearest cache
+
+static inline VF pixel_centres(const uint tile_x, const uint column)
+{
+    return to_VF(LANE_INDEX + (int)(tile_x * TILE + column * LANES)) + 0.5f;
+}
+
+/* 1 where the pixel lies in the image, else 0: planes are zero outside, which the losses rely on. */
+static inline VF inside_image(__constant camera_t *restrict camera, const VF pixel, const uint row)
+{
+    const VF one = (VF)(1.0f), zero = (VF)(0.0f);
+    return row < camera->height ? (pixel < (float)camera->width ? one : zero) : zero;
+}
+
+/* Private memory: SEGMENT * 68 bytes of splats and TILE * TILE * 16 of pixels.  Deterministic. */
+__kernel __attribute__((reqd_work_group_size(1, 1, 1)))
+void blend_forward(
+    __global const uint *restrict tile_offset,  // [T+1]
+    __global const uint *restrict tile_pairs,   // [P] front to back inside a tile
+    __global const uint *restrict pair_splat,   // [P]
+    __global const float *restrict splats,      // [N,RECORD]
+    __constant float *restrict background,      // [3]
+    __constant camera_t *restrict camera,       // [1]
+    __global float *restrict image,             // [3,tiles_y*TILE,tiles_x*TILE]
+    __global float *restrict transmittance,     // [tiles_y*TILE,tiles_x*TILE]
+    __global uint *restrict tile_last)          // [T] one past the last pair that any pixel blends
+{
+    const uint tile = get_global_id(0);
+    const uint tile_x = tile % camera->tiles_x, tile_y = tile / camera->tiles_x;
+    const uint first = tile_offset[tile], end = tile_offset[tile + 1];
+    const uint width = camera->tiles_x * TILE, plane = width * camera->tiles_y * TILE;
+    float segment[SEGMENT][RECORD];
+    uint list[SEGMENT];
+    pixels_t pixels[TILE][COLUMNS];
+    for (uint y = 0; y < TILE; y++)
+        for (uint column = 0; column < COLUMNS; column++) {
+            const pixels_t clear = {(VF)(1.0f), (VF)(0.0f), (VF)(0.0f), (VF)(0.0f)};
+            pixels[y][column] = clear;
+        }
+
+    uint last = first;
+    bool unfinished = true;
+    for (uint begin = first; begin < end && unfinished; begin += SEGMENT) {
+        const uint length = end - begin < SEGMENT ? end - begin : SEGMENT;
+        for (uint j = 0; j < length; j++)
+            vstore16(vload16(pair_splat[tile_pairs[begin + j]], splats), 0, segment[j]);
+        unfinished = false;
+        for (uint y = 0; y < TILE; y += 2) {
+            const float row = tile_y * TILE + y + 0.5f;
+            uint listed = 0;
+            for (uint j = 0; j < length; j++) {  // branch-free compaction
+                list[listed] = j;
+                listed += (segment[j][SPLAT_Y_MIN] <= row + 1.0f) & (segment[j][SPLAT_Y_MAX] >= row);
+            }
+            for (uint column = 0; column < COLUMNS; column++) {
+                const VF pixel = pixel_centres(tile_x, column);
+                pixels_t upper = pixels[y][column], lower = pixels[y + 1][column];
+                bool open = ANY((upper.t > 0.0f) | (lower.t > 0.0f));
+                for (uint k = 0; k < listed && open; k++) {
+                    const float *splat = segment[list[k]];
+                    blend(&upper, splat_at_row(splat, row), pixel, splat + SPLAT_RED);
+                    blend(&lower, splat_at_row(splat, row + 1.0f), pixel, splat + SPLAT_RED);
+                    if ((k & 15) == 15 || k + 1 == listed) {
+                        open = ANY((upper.t > 0.0f) | (lower.t > 0.0f));
+                        const uint reached = begin + list[k] + 1;
+                        last = reached > last ? reached : last;
+                    }
+                }
+                pixels[y][column] = upper;
+                pixels[y + 1][column] = lower;
+                unfinished = unfinished || open;
+            }
+        }
+    }
+
+    tile_last[tile] = last;
+    for (uint y = 0; y < TILE; y++)
+        for (uint column = 0; column < COLUMNS; column++) {
+            const uint row = tile_y * TILE + y;
+            const uint at = row * width + tile_x * TILE + column * LANES;
+            const VF inside = inside_image(camera, pixel_centres(tile_x, column), row);
+            const pixels_t p = pixels[y][column];
+            const VF t = magnitude(p.t);
+            VSTORE((p.red + t * background[0]) * inside, image + at);
+            VSTORE((p.green + t * background[1]) * inside, image + plane + at);
+            VSTORE((p.blue + t * background[2]) * inside, image + 2 * plane + at);
+            VSTORE(t * inside, transmittance + at);
+        }
+}
+
+/* Sum the lanes of each moment and write one record. */
+static inline void store_record(const moments_t m, __global float *restrict record)
+{
+    const float16 sums = (float16)(
+        sum_lanes(m.power), sum_lanes(m.x), sum_lanes(m.y), sum_lanes(m.xx), sum_lanes(m.xy), sum_lanes(m.yy),
+        sum_lanes(m.red), sum_lanes(m.green), sum_lanes(m.blue), 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f);
+    vstore16(sums, 0, record);
+}
+
+/* Splats outside, rows inside: a splat's record is summed in registers and written once, at the pair's address; pairs
+ * that no pixel reached get zeros.  Private memory: TILE * TILE * 20 bytes.  Deterministic. */
+__kernel __attribute__((reqd_work_group_size(1, 1, 1)))
+void blend_backward(
+    __global const uint *restrict tile_offset,  // [T+1]
+    __global const uint *restrict tile_pairs,   // [P] front to back inside a tile
+    __global const uint *restrict pair_splat,   // [P]
+    __global const float *restrict splats,      // [N,RECORD]
+    __constant camera_t *restrict camera,       // [1]
+    __global const float *restrict image,       // [3,tiles_y*TILE,tiles_x*TILE]
+    __global const float *restrict grad_image,  // [3,tiles_y*TILE,tiles_x*TILE]
+    __global const uint *restrict tile_last,    // [T]
+    __global float *restrict pair_moments)      // [P,RECORD] in emission order
+{
+    const uint tile = get_global_id(0);
+    const uint tile_x = tile % camera->tiles_x, tile_y = tile / camera->tiles_x;
+    const uint width = camera->tiles_x * TILE, plane = width * camera->tiles_y * TILE;
+    grad_pixels_t pixels[TILE][COLUMNS];
+    for (uint y = 0; y < TILE; y++)
+        for (uint column = 0; column < COLUMNS; column++) {
+            const uint at = (tile_y * TILE + y) * width + tile_x * TILE + column * LANES;
+            grad_pixels_t p;
+            p.t = (VF)(1.0f);
+            p.red = VLOAD(grad_image + at);
+            p.green = VLOAD(grad_image + plane + at);
+            p.blue = VLOAD(grad_image + 2 * plane + at);
+            p.rest = p.red * VLOAD(image + at) + p.green * VLOAD(image + plane + at) +
+                     p.blue * VLOAD(image + 2 * plane + at);
+            pixels[y][column] = p;
+        }
+
+    const uint end = tile_offset[tile + 1], last = tile_last[tile];
+    const float top = tile_y * TILE + 0.5f;
+    for (uint j = tile_offset[tile]; j < last; j++) {
+        const uint pair = tile_pairs[j];
+        float splat[RECORD];
+        vstore16(vload16(pair_splat[pair], splats), 0, splat);
+        const VF zero = (VF)(0.0f);
+        moments_t moments = {zero, zero, zero, zero, zero, zero, zero, zero, zero};
+        const float low = splat[SPLAT_Y_MIN] - top, high = splat[SPLAT_Y_MAX] - top;
+        const uint y_begin = low > 0.0f ? (uint)low & ~1u : 0u;
+        const uint y_end = high < TILE - 1.0f ? (uint)(high + 1.0f) : TILE;
+        for (uint y = y_begin; y < y_end; y += 2) {
+            const row_splat_t upper = splat_at_row(splat, top + y), lower = splat_at_row(splat, top + y + 1.0f);
+            for (uint column = 0; column < COLUMNS; column++) {
+                const VF pixel = pixel_centres(tile_x, column);
+                blend_backward_step(&pixels[y][column], upper, pixel, splat + SPLAT_RED, &moments);
+                blend_backward_step(&pixels[y + 1][column], lower, pixel, splat + SPLAT_RED, &moments);
+            }
+        }
+        store_record(moments, pair_moments + (size_t)pair * RECORD);
+    }
+    for (uint j = last; j < end; j++)
+        vstore16((float16)(0.0f), tile_pairs[j], pair_moments);
+}

@@ -1,0 +1,62 @@
+/* What every kernel shares: the names that the host may set with -D, the constants of the method, the camera.
+ *
+ * Letters in comments: N Gaussians, S stride of the planes (capacity, a multiple of 64), P (tile, Gaussian) pairs,
+ * T tiles, H, W image, K spherical harmonics coefficients. */
+#ifndef CLSPLAT_COMMON_H
+#define CLSPLAT_COMMON_H
+
+/* ---- names the host may set; nothing else is ever passed with -D ---- */
+#ifndef LANES
+#define LANES 16  // Gaussians or pixels per item: 16 or 8 on CPUs, 1 on GPUs
+#endif
+#ifndef GROUP
+#define GROUP 64  // items per work-group of one-dimensional kernels
+#endif
+#ifndef TILE
+#define TILE 16  // pixels per tile side
+#endif
+#ifndef TEAM
+#define TEAM 1  // items that walk one run of work together, in scans, sorts and losses: 1 on CPUs
+#endif
+#ifndef DIGIT_BITS
+#define DIGIT_BITS 11  // widest radix digit: its table is TEAM << DIGIT_BITS counters of local memory
+#endif
+#ifndef BITONIC_GROUP
+#define BITONIC_GROUP 64  // items per tile in the bitonic sort
+#endif
+#ifndef SORT_CAPACITY
+#define SORT_CAPACITY 1024  // pairs of a tile that the bitonic sort holds in local memory, 8 bytes each
+#endif
+#ifndef SPLAT_GROUP
+#define SPLAT_GROUP 32  // splats per batch of the simt backward pass
+#endif
+
+/* ---- constants of the method (Kerbl et al. 2023); tests override the first three to make blending smooth ---- */
+#ifndef ALPHA_MIN
+#define ALPHA_MIN (1.0f / 255.0f)  // fainter contributions are skipped: they do not change an 8-bit image
+#endif
+#ifndef ALPHA_MAX
+#define ALPHA_MAX 0.99f  // keeps 1 - alpha >= 0.01, so that dividing by it is safe
+#endif
+#ifndef TRANSMITTANCE_MIN
+#define TRANSMITTANCE_MIN 1.0e-4f  // a pixel is finished when the next splat would leave less
+#endif
+#define POWER_MIN (-80.0f)      // exp_power is valid from here to 0
+#define DEPTH_MAX 1.0e10f       // scene units; also rejects infinities
+#define QUAT_NORM2_MIN 1.0e-12f // shorter quaternions have no direction
+#define RAY_MARGIN 0.3f         // rays are clamped at 30 % beyond the image: the linearised projection fails further out
+#define LAMBDA_FLOOR 0.1f       // px^2, under the root of the 3-sigma radius
+#define EXTENT_SLACK 0.02f      // added to the squared radius of a splat: rounding never cuts a visible pixel
+
+#define RECORD 16  // floats per splat record and per gradient record: one 64-byte line
+
+typedef struct {
+    float world_to_camera[12];  // row-major [3,4]
+    float position[3];          // scene units
+    float fx, fy, cx, cy;       // px
+    float ray_x_min, ray_x_max, ray_y_min, ray_y_max;  // limits of x/z and y/z in the linearised projection
+    uint width, height;         // px
+    uint tiles_x, tiles_y;
+} camera_t;
+
+#endif

@@ -1,0 +1,140 @@
+/* Density control: what each Gaussian's screen gradient was, which rows a rule edits, and the rows that come out.
+ *
+ * Kerbl et al. 2023, section 5.  A rule is a box in (gradient, size, opacity) with an outcome: how many rows the Gaussian
+ * becomes (`copies`), how many of them are the old one (`kept`) and by what the scales of the fresh ones are multiplied
+ * (`shrink`).  Clone = (2, 1, 1), split in n = (n, 0, 1/1.6), prune = (0, 0, 1).  One item = one Gaussian or one row.
+ * No local memory.  Deterministic. */
+#include "common.h"
+#include "random.h"
+
+/* Add this view's screen gradient, in the units of the reference: dL by normalised device coordinates. */
+__kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
+void accumulate_stats(
+    __global const float *restrict grad_mean2d,  // [2,S] px^-1
+    __global const float *restrict radius,       // [S] px, 0 = not seen
+    __global float *restrict screen_grad,        // [S] sum of norms
+    __global float *restrict seen,               // [S] views
+    const float half_width,                      // px
+    const float half_height,                     // px
+    const uint stride,
+    const uint count)
+{
+    const uint i = get_global_id(0);
+    if (i >= count || !(radius[i] > 0.0f))
+        return;
+    const float x = half_width * grad_mean2d[i], y = half_height * grad_mean2d[stride + i];
+    screen_grad[i] += sqrt(x * x + y * y);
+    seen[i] += 1.0f;
+}
+
+/* Every Gaussian keeps its row, until a rule says otherwise. */
+__kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
+void start_edit(
+    __global uint *restrict copies,   // [N]
+    __global uint *restrict kept,     // [N]
+    __global float *restrict shrink,  // [N]
+    const uint count)
+{
+    const uint i = get_global_id(0);
+    if (i >= count)
+        return;
+    copies[i] = 1;
+    kept[i] = 1;
+    shrink[i] = 1.0f;
+}
+
+/* Apply one rule.  A Gaussian grows by the first growing rule that wants it; pruning overrides growth and judges the
+ * size after a split, as if it looked at the children. */
+__kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
+void mark_rule(
+    __global const float *restrict log_scales,     // [3,S] log of scene units
+    __global const float *restrict logit_opacity,  // [S]
+    __global const float *restrict screen_grad,    // [S]
+    __global const float *restrict seen,           // [S]
+    __global uint *restrict copies,                // [N]
+    __global uint *restrict kept,                  // [N]
+    __global float *restrict shrink,               // [N]
+    const float gradient_above,                    // mean screen gradient, at least
+    const float size_above,                        // scene units, more than
+    const float size_below,                        // scene units, at most
+    const float opacity_below,                     // less than
+    const float new_shrink,
+    const uint new_copies,
+    const uint new_kept,
+    const uint stride,
+    const uint count)
+{
+    const uint i = get_global_id(0);
+    if (i >= count || !(new_copies == 0 || copies[i] == 1))
+        return;
+    const float size = exp(fmax(log_scales[i], fmax(log_scales[stride + i], log_scales[2 * stride + i]))) * shrink[i];
+    const float opacity = 1.0f / (1.0f + exp(-logit_opacity[i]));
+    const float gradient = seen[i] > 0.0f ? screen_grad[i] / seen[i] : 0.0f;
+    if (gradient >= gradient_above && size > size_above && size <= size_below && opacity < opacity_below) {
+        copies[i] = new_copies;
+        kept[i] = new_kept;
+        shrink[i] = new_copies == 0 ? shrink[i] : new_shrink;
+    }
+}
+
+/* Which row each new row comes from, in the old order: a Gaussian's offspring stay beside it. */
+__kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
+void list_rows(
+    __global const uint *restrict copies,      // [N]
+    __global const uint *restrict kept,        // [N]
+    __global const uint *restrict row_offset,  // [N+1] scanned copies
+    __global uint *restrict source,            // [M]
+    __global uint *restrict fresh,             // [M] 0 or 1
+    const uint count)
+{
+    const uint i = get_global_id(0);
+    if (i >= count)
+        return;
+    for (uint copy = 0; copy < copies[i]; copy++) {
+        source[row_offset[i] + copy] = i;
+        fresh[row_offset[i] + copy] = copy >= kept[i] ? 1 : 0;
+    }
+}
+
+/* Move and shrink the children of split Gaussians: mean + R (s * normal), s * shrink. */
+__kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
+void spawn_children(
+    __global const uint *restrict source,   // [M] row before the edit
+    __global const uint *restrict kept,     // [N] before the edit; 0 = split
+    __global const float *restrict shrink,  // [N] before the edit
+    __global const float *restrict quats,   // [4,S] unnormalised
+    __global float *restrict means,         // [3,S] scene units
+    __global float *restrict log_scales,    // [3,S] log of scene units
+    const uint seed,
+    const uint step,
+    const uint stride,
+    const uint count)
+{
+    const uint i = get_global_id(0);
+    if (i >= count || kept[source[i]] > 0)
+        return;
+    const float3 normal = normal3((uint4)(i, step, 0, 0), (uint2)(seed, 0));
+    const float ex = exp(log_scales[i]) * normal.x;
+    const float ey = exp(log_scales[stride + i]) * normal.y;
+    const float ez = exp(log_scales[2 * stride + i]) * normal.z;
+    float w = quats[i], x = quats[stride + i], y = quats[2 * stride + i], z = quats[3 * stride + i];
+    const float inverse = 1.0f / sqrt(w * w + x * x + y * y + z * z);
+    w *= inverse, x *= inverse, y *= inverse, z *= inverse;
+    means[i] += (1.0f - 2.0f * (y * y + z * z)) * ex + 2.0f * (x * y - w * z) * ey + 2.0f * (x * z + w * y) * ez;
+    means[stride + i] += 2.0f * (x * y + w * z) * ex + (1.0f - 2.0f * (x * x + z * z)) * ey + 2.0f * (y * z - w * x) * ez;
+    means[2 * stride + i] += 2.0f * (x * z - w * y) * ex + 2.0f * (y * z + w * x) * ey + (1.0f - 2.0f * (x * x + y * y)) * ez;
+    for (uint k = 0; k < 3; k++)
+        log_scales[k * stride + i] += log(shrink[source[i]]);
+}
+
+/* No Gaussian stays more opaque than the limit (the opacity reset of 3DGS). */
+__kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
+void cap_opacity(
+    __global float *restrict logit_opacity,  // [S]
+    const float limit,                       // logit
+    const uint count)
+{
+    const uint i = get_global_id(0);
+    if (i < count)
+        logit_opacity[i] = logit_opacity[i] < limit ? logit_opacity[i] : limit;
+}

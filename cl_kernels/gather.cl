@@ -1,0 +1,51 @@
+/* Moving rows: the sum of each Gaussian's gradient records, and any per-Gaussian table in another order. */
+#include "splat.h"
+
+/* One item = LANES Gaussians; the pairs of a Gaussian are contiguous and summed in order: deterministic. */
+__kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
+void sum_records(
+    __global const float *restrict pair_moments,  // [P,RECORD]
+    __global const uint *restrict first_pair,     // [N]
+    __global const uint *restrict tile_count,     // [N]
+    __global float *restrict moments,             // [MOMENTS,S]
+    const uint stride,
+    const uint count)
+{
+    const uint i = get_global_id(0) * LANES;
+    if (i >= count)
+        return;
+    float table[LANES][RECORD];
+    for (uint lane = 0; lane < LANES; lane++) {
+        float16 sum = (float16)(0.0f);
+        const uint pairs = i + lane < count ? tile_count[i + lane] : 0;
+        const uint first = pairs > 0 ? first_pair[i + lane] : 0;
+        for (uint pair = first; pair < first + pairs; pair++)
+            sum += vload16(pair, pair_moments);
+        vstore16(sum, 0, table[lane]);
+    }
+    for (uint k = 0; k < MOMENTS; k++) {
+        float lanes[LANES];
+        for (uint lane = 0; lane < LANES; lane++)
+            lanes[lane] = table[lane][k];
+        VSTORE(VLOAD(lanes), moments + k * stride + i);
+    }
+}
+
+/* Row i of `moved` is row source[i] of `table`; rows marked fresh are zeroed where `zero_fresh` says so.
+ * One item = one row of one plane; dimension 1 is the plane. */
+__kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
+void gather_rows(
+    __global const float *restrict table,  // [components,table_stride]
+    __global const uint *restrict source,  // [count]
+    __global const uint *restrict fresh,   // [count] 0 or 1
+    __global float *restrict moved,        // [components,moved_stride]
+    const uint zero_fresh,
+    const uint table_stride,
+    const uint moved_stride,
+    const uint count)
+{
+    const uint i = get_global_id(0), plane = get_global_id(1);
+    if (i >= count)
+        return;
+    moved[plane * moved_stride + i] = zero_fresh && fresh[i] ? 0.0f : table[plane * table_stride + source[i]];
+}

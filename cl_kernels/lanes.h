@@ -1,0 +1,107 @@
+/* VF and VI: a float and an int in each of LANES lanes.  One source then serves CPUs, whose vector units want 16 or
+ * 8 Gaussians or pixels per item, and GPUs, which want one.
+ *
+ * Comparisons give -1 in vectors and 1 in scalars, so masks are combined with & and | only and used as m ? a : b.
+ * Loops that matter use operators only: some CPU runtimes call built-in functions out of line. */
+#ifndef CLSPLAT_LANES_H
+#define CLSPLAT_LANES_H
+#include "common.h"
+
+#if LANES == 16
+typedef float16 VF;
+typedef int16 VI;
+#define as_VF as_float16
+#define as_VI as_int16
+#define VLOAD(pointer) vload16(0, pointer)
+#define VSTORE(value, pointer) vstore16(value, 0, pointer)
+#define LANE_INDEX ((VI)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15))
+#define to_VF convert_float16
+#elif LANES == 8
+typedef float8 VF;
+typedef int8 VI;
+#define as_VF as_float8
+#define as_VI as_int8
+#define VLOAD(pointer) vload8(0, pointer)
+#define VSTORE(value, pointer) vstore8(value, 0, pointer)
+#define LANE_INDEX ((VI)(0, 1, 2, 3, 4, 5, 6, 7))
+#define to_VF convert_float8
+#else
+typedef float VF;
+typedef int VI;
+#define as_VF as_float
+#define as_VI as_int
+#define VLOAD(pointer) (*(pointer))
+#define VSTORE(value, pointer) (*(pointer) = (value))
+#define LANE_INDEX 0
+#define to_VF convert_float
+#endif
+
+#if LANES == 1
+#define ANY(mask) (mask)
+#else
+#define ANY(mask) any(mask)
+#endif
+
+#define ROUND_MAGIC 12582912.0f  // 1.5 * 2^23: adding it leaves the nearest integer in the low mantissa bits
+#define LOG2_E 1.44269504f
+#define LN_2 0.693147181f
+
+/* Sum of the lanes, by halves: one order on every device. */
+#if LANES == 16
+static inline float sum_lanes(const VF v)
+{
+    const float8 a = v.lo + v.hi;
+    const float4 b = a.lo + a.hi;
+    const float2 c = b.lo + b.hi;
+    return c.x + c.y;
+}
+#elif LANES == 8
+static inline float sum_lanes(const VF v)
+{
+    const float4 b = v.lo + v.hi;
+    const float2 c = b.lo + b.hi;
+    return c.x + c.y;
+}
+#else
+static inline float sum_lanes(const VF v) { return v; }
+#endif
+
+static inline VF larger(VF a, VF b) { return a > b ? a : b; }
+static inline VF smaller(VF a, VF b) { return a < b ? a : b; }
+
+/* e^x for x in [POWER_MIN, 80]: 2^n from the exponent bits, 2^f by a minimax polynomial on [-1/2, 1/2].
+ * Relative error 3e-7 near 0, 1.3e-6 at the ends.  Outside the range the lanes hold rubbish. */
+static inline VF exp_power(VF x)
+{
+    const VF t = x * LOG2_E + ROUND_MAGIC;
+    const VF n = t - ROUND_MAGIC;
+    const VF f = x * LOG2_E - n;
+    VF p = f * 1.32765e-3f + 9.67554e-3f;
+    p = p * f + 5.550713e-2f;
+    p = p * f + 2.4022120e-1f;
+    p = p * f + 6.9314697e-1f;
+    p = p * f + 1.0f;
+    return as_VF(as_VI(p) + (as_VI(t) << 23));
+}
+
+/* e^x with x clamped to [-80, 80]. */
+static inline VF exp_clamped(VF x) { return exp_power(smaller(larger(x, (VF)(-80.0f)), (VF)(80.0f))); }
+
+/* ln x for finite x > 0 (normal numbers): exponent bits plus 2 atanh((m-1)/(m+1)) for m in [0.7, 1.4]. */
+static inline VF log_positive(VF x)
+{
+    const VI bits = as_VI(x) - 0x3f3504f3;  // 0x3f3504f3 is sqrt(1/2): centres the mantissa on 1
+    const VI exponent = bits >> 23;
+    const VF m = as_VF((bits & 0x007fffff) + 0x3f3504f3);
+    const VF e = as_VF(exponent + 0x4b400000) - ROUND_MAGIC;  // int to float without a conversion call
+    const VF s = (m - 1.0f) / (m + 1.0f);
+    const VF z = s * s;
+    VF p = z * 0.23325634f + 0.28551073f;
+    p = p * z + 0.40000118f;
+    p = p * z + 0.66666667f;
+    return e * LN_2 + (p * z * s + 2.0f * s);
+}
+
+static inline VF sigmoid(VF x) { return 1.0f / (1.0f + exp_clamped(-x)); }
+
+#endif

@@ -1,0 +1,206 @@
+/* Photometric losses between a rendered image and a photograph: L1, L2 and D-SSIM, value and gradient.
+ *
+ * SSIM: 11x11 Gaussian window, sigma 1.5, zero padding, C1 = 0.01^2, C2 = 0.03^2 (Wang et al. 2004, as 3DGS uses it).
+ * Planes are [channels,H',W'] with H', W' whole tiles, zero outside the image.  One group of TEAM items = one row of
+ * one channel (SSIM: a block of its columns) and writes its sum once; gradients are written as zero outside the image.  Deterministic. */
+#include "lanes.h"
+
+#define SSIM_C1 1.0e-4f
+#define SSIM_C2 9.0e-4f
+#define REACH 5            // window is 2 * REACH + 1 wide
+#define BLOCK 256          // columns of a group
+#define MARGIN 16          // columns on either side, at least REACH and whole vectors
+#define SPAN (BLOCK + 2 * MARGIN)
+
+__constant float WINDOW[2 * REACH + 1] = {
+    1.02838008e-03f, 7.59875814e-03f, 3.60007721e-02f, 1.09360690e-01f, 2.13005538e-01f, 2.66011725e-01f,
+    2.13005538e-01f, 1.09360690e-01f, 3.60007721e-02f, 7.59875814e-03f, 1.02838008e-03f};
+
+/* 1 where the column lies in the image, else 0. */
+static inline VF inside_row(const uint column, const uint width)
+{
+    return (LANE_INDEX + (int)column) < (int)width ? (VF)(1.0f) : (VF)(0.0f);
+}
+
+/* 8-bit pixels to float planes.  One item = one pixel of one channel; dimensions x, y, channel. */
+__kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
+void unpack_target(
+    __global const uchar *restrict pixels,  // [3,height,width]
+    __global float *restrict target,        // [3,H',stride]
+    const uint width,
+    const uint height,
+    const uint stride)
+{
+    const uint x = get_global_id(0), y = get_global_id(1), channel = get_global_id(2);
+    if (x < width)
+        target[(channel * get_global_size(1) + y) * stride + x] =
+            y < height ? pixels[(channel * height + y) * width + x] * (1.0f / 255.0f) : 0.0f;
+    else if (x < stride)
+        target[(channel * get_global_size(1) + y) * stride + x] = 0.0f;
+}
+
+/* gradient (+)= l1 sign(x - y) + l2 2 (x - y).  Local memory: TEAM * 8 bytes. */
+__kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
+void pixel_loss(
+    __global const float *restrict image,   // [3,H',stride]
+    __global const float *restrict target,  // [3,H',stride]
+    __global float *restrict gradient,      // [3,H',stride]
+    __global float *restrict row_sums,      // [3,H',2] sums of |x - y| and (x - y)^2
+    const float l1,                         // weight / values in the image
+    const float l2,                         // weight / values in the image
+    const uint accumulate,                  // 0: overwrite the gradient
+    const uint width,
+    const uint height,
+    const uint rows,                        // H'
+    const uint stride)
+{
+    __local float sums[TEAM][2];
+    const uint item = get_local_id(0), y = get_group_id(1), channel = get_group_id(2);
+    const uint row = (channel * rows + y) * stride, columns = y < height ? width : 0;
+    const VF zero = (VF)(0.0f);
+    VF absolute = zero, squared = zero;
+    for (uint x = item * LANES; x < stride; x += TEAM * LANES) {
+        const VF inside = inside_row(x, columns);
+        const VF difference = VLOAD(image + row + x) - VLOAD(target + row + x);
+        const VF sign = difference > 0.0f ? inside : (difference < 0.0f ? -inside : zero);
+        const VF g = l1 * sign + (2.0f * l2) * (difference * inside);
+        VSTORE((accumulate ? VLOAD(gradient + row + x) + g : g), gradient + row + x);
+        absolute += difference * sign;
+        squared += difference * difference * inside;
+    }
+    sums[item][0] = sum_lanes(absolute);
+    sums[item][1] = sum_lanes(squared);
+    barrier(CLK_LOCAL_MEM_FENCE);
+    if (item == 0) {
+        float total_absolute = 0.0f, total_squared = 0.0f;
+        for (uint i = 0; i < TEAM; i++) {
+            total_absolute += sums[i][0];
+            total_squared += sums[i][1];
+        }
+        row_sums[(channel * rows + y) * 2] = total_absolute;
+        row_sums[(channel * rows + y) * 2 + 1] = total_squared;
+    }
+}
+
+/* Local means, then the SSIM map's derivatives by mean of x, variance of x and covariance:
+ *   a1 = 2 mx my + C1, a2 = 2 cov + C2, b1 = mx^2 + my^2 + C1, b2 = vx + vy + C2, m = a1 a2 / (b1 b2).
+ * Vertical sums go to local memory (SPAN * 20 bytes + TEAM * 4), the horizontal pass reads them. */
+__kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
+void ssim_maps(
+    __global const float *restrict image,   // [3,H',stride]
+    __global const float *restrict target,  // [3,H',stride]
+    __global float *restrict maps,          // [3,3,H',stride] derivative, channel, row, column
+    __global float *restrict block_sums,    // [3,height,blocks] sums of the SSIM map
+    const uint width,
+    const uint height,
+    const uint rows,                        // H'
+    const uint stride)
+{
+    __local float vertical[5][SPAN];
+    __local float sums[TEAM];
+    const uint item = get_local_id(0), y = get_group_id(1), channel = get_group_id(2);
+    const uint plane = rows * stride, first = get_group_id(0) * BLOCK;
+    const VF zero = (VF)(0.0f);
+    for (uint v = item * LANES; v < SPAN; v += TEAM * LANES) {
+        const uint x = first + v - MARGIN;  // wraps to a huge number left of the image
+        VF mx = zero, my = zero, xx = zero, yy = zero, xy = zero;
+        if (x < stride)
+            for (uint k = y < REACH ? REACH - y : 0; k <= 2 * REACH && y + k - REACH < height; k++) {
+                const uint at = channel * plane + (y + k - REACH) * stride + x;
+                const VF a = VLOAD(image + at), b = VLOAD(target + at);
+                const VF wa = WINDOW[k] * a, wb = WINDOW[k] * b;
+                mx += wa;
+                my += wb;
+                xx += wa * a;
+                yy += wb * b;
+                xy += wa * b;
+            }
+        VSTORE(mx, vertical[0] + v);
+        VSTORE(my, vertical[1] + v);
+        VSTORE(xx, vertical[2] + v);
+        VSTORE(yy, vertical[3] + v);
+        VSTORE(xy, vertical[4] + v);
+    }
+    barrier(CLK_LOCAL_MEM_FENCE);
+
+    VF total = zero;
+    for (uint v = item * LANES; v < BLOCK && first + v < stride; v += TEAM * LANES) {
+        VF mx = zero, my = zero, xx = zero, yy = zero, xy = zero;
+        for (uint k = 0; k <= 2 * REACH; k++) {
+            const uint at = v + MARGIN - REACH + k;
+            mx += WINDOW[k] * VLOAD(vertical[0] + at);
+            my += WINDOW[k] * VLOAD(vertical[1] + at);
+            xx += WINDOW[k] * VLOAD(vertical[2] + at);
+            yy += WINDOW[k] * VLOAD(vertical[3] + at);
+            xy += WINDOW[k] * VLOAD(vertical[4] + at);
+        }
+        const VF a1 = 2.0f * mx * my + SSIM_C1, a2 = 2.0f * (xy - mx * my) + SSIM_C2;
+        const VF b1 = mx * mx + my * my + SSIM_C1, b2 = (xx - mx * mx) + (yy - my * my) + SSIM_C2;
+        const VF inside = inside_row(first + v, width);
+        const VF inverse = inside / (b1 * b2);
+        const VF m = a1 * a2 * inverse;
+        const uint at = channel * plane + y * stride + first + v;
+        VSTORE(2.0f * my * (a2 - a1) * inverse - 2.0f * mx * m * (1.0f / b1 - 1.0f / b2), maps + at);
+        VSTORE(-m / b2, maps + 3 * plane + at);
+        VSTORE(2.0f * a1 * inverse, maps + 6 * plane + at);
+        total += m;
+    }
+    sums[item] = sum_lanes(total);
+    barrier(CLK_LOCAL_MEM_FENCE);
+    if (item == 0) {
+        float sum = 0.0f;
+        for (uint i = 0; i < TEAM; i++)
+            sum += sums[i];
+        block_sums[(channel * height + y) * get_num_groups(0) + get_group_id(0)] = sum;
+    }
+}
+
+/* gradient (+)= scale (W * d_mean + 2 x (W * d_variance) + y (W * d_covariance)), W * the window.
+ * Local memory: SPAN * 12 bytes. */
+__kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
+void ssim_gradient(
+    __global const float *restrict maps,    // [3,3,H',stride]
+    __global const float *restrict image,   // [3,H',stride]
+    __global const float *restrict target,  // [3,H',stride]
+    __global float *restrict gradient,      // [3,H',stride]
+    const float scale,                      // -weight / values in the image, for 1 - mean SSIM
+    const uint accumulate,                  // 0: overwrite the gradient
+    const uint width,
+    const uint height,
+    const uint rows,                        // H'
+    const uint stride)
+{
+    __local float vertical[3][SPAN];
+    const uint item = get_local_id(0), y = get_group_id(1), channel = get_group_id(2);
+    const uint plane = rows * stride, first = get_group_id(0) * BLOCK, columns = y < height ? width : 0;
+    const VF zero = (VF)(0.0f);
+    for (uint v = item * LANES; v < SPAN; v += TEAM * LANES) {
+        const uint x = first + v - MARGIN;
+        VF mean = zero, variance = zero, covariance = zero;
+        if (x < stride)
+            for (uint k = y < REACH ? REACH - y : 0; k <= 2 * REACH && y + k - REACH < height; k++) {
+                const uint at = channel * plane + (y + k - REACH) * stride + x;
+                mean += WINDOW[k] * VLOAD(maps + at);
+                variance += WINDOW[k] * VLOAD(maps + 3 * plane + at);
+                covariance += WINDOW[k] * VLOAD(maps + 6 * plane + at);
+            }
+        VSTORE(mean, vertical[0] + v);
+        VSTORE(variance, vertical[1] + v);
+        VSTORE(covariance, vertical[2] + v);
+    }
+    barrier(CLK_LOCAL_MEM_FENCE);
+
+    for (uint v = item * LANES; v < BLOCK && first + v < stride; v += TEAM * LANES) {
+        VF mean = zero, variance = zero, covariance = zero;
+        for (uint k = 0; k <= 2 * REACH; k++) {
+            const uint at = v + MARGIN - REACH + k;
+            mean += WINDOW[k] * VLOAD(vertical[0] + at);
+            variance += WINDOW[k] * VLOAD(vertical[1] + at);
+            covariance += WINDOW[k] * VLOAD(vertical[2] + at);
+        }
+        const uint at = channel * plane + y * stride + first + v;
+        const VF g = (scale * inside_row(first + v, columns)) *
+                     (mean + 2.0f * VLOAD(image + at) * variance + VLOAD(target + at) * covariance);
+        VSTORE((accumulate ? VLOAD(gradient + at) + g : g), gradient + at);
+    }
+}

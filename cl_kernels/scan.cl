@@ -1,0 +1,84 @@
+/* Exclusive prefix sum of unsigned integers: reduce, scan the block sums, then scan inside blocks.
+ *
+ * A block is one work-group; each of its TEAM items owns `run` consecutive values, long on CPUs (one item per
+ * group) and short on GPUs.  Integer sums: deterministic.  No group waits for another. */
+#include "common.h"
+
+/* Sum of each block.  Local memory: TEAM * 4 bytes. */
+__kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
+void scan_blocks(
+    __global const uint *restrict values,  // [count]
+    __global uint *restrict block_sum,     // [blocks]
+    const uint run,
+    const uint count)
+{
+    __local uint sums[TEAM];
+    const uint item = get_local_id(0);
+    const uint first = (get_group_id(0) * TEAM + item) * run;
+    uint sum = 0;
+    for (uint i = first; i < first + run && i < count; i++)
+        sum += values[i];
+    sums[item] = sum;
+    barrier(CLK_LOCAL_MEM_FENCE);
+    if (item == 0) {
+        uint total = 0;
+        for (uint i = 0; i < TEAM; i++)
+            total += sums[i];
+        block_sum[get_group_id(0)] = total;
+    }
+}
+
+/* Exclusive scan of the block sums, in place.  One item. */
+__kernel __attribute__((reqd_work_group_size(1, 1, 1)))
+void scan_sums(
+    __global uint *restrict block_sum,  // [blocks]
+    const uint blocks)
+{
+    uint sum = 0;
+    for (uint i = 0; i < blocks; i++) {
+        const uint value = block_sum[i];
+        block_sum[i] = sum;
+        sum += value;
+    }
+}
+
+/* offset[i] = sum of the values before i; offset[count] = their total.  Local memory: TEAM * 4 bytes. */
+__kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
+void scan_offsets(
+    __global const uint *restrict values,     // [count]
+    __global const uint *restrict block_sum,  // [blocks] after scan_sums
+    __global uint *restrict offset,           // [count+1]
+    const uint run,
+    const uint count)
+{
+    __local uint sums[TEAM];
+    const uint item = get_local_id(0);
+    const uint first = (get_group_id(0) * TEAM + item) * run;
+    uint sum = 0;
+    for (uint i = first; i < first + run && i < count; i++)
+        sum += values[i];
+    sums[item] = sum;
+    barrier(CLK_LOCAL_MEM_FENCE);
+    sum = block_sum[get_group_id(0)];
+    for (uint i = 0; i < item; i++)
+        sum += sums[i];
+    for (uint i = first; i < first + run && i < count; i++) {
+        offset[i] = sum;
+        sum += values[i];
+        if (i + 1 == count)
+            offset[count] = sum;
+    }
+}
+
+/* The values in another order: what the scan of a permuted table starts from.  One item = one place. */
+__kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
+void permute(
+    __global const uint *restrict values,  // [N]
+    __global const uint *restrict order,   // [count] index of the value at each place
+    __global uint *restrict permuted,      // [count]
+    const uint count)
+{
+    const uint place = get_global_id(0);
+    if (place < count)
+        permuted[place] = values[order[place]];
+}

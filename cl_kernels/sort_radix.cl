@@ -1,0 +1,76 @@
+/* One pass of a stable radix sort of (key, value) pairs: count digits, scan the counts (scan.cl), scatter.
+ *
+ * A block is one work-group; each of its TEAM items owns `run` consecutive pairs, so that order inside a block is
+ * order of items and stability needs no atomics.  On CPUs one item per group walks a long run with wide digits; on
+ * GPUs a group walks short runs with narrow ones.  Local memory: 4 << DIGIT_BITS bytes * TEAM.  Deterministic. */
+#include "common.h"
+
+static inline void count_digits(__global const uint *restrict keys, __local uint *counts, const uint first, const uint run,
+                                const uint shift, const uint digits, const uint count)
+{
+    const uint item = get_local_id(0);
+    for (uint digit = 0; digit < digits; digit++)
+        counts[digit * TEAM + item] = 0;
+    for (uint i = first; i < first + run && i < count; i++)
+        counts[((keys[i] >> shift) & (digits - 1)) * TEAM + item]++;
+}
+
+/* digit_count[digit][block] = keys of the block with that digit. */
+__kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
+void radix_count(
+    __global const uint *restrict keys,   // [count]
+    __global uint *restrict digit_count,  // [digits,blocks]
+    const uint shift,
+    const uint digits,
+    const uint run,
+    const uint blocks,
+    const uint count)
+{
+    __local uint counts[TEAM << DIGIT_BITS];
+    const uint item = get_local_id(0), block = get_group_id(0);
+    count_digits(keys, counts, (block * TEAM + item) * run, run, shift, digits, count);
+    barrier(CLK_LOCAL_MEM_FENCE);
+    for (uint digit = item; digit < digits; digit += TEAM) {
+        uint sum = 0;
+        for (uint i = 0; i < TEAM; i++)
+            sum += counts[digit * TEAM + i];
+        digit_count[digit * blocks + block] = sum;
+    }
+}
+
+/* Move every pair to its place.  In the first pass the values are the places themselves: 0, 1, 2, ... */
+__kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
+void radix_scatter(
+    __global const uint *restrict keys,          // [count]
+    __global const uint *restrict values,        // [count], not read in the first pass
+    __global const uint *restrict digit_offset,  // [digits*blocks+1] scanned digit_count
+    __global uint *restrict sorted_keys,         // [count]
+    __global uint *restrict sorted_values,       // [count]
+    const uint first_pass,
+    const uint shift,
+    const uint digits,
+    const uint run,
+    const uint blocks,
+    const uint count)
+{
+    __local uint places[TEAM << DIGIT_BITS];
+    const uint item = get_local_id(0), block = get_group_id(0);
+    const uint first = (block * TEAM + item) * run;
+    count_digits(keys, places, first, run, shift, digits, count);
+    barrier(CLK_LOCAL_MEM_FENCE);
+    for (uint digit = item; digit < digits; digit += TEAM) {
+        uint place = digit_offset[digit * blocks + block];
+        for (uint i = 0; i < TEAM; i++) {
+            const uint here = places[digit * TEAM + i];
+            places[digit * TEAM + i] = place;
+            place += here;
+        }
+    }
+    barrier(CLK_LOCAL_MEM_FENCE);
+    for (uint i = first; i < first + run && i < count; i++) {
+        const uint key = keys[i];
+        const uint place = places[((key >> shift) & (digits - 1)) * TEAM + item]++;
+        sorted_keys[place] = key;
+        sorted_values[place] = first_pass ? i : values[i];
+    }
+}

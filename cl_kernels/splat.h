@@ -1,0 +1,171 @@
+/* One splat at LANES pixels: alpha, blending and its gradient, and which tiles a splat touches.  Both schedules use
+ * these functions, so their images are equal bit for bit.
+ *
+ *   power = -1/2 (xx dx^2 + yy dy^2) - xy dx dy,  alpha = min(0.99, opacity e^power),  d = mean - pixel centre
+ *
+ * A splat contributes to a pixel when the pixel's row lies in its extent, power_min <= power <= 0 (power_min is where
+ * alpha falls to 1/255) and blending it leaves transmittance >= 1e-4; the first splat that would leave less finishes
+ * the pixel and is not blended (Kerbl et al. 2023).  A finished pixel keeps its transmittance with the sign turned. */
+#ifndef CLSPLAT_SPLAT_H
+#define CLSPLAT_SPLAT_H
+#include "lanes.h"
+
+/* fields of a splat record, [RECORD] floats; all zero when the Gaussian is culled */
+#define SPLAT_X 0          // mean, px
+#define SPLAT_Y 1
+#define SPLAT_XX 2         // conic, px^-2
+#define SPLAT_XY 3
+#define SPLAT_YY 4
+#define SPLAT_OPACITY 5    // after both filters
+#define SPLAT_RED 6        // then green, blue
+#define SPLAT_Y_MIN 9      // extent of alpha >= 1/255, px
+#define SPLAT_Y_MAX 10
+#define SPLAT_X_MIN 11
+#define SPLAT_X_MAX 12
+#define SPLAT_POWER_MIN 13 // ln(ALPHA_MIN / opacity)
+
+/* fields of a gradient record, [RECORD] floats: sums over pixels, with p = dL/dpower and w = alpha T */
+#define MOMENT_POWER 0     // p; divided by the opacity it is dL/dopacity
+#define MOMENT_X 1         // p dx
+#define MOMENT_Y 2         // p dy
+#define MOMENT_XX 3        // p dx dx
+#define MOMENT_XY 4        // p dx dy
+#define MOMENT_YY 5        // p dy dy
+#define MOMENT_RED 6       // w dL/dcolour; then green, blue
+#define MOMENTS 9
+
+/* The same sums while they grow, one set per lane. */
+typedef struct {
+    VF power, x, y, xx, xy, yy, red, green, blue;
+} moments_t;
+
+/* A splat seen from one row of pixels. */
+typedef struct {
+    float x;           // mean, px
+    float dy;          // px
+    float a, b, c;     // power = (a dx - b) dx - c
+    float opacity;
+    float power_min;   // above 0 when the row is outside the splat's extent: then nothing is hit
+} row_splat_t;
+
+static inline row_splat_t splat_at_row(const float *splat, const float row)
+{
+    const float dy = splat[SPLAT_Y] - row;
+    const bool inside = (row >= splat[SPLAT_Y_MIN]) & (row <= splat[SPLAT_Y_MAX]);
+    const row_splat_t s = {
+        splat[SPLAT_X], dy,
+        -0.5f * splat[SPLAT_XX], splat[SPLAT_XY] * dy, 0.5f * splat[SPLAT_YY] * dy * dy,
+        splat[SPLAT_OPACITY],
+        inside ? splat[SPLAT_POWER_MIN] : 1.0f};
+    return s;
+}
+
+/* What a splat does to LANES pixels whose transmittance before it is t. */
+typedef struct {
+    VI hit;       // the splat counts here ...
+    VI blended;   // ... and does not finish the pixel
+    VF dx;        // px
+    VF uncapped;  // alpha before the cap
+    VF remain;    // 1 - alpha
+    VF weight;    // alpha t where blended, else 0
+    VF next;      // transmittance after it; negative once finished
+} contribution_t;
+
+static inline contribution_t contribution_of(const row_splat_t s, const VF pixel, const VF t)
+{
+    contribution_t k;
+    k.dx = s.x - pixel;
+    const VF power = (k.dx * s.a - s.b) * k.dx - s.c;
+    k.uncapped = s.opacity * exp_power(power);
+    const VF alpha = smaller(k.uncapped, (VF)(ALPHA_MAX));
+    k.hit = (power >= s.power_min) & (power <= 0.0f);
+    k.remain = 1.0f - alpha;
+    const VF left = t * k.remain;
+    const VI passes = left >= TRANSMITTANCE_MIN;
+    k.blended = k.hit & passes;
+    k.weight = k.blended ? alpha * t : (VF)(0.0f);
+    const VF finished = as_VF(as_VI(t) | (VI)(0x80000000));
+    k.next = k.hit ? (passes ? left : finished) : t;
+    return k;
+}
+
+/* State of LANES pixels going front to back: transmittance and colour. */
+typedef struct {
+    VF t, red, green, blue;
+} pixels_t;
+
+static inline void blend(pixels_t *p, const row_splat_t s, const VF pixel, const float *colour)
+{
+    const contribution_t k = contribution_of(s, pixel, p->t);
+    p->red += k.weight * colour[0];
+    p->green += k.weight * colour[1];
+    p->blue += k.weight * colour[2];
+    p->t = k.next;
+}
+
+static inline VF magnitude(VF t) { return as_VF(as_VI(t) & 0x7fffffff); }
+
+/* The same walk for gradients: g = dL/dcolour of the pixel; rest = g . (what is still to be blended behind, background
+ * included), which starts as g . final colour.  Then dL/dalpha = t (c . g) - rest_after / (1 - alpha): front to back,
+ * no division to undo the transmittance. */
+typedef struct {
+    VF t, rest, red, green, blue;
+} grad_pixels_t;
+
+static inline void blend_backward_step(grad_pixels_t *p, const row_splat_t s, const VF pixel, const float *colour,
+                                       moments_t *m)
+{
+    const VF zero = (VF)(0.0f);
+    const contribution_t k = contribution_of(s, pixel, p->t);
+    const VF shade = colour[0] * p->red + colour[1] * p->green + colour[2] * p->blue;
+    p->rest = p->rest - k.weight * shade;
+    const VF grad_alpha = p->t * shade - p->rest / k.remain;
+    const VI passes = k.blended & (k.uncapped <= ALPHA_MAX);  // the cap passes no gradient
+    const VF power = passes ? k.uncapped * grad_alpha : zero;
+    const VF power_x = power * k.dx;
+    p->t = k.next;
+    m->power += power;
+    m->x += power_x;
+    m->y += power * s.dy;
+    m->xx += power_x * k.dx;
+    m->xy += power_x * s.dy;
+    m->yy += power * (s.dy * s.dy);
+    m->red += k.weight * p->red;
+    m->green += k.weight * p->green;
+    m->blue += k.weight * p->blue;
+}
+
+/* ---- tiles ---- */
+
+/* First and one past the last tile along one axis whose pixel centres reach into [low, high] px. */
+static inline uint2 tile_span(const float low, const float high, const uint tiles)
+{
+    const float first = ceil((low - (TILE - 0.5f)) * (1.0f / TILE));
+    const float last = floor((high - 0.5f) * (1.0f / TILE)) + 1.0f;
+    const float limit = (float)tiles;
+    return (uint2)((uint)(first > 0.0f ? (first < limit ? first : limit) : 0.0f),
+                   (uint)(last > 0.0f ? (last < limit ? last : limit) : 0.0f));
+}
+
+static inline float clamp_to(const float x, const float low, const float high)
+{
+    return x < low ? low : (x > high ? high : x);
+}
+
+/* Whether the splat's ellipse reaches a pixel centre's rectangle: the least -power over it lies at the mean or on the
+ * edges facing it, where it is a parabola (algorithm of StopThePop, Radl et al. 2024). */
+static inline bool touches_tile(__global const float *splat, const uint tile_x, const uint tile_y)
+{
+    const float xx = splat[SPLAT_XX], xy = splat[SPLAT_XY], yy = splat[SPLAT_YY];
+    const float x0 = tile_x * TILE + 0.5f - splat[SPLAT_X], x1 = x0 + (TILE - 1);
+    const float y0 = tile_y * TILE + 0.5f - splat[SPLAT_Y], y1 = y0 + (TILE - 1);
+    const float x = clamp_to(0.0f, x0, x1), y = clamp_to(0.0f, y0, y1);
+    const float best_y = clamp_to(-xy * x / yy, y0, y1);
+    const float best_x = clamp_to(-xy * y / xx, x0, x1);
+    const float on_vertical = 0.5f * (xx * x * x + yy * best_y * best_y) + xy * x * best_y;
+    const float on_horizontal = 0.5f * (xx * best_x * best_x + yy * y * y) + xy * best_x * y;
+    const float least = on_vertical < on_horizontal ? on_vertical : on_horizontal;
+    return least <= 0.5f * EXTENT_SLACK - splat[SPLAT_POWER_MIN];
+}
+
+#endif

@@ -1,0 +1,142 @@
+"""Gaussians on the device: a struct of arrays, and the one operation that changes their number.
+
+Every table is a set of planes [components, capacity]; hosts see [N, components].  Whatever belongs to a Gaussian is a
+table here, parameters, Adam moments and statistics alike, so that nothing can get out of step when rows move.
+
+    means [3] scene units · quats [4] (w, x, y, z), unnormalised · log_scales [3] log of scene units
+    logit_opacity [1] · sh_base [3] band 0 · sh_rest [(K-1)*3] the other bands, coefficient-major
+    filter_variance [1] scene units², the world filter; zero when there is none, never optimised
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.opencl.device import Array, Device
+
+PARAMETERS = ("means", "quats", "log_scales", "logit_opacity", "sh_base", "sh_rest")
+ALIGNMENT = 64  # capacity is a multiple of this: wide kernels need no tail
+GROWTH = 1.5
+SH_C0 = 0.28209479177387814  # basis function of band 0
+
+
+def sh_coefficients(degree: int) -> int:
+    """Number of basis functions K up to `degree`."""
+    return (degree + 1) ** 2
+
+
+@dataclass
+class Table:
+    """One quantity of every Gaussian, [components, capacity]."""
+
+    array: Array
+    components: int
+    zero_fresh: bool  # rows of new Gaussians start at zero instead of copying their source
+
+
+class Gaussians:
+    """N Gaussians and all that belongs to them."""
+
+    def __init__(self, device: Device, parameters: Mapping[str, NDArray[np.float32]]) -> None:
+        """Upload `parameters`, each [N, components] by the names of PARAMETERS; filter_variance may be given too."""
+        self.device = device
+        self.count = len(parameters["means"])
+        self.capacity = _aligned(self.count)
+        self.sh_degree = round((1 + parameters["sh_rest"].shape[1] / 3) ** 0.5) - 1
+        self.tables: dict[str, Table] = {}
+        for name in PARAMETERS:
+            self.add(name, parameters[name].shape[1])
+            self.set(name, parameters[name])
+        self.add("filter_variance", 1)
+        if "filter_variance" in parameters:
+            self.set("filter_variance", parameters["filter_variance"])
+        self._rows = device.program("gather.cl")
+
+    def __getitem__(self, name: str) -> Array:
+        return self.tables[name].array
+
+    def add(self, name: str, components: int, zero_fresh: bool = False) -> None:
+        """Attach a table of zeros."""
+        self.tables[name] = Table(self.device.zeros((components, self.capacity)), components, zero_fresh)
+
+    def get(self, name: str) -> NDArray[np.float32]:
+        """Copy a table to the host, [N, components]."""
+        planes = self.tables[name].array.get()
+        return np.ascontiguousarray(planes[:, : self.count].T)
+
+    def set(self, name: str, values: NDArray[Any]) -> None:
+        """Copy [N, components] from the host into a table."""
+        table = self.tables[name]
+        if values.shape != (self.count, table.components):
+            raise ValueError(f"{name}: expected {(self.count, table.components)}, got {values.shape}")
+        planes = np.zeros((table.components, self.capacity), np.float32)
+        planes[:, : self.count] = values.T
+        table.array.set(planes)
+
+    def rearrange(self, source: Array, fresh: Array, count: int) -> None:
+        """Row i of every table becomes row source[i]; fresh rows of moments and statistics become zero.
+
+        source, fresh: [count] uint32.  The only operation that changes the number of Gaussians.
+        """
+        capacity = self.capacity
+        if count > capacity:
+            capacity = _aligned(max(count, int(self.capacity * GROWTH)))
+        for table in self.tables.values():
+            moved = self.device.zeros((table.components, capacity))
+            self._rows.gather_rows(
+                items=(count, table.components),
+                table=table.array,
+                source=source,
+                fresh=fresh,
+                moved=moved,
+                zero_fresh=int(table.zero_fresh),
+                table_stride=self.capacity,
+                moved_stride=capacity,
+                count=count,
+            )
+            table.array = moved
+        self.count, self.capacity = count, capacity
+
+
+class Gradients:
+    """Derivatives of the loss by each parameter, with the shapes of the parameters.
+
+    A gradient that was taken before its parameter was edited no longer belongs to it and is discarded.
+    """
+
+    def __init__(self, gaussians: Gaussians) -> None:
+        self.capacity = gaussians.capacity
+        self.arrays = {
+            name: gaussians.device.zeros((gaussians.tables[name].components, gaussians.capacity)) for name in PARAMETERS
+        }
+        self.mean2d = gaussians.device.zeros((2, gaussians.capacity))  # px⁻¹, for density statistics
+        self.discarded: set[str] = set()
+
+    def __getitem__(self, name: str) -> Array:
+        return self.arrays[name]
+
+    def arguments(self) -> dict[str, Any]:
+        """The arrays by the names that kernels give them."""
+        return {**{f"grad_{name}": array for name, array in self.arrays.items()}, "grad_mean2d": self.mean2d}
+
+    def discard(self, *names: str) -> None:
+        """Mark gradients as stale; no names: all of them."""
+        self.discarded.update(names or PARAMETERS)
+
+
+@dataclass
+class Model:
+    """Gaussians and the numbers with which they are rendered."""
+
+    gaussians: Gaussians
+    degree: int  # active SH degree
+    near: float = 0.2  # scene units
+    screen_variance: float = 0.3  # px²
+    compensate: float = 0.0  # 1: opacity loses what the screen filter spreads out
+
+
+def _aligned(count: int) -> int:
+    return max(ALIGNMENT, -(-count // ALIGNMENT) * ALIGNMENT)

@@ -1,0 +1,187 @@
+"""Kernels by name: load a .cl file, build it, check arguments against its own text, launch.
+
+Arguments are passed by the names that stand in the kernel's signature, which the house style makes easy to read:
+missing, surplus or wrongly typed ones fail like a Python call.
+"""
+
+import re
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn
+
+import numpy as np
+import pyopencl as cl
+
+from clsplat import resource_dir
+from clsplat.errors import DeviceError, KernelError, MemoryLimitError
+from clsplat.opencl.device import Array
+
+if TYPE_CHECKING:
+    from clsplat.opencl.device import Device
+
+BUILD_OPTIONS = ("-cl-std=CL1.2", "-Werror")
+
+_INCLUDE = re.compile(r'^#include "(\w+\.h)"')
+_COMMENT = re.compile(r"/\*.*?\*/|//[^\n]*", re.DOTALL)
+_KERNEL = re.compile(
+    r"__kernel\s+__attribute__\(\(reqd_work_group_size\([^)]*\)\)\)\s*void\s+(?P<name>\w+)\s*\((?P<arguments>[^)]*)\)"
+)
+_POINTER = re.compile(r"__(?:global|constant)\s+(?:const\s+)?(?P<type>\w+)\s*\*\s*restrict\s+(?P<name>\w+)")
+_SCALAR = re.compile(r"const\s+(?P<type>float|uint|int)\s+(?P<name>\w+)")
+_DEFINE = re.compile(r"^#define (\w+) +(\(?[-0-9.][-+\w.]*(?: / [-+\w.]+)?\)?)[ ]*(?://.*)?$", re.MULTILINE)
+_TYPES: dict[str, np.dtype[Any]] = {
+    "float": np.dtype(np.float32),
+    "uint": np.dtype(np.uint32),
+    "int": np.dtype(np.int32),
+    "uchar": np.dtype(np.uint8),
+}
+
+
+def flatten(path: Path, seen: set[Path] | None = None) -> str:
+    """Return the source with each local header inlined once; #line keeps compiler messages truthful."""
+    seen = set() if seen is None else seen
+    text = [f'#line 1 "{path.name}"']
+    for number, line in enumerate(path.read_text().splitlines(), start=1):
+        match = _INCLUDE.match(line)
+        if match is None:
+            text.append(line)
+            continue
+        header = path.parent / match[1]
+        if header not in seen:
+            seen.add(header)
+            text.append(flatten(header, seen))
+        text.append(f'#line {number + 1} "{path.name}"')
+    return "\n".join(text)
+
+
+@cache
+def constants(file: str = "common.h") -> dict[str, float]:
+    """Return the numeric #defines of a header, so that Python has no second list of them."""
+    text = (resource_dir("cl_kernels") / file).read_text()
+    values = {}
+    for name, value in _DEFINE.findall(text):
+        numerator, _, denominator = value.strip("()").partition(" / ")
+        values[name] = float(numerator.rstrip("fu")) / float(denominator.rstrip("fu") or 1)
+    return values
+
+
+@dataclass(frozen=True)
+class Argument:
+    """One parameter of a kernel."""
+
+    name: str
+    dtype: np.dtype[Any] | None  # None: a struct, whose layout a test compares
+    pointer: bool
+
+
+def parse_kernels(source: str) -> dict[str, list[Argument]]:
+    """Return the parameters of every kernel in the source text.  Raises KernelError where the text breaks the style."""
+    kernels = {}
+    for match in _KERNEL.finditer(_COMMENT.sub("", source)):
+        kernels[match["name"]] = [_parse_argument(match["name"], a) for a in match["arguments"].split(",")]
+    return kernels
+
+
+def _parse_argument(kernel: str, text: str) -> Argument:
+    pointer, scalar = _POINTER.fullmatch(text.strip()), _SCALAR.fullmatch(text.strip())
+    if pointer:
+        return Argument(pointer["name"], _TYPES.get(str(pointer["type"])), True)
+    if scalar:
+        return Argument(scalar["name"], _TYPES[str(scalar["type"])], False)
+    raise KernelError(f"{kernel}: cannot read the parameter '{text.strip()}'")
+
+
+class Kernel:
+    """A kernel that is called with named arguments."""
+
+    def __init__(self, device: "Device", label: str, kernel: Any, arguments: list[Argument]) -> None:
+        self.label, self.arguments = label, arguments
+        self._device, self._kernel = device, kernel
+        self._kernel.set_scalar_arg_dtypes([None if a.pointer else a.dtype for a in arguments])
+        work_group = cl.kernel_work_group_info
+        handle = device.context.devices[0]
+        size = kernel.get_work_group_info(work_group.COMPILE_WORK_GROUP_SIZE, handle)
+        limit = kernel.get_work_group_info(work_group.WORK_GROUP_SIZE, handle)
+        self.group = tuple(int(n) for n in size)
+        if int(np.prod(self.group)) > limit:
+            raise DeviceError(
+                f"{label} wants {int(np.prod(self.group))} items per group; {device.info.name} allows {limit}"
+            )
+
+    def __call__(self, *, items: int | tuple[int, ...] = 0, groups: int | tuple[int, ...] = 0, **values: Any) -> None:
+        """Launch over `items`, rounded up to whole groups, or `groups` of the kernel's own size; none: no launch."""
+        amount = items or groups
+        size = (amount,) if isinstance(amount, int) else amount
+        local = self.group[: len(size)]
+        if items:
+            size = tuple(-(-n // g) * g for n, g in zip(size, local, strict=True))
+        else:
+            size = tuple(n * g for n, g in zip(size, local, strict=True))
+        if 0 in size:
+            return
+        self._kernel.set_args(*self._checked(values))
+        try:
+            event = cl.enqueue_nd_range_kernel(self._device.queue, self._kernel, size, local)
+        except cl.MemoryError as error:
+            raise MemoryLimitError(f"{self.label}: {self._device.info.name} is out of memory ({error})") from error
+        except cl.Error as error:
+            raise DeviceError(f"{self.label} failed on {self._device.info.name}: {error}") from error
+        if self._device.timings is not None:
+            self._device.timings.add(self.label, event)
+
+    def _checked(self, values: dict[str, Any]) -> list[Any]:
+        if len(values) != len(self.arguments):
+            self._complain(values)
+        checked = []
+        for argument in self.arguments:
+            value = values.get(argument.name)
+            if not argument.pointer and value is not None:
+                checked.append(value)
+            elif isinstance(value, Array) and (argument.dtype is None or value.dtype == argument.dtype):
+                checked.append(value.buffer)
+            else:
+                self._complain(values)
+        return checked
+
+    def _complain(self, values: dict[str, Any]) -> NoReturn:
+        expected = {a.name: a for a in self.arguments}
+        missing, surplus = expected.keys() - values.keys(), values.keys() - expected.keys()
+        wrong = [
+            f"{name} is {getattr(value, 'dtype', type(value).__name__)}, expected {expected[name].dtype or 'a struct'}"
+            for name, value in values.items()
+            if name in expected and expected[name].pointer and getattr(value, "dtype", None) != expected[name].dtype
+        ]
+        parts = [f"missing {', '.join(sorted(missing))}"] if missing else []
+        parts += [f"surplus {', '.join(sorted(surplus))}"] if surplus else []
+        raise KernelError(f"{self.label}: {'; '.join(parts + wrong)}")
+
+
+class Program:
+    """One .cl file, built; its kernels are attributes."""
+
+    def __init__(self, device: "Device", file: str, defines: dict[str, int | str]) -> None:
+        path = resource_dir("cl_kernels") / file
+        source = flatten(path)
+        options = [*BUILD_OPTIONS, *(f"-D{name}={value}" for name, value in sorted(defines.items()))]
+        try:
+            program = cl.Program(device.context, source).build(options)
+        except cl.Error as error:
+            raise KernelError(
+                f"{file} does not build on {device.text} with {' '.join(options)}: {_first_error(error)}"
+            ) from error
+        self.kernels = {
+            name: Kernel(device, f"{file}:{name}", cl.Kernel(program, name), arguments)
+            for name, arguments in parse_kernels(source).items()
+        }
+
+    def __getattr__(self, name: str) -> Kernel:
+        kernels: dict[str, Kernel] = self.__dict__.get("kernels", {})
+        if name not in kernels:
+            raise AttributeError(f"no kernel named '{name}'")
+        return kernels[name]
+
+
+def _first_error(error: Exception) -> str:
+    lines = [line.strip() for line in str(error).splitlines() if not line.startswith("clBuild")]
+    return next((line for line in lines if "error" in line.lower()), str(error)[:300])

@@ -1,0 +1,84 @@
+"""Finding OpenCL runtimes, and telling the ones that work from the ones that do not.
+
+This must be imported before pyopencl: the loader reads its folder of drivers once.  A runtime is tried in a process of
+its own, because some of them abort instead of reporting (PoCL before 7.2 without a linker does).
+"""
+
+import hashlib
+import os
+import subprocess
+import sys
+import sysconfig
+from pathlib import Path
+
+import platformdirs
+
+CACHE = Path(platformdirs.user_cache_dir("clsplat"))
+SYSTEM_DRIVERS = Path("/etc/OpenCL/vendors")
+PROBE_SECONDS = 120  # a first build may compile for many seconds on a slow machine
+
+_OTHER_RUNTIMES = "apt install pocl-opencl-icd, or pip install 'clsplat[intel]'"
+_ADVICE = (  # what a failing test kernel says -> what to do
+    ("unknown target cpu", f"this PoCL does not know the processor: {_OTHER_RUNTIMES}"),
+    ("linker", f"PoCL needs a linker: apt install binutils libc6-dev; or use another runtime: {_OTHER_RUNTIMES}"),
+    ("abort", f"PoCL may lack a linker: apt install binutils libc6-dev; or use another runtime: {_OTHER_RUNTIMES}"),
+)
+
+
+def add_intel_runtime() -> None:
+    """Let the loader see Intel's CPU runtime when pip installed it: its own driver file holds a placeholder path.
+
+    A folder of driver files is written that names the system's drivers and Intel's; a user who chose a folder keeps it.
+    """
+    library = Path(sysconfig.get_path("data")) / "lib" / "libintelocl.so"
+    if not library.exists() or "OCL_ICD_VENDORS" in os.environ:
+        return
+    folder = CACHE / "drivers" / hashlib.sha256(str(library).encode()).hexdigest()[:12]
+    folder.mkdir(parents=True, exist_ok=True)
+    for old in folder.glob("*.icd"):
+        if old.name != "intel-pip.icd" and not (SYSTEM_DRIVERS / old.name).exists():
+            old.unlink(missing_ok=True)
+    for driver in SYSTEM_DRIVERS.glob("*.icd"):
+        _write(folder / driver.name, driver.read_text())
+    _write(folder / "intel-pip.icd", f"{library}\n")
+    os.environ["OCL_ICD_VENDORS"] = str(folder)
+
+
+def fault_of(key: str, platform: int, device: int) -> str | None:
+    """Return None if the device builds and runs a kernel, else one sentence on what is wrong and what to install.
+
+    `key` identifies the runtime; only successes are remembered, so a mended machine is noticed at once.
+    """
+    record = CACHE / "probes" / hashlib.sha256(key.encode()).hexdigest()[:16]
+    if record.exists():
+        return None
+    command = [sys.executable, "-m", "clsplat.opencl.probe", str(platform), str(device)]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=PROBE_SECONDS, check=False)
+    except subprocess.TimeoutExpired:
+        return f"a test kernel did not finish in {PROBE_SECONDS} s"
+    if done.returncode == 0:
+        record.parent.mkdir(parents=True, exist_ok=True)
+        _write(record, key)
+        return None
+    output = f"{done.stdout}\n{done.stderr}"
+    reason = "the runtime aborts the process" if done.returncode < 0 else _error_line(output)
+    for word, advice in _ADVICE:
+        if word in f"{output} {reason}".lower():
+            return f"{reason}; {advice}"
+    return reason
+
+
+def _error_line(output: str) -> str:
+    """The line of a compiler's or Python's output that says what happened."""
+    lines = [line.strip() for line in output.splitlines() if line.strip()]
+    errors = [line for line in lines if line.lower().startswith("error:")]
+    return (errors or lines or ["the test kernel failed without a message"])[-1 if not errors else 0]
+
+
+def _write(path: Path, text: str) -> None:
+    if path.exists() and path.read_text() == text:
+        return
+    temporary = path.with_name(f"{path.name}.{os.getpid()}")
+    temporary.write_text(text)
+    os.replace(temporary, path)

@@ -1,0 +1,181 @@
+"""Which splats each tile sees, front to back.
+
+Two ways with one contract.  Radix: order the Gaussians by depth once, emit their (tile, Gaussian) pairs in that order
+and sort stably by tile alone.  Bitonic: emit in order of index, drop pairs into tiles, sort each tile by (depth, index).
+Both give every tile the same splats in the same order, ties by index.
+"""
+
+import time
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from clsplat.opencl.device import Array, Device
+from clsplat.render.workspace import Workspace
+
+Sort = Literal["auto", "radix", "bitonic"]
+TRIALS = 3  # of each sort when `auto` measures
+
+
+@dataclass(frozen=True)
+class TileLists:
+    """Pairs in emission order, where the pairs of one Gaussian are contiguous, and the order of each tile."""
+
+    pairs: int
+    pair_splat: Array  # [P] Gaussian of each pair
+    first_pair: Array  # [N] first pair of each Gaussian
+    tile_count: Array  # [N] pairs of each Gaussian
+    tile_offset: Array  # [T+1]
+    tile_pairs: Array  # [P] pairs ordered by tile, front to back
+
+
+class Tiler:
+    """Builds tile lists; `sort` is radix, bitonic or auto, which measures both on the first frame."""
+
+    def __init__(self, device: Device, workspace: Workspace, sort: Sort = "auto") -> None:
+        self.device, self.workspace, self.sort = device, workspace, sort
+        self._pairs = device.program("pairs.cl")
+        self._scan = device.program("scan.cl")
+        self._radix = device.program("sort_radix.cl")
+        self._bitonic = device.program("sort_bitonic.cl")
+        self._team = int(device.tuning["TEAM"])
+        self._digit_bits = int(device.tuning["DIGIT_BITS"])
+        self._zero = device.zeros(1, np.uint32)
+
+    def build(self, splats: Array, depth_key: Array, tiles_x: int, tiles_y: int, count: int) -> TileLists:
+        """Make the tile lists of `count` splat records.  Reads the number of pairs back: the frame's one wait."""
+        if self.sort == "auto":
+            self.sort = self._faster(splats, depth_key, tiles_x, tiles_y, count)
+        tile_count = self.workspace.array("tile_count", count, np.uint32)
+        grid = {"tiles_x": tiles_x, "tiles_y": tiles_y}
+        self._pairs.count_tiles(items=count, splats=splats, tile_count=tile_count, **grid, count=count)
+
+        order = self._depth_order(depth_key, count) if self.sort == "radix" else self._index_order(count)
+        ordered_count = self.workspace.array("ordered_count", count, np.uint32)
+        self._scan.permute(items=count, values=tile_count, order=order, permuted=ordered_count, count=count)
+        pair_offset = self.scan(ordered_count, count, "pair_offset")
+        pairs = int(pair_offset.get_item(count)) if count else 0
+
+        pair_tile = self.workspace.array("pair_tile", pairs, np.uint32)
+        pair_splat = self.workspace.array("pair_splat", pairs, np.uint32)
+        first_pair = self.workspace.array("first_pair", count, np.uint32)
+        self._pairs.emit_pairs(
+            items=count,
+            splats=splats,
+            order=order,
+            pair_offset=pair_offset,
+            pair_tile=pair_tile,
+            pair_splat=pair_splat,
+            first_pair=first_pair,
+            **grid,
+            count=count,
+        )
+        tiles = tiles_x * tiles_y
+        if self.sort == "radix":
+            tile_offset, tile_pairs = self._sort_by_tile(pair_tile, pairs, tiles)
+        else:
+            tile_offset, tile_pairs = self._sort_in_tiles(pair_tile, pair_splat, depth_key, pairs, tiles)
+        return TileLists(pairs, pair_splat, first_pair, tile_count, tile_offset, tile_pairs)
+
+    def scan(self, values: Array, count: int, name: str) -> Array:
+        """Exclusive prefix sum, [count + 1] with the total at the end."""
+        offset = self.workspace.array(name, count + 1, np.uint32)
+        if count == 0:
+            offset.fill(0)
+            return offset
+        run, blocks = self._runs(count, shortest=1 << 14)
+        block_sum = self._zero
+        if blocks > 1:
+            block_sum = self.workspace.array("block_sum", blocks, np.uint32)
+            self._scan.scan_blocks(groups=blocks, values=values, block_sum=block_sum, run=run, count=count)
+            self._scan.scan_sums(groups=1, block_sum=block_sum, blocks=blocks)
+        self._scan.scan_offsets(groups=blocks, values=values, block_sum=block_sum, offset=offset, run=run, count=count)
+        return offset
+
+    def sort_pairs(self, keys: Array, bits: int, count: int, name: str) -> tuple[Array, Array]:
+        """Stable sort of keys below 2^bits: the sorted keys and where each came from, both [count]."""
+        passes = -(-bits // self._digit_bits)
+        width = -(-bits // passes)
+        run, blocks = self._runs(count, shortest=1 << 10)
+        values = keys  # the first pass does not read them
+        for number in range(passes):
+            size = {"shift": number * width, "digits": 1 << min(width, bits - number * width)}
+            size |= {"run": run, "blocks": blocks, "count": count}
+            digit_count = self.workspace.array("digit_count", size["digits"] * blocks, np.uint32)
+            self._radix.radix_count(groups=blocks, keys=keys, digit_count=digit_count, **size)
+            digit_offset = self.scan(digit_count, size["digits"] * blocks, "digit_offset")
+            sorted_keys = self.workspace.array(f"{name}_keys{number % 2}", count, np.uint32)
+            sorted_values = self.workspace.array(f"{name}_values{number % 2}", count, np.uint32)
+            self._radix.radix_scatter(
+                groups=blocks,
+                keys=keys,
+                values=values,
+                digit_offset=digit_offset,
+                sorted_keys=sorted_keys,
+                sorted_values=sorted_values,
+                first_pass=int(number == 0),
+                **size,
+            )
+            keys, values = sorted_keys, sorted_values
+        return keys, values
+
+    def _runs(self, count: int, shortest: int) -> tuple[int, int]:
+        """How many values an item walks, and how many groups that makes."""
+        even = -(-count // (4 * self.device.info.units))  # four runs for each core even out their speeds
+        run = 8 if self._team > 1 else max(shortest, even)
+        return run, -(-count // (run * self._team))
+
+    def _depth_order(self, depth_key: Array, count: int) -> Array:
+        return self.sort_pairs(depth_key, 32, count, "depth")[1]
+
+    def _index_order(self, count: int) -> Array:
+        if self.workspace.length("index_order") < count:
+            self.workspace.array("index_order", count, np.uint32).set(np.arange(count, dtype=np.uint32))
+        return self.workspace.array("index_order", count, np.uint32)
+
+    def _sort_by_tile(self, pair_tile: Array, pairs: int, tiles: int) -> tuple[Array, Array]:
+        bits = max(1, (tiles - 1).bit_length())
+        sorted_tile, tile_pairs = self.sort_pairs(pair_tile, bits, pairs, "tile")
+        tile_offset = self.workspace.array("tile_offset", tiles + 1, np.uint32)
+        self._pairs.find_tile_offsets(
+            items=pairs + 1, sorted_tile=sorted_tile, tile_offset=tile_offset, tiles=tiles, count=pairs
+        )
+        return tile_offset, tile_pairs
+
+    def _sort_in_tiles(
+        self, pair_tile: Array, pair_splat: Array, depth_key: Array, pairs: int, tiles: int
+    ) -> tuple[Array, Array]:
+        filled = self.workspace.array("tile_fill", tiles, np.uint32)
+        filled.fill(0)
+        self._bitonic.count_pairs(items=pairs, pair_tile=pair_tile, tile_pair_count=filled, count=pairs)
+        tile_offset = self.scan(filled, tiles, "tile_offset")
+        filled.fill(0)
+        tile_depth = self.workspace.array("tile_depth", pairs, np.uint32)
+        tile_pairs = self.workspace.array("tile_pairs", pairs, np.uint32)
+        self._bitonic.fill_tiles(
+            items=pairs,
+            pair_tile=pair_tile,
+            pair_splat=pair_splat,
+            depth_key=depth_key,
+            tile_offset=tile_offset,
+            tile_fill=filled,
+            tile_depth=tile_depth,
+            tile_pairs=tile_pairs,
+            count=pairs,
+        )
+        self._bitonic.sort_tiles(groups=tiles, tile_offset=tile_offset, tile_depth=tile_depth, tile_pairs=tile_pairs)
+        return tile_offset, tile_pairs
+
+    def _faster(self, splats: Array, depth_key: Array, tiles_x: int, tiles_y: int, count: int) -> Sort:
+        seconds: dict[Sort, float] = {}
+        for sort in ("radix", "bitonic"):
+            self.sort = sort
+            times = []
+            for _ in range(1 + TRIALS):  # the first one compiles
+                start = time.perf_counter()
+                self.build(splats, depth_key, tiles_x, tiles_y, count)
+                self.device.finish()
+                times.append(time.perf_counter() - start)
+            seconds[sort] = min(times[1:])
+        return min(seconds, key=lambda s: seconds[s])
