@@ -6,7 +6,6 @@ to another one in silence.
 
 import logging
 import os
-import statistics
 from collections import defaultdict
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
@@ -177,15 +176,14 @@ class Array:
 class Device:
     """An open device: one context, one in-order queue, programs built once."""
 
-    def __init__(self, info: DeviceInfo, schedule: Schedule = "auto", profile: bool = False) -> None:
+    def __init__(self, info: DeviceInfo, schedule: Schedule = "auto") -> None:
         platform, number = info.place
         self.info = info
         self.context = cl.Context([_platforms()[platform].get_devices()[number]])
-        flags = cl.command_queue_properties
-        self.queue = cl.CommandQueue(self.context, properties=flags.PROFILING_ENABLE if profile else flags(0))
+        self.queue = cl.CommandQueue(self.context, properties=cl.command_queue_properties.PROFILING_ENABLE)
         self.schedule = resolve_schedule(info, schedule)
         self.tuning = _tuning(info, self.schedule)
-        self.timings = Timings() if profile else None
+        self.timings = Timings()
         self._programs: dict[tuple[Any, ...], Program] = {}
 
     @property
@@ -236,29 +234,27 @@ class Device:
 
 
 class Timings:
-    """Time on the device by kernel, from profiling events."""
+    """Time on the device by kernel, from profiling events, while `sampling`.
+
+    Events are dropped as soon as they are read: some drivers slow down when many are alive.
+    """
 
     def __init__(self) -> None:
+        self.sampling = False
         self._events: list[tuple[str, Any]] = []
-        self._seconds: dict[str, list[float]] = defaultdict(list)
 
     def add(self, name: str, event: Any) -> None:
-        self._events.append((name, event))
+        if self.sampling:
+            self._events.append((name, event))
 
-    def collect(self) -> None:
-        """Turn events that are done into seconds; call after Device.finish."""
+    def take(self) -> dict[str, list[float]]:
+        """Return the seconds of every launch by kernel since the last call; waits for the launches."""
+        seconds: dict[str, list[float]] = defaultdict(list)
         for name, event in self._events:
-            self._seconds[name].append((event.profile.end - event.profile.start) * 1e-9)
+            event.wait()
+            seconds[name].append((event.profile.end - event.profile.start) * 1e-9)
         self._events.clear()
-
-    def clear(self) -> None:
-        self._events.clear()
-        self._seconds.clear()
-
-    def summary(self) -> dict[str, tuple[int, float, float]]:
-        """Name -> (launches, total seconds, median seconds)."""
-        self.collect()
-        return {name: (len(s), sum(s), statistics.median(s)) for name, s in self._seconds.items()}
+        return seconds
 
 
 def resolve_schedule(info: DeviceInfo, schedule: Schedule) -> Literal["wide", "simt"]:

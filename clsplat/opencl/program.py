@@ -127,8 +127,7 @@ class Kernel:
             raise MemoryLimitError(f"{self.label}: {self._device.info.name} is out of memory ({error})") from error
         except cl.Error as error:
             raise DeviceError(f"{self.label} failed on {self._device.info.name}: {error}") from error
-        if self._device.timings is not None:
-            self._device.timings.add(self.label, event)
+        self._device.timings.add(self.label, event)
 
     def _checked(self, values: dict[str, Any]) -> list[Any]:
         if len(values) != len(self.arguments):

@@ -1,7 +1,7 @@
 """Which splats each tile sees, front to back.
 
 Two ways with one contract.  Radix: order the Gaussians by depth once, emit their (tile, Gaussian) pairs in that order
-and sort stably by tile alone.  Bitonic: emit in order of index, drop pairs into tiles, sort each tile by (depth, index).
+and sort stably by tile alone.  Bitonic: emit in order of index, drop pairs into tiles, sort each by (depth, index).
 Both give every tile the same splats in the same order, ties by index.
 """
 

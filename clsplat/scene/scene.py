@@ -10,6 +10,7 @@ Conventions of the whole project
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 from clsplat.errors import DataError
 
 Floats = NDArray[np.floating]
+Background = Literal["black", "white"]
 
 
 @dataclass(frozen=True)
@@ -80,6 +82,7 @@ class Scene:
     test: tuple[int, ...]
     points: PointCloud | None
     extent: float  # radius of the training cameras, scene units
+    background: Background = "black"  # what the photographs are usually shown on
 
     def split(self, name: str) -> tuple[View, ...]:
         """Return the views of `train`, `test` or `all`."""
@@ -95,7 +98,9 @@ class Scene:
         return replace(self, views=views)
 
 
-def make_scene(path: Path, views: list[View], test: set[int], points: PointCloud | None) -> Scene:
+def make_scene(
+    path: Path, views: list[View], test: set[int], points: PointCloud | None, background: Background = "black"
+) -> Scene:
     """Check `views`, order the split and measure the extent.
 
     Raises DataError when there is no view, when names repeat or when a pose is not finite.
@@ -113,11 +118,11 @@ def make_scene(path: Path, views: list[View], test: set[int], points: PointCloud
     if not train:
         raise DataError(f"{path}: every image is held out for testing; raise scene.holdout or add images")
     extent = camera_extent([views[i] for i in train])
-    return Scene(path, tuple(views), train, tuple(sorted(test)), points, extent)
+    return Scene(path, tuple(views), train, tuple(sorted(test)), points, extent, background)
 
 
 def camera_extent(views: list[View]) -> float:
-    """Radius of the cameras: 1.1 x the largest distance of a camera centre from their mean (3DGS, Kerbl et al. 2023)."""
+    """Radius of the cameras: 1.1 x the largest distance of a centre from their mean (Kerbl et al. 2023)."""
     centres = np.stack([v.position for v in views])
     radius = 1.1 * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
     return radius if radius > 0 else 1.0

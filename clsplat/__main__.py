@@ -1,0 +1,3 @@
+from clsplat.cli import main
+
+main()

@@ -1,0 +1,217 @@
+"""The commands.  Each prints one line for an error, and exits with that error's code."""
+
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from clsplat import screen
+from clsplat.errors import ClsplatError, ConfigError, DeviceError
+from clsplat.screen import CONSOLE, ERRORS
+
+if TYPE_CHECKING:
+    from clsplat.opencl.device import DeviceInfo
+
+app = typer.Typer(
+    help="3D Gaussian Splatting on any OpenCL device.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+DeviceOption = Annotated[
+    str | None,
+    typer.Option(help="Part of a runtime's or device's name, as `clsplat devices` prints them; `:1` for the second."),
+]
+SceneOption = Annotated[Path, typer.Option(help="A COLMAP, Blender or nerfstudio folder.")]
+debugging = False
+
+
+@app.callback()
+def common(debug: Annotated[bool, typer.Option(help="Show tracebacks and every log line.")] = False) -> None:
+    global debugging
+    debugging = debug
+    screen.start_logging(debug)
+
+
+@app.command()
+def run(
+    pipeline: Annotated[str, typer.Argument(help="A pipeline file, or the name of a shipped one.")],
+    scene: Annotated[Path | None, typer.Option(help="A COLMAP, Blender or nerfstudio folder.")] = None,
+    out: Annotated[Path | None, typer.Option(help="The run folder; default: runs/NAME.")] = None,
+    device: DeviceOption = None,
+    set_: Annotated[list[str] | None, typer.Option("--set", help="stage.key=value; may be repeated.")] = None,
+    resume: Annotated[bool, typer.Option(help="Go on from the newest checkpoint.")] = False,
+    dry_run: Annotated[bool, typer.Option(help="Check everything and say what would run.")] = False,
+) -> None:
+    """Run a pipeline."""
+    from clsplat import runner
+    from clsplat.pipeline import load
+
+    overrides = list(set_ or [])
+    if scene is not None:
+        overrides.append(f"scene.path={json.dumps(str(scene.resolve()))}")
+    checked = load(pipeline, overrides)
+    folder = out or _free_folder(Path("runs") / checked.settings.name, resume)
+    if dry_run:
+        CONSOLE.print(runner.describe(checked, runner.open_run(checked, folder, device)), markup=False)
+        return
+    runner.prepare_folder(folder, resume)
+    screen.log_to_file(folder / "log.txt")
+    state = runner.open_run(checked, folder, device)
+    with screen.progress_bar() as show:
+        runner.execute(checked, state, resume, show)
+    _summary(folder)
+
+
+@app.command()
+def check(
+    pipeline: Annotated[str, typer.Argument(help="A pipeline file, or the name of a shipped one.")] = "",
+    schema: Annotated[bool, typer.Option(help="Print the JSON schema of pipeline files, for editors.")] = False,
+) -> None:
+    """Validate a pipeline without running it."""
+    from clsplat.pipeline import load
+    from clsplat.schema import json_schema
+
+    if schema:
+        print(json.dumps(json_schema(), indent=1))
+        return
+    if not pipeline:
+        raise ConfigError("check: expected a pipeline, or --schema")
+    checked = load(pipeline)
+    CONSOLE.print(f"{checked.path}: {', '.join(stage.stage for stage in checked.settings.stages)}: fine", markup=False)
+
+
+@app.command()
+def devices(
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+) -> None:
+    """List OpenCL devices, the limits that matter, and whether each works; exit 4 when none does."""
+    from dataclasses import asdict
+
+    from clsplat.opencl.device import list_devices
+
+    found = [(info, info.fault()) for info in list_devices()]
+    if as_json:
+        print(json.dumps([{**asdict(info), "fault": fault} for info, fault in found], indent=1))
+    else:
+        for info, fault in found:
+            CONSOLE.print(_device_text(info, fault), markup=False)
+    if all(fault for _, fault in found):
+        raise DeviceError(
+            "no OpenCL device works; install a runtime: pip install 'clsplat[pocl]', pip install 'clsplat[intel]', "
+            "apt install pocl-opencl-icd, or your GPU's driver"
+        )
+
+
+@app.command()
+def render(
+    model: Annotated[Path, typer.Argument(help="A splat PLY.")],
+    scene: SceneOption,
+    split: Annotated[Literal["test", "train", "all"], typer.Option(help="Which views.")] = "test",
+    scale: Annotated[float, typer.Option(min=1, help="Divide image sizes by this.")] = 1,
+    out: Annotated[Path, typer.Option(help="Folder for the images.")] = Path("renders"),
+    format_: Annotated[
+        Literal["png", "npy"], typer.Option("--format", help="8-bit images, or float32 arrays.")
+    ] = "png",
+    device: DeviceOption = None,
+) -> None:
+    """Render a model at the views of a scene, one file for each, named as the view."""
+    from clsplat.model_file import ModelFile
+
+    opened = ModelFile(model, scene, device, scale)
+    count = opened.render(split, out, format_)
+    CONSOLE.print(f"{count} images written to {out}", markup=False)
+
+
+@app.command()
+def evaluate(
+    model: Annotated[Path, typer.Argument(help="A splat PLY.")],
+    scene: SceneOption,
+    scales: Annotated[str, typer.Option(help="Downscale factors, separated by commas.")] = "1",
+    out: Annotated[Path | None, typer.Option(help="Write the metrics here as JSON; default: print them.")] = None,
+    device: DeviceOption = None,
+) -> None:
+    """Measure a model on a scene's test and training views."""
+    from clsplat.files import write_text
+    from clsplat.model_file import ModelFile
+
+    try:
+        factors = [float(text) for text in scales.split(",")]
+    except ValueError:
+        raise ConfigError(f"--scales {scales}: expected numbers separated by commas, for example 1,2,4") from None
+    metrics = ModelFile(model, scene, device).evaluate(factors)
+    text = json.dumps(metrics, indent=1) + "\n"
+    if out is None:
+        print(text, end="")
+    else:
+        write_text(out, text)
+
+
+def _device_text(info: "DeviceInfo", fault: str | None) -> str:
+    from clsplat.opencl.device import resolve_schedule
+
+    sizes = f"{info.memory / 2**30:.1f} GiB of memory, buffers up to {info.allocation / 2**30:.1f} GiB"
+    limits = f"groups up to {info.group}, {info.local_memory >> 10} KiB local, {info.float_width} lanes"
+    return (
+        f"{info.name} ({info.kind}, {info.units} units)\n"
+        f"  runtime   {info.platform}\n"
+        f"  limits    {sizes}, {limits}\n"
+        f"  schedule  {resolve_schedule(info, 'auto')}\n"
+        f"  state     {'does not work: ' + fault if fault else 'works'}"
+    )
+
+
+def _free_folder(folder: Path, resume: bool) -> Path:
+    """The default run folder; a number keeps a new run apart from earlier ones."""
+    number, free = 1, folder
+    while (free / "pipeline.yaml").exists() and not resume:
+        number += 1
+        free = folder.with_name(f"{folder.name}-{number}")
+    return free
+
+
+def _summary(folder: Path) -> None:
+    metrics = json.loads((folder / "metrics.json").read_text())
+    test = metrics["test"].get("1")
+    quality = f"test PSNR {test['psnr']:.2f} dB, SSIM {test['ssim']:.4f}; " if test else ""
+    CONSOLE.print(
+        f"{quality}{metrics['gaussians']:,} Gaussians; {metrics['train_seconds']:.0f} s of training", markup=False
+    )
+    for title, name in (("model", "point_cloud.ply"), ("renders", "renders"), ("report", "report.html")):
+        if (folder / name).exists():
+            CONSOLE.print(f"  {title:<8} {folder / name}", markup=False)
+
+
+def _one_set_each(arguments: list[str]) -> list[str]:
+    """Let `--set a=1 b=2` stand for `--set a=1 --set b=2`."""
+    spread: list[str] = []
+    for argument in arguments:
+        follows = len(spread) >= 2 and spread[-2] == "--set"
+        spread += ["--set", argument] if follows and "=" in argument and argument[0] != "-" else [argument]
+    return spread
+
+
+def main() -> None:
+    """Run the command line; errors the user can mend end as one line."""
+    try:
+        app(_one_set_each(sys.argv[1:]), standalone_mode=False)
+    except ClsplatError as error:
+        if debugging:
+            raise
+        ERRORS.print(f"error: {error}", markup=False)
+        sys.exit(error.exit_code)
+    except typer.Abort:
+        sys.exit(130)
+    except KeyboardInterrupt:
+        ERRORS.print("error: stopped at once; --resume goes on from the last checkpoint")
+        sys.exit(130)
+    except MemoryError:
+        ERRORS.print("error: out of memory; use smaller images (scene.downscale) or fewer of them")
+        sys.exit(5)
+    except Exception as error:  # typer's usage errors carry their own message
+        if hasattr(error, "format_message"):
+            ERRORS.print(f"error: {error.format_message()}", markup=False)
+            sys.exit(2)
+        raise

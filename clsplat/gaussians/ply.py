@@ -1,0 +1,172 @@
+"""The PLY layout of the 3DGS reference: written in its order, read by property name in any order.
+
+    x y z nx ny nz f_dc_0..2 f_rest_0..(3(K-1)-1) opacity scale_0..2 rot_0..3    float32, before activation
+
+f_rest is channel-major (all red, all green, all blue); opacity is a logit, scales are logarithms, rot is (w, x, y, z).
+Normals are written as zeros.  A comment carries the numbers a renderer needs.
+"""
+
+import json
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.errors import DataError
+from clsplat.files import atomic
+from clsplat.gaussians.model import PARAMETERS, sh_coefficients
+
+HEADER_LIMIT = 1 << 16  # bytes; real headers have about 1.5 KB
+COMMENT = "comment clsplat "
+MAX_DEGREE = 3
+_TYPES = {
+    **dict.fromkeys(("char", "int8"), "i1"),
+    **dict.fromkeys(("uchar", "uint8"), "u1"),
+    **dict.fromkeys(("short", "int16"), "i2"),
+    **dict.fromkeys(("ushort", "uint16"), "u2"),
+    **dict.fromkeys(("int", "int32"), "i4"),
+    **dict.fromkeys(("uint", "uint32"), "u4"),
+    **dict.fromkeys(("float", "float32"), "f4"),
+    **dict.fromkeys(("double", "float64"), "f8"),
+}
+_COLUMNS = {
+    "means": ("x", "y", "z"),
+    "sh_base": ("f_dc_0", "f_dc_1", "f_dc_2"),
+    "logit_opacity": ("opacity",),
+    "log_scales": ("scale_0", "scale_1", "scale_2"),
+    "quats": ("rot_0", "rot_1", "rot_2", "rot_3"),
+}
+
+Parameters = dict[str, NDArray[np.float32]]  # by the names of PARAMETERS, each [N, components]
+
+
+@dataclass(frozen=True)
+class SplatFile:
+    """A model file: the parameters and what its comment says about rendering them."""
+
+    parameters: Parameters
+    rendering: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class _Header:
+    count: int
+    dtype: np.dtype[Any]
+    order: str
+    start: int  # bytes before the vertices
+    rendering: dict[str, Any]
+
+
+def read_ply(path: Path) -> SplatFile:
+    """Read a splat PLY.  Raises DataError when it is missing, damaged or not a splat."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror}); expected a PLY file") from error
+    header = _parse_header(path, data[:HEADER_LIMIT])
+    expected = header.start + header.count * header.dtype.itemsize
+    if len(data) < expected:
+        raise DataError(
+            f"{path}: holds {len(data)} bytes, but its header promises {header.count} splats, {expected} bytes; "
+            "the file is cut short, copy or export it again"
+        )
+    vertices = np.frombuffer(data, header.dtype, header.count, header.start)
+    return SplatFile(_parameters(path, vertices), header.rendering)
+
+
+def write_ply(path: Path, parameters: Parameters, rendering: dict[str, Any]) -> None:
+    """Write parameters in the reference's order; `rendering` goes into the comment as JSON."""
+    count = len(parameters["means"])
+    coefficients = 1 + parameters["sh_rest"].shape[1] // 3
+    rest = parameters["sh_rest"].reshape(count, coefficients - 1, 3).transpose(0, 2, 1).reshape(count, -1)
+    blocks = [
+        parameters["means"],
+        np.zeros((count, 3), np.float32),
+        parameters["sh_base"],
+        rest,
+        parameters["logit_opacity"],
+        parameters["log_scales"],
+        parameters["quats"],
+    ]
+    names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+    names += [f"f_rest_{i}" for i in range(rest.shape[1])]
+    names += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+    header = ["ply", "format binary_little_endian 1.0", COMMENT + json.dumps(rendering, sort_keys=True)]
+    header += [f"element vertex {count}", *(f"property float {name}" for name in names), "end_header"]
+    with atomic(path) as file:
+        file.write(("\n".join(header) + "\n").encode())
+        file.write(np.ascontiguousarray(np.concatenate(blocks, axis=1), "<f4").tobytes())
+
+
+def _parse_header(path: Path, data: bytes) -> _Header:
+    match = re.search(rb"end_header\r?\n", data)
+    if not data.startswith(b"ply") or match is None:
+        raise DataError(f"{path}: not a PLY file; expected 'ply' and 'end_header' in its first {HEADER_LIMIT} bytes")
+    lines = [line.strip() for line in data[: match.start()].decode("utf-8", "replace").splitlines()]
+    orders = {"format binary_little_endian 1.0": "<", "format binary_big_endian 1.0": ">"}
+    order = next((orders[line] for line in lines if line in orders), None)
+    if order is None:
+        raise DataError(f"{path}: expected a binary PLY (format binary_little_endian 1.0)")
+    first = next((line for line in lines if line.startswith("element ")), "")
+    found = re.fullmatch(r"element vertex (\d+)", first)
+    if found is None:
+        raise DataError(f"{path}: the first element is '{first}'; expected 'element vertex N'")
+    return _Header(int(found[1]), _vertex_type(path, lines, order), order, match.end(), _rendering(lines))
+
+
+def _vertex_type(path: Path, lines: list[str], order: str) -> np.dtype[Any]:
+    fields = []
+    vertex = False
+    for line in lines:
+        words = line.split()
+        if words[:1] == ["element"]:
+            vertex = words[1] == "vertex"
+        elif vertex and words[:1] == ["property"]:
+            if len(words) != 3 or words[1] not in _TYPES:
+                raise DataError(f"{path}: cannot read '{line}'; a splat's properties are single numbers")
+            fields.append((words[2], order + _TYPES[words[1]]))
+    names = [name for name, _ in fields]
+    if len(set(names)) < len(names):
+        raise DataError(f"{path}: a property is declared twice")
+    return np.dtype(fields)
+
+
+def _rendering(lines: list[str]) -> dict[str, Any]:
+    text = next((line.removeprefix(COMMENT) for line in lines if line.startswith(COMMENT)), "{}")
+    try:
+        values = json.loads(text)
+    except ValueError:
+        return {}
+    return values if isinstance(values, dict) else {}
+
+
+def _parameters(path: Path, vertices: NDArray[Any]) -> Parameters:
+    names = vertices.dtype.names or ()
+    missing = [column for columns in _COLUMNS.values() for column in columns if column not in names]
+    if missing:
+        raise DataError(
+            f"{path}: not a splat file: it has no {', '.join(missing[:4])}{' …' if len(missing) > 4 else ''}; "
+            "a point cloud must be trained first"
+        )
+    rest = sum(name.startswith("f_rest_") for name in names)
+    degree = next((d for d in range(MAX_DEGREE + 1) if 3 * (sh_coefficients(d) - 1) == rest), None)
+    if degree is None:
+        raise DataError(f"{path}: has {rest} f_rest properties; expected 0, 9, 24 or 45")
+    parameters = {name: _columns(vertices, columns) for name, columns in _COLUMNS.items()}
+    by_channel = _columns(vertices, tuple(f"f_rest_{i}" for i in range(rest)))
+    per_channel = sh_coefficients(degree) - 1
+    swapped = by_channel.reshape(-1, 3, per_channel).transpose(0, 2, 1)
+    parameters["sh_rest"] = np.ascontiguousarray(swapped.reshape(len(vertices), rest))
+    bad = [name for name in PARAMETERS if not np.isfinite(parameters[name]).all()]
+    if bad:
+        raise DataError(f"{path}: {', '.join(bad)} hold values that are not finite; export the file again")
+    return {name: parameters[name] for name in PARAMETERS}
+
+
+def _columns(vertices: NDArray[Any], columns: tuple[str, ...]) -> NDArray[np.float32]:
+    if not columns:
+        return np.zeros((len(vertices), 0), np.float32)
+    return np.stack([vertices[c].astype(np.float32) for c in columns], axis=1)

@@ -1,0 +1,75 @@
+"""A model file at the views of a scene: rendering and measuring without a run."""
+
+import io
+import logging
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from clsplat.errors import DataError
+from clsplat.files import atomic
+from clsplat.gaussians.model import Gaussians, Model
+from clsplat.gaussians.ply import read_ply
+from clsplat.opencl.device import Device, choose
+from clsplat.render.renderer import Renderer
+from clsplat.scene.detect import read_scene
+from clsplat.scene.images import write_image
+from clsplat.stages.render import image_path
+from clsplat.training.metrics import mean, measure, render_view
+from clsplat.training.targets import BACKGROUNDS, Targets
+
+LOG = logging.getLogger("clsplat")
+
+
+class ModelFile:
+    """A PLY opened on a device, with the scene whose cameras look at it.
+
+    The numbers it was trained with come from the file's comment; files of other programs get those of 3DGS.
+    """
+
+    def __init__(self, path: Path, scene: Path, device: str | None, scale: float = 1) -> None:
+        file = read_ply(path)
+        self.device = Device(choose(device))
+        LOG.info("device: %s", self.device.text)
+        self.scene = read_scene(scene).downscaled(scale)
+        gaussians = Gaussians(self.device, file.parameters)
+        self.model = Model(gaussians, gaussians.sh_degree)
+        for name in ("near", "screen_variance", "compensate"):
+            if isinstance(file.rendering.get(name), int | float):
+                setattr(self.model, name, float(file.rendering[name]))
+        background = file.rendering.get("background")
+        self.background = background if background in BACKGROUNDS else self.scene.background
+        self.renderer = Renderer(self.device)
+
+    def render(self, split: str, out: Path, kind: str) -> int:
+        """Write an image for each view of a split; return their number."""
+        targets = Targets(self.device, self.background)
+        views = self.scene.split(split)
+        if not views:
+            raise DataError(f"{self.scene.path}: has no {split} views")
+        for view in views:
+            camera = targets.camera(view)
+            path = image_path(out, view.name, f".{kind}")
+            if kind == "png":
+                write_image(path, render_view(self.renderer, self.model, camera, targets.background_array))
+            else:
+                frame = self.renderer.forward(self.model, camera, targets.background_array)
+                planes = frame.image.get()[:, : camera.height, : camera.width]
+                buffer = io.BytesIO()
+                np.save(buffer, np.ascontiguousarray(planes.transpose(1, 2, 0)), allow_pickle=False)
+                with atomic(path) as stream:
+                    stream.write(buffer.getvalue())
+        return len(views)
+
+    def evaluate(self, scales: list[float]) -> dict[str, Any]:
+        """Metrics by split and scale, with the keys of metrics.json."""
+        metrics: dict[str, Any] = {"test": {}, "train": {}}
+        for scale in scales:
+            scene = self.scene.downscaled(scale)
+            targets = Targets(self.device, self.background)
+            for split in ("test", "train"):
+                if scene.split(split):
+                    results = measure(self.renderer, self.model, scene.split(split), targets)
+                    metrics[split][f"{scale:g}"] = mean(results)
+        return {**metrics, "gaussians": self.model.gaussians.count, "device": self.device.text}

@@ -1,0 +1,210 @@
+"""From a pipeline file to checked stages, and through them.
+
+    name, seed, scene: {path, downscale, background, holdout}, model: {…}, render: {schedule, sort}
+    stages: a list of   - <stage>   or   - <stage>: {field: value, …}
+
+A file is complete and strict: unknown keys are errors, every value has its default in its model, and the fully resolved
+file is written to the run folder.
+"""
+
+import difflib
+import io
+import logging
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, ValidationError
+from ruamel.yaml import YAML
+
+from clsplat import resource_dir
+from clsplat.errors import ConfigError
+from clsplat.opencl.device import Schedule
+from clsplat.render.tiles import Sort
+from clsplat.settings import Settings
+from clsplat.settings_errors import explain
+from clsplat.stages import STAGES, AnyStage
+from clsplat.stages.base import Stage
+from clsplat.training.filters import ModelSettings
+from clsplat.yaml_file import Document, parse_scalar, read_yaml
+
+LOG = logging.getLogger("clsplat")
+
+
+class SceneSettings(Settings):
+    """Which photographs, and how they are read."""
+
+    path: str | None = None  # usually given by --scene
+    downscale: Annotated[float, Field(ge=1)] = 1  # image sizes are divided by this
+    background: Literal["auto", "black", "white"] = "auto"  # auto: white for Blender scenes, else black
+    holdout: Annotated[int, Field(ge=0)] = 8  # every n-th image, by name, is a test view; 0: none
+
+
+class RenderSettings(Settings):
+    """How the device works; results do not depend on it."""
+
+    schedule: Schedule = "auto"
+    sort: Sort = "auto"
+
+
+class PipelineFile(Settings):
+    """All that a pipeline file can say."""
+
+    name: Annotated[str, Field(pattern=r"^[\w.-]+$")]
+    seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
+    scene: SceneSettings = SceneSettings()
+    model: ModelSettings = ModelSettings()
+    render: RenderSettings = RenderSettings()
+    stages: Annotated[list[Annotated[AnyStage, Field(discriminator="stage")]], Field(min_length=1)]
+
+
+@dataclass(frozen=True)
+class Pipeline:
+    """A checked pipeline."""
+
+    path: Path
+    settings: PipelineFile
+
+    @property
+    def stages(self) -> list[Stage]:
+        return list(self.settings.stages)
+
+    def resolved(self) -> dict[str, Any]:
+        """Every setting with its value, as plain data in the shape of a file."""
+        data = self.settings.model_dump(mode="json")
+        data["stages"] = [_untagged(stage) for stage in data["stages"]]
+        return data
+
+    def text(self) -> str:
+        """The resolved file."""
+        stream = io.StringIO()
+        yaml = YAML(typ="safe")
+        yaml.default_flow_style = None
+        yaml.sort_base_mapping_type_on_output = False  # type: ignore[assignment]
+        yaml.width = 120
+        yaml.dump(self.resolved(), stream)
+        return stream.getvalue()
+
+
+def load(name: str, overrides: list[str] | None = None) -> Pipeline:
+    """Read and check a pipeline: a path, or the name of a shipped one; `overrides` are 'stage.key=value'.
+
+    Raises ConfigError naming file, line, place and the nearest match.
+    """
+    path = find(name)
+    document = read_yaml(path)
+    if not isinstance(document.data, dict):
+        raise ConfigError(f"{path}:1: expected keys such as name and stages")
+    data = _tagged_file(document, path)
+    for override in overrides or []:
+        _override(data, override)
+    try:
+        settings = PipelineFile.model_validate(data)
+    except ValidationError as error:
+        raise ConfigError(explain(error, PipelineFile, path, document)) from error
+    _check_order(path, settings)
+    return Pipeline(path, settings)
+
+
+def find(name: str) -> Path:
+    """The file of a pipeline given by path or by the name of a shipped one."""
+    path = Path(name)
+    if path.suffix in (".yaml", ".yml") or path.exists():
+        if not path.is_file():
+            raise ConfigError(f"{path}: no such pipeline file")
+        return path
+    shipped = {file.stem: file for file in sorted(resource_dir("pipelines").glob("*.yaml"))}
+    if name in shipped:
+        return shipped[name]
+    near = difflib.get_close_matches(name, shipped, n=1)
+    hint = f"; did you mean '{near[0]}'?" if near else f"; there are {', '.join(shipped)}, or give a path"
+    raise ConfigError(f"no pipeline named '{name}'{hint}")
+
+
+def _tagged_file(document: Document, path: Path) -> dict[str, Any]:
+    """The file's data with each stage as {stage: name, …}, which is how the models tell them apart."""
+    data = dict(document.data)
+    if isinstance(data.get("stages"), list):
+        data["stages"] = [_tagged(item, ("stages", i), document, path) for i, item in enumerate(data["stages"])]
+    return data
+
+
+def _tagged(item: Any, place: tuple[str | int, ...], document: Document, path: Path) -> Any:
+    if isinstance(item, str):
+        return {"stage": item}
+    if not (isinstance(item, dict) and len(item) == 1 and isinstance(next(iter(item.values())), dict | None)):
+        where = "".join(f"[{p}]" if isinstance(p, int) else str(p) for p in place[:2])
+        raise ConfigError(f"{path}:{document.line(place)}: {where}: expected '- stage' or '- stage: {{key: value}}'")
+    name, fields = next(iter(item.items()))
+    fields = dict(fields or {})
+    if isinstance(fields.get("during"), list):
+        fields["during"] = [
+            _tagged(inner, (*place, name, "during", i), document, path) for i, inner in enumerate(fields["during"])
+        ]
+    return {"stage": name, **fields}
+
+
+def _untagged(stage: dict[str, Any]) -> dict[str, Any]:
+    fields = {key: value for key, value in stage.items() if key != "stage"}
+    if fields["every"] is None:  # a cadence belongs inside `during` only
+        fields = {key: value for key, value in fields.items() if key not in ("every", "start", "stop")}
+    if "during" in fields:
+        fields["during"] = [_untagged(inner) for inner in fields["during"]]
+    return {stage["stage"]: fields}
+
+
+def _override(data: dict[str, Any], text: str) -> None:
+    """Apply 'place.key=value'; a stage is addressed by its name, inside `during` as well when that is the only one."""
+    place, equals, value = text.partition("=")
+    names = re.findall(r"[^.\[\]]+", place)
+    if not equals or len(names) < 1:
+        raise ConfigError(f"--set {text}: expected stage.key=value, for example optimize.steps=500")
+    node: Any = data
+    for position, name in enumerate(names[:-1]):
+        node = _descend(node, name, text, top=position == 0)
+    if isinstance(node, list) and names[-1].isdigit() and int(names[-1]) < len(node):
+        node[int(names[-1])] = parse_scalar(value)
+    elif isinstance(node, dict):
+        node[names[-1]] = parse_scalar(value)
+    else:
+        raise ConfigError(f"--set {text}: there is no '{names[-1]}' here")
+
+
+def _descend(node: Any, name: str, text: str, top: bool) -> Any:
+    if isinstance(node, list):
+        if name.isdigit() and int(name) < len(node):
+            return node[int(name)]
+        raise ConfigError(f"--set {text}: '{name}' is not a place in a list of {len(node)}")
+    if not isinstance(node, dict):
+        raise ConfigError(f"--set {text}: nothing lies below '{name}'")
+    stages = node.get("stages" if top else "during", [])
+    found = [stage for stage in stages if stage["stage"] == name]
+    if top and not found:
+        found = [inner for stage in stages for inner in stage.get("during", []) if inner["stage"] == name]
+    if len(found) > 1:
+        raise ConfigError(f"--set {text}: there are {len(found)} stages named '{name}'; set the value in the file")
+    if found:
+        return found[0]
+    if name in node:
+        return node[name]
+    if top and name not in PipelineFile.model_fields:
+        known = [*PipelineFile.model_fields, *STAGES]
+        near = difflib.get_close_matches(name, known, n=1)
+        raise ConfigError(f"--set {text}: no '{name}' in this pipeline{f'; did you mean {near[0]}?' if near else ''}")
+    node[name] = {}
+    return node[name]
+
+
+def _check_order(path: Path, settings: PipelineFile) -> None:
+    """Every stage finds what it needs made before it."""
+    made = {"scene"}
+    for i, stage in enumerate(settings.stages):
+        if stage.every is not None:
+            raise ConfigError(f"{path}: stages[{i}] {stage.stage}: 'every' belongs inside optimize.during")
+        for need in sorted(stage.needs - made):
+            makers = ", ".join(name for name, kind in STAGES.items() if need in kind.makes)
+            raise ConfigError(
+                f"{path}: stages[{i}] {stage.stage} needs '{need}', which no earlier stage makes ({makers} makes it)"
+            )
+        made |= stage.makes

@@ -1,0 +1,155 @@
+"""Running a pipeline: the run folder, the device, the scene, the stages in order, and what is left behind."""
+
+import json
+import logging
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+
+from clsplat.errors import ClsplatError, ConfigError, Interrupted, OutputError
+from clsplat.files import unwritable, write_text
+from clsplat.opencl.device import Device, choose
+from clsplat.pipeline import Pipeline
+from clsplat.render.renderer import Renderer
+from clsplat.scene.detect import read_scene
+from clsplat.stages.evaluate import Evaluate
+from clsplat.stages.export import Export
+from clsplat.stages.optimize import Optimize
+from clsplat.training import checkpoint
+from clsplat.training.run import Progress, Run
+from clsplat.training.targets import Targets
+
+LOG = logging.getLogger("clsplat")
+
+
+def prepare_folder(out: Path, resume: bool) -> None:
+    """Make the run folder.  Raises ConfigError when it holds another run, OutputError when it cannot be written."""
+    if (out / "pipeline.yaml").exists() and not resume:
+        raise ConfigError(f"{out}: already holds a run; --resume goes on with it, or give another --out")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise unwritable(out, error) from error
+    write_text(out / "status.json", json.dumps({"state": "starting"}) + "\n")
+
+
+def open_run(pipeline: Pipeline, out: Path, words: str | None) -> Run:
+    """Choose the device and read the scene.  Raises what they raise."""
+    settings = pipeline.settings
+    device = Device(choose(words), settings.render.schedule)
+    LOG.info("device: %s", device.text)
+    if settings.scene.path is None:
+        raise ConfigError(f"{pipeline.path}: no scene given; use --scene DIR, or scene: {{path: DIR}} in the file")
+    scene = read_scene(Path(settings.scene.path), settings.scene.holdout).downscaled(settings.scene.downscale)
+    background = scene.background if settings.scene.background == "auto" else settings.scene.background
+    camera = scene.views[0].camera
+    LOG.info(
+        "scene: %s, %d training and %d test views, %d x %d px, %s background, extent %.3g",
+        *(scene.path, len(scene.train), len(scene.test), camera.width, camera.height, background, scene.extent),
+    )
+    return Run(
+        device=device,
+        scene=scene,
+        out=out,
+        name=settings.name,
+        seed=settings.seed,
+        pipeline=pipeline.resolved(),
+        renderer=Renderer(device, settings.render.sort),
+        targets=Targets(device, background),
+        model_settings=settings.model,
+    )
+
+
+def execute(pipeline: Pipeline, run: Run, resume: bool, show: Callable[[Progress], None]) -> None:
+    """Run the stages, from the newest checkpoint when resuming, and write what the run folder promises."""
+    run.show = show
+    resumed = resume and checkpoint.restore(run)
+    if resume:
+        LOG.info("resumed at step %d" if resumed else "nothing to resume; starting from the beginning%.0s", run.step)
+    write_text(run.out / "pipeline.yaml", f"# resolved from {pipeline.path.name}\n{pipeline.text()}")
+    run.records.start(run.step)
+    try:
+        with _finishing_on_interrupt(run):
+            _run_stages(pipeline, run)
+        _write_metrics(run)
+        _check_outputs(pipeline, run)
+    except ClsplatError as error:
+        state = "interrupted" if isinstance(error, Interrupted) else "failed"
+        run.records.status(state, run.step, exit_code=error.exit_code, message=str(error))
+        raise
+    run.records.status("done", run.step, exit_code=0)
+
+
+def _run_stages(pipeline: Pipeline, run: Run) -> None:
+    for cursor, stage in enumerate(pipeline.stages):
+        if cursor < run.cursor:
+            continue
+        if cursor > run.cursor:
+            run.cursor, run.stage_step = cursor, 0
+        stage.run(run)
+        if run.interrupted:
+            path = checkpoint.save(run, keep=2)
+            raise Interrupted(f"stopped after {stage.stage}, saved in {path}; --resume goes on from there")
+
+
+@contextmanager
+def _finishing_on_interrupt(run: Run) -> Iterator[None]:
+    """Ctrl-C and SIGTERM let the step finish and the state be saved; a second one stops at once."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def finish(number: int, frame: FrameType | None) -> None:
+        if run.interrupted:
+            raise KeyboardInterrupt
+        LOG.info("finishing the step; press Ctrl-C again to stop at once")
+        run.interrupted = True
+
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = {number: signal.signal(number, finish) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _write_metrics(run: Run) -> None:
+    metrics = {
+        "test": run.metrics.get("test", {}),
+        "train": run.metrics.get("train", {}),
+        "gaussians": run.trained.gaussians.count,
+        "steps": run.step,
+        "train_seconds": round(run.train_seconds, 3),
+        "seed": run.seed,
+        "device": run.device.text,
+        "pipeline": run.name,
+    }
+    write_text(run.out / "metrics.json", json.dumps(metrics, indent=1) + "\n")
+
+
+def _check_outputs(pipeline: Pipeline, run: Run) -> None:
+    """A run that did not write what it declared has failed."""
+    promised = ["metrics.json", "pipeline.yaml"]
+    promised += [stage.file for stage in pipeline.stages if isinstance(stage, Export)]
+    for name in promised:
+        path = run.out / name
+        if not path.is_file() or path.stat().st_size == 0:
+            raise OutputError(f"{path}: was to be written but is missing or empty; see {run.out / 'log.txt'}")
+
+
+def describe(pipeline: Pipeline, run: Run) -> str:
+    """What a run would do, a line for each stage."""
+    lines = []
+    for stage in pipeline.stages:
+        detail = ""
+        if isinstance(stage, Optimize):
+            cadences = (f"{inner.stage} every {inner.every}" for inner in stage.during)
+            detail = f"{stage.steps} steps; " + ", ".join(cadences)
+        elif isinstance(stage, Evaluate):
+            detail = f"{len(run.scene.split(stage.split))} {stage.split} views"
+        lines.append(f"  {stage.stage:<10} {detail}".rstrip())
+    return f"would run in {run.out}:\n" + "\n".join(lines)

@@ -1,0 +1,110 @@
+"""Read COLMAP folders: which model, which photographs, which cameras a pinhole renderer can use."""
+
+import logging
+import math
+from pathlib import Path
+
+import numpy as np
+
+from clsplat.errors import DataError
+from clsplat.scene.colmap_files import (
+    MEND,
+    CameraRecord,
+    ImageRecord,
+    find_file,
+    read_cameras,
+    read_images,
+    read_points,
+)
+from clsplat.scene.images import inside, require_files
+from clsplat.scene.points import FAR
+from clsplat.scene.scene import Camera, Floats, Scene, View, every_nth, make_scene
+
+logger = logging.getLogger("clsplat")
+
+# Those that are a pinhole once all after the principal point is zero, with the number of focal lengths.
+FOCALS = {"SIMPLE_PINHOLE": 1, "PINHOLE": 2, "SIMPLE_RADIAL": 1, "RADIAL": 1, "OPENCV": 2, "FULL_OPENCV": 2}
+
+
+def read_colmap(path: Path, holdout: int = 8) -> Scene:
+    """Read a COLMAP scene: models in `sparse/N`, `sparse` or `path` itself, photographs in `images`.
+
+    Of several models the one with most images is taken.  Every `holdout`-th view by name is for testing.
+    Raises DataError when a file is missing, damaged or not supported, such as a camera with distortion.
+    """
+    model, images = _largest_model(path)
+    cameras = read_cameras(model)
+    folder = _scene_folder(path) / "images"
+    views = sorted((_view(image, cameras, folder) for image in images), key=lambda view: view.name)
+    require_files(path, (view.image_path for view in views))
+    return make_scene(path, views, every_nth([view.name for view in views], holdout), read_points(model))
+
+
+def find_models(path: Path) -> list[Path]:
+    """Return the folders at or below `path` that hold a COLMAP model, by name."""
+    sparse = path / "sparse"
+    folders = [path, sparse, *(sorted(sparse.iterdir()) if sparse.is_dir() else [])]
+    return [folder for folder in folders if find_file(folder, "cameras") and find_file(folder, "images")]
+
+
+def _largest_model(path: Path) -> tuple[Path, list[ImageRecord]]:
+    models = [(folder, read_images(folder)) for folder in find_models(path)]
+    if not models:
+        raise DataError(f"{path}: no COLMAP model; expected cameras and images (.bin or .txt) in sparse/0, sparse or .")
+    best = max(models, key=lambda model: len(model[1]))
+    others = ", ".join(f"{folder} ({len(images)})" for folder, images in models if folder != best[0])
+    logger.info("%s: %d images%s", best[0], len(best[1]), f"; left out the smaller models {others}" if others else "")
+    return best
+
+
+def _scene_folder(path: Path) -> Path:
+    """Return the folder above `sparse` when `path` is `sparse` or one of its models, else `path`."""
+    return next((folder.parent for folder in (path, path.parent) if folder.name == "sparse"), path)
+
+
+def _view(image: ImageRecord, cameras: dict[int, CameraRecord], folder: Path) -> View:
+    """Check one image and its camera.  Raises DataError."""
+    image_path = inside(folder, image.name, image.where)
+    if image.camera not in cameras:
+        raise DataError(
+            f"{image.where}: image '{image.name}' names camera {image.camera}; expected one of the cameras file, "
+            f"{sorted(cameras)[:8]}: {MEND}"
+        )
+    if not all(abs(t) < FAR for t in image.translation) or not 0 < math.hypot(*image.quaternion) < math.inf:
+        raise DataError(
+            f"{image.where}: the pose of '{image.name}' is quaternion {image.quaternion}, translation "
+            f"{image.translation}; expected finite numbers and a rotation: remove that image or {MEND}"
+        )
+    pose = np.column_stack([_rotation(image.quaternion), image.translation])
+    camera = _pinhole(image.camera, cameras[image.camera])
+    return View(image.name, camera, pose, image_path)
+
+
+def _rotation(quaternion: tuple[float, ...]) -> Floats:
+    """Rotation matrix [3, 3] of a quaternion (w, x, y, z) of any length but zero."""
+    length = math.hypot(*quaternion)
+    w, x, y, z = (part / length for part in quaternion)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def _pinhole(number: int, camera: CameraRecord) -> Camera:
+    """Return a camera without distortion.  Raises DataError for any other, and for senseless numbers."""
+    focals = FOCALS.get(camera.model)
+    if focals is None or any(camera.params[focals + 2 :]):
+        raise DataError(
+            f"{camera.where}: camera {number} is {camera.model}, with lens distortion; expected PINHOLE or "
+            "SIMPLE_PINHOLE: undistort the images first with `colmap image_undistorter`"
+        )
+    fx, fy, (cx, cy) = camera.params[0], camera.params[focals - 1], camera.params[focals : focals + 2]
+    if min(camera.width, camera.height, fx, fy) <= 0 or not np.isfinite([fx, fy, cx, cy]).all():
+        raise DataError(
+            f"{camera.where}: camera {number} is {camera.width}x{camera.height} with parameters {camera.params[:4]}; "
+            f"expected a positive size and focal length and finite numbers: {MEND}"
+        )
+    return Camera(camera.width, camera.height, fx, fy, cx, cy)

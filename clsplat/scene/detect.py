@@ -1,0 +1,28 @@
+"""Tell which kind of dataset a folder holds, and read it."""
+
+from pathlib import Path
+
+from clsplat.errors import DataError
+from clsplat.scene.blender import read_blender
+from clsplat.scene.colmap import find_models, read_colmap
+from clsplat.scene.nerfstudio import read_nerfstudio
+from clsplat.scene.scene import Scene
+
+
+def read_scene(path: Path, holdout: int = 8) -> Scene:
+    """Read a COLMAP, Blender or nerfstudio folder; `holdout` is for those that do not tell their test views.
+
+    Raises DataError when it is none of these, or damaged.
+    """
+    if not path.is_dir():
+        raise DataError(f"{path}: no such folder; expected the folder of a dataset")
+    if find_models(path):
+        return read_colmap(path, holdout)
+    if (path / "transforms_train.json").is_file():
+        return read_blender(path)
+    if (path / "transforms.json").is_file():
+        return read_nerfstudio(path, holdout)
+    raise DataError(
+        f"{path}: no dataset found; looked for COLMAP (sparse/0/cameras.bin or .txt), "
+        "Blender (transforms_train.json) and nerfstudio (transforms.json)"
+    )

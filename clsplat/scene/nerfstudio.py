@@ -1,0 +1,44 @@
+"""Read nerfstudio and instant-ngp datasets: one transforms.json."""
+
+import logging
+from pathlib import Path
+
+from clsplat.errors import DataError
+from clsplat.scene.scene import Scene, View, every_nth, make_scene
+from clsplat.scene.transforms import Transforms, view_name
+
+logger = logging.getLogger("clsplat")
+
+
+def read_nerfstudio(path: Path, holdout: int = 8) -> Scene:
+    """Read a nerfstudio scene; views are in order of name.
+
+    The split is that of the lists `train_filenames` and `test_filenames` where the file has one of them, and images
+    on neither are left out; otherwise every `holdout`-th view is for testing.
+    Raises DataError when a file is missing, damaged or not supported.
+    """
+    transforms = Transforms(path / "transforms.json")
+    views = sorted(transforms.views(), key=lambda view: view.name)
+    train, test = _listed(transforms, "train_filenames", views), _listed(transforms, "test_filenames", views)
+    if train is None and test is None:
+        return make_scene(path, views, every_nth([view.name for view in views], holdout), transforms.points())
+    test = test or set()
+    kept = views if train is None else [view for view in views if view.name in train | test]
+    if len(kept) < len(views):
+        logger.info("%s: left out %d images that no split lists", transforms.path, len(views) - len(kept))
+    held_out = {i for i, view in enumerate(kept) if view.name in test}
+    return make_scene(path, kept, held_out, transforms.points())
+
+
+def _listed(transforms: Transforms, key: str, views: list[View]) -> set[str] | None:
+    """Return the view names of a list of file paths, or None where there is none.  Raises DataError."""
+    entries = transforms.table.get(key)
+    if entries is None:
+        return None
+    if not isinstance(entries, list) or not all(isinstance(entry, str) for entry in entries):
+        raise DataError(f"{transforms.path}: {key} is not a list of file paths; export the file again")
+    names = {view_name(entry) for entry in entries}
+    unknown = sorted(names - {view.name for view in views})
+    if unknown:
+        raise DataError(f"{transforms.path}: {key} lists '{unknown[0]}', which no frame has; remove it from the list")
+    return names

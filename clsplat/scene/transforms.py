@@ -1,0 +1,161 @@
+"""Read a `transforms*.json`: the frames and points that Blender (NeRF) and nerfstudio datasets share."""
+
+import json
+import math
+from pathlib import Path, PureWindowsPath
+from typing import Any
+
+import numpy as np
+
+from clsplat.errors import DataError
+from clsplat.scene.images import image_size, inside, read_file, require_files
+from clsplat.scene.points import FAR, read_points_ply
+from clsplat.scene.scene import Camera, Floats, PointCloud, View
+
+LENSES = (
+    "PINHOLE",
+    "SIMPLE_PINHOLE",
+    "OPENCV",
+    "FULL_OPENCV",
+    "RADIAL",
+    "SIMPLE_RADIAL",
+)  # pinhole when all below are 0
+DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+
+
+class Frame:
+    """One image of the file: its own values over those that the file gives for all."""
+
+    def __init__(self, path: Path, index: int, values: dict[str, Any]) -> None:
+        self.folder, self.where, self.values = path.parent, f"{path}: frames[{index}]", values
+
+    def number(self, key: str) -> float | None:
+        """Return a finite number, or None where there is none.  Raises DataError for anything else."""
+        value = self.values.get(key)
+        if value is None:
+            return None
+        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < FAR:
+            raise DataError(f"{self.where}: {key} is {value!r}; expected a finite number: export the file again")
+        return float(value)
+
+    def file(self, key: str, suffix: str = "") -> Path | None:
+        """Return a path below the folder of the JSON file, with `suffix` where it has none, or None."""
+        value = self.values.get(key)
+        if value is None:
+            return None
+        if not isinstance(value, str):
+            raise DataError(f"{self.where}: {key} is {value!r}; expected a path below {self.folder}")
+        path = inside(self.folder, view_name(value), self.where)
+        return path if path.suffix else path.with_name(path.name + suffix)
+
+
+class Transforms:
+    """A `transforms*.json`.  Raises DataError when it is not JSON, or not a table with a list `frames`."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        try:
+            self.table = json.loads(read_file(path))
+        except (ValueError, RecursionError) as error:
+            raise DataError(f"{path}: not a JSON file ({error}); export it again") from error
+        frames = self.table.get("frames") if isinstance(self.table, dict) else None
+        if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
+            raise DataError(f"{path}: expected a table with a list of tables called `frames`; export it again")
+        self.frames = [Frame(path, i, self.table | frame) for i, frame in enumerate(frames)]
+
+    def views(self) -> list[View]:
+        """Return one view per frame, in the order of the file.
+
+        Images whose size the file does not tell are as large as the first.  Raises DataError for cameras with
+        distortion, damaged numbers, missing files and paths that leave the folder.
+        """
+        images = [_image_path(frame) for frame in self.frames]
+        masks = [frame.file("mask_path") for frame in self.frames]
+        require_files(self.path, [*images, *(mask for mask in masks if mask)])
+        told = all(frame.number("w") and frame.number("h") for frame in self.frames)
+        size = None if told else image_size(images[0])
+        return [
+            View(view_name(frame.values["file_path"]), _camera(frame, size), _world_to_camera(frame), image, mask)
+            for frame, image, mask in zip(self.frames, images, masks, strict=True)
+        ]
+
+    def points(self) -> PointCloud | None:
+        """Read `ply_file_path`, or else `points3d.ply` where that exists; None when there are no points."""
+        path = Frame(self.path, 0, self.table).file("ply_file_path")
+        beside = self.path.parent / "points3d.ply"
+        if path is None and not beside.is_file():
+            return None
+        points = read_points_ply(path or beside)
+        return points if len(points) else None
+
+
+def view_name(file_path: str) -> str:
+    """Return the name of a view: its `file_path` with forward slashes and without a leading `./`."""
+    return PureWindowsPath(file_path).as_posix()
+
+
+def _image_path(frame: Frame) -> Path:
+    path = frame.file("file_path", suffix=".png")  # Blender's exporter leaves the extension out
+    if path is None:
+        raise DataError(f"{frame.where}: it has no `file_path`; expected the path of an image: export the file again")
+    return path
+
+
+def _camera(frame: Frame, size: tuple[int, int] | None) -> Camera:
+    """Return the pinhole camera of a frame.  Raises DataError when it has distortion or no focal length."""
+    _refuse_distortion(frame)
+    default_width, default_height = size or (0, 0)
+    width, height = int(frame.number("w") or default_width), int(frame.number("h") or default_height)
+    fx, fy = _focal(frame, "fl_x", "camera_angle_x", width), _focal(frame, "fl_y", "camera_angle_y", height)
+    fx, fy = fy if fx is None else fx, fx if fy is None else fy
+    if fx is None or fy is None or min(width, height, fx, fy) <= 0:
+        raise DataError(
+            f"{frame.where}: the camera is {width}x{height} with focal lengths {fx}, {fy}; expected positive numbers "
+            "from w, h and fl_x, fl_y or camera_angle_x: export the file again"
+        )
+    cx, cy = frame.number("cx"), frame.number("cy")
+    return Camera(width, height, fx, fy, width / 2 if cx is None else cx, height / 2 if cy is None else cy)
+
+
+def _focal(frame: Frame, length_key: str, angle_key: str, pixels: int) -> float | None:
+    """Return a focal length in pixels, told as such or as the angle (rad) that `pixels` span."""
+    length, angle = frame.number(length_key), frame.number(angle_key)
+    if length is not None or angle is None:
+        return length
+    if not 0 < angle < math.pi:
+        raise DataError(f"{frame.where}: {angle_key} is {angle}; expected an angle in (0, pi): export the file again")
+    return pixels / 2 / math.tan(angle / 2)
+
+
+def _refuse_distortion(frame: Frame) -> None:
+    faults = [key for key in DISTORTION if frame.number(key)]
+    lens = frame.values.get("camera_model", "PINHOLE")
+    if lens not in LENSES or frame.values.get("is_fisheye"):
+        faults.append(f"camera_model {lens!r}")
+    if faults:
+        raise DataError(
+            f"{frame.where}: the camera has lens distortion ({', '.join(faults)}); expected a pinhole: "
+            "undistort the images first, for example with `colmap image_undistorter`"
+        )
+
+
+def _world_to_camera(frame: Frame) -> Floats:
+    """Return [3, 4], OpenCV axes, from a camera-to-world matrix with OpenGL axes (y up, z backwards)."""
+    try:
+        matrix = np.array(frame.values.get("transform_matrix"), np.float64)
+    except (ValueError, TypeError, OverflowError):
+        matrix = np.empty(0)
+    if matrix.shape not in ((4, 4), (3, 4)) or not (np.abs(matrix) < FAR).all() or not _is_rotation(matrix[:3, :3]):
+        raise DataError(
+            f"{frame.where}: transform_matrix is not 4x4 numbers with a rotation in its corner; "
+            "remove that frame or export the file again"
+        )
+    camera_to_world = np.eye(4)
+    camera_to_world[:3] = matrix[:3]
+    camera_to_world[:3, 1:3] *= -1
+    return np.linalg.inv(camera_to_world)[:3]
+
+
+def _is_rotation(matrix: Floats) -> bool:
+    """Tell whether [3, 3] is a rotation, to the few digits some exporters write; scaled or mirrored is not."""
+    return np.allclose(matrix.T @ matrix, np.eye(3), atol=1e-3) and np.linalg.det(matrix) > 0

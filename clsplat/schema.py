@@ -1,0 +1,31 @@
+"""The JSON schema of pipeline files, for editors that complete and check them."""
+
+from typing import Any
+
+from clsplat.pipeline import PipelineFile
+from clsplat.stages import STAGES
+
+
+def json_schema() -> dict[str, Any]:
+    """Return the schema in the shape of the file: a stage is its name, or its name with settings."""
+    schema = PipelineFile.model_json_schema()
+    definitions = schema["$defs"]
+    stages = {kind.__name__: name for name, kind in STAGES.items()}
+    for title in stages:
+        definitions[title]["properties"].pop("stage", None)
+    schema["properties"]["stages"]["items"] = _items(stages)
+    definitions["Optimize"]["properties"]["during"]["items"] = _items(stages)
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
+
+
+def _items(stages: dict[str, str]) -> dict[str, Any]:
+    with_settings = [
+        {
+            "type": "object",
+            "properties": {name: {"$ref": f"#/$defs/{title}"}},
+            "required": [name],
+            "additionalProperties": False,
+        }
+        for title, name in stages.items()
+    ]
+    return {"oneOf": [{"enum": sorted(stages.values())}, *with_settings]}

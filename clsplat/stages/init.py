@@ -1,0 +1,113 @@
+"""The first Gaussians: from the scene's points, at random, or from a model file."""
+
+import logging
+import math
+from pathlib import Path
+from typing import Annotated, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+from scipy.spatial import cKDTree
+
+from clsplat.errors import DataError
+from clsplat.gaussians.model import SH_C0, Gaussians, sh_coefficients
+from clsplat.gaussians.ply import Parameters, read_ply
+from clsplat.scene.scene import PointCloud, Scene
+from clsplat.stages.base import Stage
+from clsplat.training.run import Run
+
+LOG = logging.getLogger("clsplat")
+DISTANCE2_MIN = 1.0e-7  # scene units²: coincident points still get a size
+RANDOM_BOX = 1.3 / 4.03  # half side of the box by camera distance: what 3DGS takes for the Blender scenes
+
+
+class Init(Stage):
+    """Make Gaussians: isotropic, as large as the mean distance to the three nearest neighbours (Kerbl et al. 2023).
+
+    `source: auto` takes the scene's points where there are some and random ones elsewhere.  Random points fill a box
+    around the point that the cameras look at.
+    """
+
+    stage: Literal["init"] = "init"
+    makes: ClassVar[frozenset[str]] = frozenset({"model"})
+
+    source: Literal["auto", "points", "random", "ply"] = "auto"
+    opacity: Annotated[float, Field(gt=0, lt=1)] = 0.1
+    count: Annotated[int, Field(gt=0)] = 100_000  # of random points
+    file: str | None = None  # for `source: ply`
+
+    def run(self, run: Run) -> None:
+        degree = run.model_settings.sh_degree
+        gaussians = Gaussians(run.device, self._parameters(run, degree))
+        run.model = run.model_settings.model(gaussians, degree if self.source == "ply" else 0)
+        LOG.info("%d Gaussians from %s", run.model.gaussians.count, self._origin(run.scene))
+
+    def _origin(self, scene: Scene) -> str:
+        if self.source == "auto":
+            return "the scene's points" if scene.points else "random points (the scene has none)"
+        return self.source
+
+    def _parameters(self, run: Run, degree: int) -> Parameters:
+        if self.source == "ply":
+            if self.file is None:
+                raise DataError("init: source 'ply' needs 'file'")
+            return with_degree(read_ply(Path(self.file)).parameters, degree)
+        points = run.scene.points
+        if points is None and self.source == "points":
+            raise DataError(f"{run.scene.path}: has no points to start from; use init: {{source: random}}")
+        if points is None or self.source == "random":
+            points = random_points(run.scene, self.count, run.seed)
+        return from_points(points, self.opacity, degree)
+
+
+def from_points(points: PointCloud, opacity: float, degree: int) -> Parameters:
+    """One Gaussian at each point."""
+    count = len(points)
+    log_scales = 0.5 * np.log(neighbour_distance2(points.positions))
+    quats = np.zeros((count, 4))
+    quats[:, 0] = 1
+    return {
+        "means": points.positions.astype(np.float32),
+        "quats": quats.astype(np.float32),
+        "log_scales": np.repeat(log_scales[:, None], 3, axis=1).astype(np.float32),
+        "logit_opacity": np.full((count, 1), math.log(opacity / (1 - opacity)), np.float32),
+        "sh_base": ((points.colours - 0.5) / SH_C0).astype(np.float32),
+        "sh_rest": np.zeros((count, 3 * (sh_coefficients(degree) - 1)), np.float32),
+    }
+
+
+def neighbour_distance2(positions: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Mean squared distance to the three nearest neighbours, exact, [N]."""
+    neighbours = min(4, len(positions))
+    if neighbours < 2:
+        return np.full(len(positions), 1.0)
+    distance = cKDTree(positions).query(positions, k=neighbours, workers=-1)[0]
+    squared: NDArray[np.float64] = np.square(distance[:, 1:]).mean(axis=1)
+    return np.maximum(squared, DISTANCE2_MIN)
+
+
+def random_points(scene: Scene, count: int, seed: int) -> PointCloud:
+    """Grey points, uniform in a box around what the training cameras look at."""
+    views = scene.split("train")
+    positions = np.stack([view.position for view in views])
+    centre = looked_at(positions, np.stack([view.world_to_camera[2, :3] for view in views]))
+    half_side = RANDOM_BOX * float(np.median(np.linalg.norm(positions - centre, axis=1)))
+    rng = np.random.default_rng([seed, count])
+    spread = rng.uniform(-half_side, half_side, (count, 3))
+    return PointCloud((centre + spread).astype(np.float32), np.full((count, 3), 127 / 255, np.float32))
+
+
+def looked_at(positions: NDArray[np.floating], directions: NDArray[np.floating]) -> NDArray[np.floating]:
+    """The point nearest to all optical axes, in least squares, [3]."""
+    across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
+    point, *_ = np.linalg.lstsq(across.sum(axis=0), np.einsum("nij,nj->i", across, positions), rcond=None)
+    return np.asarray(point)
+
+
+def with_degree(parameters: Parameters, degree: int) -> Parameters:
+    """The same Gaussians with more or fewer SH bands."""
+    wanted = 3 * (sh_coefficients(degree) - 1)
+    rest = parameters["sh_rest"][:, :wanted]
+    padding = np.zeros((len(rest), wanted - rest.shape[1]), np.float32)
+    return {**parameters, "sh_rest": np.concatenate([rest, padding], axis=1)}

@@ -1,0 +1,37 @@
+"""Images of a split."""
+
+import logging
+from pathlib import Path, PurePosixPath
+from typing import ClassVar, Literal
+
+from clsplat.scene.images import write_image
+from clsplat.stages.base import Stage
+from clsplat.training.metrics import render_view
+from clsplat.training.run import Run
+
+LOG = logging.getLogger("clsplat")
+IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"}
+
+
+class Render(Stage):
+    """Write one PNG for each view of a split, named as the view."""
+
+    stage: Literal["render"] = "render"
+    needs: ClassVar[frozenset[str]] = frozenset({"model"})
+
+    split: Literal["test", "train", "all"] = "test"
+    folder: str = "renders"  # inside the run folder
+
+    def run(self, run: Run) -> None:
+        views = run.scene.split(self.split)
+        for view in views:
+            camera = run.targets.camera(view)
+            image = render_view(run.renderer, run.trained, camera, run.targets.background_array)
+            write_image(image_path(run.out / self.folder, view.name), image)
+        LOG.info("%d images written to %s", len(views), run.out / self.folder)
+
+
+def image_path(folder: Path, view: str, suffix: str = ".png") -> Path:
+    """The file of a view's render: its name below `folder`, with another suffix."""
+    name = PurePosixPath(view)
+    return folder / name.with_suffix(suffix) if name.suffix.lower() in IMAGE_SUFFIXES else folder / f"{view}{suffix}"

@@ -1,0 +1,41 @@
+"""The small scheduled changes of the model."""
+
+from typing import Annotated, ClassVar, Literal
+
+from pydantic import Field
+
+from clsplat.stages.base import Stage
+from clsplat.training.density import cap_opacity
+from clsplat.training.run import Run
+
+
+class RaiseSh(Stage):
+    """Let the colours use one more band of spherical harmonics."""
+
+    stage: Literal["raise_sh"] = "raise_sh"
+    needs: ClassVar[frozenset[str]] = frozenset({"model"})
+    edits: ClassVar[bool] = True
+
+    def run(self, run: Run) -> None:
+        model = run.trained
+        model.degree = min(model.degree + 1, model.gaussians.sh_degree)
+
+
+class ResetOpacity(Stage):
+    """Make every Gaussian almost transparent; those that are needed come back, floaters do not (Kerbl et al. 2023)."""
+
+    stage: Literal["reset_opacity"] = "reset_opacity"
+    needs: ClassVar[frozenset[str]] = frozenset({"model"})
+    edits: ClassVar[bool] = True
+
+    to: Annotated[float, Field(gt=0, lt=1)] = 0.01
+    when_background: Literal["black", "white"] | None = None  # act on this background only
+
+    def run(self, run: Run) -> None:
+        if self.when_background not in (None, run.targets.background_name):
+            return
+        cap_opacity(run.trained.gaussians, self.to)
+        if run.adam is not None:
+            run.adam.forget("logit_opacity")
+        if run.gradients is not None:
+            run.gradients.discard("logit_opacity")

@@ -1,0 +1,67 @@
+"""Small line charts as inline SVG."""
+
+import html
+import math
+from collections.abc import Sequence
+
+WIDTH, HEIGHT = 460, 220  # px
+LEFT, BOTTOM, TOP, RIGHT = 56, 30, 26, 12
+COLOURS = ("#2b6cb0", "#c05621", "#2f855a", "#805ad5")
+Points = Sequence[tuple[float, float]]
+
+
+def curve(title: str, lines: dict[str, Points], logarithmic: bool = False) -> str:
+    """Draw named lines of (x, y) points over common axes; a logarithmic y axis drops values that are not positive."""
+    drawn = {
+        name: [(x, math.log10(y) if logarithmic else y) for x, y in points if not logarithmic or y > 0]
+        for name, points in lines.items()
+    }
+    drawn = {name: points for name, points in drawn.items() if points}
+    if not drawn:
+        return ""
+    xs = [x for points in drawn.values() for x, _ in points]
+    ys = [y for points in drawn.values() for _, y in points]
+    x_low, x_high = 0.0, max(xs) or 1.0
+    y_low, y_high = min(ys), max(ys)
+    if y_high == y_low:
+        y_low, y_high = y_low - 0.5, y_high + 0.5
+
+    def place(x: float, y: float) -> tuple[float, float]:
+        across = (x - x_low) / (x_high - x_low)
+        up = (y - y_low) / (y_high - y_low)
+        return LEFT + across * (WIDTH - LEFT - RIGHT), HEIGHT - BOTTOM - up * (HEIGHT - BOTTOM - TOP)
+
+    parts = [f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{html.escape(title)}">']
+    parts.append(f'<text x="{LEFT}" y="15" class="title">{html.escape(title)}</text>')
+    for tick in _ticks(y_low, y_high):
+        _, y = place(x_low, tick)
+        label = _number(10**tick if logarithmic else tick)
+        parts.append(f'<line x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{y:.1f}" y2="{y:.1f}" class="grid"/>')
+        parts.append(f'<text x="{LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">{label}</text>')
+    for tick in _ticks(x_low, x_high):
+        x, _ = place(tick, y_low)
+        parts.append(f'<text x="{x:.1f}" y="{HEIGHT - 10}" text-anchor="middle">{_number(tick)}</text>')
+    for i, (name, points) in enumerate(drawn.items()):
+        colour = COLOURS[i % len(COLOURS)]
+        path = " ".join(f"{x:.1f},{y:.1f}" for x, y in (place(*point) for point in points))
+        parts.append(f'<polyline points="{path}" fill="none" stroke="{colour}" stroke-width="1.8"/>')
+        if len(drawn) > 1:
+            x = WIDTH - RIGHT - 90 * (len(drawn) - i)
+            parts.append(f'<text x="{x}" y="15" fill="{colour}">{html.escape(name)}</text>')
+    return "".join([*parts, "</svg>"])
+
+
+def _ticks(low: float, high: float) -> list[float]:
+    """Three to six round numbers between low and high."""
+    rough = (high - low) / 4
+    power = 10 ** math.floor(math.log10(rough))
+    step = next(power * m for m in (1, 2, 5, 10) if power * m >= rough)
+    first = math.ceil(low / step - 1e-9)
+    return [i * step for i in range(first, math.floor(high / step + 1e-9) + 1)]
+
+
+def _number(value: float) -> str:
+    for limit, suffix in ((1e6, "M"), (1e3, "k")):
+        if abs(value) >= limit:
+            return f"{value / limit:.3g}{suffix}"
+    return f"{value:.3g}"

@@ -1,0 +1,89 @@
+"""Adam on the tables of a Gaussians struct, with a learning rate for each."""
+
+import math
+from typing import Annotated
+
+from pydantic import Field
+
+from clsplat.gaussians.model import PARAMETERS, Gaussians, Gradients, Model, sh_coefficients
+from clsplat.opencl.program import constants
+from clsplat.settings import Settings
+
+Rate = Annotated[float, Field(ge=0)]
+
+
+class Decay(Settings):
+    """A rate that falls exponentially from `start` to `stop` over a number of steps (Kerbl et al. 2023)."""
+
+    start: Annotated[float, Field(gt=0)]
+    stop: Annotated[float, Field(gt=0)]
+    over: Annotated[int, Field(gt=0)]  # global steps
+
+    def at(self, step: int) -> float:
+        share = min(step / self.over, 1.0)
+        return math.exp((1 - share) * math.log(self.start) + share * math.log(self.stop))
+
+
+class Rates(Settings):
+    """Learning rates by parameter.  Those of `means` are multiplied by the scene's extent."""
+
+    means: Decay = Decay(start=1.6e-4, stop=1.6e-6, over=30_000)
+    quats: Rate = 1.0e-3
+    log_scales: Rate = 5.0e-3
+    logit_opacity: Rate = 5.0e-2
+    sh_base: Rate = 2.5e-3
+    sh_rest: Rate = 1.25e-4
+
+    def at(self, step: int, extent: float) -> dict[str, float]:
+        """Rates of a step, by the names of PARAMETERS."""
+        fixed = {name: getattr(self, name) for name in PARAMETERS if name != "means"}
+        return {"means": self.means.at(step) * extent, **fixed}
+
+
+class Adam:
+    """Moments live beside the parameters; each parameter counts its own updates."""
+
+    def __init__(self, gaussians: Gaussians) -> None:
+        self.gaussians = gaussians
+        self.updates = dict.fromkeys(PARAMETERS, 0)
+        self._program = gaussians.device.program("adam.cl")
+        self._lanes = int(gaussians.device.tuning["LANES"])
+        self._beta1, self._beta2 = constants("adam.cl")["BETA1"], constants("adam.cl")["BETA2"]
+        for name in PARAMETERS:
+            for moment in self._moments(name):
+                gaussians.add(moment, gaussians.tables[name].components, zero_fresh=True)
+
+    def step(self, model: Model, gradients: Gradients, rates: dict[str, float]) -> None:
+        """Update every parameter whose gradient still belongs to it.
+
+        Bands above the active SH degree have neither gradient nor moments, so leaving them out changes nothing.
+        """
+        gaussians = self.gaussians
+        for name in PARAMETERS:
+            if name in gradients.discarded:
+                continue
+            components = gaussians.tables[name].components
+            if name == "sh_rest":
+                components = 3 * (sh_coefficients(model.degree) - 1)
+            self.updates[name] += 1
+            moment1, moment2 = self._moments(name)
+            self._program.adam_step(
+                items=(-(-gaussians.count // self._lanes), components),
+                values=gaussians[name],
+                gradient=gradients[name],
+                moment1=gaussians[moment1],
+                moment2=gaussians[moment2],
+                rate=rates[name] / (1 - self._beta1 ** self.updates[name]),
+                correction2=1 / (1 - self._beta2 ** self.updates[name]),
+                stride=gaussians.capacity,
+                count=gaussians.count,
+            )
+
+    def forget(self, name: str) -> None:
+        """Zero the moments of one parameter."""
+        for moment in self._moments(name):
+            self.gaussians[moment].fill(0)
+
+    @staticmethod
+    def _moments(name: str) -> tuple[str, str]:
+        return f"adam/{name}/moment1", f"adam/{name}/moment2"

@@ -1,0 +1,221 @@
+"""Density control: rules that say which Gaussians grow or go (Kerbl et al. 2023, section 5).
+
+A rule is a box in (mean screen gradient, size, opacity) with an outcome; one kernel serves them all.  Sizes are the
+largest standard deviation as a share of the scene's extent.  Growing rules take a Gaussian in their order, the first
+that wants it; pruning rules override growth and judge the size that a split leaves.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field
+
+from clsplat.gaussians.model import Gaussians, Gradients
+from clsplat.render.renderer import Frame
+from clsplat.render.tiles import Tiler
+from clsplat.settings import Settings
+
+Positive = Annotated[float, Field(gt=0)]
+NEVER = 3.0e38  # a bound that no finite float passes
+SCREEN_GRAD, SEEN = "stats/screen_grad", "stats/seen"
+
+
+class SplatStats:
+    """What the views since the last edit said about each Gaussian: summed screen gradients, and how many saw it."""
+
+    def __init__(self, gaussians: Gaussians) -> None:
+        self.gaussians = gaussians
+        self._program = gaussians.device.program("density.cl")
+        for name in (SCREEN_GRAD, SEEN):
+            gaussians.add(name, 1, zero_fresh=True)
+
+    def add(self, frame: Frame, gradients: Gradients) -> None:
+        """Add one view.  Gradients count in normalised device coordinates, as the published thresholds do."""
+        gaussians = self.gaussians
+        self._program.accumulate_stats(
+            items=gaussians.count,
+            grad_mean2d=gradients.mean2d,
+            radius=frame.radius,
+            screen_grad=gaussians[SCREEN_GRAD],
+            seen=gaussians[SEEN],
+            half_width=frame.camera.width / 2,
+            half_height=frame.camera.height / 2,
+            stride=gaussians.capacity,
+            count=gaussians.count,
+        )
+
+    def clear(self) -> None:
+        self.gaussians[SCREEN_GRAD].fill(0)
+        self.gaussians[SEEN].fill(0)
+
+
+class Edit:
+    """What will become of each Gaussian: how many rows, how many of them the old one, by what fresh scales shrink."""
+
+    def __init__(self, gaussians: Gaussians, extent: float, step: int) -> None:
+        device, count = gaussians.device, gaussians.count
+        self.gaussians, self.extent, self.step = gaussians, extent, step
+        self.copies = device.empty(count, np.uint32)
+        self.kept = device.empty(count, np.uint32)
+        self.shrink = device.empty(count)
+        self._program = device.program("density.cl")
+        self._program.start_edit(items=count, copies=self.copies, kept=self.kept, shrink=self.shrink, count=count)
+
+    def mark(
+        self,
+        copies: int,
+        kept: int,
+        shrink: float = 1.0,
+        gradient_above: float = 0.0,
+        size_above: float = 0.0,
+        size_below: float | None = None,
+        opacity_below: float = math.inf,
+    ) -> None:
+        """Give every Gaussian in the box its outcome; sizes are shares of the extent."""
+        gaussians = self.gaussians
+        self._program.mark_rule(
+            items=gaussians.count,
+            log_scales=gaussians["log_scales"],
+            logit_opacity=gaussians["logit_opacity"],
+            screen_grad=gaussians[SCREEN_GRAD],
+            seen=gaussians[SEEN],
+            copies=self.copies,
+            kept=self.kept,
+            shrink=self.shrink,
+            gradient_above=gradient_above,
+            size_above=size_above * self.extent,
+            size_below=NEVER if size_below is None else size_below * self.extent,
+            opacity_below=min(opacity_below, NEVER),
+            new_shrink=shrink,
+            new_copies=copies,
+            new_kept=kept,
+            stride=gaussians.capacity,
+            count=gaussians.count,
+        )
+
+    def apply(self, tiler: Tiler, seed: int) -> None:
+        """Move all tables at once and place the children of split Gaussians."""
+        gaussians, device, count = self.gaussians, self.gaussians.device, self.gaussians.count
+        row_offset = tiler.scan(self.copies, count, "row_offset")
+        rows = int(row_offset.get_item(count))
+        source, fresh = device.empty(rows, np.uint32), device.empty(rows, np.uint32)
+        self._program.list_rows(
+            items=count,
+            copies=self.copies,
+            kept=self.kept,
+            row_offset=row_offset,
+            source=source,
+            fresh=fresh,
+            count=count,
+        )
+        gaussians.rearrange(source, fresh, rows)
+        self._program.spawn_children(
+            items=rows,
+            source=source,
+            kept=self.kept,
+            shrink=self.shrink,
+            quats=gaussians["quats"],
+            means=gaussians["means"],
+            log_scales=gaussians["log_scales"],
+            seed=seed,
+            step=self.step,
+            stride=gaussians.capacity,
+            count=rows,
+        )
+
+
+class Rule(Settings):
+    """A condition and what it does to the Gaussians that meet it."""
+
+    after: Annotated[int, Field(ge=0)] = 0  # global step from which, exclusive, the rule acts
+
+    def mark(self, edit: Edit) -> None:
+        raise NotImplementedError
+
+
+class Clone(Rule):
+    """Copy small Gaussians whose screen gradient is large; the copy starts at the same place."""
+
+    type: Literal["clone"] = "clone"
+    gradient_above: Positive = 2.0e-4
+    size_below: Positive = 0.01
+
+    def mark(self, edit: Edit) -> None:
+        edit.mark(copies=2, kept=1, gradient_above=self.gradient_above, size_below=self.size_below)
+
+
+class Split(Rule):
+    """Replace large Gaussians whose screen gradient is large by smaller ones, drawn from their own distribution."""
+
+    type: Literal["split"] = "split"
+    gradient_above: Positive = 2.0e-4
+    size_above: Positive = 0.01
+    children: Annotated[int, Field(ge=2, le=8)] = 2
+    shrink: Annotated[float, Field(ge=1)] = 1.6  # children's scales are divided by this
+
+    def mark(self, edit: Edit) -> None:
+        edit.mark(
+            copies=self.children,
+            kept=0,
+            shrink=1.0 / self.shrink,
+            gradient_above=self.gradient_above,
+            size_above=self.size_above,
+        )
+
+
+class PruneFaint(Rule):
+    """Remove Gaussians that are almost transparent."""
+
+    type: Literal["prune_faint"] = "prune_faint"
+    opacity_below: Positive = 0.005
+
+    def mark(self, edit: Edit) -> None:
+        edit.mark(copies=0, kept=0, opacity_below=self.opacity_below)
+
+
+class PruneLarge(Rule):
+    """Remove Gaussians that are large in the scene."""
+
+    type: Literal["prune_large"] = "prune_large"
+    size_above: Positive = 0.1
+
+    def mark(self, edit: Edit) -> None:
+        edit.mark(copies=0, kept=0, size_above=self.size_above)
+
+
+RULES: dict[str, type[Rule]] = {"clone": Clone, "split": Split, "prune_faint": PruneFaint, "prune_large": PruneLarge}
+AnyRule = Annotated[Clone | Split | PruneFaint | PruneLarge, Field(discriminator="type")]
+
+
+@dataclass(frozen=True)
+class Change:
+    """Numbers of Gaussians before and after an edit."""
+
+    before: int
+    after: int
+
+
+def densify(
+    gaussians: Gaussians, stats: SplatStats, rules: list[AnyRule], tiler: Tiler, extent: float, step: int, seed: int
+) -> Change:
+    """Apply the rules in their order, as one rearrangement, and start the statistics anew."""
+    edit = Edit(gaussians, extent, step)
+    for rule in rules:
+        if step > rule.after:
+            rule.mark(edit)
+    before = gaussians.count
+    edit.apply(tiler, seed)
+    stats.clear()
+    return Change(before, gaussians.count)
+
+
+def cap_opacity(gaussians: Gaussians, limit: float) -> None:
+    """Let no Gaussian stay more opaque than `limit` (the opacity reset of 3DGS)."""
+    gaussians.device.program("density.cl").cap_opacity(
+        items=gaussians.count,
+        logit_opacity=gaussians["logit_opacity"],
+        limit=math.log(limit / (1 - limit)),
+        count=gaussians.count,
+    )

@@ -1,0 +1,137 @@
+"""Photometric losses: each adds its share to the image's gradient, and can tell its value when somebody asks."""
+
+from abc import abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field
+
+from clsplat.opencl.device import Array
+from clsplat.opencl.program import constants
+from clsplat.render.renderer import DeviceCamera
+from clsplat.render.workspace import Workspace
+from clsplat.settings import Settings
+
+SSIM_BLOCK = int(constants("loss.cl")["BLOCK"])
+
+
+@dataclass
+class Comparison:
+    """A rendered image beside its photograph, float planes [3, rows, stride], and the gradient that losses add to."""
+
+    workspace: Workspace
+    camera: DeviceCamera
+    image: Array
+    target: Array
+    gradient: Array
+    accumulate: bool = False  # False: the next loss overwrites the gradient
+
+    @property
+    def values(self) -> int:
+        """Number of values in the image."""
+        return 3 * self.camera.width * self.camera.height
+
+    def shape_arguments(self) -> dict[str, int]:
+        camera = self.camera
+        return {"width": camera.width, "height": camera.height, "rows": camera.rows, "stride": camera.stride}
+
+
+@dataclass(frozen=True)
+class Term:
+    """A loss of one step.  Reading its value waits for the device."""
+
+    name: str
+    value: Callable[[], float]  # weight included
+
+
+class Loss(Settings):
+    """A term of the training loss."""
+
+    weight: float = 1.0
+
+    @abstractmethod
+    def add(self, comparison: Comparison) -> Term:
+        """Add weight · d(loss)/d(image) to the gradient."""
+
+
+class L1(Loss):
+    """Mean absolute difference of all values."""
+
+    type: Literal["l1"] = "l1"
+
+    def add(self, comparison: Comparison) -> Term:
+        sums = pixel_loss(comparison, l1=self.weight, l2=0.0)
+        return Term("l1", lambda: self.weight * float(sums.get()[..., 0].sum(dtype=np.float64)) / comparison.values)
+
+
+class L2(Loss):
+    """Mean squared difference of all values."""
+
+    type: Literal["l2"] = "l2"
+
+    def add(self, comparison: Comparison) -> Term:
+        sums = pixel_loss(comparison, l1=0.0, l2=self.weight)
+        return Term("l2", lambda: self.weight * float(sums.get()[..., 1].sum(dtype=np.float64)) / comparison.values)
+
+
+class Dssim(Loss):
+    """1 - SSIM (Wang et al. 2004): 11 x 11 Gaussian window, sigma 1.5, zero padding, mean over pixels and channels."""
+
+    type: Literal["dssim"] = "dssim"
+
+    def add(self, comparison: Comparison) -> Term:
+        maps, sums = ssim_maps(comparison)
+        comparison.workspace.device.program("loss.cl").ssim_gradient(
+            groups=(-(-comparison.camera.stride // SSIM_BLOCK), comparison.camera.rows, 3),
+            maps=maps,
+            image=comparison.image,
+            target=comparison.target,
+            gradient=comparison.gradient,
+            scale=-self.weight / comparison.values,
+            accumulate=int(comparison.accumulate),
+            **comparison.shape_arguments(),
+        )
+        comparison.accumulate = True
+        return Term("dssim", lambda: self.weight * (1.0 - float(sums.get().sum(dtype=np.float64)) / comparison.values))
+
+
+LOSSES: dict[str, type[Loss]] = {"l1": L1, "l2": L2, "dssim": Dssim}
+AnyLoss = Annotated[L1 | L2 | Dssim, Field(discriminator="type")]
+
+
+def pixel_loss(comparison: Comparison, l1: float, l2: float) -> Array:
+    """Add the gradient of weighted L1 and L2; return the sums of |x - y| and (x - y)² by row, [3, rows, 2]."""
+    camera, values = comparison.camera, comparison.values
+    sums = comparison.workspace.array(f"pixel_sums {l1} {l2}", (3, camera.rows, 2))
+    comparison.workspace.device.program("loss.cl").pixel_loss(
+        groups=(1, camera.rows, 3),
+        image=comparison.image,
+        target=comparison.target,
+        gradient=comparison.gradient,
+        row_sums=sums,
+        l1=l1 / values,
+        l2=l2 / values,
+        accumulate=int(comparison.accumulate),
+        **comparison.shape_arguments(),
+    )
+    comparison.accumulate = True
+    return sums
+
+
+def ssim_maps(comparison: Comparison) -> tuple[Array, Array]:
+    """Return the derivatives of the SSIM map [3, 3, rows, stride] and the map's sums [3, height, blocks]."""
+    camera, array = comparison.camera, comparison.workspace.array
+    blocks = -(-camera.stride // SSIM_BLOCK)
+    maps = array("ssim_maps", (3, 3, camera.rows, camera.stride))
+    sums = array("ssim_sums", (3, camera.height, blocks))
+    comparison.workspace.device.program("loss.cl").ssim_maps(
+        groups=(blocks, camera.height, 3),
+        image=comparison.image,
+        target=comparison.target,
+        maps=maps,
+        block_sums=sums,
+        **comparison.shape_arguments(),
+    )
+    return maps, sums

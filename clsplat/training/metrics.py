@@ -1,0 +1,72 @@
+"""Image metrics as papers quote them: of 8-bit images, PSNR over all channels, SSIM with an 11 x 11 Gaussian window."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.gaussians.model import Model
+from clsplat.opencl.device import Array
+from clsplat.render.renderer import DeviceCamera, Renderer
+from clsplat.scene.scene import View
+from clsplat.training.losses import Comparison, ssim_maps
+from clsplat.training.targets import Target, Targets, unpack
+
+PSNR_CAP = 100.0  # dB, for equal images
+Image = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class ViewMetrics:
+    """One view's figures."""
+
+    view: str
+    psnr: float  # dB
+    ssim: float
+
+
+def render_view(renderer: Renderer, model: Model, camera: DeviceCamera, background: Array) -> Image:
+    """Render to 8 bits, [height, width, 3]: clamped to [0, 1], rounded to the nearest.  background: [3]."""
+    frame = renderer.forward(model, camera, background)
+    image = frame.image.get()[:, : camera.height, : camera.width]
+    return np.ascontiguousarray((np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8).transpose(1, 2, 0))
+
+
+def psnr(image: Image, truth: Image) -> float:
+    """Peak signal-to-noise ratio in dB of two 8-bit images."""
+    error = float(np.mean((image.astype(np.float64) - truth) ** 2)) / 255**2
+    return PSNR_CAP if error == 0 else 10 * math.log10(1 / error)
+
+
+def ssim(renderer: Renderer, target: Target, image: Image) -> float:
+    """Structural similarity of an 8-bit image, [height, width, 3], and the photograph."""
+    workspace, camera = renderer.workspace, target.camera
+    pixels = renderer.device.upload(np.ascontiguousarray(image.transpose(2, 0, 1)))
+    planes = unpack(workspace, camera, pixels, "rendered")
+    truth = unpack(workspace, camera, target.pixels)
+    comparison = Comparison(workspace, camera, planes, truth, gradient=planes)
+    _, sums = ssim_maps(comparison)
+    return float(sums.get().sum(dtype=np.float64)) / comparison.values
+
+
+def measure(renderer: Renderer, model: Model, views: Sequence[View], targets: Targets) -> list[ViewMetrics]:
+    """Return the metrics of every view."""
+    results = []
+    for view in views:
+        target = targets.get(view)
+        image = render_view(renderer, model, target.camera, targets.background_array)
+        truth = target.pixels.get().transpose(1, 2, 0)
+        results.append(ViewMetrics(view.name, psnr(image, truth), ssim(renderer, target, image)))
+    return results
+
+
+def mean(results: Sequence[ViewMetrics]) -> dict[str, float | int | None]:
+    """Averages over views, with the keys of metrics.json."""
+    return {
+        "psnr": float(np.mean([r.psnr for r in results])),
+        "ssim": float(np.mean([r.ssim for r in results])),
+        "lpips": None,
+        "views": len(results),
+    }

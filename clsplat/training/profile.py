@@ -1,0 +1,40 @@
+"""Where the time of a training step goes, by stage, from the device's own clock."""
+
+from collections import defaultdict
+
+from clsplat.opencl.device import Timings
+
+STAGES = {
+    "project_forward": "project",
+    "count_tiles": "pairs",
+    "permute": "pairs",
+    "emit_pairs": "pairs",
+    "find_tile_offsets": "pairs",
+    "scan_blocks": "sort",
+    "scan_sums": "sort",
+    "scan_offsets": "sort",
+    "radix_count": "sort",
+    "radix_scatter": "sort",
+    "count_pairs": "sort",
+    "fill_tiles": "sort",
+    "sort_tiles": "sort",
+    "blend_forward": "blend",
+    "unpack_target": "loss",
+    "pixel_loss": "loss",
+    "ssim_maps": "loss",
+    "ssim_gradient": "loss",
+    "blend_backward": "blend backward",
+    "sum_records": "sum records",
+    "project_backward": "project backward",
+    "accumulate_stats": "statistics",
+    "adam_step": "adam",
+}
+ORDER = tuple(dict.fromkeys(STAGES.values()))
+
+
+def stage_milliseconds(timings: Timings, steps: int = 1) -> dict[str, float]:
+    """Average milliseconds of each stage over the `steps` sampled since the last call, in order of a step."""
+    totals: dict[str, float] = defaultdict(float)
+    for label, seconds in timings.take().items():
+        totals[STAGES.get(label.partition(":")[2], "other")] += 1e3 * sum(seconds) / steps
+    return {name: totals[name] for name in (*ORDER, "other") if name in totals}

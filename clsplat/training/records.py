@@ -1,0 +1,48 @@
+"""The files by which a run can be watched and judged: metrics.jsonl, status.json, metrics.json."""
+
+import json
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+from clsplat.files import unwritable, write_text
+
+
+class Records:
+    """Writes a run folder's records; every line of metrics.jsonl carries the step it belongs to."""
+
+    def __init__(self, out: Path) -> None:
+        self.out = out
+        self.path = out / "metrics.jsonl"
+
+    def start(self, step: int) -> None:
+        """Keep the lines up to `step` and drop later ones, which a resumed run writes again."""
+        lines = [line for line in self.read() if line["step"] <= step] if step > 0 else []
+        write_text(self.path, "".join(json.dumps(line) + "\n" for line in lines))
+
+    def add(self, step: int, kind: str, **values: Any) -> None:
+        """Append one line."""
+        line = json.dumps({"step": step, "kind": kind, **values})
+        try:
+            with self.path.open("a") as file:
+                file.write(line + "\n")
+        except OSError as error:
+            raise unwritable(self.path, error) from error
+
+    def read(self, kind: str | None = None) -> list[dict[str, Any]]:
+        """Return the lines, of one kind or all; a last line cut short by a crash is left out."""
+        if not self.path.exists():
+            return []
+        lines = []
+        for text in self.path.read_text().splitlines():
+            try:
+                lines.append(json.loads(text))
+            except ValueError:
+                continue
+        return [line for line in lines if kind in (None, line["kind"])]
+
+    def status(self, state: str, step: int, **values: Any) -> None:
+        """Say in status.json where the run stands: running, done, interrupted or failed."""
+        text = {"state": state, "step": step, "process": os.getpid(), "time": time.time(), **values}
+        write_text(self.out / "status.json", json.dumps(text, indent=1) + "\n")

@@ -1,0 +1,93 @@
+"""Everything that changes while a pipeline runs."""
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from clsplat.errors import ConfigError
+from clsplat.gaussians.model import Gradients, Model
+from clsplat.opencl.device import Device
+from clsplat.render.renderer import Renderer
+from clsplat.scene.scene import Scene, View
+from clsplat.training.adam import Adam
+from clsplat.training.density import SplatStats
+from clsplat.training.filters import ModelSettings
+from clsplat.training.records import Records
+from clsplat.training.targets import Targets
+
+LOG = logging.getLogger("clsplat")
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What the screen shows while training."""
+
+    step: int
+    steps: int
+    loss: float
+    psnr: float  # dB, of the training view just rendered, before 8 bits
+    gaussians: int
+    milliseconds: float  # per step
+    seconds_left: float
+
+
+@dataclass
+class Run:
+    """The mutable state of a pipeline; stages read and change it."""
+
+    device: Device
+    scene: Scene
+    out: Path
+    name: str
+    seed: int
+    pipeline: dict[str, Any]  # resolved settings, as written to pipeline.yaml
+    renderer: Renderer
+    targets: Targets
+    model_settings: ModelSettings
+    model: Model | None = None
+    adam: Adam | None = None
+    stats: SplatStats | None = None
+    gradients: Gradients | None = None  # of the step in progress
+    step: int = 0  # updates done, or in progress
+    cursor: int = 0  # stage in progress
+    stage_step: int = 0  # steps done in it
+    train_seconds: float = 0.0
+    metrics: dict[str, dict[str, Any]] = field(default_factory=dict)  # split -> scale -> averages
+    interrupted: bool = False  # finish the step, save, stop
+    show: Callable[[Progress], None] = lambda progress: None
+
+    def __post_init__(self) -> None:
+        self.records = Records(self.out)
+        self._order: tuple[int, np.ndarray[Any, Any]] = (-1, np.empty(0, int))
+
+    @property
+    def trained(self) -> Model:
+        """The model.  Raises ConfigError when no stage has made one."""
+        if self.model is None:
+            raise ConfigError("no model yet: an init stage must come first")
+        return self.model
+
+    def train_view(self) -> View:
+        """The view of the current step: all training views in a random order, then all in another.
+
+        The order depends on the seed and the step alone, so a resumed run goes on with the same views.
+        """
+        views = self.scene.train
+        epoch, place = divmod(self.step - 1, len(views))
+        if self._order[0] != epoch:
+            self._order = (epoch, np.random.default_rng([self.seed, epoch]).permutation(len(views)))
+        return self.scene.views[views[int(self._order[1][place])]]
+
+    def rendering(self) -> dict[str, Any]:
+        """The numbers that a model file needs to be rendered as it was trained."""
+        model = self.trained
+        return {
+            "near": model.near,
+            "screen_variance": model.screen_variance,
+            "compensate": model.compensate,
+            "background": self.targets.background_name,
+        }
