@@ -66,8 +66,9 @@ static inline float sum_lanes(const VF v)
 static inline float sum_lanes(const VF v) { return v; }
 #endif
 
-static inline VF larger(VF a, VF b) { return a > b ? a : b; }
-static inline VF smaller(VF a, VF b) { return a < b ? a : b; }
+/* A NaN in the first argument stays one. */
+static inline VF larger(VF a, VF b) { return b > a ? b : a; }
+static inline VF smaller(VF a, VF b) { return b < a ? b : a; }
 
 /* e^x for x in [POWER_MIN, 80]: 2^n from the exponent bits, 2^f by a minimax polynomial on [-1/2, 1/2].
  * Relative error 3e-7 near 0, 1.3e-6 at the ends.  Outside the range the lanes hold rubbish. */
@@ -84,8 +85,12 @@ static inline VF exp_power(VF x)
     return as_VF(as_VI(p) + (as_VI(t) << 23));
 }
 
-/* e^x with x clamped to [-80, 80]. */
-static inline VF exp_clamped(VF x) { return exp_power(smaller(larger(x, (VF)(-80.0f)), (VF)(80.0f))); }
+/* e^x with x clamped to [-80, 80]; NaN stays NaN. */
+static inline VF exp_clamped(VF x)
+{
+    const VF e = exp_power(smaller(larger(x, (VF)(-80.0f)), (VF)(80.0f)));
+    return x == x ? e : x;
+}
 
 /* ln x for finite x > 0 (normal numbers): exponent bits plus 2 atanh((m-1)/(m+1)) for m in [0.7, 1.4]. */
 static inline VF log_positive(VF x)

@@ -162,8 +162,9 @@ static inline void shape_backward(const shape_t *s, __constant camera_t *restric
     const VF x_over_z = s->x * s->inverse_z, y_over_z = s->y * s->inverse_z;
     const VF gx = jx * gu + ray_x * s->inverse_z;
     const VF gy = jy * gv + ray_y * s->inverse_z;
-    const VF gz = -s->inverse_z * (jx * (x_over_z * gu + j00 - s->ray_x * j02) + x_over_z * ray_x +
-                                   jy * (y_over_z * gv + j11 - s->ray_y * j12) + y_over_z * ray_y);
+    const VF gz = -(jx * x_over_z * gu + jy * y_over_z * gv) -
+                  s->inverse_z * (jx * (j00 - s->ray_x * j02) + x_over_z * ray_x +
+                                  jy * (j11 - s->ray_y * j12) + y_over_z * ray_y);
     for (uint k = 0; k < 3; k++)
         grad_mean[k] = w[k] * gx + w[4 + k] * gy + w[8 + k] * gz;
     grad_mean2d[0] = gu;

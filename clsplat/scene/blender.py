@@ -15,4 +15,5 @@ def read_blender(path: Path) -> Scene:
     train, test_file = transforms.views(), path / "transforms_test.json"
     test = Transforms(test_file).views() if test_file.is_file() else []
     held_out = set(range(len(train), len(train) + len(test)))
-    return make_scene(path, train + test, held_out, transforms.points())
+    # NeRF and every paper since show these sets on white.
+    return make_scene(path, train + test, held_out, transforms.points(), background="white")

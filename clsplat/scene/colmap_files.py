@@ -206,9 +206,10 @@ def _points_text(path: Path) -> tuple[Floats, NDArray[Any]]:
 
 def _lines(path: Path) -> Iterator[tuple[str, str]]:
     """Yield the place and the text of every line that is not a comment."""
-    for number, line in enumerate(_decode(str(path), read_file(path)).lstrip("\ufeff").split("\n"), start=1):
+    text = _decode(str(path), read_file(path)).lstrip("\ufeff")
+    for number, line in enumerate(map(str.strip, text.split("\n")), start=1):
         if not line.startswith("#"):
-            yield f"{path}: line {number}", line.strip()
+            yield f"{path}: line {number}", line
 
 
 def _convert(where: str, words: list[str], kinds: Sequence[Callable[[str], Any]], layout: str) -> list[Any]:

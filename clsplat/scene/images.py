@@ -1,6 +1,5 @@
-"""The files of a dataset: which paths are allowed, reading bytes and photographs, writing without leaving halves."""
+"""The files of a dataset: which paths are allowed, their bytes, and photographs."""
 
-import contextlib
 import os
 from collections.abc import Iterable
 from pathlib import Path, PureWindowsPath
@@ -10,7 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.errors import DataError, OutputError
+from clsplat.errors import DataError
+from clsplat.files import atomic
 from clsplat.scene.scene import View
 
 BLACK = (0.0, 0.0, 0.0)
@@ -52,7 +52,8 @@ def write_image(path: Path, rgb: NDArray[np.uint8]) -> None:
     assert rgb.dtype == np.uint8, rgb.dtype
     assert rgb.shape[2:] == (3,), rgb.shape
     _, encoded = cv2.imencode(".png", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
-    write_file(path, encoded.tobytes())
+    with atomic(path) as file:
+        file.write(encoded.tobytes())
 
 
 def image_size(path: Path) -> tuple[int, int]:
@@ -67,19 +68,6 @@ def read_file(path: Path) -> bytes:
         return path.read_bytes()
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
         raise DataError(f"{path}: cannot read it ({error}); check the path and its permissions") from error
-
-
-def write_file(path: Path, data: bytes) -> None:
-    """Write a whole file or nothing: under a temporary name, then renamed.  Raises OutputError when that fails."""
-    partial = path.with_name(f"{path.name}.partial")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial.write_bytes(data)
-        os.replace(partial, path)
-    except OSError as error:
-        with contextlib.suppress(OSError):
-            partial.unlink()
-        raise OutputError(f"{path}: cannot write it ({error}); check the folder and the free space") from error
 
 
 def inside(folder: Path, name: str, where: str) -> Path:

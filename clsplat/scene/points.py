@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.errors import DataError
-from clsplat.scene.images import read_file, write_file
+from clsplat.files import atomic
+from clsplat.scene.images import read_file
 from clsplat.scene.scene import Floats, PointCloud
 
 logger = logging.getLogger("clsplat")
@@ -60,7 +61,8 @@ def write_points_ply(path: Path, points: PointCloud) -> None:
         table[name] = np.rint(points.colours[:, i] * 255)
     properties = [f"property {'uchar' if POINT[name] == np.uint8 else 'float'} {name}" for name in POINT.names or ()]
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}", *properties, "end_header", ""]
-    write_file(path, "\n".join(lines).encode() + table.tobytes())
+    with atomic(path) as file:
+        file.write("\n".join(lines).encode() + table.tobytes())
 
 
 def _parse_header(path: Path, data: bytes) -> tuple[str, int, np.dtype[Any], int]:
@@ -79,7 +81,7 @@ def _parse_header(path: Path, data: bytes) -> tuple[str, int, np.dtype[Any], int
                 elements += 1
             case ["property", kind, name] if kind in TYPES:
                 fields += [(name, "<" + TYPES[kind])] if elements == 1 else []
-            case ["property", "list", *_]:
+            case ["property", "list", *_] if elements > 1:
                 pass  # a face list, after the vertices
             case [] | ["ply"] | ["comment", *_] | ["obj_info", *_]:
                 pass
@@ -109,9 +111,8 @@ def _read_binary(path: Path, body: bytes, count: int, dtype: np.dtype[Any]) -> N
 
 def _read_ascii(path: Path, body: bytes, count: int, dtype: np.dtype[Any]) -> NDArray[Any]:
     """Return the vertices, one per line, as a structured array, [count]."""
-    _require(
-        path, count, 2 * len(dtype.fields or ()), len(body) + 1
-    )  # a digit and a blank each; the last blank may be missing
+    # A number takes a digit and a blank, but the last blank may be missing.
+    _require(path, count, 2 * len(dtype.fields or ()), len(body) + 1)
     if count == 0:
         return np.empty(0, dtype)
     try:

@@ -12,22 +12,16 @@ from clsplat.scene.images import image_size, inside, read_file, require_files
 from clsplat.scene.points import FAR, read_points_ply
 from clsplat.scene.scene import Camera, Floats, PointCloud, View
 
-LENSES = (
-    "PINHOLE",
-    "SIMPLE_PINHOLE",
-    "OPENCV",
-    "FULL_OPENCV",
-    "RADIAL",
-    "SIMPLE_RADIAL",
-)  # pinhole when all below are 0
+# A camera of these is a pinhole when all of its distortion is zero.
+LENSES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "FULL_OPENCV", "RADIAL", "SIMPLE_RADIAL")
 DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
 
 class Frame:
-    """One image of the file: its own values over those that the file gives for all."""
+    """One image of the file: its own values over those that the file gives for all; `where` is for messages."""
 
-    def __init__(self, path: Path, index: int, values: dict[str, Any]) -> None:
-        self.folder, self.where, self.values = path.parent, f"{path}: frames[{index}]", values
+    def __init__(self, folder: Path, where: str, values: dict[str, Any]) -> None:
+        self.folder, self.where, self.values = folder, where, values
 
     def number(self, key: str) -> float | None:
         """Return a finite number, or None where there is none.  Raises DataError for anything else."""
@@ -61,7 +55,7 @@ class Transforms:
         frames = self.table.get("frames") if isinstance(self.table, dict) else None
         if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
             raise DataError(f"{path}: expected a table with a list of tables called `frames`; export it again")
-        self.frames = [Frame(path, i, self.table | frame) for i, frame in enumerate(frames)]
+        self.frames = [Frame(path.parent, f"{path}: frames[{i}]", self.table | own) for i, own in enumerate(frames)]
 
     def views(self) -> list[View]:
         """Return one view per frame, in the order of the file.
@@ -81,7 +75,7 @@ class Transforms:
 
     def points(self) -> PointCloud | None:
         """Read `ply_file_path`, or else `points3d.ply` where that exists; None when there are no points."""
-        path = Frame(self.path, 0, self.table).file("ply_file_path")
+        path = Frame(self.path.parent, str(self.path), self.table).file("ply_file_path")
         beside = self.path.parent / "points3d.ply"
         if path is None and not beside.is_file():
             return None

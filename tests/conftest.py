@@ -1,0 +1,31 @@
+"""Devices and random numbers for tests.
+
+Kernel tests run on every device named in CLSPLAT_TEST_DEVICES (parts of names, separated by `;`; default: the device that
+clsplat would choose), each with the wide schedule at 16 and 8 lanes and with the simt schedule.
+"""
+
+import os
+
+import numpy as np
+import pytest
+
+from clsplat.opencl.device import Device, choose
+
+NAMES = [name.strip() for name in os.environ.get("CLSPLAT_TEST_DEVICES", "").split(";")]
+TUNINGS = {"wide16": ("wide", 16), "wide8": ("wide", 8), "simt": ("simt", 1)}
+
+
+@pytest.fixture(scope="session", params=[(name, tuning) for name in NAMES for tuning in TUNINGS], ids=lambda p: "-".join(p))
+def device(request: pytest.FixtureRequest) -> Device:
+    """An open device; its kernels are built once for the whole session."""
+    name, tuning = request.param
+    schedule, lanes = TUNINGS[tuning]
+    opened = Device(choose(name or None), schedule)
+    opened.tuning["LANES"] = lanes
+    return opened
+
+
+@pytest.fixture
+def rng(request: pytest.FixtureRequest) -> np.random.Generator:
+    """Random numbers that depend on the test's name only."""
+    return np.random.default_rng(list(request.node.name.encode()))

@@ -1,0 +1,71 @@
+"""pairs.cl and the tile lists: nothing visible is missing, nothing is twice, both sorts agree."""
+
+import numpy as np
+import pytest
+
+from clsplat.render.renderer import Renderer
+from tests.scenes import random_case
+
+
+def lists_of(device, case, sort):
+    renderer = Renderer(device, sort)
+    frame = renderer.forward(case.model(device), case.device_camera(device), device.zeros(3))
+    lists = frame.lists
+    tiles = frame.camera.tiles
+    splats = lists.pair_splat.get()
+    offsets = lists.tile_offset.get()[: tiles + 1]
+    order = lists.tile_pairs.get()
+    return frame, [splats[order[offsets[t] : offsets[t + 1]]] for t in range(tiles)]
+
+
+def alpha_of(record, width, height):
+    """Alpha of a splat at every pixel, float64, [height, width]."""
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    dx, dy = record[0] - x, record[1] - y
+    power = -0.5 * (record[2] * dx**2 + record[4] * dy**2) - record[3] * dx * dy
+    return record[5] * np.exp(np.minimum(power, 0))
+
+
+@pytest.mark.parametrize(("count", "width", "height"), [(0, 40, 30), (1, 16, 16), (60, 17, 15), (150, 100, 70), (64, 5, 3)])
+def test_every_visible_pixel_is_in_a_listed_tile(device, rng, count, width, height):
+    case = random_case(rng, count, width, height)
+    frame, tiles = lists_of(device, case, "radix")
+    records, tile = frame.splats.get().astype(np.float64), frame.camera.tile
+    listed = [set(t.tolist()) for t in tiles]
+    assert all(len(s) == len(t) for s, t in zip(listed, tiles, strict=True))
+    for n, record in enumerate(records):
+        alpha = alpha_of(record, width, height) if record[5] > 0 else np.zeros((height, width))
+        for ty in range(frame.camera.tiles_y):
+            for tx in range(frame.camera.tiles_x):
+                strongest = alpha[ty * tile : (ty + 1) * tile, tx * tile : (tx + 1) * tile].max()
+                member = n in listed[ty * frame.camera.tiles_x + tx]
+                if strongest >= 1 / 255:
+                    assert member, (n, tx, ty)
+                # a tile inside the image is listed only where the splat almost reaches alpha 1/255
+                inside = (tx + 1) * tile <= width and (ty + 1) * tile <= height
+                if member and inside:
+                    assert strongest > 0.95 / 255 or min(record[12] - record[11], record[10] - record[9]) < 4
+
+
+@pytest.mark.parametrize("count", [0, 1, 65, 500])
+def test_both_sorts_list_front_to_back(device, rng, count):
+    case = random_case(rng, count, 100, 70)
+    case.parameters["means"][: count // 3] = case.parameters["means"][count // 3 : 2 * (count // 3)]  # equal depths
+    frame, radix = lists_of(device, case, "radix")
+    keys = Renderer(device, "radix").workspace  # the order is judged by the depth that the records were made from
+    assert keys is not None
+    depth = case.project().depth
+    _, bitonic = lists_of(device, case, "bitonic")
+    for a, b in zip(radix, bitonic, strict=True):
+        np.testing.assert_array_equal(a, b)
+        if len(a) > 1:
+            assert (np.diff(depth[a]) >= -1e-6 * depth[a][1:]).all()
+    assert frame.lists.pairs == sum(map(len, radix))
+
+
+def test_auto_measures_and_agrees(device, rng):
+    case = random_case(rng, 100, 60, 50)
+    _, chosen = lists_of(device, case, "auto")
+    _, radix = lists_of(device, case, "radix")
+    for a, b in zip(chosen, radix, strict=True):
+        np.testing.assert_array_equal(a, b)

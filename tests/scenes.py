@@ -1,0 +1,93 @@
+"""Small random scenes, for the kernels and for the oracle alike."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from clsplat.gaussians.model import Gaussians, Model
+from clsplat.opencl.device import Device
+from clsplat.render.renderer import DeviceCamera, upload_camera
+from clsplat.scene.scene import Camera, View
+from tests import reference as ref
+
+EYE = np.array([[0.98, 0.05, -0.19, 0.1], [-0.03, 0.995, 0.1, -0.05], [0.19, -0.09, 0.977, 0.3]])
+
+
+@dataclass(frozen=True)
+class Case:
+    """N Gaussians in front of one camera; parameters in float32, so that both sides see the same numbers."""
+
+    parameters: dict[str, np.ndarray]  # [N, components] float32
+    view: View
+    degree: int = 3
+    near: float = 0.2
+    variance: float = 0.3
+    compensate: float = 0.0
+
+    @property
+    def size(self) -> tuple[int, int]:
+        return self.view.camera.width, self.view.camera.height
+
+    def model(self, device: Device) -> Model:
+        gaussians = Gaussians(device, self.parameters)
+        return Model(gaussians, self.degree, self.near, self.variance, self.compensate)
+
+    def device_camera(self, device: Device) -> DeviceCamera:
+        return upload_camera(device, self.view)
+
+    def gaussians(self) -> ref.Gaussians:
+        p = {name: table.astype(np.float64) for name, table in self.parameters.items()}
+        sh = np.concatenate([p["sh_base"], p["sh_rest"]], axis=1).reshape(len(p["means"]), -1, 3)
+        filters = p.get("filter_variance")
+        return ref.Gaussians(
+            p["means"], p["quats"], p["log_scales"], p["logit_opacity"][:, 0], sh, None if filters is None else filters[:, 0]
+        )
+
+    def camera(self) -> ref.Camera:
+        c = self.view.camera
+        pose = np.float64(np.float32(self.view.world_to_camera))
+        return ref.Camera(pose, *(float(np.float32(v)) for v in (c.fx, c.fy, c.cx, c.cy)), c.width, c.height)
+
+    def numbers(self) -> dict[str, float]:
+        return {"near": self.near, "variance": self.variance, "compensate": self.compensate}
+
+    def project(self, thresholds: ref.Thresholds = ref.Thresholds()) -> ref.Splats:
+        return ref.project(self.gaussians(), self.camera(), self.degree, **self.numbers(), thresholds=thresholds)
+
+
+def random_case(rng: np.random.Generator, count: int, width: int = 40, height: int = 30, **changes: object) -> Case:
+    """Gaussians spread over the view and somewhat beyond it, a few pixels large."""
+    focal = 0.9 * width
+    depth = rng.uniform(1.5, 6, count)
+    across = rng.uniform(-0.65, 0.65, (count, 2)) * [width / focal, height / focal]
+    in_camera = np.stack([across[:, 0] * depth, across[:, 1] * depth, depth], axis=1)
+    rotation, translation = _orthogonal(EYE[:, :3]), EYE[:, 3]
+    parameters = {
+        "means": (in_camera - translation) @ rotation,
+        "quats": rng.normal(size=(count, 4)) * rng.uniform(0.3, 3, (count, 1)),
+        "log_scales": np.log(3 / focal * depth[:, None]) + rng.normal(-0.3, 0.6, (count, 3)),
+        "logit_opacity": rng.normal(0.5, 1.5, (count, 1)),
+        "sh_base": rng.normal(0, 0.7, (count, 3)),
+        "sh_rest": rng.normal(0, 0.15, (count, 45)),
+    }
+    camera = Camera(width, height, focal, 1.05 * focal, 0.48 * width, 0.53 * height)
+    view = View("view", camera, np.concatenate([rotation, translation[:, None]], axis=1), Path("none.png"))
+    return replace(Case({k: v.astype(np.float32) for k, v in parameters.items()}, view), **changes)
+
+
+def with_world_filter(case: Case, rng: np.random.Generator) -> Case:
+    """The same Gaussians under a 3D filter of about half their size."""
+    sizes = np.exp(case.parameters["log_scales"].mean(axis=1, keepdims=True))
+    variance = (sizes * rng.uniform(0.2, 0.8, sizes.shape)) ** 2
+    return replace(case, parameters={**case.parameters, "filter_variance": variance.astype(np.float32)})
+
+
+def _orthogonal(matrix: np.ndarray) -> np.ndarray:
+    u, _, vt = np.linalg.svd(matrix)
+    return u @ vt
+
+
+def relative_error(value: np.ndarray, truth: np.ndarray) -> float:
+    """Norm of the difference by norm of the truth."""
+    return float(np.linalg.norm(value - truth) / max(np.linalg.norm(truth), 1e-30))

@@ -1,0 +1,259 @@
+"""The readers of Blender and nerfstudio datasets."""
+
+import json
+import math
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from clsplat.scene.colmap import read_colmap
+from clsplat.scene.detect import read_scene
+from clsplat.scene.images import load_image
+from clsplat.scene.scene import Camera
+from tests.data_sets import data_set
+from tests.refusals import refusal
+
+# An OpenGL camera at (1, 2, 5) that looks down the world's -z, with y up: the identity but for its place.
+POSE = [[1, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 5], [0, 0, 0, 1]]
+SIDE = [[0, 0, 1, 9], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1]]
+LENS = {"fl_x": 50, "fl_y": 51.5, "cx": 30.5, "cy": 25, "w": 64, "h": 48}
+
+
+def frames(*names: str, **values) -> list[dict]:
+    poses = [POSE, SIDE]
+    return [{"file_path": name, "transform_matrix": poses[i % 2]} | values for i, name in enumerate(names)]
+
+
+def write(path: Path, name: str = "transforms.json", size: tuple[int, int] = (64, 48), **table) -> Path:
+    """Write one JSON file and a grey image for each of its frames; return the folder."""
+    path.mkdir(parents=True, exist_ok=True)
+    (path / name).write_text(json.dumps(table))
+    for frame in table["frames"]:
+        file = (path / frame["file_path"]).with_suffix(Path(frame["file_path"]).suffix or ".png")
+        file.parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(file), np.full((size[1], size[0], 3), 128, np.uint8))
+    return path
+
+
+# ---- real data
+
+
+def test_lego() -> None:
+    path = data_set("lego_200")
+    scene = read_scene(path)
+    assert (len(scene.train), len(scene.test)) == (100, 25)
+    assert scene.split("train")[0].name == "train/r_0"
+    assert {view.name.split("/")[0] for view in scene.split("test")} == {"test"}
+    table = json.loads((path / "transforms_train.json").read_text())
+    for view, frame in zip(scene.split("train"), table["frames"], strict=True):
+        np.testing.assert_allclose(view.position, np.array(frame["transform_matrix"])[:3, 3], atol=1e-5)
+        # Every camera looks at the origin, so that lies straight ahead, at the distance of the camera.
+        np.testing.assert_allclose(view.world_to_camera[:, 3], (0, 0, np.linalg.norm(view.position)), atol=1e-5)
+        assert view.image_path.is_file()
+    camera = scene.views[0].camera
+    assert (camera.width, camera.height, camera.cx, camera.cy) == (200, 200, 100, 100)
+    assert camera.fx == camera.fy == pytest.approx(100 / math.tan(table["camera_angle_x"] / 2))
+    assert scene.extent == pytest.approx(5.2, abs=0.1)
+    assert scene.background == "white"
+    assert scene.points is None
+
+
+def test_lego_is_upright_and_transparent() -> None:
+    view = read_scene(data_set("lego_200")).views[0]
+    assert view.world_to_camera[1, 2] < -0.9  # the world's z is up, a pixel's y down
+    assert load_image(view, (1.0, 1.0, 1.0))[0, 0].tolist() == [255, 255, 255]
+    assert load_image(view)[0, 0].tolist() == [0, 0, 0]
+
+
+def test_distorted_fox_is_refused() -> None:
+    message = refusal(read_scene, data_set("fox_nerfstudio"))
+    assert "k1, k2, p1, p2" in message
+    assert "image_undistorter" in message
+
+
+def test_fox_has_the_poses_of_its_colmap_model(tmp_path: Path) -> None:
+    """The worlds differ by a rotation and a shift, so compare each camera with the first."""
+    path = data_set("fox_nerfstudio")
+    table = json.loads((path / "transforms.json").read_text())
+    (tmp_path / "transforms.json").write_text(json.dumps(table | dict.fromkeys(("k1", "k2", "p1", "p2"), 0)))
+    (tmp_path / "images").symlink_to(path / "images")
+    ours, theirs = read_scene(tmp_path), read_colmap(data_set("fox"))
+    assert ours.test == theirs.test
+    for one, other in zip(ours.views, theirs.views, strict=True):
+        assert one.name == f"images/{other.name}"
+        relative = [
+            view.world_to_camera[:, :3] @ scene.views[0].world_to_camera[:, :3].T
+            for view, scene in ((one, ours), (other, theirs))
+        ]
+        np.testing.assert_allclose(*relative, atol=1e-5)
+        ahead = [
+            view.world_to_camera @ np.append(scene.views[0].position, 1)
+            for view, scene in ((one, ours), (other, theirs))
+        ]
+        np.testing.assert_allclose(*ahead, atol=1e-4)
+    assert ours.extent == pytest.approx(theirs.extent, rel=1e-5)
+
+
+# ---- poses and cameras
+
+
+def test_opengl_axes_become_opencv_axes(tmp_path: Path) -> None:
+    scene = read_scene(write(tmp_path, **LENS, frames=frames("a.png", "b.png")))
+    view, side = scene.views
+    np.testing.assert_allclose(view.position, (1, 2, 5))
+    # (2, 4, 1) is 1 to the right of the camera, 2 above it (so y is -2), and 4 in front of it.
+    np.testing.assert_allclose(view.world_to_camera @ (2, 4, 1, 1), (1, -2, 4))
+    np.testing.assert_allclose(side.position, (9, 0, 0))
+    np.testing.assert_allclose(side.world_to_camera @ (0, 0, -3, 1), (3, 0, 9))
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        (LENS, Camera(64, 48, 50, 51.5, 30.5, 25)),
+        ({"fl_x": 50, "w": 64, "h": 48}, Camera(64, 48, 50, 50, 32, 24)),
+        ({"fl_x": 50, "camera_angle_x": 1, "cx": 0}, Camera(64, 48, 50, 50, 0, 24)),
+        ({"camera_angle_x": math.pi / 2}, Camera(64, 48, 32, 32, 32, 24)),
+        ({"camera_angle_x": math.pi / 2, "camera_angle_y": math.pi / 2}, Camera(64, 48, 32, 24, 32, 24)),
+        (
+            LENS | {"camera_model": "OPENCV", "k1": 0.0, "p2": 0, "is_fisheye": False},
+            Camera(64, 48, 50, 51.5, 30.5, 25),
+        ),
+    ],
+)
+@pytest.mark.parametrize("per_frame", [True, False])
+def test_intrinsics(tmp_path: Path, values: dict, expected: Camera, per_frame: bool) -> None:
+    wrong = dict.fromkeys(values, "overridden")
+    table = (
+        {"frames": frames("a.png", "b.png", **values)} | wrong
+        if per_frame
+        else values | {"frames": frames("a.png", "b.png")}
+    )
+    camera = read_scene(write(tmp_path, **table)).views[1].camera
+    for ours, theirs in zip(vars(camera).values(), vars(expected).values(), strict=True):
+        assert ours == pytest.approx(theirs)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"k1": 0.1}, "k1"),
+        ({"k4": -1e-9}, "k4"),
+        ({"p2": 0.1}, "p2"),
+        ({"camera_model": "OPENCV_FISHEYE"}, "OPENCV_FISHEYE"),
+        ({"camera_model": 3}, "camera_model 3"),
+        ({"is_fisheye": True}, "camera_model"),
+        ({"fl_x": 0}, "0.0, 51.5"),
+        ({"fl_x": -5}, "-5.0"),
+        ({"fl_x": "50"}, "'50'"),
+        ({"fl_x": math.nan}, "nan"),
+        ({"fl_x": None, "fl_y": None}, "None"),
+        ({"fl_x": None, "camera_angle_x": 4}, "camera_angle_x is 4"),
+        ({"w": -64}, "-64"),
+        ({"cx": 10**400}, "cx"),
+        ({"cx": True}, "True"),
+        ({"transform_matrix": None}, "transform_matrix"),
+        ({"transform_matrix": [[1, 0], [0, 1]]}, "transform_matrix"),
+        ({"transform_matrix": [[1, 0, 0, "x"], *POSE[1:]]}, "transform_matrix"),
+        ({"transform_matrix": [[1, 0, 0, math.nan], *POSE[1:]]}, "transform_matrix"),
+        ({"transform_matrix": [[10**400, 0, 0, 1], *POSE[1:]]}, "transform_matrix"),
+        ({"transform_matrix": [[-1, 0, 0, 1], *POSE[1:]]}, "transform_matrix"),  # a mirror
+        ({"transform_matrix": [[2, 0, 0, 1], [0, 2, 0, 1], [0, 0, 2, 1], POSE[3]]}, "transform_matrix"),
+        ({"transform_matrix": [[0] * 4] * 4}, "transform_matrix"),
+        ({"file_path": None}, "file_path"),
+        ({"file_path": 3}, "file_path"),
+        ({"file_path": "../a.png"}, "'../a.png' is not a path below"),
+        ({"file_path": "/a.png"}, "not a path below"),
+        ({"file_path": "x\\..\\..\\a.png"}, "not a path below"),
+        ({"mask_path": "../a.png"}, "not a path below"),
+        ({"mask_path": "masks/a.png"}, "1 of 3 image files are missing"),
+    ],
+)
+def test_damaged_frame_is_named(tmp_path: Path, change: dict, message: str) -> None:
+    write(tmp_path, **LENS, frames=frames("a.png", "b.png"))
+    table = LENS | {"frames": frames("a.png", "b.png")}
+    table["frames"][1] |= change
+    (tmp_path / "transforms.json").write_text(json.dumps(table))
+    text = refusal(read_scene, tmp_path)
+    assert message in text
+    assert "frames[1]" in text or "missing" in text
+
+
+@pytest.mark.parametrize(
+    "text", ["", "{", "[]", "{}", '{"frames": 3}', '{"frames": [1]}', "[" * 100_000, "\xff", "\0", '"frames"']
+)
+def test_file_that_is_no_transforms(tmp_path: Path, text: str) -> None:
+    (tmp_path / "transforms.json").write_bytes(text.encode("latin-1"))
+    assert "transforms.json: " in refusal(read_scene, tmp_path)
+
+
+def test_no_frames(tmp_path: Path) -> None:
+    assert "no images" in refusal(read_scene, write(tmp_path, **LENS, frames=[]))
+
+
+def test_missing_images_are_counted(tmp_path: Path) -> None:
+    write(tmp_path, **LENS, frames=frames("a.png", "b.png"))
+    (tmp_path / "b.png").unlink()
+    assert "1 of 2 image files are missing" in refusal(read_scene, tmp_path)
+
+
+def test_mask_and_backslashes(tmp_path: Path) -> None:
+    write(tmp_path, **LENS, frames=frames("a.png", "images/b.png"))
+    table = LENS | {"frames": frames(".\\images\\b.png", mask_path="./a.png")}
+    (tmp_path / "transforms.json").write_text(json.dumps(table | {"test_filenames": []}))
+    (view,) = read_scene(tmp_path).views
+    assert view.name == "images/b.png"
+    assert view.mask_path == tmp_path / "a.png"
+
+
+# ---- splits
+
+
+def test_blender_split_is_that_of_its_files(tmp_path: Path) -> None:
+    table = {"camera_angle_x": 0.7}
+    write(tmp_path, "transforms_train.json", **table, frames=frames("./train/r_0", "./train/r_1", "./train/r_10"))
+    assert read_scene(tmp_path, holdout=2).test == ()
+    write(tmp_path, "transforms_test.json", **table, frames=frames("./test/r_0"))
+    scene = read_scene(tmp_path, holdout=2)
+    assert [view.name for view in scene.views] == ["train/r_0", "train/r_1", "train/r_10", "test/r_0"]
+    assert scene.test == (3,)
+    assert scene.views[0].image_path == tmp_path / "train" / "r_0.png"
+    assert scene.views[0].camera.width == 64
+
+
+def test_blender_files_may_have_intrinsics(tmp_path: Path) -> None:
+    write(tmp_path, "transforms_train.json", **LENS, frames=frames("a.jpg", "b.jpg"))
+    scene = read_scene(tmp_path)
+    assert scene.views[0].camera == Camera(64, 48, 50, 51.5, 30.5, 25)
+    assert scene.views[0].image_path == tmp_path / "a.jpg"
+
+
+def test_nerfstudio_holds_out_every_nth_by_name(tmp_path: Path) -> None:
+    write(tmp_path, **LENS, frames=frames("c.png", "a.png", "b.png"))
+    scene = read_scene(tmp_path, holdout=2)
+    assert [view.name for view in scene.views] == ["a.png", "b.png", "c.png"]
+    assert scene.test == (0, 2)
+
+
+@pytest.mark.parametrize(
+    ("lists", "train", "test"),
+    [
+        ({"train_filenames": ["c.png", "./a.png"], "test_filenames": ["b.png"]}, ["a.png", "c.png"], ["b.png"]),
+        ({"test_filenames": ["b.png"]}, ["a.png", "c.png", "d.png"], ["b.png"]),
+        ({"train_filenames": ["d.png"]}, ["d.png"], []),
+        ({"train_filenames": ["a.png"], "test_filenames": [], "val_filenames": ["b.png"]}, ["a.png"], []),
+    ],
+)
+def test_nerfstudio_lists(tmp_path: Path, lists: dict, train: list[str], test: list[str]) -> None:
+    scene = read_scene(write(tmp_path, **LENS, **lists, frames=frames("a.png", "b.png", "c.png", "d.png")))
+    assert [view.name for view in scene.split("train")] == train
+    assert [view.name for view in scene.split("test")] == test
+
+
+@pytest.mark.parametrize("entries", ["a.png", [1], ["z.png"]])
+def test_nerfstudio_list_that_is_wrong(tmp_path: Path, entries) -> None:
+    assert "test_filenames" in refusal(
+        read_scene, write(tmp_path, **LENS, test_filenames=entries, frames=frames("a.png", "b.png"))
+    )
