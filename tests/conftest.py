@@ -15,7 +15,9 @@ NAMES = [name.strip() for name in os.environ.get("CLSPLAT_TEST_DEVICES", "").spl
 TUNINGS = {"wide16": ("wide", 16), "wide8": ("wide", 8), "simt": ("simt", 1)}
 
 
-@pytest.fixture(scope="session", params=[(name, tuning) for name in NAMES for tuning in TUNINGS], ids=lambda p: "-".join(p))
+@pytest.fixture(
+    scope="session", params=[(name, tuning) for name in NAMES for tuning in TUNINGS], ids=lambda p: "-".join(p)
+)
 def device(request: pytest.FixtureRequest) -> Device:
     """An open device; its kernels are built once for the whole session."""
     name, tuning = request.param

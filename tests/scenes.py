@@ -11,6 +11,7 @@ from clsplat.render.renderer import DeviceCamera, upload_camera
 from clsplat.scene.scene import Camera, View
 from tests import reference as ref
 
+SHARP = ref.Thresholds()
 EYE = np.array([[0.98, 0.05, -0.19, 0.1], [-0.03, 0.995, 0.1, -0.05], [0.19, -0.09, 0.977, 0.3]])
 
 
@@ -38,10 +39,15 @@ class Case:
 
     def gaussians(self) -> ref.Gaussians:
         p = {name: table.astype(np.float64) for name, table in self.parameters.items()}
-        sh = np.concatenate([p["sh_base"], p["sh_rest"]], axis=1).reshape(len(p["means"]), -1, 3)
+        sh = np.concatenate([p["sh_base"], p["sh_rest"]], axis=1).reshape(len(p["means"]), 16, 3)
         filters = p.get("filter_variance")
         return ref.Gaussians(
-            p["means"], p["quats"], p["log_scales"], p["logit_opacity"][:, 0], sh, None if filters is None else filters[:, 0]
+            p["means"],
+            p["quats"],
+            p["log_scales"],
+            p["logit_opacity"][:, 0],
+            sh,
+            None if filters is None else filters[:, 0],
         )
 
     def camera(self) -> ref.Camera:
@@ -52,7 +58,7 @@ class Case:
     def numbers(self) -> dict[str, float]:
         return {"near": self.near, "variance": self.variance, "compensate": self.compensate}
 
-    def project(self, thresholds: ref.Thresholds = ref.Thresholds()) -> ref.Splats:
+    def project(self, thresholds: ref.Thresholds = SHARP) -> ref.Splats:
         return ref.project(self.gaussians(), self.camera(), self.degree, **self.numbers(), thresholds=thresholds)
 
 

@@ -60,11 +60,8 @@ class Optimize(Stage):
         last_step = run.step - run.stage_step + self.steps
         clock, since = time.perf_counter(), run.step
         while run.stage_step < self.steps:
-            timings = run.device.timings
-            timings.sampling = (run.step + 1) % self.log_every == 0
-            comparison, terms = self._step(run)
-            if timings.sampling or run.stage_step == self.steps or run.interrupted:
-                timings.sampling = False
+            comparison, terms = self._sampled_step(run)
+            if run.step % self.log_every == 0 or run.stage_step == self.steps or run.interrupted:
                 loss, psnr = self._values(run, comparison, terms)
                 now = time.perf_counter()
                 seconds = (now - clock) / (run.step - since)
@@ -79,6 +76,14 @@ class Optimize(Stage):
             if run.interrupted:
                 path = checkpoint.save(run, keep=2)
                 raise Interrupted(f"stopped at step {run.step}, saved in {path}; --resume goes on from there")
+
+    def _sampled_step(self, run: Run) -> tuple[Comparison, list[Term]]:
+        """One step; halfway between log lines, where no density control is due, its kernels are timed."""
+        run.device.timings.sampling = (run.step + 1) % self.log_every == self.log_every // 2
+        try:
+            return self._step(run)
+        finally:
+            run.device.timings.sampling = False
 
     def _step(self, run: Run) -> tuple[Comparison, list[Term]]:
         model, renderer = run.trained, run.renderer

@@ -30,7 +30,15 @@ def gradients_of(device: Device, case: Case, weights: np.ndarray, sort: str = "r
 def expected_gradients(case: Case, weights: np.ndarray, thresholds: ref.Thresholds = ref.Thresholds()) -> dict:
     splats = case.project(thresholds)
     by_parameter, by_splat = ref_blend.render_backward(
-        case.gaussians(), case.camera(), BACKGROUND, case.degree, splats, weights, case.variance, case.compensate, thresholds
+        case.gaussians(),
+        case.camera(),
+        BACKGROUND,
+        case.degree,
+        splats,
+        weights,
+        case.variance,
+        case.compensate,
+        thresholds,
     )
     sh = by_parameter.pop("sh")
     return {
@@ -57,7 +65,9 @@ def compare(values: dict, expected: dict, tolerance: float) -> None:
         assert relative_error(values[name], truth) < tolerance, name
 
 
-@pytest.mark.parametrize(("count", "width", "height"), [(1, 16, 16), (16, 20, 18), (17, 33, 15), (40, 40, 30), (65, 24, 24)])
+@pytest.mark.parametrize(
+    ("count", "width", "height"), [(1, 16, 16), (16, 20, 18), (17, 33, 15), (40, 40, 30), (65, 24, 24)]
+)
 def test_gradients(device, rng, count, width, height):
     case = safe_case(rng, count, width, height)
     weights = rng.normal(size=(3, height, width)).astype(np.float32)
@@ -104,7 +114,13 @@ def test_finite_differences_on_the_device(device, rng):
         image = frame.image.get()[:, :20, :24].astype(np.float64)
         return float((image * weights).sum())
 
-    for name, step in (("means", 2e-3), ("quats", 4e-3), ("log_scales", 4e-3), ("logit_opacity", 1e-2), ("sh_base", 1e-2)):
+    for name, step in (
+        ("means", 2e-3),
+        ("quats", 4e-3),
+        ("log_scales", 4e-3),
+        ("logit_opacity", 1e-2),
+        ("sh_base", 1e-2),
+    ):
         table = case.parameters[name]
         scale = np.abs(values[name]).max()
         for index in list(np.ndindex(table.shape))[::3]:

@@ -123,8 +123,16 @@ def backward_case(device, rng, case: Case) -> None:
     grad_conic = np.stack([-0.5 * m[:, 3], -m[:, 4], -0.5 * m[:, 5]], axis=1)
     grad_opacity = np.where(drawn, m[:, 0] / np.where(drawn, truth.opacity, 1), 0)
     expected = ref.project_backward(
-        case.gaussians(), case.camera(), case.degree, case.variance, case.compensate, truth,
-        grad_mean2d, grad_conic, grad_opacity, m[:, 6:9],
+        case.gaussians(),
+        case.camera(),
+        case.degree,
+        case.variance,
+        case.compensate,
+        truth,
+        grad_mean2d,
+        grad_conic,
+        grad_opacity,
+        m[:, 6:9],
     )
     expected["sh_base"] = expected["sh"][:, 0]
     expected["sh_rest"] = expected.pop("sh")[:, 1:].reshape(gaussians.count, -1)

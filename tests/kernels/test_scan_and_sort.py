@@ -14,7 +14,7 @@ def tiler_of(device, sort="radix") -> Tiler:
     return Tiler(device, Workspace(device), sort)
 
 
-@pytest.mark.parametrize("count", (0, *COUNTS))
+@pytest.mark.parametrize("count", [0, *COUNTS])
 def test_scan(device, rng, count):
     values = rng.integers(0, 100, count).astype(np.uint32)
     offsets = tiler_of(device).scan(device.upload(values), count, "test").get()

@@ -26,7 +26,9 @@ def alpha_of(record, width, height):
     return record[5] * np.exp(np.minimum(power, 0))
 
 
-@pytest.mark.parametrize(("count", "width", "height"), [(0, 40, 30), (1, 16, 16), (60, 17, 15), (150, 100, 70), (64, 5, 3)])
+@pytest.mark.parametrize(
+    ("count", "width", "height"), [(0, 40, 30), (1, 16, 16), (60, 17, 15), (150, 100, 70), (64, 5, 3)]
+)
 def test_every_visible_pixel_is_in_a_listed_tile(device, rng, count, width, height):
     case = random_case(rng, count, width, height)
     frame, tiles = lists_of(device, case, "radix")
@@ -52,8 +54,6 @@ def test_both_sorts_list_front_to_back(device, rng, count):
     case = random_case(rng, count, 100, 70)
     case.parameters["means"][: count // 3] = case.parameters["means"][count // 3 : 2 * (count // 3)]  # equal depths
     frame, radix = lists_of(device, case, "radix")
-    keys = Renderer(device, "radix").workspace  # the order is judged by the depth that the records were made from
-    assert keys is not None
     depth = case.project().depth
     _, bitonic = lists_of(device, case, "bitonic")
     for a, b in zip(radix, bitonic, strict=True):

@@ -1,0 +1,168 @@
+"""density.cl and gather.cl: statistics, rules, edits and the bookkeeping of every table."""
+
+import numpy as np
+import pytest
+
+from clsplat.gaussians.model import PARAMETERS, Gaussians, Gradients
+from clsplat.opencl.device import Device
+from clsplat.render.renderer import Renderer
+from clsplat.training.adam import Adam
+from clsplat.training.density import (
+    SCREEN_GRAD,
+    SEEN,
+    Clone,
+    PruneFaint,
+    PruneLarge,
+    SplatStats,
+    Split,
+    cap_opacity,
+    densify,
+)
+from tests import reference as ref
+from tests import reference_loss as ref_loss
+from tests.scenes import random_case
+
+RULES = [
+    Clone(gradient_above=2e-4, size_below=0.01),
+    Split(gradient_above=2e-4, size_above=0.01, children=2, shrink=1.6),
+    PruneFaint(opacity_below=0.005),
+    PruneLarge(size_above=0.1, after=3000),
+]
+EXTENT = 5.0
+
+
+def edited(device: Device, rng, count: int, step: int, rules=RULES):
+    """Random Gaussians on both sides of every threshold, before and after densify."""
+    case = random_case(rng, count)
+    p = case.parameters
+    p["log_scales"][:] = np.log(EXTENT * rng.choice([0.003, 0.03, 0.12, 0.4], (count, 1))) + rng.normal(
+        0, 0.2, (count, 3)
+    )
+    p["logit_opacity"][:] = rng.choice([-7.0, -4.0, 2.0], (count, 1))
+    gaussians = case.model(device).gaussians
+    adam, stats = Adam(gaussians), SplatStats(gaussians)
+    assert adam.gaussians is gaussians
+    for name in PARAMETERS:
+        for moment in ("moment1", "moment2"):
+            table = f"adam/{name}/{moment}"
+            gaussians.set(table, rng.uniform(1, 2, (count, gaussians.tables[table].components)))
+    seen = rng.integers(0, 4, (count, 1)).astype(np.float32)
+    mean = rng.choice([5e-5, 1e-3], (count, 1))
+    gaussians.set(SCREEN_GRAD, seen * mean)
+    gaussians.set(SEEN, seen)
+    before = {name: gaussians.get(name) for name in gaussians.tables}
+    tiler = Renderer(device, "radix").tiler
+    change = densify(gaussians, stats, rules, tiler, EXTENT, step, seed=3)
+    return before, gaussians, change
+
+
+@pytest.mark.parametrize("count", [1, 15, 16, 17, 63, 64, 65, 300])
+@pytest.mark.parametrize("step", [600, 3100])
+def test_adaptive_density_control(device, rng, count, step):
+    before, gaussians, change = edited(device, rng, count, step)
+    size = np.exp(before["log_scales"]).max(axis=1)
+    opacity = 1 / (1 + np.exp(-before["logit_opacity"][:, 0]))
+    gradient = ref_loss.mean_gradient(before[SCREEN_GRAD][:, 0], before[SEEN][:, 0])
+    action = ref_loss.adc_actions(gradient, size, opacity, EXTENT, prune_large=step > 3000)
+    rows = {ref_loss.KEEP: 1, ref_loss.CLONE: 2, ref_loss.SPLIT: 2, ref_loss.PRUNE: 0}
+    source = np.repeat(np.arange(count), [rows[a] for a in action])
+    place = np.concatenate([np.arange(rows[a]) for a in action]) if len(source) else np.zeros(0, int)
+    split = action[source] == ref_loss.SPLIT
+    fresh = split | ((action[source] == ref_loss.CLONE) & (place == 1))
+    assert (change.before, change.after) == (count, len(source))
+    assert gaussians.count == len(source)
+
+    after = {name: gaussians.get(name) for name in gaussians.tables}
+    for name in ("quats", "logit_opacity", "sh_base", "sh_rest", "filter_variance"):
+        np.testing.assert_array_equal(after[name], before[name][source])
+    for name in PARAMETERS:  # moments: kept rows keep theirs, fresh rows start at zero
+        for moment in (f"adam/{name}/moment1", f"adam/{name}/moment2"):
+            np.testing.assert_array_equal(after[moment], np.where(fresh[:, None], 0, before[moment][source]))
+    np.testing.assert_array_equal(after["means"][~split], before["means"][source][~split])
+    np.testing.assert_array_equal(after["log_scales"][~split], before["log_scales"][source][~split])
+    np.testing.assert_allclose(after["log_scales"][split], before["log_scales"][source][split] - np.log(1.6), atol=1e-5)
+    assert (after[SCREEN_GRAD] == 0).all()
+    assert (after[SEEN] == 0).all()
+    # children lie within their parent's distribution
+    offsets = after["means"][split] - before["means"][source][split]
+    sizes = size[source][split]
+    assert (np.linalg.norm(offsets, axis=1) < 6 * sizes).all()
+
+
+def test_children_follow_their_parents_distribution(device, rng):
+    count = 4000
+    case = random_case(rng, 1)
+    p = {name: np.repeat(table, count, axis=0) for name, table in case.parameters.items()}
+    p["log_scales"] = np.tile(np.log([0.5, 1.0, 0.2]).astype(np.float32), (count, 1))
+    gaussians = Gaussians(device, p)
+    stats = SplatStats(gaussians)
+    for name in (SCREEN_GRAD, SEEN):
+        gaussians.set(name, np.ones((count, 1)))
+    densify(gaussians, stats, [Split(size_above=1e-6)], Renderer(device, "radix").tiler, 1.0, 700, seed=1)
+    assert gaussians.count == 2 * count
+    q = p["quats"][0].astype(np.float64)
+    rotation = ref.rotation_matrix(q / np.linalg.norm(q))
+    noise = (gaussians.get("means") - p["means"][0]) @ rotation / [0.5, 1.0, 0.2]
+    assert np.abs(noise.mean(axis=0)).max() < 0.05
+    np.testing.assert_allclose(np.cov(noise.T), np.eye(3), atol=0.06)
+
+
+def test_random_numbers_depend_on_seed_and_step_alone(device, rng):
+    seed_state = rng.bit_generator.state
+    results = []
+    for step, seed_rng in ((600, 0), (600, 0), (700, 0)):
+        rng.bit_generator.state = seed_state
+        _, gaussians, _ = edited(device, rng, 100, step)
+        results.append(gaussians.get("means"))
+    np.testing.assert_array_equal(results[0], results[1])
+    assert (results[0] != results[2]).any()
+
+
+def test_everything_may_be_pruned(device, rng):
+    _, gaussians, change = edited(device, rng, 30, 600, rules=[PruneFaint(opacity_below=1.0)])
+    assert change.after == 0
+    assert gaussians.get("means").shape == (0, 3)
+
+
+def test_capacity_grows_when_needed(device, rng):
+    _, gaussians, change = edited(
+        device, rng, 64, 600, rules=[Split(gradient_above=1e-12, size_above=1e-9, children=8)]
+    )
+    assert change.after > 64
+    assert gaussians.capacity >= change.after
+    assert gaussians.capacity % 64 == 0
+
+
+def test_identity_rearrangement_changes_nothing(device, rng):
+    gaussians = random_case(rng, 50).model(device).gaussians
+    before = {name: gaussians.get(name) for name in gaussians.tables}
+    same = device.upload(np.arange(50, dtype=np.uint32))
+    gaussians.rearrange(same, device.zeros(50, np.uint32), 50)
+    for name, table in before.items():
+        np.testing.assert_array_equal(gaussians.get(name), table)
+
+
+def test_statistics(device, rng):
+    case = random_case(rng, 65)
+    case.parameters["means"][::4] -= 20 * case.view.world_to_camera[2, :3]  # behind the camera
+    model = case.model(device)
+    frame = Renderer(device, "radix").forward(model, case.device_camera(device), device.zeros(3))
+    stats, gradients = SplatStats(model.gaussians), Gradients(model.gaussians)
+    planes = np.zeros(gradients.mean2d.shape, np.float32)
+    planes[:, :65] = rng.normal(size=(2, 65))
+    gradients.mean2d.set(planes)
+    stats.add(frame, gradients)
+    stats.add(frame, gradients)
+    seen = frame.radius.get()[:65] > 0
+    assert 0 < seen.sum() < 65
+    width, height = case.size
+    norms = ref_loss.screen_gradient(planes[:, :65].T.astype(np.float64), width, height)
+    np.testing.assert_allclose(model.gaussians.get(SCREEN_GRAD)[:, 0], 2 * norms * seen, rtol=1e-5)
+    np.testing.assert_array_equal(model.gaussians.get(SEEN)[:, 0], 2 * seen)
+
+
+def test_opacity_is_capped(device, rng):
+    gaussians = random_case(rng, 65).model(device).gaussians
+    before = gaussians.get("logit_opacity")
+    cap_opacity(gaussians, 0.3)
+    np.testing.assert_allclose(gaussians.get("logit_opacity"), np.minimum(before, np.log(0.3 / 0.7)), rtol=1e-6)
