@@ -8,6 +8,7 @@
 #define BETA2 0.999f
 #define EPSILON 1.0e-15f
 
+/* One update of one table. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void adam_step(
     __global float *restrict values,          // [components,S]

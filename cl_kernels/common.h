@@ -44,7 +44,7 @@
 #define POWER_MIN (-80.0f)      // exp_power is valid from here to 0
 #define DEPTH_MAX 1.0e10f       // scene units; also rejects infinities
 #define QUAT_NORM2_MIN 1.0e-12f // shorter quaternions have no direction
-#define RAY_MARGIN 0.3f         // rays are clamped at 30 % beyond the image: the linearised projection fails further out
+#define RAY_MARGIN 0.3f         // rays are clamped 30 % beyond the image: the linear projection fails further out
 #define LAMBDA_FLOOR 0.1f       // px^2, under the root of the 3-sigma radius
 #define EXTENT_SLACK 0.02f      // added to the squared radius of a splat: rounding never cuts a visible pixel
 

@@ -1,6 +1,6 @@
 /* Density control: what each Gaussian's screen gradient was, which rows a rule edits, and the rows that come out.
  *
- * Kerbl et al. 2023, section 5.  A rule is a box in (gradient, size, opacity) with an outcome: how many rows the Gaussian
+ * Kerbl et al. 2023, section 5.  A rule is a box in (gradient, size, opacity) with an outcome: how many rows a Gaussian
  * becomes (`copies`), how many of them are the old one (`kept`) and by what the scales of the fresh ones are multiplied
  * (`shrink`).  Clone = (2, 1, 1), split in n = (n, 0, 1/1.6), prune = (0, 0, 1).  One item = one Gaussian or one row.
  * No local memory.  Deterministic. */
@@ -120,9 +120,10 @@ void spawn_children(
     float w = quats[i], x = quats[stride + i], y = quats[2 * stride + i], z = quats[3 * stride + i];
     const float inverse = 1.0f / sqrt(w * w + x * x + y * y + z * z);
     w *= inverse, x *= inverse, y *= inverse, z *= inverse;
-    means[i] += (1.0f - 2.0f * (y * y + z * z)) * ex + 2.0f * (x * y - w * z) * ey + 2.0f * (x * z + w * y) * ez;
-    means[stride + i] += 2.0f * (x * y + w * z) * ex + (1.0f - 2.0f * (x * x + z * z)) * ey + 2.0f * (y * z - w * x) * ez;
-    means[2 * stride + i] += 2.0f * (x * z - w * y) * ex + 2.0f * (y * z + w * x) * ey + (1.0f - 2.0f * (x * x + y * y)) * ez;
+    const float xx = 2.0f * x * x, yy = 2.0f * y * y, zz = 2.0f * z * z;
+    means[i] += (1.0f - yy - zz) * ex + 2.0f * (x * y - w * z) * ey + 2.0f * (x * z + w * y) * ez;
+    means[stride + i] += 2.0f * (x * y + w * z) * ex + (1.0f - xx - zz) * ey + 2.0f * (y * z - w * x) * ez;
+    means[2 * stride + i] += 2.0f * (x * z - w * y) * ex + 2.0f * (y * z + w * x) * ey + (1.0f - xx - yy) * ez;
     for (uint k = 0; k < 3; k++)
         log_scales[k * stride + i] += log(shrink[source[i]]);
 }

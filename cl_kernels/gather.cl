@@ -1,4 +1,5 @@
-/* Moving rows: the sum of each Gaussian's gradient records, and any per-Gaussian table in another order. */
+/* Moving rows: the sum of each Gaussian's gradient records, and any per-Gaussian table in another order.  No local
+ * memory.  Deterministic: every value has one writer and sums have one order. */
 #include "splat.h"
 
 /* One item = LANES Gaussians; the pairs of a Gaussian are contiguous and summed in order: deterministic. */

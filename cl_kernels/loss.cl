@@ -1,8 +1,8 @@
 /* Photometric losses between a rendered image and a photograph: L1, L2 and D-SSIM, value and gradient.
  *
  * SSIM: 11x11 Gaussian window, sigma 1.5, zero padding, C1 = 0.01^2, C2 = 0.03^2 (Wang et al. 2004, as 3DGS uses it).
- * Planes are [channels,H',W'] with H', W' whole tiles, zero outside the image.  One group of TEAM items = one row of
- * one channel (SSIM: a block of its columns) and writes its sum once; gradients are written as zero outside the image.  Deterministic. */
+ * Planes are [channels,H',W'] with H', W' whole tiles, zero outside the image; gradients too.  One group of TEAM items
+ * = one row of one channel (SSIM: a block of its columns); it writes its sum once.  Deterministic. */
 #include "lanes.h"
 
 #define SSIM_C1 1.0e-4f

@@ -33,6 +33,7 @@ static inline void add_band(const uint first, const uint last, const VF *basis, 
             colour[channel] += basis[k] * VLOAD(sh_rest + ((k - 1) * 3 + channel) * stride + i);
 }
 
+/* Splat records, depth keys and 3-sigma radii. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void project_forward(
     __global const float *restrict means,            // [3,S] scene units
@@ -172,9 +173,9 @@ static inline void shape_backward(const shape_t *s, __constant camera_t *restric
 }
 
 /* Gradient of one band of coefficients; `weights` becomes c_k . g, the derivative of the loss by basis_k. */
-static inline void band_backward(const uint first, const uint last, const VF *basis, const VF *grad_colour, const VI touched,
-                                 __global const float *restrict sh_rest, __global float *restrict grad_sh_rest,
-                                 const uint stride, const uint i, VF *weights)
+static inline void band_backward(const uint first, const uint last, const VF *basis, const VF *grad_colour,
+                                 const VI touched, __global const float *restrict sh_rest,
+                                 __global float *restrict grad_sh_rest, const uint stride, const uint i, VF *weights)
 {
     for (uint k = first; k < last; k++) {
         weights[k] = (VF)(0.0f);
@@ -186,13 +187,14 @@ static inline void band_backward(const uint first, const uint last, const VF *ba
     }
 }
 
-static inline void store_planes(__global float *restrict planes, const VF *values, const VI touched, const uint components,
-                                const uint stride, const uint i)
+static inline void store_planes(__global float *restrict planes, const VF *values, const VI touched,
+                                const uint components, const uint stride, const uint i)
 {
     for (uint k = 0; k < components; k++)
         VSTORE((touched ? values[k] : (VF)(0.0f)), planes + k * stride + i);
 }
 
+/* Gradients of all parameters from the moments; zero for Gaussians that were culled. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void project_backward(
     __global const float *restrict means,            // [3,S] scene units

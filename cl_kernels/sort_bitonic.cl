@@ -4,8 +4,8 @@
  * (depth bits, pair).  That order is total, since pairs are unique, so the result does not depend on how the
  * tile was filled: deterministic.
  *
- * One work-group = one tile of any length: the ascending ("flip") form of the network, in which a partner beyond the end
- * counts as +infinity and is skipped.  Local memory: SORT_CAPACITY * 8 bytes; longer tiles are sorted in place. */
+ * One work-group = one tile of any length: the ascending ("flip") form of the network, in which a partner beyond the
+ * end counts as +infinity and is skipped.  Local memory: SORT_CAPACITY * 8 bytes; longer tiles are sorted in place. */
 #include "common.h"
 
 /* tile_count[tile] = pairs of the tile.  One item = one pair. */
@@ -65,6 +65,7 @@ void fill_tiles(
         }                                                                                        \
     barrier(fence);
 
+/* Sort each tile's pairs front to back. */
 __kernel __attribute__((reqd_work_group_size(BITONIC_GROUP, 1, 1)))
 void sort_tiles(
     __global const uint *restrict tile_offset,  // [T+1]

@@ -1,0 +1,97 @@
+"""Imports go down the layers only.
+
+    cli · runner, pipeline · stages · training · render · gaussians, scene · opencl · errors, files, settings
+"""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parents[1] / "clsplat"
+ROWS = (  # from the top down; a module imports only from lower rows, or from its own folder
+    {"__main__"},
+    {"cli"},
+    {"runner", "model_file", "bench", "schema", "screen"},
+    {"pipeline"},
+    {"stages"},
+    {"training"},
+    {"render"},
+    {"gaussians", "scene"},
+    {"opencl"},
+    {"settings_errors"},
+    {"errors", "files", "settings", "yaml_file", ""},
+)
+ROW = {name: i for i, row in enumerate(ROWS) for name in row}
+MODULES = sorted(PACKAGE.rglob("*.py"))
+
+
+def unit(module: str) -> str:
+    """The row entry of 'clsplat.stages.init' is 'stages', that of 'clsplat' is ''."""
+    parts = module.split(".")
+    return parts[1] if len(parts) > 1 else ""
+
+
+def imports(path: Path) -> list[tuple[int, str]]:
+    found = []
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            found += [(node.lineno, alias.name) for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}:{node.lineno}: relative import"
+            found.append((node.lineno, node.module or ""))
+            if node.module == "clsplat":
+                found += [(node.lineno, f"clsplat.{alias.name}") for alias in node.names if alias.name in ROW]
+    return found
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_imports_go_down(path):
+    own = path.relative_to(PACKAGE).with_suffix("").parts[0]
+    own = "" if own == "__init__" else own
+    assert own in ROW, f"{path.name}: give '{own}' a row in this test and in the design"
+    for line, module in imports(path):
+        if not module.startswith("clsplat"):
+            continue
+        target = unit(module)
+        allowed = target == own or ROW[target] > ROW[own] or {own, target} <= ROWS[-1]
+        assert allowed, f"{path}:{line}: {own or 'clsplat'} imports {module}, which is not below it"
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_only_the_opencl_layer_imports_pyopencl(path):
+    if path.parent.name == "opencl":
+        return
+    for line, module in imports(path):
+        assert not module.startswith("pyopencl"), f"{path}:{line}"
+
+
+def test_inside_a_folder_imports_are_acyclic():
+    graph = {
+        ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts): {
+            module for _, module in imports(path) if module.startswith("clsplat")
+        }
+        for path in MODULES
+        if path.name != "__init__.py"
+    }
+    done: set[str] = set()
+
+    def visit(module: str, trail: tuple[str, ...]) -> None:
+        assert module not in trail, " -> ".join((*trail, module))
+        if module in done or module not in graph:
+            return
+        for target in graph[module]:
+            visit(target, (*trail, module))
+        done.add(module)
+
+    # the device builds programs and programs take devices: the only pair that knows each other, at run time
+    graph["clsplat.opencl.device"].discard("clsplat.opencl.program")
+    for module in graph:
+        visit(module, ())
+
+
+def test_data_tools_use_the_scene_layer_only():
+    for path in sorted((PACKAGE.parent / "data_tools").glob("*.py")):
+        for line, module in imports(path):
+            if module.startswith("clsplat"):
+                assert unit(module) in ("scene", "errors"), f"{path}:{line}: {module}"
