@@ -1,6 +1,6 @@
 """From a pipeline file to checked stages, and through them.
 
-    name, seed, scene: {path, downscale, background, holdout}, model: {…}, render: {schedule, sort}
+    name, seed, scene: {path, downscale, background, holdout}, model: {…}, rasterizer: {schedule, sort}
     stages: a list of   - <stage>   or   - <stage>: {field: value, …}
 
 A file is complete and strict: unknown keys are errors, every value has its default in its model, and the fully resolved
@@ -41,7 +41,7 @@ class SceneSettings(Settings):
     holdout: Annotated[int, Field(ge=0)] = 8  # every n-th image, by name, is a test view; 0: none
 
 
-class RenderSettings(Settings):
+class RasterizerSettings(Settings):
     """How the device works; results do not depend on it."""
 
     schedule: Schedule = "auto"
@@ -55,7 +55,7 @@ class PipelineFile(Settings):
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
     scene: SceneSettings = SceneSettings()
     model: ModelSettings = ModelSettings()
-    render: RenderSettings = RenderSettings()
+    rasterizer: RasterizerSettings = RasterizerSettings()
     stages: Annotated[list[Annotated[AnyStage, Field(discriminator="stage")]], Field(min_length=1)]
 
 

@@ -39,7 +39,7 @@ def prepare_folder(out: Path, resume: bool) -> None:
 def open_run(pipeline: Pipeline, out: Path, words: str | None) -> Run:
     """Choose the device and read the scene.  Raises what they raise."""
     settings = pipeline.settings
-    device = Device(choose(words), settings.render.schedule)
+    device = Device(choose(words), settings.rasterizer.schedule)
     LOG.info("device: %s", device.text)
     if settings.scene.path is None:
         raise ConfigError(f"{pipeline.path}: no scene given; use --scene DIR, or scene: {{path: DIR}} in the file")
@@ -57,7 +57,7 @@ def open_run(pipeline: Pipeline, out: Path, words: str | None) -> Run:
         name=settings.name,
         seed=settings.seed,
         pipeline=pipeline.resolved(),
-        renderer=Renderer(device, settings.render.sort),
+        renderer=Renderer(device, settings.rasterizer.sort),
         targets=Targets(device, background),
         model_settings=settings.model,
     )

@@ -5,11 +5,13 @@ clsplat would choose), each with the wide schedule at 16 and 8 lanes and with th
 """
 
 import os
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from clsplat.opencl.device import Device, choose
+from data_tools.synthetic import Options, write_dataset
 
 NAMES = [name.strip() for name in os.environ.get("CLSPLAT_TEST_DEVICES", "").split(";")]
 TUNINGS = {"wide16": ("wide", 16), "wide8": ("wide", 8), "simt": ("simt", 1)}
@@ -31,3 +33,11 @@ def device(request: pytest.FixtureRequest) -> Device:
 def rng(request: pytest.FixtureRequest) -> np.random.Generator:
     """Random numbers that depend on the test's name only."""
     return np.random.default_rng(list(request.node.name.encode()))
+
+
+@pytest.fixture(scope="session")
+def tiny_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Ten views of the synthetic still life, 40 x 40 px, two of them held out."""
+    folder = tmp_path_factory.mktemp("scene") / "tiny"
+    write_dataset(folder, Options(size=40, train=8, test=2, seed=0), workers=1)
+    return folder

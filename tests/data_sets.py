@@ -1,4 +1,4 @@
-"""Where the real datasets lie that some tests read; `shared/data/README.md` says what they are."""
+"""Where the real datasets lie that some tests read: the folder $CLSPLAT_DATA, or one beside the checkout."""
 
 import os
 from pathlib import Path

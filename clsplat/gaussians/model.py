@@ -76,6 +76,20 @@ class Gaussians:
         planes[:, : self.count] = values.T
         table.array.set(planes)
 
+    def not_finite(self) -> list[str]:
+        """Names of the parameters that hold NaN or infinity."""
+        program = self.device.program("check.cl")
+        counters = {name: self.device.zeros(1, np.uint32) for name in PARAMETERS}
+        for name, counter in counters.items():
+            program.count_not_finite(
+                items=(self.count, self.tables[name].components),
+                values=self[name],
+                counter=counter,
+                stride=self.capacity,
+                count=self.count,
+            )
+        return [name for name, counter in counters.items() if counter.get_item(0) > 0]
+
     def rearrange(self, source: Array, fresh: Array, count: int) -> None:
         """Row i of every table becomes row source[i]; fresh rows of moments and statistics become zero.
 

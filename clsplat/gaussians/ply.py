@@ -81,7 +81,7 @@ def write_ply(path: Path, parameters: Parameters, rendering: dict[str, Any]) -> 
     """Write parameters in the reference's order; `rendering` goes into the comment as JSON."""
     count = len(parameters["means"])
     coefficients = 1 + parameters["sh_rest"].shape[1] // 3
-    rest = parameters["sh_rest"].reshape(count, coefficients - 1, 3).transpose(0, 2, 1).reshape(count, -1)
+    rest = _swapped(parameters["sh_rest"], coefficients - 1, 3)
     blocks = [
         parameters["means"],
         np.zeros((count, 3), np.float32),
@@ -158,12 +158,18 @@ def _parameters(path: Path, vertices: NDArray[Any]) -> Parameters:
     parameters = {name: _columns(vertices, columns) for name, columns in _COLUMNS.items()}
     by_channel = _columns(vertices, tuple(f"f_rest_{i}" for i in range(rest)))
     per_channel = sh_coefficients(degree) - 1
-    swapped = by_channel.reshape(-1, 3, per_channel).transpose(0, 2, 1)
-    parameters["sh_rest"] = np.ascontiguousarray(swapped.reshape(len(vertices), rest))
+    parameters["sh_rest"] = _swapped(by_channel, 3, per_channel)
     bad = [name for name in PARAMETERS if not np.isfinite(parameters[name]).all()]
     if bad:
         raise DataError(f"{path}: {', '.join(bad)} hold values that are not finite; export the file again")
     return {name: parameters[name] for name in PARAMETERS}
+
+
+def _swapped(table: NDArray[np.float32], outer: int, inner: int) -> NDArray[np.float32]:
+    """Columns in outer-major order -> inner-major, [N, outer * inner]."""
+    count = len(table)
+    swapped = table.reshape(count, outer, inner).transpose(0, 2, 1)
+    return np.ascontiguousarray(swapped.reshape(count, outer * inner))
 
 
 def _columns(vertices: NDArray[Any], columns: tuple[str, ...]) -> NDArray[np.float32]:

@@ -131,7 +131,9 @@ class Tiler:
 
     def _index_order(self, count: int) -> Array:
         if self.workspace.length("index_order") < count:
-            self.workspace.array("index_order", count, np.uint32).set(np.arange(count, dtype=np.uint32))
+            self.workspace.array("index_order", count, np.uint32)
+            length = self.workspace.length("index_order")
+            self.workspace.array("index_order", length, np.uint32).set(np.arange(length, dtype=np.uint32))
         return self.workspace.array("index_order", count, np.uint32)
 
     def _sort_by_tile(self, pair_tile: Array, pairs: int, tiles: int) -> tuple[Array, Array]:

@@ -5,11 +5,9 @@ import math
 import time
 from typing import Annotated, ClassVar, Literal
 
-import numpy as np
 from pydantic import Field, field_validator
 
 from clsplat.errors import Interrupted, NumericError
-from clsplat.gaussians.model import PARAMETERS
 from clsplat.stages.base import Stage
 from clsplat.stages.checkpoint import Checkpoint
 from clsplat.stages.densify import Densify
@@ -110,15 +108,12 @@ class Optimize(Stage):
         """Read the step's loss and PSNR.  Raises NumericError, after saving the state, when they are not finite."""
         loss = sum(term.value() for term in terms)
         squared = float(pixel_loss(comparison, l1=0.0, l2=0.0).get()[..., 1].sum(dtype="float64")) / comparison.values
-        if not math.isfinite(loss):
-            gaussians = run.trained.gaussians
-            bad = next(
-                (name for name in PARAMETERS if not np.isfinite(gaussians.get(name)).all()), "none of the parameters"
-            )
+        broken = run.trained.gaussians.not_finite()
+        if broken or not math.isfinite(loss):
             path = checkpoint.save(run, keep=2)
             raise NumericError(
-                f"step {run.step}, view '{run.train_view().name}': the loss is {loss}, first not finite: {bad}; "
-                f"the state is in {path}; lower the learning rates or resume from an earlier checkpoint"
+                f"step {run.step}, view '{run.train_view().name}': the loss is {loss}, not finite: "
+                f"{', '.join(broken) or 'none of the parameters'}; the state is in {path}; lower the learning rates"
             )
         return loss, -10 * math.log10(max(squared, 1e-10))
 

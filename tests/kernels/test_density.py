@@ -166,3 +166,12 @@ def test_opacity_is_capped(device, rng):
     before = gaussians.get("logit_opacity")
     cap_opacity(gaussians, 0.3)
     np.testing.assert_allclose(gaussians.get("logit_opacity"), np.minimum(before, np.log(0.3 / 0.7)), rtol=1e-6)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_values_that_are_not_finite_are_found(device, rng, value):
+    case = random_case(rng, 65)
+    assert case.model(device).gaussians.not_finite() == []
+    case.parameters["quats"][64, 2] = value
+    case.parameters["sh_rest"][0, 44] = value
+    assert case.model(device).gaussians.not_finite() == ["quats", "sh_rest"]

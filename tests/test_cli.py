@@ -1,0 +1,138 @@
+"""The command line as scripts see it: outputs, one-line errors, exit codes."""
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.test_training import train
+
+
+def clsplat(*arguments: str | Path, expect: int = 0) -> subprocess.CompletedProcess[str]:
+    """Run the command; check its exit code and that an error is one line without a traceback."""
+    command = [sys.executable, "-m", "clsplat", *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == expect, done.stderr
+    assert "Traceback" not in done.stderr
+    errors = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
+    assert len(errors) == (1 if expect else 0), done.stderr
+    return done
+
+
+@pytest.fixture(scope="module")
+def model(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("cli") / "run"
+    train(tiny_scene, out)
+    return out / "point_cloud.ply"
+
+
+def test_run_names_the_device_first_and_says_where_things_are(tiny_scene, tmp_path):
+    done = clsplat("run", "smoke", "--scene", tiny_scene, "--out", tmp_path / "run")
+    lines = done.stdout.splitlines()
+    assert lines[0].startswith("device: ")
+    assert "schedule" in lines[0]
+    assert any("test PSNR" in line for line in lines)
+    assert any(str(tmp_path / "run" / "report.html") in line for line in lines)
+    assert "loss" in (tmp_path / "run" / "log.txt").read_text()
+
+
+def test_dry_run_touches_nothing(tiny_scene, tmp_path):
+    done = clsplat("run", "smoke", "--scene", tiny_scene, "--out", tmp_path / "run", "--dry-run")
+    assert "50 steps" in done.stdout
+    assert not (tmp_path / "run").exists()
+
+
+def test_set_takes_several_values(tiny_scene, tmp_path):
+    sets = ["--set", "optimize.steps=3", "optimize.log_every=1", "--set", "seed=4"]
+    clsplat("run", "smoke", "--scene", tiny_scene, "--out", tmp_path, *sets)
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert (metrics["steps"], metrics["seed"]) == (3, 4)
+
+
+def test_check_and_schema():
+    assert "fine" in clsplat("check", "splat").stdout
+    assert json.loads(clsplat("check", "--schema").stdout)["properties"]["stages"]
+
+
+def test_devices():
+    assert "schedule" in clsplat("devices").stdout
+    devices = json.loads(clsplat("devices", "--json").stdout)
+    assert any(device["fault"] is None for device in devices)
+
+
+def test_render_writes_one_file_for_each_view(model, tiny_scene, tmp_path):
+    clsplat("render", model, "--scene", tiny_scene, "--out", tmp_path / "png")
+    files = sorted(path.relative_to(tmp_path / "png") for path in (tmp_path / "png").rglob("*.png"))
+    assert [str(file) for file in files] == ["test/r_000.png", "test/r_001.png"]
+    clsplat("render", model, "--scene", tiny_scene, "--out", tmp_path / "npy", "--format", "npy", "--split", "all")
+    arrays = sorted((tmp_path / "npy").rglob("*.npy"))
+    assert len(arrays) == 10
+    image = cv2.imread(str(tmp_path / "png" / "test" / "r_000.png"))[..., ::-1]
+    exact = np.load(tmp_path / "npy" / "test" / "r_000.npy")
+    np.testing.assert_array_equal(image, (np.clip(exact, 0, 1) * 255 + 0.5).astype(np.uint8))
+    clsplat("render", model, "--scene", tiny_scene, "--out", tmp_path / "small", "--scale", "2")
+    assert cv2.imread(str(tmp_path / "small" / "test" / "r_000.png")).shape == (20, 20, 3)
+
+
+def test_evaluate_agrees_with_the_run(model, tiny_scene, tmp_path):
+    clsplat("evaluate", model, "--scene", tiny_scene, "--scales", "1,2", "--out", tmp_path / "m.json")
+    metrics = json.loads((tmp_path / "m.json").read_text())
+    run = json.loads((model.parent / "metrics.json").read_text())
+    assert metrics["test"]["1"] == run["test"]["1"]
+    assert metrics["test"]["2"]["views"] == 2
+    assert metrics["train"]["1"]["views"] == 8
+
+
+def damaged(scene: Path, folder: Path) -> Path:
+    shutil.copytree(scene, folder)
+    return folder
+
+
+def test_bad_data(tiny_scene, model, tmp_path):
+    missing = damaged(tiny_scene, tmp_path / "missing image")
+    (missing / "train" / "r_003.png").unlink()
+    assert "r_003.png" in clsplat("run", "smoke", "--scene", missing, "--out", tmp_path / "a", expect=3).stderr
+    text = damaged(tiny_scene, tmp_path / "bad image")
+    (text / "train" / "r_003.png").write_text("not an image")
+    assert "r_003.png" in clsplat("run", "smoke", "--scene", text, "--out", tmp_path / "b", expect=3).stderr
+    nan = damaged(tiny_scene, tmp_path / "nan pose")
+    frames = json.loads((nan / "transforms_train.json").read_text())
+    frames["frames"][2]["transform_matrix"][0][3] = float("nan")
+    (nan / "transforms_train.json").write_text(json.dumps(frames))
+    clsplat("run", "smoke", "--scene", nan, "--out", tmp_path / "c", expect=3)
+    (tmp_path / "empty").mkdir()
+    clsplat("run", "smoke", "--scene", tmp_path / "empty", "--out", tmp_path / "d", expect=3)
+    clsplat("run", "smoke", "--scene", tmp_path / "nowhere", "--out", tmp_path / "e", expect=3)
+    clsplat("render", tiny_scene / "points3d.ply", "--scene", tiny_scene, "--out", tmp_path / "f", expect=3)
+    assert not (tmp_path / "f").exists()
+    for name in "abcde":
+        assert not (tmp_path / name / "point_cloud.ply").exists()
+        assert not (tmp_path / name / "metrics.json").exists()
+
+
+def test_bad_settings(tiny_scene, tmp_path):
+    out = tmp_path / "out"
+    assert "did you mean 'smoke'" in clsplat("run", "smokee", "--scene", tiny_scene, "--out", out, expect=2).stderr
+    wrong = ["--set", "optimize.steps=30k"]
+    assert "whole number" in clsplat("run", "smoke", "--scene", tiny_scene, "--out", out, *wrong, expect=2).stderr
+    clsplat("run", "smoke", "--out", out, expect=2)
+    clsplat("run", expect=2)
+    clsplat("run", "smoke", "--nonsense", expect=2)
+    clsplat("evaluate", tiny_scene / "points3d.ply", "--scene", tiny_scene, "--scales", "a", expect=2)
+
+
+def test_unknown_device_names_what_exists(tiny_scene, tmp_path):
+    done = clsplat("run", "smoke", "--scene", tiny_scene, "--out", tmp_path / "x", "--device", "no such chip", expect=4)
+    assert "no device matches 'no such chip'; there are: " in done.stderr
+
+
+def test_output_that_cannot_be_written(tiny_scene, tmp_path):
+    (tmp_path / "file").write_text("in the way")
+    clsplat("run", "smoke", "--scene", tiny_scene, "--out", tmp_path / "file" / "run", expect=7)
+    clsplat("run", "smoke", "--scene", tiny_scene, "--out", "/proc/clsplat", expect=7)
+    assert (tmp_path / "file").read_text() == "in the way"

@@ -1,0 +1,120 @@
+"""The splat PLY: exact round trips, tolerant reading, refusals in one sentence."""
+
+import numpy as np
+import pytest
+
+from clsplat.errors import DataError, OutputError
+from clsplat.gaussians.model import PARAMETERS
+from clsplat.gaussians.ply import read_ply, write_ply
+from tests.data_sets import data_set
+from tests.scenes import random_case
+
+
+def parameters(rng, count=20, degree=3):
+    p = {name: random_case(rng, count).parameters[name] for name in PARAMETERS}
+    p["sh_rest"] = p["sh_rest"][:, : 3 * ((degree + 1) ** 2 - 1)]
+    return p
+
+
+def payload(data: bytes) -> bytes:
+    return data.split(b"end_header\n", 1)[1]
+
+
+@pytest.mark.parametrize("degree", range(4))
+@pytest.mark.parametrize("count", [0, 1, 20])
+def test_round_trip(tmp_path, rng, degree, count):
+    path = tmp_path / "a" / "model.ply"
+    written = parameters(rng, count, degree)
+    write_ply(path, written, {"near": 0.2, "background": "white"})
+    file = read_ply(path)
+    assert file.rendering == {"near": 0.2, "background": "white"}
+    for name in PARAMETERS:
+        np.testing.assert_array_equal(file.parameters[name], written[name])
+
+
+def test_layout_is_the_references(tmp_path, rng):
+    """Property by property, as other programs read it."""
+    path, p = tmp_path / "model.ply", parameters(rng, 3)
+    write_ply(path, p, {})
+    header, body = path.read_bytes().split(b"end_header\n", 1)
+    names = [line.split()[2] for line in header.decode().splitlines() if line.startswith("property float")]
+    assert names[:9] == ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+    assert names[9:54] == [f"f_rest_{i}" for i in range(45)]
+    assert names[54:] == ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+    values = np.frombuffer(body, "<f4").reshape(3, 62)
+    np.testing.assert_array_equal(values[:, 3:6], 0)
+    by_channel = p["sh_rest"].reshape(3, 15, 3)
+    np.testing.assert_array_equal(values[:, 9:24], by_channel[:, :, 0])  # all red, then green, then blue
+    np.testing.assert_array_equal(values[:, 39:54], by_channel[:, :, 2])
+    np.testing.assert_array_equal(values[:, 58:], p["quats"])
+
+
+def test_a_genuine_file_survives_unchanged(tmp_path):
+    path = data_set("splats") / "train-1000.ply"
+    file = read_ply(path)
+    assert len(file.parameters["means"]) == 1000
+    assert file.parameters["sh_rest"].shape == (1000, 45)
+    write_ply(tmp_path / "copy.ply", file.parameters, {})
+    assert payload((tmp_path / "copy.ply").read_bytes()) == payload(path.read_bytes())
+
+
+def test_reads_any_order_and_types(tmp_path, rng):
+    """Another program's dialect: double, big endian, CRLF, no normals, no f_rest, extra properties and elements."""
+    p = parameters(rng, 5, degree=0)
+    columns = {"rot": p["quats"], "scale": p["log_scales"], "f_dc": p["sh_base"]}
+    names = [f"{name}_{i}" for name, table in columns.items() for i in range(table.shape[1])]
+    dtype = np.dtype([("confidence", ">u1"), *((n, ">f8") for n in names), ("opacity", ">f4"), *((n, ">f4") for n in "zyx")])
+    table = np.zeros(5, dtype)
+    for name, values in columns.items():
+        for i in range(values.shape[1]):
+            table[f"{name}_{i}"] = values[:, i]
+    table["opacity"] = p["logit_opacity"][:, 0]
+    for i, axis in enumerate("xyz"):
+        table[axis] = p["means"][:, i]
+    kinds = {">u1": "uchar", "|u1": "uchar", ">f8": "double", ">f4": "float"}
+    lines = ["ply", "format binary_big_endian 1.0", "comment other", "element vertex 5"]
+    lines += [f"property {kinds[dtype.fields[n][0].str]} {n}" for n in dtype.names]
+    lines += ["element camera 1", "property float focal", "end_header"]
+    path = tmp_path / "other.ply"
+    path.write_bytes(("\r\n".join(lines) + "\r\n").encode() + table.tobytes() + b"\0\0\0\0")
+    file = read_ply(path)
+    for name in PARAMETERS:
+        np.testing.assert_array_equal(file.parameters[name], p[name])
+
+
+def test_refusals(tmp_path, rng):
+    good = tmp_path / "good.ply"
+    write_ply(good, parameters(rng), {})
+    data = good.read_bytes()
+    broken = {
+        "cut short": (data[:-10], "cut short"),
+        "header only": (data[:200], "not a PLY"),
+        "empty": (b"", "not a PLY"),
+        "text": (b"hello", "not a PLY"),
+        "huge count": (data.replace(b"element vertex 20", b"element vertex 99999999999999"), "cut short"),
+        "ascii": (data.replace(b"binary_little_endian", b"ascii"), "binary"),
+        "points only": (data.replace(b"property float opacity", b"property float intensity"), "not a splat"),
+        "odd f_rest": (data.replace(b"property float f_rest_44", b"property float extra"), "44 f_rest"),
+        "lists": (data.replace(b"property float nx", b"property list uchar int nx"), "cannot read"),
+        "twice": (data.replace(b"property float nx", b"property float ny"), "twice"),
+    }
+    nan = bytearray(data)
+    nan[data.index(b"end_header\n") + 11 : data.index(b"end_header\n") + 15] = np.float32(np.nan).tobytes()
+    broken["NaN"] = (bytes(nan), "not finite")
+    for name, (content, words) in broken.items():
+        path = tmp_path / "bad.ply"
+        path.write_bytes(content)
+        with pytest.raises(DataError, match=words) as error:
+            read_ply(path)
+        assert str(path) in str(error.value), name
+        assert "\n" not in str(error.value)
+    with pytest.raises(DataError, match="cannot be read"):
+        read_ply(tmp_path / "missing.ply")
+
+
+def test_writing_is_all_or_nothing(tmp_path, rng):
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(OutputError, match="cannot be written"):
+        write_ply(tmp_path / "file" / "model.ply", parameters(rng), {})
+    assert (tmp_path / "file").read_text() == "in the way"
+    assert list(tmp_path.iterdir()) == [tmp_path / "file"]
