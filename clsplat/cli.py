@@ -3,7 +3,7 @@
 import json
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -147,6 +147,52 @@ def evaluate(
         print(text, end="")
     else:
         write_text(out, text)
+
+
+@app.command()
+def bench(
+    scenes: Annotated[str, typer.Option(help="Fixed scenes, of A, B and C, separated by commas.")] = "A",
+    model: Annotated[Path | None, typer.Option(help="Also time this splat PLY, at --scene.")] = None,
+    scene: Annotated[Path | None, typer.Option(help="The scene of --model.")] = None,
+    repeats: Annotated[int, typer.Option(min=1, help="Steps of each scene.")] = 20,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    against: Annotated[Path | None, typer.Option(help="Compare with the JSON of an earlier run.")] = None,
+    device: DeviceOption = None,
+) -> None:
+    """Time the stages of a training step on fixed scenes, beside the device's measured peaks."""
+    from dataclasses import asdict
+
+    from clsplat import bench as benchmark
+    from clsplat.opencl.device import Device, choose
+
+    names = [name for name in scenes.split(",") if name]
+    if unknown := [name for name in names if name not in benchmark.SIZES]:
+        raise ConfigError(f"--scenes: no scene named '{unknown[0]}'; there are {', '.join(benchmark.SIZES)}")
+    if (model is None) != (scene is None):
+        raise ConfigError("bench: --model and --scene go together")
+    earlier = _read_json(against) if against else None
+    opened = Device(choose(device))
+    peaks = benchmark.measure_peaks(opened)
+    contestants = {name: benchmark.contestant(opened, name) for name in names}
+    if model is not None and scene is not None:
+        contestants[model.stem] = benchmark.real_contestant(opened, model, scene)
+    results = benchmark.run_bench(contestants, peaks, repeats)
+    if as_json:
+        scenes_data = {name: asdict(result) for name, result in results.items()}
+        print(json.dumps({"device": opened.text, "peaks": asdict(peaks), "scenes": scenes_data}, indent=1))
+        return
+    CONSOLE.print(f"device: {opened.text}", markup=False)
+    CONSOLE.print(f"peaks: {peaks.gflops:.0f} GFLOP/s, {peaks.gexp:.1f} Gexp/s, copy {peaks.gbytes:.1f} GB/s")
+    for name, result in results.items():
+        CONSOLE.print(benchmark.table(name, result, (earlier or {}).get("scenes", {}).get(name)), markup=False)
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    try:
+        data = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{path}: expected the JSON of an earlier `clsplat bench --json` ({error})") from error
+    return data if isinstance(data, dict) else {}
 
 
 def _device_text(info: "DeviceInfo", fault: str | None) -> str:

@@ -1,6 +1,6 @@
 """Imports go down the layers only.
 
-    cli · runner, pipeline · stages · training · render · gaussians, scene · opencl · errors, files, settings
+cli · runner, pipeline · stages · training · render · gaussians, scene · opencl · errors, files, settings
 """
 
 import ast

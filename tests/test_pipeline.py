@@ -147,6 +147,10 @@ def test_unknown_pipelines_name_the_nearest():
 def test_schema_describes_the_file():
     schema = json_schema()
     assert json.loads(json.dumps(schema)) == schema
-    names = {tuple(item["properties"])[0] for item in schema["properties"]["stages"]["items"]["oneOf"] if "properties" in item}
+    names = {
+        tuple(item["properties"])[0]
+        for item in schema["properties"]["stages"]["items"]["oneOf"]
+        if "properties" in item
+    }
     assert {"init", "optimize", "evaluate", "export"} <= names
     assert "steps" in schema["$defs"]["Optimize"]["properties"]

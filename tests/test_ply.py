@@ -63,7 +63,9 @@ def test_reads_any_order_and_types(tmp_path, rng):
     p = parameters(rng, 5, degree=0)
     columns = {"rot": p["quats"], "scale": p["log_scales"], "f_dc": p["sh_base"]}
     names = [f"{name}_{i}" for name, table in columns.items() for i in range(table.shape[1])]
-    dtype = np.dtype([("confidence", ">u1"), *((n, ">f8") for n in names), ("opacity", ">f4"), *((n, ">f4") for n in "zyx")])
+    dtype = np.dtype(
+        [("confidence", ">u1"), *((n, ">f8") for n in names), ("opacity", ">f4"), *((n, ">f4") for n in "zyx")]
+    )
     table = np.zeros(5, dtype)
     for name, values in columns.items():
         for i in range(values.shape[1]):

@@ -70,7 +70,17 @@ def test_the_same_bits_twice_and_with_one_core(finished, tiny_scene, tmp_path):
     train(tiny_scene, tmp_path / "again")
     assert digest(tmp_path / "again") == digest(finished)
     one_core = {"POCL_MAX_PTHREAD_COUNT": "1", "POCL_CPU_MAX_CU_COUNT": "1", "CL_CONFIG_CPU_TBB_NUM_WORKERS": "1"}
-    command = [sys.executable, "-m", "clsplat", "run", "smoke", "--scene", str(tiny_scene), "--out", str(tmp_path / "one")]
+    command = [
+        sys.executable,
+        "-m",
+        "clsplat",
+        "run",
+        "smoke",
+        "--scene",
+        str(tiny_scene),
+        "--out",
+        str(tmp_path / "one"),
+    ]
     subprocess.run(command, check=True, env={**os.environ, **one_core}, capture_output=True)
     assert digest(tmp_path / "one") == digest(finished)
 
@@ -108,7 +118,18 @@ def test_interrupt_saves_and_resume_goes_on(finished, tiny_scene, tmp_path):
 def test_killed_three_times_and_resumed(finished, tiny_scene, tmp_path):
     """kill -9 at random moments; the resumed run ends with the bits of the undisturbed one."""
     out, moments = tmp_path / "killed", random.Random(1)
-    command = [sys.executable, "-m", "clsplat", "run", "smoke", "--scene", str(tiny_scene), "--out", str(out), "--resume"]
+    command = [
+        sys.executable,
+        "-m",
+        "clsplat",
+        "run",
+        "smoke",
+        "--scene",
+        str(tiny_scene),
+        "--out",
+        str(out),
+        "--resume",
+    ]
     killed = 0
     while killed < 3:
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)

@@ -116,10 +116,7 @@ class Gaussians:
 
 
 class Gradients:
-    """Derivatives of the loss by each parameter, with the shapes of the parameters.
-
-    A gradient that was taken before its parameter was edited no longer belongs to it and is discarded.
-    """
+    """Derivatives of the loss by each parameter, with the shapes of the parameters."""
 
     def __init__(self, gaussians: Gaussians) -> None:
         self.capacity = gaussians.capacity
@@ -127,7 +124,6 @@ class Gradients:
             name: gaussians.device.zeros((gaussians.tables[name].components, gaussians.capacity)) for name in PARAMETERS
         }
         self.mean2d = gaussians.device.zeros((2, gaussians.capacity))  # px⁻¹, for density statistics
-        self.discarded: set[str] = set()
 
     def __getitem__(self, name: str) -> Array:
         return self.arrays[name]
@@ -135,10 +131,6 @@ class Gradients:
     def arguments(self) -> dict[str, Any]:
         """The arrays by the names that kernels give them."""
         return {**{f"grad_{name}": array for name, array in self.arrays.items()}, "grad_mean2d": self.mean2d}
-
-    def discard(self, *names: str) -> None:
-        """Mark gradients as stale; no names: all of them."""
-        self.discarded.update(names or PARAMETERS)
 
 
 @dataclass

@@ -189,5 +189,4 @@ class Renderer:
     def _fresh_gradients(self, model: Model) -> Gradients:
         if self._gradients is None or self._gradients.capacity != model.gaussians.capacity:
             self._gradients = Gradients(model.gaussians)
-        self._gradients.discarded.clear()
         return self._gradients

@@ -1,6 +1,7 @@
 """What every stage is: settings, what it needs, what it makes, and one method."""
 
 from abc import abstractmethod
+from collections.abc import Collection
 from typing import Annotated, ClassVar
 
 from pydantic import Field
@@ -17,7 +18,7 @@ class Stage(Settings):
 
     needs: ClassVar[frozenset[str]] = frozenset()  # parts of the run that must exist
     makes: ClassVar[frozenset[str]] = frozenset()  # parts that exist afterwards
-    edits: ClassVar[bool] = False  # changes parameters: runs between a step's gradients and its update
+    edits: ClassVar[bool] = False  # changes the model: acts between a step and the next
 
     stage: str  # the name in a pipeline file
     every: Annotated[int, Field(gt=0)] | None = None  # steps
@@ -29,6 +30,10 @@ class Stage(Settings):
         if self.every is None or step % self.every != 0:
             return False
         return step > self.start and (self.stop is None or step < self.stop)
+
+    def stale(self, run: Run) -> Collection[str]:
+        """Parameters whose gradients the edit makes meaningless."""
+        return ()
 
     @abstractmethod
     def run(self, run: Run) -> None:

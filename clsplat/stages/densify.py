@@ -1,9 +1,11 @@
 """Density control on a cadence."""
 
 import logging
+from collections.abc import Collection
 from typing import ClassVar, Literal
 
 from clsplat.errors import NumericError
+from clsplat.gaussians.model import PARAMETERS
 from clsplat.stages.base import Stage
 from clsplat.training.density import AnyRule, densify
 from clsplat.training.run import Run
@@ -20,12 +22,14 @@ class Densify(Stage):
 
     rules: list[AnyRule]
 
+    def stale(self, run: Run) -> Collection[str]:
+        return PARAMETERS
+
     def run(self, run: Run) -> None:
-        if run.stats is None or run.gradients is None:
+        if run.stats is None:
             return
         gaussians = run.trained.gaussians
         change = densify(gaussians, run.stats, self.rules, run.renderer.tiler, run.scene.extent, run.step, run.seed)
-        run.gradients.discard()
         run.records.add(run.step, "densify", before=change.before, after=change.after)
         LOG.debug("step %d: %d -> %d Gaussians", run.step, change.before, change.after)
         if change.after == 0:

@@ -17,10 +17,10 @@ from clsplat.stages.schedule import RaiseSh, ResetOpacity
 from clsplat.training import checkpoint
 from clsplat.training.adam import Adam, Rates
 from clsplat.training.density import SplatStats
-from clsplat.training.losses import AnyLoss, Comparison, Term, pixel_loss
+from clsplat.training.losses import AnyLoss, pixel_loss
 from clsplat.training.profile import stage_milliseconds
 from clsplat.training.run import Progress, Run
-from clsplat.training.targets import unpack
+from clsplat.training.step import Differentiated, differentiate
 
 LOG = logging.getLogger("clsplat")
 Scheduled = Annotated[RaiseSh | Densify | ResetOpacity | Checkpoint | Evaluate | Export, Field(discriminator="stage")]
@@ -29,8 +29,9 @@ Scheduled = Annotated[RaiseSh | Densify | ResetOpacity | Checkpoint | Evaluate |
 class Optimize(Stage):
     """Train for a number of steps, one view each (Kerbl et al. 2023).
 
-    Stages in `during` that edit parameters run between a step's gradients and its update, as in the reference: a
-    gradient that the edit made stale is discarded.  The others run after the update.
+    Stages in `during` that edit parameters act between a step and the next, so whatever else is due at that step sees
+    what training has settled, and nothing is edited after the last step.  As in the reference, a gradient whose
+    parameter is about to be edited is not applied.
     """
 
     stage: Literal["optimize"] = "optimize"
@@ -56,58 +57,54 @@ class Optimize(Stage):
         run.adam = run.adam or Adam(model.gaussians)
         run.stats = run.stats or SplatStats(model.gaussians)
         last_step = run.step - run.stage_step + self.steps
-        clock, since = time.perf_counter(), run.step
+        seconds: list[float] = []  # of the steps since the last report
         while run.stage_step < self.steps:
-            comparison, terms = self._sampled_step(run)
-            if run.step % self.log_every == 0 or run.stage_step == self.steps or run.interrupted:
-                loss, psnr = self._values(run, comparison, terms)
-                now = time.perf_counter()
-                seconds = (now - clock) / (run.step - since)
-                run.train_seconds += now - clock
-                self._report(run, last_step, loss, psnr, seconds)
-                clock, since = time.perf_counter(), run.step
+            start = time.perf_counter()
+            if run.stage_step > 0:
+                self._edit(run)
+            view = self._step(run)
+            report = run.step % self.log_every == 0 or run.stage_step == self.steps or run.interrupted
+            loss, psnr = self._values(run, view) if report else (0.0, 0.0)
+            seconds.append(time.perf_counter() - start)
+            run.train_seconds += seconds[-1]
+            if report:
+                self._report(run, last_step, loss, psnr, sum(seconds) / len(seconds))
+                seconds.clear()
             for stage in self.during:
                 if not stage.edits and stage.due(run.step):
-                    run.train_seconds += time.perf_counter() - clock
                     stage.run(run)
-                    clock, since = time.perf_counter(), run.step
             if run.interrupted:
                 path = checkpoint.save(run, keep=2)
                 raise Interrupted(f"stopped at step {run.step}, saved in {path}; --resume goes on from there")
 
-    def _sampled_step(self, run: Run) -> tuple[Comparison, list[Term]]:
-        """One step; halfway between log lines, where no density control is due, its kernels are timed."""
-        run.device.timings.sampling = (run.step + 1) % self.log_every == self.log_every // 2
-        try:
-            return self._step(run)
-        finally:
-            run.device.timings.sampling = False
-
-    def _step(self, run: Run) -> tuple[Comparison, list[Term]]:
-        model, renderer = run.trained, run.renderer
-        run.step += 1
-        run.stage_step += 1
-        target = run.targets.get(run.train_view())
-        frame = renderer.forward(model, target.camera, run.targets.background_array)
-        workspace, camera = renderer.workspace, target.camera
-        photograph = unpack(workspace, camera, target.pixels)
-        gradient = workspace.array("grad_image", (3, camera.rows, camera.stride))
-        comparison = Comparison(workspace, camera, frame.image, photograph, gradient)
-        terms = [loss.add(comparison) for loss in self.losses]
-        run.gradients = renderer.backward(model, frame, gradient)
-        assert run.stats is not None
-        assert run.adam is not None
-        run.stats.add(frame, run.gradients)
+    def _edit(self, run: Run) -> None:
+        """What was due at the step before."""
         for stage in self.during:
             if stage.edits and stage.due(run.step):
                 stage.run(run)
-        run.adam.step(model, run.gradients, self.rates.at(run.step, run.scene.extent))
-        return comparison, terms
 
-    def _values(self, run: Run, comparison: Comparison, terms: list[Term]) -> tuple[float, float]:
+    def _step(self, run: Run) -> Differentiated:
+        """One view; halfway between reports, where no density control is due, the kernels are timed."""
+        assert run.stats is not None
+        assert run.adam is not None
+        run.step += 1
+        run.stage_step += 1
+        run.device.timings.sampling = run.step % self.log_every == self.log_every // 2
+        model, target = run.trained, run.targets.get(run.train_view())
+        view = differentiate(run.renderer, model, target, run.targets.background_array, self.losses)
+        run.stats.add(view.frame, view.gradients)
+        stale = {name for stage in self.during if stage.due(run.step) for name in stage.stale(run)}
+        if run.stage_step == self.steps:
+            stale = set()
+        run.adam.step(model, view.gradients, self.rates.at(run.step, run.scene.extent), without=stale)
+        run.device.timings.sampling = False
+        return view
+
+    def _values(self, run: Run, view: Differentiated) -> tuple[float, float]:
         """Read the step's loss and PSNR.  Raises NumericError, after saving the state, when they are not finite."""
-        loss = sum(term.value() for term in terms)
-        squared = float(pixel_loss(comparison, l1=0.0, l2=0.0).get()[..., 1].sum(dtype="float64")) / comparison.values
+        loss = sum(term.value() for term in view.terms)
+        squared = float(pixel_loss(view.comparison, l1=0.0, l2=0.0).get()[..., 1].sum(dtype="float64"))
+        error = squared / view.comparison.values
         broken = run.trained.gaussians.not_finite()
         if broken or not math.isfinite(loss):
             path = checkpoint.save(run, keep=2)
@@ -115,7 +112,7 @@ class Optimize(Stage):
                 f"step {run.step}, view '{run.train_view().name}': the loss is {loss}, not finite: "
                 f"{', '.join(broken) or 'none of the parameters'}; the state is in {path}; lower the learning rates"
             )
-        return loss, -10 * math.log10(max(squared, 1e-10))
+        return loss, -10 * math.log10(max(error, 1e-10))
 
     def _report(self, run: Run, last_step: int, loss: float, psnr: float, seconds: float) -> None:
         count = run.trained.gaussians.count

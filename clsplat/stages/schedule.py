@@ -1,5 +1,6 @@
 """The small scheduled changes of the model."""
 
+from collections.abc import Collection
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
@@ -31,11 +32,15 @@ class ResetOpacity(Stage):
     to: Annotated[float, Field(gt=0, lt=1)] = 0.01
     when_background: Literal["black", "white"] | None = None  # act on this background only
 
+    def stale(self, run: Run) -> Collection[str]:
+        return ("logit_opacity",) if self._acts(run) else ()
+
     def run(self, run: Run) -> None:
-        if self.when_background not in (None, run.targets.background_name):
+        if not self._acts(run):
             return
         cap_opacity(run.trained.gaussians, self.to)
         if run.adam is not None:
             run.adam.forget("logit_opacity")
-        if run.gradients is not None:
-            run.gradients.discard("logit_opacity")
+
+    def _acts(self, run: Run) -> bool:
+        return self.when_background in (None, run.targets.background_name)

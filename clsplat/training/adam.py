@@ -1,6 +1,7 @@
 """Adam on the tables of a Gaussians struct, with a learning rate for each."""
 
 import math
+from collections.abc import Collection
 from typing import Annotated
 
 from pydantic import Field
@@ -53,14 +54,14 @@ class Adam:
             for moment in self._moments(name):
                 gaussians.add(moment, gaussians.tables[name].components, zero_fresh=True)
 
-    def step(self, model: Model, gradients: Gradients, rates: dict[str, float]) -> None:
-        """Update every parameter whose gradient still belongs to it.
+    def step(self, model: Model, gradients: Gradients, rates: dict[str, float], without: Collection[str] = ()) -> None:
+        """Update every parameter but those named in `without`.
 
         Bands above the active SH degree have neither gradient nor moments, so leaving them out changes nothing.
         """
         gaussians = self.gaussians
         for name in PARAMETERS:
-            if name in gradients.discarded:
+            if name in without:
                 continue
             components = gaussians.tables[name].components
             if name == "sh_rest":

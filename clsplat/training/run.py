@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from clsplat.errors import ConfigError
-from clsplat.gaussians.model import Gradients, Model
+from clsplat.gaussians.model import Model
 from clsplat.opencl.device import Device
 from clsplat.render.renderer import Renderer
 from clsplat.scene.scene import Scene, View
@@ -51,7 +51,6 @@ class Run:
     model: Model | None = None
     adam: Adam | None = None
     stats: SplatStats | None = None
-    gradients: Gradients | None = None  # of the step in progress
     step: int = 0  # updates done, or in progress
     cursor: int = 0  # stage in progress
     stage_step: int = 0  # steps done in it
