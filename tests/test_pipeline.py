@@ -50,10 +50,19 @@ def test_shipped_pipelines_are_fine_and_resolve_to_themselves(name, write):
     assert again.resolved() == pipeline.resolved()
 
 
-def test_the_seven_thousand_step_recipe_differs_where_it_says(name="splat_7k"):
-    full, short = load("splat").resolved(), load(name).resolved()
+def test_the_short_recipe_differs_only_where_its_header_says():
+    full, short = load("splat").resolved(), load("splat_7k").resolved()
     assert full["model"] == short["model"]
-    assert full["stages"][0] == short["stages"][0]
+    full_optimize, short_optimize = full["stages"][1]["optimize"], short["stages"][1]["optimize"]
+    short_optimize["steps"] = full_optimize["steps"]
+    short_optimize["rates"]["means"]["over"] *= 2
+    for stage, other in zip(full_optimize["during"], short_optimize["during"], strict=True):
+        name = next(iter(stage))
+        assert other[name].keys() == stage[name].keys()
+        other[name]["stop"] = stage[name]["stop"]
+        if name == "evaluate":
+            other[name]["every"] = stage[name]["every"]
+    assert short["stages"] == full["stages"]
 
 
 def replaced(old: str, new: str) -> str:

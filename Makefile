@@ -1,0 +1,38 @@
+# Two commands on a fresh machine: `make demo` trains a scene, `make test` runs the checks.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+
+.PHONY: demo test bench wheel clean
+
+demo: $(VENV)/installed
+	$(BIN)/python -m data_tools synthetic demo/scene
+	$(BIN)/clsplat run quickstart --scene demo/scene --out demo/run --resume
+
+test: $(VENV)/tested-with
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/python -m pytest
+
+bench: $(VENV)/installed
+	$(BIN)/clsplat bench
+
+wheel: $(VENV)/tested-with
+	$(BIN)/python -m build --wheel --outdir dist .
+
+clean:
+	rm -rf $(VENV) demo build dist *.egg-info
+
+# The embedded runtime is PoCL; where it does not know the processor or finds no linker, Intel's takes its place, and
+# `clsplat devices` says why.
+$(VENV)/installed: pyproject.toml
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --upgrade pip
+	$(BIN)/python -m pip install --quiet --editable '.[pocl]' || $(BIN)/python -m pip install --quiet --editable .
+	$(BIN)/clsplat devices || { $(BIN)/python -m pip install --quiet '.[intel]' && $(BIN)/clsplat devices; }
+	touch $@
+
+$(VENV)/tested-with: $(VENV)/installed
+	$(BIN)/python -m pip install --quiet --editable '.[dev]'
+	touch $@
