@@ -28,8 +28,8 @@ svg text.title{font-weight:600;fill:#1a202c;font-size:12px}svg .grid{stroke:#e2e
 table{border-collapse:collapse}td,th{padding:.15rem .9rem .15rem 0;text-align:right}
 th:first-child,td:first-child{text-align:left}
 td.bar{width:320px}td.bar i{display:block;height:.8rem;background:#2b6cb0;border-radius:2px}
-figure{margin:0 0 1.2rem}figure div{display:grid;grid-template-columns:repeat(3,1fr);gap:.4rem}
-figure img{width:100%;border-radius:4px}figcaption{font-size:.9rem;color:#4a5568}
+figure{margin:0 0 1.2rem}figure div{display:grid;grid-template-columns:repeat(3,auto);gap:.4rem;width:fit-content}
+figure img{max-width:100%;max-height:26rem;border-radius:4px}figcaption{font-size:.9rem;color:#4a5568}
 pre{background:#f7fafc;padding:1rem;border-radius:6px;overflow:auto;font-size:12px}
 """
 

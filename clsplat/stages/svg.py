@@ -33,7 +33,7 @@ def curve(title: str, lines: dict[str, Points], logarithmic: bool = False) -> st
 
     parts = [f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{html.escape(title)}">']
     parts.append(f'<text x="{LEFT}" y="15" class="title">{html.escape(title)}</text>')
-    for tick in _ticks(y_low, y_high):
+    for tick in _decade_ticks(y_low, y_high) if logarithmic else _ticks(y_low, y_high):
         _, y = place(x_low, tick)
         label = _number(10**tick if logarithmic else tick)
         parts.append(f'<line x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{y:.1f}" y2="{y:.1f}" class="grid"/>')
@@ -46,8 +46,8 @@ def curve(title: str, lines: dict[str, Points], logarithmic: bool = False) -> st
         path = " ".join(f"{x:.1f},{y:.1f}" for x, y in (place(*point) for point in points))
         parts.append(f'<polyline points="{path}" fill="none" stroke="{colour}" stroke-width="1.8"/>')
         if len(drawn) > 1:
-            x = WIDTH - RIGHT - 90 * (len(drawn) - i)
-            parts.append(f'<text x="{x}" y="15" fill="{colour}">{html.escape(name)}</text>')
+            x = WIDTH - RIGHT - 100 * (len(drawn) - i)
+            parts.append(f'<text x="{x}" y="15" style="fill:{colour}">{html.escape(name)}</text>')
     return "".join([*parts, "</svg>"])
 
 
@@ -58,6 +58,12 @@ def _ticks(low: float, high: float) -> list[float]:
     step = next(power * m for m in (1, 2, 5, 10) if power * m >= rough)
     first = math.ceil(low / step - 1e-9)
     return [i * step for i in range(first, math.floor(high / step + 1e-9) + 1)]
+
+
+def _decade_ticks(low: float, high: float) -> list[float]:
+    """Logarithms of 1, 2 and 5 times powers of ten between low and high."""
+    powers = range(math.floor(low), math.ceil(high) + 1)
+    return [t for p in powers for m in (1, 2, 5) if low <= (t := p + math.log10(m)) <= high]
 
 
 def _number(value: float) -> str:
