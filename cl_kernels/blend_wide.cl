@@ -11,7 +11,7 @@ static inline VF pixel_centres(const uint tile_x, const uint column)
 }
 
 /* 1 where the pixel lies in the image, else 0: planes are zero outside, which the losses rely on. */
-static inline VF inside_image(__constant camera_t *restrict camera, const VF pixel, const uint row)
+static inline VF inside_image(__constant camera_t *camera, const VF pixel, const uint row)
 {
     const VF one = (VF)(1.0f), zero = (VF)(0.0f);
     return row < camera->height ? (pixel < (float)camera->width ? one : zero) : zero;
@@ -94,7 +94,7 @@ void blend_forward(
 }
 
 /* Sum the lanes of each moment and write one record. */
-static inline void store_record(const moments_t m, __global float *restrict record)
+static inline void store_record(const moments_t m, __global float *record)
 {
     const float16 sums = (float16)(
         sum_lanes(m.power), sum_lanes(m.x), sum_lanes(m.y), sum_lanes(m.xx), sum_lanes(m.xy), sum_lanes(m.yy),

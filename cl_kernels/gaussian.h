@@ -57,11 +57,11 @@ typedef struct {
 } shape_t;
 
 static inline shape_t shape_of(
-    __global const float *restrict means,            // [3,S] scene units
-    __global const float *restrict quats,            // [4,S] unnormalised
-    __global const float *restrict log_scales,       // [3,S] log of scene units
-    __global const float *restrict filter_variance,  // [S] scene units^2
-    __constant camera_t *restrict camera,
+    __global const float *means,            // [3,S] scene units
+    __global const float *quats,            // [4,S] unnormalised
+    __global const float *log_scales,       // [3,S] log of scene units
+    __global const float *filter_variance,  // [S] scene units^2
+    __constant camera_t *camera,
     const float near_plane, const float screen_variance, const float compensate, const uint stride, const uint i)
 {
     __constant const float *w = camera->world_to_camera;

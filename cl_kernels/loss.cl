@@ -105,8 +105,11 @@ void ssim_maps(
         const uint x = first + v - MARGIN;  // wraps to a huge number left of the image
         VF mx = zero, my = zero, xx = zero, yy = zero, xy = zero;
         if (x < stride)
-            for (uint k = y < REACH ? REACH - y : 0; k <= 2 * REACH && y + k - REACH < height; k++) {
-                const uint at = channel * plane + (y + k - REACH) * stride + x;
+            for (uint k = 0; k <= 2 * REACH; k++) {
+                const uint row = y + k - REACH;  // wraps to a huge number above the image
+                if (row >= height)
+                    continue;
+                const uint at = channel * plane + row * stride + x;
                 const VF a = VLOAD(image + at), b = VLOAD(target + at);
                 const VF wa = WINDOW[k] * a, wb = WINDOW[k] * b;
                 mx += wa;
@@ -178,8 +181,11 @@ void ssim_gradient(
         const uint x = first + v - MARGIN;
         VF mean = zero, variance = zero, covariance = zero;
         if (x < stride)
-            for (uint k = y < REACH ? REACH - y : 0; k <= 2 * REACH && y + k - REACH < height; k++) {
-                const uint at = channel * plane + (y + k - REACH) * stride + x;
+            for (uint k = 0; k <= 2 * REACH; k++) {
+                const uint row = y + k - REACH;  // wraps to a huge number above the image
+                if (row >= height)
+                    continue;
+                const uint at = channel * plane + row * stride + x;
                 mean += WINDOW[k] * VLOAD(maps + at);
                 variance += WINDOW[k] * VLOAD(maps + 3 * plane + at);
                 covariance += WINDOW[k] * VLOAD(maps + 6 * plane + at);

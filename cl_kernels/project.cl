@@ -12,7 +12,7 @@
 
 /* Unit direction from the camera to LANES Gaussians; returns 1 / distance. */
 static inline VF view_direction(
-    __global const float *restrict means, __constant camera_t *restrict camera, const uint stride, const uint i, VF *d)
+    __global const float *means, __constant camera_t *camera, const uint stride, const uint i, VF *d)
 {
     VF norm2 = (VF)(0.0f);
     for (uint k = 0; k < 3; k++) {
@@ -25,7 +25,7 @@ static inline VF view_direction(
     return inverse;
 }
 
-static inline void add_band(const uint first, const uint last, const VF *basis, __global const float *restrict sh_rest,
+static inline void add_band(const uint first, const uint last, const VF *basis, __global const float *sh_rest,
                             const uint stride, const uint i, VF *colour)
 {
     for (uint k = first; k < last; k++)
@@ -113,7 +113,7 @@ void project_forward(
 }
 
 /* Gradients of the mean, quaternion and log-scales from the summed moments of a Gaussian's pixels. */
-static inline void shape_backward(const shape_t *s, __constant camera_t *restrict camera, const VF *m,
+static inline void shape_backward(const shape_t *s, __constant camera_t *camera, const VF *m,
                                   const float compensate, VF *grad_mean2d, VF *grad_mean, VF *grad_quat, VF *grad_scale)
 {
     __constant const float *w = camera->world_to_camera;
@@ -174,8 +174,8 @@ static inline void shape_backward(const shape_t *s, __constant camera_t *restric
 
 /* Gradient of one band of coefficients; `weights` becomes c_k . g, the derivative of the loss by basis_k. */
 static inline void band_backward(const uint first, const uint last, const VF *basis, const VF *grad_colour,
-                                 const VI touched, __global const float *restrict sh_rest,
-                                 __global float *restrict grad_sh_rest, const uint stride, const uint i, VF *weights)
+                                 const VI touched, __global const float *sh_rest,
+                                 __global float *grad_sh_rest, const uint stride, const uint i, VF *weights)
 {
     for (uint k = first; k < last; k++) {
         weights[k] = (VF)(0.0f);
@@ -187,7 +187,7 @@ static inline void band_backward(const uint first, const uint last, const VF *ba
     }
 }
 
-static inline void store_planes(__global float *restrict planes, const VF *values, const VI touched,
+static inline void store_planes(__global float *planes, const VF *values, const VI touched,
                                 const uint components, const uint stride, const uint i)
 {
     for (uint k = 0; k < components; k++)

@@ -5,7 +5,7 @@
  * GPUs a group walks short runs with narrow ones.  Local memory: 4 << DIGIT_BITS bytes * TEAM.  Deterministic. */
 #include "common.h"
 
-static inline void count_digits(__global const uint *restrict keys, __local uint *counts, const uint first,
+static inline void count_digits(__global const uint *keys, __local uint *counts, const uint first,
                                 const uint run, const uint shift, const uint digits, const uint count)
 {
     const uint item = get_local_id(0);

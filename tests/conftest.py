@@ -1,7 +1,7 @@
 """Devices and random numbers for tests.
 
-Kernel tests run on every device named in CLSPLAT_TEST_DEVICES (parts of names, separated by `;`; default: the device that
-clsplat would choose), each with the wide schedule at 16 and 8 lanes and with the simt schedule.
+Kernel tests run on every device named in CLSPLAT_TEST_DEVICES (parts of names, separated by `;`; default: the device
+that clsplat would choose), each with the wide schedule at 16 and 8 lanes and with the simt schedule.
 """
 
 import os

@@ -1,20 +1,19 @@
 """The oracle: 3D Gaussian splatting and its gradients in float64 NumPy, written to be read, not to be fast.
 
-Equation numbers refer to `algorithms.md`.  Projection handles one Gaussian at a time, blending one splat at a time over
-all pixels; there are no tiles.  Losses, the optimizer and density control are in `reference_loss.py`.
+Kerbl et al. 2023 (3DGS), with the filters of Yu et al. 2024 (Mip-Splatting).  Projection handles one Gaussian at a
+time; blending is in `reference_blend.py`, losses, the optimizer and density control in `reference_loss.py`.
 
 Conventions: OpenCV camera (x right, y down, z forward); the centre of pixel (0, 0) is (0.5, 0.5); quaternions are
 (w, x, y, z); `grad_x` is dL/dx.  Letters: N Gaussians, K harmonics, C = 3 channels, H, W image.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 PARAMETERS = ("means", "quats", "log_scales", "logit_opacity", "sh")
-RADIUS_TILE = 16  # px; the tile of the vanilla visibility test (2.1 step 8), whatever tile the kernels use
+RADIUS_TILE = 16  # px; the tile of the vanilla visibility test, whatever tile the kernels use
 
 
 @dataclass(frozen=True)
@@ -56,7 +55,7 @@ class Camera:
 
 @dataclass
 class Gaussians:
-    """Raw parameters (1.1), as optimised."""
+    """Raw parameters, as optimised."""
 
     means: np.ndarray  # [N,3]
     quats: np.ndarray  # [N,4] w, x, y, z; not normalised
@@ -92,10 +91,10 @@ class SplatGradients(NamedTuple):
     conic: np.ndarray  # [N,3] with respect to the scalars A, B, C
     opacity: np.ndarray  # [N]
     colour: np.ndarray  # [N,3]
-    mean2d_abs: np.ndarray  # [N,2] sum over pixels of |dL/du|, |dL/dv| (15.1)
+    mean2d_abs: np.ndarray  # [N,2] sum over pixels of |dL/du|, |dL/dv|
 
 
-# ---- Spherical harmonics (1.2) ------------------------------------------------------------------------------------
+# ---- Spherical harmonics -------------------------------------------------------------------------------------------
 
 
 def _harmonics(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> list[tuple]:
@@ -142,11 +141,11 @@ def sh_basis_gradient(directions: np.ndarray, degree: int) -> np.ndarray:
     return _harmonic_table(directions, degree)[..., 1:]
 
 
-# ---- Projection (2.1, 8.1, 8.2) -----------------------------------------------------------------------------------
+# ---- Projection ----------------------------------------------------------------------------------------------------
 
 
 def rotation_matrix(quat: np.ndarray) -> np.ndarray:
-    """R of q/|q| (2.1 step 2): [4] -> [3,3]."""
+    """R of q/|q|: [4] -> [3,3]."""
     w, x, y, z = quat / np.linalg.norm(quat)
     return np.array(
         [
@@ -158,7 +157,7 @@ def rotation_matrix(quat: np.ndarray) -> np.ndarray:
 
 
 def ray_limits(camera: Camera) -> np.ndarray:
-    """Limits of x/z and y/z in the Jacobian, for any principal point (2.1 step 3): [[x_lo, x_hi], [y_lo, y_hi]]."""
+    """Limits of x/z and y/z in the Jacobian, for any principal point: [[x_lo, x_hi], [y_lo, y_hi]]."""
     tan_x, tan_y = camera.width / (2 * camera.fx), camera.height / (2 * camera.fy)
     return np.array(
         [
@@ -228,7 +227,7 @@ def view_direction(camera: Camera, mean: np.ndarray) -> tuple[np.ndarray, float]
 
 
 def unclamped_colour(gaussians: Gaussians, n: int, camera: Camera, degree: int) -> np.ndarray:
-    """Σ Y_k(d) c_k + 0.5 (1.1): [3]."""
+    """Σ Y_k(d) c_k + 0.5: [3]."""
     basis = sh_basis(view_direction(camera, gaussians.means[n])[0], degree)
     return basis @ gaussians.sh[n, : len(basis)] + 0.5
 
@@ -238,7 +237,7 @@ def vanilla_radius(mean2d: np.ndarray, dilated: np.ndarray, width: int, height: 
     middle = (dilated[0, 0] + dilated[1, 1]) / 2
     largest = middle + np.sqrt(max(0.1, middle**2 - determinant(dilated)))
     radius = np.ceil(3 * np.sqrt(largest))
-    index = mean2d - 0.5  # section 1 counts pixels from their centres
+    index = mean2d - 0.5  # the reference implementation counts pixels from their centres
     grid = np.ceil(np.array([width, height]) / RADIUS_TILE)
     first = np.clip(np.trunc((index - radius) / RADIUS_TILE), 0, grid)
     last = np.clip(np.trunc((index + radius + RADIUS_TILE - 1) / RADIUS_TILE), 0, grid)
@@ -288,7 +287,7 @@ def project(
     return splats
 
 
-# ---- Projection, backwards (section 3) ----------------------------------------------------------------------------
+# ---- Projection, backwards -----------------------------------------------------------------------------------------
 
 
 def quat_gradient(quat: np.ndarray, h: np.ndarray) -> np.ndarray:
@@ -349,7 +348,7 @@ def project_backward(
     for n in np.flatnonzero(splats.visible):
         foot = footprint(gaussians, n, camera, variance)
 
-        # Opacity o = sigmoid * ρ * κ (1.1, 8.1, 8.2)
+        # Opacity o = sigmoid * ρ * κ
         sigmoid, rho, kappa = opacity_factors(gaussians.logit_opacity[n], foot, compensate)
         grad["logit_opacity"][n] = grad_opacity[n] * rho * kappa * sigmoid * (1 - sigmoid)
         grad_kappa = grad_opacity[n] * sigmoid * rho
@@ -386,168 +385,3 @@ def project_backward(
         through_rho = grad_opacity[n] * splats.opacity[n] * gaussians.filter_variance[n] / foot.filtered**2
         grad["log_scales"][n] = through_covariance + through_rho
     return grad
-
-
-# ---- Blending (2.3) and its gradient (section 3) ------------------------------------------------------------------
-
-
-class BlendStep(NamedTuple):
-    """One splat over all pixels; every array is [H,W]."""
-
-    index: int
-    dx: np.ndarray
-    dy: np.ndarray
-    falloff: np.ndarray  # e^-σ
-    alpha: np.ndarray
-    before: np.ndarray  # transmittance in front of the splat
-    tried: np.ndarray  # the pixel had not stopped yet
-    candidate: np.ndarray  # tried and not too faint
-    blended: np.ndarray  # candidate and does not make the pixel stop
-
-
-def depth_order(splats: Splats) -> np.ndarray:
-    """Visible splats front to back, ties by index."""
-    order = np.argsort(splats.depth, kind="stable")
-    return order[splats.visible[order]]
-
-
-def blend_steps(splats: Splats, width: int, height: int, thresholds: Thresholds) -> Iterator[BlendStep]:
-    """Walk through the splats front to back (2.3)."""
-    pixel_x, pixel_y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    transmittance = np.ones((height, width))
-    running = np.ones((height, width), bool)
-    for i in depth_order(splats):
-        a, b, c = splats.conic[i]
-        dx, dy = splats.mean2d[i, 0] - pixel_x, splats.mean2d[i, 1] - pixel_y
-        sigma = 0.5 * (a * dx**2 + c * dy**2) + b * dx * dy
-        falloff = np.exp(-sigma)
-        alpha = np.minimum(thresholds.alpha_max, splats.opacity[i] * falloff)
-        after = transmittance * (1 - alpha)
-        candidate = running & (sigma >= 0) & (alpha >= thresholds.alpha_min)
-        stops = candidate & (after < thresholds.transmittance_min)
-        blended = candidate & ~stops
-        yield BlendStep(i, dx, dy, falloff, alpha, transmittance, running, candidate, blended)
-        running = running & ~stops
-        transmittance = np.where(blended, after, transmittance)
-
-
-def blend(
-    splats: Splats, width: int, height: int, background: np.ndarray, thresholds: Thresholds = Thresholds()
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Image [3,H,W], final transmittance [H,W], number of blended splats [H,W]."""
-    image = np.zeros((3, height, width))
-    transmittance = np.ones((height, width))
-    count = np.zeros((height, width), int)
-    for step in blend_steps(splats, width, height, thresholds):
-        weight = np.where(step.blended, step.alpha * step.before, 0)
-        image += splats.colour[step.index][:, None, None] * weight
-        transmittance = np.where(step.blended, step.before * (1 - step.alpha), transmittance)
-        count += step.blended
-    return image + np.asarray(background)[:, None, None] * transmittance, transmittance, count
-
-
-def blend_backward(
-    splats: Splats,
-    width: int,
-    height: int,
-    background: np.ndarray,
-    grad_image: np.ndarray,
-    thresholds: Thresholds = Thresholds(),
-) -> SplatGradients:
-    """Gradients of the splats, in the prefix form of section 3.  Where alpha is capped its derivative is zero."""
-    n = len(splats.opacity)
-    grad = SplatGradients(np.zeros((n, 2)), np.zeros((n, 3)), np.zeros(n), np.zeros((n, 3)), np.zeros((n, 2)))
-    image, final, _ = blend(splats, width, height, background, thresholds)
-    through_background = np.einsum("c,chw->hw", background, grad_image)
-    behind = image - np.asarray(background)[:, None, None] * final  # S_N - S_i, once splat i has been taken off
-    for step in blend_steps(splats, width, height, thresholds):
-        i, alpha, before = step.index, step.alpha, step.before
-        colour = splats.colour[i][:, None, None]
-        behind = behind - colour * np.where(step.blended, alpha * before, 0)
-        grad.colour[i] = np.sum(grad_image * np.where(step.blended, alpha * before, 0), axis=(1, 2))
-        grad_alpha = np.sum((colour * before - behind / (1 - alpha)) * grad_image, axis=0)
-        grad_alpha -= final / (1 - alpha) * through_background
-        capped = splats.opacity[i] * step.falloff > thresholds.alpha_max
-        grad_alpha = np.where(step.blended & ~capped, grad_alpha, 0)
-
-        grad.opacity[i] = np.sum(step.falloff * grad_alpha)
-        grad_sigma = -splats.opacity[i] * step.falloff * grad_alpha
-        a, b, c = splats.conic[i]
-        grad_u = grad_sigma * (a * step.dx + b * step.dy)
-        grad_v = grad_sigma * (b * step.dx + c * step.dy)
-        grad.mean2d[i] = grad_u.sum(), grad_v.sum()
-        grad.mean2d_abs[i] = np.abs(grad_u).sum(), np.abs(grad_v).sum()
-        moments = 0.5 * step.dx**2, step.dx * step.dy, 0.5 * step.dy**2
-        grad.conic[i] = [np.sum(grad_sigma * moment) for moment in moments]
-    return grad
-
-
-class Margin(NamedTuple):
-    """Smallest relative distances to a decision that float32 might take differently; inf where there is none."""
-
-    alpha: float  # |α / alpha_min - 1| over pixels that have not stopped
-    transmittance: float  # |T' / transmittance_min - 1| over splats that are not too faint
-    cap: float  # |o e^-σ / alpha_max - 1|: the image is continuous there, its gradient is not
-    depth: float  # relative gap between neighbours in the depth order
-
-
-def margin(splats: Splats, width: int, height: int, thresholds: Thresholds = Thresholds()) -> Margin:
-    """Tell how far blending stays from its thresholds, so that a test can choose a scene without flips."""
-    alpha, transmittance, cap = [np.inf], [np.inf], [np.inf]
-    for step in blend_steps(splats, width, height, thresholds):
-        uncapped = splats.opacity[step.index] * step.falloff
-        cap.append(_relative_gap(uncapped[step.candidate], thresholds.alpha_max))
-        alpha.append(_relative_gap(step.alpha[step.tried], thresholds.alpha_min))
-        after = step.before * (1 - step.alpha)
-        transmittance.append(_relative_gap(after[step.candidate], thresholds.transmittance_min))
-    depth = splats.depth[depth_order(splats)]
-    gap = np.min(np.diff(depth) / depth[1:], initial=np.inf)
-    return Margin(min(alpha), min(transmittance), min(cap), float(gap))
-
-
-def _relative_gap(values: np.ndarray, threshold: float) -> float:
-    return float(np.min(np.abs(values / threshold - 1), initial=np.inf)) if threshold > 0 else np.inf
-
-
-# ---- Both together ------------------------------------------------------------------------------------------------
-
-
-class Frame(NamedTuple):
-    """What `render` returns."""
-
-    image: np.ndarray  # [3,H,W]
-    transmittance: np.ndarray  # [H,W]
-    count: np.ndarray  # [H,W] blended splats
-    splats: Splats
-
-
-def render(
-    gaussians: Gaussians,
-    camera: Camera,
-    background: np.ndarray,
-    degree: int,
-    near: float = 0.2,
-    variance: float = 0.3,
-    compensate: float = 0.0,
-    thresholds: Thresholds = Thresholds(),
-) -> Frame:
-    """Project and blend."""
-    splats = project(gaussians, camera, degree, near, variance, compensate, thresholds)
-    return Frame(*blend(splats, camera.width, camera.height, background, thresholds), splats)
-
-
-def render_backward(
-    gaussians: Gaussians,
-    camera: Camera,
-    background: np.ndarray,
-    degree: int,
-    splats: Splats,
-    grad_image: np.ndarray,
-    variance: float = 0.3,
-    compensate: float = 0.0,
-    thresholds: Thresholds = Thresholds(),
-) -> tuple[dict[str, np.ndarray], SplatGradients]:
-    """Gradients of the parameters, and those of the splats on the way (for density control)."""
-    grad = blend_backward(splats, camera.width, camera.height, background, grad_image, thresholds)
-    upstream = grad.mean2d, grad.conic, grad.opacity, grad.colour
-    return project_backward(gaussians, camera, degree, variance, compensate, splats, *upstream), grad

@@ -1,6 +1,6 @@
 """The oracle, second part: image losses, Adam and density control in float64 NumPy.
 
-Section numbers refer to `algorithms.md`.  Images are [C,H,W]: x is the render, y the target; gradients
+Images are [C,H,W]: x is the render, y the target; gradients
 are with respect to x.
 """
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from tests.reference import rotation_matrix
 
-# ---- Losses and metrics (section 4) -------------------------------------------------------------------------------
+# ---- Losses and metrics --------------------------------------------------------------------------------------------
 
 SSIM_RADIUS = 5
 SSIM_SIGMA = 1.5
@@ -52,7 +52,7 @@ def window_mean(image: np.ndarray) -> np.ndarray:
 
 
 def _ssim_terms(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
-    """μ1, μ2, a1, a2, b1, b2 of section 4."""
+    """μ1, μ2, a1, a2, b1, b2."""
     mu1, mu2 = window_mean(x), window_mean(y)
     variance1 = window_mean(x * x) - mu1**2
     variance2 = window_mean(y * y) - mu2**2
@@ -80,7 +80,7 @@ def dssim(x: np.ndarray, y: np.ndarray) -> tuple[float, np.ndarray]:
     return 1 - np.mean(m), grad
 
 
-# ---- Adam (section 5) ---------------------------------------------------------------------------------------------
+# ---- Adam ----------------------------------------------------------------------------------------------------------
 
 
 def adam_step(
@@ -102,14 +102,14 @@ def adam_step(
     return parameter - rate * mean / (np.sqrt(square) + epsilon), moment1, moment2
 
 
-# ---- Density control (sections 6, 8.3, 15.1) ----------------------------------------------------------------------
+# ---- Density control -----------------------------------------------------------------------------------------------
 
 KEEP, CLONE, SPLIT, PRUNE = 0, 1, 2, 3  # rows left afterwards: itself; itself twice; two children; none
 
 
 @dataclass(frozen=True)
 class DensityRule:
-    """Constants of section 6; lengths are fractions of the scene extent."""
+    """Constants; lengths are fractions of the scene extent."""
 
     clone_gradient: float = 2e-4
     split_gradient: float = 2e-4
@@ -124,12 +124,12 @@ ABSGS = DensityRule(split_gradient=4e-4, dense=0.001)
 
 
 def screen_gradient(grad_mean2d: np.ndarray, width: int, height: int) -> np.ndarray:
-    """‖g2d‖ of section 3: pixels -> normalised device coordinates: [N,2] -> [N].  Also for `mean2d_abs` (15.1)."""
+    """‖g2d‖: pixels -> normalised device coordinates: [N,2] -> [N].  Also for `mean2d_abs`."""
     return np.hypot(width / 2 * grad_mean2d[:, 0], height / 2 * grad_mean2d[:, 1])
 
 
 def mean_gradient(total: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """ḡ of section 6: [N]; 0 where the Gaussian was never visible."""
+    """ḡ: [N]; 0 where the Gaussian was never visible."""
     return np.where(count > 0, total / np.maximum(count, 1), 0)
 
 

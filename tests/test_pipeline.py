@@ -71,12 +71,24 @@ def replaced(old: str, new: str) -> str:
 
 
 REFUSED = {
-    "misspelt key": (replaced("weight: 0.8", "wieght: 0.8"), r"x.yaml:7: stages\[1\].optimize.losses\[0\].wieght: unknown key; did you mean 'weight'\?"),
+    "misspelt key": (
+        replaced("weight: 0.8", "wieght: 0.8"),
+        r"x.yaml:7: stages\[1\].optimize.losses\[0\].wieght: unknown key; did you mean 'weight'",
+    ),
     "misspelt stage": (replaced("- evaluate", "- evalute"), r"no stage named 'evalute'; did you mean 'evaluate'\?"),
-    "misspelt loss": (replaced("type: dssim", "type: dsim"), r"x.yaml:8: stages\[1\].optimize.losses\[1\].*no loss named 'dsim'; did you mean 'dssim'\?"),
-    "misspelt rule": (replaced("type: clone", "type: clon"), r"during\[0\].densify.rules\[0\].*no rule named 'clon'; did you mean 'clone'\?"),
+    "misspelt loss": (
+        replaced("type: dssim", "type: dsim"),
+        r"x.yaml:8: stages\[1\].optimize.losses\[1\].*no loss named 'dsim'; did you mean 'dssim'\?",
+    ),
+    "misspelt rule": (
+        replaced("type: clone", "type: clon"),
+        r"during\[0\].densify.rules\[0\].*no rule named 'clon'; did you mean 'clone'\?",
+    ),
     "misspelt top key": (replaced("name: small", "nam: small"), r"'name' is missing|unknown key; did you mean 'name'"),
-    "text for a number": (replaced("steps: 10", "steps: 30k"), r"x.yaml:5: stages\[1\].optimize.steps: expected a whole number, got '30k'"),
+    "text for a number": (
+        replaced("steps: 10", "steps: 30k"),
+        r"x.yaml:5: stages\[1\].optimize.steps: expected a whole number, got '30k'",
+    ),
     "quoted number": (replaced("steps: 10", "steps: '10'"), "expected a whole number, got '10'"),
     "fraction for a whole": (replaced("steps: 10", "steps: 10.5"), "expected a whole number, got 10.5"),
     "negative": (replaced("steps: 10", "steps: -1"), "greater than 0, got -1"),
@@ -84,16 +96,22 @@ REFUSED = {
     "missing steps": (replaced("      steps: 10\n", ""), "'steps' is missing"),
     "no cadence": (replaced("checkpoint: {every: 5}", "checkpoint"), "needs 'every' inside 'during'"),
     "cadence outside": (replaced("- evaluate", "- evaluate: {every: 3}"), r"'every' belongs inside optimize.during"),
-    "wrong order": (replaced("  - init\n", ""), r"stages\[0\] optimize needs 'model', which no earlier stage makes \(init makes it\)"),
+    "wrong order": (
+        replaced("  - init\n", ""),
+        r"stages\[0\] optimize needs 'model', which no earlier stage makes \(init makes it\)",
+    ),
     "stage not for during": (replaced("checkpoint: {every: 5}", "init: {every: 5}"), "no stage named 'init'"),
     "duplicate key": (replaced("steps: 10", "steps: 10\n      steps: 20"), r"x.yaml:6: found duplicate key"),
-    "two keys in a stage": (replaced("  - evaluate", "  - evaluate: {}\n    export: {}"), r"stages\[2\]: expected '- stage'"),
+    "two keys in a stage": (
+        replaced("  - evaluate", "  - evaluate: {}\n    export: {}"),
+        r"stages\[2\]: expected '- stage'",
+    ),
     "not yaml": ("name: [", r"x.yaml:\d"),
     "a list": ("- a\n- b\n", "expected keys such as name and stages"),
     "empty": ("", "expected keys"),
     "tagged object": ("name: !!python/object:os.system small\n", "x.yaml"),
     "unsafe name": (replaced("name: small", "name: ../up"), "name"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("case", REFUSED)
@@ -157,7 +175,7 @@ def test_schema_describes_the_file():
     schema = json_schema()
     assert json.loads(json.dumps(schema)) == schema
     names = {
-        tuple(item["properties"])[0]
+        next(iter(item["properties"]))
         for item in schema["properties"]["stages"]["items"]["oneOf"]
         if "properties" in item
     }

@@ -7,6 +7,7 @@ import pytest
 from skimage.metrics import structural_similarity
 
 from tests import reference as ref
+from tests import reference_blend as blending
 from tests import reference_loss as loss
 
 WIDTH, HEIGHT = 40, 30
@@ -114,12 +115,12 @@ def check_chain(rng, gaussians: ref.Gaussians, camera: ref.Camera, degree: int, 
 
     def value() -> float:
         return np.sum(
-            weights * ref.render(gaussians, camera, BACKGROUND, degree, thresholds=ref.SMOOTH, **screen).image
+            weights * blending.render(gaussians, camera, BACKGROUND, degree, thresholds=ref.SMOOTH, **screen).image
         )
 
     splats = ref.project(gaussians, camera, degree, thresholds=ref.SMOOTH, **screen)
     assert splats.visible.all()
-    analytic, _ = ref.render_backward(
+    analytic, _ = blending.render_backward(
         gaussians, camera, BACKGROUND, degree, splats, weights, thresholds=ref.SMOOTH, **screen
     )
     check_gradients(analytic, gaussians, value)
@@ -164,9 +165,9 @@ def test_chain_clamped_ray(rng, side):
     gaussians.log_scales[0] = np.log([1.2, 1.5, 0.9])
     gaussians.logit_opacity[0] = 2
     assert np.any(ref.clamped_ray(camera, point) != point[:2])
-    frame = ref.render(gaussians, camera, BACKGROUND, 1)
+    frame = blending.render(gaussians, camera, BACKGROUND, 1)
     without = replace(gaussians, logit_opacity=gaussians.logit_opacity - [100, 0, 0, 0])
-    assert np.max(np.abs(frame.image - ref.render(without, camera, BACKGROUND, 1).image)) > 0.05
+    assert np.max(np.abs(frame.image - blending.render(without, camera, BACKGROUND, 1).image)) > 0.05
     check_chain(rng, gaussians, camera, 1)
 
 
@@ -188,8 +189,8 @@ def test_chain_with_capped_alpha(rng):
     gaussians.logit_opacity[2] = 6
     gaussians.log_scales[2] = np.log([0.8, 0.9, 0.7])  # wide: several pixels above the cap
     splats = ref.project(gaussians, camera, 1)
-    assert any(np.any(step.alpha == 0.99) for step in ref.blend_steps(splats, WIDTH, HEIGHT, ref.SMOOTH))
-    assert ref.margin(splats, WIDTH, HEIGHT, ref.SMOOTH).cap > 10 * STEP, "a pixel would cross the cap"
+    assert any(np.any(step.alpha == 0.99) for step in blending.blend_steps(splats, WIDTH, HEIGHT, ref.SMOOTH))
+    assert blending.margin(splats, WIDTH, HEIGHT, ref.SMOOTH).cap > 10 * STEP, "a pixel would cross the cap"
     check_chain(rng, gaussians, camera, 1)
 
 
@@ -202,7 +203,7 @@ def test_blend_gradients(rng):
     splats = ref.project(random_gaussians(rng, camera, 0), camera, 0)
     thresholds = ref.Thresholds(transmittance_min=0.2)  # high, so that some pixels stop
     safe, stopped, faint = np.ones((HEIGHT, WIDTH), bool), np.zeros((HEIGHT, WIDTH), bool), 0
-    for step in ref.blend_steps(splats, WIDTH, HEIGHT, thresholds):
+    for step in blending.blend_steps(splats, WIDTH, HEIGHT, thresholds):
         near_alpha_min = np.abs(step.alpha / thresholds.alpha_min - 1) < 0.3
         near_stop = np.abs(step.before * (1 - step.alpha) / thresholds.transmittance_min - 1) < 0.3
         safe &= ~(step.tried & (near_alpha_min | near_stop))
@@ -213,15 +214,15 @@ def test_blend_gradients(rng):
     weights = rng.normal(0, 1, (3, HEIGHT, WIDTH)) * safe
 
     def value() -> float:
-        return np.sum(weights * ref.blend(splats, WIDTH, HEIGHT, BACKGROUND, thresholds)[0])
+        return np.sum(weights * blending.blend(splats, WIDTH, HEIGHT, BACKGROUND, thresholds)[0])
 
-    grad = ref.blend_backward(splats, WIDTH, HEIGHT, BACKGROUND, weights, thresholds)._asdict()
+    grad = blending.blend_backward(splats, WIDTH, HEIGHT, BACKGROUND, weights, thresholds)._asdict()
     del grad["mean2d_abs"]
     check_gradients(grad, splats, value)
 
 
 def test_absolute_mean2d_gradient(rng):
-    """The sum over pixels of the absolute gradient of one pixel at a time (15.1)."""
+    """The sum over pixels of the absolute gradient of one pixel at a time."""
     width, height = 9, 7
     camera = simple_camera(width, height, 12.0)
     splats = ref.project(random_gaussians(rng, camera, 0), camera, 0)
@@ -230,8 +231,8 @@ def test_absolute_mean2d_gradient(rng):
     for row, column in np.ndindex(height, width):
         single = np.zeros_like(weights)
         single[:, row, column] = weights[:, row, column]
-        total += np.abs(ref.blend_backward(splats, width, height, BACKGROUND, single).mean2d)
-    grad = ref.blend_backward(splats, width, height, BACKGROUND, weights)
+        total += np.abs(blending.blend_backward(splats, width, height, BACKGROUND, single).mean2d)
+    grad = blending.blend_backward(splats, width, height, BACKGROUND, weights)
     np.testing.assert_allclose(grad.mean2d_abs, total, rtol=1e-12)
     assert np.all(grad.mean2d_abs > 1.01 * np.abs(grad.mean2d))
 
@@ -293,7 +294,7 @@ def test_single_isotropic_gaussian():
     colour = np.array([0.9, 0.3, 0.1])
     camera = simple_camera(focal=focal)
     gaussians = isotropic([0, 0, depth], scale, opacity, colour)
-    frame = ref.render(gaussians, camera, BACKGROUND, 0, thresholds=ref.SMOOTH)
+    frame = blending.render(gaussians, camera, BACKGROUND, 0, thresholds=ref.SMOOTH)
     x, y = np.meshgrid(np.arange(WIDTH) + 0.5 - WIDTH / 2, np.arange(HEIGHT) + 0.5 - HEIGHT / 2)
     alpha = opacity * np.exp(-0.5 * (x**2 + y**2) / ((focal * scale / depth) ** 2 + 0.3))
     expected = colour[:, None, None] * alpha + BACKGROUND[:, None, None] * (1 - alpha)
@@ -307,7 +308,7 @@ def test_pixel_centres_and_axes():
     splats = ref.project(isotropic([0.3, -0.6, 3], 0.1, 0.5, [1, 1, 1]), simple_camera(), 0)
     np.testing.assert_allclose(splats.mean2d, [[24, 7]], rtol=1e-14)
     np.testing.assert_allclose(splats.depth, [3])
-    image, _, _ = ref.blend(splats, WIDTH, HEIGHT, np.zeros(3))
+    image, _, _ = blending.blend(splats, WIDTH, HEIGHT, np.zeros(3))
     middle = image[0, 6:8, 23:25]  # the mean is the corner shared by these four pixels
     assert middle.min() > 0.99 * image.max()
 
@@ -390,7 +391,7 @@ def test_filters_in_closed_form():
 def test_two_splats_by_hand():
     """Front 0.5 red, behind it 0.4 green, background blue: 0.5 + 0.2 + 0.3."""
     splats = flat_splats(depth=[2, 1], opacity=[0.4, 0.5], colour=[[0, 1, 0], [1, 0, 0]])
-    image, transmittance, count = ref.blend(splats, 1, 1, np.array([0, 0, 1]))
+    image, transmittance, count = blending.blend(splats, 1, 1, np.array([0, 0, 1]))
     np.testing.assert_allclose(image[:, 0, 0], [0.5, 0.2, 0.3])
     np.testing.assert_allclose(transmittance, 0.3)
     assert count[0, 0] == 2
@@ -398,7 +399,7 @@ def test_two_splats_by_hand():
 
 def test_equal_depths_keep_the_order_of_indices():
     splats = flat_splats(depth=[1, 1, 1], opacity=[0.5, 0.5, 0.5], colour=np.eye(3))
-    image, _, _ = ref.blend(splats, 1, 1, np.zeros(3))
+    image, _, _ = blending.blend(splats, 1, 1, np.zeros(3))
     np.testing.assert_allclose(image[:, 0, 0], [0.5, 0.25, 0.125])
 
 
@@ -407,16 +408,16 @@ def test_order_of_gaussians_does_not_matter(rng):
     gaussians = random_gaussians(rng, camera, 1)
     shuffle = np.array([3, 0, 4, 1, 2])
     shuffled = ref.Gaussians(**{name: values[shuffle] for name, values in vars(gaussians).items()})
-    image = ref.render(gaussians, camera, BACKGROUND, 1).image
-    np.testing.assert_array_equal(ref.render(shuffled, camera, BACKGROUND, 1).image, image)
+    image = blending.render(gaussians, camera, BACKGROUND, 1).image
+    np.testing.assert_array_equal(blending.render(shuffled, camera, BACKGROUND, 1).image, image)
 
 
 def test_alpha_is_capped():
     splats = flat_splats(depth=[1], opacity=[0.999], colour=[[1, 1, 1]])
-    image, transmittance, _ = ref.blend(splats, 1, 1, np.zeros(3))
+    image, transmittance, _ = blending.blend(splats, 1, 1, np.zeros(3))
     np.testing.assert_allclose(image, 0.99)
     np.testing.assert_allclose(transmittance, 0.01)
-    grad = ref.blend_backward(splats, 1, 1, np.zeros(3), np.ones((3, 1, 1)))
+    grad = blending.blend_backward(splats, 1, 1, np.zeros(3), np.ones((3, 1, 1)))
     assert grad.opacity[0] == 0
     np.testing.assert_allclose(grad.colour, 0.99)
 
@@ -425,7 +426,7 @@ def test_faint_alpha_is_skipped():
     """alpha < 1/255 is skipped, alpha = 1/255 is not."""
     limit = 1 / 255
     splats = flat_splats(depth=[1, 2], opacity=[np.nextafter(limit, 0), limit], colour=[[1, 0, 0], [0, 1, 0]])
-    image, _, count = ref.blend(splats, 1, 1, np.zeros(3))
+    image, _, count = blending.blend(splats, 1, 1, np.zeros(3))
     np.testing.assert_allclose(image[:, 0, 0], [0, limit, 0])
     assert count[0, 0] == 1
 
@@ -434,19 +435,19 @@ def test_negative_sigma_is_skipped():
     """No projection makes such a conic, but rounding does."""
     splats = flat_splats(depth=[1], opacity=[0.5], colour=[[1, 1, 1]])
     splats.conic[0] = [-1e-3, 0, -1e-3]
-    assert ref.blend(splats, 1, 1, np.zeros(3))[2][0, 0] == 0
+    assert blending.blend(splats, 1, 1, np.zeros(3))[2][0, 0] == 0
     splats.conic[0] = [1e-3, 0, 1e-3]
-    assert ref.blend(splats, 1, 1, np.zeros(3))[2][0, 0] == 1
+    assert blending.blend(splats, 1, 1, np.zeros(3))[2][0, 0] == 1
 
 
 def test_stopping_splat_is_excluded():
     """0.1 · 0.02 · 0.02 < 1e-4: the third splat stops the pixel unseen, and the faint fourth is not reached."""
     splats = flat_splats(depth=[1, 2, 3, 4], opacity=[0.9, 0.98, 0.98, 0.1], colour=[*np.eye(3).tolist(), [9, 9, 9]])
-    image, transmittance, count = ref.blend(splats, 1, 1, np.ones(3))
+    image, transmittance, count = blending.blend(splats, 1, 1, np.ones(3))
     np.testing.assert_allclose(image[:, 0, 0], [0.9 + 0.002, 0.098 + 0.002, 0.002])
     np.testing.assert_allclose(transmittance, 0.002)
     assert count[0, 0] == 2
-    grad = ref.blend_backward(splats, 1, 1, np.ones(3), np.ones((3, 1, 1)))
+    grad = blending.blend_backward(splats, 1, 1, np.ones(3), np.ones((3, 1, 1)))
     assert np.all(grad.opacity[2:] == 0)
     assert np.all(grad.colour[2:] == 0)
 
@@ -454,7 +455,7 @@ def test_stopping_splat_is_excluded():
 def test_transmittance_of_the_threshold_itself_does_not_stop():
     thresholds = ref.Thresholds(transmittance_min=0.25)
     splats = flat_splats(depth=[1, 2, 3], opacity=[0.5, 0.5, 0.01], colour=np.eye(3))
-    _, transmittance, count = ref.blend(splats, 1, 1, np.zeros(3), thresholds)
+    _, transmittance, count = blending.blend(splats, 1, 1, np.zeros(3), thresholds)
     assert count[0, 0] == 2
     assert transmittance[0, 0] == 0.25
 
@@ -463,12 +464,12 @@ def test_margin():
     """The second splat is too faint, the third stops the pixel, so that the fourth does not count."""
     splats = flat_splats(depth=[1, 1.25, 2, 3], opacity=[0.5, 0.02, 0.9, 0.0301], colour=np.ones((4, 3)))
     thresholds = ref.Thresholds(alpha_min=0.03, alpha_max=0.99, transmittance_min=0.08)
-    margin = ref.margin(splats, 1, 1, thresholds)
+    margin = blending.margin(splats, 1, 1, thresholds)
     np.testing.assert_allclose(margin.alpha, 1 - 0.02 / 0.03)
     np.testing.assert_allclose(margin.transmittance, 1 - 0.5 * 0.1 / 0.08)
     np.testing.assert_allclose(margin.cap, 1 - 0.9 / 0.99)
     np.testing.assert_allclose(margin.depth, 0.25 / 1.25)
-    assert ref.margin(splats, 1, 1, ref.SMOOTH)[:2] == (np.inf, np.inf)
+    assert blending.margin(splats, 1, 1, ref.SMOOTH)[:2] == (np.inf, np.inf)
 
 
 # ---- Culling and radius -------------------------------------------------------------------------------------------
@@ -565,7 +566,7 @@ def test_loss_values():
 
 
 def test_ssim_taps():
-    """Against the published numbers of section 4."""
+    """Against the published numbers."""
     published = [0.00102838, 0.00759876, 0.03600077, 0.10936069, 0.21300554, 0.26601172]
     np.testing.assert_allclose(loss.ssim_taps(), published + published[4::-1], atol=5e-9)
 

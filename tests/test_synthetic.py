@@ -14,7 +14,9 @@ from clsplat.errors import DataError, OutputError
 from clsplat.scene.points import read_points_ply
 from data_tools import __main__ as command
 from data_tools import synthetic
-from data_tools.synthetic import SCENE, Box, Cylinder, Options, Shape, Sphere, trace, write_dataset
+from data_tools.shapes import Box, Cylinder, Shape, Sphere
+from data_tools.still_life import SCENE
+from data_tools.synthetic import Options, trace, write_dataset
 
 Array = NDArray[Any]
 

@@ -1,0 +1,190 @@
+"""Shapes that a ray caster meets, in closed form: balls, boxes, cylinders.
+
+Arrays hold planes: points and directions are [3, R] (or [3, 1], which broadcasts), one column per ray; lengths are
+scene units.  Each shape is convex, so a ray is inside it between one `enter` and one `leave` distance.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Vector = tuple[float, float, float]
+Paint = Callable[[Array], Array]  # points in the shape's own axes [3, R] -> albedo [3, R]
+GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
+
+
+def dot(a: Array, b: Array) -> Array:
+    """Sum of products over the first axis, [R]."""
+    total: Array = a[0] * b[0]
+    for i in range(1, len(a)):
+        total = total + a[i] * b[i]
+    return total
+
+
+def rotate(matrix: Array, v: Array) -> Array:
+    """Apply a [3, 3] matrix to columns [3, R]; no BLAS, whose rounding may depend on its threads."""
+    return np.asarray(matrix[:, :1] * v[0] + matrix[:, 1:2] * v[1] + matrix[:, 2:] * v[2])
+
+
+def unit(v: Array) -> Array:
+    """Scale columns to length 1."""
+    return np.asarray(v / np.sqrt(dot(v, v)))
+
+
+def align(axis: Array, x: float, y: float, z: Array | float) -> Array:
+    """Turn (x, y, z) so that z lies along the unit columns `axis` (Duff et al. 2017)."""
+    sign = np.copysign(1.0, axis[2])
+    a = -1 / (sign + axis[2])
+    b = axis[0] * axis[1] * a
+    right = np.array([1 + sign * axis[0] * axis[0] * a, sign * b, -sign * axis[0]])
+    up = np.array([b, sign + axis[1] * axis[1] * a, -axis[1]])
+    return np.asarray(x * right + y * up + z * axis)
+
+
+def disc(count: int) -> Array:
+    """Points spread evenly over the unit disc (Vogel's spiral), [2, count]."""
+    radius, angle = np.sqrt((np.arange(count) + 0.5) / count), np.arange(count) * GOLDEN_ANGLE
+    return np.array([radius * np.cos(angle), radius * np.sin(angle)])
+
+
+def spiral(count: int, low: float, high: float, phase: float = 0.0) -> Array:
+    """Unit vectors spread evenly between two elevations (degrees) on a Fibonacci spiral, [count, 3]."""
+    bottom, top = np.sin(np.radians((low, high)))
+    z = bottom + (top - bottom) * (np.arange(count) + 0.5) / count
+    angle = np.arange(count) * GOLDEN_ANGLE + phase
+    return np.stack([np.sqrt(1 - z * z) * np.cos(angle), np.sqrt(1 - z * z) * np.sin(angle), z], axis=1)
+
+
+def round_interval(origins: Array, directions: Array, radius: float) -> tuple[Array, Array]:
+    """Where rays are within `radius` of the origin: a ball (3 axes) or an endless cylinder (2).  Miss: enter = inf."""
+    a, b = np.maximum(dot(directions, directions), 1e-12), dot(origins, directions)
+    square = b * b - a * (dot(origins, origins) - radius * radius)
+    root = np.sqrt(np.maximum(square, 0))
+    return np.where(square > 0, (-b - root) / a, np.inf), (root - b) / a
+
+
+def slab_interval(origins: Array, directions: Array, half: float) -> tuple[Array, Array]:
+    """Where rays have one coordinate within `half` of 0."""
+    inverse = 1 / np.where(np.abs(directions) < 1e-12, 1e-12, directions)
+    middle, reach = -origins * inverse, half * np.abs(inverse)
+    return middle - reach, middle + reach
+
+
+def common(*intervals: tuple[Array, Array]) -> tuple[Array, Array]:
+    """Intersect intervals."""
+    enters, leaves = zip(*intervals, strict=True)
+    return np.maximum.reduce(enters), np.minimum.reduce(leaves)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shape:
+    """A painted convex body with its own axes: turned by `tilt` about x, then by `yaw` about z (degrees)."""
+
+    centre: Vector
+    paint: Paint
+    yaw: float = 0.0
+    tilt: float = 0.0
+
+    @property
+    def reach(self) -> float:
+        """Radius of the bounding ball."""
+        raise NotImplementedError
+
+    def interval(self, origins: Array, directions: Array) -> tuple[Array, Array]:
+        """Where rays, given in the shape's own axes, are inside."""
+        raise NotImplementedError
+
+    def local_normal(self, points: Array) -> Array:
+        """Outward normals of surface points, both in the shape's own axes."""
+        raise NotImplementedError
+
+    @cached_property
+    def axes(self) -> Array:
+        """World to own axes, [3, 3]."""
+        (cy, sy), (ct, st) = ((np.cos(a), np.sin(a)) for a in np.radians((self.yaw, self.tilt)))
+        yaw, tilt = np.array([[cy, sy, 0], [-sy, cy, 0], [0, 0, 1]]), np.array([[1, 0, 0], [0, ct, st], [0, -st, ct]])
+        return np.asarray(tilt @ yaw)
+
+    def local(self, points: Array) -> Array:
+        """Bring world points into the shape's own axes."""
+        return rotate(self.axes, points - np.array(self.centre)[:, None])
+
+    def intersect(self, origins: Array, directions: Array) -> Array:
+        """Distance along each ray to the surface ahead, [R]; inf = miss."""
+        offset = origins - np.array(self.centre)[:, None]
+        along, square = dot(offset, directions), dot(offset, offset) - self.reach**2
+        near = np.flatnonzero((square < along * along) & ((along < 0) | (square < 0)))  # the few rays that can hit
+        distance = np.full(along.shape, np.inf)
+        offset, directions = (np.broadcast_to(v, (3, len(along)))[:, near] for v in (offset, directions))
+        enter, leave = self.interval(rotate(self.axes, offset), rotate(self.axes, directions))
+        ahead = np.where(enter > 0, enter, leave)
+        distance[near] = np.where((enter <= leave) & (ahead > 0), ahead, np.inf)
+        return distance
+
+    def normal(self, points: Array) -> Array:
+        """Outward unit normals of surface points, [3, R]."""
+        return rotate(self.axes.T, self.local_normal(self.local(points)))
+
+    def texture(self, points: Array) -> Array:
+        """Albedo of surface points, [3, R]."""
+        return self.paint(self.local(points))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sphere(Shape):
+    """A ball."""
+
+    radius: float
+
+    @property
+    def reach(self) -> float:
+        return self.radius
+
+    def interval(self, origins: Array, directions: Array) -> tuple[Array, Array]:
+        return round_interval(origins, directions, self.radius)
+
+    def local_normal(self, points: Array) -> Array:
+        return points / self.radius
+
+
+@dataclass(frozen=True, kw_only=True)
+class Box(Shape):
+    """A block of half sides `half`."""
+
+    half: Vector
+
+    @property
+    def reach(self) -> float:
+        return float(np.linalg.norm(self.half))
+
+    def interval(self, origins: Array, directions: Array) -> tuple[Array, Array]:
+        return common(*(slab_interval(origins[i], directions[i], self.half[i]) for i in range(3)))
+
+    def local_normal(self, points: Array) -> Array:
+        depth = np.abs(points) - np.array(self.half)[:, None]
+        return np.asarray(np.sign(points) * (depth == depth.max(axis=0)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cylinder(Shape):
+    """A closed cylinder along its own z."""
+
+    radius: float
+    half: float
+
+    @property
+    def reach(self) -> float:
+        return float(np.hypot(self.radius, self.half))
+
+    def interval(self, origins: Array, directions: Array) -> tuple[Array, Array]:
+        side = round_interval(origins[:2], directions[:2], self.radius)
+        return common(side, slab_interval(origins[2], directions[2], self.half))
+
+    def local_normal(self, points: Array) -> Array:
+        x, y, z = points
+        cap = np.abs(z) - self.half > np.hypot(x, y) - self.radius
+        return np.where(cap, [0 * x, 0 * x, np.sign(z)], [x / self.radius, y / self.radius, 0 * z])
