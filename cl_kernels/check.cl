@@ -1,7 +1,7 @@
 /* Watching over the numbers: how many values of a table are not finite.
  *
- * One item = one Gaussian of one plane; dimension 1 is the plane.  No local memory.  The counter is an integer atomic, so
- * the count does not depend on the order of the items. */
+ * One item = one Gaussian of one plane; dimension 1 is the plane.  No local memory.  The counter is an integer atomic,
+ * so the count does not depend on the order of the items. */
 #include "common.h"
 
 /* counter += values of the table that are NaN or infinite. */

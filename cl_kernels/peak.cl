@@ -12,7 +12,8 @@ void peak_fma(
 {
     const uint i = get_global_id(0);
     const VF step = (VF)(0.5f * factor), m = (VF)(factor);
-    VF a = (VF)((float)i), b = a + 1.0f, c = a + 2.0f, d = a + 3.0f, e = a + 4.0f, f = a + 5.0f, g = a + 6.0f, h = a + 7.0f;
+    VF a = (VF)((float)i), b = a + 1.0f, c = a + 2.0f, d = a + 3.0f;
+    VF e = a + 4.0f, f = a + 5.0f, g = a + 6.0f, h = a + 7.0f;
     for (uint k = 0; k < rounds; k++) {
         a = a * m + step;
         b = b * m + step;

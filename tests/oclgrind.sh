@@ -8,7 +8,7 @@ log=$(mktemp)
 for check in --data-races --uninitialized; do
     : > "$log"
     CLSPLAT_TEST_DEVICES=Oclgrind oclgrind "$check" --max-errors 20 --log "$log" \
-        "$python" -m pytest tests/kernels -m oclgrind -p no:cacheprovider "$@"
+        "$python" -m pytest tests/kernels -m "not large" -p no:cacheprovider "$@"
     if [ -s "$log" ]; then
         cat "$log"
         echo "oclgrind $check: found something" >&2

@@ -6,6 +6,7 @@ to another one in silence.
 
 import logging
 import os
+import warnings
 from collections import defaultdict
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 
 DEVICE_VARIABLE = "CLSPLAT_DEVICE"
 LOG = logging.getLogger("clsplat")
+warnings.filterwarnings("ignore", category=cl.CompilerWarning)  # some runtimes always have something to say
 Schedule = Literal["auto", "wide", "simt"]
 
 

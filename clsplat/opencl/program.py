@@ -99,15 +99,8 @@ class Kernel:
         self.label, self.arguments = label, arguments
         self._device, self._kernel = device, kernel
         self._kernel.set_scalar_arg_dtypes([None if a.pointer else a.dtype for a in arguments])
-        work_group = cl.kernel_work_group_info
-        handle = device.context.devices[0]
-        size = kernel.get_work_group_info(work_group.COMPILE_WORK_GROUP_SIZE, handle)
-        limit = kernel.get_work_group_info(work_group.WORK_GROUP_SIZE, handle)
+        size = kernel.get_work_group_info(cl.kernel_work_group_info.COMPILE_WORK_GROUP_SIZE, device.context.devices[0])
         self.group = tuple(int(n) for n in size)
-        if int(np.prod(self.group)) > limit:
-            raise DeviceError(
-                f"{label} wants {int(np.prod(self.group))} items per group; {device.info.name} allows {limit}"
-            )
 
     def __call__(self, *, items: int | tuple[int, ...] = 0, groups: int | tuple[int, ...] = 0, **values: Any) -> None:
         """Launch over `items`, rounded up to whole groups, or `groups` of the kernel's own size; none: no launch."""

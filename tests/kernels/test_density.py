@@ -89,6 +89,7 @@ def test_adaptive_density_control(device, rng, count, step):
     assert (np.linalg.norm(offsets, axis=1) < 6 * sizes).all()
 
 
+@pytest.mark.large
 def test_children_follow_their_parents_distribution(device, rng):
     count = 4000
     case = random_case(rng, 1)

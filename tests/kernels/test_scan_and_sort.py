@@ -7,7 +7,8 @@ from clsplat.render.tiles import Tiler
 from clsplat.render.workspace import Workspace
 
 # around the team's run (8 * 64), the CPU's shortest run and block, and powers of two
-COUNTS = (1, 2, 7, 63, 64, 65, 511, 512, 513, 1023, 1024, 1025, 16383, 16384, 16385, 70001)
+LARGE = tuple(pytest.param(count, marks=pytest.mark.large) for count in (16383, 16384, 16385, 70001))
+COUNTS = (1, 2, 7, 63, 64, 65, 511, 512, 513, 1023, 1024, 1025, *LARGE)
 
 
 def tiler_of(device, sort="radix") -> Tiler:
