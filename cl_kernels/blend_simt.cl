@@ -21,7 +21,7 @@ void blend_forward(
     __local float batch[BATCH][RECORD];
     __local uint open;  // pixels of the tile that still want splats
     const uint item = get_local_id(0), tile = get_group_id(0);
-    const uint tile_x = tile % camera->tiles_x, tile_y = tile / camera->tiles_x;
+    const uint tile_y = tile / camera->tiles_x, tile_x = tile - tile_y * camera->tiles_x;
     const uint column = tile_x * TILE + item % TILE, line = tile_y * TILE + item / TILE;
     const uint width = camera->tiles_x * TILE, plane = width * camera->tiles_y * TILE;
     const float pixel = column + 0.5f, row = line + 0.5f;
@@ -81,7 +81,7 @@ void blend_backward(
 {
     __local grad_pixels_t pixels[PIXELS];
     const uint item = get_local_id(0), tile = get_group_id(0);
-    const uint tile_x = tile % camera->tiles_x, tile_y = tile / camera->tiles_x;
+    const uint tile_y = tile / camera->tiles_x, tile_x = tile - tile_y * camera->tiles_x;
     const uint width = camera->tiles_x * TILE, plane = width * camera->tiles_y * TILE;
     for (uint i = item; i < PIXELS; i += SPLAT_GROUP) {
         const uint at = (tile_y * TILE + i / TILE) * width + tile_x * TILE + i % TILE;

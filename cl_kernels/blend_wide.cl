@@ -31,7 +31,7 @@ void blend_forward(
     __global uint *restrict tile_last)          // [T] one past the last pair that any pixel blends
 {
     const uint tile = get_global_id(0);
-    const uint tile_x = tile % camera->tiles_x, tile_y = tile / camera->tiles_x;
+    const uint tile_y = tile / camera->tiles_x, tile_x = tile - tile_y * camera->tiles_x;
     const uint first = tile_offset[tile], end = tile_offset[tile + 1];
     const uint width = camera->tiles_x * TILE, plane = width * camera->tiles_y * TILE;
     float segment[SEGMENT][RECORD];
@@ -117,7 +117,7 @@ void blend_backward(
     __global float *restrict pair_moments)      // [P,RECORD] in emission order
 {
     const uint tile = get_global_id(0);
-    const uint tile_x = tile % camera->tiles_x, tile_y = tile / camera->tiles_x;
+    const uint tile_y = tile / camera->tiles_x, tile_x = tile - tile_y * camera->tiles_x;
     const uint width = camera->tiles_x * TILE, plane = width * camera->tiles_y * TILE;
     grad_pixels_t pixels[TILE][COLUMNS];
     for (uint y = 0; y < TILE; y++)

@@ -170,9 +170,11 @@ class Array:
             cl.enqueue_copy(self.device.queue, self.buffer, host)
 
     def fill(self, value: float) -> None:
-        if self.nbytes:
-            pattern = np.array(value, self.dtype)
-            cl.enqueue_fill_buffer(self.device.queue, self.buffer, pattern, 0, self.nbytes)
+        """Set every value of an array of floats or 32-bit integers."""
+        word = int(np.array(value, self.dtype).view(np.uint32))
+        words = Array(self.device, self.buffer, self.shape, np.dtype(np.uint32))
+        count = self.nbytes // 4
+        self.device.program("fill.cl").fill_words(items=-(-count // 16), values=words, word=word, count=count)
 
 
 class Device:
@@ -196,7 +198,7 @@ class Device:
         """Allocate without initialising.  Raises MemoryLimitError with the sizes involved."""
         shape = (shape,) if isinstance(shape, int) else shape
         kind = np.dtype(dtype)
-        size = max(int(np.prod(shape, dtype=np.int64)) * kind.itemsize, 64)
+        size = _whole_lines(int(np.prod(shape, dtype=np.int64)) * kind.itemsize)
         if size > self.info.allocation:
             raise MemoryLimitError(
                 f"one buffer of {size / 2**20:.0f} MiB is more than {self.info.name} allows "
@@ -233,6 +235,11 @@ class Device:
     def finish(self) -> None:
         """Wait until everything enqueued is done."""
         self.queue.finish()
+
+
+def _whole_lines(size: int) -> int:
+    """Bytes rounded up to 64, at least as many: vectors may run past the last value, and no buffer may be empty."""
+    return max(64, -(-size // 64) * 64)
 
 
 class Timings:
