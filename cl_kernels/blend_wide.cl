@@ -142,8 +142,9 @@ void blend_backward(
         const VF zero = (VF)(0.0f);
         moments_t moments = {zero, zero, zero, zero, zero, zero, zero, zero, zero};
         const float low = splat[SPLAT_Y_MIN] - top, high = splat[SPLAT_Y_MAX] - top;
-        const uint y_begin = low > 0.0f ? (uint)low & ~1u : 0u;
+        const uint y_first = low > 0.0f ? (uint)low : 0u;
         const uint y_end = high < TILE - 1.0f ? (uint)(high + 1.0f) : TILE;
+        const uint y_begin = y_first - (y_end == TILE ? (y_end - y_first) & 1u : 0u);  // whole pairs of rows
         for (uint y = y_begin; y < y_end; y += 2) {
             const row_splat_t upper = splat_at_row(splat, top + y), lower = splat_at_row(splat, top + y + 1.0f);
             for (uint column = 0; column < COLUMNS; column++) {

@@ -66,6 +66,27 @@ static inline float sum_lanes(const VF v)
 static inline float sum_lanes(const VF v) { return v; }
 #endif
 
+/* Lane j of v[i] becomes lane i of v[j]: log2(LANES) perfect shuffles of the LANES vectors. */
+static inline void transpose(VF *v)
+{
+#if LANES > 1
+    for (uint round = 1; round < LANES; round *= 2) {
+        VF shuffled[LANES];
+        for (uint k = 0; k < LANES / 2; k++) {
+            shuffled[2 * k].even = v[k].lo;
+            shuffled[2 * k].odd = v[k + LANES / 2].lo;
+            shuffled[2 * k + 1].even = v[k].hi;
+            shuffled[2 * k + 1].odd = v[k + LANES / 2].hi;
+        }
+        for (uint k = 0; k < LANES; k++)
+            v[k] = shuffled[k];
+    }
+#endif
+}
+
+/* The integer in each lane, for whole numbers below 2^22 in size. */
+static inline VI to_VI(VF whole) { return as_VI(whole + ROUND_MAGIC) - 0x4b400000; }
+
 /* A NaN in the first argument stays one. */
 static inline VF larger(VF a, VF b) { return b > a ? b : a; }
 static inline VF smaller(VF a, VF b) { return b < a ? b : a; }

@@ -1,37 +1,37 @@
 /* Which tiles each splat touches, as a list of (tile, splat) pairs.
  *
- * A pair's address is its place in emission order, so the pairs of one Gaussian are contiguous.  Counting and emitting
- * share touches_tile, so they agree exactly.  Deterministic: each pair has one writer. */
-#include "splat.h"
+ * A pair's address is its place in emission order, so the pairs of one Gaussian are contiguous.  Deterministic: each
+ * pair has one writer. */
+#include "tiles.h"
 
-/* One item = one Gaussian.  No local memory. */
-__kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
-void count_tiles(
-    __global const float *restrict splats,  // [N,RECORD]
-    __global uint *restrict tile_count,     // [N] tiles touched; 0 when culled
-    const uint tiles_x,
-    const uint tiles_y,
-    const uint count)
+/* The tiles of a rectangle too large for a mask, tested again, as when they were counted. */
+static inline void emit_large(__global const float *splat, uint pair, const uint i, __global uint *pair_tile,
+                              __global uint *pair_splat, const uint tiles_x, const uint tiles_y)
 {
-    const uint i = get_global_id(0);
-    if (i >= count)
-        return;
-    __global const float *splat = splats + (size_t)i * RECORD;
-    uint touched = 0;
-    if (splat[SPLAT_OPACITY] > 0.0f) {
-        const uint2 span_x = tile_span(splat[SPLAT_X_MIN], splat[SPLAT_X_MAX], tiles_x);
-        const uint2 span_y = tile_span(splat[SPLAT_Y_MIN], splat[SPLAT_Y_MAX], tiles_y);
-        for (uint y = span_y.x; y < span_y.y; y++)
-            for (uint x = span_x.x; x < span_x.y; x++)
-                touched += touches_tile(splat, x, y) ? 1 : 0;
-    }
-    tile_count[i] = touched;
+    VF fields[RECORD];
+    for (uint k = 0; k < RECORD; k++)
+        fields[k] = (VF)(splat[k]);
+    const footprint_t f = footprint_of(fields, (VI)(-1), tiles_x, tiles_y);
+    float first_x[LANES], first_y[LANES], columns[LANES], rows[LANES];
+    VSTORE(f.first_x, first_x);
+    VSTORE(f.first_y, first_y);
+    VSTORE(f.columns, columns);
+    VSTORE(f.rows, rows);
+    for (uint row = 0; row < (uint)rows[0]; row++)
+        for (uint column = 0; column < (uint)columns[0]; column++)
+            if (ANY(touches_tile(&f, (float)column, (float)row))) {
+                pair_tile[pair] = ((uint)first_y[0] + row) * tiles_x + (uint)first_x[0] + column;
+                pair_splat[pair] = i;
+                pair++;
+            }
 }
 
 /* One item = one place of `order`.  No local memory. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void emit_pairs(
     __global const float *restrict splats,       // [N,RECORD]
+    __global const uint *restrict tile_box,      // [S] see tiles.h
+    __global const uint *restrict tile_mask,     // [S] see tiles.h
     __global const uint *restrict order,         // [N] Gaussian at each place
     __global const uint *restrict pair_offset,   // [N+1] first pair of each place
     __global uint *restrict pair_tile,           // [P]
@@ -49,16 +49,24 @@ void emit_pairs(
     first_pair[i] = pair;
     if (pair_offset[place + 1] == pair)
         return;
-    __global const float *splat = splats + (size_t)i * RECORD;
-    const uint2 span_x = tile_span(splat[SPLAT_X_MIN], splat[SPLAT_X_MAX], tiles_x);
-    const uint2 span_y = tile_span(splat[SPLAT_Y_MIN], splat[SPLAT_Y_MAX], tiles_y);
-    for (uint y = span_y.x; y < span_y.y; y++)
-        for (uint x = span_x.x; x < span_x.y; x++)
-            if (touches_tile(splat, x, y)) {
-                pair_tile[pair] = y * tiles_x + x;
-                pair_splat[pair] = i;
-                pair++;
-            }
+    const uint box = tile_box[i], width = box >> (2 * BOX_BITS), low = (1u << BOX_BITS) - 1;
+    if (width == 0) {
+        emit_large(splats + (size_t)i * RECORD, pair, i, pair_tile, pair_splat, tiles_x, tiles_y);
+        return;
+    }
+    uint tile = (box >> BOX_BITS & low) * tiles_x + (box & low), column = 0;
+    for (uint mask = tile_mask[i]; mask != 0; mask >>= 1) {
+        if (mask & 1u) {
+            pair_tile[pair] = tile + column;
+            pair_splat[pair] = i;
+            pair++;
+        }
+        column++;
+        if (column == width) {
+            column = 0;
+            tile += tiles_x;
+        }
+    }
 }
 
 /* Where each tile's pairs begin in the list sorted by tile.  One item = one pair, and one past the last. */

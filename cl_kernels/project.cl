@@ -8,7 +8,7 @@
  * One item = LANES Gaussians.  No local memory.  Deterministic: no item writes what another reads. */
 #include "gaussian.h"
 #include "harmonics.h"
-#include "splat.h"
+#include "tiles.h"
 
 /* Unit direction from the camera to LANES Gaussians; returns 1 / distance. */
 static inline VF view_direction(
@@ -33,7 +33,7 @@ static inline void add_band(const uint first, const uint last, const VF *basis, 
             colour[channel] += basis[k] * VLOAD(sh_rest + ((k - 1) * 3 + channel) * stride + i);
 }
 
-/* Splat records, depth keys and 3-sigma radii. */
+/* Splat records, depth keys, 3-sigma radii and the tiles that each splat touches. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void project_forward(
     __global const float *restrict means,            // [3,S] scene units
@@ -45,7 +45,10 @@ void project_forward(
     __global const float *restrict filter_variance,  // [S] scene units^2
     __constant camera_t *restrict camera,            // [1]
     __global float *restrict splats,                 // [N,RECORD] see splat.h
-    __global uint *restrict depth_key,               // [N] bits of z, all ones when culled
+    __global uint *restrict depth_key,               // [S] bits of z, all ones when culled
+    __global uint *restrict tile_count,              // [S] tiles touched; 0 when culled
+    __global uint *restrict tile_box,                // [S] see tiles.h
+    __global uint *restrict tile_mask,               // [S] see tiles.h
     __global float *restrict radius,                 // [S] px, 3 sigma; 0 when outside the tile grid
     const float near_plane,                          // scene units
     const float screen_variance,                     // px^2
@@ -100,15 +103,19 @@ void project_forward(
         u, v, s.conic_xx, s.conic_xy, s.conic_yy, opacity,
         larger(colour[0], zero), larger(colour[1], zero), larger(colour[2], zero),
         v - half_y, v + half_y, u - half_x, u + half_x, power_min, zero, zero};
-    float table[RECORD][LANES];
-    for (uint k = 0; k < RECORD; k++)
-        VSTORE((visible ? fields[k] : zero), table[k]);
-    int key[LANES];
-    VSTORE((visible ? as_VI(s.z) : (VI)(-1)), key);
-    for (uint lane = 0; lane < LANES && i + lane < count; lane++) {
-        for (uint k = 0; k < RECORD; k++)
-            splats[(size_t)(i + lane) * RECORD + k] = table[k][lane];
-        depth_key[i + lane] = as_uint(key[lane]);
+    const footprint_t footprint = footprint_of(fields, visible, camera->tiles_x, camera->tiles_y);
+    VI mask;
+    VSTORE(count_tiles(&footprint, &mask), (__global int *)tile_count + i);
+    VSTORE(mask, (__global int *)tile_mask + i);
+    VSTORE(box_of(&footprint), (__global int *)tile_box + i);
+    VSTORE((visible ? as_VI(s.z) : (VI)(-1)), (__global int *)depth_key + i);
+    for (uint part = 0; part < RECORD; part += LANES) {
+        VF rows[LANES];
+        for (uint k = 0; k < LANES; k++)
+            rows[k] = visible ? fields[part + k] : zero;
+        transpose(rows);
+        for (uint lane = 0; lane < LANES && i + lane < count; lane++)
+            VSTORE(rows[lane], splats + (size_t)(i + lane) * RECORD + part);
     }
 }
 

@@ -76,7 +76,8 @@ static inline contribution_t contribution_of(const row_splat_t s, const VF pixel
     contribution_t k;
     k.dx = s.x - pixel;
     const VF power = (k.dx * s.a - s.b) * k.dx - s.c;
-    k.uncapped = s.opacity * exp_power(power);
+    /* no pixel that is hit needs the bound; without it, far ones get subnormal numbers, which cost dearly */
+    k.uncapped = s.opacity * exp_power(larger(power, (VF)(POWER_MIN)));
     const VF alpha = smaller(k.uncapped, (VF)(ALPHA_MAX));
     k.hit = (power >= s.power_min) & (power <= 0.0f);
     k.remain = 1.0f - alpha;
@@ -133,39 +134,6 @@ static inline void blend_backward_step(grad_pixels_t *p, const row_splat_t s, co
     m->red += k.weight * p->red;
     m->green += k.weight * p->green;
     m->blue += k.weight * p->blue;
-}
-
-/* ---- tiles ---- */
-
-/* First and one past the last tile along one axis whose pixel centres reach into [low, high] px. */
-static inline uint2 tile_span(const float low, const float high, const uint tiles)
-{
-    const float first = ceil((low - (TILE - 0.5f)) * (1.0f / TILE));
-    const float last = floor((high - 0.5f) * (1.0f / TILE)) + 1.0f;
-    const float limit = (float)tiles;
-    return (uint2)((uint)(first > 0.0f ? (first < limit ? first : limit) : 0.0f),
-                   (uint)(last > 0.0f ? (last < limit ? last : limit) : 0.0f));
-}
-
-static inline float clamp_to(const float x, const float low, const float high)
-{
-    return x < low ? low : (x > high ? high : x);
-}
-
-/* Whether the splat's ellipse reaches a pixel centre's rectangle: the least -power over it lies at the mean or on the
- * edges facing it, where it is a parabola (algorithm of StopThePop, Radl et al. 2024). */
-static inline bool touches_tile(__global const float *splat, const uint tile_x, const uint tile_y)
-{
-    const float xx = splat[SPLAT_XX], xy = splat[SPLAT_XY], yy = splat[SPLAT_YY];
-    const float x0 = tile_x * TILE + 0.5f - splat[SPLAT_X], x1 = x0 + (TILE - 1);
-    const float y0 = tile_y * TILE + 0.5f - splat[SPLAT_Y], y1 = y0 + (TILE - 1);
-    const float x = clamp_to(0.0f, x0, x1), y = clamp_to(0.0f, y0, y1);
-    const float best_y = clamp_to(-xy * x / yy, y0, y1);
-    const float best_x = clamp_to(-xy * y / xx, x0, x1);
-    const float on_vertical = 0.5f * (xx * x * x + yy * best_y * best_y) + xy * x * best_y;
-    const float on_horizontal = 0.5f * (xx * best_x * best_x + yy * y * y) + xy * best_x * y;
-    const float least = on_vertical < on_horizontal ? on_vertical : on_horizontal;
-    return least <= 0.5f * EXTENT_SLACK - splat[SPLAT_POWER_MIN];
 }
 
 #endif

@@ -1,6 +1,6 @@
 """From Gaussians and a camera to an image, and from the image's gradient back to the Gaussians'."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -8,7 +8,7 @@ import numpy as np
 from clsplat.gaussians.model import Gradients, Model
 from clsplat.opencl.device import Array, Device
 from clsplat.opencl.program import constants
-from clsplat.render.tiles import Sort, TileLists, Tiler
+from clsplat.render.tiles import Footprints, Sort, TileLists, Tiler
 from clsplat.render.workspace import Workspace
 from clsplat.scene.scene import View
 
@@ -106,17 +106,17 @@ class Renderer:
         gaussians, array = model.gaussians, self.workspace.array
         count, stride = gaussians.count, gaussians.capacity
         splats = array("splats", (count, RECORD))
-        depth_key = array("depth_key", count, np.uint32)
+        footprints = Footprints(*(array(field.name, stride, np.uint32) for field in fields(Footprints)))
         radius = array("radius", stride)
         self._project.project_forward(
             items=-(-count // self._lanes),
             **self._shape_arguments(model, camera),
             sh_base=gaussians["sh_base"],
             splats=splats,
-            depth_key=depth_key,
+            **vars(footprints),
             radius=radius,
         )
-        lists = self.tiler.build(splats, depth_key, camera.tiles_x, camera.tiles_y, count)
+        lists = self.tiler.build(splats, footprints, camera.tiles_x, camera.tiles_y, count)
         image = array("image", (3, camera.rows, camera.stride))
         transmittance = array("transmittance", (camera.rows, camera.stride))
         tile_last = array("tile_last", camera.tiles, np.uint32)

@@ -19,13 +19,23 @@ TRIALS = 3  # of each sort when `auto` measures
 
 
 @dataclass(frozen=True)
+class Footprints:
+    """Where each splat lies in depth and on the grid of tiles, [S] uint32 each; see cl_kernels/tiles.h."""
+
+    depth_key: Array
+    tile_count: Array
+    tile_box: Array
+    tile_mask: Array
+
+
+@dataclass(frozen=True)
 class TileLists:
     """Pairs in emission order, where the pairs of one Gaussian are contiguous, and the order of each tile."""
 
     pairs: int
     pair_splat: Array  # [P] Gaussian of each pair
     first_pair: Array  # [N] first pair of each Gaussian
-    tile_count: Array  # [N] pairs of each Gaussian
+    tile_count: Array  # [S] pairs of each Gaussian
     tile_offset: Array  # [T+1]
     tile_pairs: Array  # [P] pairs ordered by tile, front to back
 
@@ -43,14 +53,11 @@ class Tiler:
         self._digit_bits = int(device.tuning["DIGIT_BITS"])
         self._zero = device.zeros(1, np.uint32)
 
-    def build(self, splats: Array, depth_key: Array, tiles_x: int, tiles_y: int, count: int) -> TileLists:
+    def build(self, splats: Array, footprints: Footprints, tiles_x: int, tiles_y: int, count: int) -> TileLists:
         """Make the tile lists of `count` splat records.  Reads the number of pairs back: the frame's one wait."""
         if self.sort == "auto":
-            self.sort = self._faster(splats, depth_key, tiles_x, tiles_y, count)
-        tile_count = self.workspace.array("tile_count", count, np.uint32)
-        grid = {"tiles_x": tiles_x, "tiles_y": tiles_y}
-        self._pairs.count_tiles(items=count, splats=splats, tile_count=tile_count, **grid, count=count)
-
+            self.sort = self._faster(splats, footprints, tiles_x, tiles_y, count)
+        depth_key, tile_count = footprints.depth_key, footprints.tile_count
         order = self._depth_order(depth_key, count) if self.sort == "radix" else self._index_order(count)
         ordered_count = self.workspace.array("ordered_count", count, np.uint32)
         self._scan.permute(items=count, values=tile_count, order=order, permuted=ordered_count, count=count)
@@ -63,12 +70,15 @@ class Tiler:
         self._pairs.emit_pairs(
             items=count,
             splats=splats,
+            tile_box=footprints.tile_box,
+            tile_mask=footprints.tile_mask,
             order=order,
             pair_offset=pair_offset,
             pair_tile=pair_tile,
             pair_splat=pair_splat,
             first_pair=first_pair,
-            **grid,
+            tiles_x=tiles_x,
+            tiles_y=tiles_y,
             count=count,
         )
         tiles = tiles_x * tiles_y
@@ -169,14 +179,14 @@ class Tiler:
         self._bitonic.sort_tiles(groups=tiles, tile_offset=tile_offset, tile_depth=tile_depth, tile_pairs=tile_pairs)
         return tile_offset, tile_pairs
 
-    def _faster(self, splats: Array, depth_key: Array, tiles_x: int, tiles_y: int, count: int) -> Sort:
+    def _faster(self, splats: Array, footprints: Footprints, tiles_x: int, tiles_y: int, count: int) -> Sort:
         seconds: dict[Sort, float] = {}
         for sort in ("radix", "bitonic"):
             self.sort = sort
             times = []
             for _ in range(1 + TRIALS):  # the first one compiles
                 start = time.perf_counter()
-                self.build(splats, depth_key, tiles_x, tiles_y, count)
+                self.build(splats, footprints, tiles_x, tiles_y, count)
                 self.device.finish()
                 times.append(time.perf_counter() - start)
             seconds[sort] = min(times[1:])

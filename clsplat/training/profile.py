@@ -6,7 +6,6 @@ from clsplat.opencl.device import Timings
 
 STAGES = {
     "project_forward": "project",
-    "count_tiles": "pairs",
     "permute": "pairs",
     "emit_pairs": "pairs",
     "find_tile_offsets": "pairs",

@@ -1,0 +1,93 @@
+/* Which tiles splats touch: LANES splats at once, or one splat in every lane.
+ *
+ * The rectangle of tiles around a splat's extent holds `columns` x `rows` tiles; each is tested exactly.  A footprint
+ * is what pairs are emitted from: the rectangle's corner and width in `tile_box`, and one bit per touched tile in
+ * `tile_mask` where the rectangle has no more than 32 tiles; larger ones have width 0 there and are tested again. */
+#ifndef CLSPLAT_TILES_H
+#define CLSPLAT_TILES_H
+#include "splat.h"
+
+#define BOX_BITS 12        // of a tile's column and row: images up to 4096 tiles wide
+#define BOX_TILES_MAX 32   // bits of a mask
+
+typedef struct {
+    VF x, y;               // mean, px
+    VF xx, xy, yy;         // conic, px^-2
+    VF along_x, along_y;   // where the ellipse is highest over x, and furthest right over y: -xy/yy, -xy/xx
+    VF reach;              // the least power at which alpha is 1/255, without its sign, and the slack
+    VF first_x, first_y;   // corner of the rectangle, tiles
+    VF columns, rows;      // its size, tiles; none when the splat is not visible
+} footprint_t;
+
+static inline VF clamp_to(const VF x, const VF low, const VF high) { return smaller(larger(x, low), high); }
+
+/* First and one past the last tile along one axis whose pixel centres reach into [low, high] px. */
+static inline VF first_tile(const VF low, const uint tiles)
+{
+    return ceil(clamp_to((low - (TILE - 0.5f)) * (1.0f / TILE), (VF)(0.0f), (VF)(tiles)));
+}
+
+static inline VF end_tile(const VF high, const uint tiles)
+{
+    return clamp_to(floor(clamp_to((high - 0.5f) * (1.0f / TILE), (VF)(-1.0f), (VF)(tiles))) + 1.0f,
+                    (VF)(0.0f), (VF)(tiles));
+}
+
+/* The footprint of splats given by the fields of their records. */
+static inline footprint_t footprint_of(const VF *splat, const VI visible, const uint tiles_x, const uint tiles_y)
+{
+    const VF zero = (VF)(0.0f);
+    footprint_t f;
+    f.x = splat[SPLAT_X];
+    f.y = splat[SPLAT_Y];
+    f.xx = splat[SPLAT_XX];
+    f.xy = splat[SPLAT_XY];
+    f.yy = splat[SPLAT_YY];
+    f.along_x = -f.xy / f.yy;
+    f.along_y = -f.xy / f.xx;
+    f.reach = 0.5f * EXTENT_SLACK - splat[SPLAT_POWER_MIN];
+    f.first_x = first_tile(splat[SPLAT_X_MIN], tiles_x);
+    f.first_y = first_tile(splat[SPLAT_Y_MIN], tiles_y);
+    f.columns = visible ? larger(end_tile(splat[SPLAT_X_MAX], tiles_x) - f.first_x, zero) : zero;
+    f.rows = visible ? larger(end_tile(splat[SPLAT_Y_MAX], tiles_y) - f.first_y, zero) : zero;
+    return f;
+}
+
+/* Whether the ellipse reaches a pixel centre of the tile in `column` and `row` of the rectangle: the least -power over
+ * the centres' rectangle lies at the mean or on the edges facing it, where it is a parabola (the test of StopThePop,
+ * Radl et al. 2024). */
+static inline VI touches_tile(const footprint_t *f, const float column, const float row)
+{
+    const VF x0 = (f->first_x + column) * TILE + 0.5f - f->x, x1 = x0 + (TILE - 1.0f);
+    const VF y0 = (f->first_y + row) * TILE + 0.5f - f->y, y1 = y0 + (TILE - 1.0f);
+    const VF x = clamp_to((VF)(0.0f), x0, x1), y = clamp_to((VF)(0.0f), y0, y1);
+    const VF best_y = clamp_to(f->along_x * x, y0, y1);
+    const VF best_x = clamp_to(f->along_y * y, x0, x1);
+    const VF on_vertical = 0.5f * (f->xx * x * x + f->yy * best_y * best_y) + f->xy * x * best_y;
+    const VF on_horizontal = 0.5f * (f->xx * best_x * best_x + f->yy * y * y) + f->xy * best_x * y;
+    return (smaller(on_vertical, on_horizontal) <= f->reach) & (column < f->columns) & (row < f->rows);
+}
+
+/* How many tiles each splat touches; their mask. */
+static inline VI count_tiles(const footprint_t *f, VI *mask)
+{
+    const VI columns = to_VI(f->columns), zero = (VI)(0);
+    VI count = zero;
+    *mask = zero;
+    for (int row = 0; ANY((float)row < f->rows); row++)
+        for (int column = 0; ANY((column < columns) & ((float)row < f->rows)); column++) {
+            const VI touched = touches_tile(f, (float)column, (float)row);
+            count += touched ? (VI)(1) : zero;
+            *mask |= touched ? (VI)(1) << ((row * columns + column) & 31) : zero;
+        }
+    return count;
+}
+
+/* Corner and width of the rectangles; width 0 where a mask cannot hold them. */
+static inline VI box_of(const footprint_t *f)
+{
+    const VI width = f->columns * f->rows <= (float)BOX_TILES_MAX ? to_VI(f->columns) : (VI)(0);
+    return to_VI(f->first_x) | to_VI(f->first_y) << BOX_BITS | width << (2 * BOX_BITS);
+}
+
+#endif
