@@ -88,8 +88,7 @@ class Contestant:
         self.device.timings.sampling = record
         start = time.perf_counter()
         view = differentiate(self.renderer, self.model, self.target, self.background, self.losses)
-        self.stats.add(view.frame, view.gradients)
-        self.adam.step(self.model, view.gradients, self.rates)
+        self.stats.add(view.frame, self.adam.update(self.model, view.frame, view.moments, self.rates))
         self.device.finish()
         seconds = time.perf_counter() - start
         self.device.timings.sampling = False
@@ -150,9 +149,8 @@ def floors(work: Work, peaks: Peaks) -> dict[str, float]:
         "loss": floor(1250 * pixels, 60 * pixels),
         "blend backward": floor(vector * (80 * work.rows + 60 * pairs), 128 * pairs),
         "sum records": floor(9 * pairs, 64 * pairs + 36 * n),
-        "project backward": floor(900 * n, (236 + 36 + 64 + 236) * n),
+        "update": floor((900 + 12 * 59) * n, (64 + 36 + 8 + 24 * 59) * n),
         "statistics": floor(0, 20 * n),
-        "adam": floor(12 * 59 * n, 28 * 59 * n),
     }
 
 

@@ -5,6 +5,7 @@ to another one in silence.
 """
 
 import logging
+import math
 import os
 import warnings
 from collections import defaultdict
@@ -146,7 +147,7 @@ class Array:
 
     @property
     def nbytes(self) -> int:
-        return int(np.prod(self.shape, dtype=np.int64)) * self.dtype.itemsize
+        return math.prod(self.shape) * self.dtype.itemsize
 
     def get(self) -> NDArray[Any]:
         """Copy to the host; waits for the device."""
@@ -198,7 +199,7 @@ class Device:
         """Allocate without initialising.  Raises MemoryLimitError with the sizes involved."""
         shape = (shape,) if isinstance(shape, int) else shape
         kind = np.dtype(dtype)
-        size = _whole_lines(int(np.prod(shape, dtype=np.int64)) * kind.itemsize)
+        size = _whole_lines(math.prod(shape) * kind.itemsize)
         if size > self.info.allocation:
             raise MemoryLimitError(
                 f"one buffer of {size / 2**20:.0f} MiB is more than {self.info.name} allows "

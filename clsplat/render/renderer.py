@@ -99,7 +99,6 @@ class Renderer:
         self._blend = device.program(f"blend_{device.schedule}.cl")
         self._gather = device.program("gather.cl")
         self._lanes = int(device.tuning["LANES"])
-        self._gradients: Gradients | None = None
 
     def forward(self, model: Model, camera: DeviceCamera, background: Array) -> Frame:
         """Render the model.  background: [3]."""
@@ -110,7 +109,7 @@ class Renderer:
         radius = array("radius", stride)
         self._project.project_forward(
             items=-(-count // self._lanes),
-            **self._shape_arguments(model, camera),
+            **shape_arguments(model, camera),
             sh_base=gaussians["sh_base"],
             splats=splats,
             **vars(footprints),
@@ -134,10 +133,12 @@ class Renderer:
         )
         return Frame(camera, splats, radius, lists, tile_last, image, transmittance)
 
-    def backward(self, model: Model, frame: Frame, grad_image: Array) -> Gradients:
-        """Differentiate the last frame.  grad_image: [3, rows, stride], zero outside the image."""
+    def moments(self, model: Model, frame: Frame, grad_image: Array) -> Array:
+        """Sums over each Gaussian's pixels that its gradients are made of, [MOMENTS, S]; see cl_kernels/splat.h.
+
+        grad_image: [3, rows, stride], zero outside the image.
+        """
         gaussians, lists = model.gaussians, frame.lists
-        count, stride = gaussians.count, gaussians.capacity
         pair_moments = self.workspace.array("pair_moments", (lists.pairs, RECORD))
         self._blend.blend_backward(
             groups=frame.camera.tiles,
@@ -151,42 +152,42 @@ class Renderer:
             tile_last=frame.tile_last,
             pair_moments=pair_moments,
         )
-        moments = self.workspace.array("moments", (MOMENTS, stride))
-        items = -(-count // self._lanes)
+        moments = self.workspace.array("moments", (MOMENTS, gaussians.capacity))
         self._gather.sum_records(
-            items=items,
+            items=-(-gaussians.count // self._lanes),
             pair_moments=pair_moments,
             first_pair=lists.first_pair,
             tile_count=lists.tile_count,
             moments=moments,
-            stride=stride,
-            count=count,
+            stride=gaussians.capacity,
+            count=gaussians.count,
         )
-        gradients = self._fresh_gradients(model)
+        return moments
+
+    def gradients(self, model: Model, frame: Frame, moments: Array) -> Gradients:
+        """Derivatives of the loss by every parameter of the model that made the frame."""
+        gradients = Gradients(model.gaussians)
         self._project.project_backward(
-            items=items,
-            **self._shape_arguments(model, frame.camera),
+            items=-(-model.gaussians.count // self._lanes),
+            **shape_arguments(model, frame.camera),
             splats=frame.splats,
             moments=moments,
             **gradients.arguments(),
         )
         return gradients
 
-    def _shape_arguments(self, model: Model, camera: DeviceCamera) -> dict[str, Any]:
-        gaussians = model.gaussians
-        names = ("means", "quats", "log_scales", "logit_opacity", "sh_rest", "filter_variance")
-        return {
-            **{name: gaussians[name] for name in names},
-            "camera": camera.array,
-            "near_plane": model.near,
-            "screen_variance": model.screen_variance,
-            "compensate": model.compensate,
-            "degree": model.degree,
-            "stride": gaussians.capacity,
-            "count": gaussians.count,
-        }
 
-    def _fresh_gradients(self, model: Model) -> Gradients:
-        if self._gradients is None or self._gradients.capacity != model.gaussians.capacity:
-            self._gradients = Gradients(model.gaussians)
-        return self._gradients
+def shape_arguments(model: Model, camera: DeviceCamera) -> dict[str, Any]:
+    """What every kernel takes that projects Gaussians, by the names of its arguments."""
+    gaussians = model.gaussians
+    names = ("means", "quats", "log_scales", "logit_opacity", "sh_rest", "filter_variance")
+    return {
+        **{name: gaussians[name] for name in names},
+        "camera": camera.array,
+        "near_plane": model.near,
+        "screen_variance": model.screen_variance,
+        "compensate": model.compensate,
+        "degree": model.degree,
+        "stride": gaussians.capacity,
+        "count": gaussians.count,
+    }

@@ -1,5 +1,7 @@
 """Device memory that a frame needs and the next one reuses."""
 
+import math
+
 import numpy as np
 from numpy.typing import DTypeLike
 
@@ -19,7 +21,7 @@ class Workspace:
         """Return an array of that shape, with whatever the buffer held before."""
         shape = (shape,) if isinstance(shape, int) else shape
         kind = np.dtype(dtype)
-        length = int(np.prod(shape, dtype=np.int64))
+        length = math.prod(shape)
         held = self._arrays.get(name)
         if held is None or held.nbytes < length * kind.itemsize:
             grown = length if held is None else int(length * GROWTH)

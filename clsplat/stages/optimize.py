@@ -92,11 +92,17 @@ class Optimize(Stage):
         run.device.timings.sampling = run.step % self.log_every == self.log_every // 2
         model, target = run.trained, run.targets.get(run.train_view())
         view = differentiate(run.renderer, model, target, run.targets.background_array, self.losses)
-        run.stats.add(view.frame, view.gradients)
         stale = {name for stage in self.during if stage.due(run.step) for name in stage.stale(run)}
         if run.stage_step == self.steps:
             stale = set()
-        run.adam.step(model, view.gradients, self.rates.at(run.step, run.scene.extent), without=stale)
+        rates = self.rates.at(run.step, run.scene.extent)
+        if stale:
+            gradients = run.renderer.gradients(model, view.frame, view.moments)
+            run.adam.step(model, gradients, rates, without=stale)
+            grad_mean2d = gradients.mean2d
+        else:
+            grad_mean2d = run.adam.update(model, view.frame, view.moments, rates)
+        run.stats.add(view.frame, grad_mean2d)
         run.device.timings.sampling = False
         return view
 

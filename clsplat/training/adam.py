@@ -2,12 +2,14 @@
 
 import math
 from collections.abc import Collection
-from typing import Annotated
+from typing import Annotated, Any
 
 from pydantic import Field
 
 from clsplat.gaussians.model import PARAMETERS, Gaussians, Gradients, Model, sh_coefficients
+from clsplat.opencl.device import Array
 from clsplat.opencl.program import constants
+from clsplat.render.renderer import Frame, shape_arguments
 from clsplat.settings import Settings
 
 Rate = Annotated[float, Field(ge=0)]
@@ -49,13 +51,36 @@ class Adam:
         self.updates = dict.fromkeys(PARAMETERS, 0)
         self._program = gaussians.device.program("adam.cl")
         self._lanes = int(gaussians.device.tuning["LANES"])
-        self._beta1, self._beta2 = constants("adam.cl")["BETA1"], constants("adam.cl")["BETA2"]
+        self._beta1, self._beta2 = constants("adam.h")["BETA1"], constants("adam.h")["BETA2"]
         for name in PARAMETERS:
             for moment in self._moments(name):
                 gaussians.add(moment, gaussians.tables[name].components, zero_fresh=True)
 
+    def update(self, model: Model, frame: Frame, moments: Array, rates: dict[str, float]) -> Array:
+        """Update every parameter from the moments of the frame's pixels, [MOMENTS, S].
+
+        Returns the gradient of the projected means, [2, S] px⁻¹.
+        """
+        gaussians = self.gaussians
+        grad_mean2d = gaussians.device.empty((2, gaussians.capacity))
+        arguments: dict[str, Any] = {"sh_base": gaussians["sh_base"]}
+        for name in PARAMETERS:
+            moment1, moment2 = self._moments(name)
+            rate, correction2 = self._factors(name, rates)
+            arguments |= {f"{name}_moment1": gaussians[moment1], f"{name}_moment2": gaussians[moment2]}
+            arguments |= {f"{name}_rate": rate, f"{name}_correction2": correction2}
+        self._program.update_gaussians(
+            items=-(-gaussians.count // self._lanes),
+            **shape_arguments(model, frame.camera),
+            **arguments,
+            splats=frame.splats,
+            moments=moments,
+            grad_mean2d=grad_mean2d,
+        )
+        return grad_mean2d
+
     def step(self, model: Model, gradients: Gradients, rates: dict[str, float], without: Collection[str] = ()) -> None:
-        """Update every parameter but those named in `without`.
+        """Update every parameter but those named in `without` from gradients in memory.
 
         Bands above the active SH degree have neither gradient nor moments, so leaving them out changes nothing.
         """
@@ -66,19 +91,25 @@ class Adam:
             components = gaussians.tables[name].components
             if name == "sh_rest":
                 components = 3 * (sh_coefficients(model.degree) - 1)
-            self.updates[name] += 1
             moment1, moment2 = self._moments(name)
+            rate, correction2 = self._factors(name, rates)
             self._program.adam_step(
                 items=(-(-gaussians.count // self._lanes), components),
                 values=gaussians[name],
                 gradient=gradients[name],
                 moment1=gaussians[moment1],
                 moment2=gaussians[moment2],
-                rate=rates[name] / (1 - self._beta1 ** self.updates[name]),
-                correction2=1 / (1 - self._beta2 ** self.updates[name]),
+                rate=rate,
+                correction2=correction2,
                 stride=gaussians.capacity,
                 count=gaussians.count,
             )
+
+    def _factors(self, name: str, rates: dict[str, float]) -> tuple[float, float]:
+        """Rate and second factor of a parameter's next update, corrected for the moments' start at zero."""
+        self.updates[name] += 1
+        updates = self.updates[name]
+        return rates[name] / (1 - self._beta1**updates), 1 / (1 - self._beta2**updates)
 
     def forget(self, name: str) -> None:
         """Zero the moments of one parameter."""

@@ -12,7 +12,8 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from clsplat.gaussians.model import Gaussians, Gradients
+from clsplat.gaussians.model import Gaussians
+from clsplat.opencl.device import Array
 from clsplat.render.renderer import Frame
 from clsplat.render.tiles import Tiler
 from clsplat.settings import Settings
@@ -31,12 +32,12 @@ class SplatStats:
         for name in (SCREEN_GRAD, SEEN):
             gaussians.add(name, 1, zero_fresh=True)
 
-    def add(self, frame: Frame, gradients: Gradients) -> None:
-        """Add one view.  Gradients count in normalised device coordinates, as the published thresholds do."""
+    def add(self, frame: Frame, grad_mean2d: Array) -> None:
+        """Add one view.  grad_mean2d: [2, S] px⁻¹; it counts in normalised device coordinates, as published."""
         gaussians = self.gaussians
         self._program.accumulate_stats(
             items=gaussians.count,
-            grad_mean2d=gradients.mean2d,
+            grad_mean2d=grad_mean2d,
             radius=frame.radius,
             screen_grad=gaussians[SCREEN_GRAD],
             seen=gaussians[SEEN],

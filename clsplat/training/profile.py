@@ -24,9 +24,10 @@ STAGES = {
     "ssim_gradient": "loss",
     "blend_backward": "blend backward",
     "sum_records": "sum records",
-    "project_backward": "project backward",
+    "project_backward": "update",
+    "adam_step": "update",
+    "update_gaussians": "update",
     "accumulate_stats": "statistics",
-    "adam_step": "adam",
 }
 ORDER = tuple(dict.fromkeys(STAGES.values()))
 

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from clsplat.gaussians.model import Gradients, Model
+from clsplat.gaussians.model import Model
 from clsplat.opencl.device import Array
 from clsplat.render.renderer import Frame, Renderer
 from clsplat.training.losses import Comparison, Loss, Term
@@ -12,22 +12,22 @@ from clsplat.training.targets import Target, unpack
 
 @dataclass(frozen=True)
 class Differentiated:
-    """A view's frame, its losses and their gradients; valid until the next one."""
+    """A view's frame, its losses and what their gradients are made of; valid until the next one."""
 
     frame: Frame
     comparison: Comparison
     terms: list[Term]
-    gradients: Gradients
+    moments: Array  # [MOMENTS, S]
 
 
 def differentiate(
     renderer: Renderer, model: Model, target: Target, background: Array, losses: Sequence[Loss]
 ) -> Differentiated:
-    """Return the gradients of the sum of `losses` at one view.  background: [3]."""
+    """Return the derivative of the sum of `losses` at one view, as moments of pixels.  background: [3]."""
     workspace, camera = renderer.workspace, target.camera
     frame = renderer.forward(model, camera, background)
     photograph = unpack(workspace, camera, target.pixels)
     gradient = workspace.array("grad_image", (3, camera.rows, camera.stride))
     comparison = Comparison(workspace, camera, frame.image, photograph, gradient)
     terms = [loss.add(comparison) for loss in losses]
-    return Differentiated(frame, comparison, terms, renderer.backward(model, frame, gradient))
+    return Differentiated(frame, comparison, terms, renderer.moments(model, frame, gradient))

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from clsplat.gaussians.model import PARAMETERS, Gradients
+from clsplat.render.renderer import Renderer
 from clsplat.training.adam import Adam, Rates
 from tests import reference_loss as ref_loss
-from tests.scenes import random_case
+from tests.scenes import random_case, with_world_filter
 
 
 @pytest.mark.parametrize("count", [1, 15, 16, 17, 64, 65])
@@ -40,6 +41,35 @@ def test_steps(device, rng, count):
             rtol=1e-5,
             atol=1e-6 * np.abs(moments[name][0]).max(),
         )
+
+
+@pytest.mark.parametrize("count", [1, 17, 64, 150])
+@pytest.mark.parametrize("degree", [0, 2, 3])
+def test_update_on_the_way_equals_gradients_in_memory(device, rng, count, degree):
+    """update_gaussians against project_backward and adam_step, bit for bit, moments and screen gradients too."""
+    case = with_world_filter(random_case(rng, count, degree=degree, compensate=1.0), rng)
+    case.parameters["means"][1::5] -= 20 * case.view.world_to_camera[2, :3]  # behind the camera
+    weights = rng.normal(size=(3, 32, 48)).astype(np.float32)
+    weights[:, 30:], weights[:, :, 40:] = 0, 0
+    tables = []
+    for fused in (False, True):
+        renderer, model = Renderer(device, "radix"), case.model(device)
+        camera = case.device_camera(device)
+        adam, rates = Adam(model.gaussians), Rates().at(3, extent=2.0)
+        for _ in range(2):
+            frame = renderer.forward(model, camera, device.zeros(3))
+            moments = renderer.moments(model, frame, device.upload(weights[:, : camera.rows, : camera.stride].copy()))
+            if fused:
+                grad_mean2d = adam.update(model, frame, moments, rates)
+            else:
+                gradients = renderer.gradients(model, frame, moments)
+                adam.step(model, gradients, rates)
+                grad_mean2d = gradients.mean2d
+        mean2d = grad_mean2d.get()[:, :count]
+        tables.append({"mean2d": mean2d, **{name: model.gaussians.get(name) for name in model.gaussians.tables}})
+    assert count == 1 or (tables[0]["means"] != case.parameters["means"]).any()
+    for name, table in tables[0].items():
+        np.testing.assert_array_equal(tables[1][name], table, err_msg=name)
 
 
 def test_bands_above_the_active_degree_stay(device, rng):

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from clsplat.gaussians.model import Gradients
 from clsplat.render.renderer import CAMERA, MOMENTS, RECORD, Renderer
 from tests import reference as ref
 from tests.scenes import Case, random_case, relative_error, with_world_filter
@@ -109,14 +108,7 @@ def backward_case(device, rng, case: Case) -> None:
     drawn = frame.splats.get()[:, 5] > 0
     moments = np.zeros((MOMENTS, gaussians.capacity), np.float32)
     moments[:, : gaussians.count] = rng.normal(size=(MOMENTS, gaussians.count)) * drawn
-    gradients = Gradients(gaussians)
-    device.program("project.cl").project_backward(
-        items=-(-gaussians.count // int(device.tuning["LANES"])),
-        **renderer._shape_arguments(model, camera),
-        splats=frame.splats,
-        moments=device.upload(moments),
-        **gradients.arguments(),
-    )
+    gradients = renderer.gradients(model, frame, device.upload(moments))
     m = moments[:, : gaussians.count].astype(np.float64).T
     a, b, c = truth.conic.T
     grad_mean2d = -np.stack([a * m[:, 1] + b * m[:, 2], b * m[:, 1] + c * m[:, 2]], axis=1)

@@ -1,0 +1,148 @@
+/* Gradients of a Gaussian's parameters from the summed moments of its pixels: the reverse of projection and colour,
+ * recomputing what the forward pass had.  Both ways of updating parameters use it, so they give the same bits. */
+#ifndef CLSPLAT_BACKWARD_H
+#define CLSPLAT_BACKWARD_H
+#include "gaussian.h"
+#include "harmonics.h"
+#include "splat.h"
+
+/* Unit direction from the camera to LANES Gaussians; returns 1 / distance. */
+static inline VF view_direction(
+    __global const float *means, __constant camera_t *camera, const uint stride, const uint i, VF *d)
+{
+    VF norm2 = (VF)(0.0f);
+    for (uint k = 0; k < 3; k++) {
+        d[k] = VLOAD(means + k * stride + i) - camera->position[k];
+        norm2 = norm2 + d[k] * d[k];
+    }
+    const VF inverse = 1.0f / sqrt(norm2 + 1.0e-30f);
+    for (uint k = 0; k < 3; k++)
+        d[k] = d[k] * inverse;
+    return inverse;
+}
+
+/* Gradients of the mean, quaternion and log-scales from the summed moments of a Gaussian's pixels. */
+static inline void shape_backward(const shape_t *s, __constant camera_t *camera, const VF *m,
+                                  const float compensate, VF *grad_mean2d, VF *grad_mean, VF *grad_quat, VF *grad_scale)
+{
+    __constant const float *w = camera->world_to_camera;
+    const VF a = s->conic_xx, b = s->conic_xy, c = s->conic_yy;
+    const VF gu = -(a * m[MOMENT_X] + b * m[MOMENT_Y]);
+    const VF gv = -(b * m[MOMENT_X] + c * m[MOMENT_Y]);
+
+    /* conic -> covariance: -K G K with G = ((gA, gB/2), (gB/2, gC)) */
+    const VF ga = -0.5f * m[MOMENT_XX], gb = -0.5f * m[MOMENT_XY], gc = -0.5f * m[MOMENT_YY];
+    const VF k00 = a * ga + b * gb, k01 = a * gb + b * gc, k10 = b * ga + c * gb, k11 = b * gb + c * gc;
+    /* energy of the screen filter: ratio = det0 / det1, d ratio = tr((adj(V0) / det1 - ratio K) dV) */
+    const VF energy2 = larger(1.0f + compensate * (s->ratio - 1.0f), (VF)(1.0e-12f));
+    const VF g_ratio = compensate * 0.5f * m[MOMENT_POWER] / energy2;
+    const VF g00 = g_ratio * (s->yy / s->determinant - s->ratio * a) - (k00 * a + k01 * b);
+    const VF g01 = g_ratio * (-s->xy / s->determinant - s->ratio * b) - (k00 * b + k01 * c);
+    const VF g11 = g_ratio * (s->xx / s->determinant - s->ratio * c) - (k10 * b + k11 * c);
+
+    /* covariance -> V = T M -> T, rotation, scales */
+    VF gt[6] = {0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f}, gr[9];
+    for (uint k = 0; k < 3; k++) {
+        const VF v0 = 2.0f * (g00 * s->v[k] + g01 * s->v[3 + k]);
+        const VF v1 = 2.0f * (g01 * s->v[k] + g11 * s->v[3 + k]);
+        VF g_filtered = (VF)(0.0f);
+        for (uint j = 0; j < 3; j++) {
+            const VF axis = s->rotation[3 * j + k] * s->filtered[k];
+            gt[j] += v0 * axis;
+            gt[3 + j] += v1 * axis;
+            const VF gm = s->t[j] * v0 + s->t[3 + j] * v1;
+            g_filtered += gm * s->rotation[3 * j + k];
+            gr[3 * j + k] = gm * s->filtered[k];
+        }
+        const VF inverse = 1.0f / s->filtered[k];
+        grad_scale[k] = (g_filtered * s->scale2[k] + m[MOMENT_POWER] * s->filter * inverse) * inverse;
+    }
+    rotation_backward(s->unit, s->inverse_norm, gr, grad_quat);
+
+    /* T = J W and the projected mean -> camera-space mean -> world */
+    VF j00 = (VF)(0.0f), j02 = (VF)(0.0f), j11 = (VF)(0.0f), j12 = (VF)(0.0f);
+    for (uint k = 0; k < 3; k++) {
+        j00 += gt[k] * w[k];
+        j02 += gt[k] * w[8 + k];
+        j11 += gt[3 + k] * w[4 + k];
+        j12 += gt[3 + k] * w[8 + k];
+    }
+    const VF zero = (VF)(0.0f), jx = camera->fx * s->inverse_z, jy = camera->fy * s->inverse_z;
+    const VF ray_x = s->free_x ? -jx * j02 : zero, ray_y = s->free_y ? -jy * j12 : zero;
+    const VF x_over_z = s->x * s->inverse_z, y_over_z = s->y * s->inverse_z;
+    const VF gx = jx * gu + ray_x * s->inverse_z;
+    const VF gy = jy * gv + ray_y * s->inverse_z;
+    const VF gz = -(jx * x_over_z * gu + jy * y_over_z * gv) -
+                  s->inverse_z * (jx * (j00 - s->ray_x * j02) + x_over_z * ray_x +
+                                  jy * (j11 - s->ray_y * j12) + y_over_z * ray_y);
+    for (uint k = 0; k < 3; k++)
+        grad_mean[k] = w[k] * gx + w[4 + k] * gy + w[8 + k] * gz;
+    grad_mean2d[0] = gu;
+    grad_mean2d[1] = gv;
+}
+
+/* The weight of each basis function in the derivative by direction: c_k . g. */
+static inline void weigh_band(const uint first, const uint last, const VF *grad_colour,
+                              __global const float *sh_rest, const uint stride, const uint i, VF *weights)
+{
+    for (uint k = first; k < last; k++) {
+        weights[k] = (VF)(0.0f);
+        for (uint channel = 0; channel < 3; channel++)
+            weights[k] += VLOAD(sh_rest + ((k - 1) * 3 + channel) * stride + i) * grad_colour[channel];
+    }
+}
+
+/* Gradients of everything but the coefficients of harmonics: those are basis[k] * colour[channel]. */
+typedef struct {
+    VI touched;      // the Gaussian was drawn; where not, all gradients are zero, whatever stands here
+    VF mean2d[2];    // px^-1
+    VF means[3], quats[4], log_scales[3], logit_opacity;
+    VF basis[16], colour[3];
+} gradient_t;
+
+static inline gradient_t gradient_of(
+    __global const float *means,            // [3,S] scene units
+    __global const float *quats,            // [4,S] unnormalised
+    __global const float *log_scales,       // [3,S] log of scene units
+    __global const float *logit_opacity,    // [S]
+    __global const float *sh_rest,          // [(K-1)*3,S] coefficient-major
+    __global const float *filter_variance,  // [S] scene units^2
+    __constant camera_t *camera,            // [1]
+    __global const float *splats,           // [N,RECORD] see splat.h
+    __global const float *moments,          // [MOMENTS,S] see splat.h
+    const float near_plane, const float screen_variance, const float compensate, const uint degree,
+    const uint stride, const uint count, const uint i)
+{
+    const shape_t s = shape_of(means, quats, log_scales, filter_variance, camera, near_plane, screen_variance,
+                               compensate, stride, i);
+    gradient_t g;
+    VF m[MOMENTS];
+    float table[4][LANES];
+    for (uint lane = 0; lane < LANES; lane++)
+        for (uint k = 0; k < 4; k++)
+            table[k][lane] = i + lane < count ? splats[(size_t)(i + lane) * RECORD + SPLAT_OPACITY + k] : 0.0f;
+    g.touched = VLOAD(table[0]) > 0.0f;  // culled records are all zero
+    for (uint k = 0; k < MOMENTS; k++)
+        m[k] = VLOAD(moments + k * stride + i);
+    for (uint channel = 0; channel < 3; channel++)  // max(0, .) passes no gradient where it clamped
+        g.colour[channel] = VLOAD(table[1 + channel]) > 0.0f ? m[MOMENT_RED + channel] : (VF)(0.0f);
+
+    shape_backward(&s, camera, m, compensate, g.mean2d, g.means, g.quats, g.log_scales);
+    VF d[3], weights[16], gd[3] = {0.0f, 0.0f, 0.0f};
+    const VF inverse_distance = view_direction(means, camera, stride, i, d);
+    harmonics_basis(degree, d[0], d[1], d[2], g.basis);
+    if (degree > 0)
+        weigh_band(1, 4, g.colour, sh_rest, stride, i, weights);
+    if (degree > 1)
+        weigh_band(4, 9, g.colour, sh_rest, stride, i, weights);
+    if (degree > 2)
+        weigh_band(9, 16, g.colour, sh_rest, stride, i, weights);
+    harmonics_direction_gradient(degree, d[0], d[1], d[2], weights, gd, gd + 1, gd + 2);
+    const VF along = d[0] * gd[0] + d[1] * gd[1] + d[2] * gd[2];
+    for (uint k = 0; k < 3; k++)
+        g.means[k] += (gd[k] - d[k] * along) * inverse_distance;
+    g.logit_opacity = m[MOMENT_POWER] * (1.0f - sigmoid(VLOAD(logit_opacity + i)));
+    return g;
+}
+
+#endif
