@@ -59,7 +59,11 @@ def run(
         return
     runner.prepare_folder(folder, resume)
     screen.log_to_file(folder / "log.txt")
-    state = runner.open_run(checked, folder, device)
+    try:
+        state = runner.open_run(checked, folder, device)
+    except ClsplatError as error:
+        runner.give_up(folder, error)
+        raise
     with screen.progress_bar() as show:
         runner.execute(checked, state, resume, show)
     _summary(folder)

@@ -19,6 +19,7 @@ from clsplat.stages.evaluate import Evaluate
 from clsplat.stages.export import Export
 from clsplat.stages.optimize import Optimize
 from clsplat.training import checkpoint
+from clsplat.training.records import Records
 from clsplat.training.run import Progress, Run
 from clsplat.training.targets import Targets
 
@@ -34,6 +35,11 @@ def prepare_folder(out: Path, resume: bool) -> None:
     except OSError as error:
         raise unwritable(out, error) from error
     write_text(out / "status.json", json.dumps({"state": "starting"}) + "\n")
+
+
+def give_up(out: Path, error: ClsplatError) -> None:
+    """Say in the run folder's status.json why nothing was run."""
+    Records(out).status("failed", 0, exit_code=error.exit_code, message=str(error))
 
 
 def open_run(pipeline: Pipeline, out: Path, words: str | None) -> Run:

@@ -25,8 +25,8 @@ EXPECTED = {
 
 
 def explain(error: ValidationError, root: type[BaseModel], path: Path, document: Document) -> str:
-    """Describe the first thing that is wrong."""
-    first = error.errors()[0]
+    """Describe the first thing that is wrong; a misspelt key explains the one that is missing, so it goes first."""
+    first = min(error.errors(), key=lambda one: one["type"] != "extra_forbidden")
     place, model = _follow(first["loc"], root)
     return f"{path}:{document.line(place)}: {_text(place)}: {_complaint(dict(first), place, model)}"
 
@@ -35,7 +35,7 @@ def _complaint(error: dict[str, Any], place: Place, model: type[BaseModel] | Non
     kind, value = error["type"], error["input"]
     if kind == "extra_forbidden":
         known = [name for name in (model.model_fields if model else {}) if name not in ("stage", "type")]
-        return f"unknown key{_nearest(str(place[-1]), known)}"
+        return f"unknown key '{place[-1]}'{_nearest(str(place[-1]), known)}"
     if kind == "missing":
         return f"'{place[-1]}' is missing"
     if kind == "union_tag_invalid":

@@ -54,6 +54,14 @@ def test_set_takes_several_values(tiny_scene, tmp_path):
     assert (metrics["steps"], metrics["seed"]) == (3, 4)
 
 
+def test_a_run_that_cannot_start_says_so_in_its_status(tmp_path):
+    (tmp_path / "scene").mkdir()
+    clsplat("run", "smoke", "--scene", tmp_path / "scene", "--out", tmp_path / "run", expect=3)
+    status = json.loads((tmp_path / "run" / "status.json").read_text())
+    assert (status["state"], status["exit_code"]) == ("failed", 3)
+    assert "no dataset found" in status["message"]
+
+
 def test_check_and_schema():
     assert "fine" in clsplat("check", "splat").stdout
     assert json.loads(clsplat("check", "--schema").stdout)["properties"]["stages"]
