@@ -13,6 +13,7 @@ from clsplat.opencl.program import constants
 from clsplat.render.renderer import DeviceCamera
 from clsplat.render.workspace import Workspace
 from clsplat.settings import Settings
+from clsplat.training.weights import Weight, at_step
 
 SSIM_BLOCK = int(constants("loss.cl")["BLOCK"])
 
@@ -26,6 +27,7 @@ class Comparison:
     image: Array
     target: Array
     gradient: Array
+    step: int = 0  # that weights are taken at
     accumulate: bool = False  # False: the next loss overwrites the gradient
 
     @property
@@ -49,7 +51,7 @@ class Term:
 class Loss(Settings):
     """A term of the training loss."""
 
-    weight: float = 1.0
+    weight: Weight = 1.0  # a number, or [[step, weight], ...] with straight lines between
 
     @abstractmethod
     def add(self, comparison: Comparison) -> Term:
@@ -62,8 +64,9 @@ class L1(Loss):
     type: Literal["l1"] = "l1"
 
     def add(self, comparison: Comparison) -> Term:
-        sums = pixel_loss(comparison, l1=self.weight, l2=0.0)
-        return Term("l1", lambda: self.weight * float(sums.get()[..., 0].sum(dtype=np.float64)) / comparison.values)
+        weight = at_step(self.weight, comparison.step)
+        sums = pixel_loss(comparison, l1=weight, l2=0.0)
+        return Term("l1", lambda: weight * float(sums.get()[..., 0].sum(dtype=np.float64)) / comparison.values)
 
 
 class L2(Loss):
@@ -72,8 +75,9 @@ class L2(Loss):
     type: Literal["l2"] = "l2"
 
     def add(self, comparison: Comparison) -> Term:
-        sums = pixel_loss(comparison, l1=0.0, l2=self.weight)
-        return Term("l2", lambda: self.weight * float(sums.get()[..., 1].sum(dtype=np.float64)) / comparison.values)
+        weight = at_step(self.weight, comparison.step)
+        sums = pixel_loss(comparison, l1=0.0, l2=weight)
+        return Term("l2", lambda: weight * float(sums.get()[..., 1].sum(dtype=np.float64)) / comparison.values)
 
 
 class Dssim(Loss):
@@ -82,6 +86,7 @@ class Dssim(Loss):
     type: Literal["dssim"] = "dssim"
 
     def add(self, comparison: Comparison) -> Term:
+        weight = at_step(self.weight, comparison.step)
         maps, sums = ssim_maps(comparison)
         comparison.workspace.device.program("loss.cl").ssim_gradient(
             groups=(-(-comparison.camera.stride // SSIM_BLOCK), comparison.camera.rows, 3),
@@ -89,12 +94,12 @@ class Dssim(Loss):
             image=comparison.image,
             target=comparison.target,
             gradient=comparison.gradient,
-            scale=-self.weight / comparison.values,
+            scale=-weight / comparison.values,
             accumulate=int(comparison.accumulate),
             **comparison.shape_arguments(),
         )
         comparison.accumulate = True
-        return Term("dssim", lambda: self.weight * (1.0 - float(sums.get().sum(dtype=np.float64)) / comparison.values))
+        return Term("dssim", lambda: weight * (1.0 - float(sums.get().sum(dtype=np.float64)) / comparison.values))
 
 
 LOSSES: dict[str, type[Loss]] = {"l1": L1, "l2": L2, "dssim": Dssim}

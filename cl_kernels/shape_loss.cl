@@ -1,0 +1,65 @@
+/* Penalties on the shape of Gaussians, by their scales s: value and gradient.
+ *
+ *   covariance trace   P = max(sum_j s_j^2 - tau, 0): bounds the size, and only through it the shape
+ *   anisotropy         A = max(s_max / s_min - r, 0): bounds the shape, whatever the size
+ *
+ * One item = LANES Gaussians; each adds to the gradient and writes its own sum.  No local memory.  Deterministic. */
+#include "lanes.h"
+
+/* grad_log_scales += weight dP/d(log s).  The bound of a Gaussian is max(above, pixels^2 * nearest^2). */
+__kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
+void covariance_trace(
+    __global const float *restrict log_scales,  // [3,S] log of scene units
+    __global const float *restrict nearest2,    // [S] squared size of a pixel at the nearest view, scene units^2
+    __global float *restrict grad_log_scales,   // [3,S]
+    __global float *restrict sums,              // [items] sums of P, scene units^2
+    const float above,                          // scene units^2
+    const float pixels2,                        // px^2; 0: the bound is the same everywhere
+    const float weight,                         // scene units^-2
+    const uint stride,
+    const uint count)
+{
+    const uint i = get_global_id(0) * LANES;
+    if (i >= count)
+        return;
+    VF scale2[3], trace = (VF)(0.0f);
+    for (uint k = 0; k < 3; k++) {
+        scale2[k] = exp_clamped(2.0f * VLOAD(log_scales + k * stride + i));
+        trace += scale2[k];
+    }
+    const VF excess = trace - (above + pixels2 * VLOAD(nearest2 + i));
+    const VI penalised = ((LANE_INDEX + (int)i) < (int)count) & (excess > 0.0f);
+    const VF factor = penalised ? (VF)(2.0f * weight) : (VF)(0.0f);
+    for (uint k = 0; k < 3; k++)
+        VSTORE(VLOAD(grad_log_scales + k * stride + i) + factor * scale2[k], grad_log_scales + k * stride + i);
+    sums[get_global_id(0)] = sum_lanes(penalised ? excess : (VF)(0.0f));
+}
+
+/* grad_log_scales += weight dA/d(log s): the ratio itself, up for the longest axis and down for the shortest. */
+__kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
+void anisotropy(
+    __global const float *restrict log_scales,  // [3,S] log of scene units
+    __global float *restrict grad_log_scales,   // [3,S]
+    __global float *restrict sums,              // [items] sums of A
+    const float above,
+    const float weight,
+    const uint stride,
+    const uint count)
+{
+    const uint i = get_global_id(0) * LANES;
+    if (i >= count)
+        return;
+    VF scales[3];
+    for (uint k = 0; k < 3; k++)
+        scales[k] = VLOAD(log_scales + k * stride + i);
+    const VF longest = larger(larger(scales[0], scales[1]), scales[2]);
+    const VF shortest = smaller(smaller(scales[0], scales[1]), scales[2]);
+    const VF ratio = exp_clamped(longest - shortest);
+    const VI penalised = ((LANE_INDEX + (int)i) < (int)count) & (ratio > above);
+    const VF slope = penalised ? weight * ratio : (VF)(0.0f), zero = (VF)(0.0f);
+    for (uint k = 0; k < 3; k++) {
+        const VF up = scales[k] == longest ? slope : zero, down = scales[k] == shortest ? slope : zero;
+        VSTORE(VLOAD(grad_log_scales + k * stride + i) + (up - down), grad_log_scales + k * stride + i);
+    }
+    sums[get_global_id(0)] = sum_lanes(penalised ? ratio - above : zero);
+}

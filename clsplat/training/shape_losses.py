@@ -1,0 +1,98 @@
+"""Penalties on the shapes of Gaussians: each adds its share to the gradient of `log_scales`.
+
+A trace bounds the size of a Gaussian, not its anisotropy; the two are separate terms.
+"""
+
+from abc import abstractmethod
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from clsplat.gaussians.model import Gaussians, Gradients
+from clsplat.opencl.device import Array
+from clsplat.render.workspace import Workspace
+from clsplat.settings import Settings
+from clsplat.training.losses import Term
+from clsplat.training.weights import Weight, at_step
+
+Positive = Annotated[float, Field(gt=0)]
+
+
+@dataclass(frozen=True)
+class Shapes:
+    """What a penalty works on: Gaussians, the gradients it adds to, and the scene's measures."""
+
+    workspace: Workspace
+    gaussians: Gaussians
+    gradients: Gradients
+    extent: float  # scene units
+    step: int
+
+    @property
+    def items(self) -> int:
+        return -(-self.gaussians.count // int(self.gaussians.device.tuning["LANES"]))
+
+    def sums(self, name: str) -> Array:
+        return self.workspace.array(f"{name} sums", self.items)
+
+    def arguments(self) -> dict[str, Any]:
+        gaussians = self.gaussians
+        return {
+            "items": self.items,
+            "log_scales": gaussians["log_scales"],
+            "grad_log_scales": self.gradients["log_scales"],
+            "stride": gaussians.capacity,
+            "count": gaussians.count,
+        }
+
+
+class ShapeLoss(Settings):
+    """A term of the training loss that looks at Gaussians, not at an image."""
+
+    weight: Weight = 1.0
+
+    @abstractmethod
+    def add(self, shapes: Shapes) -> Term:
+        """Add weight · d(loss)/d(log_scales) to the gradients."""
+
+
+class CovarianceTrace(ShapeLoss):
+    """Mean over Gaussians of max(tr Σ - τ, 0), lengths by the scene's extent (Micro-splatting, Lee et al. 2025).
+
+    τ is `above`, or, where `pixels` is given, 3 s² for the s that spans so many pixels at the nearest training view.
+    """
+
+    type: Literal["covariance_trace"] = "covariance_trace"
+    above: Annotated[float, Field(ge=0)] = 3.0e-4  # extents²: a standard deviation of 1 % along each axis
+    pixels: Positive | None = None  # px
+
+    def add(self, shapes: Shapes) -> Term:
+        gaussians, sums = shapes.gaussians, shapes.sums("covariance_trace")
+        weight = at_step(self.weight, shapes.step) / max(1, gaussians.count) / shapes.extent**2
+        gaussians.device.program("shape_loss.cl").covariance_trace(
+            **shapes.arguments(),
+            nearest2=gaussians["log_scales"],
+            sums=sums,
+            above=self.above * shapes.extent**2,
+            pixels2=0.0,
+            weight=weight,
+        )
+        return Term("covariance_trace", lambda: weight * float(sums.get().sum(dtype=np.float64)))
+
+
+class Anisotropy(ShapeLoss):
+    """Mean over Gaussians of max(longest / shortest axis - r, 0), with r = `above` (the form of PhysGaussian, Xie et
+    al. 2024)."""
+
+    type: Literal["anisotropy"] = "anisotropy"
+    above: Annotated[float, Field(ge=1)] = 10.0
+
+    def add(self, shapes: Shapes) -> Term:
+        gaussians, sums = shapes.gaussians, shapes.sums("anisotropy")
+        weight = at_step(self.weight, shapes.step) / max(1, gaussians.count)
+        gaussians.device.program("shape_loss.cl").anisotropy(
+            **shapes.arguments(), sums=sums, above=self.above, weight=weight
+        )
+        return Term("anisotropy", lambda: weight * float(sums.get().sum(dtype=np.float64)))

@@ -1,0 +1,72 @@
+"""shape_loss.cl against the oracle, and the oracle against finite differences."""
+
+import numpy as np
+import pytest
+
+from clsplat.gaussians.model import Gradients
+from clsplat.render.workspace import Workspace
+from clsplat.training.shape_losses import Anisotropy, CovarianceTrace, Shapes
+from tests import reference_shape as ref
+from tests.scenes import random_case
+
+COUNTS = (1, 7, 8, 15, 16, 17, 64, 65, 200)
+EXTENT = 2.5
+
+
+def shapes_of(device, rng, count: int) -> tuple[Shapes, np.ndarray]:
+    """Gaussians of many sizes and forms, with gradients that are not zero to begin with."""
+    case = random_case(rng, count)
+    case.parameters["log_scales"][:] = rng.normal(-2, 1.5, (count, 3))
+    gaussians = case.model(device).gaussians
+    gradients = Gradients(gaussians)
+    planes = np.zeros((3, gaussians.capacity), np.float32)
+    planes[:, :count] = 0.25
+    gradients["log_scales"].set(planes)
+    shapes = Shapes(Workspace(device), gaussians, gradients, EXTENT, step=1)
+    return shapes, case.parameters["log_scales"].astype(np.float64)
+
+
+def check(shapes: Shapes, term, value: float, gradient: np.ndarray) -> None:
+    assert term.value() == pytest.approx(value, rel=1e-5, abs=1e-12)
+    planes, count = shapes.gradients["log_scales"].get(), shapes.gaussians.count
+    added = planes[:, :count].T.astype(np.float64) - 0.25
+    np.testing.assert_allclose(added, gradient, rtol=1e-4, atol=1e-6 * max(1, np.abs(gradient).max()))
+    assert (planes[:, count:] == 0).all()
+
+
+@pytest.mark.parametrize("count", COUNTS)
+def test_covariance_trace(device, rng, count):
+    shapes, log_scales = shapes_of(device, rng, count)
+    term = CovarianceTrace(weight=3.0, above=0.02).add(shapes)
+    value, gradient = ref.covariance_trace(log_scales, 0.02 * EXTENT**2, EXTENT)
+    assert count < 16 or 0 < np.count_nonzero(gradient) < gradient.size
+    check(shapes, term, 3 * value, 3 * gradient)
+
+
+@pytest.mark.parametrize("count", COUNTS)
+def test_anisotropy(device, rng, count):
+    shapes, log_scales = shapes_of(device, rng, count)
+    term = Anisotropy(weight=0.1, above=8.0).add(shapes)
+    value, gradient = ref.anisotropy(log_scales, 8.0)
+    assert count < 16 or 0 < np.count_nonzero(gradient) < gradient.size
+    check(shapes, term, 0.1 * value, 0.1 * gradient)
+
+
+@pytest.mark.parametrize("penalty", [lambda x: ref.covariance_trace(x, 0.1, EXTENT), lambda x: ref.anisotropy(x, 5.0)])
+def test_oracle_against_finite_differences(rng, penalty):
+    log_scales, step = rng.normal(-1, 1, (30, 3)), 1e-6
+    _, gradient = penalty(log_scales)
+    for n, axis in np.ndindex(log_scales.shape):
+        change = np.zeros_like(log_scales)
+        change[n, axis] = step
+        slope = (penalty(log_scales + change)[0] - penalty(log_scales - change)[0]) / (2 * step)
+        assert slope == pytest.approx(gradient[n, axis], rel=1e-6, abs=1e-9)
+
+
+def test_not_a_number_stays_where_it_is(device, rng):
+    shapes, log_scales = shapes_of(device, rng, 40)
+    log_scales[5] = np.nan
+    shapes.gaussians.set("log_scales", log_scales)
+    CovarianceTrace(above=0.02).add(shapes)
+    planes = shapes.gradients["log_scales"].get()[:, :40]
+    assert np.isfinite(np.delete(planes, 5, axis=1)).all()
