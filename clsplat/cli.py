@@ -134,19 +134,23 @@ def evaluate(
     model: Annotated[Path, typer.Argument(help="A splat PLY.")],
     scene: SceneOption,
     scales: Annotated[str, typer.Option(help="Downscale factors, separated by commas.")] = "1",
+    metrics: Annotated[str, typer.Option(help="Of psnr, ssim, ms_ssim and flip, separated by commas.")] = "psnr,ssim",
+    lpips: Annotated[Path | None, typer.Option(help="An ONNX file of LPIPS; without it lpips is null.")] = None,
+    lpips_input: Annotated[Literal["-1..1", "0..1"], typer.Option(help="The values LPIPS is given.")] = "-1..1",
     out: Annotated[Path | None, typer.Option(help="Write the metrics here as JSON; default: print them.")] = None,
     device: DeviceOption = None,
 ) -> None:
     """Measure a model on a scene's test and training views."""
     from clsplat.files import write_text
     from clsplat.model_file import ModelFile
+    from clsplat.training.perceptual import Perceptual, metric_names
 
     try:
         factors = [float(text) for text in scales.split(",")]
     except ValueError:
         raise ConfigError(f"--scales {scales}: expected numbers separated by commas, for example 1,2,4") from None
-    metrics = ModelFile(model, scene, device).evaluate(factors)
-    text = json.dumps(metrics, indent=1) + "\n"
+    perceptual = Perceptual.open(metric_names(metrics.split(",")), lpips, lpips_input)
+    text = json.dumps(ModelFile(model, scene, device).evaluate(factors, perceptual), indent=1) + "\n"
     if out is None:
         print(text, end="")
     else:

@@ -17,6 +17,7 @@ from clsplat.scene.detect import read_scene
 from clsplat.scene.images import write_image
 from clsplat.stages.render import image_path
 from clsplat.training.metrics import mean, measure, render_view
+from clsplat.training.perceptual import Perceptual
 from clsplat.training.targets import BACKGROUNDS, Targets
 
 LOG = logging.getLogger("clsplat")
@@ -62,7 +63,7 @@ class ModelFile:
                     stream.write(buffer.getvalue())
         return len(views)
 
-    def evaluate(self, scales: list[float]) -> dict[str, Any]:
+    def evaluate(self, scales: list[float], perceptual: Perceptual) -> dict[str, Any]:
         """Metrics by split and scale, with the keys of metrics.json."""
         metrics: dict[str, Any] = {"test": {}, "train": {}}
         for scale in scales:
@@ -70,6 +71,6 @@ class ModelFile:
             targets = Targets(self.device, self.background)
             for split in ("test", "train"):
                 if scene.split(split):
-                    results = measure(self.renderer, self.model, scene.split(split), targets)
-                    metrics[split][f"{scale:g}"] = mean(results)
+                    results = measure(self.renderer, self.model, scene.split(split), targets, perceptual)
+                    metrics[split][f"{scale:g}"] = mean(results, perceptual)
         return {**metrics, "gaussians": self.model.gaussians.count, "device": self.device.text}

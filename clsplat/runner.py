@@ -45,6 +45,8 @@ def give_up(out: Path, error: ClsplatError) -> None:
 def open_run(pipeline: Pipeline, out: Path, words: str | None) -> Run:
     """Choose the device and read the scene.  Raises what they raise."""
     settings = pipeline.settings
+    for stage in pipeline.stages:
+        stage.check()
     device = Device(choose(words), settings.rasterizer.schedule)
     LOG.info("device: %s", device.text)
     if settings.scene.path is None:

@@ -80,6 +80,32 @@ def dssim(x: np.ndarray, y: np.ndarray) -> tuple[float, np.ndarray]:
     return 1 - np.mean(m), grad
 
 
+def ms_ssim(x: np.ndarray, y: np.ndarray, scales: int) -> float:
+    """MS-SSIM (Wang et al. 2003) over whole windows only, weights divided by their sum: one window at a time."""
+    weights = np.array([0.0448, 0.2856, 0.3001, 0.2363, 0.1333])[:scales]
+    window = np.outer(ssim_taps(), ssim_taps())
+    channels, products = len(x), np.ones(len(x))
+    for scale, weight in enumerate(weights / weights.sum()):
+        height, width = x.shape[1:]
+        luminance, structure = [], []
+        for row in range(height - 10):
+            for column in range(width - 10):
+                a, b = (image[:, row : row + 11, column : column + 11] for image in (x, y))
+                mu1, mu2 = (a * window).sum((1, 2)), (b * window).sum((1, 2))
+                d1, d2 = a - mu1[:, None, None], b - mu2[:, None, None]
+                variance1, variance2 = (d1 * d1 * window).sum((1, 2)), (d2 * d2 * window).sum((1, 2))
+                covariance = (d1 * d2 * window).sum((1, 2))
+                luminance.append((2 * mu1 * mu2 + C1) / (mu1**2 + mu2**2 + C1))
+                structure.append((2 * covariance + C2) / (variance1 + variance2 + C2))
+        terms = np.array(structure) * (np.array(luminance) if scale == scales - 1 else 1)
+        products *= np.maximum(terms.mean(axis=0), 0) ** weight
+        x, y = (
+            image[:, : height // 2 * 2, : width // 2 * 2].reshape(channels, height // 2, 2, width // 2, 2).mean((2, 4))
+            for image in (x, y)
+        )
+    return float(products.mean())
+
+
 # ---- Adam ----------------------------------------------------------------------------------------------------------
 
 

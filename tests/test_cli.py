@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.onnx_writer import distance_network
 from tests.test_training import train
 
 
@@ -94,6 +95,21 @@ def test_evaluate_agrees_with_the_run(model, tiny_scene, tmp_path):
     assert metrics["test"]["1"] == run["test"]["1"]
     assert metrics["test"]["2"]["views"] == 2
     assert metrics["train"]["1"]["views"] == 8
+
+
+def test_evaluate_with_more_metrics(model, tiny_scene, tmp_path):
+    network = tmp_path / "distance.onnx"
+    network.write_bytes(distance_network())
+    more = ["--metrics", "psnr,ssim,ms_ssim", "--lpips", network, "--lpips-input", "0..1"]
+    clsplat("evaluate", model, "--scene", tiny_scene, "--out", tmp_path / "m.json", *more)
+    test = json.loads((tmp_path / "m.json").read_text())["test"]["1"]
+    assert 0 < test["ms_ssim"] < 1
+    assert test["ms_ssim_scales"] == 2  # 40 px
+    assert test["lpips"] == pytest.approx(10 ** (-test["psnr"] / 10), rel=0.1)  # this network measures squares
+    assert test["lpips_input"] == "0..1"
+    clsplat("evaluate", model, "--scene", tiny_scene, "--metrics", "psnr,mssim", expect=2)
+    network.write_bytes(distance_network(inputs=("a", "b")))
+    clsplat("evaluate", model, "--scene", tiny_scene, *more, expect=2)
 
 
 def damaged(scene: Path, folder: Path) -> Path:

@@ -14,11 +14,12 @@ import numpy as np
 import pytest
 
 from clsplat import runner
-from clsplat.errors import ConfigError, Interrupted, NumericError
+from clsplat.errors import ConfigError, DataError, Interrupted, NumericError
 from clsplat.gaussians.ply import read_ply
 from clsplat.pipeline import load
 from clsplat.training import checkpoint
 from clsplat.training.run import Progress, Run
+from tests.onnx_writer import distance_network
 
 
 def train(scene: Path, out: Path, *overrides: str, pipeline: str = "smoke", resume: bool = False) -> Run:
@@ -83,6 +84,19 @@ def test_the_same_bits_twice_and_with_one_core(finished, tiny_scene, tmp_path):
     ]
     subprocess.run(command, check=True, env={**os.environ, **one_core}, capture_output=True)
     assert digest(tmp_path / "one") == digest(finished)
+
+
+def test_more_metrics_are_recorded(tiny_scene, tmp_path):
+    (tmp_path / "distance.onnx").write_bytes(distance_network())
+    metrics = "evaluate.metrics=[psnr, ssim, ms_ssim]"
+    run = train(tiny_scene, tmp_path / "run", "optimize.steps=3", metrics, f"evaluate.lpips='{tmp_path}/distance.onnx'")
+    averages = json.loads((tmp_path / "run" / "metrics.json").read_text())["test"]["1"]
+    views = run.records.read("view")
+    for name in ("psnr", "ssim", "ms_ssim", "lpips"):
+        assert averages[name] == pytest.approx(np.mean([view[name] for view in views]))
+    with pytest.raises(DataError, match="nowhere"):
+        train(tiny_scene, tmp_path / "early", "evaluate.lpips=nowhere.onnx")
+    assert not (tmp_path / "early" / "metrics.jsonl").exists(), "refused before training"
 
 
 def test_another_seed_gives_other_bits(finished, tiny_scene, tmp_path):

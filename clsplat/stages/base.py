@@ -35,6 +35,9 @@ class Stage(Settings):
         """Parameters whose gradients the edit makes meaningless."""
         return ()
 
+    def check(self) -> None:
+        """Raise now what would stop the stage later, such as a missing file."""
+
     @abstractmethod
     def run(self, run: Run) -> None:
         """Do it."""

@@ -1,13 +1,14 @@
 """Metrics of a split."""
 
 import logging
-from dataclasses import asdict
 from typing import Annotated, ClassVar, Literal
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from clsplat.stages.base import Stage
+from clsplat.training.lpips import InputRange
 from clsplat.training.metrics import mean, measure
+from clsplat.training.perceptual import Metric, Perceptual
 from clsplat.training.run import Run
 from clsplat.training.targets import Targets
 
@@ -23,19 +24,36 @@ class Evaluate(Stage):
 
     split: Literal["test", "train"] = "test"
     scales: Annotated[list[int], Field(min_length=1)] = Field([1])  # downscale factors, on top of the scene's
+    metrics: list[Metric] = Field(["psnr", "ssim"])
+    lpips: str | None = None  # ONNX file
+    lpips_input: InputRange = "-1..1"  # 0..1: as in the tables of 3DGS and Mip-Splatting
+
+    @field_validator("metrics")
+    @classmethod
+    def _with_psnr_and_ssim(cls, metrics: list[Metric]) -> list[Metric]:
+        if not {"psnr", "ssim"} <= set(metrics):
+            raise ValueError("'psnr' and 'ssim' must be among the metrics: every metrics.json has them")
+        return metrics
+
+    def check(self) -> None:
+        self._perceptual()
+
+    def _perceptual(self) -> Perceptual:
+        return Perceptual.open(self.metrics, self.lpips, self.lpips_input)
 
     def run(self, run: Run) -> None:
         scene = run.scene
         if not scene.split(self.split):
             LOG.warning("no %s views: nothing to evaluate (scene.holdout chooses them)", self.split)
             return
+        perceptual = self._perceptual()
         for scale in self.scales:
             views = scene.downscaled(scale).split(self.split)
             targets = run.targets if scale == 1 else Targets(run.device, run.targets.background_name)
-            results = measure(run.renderer, run.trained, views, targets)
+            results = measure(run.renderer, run.trained, views, targets, perceptual)
             for result in results:
-                run.records.add(run.step, "view", split=self.split, scale=scale, **asdict(result))
-            averages = mean(results)
+                run.records.add(run.step, "view", split=self.split, scale=scale, **result.line())
+            averages = mean(results, perceptual)
             run.records.add(run.step, "evaluate", split=self.split, scale=scale, **averages)
             run.metrics.setdefault(self.split, {})[str(scale)] = averages
             LOG.info(

@@ -52,6 +52,10 @@ class Optimize(Stage):
                 raise ValueError(f"'{getattr(stage, 'stage', '')}' needs 'every' inside 'during'")
         return during
 
+    def check(self) -> None:
+        for stage in self.during:
+            stage.check()
+
     def run(self, run: Run) -> None:
         model = run.trained
         run.adam = run.adam or Adam(model.gaussians)

@@ -12,7 +12,8 @@ import numpy as np
 from clsplat.files import write_text
 from clsplat.stages.base import Stage
 from clsplat.stages.svg import curve
-from clsplat.training.metrics import Image, render_view
+from clsplat.training.metrics import render_view
+from clsplat.training.perceptual import Image
 from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")

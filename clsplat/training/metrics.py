@@ -2,20 +2,21 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from clsplat.gaussians.model import Model
 from clsplat.opencl.device import Array
 from clsplat.render.renderer import DeviceCamera, Renderer
 from clsplat.scene.scene import View
 from clsplat.training.losses import Comparison, ssim_maps
+from clsplat.training.perceptual import Image, Perceptual
 from clsplat.training.targets import Target, Targets, unpack
 
 PSNR_CAP = 100.0  # dB, for equal images
-Image = NDArray[np.uint8]
+NOTHING_MORE = Perceptual()
 
 
 @dataclass(frozen=True)
@@ -25,6 +26,11 @@ class ViewMetrics:
     view: str
     psnr: float  # dB
     ssim: float
+    perceptual: dict[str, float | None] = field(default_factory=dict)
+
+    def line(self) -> dict[str, Any]:
+        """The figures as a line of metrics.jsonl has them."""
+        return {"view": self.view, "psnr": self.psnr, "ssim": self.ssim, **self.perceptual}
 
 
 def render_view(renderer: Renderer, model: Model, camera: DeviceCamera, background: Array) -> Image:
@@ -51,22 +57,25 @@ def ssim(renderer: Renderer, target: Target, image: Image) -> float:
     return float(sums.get().sum(dtype=np.float64)) / comparison.values
 
 
-def measure(renderer: Renderer, model: Model, views: Sequence[View], targets: Targets) -> list[ViewMetrics]:
+def measure(
+    renderer: Renderer, model: Model, views: Sequence[View], targets: Targets, perceptual: Perceptual = NOTHING_MORE
+) -> list[ViewMetrics]:
     """Return the metrics of every view."""
     results = []
     for view in views:
         target = targets.get(view)
         image = render_view(renderer, model, target.camera, targets.background_array)
         truth = target.pixels.get().transpose(1, 2, 0)
-        results.append(ViewMetrics(view.name, psnr(image, truth), ssim(renderer, target, image)))
+        more = perceptual.measure(image, truth)
+        results.append(ViewMetrics(view.name, psnr(image, truth), ssim(renderer, target, image), more))
     return results
 
 
-def mean(results: Sequence[ViewMetrics]) -> dict[str, float | int | None]:
+def mean(results: Sequence[ViewMetrics], perceptual: Perceptual = NOTHING_MORE) -> dict[str, Any]:
     """Averages over views, with the keys of metrics.json."""
     return {
         "psnr": float(np.mean([r.psnr for r in results])),
         "ssim": float(np.mean([r.ssim for r in results])),
-        "lpips": None,
+        **perceptual.mean([r.perceptual for r in results]),
         "views": len(results),
     }

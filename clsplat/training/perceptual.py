@@ -1,0 +1,142 @@
+"""Metrics nearer to what people see than PSNR, of 8-bit images and on the host: MS-SSIM, FLIP and LPIPS."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import correlate1d
+
+from clsplat.errors import ConfigError
+from clsplat.training.lpips import InputRange, Lpips
+
+Metric = Literal["psnr", "ssim", "ms_ssim", "flip"]
+METRICS: tuple[Metric, ...] = get_args(Metric)
+Image = NDArray[np.uint8]
+Floats = NDArray[np.float64]
+
+MS_SSIM_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)  # Wang et al. 2003, finest scale first
+RADIUS, SIGMA = 5, 1.5  # window of 11 x 11
+C1, C2 = 0.01**2, 0.03**2
+
+
+@dataclass(frozen=True)
+class Perceptual:
+    """What to measure beyond PSNR and SSIM."""
+
+    names: tuple[Metric, ...] = ()
+    lpips: Lpips | None = None
+
+    @classmethod
+    def open(cls, names: Sequence[Metric], lpips: str | Path | None, lpips_input: InputRange) -> "Perceptual":
+        """Find what the metrics need.  Raises ConfigError for a missing package, DataError for a missing network."""
+        chosen = tuple(name for name in METRICS[2:] if name in names)
+        if "flip" in chosen:
+            _flip_package()
+        return cls(chosen, Lpips(Path(lpips), lpips_input) if lpips is not None else None)
+
+    def measure(self, image: Image, truth: Image) -> dict[str, float | None]:
+        """Return the figures of one view, by name.  image, truth: [height, width, 3]."""
+        values: dict[str, float | None] = {}
+        if "ms_ssim" in self.names:
+            values["ms_ssim"] = ms_ssim(image, truth)
+            values["ms_ssim_scales"] = ms_ssim_scales(image)
+        if "flip" in self.names:
+            values["flip"] = flip(image, truth)
+        if self.lpips is not None:
+            values["lpips"] = self.lpips.distance(image, truth)
+        return values
+
+    def mean(self, views: Sequence[dict[str, float | None]]) -> dict[str, Any]:
+        """Return averages over views with the keys of metrics.json, and why a figure is missing."""
+        averages: dict[str, Any] = {name: _mean(views, name) for name in self.names}
+        if "ms_ssim" in self.names:
+            averages["ms_ssim_scales"] = min(int(view["ms_ssim_scales"] or 0) for view in views)
+            if averages["ms_ssim"] is None:
+                averages["ms_ssim_reason"] = f"images are smaller than the window of {2 * RADIUS + 1} px"
+        if self.lpips is None:
+            return {**averages, "lpips": None, "lpips_reason": "no ONNX file given"}
+        return {**averages, "lpips": _mean(views, "lpips"), **self.lpips.origin()}
+
+
+def metric_names(names: Sequence[str]) -> list[Metric]:
+    """Return the names as metrics.  Raises ConfigError for an unknown one."""
+    if unknown := [name for name in names if name not in METRICS]:
+        raise ConfigError(f"no metric named '{unknown[0]}'; there are {', '.join(METRICS)}")
+    return [name for name in METRICS if name in names]
+
+
+def _mean(views: Sequence[dict[str, float | None]], name: str) -> float | None:
+    values = [value for view in views if (value := view[name]) is not None]
+    return float(np.mean(values)) if values else None
+
+
+def ms_ssim_scales(image: Image) -> int:
+    """Number of scales, at most five, at which the window fits into the image."""
+    side = min(image.shape[:2])
+    return sum(side >> scale >= 2 * RADIUS + 1 for scale in range(len(MS_SSIM_WEIGHTS)))
+
+
+def ms_ssim(image: Image, truth: Image) -> float | None:
+    """Multi-scale structural similarity (Wang, Simoncelli and Bovik 2003), in double precision.
+
+    For each channel, the product over scales of the mean contrast-structure term, at the coarsest scale times the
+    luminance term, to the power of the scale's weight; then the mean of the channels.  A scale is the one before,
+    averaged over 2 x 2 pixels and halved.  Means are over the pixels whose 11 x 11 Gaussian window lies inside the
+    image; a negative mean counts as 0.  An image with a side below 176 px has room for fewer scales: the weights of
+    those that fit are divided by their sum.  None when not even one fits.
+    """
+    scales = ms_ssim_scales(image)
+    if scales == 0:
+        return None
+    weights = np.array(MS_SSIM_WEIGHTS[:scales]) / sum(MS_SSIM_WEIGHTS[:scales])
+    x, y = image / 255.0, truth / 255.0
+    product = np.ones(3)
+    for scale, weight in enumerate(weights):
+        if scale > 0:
+            x, y = _halved(x), _halved(y)
+        luminance, structure = _ssim_terms(x, y)
+        terms = structure * luminance if scale == scales - 1 else structure
+        product *= np.maximum(terms.mean(axis=(0, 1)), 0) ** weight
+    return float(product.mean())
+
+
+def _halved(image: Floats) -> Floats:
+    """Averages of 2 x 2 pixels; an odd last row or column is left out."""
+    height, width = image.shape[0] // 2 * 2, image.shape[1] // 2 * 2
+    even = image[:height, :width]
+    mean: Floats = (even[::2, ::2] + even[1::2, ::2] + even[::2, 1::2] + even[1::2, 1::2]) / 4
+    return mean
+
+
+def _ssim_terms(x: Floats, y: Floats) -> tuple[Floats, Floats]:
+    """Luminance and contrast-structure of every pixel with a whole window (Wang et al. 2004)."""
+    mx, my = _window_mean(x), _window_mean(y)
+    variances = _window_mean(x * x) - mx * mx + _window_mean(y * y) - my * my
+    covariance = _window_mean(x * y) - mx * my
+    return (2 * mx * my + C1) / (mx * mx + my * my + C1), (2 * covariance + C2) / (variances + C2)
+
+
+def _window_mean(image: Floats) -> Floats:
+    taps = np.exp(-(np.arange(-RADIUS, RADIUS + 1) ** 2) / (2 * SIGMA**2))
+    taps /= taps.sum()
+    rows = correlate1d(image, taps, axis=0)[RADIUS:-RADIUS]
+    return np.asarray(correlate1d(rows, taps, axis=1)[:, RADIUS:-RADIUS])
+
+
+def flip(image: Image, truth: Image) -> float:
+    """Mean FLIP (Andersson et al. 2020) at 67 pixels per degree; 0 for equal images.  Raises ConfigError without it."""
+    reference, test = (np.ascontiguousarray(picture, np.float32) / np.float32(255) for picture in (truth, image))
+    _, mean, _ = _flip_package().evaluate(reference, test, "LDR", applyMagma=False)
+    return float(mean)
+
+
+def _flip_package() -> ModuleType:
+    try:
+        import flip_evaluator
+    except ImportError as error:
+        raise ConfigError("metric flip: its package is not installed; pip install 'clsplat[metrics]'") from error
+    return flip_evaluator  # type: ignore[no-any-return]
