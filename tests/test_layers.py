@@ -19,7 +19,7 @@ ROWS = (  # from the top down; a module imports only from lower rows, or from it
     {"render"},
     {"gaussians", "scene"},
     {"opencl"},
-    {"settings_errors"},
+    {"settings_errors", "pages"},
     {"errors", "files", "settings", "yaml_file", ""},
 )
 ROW = {name: i for i, row in enumerate(ROWS) for name in row}

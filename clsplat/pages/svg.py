@@ -2,25 +2,37 @@
 
 import html
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 WIDTH, HEIGHT = 460, 220  # px
 LEFT, BOTTOM, TOP, RIGHT = 56, 30, 26, 12
-COLOURS = ("#2b6cb0", "#c05621", "#2f855a", "#805ad5")
-Points = Sequence[tuple[float, float]]
+COLOURS = ("#2b6cb0", "#c05621", "#2f855a", "#805ad5", "#b83280", "#0f8a9d", "#8a6d1b", "#4a5568")
+FEW = 12  # a line of so few points shows each of them
 
 
-def curve(title: str, lines: dict[str, Points], logarithmic: bool = False) -> str:
-    """Draw named lines of (x, y) points over common axes; a logarithmic y axis drops values that are not positive."""
-    drawn = {
-        name: [(x, math.log10(y) if logarithmic else y) for x, y in points if not logarithmic or y > 0]
-        for name, points in lines.items()
-    }
-    drawn = {name: points for name, points in drawn.items() if points}
+@dataclass(frozen=True)
+class Line:
+    """Points (x, y) in order of x."""
+
+    points: Sequence[tuple[float, float]]
+    name: str = ""  # in the legend
+    colour: str = ""  # by default the next one
+
+
+def curve(
+    title: str, lines: Sequence[Line], logarithmic: bool = False, ticks: Mapping[float, str] | None = None
+) -> str:
+    """Draw lines over common axes; a logarithmic y axis drops values that are not positive.
+
+    `ticks` name places on the x axis, which otherwise gets numbers.  No points, no chart: "".
+    """
+    drawn = [_drawn(line, logarithmic) for line in lines]
+    drawn = [line for line in drawn if line.points]
     if not drawn:
         return ""
-    xs = [x for points in drawn.values() for x, _ in points]
-    ys = [y for points in drawn.values() for _, y in points]
+    xs = [x for line in drawn for x, _ in line.points]
+    ys = [y for line in drawn for _, y in line.points]
     x_low, x_high = 0.0, max(xs) or 1.0
     y_low, y_high = min(ys), max(ys)
     if y_high == y_low:
@@ -38,17 +50,27 @@ def curve(title: str, lines: dict[str, Points], logarithmic: bool = False) -> st
         label = _number(10**tick if logarithmic else tick)
         parts.append(f'<line x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{y:.1f}" y2="{y:.1f}" class="grid"/>')
         parts.append(f'<text x="{LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">{label}</text>')
-    for tick in _ticks(x_low, x_high):
+    for tick, label in (ticks or {tick: _number(tick) for tick in _ticks(x_low, x_high)}).items():
         x, _ = place(tick, y_low)
-        parts.append(f'<text x="{x:.1f}" y="{HEIGHT - 10}" text-anchor="middle">{_number(tick)}</text>')
-    for i, (name, points) in enumerate(drawn.items()):
-        colour = COLOURS[i % len(COLOURS)]
-        path = " ".join(f"{x:.1f},{y:.1f}" for x, y in (place(*point) for point in points))
+        parts.append(f'<text x="{x:.1f}" y="{HEIGHT - 10}" text-anchor="middle">{html.escape(label)}</text>')
+    for i, line in enumerate(drawn):
+        colour = line.colour or COLOURS[i % len(COLOURS)]
+        places = [place(*point) for point in line.points]
+        path = " ".join(f"{x:.1f},{y:.1f}" for x, y in places)
         parts.append(f'<polyline points="{path}" fill="none" stroke="{colour}" stroke-width="1.8"/>')
-        if len(drawn) > 1:
+        if len(places) <= FEW:
+            parts += [f'<circle cx="{x:.1f}" cy="{y:.1f}" r="2.6" fill="{colour}"/>' for x, y in places]
+        if line.name and len(drawn) > 1:
             x = WIDTH - RIGHT - 100 * (len(drawn) - i)
-            parts.append(f'<text x="{x}" y="15" style="fill:{colour}">{html.escape(name)}</text>')
+            parts.append(f'<text x="{x}" y="15" style="fill:{colour}">{html.escape(line.name)}</text>')
     return "".join([*parts, "</svg>"])
+
+
+def _drawn(line: Line, logarithmic: bool) -> Line:
+    """The line as the axes have it."""
+    if not logarithmic:
+        return line
+    return replace(line, points=[(x, math.log10(y)) for x, y in line.points if y > 0])
 
 
 def _ticks(low: float, high: float) -> list[float]:
