@@ -158,6 +158,18 @@ def evaluate(
 
 
 @app.command()
+def compare(
+    runs: Annotated[list[Path], typer.Argument(help="Run folders; that of a matrix stands for all its runs.")],
+    out: Annotated[Path, typer.Option(help="The page to write.")] = Path("compare.html"),
+) -> None:
+    """Show runs side by side on one page that opens offline."""
+    from clsplat.compare.page import write_comparison
+
+    count = write_comparison(runs, out)
+    CONSOLE.print(f"{count} runs compared in {out}", markup=False)
+
+
+@app.command()
 def bench(
     scenes: Annotated[str, typer.Option(help="Fixed scenes, of A, B and C, separated by commas.")] = "A",
     model: Annotated[Path | None, typer.Option(help="Also time this splat PLY, at --scene.")] = None,

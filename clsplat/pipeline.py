@@ -22,6 +22,8 @@ from clsplat import resource_dir
 from clsplat.errors import ConfigError
 from clsplat.opencl.device import Schedule
 from clsplat.render.tiles import Sort
+from clsplat.scene.detect import read_scene
+from clsplat.scene.scene import Background, Scene
 from clsplat.settings import Settings
 from clsplat.settings_errors import explain
 from clsplat.stages import STAGES, AnyStage
@@ -39,6 +41,13 @@ class SceneSettings(Settings):
     downscale: Annotated[float, Field(ge=1)] = 1  # image sizes are divided by this
     background: Literal["auto", "black", "white"] = "auto"  # auto: white for Blender scenes, else black
     holdout: Annotated[int, Field(ge=0)] = 8  # every n-th image, by name, is a test view; 0: none
+
+    def read(self) -> tuple[Scene, Background]:
+        """Return the scene at its size, and what its photographs are shown on.  Raises DataError."""
+        if self.path is None:
+            raise ConfigError("no scene given; use --scene DIR, or scene: {path: DIR} in the pipeline file")
+        scene = read_scene(Path(self.path), self.holdout).downscaled(self.downscale)
+        return scene, scene.background if self.background == "auto" else self.background
 
 
 class RasterizerSettings(Settings):

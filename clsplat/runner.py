@@ -14,7 +14,6 @@ from clsplat.files import unwritable, write_text
 from clsplat.opencl.device import Device, choose
 from clsplat.pipeline import Pipeline
 from clsplat.render.renderer import Renderer
-from clsplat.scene.detect import read_scene
 from clsplat.stages.evaluate import Evaluate
 from clsplat.stages.export import Export
 from clsplat.stages.optimize import Optimize
@@ -49,10 +48,7 @@ def open_run(pipeline: Pipeline, out: Path, words: str | None) -> Run:
         stage.check()
     device = Device(choose(words), settings.rasterizer.schedule)
     LOG.info("device: %s", device.text)
-    if settings.scene.path is None:
-        raise ConfigError(f"{pipeline.path}: no scene given; use --scene DIR, or scene: {{path: DIR}} in the file")
-    scene = read_scene(Path(settings.scene.path), settings.scene.holdout).downscaled(settings.scene.downscale)
-    background = scene.background if settings.scene.background == "auto" else settings.scene.background
+    scene, background = settings.scene.read()
     camera = scene.views[0].camera
     LOG.info(
         "scene: %s, %d training and %d test views, %d x %d px, %s background, extent %.3g",

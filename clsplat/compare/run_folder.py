@@ -1,0 +1,127 @@
+"""A finished run as its folder tells it: settings, metrics, records, renders."""
+
+import json
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from clsplat.errors import ConfigError, DataError
+from clsplat.pipeline import SceneSettings
+from clsplat.scene.images import read_file
+from clsplat.settings_errors import explain
+from clsplat.training.records import Records
+from clsplat.yaml_file import read_yaml
+
+
+class Averages(BaseModel):
+    """Metrics of a split at one scale; perceptual ones and remarks on them stand beside."""
+
+    model_config = ConfigDict(extra="allow", allow_inf_nan=False)
+
+    psnr: float
+    ssim: float
+    lpips: float | None = None
+    views: int
+
+    def figure(self, metric: str) -> float | None:
+        """A metric by its name; None where it was not measured."""
+        value = getattr(self, metric, None)
+        return float(value) if isinstance(value, int | float) else None
+
+
+Scales = dict[Annotated[str, Field(pattern=r"^\d+(\.\d+)?$")], Averages]
+
+
+class RunMetrics(BaseModel):
+    """metrics.json."""
+
+    test: Scales
+    train: Scales
+    gaussians: int
+    steps: int
+    train_seconds: float
+    seed: int
+    device: str
+    pipeline: str
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """One finished run."""
+
+    path: Path
+    settings: dict[str, Any]  # the resolved pipeline, in the shape of a file
+    scene: SceneSettings
+    metrics: RunMetrics
+
+    @classmethod
+    def read(cls, path: Path) -> "RunFolder":
+        """Read a run folder.
+
+        Raises DataError when it is missing, unfinished or damaged, ConfigError when its pipeline.yaml cannot be read.
+        """
+        if not path.is_dir():
+            raise DataError(f"{path}: no such folder; expected the folder of a finished run")
+        if not (path / "pipeline.yaml").is_file():
+            raise DataError(f"{path}: has no pipeline.yaml; expected the folder of a finished run")
+        if not (path / "metrics.json").is_file():
+            raise DataError(f"{path}: has no metrics.json, so the run {_state(path)}; finish it with --resume")
+        settings = read_settings(path)
+        return cls(path, settings, _scene(path, settings), _metrics(path / "metrics.json"))
+
+    @cached_property
+    def records(self) -> list[dict[str, Any]]:
+        """The lines of metrics.jsonl; none where it is missing.  Raises DataError when it is damaged."""
+        try:
+            return Records(self.path).read()
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise DataError(f"{self.path / 'metrics.jsonl'}: damaged ({error!r}); expected lines of JSON") from error
+
+    def points(self, kind: str, figure: str, **where: Any) -> list[tuple[float, float]]:
+        """(step, figure) of all records of a kind, such as `train`, in which `where` holds."""
+        lines = (line for line in self.records if line["kind"] == kind)
+        chosen = (line for line in lines if all(line.get(key) == value for key, value in where.items()))
+        return [(line["step"], line[figure]) for line in chosen if isinstance(line.get(figure), int | float)]
+
+    @property
+    def renders(self) -> Path:
+        """The folder of the images that the run's last `render` stage wrote."""
+        stages = [stage["render"] for stage in self.settings["stages"] if isinstance(stage, dict) and "render" in stage]
+        return self.path / (stages[-1] or {}).get("folder", "renders") if stages else self.path / "renders"
+
+
+def read_settings(path: Path) -> dict[str, Any]:
+    """Return a run folder's pipeline.yaml as plain data.  Raises ConfigError when that is not what it holds."""
+    data = read_yaml(path / "pipeline.yaml").data
+    if not isinstance(data, dict) or not isinstance(data.get("stages", []), list):
+        raise ConfigError(f"{path / 'pipeline.yaml'}: damaged; expected keys such as name and stages")
+    return {"stages": [], **data}
+
+
+def _scene(path: Path, settings: dict[str, Any]) -> SceneSettings:
+    try:
+        return SceneSettings.model_validate(settings.get("scene", {}))
+    except ValidationError as error:
+        file = path / "pipeline.yaml"
+        raise ConfigError(explain(error, SceneSettings, file, read_yaml(file))) from error
+
+
+def _metrics(path: Path) -> RunMetrics:
+    try:
+        return RunMetrics.model_validate_json(read_file(path))
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(str(part) for part in first["loc"])
+        message = first["msg"].removeprefix("Invalid JSON: ")
+        raise DataError(f"{path}: {place + ': ' if place else ''}{message}; the file is damaged, run again") from error
+
+
+def _state(path: Path) -> str:
+    try:
+        state = json.loads((path / "status.json").read_text()).get("state")
+    except (OSError, ValueError, AttributeError):
+        state = None
+    return {"failed": "failed", "interrupted": "was interrupted"}.get(str(state), "is not finished")

@@ -1,0 +1,235 @@
+"""Comparisons of constructed run folders: what is one row, what differs, what is shown, what is refused."""
+
+import base64
+import json
+import re
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from clsplat.compare import crops
+from clsplat.compare.comparison import Comparison
+from clsplat.compare.differences import differing, flat
+from clsplat.compare.page import write_comparison
+from clsplat.compare.run_folder import RunFolder
+from clsplat.errors import ClsplatError, ConfigError, DataError
+from clsplat.pipeline import load
+from clsplat.scene.detect import read_scene
+from clsplat.scene.images import load_image, write_image
+from tests.test_cli import clsplat
+
+WHITE = (1.0, 1.0, 1.0)  # behind the photographs of a Blender scene
+
+
+@pytest.fixture
+def make_run(tiny_scene, tmp_path):
+    """Write the folder of a run that never was; its renders are the photographs, darker by `error` grey levels."""
+
+    def make(name: str, *overrides: str, psnr: float = 20.0, error: int = 10, **changes: object) -> Path:
+        folder = tmp_path / name
+        pipeline = load("smoke", [f"scene.path='{tiny_scene}'", *overrides])
+        folder.mkdir()
+        (folder / "pipeline.yaml").write_text(pipeline.text())
+        averages = {"psnr": psnr, "ssim": psnr / 30, "lpips": None, "lpips_reason": "no ONNX file given", "views": 2}
+        metrics = {
+            "test": {"1": averages, "2": {**averages, "psnr": psnr + 1}},
+            "train": {},
+            "gaussians": 1000,
+            "steps": 50,
+            "train_seconds": 61.0,
+            "seed": pipeline.settings.seed,
+            "device": "a device",
+            "pipeline": "smoke",
+            **changes,
+        }
+        (folder / "metrics.json").write_text(json.dumps(metrics))
+        lines = [{"step": s, "kind": "train", "psnr": psnr - 50 / s, "gaussians": 900 + s} for s in (10, 20, 50)]
+        (folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+        for view in read_scene(tiny_scene).split("test"):
+            image = load_image(view, WHITE)
+            image[20:, 20:] = np.clip(image[20:, 20:].astype(int) - error, 0, 255)
+            write_image(folder / "renders" / f"{view.name}.png", image)
+        return folder
+
+    return make
+
+
+def page_of(tmp_path: Path, *folders: Path) -> str:
+    assert write_comparison(folders, tmp_path / "page.html") == len(folders)
+    return (tmp_path / "page.html").read_text()
+
+
+def test_seeds_are_one_row_with_mean_and_deviation(make_run, tmp_path):
+    seeds = [make_run(f"seed{i}", f"seed={i}", psnr=20.0 + i) for i in range(3)]
+    other = make_run("other", "init.opacity=0.3", psnr=24.0)
+    comparison = Comparison.read([*seeds, other])
+    (rows,) = comparison.scenes.values()
+    assert [len(row.runs) for row in rows] == [3, 1]
+    assert [row.variant.letter for row in rows] == ["A", "B"]
+    assert [row.variant.name for row in rows] == ["smoke, opacity 0.1", "smoke, opacity 0.3"]
+    page = page_of(tmp_path, *seeds, other)
+    assert "<td>21.00 <small>± 1.00</small>" in page  # of 20, 21, 22
+    assert "<td class=best>24.00<td" in page, "the best is bold, one run has no deviation"
+    assert "<td>22.00 <small>± 1.00</small>" in page, "at half size, where each is one higher"
+    assert page.count("<polyline") == 4 + 4 + 2 + 2, "PSNR and Gaussians by run, PSNR and SSIM by size and variant"
+    assert "LPIPS" not in page, "nobody measured it"
+
+
+def test_another_scene_or_size_is_another_table(make_run, tiny_scene, tmp_path):
+    shutil.copytree(tiny_scene, tmp_path / "second")
+    one, two = make_run("one", psnr=20), make_run("two", f"scene.path='{tmp_path / 'second'}'", psnr=30)
+    half = make_run("half", "scene.downscale=2", psnr=40)
+    shutil.rmtree(half / "renders")
+    comparison = Comparison.read([one, two, half])
+    assert list(comparison.scenes) == ["tiny", "second", "tiny at 1/2"]
+    assert len(comparison.variants) == 1, "the scene does not make a variant"
+    page = page_of(tmp_path, one, two, half)
+    assert "Mean of 3 scenes" in page
+    assert "<td>30.00" in page[: page.index("<h2>tiny</h2>")]
+    assert page.count("<p class=note>no crops: ") == 1, "only the run without renders has none"
+
+
+def test_differing_settings_are_found_by_name_not_by_place():
+    one = flat(load("splat").resolved())
+    assert one["optimize.steps"] == "30000"
+    assert one["optimize.densify.clone.gradient_above"] == "0.0002"
+    assert one["optimize.reset_opacity#2.when_background"] == "white"
+    assert one["optimize.dssim.weight"] == "0.2"
+    two = flat(load("splat", ["optimize.losses[0].weight=0.7", "optimize.densify.stop=900"]).resolved())
+    assert differing([one, two]) == ["optimize.l1.weight", "optimize.densify.stop"]
+    assert differing([one, one]) == []
+    short = flat(load("smoke").resolved())
+    assert "optimize.densify.prune_large.after" in differing([one, short]), "a rule that only one has"
+
+
+def test_the_page_shows_the_differing_settings_only(make_run, tmp_path):
+    page = page_of(tmp_path, make_run("a"), make_run("b", "optimize.densify.every=20"))
+    table = page[page.index("Settings that differ") : page.index("<h2>Runs")]
+    assert re.findall(r"<tr><td>([^<]*)<td>([^<]*)<td>([^<]*)", table) == [("optimize.densify.every", "10", "20")]
+
+
+def crops_of(*folders: Path) -> str:
+    runs = [RunFolder.read(folder) for folder in folders]
+    return crops.crops([crops.Contestant("run", run) for run in runs], *runs[0].scene.read())
+
+
+def test_crops_are_where_the_runs_differ(make_run, monkeypatch):
+    """One run is the photograph, the other is darker in the lower right quarter."""
+    monkeypatch.setattr(crops, "SMALLEST", 12)
+    text = crops_of(make_run("truth", error=0), make_run("darker", error=60))
+    places = [tuple(map(float, found)) for found in re.findall(r"left:([\d.]+)%;top:([\d.]+)%", text)]
+    assert len(places) == 2, "one of each test view"
+    assert all(50 <= left <= 70 and 50 <= top <= 70 for left, top in places)
+    assert text.count("100.00 dB in this crop") == 2
+    assert text.count("<input type=range") == 4
+
+
+def test_a_single_run_is_held_against_the_photograph(make_run):
+    text = crops_of(make_run("alone", error=60))
+    assert text.count("<input type=range") == 2
+    assert "100.00 dB" not in text
+
+
+def test_the_page_needs_nothing_else(make_run, tmp_path):
+    page = page_of(tmp_path, make_run("a"), make_run("b", "init.opacity=0.3"))
+    assert not re.search(r"https?://|<link|src=\"(?!data:)|@import", page)
+    first = re.search(r'class=slider><img src="data:image/png;base64,([^"]+)', page)
+    pixels = cv2.imdecode(np.frombuffer(base64.b64decode(first[1]), np.uint8), cv2.IMREAD_COLOR)
+    assert pixels.shape == (40, 40, 3), "crops keep every bit"
+
+
+def test_names_are_escaped(make_run, tmp_path):
+    folder = make_run("<b>x", device="<i>y", pipeline="<u>z")
+    page = page_of(tmp_path, folder)
+    assert not re.search(r"<b>x|<i>y|<u>z", page)
+    assert "&lt;b&gt;x" in page
+
+
+def test_lpips_of_different_ranges_is_marked(make_run, tmp_path):
+    def averages(inputs: str) -> dict[str, object]:
+        return {"1": {"psnr": 20, "ssim": 0.5, "lpips": 0.25, "lpips_input": inputs, "views": 2}}
+
+    one, two = make_run("one", test=averages("0..1")), make_run("two", "init.opacity=0.3", test=averages("-1..1"))
+    page = page_of(tmp_path, one, two)
+    assert "0.2500" in page
+    assert "The input range of LPIPS is not the same in all runs (-1..1, 0..1)." in page
+
+
+def broken(make_run, how: str) -> Path:
+    folder: Path = make_run("run")
+    match how:
+        case "missing":
+            return folder.with_name("nowhere")
+        case "no settings":
+            (folder / "pipeline.yaml").unlink()
+        case "unfinished":
+            (folder / "metrics.json").unlink()
+            (folder / "status.json").write_text('{"state": "interrupted"}')
+        case "damaged metrics":
+            (folder / "metrics.json").write_text('{"test": {"1": {"psnr"')
+        case "metrics of something else":
+            (folder / "metrics.json").write_text('{"test": {"1": {"psnr": "high"}}}')
+        case "damaged records":
+            (folder / "metrics.jsonl").write_text("[1, 2]\n")
+        case "damaged settings":
+            (folder / "pipeline.yaml").write_text("name: [")
+        case "settings of something else":
+            (folder / "pipeline.yaml").write_text("- a\n")
+        case "no such scene setting":
+            (folder / "pipeline.yaml").write_text("scene: {pth: x}\nstages: []\n")
+    return folder
+
+
+@pytest.mark.parametrize(("how", "code", "words"), [
+    ("missing", 3, "nowhere: no such folder"),
+    ("no settings", 3, "has no pipeline.yaml"),
+    ("unfinished", 3, "has no metrics.json, so the run was interrupted; finish it with --resume"),
+    ("damaged metrics", 3, "metrics.json: .*the file is damaged"),
+    ("metrics of something else", 3, r"metrics.json: test.1.psnr: "),
+    ("damaged records", 3, "metrics.jsonl: damaged"),
+    ("damaged settings", 2, r"pipeline.yaml:\d"),
+    ("settings of something else", 2, "expected keys such as name and stages"),
+    ("no such scene setting", 2, "unknown key; did you mean 'path'"),
+])  # fmt: skip
+def test_refusals(make_run, tmp_path, how, code, words):
+    with pytest.raises(ClsplatError, match=words) as error:
+        write_comparison([broken(make_run, how)], tmp_path / "page.html")
+    assert error.value.exit_code == code
+    assert "\n" not in str(error.value)
+    assert not (tmp_path / "page.html").exists()
+
+
+def test_the_same_run_twice_is_refused(make_run, tmp_path):
+    folder = make_run("run")
+    with pytest.raises(ConfigError, match="given twice"):
+        write_comparison([folder, tmp_path / "." / "run"], tmp_path / "page.html")
+
+
+def test_without_the_photographs_the_rest_is_shown(make_run, tmp_path):
+    folder = make_run("run")
+    text = (folder / "pipeline.yaml").read_text()
+    (folder / "pipeline.yaml").write_text(re.sub(r"path: .*tiny.*?,", "path: /nowhere,", text))
+    page = page_of(tmp_path, folder)
+    assert "no crops: /nowhere: no such folder" in page
+    assert "20.00" in page
+
+
+def test_a_damaged_render_is_refused(make_run, tmp_path):
+    folder = make_run("run")
+    (folder / "renders/test/r_001.png").write_bytes((folder / "renders/test/r_001.png").read_bytes()[:40])
+    with pytest.raises(DataError, match=r"r_001.png: not an image, or a damaged one"):
+        write_comparison([folder], tmp_path / "page.html")
+    cv2.imwrite(str(folder / "renders/test/r_001.png"), np.zeros((41, 50, 3), np.uint8))
+    with pytest.raises(DataError, match=r"r_001.png: the image is 50x41 pixels, its camera 40x40"):
+        write_comparison([folder], tmp_path / "page.html")
+
+
+def test_the_command(make_run, tmp_path):
+    done = clsplat("compare", make_run("a"), make_run("b", "seed=1"), "--out", tmp_path / "c.html")
+    assert "2 runs compared" in done.stdout
+    assert "tiny" in (tmp_path / "c.html").read_text()
+    clsplat("compare", tmp_path / "nowhere", "--out", tmp_path / "d.html", expect=3)
+    clsplat("compare", expect=2)
