@@ -3,16 +3,13 @@
 import json
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
 from clsplat import screen
 from clsplat.errors import ClsplatError, ConfigError, DeviceError
 from clsplat.screen import CONSOLE, ERRORS
-
-if TYPE_CHECKING:
-    from clsplat.opencl.device import DeviceInfo
 
 app = typer.Typer(
     help="3D Gaussian Splatting on any OpenCL device.",
@@ -46,27 +43,27 @@ def run(
     dry_run: Annotated[bool, typer.Option(help="Check everything and say what would run.")] = False,
 ) -> None:
     """Run a pipeline."""
-    from clsplat import runner
+    from clsplat import experiment, runner
+    from clsplat.matrix import load_experiment
     from clsplat.pipeline import load
 
     overrides = list(set_ or [])
     if scene is not None:
         overrides.append(f"scene.path={json.dumps(str(scene.resolve()))}")
+    if found := load_experiment(pipeline, overrides):
+        folder = out or runner.free_folder(Path("runs") / found.name, resume)
+        if dry_run:
+            CONSOLE.print(experiment.describe(found, folder), markup=False)
+        else:
+            experiment.run(found, folder, device, resume)
+        return
     checked = load(pipeline, overrides)
-    folder = out or _free_folder(Path("runs") / checked.settings.name, resume)
+    folder = out or runner.free_folder(Path("runs") / checked.settings.name, resume)
     if dry_run:
         CONSOLE.print(runner.describe(checked, runner.open_run(checked, folder, device)), markup=False)
         return
-    runner.prepare_folder(folder, resume)
-    screen.log_to_file(folder / "log.txt")
-    try:
-        state = runner.open_run(checked, folder, device)
-    except ClsplatError as error:
-        runner.give_up(folder, error)
-        raise
-    with screen.progress_bar() as show:
-        runner.execute(checked, state, resume, show)
-    _summary(folder)
+    experiment.run_pipeline(checked, folder, device, resume)
+    screen.summary(folder)
 
 
 @app.command()
@@ -75,6 +72,7 @@ def check(
     schema: Annotated[bool, typer.Option(help="Print the JSON schema of pipeline files, for editors.")] = False,
 ) -> None:
     """Validate a pipeline without running it."""
+    from clsplat.matrix import load_experiment
     from clsplat.pipeline import load
     from clsplat.schema import json_schema
 
@@ -83,6 +81,9 @@ def check(
         return
     if not pipeline:
         raise ConfigError("check: expected a pipeline, or --schema")
+    if found := load_experiment(pipeline):
+        CONSOLE.print(f"{found.path}: {', '.join(cell.name for cell in found.cells)}: fine", markup=False)
+        return
     checked = load(pipeline)
     CONSOLE.print(f"{checked.path}: {', '.join(stage.stage for stage in checked.settings.stages)}: fine", markup=False)
 
@@ -101,7 +102,7 @@ def devices(
         print(json.dumps([{**asdict(info), "fault": fault} for info, fault in found], indent=1))
     else:
         for info, fault in found:
-            CONSOLE.print(_device_text(info, fault), markup=False)
+            CONSOLE.print(screen.device_text(info, fault), markup=False)
     if all(fault for _, fault in found):
         raise DeviceError(
             "no OpenCL device works; install a runtime: pip install 'clsplat[pocl]', pip install 'clsplat[intel]', "
@@ -213,41 +214,6 @@ def _read_json(path: Path) -> dict[str, Any]:
     except (OSError, ValueError) as error:
         raise ConfigError(f"{path}: expected the JSON of an earlier `clsplat bench --json` ({error})") from error
     return data if isinstance(data, dict) else {}
-
-
-def _device_text(info: "DeviceInfo", fault: str | None) -> str:
-    from clsplat.opencl.device import resolve_schedule
-
-    sizes = f"{info.memory / 2**30:.1f} GiB of memory, buffers up to {info.allocation / 2**30:.1f} GiB"
-    limits = f"groups up to {info.group}, {info.local_memory >> 10} KiB local, {info.float_width} lanes"
-    return (
-        f"{info.name} ({info.kind}, {info.units} units)\n"
-        f"  runtime   {info.platform}\n"
-        f"  limits    {sizes}, {limits}\n"
-        f"  schedule  {resolve_schedule(info, 'auto')}\n"
-        f"  state     {'does not work: ' + fault if fault else 'works'}"
-    )
-
-
-def _free_folder(folder: Path, resume: bool) -> Path:
-    """The default run folder; a number keeps a new run apart from earlier ones."""
-    number, free = 1, folder
-    while (free / "pipeline.yaml").exists() and not resume:
-        number += 1
-        free = folder.with_name(f"{folder.name}-{number}")
-    return free
-
-
-def _summary(folder: Path) -> None:
-    metrics = json.loads((folder / "metrics.json").read_text())
-    test = metrics["test"].get("1")
-    quality = f"test PSNR {test['psnr']:.2f} dB, SSIM {test['ssim']:.4f}; " if test else ""
-    CONSOLE.print(
-        f"{quality}{metrics['gaussians']:,} Gaussians; {metrics['train_seconds']:.0f} s of training", markup=False
-    )
-    for title, name in (("model", "point_cloud.ply"), ("renders", "renders"), ("report", "report.html")):
-        if (folder / name).exists():
-            CONSOLE.print(f"  {title:<8} {folder / name}", markup=False)
 
 
 def _one_set_each(arguments: list[str]) -> list[str]:

@@ -7,10 +7,12 @@ A file is complete and strict: unknown keys are errors, every value has its defa
 file is written to the run folder.
 """
 
+import copy
 import difflib
 import io
 import logging
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -57,10 +59,13 @@ class RasterizerSettings(Settings):
     sort: Sort = "auto"
 
 
+Name = Annotated[str, Field(pattern=r"^[\w.-]+$")]
+
+
 class PipelineFile(Settings):
     """All that a pipeline file can say."""
 
-    name: Annotated[str, Field(pattern=r"^[\w.-]+$")]
+    name: Name
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
     scene: SceneSettings = SceneSettings()
     model: ModelSettings = ModelSettings()
@@ -102,11 +107,15 @@ def load(name: str, overrides: list[str] | None = None) -> Pipeline:
     Raises ConfigError naming file, line, place and the nearest match.
     """
     path = find(name)
-    document = read_yaml(path)
+    return checked(path, read_yaml(path), overrides or [])
+
+
+def checked(path: Path, document: Document, overrides: Sequence[str] = ()) -> Pipeline:
+    """Check what was read from a pipeline file; the document stays as it is.  Raises ConfigError as `load` does."""
     if not isinstance(document.data, dict):
         raise ConfigError(f"{path}:1: expected keys such as name and stages")
-    data = _tagged_file(document, path)
-    for override in overrides or []:
+    data = _tagged_file(Document(copy.deepcopy(document.data), document.lines), path)
+    for override in overrides:
         _override(data, override)
     try:
         settings = PipelineFile.model_validate(data)

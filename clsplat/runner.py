@@ -41,6 +41,15 @@ def give_up(out: Path, error: ClsplatError) -> None:
     Records(out).status("failed", 0, exit_code=error.exit_code, message=str(error))
 
 
+def free_folder(folder: Path, resume: bool) -> Path:
+    """The default run folder; a number keeps a new run apart from earlier ones."""
+    number, free = 1, folder
+    while (free / "pipeline.yaml").exists() and not resume:
+        number += 1
+        free = folder.with_name(f"{folder.name}-{number}")
+    return free
+
+
 def open_run(pipeline: Pipeline, out: Path, words: str | None) -> Run:
     """Choose the device and read the scene.  Raises what they raise."""
     settings = pipeline.settings

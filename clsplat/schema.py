@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from clsplat.matrix import Matrix
 from clsplat.pipeline import PipelineFile
 from clsplat.stages import STAGES
 
@@ -14,6 +15,14 @@ def json_schema() -> dict[str, Any]:
     for title in stages:
         definitions[title]["properties"].pop("stage", None)
     schema["properties"]["stages"]["items"] = _items(stages)
+    matrix = Matrix.model_json_schema()
+    definitions |= {**matrix.pop("$defs", {}), "Matrix": matrix}
+    schema["properties"]["matrix"] = {"$ref": "#/$defs/Matrix"}
+    schema["required"].remove("stages")  # a matrix can name pipelines, and then stands alone
+    schema["anyOf"] = [
+        {"required": ["stages"]},
+        {"required": ["matrix"], "properties": {"matrix": {"required": ["pipelines"]}}},
+    ]
     definitions["Optimize"]["properties"]["during"]["items"] = _items(stages)
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
 

@@ -1,5 +1,6 @@
 """What the terminal shows: a live line of progress, or plain lines where there is no terminal."""
 
+import json
 import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -9,6 +10,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.progress import BarColumn, Progress, TextColumn
 
+from clsplat.opencl.device import DeviceInfo, resolve_schedule
 from clsplat.training import run as training
 
 LOG = logging.getLogger("clsplat")
@@ -34,11 +36,17 @@ def start_logging(debug: bool) -> None:
     LOG.addHandler(handler)
 
 
-def log_to_file(path: Path) -> None:
+@contextmanager
+def logging_to(path: Path) -> Iterator[None]:
     """Append the log to a file, with the time of every line."""
     handler = logging.FileHandler(path)
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
     LOG.addHandler(handler)
+    try:
+        yield
+    finally:
+        LOG.removeHandler(handler)
+        handler.close()
 
 
 def line(progress: training.Progress) -> str:
@@ -48,6 +56,32 @@ def line(progress: training.Progress) -> str:
         f"step {p.step}/{p.steps}  loss {p.loss:.4f}  psnr {p.psnr:.1f}  gaussians {p.gaussians:,}  "
         f"{p.milliseconds:.1f} ms/step  {_clock(p.seconds_left)} left"
     )
+
+
+def device_text(info: DeviceInfo, fault: str | None) -> str:
+    """A device and whether it works, for people."""
+    sizes = f"{info.memory / 2**30:.1f} GiB of memory, buffers up to {info.allocation / 2**30:.1f} GiB"
+    limits = f"groups up to {info.group}, {info.local_memory >> 10} KiB local, {info.float_width} lanes"
+    return (
+        f"{info.name} ({info.kind}, {info.units} units)\n"
+        f"  runtime   {info.platform}\n"
+        f"  limits    {sizes}, {limits}\n"
+        f"  schedule  {resolve_schedule(info, 'auto')}\n"
+        f"  state     {'does not work: ' + fault if fault else 'works'}"
+    )
+
+
+def summary(folder: Path) -> None:
+    """Print what a run achieved, and where it lies."""
+    metrics = json.loads((folder / "metrics.json").read_text())
+    test = metrics["test"].get("1")
+    quality = f"test PSNR {test['psnr']:.2f} dB, SSIM {test['ssim']:.4f}; " if test else ""
+    CONSOLE.print(
+        f"{quality}{metrics['gaussians']:,} Gaussians; {metrics['train_seconds']:.0f} s of training", markup=False
+    )
+    for title, name in (("model", "point_cloud.ply"), ("renders", "renders"), ("report", "report.html")):
+        if (folder / name).exists():
+            CONSOLE.print(f"  {title:<8} {folder / name}", markup=False)
 
 
 @contextmanager

@@ -12,7 +12,9 @@ PACKAGE = Path(__file__).parents[1] / "clsplat"
 ROWS = (  # from the top down; a module imports only from lower rows, or from its own folder
     {"__main__"},
     {"cli"},
-    {"runner", "model_file", "bench", "compare", "schema", "screen"},
+    {"experiment", "schema"},
+    {"matrix"},
+    {"runner", "model_file", "bench", "compare", "screen"},
     {"pipeline"},
     {"stages"},
     {"training"},

@@ -1,0 +1,213 @@
+"""A pipeline file with `matrix:`: one run for each combination of pipelines, scenes, settings and seeds.
+
+    name: ablation
+    matrix:
+      pipelines: [splat_7k, my_variant.yaml]   # without these: the stages of this file
+      scenes: [data/lego, data/garden]
+      seeds: [0, 1, 2]
+      set:                                     # each key is swept over its list
+        densify.every: [100, 200]
+
+Each cell runs in its own folder below the run folder, named after its place on every axis.
+"""
+
+import itertools
+import json
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import Field, JsonValue, ValidationError, model_validator
+
+from clsplat.errors import ConfigError
+from clsplat.pipeline import Name, Pipeline, checked, find
+from clsplat.settings import Settings
+from clsplat.settings_errors import explain
+from clsplat.yaml_file import Document, Place, read_yaml
+
+LIMIT = 1000  # cells: more is a slip
+
+
+class Matrix(Settings):
+    """The axes; every one that is listed has a part in the cells' names."""
+
+    pipelines: list[str] = Field([])  # files, or names of shipped ones
+    scenes: list[str] = Field([])  # folders
+    seeds: list[Annotated[int, Field(ge=0, lt=2**32)]] = Field([])
+    set: dict[str, Annotated[list[JsonValue], Field(min_length=1)]] = Field({})  # stage.key: its values
+
+    @model_validator(mode="after")
+    def _has_cells(self) -> "Matrix":
+        axes: list[list[Any]] = [self.pipelines, self.scenes, self.seeds, *self.set.values()]
+        if not any(axes):
+            raise ValueError("expected one of pipelines, scenes, seeds and set")
+        for axis in axes:
+            if len({json.dumps(value) for value in axis}) < len(axis):
+                raise ValueError(f"the same value twice in {axis}")
+        return self
+
+
+class MatrixFile(Settings):
+    """What a file with `matrix:` can say; `stages` and the rest only when the matrix names no pipelines."""
+
+    name: Name
+    matrix: Matrix
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One run."""
+
+    name: str  # of its folder
+    pipeline: Pipeline
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """All runs of a file."""
+
+    path: Path
+    name: str
+    text: str  # of the file
+    cells: list[Cell]
+
+
+@dataclass(frozen=True)
+class _Choice:
+    """A value on an axis."""
+
+    label: str
+    override: str  # place=value
+    place: Place  # in the file
+
+
+def load_experiment(name: str, overrides: Sequence[str] = ()) -> Experiment | None:
+    """Read and check a pipeline file with `matrix:`, and every cell of it; None for a file without.
+
+    Raises ConfigError with file and line.
+    """
+    path = find(name)
+    document = read_yaml(path)
+    if not isinstance(document.data, dict) or "matrix" not in document.data:
+        return None
+    named = document.data["matrix"].get("pipelines") if isinstance(document.data["matrix"], dict) else None
+    try:
+        own = {key: value for key, value in document.data.items() if named or key in MatrixFile.model_fields}
+        file = MatrixFile.model_validate(own)
+    except ValidationError as error:
+        raise ConfigError(explain(error, MatrixFile, path, document)) from error
+    axes = _axes(file.matrix)
+    _check_overrides(path, axes, overrides)
+    bases = _bases(path, document, file.matrix)
+    if (count := len(bases) * math.prod(len(axis) for axis in axes)) > LIMIT:
+        raise ConfigError(f"{path}: the matrix has {count} cells; at most {LIMIT} are run, so list fewer values")
+    for base in bases:
+        _check_choices(path, document, base, axes, overrides)
+    cells = [_cell(base, choices, overrides) for base in bases for choices in itertools.product(*axes)]
+    _check_names(path, cells)
+    return Experiment(path, file.name, path.read_text(encoding="utf-8"), cells)
+
+
+@dataclass(frozen=True)
+class _Base:
+    """The pipeline that cells start from."""
+
+    label: str  # "" when it is the file with the matrix
+    path: Path
+    document: Document
+
+
+def _bases(path: Path, document: Document, matrix: Matrix) -> list[_Base]:
+    if not matrix.pipelines:
+        data = {key: value for key, value in document.data.items() if key != "matrix"}
+        return [_Base("", path, Document(data, document.lines))]
+    bases = []
+    for i, name in enumerate(matrix.pipelines):
+        try:
+            found = find(name)
+            base = _Base(found.stem, found, read_yaml(found))
+            checked(base.path, base.document)
+        except ConfigError as error:
+            line = document.line(("matrix", "pipelines", i))
+            raise ConfigError(f"{path}:{line}: matrix.pipelines[{i}]: {error}") from error
+        bases.append(base)
+    return bases
+
+
+def _axes(matrix: Matrix) -> list[list[_Choice]]:
+    """Every axis but the pipelines, in the order of the cells' names."""
+    axes = []
+    if matrix.scenes:
+        labels = _distinct([Path(scene).parts for scene in matrix.scenes])
+        axes.append([
+            _Choice(label, _override("scene.path", str(Path(scene).resolve())), ("matrix", "scenes", i))
+            for i, (label, scene) in enumerate(zip(labels, matrix.scenes, strict=True))
+        ])  # fmt: skip
+    keys = _distinct([tuple(key.split(".")) for key in matrix.set])
+    for short, (key, values) in zip(keys, matrix.set.items(), strict=True):
+        axes.append([
+            _Choice(f"{short}={_text(value)}", _override(key, value), ("matrix", "set", key, i))
+            for i, value in enumerate(values)
+        ])  # fmt: skip
+    if matrix.seeds:
+        axes.append([
+            _Choice(f"seed={seed}", _override("seed", seed), ("matrix", "seeds", i))
+            for i, seed in enumerate(matrix.seeds)
+        ])  # fmt: skip
+    return axes
+
+
+def _cell(base: _Base, choices: Sequence[_Choice], overrides: Sequence[str]) -> Cell:
+    parts = [base.label, *(choice.label for choice in choices)]
+    name = re.sub(r"[^\w.=+-]+", "_", "-".join(part for part in parts if part))
+    pipeline = checked(base.path, base.document, [*overrides, *(choice.override for choice in choices)])
+    return Cell(name, pipeline)
+
+
+def _check_choices(
+    path: Path, document: Document, base: _Base, axes: Sequence[Sequence[_Choice]], overrides: Sequence[str]
+) -> None:
+    """Say which value of the matrix a pipeline refuses, before values meet each other."""
+    checked(base.path, base.document, list(overrides))
+    for choice in itertools.chain(*axes):
+        try:
+            checked(base.path, base.document, [*overrides, choice.override])
+        except ConfigError as error:
+            place = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in choice.place)[1:]
+            reason = re.sub(r"^(\S+:\d+|--set [^:]*): ", "", str(error))
+            raise ConfigError(f"{path}:{document.line(choice.place)}: {place}: {reason}") from error
+
+
+def _check_overrides(path: Path, axes: Sequence[Sequence[_Choice]], overrides: Sequence[str]) -> None:
+    swept = {choice.override.partition("=")[0] for axis in axes for choice in axis}
+    for override in overrides:
+        if (place := override.partition("=")[0]) in swept:
+            raise ConfigError(f"{path}: the matrix lists values of {place}; change them there, not by an option")
+
+
+def _check_names(path: Path, cells: Sequence[Cell]) -> None:
+    names = [cell.name.casefold() for cell in cells]  # some file systems know no case
+    if twice := next((cell.name for cell in cells if names.count(cell.name.casefold()) > 1), None):
+        raise ConfigError(f"{path}: two cells of the matrix would be named '{twice}'; rename a pipeline or a folder")
+
+
+def _distinct(paths: Sequence[tuple[str, ...]]) -> list[str]:
+    """The shortest ends of the paths that tell them apart."""
+    for length in range(1, max((len(parts) for parts in paths), default=0) + 1):
+        names = ["-".join(parts[-length:]) for parts in paths]
+        if len(set(names)) == len(names):
+            return names
+    return ["-".join(parts) for parts in paths]
+
+
+def _override(place: str, value: Any) -> str:
+    return f"{place}={json.dumps(value)}"
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, list):
+        return "+".join(_text(item) for item in value)
+    return value if isinstance(value, str) else json.dumps(value)
