@@ -99,7 +99,7 @@ void blend_backward(
         const bool owns = begin + item < end, active = begin + item < last;
         const uint pair = owns ? tile_pairs[begin + item] : 0;
         float splat[RECORD] = {0.0f};
-        moments_t m = {0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f};
+        moments_t m = {0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f};
         if (active)
             for (uint k = 0; k < RECORD; k++)
                 splat[k] = splats[(size_t)pair_splat[pair] * RECORD + k];
@@ -117,6 +117,6 @@ void blend_backward(
             }
         if (owns)
             vstore16((float16)(m.power, m.x, m.y, m.xx, m.xy, m.yy, m.red, m.green, m.blue,
-                               0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f), pair, pair_moments);
+                               m.abs_x, m.abs_y, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f), pair, pair_moments);
     }
 }

@@ -7,24 +7,54 @@
 #include "common.h"
 #include "random.h"
 
-/* Add this view's screen gradient, in the units of the reference: dL by normalised device coordinates. */
+/* Count the views that see each Gaussian. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
-void accumulate_stats(
-    __global const float *restrict grad_mean2d,  // [2,S] px^-1
-    __global const float *restrict radius,       // [S] px, 0 = not seen
-    __global float *restrict screen_grad,        // [S] sum of norms
-    __global float *restrict seen,               // [S] views
-    const float half_width,                      // px
-    const float half_height,                     // px
+void count_seen(
+    __global const float *restrict radius,  // [S] px, 0 = not seen
+    __global float *restrict seen,          // [S] views
+    const uint count)
+{
+    const uint i = get_global_id(0);
+    if (i < count && radius[i] > 0.0f)
+        seen[i] += 1.0f;
+}
+
+/* Add the Euclidean norm of this view's screen gradient, in the units of the reference: dL by normalised device
+ * coordinates.  The gradient lies in planes `first` and `first` + 1. */
+__kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
+void accumulate_norm(
+    __global const float *restrict planes,  // [>first+1,S] px^-1
+    __global const float *restrict radius,  // [S] px, 0 = not seen
+    __global float *restrict total,         // [S] over views
+    const float half_width,                 // px
+    const float half_height,                // px
+    const uint first,
     const uint stride,
     const uint count)
 {
     const uint i = get_global_id(0);
     if (i >= count || !(radius[i] > 0.0f))
         return;
-    const float x = half_width * grad_mean2d[i], y = half_height * grad_mean2d[stride + i];
-    screen_grad[i] += sqrt(x * x + y * y);
-    seen[i] += 1.0f;
+    const float x = half_width * planes[first * stride + i], y = half_height * planes[(first + 1) * stride + i];
+    total[i] += sqrt(x * x + y * y);
+}
+
+/* The same with |x| + |y| for the norm. */
+__kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
+void accumulate_sum(
+    __global const float *restrict planes,  // [>first+1,S] px^-1
+    __global const float *restrict radius,  // [S] px, 0 = not seen
+    __global float *restrict total,         // [S] over views
+    const float half_width,                 // px
+    const float half_height,                // px
+    const uint first,
+    const uint stride,
+    const uint count)
+{
+    const uint i = get_global_id(0);
+    if (i >= count || !(radius[i] > 0.0f))
+        return;
+    total[i] += half_width * fabs(planes[first * stride + i]) + half_height * fabs(planes[(first + 1) * stride + i]);
 }
 
 /* Every Gaussian keeps its row, until a rule says otherwise. */
@@ -49,12 +79,12 @@ __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void mark_rule(
     __global const float *restrict log_scales,     // [3,S] log of scene units
     __global const float *restrict logit_opacity,  // [S]
-    __global const float *restrict screen_grad,    // [S]
-    __global const float *restrict seen,           // [S]
+    __global const float *restrict statistic,      // [S] sum over views
+    __global const float *restrict seen,           // [S] views
     __global uint *restrict copies,                // [N]
     __global uint *restrict kept,                  // [N]
     __global float *restrict shrink,               // [N]
-    const float gradient_above,                    // mean screen gradient, at least
+    const float gradient_above,                    // mean of the statistic, at least
     const float size_above,                        // scene units, more than
     const float size_below,                        // scene units, at most
     const float opacity_below,                     // less than
@@ -69,7 +99,7 @@ void mark_rule(
         return;
     const float size = exp(fmax(log_scales[i], fmax(log_scales[stride + i], log_scales[2 * stride + i]))) * shrink[i];
     const float opacity = 1.0f / (1.0f + exp(-logit_opacity[i]));
-    const float gradient = seen[i] > 0.0f ? screen_grad[i] / seen[i] : 0.0f;
+    const float gradient = seen[i] > 0.0f ? statistic[i] / seen[i] : 0.0f;
     if (gradient >= gradient_above && size > size_above && size <= size_below && opacity < opacity_below) {
         copies[i] = new_copies;
         kept[i] = new_kept;
@@ -128,14 +158,26 @@ void spawn_children(
         log_scales[k * stride + i] += log(shrink[source[i]]);
 }
 
-/* No Gaussian stays more opaque than the limit (the opacity reset of 3DGS). */
+/* No Gaussian stays more opaque than the limit once the world filter has spread it out (the opacity reset of 3DGS and
+ * Mip-Splatting). */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void cap_opacity(
-    __global float *restrict logit_opacity,  // [S]
-    const float limit,                       // logit
+    __global const float *restrict log_scales,       // [3,S] log of scene units
+    __global const float *restrict filter_variance,  // [S] scene units^2
+    __global float *restrict logit_opacity,          // [S]
+    const float limit,                               // of the filtered opacity
+    const uint stride,
     const uint count)
 {
     const uint i = get_global_id(0);
-    if (i < count)
-        logit_opacity[i] = logit_opacity[i] < limit ? logit_opacity[i] : limit;
+    if (i >= count)
+        return;
+    float energy2 = 1.0f;
+    for (uint k = 0; k < 3 && filter_variance[i] > 0.0f; k++) {
+        const float scale = exp(log_scales[k * stride + i]);
+        energy2 /= 1.0f + filter_variance[i] / (scale * scale);
+    }
+    const float most = limit / sqrt(energy2);  // of the opacity before the filter; may be 1 and more
+    const float logit = most < 1.0f ? log(most / (1.0f - most)) : logit_opacity[i];
+    logit_opacity[i] = logit_opacity[i] < logit ? logit_opacity[i] : logit;
 }

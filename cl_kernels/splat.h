@@ -32,11 +32,12 @@
 #define MOMENT_XY 4        // p dx dy
 #define MOMENT_YY 5        // p dy dy
 #define MOMENT_RED 6       // w dL/dcolour; then green, blue
-#define MOMENTS 9
+#define MOMENT_ABS_X 9     // |dL/dx| of the mean, px^-1; from here on only where MOMENTS says so
+#define MOMENT_ABS_Y 10
 
 /* The same sums while they grow, one set per lane. */
 typedef struct {
-    VF power, x, y, xx, xy, yy, red, green, blue;
+    VF power, x, y, xx, xy, yy, red, green, blue, abs_x, abs_y;
 } moments_t;
 
 /* A splat seen from one row of pixels. */
@@ -44,6 +45,7 @@ typedef struct {
     float x;           // mean, px
     float dy;          // px
     float a, b, c;     // power = (a dx - b) dx - c
+    float xy, slope;   // dpower/dy of the mean = -(xy dx + slope)
     float opacity;
     float power_min;   // above 0 when the row is outside the splat's extent: then nothing is hit
 } row_splat_t;
@@ -55,6 +57,7 @@ static inline row_splat_t splat_at_row(const float *splat, const float row)
     const row_splat_t s = {
         splat[SPLAT_X], dy,
         -0.5f * splat[SPLAT_XX], splat[SPLAT_XY] * dy, 0.5f * splat[SPLAT_YY] * dy * dy,
+        splat[SPLAT_XY], splat[SPLAT_YY] * dy,
         splat[SPLAT_OPACITY],
         inside ? splat[SPLAT_POWER_MIN] : 1.0f};
     return s;
@@ -134,6 +137,10 @@ static inline void blend_backward_step(grad_pixels_t *p, const row_splat_t s, co
     m->red += k.weight * p->red;
     m->green += k.weight * p->green;
     m->blue += k.weight * p->blue;
+    if (MOMENTS > MOMENT_ABS_X) {  // known when compiled
+        m->abs_x += magnitude(power * (s.b - 2.0f * s.a * k.dx));
+        m->abs_y += magnitude(power * (s.xy * k.dx + s.slope));
+    }
 }
 
 #endif

@@ -22,9 +22,10 @@ from clsplat.render.renderer import RECORD, Frame, Renderer
 from clsplat.scene.detect import read_scene
 from clsplat.scene.scene import Camera, View
 from clsplat.training.adam import Adam, Rates
-from clsplat.training.density import PruneLarge, SplatStats, densify
+from clsplat.training.density import PruneLarge, densify
 from clsplat.training.losses import L1, Dssim
 from clsplat.training.profile import stage_milliseconds
+from clsplat.training.statistics import SplatStats
 from clsplat.training.step import differentiate
 from clsplat.training.targets import Target, Targets
 
@@ -88,7 +89,7 @@ class Contestant:
         self.device.timings.sampling = record
         start = time.perf_counter()
         view = differentiate(self.renderer, self.model, self.target, self.background, self.losses)
-        self.stats.add(view.frame, self.adam.update(self.model, view.frame, view.moments, self.rates))
+        self.stats.add(view, self.adam.update(self.model, view.frame, view.moments, self.rates))
         self.device.finish()
         seconds = time.perf_counter() - start
         self.device.timings.sampling = False

@@ -9,13 +9,14 @@ import numpy as np
 
 from clsplat.errors import DataError
 from clsplat.files import atomic
-from clsplat.gaussians.model import Gaussians, Model
+from clsplat.gaussians.model import Gaussians
 from clsplat.gaussians.ply import read_ply
 from clsplat.opencl.device import Device, choose
 from clsplat.render.renderer import Renderer
 from clsplat.scene.detect import read_scene
 from clsplat.scene.images import write_image
 from clsplat.stages.render import image_path
+from clsplat.training.filters import Dilation, Mip, ModelSettings
 from clsplat.training.metrics import mean, measure, render_view
 from clsplat.training.perceptual import Perceptual
 from clsplat.training.targets import BACKGROUNDS, Targets
@@ -26,16 +27,19 @@ LOG = logging.getLogger("clsplat")
 class ModelFile:
     """A PLY opened on a device, with the scene whose cameras look at it.
 
-    The numbers it was trained with come from the file's comment; files of other programs get those of 3DGS.
+    The numbers it was trained with come from the file's comment; files of other programs get those of 3DGS, or of
+    Mip-Splatting where the file says so.
     """
 
     def __init__(self, path: Path, scene: Path, device: str | None, scale: float = 1) -> None:
         file = read_ply(path)
         self.device = Device(choose(device))
         LOG.info("device: %s", self.device.text)
-        self.scene = read_scene(scene).downscaled(scale)
+        self.photographs = read_scene(scene)
+        self.scene = self.photographs.downscaled(scale)
         gaussians = Gaussians(self.device, file.parameters)
-        self.model = Model(gaussians, gaussians.sh_degree)
+        screen = Mip() if file.mode == "mip" else Dilation()
+        self.model = ModelSettings(screen_filter=screen).model(gaussians, gaussians.sh_degree)
         for name in ("near", "screen_variance", "compensate"):
             if isinstance(file.rendering.get(name), int | float):
                 setattr(self.model, name, float(file.rendering[name]))
@@ -64,10 +68,10 @@ class ModelFile:
         return len(views)
 
     def evaluate(self, scales: list[float], perceptual: Perceptual) -> dict[str, Any]:
-        """Metrics by split and scale, with the keys of metrics.json."""
+        """Metrics by split and scale, by what the photographs' sizes are divided, with the keys of metrics.json."""
         metrics: dict[str, Any] = {"test": {}, "train": {}}
         for scale in scales:
-            scene = self.scene.downscaled(scale)
+            scene = self.photographs.downscaled(scale)
             targets = Targets(self.device, self.background)
             for split in ("test", "train"):
                 if scene.split(split):

@@ -31,6 +31,7 @@ from clsplat.settings_errors import explain
 from clsplat.stages import STAGES, AnyStage
 from clsplat.stages.base import Stage
 from clsplat.training.filters import ModelSettings
+from clsplat.training.sampling import Sampling
 from clsplat.yaml_file import Document, parse_scalar, read_yaml
 
 LOG = logging.getLogger("clsplat")
@@ -41,14 +42,21 @@ class SceneSettings(Settings):
 
     path: str | None = None  # usually given by --scene
     downscale: Annotated[float, Field(ge=1)] = 1  # image sizes are divided by this
+    levels: Annotated[int, Field(ge=1, le=8)] = 1  # scales to train on: downscale, and twice, four times, … that
+    sampling: Sampling = "uniform"  # of views among several levels
     background: Literal["auto", "black", "white"] = "auto"  # auto: white for Blender scenes, else black
     holdout: Annotated[int, Field(ge=0)] = 8  # every n-th image, by name, is a test view; 0: none
 
+    @property
+    def scales(self) -> tuple[float, ...]:
+        """What the original photographs' sizes are divided by for training, from the finest."""
+        return tuple(self.downscale * 2**level for level in range(self.levels))
+
     def read(self) -> tuple[Scene, Background]:
-        """Return the scene at its size, and what its photographs are shown on.  Raises DataError."""
+        """Return the photographs, and what they are shown on.  Raises DataError."""
         if self.path is None:
             raise ConfigError("no scene given; use --scene DIR, or scene: {path: DIR} in the pipeline file")
-        scene = read_scene(Path(self.path), self.holdout).downscaled(self.downscale)
+        scene = read_scene(Path(self.path), self.holdout)
         return scene, scene.background if self.background == "auto" else self.background
 
 

@@ -57,7 +57,8 @@ def open_run(pipeline: Pipeline, out: Path, words: str | None) -> Run:
         stage.check()
     device = Device(choose(words), settings.rasterizer.schedule)
     LOG.info("device: %s", device.text)
-    scene, background = settings.scene.read()
+    photographs, background = settings.scene.read()
+    scene = photographs.downscaled(*settings.scene.scales)
     camera = scene.views[0].camera
     LOG.info(
         "scene: %s, %d training and %d test views, %d x %d px, %s background, extent %.3g",
@@ -66,6 +67,7 @@ def open_run(pipeline: Pipeline, out: Path, words: str | None) -> Run:
     return Run(
         device=device,
         scene=scene,
+        photographs=photographs,
         out=out,
         name=settings.name,
         seed=settings.seed,
@@ -73,6 +75,7 @@ def open_run(pipeline: Pipeline, out: Path, words: str | None) -> Run:
         renderer=Renderer(device, settings.rasterizer.sort),
         targets=Targets(device, background),
         model_settings=settings.model,
+        sampling=settings.scene.sampling,
     )
 
 
@@ -163,6 +166,8 @@ def describe(pipeline: Pipeline, run: Run) -> str:
             cadences = (f"{inner.stage} every {inner.every}" for inner in stage.during)
             detail = f"{stage.steps} steps; " + ", ".join(cadences)
         elif isinstance(stage, Evaluate):
-            detail = f"{len(run.scene.split(stage.split))} {stage.split} views"
+            views = run.photographs.downscaled(run.scale).split(stage.split)
+            scales = ", ".join(f"1/{scale:g}" for scale in stage.scales or [run.scale])
+            detail = f"{len(views)} {stage.split} views at {scales}"
         lines.append(f"  {stage.stage:<10} {detail}".rstrip())
     return f"would run in {run.out}:\n" + "\n".join(lines)

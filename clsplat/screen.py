@@ -74,7 +74,7 @@ def device_text(info: DeviceInfo, fault: str | None) -> str:
 def summary(folder: Path) -> None:
     """Print what a run achieved, and where it lies."""
     metrics = json.loads((folder / "metrics.json").read_text())
-    test = metrics["test"].get("1")
+    test = next(iter(metrics["test"].values()), None)
     quality = f"test PSNR {test['psnr']:.2f} dB, SSIM {test['ssim']:.4f}; " if test else ""
     CONSOLE.print(
         f"{quality}{metrics['gaussians']:,} Gaussians; {metrics['train_seconds']:.0f} s of training", markup=False

@@ -10,7 +10,14 @@ from pydantic import BaseModel, ValidationError
 
 from clsplat.yaml_file import Document, Place
 
-KINDS = {"losses": "loss", "rules": "rule", "stages": "stage", "during": "stage", "screen_filter": "screen filter"}
+KINDS = {
+    "losses": "loss",
+    "rules": "rule",
+    "stages": "stage",
+    "during": "stage",
+    "world_filter": "world filter",
+    "screen_filter": "screen filter",
+}
 EXPECTED = {
     "int_type": "a whole number",
     "int_from_float": "a whole number",

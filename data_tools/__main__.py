@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from clsplat.errors import ClsplatError
+from data_tools.multiscale import write_multiscale
 from data_tools.synthetic import Options, write_dataset
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False)
@@ -27,6 +28,16 @@ def synthetic(
 ) -> None:
     """Ray-cast the demo scene: a still life with exact cameras, in the Blender (NeRF-synthetic) layout."""
     print(write_dataset(out, Options(size, train, test, seed)))
+
+
+@app.command()
+def multiscale(
+    source: Annotated[Path, typer.Argument(help="Folder of a single-scale Blender dataset.")],
+    out: Annotated[Path, typer.Argument(help="Folder to make.")],
+    levels: Annotated[int, typer.Option(min=1, max=8, help="Scales: full size, half, quarter, …")] = 4,
+) -> None:
+    """Make the multi-scale Blender dataset of mip-NeRF from a single-scale one."""
+    print(f"{write_multiscale(source, out, levels)} images written to {out}")
 
 
 def main() -> None:

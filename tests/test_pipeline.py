@@ -50,19 +50,78 @@ def test_shipped_pipelines_are_fine_and_resolve_to_themselves(name, write):
     assert again.resolved() == pipeline.resolved()
 
 
-def test_the_short_recipe_differs_only_where_its_header_says():
-    full, short = load("splat").resolved(), load("splat_7k").resolved()
-    assert full["model"] == short["model"]
-    full_optimize, short_optimize = full["stages"][1]["optimize"], short["stages"][1]["optimize"]
-    short_optimize["steps"] = full_optimize["steps"]
-    short_optimize["rates"]["means"]["over"] *= 2
-    for stage, other in zip(full_optimize["during"], short_optimize["during"], strict=True):
-        name = next(iter(stage))
-        assert other[name].keys() == stage[name].keys()
-        other[name]["stop"] = stage[name]["stop"]
-        if name == "evaluate":
-            other[name]["every"] = stage[name]["every"]
-    assert short["stages"] == full["stages"]
+def flat(value: object, place: str = "") -> dict[str, object]:
+    """Every setting by its place; stages and rules go by their names, the second of a name as name~2."""
+    if isinstance(value, dict) and "type" in value and place:
+        value = {key: inner for key, inner in value.items() if key != "type"} | {"": value["type"]}
+    if isinstance(value, dict):
+        return {k: v for key, inner in value.items() for k, v in flat(inner, f"{place}.{key}".strip(".")).items()}
+    if isinstance(value, list) and all(isinstance(item, dict) for item in value):
+        names: list[str] = []
+        found: dict[str, object] = {}
+        for item in value:
+            name = item.get("type") or next(iter(item))
+            names.append(name)
+            key = f"{place}.{name}" + (f"~{names.count(name)}" if names.count(name) > 1 else "")
+            found |= flat(item if "type" in item else item[name], key)
+        return found
+    return {place: value}
+
+
+def changes(base: str, recipe: str) -> set[str]:
+    """Places, shortened to what tells them apart, in which a recipe has other settings than its base."""
+    old, new = flat(load(base).resolved()), flat(load(recipe).resolved())
+    places = {place for place in old.keys() | new.keys() if old.get(place, "-") != new.get(place, "-")}
+    return {place.removeprefix("stages.optimize.").removeprefix("during.") for place in places - {"name"}}
+
+
+SMOOTHING = {"model.world_filter", "model.world_filter.focal", "model.world_filter.variance"}
+MIP = {"model.screen_filter", "model.screen_filter.compensate", "model.screen_filter.variance"}
+REFRESH = {f"refresh_filter.{key}" for key in ("every", "start", "stop")}
+ENDS = {f"{stage}.stop" for stage in ("densify", "reset_opacity")}
+TWIN = {"steps", "rates.means.over", "evaluate.every", *ENDS}
+MATCHING = {
+    f"densify.rules.{rule}~2{key}"
+    for rule, size in (("clone", (".size_below",)), ("split", (".size_above", ".children", ".shrink")))
+    for key in ("", ".after", ".statistic", ".as_many_as", ".gradient_above", *size)
+}
+DIFFERENCES = {
+    ("splat", "splat_7k"): TWIN,
+    ("splat", "mip_splatting"): SMOOTHING | MIP | REFRESH,
+    ("splat", "mip_splatting_no_3d"): MIP,
+    ("mip_splatting", "mip_splatting_no_2d"): {"model.screen_filter.variance"},
+    ("splat", "splat_ewa"): {"model.screen_filter", "model.screen_filter.compensate"},
+    ("mip_splatting", "mip_splatting_gof"): MATCHING,
+    ("splat", "absgs"): {
+        *("densify.rules.clone.size_below", "densify.rules.split.size_above"),
+        *("densify.rules.split.statistic", "densify.rules.split.gradient_above"),
+        *("reset_opacity.every", "reset_opacity.to", "reset_opacity~2.every", "reset_opacity~2.stop"),
+        *("reset_opacity~2.when_background", "reset_opacity~3.every", "reset_opacity~3.start"),
+        *("reset_opacity~3.stop", "reset_opacity~3.to", "reset_opacity~3.when_background"),
+    },
+    **{
+        (name, f"{name}_7k"): TWIN | ({"refresh_filter.start", "refresh_filter.stop"} if refreshes else set())
+        for name, refreshes in (
+            ("mip_splatting", True),
+            ("mip_splatting_no_3d", False),
+            ("mip_splatting_no_2d", True),
+            ("splat_ewa", False),
+        )
+    },
+}
+
+
+@pytest.mark.parametrize(("base", "recipe"), DIFFERENCES, ids="-".join)
+def test_recipes_differ_only_where_their_headers_say(base, recipe):
+    assert changes(base, recipe) == DIFFERENCES[base, recipe]
+
+
+@pytest.mark.parametrize(("full", "short"), [("splat", "splat_7k"), ("splat_ewa", "splat_ewa_7k")])
+def test_the_short_recipes_shorten_alike(full, short):
+    old, new = flat(load(full).resolved()), flat(load(short).resolved())
+    place = "stages.optimize.rates.means.over"
+    assert 2 * new[place] == old[place]
+    assert new["stages.optimize.during.densify.stop"] == new["stages.optimize.during.reset_opacity.stop"] == 4000
 
 
 def replaced(old: str, new: str) -> str:

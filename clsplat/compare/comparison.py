@@ -35,6 +35,11 @@ class Row:
     variant: Variant
     runs: list[RunFolder]
 
+    @property
+    def scale(self) -> str:
+        """The downscale factor of the finest images trained on."""
+        return f"{self.runs[0].scene.downscale:g}"
+
     def scales(self, split: str) -> list[str]:
         """The downscale factors at which every run was measured, from full size down."""
         measured: list[set[str]] = [set(getattr(run.metrics, split)) for run in self.runs]

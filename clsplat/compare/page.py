@@ -51,7 +51,9 @@ def _curves(rows: Sequence[Row]) -> str:
         return [Line(points, colour=colour) for colour, points in found if len(points) > 1]
 
     charts = [
-        curve("test PSNR over steps, dB", lines("evaluate", "psnr", split="test", scale=1)),
+        curve(
+            "test PSNR over steps, dB", lines("evaluate", "psnr", split="test", scale=rows[0].runs[0].scene.downscale)
+        ),
         curve("PSNR of single training views over steps, dB", lines("train", "psnr")),
         curve("Gaussians over steps", lines("train", "gaussians")),
         *(chart for split in ("test", "train") for chart in _scale_charts(rows, split)),
@@ -81,7 +83,9 @@ def _crops(rows: Sequence[Row]) -> str:
     """Crops of each row's first run; a scene that has moved away since leaves a remark."""
     contestants = [crops.Contestant(tables.label(row.variant), row.runs[0]) for row in rows]
     try:
-        scene, background = rows[0].runs[0].scene.read()
+        settings = rows[0].runs[0].scene
+        photographs, background = settings.read()
+        scene = photographs.downscaled(settings.downscale)
     except (DataError, ConfigError) as error:
         LOG.warning("no crops: %s", error)
         return f"<p class=note>no crops: {html.escape(str(error))}</p>"

@@ -37,13 +37,14 @@ def label(variant: Variant) -> str:
 
 
 def metrics(rows: Sequence[Row]) -> str:
-    """Full-size test metrics with the costs, then everything else that was measured; the best of a column is bold."""
+    """Test metrics at the size trained on with the costs, then everything else that was measured; the best of a column is bold."""
     costs = [
         ("Gaussians", _column([[run.metrics.gaussians for run in row.runs] for row in rows], 0)),
         ("steps", _column([[run.metrics.steps for run in row.runs] for row in rows], 0)),
         ("training", [f"<td>{duration(fmean(run.metrics.train_seconds for run in row.runs))}" for row in rows]),
     ]
-    groups = [("test", "1")] if "1" in scales(rows, "test") else []
+    scale = rows[0].scale
+    groups = [("test", scale)] if scale in scales(rows, "test") else []
     more = [
         (split, scale) for split in ("test", "train") for scale in scales(rows, split) if (split, scale) not in groups
     ]
@@ -90,7 +91,9 @@ def over_scenes(comparison: Comparison) -> str:
         return ""
     head, columns = "", []
     for name, (title, digits, best) in METRICS.items():
-        means = [[fmean(values) for row in rows if (values := row.figures("test", "1", name))] for rows in complete]
+        means = [
+            [fmean(values) for row in rows if (values := row.figures("test", row.scale, name))] for rows in complete
+        ]
         if all(len(values) == len(scenes) for values in means):
             head += f"<th>{title}"
             columns.append(_column([[fmean(values)] for values in means], digits, best))

@@ -3,7 +3,9 @@
     x y z nx ny nz f_dc_0..2 f_rest_0..(3(K-1)-1) opacity scale_0..2 rot_0..3    float32, before activation
 
 f_rest is channel-major (all red, all green, all blue); opacity is a logit, scales are logarithms, rot is (w, x, y, z).
-Normals are written as zeros.  A comment carries the numbers a renderer needs.
+Normals are written as zeros.  Where a world filter is not yet part of scales and opacity, `filter_3D` follows, its
+standard deviation (Mip-Splatting).  Comments carry the numbers a renderer needs, and the mode by which viewers know
+that opacities lose what a filter on the screen spreads out: `SplatRenderMode: mip`, else `default`.
 """
 
 import json
@@ -21,6 +23,8 @@ from clsplat.gaussians.model import PARAMETERS, sh_coefficients
 
 HEADER_LIMIT = 1 << 16  # bytes; real headers have about 1.5 KB
 COMMENT = "comment clsplat "
+MODE = "comment SplatRenderMode: "
+FILTER = "filter_3D"
 MAX_DEGREE = 3
 _TYPES = {
     **dict.fromkeys(("char", "int8"), "i1"),
@@ -47,8 +51,9 @@ Parameters = dict[str, NDArray[np.float32]]  # by the names of PARAMETERS, each 
 class SplatFile:
     """A model file: the parameters and what its comment says about rendering them."""
 
-    parameters: Parameters
+    parameters: Parameters  # filter_variance too, where the file has it
     rendering: dict[str, Any] = field(default_factory=dict)
+    mode: str = "default"  # SplatRenderMode
 
 
 @dataclass(frozen=True)
@@ -58,6 +63,7 @@ class _Header:
     order: str
     start: int  # bytes before the vertices
     rendering: dict[str, Any]
+    mode: str
 
 
 def read_ply(path: Path) -> SplatFile:
@@ -74,11 +80,15 @@ def read_ply(path: Path) -> SplatFile:
             "the file is cut short, copy or export it again"
         )
     vertices = np.frombuffer(data, header.dtype, header.count, header.start)
-    return SplatFile(_parameters(path, vertices), header.rendering)
+    parameters = _parameters(path, vertices)
+    return SplatFile(parameters, header.rendering, "mip" if "filter_variance" in parameters else header.mode)
 
 
 def write_ply(path: Path, parameters: Parameters, rendering: dict[str, Any]) -> None:
-    """Write parameters in the reference's order; `rendering` goes into the comment as JSON."""
+    """Write parameters in the reference's order, and filter_variance where it is given.
+
+    `rendering` goes into a comment as JSON; where it says `compensate`, the file's mode is mip.
+    """
     count = len(parameters["means"])
     coefficients = 1 + parameters["sh_rest"].shape[1] // 3
     rest = _swapped(parameters["sh_rest"], coefficients - 1, 3)
@@ -94,7 +104,11 @@ def write_ply(path: Path, parameters: Parameters, rendering: dict[str, Any]) -> 
     names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
     names += [f"f_rest_{i}" for i in range(rest.shape[1])]
     names += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
-    header = ["ply", "format binary_little_endian 1.0", COMMENT + json.dumps(rendering, sort_keys=True)]
+    if "filter_variance" in parameters:
+        blocks.append(np.sqrt(parameters["filter_variance"]))
+        names.append(FILTER)
+    mode = "mip" if rendering.get("compensate") else "default"
+    header = ["ply", "format binary_little_endian 1.0", COMMENT + json.dumps(rendering, sort_keys=True), MODE + mode]
     header += [f"element vertex {count}", *(f"property float {name}" for name in names), "end_header"]
     with atomic(path) as file:
         file.write(("\n".join(header) + "\n").encode())
@@ -114,7 +128,7 @@ def _parse_header(path: Path, data: bytes) -> _Header:
     found = re.fullmatch(r"element vertex (\d+)", first)
     if found is None:
         raise DataError(f"{path}: the first element is '{first}'; expected 'element vertex N'")
-    return _Header(int(found[1]), _vertex_type(path, lines, order), order, match.end(), _rendering(lines))
+    return _Header(int(found[1]), _vertex_type(path, lines, order), order, match.end(), _rendering(lines), _mode(lines))
 
 
 def _vertex_type(path: Path, lines: list[str], order: str) -> np.dtype[Any]:
@@ -143,6 +157,10 @@ def _rendering(lines: list[str]) -> dict[str, Any]:
     return values if isinstance(values, dict) else {}
 
 
+def _mode(lines: list[str]) -> str:
+    return next((line.removeprefix(MODE).strip() for line in lines if line.startswith(MODE)), "default")
+
+
 def _parameters(path: Path, vertices: NDArray[Any]) -> Parameters:
     names = vertices.dtype.names or ()
     missing = [column for columns in _COLUMNS.values() for column in columns if column not in names]
@@ -159,10 +177,13 @@ def _parameters(path: Path, vertices: NDArray[Any]) -> Parameters:
     by_channel = _columns(vertices, tuple(f"f_rest_{i}" for i in range(rest)))
     per_channel = sh_coefficients(degree) - 1
     parameters["sh_rest"] = _swapped(by_channel, 3, per_channel)
-    bad = [name for name in PARAMETERS if not np.isfinite(parameters[name]).all()]
+    parameters = {name: parameters[name] for name in PARAMETERS}
+    if FILTER in names:
+        parameters["filter_variance"] = np.square(_columns(vertices, (FILTER,)))
+    bad = [name for name, table in parameters.items() if not np.isfinite(table).all()]
     if bad:
         raise DataError(f"{path}: {', '.join(bad)} hold values that are not finite; export the file again")
-    return {name: parameters[name] for name in PARAMETERS}
+    return parameters
 
 
 def _swapped(table: NDArray[np.float32], outer: int, inner: int) -> NDArray[np.float32]:

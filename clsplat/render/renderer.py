@@ -4,6 +4,7 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from clsplat.gaussians.model import Gradients, Model
 from clsplat.opencl.device import Array, Device
@@ -13,7 +14,7 @@ from clsplat.render.workspace import Workspace
 from clsplat.scene.scene import View
 
 RECORD = int(constants()["RECORD"])
-MOMENTS = int(constants("splat.h")["MOMENTS"])
+MOMENTS = int(constants()["MOMENTS"])
 RAY_MARGIN = constants()["RAY_MARGIN"]
 
 # camera_t of cl_kernels/common.h
@@ -55,11 +56,20 @@ class DeviceCamera:
 
 
 def upload_camera(device: Device, view: View) -> DeviceCamera:
-    """Put a view's camera on the device.
+    """Put a view's camera on the device."""
+    tile = int(device.tuning["TILE"])
+    values = camera_values(view, tile)
+    tiles_x, tiles_y = int(values["tiles_x"]), int(values["tiles_y"])
+    array = device.upload(values.reshape(1))
+    return DeviceCamera(array, view.camera.width, view.camera.height, tiles_x, tiles_y, tile)
+
+
+def camera_values(view: View, tile: int) -> NDArray[Any]:
+    """A view's camera_t, [].
 
     Rays are clamped 30 % of half the field of view beyond the image's edges (gsplat's off-centre form).
     """
-    camera, tile = view.camera, int(device.tuning["TILE"])
+    camera = view.camera
     tiles_x, tiles_y = -(-camera.width // tile), -(-camera.height // tile)
     margin_x = RAY_MARGIN * camera.width / (2 * camera.fx)
     margin_y = RAY_MARGIN * camera.height / (2 * camera.fy)
@@ -71,8 +81,7 @@ def upload_camera(device: Device, view: View) -> DeviceCamera:
         *(-camera.cy / camera.fy - margin_y, (camera.height - camera.cy) / camera.fy + margin_y),
         *(camera.width, camera.height, tiles_x, tiles_y),
     )
-    array = device.upload(np.array([values], CAMERA))
-    return DeviceCamera(array, camera.width, camera.height, tiles_x, tiles_y, tile)
+    return np.array(values, CAMERA)
 
 
 @dataclass(frozen=True)
@@ -97,7 +106,6 @@ class Renderer:
         self.tiler = Tiler(device, self.workspace, sort)
         self._project = device.program("project.cl")
         self._blend = device.program(f"blend_{device.schedule}.cl")
-        self._gather = device.program("gather.cl")
         self._lanes = int(device.tuning["LANES"])
 
     def forward(self, model: Model, camera: DeviceCamera, background: Array) -> Frame:
@@ -133,14 +141,15 @@ class Renderer:
         )
         return Frame(camera, splats, radius, lists, tile_last, image, transmittance)
 
-    def moments(self, model: Model, frame: Frame, grad_image: Array) -> Array:
-        """Sums over each Gaussian's pixels that its gradients are made of, [MOMENTS, S]; see cl_kernels/splat.h.
+    def moments(self, model: Model, frame: Frame, grad_image: Array, count: int = MOMENTS) -> Array:
+        """Sums over each Gaussian's pixels that its gradients are made of, [count, S]; see cl_kernels/splat.h.
 
-        grad_image: [3, rows, stride], zero outside the image.
+        grad_image: [3, rows, stride], zero outside the image.  More than MOMENTS of them cost more time.
         """
         gaussians, lists = model.gaussians, frame.lists
+        defines = {} if count == MOMENTS else {"MOMENTS": count}
         pair_moments = self.workspace.array("pair_moments", (lists.pairs, RECORD))
-        self._blend.blend_backward(
+        self.device.program(f"blend_{self.device.schedule}.cl", **defines).blend_backward(
             groups=frame.camera.tiles,
             tile_offset=lists.tile_offset,
             tile_pairs=lists.tile_pairs,
@@ -152,8 +161,8 @@ class Renderer:
             tile_last=frame.tile_last,
             pair_moments=pair_moments,
         )
-        moments = self.workspace.array("moments", (MOMENTS, gaussians.capacity))
-        self._gather.sum_records(
+        moments = self.workspace.array("moments", (count, gaussians.capacity))
+        self.device.program("gather.cl", **defines).sum_records(
             items=-(-gaussians.count // self._lanes),
             pair_moments=pair_moments,
             first_pair=lists.first_pair,

@@ -5,13 +5,15 @@ from pathlib import Path
 from clsplat.errors import DataError
 from clsplat.scene.blender import read_blender
 from clsplat.scene.colmap import find_models, read_colmap
+from clsplat.scene.multiscale import FILE, read_multiscale
 from clsplat.scene.nerfstudio import read_nerfstudio
 from clsplat.scene.scene import Scene
 
 
 def read_scene(path: Path, holdout: int = 8) -> Scene:
-    """Read a COLMAP, Blender or nerfstudio folder; `holdout` is for those that do not tell their test views.
+    """Read a COLMAP, Blender (of one scale or several) or nerfstudio folder.
 
+    `holdout` is for those that do not tell their test views.
     Raises DataError when it is none of these, or damaged.
     """
     if not path.is_dir():
@@ -20,9 +22,11 @@ def read_scene(path: Path, holdout: int = 8) -> Scene:
         return read_colmap(path, holdout)
     if (path / "transforms_train.json").is_file():
         return read_blender(path)
+    if (path / FILE).is_file():
+        return read_multiscale(path)
     if (path / "transforms.json").is_file():
         return read_nerfstudio(path, holdout)
     raise DataError(
         f"{path}: no dataset found; looked for COLMAP (sparse/0/cameras.bin or .txt), "
-        "Blender (transforms_train.json) and nerfstudio (transforms.json)"
+        "Blender (transforms_train.json, metadata.json) and nerfstudio (transforms.json)"
     )

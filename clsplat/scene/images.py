@@ -22,7 +22,7 @@ def load_image(view: View, background: tuple[float, float, float] | None = None)
     `background` is a colour in [0, 1], black by default.  Raises DataError when the file cannot be read as an 8- or
     16-bit image, or when it is not the camera's image before downscaling.
     """
-    pixels = _read_pixels(view.image_path)
+    pixels = read_image(view.image_path)
     width, height = view.camera.width, view.camera.height
     file_height, file_width = pixels.shape[:2]
     if not _scales_to((file_width, file_height), (width, height)):
@@ -58,7 +58,7 @@ def write_image(path: Path, rgb: NDArray[np.uint8]) -> None:
 
 def image_size(path: Path) -> tuple[int, int]:
     """Return (width, height) of an image file in pixels.  Raises DataError when it cannot be read."""
-    height, width = _read_pixels(path).shape[:2]
+    height, width = read_image(path).shape[:2]
     return width, height
 
 
@@ -87,7 +87,7 @@ def require_files(path: Path, files: Iterable[Path]) -> None:
         raise DataError(f"{path}: {len(missing)} of {len(wanted)} image files are missing: {few}; put them back")
 
 
-def _read_pixels(path: Path) -> NDArray[Any]:
+def read_image(path: Path) -> NDArray[Any]:
     """Decode an image file to RGB or RGBA, [H, W, 3 or 4], uint8 or uint16, as stored: no EXIF rotation."""
     data = np.frombuffer(read_file(path), np.uint8)  # not cv2.imread: that needs ASCII paths on Windows
     try:

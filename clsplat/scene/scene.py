@@ -53,12 +53,19 @@ class View:
     world_to_camera: Floats  # [3, 4] float64
     image_path: Path
     mask_path: Path | None = None
+    scale: float = 1  # by what the original photograph's size was divided
 
     @property
     def position(self) -> Floats:
         """Camera centre in world coordinates, [3]."""
         rotation, translation = self.world_to_camera[:, :3], self.world_to_camera[:, 3]
         return -rotation.T @ translation
+
+    def at(self, scale: float) -> "View":
+        """Return the same photograph at another scale."""
+        if scale == self.scale:
+            return self
+        return replace(self, camera=self.camera.downscaled(scale / self.scale), scale=scale)
 
 
 @dataclass(frozen=True)
@@ -90,12 +97,33 @@ class Scene:
             return self.views
         return tuple(self.views[i] for i in (self.train if name == "train" else self.test))
 
-    def downscaled(self, factor: float) -> "Scene":
-        """Return the scene with every image divided by `factor`."""
-        if factor == 1:
+    @property
+    def scales(self) -> tuple[float, ...]:
+        """The scales of the views, from the finest."""
+        return tuple(sorted({view.scale for view in self.views}))
+
+    def downscaled(self, *factors: float) -> "Scene":
+        """Return the scene with every photograph at 1/factor of its original size, at each of the `factors`.
+
+        Views that have the scale already are taken; where there is none, those of the finest scale are resampled.
+        Raises DataError for a scale finer than any there is.
+        """
+        if factors == self.scales:
             return self
-        views = tuple(replace(v, camera=v.camera.downscaled(factor)) for v in self.views)
-        return replace(self, views=views)
+        views: list[View] = []
+        splits: dict[str, list[int]] = {"train": [], "test": []}
+        for factor in factors:
+            finest = min(self.scales)
+            if factor < finest:
+                raise DataError(
+                    f"{self.path}: the finest images have 1/{finest:g} of their full size; expected 1/{factor:g}"
+                )
+            taken = factor if factor in self.scales else finest
+            for name, indices in splits.items():
+                found = [view for view in self.split(name) if view.scale == taken]
+                indices += range(len(views), len(views) + len(found))
+                views += [view.at(factor) for view in found]
+        return replace(self, views=tuple(views), train=tuple(splits["train"]), test=tuple(splits["test"]))
 
 
 def make_scene(

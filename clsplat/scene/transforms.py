@@ -63,13 +63,13 @@ class Transforms:
         Images whose size the file does not tell are as large as the first.  Raises DataError for cameras with
         distortion, damaged numbers, missing files and paths that leave the folder.
         """
-        images = [_image_path(frame) for frame in self.frames]
+        images = [image_path_of(frame) for frame in self.frames]
         masks = [frame.file("mask_path") for frame in self.frames]
         require_files(self.path, [*images, *(mask for mask in masks if mask)])
         told = all(frame.number("w") and frame.number("h") for frame in self.frames)
         size = None if told else image_size(images[0])
         return [
-            View(view_name(frame.values["file_path"]), _camera(frame, size), _world_to_camera(frame), image, mask)
+            View(view_name(frame.values["file_path"]), camera_of(frame, size), pose_of(frame), image, mask)
             for frame, image, mask in zip(self.frames, images, masks, strict=True)
         ]
 
@@ -88,14 +88,14 @@ def view_name(file_path: str) -> str:
     return PureWindowsPath(file_path).as_posix()
 
 
-def _image_path(frame: Frame) -> Path:
+def image_path_of(frame: Frame) -> Path:
     path = frame.file("file_path", suffix=".png")  # Blender's exporter leaves the extension out
     if path is None:
         raise DataError(f"{frame.where}: it has no `file_path`; expected the path of an image: export the file again")
     return path
 
 
-def _camera(frame: Frame, size: tuple[int, int] | None) -> Camera:
+def camera_of(frame: Frame, size: tuple[int, int] | None) -> Camera:
     """Return the pinhole camera of a frame.  Raises DataError when it has distortion or no focal length."""
     _refuse_distortion(frame)
     default_width, default_height = size or (0, 0)
@@ -133,7 +133,7 @@ def _refuse_distortion(frame: Frame) -> None:
         )
 
 
-def _world_to_camera(frame: Frame) -> Floats:
+def pose_of(frame: Frame) -> Floats:
     """Return [3, 4], OpenCV axes, from a camera-to-world matrix with OpenGL axes (y up, z backwards)."""
     try:
         matrix = np.array(frame.values.get("transform_matrix"), np.float64)

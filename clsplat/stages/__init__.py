@@ -9,7 +9,7 @@ from clsplat.stages.init import Init
 from clsplat.stages.optimize import Optimize
 from clsplat.stages.render import Render
 from clsplat.stages.report import Report
-from clsplat.stages.schedule import RaiseSh, ResetOpacity
+from clsplat.stages.schedule import RaiseSh, RefreshFilter, ResetOpacity
 
 STAGES: dict[str, type[Stage]] = {
     "init": Init,
@@ -17,10 +17,23 @@ STAGES: dict[str, type[Stage]] = {
     "densify": Densify,
     "raise_sh": RaiseSh,
     "reset_opacity": ResetOpacity,
+    "refresh_filter": RefreshFilter,
     "checkpoint": Checkpoint,
     "evaluate": Evaluate,
     "render": Render,
     "export": Export,
     "report": Report,
 }
-AnyStage = Init | Optimize | Densify | RaiseSh | ResetOpacity | Checkpoint | Evaluate | Render | Export | Report
+AnyStage = (
+    Init
+    | Optimize
+    | Densify
+    | RaiseSh
+    | ResetOpacity
+    | RefreshFilter
+    | Checkpoint
+    | Evaluate
+    | Render
+    | Export
+    | Report
+)

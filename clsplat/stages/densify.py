@@ -30,6 +30,7 @@ class Densify(Stage):
             return
         gaussians = run.trained.gaussians
         change = densify(gaussians, run.stats, self.rules, run.renderer.tiler, run.scene.extent, run.step, run.seed)
+        run.refresh_filter()
         run.records.add(run.step, "densify", before=change.before, after=change.after)
         LOG.debug("step %d: %d -> %d Gaussians", run.step, change.before, change.after)
         if change.after == 0:

@@ -13,17 +13,22 @@ from clsplat.training.run import Run
 from clsplat.training.targets import Targets
 
 LOG = logging.getLogger("clsplat")
+Scale = Annotated[float, Field(ge=1)]
 
 
 class Evaluate(Stage):
-    """Render the views of a split and compare them, as 8-bit images, with the photographs."""
+    """Render the views of a split and compare them, as 8-bit images, with the photographs.
+
+    Each of `scales` divides the size of the original photographs, whatever size was trained on: a scene trained at
+    `downscale: 8` is zoomed in upon by `scales: [8, 4, 2, 1]`.
+    """
 
     stage: Literal["evaluate"] = "evaluate"
     needs: ClassVar[frozenset[str]] = frozenset({"model"})
     makes: ClassVar[frozenset[str]] = frozenset({"metrics"})
 
     split: Literal["test", "train"] = "test"
-    scales: Annotated[list[int], Field(min_length=1)] = Field([1])  # downscale factors, on top of the scene's
+    scales: Annotated[list[Scale], Field(min_length=1)] | None = None  # of the photographs; None: the finest trained on
     metrics: list[Metric] = Field(["psnr", "ssim"])
     lpips: str | None = None  # ONNX file
     lpips_input: InputRange = "-1..1"  # 0..1: as in the tables of 3DGS and Mip-Splatting
@@ -42,21 +47,21 @@ class Evaluate(Stage):
         return Perceptual.open(self.metrics, self.lpips, self.lpips_input)
 
     def run(self, run: Run) -> None:
-        scene = run.scene
-        if not scene.split(self.split):
+        if not run.scene.split(self.split):
             LOG.warning("no %s views: nothing to evaluate (scene.holdout chooses them)", self.split)
             return
         perceptual = self._perceptual()
-        for scale in self.scales:
-            views = scene.downscaled(scale).split(self.split)
-            targets = run.targets if scale == 1 else Targets(run.device, run.targets.background_name)
+        for scale in self.scales or [run.scale]:
+            views = run.photographs.downscaled(scale).split(self.split)
+            trained = scale in run.scene.scales
+            targets = run.targets if trained else Targets(run.device, run.targets.background_name)
             results = measure(run.renderer, run.trained, views, targets, perceptual)
             for result in results:
                 run.records.add(run.step, "view", split=self.split, scale=scale, **result.line())
             averages = mean(results, perceptual)
             run.records.add(run.step, "evaluate", split=self.split, scale=scale, **averages)
-            run.metrics.setdefault(self.split, {})[str(scale)] = averages
+            run.metrics.setdefault(self.split, {})[f"{scale:g}"] = averages
             LOG.info(
-                "step %d  %s views at 1/%d: PSNR %.2f dB  SSIM %.4f  (%d views)",
+                "step %d  %s views at 1/%g: PSNR %.2f dB  SSIM %.4f  (%d views)",
                 *(run.step, self.split, scale, averages["psnr"], averages["ssim"], len(results)),
             )

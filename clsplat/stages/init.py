@@ -41,6 +41,7 @@ class Init(Stage):
         degree = run.model_settings.sh_degree
         gaussians = Gaussians(run.device, self._parameters(run, degree))
         run.model = run.model_settings.model(gaussians, degree if self.source == "ply" else 0)
+        run.refresh_filter()
         LOG.info("%d Gaussians from %s", run.model.gaussians.count, self._origin(run.scene))
 
     def _origin(self, scene: Scene) -> str:

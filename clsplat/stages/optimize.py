@@ -13,17 +13,19 @@ from clsplat.stages.checkpoint import Checkpoint
 from clsplat.stages.densify import Densify
 from clsplat.stages.evaluate import Evaluate
 from clsplat.stages.export import Export
-from clsplat.stages.schedule import RaiseSh, ResetOpacity
+from clsplat.stages.schedule import RaiseSh, RefreshFilter, ResetOpacity
 from clsplat.training import checkpoint
 from clsplat.training.adam import Adam, Rates
-from clsplat.training.density import SplatStats
 from clsplat.training.losses import AnyLoss, pixel_loss
 from clsplat.training.profile import stage_milliseconds
 from clsplat.training.run import Progress, Run
+from clsplat.training.statistics import SplatStats
 from clsplat.training.step import Differentiated, differentiate
 
 LOG = logging.getLogger("clsplat")
-Scheduled = Annotated[RaiseSh | Densify | ResetOpacity | Checkpoint | Evaluate | Export, Field(discriminator="stage")]
+Scheduled = Annotated[
+    RaiseSh | Densify | ResetOpacity | RefreshFilter | Checkpoint | Evaluate | Export, Field(discriminator="stage")
+]
 
 
 class Optimize(Stage):
@@ -59,7 +61,7 @@ class Optimize(Stage):
     def run(self, run: Run) -> None:
         model = run.trained
         run.adam = run.adam or Adam(model.gaussians)
-        run.stats = run.stats or SplatStats(model.gaussians)
+        run.stats = SplatStats(model.gaussians, self._statistics())
         last_step = run.step - run.stage_step + self.steps
         seconds: list[float] = []  # of the steps since the last report
         while run.stage_step < self.steps:
@@ -81,6 +83,11 @@ class Optimize(Stage):
                 path = checkpoint.save(run, keep=2)
                 raise Interrupted(f"stopped at step {run.step}, saved in {path}; --resume goes on from there")
 
+    def _statistics(self) -> set[str]:
+        """Columns that some density rule reads."""
+        rules = [rule for stage in self.during if isinstance(stage, Densify) for rule in stage.rules]
+        return {name for rule in rules for name in rule.statistics}
+
     def _edit(self, run: Run) -> None:
         """What was due at the step before."""
         for stage in self.during:
@@ -95,7 +102,8 @@ class Optimize(Stage):
         run.stage_step += 1
         run.device.timings.sampling = run.step % self.log_every == self.log_every // 2
         model, target = run.trained, run.targets.get(run.train_view())
-        view = differentiate(run.renderer, model, target, run.targets.background_array, self.losses)
+        background, moments = run.targets.background_array, run.stats.moments
+        view = differentiate(run.renderer, model, target, background, self.losses, moments)
         stale = {name for stage in self.during if stage.due(run.step) for name in stage.stale(run)}
         if run.stage_step == self.steps:
             stale = set()
@@ -106,7 +114,7 @@ class Optimize(Stage):
             grad_mean2d = gradients.mean2d
         else:
             grad_mean2d = run.adam.update(model, view.frame, view.moments, rates)
-        run.stats.add(view.frame, grad_mean2d)
+        run.stats.add(view, grad_mean2d)
         run.device.timings.sampling = False
         return view
 

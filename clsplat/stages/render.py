@@ -23,7 +23,7 @@ class Render(Stage):
     folder: str = "renders"  # inside the run folder
 
     def run(self, run: Run) -> None:
-        views = run.scene.split(self.split)
+        views = run.scene.downscaled(run.scale).split(self.split)
         for view in views:
             camera = run.targets.camera(view)
             image = render_view(run.renderer, run.trained, camera, run.targets.background_array)

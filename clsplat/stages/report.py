@@ -38,7 +38,7 @@ def _figures(run: Run) -> str:
     values = {}
     for split, scales in run.metrics.items():
         for scale, averages in scales.items():
-            suffix = "" if scale == "1" else f" at 1/{scale}"
+            suffix = "" if scale == f"{run.scale:g}" else f" at 1/{scale}"
             values[f"{split} PSNR{suffix} ({averages['views']} views)"] = f"{averages['psnr']:.2f} dB"
             values[f"{split} SSIM{suffix}"] = f"{averages['ssim']:.4f}"
     values["Gaussians"] = f"{run.trained.gaussians.count:,}"
@@ -53,7 +53,9 @@ def _curves(run: Run) -> str:
         return ""
     line = {key: [(r["step"], r[key]) for r in train] for key in ("loss", "psnr", "gaussians", "ms")}
     measured = [
-        Line([(r["step"], r["psnr"]) for r in tests if r["split"] == split and r["scale"] == 1], f"{split} views")
+        Line(
+            [(r["step"], r["psnr"]) for r in tests if r["split"] == split and r["scale"] == run.scale], f"{split} views"
+        )
         for split in ("test", "train")
     ]
     charts = [
@@ -88,8 +90,8 @@ def _times(run: Run) -> str:
 
 def _views(run: Run) -> str:
     """The worst and the best views of the last evaluation: render, truth and four times their difference."""
-    lines = [r for r in run.records.read("view") if r["scale"] == 1 and r["step"] == run.step]
-    by_name = {view.name: view for view in run.scene.views}
+    lines = [r for r in run.records.read("view") if r["scale"] == run.scale and r["step"] == run.step]
+    by_name = {view.name: view for view in run.scene.downscaled(run.scale).views}
     ranked = sorted((r for r in lines if r["view"] in by_name), key=lambda r: r["psnr"])
     if not ranked:
         return ""

@@ -23,7 +23,10 @@ class RaiseSh(Stage):
 
 
 class ResetOpacity(Stage):
-    """Make every Gaussian almost transparent; those that are needed come back, floaters do not (Kerbl et al. 2023)."""
+    """Make every Gaussian almost transparent; those that are needed come back, floaters do not (Kerbl et al. 2023).
+
+    `to` is the opacity after the world filter (Yu et al. 2024).
+    """
 
     stage: Literal["reset_opacity"] = "reset_opacity"
     needs: ClassVar[frozenset[str]] = frozenset({"model"})
@@ -44,3 +47,17 @@ class ResetOpacity(Stage):
 
     def _acts(self, run: Run) -> bool:
         return self.when_background in (None, run.targets.background_name)
+
+
+class RefreshFilter(Stage):
+    """Let the world filter follow the Gaussians as they move.
+
+    It also does so when they are made and after every density edit; a model without a world filter has nothing to do.
+    """
+
+    stage: Literal["refresh_filter"] = "refresh_filter"
+    needs: ClassVar[frozenset[str]] = frozenset({"model"})
+    edits: ClassVar[bool] = True
+
+    def run(self, run: Run) -> None:
+        run.refresh_filter()

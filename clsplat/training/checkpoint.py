@@ -18,8 +18,9 @@ from clsplat.errors import ConfigError, DataError
 from clsplat.files import atomic
 from clsplat.gaussians.model import PARAMETERS, Gaussians
 from clsplat.training.adam import Adam
-from clsplat.training.density import SplatStats
 from clsplat.training.run import Run
+from clsplat.training.statistics import FOLDER as STATS_FOLDER
+from clsplat.training.statistics import SEEN, SplatStats
 
 FORMAT = 1
 FOLDER = "checkpoints"
@@ -99,7 +100,8 @@ def _restore(run: Run, meta: dict[str, Any], tables: Tables) -> None:
     if meta["updates"]:
         run.adam = Adam(gaussians)
         run.adam.updates = meta["updates"]
-        run.stats = SplatStats(gaussians)
+        columns = [name for name in tables if name.startswith(STATS_FOLDER) and name != SEEN]
+        run.stats = SplatStats(gaussians, [name.removeprefix(STATS_FOLDER) for name in columns])
     for name in gaussians.tables:
         gaussians.set(name, tables[_key(name)])
     run.step, run.cursor, run.stage_step = meta["step"], meta["cursor"], meta["stage_step"]

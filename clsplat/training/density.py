@@ -1,63 +1,33 @@
 """Density control: rules that say which Gaussians grow or go (Kerbl et al. 2023, section 5).
 
-A rule is a box in (mean screen gradient, size, opacity) with an outcome; one kernel serves them all.  Sizes are the
+A rule is a box in (mean of a statistic, size, opacity) with an outcome; one kernel serves them all.  Sizes are the
 largest standard deviation as a share of the scene's extent.  Growing rules take a Gaussian in their order, the first
 that wants it; pruning rules override growth and judge the size that a split leaves.
 """
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
 
 from clsplat.gaussians.model import Gaussians
-from clsplat.opencl.device import Array
-from clsplat.render.renderer import Frame
 from clsplat.render.tiles import Tiler
 from clsplat.settings import Settings
+from clsplat.training.statistics import SplatStats, StatisticName
 
 Positive = Annotated[float, Field(gt=0)]
 NEVER = 3.0e38  # a bound that no finite float passes
-SCREEN_GRAD, SEEN = "stats/screen_grad", "stats/seen"
-
-
-class SplatStats:
-    """What the views since the last edit said about each Gaussian: summed screen gradients, and how many saw it."""
-
-    def __init__(self, gaussians: Gaussians) -> None:
-        self.gaussians = gaussians
-        self._program = gaussians.device.program("density.cl")
-        for name in (SCREEN_GRAD, SEEN):
-            gaussians.add(name, 1, zero_fresh=True)
-
-    def add(self, frame: Frame, grad_mean2d: Array) -> None:
-        """Add one view.  grad_mean2d: [2, S] px⁻¹; it counts in normalised device coordinates, as published."""
-        gaussians = self.gaussians
-        self._program.accumulate_stats(
-            items=gaussians.count,
-            grad_mean2d=grad_mean2d,
-            radius=frame.radius,
-            screen_grad=gaussians[SCREEN_GRAD],
-            seen=gaussians[SEEN],
-            half_width=frame.camera.width / 2,
-            half_height=frame.camera.height / 2,
-            stride=gaussians.capacity,
-            count=gaussians.count,
-        )
-
-    def clear(self) -> None:
-        self.gaussians[SCREEN_GRAD].fill(0)
-        self.gaussians[SEEN].fill(0)
+LEAST = 1.2e-38  # the smallest normal float: a bound that only zero misses
 
 
 class Edit:
     """What will become of each Gaussian: how many rows, how many of them the old one, by what fresh scales shrink."""
 
-    def __init__(self, gaussians: Gaussians, extent: float, step: int) -> None:
+    def __init__(self, gaussians: Gaussians, stats: SplatStats, extent: float, step: int) -> None:
         device, count = gaussians.device, gaussians.count
-        self.gaussians, self.extent, self.step = gaussians, extent, step
+        self.gaussians, self.stats, self.extent, self.step = gaussians, stats, extent, step
         self.copies = device.empty(count, np.uint32)
         self.kept = device.empty(count, np.uint32)
         self.shrink = device.empty(count)
@@ -69,6 +39,7 @@ class Edit:
         copies: int,
         kept: int,
         shrink: float = 1.0,
+        statistic: str | None = None,
         gradient_above: float = 0.0,
         size_above: float = 0.0,
         size_below: float | None = None,
@@ -80,8 +51,8 @@ class Edit:
             items=gaussians.count,
             log_scales=gaussians["log_scales"],
             logit_opacity=gaussians["logit_opacity"],
-            screen_grad=gaussians[SCREEN_GRAD],
-            seen=gaussians[SEEN],
+            statistic=self.stats.total(statistic) if statistic else self.stats.seen,
+            seen=self.stats.seen,
             copies=self.copies,
             kept=self.kept,
             shrink=self.shrink,
@@ -95,6 +66,13 @@ class Edit:
             stride=gaussians.capacity,
             count=gaussians.count,
         )
+
+    def matching(self, statistic: str, other: str, gradient_above: float) -> float:
+        """The threshold that as many Gaussians reach in `statistic` as reach `gradient_above` in `other`."""
+        if self.gaussians.count == 0:
+            return LEAST
+        share = float(np.mean(self.stats.mean(other) >= np.float32(gradient_above)))
+        return max(float(np.quantile(self.stats.mean(statistic), 1 - share)), LEAST)
 
     def apply(self, tiler: Tiler, seed: int) -> None:
         """Move all tables at once and place the children of split Gaussians."""
@@ -132,26 +110,52 @@ class Rule(Settings):
 
     after: Annotated[int, Field(ge=0)] = 0  # global step from which, exclusive, the rule acts
 
+    @property
+    def statistics(self) -> set[str]:
+        """Columns that the rule reads."""
+        return set()
+
     def mark(self, edit: Edit) -> None:
         raise NotImplementedError
 
 
-class Clone(Rule):
-    """Copy small Gaussians whose screen gradient is large; the copy starts at the same place."""
+class Grow(Rule):
+    """What rules have in common that act where the mean of a statistic is large.
+
+    With `as_many_as` the threshold is not `gradient_above` itself but the value that as many Gaussians reach in
+    `statistic` as reach `gradient_above` in that other one (Gaussian Opacity Fields, Yu et al. 2024).
+    """
+
+    statistic: StatisticName = "screen_grad"
+    gradient_above: Positive = 2.0e-4  # mean over views, at least
+    as_many_as: StatisticName | None = None
+
+    @property
+    def statistics(self) -> set[str]:
+        return {self.statistic, self.as_many_as or self.statistic}
+
+    def condition(self, edit: Edit) -> dict[str, Any]:
+        """The rule's part of Edit.mark."""
+        above = self.gradient_above
+        if self.as_many_as:
+            above = edit.matching(self.statistic, self.as_many_as, above)
+        return {"statistic": self.statistic, "gradient_above": above}
+
+
+class Clone(Grow):
+    """Copy small Gaussians whose statistic is large; the copy starts at the same place."""
 
     type: Literal["clone"] = "clone"
-    gradient_above: Positive = 2.0e-4
     size_below: Positive = 0.01
 
     def mark(self, edit: Edit) -> None:
-        edit.mark(copies=2, kept=1, gradient_above=self.gradient_above, size_below=self.size_below)
+        edit.mark(copies=2, kept=1, size_below=self.size_below, **self.condition(edit))
 
 
-class Split(Rule):
-    """Replace large Gaussians whose screen gradient is large by smaller ones, drawn from their own distribution."""
+class Split(Grow):
+    """Replace large Gaussians whose statistic is large by smaller ones, drawn from their own distribution."""
 
     type: Literal["split"] = "split"
-    gradient_above: Positive = 2.0e-4
     size_above: Positive = 0.01
     children: Annotated[int, Field(ge=2, le=8)] = 2
     shrink: Annotated[float, Field(ge=1)] = 1.6  # children's scales are divided by this
@@ -161,8 +165,8 @@ class Split(Rule):
             copies=self.children,
             kept=0,
             shrink=1.0 / self.shrink,
-            gradient_above=self.gradient_above,
             size_above=self.size_above,
+            **self.condition(edit),
         )
 
 
@@ -202,7 +206,7 @@ def densify(
     gaussians: Gaussians, stats: SplatStats, rules: list[AnyRule], tiler: Tiler, extent: float, step: int, seed: int
 ) -> Change:
     """Apply the rules in their order, as one rearrangement, and start the statistics anew."""
-    edit = Edit(gaussians, extent, step)
+    edit = Edit(gaussians, stats, extent, step)
     for rule in rules:
         if step > rule.after:
             rule.mark(edit)
@@ -213,10 +217,13 @@ def densify(
 
 
 def cap_opacity(gaussians: Gaussians, limit: float) -> None:
-    """Let no Gaussian stay more opaque than `limit` (the opacity reset of 3DGS)."""
+    """Let no Gaussian stay more opaque than `limit` as it is drawn, world filter included (the opacity reset)."""
     gaussians.device.program("density.cl").cap_opacity(
         items=gaussians.count,
+        log_scales=gaussians["log_scales"],
+        filter_variance=gaussians["filter_variance"],
         logit_opacity=gaussians["logit_opacity"],
-        limit=math.log(limit / (1 - limit)),
+        limit=limit,
+        stride=gaussians.capacity,
         count=gaussians.count,
     )

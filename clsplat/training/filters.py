@@ -1,29 +1,119 @@
-"""What a pipeline's `model:` says: the degree of the colours and the two low-pass filters, as numbers."""
+"""What a pipeline's `model:` says: the degree of the colours and the two low-pass filters, as numbers.
 
+A world filter fills `filter_variance`, what is added to the squared scales of each Gaussian; a screen filter is two
+numbers of the model.  Rendering reads both always and knows neither by name.
+"""
+
+from abc import abstractmethod
+from collections.abc import Sequence
 from typing import Annotated, Literal
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from clsplat.gaussians.model import Gaussians, Model
+from clsplat.opencl.device import Array, Device
+from clsplat.render.renderer import camera_values
+from clsplat.scene.scene import View
 from clsplat.settings import Settings
 
 
-class NoWorldFilter(Settings):
+class FilterViews:
+    """The views that sample the Gaussians: their cameras on the device, [V] camera_t, and focal lengths, [V] px."""
+
+    def __init__(self, device: Device, views: Sequence[View]) -> None:
+        tile = int(device.tuning["TILE"])
+        self.cameras: Array = device.upload(np.stack([camera_values(view, tile) for view in views]))
+        self.focal: NDArray[np.float32] = np.array([view.camera.fx for view in views], np.float32)
+
+
+class WorldFilter(Settings):
+    """How Gaussians are blurred in the world."""
+
+    @abstractmethod
+    def refresh(self, gaussians: Gaussians, views: FilterViews, near: float) -> None:
+        """Write `filter_variance` for where the Gaussians are now; what lies nearer than `near` is not seen."""
+
+
+class NoWorldFilter(WorldFilter):
     """Gaussians keep their own size."""
 
     type: Literal["none"] = "none"
 
+    def refresh(self, gaussians: Gaussians, views: FilterViews, near: float) -> None:
+        pass
 
-class Dilation(Settings):
-    """Add a variance to every splat on the screen, so that none is thinner than a pixel (Kerbl et al. 2023)."""
+
+class Smoothing(WorldFilter):
+    """Blur Gaussians by what the training views can resolve (the 3D smoothing filter of Mip-Splatting, Yu et al. 2024).
+
+    A view of focal length f px samples a Gaussian at depth z every z/f scene units.  `per_camera` takes the smallest
+    such interval (eq. 6); `global_max` the smallest z by the largest f of all views, as the paper's code does.
+    """
+
+    type: Literal["smoothing"] = "smoothing"
+    variance: Annotated[float, Field(ge=0)] = 0.2  # in sampling intervals²
+    focal: Literal["per_camera", "global_max"] = "per_camera"
+
+    def refresh(self, gaussians: Gaussians, views: FilterViews, near: float) -> None:
+        device, program = gaussians.device, gaussians.device.program("filter.cl")
+        focal = np.full_like(views.focal, views.focal.max()) if self.focal == "global_max" else views.focal
+        largest = device.zeros(1, np.uint32)
+        items = -(-gaussians.count // int(device.tuning["LANES"]))
+        interval = gaussians["filter_variance"]
+        program.sampling_interval(
+            items=items,
+            means=gaussians["means"],
+            cameras=views.cameras,
+            focal=device.upload(focal),
+            interval=interval,
+            largest=largest,
+            near_plane=near,
+            views=len(focal),
+            stride=gaussians.capacity,
+            count=gaussians.count,
+        )
+        program.filter_variance(
+            items=items, largest=largest, interval=interval, variance=self.variance, count=gaussians.count
+        )
+
+
+class ScreenFilter(Settings):
+    """How splats are blurred on the screen."""
+
+    variance: Annotated[float, Field(ge=0)]  # px²
+    compensate: Literal[0, 1]  # 1: opacity loses what the filter spreads out
+
+
+class Dilation(ScreenFilter):
+    """Add a variance to every splat, so that none is thinner than a pixel (Kerbl et al. 2023)."""
 
     type: Literal["dilation"] = "dilation"
-    variance: Annotated[float, Field(ge=0)] = 0.3  # px²
-    compensate: Literal[0, 1] = 0  # 1: opacity loses what the filter spreads out
+    variance: Annotated[float, Field(ge=0)] = 0.3
+    compensate: Literal[0, 1] = 0
 
 
-WORLD_FILTERS = {"none": NoWorldFilter}
-SCREEN_FILTERS = {"dilation": Dilation}
+class Ewa(ScreenFilter):
+    """The same variance, but splats keep their energy (Zwicker et al. 2001; "3DGS + EWA" in Yu et al. 2024)."""
+
+    type: Literal["ewa"] = "ewa"
+    variance: Annotated[float, Field(ge=0)] = 0.3
+    compensate: Literal[0, 1] = 1
+
+
+class Mip(ScreenFilter):
+    """Blur by about a pixel, splats keep their energy (the 2D Mip filter of Mip-Splatting, Yu et al. 2024, eq. 11)."""
+
+    type: Literal["mip"] = "mip"
+    variance: Annotated[float, Field(ge=0)] = 0.1
+    compensate: Literal[0, 1] = 1
+
+
+WORLD_FILTERS: dict[str, type[WorldFilter]] = {"none": NoWorldFilter, "smoothing": Smoothing}
+SCREEN_FILTERS: dict[str, type[ScreenFilter]] = {"dilation": Dilation, "ewa": Ewa, "mip": Mip}
+AnyWorldFilter = Annotated[NoWorldFilter | Smoothing, Field(discriminator="type")]
+AnyScreenFilter = Annotated[Dilation | Ewa | Mip, Field(discriminator="type")]
 
 
 class ModelSettings(Settings):
@@ -31,8 +121,8 @@ class ModelSettings(Settings):
 
     sh_degree: Annotated[int, Field(ge=0, le=3)] = 3
     near: Annotated[float, Field(gt=0)] = 0.2  # scene units; nearer Gaussians are not drawn
-    world_filter: NoWorldFilter = NoWorldFilter()
-    screen_filter: Dilation = Dilation()
+    world_filter: AnyWorldFilter = NoWorldFilter()
+    screen_filter: AnyScreenFilter = Dilation()
 
     def model(self, gaussians: Gaussians, degree: int) -> Model:
         """Return the Gaussians with the numbers of these settings; `degree` is the active one."""

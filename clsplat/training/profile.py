@@ -27,7 +27,11 @@ STAGES = {
     "project_backward": "update",
     "adam_step": "update",
     "update_gaussians": "update",
-    "accumulate_stats": "statistics",
+    "count_seen": "statistics",
+    "accumulate_norm": "statistics",
+    "accumulate_sum": "statistics",
+    "sampling_interval": "filter",
+    "filter_variance": "filter",
 }
 ORDER = tuple(dict.fromkeys(STAGES.values()))
 

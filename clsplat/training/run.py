@@ -6,17 +6,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from clsplat.errors import ConfigError
 from clsplat.gaussians.model import Model
 from clsplat.opencl.device import Device
 from clsplat.render.renderer import Renderer
 from clsplat.scene.scene import Scene, View
 from clsplat.training.adam import Adam
-from clsplat.training.density import SplatStats
-from clsplat.training.filters import ModelSettings
+from clsplat.training.filters import FilterViews, ModelSettings
 from clsplat.training.records import Records
+from clsplat.training.sampling import Sampling, ViewOrder
+from clsplat.training.statistics import SplatStats
 from clsplat.training.targets import Targets
 
 LOG = logging.getLogger("clsplat")
@@ -40,7 +39,8 @@ class Run:
     """The mutable state of a pipeline; stages read and change it."""
 
     device: Device
-    scene: Scene
+    scene: Scene  # as trained on: at one scale or several
+    photographs: Scene  # as read
     out: Path
     name: str
     seed: int
@@ -48,6 +48,7 @@ class Run:
     renderer: Renderer
     targets: Targets
     model_settings: ModelSettings
+    sampling: Sampling = "uniform"
     model: Model | None = None
     adam: Adam | None = None
     stats: SplatStats | None = None
@@ -61,7 +62,8 @@ class Run:
 
     def __post_init__(self) -> None:
         self.records = Records(self.out)
-        self._order: tuple[int, np.ndarray[Any, Any]] = (-1, np.empty(0, int))
+        self._order = ViewOrder(self.scene.split("train"), self.sampling, self.seed)
+        self._filter_views: FilterViews | None = None
 
     @property
     def trained(self) -> Model:
@@ -70,16 +72,21 @@ class Run:
             raise ConfigError("no model yet: an init stage must come first")
         return self.model
 
-    def train_view(self) -> View:
-        """The view of the current step: all training views in a random order, then all in another.
+    @property
+    def scale(self) -> float:
+        """The finest scale that is trained on: by what the photographs' size is divided."""
+        return self.scene.scales[0]
 
-        The order depends on the seed and the step alone, so a resumed run goes on with the same views.
-        """
-        views = self.scene.train
-        epoch, place = divmod(self.step - 1, len(views))
-        if self._order[0] != epoch:
-            self._order = (epoch, np.random.default_rng([self.seed, epoch]).permutation(len(views)))
-        return self.scene.views[views[int(self._order[1][place])]]
+    def train_view(self) -> View:
+        """The view of the current step."""
+        return self._order.at(self.step)
+
+    def refresh_filter(self) -> None:
+        """Let the world filter follow the Gaussians: after they are made, and after their number changes."""
+        if self._filter_views is None:
+            self._filter_views = FilterViews(self.device, self.scene.split("train"))
+        model = self.trained
+        self.model_settings.world_filter.refresh(model.gaussians, self._filter_views, model.near)
 
     def rendering(self) -> dict[str, Any]:
         """The numbers that a model file needs to be rendered as it was trained."""

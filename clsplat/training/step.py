@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from clsplat.gaussians.model import Model
 from clsplat.opencl.device import Array
-from clsplat.render.renderer import Frame, Renderer
+from clsplat.render.renderer import MOMENTS, Frame, Renderer
 from clsplat.training.losses import Comparison, Loss, Term
 from clsplat.training.targets import Target, unpack
 
@@ -17,17 +17,17 @@ class Differentiated:
     frame: Frame
     comparison: Comparison
     terms: list[Term]
-    moments: Array  # [MOMENTS, S]
+    moments: Array  # [count, S]
 
 
 def differentiate(
-    renderer: Renderer, model: Model, target: Target, background: Array, losses: Sequence[Loss]
+    renderer: Renderer, model: Model, target: Target, background: Array, losses: Sequence[Loss], count: int = MOMENTS
 ) -> Differentiated:
-    """Return the derivative of the sum of `losses` at one view, as moments of pixels.  background: [3]."""
+    """Return the derivative of the sum of `losses` at one view, as `count` moments of pixels.  background: [3]."""
     workspace, camera = renderer.workspace, target.camera
     frame = renderer.forward(model, camera, background)
     photograph = unpack(workspace, camera, target.pixels)
     gradient = workspace.array("grad_image", (3, camera.rows, camera.stride))
     comparison = Comparison(workspace, camera, frame.image, photograph, gradient)
     terms = [loss.add(comparison) for loss in losses]
-    return Differentiated(frame, comparison, terms, renderer.moments(model, frame, gradient))
+    return Differentiated(frame, comparison, terms, renderer.moments(model, frame, gradient, count))

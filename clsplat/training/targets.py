@@ -28,22 +28,24 @@ class Targets:
         self.device = device
         self.background_name = background
         self.background_array = device.upload(np.array(BACKGROUNDS[background], np.float32))
-        self._cameras: dict[str, DeviceCamera] = {}  # by name of the view
-        self._targets: dict[str, Target] = {}
+        self._cameras: dict[tuple[str, float], DeviceCamera] = {}  # by name and scale of the view
+        self._targets: dict[tuple[str, float], Target] = {}
 
     def camera(self, view: View) -> DeviceCamera:
         """Return the camera of a view."""
-        if view.name not in self._cameras:
-            self._cameras[view.name] = upload_camera(self.device, view)
-        return self._cameras[view.name]
+        key = view.name, view.scale
+        if key not in self._cameras:
+            self._cameras[key] = upload_camera(self.device, view)
+        return self._cameras[key]
 
     def get(self, view: View) -> Target:
         """Return the photograph of a view.  Raises DataError when its file cannot be read."""
-        if view.name not in self._targets:
+        key = view.name, view.scale
+        if key not in self._targets:
             image = load_image(view, BACKGROUNDS[self.background_name])
             pixels = self.device.upload(np.ascontiguousarray(image.transpose(2, 0, 1)))
-            self._targets[view.name] = Target(self.camera(view), pixels)
-        return self._targets[view.name]
+            self._targets[key] = Target(self.camera(view), pixels)
+        return self._targets[key]
 
 
 def unpack(workspace: Workspace, camera: DeviceCamera, pixels: Array, name: str = "target") -> Array:

@@ -7,20 +7,11 @@ from clsplat.gaussians.model import PARAMETERS, Gaussians
 from clsplat.opencl.device import Device
 from clsplat.render.renderer import Renderer
 from clsplat.training.adam import Adam
-from clsplat.training.density import (
-    SCREEN_GRAD,
-    SEEN,
-    Clone,
-    PruneFaint,
-    PruneLarge,
-    SplatStats,
-    Split,
-    cap_opacity,
-    densify,
-)
+from clsplat.training.density import Clone, PruneFaint, PruneLarge, Split, cap_opacity, densify
+from clsplat.training.statistics import SEEN, SplatStats
 from tests import reference as ref
 from tests import reference_loss as ref_loss
-from tests.scenes import random_case
+from tests.scenes import random_case, with_world_filter
 
 RULES = [
     Clone(gradient_above=2e-4, size_below=0.01),
@@ -29,6 +20,7 @@ RULES = [
     PruneLarge(size_above=0.1, after=3000),
 ]
 EXTENT = 5.0
+SCREEN_GRAD = "stats/screen_grad"
 
 
 def edited(device: Device, rng, count: int, step: int, rules=RULES):
@@ -143,30 +135,32 @@ def test_identity_rearrangement_changes_nothing(device, rng):
         np.testing.assert_array_equal(gaussians.get(name), table)
 
 
-def test_statistics(device, rng):
-    case = random_case(rng, 65)
-    case.parameters["means"][::4] -= 20 * case.view.world_to_camera[2, :3]  # behind the camera
-    model = case.model(device)
-    frame = Renderer(device, "radix").forward(model, case.device_camera(device), device.zeros(3))
-    stats = SplatStats(model.gaussians)
-    planes = np.zeros((2, model.gaussians.capacity), np.float32)
-    planes[:, :65] = rng.normal(size=(2, 65))
-    grad_mean2d = device.upload(planes)
-    stats.add(frame, grad_mean2d)
-    stats.add(frame, grad_mean2d)
-    seen = frame.radius.get()[:65] > 0
-    assert 0 < seen.sum() < 65
-    width, height = case.size
-    norms = ref_loss.screen_gradient(planes[:, :65].T.astype(np.float64), width, height)
-    np.testing.assert_allclose(model.gaussians.get(SCREEN_GRAD)[:, 0], 2 * norms * seen, rtol=1e-5)
-    np.testing.assert_array_equal(model.gaussians.get(SEEN)[:, 0], 2 * seen)
-
-
-def test_opacity_is_capped(device, rng):
-    gaussians = random_case(rng, 65).model(device).gaussians
+@pytest.mark.parametrize("count", [0, 1, 63, 64, 65])
+def test_opacity_is_capped(device, rng, count):
+    gaussians = random_case(rng, count).model(device).gaussians
     before = gaussians.get("logit_opacity")
     cap_opacity(gaussians, 0.3)
     np.testing.assert_allclose(gaussians.get("logit_opacity"), np.minimum(before, np.log(0.3 / 0.7)), rtol=1e-6)
+
+
+def test_opacity_is_capped_after_the_world_filter(device, rng):
+    """No filter leaves the limit itself, a strong one leaves everything as it is."""
+    case = with_world_filter(random_case(rng, 300), rng)
+    case.parameters["filter_variance"][:3] = np.array([[0], [1e6], [1e-30]])
+    case.parameters["log_scales"][2] = -60  # underflows
+    case.parameters["logit_opacity"][:3] = 4
+    gaussians = case.model(device).gaussians
+    cap_opacity(gaussians, 0.3)
+    after = gaussians.get("logit_opacity")[:, 0].astype(np.float64)
+    oracle = case.gaussians()
+    scale2 = np.exp(2 * oracle.log_scales)
+    ratio = np.prod(np.sqrt(scale2 / (scale2 + oracle.filter_variance[:, None])), axis=1)
+    expected = np.minimum(oracle.logit_opacity, 99)
+    capped = ratio / (1 + np.exp(-expected)) > 0.3
+    expected[capped] = ref_loss.reset_logit(expected[capped], ratio[capped], 0.3)
+    assert 20 < capped.sum() < 280
+    np.testing.assert_allclose(after, expected, rtol=2e-5, atol=2e-5)
+    assert (ratio / (1 + np.exp(-after)) <= 0.3 * (1 + 1e-5)).all()
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])

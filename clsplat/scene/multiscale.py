@@ -1,0 +1,51 @@
+"""Read the multi-scale Blender datasets of mip-NeRF: one metadata.json, every photograph at several scales."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from clsplat.errors import DataError
+from clsplat.scene.images import read_file, require_files
+from clsplat.scene.points import read_points_ply
+from clsplat.scene.scene import Scene, View, make_scene
+from clsplat.scene.transforms import Frame, camera_of, image_path_of, pose_of, view_name
+
+FILE = "metadata.json"
+COLUMNS = ("file_path", "cam2world", "width", "height", "focal", "label")  # one value for each image
+
+
+def read_multiscale(path: Path) -> Scene:
+    """Read a multi-scale Blender scene; an image of label j shows 1/2^j of the full size.
+
+    Raises DataError when a file is missing, damaged or not supported.
+    """
+    try:
+        splits = json.loads(read_file(path / FILE))
+    except (ValueError, RecursionError) as error:
+        raise DataError(f"{path / FILE}: not a JSON file ({error}); make it again") from error
+    train, test = (_views(path / FILE, splits, name) for name in ("train", "test"))
+    require_files(path, (view.image_path for view in train + test))
+    points = path / "points3d.ply"
+    held_out = set(range(len(train), len(train) + len(test)))
+    cloud = read_points_ply(points) if points.is_file() else None
+    return make_scene(path, train + test, held_out, cloud, background="white")
+
+
+def _views(path: Path, splits: Any, name: str) -> list[View]:
+    table = splits.get(name) if isinstance(splits, dict) else None
+    columns: list[Any] = [table.get(column) for column in COLUMNS] if isinstance(table, dict) else [None]
+    if not all(isinstance(column, list) for column in columns) or len(set(map(len, columns))) > 1:
+        raise DataError(f"{path}: '{name}' lacks lists of one length called {', '.join(COLUMNS)}; make it again")
+    views = []
+    for i, (file, pose, width, height, focal, label) in enumerate(zip(*columns, strict=True)):
+        values = {"file_path": file, "transform_matrix": pose, "w": width, "h": height, "fl_x": focal, "label": label}
+        frame = Frame(path.parent, f"{path}: {name}[{i}]", values)
+        level = frame.number("label")
+        if level is None or not 0 <= level <= 8 or level % 1:
+            raise DataError(
+                f"{frame.where}: label is {label!r}; expected how often the image was halved: make it again"
+            )
+        image = image_path_of(frame)
+        view = View(view_name(file), camera_of(frame, None), pose_of(frame), image, scale=2**level)
+        views.append(view)
+    return views

@@ -1,0 +1,133 @@
+"""What the views since the last edit said about each Gaussian, in named columns that density rules choose from.
+
+A column is a table `stats/<name>`: the sum of one number per view, over the views that saw the Gaussian.  Only columns
+that some rule names are summed, and only they cost time.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Collection
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.gaussians.model import Gaussians
+from clsplat.opencl.device import Array
+from clsplat.opencl.program import constants
+from clsplat.render.renderer import MOMENTS, Frame
+from clsplat.training.step import Differentiated
+
+FOLDER = "stats/"
+SEEN = "stats/seen"
+ABS_X = int(constants("splat.h")["MOMENT_ABS_X"])
+StatisticName = Literal["screen_grad", "screen_grad_abs", "screen_grad_abs_sum"]
+
+
+class Statistic(ABC):
+    """How one view adds to a column."""
+
+    moments: ClassVar[int] = MOMENTS  # sums over pixels that the backward pass must make
+
+    @abstractmethod
+    def add(self, gaussians: Gaussians, view: Differentiated, grad_mean2d: Array, total: Array) -> None:
+        """Add a view to `total`, [S].  grad_mean2d: [2, S] px⁻¹."""
+
+
+class ScreenGrad(Statistic):
+    """Length of the gradient by the projected mean (Kerbl et al. 2023).
+
+    Gradients count in normalised device coordinates, as the published thresholds do.
+    """
+
+    def add(self, gaussians: Gaussians, view: Differentiated, grad_mean2d: Array, total: Array) -> None:
+        gaussians.device.program("density.cl").accumulate_norm(
+            **_arguments(gaussians, view.frame), planes=grad_mean2d, first=0, total=total
+        )
+
+
+class ScreenGradAbs(Statistic):
+    """The same of sums of absolute values over pixels, which do not cancel (AbsGS, Ye et al. 2024)."""
+
+    moments = ABS_X + 2
+
+    def add(self, gaussians: Gaussians, view: Differentiated, grad_mean2d: Array, total: Array) -> None:
+        gaussians.device.program("density.cl").accumulate_norm(
+            **_arguments(gaussians, view.frame), planes=view.moments, first=ABS_X, total=total
+        )
+
+
+class ScreenGradAbsSum(Statistic):
+    """Those sums of absolute values in x and in y added up (Gaussian Opacity Fields, Yu et al. 2024)."""
+
+    moments = ABS_X + 2
+
+    def add(self, gaussians: Gaussians, view: Differentiated, grad_mean2d: Array, total: Array) -> None:
+        gaussians.device.program("density.cl").accumulate_sum(
+            **_arguments(gaussians, view.frame), planes=view.moments, first=ABS_X, total=total
+        )
+
+
+STATISTICS: dict[str, Statistic] = {
+    "screen_grad": ScreenGrad(),
+    "screen_grad_abs": ScreenGradAbs(),
+    "screen_grad_abs_sum": ScreenGradAbsSum(),
+}
+
+
+class SplatStats:
+    """The columns of a model, and how many views saw each Gaussian."""
+
+    def __init__(self, gaussians: Gaussians, names: Collection[str] = ("screen_grad",)) -> None:
+        """Attach the columns `names` and drop any other; those that are there keep their sums."""
+        self.gaussians = gaussians
+        self.names = tuple(sorted(names))
+        tables = [*(FOLDER + name for name in self.names), SEEN]
+        for name in [name for name in gaussians.tables if name.startswith(FOLDER) and name not in tables]:
+            del gaussians.tables[name]
+        for name in tables:
+            if name not in gaussians.tables:
+                gaussians.add(name, 1, zero_fresh=True)
+
+    @property
+    def moments(self) -> int:
+        """How many sums over pixels the backward pass must make for these columns."""
+        return max((STATISTICS[name].moments for name in self.names), default=MOMENTS)
+
+    def total(self, name: str) -> Array:
+        """A column's sums over views, [S]."""
+        return self.gaussians[FOLDER + name]
+
+    @property
+    def seen(self) -> Array:
+        """Number of views that saw each Gaussian, [S]."""
+        return self.gaussians[SEEN]
+
+    def add(self, view: Differentiated, grad_mean2d: Array) -> None:
+        """Add one view.  grad_mean2d: [2, S] px⁻¹."""
+        gaussians = self.gaussians
+        gaussians.device.program("density.cl").count_seen(
+            items=gaussians.count, radius=view.frame.radius, seen=self.seen, count=gaussians.count
+        )
+        for name in self.names:
+            STATISTICS[name].add(gaussians, view, grad_mean2d, self.total(name))
+
+    def mean(self, name: str) -> NDArray[np.float32]:
+        """A column's mean over the views that saw each Gaussian, on the host, [N]; 0 where none did."""
+        total, seen = (self.gaussians.get(table)[:, 0] for table in (FOLDER + name, SEEN))
+        return np.divide(total, seen, out=np.zeros_like(total), where=seen > 0)
+
+    def clear(self) -> None:
+        for name in self.gaussians.tables:
+            if name.startswith(FOLDER):
+                self.gaussians[name].fill(0)
+
+
+def _arguments(gaussians: Gaussians, frame: Frame) -> dict[str, Any]:
+    return {
+        "items": gaussians.count,
+        "radius": frame.radius,
+        "half_width": frame.camera.width / 2,
+        "half_height": frame.camera.height / 2,
+        "stride": gaussians.capacity,
+        "count": gaussians.count,
+    }

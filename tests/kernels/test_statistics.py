@@ -1,0 +1,168 @@
+"""The columns that density rules read, from the sums over pixels to the rules' decisions."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from clsplat.opencl.device import Device
+from clsplat.render.renderer import MOMENTS, Renderer
+from clsplat.training.density import Clone, PruneFaint, Split, densify
+from clsplat.training.statistics import ABS_X, SEEN, STATISTICS, SplatStats
+from clsplat.training.step import Differentiated
+from tests import reference_blend as ref_blend
+from tests import reference_loss as ref_loss
+from tests.scenes import Case, random_case, relative_error, with_world_filter
+
+BACKGROUND = np.array([0.3, 0.6, 0.1], np.float32)
+ALL = ABS_X + 2
+
+
+def moments_of(device: Device, case: Case, weights: np.ndarray, count: int) -> np.ndarray:
+    """Sums over each Gaussian's pixels under the loss Σ weights · image, [N, count]."""
+    renderer, model, camera = Renderer(device, "radix"), case.model(device), case.device_camera(device)
+    frame = renderer.forward(model, camera, device.upload(BACKGROUND))
+    planes = np.zeros((3, camera.rows, camera.stride), np.float32)
+    planes[:, : camera.height, : camera.width] = weights
+    return renderer.moments(model, frame, device.upload(planes), count).get()[:, : model.gaussians.count].T
+
+
+def expected_abs(case: Case, weights: np.ndarray) -> np.ndarray:
+    """Sums over pixels of |dL/du| and |dL/dv|, [N, 2]."""
+    splats = case.project()
+    return ref_blend.blend_backward(splats, *case.size, BACKGROUND.astype(np.float64), weights).mean2d_abs
+
+
+@pytest.mark.parametrize(
+    ("count", "width", "height"), [(0, 16, 16), (1, 16, 16), (17, 33, 15), (40, 40, 30), (65, 24, 24)]
+)
+def test_absolute_gradients(device, rng, count, width, height):
+    case = with_world_filter(random_case(rng, count, width, height, variance=0.1, compensate=1.0), rng)
+    weights = rng.normal(size=(3, height, width)).astype(np.float32)
+    moments = moments_of(device, case, weights, ALL)
+    assert relative_error(moments[:, ABS_X:], expected_abs(case, weights)) < 2e-3  # pixels at thresholds
+    assert relative_error(moments[:, :MOMENTS], moments_of(device, case, weights, MOMENTS)) < 1e-6
+
+
+def test_schedules_agree(device, rng):
+    case = random_case(rng, 400, 90, 70)
+    weights = rng.normal(size=(3, 70, 90)).astype(np.float32)
+    other = Device(device.info, "simt" if device.schedule == "wide" else "wide")
+    mine, theirs = moments_of(device, case, weights, ALL), moments_of(other, case, weights, ALL)
+    assert relative_error(mine[:, ABS_X:], theirs[:, ABS_X:]) < 1e-6
+
+
+def test_absolute_sums_do_not_cancel(device):
+    """A wide splat under a loss that pulls its left half left and its right half right."""
+    rng = np.random.default_rng(0)
+    case = random_case(rng, 1, 48, 48)
+    pose = np.eye(4)[:3]
+    camera = replace(case.view.camera, fx=40.0, fy=40.0, cx=24.0, cy=24.0)
+    case = replace(case, view=replace(case.view, world_to_camera=pose, camera=camera), degree=0)
+    p = case.parameters
+    p["means"][:], p["log_scales"][:], p["logit_opacity"][:] = (0, 0, 4), np.log(0.5), 0
+    p["quats"][:] = (1, 0, 0, 0)
+    weights = np.zeros((3, 48, 48), np.float32)
+    weights[:, :, :] = np.where(np.abs(np.arange(48) - 23.5) > 6, 1, -1)  # symmetric: the halves pull apart
+    moments = moments_of(device, case, weights, ALL)[0].astype(np.float64)
+    assert abs(moments[1]) < 1e-4 * moments[ABS_X]
+    np.testing.assert_allclose(moments[ABS_X:], expected_abs(case, weights)[0], rtol=2e-3)
+
+
+@pytest.mark.parametrize("names", [(), ("screen_grad",), tuple(STATISTICS)])
+def test_columns(device, rng, names):
+    case = random_case(rng, 65)
+    case.parameters["means"][::4] -= 20 * case.view.world_to_camera[2, :3]  # behind the camera
+    model = case.model(device)
+    frame = Renderer(device, "radix").forward(model, case.device_camera(device), device.zeros(3))
+    gaussians, (width, height) = model.gaussians, case.size
+    stats = SplatStats(gaussians, names)
+    assert stats.moments == (ALL if len(names) > 1 else MOMENTS)
+    planes = rng.normal(size=(ALL, gaussians.capacity)).astype(np.float32)
+    planes[ABS_X:] = np.abs(planes[ABS_X:])
+    view = Differentiated(frame, None, [], device.upload(planes))
+    for _ in range(2):
+        stats.add(view, device.upload(planes[:2]))
+    seen = frame.radius.get()[:65] > 0
+    assert 0 < seen.sum() < 65
+    half = np.array([width / 2, height / 2])
+    expected = {
+        "screen_grad": ref_loss.screen_gradient(planes[:2, :65].T.astype(np.float64), width, height),
+        "screen_grad_abs": ref_loss.screen_gradient(planes[ABS_X:, :65].T.astype(np.float64), width, height),
+        "screen_grad_abs_sum": planes[ABS_X:, :65].T.astype(np.float64) @ half,
+    }
+    for name in names:
+        np.testing.assert_allclose(gaussians.get(f"stats/{name}")[:, 0], 2 * expected[name] * seen, rtol=1e-5)
+        np.testing.assert_allclose(stats.mean(name), expected[name] * seen, rtol=1e-5)
+    np.testing.assert_array_equal(gaussians.get(SEEN)[:, 0], 2 * seen)
+    stats.clear()
+    assert not any(gaussians.get(f"stats/{name}").any() for name in (*names, "seen"))
+
+
+def test_columns_come_and_go_and_keep_their_sums(device, rng):
+    gaussians = random_case(rng, 20).model(device).gaussians
+    stats = SplatStats(gaussians, ["screen_grad"])
+    gaussians["stats/screen_grad"].fill(3)
+    stats = SplatStats(gaussians, ["screen_grad", "screen_grad_abs"])
+    assert (gaussians.get("stats/screen_grad") == 3).all()
+    stats = SplatStats(gaussians, ["screen_grad_abs"])
+    assert stats.names == ("screen_grad_abs",)
+    assert "stats/screen_grad" not in gaussians.tables
+
+
+def made(device: Device, screen_grad: list[float], absolute: list[float], size: list[float], rules: list) -> list[int]:
+    """Rows that each Gaussian becomes under `rules`, from means of its statistics and its size."""
+    count = len(size)
+    case = random_case(np.random.default_rng(1), count)
+    case.parameters["log_scales"][:] = np.log(np.array(size))[:, None]
+    case.parameters["logit_opacity"][:] = 0
+    case.parameters["sh_base"][:, 0] = np.arange(count)
+    gaussians = case.model(device).gaussians
+    stats = SplatStats(gaussians, {name for rule in rules for name in rule.statistics})
+    gaussians.set(SEEN, np.full((count, 1), 2.0))
+    for name, means in (("screen_grad", screen_grad), ("screen_grad_abs", absolute), ("screen_grad_abs_sum", absolute)):
+        if name in stats.names:
+            gaussians.set(f"stats/{name}", 2 * np.array(means)[:, None])
+    densify(gaussians, stats, rules, Renderer(device, "radix").tiler, 1.0, 600, seed=0)
+    return np.bincount(gaussians.get("sh_base")[:, 0].astype(int), minlength=count).tolist()
+
+
+def test_absgs_splits_where_gradients_cancel(device):
+    """Clone by the ordinary gradient, split by the absolute one, divided at 0.001 of the extent."""
+    rules = [
+        Clone(gradient_above=2e-4, size_below=0.001),
+        Split(statistic="screen_grad_abs", gradient_above=4e-4, size_above=0.001),
+        PruneFaint(),
+    ]
+    cases = [
+        (3e-4, 3e-4, 0.0005, 2),  # small and pulled: cloned
+        (1e-4, 9e-4, 0.0005, 1),  # small, its gradients cancel: stays
+        (1e-4, 9e-4, 0.02, 2),  # large, its gradients cancel: split, which the ordinary gradient would not do
+        (3e-4, 3e-4, 0.02, 1),  # large, but the absolute gradient is below its own threshold
+        (3e-4, 5e-4, 0.002, 2),
+    ]
+    grad, absolute, size, rows = (list(column) for column in zip(*cases, strict=True))
+    assert made(device, grad, absolute, size, rules) == rows
+    oracle = ref_loss.adc_actions(
+        np.array(grad), np.array(size), np.full(5, 0.5), 1.0, False, ref_loss.ABSGS, np.array(absolute)
+    )
+    assert [1 + (action in (ref_loss.CLONE, ref_loss.SPLIT)) for action in oracle] == rows
+
+
+def test_as_many_as_takes_the_matching_quantile(device):
+    """Two of eight reach the ordinary threshold, so the two or so largest absolute gradients qualify as well."""
+    grad = [9e-4, 5e-4, 1e-4, 1e-4, 1e-4, 1e-4, 1e-4, 1e-4]
+    absolute = [1e-3, 2e-3, 3e-3, 4e-3, 5e-3, 6e-3, 7e-3, 8e-3]
+    clone = Clone(gradient_above=2e-4, size_below=1)
+    matching = Clone(statistic="screen_grad_abs_sum", as_many_as="screen_grad", gradient_above=2e-4, size_below=1)
+    assert made(device, grad, absolute, [0.1] * 8, [clone]) == [2, 2, 1, 1, 1, 1, 1, 1]
+    limit = np.quantile(absolute, 0.75)
+    assert [value >= limit for value in absolute[-3:]] == [False, True, True]
+    assert made(device, grad, absolute, [0.1] * 8, [clone, matching]) == [2, 2, 1, 1, 1, 1, 2, 2]
+
+
+def test_as_many_as_never_takes_those_without_any(device):
+    """If so many qualify that the quantile is zero, a Gaussian without gradient still does not."""
+    grad, absolute = [9e-4, 9e-4, 9e-4, 0.0], [0.0, 0.0, 0.0, 1e-3]
+    matching = Clone(statistic="screen_grad_abs_sum", as_many_as="screen_grad", gradient_above=2e-4, size_below=1)
+    assert made(device, grad, absolute, [0.1] * 4, [matching]) == [1, 1, 1, 2]
