@@ -37,7 +37,7 @@ def label(variant: Variant) -> str:
 
 
 def metrics(rows: Sequence[Row]) -> str:
-    """Test metrics at the size trained on with the costs, then everything else that was measured; the best of a column is bold."""
+    """Test metrics at the size trained on with the costs, then all else that was measured; the best are bold."""
     costs = [
         ("Gaussians", _column([[run.metrics.gaussians for run in row.runs] for row in rows], 0)),
         ("steps", _column([[run.metrics.steps for run in row.runs] for row in rows], 0)),
