@@ -99,7 +99,7 @@ static inline void store_record(const moments_t m, __global float *record)
     const float16 sums = (float16)(
         sum_lanes(m.power), sum_lanes(m.x), sum_lanes(m.y), sum_lanes(m.xx), sum_lanes(m.xy), sum_lanes(m.yy),
         sum_lanes(m.red), sum_lanes(m.green), sum_lanes(m.blue), sum_lanes(m.abs_x), sum_lanes(m.abs_y),
-        0.0f, 0.0f, 0.0f, 0.0f, 0.0f);
+        sum_lanes(m.weight), sum_lanes(m.texture), 0.0f, 0.0f, 0.0f);
     vstore16(sums, 0, record);
 }
 
@@ -114,6 +114,7 @@ void blend_backward(
     __constant camera_t *restrict camera,       // [1]
     __global const float *restrict image,       // [3,tiles_y*TILE,tiles_x*TILE]
     __global const float *restrict grad_image,  // [3,tiles_y*TILE,tiles_x*TILE]
+    __global const float *restrict texture,     // [tiles_y*TILE,tiles_x*TILE] read where MOMENTS says so
     __global const uint *restrict tile_last,    // [T]
     __global float *restrict pair_moments)      // [P,RECORD] in emission order
 {
@@ -131,6 +132,9 @@ void blend_backward(
             p.blue = VLOAD(grad_image + 2 * plane + at);
             p.rest = p.red * VLOAD(image + at) + p.green * VLOAD(image + plane + at) +
                      p.blue * VLOAD(image + 2 * plane + at);
+#if MOMENTS > MOMENT_WEIGHT
+            p.texture = VLOAD(texture + at);
+#endif
             pixels[y][column] = p;
         }
 
@@ -141,7 +145,7 @@ void blend_backward(
         float splat[RECORD];
         vstore16(vload16(pair_splat[pair], splats), 0, splat);
         const VF zero = (VF)(0.0f);
-        moments_t moments = {zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero};
+        moments_t moments = {zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero};
         const float low = splat[SPLAT_Y_MIN] - top, high = splat[SPLAT_Y_MAX] - top;
         const uint y_first = low > 0.0f ? (uint)low : 0u;
         const uint y_end = high < TILE - 1.0f ? (uint)(high + 1.0f) : TILE;

@@ -31,7 +31,7 @@
 #define SPLAT_GROUP 32  // splats per batch of the simt backward pass
 #endif
 #ifndef MOMENTS
-#define MOMENTS 9  // sums over pixels in a gradient record (splat.h): 11 where density statistics want the last two
+#define MOMENTS 9  // sums over pixels in a gradient record (splat.h): 11 or 13 where density statistics want the last
 #endif
 
 /* ---- constants of the method (Kerbl et al. 2023); tests override the first three to make blending smooth ---- */

@@ -4,8 +4,8 @@
  * becomes (`copies`), how many of them are the old one (`kept`) and by what the scales of the fresh ones are multiplied
  * (`shrink`).  Clone = (2, 1, 1), split in n = (n, 0, 1/1.6), prune = (0, 0, 1).  One item = one Gaussian or one row.
  * No local memory.  Deterministic. */
-#include "common.h"
 #include "random.h"
+#include "splat.h"
 
 /* Count the views that see each Gaussian. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
@@ -57,6 +57,34 @@ void accumulate_sum(
     total[i] += half_width * fabs(planes[first * stride + i]) + half_height * fabs(planes[(first + 1) * stride + i]);
 }
 
+/* Add this view's mean texture under each Gaussian, weighted as it is blended. */
+__kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
+void accumulate_ratio(
+    __global const float *restrict moments,  // [MOMENTS,S] see splat.h; MOMENT_WEIGHT and MOMENT_TEXTURE are read
+    __global const float *restrict radius,   // [S] px, 0 = not seen
+    __global float *restrict total,          // [S] over views, px^-1
+    const uint stride,
+    const uint count)
+{
+    const uint i = get_global_id(0);
+    if (i >= count || !(radius[i] > 0.0f))
+        return;
+    const float weight = moments[MOMENT_WEIGHT * stride + i];
+    total[i] += weight > 0.0f ? moments[MOMENT_TEXTURE * stride + i] / weight : 0.0f;
+}
+
+/* Add this view's radius. */
+__kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
+void accumulate_radius(
+    __global const float *restrict radius,  // [S] px, 0 = not seen
+    __global float *restrict total,         // [S] over views, px
+    const uint count)
+{
+    const uint i = get_global_id(0);
+    if (i < count)
+        total[i] += radius[i];
+}
+
 /* Every Gaussian keeps its row, until a rule says otherwise. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void start_edit(
@@ -105,6 +133,26 @@ void mark_rule(
         kept[i] = new_kept;
         shrink[i] = new_copies == 0 ? shrink[i] : new_shrink;
     }
+}
+
+/* Apply one rule to the Gaussians that the host has chosen, with the same precedence. */
+__kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
+void mark_chosen(
+    __global const uint *restrict chosen,  // [N] 0 or 1
+    __global uint *restrict copies,        // [N]
+    __global uint *restrict kept,          // [N]
+    __global float *restrict shrink,       // [N]
+    const float new_shrink,
+    const uint new_copies,
+    const uint new_kept,
+    const uint count)
+{
+    const uint i = get_global_id(0);
+    if (i >= count || chosen[i] == 0 || !(new_copies == 0 || copies[i] == 1))
+        return;
+    copies[i] = new_copies;
+    kept[i] = new_kept;
+    shrink[i] = new_copies == 0 ? shrink[i] : new_shrink;
 }
 
 /* Which row each new row comes from, in the old order: a Gaussian's offspring stay beside it. */

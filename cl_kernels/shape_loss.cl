@@ -6,7 +6,7 @@
  * One item = LANES Gaussians; each adds to the gradient and writes its own sum.  No local memory.  Deterministic. */
 #include "lanes.h"
 
-/* grad_log_scales += weight dP/d(log s).  The bound of a Gaussian is max(above, pixels^2 * nearest^2). */
+/* grad_log_scales += weight dP/d(log s).  The bound of a Gaussian is above + pixels^2 nearest^2. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void covariance_trace(
     __global const float *restrict log_scales,  // [3,S] log of scene units

@@ -34,10 +34,12 @@
 #define MOMENT_RED 6       // w dL/dcolour; then green, blue
 #define MOMENT_ABS_X 9     // |dL/dx| of the mean, px^-1; from here on only where MOMENTS says so
 #define MOMENT_ABS_Y 10
+#define MOMENT_WEIGHT 11   // w
+#define MOMENT_TEXTURE 12  // w times the texture at the pixel
 
 /* The same sums while they grow, one set per lane. */
 typedef struct {
-    VF power, x, y, xx, xy, yy, red, green, blue, abs_x, abs_y;
+    VF power, x, y, xx, xy, yy, red, green, blue, abs_x, abs_y, weight, texture;
 } moments_t;
 
 /* A splat seen from one row of pixels. */
@@ -114,6 +116,9 @@ static inline VF magnitude(VF t) { return as_VF(as_VI(t) & 0x7fffffff); }
  * no division to undo the transmittance. */
 typedef struct {
     VF t, rest, red, green, blue;
+#if MOMENTS > MOMENT_WEIGHT
+    VF texture;
+#endif
 } grad_pixels_t;
 
 static inline void blend_backward_step(grad_pixels_t *p, const row_splat_t s, const VF pixel, const float *colour,
@@ -137,10 +142,14 @@ static inline void blend_backward_step(grad_pixels_t *p, const row_splat_t s, co
     m->red += k.weight * p->red;
     m->green += k.weight * p->green;
     m->blue += k.weight * p->blue;
-    if (MOMENTS > MOMENT_ABS_X) {  // known when compiled
-        m->abs_x += magnitude(power * (s.b - 2.0f * s.a * k.dx));
-        m->abs_y += magnitude(power * (s.xy * k.dx + s.slope));
-    }
+#if MOMENTS > MOMENT_ABS_X
+    m->abs_x += magnitude(power * (s.b - 2.0f * s.a * k.dx));
+    m->abs_y += magnitude(power * (s.xy * k.dx + s.slope));
+#endif
+#if MOMENTS > MOMENT_WEIGHT
+    m->weight += k.weight;
+    m->texture += k.weight * p->texture;
+#endif
 }
 
 #endif

@@ -22,7 +22,7 @@ from clsplat.render.renderer import RECORD, Frame, Renderer
 from clsplat.scene.detect import read_scene
 from clsplat.scene.scene import Camera, View
 from clsplat.training.adam import Adam, Rates
-from clsplat.training.density import PruneLarge, densify
+from clsplat.training.density import Measures, PruneLarge, densify
 from clsplat.training.losses import L1, Dssim
 from clsplat.training.profile import stage_milliseconds
 from clsplat.training.statistics import SplatStats
@@ -104,7 +104,7 @@ class Contestant:
         self.device.finish()
         start = time.perf_counter()
         never = [PruneLarge(size_above=1e30)]
-        densify(self.model.gaussians, self.stats, list(never), self.renderer.tiler, 1.0, 1, 0)
+        densify(self.model.gaussians, self.stats, list(never), self.renderer.tiler, Measures(1.0), 1, 0)
         self.device.finish()
         self.densify.append(1e3 * (time.perf_counter() - start))
 

@@ -66,6 +66,14 @@ def blend(
     return image + np.asarray(background)[:, None, None] * transmittance, transmittance, count
 
 
+def blend_weights(splats: Splats, width: int, height: int, thresholds: Thresholds = Thresholds()) -> np.ndarray:
+    """What each splat contributes to each pixel, α T, [N,H,W]."""
+    weights = np.zeros((len(splats.opacity), height, width))
+    for step in blend_steps(splats, width, height, thresholds):
+        weights[step.index] = np.where(step.blended, step.alpha * step.before, 0)
+    return weights
+
+
 def blend_backward(
     splats: Splats,
     width: int,

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from clsplat.opencl.device import Array, Device
 
 PARAMETERS = ("means", "quats", "log_scales", "logit_opacity", "sh_base", "sh_rest")
+INTERVAL2 = "sampling_interval2"  # scene units², of the training view that samples finest; only where somebody asks
 ALIGNMENT = 64  # capacity is a multiple of this: wide kernels need no tail
 GROWTH = 1.5
 SH_C0 = 0.28209479177387814  # basis function of band 0
@@ -51,8 +52,10 @@ class Gaussians:
             self.add(name, parameters[name].shape[1])
             self.set(name, parameters[name])
         self.add("filter_variance", 1)
-        if "filter_variance" in parameters:
-            self.set("filter_variance", parameters["filter_variance"])
+        for name in ("filter_variance", INTERVAL2):
+            if name in parameters:
+                self.add(name, 1)
+                self.set(name, parameters[name])
         self._rows = device.program("gather.cl")
 
     def __getitem__(self, name: str) -> Array:

@@ -107,6 +107,7 @@ class Renderer:
         self._project = device.program("project.cl")
         self._blend = device.program(f"blend_{device.schedule}.cl")
         self._lanes = int(device.tuning["LANES"])
+        self._gradients: Gradients | None = None  # made when somebody asks for them
 
     def forward(self, model: Model, camera: DeviceCamera, background: Array) -> Frame:
         """Render the model.  background: [3]."""
@@ -141,10 +142,13 @@ class Renderer:
         )
         return Frame(camera, splats, radius, lists, tile_last, image, transmittance)
 
-    def moments(self, model: Model, frame: Frame, grad_image: Array, count: int = MOMENTS) -> Array:
+    def moments(
+        self, model: Model, frame: Frame, grad_image: Array, count: int = MOMENTS, texture: Array | None = None
+    ) -> Array:
         """Sums over each Gaussian's pixels that its gradients are made of, [count, S]; see cl_kernels/splat.h.
 
-        grad_image: [3, rows, stride], zero outside the image.  More than MOMENTS of them cost more time.
+        grad_image: [3, rows, stride], zero outside the image.  More than MOMENTS of them cost more time; the last are
+        of `texture`, [rows, stride].
         """
         gaussians, lists = model.gaussians, frame.lists
         defines = {} if count == MOMENTS else {"MOMENTS": count}
@@ -158,6 +162,7 @@ class Renderer:
             camera=frame.camera.array,
             image=frame.image,
             grad_image=grad_image,
+            texture=texture or frame.transmittance,  # without a texture the kernel reads none
             tile_last=frame.tile_last,
             pair_moments=pair_moments,
         )
@@ -174,8 +179,10 @@ class Renderer:
         return moments
 
     def gradients(self, model: Model, frame: Frame, moments: Array) -> Gradients:
-        """Derivatives of the loss by every parameter of the model that made the frame."""
-        gradients = Gradients(model.gaussians)
+        """Derivatives of the loss by every parameter of the model that made the frame; valid until the next ones."""
+        if self._gradients is None or self._gradients.capacity != model.gaussians.capacity:
+            self._gradients = Gradients(model.gaussians)
+        gradients = self._gradients
         self._project.project_backward(
             items=-(-model.gaussians.count // self._lanes),
             **shape_arguments(model, frame.camera),

@@ -2,12 +2,15 @@
 
 import logging
 from collections.abc import Collection
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
+
+from pydantic import Field
 
 from clsplat.errors import NumericError
 from clsplat.gaussians.model import PARAMETERS
 from clsplat.stages.base import Stage
-from clsplat.training.density import AnyRule, densify
+from clsplat.training.density import Measures, densify
+from clsplat.training.rules import AnyRule
 from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
@@ -21,6 +24,18 @@ class Densify(Stage):
     edits: ClassVar[bool] = True
 
     rules: list[AnyRule]
+    max_gaussians: Annotated[int, Field(gt=0)] | None = None  # growth stops here; pruning goes on
+
+    @property
+    def statistics(self) -> set[str]:
+        """Columns that the rules read."""
+        limited = {"screen_grad"} if self.max_gaussians else set()
+        return limited.union(*(rule.statistics for rule in self.rules))
+
+    @property
+    def tables(self) -> set[str]:
+        """Tables of the Gaussians that the rules read beside the parameters."""
+        return {name for rule in self.rules for name in rule.tables}
 
     def stale(self, run: Run) -> Collection[str]:
         return PARAMETERS
@@ -29,9 +44,11 @@ class Densify(Stage):
         if run.stats is None:
             return
         gaussians = run.trained.gaussians
-        change = densify(gaussians, run.stats, self.rules, run.renderer.tiler, run.scene.extent, run.step, run.seed)
+        measures = Measures(run.scene.extent, run.texture_quantile)
+        tiler = run.renderer.tiler
+        change = densify(gaussians, run.stats, self.rules, tiler, measures, run.step, run.seed, most=self.max_gaussians)
         run.refresh_filter()
-        run.records.add(run.step, "densify", before=change.before, after=change.after)
+        run.records.add(run.step, "densify", before=change.before, after=change.after, causes=change.causes)
         LOG.debug("step %d: %d -> %d Gaussians", run.step, change.before, change.after)
         if change.after == 0:
             raise NumericError(f"step {run.step}: every Gaussian was pruned; weaken the prune rules or lower the rates")

@@ -16,9 +16,10 @@ from clsplat.stages.export import Export
 from clsplat.stages.schedule import RaiseSh, RefreshFilter, ResetOpacity
 from clsplat.training import checkpoint
 from clsplat.training.adam import Adam, Rates
-from clsplat.training.losses import AnyLoss, pixel_loss
+from clsplat.training.losses import L1, L2, Dssim, Loss, pixel_loss
 from clsplat.training.profile import stage_milliseconds
 from clsplat.training.run import Progress, Run
+from clsplat.training.shape_losses import Anisotropy, CovarianceTrace, ShapeLoss, Shapes
 from clsplat.training.statistics import SplatStats
 from clsplat.training.step import Differentiated, differentiate
 
@@ -26,6 +27,7 @@ LOG = logging.getLogger("clsplat")
 Scheduled = Annotated[
     RaiseSh | Densify | ResetOpacity | RefreshFilter | Checkpoint | Evaluate | Export, Field(discriminator="stage")
 ]
+AnyTerm = Annotated[L1 | L2 | Dssim | CovarianceTrace | Anisotropy, Field(discriminator="type")]
 
 
 class Optimize(Stage):
@@ -42,9 +44,16 @@ class Optimize(Stage):
 
     steps: Annotated[int, Field(gt=0)]
     rates: Rates = Rates()
-    losses: Annotated[list[AnyLoss], Field(min_length=1)]
+    losses: list[AnyTerm]
     during: list[Scheduled] = Field([])
     log_every: Annotated[int, Field(gt=0)] = 100  # steps between lines of metrics.jsonl
+
+    @field_validator("losses")
+    @classmethod
+    def _of_an_image(cls, losses: list[AnyTerm]) -> list[AnyTerm]:
+        if not any(isinstance(loss, Loss) for loss in losses):
+            raise ValueError("expected at least one loss that compares images: l1, l2 or dssim")
+        return losses
 
     @field_validator("during")
     @classmethod
@@ -62,6 +71,7 @@ class Optimize(Stage):
         model = run.trained
         run.adam = run.adam or Adam(model.gaussians)
         run.stats = SplatStats(model.gaussians, self._statistics())
+        self._attach(run)
         last_step = run.step - run.stage_step + self.steps
         seconds: list[float] = []  # of the steps since the last report
         while run.stage_step < self.steps:
@@ -83,10 +93,26 @@ class Optimize(Stage):
                 path = checkpoint.save(run, keep=2)
                 raise Interrupted(f"stopped at step {run.step}, saved in {path}; --resume goes on from there")
 
+    @property
+    def _edits(self) -> list[Densify]:
+        return [stage for stage in self.during if isinstance(stage, Densify)]
+
     def _statistics(self) -> set[str]:
         """Columns that some density rule reads."""
-        rules = [rule for stage in self.during if isinstance(stage, Densify) for rule in stage.rules]
-        return {name for rule in rules for name in rule.statistics}
+        return {name for stage in self._edits for name in stage.statistics}
+
+    def _attach(self, run: Run) -> None:
+        """Add the tables that losses and rules read; a resumed run has them."""
+        gaussians = run.trained.gaussians
+        parts: list[ShapeLoss | Densify] = [*self._penalties, *self._edits]
+        wanted = {name for part in parts for name in part.tables}
+        for name in sorted(wanted - gaussians.tables.keys()):
+            gaussians.add(name, 1)
+            run.refresh_filter()
+
+    @property
+    def _penalties(self) -> list[ShapeLoss]:
+        return [loss for loss in self.losses if isinstance(loss, ShapeLoss)]
 
     def _edit(self, run: Run) -> None:
         """What was due at the step before."""
@@ -103,13 +129,16 @@ class Optimize(Stage):
         run.device.timings.sampling = run.step % self.log_every == self.log_every // 2
         model, target = run.trained, run.targets.get(run.train_view())
         background, moments = run.targets.background_array, run.stats.moments
-        view = differentiate(run.renderer, model, target, background, self.losses, moments)
+        images = [loss for loss in self.losses if isinstance(loss, Loss)]
+        view = differentiate(run.renderer, model, target, background, images, run.step, moments)
         stale = {name for stage in self.during if stage.due(run.step) for name in stage.stale(run)}
         if run.stage_step == self.steps:
             stale = set()
         rates = self.rates.at(run.step, run.scene.extent)
-        if stale:
+        if stale or self._penalties:
             gradients = run.renderer.gradients(model, view.frame, view.moments)
+            shapes = Shapes(run.renderer.workspace, model.gaussians, gradients, run.scene.extent, run.step)
+            view.terms.extend(penalty.add(shapes) for penalty in self._penalties)
             run.adam.step(model, gradients, rates, without=stale)
             grad_mean2d = gradients.mean2d
         else:

@@ -6,28 +6,44 @@ that wants it; pruning rules override growth and judge the size that a split lea
 """
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
+from clsplat.errors import ConfigError
 from clsplat.gaussians.model import Gaussians
 from clsplat.render.tiles import Tiler
 from clsplat.settings import Settings
 from clsplat.training.statistics import SplatStats, StatisticName
+from clsplat.training.thresholds import Quantile, Threshold
 
 Positive = Annotated[float, Field(gt=0)]
 NEVER = 3.0e38  # a bound that no finite float passes
 LEAST = 1.2e-38  # the smallest normal float: a bound that only zero misses
 
 
+def _no_photographs(share: float) -> float:
+    raise ConfigError("a quantile of pixels needs training photographs")
+
+
+@dataclass(frozen=True)
+class Measures:
+    """What rules measure Gaussians by: the scene's extent in scene units, and the texture of its photographs."""
+
+    extent: float
+    texture_quantile: Callable[[float], float] = _no_photographs
+
+
 class Edit:
     """What will become of each Gaussian: how many rows, how many of them the old one, by what fresh scales shrink."""
 
-    def __init__(self, gaussians: Gaussians, stats: SplatStats, extent: float, step: int) -> None:
+    def __init__(self, gaussians: Gaussians, stats: SplatStats, measures: Measures, step: int) -> None:
         device, count = gaussians.device, gaussians.count
-        self.gaussians, self.stats, self.extent, self.step = gaussians, stats, extent, step
+        self.gaussians, self.stats, self.measures, self.step = gaussians, stats, measures, step
         self.copies = device.empty(count, np.uint32)
         self.kept = device.empty(count, np.uint32)
         self.shrink = device.empty(count)
@@ -57,8 +73,8 @@ class Edit:
             kept=self.kept,
             shrink=self.shrink,
             gradient_above=gradient_above,
-            size_above=size_above * self.extent,
-            size_below=NEVER if size_below is None else size_below * self.extent,
+            size_above=size_above * self.measures.extent,
+            size_below=NEVER if size_below is None else size_below * self.measures.extent,
             opacity_below=min(opacity_below, NEVER),
             new_shrink=shrink,
             new_copies=copies,
@@ -73,6 +89,44 @@ class Edit:
             return LEAST
         share = float(np.mean(self.stats.mean(other) >= np.float32(gradient_above)))
         return max(float(np.quantile(self.stats.mean(statistic), 1 - share)), LEAST)
+
+    def threshold(self, statistic: str, threshold: Threshold) -> float:
+        """The number that a threshold on a statistic stands for."""
+        if not isinstance(threshold, Quantile):
+            return threshold
+        if threshold.of == "pixels":
+            return self.measures.texture_quantile(threshold.quantile)
+        mean = self.stats.mean(statistic)
+        return max(float(np.quantile(mean, threshold.quantile)), LEAST) if len(mean) else LEAST
+
+    def choose(self, chosen: NDArray[np.bool_], copies: int, kept: int, shrink: float = 1.0) -> None:
+        """Give the Gaussians that the host has chosen, [N], their outcome."""
+        self._program.mark_chosen(
+            items=self.gaussians.count,
+            chosen=self.gaussians.device.upload(chosen.astype(np.uint32)),
+            copies=self.copies,
+            kept=self.kept,
+            shrink=self.shrink,
+            new_shrink=shrink,
+            new_copies=copies,
+            new_kept=kept,
+            count=self.gaussians.count,
+        )
+
+    def rows(self) -> NDArray[np.uint32]:
+        """How many rows each Gaussian will have, [N]."""
+        return self.copies.get()
+
+    def limit(self, most: int, statistic: str) -> None:
+        """Take growth back until at most `most` rows remain: smallest statistic first, ties from the last row on."""
+        rows, kept = self.rows().astype(np.int64), self.kept.get()
+        growing = np.flatnonzero(rows > 1)
+        order = growing[np.argsort(-self.stats.mean(statistic)[growing], kind="stable")]
+        total = int(np.minimum(rows, 1).sum()) + np.cumsum(rows[order] - 1)
+        refused = order[total > most]
+        rows[refused], kept[refused] = 1, 1
+        self.copies.set(rows.astype(np.uint32))
+        self.kept.set(kept)
 
     def apply(self, tiler: Tiler, seed: int) -> None:
         """Move all tables at once and place the children of split Gaussians."""
@@ -113,6 +167,11 @@ class Rule(Settings):
     @property
     def statistics(self) -> set[str]:
         """Columns that the rule reads."""
+        return set()
+
+    @property
+    def tables(self) -> set[str]:
+        """Tables of the Gaussians that the rule reads beside the parameters."""
         return set()
 
     def mark(self, edit: Edit) -> None:
@@ -190,30 +249,43 @@ class PruneLarge(Rule):
         edit.mark(copies=0, kept=0, size_above=self.size_above)
 
 
-RULES: dict[str, type[Rule]] = {"clone": Clone, "split": Split, "prune_faint": PruneFaint, "prune_large": PruneLarge}
-AnyRule = Annotated[Clone | Split | PruneFaint | PruneLarge, Field(discriminator="type")]
-
-
 @dataclass(frozen=True)
 class Change:
     """Numbers of Gaussians before and after an edit."""
 
     before: int
     after: int
+    causes: dict[str, int]  # Gaussians whose fate a rule decided, by the rule's name
 
 
 def densify(
-    gaussians: Gaussians, stats: SplatStats, rules: list[AnyRule], tiler: Tiler, extent: float, step: int, seed: int
+    gaussians: Gaussians,
+    stats: SplatStats,
+    rules: Sequence[Rule],
+    tiler: Tiler,
+    measures: Measures,
+    step: int,
+    seed: int,
+    most: int | None = None,
 ) -> Change:
-    """Apply the rules in their order, as one rearrangement, and start the statistics anew."""
-    edit = Edit(gaussians, stats, extent, step)
+    """Apply the rules in their order, as one rearrangement, and start the statistics anew.
+
+    Growth stops at `most` Gaussians: those with the largest screen gradient grow first.
+    """
+    edit = Edit(gaussians, stats, measures, step)
+    causes: dict[str, int] = {}
+    before = gaussians.count
     for rule in rules:
         if step > rule.after:
+            rows = edit.rows()
             rule.mark(edit)
-    before = gaussians.count
+            name = getattr(rule, "type", "rule")
+            causes[name] = causes.get(name, 0) + int((edit.rows() != rows).sum())
+    if most is not None and int(edit.rows().sum(dtype=np.int64)) > most:
+        edit.limit(most, "screen_grad")
     edit.apply(tiler, seed)
     stats.clear()
-    return Change(before, gaussians.count)
+    return Change(before, gaussians.count, causes)
 
 
 def cap_opacity(gaussians: Gaussians, limit: float) -> None:

@@ -57,26 +57,30 @@ class Smoothing(WorldFilter):
     focal: Literal["per_camera", "global_max"] = "per_camera"
 
     def refresh(self, gaussians: Gaussians, views: FilterViews, near: float) -> None:
-        device, program = gaussians.device, gaussians.device.program("filter.cl")
         focal = np.full_like(views.focal, views.focal.max()) if self.focal == "global_max" else views.focal
-        largest = device.zeros(1, np.uint32)
-        items = -(-gaussians.count // int(device.tuning["LANES"]))
-        interval = gaussians["filter_variance"]
-        program.sampling_interval(
-            items=items,
-            means=gaussians["means"],
-            cameras=views.cameras,
-            focal=device.upload(focal),
-            interval=interval,
-            largest=largest,
-            near_plane=near,
-            views=len(focal),
-            stride=gaussians.capacity,
-            count=gaussians.count,
-        )
-        program.filter_variance(
-            items=items, largest=largest, interval=interval, variance=self.variance, count=gaussians.count
-        )
+        measure_intervals(gaussians, views, focal, near, self.variance, gaussians["filter_variance"])
+
+
+def measure_intervals(
+    gaussians: Gaussians, views: FilterViews, focal: NDArray[np.float32], near: float, factor: float, squared: Array
+) -> None:
+    """Write `factor` times the squared sampling interval of each Gaussian, [S] scene units².  focal: [V] px."""
+    device, program = gaussians.device, gaussians.device.program("filter.cl")
+    largest = device.zeros(1, np.uint32)
+    items = -(-gaussians.count // int(device.tuning["LANES"]))
+    program.sampling_interval(
+        items=items,
+        means=gaussians["means"],
+        cameras=views.cameras,
+        focal=device.upload(focal),
+        interval=squared,
+        largest=largest,
+        near_plane=near,
+        views=len(focal),
+        stride=gaussians.capacity,
+        count=gaussians.count,
+    )
+    program.filter_variance(items=items, largest=largest, interval=squared, variance=factor, count=gaussians.count)
 
 
 class ScreenFilter(Settings):

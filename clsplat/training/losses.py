@@ -3,10 +3,9 @@
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
-from pydantic import Field
 
 from clsplat.opencl.device import Array
 from clsplat.opencl.program import constants
@@ -103,7 +102,6 @@ class Dssim(Loss):
 
 
 LOSSES: dict[str, type[Loss]] = {"l1": L1, "l2": L2, "dssim": Dssim}
-AnyLoss = Annotated[L1 | L2 | Dssim, Field(discriminator="type")]
 
 
 def pixel_loss(comparison: Comparison, l1: float, l2: float) -> Array:

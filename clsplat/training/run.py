@@ -7,16 +7,17 @@ from pathlib import Path
 from typing import Any
 
 from clsplat.errors import ConfigError
-from clsplat.gaussians.model import Model
+from clsplat.gaussians.model import INTERVAL2, Model
 from clsplat.opencl.device import Device
 from clsplat.render.renderer import Renderer
 from clsplat.scene.scene import Scene, View
 from clsplat.training.adam import Adam
-from clsplat.training.filters import FilterViews, ModelSettings
+from clsplat.training.filters import FilterViews, ModelSettings, measure_intervals
 from clsplat.training.records import Records
 from clsplat.training.sampling import Sampling, ViewOrder
 from clsplat.training.statistics import SplatStats
 from clsplat.training.targets import Targets
+from clsplat.training.texture import texture_quantile
 
 LOG = logging.getLogger("clsplat")
 
@@ -64,6 +65,7 @@ class Run:
         self.records = Records(self.out)
         self._order = ViewOrder(self.scene.split("train"), self.sampling, self.seed)
         self._filter_views: FilterViews | None = None
+        self._texture_quantiles: dict[float, float] = {}
 
     @property
     def trained(self) -> Model:
@@ -85,8 +87,17 @@ class Run:
         """Let the world filter follow the Gaussians: after they are made, and after their number changes."""
         if self._filter_views is None:
             self._filter_views = FilterViews(self.device, self.scene.split("train"))
-        model = self.trained
-        self.model_settings.world_filter.refresh(model.gaussians, self._filter_views, model.near)
+        model, views = self.trained, self._filter_views
+        self.model_settings.world_filter.refresh(model.gaussians, views, model.near)
+        if INTERVAL2 in model.gaussians.tables:
+            measure_intervals(model.gaussians, views, views.focal, model.near, 1.0, model.gaussians[INTERVAL2])
+
+    def texture_quantile(self, share: float) -> float:
+        """The gradient magnitude, per px, that `share` of the training photographs' pixels stay below."""
+        if share not in self._texture_quantiles:
+            targets = (self.targets.get(view) for view in self.scene.split("train"))
+            self._texture_quantiles[share] = texture_quantile(self.renderer.workspace, targets, share)
+        return self._texture_quantiles[share]
 
     def rendering(self) -> dict[str, Any]:
         """The numbers that a model file needs to be rendered as it was trained."""

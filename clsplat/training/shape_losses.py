@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from clsplat.gaussians.model import Gaussians, Gradients
+from clsplat.gaussians.model import INTERVAL2, Gaussians, Gradients
 from clsplat.opencl.device import Array
 from clsplat.render.workspace import Workspace
 from clsplat.settings import Settings
@@ -53,6 +53,11 @@ class ShapeLoss(Settings):
 
     weight: Weight = 1.0
 
+    @property
+    def tables(self) -> set[str]:
+        """Tables of the Gaussians that the penalty reads beside the parameters."""
+        return set()
+
     @abstractmethod
     def add(self, shapes: Shapes) -> Term:
         """Add weight · d(loss)/d(log_scales) to the gradients."""
@@ -68,15 +73,19 @@ class CovarianceTrace(ShapeLoss):
     above: Annotated[float, Field(ge=0)] = 3.0e-4  # extents²: a standard deviation of 1 % along each axis
     pixels: Positive | None = None  # px
 
+    @property
+    def tables(self) -> set[str]:
+        return {INTERVAL2} if self.pixels else set()
+
     def add(self, shapes: Shapes) -> Term:
         gaussians, sums = shapes.gaussians, shapes.sums("covariance_trace")
         weight = at_step(self.weight, shapes.step) / max(1, gaussians.count) / shapes.extent**2
         gaussians.device.program("shape_loss.cl").covariance_trace(
             **shapes.arguments(),
-            nearest2=gaussians["log_scales"],
+            nearest2=gaussians[INTERVAL2] if self.pixels else gaussians["filter_variance"],  # without pixels: times 0
             sums=sums,
-            above=self.above * shapes.extent**2,
-            pixels2=0.0,
+            above=0.0 if self.pixels else self.above * shapes.extent**2,
+            pixels2=3.0 * (self.pixels or 0.0) ** 2,
             weight=weight,
         )
         return Term("covariance_trace", lambda: weight * float(sums.get().sum(dtype=np.float64)))
@@ -96,3 +105,6 @@ class Anisotropy(ShapeLoss):
             **shapes.arguments(), sums=sums, above=self.above, weight=weight
         )
         return Term("anisotropy", lambda: weight * float(sums.get().sum(dtype=np.float64)))
+
+
+SHAPE_LOSSES: dict[str, type[ShapeLoss]] = {"covariance_trace": CovarianceTrace, "anisotropy": Anisotropy}

@@ -16,11 +16,15 @@ from clsplat.opencl.device import Array
 from clsplat.opencl.program import constants
 from clsplat.render.renderer import MOMENTS, Frame
 from clsplat.training.step import Differentiated
+from clsplat.training.texture import image_gradient
 
 FOLDER = "stats/"
 SEEN = "stats/seen"
 ABS_X = int(constants("splat.h")["MOMENT_ABS_X"])
-StatisticName = Literal["screen_grad", "screen_grad_abs", "screen_grad_abs_sum"]
+WEIGHT = int(constants("splat.h")["MOMENT_WEIGHT"])
+StatisticName = Literal[
+    "screen_grad", "screen_grad_abs", "screen_grad_abs_sum", "texture", "rendered_texture", "screen_radius"
+]
 
 
 class Statistic(ABC):
@@ -67,10 +71,56 @@ class ScreenGradAbsSum(Statistic):
         )
 
 
+class Texture(Statistic):
+    """Mean of the photograph's gradient magnitude under the splat, weighted as it is blended, per px."""
+
+    moments = WEIGHT + 2
+
+    def add(self, gaussians: Gaussians, view: Differentiated, grad_mean2d: Array, total: Array) -> None:
+        gaussians.device.program("density.cl").accumulate_ratio(
+            items=gaussians.count,
+            moments=view.moments,
+            radius=view.frame.radius,
+            total=total,
+            stride=gaussians.capacity,
+            count=gaussians.count,
+        )
+
+
+class RenderedTexture(Statistic):
+    """The rendered image's gradient magnitude at the projected mean, per px (Micro-splatting, Lee et al. 2025)."""
+
+    def add(self, gaussians: Gaussians, view: Differentiated, grad_mean2d: Array, total: Array) -> None:
+        frame, comparison = view.frame, view.comparison
+        gaussians.device.program("texture.cl").sample_magnitude(
+            items=gaussians.count,
+            magnitude=image_gradient(comparison.workspace, frame.camera, frame.image),
+            splats=frame.splats,
+            radius=frame.radius,
+            total=total,
+            width=frame.camera.width,
+            height=frame.camera.height,
+            stride=frame.camera.stride,
+            count=gaussians.count,
+        )
+
+
+class ScreenRadius(Statistic):
+    """Three standard deviations on the screen, px."""
+
+    def add(self, gaussians: Gaussians, view: Differentiated, grad_mean2d: Array, total: Array) -> None:
+        gaussians.device.program("density.cl").accumulate_radius(
+            items=gaussians.count, radius=view.frame.radius, total=total, count=gaussians.count
+        )
+
+
 STATISTICS: dict[str, Statistic] = {
     "screen_grad": ScreenGrad(),
     "screen_grad_abs": ScreenGradAbs(),
     "screen_grad_abs_sum": ScreenGradAbsSum(),
+    "texture": Texture(),
+    "rendered_texture": RenderedTexture(),
+    "screen_radius": ScreenRadius(),
 }
 
 

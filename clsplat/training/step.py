@@ -5,9 +5,13 @@ from dataclasses import dataclass
 
 from clsplat.gaussians.model import Model
 from clsplat.opencl.device import Array
+from clsplat.opencl.program import constants
 from clsplat.render.renderer import MOMENTS, Frame, Renderer
 from clsplat.training.losses import Comparison, Loss, Term
 from clsplat.training.targets import Target, unpack
+from clsplat.training.texture import image_gradient
+
+TEXTURE = int(constants("splat.h")["MOMENT_TEXTURE"])
 
 
 @dataclass(frozen=True)
@@ -21,13 +25,20 @@ class Differentiated:
 
 
 def differentiate(
-    renderer: Renderer, model: Model, target: Target, background: Array, losses: Sequence[Loss], count: int = MOMENTS
+    renderer: Renderer,
+    model: Model,
+    target: Target,
+    background: Array,
+    losses: Sequence[Loss],
+    step: int = 1,
+    count: int = MOMENTS,
 ) -> Differentiated:
     """Return the derivative of the sum of `losses` at one view, as `count` moments of pixels.  background: [3]."""
     workspace, camera = renderer.workspace, target.camera
     frame = renderer.forward(model, camera, background)
     photograph = unpack(workspace, camera, target.pixels)
     gradient = workspace.array("grad_image", (3, camera.rows, camera.stride))
-    comparison = Comparison(workspace, camera, frame.image, photograph, gradient)
+    comparison = Comparison(workspace, camera, frame.image, photograph, gradient, step)
     terms = [loss.add(comparison) for loss in losses]
-    return Differentiated(frame, comparison, terms, renderer.moments(model, frame, gradient, count))
+    texture = image_gradient(workspace, camera, photograph) if count > TEXTURE else None
+    return Differentiated(frame, comparison, terms, renderer.moments(model, frame, gradient, count, texture))

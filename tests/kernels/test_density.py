@@ -7,7 +7,7 @@ from clsplat.gaussians.model import PARAMETERS, Gaussians
 from clsplat.opencl.device import Device
 from clsplat.render.renderer import Renderer
 from clsplat.training.adam import Adam
-from clsplat.training.density import Clone, PruneFaint, PruneLarge, Split, cap_opacity, densify
+from clsplat.training.density import Clone, Measures, PruneFaint, PruneLarge, Split, cap_opacity, densify
 from clsplat.training.statistics import SEEN, SplatStats
 from tests import reference as ref
 from tests import reference_loss as ref_loss
@@ -44,7 +44,7 @@ def edited(device: Device, rng, count: int, step: int, rules=RULES):
     gaussians.set(SEEN, seen)
     before = {name: gaussians.get(name) for name in gaussians.tables}
     tiler = Renderer(device, "radix").tiler
-    change = densify(gaussians, stats, rules, tiler, EXTENT, step, seed=3)
+    change = densify(gaussians, stats, rules, tiler, Measures(EXTENT), step, seed=3)
     return before, gaussians, change
 
 
@@ -91,7 +91,7 @@ def test_children_follow_their_parents_distribution(device, rng):
     stats = SplatStats(gaussians)
     for name in (SCREEN_GRAD, SEEN):
         gaussians.set(name, np.ones((count, 1)))
-    densify(gaussians, stats, [Split(size_above=1e-6)], Renderer(device, "radix").tiler, 1.0, 700, seed=1)
+    densify(gaussians, stats, [Split(size_above=1e-6)], Renderer(device, "radix").tiler, Measures(1.0), 700, seed=1)
     assert gaussians.count == 2 * count
     q = p["quats"][0].astype(np.float64)
     rotation = ref.rotation_matrix(q / np.linalg.norm(q))

@@ -7,8 +7,8 @@ import pytest
 
 from clsplat.opencl.device import Device
 from clsplat.render.renderer import MOMENTS, Renderer
-from clsplat.training.density import Clone, PruneFaint, Split, densify
-from clsplat.training.statistics import ABS_X, SEEN, STATISTICS, SplatStats
+from clsplat.training.density import Clone, Measures, PruneFaint, Split, densify
+from clsplat.training.statistics import ABS_X, SEEN, WEIGHT, SplatStats
 from clsplat.training.step import Differentiated
 from tests import reference_blend as ref_blend
 from tests import reference_loss as ref_loss
@@ -69,7 +69,10 @@ def test_absolute_sums_do_not_cancel(device):
     np.testing.assert_allclose(moments[ABS_X:], expected_abs(case, weights)[0], rtol=2e-3)
 
 
-@pytest.mark.parametrize("names", [(), ("screen_grad",), tuple(STATISTICS)])
+OF_GRADIENTS = ("screen_grad", "screen_grad_abs", "screen_grad_abs_sum")
+
+
+@pytest.mark.parametrize("names", [(), ("screen_grad",), OF_GRADIENTS])
 def test_columns(device, rng, names):
     case = random_case(rng, 65)
     case.parameters["means"][::4] -= 20 * case.view.world_to_camera[2, :3]  # behind the camera
@@ -123,7 +126,7 @@ def made(device: Device, screen_grad: list[float], absolute: list[float], size: 
     for name, means in (("screen_grad", screen_grad), ("screen_grad_abs", absolute), ("screen_grad_abs_sum", absolute)):
         if name in stats.names:
             gaussians.set(f"stats/{name}", 2 * np.array(means)[:, None])
-    densify(gaussians, stats, rules, Renderer(device, "radix").tiler, 1.0, 600, seed=0)
+    densify(gaussians, stats, rules, Renderer(device, "radix").tiler, Measures(1.0), 600, seed=0)
     return np.bincount(gaussians.get("sh_base")[:, 0].astype(int), minlength=count).tolist()
 
 
@@ -166,3 +169,30 @@ def test_as_many_as_never_takes_those_without_any(device):
     grad, absolute = [9e-4, 9e-4, 9e-4, 0.0], [0.0, 0.0, 0.0, 1e-3]
     matching = Clone(statistic="screen_grad_abs_sum", as_many_as="screen_grad", gradient_above=2e-4, size_below=1)
     assert made(device, grad, absolute, [0.1] * 4, [matching]) == [1, 1, 1, 2]
+
+
+def test_texture_under_splats(device, rng):
+    """Σ w texture / Σ w against the oracle's blend weights; the other moments stay as they are."""
+    case = random_case(rng, 40, 48, 32)
+    renderer, model, camera = Renderer(device, "radix"), case.model(device), case.device_camera(device)
+    texture = np.zeros((camera.rows, camera.stride), np.float32)
+    texture[:32, :48] = rng.uniform(0, 0.5, (32, 48))
+    weights = np.zeros((3, camera.rows, camera.stride), np.float32)
+    weights[:, :32, :48] = rng.normal(size=(3, 32, 48))
+    frame = renderer.forward(model, camera, device.zeros(3))
+    planes = device.upload(weights)
+    few = renderer.moments(model, frame, planes).get()[:, :40]
+    moments = renderer.moments(model, frame, planes, WEIGHT + 2, device.upload(texture))
+    assert relative_error(moments.get()[:MOMENTS, :40], few) < 1e-6
+    blended = ref_blend.blend_weights(case.project(), 48, 32)
+    weight, textured = blended.sum(axis=(1, 2)), (blended * texture[:32, :48]).sum(axis=(1, 2))
+    assert relative_error(moments.get()[WEIGHT, :40], weight) < 1e-3  # pixels at thresholds
+    assert relative_error(moments.get()[WEIGHT + 1, :40], textured) < 1e-3
+
+    stats = SplatStats(model.gaussians, ["texture", "screen_radius"])
+    for _ in range(3):
+        stats.add(Differentiated(frame, None, [], moments), device.zeros((2, model.gaussians.capacity)))
+    seen = (frame.radius.get()[:40] > 0) & (weight > 0.1)
+    assert seen.sum() > 10
+    np.testing.assert_allclose(stats.mean("texture")[seen], textured[seen] / weight[seen], rtol=5e-3)
+    np.testing.assert_allclose(stats.mean("screen_radius"), frame.radius.get()[:40], rtol=1e-6)

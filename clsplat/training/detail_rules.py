@@ -1,0 +1,92 @@
+"""Rules that grow Gaussians where the picture has detail, or where they have become too large (Lee et al. 2025).
+
+Both choose on the host, from tables and statistics, so that guards which compare Gaussians with each other are a line
+of NumPy.
+"""
+
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from clsplat.gaussians.model import INTERVAL2
+from clsplat.training.density import Edit, Positive, Rule
+from clsplat.training.statistics import SEEN, StatisticName
+from clsplat.training.thresholds import Quantile, Share, Threshold
+
+BETA = 0.5  # Lee et al. 2025: a child's covariance is half its parent's
+
+
+class Subdivide(Rule):
+    """What rules have in common that replace Gaussians by smaller ones, a limited share of them at a time."""
+
+    children: Annotated[int, Field(ge=2, le=8)] = 2
+    beta: Annotated[float, Field(gt=0, le=1)] = BETA  # a child's covariance by its parent's
+    at_most: Share = 0.05  # of all Gaussians in one edit, those with the largest score
+    radius_above: Annotated[float, Field(ge=0)] = 2.0  # px, three standard deviations, mean over views
+
+    @property
+    def statistics(self) -> set[str]:
+        return {"screen_radius"}
+
+    def subdivide(self, edit: Edit, wanted: NDArray[np.bool_], score: NDArray[np.float32]) -> None:
+        """Split the wanted Gaussians that no rule before has taken and that can be seen to be split."""
+        wanted = wanted & (edit.rows() == 1) & (edit.stats.mean("screen_radius") >= self.radius_above)
+        chosen = largest(wanted, score, int(self.at_most * len(wanted)))
+        edit.choose(chosen, copies=self.children, kept=0, shrink=self.beta**0.5)
+
+
+def largest(wanted: NDArray[np.bool_], score: NDArray[np.float32], most: int) -> NDArray[np.bool_]:
+    """Of the wanted ones the `most` with the largest score, ties by index."""
+    places = np.flatnonzero(wanted)
+    order = np.argsort(-score[places], kind="stable")
+    chosen = np.zeros_like(wanted)
+    chosen[places[order[:most]]] = True
+    return chosen
+
+
+class SplitTextured(Subdivide):
+    """Split Gaussians where the picture is textured.
+
+    `gradient_above` 0 is the strict form: texture alone decides.  Above 0 the form is lowered: the screen gradient must
+    also reach it, a threshold below that of the other rules.
+    """
+
+    type: Literal["split_textured"] = "split_textured"
+    texture: StatisticName = "texture"
+    texture_above: Threshold = Quantile(quantile=0.8, of="pixels")
+    gradient_above: Annotated[float, Field(ge=0)] = 1.0e-4
+
+    @property
+    def statistics(self) -> set[str]:
+        return {*super().statistics, self.texture, "screen_grad"}
+
+    def mark(self, edit: Edit) -> None:
+        texture, gradient = edit.stats.mean(self.texture), edit.stats.mean("screen_grad")
+        above = edit.threshold(self.texture, self.texture_above)
+        seen = edit.gaussians.get(SEEN)[:, 0] > 0
+        self.subdivide(edit, seen & (texture >= above) & (gradient >= self.gradient_above), texture)
+
+
+class SplitOversized(Subdivide):
+    """Split Gaussians whose covariance trace passes τ = 3 s².
+
+    s is `rms_above` in extents, or, where `pixels` is given, what spans so many pixels at the nearest training view.
+    """
+
+    type: Literal["split_oversized"] = "split_oversized"
+    rms_above: Positive = 0.01
+    pixels: Positive | None = None  # px
+
+    @property
+    def tables(self) -> set[str]:
+        return {INTERVAL2} if self.pixels else set()
+
+    def mark(self, edit: Edit) -> None:
+        rms = np.sqrt(np.exp(2 * edit.gaussians.get("log_scales")).mean(axis=1))
+        if self.pixels:
+            bound = self.pixels * np.sqrt(edit.gaussians.get(INTERVAL2)[:, 0])
+        else:
+            bound = np.full_like(rms, self.rms_above * edit.measures.extent)
+        self.subdivide(edit, rms > bound, rms / np.maximum(bound, 1e-30))

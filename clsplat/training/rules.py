@@ -1,0 +1,24 @@
+"""All density rules by the names that pipelines give them."""
+
+from typing import Annotated
+
+from pydantic import Field
+
+from clsplat.training.density import Clone, PruneFaint, PruneLarge, Rule, Split
+from clsplat.training.detail_rules import SplitOversized, SplitTextured
+from clsplat.training.thinning_rules import MergeNeighbours, PruneUnimportant
+
+RULES: dict[str, type[Rule]] = {
+    "clone": Clone,
+    "split": Split,
+    "split_textured": SplitTextured,
+    "split_oversized": SplitOversized,
+    "prune_faint": PruneFaint,
+    "prune_large": PruneLarge,
+    "prune_unimportant": PruneUnimportant,
+    "merge_neighbours": MergeNeighbours,
+}
+AnyRule = Annotated[
+    Clone | Split | SplitTextured | SplitOversized | PruneFaint | PruneLarge | PruneUnimportant | MergeNeighbours,
+    Field(discriminator="type"),
+]

@@ -1,0 +1,41 @@
+"""How fast images change: |Sobel| / 8 of their luminance."""
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from clsplat.opencl.device import Array
+from clsplat.render.renderer import DeviceCamera
+from clsplat.render.workspace import Workspace
+from clsplat.training.targets import Target, unpack
+
+STEEPEST = 0.75  # per px: above the largest possible magnitude
+BINS = 3000
+
+
+def image_gradient(workspace: Workspace, camera: DeviceCamera, image: Array, name: str = "texture") -> Array:
+    """Gradient magnitudes, [rows, stride] per px, of an image [3, rows, stride] in [0, 1]."""
+    magnitude = workspace.array(name, (camera.rows, camera.stride))
+    device = workspace.device
+    device.program("texture.cl").image_gradient(
+        items=(-(-camera.stride // int(device.tuning["LANES"])), camera.rows),
+        image=image,
+        magnitude=magnitude,
+        width=camera.width,
+        height=camera.height,
+        rows=camera.rows,
+        stride=camera.stride,
+    )
+    return magnitude
+
+
+def texture_quantile(workspace: Workspace, targets: Iterable[Target], share: float) -> float:
+    """The magnitude, per px, that `share` of all pixels of the photographs stay below, to 1 / 4000."""
+    counts = np.zeros(BINS, np.int64)
+    for target in targets:
+        camera = target.camera
+        magnitude = image_gradient(workspace, camera, unpack(workspace, camera, target.pixels)).get()
+        inside = magnitude[: camera.height, : camera.width]
+        counts += np.histogram(inside, BINS, (0, STEEPEST))[0]
+    below = np.searchsorted(np.cumsum(counts), share * counts.sum())
+    return float(below + 1) * STEEPEST / BINS

@@ -1,0 +1,127 @@
+"""Rules that need fewer Gaussians for the same picture (the refinement of Micro-splatting's second version, Lee et al.
+2025b; thresholds and formulas are ours)."""
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from clsplat.gaussians.model import SH_C0
+from clsplat.training.density import Edit, Positive, Rule
+from clsplat.training.thresholds import Share
+
+Floats = NDArray[np.float64]
+
+
+class PruneUnimportant(Rule):
+    """Remove the share of all Gaussians with the least opacity times mean scale."""
+
+    type: Literal["prune_unimportant"] = "prune_unimportant"
+    share: Share = 0.05
+
+    def mark(self, edit: Edit) -> None:
+        gaussians = edit.gaussians
+        opacity = 1 / (1 + np.exp(-gaussians.get("logit_opacity")[:, 0].astype(np.float64)))
+        score = opacity * np.exp(gaussians.get("log_scales").astype(np.float64).mean(axis=1))
+        chosen = np.zeros(len(score), bool)
+        chosen[np.argsort(score, kind="stable")[: int(self.share * len(score))]] = True
+        edit.choose(chosen, copies=0, kept=0)
+
+
+class MergeNeighbours(Rule):
+    """Replace two mutual nearest neighbours, close and of like colour, by one Gaussian with their moments.
+
+    The heavier one keeps its row, Adam's moments and statistics, and takes the mixture's mean and covariance, the mean
+    of the colours, and the opacity that keeps opacity times volume; weights are opacity times volume.
+    """
+
+    type: Literal["merge_neighbours"] = "merge_neighbours"
+    distance_below: Positive = 0.5  # of the sum of their mean scales
+    colour_below: Positive = 0.05  # largest difference of a base colour's channel, in [0, 1]
+
+    def mark(self, edit: Edit) -> None:
+        gaussians = edit.gaussians
+        names = ("means", "quats", "log_scales", "logit_opacity", "sh_base", "sh_rest")
+        tables = {name: gaussians.get(name).astype(np.float64) for name in names}
+        first, second = self._pairs(tables)
+        alone = edit.rows() == 1
+        usable = alone[first] & alone[second]
+        first, second = first[usable], second[usable]
+        if not len(first):
+            return
+        for name, values in merged(tables, first, second).items():
+            tables[name][first] = values
+            gaussians.set(name, tables[name])
+        absorbed = np.zeros(gaussians.count, bool)
+        absorbed[second] = True
+        edit.choose(absorbed, copies=0, kept=0)
+
+    def _pairs(self, tables: dict[str, Floats]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Rows of mutual nearest neighbours that may merge, the heavier one first."""
+        means, mass = tables["means"], mass_of(tables)
+        if len(means) < 2:
+            return np.empty(0, np.int64), np.empty(0, np.int64)
+        distance, nearest = (column[:, 1] for column in cKDTree(means).query(means, k=2))
+        rows = np.arange(len(means))
+        mutual = (nearest[nearest] == rows) & (rows < nearest)
+        size = np.exp(tables["log_scales"].mean(axis=1))
+        close = distance < self.distance_below * (size + size[nearest])
+        colour = SH_C0 * np.abs(tables["sh_base"] - tables["sh_base"][nearest]).max(axis=1)
+        one = rows[mutual & close & (colour < self.colour_below)]
+        other = nearest[one]
+        heavier = mass[one] >= mass[other]
+        return np.where(heavier, one, other), np.where(heavier, other, one)
+
+
+def mass_of(tables: dict[str, Floats]) -> Floats:
+    """Opacity times volume, up to a constant, [N]."""
+    mass: Floats = np.exp(tables["log_scales"].sum(axis=1)) / (1 + np.exp(-tables["logit_opacity"][:, 0]))
+    return mass
+
+
+def merged(tables: dict[str, Floats], first: NDArray[np.int64], second: NDArray[np.int64]) -> dict[str, Floats]:
+    """The Gaussians with the first two moments of the mixtures of `first` and `second`, by parameter, [pairs, ...]."""
+    mass = mass_of(tables)
+    total = mass[first] + mass[second]
+    share = (mass[second] / total)[:, None]
+    means = (1 - share) * tables["means"][first] + share * tables["means"][second]
+    covariance = np.zeros((len(first), 3, 3))
+    for rows, weight in ((first, 1 - share), (second, share)):
+        offset = tables["means"][rows] - means
+        own = covariance_of(tables["quats"][rows], tables["log_scales"][rows])
+        covariance += weight[:, :, None] * (own + offset[:, :, None] * offset[:, None, :])
+    variances, axes = np.linalg.eigh(covariance)
+    log_scales = 0.5 * np.log(np.maximum(variances, 1e-30))
+    axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]  # a rotation, not a reflection
+    opacity = np.clip(total / np.exp(log_scales.sum(axis=1)), 1e-6, 0.99)
+    colours = {
+        name: (1 - share) * tables[name][first] + share * tables[name][second] for name in ("sh_base", "sh_rest")
+    }
+    return {
+        "means": means,
+        "quats": quats_of(axes),
+        "log_scales": log_scales,
+        "logit_opacity": np.log(opacity / (1 - opacity))[:, None],
+        **colours,
+    }
+
+
+def covariance_of(quats: Floats, log_scales: Floats) -> Floats:
+    """R diag(s²) Rᵀ, [N, 3, 3]."""
+    w, x, y, z = (quats / np.linalg.norm(quats, axis=1, keepdims=True)).T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    axes = np.moveaxis(np.array(rows), -1, 0) * np.exp(log_scales)[:, None, :]
+    covariance: Floats = np.einsum("nij,nkj->nik", axes, axes)
+    return covariance
+
+
+def quats_of(rotations: Floats) -> Floats:
+    """Unit quaternions (w, x, y, z) of rotation matrices [N, 3, 3]."""
+    quats: Floats = np.roll(Rotation.from_matrix(rotations).as_quat(), 1, axis=1)
+    return quats

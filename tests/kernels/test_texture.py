@@ -1,0 +1,66 @@
+"""texture.cl against SciPy's Sobel filter."""
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from clsplat.render.renderer import Renderer
+from tests.kernels.test_loss import camera_of
+from tests.scenes import random_case
+
+SIZES = ((1, 1), (2, 3), (7, 5), (8, 8), (9, 2), (15, 4), (16, 16), (17, 17), (40, 30), (65, 3))
+
+
+def magnitude_of(image: np.ndarray) -> np.ndarray:
+    """|Sobel| / 8 of the luminance of [3, H, W], float64."""
+    luminance = np.tensordot([0.299, 0.587, 0.114], image.astype(np.float64), axes=1)
+    across, down = (ndimage.sobel(luminance, axis=axis, mode="nearest") for axis in (1, 0))
+    return np.hypot(across, down) / 8
+
+
+@pytest.mark.parametrize(("width", "height"), SIZES)
+def test_image_gradient(device, rng, width, height):
+    camera = camera_of(device, width, height)
+    image = rng.uniform(0, 1, (3, height, width)).astype(np.float32)
+    planes = np.zeros((3, camera.rows, camera.stride), np.float32)
+    planes[:, :height, :width] = image
+    magnitude = device.zeros((camera.rows, camera.stride))
+    magnitude.fill(9)
+    device.program("texture.cl").image_gradient(
+        items=(-(-camera.stride // int(device.tuning["LANES"])), camera.rows),
+        image=device.upload(planes),
+        magnitude=magnitude,
+        width=width,
+        height=height,
+        rows=camera.rows,
+        stride=camera.stride,
+    )
+    found = magnitude.get()
+    np.testing.assert_allclose(found[:height, :width], magnitude_of(image), atol=1e-6)
+    found[:height, :width] = 0
+    assert (found == 0).all()
+
+
+@pytest.mark.parametrize("count", [1, 63, 64, 65, 150])
+def test_sample_at_projected_means(device, rng, count):
+    case = random_case(rng, count, 40, 30)
+    renderer = Renderer(device, "radix")
+    frame = renderer.forward(case.model(device), case.device_camera(device), device.zeros(3))
+    magnitude = rng.uniform(0, 1, (frame.camera.rows, frame.camera.stride)).astype(np.float32)
+    total = device.zeros(frame.radius.shape)
+    for _ in range(2):
+        device.program("texture.cl").sample_magnitude(
+            items=count,
+            magnitude=device.upload(magnitude),
+            splats=frame.splats,
+            radius=frame.radius,
+            total=total,
+            width=40,
+            height=30,
+            stride=frame.camera.stride,
+            count=count,
+        )
+    x, y = frame.splats.get()[:count, :2].T
+    column, row = np.clip(x, 0, 39).astype(int), np.clip(y, 0, 29).astype(int)
+    seen = frame.radius.get()[:count] > 0
+    np.testing.assert_allclose(total.get()[:count], 2 * magnitude[row, column] * seen, rtol=1e-6)
