@@ -1,6 +1,6 @@
 """From a pipeline file to checked stages, and through them.
 
-    name, seed, scene: {path, downscale, background, holdout}, model: {…}, rasterizer: {schedule, sort}
+    name, seed, scene: {path, downscale, background, …}, model: {…}, rasterizer: {schedule, sort}
     stages: a list of   - <stage>   or   - <stage>: {field: value, …}
 
 A file is complete and strict: unknown keys are errors, every value has its default in its model, and the fully resolved
@@ -45,6 +45,9 @@ class SceneSettings(Settings):
     levels: Annotated[int, Field(ge=1, le=8)] = 1  # scales to train on: downscale, and twice, four times, … that
     sampling: Sampling = "uniform"  # of views among several levels
     background: Literal["auto", "black", "white"] = "auto"  # auto: white for Blender scenes, else black
+    image_budget: Annotated[int, Field(gt=0)] | None = (
+        None  # MiB of photographs on the device; default: a quarter of it
+    )
     holdout: Annotated[int, Field(ge=0)] = 8  # every n-th image, by name, is a test view; 0: none
 
     @property

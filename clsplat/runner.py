@@ -59,7 +59,7 @@ def open_run(pipeline: Pipeline, out: Path, words: str | None) -> Run:
     LOG.info("device: %s", device.text)
     photographs, background = settings.scene.read()
     scene = photographs.downscaled(*settings.scene.scales)
-    camera = scene.views[0].camera
+    camera, budget = scene.views[0].camera, settings.scene.image_budget
     LOG.info(
         "scene: %s, %d training and %d test views, %d x %d px, %s background, extent %.3g",
         *(scene.path, len(scene.train), len(scene.test), camera.width, camera.height, background, scene.extent),
@@ -73,7 +73,7 @@ def open_run(pipeline: Pipeline, out: Path, words: str | None) -> Run:
         seed=settings.seed,
         pipeline=pipeline.resolved(),
         renderer=Renderer(device, settings.rasterizer.sort),
-        targets=Targets(device, background),
+        targets=Targets(device, background, None if budget is None else budget << 20),
         model_settings=settings.model,
         sampling=settings.scene.sampling,
     )

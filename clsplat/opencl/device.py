@@ -8,6 +8,7 @@ import logging
 import math
 import os
 import warnings
+import weakref
 from collections import defaultdict
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
@@ -137,6 +138,10 @@ def _named(words: str, devices: list[DeviceInfo]) -> DeviceInfo:
     return info
 
 
+class Buffer(cl.Buffer):
+    """Device memory whose end can be noticed, which pyopencl's own class does not allow."""
+
+
 class Array:
     """A typed piece of device memory; it has no arithmetic."""
 
@@ -189,6 +194,8 @@ class Device:
         self.schedule = resolve_schedule(info, schedule)
         self.tuning = _tuning(info, self.schedule)
         self.timings = Timings()
+        self.allocated = 0  # bytes of all buffers that are alive
+        self.peak = 0  # the most there ever were
         self._programs: dict[tuple[Any, ...], Program] = {}
 
     @property
@@ -206,13 +213,19 @@ class Device:
                 f"({self.info.allocation / 2**20:.0f} MiB); use fewer Gaussians or smaller images"
             )
         try:
-            buffer = cl.Buffer(self.context, cl.mem_flags.READ_WRITE, size)
+            buffer = Buffer(self.context, cl.mem_flags.READ_WRITE, size)
         except cl.Error as error:
             raise MemoryLimitError(
                 f"{self.info.name} could not allocate {size / 2**20:.0f} MiB more ({error}); "
                 "use fewer Gaussians or smaller images"
             ) from error
+        self.allocated += size
+        self.peak = max(self.peak, self.allocated)
+        weakref.finalize(buffer, self._released, size)
         return Array(self, buffer, shape, kind)
+
+    def _released(self, size: int) -> None:
+        self.allocated -= size
 
     def zeros(self, shape: int | tuple[int, ...], dtype: DTypeLike = np.float32) -> Array:
         array = self.empty(shape, dtype)

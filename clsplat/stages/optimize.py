@@ -128,6 +128,7 @@ class Optimize(Stage):
         run.stage_step += 1
         run.device.timings.sampling = run.step % self.log_every == self.log_every // 2
         model, target = run.trained, run.targets.get(run.train_view())
+        run.announce_views()
         background, moments = run.targets.background_array, run.stats.moments
         images = [loss for loss in self.losses if isinstance(loss, Loss)]
         view = differentiate(run.renderer, model, target, background, images, run.step, moments)

@@ -19,6 +19,7 @@ from clsplat.training.statistics import SplatStats
 from clsplat.training.targets import Targets
 from clsplat.training.texture import texture_quantile
 
+READ_AHEAD = 4  # photographs
 LOG = logging.getLogger("clsplat")
 
 
@@ -82,6 +83,10 @@ class Run:
     def train_view(self) -> View:
         """The view of the current step."""
         return self._order.at(self.step)
+
+    def announce_views(self) -> None:
+        """Let the photographs of the next steps be read ahead."""
+        self.targets.announce(self._order.at(self.step + ahead) for ahead in range(1, READ_AHEAD + 1))
 
     def refresh_filter(self) -> None:
         """Let the world filter follow the Gaussians: after they are made, and after their number changes."""

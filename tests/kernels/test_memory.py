@@ -1,0 +1,46 @@
+"""What lies on the device is counted, and photographs keep to their budget."""
+
+import gc
+
+import numpy as np
+import pytest
+
+from clsplat.errors import DataError
+from clsplat.scene.detect import read_scene
+from clsplat.training.targets import Targets
+
+
+def test_buffers_are_counted_while_they_live(device):
+    gc.collect()
+    before = device.allocated
+    one, two = device.empty(1000), device.zeros((3, 500), np.uint32)
+    assert device.allocated - before == 4032 + 6016  # whole lines of 64 bytes
+    assert device.peak >= device.allocated
+    del one
+    assert device.allocated - before == 6016
+    del two
+    assert device.allocated == before
+
+
+@pytest.mark.parametrize("kept", [0, 1, 3, 100])
+def test_photographs_keep_to_the_budget(device, tiny_scene, kept):
+    views = read_scene(tiny_scene).split("train")
+    size = 3 * views[0].camera.width * views[0].camera.height
+    targets, plenty = Targets(device, "white", budget=kept * size), Targets(device, "white")
+    for turn in range(3):
+        targets.announce(views[turn : turn + 2])
+        for view in views:
+            np.testing.assert_array_equal(targets.get(view).pixels.get(), plenty.get(view).pixels.get())
+            assert sum(target.pixels.nbytes for target in targets._targets.values()) <= max(kept, 1) * size
+
+
+def test_a_damaged_photograph_read_ahead_is_reported_when_it_is_asked_for(device, tiny_scene, tmp_path):
+    from dataclasses import replace
+
+    damaged = tmp_path / "damaged.png"
+    damaged.write_bytes(b"not an image")
+    view = replace(read_scene(tiny_scene).split("train")[0], image_path=damaged)
+    targets = Targets(device, "white")
+    targets.announce([view])
+    with pytest.raises(DataError, match=r"damaged\.png"):
+        targets.get(view)
