@@ -24,13 +24,12 @@ class Densify(Stage):
     edits: ClassVar[bool] = True
 
     rules: list[AnyRule]
-    max_gaussians: Annotated[int, Field(gt=0)] | None = None  # growth stops here; pruning goes on
+    max_gaussians: Annotated[int, Field(gt=0)] | None = None  # growth stops here, or where memory ends; pruning goes on
 
     @property
     def statistics(self) -> set[str]:
         """Columns that the rules read."""
-        limited = {"screen_grad"} if self.max_gaussians else set()
-        return limited.union(*(rule.statistics for rule in self.rules))
+        return {name for rule in self.rules for name in rule.statistics}
 
     @property
     def tables(self) -> set[str]:
@@ -46,8 +45,12 @@ class Densify(Stage):
         gaussians = run.trained.gaussians
         measures = Measures(run.scene.extent, run.texture_quantile)
         tiler = run.renderer.tiler
-        change = densify(gaussians, run.stats, self.rules, tiler, measures, run.step, run.seed, most=self.max_gaussians)
+        fits = run.memory_plan().most
+        most = min(fits, self.max_gaussians or fits)
+        change = densify(gaussians, run.stats, self.rules, tiler, measures, run.step, run.seed, most)
         run.refresh_filter()
+        if change.after == fits:
+            LOG.warning("step %d: growth stops at %d Gaussians, all that fit in the device's memory", run.step, fits)
         run.records.add(run.step, "densify", before=change.before, after=change.after, causes=change.causes)
         LOG.debug("step %d: %d -> %d Gaussians", run.step, change.before, change.after)
         if change.after == 0:

@@ -72,6 +72,9 @@ class Optimize(Stage):
         run.adam = run.adam or Adam(model.gaussians)
         run.stats = SplatStats(model.gaussians, self._statistics())
         self._attach(run)
+        memory = run.memory_plan()
+        LOG.info(memory.text(model.gaussians.count))
+        memory.check(model.gaussians.count)
         last_step = run.step - run.stage_step + self.steps
         seconds: list[float] = []  # of the steps since the last report
         while run.stage_step < self.steps:

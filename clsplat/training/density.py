@@ -117,11 +117,12 @@ class Edit:
         """How many rows each Gaussian will have, [N]."""
         return self.copies.get()
 
-    def limit(self, most: int, statistic: str) -> None:
-        """Take growth back until at most `most` rows remain: smallest statistic first, ties from the last row on."""
+    def limit(self, most: int) -> None:
+        """Take growth back until at most `most` rows remain: from the smallest values of the first column on."""
         rows, kept = self.rows().astype(np.int64), self.kept.get()
         growing = np.flatnonzero(rows > 1)
-        order = growing[np.argsort(-self.stats.mean(statistic)[growing], kind="stable")]
+        score = self.stats.mean(self.stats.names[0]) if self.stats.names else np.zeros(len(rows), np.float32)
+        order = growing[np.argsort(-score[growing], kind="stable")]
         total = int(np.minimum(rows, 1).sum()) + np.cumsum(rows[order] - 1)
         refused = order[total > most]
         rows[refused], kept[refused] = 1, 1
@@ -270,7 +271,7 @@ def densify(
 ) -> Change:
     """Apply the rules in their order, as one rearrangement, and start the statistics anew.
 
-    Growth stops at `most` Gaussians: those with the largest screen gradient grow first.
+    Growth stops at `most` Gaussians: those with the largest screen gradient (the first column) grow first.
     """
     edit = Edit(gaussians, stats, measures, step)
     causes: dict[str, int] = {}
@@ -282,7 +283,7 @@ def densify(
             name = getattr(rule, "type", "rule")
             causes[name] = causes.get(name, 0) + int((edit.rows() != rows).sum())
     if most is not None and int(edit.rows().sum(dtype=np.int64)) > most:
-        edit.limit(most, "screen_grad")
+        edit.limit(most)
     edit.apply(tiler, seed)
     stats.clear()
     return Change(before, gaussians.count, causes)

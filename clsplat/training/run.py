@@ -13,6 +13,7 @@ from clsplat.render.renderer import Renderer
 from clsplat.scene.scene import Scene, View
 from clsplat.training.adam import Adam
 from clsplat.training.filters import FilterViews, ModelSettings, measure_intervals
+from clsplat.training.memory import MemoryPlan, plan
 from clsplat.training.records import Records
 from clsplat.training.sampling import Sampling, ViewOrder
 from clsplat.training.statistics import SplatStats
@@ -83,6 +84,14 @@ class Run:
     def train_view(self) -> View:
         """The view of the current step."""
         return self._order.at(self.step)
+
+    def memory_plan(self) -> MemoryPlan:
+        """What training with the present tables takes of the device's memory."""
+        views = self.scene.split("train")
+        bytes_held = min(self.targets.budget, sum(3 * view.camera.width * view.camera.height for view in views))
+        tile = int(self.device.tuning["TILE"])
+        pixels = max((-(-v.camera.width // tile)) * (-(-v.camera.height // tile)) * tile**2 for v in views)
+        return plan(self.trained.gaussians, bytes_held, pixels)
 
     def announce_views(self) -> None:
         """Let the photographs of the next steps be read ahead."""

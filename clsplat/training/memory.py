@@ -1,0 +1,71 @@
+"""How much of the device's memory training will take, before it takes it.
+
+Bytes come from the tables and buffers themselves: what a Gaussian has in tables, and what a frame keeps for each
+Gaussian, each pair and each pixel.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from clsplat.errors import MemoryLimitError
+from clsplat.gaussians.model import GROWTH, Gaussians
+from clsplat.opencl.device import DeviceInfo
+from clsplat.render.renderer import MOMENTS, RECORD
+
+PAIRS = 5  # (tile, Gaussian) pairs of a Gaussian, where nothing is known yet; trained scenes have 1.5 to 4
+FRAME_GAUSSIAN = 4 * (RECORD + MOMENTS + 2 + 5 + 7)  # records, moments, mean2d; keys and radius; sorting by depth
+FRAME_PAIR = 4 * (RECORD + 6)  # gradient record; tile and Gaussian of the pair, sorting by tile
+FRAME_PIXEL = 4 * (4 * 3 + 1 + 9)  # image, target, gradient, rendered again; transmittance; derivatives of SSIM
+
+
+@dataclass(frozen=True)
+class MemoryPlan:
+    """Bytes on the device."""
+
+    gaussian: int  # for each Gaussian, tables and frame
+    pair: int
+    fixed: int  # photographs and planes of pixels
+    largest_table: int  # for each Gaussian, in the largest single buffer
+    limit: int  # of the device
+    allocation: int  # of a single buffer
+
+    def needed(self, gaussians: int) -> int:
+        """Bytes at a number of Gaussians, with room to grow and a table that moves."""
+        grown = GROWTH * self.gaussian + self.largest_table + PAIRS * self.pair
+        return self.fixed + int(gaussians * grown)
+
+    @property
+    def most(self) -> int:
+        """The largest number of Gaussians that fits, in all and in single buffers."""
+        by_total = (self.limit - self.fixed) / (GROWTH * self.gaussian + self.largest_table + PAIRS * self.pair)
+        by_buffer = self.allocation / max(GROWTH * self.largest_table, PAIRS * 4 * RECORD)
+        return max(0, int(min(by_total, by_buffer)))
+
+    def text(self, gaussians: int) -> str:
+        """One line: what is needed now, and what fits."""
+        mib = 2**20
+        return (
+            f"memory: {self.needed(gaussians) / mib:,.0f} MiB for {gaussians:,} Gaussians ({self.gaussian} bytes each "
+            f"and {self.pair} a pair, photographs and planes {self.fixed / mib:,.0f} MiB); {self.most:,} fit in "
+            f"{self.limit / mib:,.0f} MiB with buffers up to {self.allocation / mib:,.0f} MiB"
+        )
+
+    def check(self, gaussians: int) -> None:
+        """Raise MemoryLimitError when that many Gaussians do not fit."""
+        if gaussians > self.most:
+            raise MemoryLimitError(
+                f"{self.text(gaussians)}: start from fewer points, use smaller images (scene.downscale) or fewer of them "
+                "on the device (scene.image_budget)"
+            )
+
+
+def plan(gaussians: Gaussians, photographs: int, pixels: int) -> MemoryPlan:
+    """Plan for the tables that the Gaussians have.
+
+    photographs: bytes of them on the device; pixels: of the largest view, whole tiles.
+    """
+    info: DeviceInfo = gaussians.device.info
+    sizes = [4 * table.components for table in gaussians.tables.values()]
+    fixed = photographs + FRAME_PIXEL * pixels
+    return MemoryPlan(int(np.sum(sizes)) + FRAME_GAUSSIAN, FRAME_PAIR, fixed, max(sizes), info.memory, info.allocation)

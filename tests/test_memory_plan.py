@@ -1,0 +1,62 @@
+"""The plan of memory: what is counted, what fits, and what is refused."""
+
+import pytest
+
+from clsplat.errors import MemoryLimitError
+from clsplat.training.memory import FRAME_GAUSSIAN, MemoryPlan, plan
+from tests.scenes import random_case
+from tests.test_cli import clsplat
+from tests.test_training import train
+
+SMALL = MemoryPlan(
+    gaussian=1000, pair=88, fixed=10_000_000, largest_table=180, limit=100_000_000, allocation=50_000_000
+)
+
+
+def test_bytes_come_from_the_tables(device, rng):
+    gaussians = random_case(rng, 100).model(device).gaussians
+    parameters = 4 * (3 + 4 + 3 + 1 + 3 + 45 + 1)  # with the filter's variance
+    assert plan(gaussians, 0, 0).gaussian == parameters + FRAME_GAUSSIAN
+    gaussians.add("more", 7)
+    assert plan(gaussians, 0, 0).gaussian == parameters + FRAME_GAUSSIAN + 28
+    assert plan(gaussians, 1000, 256).fixed == 1000 + 256 * 88
+    assert plan(gaussians, 0, 0).largest_table == 180
+
+
+def test_what_fits_fits_and_one_more_does_not():
+    assert SMALL.needed(SMALL.most) <= SMALL.limit < SMALL.needed(SMALL.most + 1)
+    SMALL.check(SMALL.most)
+    with pytest.raises(MemoryLimitError, match=r"fit in 95 MiB.*start from fewer points"):
+        SMALL.check(SMALL.most + 1)
+
+
+def test_a_single_buffer_may_be_what_is_too_large():
+    narrow = MemoryPlan(gaussian=10, pair=88, fixed=0, largest_table=180, limit=10**12, allocation=27_000_000)
+    assert narrow.most == 84_375  # records of 5 pairs of 64 bytes
+
+
+def test_training_that_cannot_fit_is_refused_before_it_starts(tiny_scene, tmp_path, monkeypatch):
+    monkeypatch.setattr("clsplat.training.run.plan", lambda *_: SMALL)
+    with pytest.raises(MemoryLimitError):
+        train(tiny_scene, tmp_path / "run", "init.source=random", "init.count=80000")
+
+
+def test_growth_stops_where_memory_ends(tiny_scene, tmp_path, monkeypatch):
+    free = train(tiny_scene, tmp_path / "free").trained.gaussians.count
+    fits = MemoryPlan(gaussian=0, pair=0, fixed=0, largest_table=1, limit=9000, allocation=10**9)
+    monkeypatch.setattr("clsplat.training.run.plan", lambda *_: fits)
+    assert 8000 < train(tiny_scene, tmp_path / "tight").trained.gaussians.count <= 9000 < free
+
+
+def test_photographs_read_again_and_again_train_to_the_same_bits(tiny_scene, tmp_path, monkeypatch):
+    train(tiny_scene, tmp_path / "held")
+    monkeypatch.setattr("clsplat.training.targets.BUDGET_SHARE", 1e-9)
+    assert train(tiny_scene, tmp_path / "tight").targets.budget < 100
+    held, tight = ((tmp_path / name / "point_cloud.ply").read_bytes() for name in ("held", "tight"))
+    assert held == tight
+
+
+def test_dry_run_says_what_fits(tiny_scene, tmp_path):
+    done = clsplat("run", "smoke", "--scene", tiny_scene, "--out", tmp_path / "run")
+    assert "memory: " in done.stdout
+    assert " fit in " in done.stdout
