@@ -55,8 +55,8 @@ class MemoryPlan:
         """Raise MemoryLimitError when that many Gaussians do not fit."""
         if gaussians > self.most:
             raise MemoryLimitError(
-                f"{self.text(gaussians)}: start from fewer points, use smaller images (scene.downscale) or fewer of them "
-                "on the device (scene.image_budget)"
+                f"{self.text(gaussians)}: start from fewer points, use smaller images (scene.downscale) or fewer "
+                "of them on the device (scene.image_budget)"
             )
 
 
