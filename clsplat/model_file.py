@@ -67,7 +67,7 @@ class ModelFile:
                     stream.write(buffer.getvalue())
         return len(views)
 
-    def evaluate(self, scales: list[float], perceptual: Perceptual) -> dict[str, Any]:
+    def evaluate(self, scales: list[float], perceptual: Perceptual = NOTHING_MORE) -> dict[str, Any]:
         """Metrics by split and scale, by what the photographs' sizes are divided, with the keys of metrics.json."""
         metrics: dict[str, Any] = {"test": {}, "train": {}}
         for scale in scales:

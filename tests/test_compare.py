@@ -33,9 +33,10 @@ def make_run(tiny_scene, tmp_path):
         pipeline = load("smoke", [f"scene.path='{tiny_scene}'", *overrides])
         folder.mkdir()
         (folder / "pipeline.yaml").write_text(pipeline.text())
+        scale = pipeline.settings.scene.downscale
         averages = {"psnr": psnr, "ssim": psnr / 30, "lpips": None, "lpips_reason": "no ONNX file given", "views": 2}
         metrics = {
-            "test": {"1": averages, "2": {**averages, "psnr": psnr + 1}},
+            "test": {f"{scale:g}": averages, f"{2 * scale:g}": {**averages, "psnr": psnr + 1}},
             "train": {},
             "gaussians": 1000,
             "steps": 50,
