@@ -82,7 +82,10 @@ def check(
     if not pipeline:
         raise ConfigError("check: expected a pipeline, or --schema")
     if found := load_experiment(pipeline):
-        CONSOLE.print(f"{found.path}: {', '.join(cell.name for cell in found.cells)}: fine", markup=False)
+        CONSOLE.print(
+            f"{found.path}: {len(found.cells)} cells: {', '.join(cell.name for cell in found.cells)}: fine",
+            markup=False,
+        )
         return
     checked = load(pipeline)
     CONSOLE.print(f"{checked.path}: {', '.join(stage.stage for stage in checked.settings.stages)}: fine", markup=False)

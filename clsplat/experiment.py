@@ -95,7 +95,7 @@ def _compare(experiment: Experiment, out: Path, failures: dict[str, ClsplatError
     finished = [out / cell.name for cell in experiment.cells if cell.name not in failures]
     remarks = [f"{name} failed and is not shown: {error}" for name, error in failures.items()]
     if finished:
-        write_comparison(finished, out / PAGE, remarks)
+        write_comparison(finished, out / PAGE, experiment.name, remarks)
         LOG.info("%d runs compared in %s", len(finished), out / PAGE)
 
 

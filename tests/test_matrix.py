@@ -289,6 +289,7 @@ def test_folders_are_not_mixed(finished, tiny_scene, tmp_path):
 
 def test_check_and_dry_run_list_the_cells(finished, tmp_path):
     done = clsplat("check", finished[0])
+    assert "x.yaml: 4 cells: steps=4" in done.stdout
     assert "steps=6-opacity=0.1-seed=1: fine" in done.stdout
     done = clsplat("run", finished[0], "--out", tmp_path / "new", "--dry-run")
     assert "would run 4 cells" in done.stdout

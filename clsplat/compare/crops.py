@@ -22,7 +22,7 @@ SHOWN = 4  # crops of a scene, each of another view
 OVERVIEW = 340  # px, width of the whole view
 STYLE = """
 .crop{margin:1.2rem 0 2rem;--cut:50%}.crop p{margin:.2rem 0;font-size:.9rem;color:#4a5568}
-.crop>div{display:grid;grid-template-columns:repeat(auto-fit,minmax(230px,1fr));gap:.8rem;align-items:start}
+.crop>div{display:grid;grid-template-columns:repeat(auto-fit,minmax(190px,1fr));gap:.8rem;align-items:start}
 .crop .whole{position:relative}.crop .whole img{width:100%;display:block;border-radius:4px}
 .crop .whole i{position:absolute;border:2px solid #e53e3e;box-shadow:0 0 0 1px #fff}
 .slider{position:relative;overflow:hidden;border-radius:4px;image-rendering:pixelated;

@@ -16,15 +16,15 @@ from clsplat.pages.svg import Line, curve
 LOG = logging.getLogger("clsplat")
 
 
-def write_comparison(paths: Sequence[Path], out: Path, remarks: Sequence[str] = ()) -> int:
+def write_comparison(paths: Sequence[Path], out: Path, title: str = "", remarks: Sequence[str] = ()) -> int:
     """Write the page on some run folders; return the number of runs on it.  Raises what Comparison.read raises."""
     comparison = Comparison.read(paths)
-    write_text(out, comparison_page(comparison, remarks))
+    write_text(out, comparison_page(comparison, title, remarks))
     return len(comparison.runs)
 
 
-def comparison_page(comparison: Comparison, remarks: Sequence[str] = ()) -> str:
-    """Return the page; `remarks` stand at its top."""
+def comparison_page(comparison: Comparison, title: str, remarks: Sequence[str]) -> str:
+    """Return the page; its title is by default the names of the pipelines, and `remarks` stand at its top."""
     sections = [f"<p class=note>{html.escape(remark)}</p>" for remark in remarks]
     if len(comparison.scenes) > 1:
         sections.append(tables.over_scenes(comparison))
@@ -32,7 +32,8 @@ def comparison_page(comparison: Comparison, remarks: Sequence[str] = ()) -> str:
         sections += [f"<h2>{html.escape(scene)}</h2>", tables.metrics(rows), _curves(rows), _crops(rows)]
     sections += [tables.settings(comparison.variants), tables.folders(comparison)]
     names = list(dict.fromkeys(run.metrics.pipeline for run in comparison.runs))
-    title = f"{' · '.join(names[:4])}{' · …' if len(names) > 4 else ''}: {_counted(len(comparison.runs), 'run')}"
+    title = title or f"{' · '.join(names[:4])}{' · …' if len(names) > 4 else ''}"
+    title += f": {_counted(len(comparison.runs), 'run')}"
     subtitle = f"{_counted(len(comparison.variants), 'variant')} on {_counted(len(comparison.scenes), 'scene')}"
     devices = {run.metrics.device for run in comparison.runs}
     subtitle += f"; device: {devices.pop()}" if len(devices) == 1 else "; several devices"
