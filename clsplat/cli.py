@@ -176,31 +176,43 @@ def compare(
 @app.command()
 def bench(
     scenes: Annotated[str, typer.Option(help="Fixed scenes, of A, B and C, separated by commas.")] = "A",
-    model: Annotated[Path | None, typer.Option(help="Also time this splat PLY, at --scene.")] = None,
+    model: Annotated[Path | None, typer.Option(help="Also time this splat or point cloud (PLY), at --scene.")] = None,
     scene: Annotated[Path | None, typer.Option(help="The scene of --model.")] = None,
     repeats: Annotated[int, typer.Option(min=1, help="Steps of each scene.")] = 20,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
     against: Annotated[Path | None, typer.Option(help="Compare with the JSON of an earlier run.")] = None,
+    growth: Annotated[
+        Path | None, typer.Option(help="Only time 50 000 to a million Gaussians; an SVG is written.")
+    ] = None,
     device: DeviceOption = None,
 ) -> None:
     """Time the stages of a training step on fixed scenes, beside the device's measured peaks."""
     from dataclasses import asdict
 
-    from clsplat import bench as benchmark
+    from clsplat.bench.contest import run_bench
+    from clsplat.bench.peaks import measure_peaks
+    from clsplat.bench.scenes import SIZES, contestant, grown, real_contestant
+    from clsplat.bench.table import growth_chart, growth_table, table
+    from clsplat.files import write_text
     from clsplat.opencl.device import Device, choose
 
     names = [name for name in scenes.split(",") if name]
-    if unknown := [name for name in names if name not in benchmark.SIZES]:
-        raise ConfigError(f"--scenes: no scene named '{unknown[0]}'; there are {', '.join(benchmark.SIZES)}")
+    if unknown := [name for name in names if name not in SIZES]:
+        raise ConfigError(f"--scenes: no scene named '{unknown[0]}'; there are {', '.join(SIZES)}")
     if (model is None) != (scene is None):
         raise ConfigError("bench: --model and --scene go together")
     earlier = _read_json(against) if against else None
     opened = Device(choose(device))
-    peaks = benchmark.measure_peaks(opened)
-    contestants = {name: benchmark.contestant(opened, name) for name in names}
+    peaks = measure_peaks(opened)
+    if growth is not None:
+        sizes = [run_bench({"": one}, peaks, repeats)[""] for one in grown(opened)]
+        write_text(growth, growth_chart(sizes))
+        CONSOLE.print(f"device: {opened.text}\n{growth_table(sizes)}", markup=False)
+        return
+    contestants = {name: contestant(opened, *SIZES[name]) for name in names}
     if model is not None and scene is not None:
-        contestants[model.stem] = benchmark.real_contestant(opened, model, scene)
-    results = benchmark.run_bench(contestants, peaks, repeats)
+        contestants[model.stem] = real_contestant(opened, model, scene)
+    results = run_bench(contestants, peaks, repeats)
     if as_json:
         scenes_data = {name: asdict(result) for name, result in results.items()}
         print(json.dumps({"device": opened.text, "peaks": asdict(peaks), "scenes": scenes_data}, indent=1))
@@ -208,7 +220,7 @@ def bench(
     CONSOLE.print(f"device: {opened.text}", markup=False)
     CONSOLE.print(f"peaks: {peaks.gflops:.0f} GFLOP/s, {peaks.gexp:.1f} Gexp/s, copy {peaks.gbytes:.1f} GB/s")
     for name, result in results.items():
-        CONSOLE.print(benchmark.table(name, result, (earlier or {}).get("scenes", {}).get(name)), markup=False)
+        CONSOLE.print(table(name, result, (earlier or {}).get("scenes", {}).get(name)), markup=False)
 
 
 def _read_json(path: Path) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from clsplat.scene.detect import read_scene
 from clsplat.scene.images import write_image
 from clsplat.stages.render import image_path
 from clsplat.training.filters import Dilation, Mip, ModelSettings
-from clsplat.training.metrics import mean, measure, render_view
+from clsplat.training.metrics import NOTHING_MORE, mean, measure, render_view
 from clsplat.training.perceptual import Perceptual
 from clsplat.training.targets import BACKGROUNDS, Targets
 

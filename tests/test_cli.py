@@ -160,3 +160,12 @@ def test_output_that_cannot_be_written(tiny_scene, tmp_path):
     clsplat("run", "smoke", "--scene", tiny_scene, "--out", tmp_path / "file" / "run", expect=7)
     clsplat("run", "smoke", "--scene", tiny_scene, "--out", "/proc/clsplat", expect=7)
     assert (tmp_path / "file").read_text() == "in the way"
+
+
+def test_bench_times_a_point_cloud_and_counts_memory(tiny_scene):
+    cloud = tiny_scene / "points3d.ply"
+    done = clsplat("bench", "--scenes", "", "--model", cloud, "--scene", tiny_scene, "--repeats", "2", "--json")
+    found = json.loads(done.stdout)["scenes"]["points3d"]
+    assert found["work"]["gaussians"] > 100
+    assert set(found["floors"]) <= set(found["stages"])
+    assert 0 < found["memory"] < 2 * found["planned"]

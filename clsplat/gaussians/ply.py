@@ -66,6 +66,16 @@ class _Header:
     mode: str
 
 
+def is_splat(path: Path) -> bool:
+    """Tell a splat from a point cloud by its header.  Raises DataError when it is missing or not a PLY."""
+    try:
+        with path.open("rb") as file:
+            data = file.read(HEADER_LIMIT)
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror}); expected a PLY file") from error
+    return "f_dc_0" in (_parse_header(path, data).dtype.names or ())
+
+
 def read_ply(path: Path) -> SplatFile:
     """Read a splat PLY.  Raises DataError when it is missing, damaged or not a splat."""
     try:

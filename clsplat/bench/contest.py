@@ -1,0 +1,125 @@
+"""Scenes that take turns at whole training steps, so that a slow moment of the machine meets all; medians count."""
+
+import statistics
+import time
+from collections import defaultdict
+from dataclasses import dataclass
+
+import numpy as np
+
+from clsplat.bench.floors import Work, floors
+from clsplat.bench.peaks import Peaks
+from clsplat.gaussians.model import Gaussians, Model
+from clsplat.gaussians.ply import Parameters
+from clsplat.opencl.device import Device
+from clsplat.render.renderer import RECORD, Frame, Renderer
+from clsplat.training.adam import Adam, Rates
+from clsplat.training.density import Measures, PruneLarge, densify
+from clsplat.training.losses import L1, Dssim
+from clsplat.training.memory import plan
+from clsplat.training.profile import stage_milliseconds
+from clsplat.training.statistics import SplatStats
+from clsplat.training.step import differentiate
+from clsplat.training.targets import Target
+
+WARM_UP = 3  # steps: kernels are compiled and buffers grown
+
+
+@dataclass
+class Result:
+    """One scene's figures, in milliseconds."""
+
+    work: Work
+    stages: dict[str, float]
+    floors: dict[str, float]
+    step: float  # on the clock
+    densify: float
+    host: float  # of the step, beyond the device's own time
+    memory: int  # bytes on the device, at most
+    planned: int  # bytes, as training would plan them
+
+
+class Contestant:
+    """One scene, ready to be stepped."""
+
+    def __init__(self, device: Device, parameters: Parameters, target: Target, background: str) -> None:
+        self.device, self.target = device, target
+        self._before = device.peak = device.allocated
+        self.renderer = Renderer(device, "radix")
+        gaussians = Gaussians(device, parameters)
+        self.model = Model(gaussians, gaussians.sh_degree)
+        self.adam, self.stats = Adam(gaussians), SplatStats(gaussians)
+        self.background = device.zeros(3)
+        self.background.fill(1.0 if background == "white" else 0.0)
+        self.losses = (L1(weight=0.8), Dssim(weight=0.2))
+        self.rates = dict.fromkeys(Rates().at(1, 1.0), 0.0)  # nothing moves: every step does the same work
+        self.clock: list[float] = []
+        self.stages: dict[str, list[float]] = defaultdict(list)
+        self.densify: list[float] = []
+        self.frame: Frame | None = None
+        for _ in range(WARM_UP):
+            self.step(record=False)
+        self.edit()
+        self.memory = device.peak - self._before
+
+    def step(self, record: bool) -> None:
+        """One training step; `record` keeps its times."""
+        self.device.finish()
+        self.device.timings.sampling = record
+        start = time.perf_counter()
+        view = differentiate(self.renderer, self.model, self.target, self.background, self.losses)
+        self.stats.add(view, self.adam.update(self.model, view.frame, view.moments, self.rates))
+        self.device.finish()
+        seconds = time.perf_counter() - start
+        self.device.timings.sampling = False
+        self.frame = view.frame
+        if record:
+            self.clock.append(1e3 * seconds)
+            for name, milliseconds in stage_milliseconds(self.device.timings).items():
+                self.stages[name].append(milliseconds)
+
+    def edit(self) -> None:
+        """One density edit that moves every table and changes nothing."""
+        self.device.finish()
+        start = time.perf_counter()
+        never = [PruneLarge(size_above=1e30)]
+        densify(self.model.gaussians, self.stats, list(never), self.renderer.tiler, Measures(1.0), 1, 0)
+        self.device.finish()
+        self.densify.append(1e3 * (time.perf_counter() - start))
+
+    def result(self, peaks: Peaks) -> Result:
+        work = self._work()
+        stages = {name: statistics.median(times) for name, times in self.stages.items()}
+        clock = statistics.median(self.clock)
+        host = clock - sum(stages.values())
+        densify_ms, planned = statistics.median(self.densify[1:]), self._planned()
+        return Result(work, stages, floors(work, peaks), clock, densify_ms, host, self.memory, planned)
+
+    def _planned(self) -> int:
+        camera = self.target.camera
+        gaussians = self.model.gaussians
+        return plan(gaussians, self.target.pixels.nbytes, camera.stride * camera.rows).needed(gaussians.count)
+
+    def _work(self) -> Work:
+        assert self.frame is not None
+        lists, camera = self.frame.lists, self.frame.camera
+        records = self.frame.splats.get().reshape(-1, RECORD)[lists.pair_splat.get()[: lists.pairs]]
+        offsets = lists.tile_offset.get()[: camera.tiles + 1]
+        tiles = np.empty(lists.pairs, np.int64)
+        tiles[lists.tile_pairs.get()[: lists.pairs]] = np.repeat(np.arange(camera.tiles), np.diff(offsets))
+        top = tiles // camera.tiles_x * camera.tile + 0.5
+        first = np.maximum(np.ceil(records[:, 9] - top), 0)
+        last = np.minimum(np.floor(records[:, 10] - top), camera.tile - 1)
+        rows = int(np.maximum(last - first + 1, 0).sum()) * camera.tile // 16
+        return Work(self.model.gaussians.count, lists.pairs, rows, camera.width * camera.height)
+
+
+def run_bench(contestants: dict[str, Contestant], peaks: Peaks, repeats: int) -> dict[str, Result]:
+    """Step every scene `repeats` times, in turns."""
+    for _ in range(repeats):
+        for contender in contestants.values():
+            contender.step(record=True)
+    for contender in contestants.values():
+        for _ in range(3):
+            contender.edit()
+    return {name: contender.result(peaks) for name, contender in contestants.items()}

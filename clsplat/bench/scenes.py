@@ -1,0 +1,69 @@
+"""The scenes that are timed: fixed and seeded ones, and real ones given as files."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.bench.contest import Contestant
+from clsplat.gaussians.model import SH_C0
+from clsplat.gaussians.ply import Parameters, is_splat, read_ply
+from clsplat.opencl.device import Device
+from clsplat.scene.detect import read_scene
+from clsplat.scene.points import read_points_ply
+from clsplat.scene.scene import Camera, View
+from clsplat.stages.init import from_points
+from clsplat.training.targets import Target, Targets
+
+FOCAL = 400.0  # px, of the synthetic scenes
+SIZE = 2.2  # px, standard deviation of their splats
+SIZES = {"A": (400, 400, 50_000), "B": (800, 800, 300_000), "C": (1920, 1080, 1_000_000)}
+GROWTH_COUNTS = (50_000, 100_000, 200_000, 400_000, 700_000, 1_000_000)
+
+
+def synthetic(width: int, height: int, count: int, size: float = SIZE) -> tuple[Parameters, View]:
+    """Flat Gaussians facing the camera, of about `size` px, log-normal sizes, random opacities."""
+    rng = np.random.default_rng(0)
+    u, v = rng.uniform(-8, width + 8, count), rng.uniform(-8, height + 8, count)
+    sizes = size * np.exp(rng.normal(0, 0.5, (count, 2)))
+    angle, depth = rng.uniform(0, np.pi, count), rng.uniform(1, 10, count)
+    means = np.stack([(u - width / 2) / FOCAL * depth, (v - height / 2) / FOCAL * depth, depth], axis=1)
+    scales = np.column_stack([sizes * depth[:, None] / FOCAL, np.full(count, 1e-4)])
+    zero = np.zeros(count)
+    tables: dict[str, NDArray[Any]] = {
+        "means": means,
+        "quats": np.stack([np.cos(angle / 2), zero, zero, np.sin(angle / 2)], axis=1),
+        "log_scales": np.log(scales),
+        "logit_opacity": rng.normal(-1, 1.5, (count, 1)),
+        "sh_base": (rng.uniform(0, 1, (count, 3)) - 0.5) / SH_C0,
+        "sh_rest": rng.normal(0, 0.02, (count, 45)),
+    }
+    camera = Camera(width, height, FOCAL, FOCAL, width / 2, height / 2)
+    parameters = {key: table.astype(np.float32) for key, table in tables.items()}
+    return parameters, View("bench", camera, np.eye(4)[:3], Path("bench"))
+
+
+def contestant(device: Device, width: int, height: int, count: int, size: float = SIZE) -> Contestant:
+    """Open a synthetic scene with a noise image for its photograph."""
+    parameters, view = synthetic(width, height, count, size)
+    targets = Targets(device, "black")
+    shape = (3, height, width)
+    pixels = np.random.default_rng(1).integers(0, 256, shape, dtype=np.uint8)
+    return Contestant(device, parameters, Target(targets.camera(view), device.upload(pixels)), "black")
+
+
+def real_contestant(device: Device, model: Path, scene: Path) -> Contestant:
+    """Open a splat PLY, or a point cloud as `init` would begin with it, at the first training view of a scene."""
+    opened = read_scene(scene)
+    targets = Targets(device, opened.background)
+    parameters = read_ply(model).parameters if is_splat(model) else from_points(read_points_ply(model), 0.1, 3)
+    return Contestant(device, parameters, targets.get(opened.split("train")[0]), opened.background)
+
+
+def grown(device: Device) -> Iterator[Contestant]:
+    """Open scenes of 50 000 to a million Gaussians over one image, as much smaller as there are more of them."""
+    width, height, most = SIZES["C"]
+    for count in GROWTH_COUNTS:
+        yield contestant(device, width, height, count, SIZE * (most / count) ** 0.5)
