@@ -85,6 +85,7 @@ MATCHING = {
     for rule, size in (("clone", (".size_below",)), ("split", (".size_above", ".children", ".shrink")))
     for key in ("", ".after", ".statistic", ".as_many_as", ".gradient_above", *size)
 }
+SUBDIVIDE = (".after", ".at_most", ".beta", ".children", ".radius_above")
 DIFFERENCES = {
     ("splat", "splat_7k"): TWIN,
     ("splat", "mip_splatting"): SMOOTHING | MIP | REFRESH,
@@ -99,6 +100,20 @@ DIFFERENCES = {
         *("reset_opacity~2.when_background", "reset_opacity~3.every", "reset_opacity~3.start"),
         *("reset_opacity~3.stop", "reset_opacity~3.to", "reset_opacity~3.when_background"),
     },
+    ("splat", "micro_splatting"): {
+        *(f"densify.rules.split_textured{key}" for key in ("", *SUBDIVIDE, ".texture", ".gradient_above")),
+        *(f"densify.rules.split_textured.texture_above.{key}" for key in ("of", "quantile")),
+        *(f"densify.rules.split_oversized{key}" for key in ("", *SUBDIVIDE, ".pixels", ".rms_above")),
+        *(f"losses.covariance_trace{key}" for key in ("", ".above", ".pixels", ".weight")),
+        *("losses.l1.weight", "losses.l2", "losses.l2.weight"),
+        *(f"stages.evaluate~2.{key}" for key in ("lpips", "lpips_input", "metrics", "scales", "split")),
+    },
+    ("micro_splatting", "micro_splatting_v2"): {
+        *(f"densify~{n}.{key}" for n in (2, 3) for key in ("every", "max_gaussians", "start", "stop")),
+        *(f"densify~2.rules.prune_unimportant{key}" for key in ("", ".after", ".share")),
+        *(f"densify~3.rules.merge_neighbours{key}" for key in ("", ".after", ".colour_below", ".distance_below")),
+    },
+    ("micro_splatting", "micro_splatting_7k"): TWIN | {"losses.l1.weight", "losses.l2.weight"},
     **{
         (name, f"{name}_7k"): TWIN | ({"refresh_filter.start", "refresh_filter.stop"} if refreshes else set())
         for name, refreshes in (

@@ -16,6 +16,7 @@ from clsplat.stages.export import Export
 from clsplat.stages.schedule import RaiseSh, RefreshFilter, ResetOpacity
 from clsplat.training import checkpoint
 from clsplat.training.adam import Adam, Rates
+from clsplat.training.census import census
 from clsplat.training.losses import L1, L2, Dssim, Loss, pixel_loss
 from clsplat.training.profile import stage_milliseconds
 from clsplat.training.run import Progress, Run
@@ -24,6 +25,7 @@ from clsplat.training.statistics import SplatStats
 from clsplat.training.step import Differentiated, differentiate
 
 LOG = logging.getLogger("clsplat")
+CENSUS_EVERY = 5  # reports
 Scheduled = Annotated[
     RaiseSh | Densify | ResetOpacity | RefreshFilter | Checkpoint | Evaluate | Export, Field(discriminator="stage")
 ]
@@ -169,5 +171,7 @@ class Optimize(Stage):
         count = run.trained.gaussians.count
         stages = stage_milliseconds(run.device.timings)
         run.records.add(run.step, "train", loss=loss, psnr=psnr, gaussians=count, ms=1e3 * seconds, stages=stages)
+        if run.step % (CENSUS_EVERY * self.log_every) == 0 or run.step == last_step:
+            run.records.add(run.step, "census", gaussians=count, **census(run.trained.gaussians))
         run.records.status("running", run.step, steps=last_step, gaussians=count)
         run.show(Progress(run.step, last_step, loss, psnr, count, 1e3 * seconds, seconds * (last_step - run.step)))

@@ -11,6 +11,7 @@ from clsplat.files import write_text
 from clsplat.pages.page import duration, embedded, figures, page
 from clsplat.pages.svg import Line, curve
 from clsplat.stages.base import Stage
+from clsplat.training.census import SHARES
 from clsplat.training.metrics import render_view
 from clsplat.training.perceptual import Image
 from clsplat.training.run import Run
@@ -28,7 +29,7 @@ class Report(Stage):
     file: str = "report.html"  # inside the run folder
 
     def run(self, run: Run) -> None:
-        sections = [_figures(run), _curves(run), _times(run), _views(run), _settings(run)]
+        sections = [_figures(run), _curves(run), _census(run), _times(run), _views(run), _settings(run)]
         title = f"{run.name} · {run.scene.path.name}"
         write_text(run.out / self.file, page(title, run.device.text, sections))
         LOG.info("report written to %s", run.out / self.file)
@@ -65,6 +66,41 @@ def _curves(run: Run) -> str:
         curve("milliseconds per step", [Line(line["ms"])]),
     ]
     return f"<h2>Training</h2><div class=curves>{''.join(charts)}</div>"
+
+
+def _census(run: Run) -> str:
+    """How sizes, shapes and opacities are spread over training, what density rules did, and PSNR by Gaussians."""
+    lines = run.records.read("census")
+    if len(lines) < 2:
+        return ""
+    shares = [f"{share:.0%}" for share in SHARES]
+
+    def spread(name: str) -> list[Line]:
+        return [Line([(r["step"], r[name][i]) for r in lines], share) for i, share in enumerate(shares)]
+
+    charts = [
+        curve("size (rms scale, scene units), quantiles", spread("size"), logarithmic=True),
+        curve("anisotropy (longest by shortest axis), quantiles", spread("anisotropy"), logarithmic=True),
+        curve("opacity, quantiles", spread("opacity")),
+        curve("Gaussians changed by each rule, in all", _causes(run)),
+        curve("test PSNR, dB, over thousands of Gaussians", [Line(_psnr_by_gaussians(run))]),
+    ]
+    return f"<h2>The Gaussians</h2><div class=curves>{''.join(charts)}</div>"
+
+
+def _causes(run: Run) -> list[Line]:
+    """Gaussians that each rule of density control has taken so far."""
+    edits = run.records.read("densify")
+    names = dict.fromkeys(name for edit in edits for name in edit.get("causes", {}))
+    totals = {name: np.cumsum([edit["causes"].get(name, 0) for edit in edits]) for name in names}
+    steps = [edit["step"] for edit in edits]
+    return [Line(list(zip(steps, map(float, total), strict=True)), name) for name, total in totals.items()]
+
+
+def _psnr_by_gaussians(run: Run) -> list[tuple[float, float]]:
+    counts = {r["step"]: r["gaussians"] for r in run.records.read("train")}
+    tests = [r for r in run.records.read("evaluate") if r["split"] == "test" and r["scale"] == run.scale]
+    return sorted((counts[r["step"]] / 1e3, r["psnr"]) for r in tests if r["step"] in counts)
 
 
 def _times(run: Run) -> str:

@@ -1,0 +1,18 @@
+"""What the Gaussians of a model look like all together."""
+
+import numpy as np
+
+from clsplat.gaussians.model import Gaussians
+
+SHARES = (0.05, 0.25, 0.5, 0.75, 0.95)
+
+
+def census(gaussians: Gaussians) -> dict[str, list[float]]:
+    """Quantiles, at SHARES, of size (rms scale, scene units), anisotropy (longest by shortest axis) and opacity."""
+    log_scales = gaussians.get("log_scales").astype(np.float64)
+    columns = {
+        "size": np.sqrt(np.exp(2 * log_scales).mean(axis=1)),
+        "anisotropy": np.exp(log_scales.max(axis=1) - log_scales.min(axis=1)),
+        "opacity": 1 / (1 + np.exp(-gaussians.get("logit_opacity")[:, 0].astype(np.float64))),
+    }
+    return {name: [float(value) for value in np.quantile(column, SHARES)] for name, column in columns.items()}

@@ -1,0 +1,60 @@
+"""Whole runs with changing weights, penalties and subdividing rules: bits, resume, and what the report says of them."""
+
+import json
+
+import numpy as np
+import pytest
+
+from clsplat.training.census import SHARES, census
+from tests.scenes import random_case
+from tests.test_training import train
+
+PENALTY = "{type: covariance_trace, weight: 0.5, pixels: 1.0}"
+LOSSES = f"optimize.losses=[{{type: l1, weight: [[10, 0.8], [40, 0.4]]}}, {{type: l2, weight: 2.0}}, {PENALTY}]"
+RULES = (
+    "densify.rules=[{type: clone}, {type: split_textured, texture_above: {quantile: 0.5, of: pixels}, "
+    "gradient_above: 0.0, radius_above: 0.5}, {type: split_oversized, pixels: 1.5, radius_above: 0.5}, "
+    "{type: merge_neighbours}, {type: prune_unimportant, share: 0.01}]"
+)
+SETTINGS = (LOSSES, RULES, "optimize.log_every=5", "optimize.checkpoint.keep=9")
+
+
+@pytest.fixture(scope="module")
+def finished(tiny_scene, tmp_path_factory):
+    out = tmp_path_factory.mktemp("micro") / "run"
+    return train(tiny_scene, out, *SETTINGS)
+
+
+def test_every_rule_and_penalty_acts(finished):
+    lines = [json.loads(line) for line in (finished.out / "metrics.jsonl").read_text().splitlines()]
+    edits = [line for line in lines if line["kind"] == "densify"]
+    for name in ("clone", "split_textured", "split_oversized", "merge_neighbours", "prune_unimportant"):
+        assert sum(edit["causes"][name] for edit in edits) > 0, name
+    found = [line for line in lines if line["kind"] == "census"]
+    assert found[-1]["step"] == 50
+    assert all(len(line["anisotropy"]) == len(SHARES) for line in found)
+    page = (finished.out / "report.html").read_text()
+    assert "anisotropy" in page
+    assert "split_textured" in page
+
+
+def test_same_bits_and_exact_resume(finished, tiny_scene, tmp_path):
+    whole = (finished.out / "point_cloud.ply").read_bytes()
+    again = train(tiny_scene, tmp_path / "again", *SETTINGS)
+    assert (again.out / "point_cloud.ply").read_bytes() == whole
+    for step in (30, 40, 50):
+        (again.out / "checkpoints" / f"step_{step:06d}.npz").unlink()
+    (again.out / "point_cloud.ply").unlink()
+    assert (again.out / "checkpoints" / "step_000020.npz").exists()
+    resumed = train(tiny_scene, tmp_path / "again", *SETTINGS, resume=True)
+    assert (resumed.out / "point_cloud.ply").read_bytes() == whole
+
+
+def test_census_of_known_gaussians(device, rng):
+    case = random_case(rng, 5)
+    case.parameters["log_scales"][:] = np.log([[1, 1, 1], [1, 1, 2], [1, 1, 3], [1, 1, 4], [1, 1, 5]])
+    case.parameters["logit_opacity"][:] = 0
+    found = census(case.model(device).gaussians)
+    np.testing.assert_allclose(found["anisotropy"], np.quantile([1, 2, 3, 4, 5], SHARES), rtol=1e-6)
+    np.testing.assert_allclose(found["size"][2], np.sqrt(11 / 3), rtol=1e-6)
+    assert found["opacity"] == [0.5] * 5
