@@ -16,11 +16,12 @@ void blend_forward(
     __constant camera_t *restrict camera,       // [1]
     __global float *restrict image,             // [3,tiles_y*TILE,tiles_x*TILE]
     __global float *restrict transmittance,     // [tiles_y*TILE,tiles_x*TILE]
-    __global uint *restrict tile_last)          // [T] one past the last pair that any pixel blends
+    __global uint *restrict tile_last,          // [T] one past the last pair that any pixel blends
+    const uint first_tile)                      // of this launch
 {
     __local float batch[BATCH][RECORD];
     __local uint open;  // pixels of the tile that still want splats
-    const uint item = get_local_id(0), tile = get_group_id(0);
+    const uint item = get_local_id(0), tile = first_tile + get_group_id(0);
     const uint tile_y = tile / camera->tiles_x, tile_x = tile - tile_y * camera->tiles_x;
     const uint column = tile_x * TILE + item % TILE, line = tile_y * TILE + item / TILE;
     const uint width = camera->tiles_x * TILE, plane = width * camera->tiles_y * TILE;
@@ -78,10 +79,11 @@ void blend_backward(
     __global const float *restrict grad_image,  // [3,tiles_y*TILE,tiles_x*TILE]
     __global const float *restrict texture,     // [tiles_y*TILE,tiles_x*TILE] read where MOMENTS says so
     __global const uint *restrict tile_last,    // [T]
-    __global float *restrict pair_moments)      // [P,RECORD] in emission order
+    __global float *restrict pair_moments,      // [P,RECORD] in emission order
+    const uint first_tile)                      // of this launch
 {
     __local grad_pixels_t pixels[PIXELS];
-    const uint item = get_local_id(0), tile = get_group_id(0);
+    const uint item = get_local_id(0), tile = first_tile + get_group_id(0);
     const uint tile_y = tile / camera->tiles_x, tile_x = tile - tile_y * camera->tiles_x;
     const uint width = camera->tiles_x * TILE, plane = width * camera->tiles_y * TILE;
     for (uint i = item; i < PIXELS; i += SPLAT_GROUP) {

@@ -28,9 +28,10 @@ void blend_forward(
     __constant camera_t *restrict camera,       // [1]
     __global float *restrict image,             // [3,tiles_y*TILE,tiles_x*TILE]
     __global float *restrict transmittance,     // [tiles_y*TILE,tiles_x*TILE]
-    __global uint *restrict tile_last)          // [T] one past the last pair that any pixel blends
+    __global uint *restrict tile_last,          // [T] one past the last pair that any pixel blends
+    const uint first_tile)                      // of this launch
 {
-    const uint tile = get_global_id(0);
+    const uint tile = first_tile + get_global_id(0);
     const uint tile_y = tile / camera->tiles_x, tile_x = tile - tile_y * camera->tiles_x;
     const uint first = tile_offset[tile], end = tile_offset[tile + 1];
     const uint width = camera->tiles_x * TILE, plane = width * camera->tiles_y * TILE;
@@ -116,9 +117,10 @@ void blend_backward(
     __global const float *restrict grad_image,  // [3,tiles_y*TILE,tiles_x*TILE]
     __global const float *restrict texture,     // [tiles_y*TILE,tiles_x*TILE] read where MOMENTS says so
     __global const uint *restrict tile_last,    // [T]
-    __global float *restrict pair_moments)      // [P,RECORD] in emission order
+    __global float *restrict pair_moments,      // [P,RECORD] in emission order
+    const uint first_tile)                      // of this launch
 {
-    const uint tile = get_global_id(0);
+    const uint tile = first_tile + get_global_id(0);
     const uint tile_y = tile / camera->tiles_x, tile_x = tile - tile_y * camera->tiles_x;
     const uint width = camera->tiles_x * TILE, plane = width * camera->tiles_y * TILE;
     grad_pixels_t pixels[TILE][COLUMNS];

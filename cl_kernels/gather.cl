@@ -9,6 +9,7 @@ void sum_records(
     __global const uint *restrict first_pair,     // [N]
     __global const uint *restrict tile_count,     // [N]
     __global float *restrict moments,             // [MOMENTS,S]
+    const uint accumulate,                        // 1: go on from the sums that are there
     const uint stride,
     const uint count)
 {
@@ -16,8 +17,14 @@ void sum_records(
     if (i >= count)
         return;
     float table[LANES][RECORD];
+    for (uint k = 0; k < RECORD; k++) {
+        float lanes[LANES];
+        VSTORE((accumulate && k < MOMENTS ? VLOAD(moments + k * stride + i) : (VF)(0.0f)), lanes);
+        for (uint lane = 0; lane < LANES; lane++)
+            table[lane][k] = lanes[lane];
+    }
     for (uint lane = 0; lane < LANES; lane++) {
-        float16 sum = (float16)(0.0f);
+        float16 sum = vload16(0, table[lane]);
         const uint pairs = i + lane < count ? tile_count[i + lane] : 0;
         const uint first = pairs > 0 ? first_pair[i + lane] : 0;
         for (uint pair = first; pair < first + pairs; pair++)

@@ -6,12 +6,12 @@
 
 /* The tiles of a rectangle too large for a mask, tested again, as when they were counted. */
 static inline void emit_large(__global const float *splat, uint pair, const uint i, __global uint *pair_tile,
-                              __global uint *pair_splat, const uint tiles_x, const uint tiles_y)
+                              __global uint *pair_splat, const uint tiles_x, const uint row_begin, const uint row_end)
 {
     VF fields[RECORD];
     for (uint k = 0; k < RECORD; k++)
         fields[k] = (VF)(splat[k]);
-    const footprint_t f = footprint_of(fields, (VI)(-1), tiles_x, tiles_y);
+    const footprint_t f = footprint_of(fields, (VI)(-1), tiles_x, row_begin, row_end);
     float first_x[LANES], first_y[LANES], columns[LANES], rows[LANES];
     VSTORE(f.first_x, first_x);
     VSTORE(f.first_y, first_y);
@@ -38,7 +38,8 @@ void emit_pairs(
     __global uint *restrict pair_splat,          // [P]
     __global uint *restrict first_pair,          // [N] first pair of each Gaussian
     const uint tiles_x,
-    const uint tiles_y,
+    const uint row_begin,                        // of the band of tiles
+    const uint row_end,
     const uint count)
 {
     const uint place = get_global_id(0);
@@ -51,7 +52,7 @@ void emit_pairs(
         return;
     const uint box = tile_box[i], width = box >> (2 * BOX_BITS), low = (1u << BOX_BITS) - 1;
     if (width == 0) {
-        emit_large(splats + (size_t)i * RECORD, pair, i, pair_tile, pair_splat, tiles_x, tiles_y);
+        emit_large(splats + (size_t)i * RECORD, pair, i, pair_tile, pair_splat, tiles_x, row_begin, row_end);
         return;
     }
     uint tile = (box >> BOX_BITS & low) * tiles_x + (box & low), column = 0;

@@ -37,6 +37,8 @@ void project_forward(
     const float near_plane,                          // scene units
     const float screen_variance,                     // px^2
     const float compensate,                          // 0 or 1
+    const uint row_begin,                            // of the band of tiles whose lists are wanted
+    const uint row_end,
     const uint degree,
     const uint stride,
     const uint count)
@@ -87,7 +89,7 @@ void project_forward(
         u, v, s.conic_xx, s.conic_xy, s.conic_yy, opacity,
         larger(colour[0], zero), larger(colour[1], zero), larger(colour[2], zero),
         v - half_y, v + half_y, u - half_x, u + half_x, power_min, zero, zero};
-    const footprint_t footprint = footprint_of(fields, visible, camera->tiles_x, camera->tiles_y);
+    const footprint_t footprint = footprint_of(fields, visible, camera->tiles_x, row_begin, row_end);
     VI mask;
     VSTORE(count_tiles(&footprint, &mask), (__global int *)tile_count + i);
     VSTORE(mask, (__global int *)tile_mask + i);

@@ -21,20 +21,21 @@ typedef struct {
 
 static inline VF clamp_to(const VF x, const VF low, const VF high) { return smaller(larger(x, low), high); }
 
-/* First and one past the last tile along one axis whose pixel centres reach into [low, high] px. */
-static inline VF first_tile(const VF low, const uint tiles)
+/* First and one past the last tile of `begin` to `end` along one axis whose pixel centres reach into [low, high] px. */
+static inline VF first_tile(const VF low, const uint begin, const uint end)
 {
-    return ceil(clamp_to((low - (TILE - 0.5f)) * (1.0f / TILE), (VF)(0.0f), (VF)(tiles)));
+    return ceil(clamp_to((low - (TILE - 0.5f)) * (1.0f / TILE), (VF)(begin), (VF)(end)));
 }
 
-static inline VF end_tile(const VF high, const uint tiles)
+static inline VF end_tile(const VF high, const uint begin, const uint end)
 {
-    return clamp_to(floor(clamp_to((high - 0.5f) * (1.0f / TILE), (VF)(-1.0f), (VF)(tiles))) + 1.0f,
-                    (VF)(0.0f), (VF)(tiles));
+    return clamp_to(floor(clamp_to((high - 0.5f) * (1.0f / TILE), (VF)(-1.0f), (VF)(end))) + 1.0f,
+                    (VF)(begin), (VF)(end));
 }
 
-/* The footprint of splats given by the fields of their records. */
-static inline footprint_t footprint_of(const VF *splat, const VI visible, const uint tiles_x, const uint tiles_y)
+/* The footprint, in a band of rows of tiles, of splats given by the fields of their records. */
+static inline footprint_t footprint_of(const VF *splat, const VI visible, const uint tiles_x, const uint row_begin,
+                                       const uint row_end)
 {
     const VF zero = (VF)(0.0f);
     footprint_t f;
@@ -46,10 +47,10 @@ static inline footprint_t footprint_of(const VF *splat, const VI visible, const 
     f.along_x = -f.xy / f.yy;
     f.along_y = -f.xy / f.xx;
     f.reach = 0.5f * EXTENT_SLACK - splat[SPLAT_POWER_MIN];
-    f.first_x = first_tile(splat[SPLAT_X_MIN], tiles_x);
-    f.first_y = first_tile(splat[SPLAT_Y_MIN], tiles_y);
-    f.columns = visible ? larger(end_tile(splat[SPLAT_X_MAX], tiles_x) - f.first_x, zero) : zero;
-    f.rows = visible ? larger(end_tile(splat[SPLAT_Y_MAX], tiles_y) - f.first_y, zero) : zero;
+    f.first_x = first_tile(splat[SPLAT_X_MIN], 0, tiles_x);
+    f.first_y = first_tile(splat[SPLAT_Y_MIN], row_begin, row_end);
+    f.columns = visible ? larger(end_tile(splat[SPLAT_X_MAX], 0, tiles_x) - f.first_x, zero) : zero;
+    f.rows = visible ? larger(end_tile(splat[SPLAT_Y_MAX], row_begin, row_end) - f.first_y, zero) : zero;
     return f;
 }
 

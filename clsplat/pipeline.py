@@ -1,6 +1,6 @@
 """From a pipeline file to checked stages, and through them.
 
-    name, seed, scene: {path, downscale, background, …}, model: {…}, rasterizer: {schedule, sort}
+    name, seed, scene: {path, downscale, background, …}, model: {…}, rasterizer: {schedule, sort, …}
     stages: a list of   - <stage>   or   - <stage>: {field: value, …}
 
 A file is complete and strict: unknown keys are errors, every value has its default in its model, and the fully resolved
@@ -23,6 +23,7 @@ from ruamel.yaml import YAML
 from clsplat import resource_dir
 from clsplat.errors import ConfigError
 from clsplat.opencl.device import Schedule
+from clsplat.render.renderer import RECORD, UNLIMITED, Budget
 from clsplat.render.tiles import Sort
 from clsplat.scene.detect import read_scene
 from clsplat.scene.scene import Background, Scene
@@ -68,6 +69,15 @@ class RasterizerSettings(Settings):
 
     schedule: Schedule = "auto"
     sort: Sort = "auto"
+    pair_budget: Annotated[int, Field(gt=0)] | None = None  # MiB of gradient records; default: the largest buffer
+    launch_tiles: Annotated[int, Field(ge=0)] = 0  # tiles blended by one launch, for watchdogs of displays; 0: all
+
+    def budget(self) -> Budget | None:
+        """How much the renderer does at a time."""
+        if self.pair_budget is None and self.launch_tiles == 0:
+            return None
+        records = UNLIMITED if self.pair_budget is None else (self.pair_budget << 20) // (4 * RECORD)
+        return Budget(records, self.launch_tiles)
 
 
 Name = Annotated[str, Field(pattern=r"^[\w.-]+$")]

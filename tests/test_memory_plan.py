@@ -60,3 +60,11 @@ def test_dry_run_says_what_fits(tiny_scene, tmp_path):
     done = clsplat("run", "smoke", "--scene", tiny_scene, "--out", tmp_path / "run")
     assert "memory: " in done.stdout
     assert " fit in " in done.stdout
+
+
+def test_bands_and_short_launches_train_to_the_same_bits(tiny_scene, tmp_path):
+    train(tiny_scene, tmp_path / "whole")
+    cut = train(tiny_scene, tmp_path / "cut", "rasterizer.pair_budget=1", "rasterizer.launch_tiles=2")
+    assert len(cut.renderer._split(cut.targets.camera(cut.scene.views[0]))) > 1
+    whole, banded = ((tmp_path / name / "point_cloud.ply").read_bytes() for name in ("whole", "cut"))
+    assert whole == banded

@@ -1,6 +1,7 @@
 """From Gaussians and a camera to an image, and from the image's gradient back to the Gaussians'."""
 
 from dataclasses import dataclass, fields
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -9,12 +10,13 @@ from numpy.typing import NDArray
 from clsplat.gaussians.model import Gradients, Model
 from clsplat.opencl.device import Array, Device
 from clsplat.opencl.program import constants
-from clsplat.render.tiles import Footprints, Sort, TileLists, Tiler
+from clsplat.render.tiles import Band, Footprints, Sort, TileLists, Tiler, TooManyPairs
 from clsplat.render.workspace import Workspace
 from clsplat.scene.scene import View
 
 RECORD = int(constants()["RECORD"])
 MOMENTS = int(constants()["MOMENTS"])
+UNLIMITED = 2**31  # pairs
 RAY_MARGIN = constants()["RAY_MARGIN"]
 
 # camera_t of cl_kernels/common.h
@@ -95,13 +97,24 @@ class Frame:
     tile_last: Array  # [T]
     image: Array  # [3, rows, stride], zero outside the image
     transmittance: Array  # [rows, stride]
+    bands: list[Band]  # of which `lists` are those of the last
+
+
+@dataclass(frozen=True)
+class Budget:
+    """How much is done at a time; results do not depend on it."""
+
+    pairs: int  # (tile, Gaussian) pairs
+    tiles: int = 0  # of a launch; 0: all
 
 
 class Renderer:
     """Renders one frame at a time; its buffers are reused from frame to frame."""
 
-    def __init__(self, device: Device, sort: Sort = "auto") -> None:
+    def __init__(self, device: Device, sort: Sort = "auto", budget: Budget | None = None) -> None:
         self.device = device
+        self.budget = budget or Budget(device.info.allocation // (4 * RECORD))
+        self._bands: dict[int, int] = {}  # into how many bands frames of so many rows of tiles are split
         self.workspace = Workspace(device)
         self.tiler = Tiler(device, self.workspace, sort)
         self._project = device.program("project.cl")
@@ -110,12 +123,57 @@ class Renderer:
         self._gradients: Gradients | None = None  # made when somebody asks for them
 
     def forward(self, model: Model, camera: DeviceCamera, background: Array) -> Frame:
-        """Render the model.  background: [3]."""
-        gaussians, array = model.gaussians, self.workspace.array
+        """Render the model.  background: [3].
+
+        Where the pairs of all tiles together pass the budget, fewer rows of tiles are done at a time: the same bits.
+        """
+        while True:
+            try:
+                return self._forward(model, camera, background)
+            except TooManyPairs:
+                self._bands[camera.tiles_y] = 2 * self._bands.get(camera.tiles_y, 1)
+
+    def _forward(self, model: Model, camera: DeviceCamera, background: Array) -> Frame:
+        array = self.workspace.array
+        splats = array("splats", (model.gaussians.count, RECORD))
+        radius = array("radius", model.gaussians.capacity)
+        image = array("image", (3, camera.rows, camera.stride))
+        transmittance = array("transmittance", (camera.rows, camera.stride))
+        tile_last = array("tile_last", camera.tiles, np.uint32)
+        bands = self._split(camera)
+        for band in bands:
+            lists = self._project_band(model, camera, band, splats, radius)
+            for first_tile, groups in self._launches(band):
+                self._blend.blend_forward(
+                    groups=groups,
+                    tile_offset=lists.tile_offset,
+                    tile_pairs=lists.tile_pairs,
+                    pair_splat=lists.pair_splat,
+                    splats=splats,
+                    background=background,
+                    camera=camera.array,
+                    image=image,
+                    transmittance=transmittance,
+                    tile_last=tile_last,
+                    first_tile=first_tile,
+                )
+        return Frame(camera, splats, radius, lists, tile_last, image, transmittance, bands)
+
+    def _split(self, camera: DeviceCamera) -> list[Band]:
+        rows = np.linspace(0, camera.tiles_y, min(self._bands.get(camera.tiles_y, 1), camera.tiles_y) + 1).astype(int)
+        return [Band(camera.tiles_x, camera.tiles_y, int(a), int(b)) for a, b in pairwise(rows)]
+
+    def _launches(self, band: Band) -> list[tuple[int, int]]:
+        """First tile and number of tiles of each launch: few at a time where a display's watchdog looks on."""
+        step = self.budget.tiles or band.tiles_inside
+        end = band.first_tile + band.tiles_inside
+        return [(first, min(step, end - first)) for first in range(band.first_tile, end, step)]
+
+    def _project_band(self, model: Model, camera: DeviceCamera, band: Band, splats: Array, radius: Array) -> TileLists:
+        gaussians = model.gaussians
         count, stride = gaussians.count, gaussians.capacity
-        splats = array("splats", (count, RECORD))
-        footprints = Footprints(*(array(field.name, stride, np.uint32) for field in fields(Footprints)))
-        radius = array("radius", stride)
+        arrays = (self.workspace.array(field.name, stride, np.uint32) for field in fields(Footprints))
+        footprints = Footprints(*arrays)
         self._project.project_forward(
             items=-(-count // self._lanes),
             **shape_arguments(model, camera),
@@ -123,24 +181,11 @@ class Renderer:
             splats=splats,
             **vars(footprints),
             radius=radius,
+            row_begin=band.row_begin,
+            row_end=band.row_end,
         )
-        lists = self.tiler.build(splats, footprints, camera.tiles_x, camera.tiles_y, count)
-        image = array("image", (3, camera.rows, camera.stride))
-        transmittance = array("transmittance", (camera.rows, camera.stride))
-        tile_last = array("tile_last", camera.tiles, np.uint32)
-        self._blend.blend_forward(
-            groups=camera.tiles,
-            tile_offset=lists.tile_offset,
-            tile_pairs=lists.tile_pairs,
-            pair_splat=lists.pair_splat,
-            splats=splats,
-            background=background,
-            camera=camera.array,
-            image=image,
-            transmittance=transmittance,
-            tile_last=tile_last,
-        )
-        return Frame(camera, splats, radius, lists, tile_last, image, transmittance)
+        single = band.row_end - band.row_begin == 1  # it cannot be split further
+        return self.tiler.build(splats, footprints, band, count, UNLIMITED if single else self.budget.pairs)
 
     def moments(
         self, model: Model, frame: Frame, grad_image: Array, count: int = MOMENTS, texture: Array | None = None
@@ -150,32 +195,39 @@ class Renderer:
         grad_image: [3, rows, stride], zero outside the image.  More than MOMENTS of them cost more time; the last are
         of `texture`, [rows, stride].
         """
-        gaussians, lists = model.gaussians, frame.lists
+        gaussians = model.gaussians
         defines = {} if count == MOMENTS else {"MOMENTS": count}
-        pair_moments = self.workspace.array("pair_moments", (lists.pairs, RECORD))
-        self.device.program(f"blend_{self.device.schedule}.cl", **defines).blend_backward(
-            groups=frame.camera.tiles,
-            tile_offset=lists.tile_offset,
-            tile_pairs=lists.tile_pairs,
-            pair_splat=lists.pair_splat,
-            splats=frame.splats,
-            camera=frame.camera.array,
-            image=frame.image,
-            grad_image=grad_image,
-            texture=texture or frame.transmittance,  # without a texture the kernel reads none
-            tile_last=frame.tile_last,
-            pair_moments=pair_moments,
-        )
         moments = self.workspace.array("moments", (count, gaussians.capacity))
-        self.device.program("gather.cl", **defines).sum_records(
-            items=-(-gaussians.count // self._lanes),
-            pair_moments=pair_moments,
-            first_pair=lists.first_pair,
-            tile_count=lists.tile_count,
-            moments=moments,
-            stride=gaussians.capacity,
-            count=gaussians.count,
-        )
+        for number, band in enumerate(frame.bands):
+            lists = frame.lists
+            if len(frame.bands) > 1:
+                lists = self._project_band(model, frame.camera, band, frame.splats, frame.radius)
+            pair_moments = self.workspace.array("pair_moments", (lists.pairs, RECORD))
+            for first_tile, groups in self._launches(band):
+                self.device.program(f"blend_{self.device.schedule}.cl", **defines).blend_backward(
+                    groups=groups,
+                    tile_offset=lists.tile_offset,
+                    tile_pairs=lists.tile_pairs,
+                    pair_splat=lists.pair_splat,
+                    splats=frame.splats,
+                    camera=frame.camera.array,
+                    image=frame.image,
+                    grad_image=grad_image,
+                    texture=texture or frame.transmittance,  # without a texture the kernel reads none
+                    tile_last=frame.tile_last,
+                    pair_moments=pair_moments,
+                    first_tile=first_tile,
+                )
+            self.device.program("gather.cl", **defines).sum_records(
+                items=-(-gaussians.count // self._lanes),
+                pair_moments=pair_moments,
+                first_pair=lists.first_pair,
+                tile_count=lists.tile_count,
+                moments=moments,
+                accumulate=int(number > 0),
+                stride=gaussians.capacity,
+                count=gaussians.count,
+            )
         return moments
 
     def gradients(self, model: Model, frame: Frame, moments: Array) -> Gradients:

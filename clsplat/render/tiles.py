@@ -40,6 +40,33 @@ class TileLists:
     tile_pairs: Array  # [P] pairs ordered by tile, front to back
 
 
+@dataclass(frozen=True)
+class Band:
+    """Rows of tiles, from `row_begin` up to `row_end`, of a grid: all of them, or those that are done at a time."""
+
+    tiles_x: int
+    tiles_y: int
+    row_begin: int
+    row_end: int
+
+    @property
+    def tiles(self) -> int:
+        """Number of tiles of the whole grid."""
+        return self.tiles_x * self.tiles_y
+
+    @property
+    def first_tile(self) -> int:
+        return self.row_begin * self.tiles_x
+
+    @property
+    def tiles_inside(self) -> int:
+        return (self.row_end - self.row_begin) * self.tiles_x
+
+
+class TooManyPairs(Exception):
+    """More pairs in a band than were allowed: blend fewer rows of tiles at a time."""
+
+
 class Tiler:
     """Builds tile lists; `sort` is radix, bitonic or auto, which measures both on the first frame."""
 
@@ -53,16 +80,21 @@ class Tiler:
         self._digit_bits = int(device.tuning["DIGIT_BITS"])
         self._zero = device.zeros(1, np.uint32)
 
-    def build(self, splats: Array, footprints: Footprints, tiles_x: int, tiles_y: int, count: int) -> TileLists:
-        """Make the tile lists of `count` splat records.  Reads the number of pairs back: the frame's one wait."""
+    def build(self, splats: Array, footprints: Footprints, band: Band, count: int, most: int) -> TileLists:
+        """Make the tile lists of `count` splat records in a band.  Reads the number of pairs back: the one wait.
+
+        Raises TooManyPairs when there are more than `most`.
+        """
         if self.sort == "auto":
-            self.sort = self._faster(splats, footprints, tiles_x, tiles_y, count)
+            self.sort = self._faster(splats, footprints, band, count, most)
         depth_key, tile_count = footprints.depth_key, footprints.tile_count
         order = self._depth_order(depth_key, count) if self.sort == "radix" else self._index_order(count)
         ordered_count = self.workspace.array("ordered_count", count, np.uint32)
         self._scan.permute(items=count, values=tile_count, order=order, permuted=ordered_count, count=count)
         pair_offset = self.scan(ordered_count, count, "pair_offset")
         pairs = int(pair_offset.get_item(count)) if count else 0
+        if pairs > most:
+            raise TooManyPairs
 
         pair_tile = self.workspace.array("pair_tile", pairs, np.uint32)
         pair_splat = self.workspace.array("pair_splat", pairs, np.uint32)
@@ -77,11 +109,12 @@ class Tiler:
             pair_tile=pair_tile,
             pair_splat=pair_splat,
             first_pair=first_pair,
-            tiles_x=tiles_x,
-            tiles_y=tiles_y,
+            tiles_x=band.tiles_x,
+            row_begin=band.row_begin,
+            row_end=band.row_end,
             count=count,
         )
-        tiles = tiles_x * tiles_y
+        tiles = band.tiles
         if self.sort == "radix":
             tile_offset, tile_pairs = self._sort_by_tile(pair_tile, pairs, tiles)
         else:
@@ -179,14 +212,14 @@ class Tiler:
         self._bitonic.sort_tiles(groups=tiles, tile_offset=tile_offset, tile_depth=tile_depth, tile_pairs=tile_pairs)
         return tile_offset, tile_pairs
 
-    def _faster(self, splats: Array, footprints: Footprints, tiles_x: int, tiles_y: int, count: int) -> Sort:
+    def _faster(self, splats: Array, footprints: Footprints, band: Band, count: int, most: int) -> Sort:
         seconds: dict[Sort, float] = {}
         for sort in ("radix", "bitonic"):
             self.sort = sort
             times = []
             for _ in range(1 + TRIALS):  # the first one compiles
                 start = time.perf_counter()
-                self.build(splats, footprints, tiles_x, tiles_y, count)
+                self.build(splats, footprints, band, count, most)
                 self.device.finish()
                 times.append(time.perf_counter() - start)
             seconds[sort] = min(times[1:])
