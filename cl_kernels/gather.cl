@@ -17,13 +17,10 @@ void sum_records(
     if (i >= count)
         return;
     float table[LANES][RECORD];
-    for (uint k = 0; k < RECORD; k++) {
-        float lanes[LANES];
-        VSTORE((accumulate && k < MOMENTS ? VLOAD(moments + k * stride + i) : (VF)(0.0f)), lanes);
-        for (uint lane = 0; lane < LANES; lane++)
-            table[lane][k] = lanes[lane];
-    }
     for (uint lane = 0; lane < LANES; lane++) {
+        vstore16((float16)(0.0f), 0, table[lane]);
+        for (uint k = 0; k < MOMENTS && accumulate; k++)
+            table[lane][k] = moments[k * stride + i + lane];
         float16 sum = vload16(0, table[lane]);
         const uint pairs = i + lane < count ? tile_count[i + lane] : 0;
         const uint first = pairs > 0 ? first_pair[i + lane] : 0;
