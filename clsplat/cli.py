@@ -181,6 +181,7 @@ def bench(
     repeats: Annotated[int, typer.Option(min=1, help="Steps of each scene.")] = 20,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
     against: Annotated[Path | None, typer.Option(help="Compare with the JSON of an earlier run.")] = None,
+    schedule: Annotated[Literal["auto", "wide", "simt"], typer.Option(help="wide for CPUs, simt for GPUs.")] = "auto",
     growth: Annotated[
         Path | None, typer.Option(help="Only time 50 000 to a million Gaussians; an SVG is written.")
     ] = None,
@@ -202,7 +203,7 @@ def bench(
     if (model is None) != (scene is None):
         raise ConfigError("bench: --model and --scene go together")
     earlier = _read_json(against) if against else None
-    opened = Device(choose(device))
+    opened = Device(choose(device), schedule)
     peaks = measure_peaks(opened)
     if growth is not None:
         sizes = [run_bench({"": one}, peaks, repeats)[""] for one in grown(opened)]
