@@ -26,18 +26,31 @@ void adam_step(
     adam_update(values + at, moment1 + at, moment2 + at, VLOAD(gradient + at), rate, correction2);
 }
 
-static inline void update_planes(__global float *values, __global float *moment1, __global float *moment2,
-                                 const VF *gradient, const VI touched, const float rate, const float correction2,
-                                 const uint components, const uint stride, const uint i)
+/* Update one plane of a block.  gradient: [VECTORS]. */
+static inline void update_plane(__global float *values, __global float *moment1, __global float *moment2,
+                                const VF *gradient, const gradient_t *g, const uint vectors, const float rate,
+                                const float correction2)
 {
-    for (uint k = 0; k < components; k++) {
-        const uint at = k * stride + i;
-        const VF g = touched ? gradient[k] : (VF)(0.0f);
-        adam_update(values + at, moment1 + at, moment2 + at, g, rate, correction2);
-    }
+    for (uint v = 0; v < vectors; v++)
+        adam_update(values + v * LANES, moment1 + v * LANES, moment2 + v * LANES,
+                    g[v].touched ? gradient[v] : (VF)(0.0f), rate, correction2);
 }
 
-/* The update of all tables from the moments of the pixels.  Rates are divided by 1 - BETA1^t. */
+/* Update plane `plane` of a table, with the member `member` of the block's gradients. */
+#define UPDATE(table, plane, member)                                                                          \
+    do {                                                                                                      \
+        const uint at = (plane) * stride + i;                                                                 \
+        VF gradient[VECTORS];                                                                                   \
+        for (uint v = 0; v < vectors; v++)                                                                    \
+            gradient[v] = g[v].member;                                                                        \
+        update_plane(table + at, table##_moment1 + at, table##_moment2 + at, gradient, g, vectors,            \
+                     table##_rate, table##_correction2);                                                      \
+    } while (0)
+
+/* The update of all tables from the moments of the pixels.  Rates are divided by 1 - BETA1^t.
+ *
+ * One item = VECTORS vectors of Gaussians, plane by plane, so that memory is walked in runs.  Private memory:
+ * VECTORS * LANES * 200 bytes. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void update_gaussians(
     __global float *restrict means,                  // [3,S] scene units
@@ -82,29 +95,32 @@ void update_gaussians(
     const uint stride,
     const uint count)
 {
-    const uint i = get_global_id(0) * LANES;
+    const uint i = get_global_id(0) * LANES * VECTORS;
     if (i >= count)
         return;
-    const gradient_t g = gradient_of(means, quats, log_scales, logit_opacity, sh_rest, filter_variance, camera, splats,
-                                     moments, near_plane, screen_variance, compensate, degree, stride, count, i);
-    for (uint k = 0; k < 2; k++)
-        VSTORE((g.touched ? g.mean2d[k] : (VF)(0.0f)), grad_mean2d + k * stride + i);
-    update_planes(means, means_moment1, means_moment2, g.means, g.touched, means_rate,
-                  means_correction2, 3, stride, i);
-    update_planes(quats, quats_moment1, quats_moment2, g.quats, g.touched, quats_rate,
-                  quats_correction2, 4, stride, i);
-    update_planes(log_scales, log_scales_moment1, log_scales_moment2, g.log_scales, g.touched, log_scales_rate,
-                  log_scales_correction2, 3, stride, i);
-    update_planes(logit_opacity, logit_opacity_moment1, logit_opacity_moment2, &g.logit_opacity, g.touched,
-                  logit_opacity_rate, logit_opacity_correction2, 1, stride, i);
-    for (uint k = 0; k < (degree + 1) * (degree + 1); k++) {
-        const uint at = k > 0 ? (k - 1) * 3 * stride : 0;
-        const VF gradient[3] = {g.basis[k] * g.colour[0], g.basis[k] * g.colour[1], g.basis[k] * g.colour[2]};
-        if (k == 0)
-            update_planes(sh_base, sh_base_moment1, sh_base_moment2, gradient, g.touched, sh_base_rate,
-                          sh_base_correction2, 3, stride, i);
-        else
-            update_planes(sh_rest + at, sh_rest_moment1 + at, sh_rest_moment2 + at, gradient, g.touched, sh_rest_rate,
-                          sh_rest_correction2, 3, stride, i);
+    const uint left = (count - i + LANES - 1) / LANES, vectors = left < VECTORS ? left : VECTORS;
+    gradient_t g[VECTORS];
+    VF weights[VECTORS][16];
+    for (uint v = 0; v < vectors; v++)
+        colour_backward(splats, moments, stride, count, i + v * LANES, g + v);
+    weigh_harmonics(sh_rest, g, vectors, degree, stride, i, weights);
+    for (uint v = 0; v < vectors; v++) {
+        const uint at = i + v * LANES;
+        gradient_of(means, quats, log_scales, logit_opacity, filter_variance, camera, moments, weights[v], near_plane,
+                    screen_variance, compensate, degree, stride, at, g + v);
+        for (uint k = 0; k < 2; k++)
+            VSTORE((g[v].touched ? g[v].mean2d[k] : (VF)(0.0f)), grad_mean2d + k * stride + at);
     }
+    for (uint k = 0; k < 3; k++)
+        UPDATE(means, k, means[k]);
+    for (uint k = 0; k < 4; k++)
+        UPDATE(quats, k, quats[k]);
+    for (uint k = 0; k < 3; k++)
+        UPDATE(log_scales, k, log_scales[k]);
+    UPDATE(logit_opacity, 0, logit_opacity);
+    for (uint channel = 0; channel < 3; channel++)
+        UPDATE(sh_base, channel, basis[0] * g[v].colour[channel]);
+    for (uint k = 1; k < (degree + 1) * (degree + 1); k++)
+        for (uint channel = 0; channel < 3; channel++)
+            UPDATE(sh_rest, (k - 1) * 3 + channel, basis[k] * g[v].colour[channel]);
 }

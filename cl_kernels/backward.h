@@ -81,17 +81,6 @@ static inline void shape_backward(const shape_t *s, __constant camera_t *camera,
     grad_mean2d[1] = gv;
 }
 
-/* The weight of each basis function in the derivative by direction: c_k . g. */
-static inline void weigh_band(const uint first, const uint last, const VF *grad_colour,
-                              __global const float *sh_rest, const uint stride, const uint i, VF *weights)
-{
-    for (uint k = first; k < last; k++) {
-        weights[k] = (VF)(0.0f);
-        for (uint channel = 0; channel < 3; channel++)
-            weights[k] += VLOAD(sh_rest + ((k - 1) * 3 + channel) * stride + i) * grad_colour[channel];
-    }
-}
-
 /* Gradients of everything but the coefficients of harmonics: those are basis[k] * colour[channel]. */
 typedef struct {
     VI touched;      // the Gaussian was drawn; where not, all gradients are zero, whatever stands here
@@ -100,49 +89,65 @@ typedef struct {
     VF basis[16], colour[3];
 } gradient_t;
 
-static inline gradient_t gradient_of(
-    __global const float *means,            // [3,S] scene units
-    __global const float *quats,            // [4,S] unnormalised
-    __global const float *log_scales,       // [3,S] log of scene units
-    __global const float *logit_opacity,    // [S]
-    __global const float *sh_rest,          // [(K-1)*3,S] coefficient-major
-    __global const float *filter_variance,  // [S] scene units^2
-    __constant camera_t *camera,            // [1]
-    __global const float *splats,           // [N,RECORD] see splat.h
-    __global const float *moments,          // [MOMENTS,S] see splat.h
-    const float near_plane, const float screen_variance, const float compensate, const uint degree,
-    const uint stride, const uint count, const uint i)
+/* Which Gaussians were drawn, and the gradients of their colours. */
+static inline void colour_backward(
+    __global const float *splats,   // [N,RECORD] see splat.h
+    __global const float *moments,  // [MOMENTS,S] see splat.h
+    const uint stride, const uint count, const uint i, gradient_t *g)
 {
-    const shape_t s = shape_of(means, quats, log_scales, filter_variance, camera, near_plane, screen_variance,
-                               compensate, stride, i);
-    gradient_t g;
-    VF m[MOMENTS];
     float table[4][LANES];
     for (uint lane = 0; lane < LANES; lane++)
         for (uint k = 0; k < 4; k++)
             table[k][lane] = i + lane < count ? splats[(size_t)(i + lane) * RECORD + SPLAT_OPACITY + k] : 0.0f;
-    g.touched = VLOAD(table[0]) > 0.0f;  // culled records are all zero
+    g->touched = VLOAD(table[0]) > 0.0f;  // culled records are all zero
+    for (uint channel = 0; channel < 3; channel++)  // max(0, .) passes no gradient where it clamped
+        g->colour[channel] = VLOAD(table[1 + channel]) > 0.0f
+                                 ? VLOAD(moments + (MOMENT_RED + channel) * stride + i) : (VF)(0.0f);
+}
+
+/* The weight of each basis function in the derivative by direction, c_k . g, for a block of vectors: plane by plane, so
+ * that memory is read in runs. */
+static inline void weigh_harmonics(
+    __global const float *sh_rest,  // [(K-1)*3,S] coefficient-major
+    const gradient_t *g, const uint vectors, const uint degree, const uint stride, const uint i, VF (*weights)[16])
+{
+    for (uint k = 1; k < (degree + 1) * (degree + 1); k++) {
+        for (uint v = 0; v < vectors; v++)
+            weights[v][k] = (VF)(0.0f);
+        for (uint channel = 0; channel < 3; channel++)
+            for (uint v = 0; v < vectors; v++)
+                weights[v][k] += VLOAD(sh_rest + ((k - 1) * 3 + channel) * stride + i + v * LANES) *
+                                 g[v].colour[channel];
+    }
+}
+
+/* The rest of a gradient whose colours and weights of harmonics are known. */
+static inline void gradient_of(
+    __global const float *means,            // [3,S] scene units
+    __global const float *quats,            // [4,S] unnormalised
+    __global const float *log_scales,       // [3,S] log of scene units
+    __global const float *logit_opacity,    // [S]
+    __global const float *filter_variance,  // [S] scene units^2
+    __constant camera_t *camera,            // [1]
+    __global const float *moments,          // [MOMENTS,S] see splat.h
+    const VF *weights,                      // [16]
+    const float near_plane, const float screen_variance, const float compensate, const uint degree,
+    const uint stride, const uint i, gradient_t *g)
+{
+    const shape_t s = shape_of(means, quats, log_scales, filter_variance, camera, near_plane, screen_variance,
+                               compensate, stride, i);
+    VF m[MOMENTS];
     for (uint k = 0; k < MOMENTS; k++)
         m[k] = VLOAD(moments + k * stride + i);
-    for (uint channel = 0; channel < 3; channel++)  // max(0, .) passes no gradient where it clamped
-        g.colour[channel] = VLOAD(table[1 + channel]) > 0.0f ? m[MOMENT_RED + channel] : (VF)(0.0f);
-
-    shape_backward(&s, camera, m, compensate, g.mean2d, g.means, g.quats, g.log_scales);
-    VF d[3], weights[16], gd[3] = {0.0f, 0.0f, 0.0f};
+    shape_backward(&s, camera, m, compensate, g->mean2d, g->means, g->quats, g->log_scales);
+    VF d[3], gd[3] = {0.0f, 0.0f, 0.0f};
     const VF inverse_distance = view_direction(means, camera, stride, i, d);
-    harmonics_basis(degree, d[0], d[1], d[2], g.basis);
-    if (degree > 0)
-        weigh_band(1, 4, g.colour, sh_rest, stride, i, weights);
-    if (degree > 1)
-        weigh_band(4, 9, g.colour, sh_rest, stride, i, weights);
-    if (degree > 2)
-        weigh_band(9, 16, g.colour, sh_rest, stride, i, weights);
+    harmonics_basis(degree, d[0], d[1], d[2], g->basis);
     harmonics_direction_gradient(degree, d[0], d[1], d[2], weights, gd, gd + 1, gd + 2);
     const VF along = d[0] * gd[0] + d[1] * gd[1] + d[2] * gd[2];
     for (uint k = 0; k < 3; k++)
-        g.means[k] += (gd[k] - d[k] * along) * inverse_distance;
-    g.logit_opacity = m[MOMENT_POWER] * (1.0f - sigmoid(VLOAD(logit_opacity + i)));
-    return g;
+        g->means[k] += (gd[k] - d[k] * along) * inverse_distance;
+    g->logit_opacity = m[MOMENT_POWER] * (1.0f - sigmoid(VLOAD(logit_opacity + i)));
 }
 
 #endif

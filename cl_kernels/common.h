@@ -9,6 +9,9 @@
 #ifndef LANES
 #define LANES 16  // Gaussians or pixels per item: 16 or 8 on CPUs, 1 on GPUs
 #endif
+#ifndef VECTORS
+#define VECTORS 1  // vectors of LANES Gaussians that one item updates together: 4 on CPUs
+#endif
 #ifndef GROUP
 #define GROUP 64  // items per work-group of one-dimensional kernels
 #endif

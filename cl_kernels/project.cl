@@ -141,8 +141,12 @@ void project_backward(
     const uint i = get_global_id(0) * LANES;
     if (i >= count)
         return;
-    const gradient_t g = gradient_of(means, quats, log_scales, logit_opacity, sh_rest, filter_variance, camera, splats,
-                                     moments, near_plane, screen_variance, compensate, degree, stride, count, i);
+    gradient_t g;
+    VF weights[1][16];
+    colour_backward(splats, moments, stride, count, i, &g);
+    weigh_harmonics(sh_rest, &g, 1, degree, stride, i, weights);
+    gradient_of(means, quats, log_scales, logit_opacity, filter_variance, camera, moments, weights[0], near_plane,
+                screen_variance, compensate, degree, stride, i, &g);
     store_planes(grad_means, g.means, g.touched, 3, stride, i);
     store_planes(grad_quats, g.quats, g.touched, 4, stride, i);
     store_planes(grad_log_scales, g.log_scales, g.touched, 3, stride, i);

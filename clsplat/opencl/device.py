@@ -292,9 +292,17 @@ def resolve_schedule(info: DeviceInfo, schedule: Schedule) -> Literal["wide", "s
 def _tuning(info: DeviceInfo, schedule: Literal["wide", "simt"]) -> dict[str, int | str]:
     """The -D values that fit kernels to a device; their meaning stands in cl_kernels/common.h."""
     if schedule == "wide":
-        return {"LANES": 16 if info.float_width >= 16 else 8, "GROUP": 16, "TEAM": 1, "DIGIT_BITS": 11, "TILE": 16}
+        return {
+            "LANES": 16 if info.float_width >= 16 else 8,
+            "VECTORS": 4,
+            "GROUP": 16,
+            "TEAM": 1,
+            "DIGIT_BITS": 11,
+            "TILE": 16,
+        }
     return {
         "LANES": 1,
+        "VECTORS": 1,
         "GROUP": 64,
         "TEAM": 64,
         "DIGIT_BITS": 4,

@@ -51,6 +51,7 @@ class Adam:
         self.updates = dict.fromkeys(PARAMETERS, 0)
         self._program = gaussians.device.program("adam.cl")
         self._lanes = int(gaussians.device.tuning["LANES"])
+        self._vectors = int(gaussians.device.tuning["VECTORS"])
         self._beta1, self._beta2 = constants("adam.h")["BETA1"], constants("adam.h")["BETA2"]
         for name in PARAMETERS:
             for moment in self._moments(name):
@@ -70,7 +71,7 @@ class Adam:
             arguments |= {f"{name}_moment1": gaussians[moment1], f"{name}_moment2": gaussians[moment2]}
             arguments |= {f"{name}_rate": rate, f"{name}_correction2": correction2}
         self._program.update_gaussians(
-            items=-(-gaussians.count // self._lanes),
+            items=-(-gaussians.count // (self._lanes * self._vectors)),
             **shape_arguments(model, frame.camera),
             **arguments,
             splats=frame.splats,
