@@ -88,7 +88,7 @@ def test_another_scene_or_size_is_another_table(make_run, tiny_scene, tmp_path):
     assert list(comparison.scenes) == ["tiny", "second", "tiny at 1/2"]
     assert len(comparison.variants) == 1, "the scene does not make a variant"
     page = page_of(tmp_path, one, two, half)
-    assert "Mean of 3 scenes" in page
+    assert "Mean of 3 scenes</h2><p class=sub>test views, at the size trained on" in page
     assert "<td>30.00" in page[: page.index("<h2>tiny</h2>")]
     assert page.count("<p class=note>no crops: ") == 1, "only the run without renders has none"
 

@@ -103,7 +103,7 @@ def over_scenes(comparison: Comparison) -> str:
         f"<tr><td>{label(rows[0].variant)}{''.join(c[i] for c in columns)}" for i, rows in enumerate(complete)
     )
     return (
-        f"<h2>Mean of {len(scenes)} scenes</h2><p class=sub>test views, full size</p>"
+        f"<h2>Mean of {len(scenes)} scenes</h2><p class=sub>test views, at the size trained on</p>"
         f"<div class=wide><table class=data><tr><th>run{head}{body}</table></div>"
     )
 
