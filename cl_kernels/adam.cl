@@ -40,7 +40,7 @@ static inline void update_plane(__global float *values, __global float *moment1,
 #define UPDATE(table, plane, member)                                                                          \
     do {                                                                                                      \
         const uint at = (plane) * stride + i;                                                                 \
-        VF gradient[VECTORS];                                                                                   \
+        VF gradient[VECTORS];                                                                                 \
         for (uint v = 0; v < vectors; v++)                                                                    \
             gradient[v] = g[v].member;                                                                        \
         update_plane(table + at, table##_moment1 + at, table##_moment2 + at, gradient, g, vectors,            \
