@@ -3,7 +3,7 @@
 #include "splat.h"
 
 #define COLUMNS (TILE / LANES)  // vectors per tile row
-#define SEGMENT 128             // splats of a tile copied together, so that its rows read them from the nearest cache
+#define SEGMENT 128             // splats of a tile copied together: their waits for memory overlap, rows read the nearest cache
 
 static inline VF pixel_centres(const uint tile_x, const uint column)
 {
@@ -104,8 +104,31 @@ static inline void store_record(const moments_t m, __global float *record)
     vstore16(sums, 0, record);
 }
 
+/* Walk one splat over the rows of its tile that it reaches, whole pairs of rows. */
+static inline moments_t moments_of(const float *splat, const uint tile_x, const uint tile_y,
+                                   grad_pixels_t (*pixels)[COLUMNS])
+{
+    const VF zero = (VF)(0.0f);
+    moments_t moments = {zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero};
+    const float top = tile_y * TILE + 0.5f;
+    const float low = splat[SPLAT_Y_MIN] - top, high = splat[SPLAT_Y_MAX] - top;
+    const uint y_first = low > 0.0f ? (uint)low : 0u;
+    const uint y_end = high < TILE - 1.0f ? (uint)(high + 1.0f) : TILE;
+    const uint y_begin = y_first - (y_end == TILE ? (y_end - y_first) & 1u : 0u);
+    for (uint y = y_begin; y < y_end; y += 2) {
+        const row_splat_t upper = splat_at_row(splat, top + y), lower = splat_at_row(splat, top + y + 1.0f);
+        for (uint column = 0; column < COLUMNS; column++) {
+            const VF pixel = pixel_centres(tile_x, column);
+            blend_backward_step(&pixels[y][column], upper, pixel, splat + SPLAT_RED, &moments);
+            blend_backward_step(&pixels[y + 1][column], lower, pixel, splat + SPLAT_RED, &moments);
+        }
+    }
+    return moments;
+}
+
 /* Splats outside, rows inside: a splat's record is summed in registers and written once, at the pair's address; pairs
- * that no pixel reached get zeros.  Private memory: TILE * TILE * 20 bytes.  Deterministic. */
+ * that no pixel reached get zeros.  Private memory: SEGMENT * 68 bytes of splats and TILE * TILE * 20 of pixels.
+ * Deterministic. */
 __kernel __attribute__((reqd_work_group_size(1, 1, 1)))
 void blend_backward(
     __global const uint *restrict tile_offset,  // [T+1]
@@ -141,26 +164,18 @@ void blend_backward(
         }
 
     const uint end = tile_offset[tile + 1], last = tile_last[tile];
-    const float top = tile_y * TILE + 0.5f;
-    for (uint j = tile_offset[tile]; j < last; j++) {
-        const uint pair = tile_pairs[j];
-        float splat[RECORD];
-        vstore16(vload16(pair_splat[pair], splats), 0, splat);
-        const VF zero = (VF)(0.0f);
-        moments_t moments = {zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero};
-        const float low = splat[SPLAT_Y_MIN] - top, high = splat[SPLAT_Y_MAX] - top;
-        const uint y_first = low > 0.0f ? (uint)low : 0u;
-        const uint y_end = high < TILE - 1.0f ? (uint)(high + 1.0f) : TILE;
-        const uint y_begin = y_first - (y_end == TILE ? (y_end - y_first) & 1u : 0u);  // whole pairs of rows
-        for (uint y = y_begin; y < y_end; y += 2) {
-            const row_splat_t upper = splat_at_row(splat, top + y), lower = splat_at_row(splat, top + y + 1.0f);
-            for (uint column = 0; column < COLUMNS; column++) {
-                const VF pixel = pixel_centres(tile_x, column);
-                blend_backward_step(&pixels[y][column], upper, pixel, splat + SPLAT_RED, &moments);
-                blend_backward_step(&pixels[y + 1][column], lower, pixel, splat + SPLAT_RED, &moments);
-            }
+    for (uint begin = tile_offset[tile]; begin < last; begin += SEGMENT) {
+        const uint length = last - begin < SEGMENT ? last - begin : SEGMENT;
+        float segment[SEGMENT][RECORD];
+        uint pairs[SEGMENT];
+        for (uint j = 0; j < length; j++) {  // together, so that their waits for memory overlap
+            pairs[j] = tile_pairs[begin + j];
+            vstore16(vload16(pair_splat[pairs[j]], splats), 0, segment[j]);
         }
-        store_record(moments, pair_moments + (size_t)pair * RECORD);
+        for (uint j = 0; j < length; j++) {
+            const moments_t moments = moments_of(segment[j], tile_x, tile_y, pixels);
+            store_record(moments, pair_moments + (size_t)pairs[j] * RECORD);
+        }
     }
     for (uint j = last; j < end; j++)
         vstore16((float16)(0.0f), tile_pairs[j], pair_moments);
