@@ -3,7 +3,7 @@
 #include "splat.h"
 
 #define COLUMNS (TILE / LANES)  // vectors per tile row
-#define SEGMENT 128             // splats of a tile copied together: their waits for memory overlap, rows read the nearest cache
+#define SEGMENT 128             // splats of a tile fetched together: memory is waited for once, rows read the cache
 
 static inline VF pixel_centres(const uint tile_x, const uint column)
 {
