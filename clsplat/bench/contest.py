@@ -14,7 +14,8 @@ from clsplat.gaussians.ply import Parameters
 from clsplat.opencl.device import Device
 from clsplat.render.renderer import RECORD, Frame, Renderer
 from clsplat.training.adam import Adam, Rates
-from clsplat.training.density import Measures, PruneLarge, densify
+from clsplat.training.basic_rules import PruneLarge
+from clsplat.training.density import Measures, densify
 from clsplat.training.losses import L1, Dssim
 from clsplat.training.memory import plan
 from clsplat.training.profile import stage_milliseconds

@@ -9,7 +9,6 @@ import math
 import os
 import warnings
 import weakref
-from collections import defaultdict
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -18,6 +17,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from clsplat.errors import ConfigError, DeviceError, MemoryLimitError
 from clsplat.opencl import runtimes
+from clsplat.opencl.timings import Timings
 
 runtimes.add_intel_runtime()
 import pyopencl as cl  # noqa: E402
@@ -254,30 +254,6 @@ class Device:
 def _whole_lines(size: int) -> int:
     """Bytes rounded up to 64, at least as many: vectors may run past the last value, and no buffer may be empty."""
     return max(64, -(-size // 64) * 64)
-
-
-class Timings:
-    """Time on the device by kernel, from profiling events, while `sampling`.
-
-    Events are dropped as soon as they are read: some drivers slow down when many are alive.
-    """
-
-    def __init__(self) -> None:
-        self.sampling = False
-        self._events: list[tuple[str, Any]] = []
-
-    def add(self, name: str, event: Any) -> None:
-        if self.sampling:
-            self._events.append((name, event))
-
-    def take(self) -> dict[str, list[float]]:
-        """Return the seconds of every launch by kernel since the last call; waits for the launches."""
-        seconds: dict[str, list[float]] = defaultdict(list)
-        for name, event in self._events:
-            event.wait()
-            seconds[name].append((event.profile.end - event.profile.start) * 1e-9)
-        self._events.clear()
-        return seconds
 
 
 def resolve_schedule(info: DeviceInfo, schedule: Schedule) -> Literal["wide", "simt"]:

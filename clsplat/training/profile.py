@@ -2,7 +2,7 @@
 
 from collections import defaultdict
 
-from clsplat.opencl.device import Timings
+from clsplat.opencl.timings import Timings
 
 STAGES = {
     "project_forward": "project",

@@ -4,7 +4,8 @@ from typing import Annotated
 
 from pydantic import Field
 
-from clsplat.training.density import Clone, PruneFaint, PruneLarge, Rule, Split
+from clsplat.training.basic_rules import Clone, PruneFaint, PruneLarge, Split
+from clsplat.training.density import Rule
 from clsplat.training.detail_rules import SplitOversized, SplitTextured
 from clsplat.training.thinning_rules import MergeNeighbours, PruneUnimportant
 

@@ -7,7 +7,8 @@ from clsplat.gaussians.model import PARAMETERS, Gaussians
 from clsplat.opencl.device import Device
 from clsplat.render.renderer import Renderer
 from clsplat.training.adam import Adam
-from clsplat.training.density import Clone, Measures, PruneFaint, PruneLarge, Split, cap_opacity, densify
+from clsplat.training.basic_rules import Clone, PruneFaint, PruneLarge, Split
+from clsplat.training.density import Measures, cap_opacity, densify
 from clsplat.training.statistics import SEEN, SplatStats
 from tests import reference as ref
 from tests import reference_loss as ref_loss

@@ -6,7 +6,8 @@ import pytest
 from clsplat.gaussians.model import INTERVAL2
 from clsplat.render.renderer import Renderer
 from clsplat.training.adam import Adam
-from clsplat.training.density import Clone, Measures, PruneFaint, densify
+from clsplat.training.basic_rules import Clone, PruneFaint
+from clsplat.training.density import Measures, densify
 from clsplat.training.detail_rules import SplitOversized, SplitTextured, largest
 from clsplat.training.statistics import SEEN, SplatStats
 from clsplat.training.thinning_rules import MergeNeighbours, PruneUnimportant, covariance_of, mass_of, merged

@@ -7,7 +7,8 @@ import pytest
 
 from clsplat.opencl.device import Device
 from clsplat.render.renderer import MOMENTS, Renderer
-from clsplat.training.density import Clone, Measures, PruneFaint, Split, densify
+from clsplat.training.basic_rules import Clone, PruneFaint, Split
+from clsplat.training.density import Measures, densify
 from clsplat.training.statistics import ABS_X, SEEN, WEIGHT, SplatStats
 from clsplat.training.step import Differentiated
 from tests import reference_blend as ref_blend

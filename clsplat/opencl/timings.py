@@ -1,0 +1,28 @@
+"""Where the device's time goes."""
+
+from collections import defaultdict
+from typing import Any
+
+
+class Timings:
+    """Time on the device by kernel, from profiling events, while `sampling`.
+
+    Events are dropped as soon as they are read: some drivers slow down when many are alive.
+    """
+
+    def __init__(self) -> None:
+        self.sampling = False
+        self._events: list[tuple[str, Any]] = []
+
+    def add(self, name: str, event: Any) -> None:
+        if self.sampling:
+            self._events.append((name, event))
+
+    def take(self) -> dict[str, list[float]]:
+        """Return the seconds of every launch by kernel since the last call; waits for the launches."""
+        seconds: dict[str, list[float]] = defaultdict(list)
+        for name, event in self._events:
+            event.wait()
+            seconds[name].append((event.profile.end - event.profile.start) * 1e-9)
+        self._events.clear()
+        return seconds

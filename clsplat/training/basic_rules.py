@@ -1,0 +1,79 @@
+"""The rules of adaptive density control: clone, split and prune (Kerbl et al. 2023, section 5)."""
+
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
+
+from clsplat.training.density import Edit, Positive, Rule
+from clsplat.training.statistics import StatisticName
+
+
+class Grow(Rule):
+    """What rules have in common that act where the mean of a statistic is large.
+
+    With `as_many_as` the threshold is not `gradient_above` itself but the value that as many Gaussians reach in
+    `statistic` as reach `gradient_above` in that other one (Gaussian Opacity Fields, Yu et al. 2024).
+    """
+
+    statistic: StatisticName = "screen_grad"
+    gradient_above: Positive = 2.0e-4  # mean over views, at least
+    as_many_as: StatisticName | None = None
+
+    @property
+    def statistics(self) -> set[str]:
+        return {self.statistic, self.as_many_as or self.statistic}
+
+    def condition(self, edit: Edit) -> dict[str, Any]:
+        """The rule's part of Edit.mark."""
+        above = self.gradient_above
+        if self.as_many_as:
+            above = edit.matching(self.statistic, self.as_many_as, above)
+        return {"statistic": self.statistic, "gradient_above": above}
+
+
+class Clone(Grow):
+    """Copy small Gaussians whose statistic is large; the copy starts at the same place."""
+
+    type: Literal["clone"] = "clone"
+    size_below: Positive = 0.01
+
+    def mark(self, edit: Edit) -> None:
+        edit.mark(copies=2, kept=1, size_below=self.size_below, **self.condition(edit))
+
+
+class Split(Grow):
+    """Replace large Gaussians whose statistic is large by smaller ones, drawn from their own distribution."""
+
+    type: Literal["split"] = "split"
+    size_above: Positive = 0.01
+    children: Annotated[int, Field(ge=2, le=8)] = 2
+    shrink: Annotated[float, Field(ge=1)] = 1.6  # children's scales are divided by this
+
+    def mark(self, edit: Edit) -> None:
+        edit.mark(
+            copies=self.children,
+            kept=0,
+            shrink=1.0 / self.shrink,
+            size_above=self.size_above,
+            **self.condition(edit),
+        )
+
+
+class PruneFaint(Rule):
+    """Remove Gaussians that are almost transparent."""
+
+    type: Literal["prune_faint"] = "prune_faint"
+    opacity_below: Positive = 0.005
+
+    def mark(self, edit: Edit) -> None:
+        edit.mark(copies=0, kept=0, opacity_below=self.opacity_below)
+
+
+class PruneLarge(Rule):
+    """Remove Gaussians that are large in the scene."""
+
+    type: Literal["prune_large"] = "prune_large"
+    size_above: Positive = 0.1
+
+    def mark(self, edit: Edit) -> None:
+        edit.mark(copies=0, kept=0, size_above=self.size_above)
