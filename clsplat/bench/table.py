@@ -1,10 +1,14 @@
 """The figures as text, and the growth of costs as a picture."""
 
+import statistics
 from collections.abc import Sequence
 from typing import Any
 
 from clsplat.bench.contest import Result
 from clsplat.pages.svg import Line, curve
+
+STANDALONE = 'xmlns="http://www.w3.org/2000/svg" width="460" height="220"'
+STYLE = "<style>text{font:11px sans-serif;fill:#4a5568}.grid{stroke:#e2e8f0}</style>"
 
 
 def table(name: str, result: Result, earlier: dict[str, Any] | None) -> str:
@@ -45,4 +49,7 @@ def growth_table(results: Sequence[Result]) -> str:
 def growth_chart(results: Sequence[Result]) -> str:
     """Milliseconds of a step over Gaussians + pairs, as SVG."""
     points = [((r.work.gaussians + r.work.pairs) / 1e6, r.step) for r in results]
-    return curve("ms per step over millions of Gaussians + pairs", [Line(points)])
+    slope, most = statistics.median(y / x for x, y in points), max(x for x, _ in points)
+    lines = [Line(points, "measured"), Line([(0, 0), (most, slope * most)], "in proportion")]
+    drawing = curve("ms per step over millions of Gaussians + pairs", lines)
+    return drawing.replace("<svg", f"<svg {STANDALONE}", 1).replace("</svg>", f"{STYLE}</svg>")
