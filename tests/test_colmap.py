@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from clsplat.scene.colmap import read_colmap
 from clsplat.scene.colmap_files import MODELS, PARAMETERS, read_cameras, read_images, read_points
 from clsplat.scene.detect import read_scene
+from clsplat.scene.images import load_image
 from clsplat.scene.scene import Camera, Scene
 from tests.colmap_writer import (
     PINHOLE,
@@ -26,7 +27,6 @@ from tests.colmap_writer import (
     write_scene,
 )
 from tests.data_sets import data_set
-from tests.refusals import refusal
 
 SCENES = ["fox", "fox_peers", "kitchen", "lund", "brighton"]
 STATUES = [f"colmap_models/statue_{model}" for model in ("PINHOLE", "SIMPLE_RADIAL", "OPENCV", "OPENCV_FISHEYE")]
@@ -90,11 +90,12 @@ def test_every_camera_model_equals_pycolmap(name: str, kind: str) -> None:
     assert_same_points(folder, reconstruction)
 
 
-@pytest.mark.parametrize("name", [*STATUES[1:], "fox_opencv"])
-def test_distorted_real_cameras_are_refused(name: str) -> None:
-    message = refusal(read_colmap, data_set(name))
-    assert "camera 1" in message
-    assert "image_undistorter" in message
+def test_distorted_real_photographs_are_straightened() -> None:
+    scene, undistorted = read_colmap(data_set("fox_opencv")), read_colmap(data_set("fox"))
+    assert all(view.lens and view.lens.model == "OPENCV" for view in scene.views)
+    view = scene.views[3]
+    assert load_image(view).shape == (view.camera.height, view.camera.width, 3)
+    assert abs(view.camera.width - undistorted.views[3].camera.width) < 20
 
 
 def test_every_camera_model_is_known() -> None:

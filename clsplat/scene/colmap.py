@@ -17,20 +17,19 @@ from clsplat.scene.colmap_files import (
     read_points,
 )
 from clsplat.scene.images import inside, require_files
+from clsplat.scene.lens import MODELS, Lens
 from clsplat.scene.points import FAR
-from clsplat.scene.scene import Camera, Floats, Scene, View, every_nth, make_scene
+from clsplat.scene.scene import Floats, Scene, View, every_nth, make_scene
 
 logger = logging.getLogger("clsplat")
-
-# Those that are a pinhole once all after the principal point is zero, with the number of focal lengths.
-FOCALS = {"SIMPLE_PINHOLE": 1, "PINHOLE": 2, "SIMPLE_RADIAL": 1, "RADIAL": 1, "OPENCV": 2, "FULL_OPENCV": 2}
 
 
 def read_colmap(path: Path, holdout: int = 8) -> Scene:
     """Read a COLMAP scene: models in `sparse/N`, `sparse` or `path` itself, photographs in `images`.
 
     Of several models the one with most images is taken.  Every `holdout`-th view by name is for testing.
-    Raises DataError when a file is missing, damaged or not supported, such as a camera with distortion.
+    Photographs of cameras with distortion are straightened as they are read.  Raises DataError when a file is missing,
+    damaged or not supported.
     """
     model, images = _largest_model(path)
     cameras = read_cameras(model)
@@ -76,8 +75,10 @@ def _view(image: ImageRecord, cameras: dict[int, CameraRecord], folder: Path) ->
             f"{image.translation}; expected finite numbers and a rotation: remove that image or {MEND}"
         )
     pose = np.column_stack([_rotation(image.quaternion), image.translation])
-    camera = _pinhole(image.camera, cameras[image.camera])
-    return View(image.name, camera, pose, image_path)
+    lens = _lens(image.camera, cameras[image.camera])
+    if lens.distorts:
+        return View(image.name, lens.pinhole, pose, image_path, lens=lens)
+    return View(image.name, lens.camera, pose, image_path)
 
 
 def _rotation(quaternion: tuple[float, ...]) -> Floats:
@@ -93,18 +94,18 @@ def _rotation(quaternion: tuple[float, ...]) -> Floats:
     )
 
 
-def _pinhole(number: int, camera: CameraRecord) -> Camera:
-    """Return a camera without distortion.  Raises DataError for any other, and for senseless numbers."""
-    focals = FOCALS.get(camera.model)
-    if focals is None or any(camera.params[focals + 2 :]):
+def _lens(number: int, camera: CameraRecord) -> Lens:
+    """Check a camera.  Raises DataError for models that are not supported, and for senseless numbers."""
+    if camera.model not in MODELS:
         raise DataError(
-            f"{camera.where}: camera {number} is {camera.model}, with lens distortion; expected PINHOLE or "
-            "SIMPLE_PINHOLE: undistort the images first with `colmap image_undistorter`"
+            f"{camera.where}: camera {number} is {camera.model}; expected one of {', '.join(MODELS)}: "
+            "undistort the images first with `colmap image_undistorter`"
         )
-    fx, fy, (cx, cy) = camera.params[0], camera.params[focals - 1], camera.params[focals : focals + 2]
-    if min(camera.width, camera.height, fx, fy) <= 0 or not np.isfinite([fx, fy, cx, cy]).all():
+    if min(camera.width, camera.height, *camera.params[: MODELS[camera.model][0]]) <= 0 or not all(
+        abs(value) < FAR for value in camera.params
+    ):
         raise DataError(
             f"{camera.where}: camera {number} is {camera.width}x{camera.height} with parameters {camera.params[:4]}; "
             f"expected a positive size and focal length and finite numbers: {MEND}"
         )
-    return Camera(camera.width, camera.height, fx, fy, cx, cy)
+    return Lens(camera.width, camera.height, camera.model, camera.params)

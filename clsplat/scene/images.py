@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from clsplat.errors import DataError
 from clsplat.files import atomic
+from clsplat.scene.lens import Lens
 from clsplat.scene.scene import View
 
 BLACK = (0.0, 0.0, 0.0)
@@ -23,6 +24,8 @@ def load_image(view: View, background: tuple[float, float, float] | None = None)
     16-bit image, or when it is not the camera's image before downscaling.
     """
     pixels = read_image(view.image_path)
+    if view.lens:
+        pixels = _straightened(pixels, view.lens, view.image_path)
     width, height = view.camera.width, view.camera.height
     file_height, file_width = pixels.shape[:2]
     if not _scales_to((file_width, file_height), (width, height)):
@@ -45,6 +48,17 @@ def load_image(view: View, background: tuple[float, float, float] | None = None)
     composite = colour * alpha + np.array(background or BLACK) * (1 - alpha)
     slack = 1e-3 if resized else 0.0  # OpenCV's area weights are single precision: no level may be lost to them
     return np.asarray(composite * 255 + slack, np.uint8)  # truncated: so does the reference (Kerbl et al. 2023)
+
+
+def _straightened(pixels: NDArray[Any], lens: Lens, path: Path) -> NDArray[Any]:
+    """The photograph without the lens's distortion.  Raises DataError when it is not as large as the lens says."""
+    height, width = pixels.shape[:2]
+    if (width, height) != (lens.width, lens.height):
+        raise DataError(
+            f"{path}: the image is {width}x{height} pixels, its {lens.model} camera {lens.width}x{lens.height}; "
+            "expected the same size: use the images the cameras were made from"
+        )
+    return lens.undistort(pixels)
 
 
 def write_image(path: Path, rgb: NDArray[np.uint8]) -> None:

@@ -16,32 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.errors import DataError
+from clsplat.scene.camera import Camera as Camera
+from clsplat.scene.lens import Lens
 
 Floats = NDArray[np.floating]
 Background = Literal["black", "white"]
-
-
-@dataclass(frozen=True)
-class Camera:
-    """A pinhole camera: image size, focal lengths and principal point, in pixels."""
-
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-
-    def resized(self, width: int, height: int) -> "Camera":
-        """Return the camera of the same photograph resampled to another size."""
-        sx, sy = width / self.width, height / self.height
-        return Camera(width, height, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy)
-
-    def downscaled(self, factor: float) -> "Camera":
-        """Return the camera after dividing the image size by `factor`, rounded to whole pixels."""
-        if factor == 1:
-            return self
-        return self.resized(max(1, round(self.width / factor)), max(1, round(self.height / factor)))
 
 
 @dataclass(frozen=True)
@@ -53,6 +32,7 @@ class View:
     world_to_camera: Floats  # [3, 4] float64
     image_path: Path
     mask_path: Path | None = None
+    lens: Lens | None = None  # of the photograph on disk, where it is not `camera`'s pinhole
     scale: float = 1  # by what the original photograph's size was divided
 
     @property

@@ -9,12 +9,17 @@ import numpy as np
 
 from clsplat.errors import DataError
 from clsplat.scene.images import image_size, inside, read_file, require_files
+from clsplat.scene.lens import Lens
 from clsplat.scene.points import FAR, read_points_ply
 from clsplat.scene.scene import Camera, Floats, PointCloud, View
 
-# A camera of these is a pinhole when all of its distortion is zero.
-LENSES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "FULL_OPENCV", "RADIAL", "SIMPLE_RADIAL")
-DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+LENSES = {  # what parameters a camera_model has, in COLMAP's order
+    **dict.fromkeys(("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"), DISTORTION[:4]),
+    "FULL_OPENCV": DISTORTION,
+    "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
+}
+COLMAP = {4: "OPENCV", 8: "FULL_OPENCV"}  # by the number of parameters
 
 
 class Frame:
@@ -60,18 +65,20 @@ class Transforms:
     def views(self) -> list[View]:
         """Return one view per frame, in the order of the file.
 
-        Images whose size the file does not tell are as large as the first.  Raises DataError for cameras with
-        distortion, damaged numbers, missing files and paths that leave the folder.
+        Images whose size the file does not tell are as large as the first; those of distorting lenses are straightened
+        as they are read.  Raises DataError for damaged numbers, missing files and paths that leave the folder.
         """
         images = [image_path_of(frame) for frame in self.frames]
         masks = [frame.file("mask_path") for frame in self.frames]
         require_files(self.path, [*images, *(mask for mask in masks if mask)])
         told = all(frame.number("w") and frame.number("h") for frame in self.frames)
         size = None if told else image_size(images[0])
-        return [
-            View(view_name(frame.values["file_path"]), camera_of(frame, size), pose_of(frame), image, mask)
-            for frame, image, mask in zip(self.frames, images, masks, strict=True)
-        ]
+        views = []
+        for frame, image, mask in zip(self.frames, images, masks, strict=True):
+            lens = lens_of(frame, camera_of(frame, size))
+            camera, bent = (lens.pinhole, lens) if lens.distorts else (lens.camera, None)
+            views.append(View(view_name(frame.values["file_path"]), camera, pose_of(frame), image, mask, bent))
+        return views
 
     def points(self) -> PointCloud | None:
         """Read `ply_file_path`, or else `points3d.ply` where that exists; None when there are no points."""
@@ -96,8 +103,7 @@ def image_path_of(frame: Frame) -> Path:
 
 
 def camera_of(frame: Frame, size: tuple[int, int] | None) -> Camera:
-    """Return the pinhole camera of a frame.  Raises DataError when it has distortion or no focal length."""
-    _refuse_distortion(frame)
+    """Return the camera of a frame without its distortion.  Raises DataError when it has no focal length."""
     default_width, default_height = size or (0, 0)
     width, height = int(frame.number("w") or default_width), int(frame.number("h") or default_height)
     fx, fy = _focal(frame, "fl_x", "camera_angle_x", width), _focal(frame, "fl_y", "camera_angle_y", height)
@@ -121,16 +127,20 @@ def _focal(frame: Frame, length_key: str, angle_key: str, pixels: int) -> float 
     return pixels / 2 / math.tan(angle / 2)
 
 
-def _refuse_distortion(frame: Frame) -> None:
-    faults = [key for key in DISTORTION if frame.number(key)]
-    lens = frame.values.get("camera_model", "PINHOLE")
-    if lens not in LENSES or frame.values.get("is_fisheye"):
-        faults.append(f"camera_model {lens!r}")
-    if faults:
+def lens_of(frame: Frame, camera: Camera) -> Lens:
+    """Return the lens of a frame: OpenCV's polynomial, rational or fisheye one.  Raises DataError for others."""
+    model = "OPENCV_FISHEYE" if frame.values.get("is_fisheye") else frame.values.get("camera_model", "OPENCV")
+    used = LENSES.get(model)
+    told = {key: frame.number(key) or 0.0 for key in DISTORTION}
+    surplus = [key for key, value in told.items() if value and key not in (used or DISTORTION)]
+    if used is None or surplus:
+        fault = f"camera_model {model!r}" + (f" with {', '.join(surplus)}" if surplus else "")
         raise DataError(
-            f"{frame.where}: the camera has lens distortion ({', '.join(faults)}); expected a pinhole: "
+            f"{frame.where}: {fault}; expected one of {', '.join(LENSES)} with its own parameters: "
             "undistort the images first, for example with `colmap image_undistorter`"
         )
+    params = (camera.fx, camera.fy, camera.cx, camera.cy, *(told[key] for key in used))
+    return Lens(camera.width, camera.height, "OPENCV_FISHEYE" if "FISHEYE" in model else COLMAP[len(used)], params)
 
 
 def pose_of(frame: Frame) -> Floats:

@@ -1,0 +1,176 @@
+"""Lenses that bend light: COLMAP's camera models, and the pinhole photographs that are made from theirs.
+
+Normalised coordinates are (x/z, y/z) of a point before the camera.  A lens moves them; focal lengths and principal
+point turn them into pixels.  Formulas are those of COLMAP's sources (sensor/models.h), which follow OpenCV's.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.errors import DataError
+from clsplat.scene.camera import Camera
+
+Floats = NDArray[np.float64]
+Distortion = Callable[[Floats, Floats, Sequence[float]], tuple[Floats, Floats]]
+BORDER = 200  # points along each edge of a photograph
+ROUNDS = 50  # of Newton's method
+EXACT = 1.0e-6  # normalised units
+
+
+def _radial(u: Floats, v: Floats, k: Sequence[float]) -> tuple[Floats, Floats]:
+    r2 = u * u + v * v
+    factor = 1 + sum(c * r2 ** (i + 1) for i, c in enumerate(k))
+    return u * factor, v * factor
+
+
+def _tangential(u: Floats, v: Floats, p1: float, p2: float) -> tuple[Floats, Floats]:
+    r2 = u * u + v * v
+    return 2 * p1 * u * v + p2 * (r2 + 2 * u * u), 2 * p2 * u * v + p1 * (r2 + 2 * v * v)
+
+
+def _opencv(u: Floats, v: Floats, k: Sequence[float]) -> tuple[Floats, Floats]:
+    (x, y), (dx, dy) = _radial(u, v, k[:2]), _tangential(u, v, k[2], k[3])
+    return x + dx, y + dy
+
+
+def _full_opencv(u: Floats, v: Floats, k: Sequence[float]) -> tuple[Floats, Floats]:
+    r2 = u * u + v * v
+    factor = (1 + k[0] * r2 + k[1] * r2**2 + k[4] * r2**3) / (1 + k[5] * r2 + k[6] * r2**2 + k[7] * r2**3)
+    dx, dy = _tangential(u, v, k[2], k[3])
+    return u * factor + dx, v * factor + dy
+
+
+def _fisheye(u: Floats, v: Floats, k: Sequence[float]) -> tuple[Floats, Floats]:
+    r = np.hypot(u, v)
+    theta = np.arctan(r)
+    bent = theta * (1 + sum(c * theta ** (2 * i + 2) for i, c in enumerate(k)))
+    factor = np.where(r > 1e-12, bent / np.maximum(r, 1e-12), 1.0)
+    return u * factor, v * factor
+
+
+def _thin_prism(u: Floats, v: Floats, k: Sequence[float]) -> tuple[Floats, Floats]:
+    u, v = _fisheye(u, v, ())
+    r2 = u * u + v * v
+    (x, y), (dx, dy) = _radial(u, v, (k[0], k[1], k[4], k[5])), _tangential(u, v, k[2], k[3])
+    return x + dx + k[6] * r2, y + dy + k[7] * r2
+
+
+def _fov(u: Floats, v: Floats, k: Sequence[float]) -> tuple[Floats, Floats]:
+    r, omega = np.hypot(u, v), k[0]
+    if abs(omega) < 1e-9:
+        return u, v
+    bent = np.arctan(2 * r * np.tan(omega / 2)) / omega
+    factor = np.where(r > 1e-12, bent / np.maximum(r, 1e-12), 2 * np.tan(omega / 2) / omega)
+    return u * factor, v * factor
+
+
+MODELS: dict[str, tuple[int, Distortion]] = {  # focal lengths, and what comes after the principal point
+    "SIMPLE_PINHOLE": (1, lambda u, v, k: (u, v)),
+    "PINHOLE": (2, lambda u, v, k: (u, v)),
+    "SIMPLE_RADIAL": (1, _radial),
+    "RADIAL": (1, _radial),
+    "OPENCV": (2, _opencv),
+    "FULL_OPENCV": (2, _full_opencv),
+    "FOV": (2, _fov),
+    "OPENCV_FISHEYE": (2, _fisheye),
+    "SIMPLE_RADIAL_FISHEYE": (1, _fisheye),
+    "RADIAL_FISHEYE": (1, _fisheye),
+    "THIN_PRISM_FISHEYE": (2, _thin_prism),
+}
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A camera as it took the photograph: size in pixels, a model of MODELS, its parameters in COLMAP's order."""
+
+    width: int
+    height: int
+    model: str
+    params: tuple[float, ...]
+
+    @property
+    def _split(self) -> tuple[float, float, float, float, tuple[float, ...]]:
+        focals = MODELS[self.model][0]
+        cx, cy = self.params[focals : focals + 2]
+        return self.params[0], self.params[focals - 1], cx, cy, self.params[focals + 2 :]
+
+    @property
+    def distorts(self) -> bool:
+        """Whether the lens does anything; a fisheye always does."""
+        return "FISHEYE" in self.model or any(self._split[4])
+
+    def bend(self, u: Floats, v: Floats) -> tuple[Floats, Floats]:
+        """Pixels of normalised coordinates."""
+        fx, fy, cx, cy, rest = self._split
+        x, y = MODELS[self.model][1](u, v, rest)
+        return fx * x + cx, fy * y + cy
+
+    def project(self, points: Floats) -> Floats:
+        """Pixels [M, 2] of points [M, 3] in camera space, in front of it."""
+        return np.stack(self.bend(points[:, 0] / points[:, 2], points[:, 1] / points[:, 2]), axis=1)
+
+    def unbend(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
+        """Normalised coordinates of pixels, by Newton's method; NaN where there are none."""
+        fx, fy, cx, cy, rest = self._split
+        distort = MODELS[self.model][1]
+        goal_u, goal_v = (x - cx) / fx, (y - cy) / fy
+        u, v = goal_u.copy(), goal_v.copy()
+        step = 1e-7
+        with np.errstate(all="ignore"):
+            for _ in range(ROUNDS):
+                a, b = distort(u, v, rest)
+                au, bu = distort(u + step, v, rest)
+                av, bv = distort(u, v + step, rest)
+                j00, j10, j01, j11 = (au - a) / step, (bu - b) / step, (av - a) / step, (bv - b) / step
+                det = j00 * j11 - j01 * j10
+                da, db = goal_u - a, goal_v - b
+                u, v = u + (j11 * da - j01 * db) / det, v + (j00 * db - j10 * da) / det
+            a, b = distort(u, v, rest)
+            good = (np.abs(a - goal_u) < EXACT) & (np.abs(b - goal_v) < EXACT)
+        return np.where(good, u, np.nan), np.where(good, v, np.nan)
+
+    @property
+    def camera(self) -> Camera:
+        """The camera without the distortion, at the photograph's own size."""
+        fx, fy, cx, cy, _ = self._split
+        return Camera(self.width, self.height, fx, fy, cx, cy)
+
+    @cached_property
+    def pinhole(self) -> Camera:
+        """The camera of the undistorted photograph: same focal lengths, the largest upright part without blank pixels.
+
+        Raises DataError when the lens leaves no such part.
+        """
+        fx, fy, _, _, _ = self._split
+        along_x, along_y = np.linspace(0, self.width, BORDER), np.linspace(0, self.height, BORDER)
+        left = self.unbend(np.zeros(BORDER), along_y)[0]
+        right = self.unbend(np.full(BORDER, float(self.width)), along_y)[0]
+        top = self.unbend(along_x, np.zeros(BORDER))[1]
+        bottom = self.unbend(along_x, np.full(BORDER, float(self.height)))[1]
+        if not all(np.isfinite(side).any() for side in (left, right, top, bottom)):
+            raise DataError(f"the lens {self.model} {self.params} cannot be inverted; calibrate the camera again")
+        u0, u1, v0, v1 = np.nanmax(left), np.nanmin(right), np.nanmax(top), np.nanmin(bottom)
+        width, height = int((u1 - u0) * fx), int((v1 - v0) * fy)
+        if min(width, height) < 1:
+            raise DataError(
+                f"the lens {self.model} {self.params} leaves nothing of its image; calibrate the camera again"
+            )
+        return Camera(width, height, fx, fy, float(-u0 * fx), float(-v0 * fy))
+
+    def undistort(self, pixels: NDArray[Any]) -> NDArray[Any]:
+        """The photograph as `pinhole` would have taken it, [H, W, C] of the same type."""
+        camera = self.pinhole
+        u, v = np.meshgrid(
+            (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx,
+            (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy,
+        )
+        x, y = self.bend(u, v)
+        maps = (x - 0.5).astype(np.float32), (y - 0.5).astype(np.float32)  # OpenCV's pixels have whole centres
+        straight = cv2.remap(pixels, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return straight.reshape(camera.height, camera.width, -1)

@@ -1,0 +1,65 @@
+"""Camera models against pycolmap's projections, and straightened photographs against the lens."""
+
+import json
+
+import numpy as np
+import pytest
+
+from clsplat.errors import DataError
+from clsplat.scene.lens import MODELS, Lens
+from tests.data_sets import data_set
+
+STRONG = Lens(200, 150, "OPENCV", (160.0, 165.0, 97.0, 80.0, -0.25, 0.06, 0.002, -0.001))
+FISHEYE = Lens(200, 150, "OPENCV_FISHEYE", (90.0, 91.0, 101.0, 74.0, 0.02, -0.01, 0.003, 0.0))
+
+
+def test_every_model_projects_as_colmap_does():
+    """Worst error 0.01 px, for a field-of-view lens so weak that COLMAP takes a series; the others 1e-12."""
+    cases = json.loads((data_set("colmap_models") / "projection_oracle.json").read_text())
+    assert {case["model"] for case in cases.values()} == set(MODELS)
+    for name, case in cases.items():
+        lens = Lens(case["width"], case["height"], case["model"], tuple(case["params"]))
+        pixels = np.array(case["pixels"])
+        error = np.abs(lens.project(np.array(case["points_cam"])) - pixels).max()
+        assert error < (0.02 if name == "FOV_fitted" else 1e-9), name
+        back = np.stack(lens.unbend(*pixels.T), axis=1)
+        np.testing.assert_allclose(back, case["normalized_back"], atol=1e-8, err_msg=name)
+
+
+@pytest.mark.parametrize("lens", [STRONG, FISHEYE])
+def test_straightened_photographs_agree_with_the_lens(lens):
+    """A photograph of directions: what a pixel of the pinhole shows is its own ray, to 0.1 px at the corners."""
+    y, x = np.meshgrid(np.arange(lens.height) + 0.5, np.arange(lens.width) + 0.5, indexing="ij")
+    u, v = lens.unbend(x.ravel(), y.ravel())
+    photograph = np.stack([u, v, np.zeros_like(u)], axis=1).reshape(lens.height, lens.width, 3).astype(np.float32)
+    camera = lens.pinhole
+    shown = lens.undistort(photograph)
+    rows, columns = np.array([0, 0, -1, -1, 40]), np.array([0, -1, 0, -1, 50])
+    px = (np.arange(camera.width) + 0.5)[columns]
+    py = (np.arange(camera.height) + 0.5)[rows]
+    seen = shown[rows, columns, :2] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+    np.testing.assert_allclose(seen, np.stack([px, py], axis=1), atol=0.1)
+
+
+@pytest.mark.parametrize("lens", [STRONG, FISHEYE])
+def test_no_pixel_of_the_pinhole_is_blank(lens):
+    camera = lens.pinhole
+    columns, rows = np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5
+    u, v = np.meshgrid((columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy)
+    x, y = lens.bend(u, v)
+    assert x.min() > -0.5
+    assert y.min() > -0.5
+    assert x.max() < lens.width + 0.5
+    assert y.max() < lens.height + 0.5
+
+
+def test_a_lens_without_distortion_changes_nothing(rng):
+    lens = Lens(40, 30, "OPENCV", (50.0, 51.0, 19.0, 16.0, 0.0, 0.0, 0.0, 0.0))
+    assert not lens.distorts
+    assert (lens.pinhole.width, lens.pinhole.height) in [(40, 30), (39, 29), (40, 29), (39, 30)]
+    assert FISHEYE.distorts
+
+
+def test_a_lens_that_cannot_be_inverted_is_refused():
+    with pytest.raises(DataError, match="calibrate the camera again"):
+        _ = Lens(100, 100, "SIMPLE_RADIAL", (1.0, 50.0, 50.0, -9.0)).pinhole
