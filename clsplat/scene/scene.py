@@ -8,6 +8,7 @@ Conventions of the whole project
     colours     as the image files store them, in [0, 1]
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -21,6 +22,8 @@ from clsplat.scene.lens import Lens
 
 Floats = NDArray[np.floating]
 Background = Literal["black", "white"]
+STRAY = 10.0  # a walk of evenly spaced cameras has 2, an orbit 1, a close-up among overviews about 4
+STRAY_SHARE = 0.2
 
 
 @dataclass(frozen=True)
@@ -130,10 +133,24 @@ def make_scene(
 
 
 def camera_extent(views: list[View]) -> float:
-    """Radius of the cameras: 1.1 x the largest distance of a centre from their mean (Kerbl et al. 2023)."""
-    centres = np.stack([v.position for v in views])
+    """Radius of the cameras: 1.1 x the largest distance of a centre from their mean (Kerbl et al. 2023).
+
+    Strayed cameras do not count: one wrong pose would scale every size and rate of the scene.
+    """
+    centres = np.stack([v.position for v in views])[~strayed(views)]
     radius = 1.1 * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
     return radius if radius > 0 else 1.0
+
+
+def strayed(views: Sequence[View]) -> NDArray[np.bool_]:
+    """Which cameras, [N], lie more than STRAY times the median distance from the median centre.
+
+    None do when those are more than STRAY_SHARE of all: then the scene is like that.
+    """
+    centres = np.stack([v.position for v in views])
+    distance = np.linalg.norm(centres - np.median(centres, axis=0), axis=1)
+    far = distance > STRAY * np.median(distance)
+    return far if np.median(distance) > 0 and far.mean() <= STRAY_SHARE else np.zeros(len(views), bool)
 
 
 def every_nth(names: list[str], holdout: int) -> set[int]:

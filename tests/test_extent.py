@@ -1,0 +1,45 @@
+"""The scale of a scene, which sizes and rates are relative to, and cameras that must not decide it."""
+
+import numpy as np
+import pytest
+
+from clsplat.scene.scene import Camera, View, camera_extent, strayed
+
+
+def views_at(centres):
+    poses = [np.column_stack([np.eye(3), -np.asarray(centre, float)]) for centre in centres]
+    return [View(f"{i}.png", Camera(4, 4, 4, 4, 2, 2), pose, f"{i}.png") for i, pose in enumerate(poses)]
+
+
+def orbit(count=24, radius=3.0):
+    angles = np.linspace(0, 2 * np.pi, count, endpoint=False)
+    return np.stack([radius * np.cos(angles), radius * np.sin(angles), np.full(count, 1.0)], axis=1)
+
+
+@pytest.mark.parametrize("distance", [1e2, 1e5, 1e9])
+def test_a_far_camera_does_not_change_the_extent(distance):
+    """Nor, therefore, any learning rate or threshold."""
+    healthy = orbit()
+    assert camera_extent(views_at([*healthy, (distance, 0, 0)])) == camera_extent(views_at(healthy))
+    assert strayed(views_at([*healthy, (distance, 0, 0)])).tolist() == [False] * 24 + [True]
+
+
+@pytest.mark.parametrize(
+    "centres",
+    [
+        orbit(),
+        [(x, 0, 0) for x in range(100)],
+        [(0, 0, 0)] * 5,
+        [(0, 0, 0)] * 5 + [(1, 0, 0)],
+        [*orbit(40, 1.0), *orbit(20, 30.0)],
+        [(0, 0, 0), (1, 0, 0)],
+        [(0, 0, 0)],
+    ],
+    ids=["orbit", "walk", "one place", "one step", "close-ups and overviews", "two", "one"],
+)
+def test_healthy_cameras_all_count(centres):
+    views = views_at(centres)
+    assert not strayed(views).any()
+    points = np.asarray(centres, float)
+    radius = 1.1 * np.linalg.norm(points - points.mean(axis=0), axis=1).max()
+    assert camera_extent(views) == pytest.approx(radius or 1.0)
