@@ -22,11 +22,12 @@ static inline VF inside_row(const uint column, const uint width)
     return (LANE_INDEX + (int)column) < (int)width ? (VF)(1.0f) : (VF)(0.0f);
 }
 
-/* 8-bit pixels to float planes.  One item = one pixel of one channel; dimensions x, y, channel. */
+/* 8-bit pixels to float planes; a fourth channel, the mask, is 0 or 1.  One item = one pixel of one channel;
+ * dimensions x, y, channel. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void unpack_target(
-    __global const uchar *restrict pixels,  // [3,height,width]
-    __global float *restrict target,        // [3,H',stride]
+    __global const uchar *restrict pixels,  // [3 or 4,height,width]
+    __global float *restrict target,        // [3 or 4,H',stride]
     const uint width,
     const uint height,
     const uint stride)
@@ -34,9 +35,21 @@ void unpack_target(
     const uint x = get_global_id(0), y = get_global_id(1), channel = get_global_id(2);
     if (x < width)
         target[(channel * get_global_size(1) + y) * stride + x] =
-            y < height ? pixels[(channel * height + y) * width + x] * (1.0f / 255.0f) : 0.0f;
+            y < height ? pixels[(channel * height + y) * width + x] * (channel < 3 ? 1.0f / 255.0f : 1.0f) : 0.0f;
     else if (x < stride)
         target[(channel * get_global_size(1) + y) * stride + x] = 0.0f;
+}
+
+/* Pixels that the mask leaves out become zero.  One item = one pixel of one channel; dimensions pixel, channel. */
+__kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
+void apply_mask(
+    __global float *restrict planes,        // [3,H',stride]
+    __global const float *restrict target,  // [4,H',stride], the last is the mask
+    const uint pixels)                      // H' * stride
+{
+    const uint pixel = get_global_id(0), channel = get_global_id(1);
+    if (pixel < pixels && target[3 * pixels + pixel] == 0.0f)
+        planes[channel * pixels + pixel] = 0.0f;
 }
 
 /* gradient (+)= l1 sign(x - y) + l2 2 (x - y).  Local memory: TEAM * 8 bytes. */

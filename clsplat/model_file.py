@@ -35,7 +35,9 @@ class ModelFile:
         file = read_ply(path)
         self.device = Device(choose(device))
         LOG.info("device: %s", self.device.text)
-        self.photographs = read_scene(scene)
+        self.photographs = read_scene(scene).with_alpha(
+            "mask" if file.rendering.get("alpha") == "mask" else "transparency"
+        )
         self.scene = self.photographs.downscaled(scale)
         gaussians = Gaussians(self.device, file.parameters)
         screen = Mip() if file.mode == "mip" else Dilation()

@@ -26,7 +26,7 @@ from clsplat.opencl.device import Schedule
 from clsplat.render.renderer import RECORD, UNLIMITED, Budget
 from clsplat.render.tiles import Sort
 from clsplat.scene.detect import read_scene
-from clsplat.scene.scene import Background, Scene
+from clsplat.scene.scene import Alpha, Background, Scene
 from clsplat.settings import Settings
 from clsplat.settings_errors import explain
 from clsplat.stages import STAGES, AnyStage
@@ -45,6 +45,7 @@ class SceneSettings(Settings):
     downscale: Annotated[float, Field(ge=1)] = 1  # image sizes are divided by this
     levels: Annotated[int, Field(ge=1, le=8)] = 1  # scales to train on: downscale, and twice, four times, … that
     sampling: Sampling = "uniform"  # of views among several levels
+    alpha: Alpha = "transparency"  # of photographs: blended with the background, or a mask of what counts
     background: Literal["auto", "black", "white"] = "auto"  # auto: white for Blender scenes, else black
     image_budget: Annotated[int, Field(gt=0)] | None = (
         None  # MiB of photographs on the device; default: a quarter of it
@@ -60,7 +61,7 @@ class SceneSettings(Settings):
         """Return the photographs, and what they are shown on.  Raises DataError."""
         if self.path is None:
             raise ConfigError("no scene given; use --scene DIR, or scene: {path: DIR} in the pipeline file")
-        scene = read_scene(Path(self.path), self.holdout)
+        scene = read_scene(Path(self.path), self.holdout).with_alpha(self.alpha)
         return scene, scene.background if self.background == "auto" else self.background
 
 

@@ -73,7 +73,7 @@ def open_run(pipeline: Pipeline, out: Path, words: str | None) -> Run:
         seed=settings.seed,
         pipeline=pipeline.resolved(),
         renderer=Renderer(device, settings.rasterizer.sort, settings.rasterizer.budget()),
-        targets=Targets(device, background, None if budget is None else budget << 20),
+        targets=Targets(device, background, None if budget is None else budget << 20, out / "straightened"),
         model_settings=settings.model,
         sampling=settings.scene.sampling,
     )

@@ -2,6 +2,7 @@
 
 import logging
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -28,13 +29,15 @@ def read_colmap(path: Path, holdout: int = 8) -> Scene:
     """Read a COLMAP scene: models in `sparse/N`, `sparse` or `path` itself, photographs in `images`.
 
     Of several models the one with most images is taken.  Every `holdout`-th view by name is for testing.
-    Photographs of cameras with distortion are straightened as they are read.  Raises DataError when a file is missing,
-    damaged or not supported.
+    Photographs of cameras with distortion are straightened as they are read.  Masks are taken from the
+    folder `masks`: an image's name with .png behind it or in place of its suffix.  Raises DataError when a file is
+    missing, damaged or not supported.
     """
     model, images = _largest_model(path)
     cameras = read_cameras(model)
     folder = _scene_folder(path) / "images"
     views = sorted((_view(image, cameras, folder) for image in images), key=lambda view: view.name)
+    views = [replace(view, mask_path=_mask(folder.with_name("masks"), view.name)) for view in views]
     require_files(path, (view.image_path for view in views))
     return make_scene(path, views, every_nth([view.name for view in views], holdout), read_points(model))
 
@@ -79,6 +82,12 @@ def _view(image: ImageRecord, cameras: dict[int, CameraRecord], folder: Path) ->
     if lens.distorts:
         return View(image.name, lens.pinhole, pose, image_path, lens=lens)
     return View(image.name, lens.camera, pose, image_path)
+
+
+def _mask(folder: Path, name: str) -> Path | None:
+    """The mask of an image: its name with .png behind it (COLMAP) or in place of its suffix."""
+    files = (folder / f"{name}.png", (folder / name).with_suffix(".png"))
+    return next((file for file in files if file.is_file()), None)
 
 
 def _rotation(quaternion: tuple[float, ...]) -> Floats:

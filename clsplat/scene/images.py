@@ -1,5 +1,6 @@
 """The files of a dataset: which paths are allowed, their bytes, and photographs."""
 
+import operator
 import os
 from collections.abc import Iterable
 from pathlib import Path, PureWindowsPath
@@ -11,10 +12,10 @@ from numpy.typing import NDArray
 
 from clsplat.errors import DataError
 from clsplat.files import atomic
-from clsplat.scene.lens import Lens
 from clsplat.scene.scene import View
 
 BLACK = (0.0, 0.0, 0.0)
+WHITE = 0.99  # of the largest value: a mask that was stored as JPEG is never quite white
 
 
 def load_image(view: View, background: tuple[float, float, float] | None = None) -> NDArray[np.uint8]:
@@ -23,17 +24,9 @@ def load_image(view: View, background: tuple[float, float, float] | None = None)
     `background` is a colour in [0, 1], black by default.  Raises DataError when the file cannot be read as an 8- or
     16-bit image, or when it is not the camera's image before downscaling.
     """
-    pixels = read_image(view.image_path)
-    if view.lens:
-        pixels = _straightened(pixels, view.lens, view.image_path)
+    pixels = _as_taken(view, view.image_path)
     width, height = view.camera.width, view.camera.height
-    file_height, file_width = pixels.shape[:2]
-    if not _scales_to((file_width, file_height), (width, height)):
-        raise DataError(
-            f"{view.image_path}: the image is {file_width}x{file_height} pixels, its camera {width}x{height}; "
-            "expected the same size, or a larger image of the same shape: use the images the cameras were made from"
-        )
-    opaque, resized = pixels.shape[2] == 3, (file_width, file_height) != (width, height)
+    opaque, resized = pixels.shape[2] == 3, pixels.shape[:2] != (height, width)
     if opaque and not resized and pixels.dtype == np.uint8:
         return pixels
     # Double where the reference uses it, to truncate as it does; single saves memory on large photographs.
@@ -50,15 +43,45 @@ def load_image(view: View, background: tuple[float, float, float] | None = None)
     return np.asarray(composite * 255 + slack, np.uint8)  # truncated: so does the reference (Kerbl et al. 2023)
 
 
-def _straightened(pixels: NDArray[Any], lens: Lens, path: Path) -> NDArray[Any]:
-    """The photograph without the lens's distortion.  Raises DataError when it is not as large as the lens says."""
-    height, width = pixels.shape[:2]
-    if (width, height) != (lens.width, lens.height):
+def load_mask(view: View) -> NDArray[np.bool_] | None:
+    """Return which pixels of `load_image` count, [H, W], or None where all do.
+
+    They do where the whole of the pixel is white in the mask file and, for alpha as mask, opaque in the photograph.
+    Raises DataError as load_image does.
+    """
+    layers = []
+    if view.mask_path is not None:
+        layers.append(_as_taken(view, view.mask_path)[:, :, :1])
+    if view.alpha == "mask":
+        pixels = _as_taken(view, view.image_path)
+        layers += [pixels[:, :, 3:]] if pixels.shape[2] == 4 else []
+    size = view.camera.width, view.camera.height
+    masks = [
+        cv2.resize(layer.astype(np.float32), size, interpolation=cv2.INTER_AREA) > WHITE * np.iinfo(layer.dtype).max
+        for layer in layers
+    ]
+    return np.logical_and.reduce(masks) if masks else None
+
+
+def _as_taken(view: View, path: Path) -> NDArray[Any]:
+    """The pixels of a file as its camera saw them: upright, straightened, before downscaling.
+
+    A file that is turned by its EXIF tag is turned where only then it is the camera's image: COLMAP ignores the tag.
+    Raises DataError when it is not the camera's image in either case.
+    """
+    pixels, lens = read_image(path), view.lens
+    stored = pixels.shape[1::-1]
+    camera = (lens.width, lens.height) if lens else (view.camera.width, view.camera.height)
+    fits = operator.eq if lens else _scales_to
+    if not fits(stored, camera) and fits(stored[::-1], camera):
+        pixels = read_image(path, upright=True)
+    width, height = pixels.shape[1::-1]
+    if not fits((width, height), camera):
         raise DataError(
-            f"{path}: the image is {width}x{height} pixels, its {lens.model} camera {lens.width}x{lens.height}; "
-            "expected the same size: use the images the cameras were made from"
+            f"{path}: the image is {width}x{height} pixels, its camera {camera[0]}x{camera[1]}; expected the same size"
+            f"{'' if lens else ', or a larger image of the same shape'}: use the images the cameras were made from"
         )
-    return lens.undistort(pixels)
+    return lens.undistort(pixels) if lens else pixels
 
 
 def write_image(path: Path, rgb: NDArray[np.uint8]) -> None:
@@ -101,11 +124,11 @@ def require_files(path: Path, files: Iterable[Path]) -> None:
         raise DataError(f"{path}: {len(missing)} of {len(wanted)} image files are missing: {few}; put them back")
 
 
-def read_image(path: Path) -> NDArray[Any]:
-    """Decode an image file to RGB or RGBA, [H, W, 3 or 4], uint8 or uint16, as stored: no EXIF rotation."""
+def read_image(path: Path, upright: bool = False) -> NDArray[Any]:
+    """Decode an image file to RGB or RGBA, [H, W, 3 or 4], uint8 or uint16; `upright` turns it by its EXIF tag."""
     data = np.frombuffer(read_file(path), np.uint8)  # not cv2.imread: that needs ASCII paths on Windows
     try:
-        pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
+        pixels = cv2.imdecode(data, cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH if upright else cv2.IMREAD_UNCHANGED)
     except cv2.error:
         pixels = None
     if pixels is None:

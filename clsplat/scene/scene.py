@@ -22,6 +22,7 @@ from clsplat.scene.lens import Lens
 
 Floats = NDArray[np.floating]
 Background = Literal["black", "white"]
+Alpha = Literal["transparency", "mask"]  # what the fourth channel of a photograph is
 STRAY = 10.0  # a walk of evenly spaced cameras has 2, an orbit 1, a close-up among overviews about 4
 STRAY_SHARE = 0.2
 
@@ -34,7 +35,8 @@ class View:
     camera: Camera
     world_to_camera: Floats  # [3, 4] float64
     image_path: Path
-    mask_path: Path | None = None
+    mask_path: Path | None = None  # an image of the photograph's size, white where it counts
+    alpha: Alpha = "transparency"
     lens: Lens | None = None  # of the photograph on disk, where it is not `camera`'s pinhole
     scale: float = 1  # by what the original photograph's size was divided
 
@@ -79,6 +81,10 @@ class Scene:
         if name == "all":
             return self.views
         return tuple(self.views[i] for i in (self.train if name == "train" else self.test))
+
+    def with_alpha(self, alpha: Alpha) -> "Scene":
+        """Return the scene with the fourth channel of its photographs taken as transparency or as mask."""
+        return replace(self, views=tuple(replace(view, alpha=alpha) for view in self.views))
 
     @property
     def scales(self) -> tuple[float, ...]:

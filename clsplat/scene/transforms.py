@@ -77,7 +77,7 @@ class Transforms:
         for frame, image, mask in zip(self.frames, images, masks, strict=True):
             lens = lens_of(frame, camera_of(frame, size))
             camera, bent = (lens.pinhole, lens) if lens.distorts else (lens.camera, None)
-            views.append(View(view_name(frame.values["file_path"]), camera, pose_of(frame), image, mask, bent))
+            views.append(View(view_name(frame.values["file_path"]), camera, pose_of(frame), image, mask, lens=bent))
         return views
 
     def points(self) -> PointCloud | None:

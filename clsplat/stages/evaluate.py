@@ -10,7 +10,6 @@ from clsplat.training.lpips import InputRange
 from clsplat.training.metrics import mean, measure
 from clsplat.training.perceptual import Metric, Perceptual
 from clsplat.training.run import Run
-from clsplat.training.targets import Targets
 
 LOG = logging.getLogger("clsplat")
 Scale = Annotated[float, Field(ge=1)]
@@ -54,7 +53,7 @@ class Evaluate(Stage):
         for scale in self.scales or [run.scale]:
             views = run.photographs.downscaled(scale).split(self.split)
             trained = scale in run.scene.scales
-            targets = run.targets if trained else Targets(run.device, run.targets.background_name)
+            targets = run.targets if trained else run.targets.fresh()
             results = measure(run.renderer, run.trained, views, targets, perceptual)
             for result in results:
                 run.records.add(run.step, "view", split=self.split, scale=scale, **result.line())

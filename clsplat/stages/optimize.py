@@ -157,7 +157,7 @@ class Optimize(Stage):
         """Read the step's loss and PSNR.  Raises NumericError, after saving the state, when they are not finite."""
         loss = sum(term.value() for term in view.terms)
         squared = float(pixel_loss(view.comparison, l1=0.0, l2=0.0).get()[..., 1].sum(dtype="float64"))
-        error = squared / view.comparison.values
+        error = squared / view.comparison.counted
         broken = run.trained.gaussians.not_finite()
         if broken or not math.isfinite(loss):
             path = checkpoint.save(run, keep=2)

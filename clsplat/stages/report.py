@@ -139,7 +139,7 @@ def _views(run: Run) -> str:
         for record in chosen:
             target = run.targets.get(by_name[record["view"]])
             image = render_view(run.renderer, run.trained, target.camera, run.targets.background_array)
-            text += _figure(record, image, target.pixels.get().transpose(1, 2, 0))
+            text += _figure(record, image, target.image())
     return text
 
 

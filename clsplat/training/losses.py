@@ -19,7 +19,11 @@ SSIM_BLOCK = int(constants("loss.cl")["BLOCK"])
 
 @dataclass
 class Comparison:
-    """A rendered image beside its photograph, float planes [3, rows, stride], and the gradient that losses add to."""
+    """A rendered image beside its photograph, float planes [3, rows, stride], and the gradient that losses add to.
+
+    The photograph may have a fourth plane, its mask; losses are means over the whole image, so that a threshold means
+    the same with and without one.
+    """
 
     workspace: Workspace
     camera: DeviceCamera
@@ -33,6 +37,11 @@ class Comparison:
     def values(self) -> int:
         """Number of values in the image."""
         return 3 * self.camera.width * self.camera.height
+
+    @property
+    def counted(self) -> int:
+        """Number of values in pixels that count; waits for the device where there is a mask."""
+        return 3 * int(self.target.get()[3].sum()) if self.target.shape[0] == 4 else self.values
 
     def shape_arguments(self) -> dict[str, int]:
         camera = self.camera

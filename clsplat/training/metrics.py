@@ -12,8 +12,8 @@ from clsplat.opencl.device import Array
 from clsplat.render.renderer import DeviceCamera, Renderer
 from clsplat.scene.scene import View
 from clsplat.training.losses import Comparison, ssim_maps
-from clsplat.training.perceptual import Image, Perceptual
-from clsplat.training.targets import Target, Targets, unpack
+from clsplat.training.perceptual import Image, Perceptual, ssim_map
+from clsplat.training.targets import Mask, Target, Targets, unpack
 
 PSNR_CAP = 100.0  # dB, for equal images
 NOTHING_MORE = Perceptual()
@@ -40,9 +40,10 @@ def render_view(renderer: Renderer, model: Model, camera: DeviceCamera, backgrou
     return np.ascontiguousarray((np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8).transpose(1, 2, 0))
 
 
-def psnr(image: Image, truth: Image) -> float:
-    """Peak signal-to-noise ratio in dB of two 8-bit images."""
-    error = float(np.mean((image.astype(np.float64) - truth) ** 2)) / 255**2
+def psnr(image: Image, truth: Image, mask: Mask | None = None) -> float:
+    """Peak signal-to-noise ratio in dB of two 8-bit images, over the pixels that count."""
+    squared = (image.astype(np.float64) - truth) ** 2
+    error = float(np.mean(squared if mask is None else squared[mask])) / 255**2
     return PSNR_CAP if error == 0 else 10 * math.log10(1 / error)
 
 
@@ -60,14 +61,22 @@ def ssim(renderer: Renderer, target: Target, image: Image) -> float:
 def measure(
     renderer: Renderer, model: Model, views: Sequence[View], targets: Targets, perceptual: Perceptual = NOTHING_MORE
 ) -> list[ViewMetrics]:
-    """Return the metrics of every view."""
+    """Return the metrics of every view.
+
+    What a mask leaves out is black in both images, and PSNR and SSIM are means over the other pixels.
+    """
     results = []
     for view in views:
         target = targets.get(view)
         image = render_view(renderer, model, target.camera, targets.background_array)
-        truth = target.pixels.get().transpose(1, 2, 0)
+        truth, mask = target.image(), target.mask()
+        if mask is None:
+            similarity = ssim(renderer, target, image)
+        else:
+            image, truth = image * mask[..., None], truth * mask[..., None]
+            similarity = float(ssim_map(image, truth)[mask].mean())
         more = perceptual.measure(image, truth)
-        results.append(ViewMetrics(view.name, psnr(image, truth), ssim(renderer, target, image), more))
+        results.append(ViewMetrics(view.name, psnr(image, truth, mask), similarity, more))
     return results
 
 

@@ -112,6 +112,13 @@ def _halved(image: Floats) -> Floats:
     return mean
 
 
+def ssim_map(image: Image, truth: Image) -> Floats:
+    """Structural similarity of every pixel and channel, as training has it: zeros around the image."""
+    padding = ((RADIUS, RADIUS), (RADIUS, RADIUS), (0, 0))
+    luminance, structure = _ssim_terms(np.pad(image / 255.0, padding), np.pad(truth / 255.0, padding))
+    return luminance * structure
+
+
 def _ssim_terms(x: Floats, y: Floats) -> tuple[Floats, Floats]:
     """Luminance and contrast-structure of every pixel with a whole window (Wang et al. 2004)."""
     mx, my = _window_mean(x), _window_mean(y)

@@ -121,4 +121,5 @@ class Run:
             "screen_variance": model.screen_variance,
             "compensate": model.compensate,
             "background": self.targets.background_name,
+            "alpha": self.photographs.views[0].alpha,
         }

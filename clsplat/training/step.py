@@ -8,7 +8,7 @@ from clsplat.opencl.device import Array
 from clsplat.opencl.program import constants
 from clsplat.render.renderer import MOMENTS, Frame, Renderer
 from clsplat.training.losses import Comparison, Loss, Term
-from clsplat.training.targets import Target, unpack
+from clsplat.training.targets import Target, cover, unpack
 from clsplat.training.texture import image_gradient
 
 TEXTURE = int(constants("splat.h")["MOMENT_TEXTURE"])
@@ -39,6 +39,11 @@ def differentiate(
     photograph = unpack(workspace, camera, target.pixels)
     gradient = workspace.array("grad_image", (3, camera.rows, camera.stride))
     comparison = Comparison(workspace, camera, frame.image, photograph, gradient, step)
+    if target.masked:  # what does not count is black in both, and pulls at nothing
+        cover(workspace, camera, frame.image, photograph)
+        cover(workspace, camera, photograph, photograph)
     terms = [loss.add(comparison) for loss in losses]
+    if target.masked:
+        cover(workspace, camera, gradient, photograph)
     texture = image_gradient(workspace, camera, photograph) if count > TEXTURE else None
     return Differentiated(frame, comparison, terms, renderer.moments(model, frame, gradient, count, texture))

@@ -3,6 +3,7 @@
 from collections.abc import Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,9 +12,10 @@ from numpy.typing import NDArray
 from clsplat.opencl.device import Array, Device
 from clsplat.render.renderer import DeviceCamera, upload_camera
 from clsplat.render.workspace import Workspace
-from clsplat.scene.images import load_image
+from clsplat.scene.photographs import load_photograph
 from clsplat.scene.scene import Background, View
 
+Mask = NDArray[np.bool_]
 BACKGROUNDS: dict[Background, tuple[float, float, float]] = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 BUDGET_SHARE = 0.25  # of the device's memory, when no budget is given
 
@@ -23,7 +25,19 @@ class Target:
     """One photograph and its camera."""
 
     camera: DeviceCamera
-    pixels: Array  # [3, height, width] uint8
+    pixels: Array  # [3, height, width] uint8, with a fourth plane of 0 and 1 where a mask says what counts
+
+    @property
+    def masked(self) -> bool:
+        return bool(self.pixels.shape[0] == 4)
+
+    def image(self) -> NDArray[np.uint8]:
+        """The colours on the host, [height, width, 3]."""
+        return np.asarray(self.pixels.get()[:3].transpose(1, 2, 0))
+
+    def mask(self) -> Mask | None:
+        """Which pixels count, [height, width], or None where all do."""
+        return np.asarray(self.pixels.get()[3] > 0) if self.masked else None
 
 
 Key = tuple[str, float]  # name and scale of a view
@@ -35,8 +49,11 @@ class Targets:
     Views that are announced are read ahead by a thread; what a view looks like does not depend on who read it.
     """
 
-    def __init__(self, device: Device, background: Background, budget: int | None = None) -> None:
+    def __init__(
+        self, device: Device, background: Background, budget: int | None = None, straightened: Path | None = None
+    ) -> None:
         self.device = device
+        self.straightened = straightened  # folder that keeps photographs of distorting lenses
         self.background_name = background
         self.background_array = device.upload(np.array(BACKGROUNDS[background], np.float32))
         self.budget = int(device.info.memory * BUDGET_SHARE) if budget is None else budget
@@ -44,6 +61,10 @@ class Targets:
         self._targets: dict[Key, Target] = {}  # least recently used first
         self._reading: dict[Key, Future[NDArray[Any]]] = {}
         self._reader: ThreadPoolExecutor | None = None
+
+    def fresh(self) -> "Targets":
+        """Return the same with nothing held, for views that are wanted once."""
+        return Targets(self.device, self.background_name, straightened=self.straightened)
 
     def camera(self, view: View) -> DeviceCamera:
         """Return the camera of a view."""
@@ -73,8 +94,8 @@ class Targets:
                 self._reading[key] = self._reader.submit(self._read, view)
 
     def _read(self, view: View) -> NDArray[Any]:
-        """Pixels [3, height, width] uint8."""
-        image = load_image(view, BACKGROUNDS[self.background_name])
+        """Pixels [3 or 4, height, width] uint8."""
+        image = load_photograph(view, BACKGROUNDS[self.background_name], self.straightened)
         return np.ascontiguousarray(image.transpose(2, 0, 1))
 
     def _make_room(self, size: int) -> None:
@@ -84,10 +105,14 @@ class Targets:
 
 
 def unpack(workspace: Workspace, camera: DeviceCamera, pixels: Array, name: str = "target") -> Array:
-    """Return 8-bit pixels [3, height, width] as float planes [3, rows, stride], zero outside the image."""
-    planes = workspace.array(name, (3, camera.rows, camera.stride))
+    """Return 8-bit pixels [C, height, width] as float planes [C, rows, stride], zero outside the image.
+
+    The first three are colours by 255; a fourth, the mask, stays 0 and 1.
+    """
+    channels = pixels.shape[0]
+    planes = workspace.array(name, (channels, camera.rows, camera.stride))
     workspace.device.program("loss.cl").unpack_target(
-        items=(camera.stride, camera.rows, 3),
+        items=(camera.stride, camera.rows, channels),
         pixels=pixels,
         target=planes,
         width=camera.width,
@@ -95,3 +120,10 @@ def unpack(workspace: Workspace, camera: DeviceCamera, pixels: Array, name: str 
         stride=camera.stride,
     )
     return planes
+
+
+def cover(workspace: Workspace, camera: DeviceCamera, planes: Array, target: Array) -> None:
+    """Set `planes` [3, rows, stride] to zero where the fourth plane of `target` [4, rows, stride] is."""
+    workspace.device.program("loss.cl").apply_mask(
+        items=(camera.rows * camera.stride, 3), planes=planes, target=target, pixels=camera.rows * camera.stride
+    )

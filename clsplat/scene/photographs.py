@@ -1,0 +1,47 @@
+"""A photograph as training wants it: its colours, and which of its pixels count."""
+
+import hashlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.errors import DataError
+from clsplat.files import atomic
+from clsplat.scene.images import load_image, load_mask, read_image
+from clsplat.scene.scene import View
+
+
+def load_photograph(
+    view: View, background: tuple[float, float, float], straightened: Path | None = None
+) -> NDArray[np.uint8]:
+    """Return RGB, [H, W, 3], or with a mask RGB and 0 or 1, [H, W, 4].
+
+    Photographs of distorting lenses are kept in the folder `straightened`, so that each is straightened once.
+    Raises DataError as load_image does.
+    """
+    if view.lens is None or straightened is None:
+        return _loaded(view, background)
+    file = straightened / f"{view.name}.{_key(view)}.png"
+    try:
+        return read_image(file).astype(np.uint8)
+    except DataError:
+        pixels = _loaded(view, background)
+    order = [2, 1, 0, 3][: pixels.shape[2]]
+    _, encoded = cv2.imencode(".png", np.ascontiguousarray(pixels[:, :, order]))
+    with atomic(file) as stream:
+        stream.write(encoded.tobytes())
+    return pixels
+
+
+def _key(view: View) -> str:
+    """Changes with the file, the lens and the size."""
+    state = view.image_path.stat() if view.image_path.exists() else None
+    parts = view.lens, view.camera, view.mask_path, view.alpha, state and (state.st_mtime_ns, state.st_size)
+    return hashlib.sha256(repr(parts).encode()).hexdigest()[:12]
+
+
+def _loaded(view: View, background: tuple[float, float, float]) -> NDArray[np.uint8]:
+    pixels, mask = load_image(view, background), load_mask(view)
+    return pixels if mask is None else np.dstack([pixels, mask.astype(np.uint8)])
