@@ -29,7 +29,7 @@ clean:
 $(VENV)/installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
-	$(BIN)/python -m pip install --quiet --editable '.[pocl]' || $(BIN)/python -m pip install --quiet --editable .
+	for extras in '[pocl,photos]' '[pocl]' ''; do $(BIN)/python -m pip install --quiet --editable ".$$extras" && break; done
 	$(BIN)/clsplat devices || { $(BIN)/python -m pip install --quiet '.[intel]' && $(BIN)/clsplat devices; }
 	touch $@
 

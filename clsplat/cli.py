@@ -51,18 +51,21 @@ def run(
     if scene is not None:
         overrides.append(f"scene.path={json.dumps(str(scene.resolve()))}")
     if found := load_experiment(pipeline, overrides):
-        folder = out or runner.free_folder(Path("runs") / found.name, resume)
+        folder = out or runner.free_folder(Path("runs") / found.name, None, resume)
         if dry_run:
             CONSOLE.print(experiment.describe(found, folder), markup=False)
         else:
             experiment.run(found, folder, device, resume)
         return
     checked = load(pipeline, overrides)
-    folder = out or runner.free_folder(Path("runs") / checked.settings.name, resume)
+    folder = out or runner.free_folder(Path("runs") / checked.settings.name, checked, resume)
     if dry_run:
-        CONSOLE.print(runner.describe(checked, runner.open_run(checked, folder, device)), markup=False)
+        CONSOLE.print(runner.describe(checked, folder, device), markup=False)
         return
-    experiment.run_pipeline(checked, folder, device, resume)
+    if runner.up_to_date(checked, checked.preparation(folder), folder):
+        CONSOLE.print(f"{folder}: up to date; change a setting, or give another --out, to run again", markup=False)
+    else:
+        experiment.run_pipeline(checked, folder, device, resume)
     screen.summary(folder)
 
 
@@ -88,7 +91,8 @@ def check(
         )
         return
     checked = load(pipeline)
-    CONSOLE.print(f"{checked.path}: {', '.join(stage.stage for stage in checked.settings.stages)}: fine", markup=False)
+    names = [stage.stage for stage in (*checked.settings.prepare, *checked.settings.stages)]
+    CONSOLE.print(f"{checked.path}: {', '.join(names)}: fine", markup=False)
 
 
 @app.command()

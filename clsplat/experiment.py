@@ -68,8 +68,8 @@ def run(experiment: Experiment, out: Path, device: str | None, resume: bool) -> 
 
 def describe(experiment: Experiment, out: Path) -> str:
     """What would run, a line for each cell.  Raises DataError when a scene cannot be read."""
-    for scene in {cell.pipeline.settings.scene for cell in experiment.cells}:
-        scene.read()
+    for scene in {c.pipeline.settings.scene for c in experiment.cells if not c.pipeline.settings.prepare}:
+        scene.read(scene.folder)
     lines = []
     for cell in experiment.cells:
         state = "done" if _finished(cell, out / cell.name) else "unfinished" if (out / cell.name).exists() else ""

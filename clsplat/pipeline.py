@@ -23,6 +23,8 @@ from ruamel.yaml import YAML
 from clsplat import resource_dir
 from clsplat.errors import ConfigError
 from clsplat.opencl.device import Schedule
+from clsplat.prepare.cache import Planned, plan
+from clsplat.prepare.steps import STEPS, AnyStep
 from clsplat.render.renderer import RECORD, UNLIMITED, Budget
 from clsplat.render.tiles import Sort
 from clsplat.scene.detect import read_scene
@@ -57,11 +59,16 @@ class SceneSettings(Settings):
         """What the original photographs' sizes are divided by for training, from the finest."""
         return tuple(self.downscale * 2**level for level in range(self.levels))
 
-    def read(self) -> tuple[Scene, Background]:
-        """Return the photographs, and what they are shown on.  Raises DataError."""
+    @property
+    def folder(self) -> Path:
+        """Where the photographs lie.  Raises ConfigError when nobody said so."""
         if self.path is None:
             raise ConfigError("no scene given; use --scene DIR, or scene: {path: DIR} in the pipeline file")
-        scene = read_scene(Path(self.path), self.holdout).with_alpha(self.alpha)
+        return Path(self.path)
+
+    def read(self, folder: Path) -> tuple[Scene, Background]:
+        """Return the photographs of a folder, and what they are shown on.  Raises DataError."""
+        scene = read_scene(folder, self.holdout).with_alpha(self.alpha)
         return scene, scene.background if self.background == "auto" else self.background
 
 
@@ -81,6 +88,7 @@ class RasterizerSettings(Settings):
         return Budget(records, self.launch_tiles)
 
 
+LISTS = ("prepare", "stages")
 Name = Annotated[str, Field(pattern=r"^[\w.-]+$")]
 
 
@@ -92,6 +100,7 @@ class PipelineFile(Settings):
     scene: SceneSettings = SceneSettings()
     model: ModelSettings = ModelSettings()
     rasterizer: RasterizerSettings = RasterizerSettings()
+    prepare: list[Annotated[AnyStep, Field(discriminator="stage")]] = Field([])  # photographs -> scene, done once
     stages: Annotated[list[Annotated[AnyStage, Field(discriminator="stage")]], Field(min_length=1)]
 
 
@@ -106,10 +115,15 @@ class Pipeline:
     def stages(self) -> list[Stage]:
         return list(self.settings.stages)
 
+    def preparation(self, out: Path) -> list[Planned]:
+        """What must be done to the photographs before a run in `out`, and why.  Raises DataError."""
+        settings = self.settings
+        return plan(settings.prepare, settings.scene.folder, prepared_beside(out)) if settings.prepare else []
+
     def resolved(self) -> dict[str, Any]:
         """Every setting with its value, as plain data in the shape of a file."""
         data = self.settings.model_dump(mode="json")
-        data["stages"] = [_untagged(stage) for stage in data["stages"]]
+        data |= {key: [_untagged(stage) for stage in data[key]] for key in LISTS}
         return data
 
     def text(self) -> str:
@@ -121,6 +135,11 @@ class Pipeline:
         yaml.width = 120
         yaml.dump(self.resolved(), stream)
         return stream.getvalue()
+
+
+def prepared_beside(out: Path) -> Path:
+    """Where results of `prepare:` lie: beside the run folder, for all runs there."""
+    return out.absolute().parent / "prepared"
 
 
 def load(name: str, overrides: list[str] | None = None) -> Pipeline:
@@ -165,8 +184,9 @@ def find(name: str) -> Path:
 def _tagged_file(document: Document, path: Path) -> dict[str, Any]:
     """The file's data with each stage as {stage: name, …}, which is how the models tell them apart."""
     data = dict(document.data)
-    if isinstance(data.get("stages"), list):
-        data["stages"] = [_tagged(item, ("stages", i), document, path) for i, item in enumerate(data["stages"])]
+    for key in LISTS:
+        if isinstance(data.get(key), list):
+            data[key] = [_tagged(item, (key, i), document, path) for i, item in enumerate(data[key])]
     return data
 
 
@@ -187,7 +207,7 @@ def _tagged(item: Any, place: tuple[str | int, ...], document: Document, path: P
 
 def _untagged(stage: dict[str, Any]) -> dict[str, Any]:
     fields = {key: value for key, value in stage.items() if key != "stage"}
-    if fields["every"] is None:  # a cadence belongs inside `during` only
+    if fields.get("every") is None:  # a cadence belongs inside `during` only
         fields = {key: value for key, value in fields.items() if key not in ("every", "start", "stop")}
     if "during" in fields:
         fields["during"] = [_untagged(inner) for inner in fields["during"]]
@@ -218,7 +238,7 @@ def _descend(node: Any, name: str, text: str, top: bool) -> Any:
         raise ConfigError(f"--set {text}: '{name}' is not a place in a list of {len(node)}")
     if not isinstance(node, dict):
         raise ConfigError(f"--set {text}: nothing lies below '{name}'")
-    stages = node.get("stages" if top else "during", [])
+    stages = [stage for key in (LISTS if top else ("during",)) for stage in node.get(key, [])]
     found = [stage for stage in stages if stage["stage"] == name]
     if top and not found:
         found = [inner for stage in stages for inner in stage.get("during", []) if inner["stage"] == name]
@@ -229,7 +249,7 @@ def _descend(node: Any, name: str, text: str, top: bool) -> Any:
     if name in node:
         return node[name]
     if top and name not in PipelineFile.model_fields:
-        known = [*PipelineFile.model_fields, *STAGES]
+        known = [*PipelineFile.model_fields, *STAGES, *STEPS]
         near = difflib.get_close_matches(name, known, n=1)
         raise ConfigError(f"--set {text}: no '{name}' in this pipeline{f'; did you mean {near[0]}?' if near else ''}")
     node[name] = {}

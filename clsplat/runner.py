@@ -4,7 +4,7 @@ import json
 import logging
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
@@ -12,7 +12,8 @@ from types import FrameType
 from clsplat.errors import ClsplatError, ConfigError, Interrupted, OutputError
 from clsplat.files import unwritable, write_text
 from clsplat.opencl.device import Device, choose
-from clsplat.pipeline import Pipeline
+from clsplat.pipeline import Pipeline, load, prepared_beside
+from clsplat.prepare.cache import NOTE, Planned, note, noted, prepare
 from clsplat.render.renderer import Renderer
 from clsplat.stages.evaluate import Evaluate
 from clsplat.stages.export import Export
@@ -41,13 +42,25 @@ def give_up(out: Path, error: ClsplatError) -> None:
     Records(out).status("failed", 0, exit_code=error.exit_code, message=str(error))
 
 
-def free_folder(folder: Path, resume: bool) -> Path:
-    """The default run folder; a number keeps a new run apart from earlier ones."""
+def free_folder(folder: Path, pipeline: Pipeline | None, resume: bool) -> Path:
+    """The default run folder: a number keeps a new run apart from earlier ones, but for a finished one of the same."""
     number, free = 1, folder
-    while (free / "pipeline.yaml").exists() and not resume:
+    planned = pipeline.preparation(folder) if pipeline else []
+    while (free / "pipeline.yaml").exists() and not resume and not (pipeline and up_to_date(pipeline, planned, free)):
         number += 1
         free = folder.with_name(f"{folder.name}-{number}")
     return free
+
+
+def up_to_date(pipeline: Pipeline, planned: Sequence[Planned], out: Path) -> bool:
+    """Whether `out` holds a finished run of this pipeline and the same photographs; never where nothing is prepared."""
+    if not planned or noted(out) != note(planned):
+        return False
+    try:
+        done = json.loads((out / "status.json").read_text())["state"] == "done"
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
+    return done and load(str(out / "pipeline.yaml")).resolved() == pipeline.resolved()
 
 
 def open_run(pipeline: Pipeline, out: Path, words: str | None) -> Run:
@@ -57,7 +70,10 @@ def open_run(pipeline: Pipeline, out: Path, words: str | None) -> Run:
         stage.check()
     device = Device(choose(words), settings.rasterizer.schedule)
     LOG.info("device: %s", device.text)
-    photographs, background = settings.scene.read()
+    planned = pipeline.preparation(out)
+    if planned and noted(out) not in (None, note(planned)):
+        raise ConfigError(f"{out}: began with other photographs, or other settings to prepare them; give another --out")
+    photographs, background = settings.scene.read(prepare(planned, settings.scene.folder, prepared_beside(out)))
     scene = photographs.downscaled(*settings.scene.scales)
     camera, budget = scene.views[0].camera, settings.scene.image_budget
     LOG.info(
@@ -76,6 +92,7 @@ def open_run(pipeline: Pipeline, out: Path, words: str | None) -> Run:
         targets=Targets(device, background, None if budget is None else budget << 20, out / "straightened"),
         model_settings=settings.model,
         sampling=settings.scene.sampling,
+        prepared=note(planned) if planned else None,
     )
 
 
@@ -86,6 +103,8 @@ def execute(pipeline: Pipeline, run: Run, resume: bool, show: Callable[[Progress
     if resume:
         LOG.info("resumed at step %d" if resumed else "nothing to resume; starting from the beginning%.0s", run.step)
     write_text(run.out / "pipeline.yaml", f"# resolved from {pipeline.path.name}\n{pipeline.text()}")
+    if run.prepared:
+        write_text(run.out / NOTE, json.dumps(run.prepared) + "\n")
     run.records.start(run.step)
     try:
         with _finishing_on_interrupt(run):
@@ -157,17 +176,21 @@ def _check_outputs(pipeline: Pipeline, run: Run) -> None:
             raise OutputError(f"{path}: was to be written but is missing or empty; see {run.out / 'log.txt'}")
 
 
-def describe(pipeline: Pipeline, run: Run) -> str:
-    """What a run would do, a line for each stage."""
-    lines = []
+def describe(pipeline: Pipeline, out: Path, device: str | None) -> str:
+    """What a run in `out` would do, a line for each stage.  Raises what open_run raises, once photographs are ready."""
+    planned = pipeline.preparation(out)
+    if planned and up_to_date(pipeline, planned, out):
+        return f"{out}: up to date"
+    lines = [f"  {one.step.stage:<14} {one.why or 'done'}" for one in planned]
+    run = None if any(one.why for one in planned) else open_run(pipeline, out, device)
     for stage in pipeline.stages:
         detail = ""
         if isinstance(stage, Optimize):
             cadences = (f"{inner.stage} every {inner.every}" for inner in stage.during)
             detail = f"{stage.steps} steps; " + ", ".join(cadences)
-        elif isinstance(stage, Evaluate):
+        elif isinstance(stage, Evaluate) and run:
             views = run.photographs.downscaled(run.scale).split(stage.split)
             scales = ", ".join(f"1/{scale:g}" for scale in stage.scales or [run.scale])
             detail = f"{len(views)} {stage.split} views at {scales}"
-        lines.append(f"  {stage.stage:<10} {detail}".rstrip())
-    return f"would run in {run.out}:\n" + "\n".join(lines)
+        lines.append(f"  {stage.stage:<14} {detail}".rstrip())
+    return f"would run in {out}:\n" + "\n".join(lines)

@@ -4,6 +4,7 @@ from typing import Any
 
 from clsplat.matrix import Matrix
 from clsplat.pipeline import PipelineFile
+from clsplat.prepare.steps import STEPS
 from clsplat.stages import STAGES
 
 
@@ -12,9 +13,11 @@ def json_schema() -> dict[str, Any]:
     schema = PipelineFile.model_json_schema()
     definitions = schema["$defs"]
     stages = {kind.__name__: name for name, kind in STAGES.items()}
-    for title in stages:
+    steps = {kind.__name__: name for name, kind in STEPS.items()}
+    for title in (*stages, *steps):
         definitions[title]["properties"].pop("stage", None)
     schema["properties"]["stages"]["items"] = _items(stages)
+    schema["properties"]["prepare"]["items"] = _items(steps)
     matrix = Matrix.model_json_schema()
     definitions |= {**matrix.pop("$defs", {}), "Matrix": matrix}
     schema["properties"]["matrix"] = {"$ref": "#/$defs/Matrix"}

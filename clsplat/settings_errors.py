@@ -13,6 +13,7 @@ from clsplat.yaml_file import Document, Place
 KINDS = {
     "losses": "loss",
     "rules": "rule",
+    "prepare": "step",
     "stages": "stage",
     "during": "stage",
     "world_filter": "world filter",

@@ -85,7 +85,7 @@ def _crops(rows: Sequence[Row]) -> str:
     contestants = [crops.Contestant(tables.label(row.variant), row.runs[0]) for row in rows]
     try:
         settings = rows[0].runs[0].scene
-        photographs, background = settings.read()
+        photographs, background = settings.read(rows[0].runs[0].photographs)
         scene = photographs.downscaled(settings.downscale)
     except (DataError, ConfigError) as error:
         LOG.warning("no crops: %s", error)

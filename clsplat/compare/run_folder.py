@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from clsplat.errors import ConfigError, DataError
 from clsplat.pipeline import SceneSettings
+from clsplat.prepare.cache import noted
 from clsplat.scene.images import read_file
 from clsplat.settings_errors import explain
 from clsplat.training.records import Records
@@ -71,6 +72,12 @@ class RunFolder:
             raise DataError(f"{path}: has no metrics.json, so the run {_state(path)}; finish it with --resume")
         settings = read_settings(path)
         return cls(path, settings, _scene(path, settings), _metrics(path / "metrics.json"))
+
+    @property
+    def photographs(self) -> Path:
+        """The folder that it trained on.  Raises ConfigError when nobody said so."""
+        prepared = noted(self.path)
+        return Path(prepared["folder"]) if prepared else self.scene.folder
 
     @cached_property
     def records(self) -> list[dict[str, Any]]:

@@ -9,6 +9,14 @@ from clsplat.scene.multiscale import FILE, read_multiscale
 from clsplat.scene.nerfstudio import read_nerfstudio
 from clsplat.scene.scene import Scene
 
+FILES = ("transforms_train.json", FILE, "transforms.json")  # besides COLMAP's
+PHOTOS = (".jpg", ".jpeg", ".png")
+
+
+def holds_scene(path: Path) -> bool:
+    """Whether a folder has cameras, of any kind that read_scene knows."""
+    return bool(find_models(path)) or any((path / name).is_file() for name in FILES)
+
 
 def read_scene(path: Path, holdout: int = 8) -> Scene:
     """Read a COLMAP, Blender (of one scale or several) or nerfstudio folder.
@@ -26,6 +34,10 @@ def read_scene(path: Path, holdout: int = 8) -> Scene:
         return read_multiscale(path)
     if (path / "transforms.json").is_file():
         return read_nerfstudio(path, holdout)
+    if any(file.suffix.lower() in PHOTOS for file in path.iterdir()):
+        raise DataError(
+            f"{path}: photographs without cameras; `clsplat run photos --scene {path}` finds where they were taken"
+        )
     raise DataError(
         f"{path}: no dataset found; looked for COLMAP (sparse/0/cameras.bin or .txt), "
         "Blender (transforms_train.json, metadata.json) and nerfstudio (transforms.json)"

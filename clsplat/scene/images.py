@@ -46,7 +46,8 @@ def load_image(view: View, background: tuple[float, float, float] | None = None)
 def load_mask(view: View) -> NDArray[np.bool_] | None:
     """Return which pixels of `load_image` count, [H, W], or None where all do.
 
-    They do where the whole of the pixel is white in the mask file and, for alpha as mask, opaque in the photograph.
+    They do where the whole of the pixel is white in the mask file, for alpha as mask opaque in the photograph, and for
+    a lens whose whole photograph is wanted, not blank.
     Raises DataError as load_image does.
     """
     layers = []
@@ -55,6 +56,8 @@ def load_mask(view: View) -> NDArray[np.bool_] | None:
     if view.alpha == "mask":
         pixels = _as_taken(view, view.image_path)
         layers += [pixels[:, :, 3:]] if pixels.shape[2] == 4 else []
+    if view.lens is not None and view.lens.whole:
+        layers.append(np.where(view.lens.shown, 255, 0).astype(np.uint8)[:, :, None])
     size = view.camera.width, view.camera.height
     masks = [
         cv2.resize(layer.astype(np.float32), size, interpolation=cv2.INTER_AREA) > WHITE * np.iinfo(layer.dtype).max

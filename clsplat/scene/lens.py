@@ -21,6 +21,9 @@ Distortion = Callable[[Floats, Floats, Sequence[float]], tuple[Floats, Floats]]
 BORDER = 200  # points along each edge of a photograph
 ROUNDS = 50  # of Newton's method
 EXACT = 1.0e-6  # normalised units
+ALIKE = 1.0e-3  # normalised units
+WIDEST = 3**0.5  # tan of 60 degrees: a pinhole of more is mostly stretched edges
+LARGEST = 2.0  # times the photograph's size
 
 
 def _radial(u: Floats, v: Floats, k: Sequence[float]) -> tuple[Floats, Floats]:
@@ -93,6 +96,7 @@ class Lens:
     height: int
     model: str
     params: tuple[float, ...]
+    whole: bool = False  # straightened photographs show all of it, blank pixels too, not the part without them
 
     @property
     def _split(self) -> tuple[float, float, float, float, tuple[float, ...]]:
@@ -145,7 +149,8 @@ class Lens:
     def pinhole(self) -> Camera:
         """The camera of the undistorted photograph: same focal lengths, the largest upright part without blank pixels.
 
-        Raises DataError when the lens leaves no such part.
+        Of the `whole` photograph it is the smallest part that shows it, within 60 degrees to each side and twice its
+        size.  Raises DataError when the lens leaves no such part.
         """
         fx, fy, _, _, _ = self._split
         along_x, along_y = np.linspace(0, self.width, BORDER), np.linspace(0, self.height, BORDER)
@@ -156,6 +161,11 @@ class Lens:
         if not all(np.isfinite(side).any() for side in (left, right, top, bottom)):
             raise DataError(f"the lens {self.model} {self.params} cannot be inverted; calibrate the camera again")
         u0, u1, v0, v1 = np.nanmax(left), np.nanmin(right), np.nanmax(top), np.nanmin(bottom)
+        if self.whole:
+            across, down = np.concatenate([left, right]), np.concatenate([top, bottom])
+            wide, high = self.width * (LARGEST / 2) / fx, self.height * (LARGEST / 2) / fy
+            u0, u1 = max(np.nanmin(across), -WIDEST, -wide), min(np.nanmax(across), WIDEST, wide)
+            v0, v1 = max(np.nanmin(down), -WIDEST, -high), min(np.nanmax(down), WIDEST, high)
         width, height = int((u1 - u0) * fx), int((v1 - v0) * fy)
         if min(width, height) < 1:
             raise DataError(
@@ -166,11 +176,25 @@ class Lens:
     def undistort(self, pixels: NDArray[Any]) -> NDArray[Any]:
         """The photograph as `pinhole` would have taken it, [H, W, C] of the same type."""
         camera = self.pinhole
-        u, v = np.meshgrid(
-            (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx,
-            (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy,
-        )
-        x, y = self.bend(u, v)
+        x, y = self.bend(*_rays(camera))
         maps = (x - 0.5).astype(np.float32), (y - 0.5).astype(np.float32)  # OpenCV's pixels have whole centres
         straight = cv2.remap(pixels, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return straight.reshape(camera.height, camera.width, -1)
+
+    @cached_property
+    def shown(self) -> NDArray[np.bool_]:
+        """Which pixels of `pinhole`, [H, W], the photograph shows: rays that land in it and come back as themselves."""
+        u, v = _rays(self.pinhole)
+        x, y = self.bend(u, v)
+        back_u, back_v = self.unbend(x, y)
+        inside = (x >= 0) & (y >= 0) & (x <= self.width) & (y <= self.height)
+        return inside & (np.abs(back_u - u) < ALIKE) & (np.abs(back_v - v) < ALIKE)
+
+
+def _rays(camera: Camera) -> tuple[Floats, Floats]:
+    """Normalised coordinates of all pixel centres, [H, W] each."""
+    u, v = np.meshgrid(
+        (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx,
+        (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy,
+    )
+    return u, v

@@ -52,6 +52,7 @@ class Run:
     targets: Targets
     model_settings: ModelSettings
     sampling: Sampling = "uniform"
+    prepared: dict[str, str] | None = None  # what `prepare:` made the photographs of, and where they lie
     model: Model | None = None
     adam: Adam | None = None
     stats: SplatStats | None = None

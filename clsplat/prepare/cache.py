@@ -1,0 +1,150 @@
+"""Doing the steps of `prepare:` once: a result lies in a folder named by the hash of all that it depends on."""
+
+import hashlib
+import json
+import logging
+import os
+import shutil
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from clsplat.errors import DataError, OutputError
+from clsplat.files import unwritable, write_text
+from clsplat.prepare.steps import Step
+
+LOG = logging.getLogger("clsplat")
+RECORD = "record.json"
+NOTE = "prepared.json"  # in the run folder
+
+
+@dataclass(frozen=True)
+class Planned:
+    """A step and where its result lies, or will."""
+
+    step: Step
+    photos: str  # the folder that it all began with
+    inputs: str  # hash of what it reads
+    folder: Path
+    why: str  # it must be done; "" when it is
+
+    @property
+    def key(self) -> str:
+        """Hash of all that the result depends on."""
+        return _digest([self.step.stage, self.step.version, self.step.model_dump(mode="json"), self.inputs])
+
+
+def plan(steps: Sequence[Step], source: Path, root: Path) -> list[Planned]:
+    """Tell which steps must be done for the photographs in `source`, and why; results lie below `root`.
+
+    Raises DataError when the photographs cannot be read.
+    """
+    planned: list[Planned] = []
+    inputs = fingerprint(source, root.parent)
+    for step in steps:
+        key = Planned(step, str(source.resolve()), inputs, Path(), "").key
+        folder = root / f"{step.stage}-{key[:12]}"
+        planned.append(Planned(step, str(source.resolve()), inputs, folder, _why(step, inputs, folder, source)))
+        inputs = key
+    done = max((i for i, one in enumerate(planned) if not one.why), default=-1)
+    return [replace(one, why="") if i < done else one for i, one in enumerate(planned)]  # on the way to what is done
+
+
+def prepare(planned: Sequence[Planned], source: Path, root: Path) -> Path:
+    """Do what must be done and return the last result.  Raises what the steps raise, and leaves nothing half-made."""
+    for one in planned:
+        if one.why:
+            _do(one, source, root)
+        else:
+            LOG.info("%s: done before, in %s", one.step.stage, one.folder)
+        source = one.folder
+    return source
+
+
+def fingerprint(folder: Path, without: Path) -> str:
+    """A hash of the names and contents of all files below a folder, hidden ones and those below `without` left out.
+
+    Raises DataError when there is no such folder, or a file in it cannot be read.
+    """
+    if not folder.is_dir():
+        raise DataError(f"{folder}: no such folder; expected one with photographs")
+    parts = []
+    for base, folders, files in os.walk(folder):
+        folders[:] = sorted(name for name in folders if name[0] != "." and not _same(Path(base) / name, without))
+        for name in sorted(files):
+            path = Path(base) / name
+            if name[0] != "." and path.is_file():
+                try:
+                    with path.open("rb") as file:
+                        content = hashlib.file_digest(file, "sha256").hexdigest()
+                except OSError as error:
+                    raise DataError(f"{path}: cannot be read ({error.strerror}); check its permissions") from error
+                parts.append([path.relative_to(folder).as_posix(), content])
+    return _digest(parts)
+
+
+def note(planned: Sequence[Planned]) -> dict[str, str]:
+    """What a run folder keeps of its photographs: the hash of all that they depend on, and their folder."""
+    return {"inputs": planned[-1].key, "folder": str(planned[-1].folder)}
+
+
+def noted(out: Path) -> dict[str, str] | None:
+    """The note of a run folder, where there is one."""
+    try:
+        text = json.loads((out / NOTE).read_text())
+        return {"inputs": str(text["inputs"]), "folder": str(text["folder"])}
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def _same(path: Path, other: Path) -> bool:
+    return path.resolve() == other.resolve()
+
+
+def _do(one: Planned, source: Path, root: Path) -> None:
+    """Make a result in a hidden folder beside its place, and rename it when it is whole."""
+    temporary = one.folder.with_name(f".{one.folder.name}")
+    LOG.info("%s: %s", one.step.stage, one.why)
+    start = time.perf_counter()
+    try:
+        shutil.rmtree(temporary, ignore_errors=True)  # of a run that was killed
+        temporary.mkdir(parents=True)
+        told = one.step.make(source.resolve(), temporary, root.parent)
+        seconds = round(time.perf_counter() - start, 1)
+        settings = one.step.model_dump(mode="json")
+        record = {"photos": one.photos, "inputs": one.inputs, "settings": settings, "seconds": seconds, **told}
+        write_text(temporary / RECORD, json.dumps(record, indent=1) + "\n")
+        os.replace(temporary, one.folder)
+    except OSError as error:
+        raise unwritable(one.folder, error) from error
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+    figures = ", ".join(f"{name} {value}" for name, value in told.items() if value not in ([], ""))
+    LOG.info("%s: %s  %.0f s", one.step.stage, figures, seconds)
+
+
+def _why(step: Step, inputs: str, folder: Path, source: Path) -> str:
+    """Why there is no result, if there is none: what differs from the newest one of the same photographs."""
+    if (folder / RECORD).is_file():
+        return ""
+    found = []
+    for path in folder.parent.glob(f"{step.stage}-*/{RECORD}"):
+        try:
+            record = json.loads(path.read_text())
+        except (OSError, ValueError) as error:
+            raise OutputError(f"{path}: cannot be read back ({error}); remove its folder") from error
+        if record.get("photos") == str(source.resolve()):
+            found.append((path.stat().st_mtime, record))
+    if not found:
+        return "not done yet"
+    before = max(found, key=lambda pair: pair[0])[1]
+    for name, value in step.model_dump(mode="json").items():
+        if before["settings"].get(name) != value:
+            return f"{name} is {value}, was {before['settings'].get(name)}"
+    return "what it reads has changed" if before["inputs"] != inputs else "the step itself has changed"
+
+
+def _digest(data: Any) -> str:
+    return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()

@@ -1,0 +1,97 @@
+"""The steps that a pipeline's `prepare:` can name.  Each makes a folder from a folder, on the host."""
+
+from abc import abstractmethod
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal
+
+from pydantic import Field
+
+from clsplat.errors import DataError
+from clsplat.scene.detect import holds_scene
+from clsplat.scene.lens import MODELS
+from clsplat.settings import Settings
+from data_tools.photos import Cameras, Mapper, Matching, find_features, map_cameras, match_features
+from data_tools.undistort import Blank, undistort_scene
+
+Count = Annotated[int, Field(gt=0)]
+
+
+class Step(Settings):
+    """Makes a folder from a folder.  Its result is known by its inputs, its settings and `version`."""
+
+    version: ClassVar[int] = 1  # changes with what the step does
+
+    stage: str  # the name in a pipeline file
+
+    @abstractmethod
+    def make(self, source: Path, out: Path, without: Path) -> dict[str, Any]:
+        """Fill the empty folder `out` from `source`, without looking below `without`; return figures to tell."""
+
+
+class FindFeatures(Step):
+    """SIFT features of photographs."""
+
+    stage: Literal["find_features"] = "find_features"
+
+    long_side: Count = 1600  # px: photographs are made smaller to look for features
+    features: Count = 8192  # at most, in each
+    camera_model: Literal["SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "PINHOLE", "SIMPLE_PINHOLE"] = (
+        "SIMPLE_RADIAL"
+    )
+    cameras: Cameras = "auto"  # auto: one for photographs of the same size and focal length
+
+    def make(self, source: Path, out: Path, without: Path) -> dict[str, Any]:
+        assert self.camera_model in MODELS
+        if holds_scene(source):
+            raise DataError(
+                f"{source}: has its cameras already; train it with a pipeline without `prepare`, such as splat_7k, "
+                "or give the folder of the photographs alone"
+            )
+        return find_features(
+            source, out, self.long_side, self.features, self.camera_model, self.cameras, without.resolve()
+        )
+
+
+class MatchFeatures(Step):
+    """Which features of two photographs are the same point."""
+
+    stage: Literal["match_features"] = "match_features"
+
+    matching: Matching = "auto"  # auto: exhaustive, vocabulary beyond 200 photographs
+    neighbours: Count = 10  # photographs that each is matched with, when not with all
+
+    def make(self, source: Path, out: Path, without: Path) -> dict[str, Any]:
+        return match_features(source, out, self.matching, self.neighbours)
+
+
+class MapCameras(Step):
+    """Cameras and points from matches."""
+
+    stage: Literal["map_cameras"] = "map_cameras"
+
+    mapper: Mapper = "incremental"
+    threads: Count = 1  # more are faster, and not repeatable to the bit
+
+    def make(self, source: Path, out: Path, without: Path) -> dict[str, Any]:
+        return map_cameras(source, out, self.mapper, self.threads)
+
+
+class Undistort(Step):
+    """Photographs as a pinhole camera would have taken them, at the size to train on."""
+
+    stage: Literal["undistort"] = "undistort"
+
+    long_side: Count | None = None  # px; none: as large as the photographs
+    blank: Blank = "crop"  # mask: keep the whole photograph, and mask what it does not show
+
+    def make(self, source: Path, out: Path, without: Path) -> dict[str, Any]:
+        return {"images": undistort_scene(source, out, self.long_side, self.blank)}
+
+
+STEPS: dict[str, type[Step]] = {
+    "find_features": FindFeatures,
+    "match_features": MatchFeatures,
+    "map_cameras": MapCameras,
+    "undistort": Undistort,
+}
+AnyStep = FindFeatures | MatchFeatures | MapCameras | Undistort

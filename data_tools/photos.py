@@ -1,0 +1,274 @@
+"""Structure from motion with pycolmap: from photographs to cameras and points, in three steps that can be repeated.
+
+    find_features    photographs        -> images/, database.db
+    match_features   images, database   -> images/, database.db with matches
+    map_cameras      images, database   -> images/, sparse/0: a COLMAP folder
+
+Each writes into an empty folder and leaves what it reads alone.  The same photographs and settings give the same files:
+images are registered in order of their names before threads look at them, every random number has a seed, and mapping
+runs in one thread unless told otherwise.
+"""
+
+import logging
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import ModuleType
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+
+from clsplat.errors import ConfigError, DataError
+from clsplat.scene.images import read_image
+from data_tools.vocabulary import alike
+
+LOG = logging.getLogger("clsplat")
+Matching = Literal["auto", "exhaustive", "sequential", "vocabulary"]
+Mapper = Literal["incremental", "global"]
+Cameras = Literal["auto", "one", "per_folder", "per_image"]
+SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"}
+STRANGE = {".heic", ".heif", ".avif", ".dng", ".cr2", ".nef", ".arw"}  # photographs that OpenCV does not read
+FEWEST = 3  # photographs, and registered images of a model
+EXHAUSTIVE = 200  # photographs, at most, whose pairs are all matched: beyond that their number hurts
+CHUNK = 10  # photographs between lines of progress
+DATABASE, IMAGES = "database.db", "images"
+
+
+def list_photos(folder: Path, without: Path | None = None) -> list[str]:
+    """Names of the photographs below a folder, sorted, hidden ones and those below `without` left out.
+
+    Raises DataError when there are too few of them.
+    """
+    if not folder.is_dir():
+        raise DataError(f"{folder}: no such folder; expected one with photographs")
+    names: list[str] = []
+    strange: list[str] = []
+    for base, folders, files in os.walk(folder):
+        folders[:] = sorted(f for f in folders if f[0] != "." and (Path(base) / f).resolve() != without)
+        for file in files:
+            suffix = Path(file).suffix.lower()
+            if file[0] != "." and suffix in SUFFIXES | STRANGE:
+                name = (Path(base) / file).relative_to(folder).as_posix()
+                (names if suffix in SUFFIXES else strange).append(name)
+    if strange:
+        LOG.warning("%s: %d files such as %s are left out: convert them to JPEG", folder, len(strange), strange[0])
+    if len(names) < FEWEST:
+        raise DataError(
+            f"{folder}: found {len(names)} photographs; expected at least {FEWEST}, of {', '.join(sorted(SUFFIXES))}"
+        )
+    return sorted(names)
+
+
+def find_features(
+    photos: Path,
+    out: Path,
+    long_side: int = 1600,
+    features: int = 8192,
+    camera_model: str = "SIMPLE_RADIAL",
+    cameras: Cameras = "auto",
+    without: Path | None = None,
+) -> dict[str, Any]:
+    """Find SIFT features (Lowe 2004) in photographs, at most `long_side` px large, for at most `features` of each.
+
+    Photographs that their EXIF tag turns are copied upright, others linked.  `cameras: auto` lets photographs of one
+    size and focal length share a camera.  Raises DataError when fewer than three can be read.
+    """
+    pycolmap = _pycolmap()
+    names = _gather(photos, out / IMAGES, list_photos(photos, without))
+    database, mode = str(out / DATABASE), {"auto": "AUTO", "one": "SINGLE"}.get(cameras, cameras.upper())
+    reader, extraction = pycolmap.ImageReaderOptions(), pycolmap.FeatureExtractionOptions()
+    reader.camera_model = camera_model
+    extraction.max_image_size, extraction.use_gpu = long_side, False
+    extraction.sift.max_num_features = features
+    with _explained(photos, "find features"):
+        pycolmap.Database.open(database).close()
+        pycolmap.import_images(
+            database, str(out / IMAGES), getattr(pycolmap.CameraMode, mode), image_names=names, options=reader
+        )
+        for start in range(0, len(names), CHUNK):
+            pycolmap.extract_features(
+                database,
+                str(out / IMAGES),
+                names[start : start + CHUNK],
+                extraction_options=extraction,
+                reader_options=reader,
+                device=pycolmap.Device.cpu,
+            )
+            LOG.info("features of %d of %d photographs", min(start + CHUNK, len(names)), len(names))
+    return {"photographs": len(names)}
+
+
+def match_features(source: Path, out: Path, matching: Matching = "auto", neighbours: int = 10) -> dict[str, Any]:
+    """Match features between photographs: all pairs, each with the `neighbours` next ones by name, or alike ones.
+
+    `auto` matches all pairs of at most 200 photographs, and the most alike of more.  Raises DataError when nothing
+    matches.
+    """
+    pycolmap = _pycolmap()
+    _link(source / IMAGES, out / IMAGES)
+    shutil.copyfile(source / DATABASE, out / DATABASE)
+    database = out / DATABASE
+    count = _count(pycolmap, database, "num_images")
+    chosen = ("exhaustive" if count <= EXHAUSTIVE else "vocabulary") if matching == "auto" else matching
+    options, verification = pycolmap.FeatureMatchingOptions(), pycolmap.TwoViewGeometryOptions()
+    options.use_gpu, verification.ransac.random_seed = False, 0
+    common = {
+        "matching_options": options,
+        "verification_options": verification,
+        "device": pycolmap.Device.cpu,
+    }
+    LOG.info("matching %d photographs, %s", count, chosen)
+    with _explained(source, "match photographs"):
+        if chosen == "sequential":
+            pairing = pycolmap.SequentialPairingOptions()
+            pairing.overlap = neighbours
+            pycolmap.match_sequential(str(database), pairing_options=pairing, **common)
+        elif chosen == "vocabulary":
+            pairs = out / "pairs.txt"
+            pairs.write_text("".join(f"{a} {b}\n" for a, b in _alike_pairs(pycolmap, database, 2 * neighbours)))
+            imported = pycolmap.ImportedPairingOptions()
+            imported.match_list_path = pairs
+            pycolmap.match_image_pairs(str(database), pairing_options=imported, **common)
+        else:
+            pycolmap.match_exhaustive(str(database), **common)
+    verified = _count(pycolmap, database, "num_verified_image_pairs")
+    if verified == 0:
+        raise DataError(
+            f"{source / IMAGES}: no two of the {count} photographs show the same thing; take them with more overlap, "
+            "of a scene that stands still"
+        )
+    return {"matching": chosen, "pairs": verified}
+
+
+def map_cameras(source: Path, out: Path, mapper: Mapper = "incremental", threads: int = 1) -> dict[str, Any]:
+    """Place cameras and points; keep the largest model as sparse/0 and tell of the others.
+
+    `mapper: global` is faster for many photographs; more than one thread is faster and not repeatable to the bit.
+    Raises DataError when no model of three images comes out.
+    """
+    pycolmap = _pycolmap()
+    _link(source / IMAGES, out / IMAGES)
+    work = out / ".models"
+    work.mkdir()
+    names = _image_names(pycolmap, source / DATABASE)
+    is_global = mapper == "global"
+    options = pycolmap.GlobalPipelineOptions() if is_global else pycolmap.IncrementalPipelineOptions()
+    options.num_threads = options.mapper.num_threads = threads
+    options.random_seed = options.mapper.random_seed = 0
+    options.min_model_size = FEWEST
+    pycolmap.set_random_seed(0)
+    with _explained(source / IMAGES, "place the cameras"):
+        function = pycolmap.global_mapping if is_global else pycolmap.incremental_mapping
+        paths = str(source / DATABASE), str(out / IMAGES), str(work)
+        placed = [2]
+
+        def count() -> None:
+            placed[0] += 1
+            if placed[0] % CHUNK == 0:
+                LOG.info("%d of %d photographs placed", placed[0], len(names))
+
+        watched = {} if is_global else {"next_image_callback": count}
+        models = list(function(*paths, options=options, **watched).values())
+    shutil.rmtree(work)
+    models.sort(key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
+    if not models or models[0].num_reg_images() < FEWEST:
+        raise DataError(
+            f"{source / IMAGES}: the {len(names)} photographs could not be placed; take more of them, sharp, from "
+            "places a step apart, of a scene with texture that stands still"
+        )
+    best = models[0]
+    (out / "sparse" / "0").mkdir(parents=True)
+    best.write(str(out / "sparse" / "0"))
+    registered = {best.images[number].name for number in best.reg_image_ids()}
+    missing = [name for name in names if name not in registered]
+    if missing:
+        LOG.warning("%d photographs could not be placed: %s", len(missing), ", ".join(missing[:8]))
+    others = [model.num_reg_images() for model in models[1:]]
+    if others:
+        LOG.warning("%d smaller models, of %s images, are left out", len(others), ", ".join(map(str, others)))
+    return {
+        "registered": len(registered),
+        "not_registered": missing,
+        "other_models": others,
+        "points": best.num_points3D(),
+        "error_px": round(best.compute_mean_reprojection_error(), 3),
+    }
+
+
+def _gather(photos: Path, images: Path, names: list[str]) -> list[str]:
+    """Link photographs into a folder, or copy them upright; return the names of those that can be read."""
+    kept = []
+    for name in names:
+        try:
+            stored, upright = read_image(photos / name), read_image(photos / name, upright=True)
+        except DataError as error:
+            LOG.warning("%s; left out", error)
+            continue
+        (images / name).parent.mkdir(parents=True, exist_ok=True)
+        if stored.shape[:2] == upright.shape[:2] and (stored[:, :, :3] == upright[:, :, :3]).all():
+            _link(photos / name, images / name)
+        else:
+            _, encoded = cv2.imencode(".jpg", np.ascontiguousarray(upright[:, :, ::-1]), [cv2.IMWRITE_JPEG_QUALITY, 98])
+            (images / name).write_bytes(encoded.tobytes())
+        kept.append(name)
+    if len(kept) < FEWEST:
+        raise DataError(f"{photos}: only {len(kept)} of {len(names)} photographs can be read; export them again")
+    return kept
+
+
+def _link(source: Path, target: Path) -> None:
+    """Link a file or folder, or copy it where links are not to be had."""
+    try:
+        target.symlink_to(source.resolve(), target_is_directory=source.is_dir())
+    except OSError:
+        (shutil.copytree if source.is_dir() else shutil.copyfile)(source, target)
+
+
+def _alike_pairs(pycolmap: ModuleType, database: Path, neighbours: int) -> list[tuple[str, str]]:
+    opened = pycolmap.Database.open(str(database))
+    images = sorted(opened.read_all_images(), key=lambda image: image.name)
+    tables = [np.asarray(opened.read_descriptors(image.image_id).data, np.float32) for image in images]
+    opened.close()
+    if spaced := [image.name for image in images if len(image.name.split()) > 1]:
+        raise DataError(
+            f"'{spaced[0]}': COLMAP's lists of pairs know no spaces in names; rename it, or match all pairs"
+        )
+    return [(images[i].name, images[j].name) for i, j in alike(tables, neighbours)]
+
+
+def _count(pycolmap: ModuleType, database: Path, what: str) -> int:
+    opened = pycolmap.Database.open(str(database))
+    try:
+        value = getattr(opened, what)
+        return int(value() if callable(value) else value)
+    finally:
+        opened.close()
+
+
+def _image_names(pycolmap: ModuleType, database: Path) -> list[str]:
+    opened = pycolmap.Database.open(str(database))
+    try:
+        return sorted(image.name for image in opened.read_all_images())
+    finally:
+        opened.close()
+
+
+def _pycolmap() -> ModuleType:
+    try:
+        import pycolmap
+    except ImportError as error:
+        raise ConfigError("placing photographs needs pycolmap: pip install 'clsplat[photos]'") from error
+    pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR.value)
+    return pycolmap
+
+
+@contextmanager
+def _explained(place: Path, what: str) -> Iterator[None]:
+    """pycolmap's errors as one sentence."""
+    try:
+        yield
+    except (ValueError, RuntimeError) as error:
+        raise DataError(f"{place}: could not {what} ({str(error).splitlines()[0]}); check the photographs") from error

@@ -1,0 +1,62 @@
+"""A scene as pinhole cameras would have taken it: straightened photographs, smaller ones if wanted, and their masks."""
+
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from clsplat.errors import DataError
+from clsplat.scene.detect import read_scene
+from clsplat.scene.images import load_image, load_mask, write_image
+from clsplat.scene.scene import View
+from data_tools.colmap_writer import write_model
+
+Blank = Literal["crop", "mask"]
+
+
+def undistort_scene(source: Path, out: Path, long_side: int | None = None, blank: Blank = "crop") -> int:
+    """Write a COLMAP scene of pinhole cameras into `out`; return the number of its images.
+
+    Photographs larger than `long_side` px are made smaller.  `blank: crop` keeps the largest part of a photograph
+    without blank pixels, `mask` the whole, with masks of what is blank.  Images that are there already are left alone.
+    Raises DataError when the scene cannot be read.
+    """
+    scene = read_scene(source, holdout=0)
+    names = _png_names([view.name for view in scene.views])
+    views = []
+    for view, name in zip(scene.views, names, strict=True):
+        wanted = replace(_sized(_shown(view, blank), long_side), alpha="mask")
+        image, mask = out / "images" / name, out / "masks" / name
+        if not image.is_file():
+            counts = load_mask(wanted)
+            if counts is not None and not counts.all():
+                write_image(mask, np.repeat(np.where(counts, 255, 0).astype(np.uint8)[:, :, None], 3, axis=2))
+            write_image(image, load_image(wanted))
+        views.append(replace(wanted, name=name))
+    write_model(out / "sparse" / "0", views, scene.points)
+    return len(views)
+
+
+def _shown(view: View, blank: Blank) -> View:
+    if view.lens is None or blank == "crop":
+        return view
+    lens = replace(view.lens, whole=True)
+    return replace(view, lens=lens, camera=lens.pinhole)
+
+
+def _sized(view: View, long_side: int | None) -> View:
+    """The view with no side longer than `long_side` px."""
+    longest = max(view.camera.width, view.camera.height)
+    return view if long_side is None else view.at(max(1.0, longest / long_side))
+
+
+def _png_names(names: list[str]) -> list[str]:
+    """The names with .png for their suffix, or behind it where names would be the same."""
+    short = [Path(name).with_suffix(".png").as_posix() for name in names]
+    taken = Counter(short)
+    chosen = [one if taken[one] == 1 else f"{name}.png" for one, name in zip(short, names, strict=True)]
+    if len(set(chosen)) < len(chosen):
+        raise DataError(f"two images would be called '{Counter(chosen).most_common(1)[0][0]}'; rename one")
+    return chosen

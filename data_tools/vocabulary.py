@@ -1,0 +1,45 @@
+"""Which photographs look alike: bags of visual words (Sivic and Zisserman 2003), learnt from these photographs."""
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+WORDS = 1024
+SAMPLES = 40  # descriptors by word that words are learnt from
+ROUNDS = 10  # of k-means
+
+
+def alike(tables: Sequence[NDArray[np.float32]], neighbours: int) -> list[tuple[int, int]]:
+    """Pairs (i, j), i < j, of each photograph with the `neighbours` most alike ones.
+
+    tables: descriptors [M, 128] of each photograph.  A word is a cell of k-means over a sample of the descriptors;
+    photographs are compared by the cosine of their TF-IDF vectors.
+    """
+    rng = np.random.default_rng(0)
+    sample = np.concatenate(
+        [table[rng.permutation(len(table))[: SAMPLES * WORDS // len(tables) + 1]] for table in tables]
+    )
+    counts = np.zeros((len(tables), WORDS))
+    words = _words(sample)
+    for row, table in enumerate(tables):
+        if len(table):
+            distance = (words**2).sum(axis=1) - 2 * table @ words.T
+            counts[row] += np.bincount(distance.argmin(axis=1), minlength=WORDS)
+    rarity = np.log(len(tables) / np.maximum((counts > 0).sum(axis=0), 1))
+    vectors = counts * rarity
+    vectors /= np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
+    likeness = vectors @ vectors.T
+    np.fill_diagonal(likeness, -1)
+    nearest = np.argsort(-likeness, axis=1, kind="stable")[:, : min(neighbours, len(tables) - 1)]
+    return sorted({(min(i, int(j)), max(i, int(j))) for i, row in enumerate(nearest) for j in row})
+
+
+def _words(sample: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Centres of k-means, [at most WORDS, 128]."""
+    cv2.setRNGSeed(0)
+    criteria = (cv2.TERM_CRITERIA_MAX_ITER, ROUNDS, 0)
+    count, labels = min(WORDS, len(sample)), np.empty(0, np.int32)
+    _, _, words = cv2.kmeans(sample, count, labels, criteria, 1, cv2.KMEANS_PP_CENTERS)
+    return np.asarray(words, np.float32)
