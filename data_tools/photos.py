@@ -111,7 +111,7 @@ def match_features(source: Path, out: Path, matching: Matching = "auto", neighbo
     _link(source / IMAGES, out / IMAGES)
     shutil.copyfile(source / DATABASE, out / DATABASE)
     database = out / DATABASE
-    count = _count(pycolmap, database, "num_images")
+    count = len(_image_names(pycolmap, database))
     chosen = ("exhaustive" if count <= EXHAUSTIVE else "vocabulary") if matching == "auto" else matching
     options, verification = pycolmap.FeatureMatchingOptions(), pycolmap.TwoViewGeometryOptions()
     options.use_gpu, verification.ransac.random_seed = False, 0
@@ -134,7 +134,7 @@ def match_features(source: Path, out: Path, matching: Matching = "auto", neighbo
             pycolmap.match_image_pairs(str(database), pairing_options=imported, **common)
         else:
             pycolmap.match_exhaustive(str(database), **common)
-    verified = _count(pycolmap, database, "num_verified_image_pairs")
+    verified = _matched_pairs(pycolmap, database)
     if verified == 0:
         raise DataError(
             f"{source / IMAGES}: no two of the {count} photographs show the same thing; take them with more overlap, "
@@ -239,11 +239,12 @@ def _alike_pairs(pycolmap: ModuleType, database: Path, neighbours: int) -> list[
     return [(images[i].name, images[j].name) for i, j in alike(tables, neighbours)]
 
 
-def _count(pycolmap: ModuleType, database: Path, what: str) -> int:
+def _matched_pairs(pycolmap: ModuleType, database: Path) -> int:
+    """Number of pairs that share features which agree on how the cameras stand."""
     opened = pycolmap.Database.open(str(database))
     try:
-        value = getattr(opened, what)
-        return int(value() if callable(value) else value)
+        _, inliers = opened.read_two_view_geometry_num_inliers()
+        return int(np.count_nonzero(inliers))
     finally:
         opened.close()
 

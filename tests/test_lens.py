@@ -1,6 +1,7 @@
 """Camera models against pycolmap's projections, and straightened photographs against the lens."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -39,6 +40,31 @@ def test_straightened_photographs_agree_with_the_lens(lens):
     py = (np.arange(camera.height) + 0.5)[rows]
     seen = shown[rows, columns, :2] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
     np.testing.assert_allclose(seen, np.stack([px, py], axis=1), atol=0.1)
+
+
+@pytest.mark.parametrize("lens", [STRONG, FISHEYE])
+def test_the_whole_photograph(lens):
+    """Every ray within 60 degrees and twice the size is in the wide pinhole; its mask tells what it shows, to 0.1 px."""
+    lens = replace(lens, whole=True)
+    y, x = np.meshgrid(np.arange(lens.height) + 0.5, np.arange(lens.width) + 0.5, indexing="ij")
+    u, v = lens.unbend(x, y)
+    camera = lens.pinhole
+    columns, rows = u * camera.fx + camera.cx, v * camera.fy + camera.cy
+    near = (np.maximum(np.abs(u), np.abs(v)) < 3**0.5) & (np.abs(u) < 200 / camera.fx) & (np.abs(v) < 150 / camera.fy)
+    assert columns[near].min() > -1
+    assert rows[near].min() > -1
+    assert columns[near].max() < camera.width + 1
+    assert rows[near].max() < camera.height + 1
+    seen = lens.undistort(np.stack([u, v, v], axis=2).astype(np.float32))
+    py, px = np.nonzero(lens.shown)
+    assert 0.5 < lens.shown.mean() < 1
+    inner = (py % 7 == 0) | (px % 7 == 0)
+    py, px = py[inner], px[inner]
+    found = seen[py, px, :2] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+    error = np.abs(found - np.stack([px + 0.5, py + 0.5], axis=1)).max(axis=1)
+    x, y = lens.bend((px + 0.5 - camera.cx) / camera.fx, (py + 0.5 - camera.cy) / camera.fy)
+    whole = (x > 0.5) & (y > 0.5) & (x < lens.width - 0.5) & (y < lens.height - 0.5)  # not on the last half pixel
+    assert error[whole].max() < 0.1
 
 
 @pytest.mark.parametrize("lens", [STRONG, FISHEYE])

@@ -1,0 +1,197 @@
+"""Structure from motion on real photographs, against the poses they came with; and photographs that need care."""
+
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from clsplat.errors import DataError
+from clsplat.scene.colmap import read_colmap
+from clsplat.scene.images import load_image, load_mask
+from clsplat.scene.lens import Lens
+from clsplat.scene.scene import Camera, View
+from data_tools.colmap_writer import write_model
+from data_tools.photos import find_features, list_photos, map_cameras, match_features
+from data_tools.undistort import undistort_scene
+from data_tools.vocabulary import alike
+from tests.colmap_writer import CameraEntry, ImageEntry, Model, PointEntry
+from tests.colmap_writer import write_model as write_test_model
+from tests.data_sets import data_set
+from tests.refusals import refusal
+from tests.test_masks import with_orientation
+
+
+def place(photos: Path, out: Path, **matching: object) -> Path:
+    for name in ("features", "matches", "cameras"):
+        (out / name).mkdir(parents=True)
+    find_features(photos, out / "features", long_side=480, features=2048)
+    match_features(out / "features", out / "matches", **matching)
+    map_cameras(out / "matches", out / "cameras")
+    return out / "cameras"
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Fourteen neighbouring photographs."""
+    pytest.importorskip("pycolmap")
+    source = data_set("fox_opencv")
+    folder = tmp_path_factory.mktemp("photos")
+    for view in sorted(read_colmap(source).views, key=lambda view: view.name)[:14]:
+        shutil.copy(view.image_path, folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def placed(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return place(photos, tmp_path_factory.mktemp("placed"))
+
+
+def aligned_errors(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Distances after the best similarity transform (Umeyama 1991), [N]."""
+    a, b = found - found.mean(axis=0), truth - truth.mean(axis=0)
+    u, d, vt = np.linalg.svd(b.T @ a)
+    sign = np.diag([1, 1, np.sign(np.linalg.det(u @ vt))])
+    scale = (d * np.diag(sign)).sum() / (a**2).sum()
+    return np.linalg.norm(b - scale * a @ (u @ sign @ vt).T, axis=1)
+
+
+def test_cameras_are_where_they_were(placed):
+    truth = {view.name: view.position for view in read_colmap(data_set("fox_opencv")).views}
+    views = read_colmap(placed).views
+    assert len(views) == 14
+    errors = aligned_errors(np.stack([v.position for v in views]), np.stack([truth[v.name] for v in views]))
+    reach = np.linalg.norm(np.ptp([truth[v.name] for v in views], axis=0))
+    assert np.median(errors) < 0.01 * reach
+    assert errors.max() < 0.03 * reach
+
+
+def test_the_same_photographs_give_the_same_cameras(photos, placed, tmp_path):
+    again = place(photos, tmp_path)
+    for name in ("cameras.bin", "images.bin", "points3D.bin"):
+        assert (again / "sparse" / "0" / name).read_bytes() == (placed / "sparse" / "0" / name).read_bytes(), name
+
+
+@pytest.mark.parametrize("matching", ["sequential", "vocabulary"])
+def test_other_ways_to_match(photos, tmp_path, matching):
+    placed = place(photos, tmp_path, matching=matching, neighbours=3)
+    assert len(read_colmap(placed).views) >= 12
+
+
+def test_photographs_that_show_nothing(tmp_path):
+    pytest.importorskip("pycolmap")
+    for i in range(3):
+        cv2.imwrite(str(tmp_path / f"{i}.png"), np.full((64, 64, 3), 80, np.uint8))
+    with pytest.raises(DataError, match="no two of the 3 photographs show the same thing"):
+        place(tmp_path, tmp_path / "out")
+
+
+# ---- which photographs
+
+
+def test_photographs_are_found_below_the_folder(tmp_path):
+    (tmp_path / "a" / ".hidden").mkdir(parents=True)
+    (tmp_path / "runs").mkdir()
+    for name in ("b.JPG", "a/ü 1.png", "a/.hidden/x.jpg", ".y.png", "runs/r.png", "K.txt", "c.tif"):
+        (tmp_path / name).touch()
+    assert list_photos(tmp_path, tmp_path / "runs") == ["a/ü 1.png", "b.JPG", "c.tif"]
+    (tmp_path / "c.tif").unlink()
+    assert "found 2 photographs; expected at least 3" in refusal(list_photos, tmp_path, tmp_path / "runs")
+
+
+def test_damaged_photographs_are_left_out_and_turned_ones_turned(tmp_path, caplog):
+    pytest.importorskip("pycolmap")
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    pixels = np.random.default_rng(0).integers(0, 256, (32, 48, 3)).astype(np.uint8)
+    for i in range(3):
+        cv2.imwrite(str(photos / f"{i}.png"), pixels)
+    with_orientation(photos / "turned.jpg", pixels, 6)
+    (photos / "broken.jpg").write_bytes(b"\xff\xd8\xff nothing")
+    (tmp_path / "out").mkdir()
+    told = find_features(photos, tmp_path / "out")
+    images = tmp_path / "out" / "images"
+    assert told["photographs"] == 4
+    assert "broken.jpg" in caplog.text
+    assert sorted(path.name for path in images.iterdir()) == ["0.png", "1.png", "2.png", "turned.jpg"]
+    assert (images / "0.png").is_symlink()
+    assert cv2.imread(str(images / "turned.jpg"), cv2.IMREAD_UNCHANGED).shape == (48, 32, 3)
+
+
+def test_alike_photographs(rng):
+    """Each shares half of its features with the next one, in a ring."""
+    halves = rng.random((6, 300, 128), dtype=np.float32)
+    tables = [np.concatenate([halves[i], halves[(i + 1) % 6]]) for i in range(6)]
+    assert alike(tables, 2) == [(0, 1), (0, 5), (1, 2), (2, 3), (3, 4), (4, 5)]
+    assert alike([*tables[:2], np.empty((0, 128), np.float32)], 1)[0] == (0, 1)
+
+
+# ---- the scene written
+
+
+def test_a_written_model_reads_back(tmp_path, rng):
+    camera = Camera(6, 4, 5.5, 5.25, 3.1, 1.9)
+    turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    turn *= np.sign(np.linalg.det(turn))
+    views = [
+        View("é/a.png", camera, np.column_stack([turn, [1.0, 2.0, 3.0]]), tmp_path),
+        View("b.png", Camera(4, 6, 5, 5, 2, 3), np.eye(3, 4), tmp_path),
+    ]
+    write_model(tmp_path / "sparse" / "0", views, None)
+    for view in views:
+        path = tmp_path / "images" / view.name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(path), np.zeros((view.camera.height, view.camera.width, 3), np.uint8))
+    for view, read in zip(sorted(views, key=lambda v: v.name), read_colmap(tmp_path).views, strict=True):
+        assert (read.name, read.camera) == (view.name, view.camera)
+        np.testing.assert_allclose(read.world_to_camera, view.world_to_camera, atol=1e-12)
+
+
+BENT = [
+    Lens(200, 150, "OPENCV", (160.0, 165.0, 97.0, 80.0, -0.25, 0.06, 0.002, -0.001)),
+    Lens(200, 150, "OPENCV_FISHEYE", (90.0, 91.0, 101.0, 74.0, 0.02, -0.01, 0.003, 0.0)),
+    Lens(200, 150, "SIMPLE_RADIAL", (160.0, 100.0, 75.0, 0.1)),
+]
+
+
+@pytest.mark.parametrize("lens", BENT, ids=lambda lens: lens.model)
+@pytest.mark.parametrize("blank", ["crop", "mask"])
+def test_undistorted_scene(tmp_path, lens, blank):
+    """A pattern that depends on the ray is seen along the pinhole's own rays; what is blank is masked."""
+    columns, rows = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
+    (tmp_path / "images").mkdir()
+    photograph = np.nan_to_num(pattern(*lens.unbend(columns, rows)))
+    cv2.imwrite(str(tmp_path / "images" / "a.png"), np.rint(photograph).astype(np.uint8))
+    entry = CameraEntry(1, lens.model, lens.width, lens.height, lens.params)
+    write_test_model(tmp_path / "sparse" / "0", Model([entry], [ImageEntry("a.png")], [PointEntry((0, 0, 3))]))
+    assert undistort_scene(tmp_path, tmp_path / "out", blank=blank) == 1
+    (view,) = read_colmap(tmp_path / "out", 0).views
+    assert view.lens is None
+    shown, mask = load_image(view), load_mask(view)
+    if blank == "crop":
+        assert mask is None
+        mask = np.ones(shown.shape[:2], bool)
+    else:
+        assert mask is not None
+        assert 0.4 < mask.mean() < 1
+        assert view.camera.width * view.camera.height > lens.pinhole.width * lens.pinhole.height
+    y, x = np.nonzero(mask)
+    seen = pattern((x + 0.5 - view.camera.cx) / view.camera.fx, (y + 0.5 - view.camera.cy) / view.camera.fy)
+    assert np.abs(shown[y, x, 0] - seen).max() < 2
+
+
+def pattern(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Smooth enough for the edge of a fisheye, where a pixel is a long way."""
+    return 127 + 100 * np.sin(2 * u) * np.cos(1.5 * v)
+
+
+def test_undistorted_photographs_are_smaller_and_kept(tmp_path):
+    source = data_set("brighton")
+    count = undistort_scene(source, tmp_path / "out", long_side=120)
+    views = read_colmap(tmp_path / "out").views
+    assert len(views) == count == len(read_colmap(source).views)
+    assert {max(view.camera.width, view.camera.height) for view in views} == {120}
+    times = {view.image_path: view.image_path.stat().st_mtime_ns for view in views}
+    undistort_scene(source, tmp_path / "out", long_side=120)
+    assert {path: path.stat().st_mtime_ns for path in times} == times

@@ -1,0 +1,185 @@
+"""Steps from photographs to a scene: done once, redone when what they depend on changes, nothing left half-made."""
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+import pytest
+from typer.testing import CliRunner
+
+from clsplat import cli, runner
+from clsplat.errors import ConfigError, DataError
+from clsplat.pipeline import load
+from clsplat.prepare import steps as prepare_steps
+from clsplat.prepare.cache import fingerprint, plan, prepare
+from clsplat.prepare.steps import Step
+from tests.refusals import refusal
+
+
+class Copy(Step):
+    """Writes what it read, and its letter behind it."""
+
+    calls: ClassVar[list[str]] = []
+
+    stage: Literal["copy"] = "copy"
+    letter: str = "a"
+    fail: bool = False
+
+    def make(self, source: Path, out: Path, without: Path) -> dict[str, Any]:
+        self.calls.append(self.letter)
+        text = "".join(sorted(path.read_text() for path in source.glob("*.txt")))
+        (out / "x.txt").write_text(text + self.letter)
+        if self.fail:
+            raise DataError("broken")
+        return {"length": len(text)}
+
+
+@pytest.fixture
+def photos(tmp_path: Path) -> Path:
+    Copy.calls.clear()
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "p.txt").write_text("p")
+    return tmp_path / "photos"
+
+
+def do(steps: list[Step], photos: Path, root: Path) -> tuple[str, list[str]]:
+    """The text of the last result, and the letters of the steps that ran."""
+    Copy.calls.clear()
+    folder = prepare(plan(steps, photos, root), photos, root)
+    return (folder / "x.txt").read_text(), list(Copy.calls)
+
+
+def test_the_second_time_nothing_is_done(photos, tmp_path):
+    root, steps = tmp_path / "runs" / "prepared", [Copy(letter="a"), Copy(letter="b")]
+    assert do(steps, photos, root) == ("pab", ["a", "b"])
+    assert do(steps, photos, root) == ("pab", [])
+
+
+def test_what_depends_on_a_change_is_redone(photos, tmp_path):
+    root, a, b, c = tmp_path / "runs" / "prepared", Copy(letter="a"), Copy(letter="b"), Copy(letter="c")
+    do([a, b, c], photos, root)
+    assert do([a, Copy(letter="x"), c], photos, root) == ("paxc", ["x", "c"])
+    assert do([a, b, c], photos, root) == ("pabc", [])  # the earlier result is still there
+    (photos / "q.txt").write_text("q")
+    assert do([a, b, c], photos, root) == ("pqabc", ["a", "b", "c"])
+
+
+def test_why(photos, tmp_path):
+    root, steps = tmp_path / "runs" / "prepared", [Copy(letter="a"), Copy(letter="b")]
+    assert [one.why for one in plan(steps, photos, root)] == ["not done yet"] * 2
+    do(steps, photos, root)
+    assert [one.why for one in plan(steps, photos, root)] == ["", ""]
+    changed = plan([steps[0], Copy(letter="z")], photos, root)
+    assert [one.why for one in changed] == ["", "letter is z, was b"]
+    (photos / "p.txt").write_text("P")
+    assert plan(steps, photos, root)[0].why == "letter is a, was b"  # the newest of that step
+    assert [one.why for one in plan(steps[1:], photos, root)] == ["what it reads has changed"]
+
+
+def test_results_on_the_way_are_not_missed(photos, tmp_path):
+    root, steps = tmp_path / "runs" / "prepared", [Copy(letter="a"), Copy(letter="b")]
+    do(steps, photos, root)
+    first = plan(steps, photos, root)[0].folder
+    first.rename(tmp_path / "elsewhere")
+    assert do(steps, photos, root) == ("pab", [])
+
+
+def test_a_step_that_fails_leaves_nothing(photos, tmp_path):
+    root = tmp_path / "runs" / "prepared"
+    assert refusal(do, [Copy(letter="a"), Copy(letter="b", fail=True)], photos, root) == "broken"
+    assert [path.name.split("-")[0] for path in root.iterdir()] == ["copy"]
+    assert do([Copy(letter="a"), Copy(letter="b")], photos, root) == ("pab", ["b"])
+
+
+def test_what_a_killed_run_left_is_removed(photos, tmp_path):
+    root, steps = tmp_path / "runs" / "prepared", [Copy(letter="a")]
+    folder = plan(steps, photos, root)[0].folder
+    left = folder.with_name(f".{folder.name}")
+    left.mkdir(parents=True)
+    (left / "half.txt").write_text("half")
+    assert do(steps, photos, root) == ("pa", ["a"])
+    assert [path.name for path in root.iterdir()] == [folder.name]
+    assert not (folder / "half.txt").exists()
+
+
+def test_runs_inside_the_folder_of_photographs_do_not_count(photos, tmp_path):
+    root, steps = photos / "runs" / "prepared", [Copy(letter="a")]
+    before = fingerprint(photos, photos / "runs")
+    do(steps, photos, root)
+    assert fingerprint(photos, photos / "runs") == before != fingerprint(photos, tmp_path)
+    assert do(steps, photos, root) == ("pa", [])
+
+
+# ---- as part of a pipeline
+
+
+@pytest.fixture
+def pipeline(photos: Path, tiny_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A recipe whose only step makes the tiny scene, whatever the photographs."""
+
+    def make(step: Step, source: Path, out: Path, without: Path) -> dict[str, Any]:
+        shutil.copytree(tiny_scene, out, dirs_exist_ok=True)
+        return {}
+
+    text = Path(load("smoke").path).read_text()
+    file = tmp_path / "p.yaml"
+    file.write_text(text.replace("stages:", "prepare:\n  - find_features: {long_side: 99}\nstages:", 1))
+    monkeypatch.setattr(prepare_steps.FindFeatures, "make", make)
+    monkeypatch.chdir(tmp_path)
+    return file
+
+
+def clsplat(*words: str) -> tuple[int, str]:
+    result = CliRunner().invoke(cli.app, list(words))
+    if result.exception and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    return result.exit_code, result.output
+
+
+def run(pipeline: Path, photos: Path, *words: str) -> str:
+    return clsplat("run", str(pipeline), "--scene", str(photos), "--set", "optimize.steps=3", *words)[1]
+
+
+def test_a_pipeline_that_was_run_is_up_to_date(pipeline, photos, tmp_path):
+    assert "find_features  not done yet" in run(pipeline, photos, "--dry-run")
+    assert not (tmp_path / "runs").exists()
+    run(pipeline, photos)
+    model = (tmp_path / "runs" / "smoke" / "point_cloud.ply").stat().st_mtime_ns
+    assert "up to date" in run(pipeline, photos, "--dry-run")
+    assert "up to date" in run(pipeline, photos)
+    assert (tmp_path / "runs" / "smoke" / "point_cloud.ply").stat().st_mtime_ns == model
+    assert sorted(path.name for path in (tmp_path / "runs").iterdir()) == ["prepared", "smoke"]
+
+
+def test_a_changed_setting_is_another_run(pipeline, photos, tmp_path):
+    run(pipeline, photos)
+    assert "find_features  done" in run(pipeline, photos, "--dry-run", "--set", "optimize.log_every=2")
+    run(pipeline, photos, "--set", "optimize.log_every=2")
+    assert (tmp_path / "runs" / "smoke-2" / "metrics.json").is_file()
+    assert "long_side is 50, was 99" in run(pipeline, photos, "--dry-run", "--set", "find_features.long_side=50")
+    (photos / "p.txt").write_text("other")
+    assert "what it reads has changed" in run(pipeline, photos, "--dry-run")
+
+
+def test_a_run_does_not_go_on_with_other_photographs(pipeline, photos, tmp_path):
+    checked = load(str(pipeline), [f"scene.path='{photos}'", "optimize.steps=3"])
+    out = tmp_path / "runs" / "a"
+    runner.prepare_folder(out, False)
+    runner.execute(checked, runner.open_run(checked, out, None), False, lambda progress: None)
+    (photos / "p.txt").write_text("other")
+    with pytest.raises(ConfigError, match="other photographs"):
+        runner.open_run(checked, out, None)
+
+
+def test_a_folder_with_cameras_is_not_a_folder_of_photographs(tiny_scene, tmp_path):
+    step = prepare_steps.FindFeatures()
+    message = refusal(prepare, plan([step], tiny_scene, tmp_path / "r" / "p"), tiny_scene, tmp_path / "r" / "p")
+    assert "has its cameras already" in message
+    assert not list((tmp_path / "r" / "p").iterdir())
+
+
+def test_the_note_of_a_run_names_its_photographs(pipeline, photos, tmp_path):
+    run(pipeline, photos)
+    note = json.loads((tmp_path / "runs" / "smoke" / "prepared.json").read_text())
+    assert (Path(note["folder"]) / "transforms_train.json").is_file()
