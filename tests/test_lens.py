@@ -44,7 +44,7 @@ def test_straightened_photographs_agree_with_the_lens(lens):
 
 @pytest.mark.parametrize("lens", [STRONG, FISHEYE])
 def test_the_whole_photograph(lens):
-    """Every ray within 60 degrees and twice the size is in the wide pinhole; its mask tells what it shows, to 0.1 px."""
+    """Every ray within 60 degrees and twice the size is in the wide pinhole; it shows what its mask says, to 0.1 px."""
     lens = replace(lens, whole=True)
     y, x = np.meshgrid(np.arange(lens.height) + 0.5, np.arange(lens.width) + 0.5, indexing="ij")
     u, v = lens.unbend(x, y)
