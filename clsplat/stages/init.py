@@ -2,6 +2,7 @@
 
 import logging
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
@@ -13,28 +14,32 @@ from scipy.spatial import cKDTree
 from clsplat.errors import DataError
 from clsplat.gaussians.model import SH_C0, Gaussians, sh_coefficients
 from clsplat.gaussians.ply import Parameters, read_ply
-from clsplat.scene.scene import PointCloud, Scene
+from clsplat.scene.images import load_image, read_image
+from clsplat.scene.plane_sweep import swept_points
+from clsplat.scene.scene import PointCloud, Scene, View
 from clsplat.stages.base import Stage
 from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
 DISTANCE2_MIN = 1.0e-7  # scene units²: coincident points still get a size
+FEWEST = 100  # points of a sweep that are worth starting from
 RANDOM_BOX = 1.3 / 4.03  # half side of the box by camera distance: what 3DGS takes for the Blender scenes
 
 
 class Init(Stage):
     """Make Gaussians: isotropic, as large as the mean distance to the three nearest neighbours (Kerbl et al. 2023).
 
-    `source: auto` takes the scene's points where there are some and random ones elsewhere.  Random points fill a box
-    around the point that the cameras look at.
+    `source: auto` takes the scene's points where there are some; elsewhere it sweeps the photographs for surfaces, or,
+    where those are cut out (with alpha), takes random points, which fill a box around what the cameras look at.
     """
 
     stage: Literal["init"] = "init"
     makes: ClassVar[frozenset[str]] = frozenset({"model"})
 
-    source: Literal["auto", "points", "random", "ply"] = "auto"
+    source: Literal["auto", "points", "sweep", "random", "ply"] = "auto"
     opacity: Annotated[float, Field(gt=0, lt=1)] = 0.1
     count: Annotated[int, Field(gt=0)] = 100_000  # of random points
+    swept: Annotated[int, Field(gt=0)] = 20_000  # points at most of a sweep
     file: str | None = None  # for `source: ply`
 
     def run(self, run: Run) -> None:
@@ -45,21 +50,40 @@ class Init(Stage):
         LOG.info("%d Gaussians from %s", run.model.gaussians.count, self._origin(run.scene))
 
     def _origin(self, scene: Scene) -> str:
-        if self.source == "auto":
-            return "the scene's points" if scene.points else "random points (the scene has none)"
-        return self.source
+        names = {"points": "the scene's points", "random": "random points", "sweep": "a sweep over the photographs"}
+        source = self._source(scene)
+        return names.get(source, source) + (
+            "" if scene.points is not None or source == "ply" else ": the scene has none"
+        )
+
+    def _source(self, scene: Scene) -> str:
+        if self.source != "auto":
+            return self.source
+        if scene.points is not None:
+            return "points"
+        return "random" if read_image(scene.views[0].image_path).shape[2] == 4 else "sweep"
 
     def _parameters(self, run: Run, degree: int) -> Parameters:
         if self.source == "ply":
             if self.file is None:
                 raise DataError("init: source 'ply' needs 'file'")
             return with_degree(read_ply(Path(self.file)).parameters, degree)
-        points = run.scene.points
-        if points is None and self.source == "points":
-            raise DataError(f"{run.scene.path}: has no points to start from; use init: {{source: random}}")
-        if points is None or self.source == "random":
+        points, source = run.scene.points, self._source(run.scene)
+        if source == "random":
             points = random_points(run.scene, self.count, run.seed)
+        elif source == "sweep":
+            points = self._swept(run)
+        elif points is None:
+            raise DataError(f"{run.scene.path}: has no points to start from; use init: {{source: sweep}}")
         return from_points(points, self.opacity, degree)
+
+    def _swept(self, run: Run) -> PointCloud:
+        views = run.scene.split("train")
+        points = swept_points(views, centre_of(views), load_image, self.swept, run.seed)
+        if len(points) < FEWEST:
+            LOG.warning("the photographs agree on %d points only; starting from random ones", len(points))
+            return random_points(run.scene, self.count, run.seed)
+        return points
 
 
 def from_points(points: PointCloud, opacity: float, degree: int) -> Parameters:
@@ -91,12 +115,16 @@ def neighbour_distance2(positions: NDArray[np.floating]) -> NDArray[np.float64]:
 def random_points(scene: Scene, count: int, seed: int) -> PointCloud:
     """Grey points, uniform in a box around what the training cameras look at."""
     views = scene.split("train")
-    positions = np.stack([view.position for view in views])
-    centre = looked_at(positions, np.stack([view.world_to_camera[2, :3] for view in views]))
+    positions, centre = np.stack([view.position for view in views]), centre_of(views)
     half_side = RANDOM_BOX * float(np.median(np.linalg.norm(positions - centre, axis=1)))
     rng = np.random.default_rng([seed, count])
     spread = rng.uniform(-half_side, half_side, (count, 3))
     return PointCloud((centre + spread).astype(np.float32), np.full((count, 3), 127 / 255, np.float32))
+
+
+def centre_of(views: Sequence[View]) -> NDArray[np.floating]:
+    """What the cameras look at, [3]."""
+    return looked_at(np.stack([v.position for v in views]), np.stack([v.world_to_camera[2, :3] for v in views]))
 
 
 def looked_at(positions: NDArray[np.floating], directions: NDArray[np.floating]) -> NDArray[np.floating]:
