@@ -177,6 +177,14 @@ def compare(
     CONSOLE.print(f"{count} runs compared in {out}", markup=False)
 
 
+@app.command(add_help_option=False, context_settings={"allow_extra_args": True, "ignore_unknown_options": True})
+def data(context: typer.Context) -> None:
+    """Prepare datasets: photos, video, undistort, resize, masks, multiscale, synthetic, fetch."""
+    from data_tools.__main__ import app as tools
+
+    tools(context.args, prog_name="clsplat data", standalone_mode=False)
+
+
 @app.command()
 def bench(
     scenes: Annotated[str, typer.Option(help="Fixed scenes, of A, B and C, separated by commas.")] = "A",

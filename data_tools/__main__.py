@@ -1,4 +1,4 @@
-"""Dataset preparation: python -m data_tools COMMAND ..."""
+"""Dataset preparation: `clsplat data COMMAND …`, or `python -m data_tools COMMAND …`."""
 
 import sys
 from pathlib import Path
@@ -8,7 +8,9 @@ import typer
 
 from clsplat.errors import ClsplatError
 from data_tools.multiscale import write_multiscale
+from data_tools.photos import Mapper, Matching
 from data_tools.synthetic import Options, write_dataset
+from data_tools.undistort import Blank
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False)
 
@@ -38,6 +40,85 @@ def multiscale(
 ) -> None:
     """Make the multi-scale Blender dataset of mip-NeRF from a single-scale one."""
     print(f"{write_multiscale(source, out, levels)} images written to {out}")
+
+
+@app.command()
+def photos(
+    source: Annotated[Path, typer.Argument(help="Folder of photographs; it is not written to.")],
+    out: Annotated[Path, typer.Argument(help="Folder for the scene; what it holds already is not made again.")],
+    long_side: Annotated[int, typer.Option(min=64, help="Pixels to look for features at.")] = 1600,
+    camera_model: Annotated[str, typer.Option(help="SIMPLE_RADIAL, OPENCV, OPENCV_FISHEYE, …")] = "SIMPLE_RADIAL",
+    matching: Annotated[Matching, typer.Option(help="Which photographs are compared.")] = "auto",
+    mapper: Annotated[Mapper, typer.Option(help="How cameras are placed.")] = "incremental",
+) -> None:
+    """Find the cameras of photographs: features, matches, structure from motion; a COLMAP folder."""
+    from data_tools.photos import place_photos
+
+    told = place_photos(source, out, long_side, camera_model, matching, mapper)
+    print("\n".join(f"{name}: {value}" for name, value in told.items()))
+
+
+@app.command()
+def video(
+    file: Annotated[Path, typer.Argument(help="A video.")],
+    out: Annotated[Path, typer.Argument(help="Folder for the frames.")],
+    frames: Annotated[int, typer.Option(min=1, help="Equal parts; the sharpest frame of each is kept.")] = 100,
+    long_side: Annotated[int | None, typer.Option(min=16, help="Pixels, at most.")] = None,
+) -> None:
+    """Take sharp, evenly spaced frames of a video."""
+    from data_tools.video import write_frames
+
+    print(f"{write_frames(file, out, frames, long_side)} frames in {out}")
+
+
+@app.command()
+def undistort(
+    scene: Annotated[Path, typer.Argument(help="A COLMAP or nerfstudio folder.")],
+    out: Annotated[Path, typer.Argument(help="Folder for the scene of pinhole cameras.")],
+    long_side: Annotated[int | None, typer.Option(min=16, help="Pixels, at most.")] = None,
+    blank: Annotated[Blank, typer.Option(help="Cut blank pixels off, or keep and mask them.")] = "crop",
+) -> None:
+    """Straighten the photographs of distorting lenses, fisheyes too."""
+    from data_tools.undistort import undistort_scene
+
+    print(f"{undistort_scene(scene, out, long_side, blank)} images in {out}")
+
+
+@app.command()
+def resize(
+    scene: Annotated[Path, typer.Argument(help="Folder that holds `images`.")],
+    levels: Annotated[int, typer.Option(min=1, max=6, help="images_2, images_4, …")] = 3,
+) -> None:
+    """Make image pyramids beside a scene's images."""
+    from data_tools.resize import write_pyramid
+
+    print(f"{write_pyramid(scene, levels)} images written beside {scene / 'images'}")
+
+
+@app.command()
+def masks(
+    scene: Annotated[Path, typer.Argument(help="A COLMAP, Blender or nerfstudio folder.")],
+    folder: Annotated[Path | None, typer.Option(help="Masks made elsewhere; default: from the images' alpha.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Where to; default: SCENE/masks.")] = None,
+    threshold: Annotated[float, typer.Option(min=0, max=1, help="Alpha that counts.")] = 0.5,
+) -> None:
+    """Write masks of what counts, from alpha or from a folder."""
+    from data_tools.masks import write_masks
+
+    print(f"{write_masks(scene, folder, out, threshold)} masks written")
+
+
+@app.command()
+def fetch(
+    name: Annotated[str, typer.Argument(help="mipnerf360, tandt_db, or the address of a ZIP or TAR archive.")],
+    out: Annotated[Path, typer.Argument(help="Folder to make.")],
+    sha256: Annotated[str, typer.Option(help="The checksum of an archive given by its address.")] = "",
+) -> None:
+    """Download a public data set; a broken download goes on where it broke."""
+    from data_tools.fetch import Source, named
+    from data_tools.fetch import fetch as download
+
+    download(Source(name, "", sha256 or None) if "://" in name else named(name), out)
 
 
 def main() -> None:

@@ -12,7 +12,7 @@ runs in one thread unless told otherwise.
 import logging
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
@@ -60,6 +60,39 @@ def list_photos(folder: Path, without: Path | None = None) -> list[str]:
             f"{folder}: found {len(names)} photographs; expected at least {FEWEST}, of {', '.join(sorted(SUFFIXES))}"
         )
     return sorted(names)
+
+
+def place_photos(
+    photos: Path,
+    out: Path,
+    long_side: int = 1600,
+    camera_model: str = "SIMPLE_RADIAL",
+    matching: Matching = "auto",
+    mapper: Mapper = "incremental",
+) -> dict[str, Any]:
+    """Do all three steps into `out`, a COLMAP folder whose hidden folder `.steps` lets a killed run go on.
+
+    Raises what they raise.
+    """
+    steps: list[tuple[str, Callable[[Path, Path], dict[str, Any]]]] = [
+        ("features", lambda source, to: find_features(source, to, long_side, camera_model=camera_model)),
+        ("matches", lambda source, to: match_features(source, to, matching)),
+        ("cameras", lambda source, to: map_cameras(source, to, mapper)),
+    ]
+    if (out / "sparse" / "0").is_dir():
+        raise DataError(f"{out}: holds a model already; remove it, or give another folder")
+    source, told = photos, dict[str, Any]()
+    for name, step in steps:
+        folder, temporary = out / ".steps" / name, out / ".steps" / f"{name}.part"
+        if not folder.is_dir():
+            shutil.rmtree(temporary, ignore_errors=True)
+            temporary.mkdir(parents=True)
+            told |= step(source.resolve(), temporary)
+            temporary.rename(folder)
+        source = folder
+    _link(source / IMAGES, out / IMAGES)
+    (source / "sparse").rename(out / "sparse")
+    return told
 
 
 def find_features(

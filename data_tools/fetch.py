@@ -1,0 +1,193 @@
+"""Public data sets by name: downloaded, continued where a connection broke, verified, and unpacked whole."""
+
+import hashlib
+import shutil
+import tarfile
+import time
+import urllib.error
+import urllib.request
+import zipfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath, PureWindowsPath
+from typing import BinaryIO
+
+from clsplat.errors import ConfigError, DataError, OutputError
+from clsplat.files import unwritable
+
+CHUNK = 1 << 20  # bytes
+TRIES = 5  # of one download
+PAUSE = 1.0  # s between them
+TIMEOUT = 30  # s without a byte
+LARGEST = 200 << 30  # bytes that an archive may unpack to
+Tell = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Source:
+    """An archive on the web.  Without a checksum the one that is seen is told, so that it can be compared."""
+
+    url: str
+    licence: str
+    sha256: str | None = None
+
+
+SOURCES = {
+    "mipnerf360": Source(
+        "http://storage.googleapis.com/gresearch/refraw360/360_v2.zip",
+        "Mip-NeRF 360 (Barron et al. 2022); no licence is stated: for research",
+    ),
+    "tandt_db": Source(
+        "https://repo-sam.inria.fr/fungraph/3d-gaussian-splatting/datasets/input/tandt_db.zip",
+        "Tanks and Temples (Knapitsch et al. 2017) and Deep Blending (Hedman et al. 2018), as 3DGS uses them",
+    ),
+}
+
+
+def named(name: str) -> Source:
+    """Return a known source.  Raises ConfigError."""
+    if name not in SOURCES:
+        raise ConfigError(f"no data set named '{name}'; there are {', '.join(SOURCES)}, or give --url")
+    return SOURCES[name]
+
+
+def fetch(source: Source, out: Path, tell: Tell = print) -> Path:
+    """Download an archive and unpack it as the folder `out`; a folder that is there already is left alone.
+
+    What was downloaded before a connection broke, or the process was killed, is kept beside as `….part` and continued.
+    Raises DataError when the archive cannot be had, is not what was expected or would write outside of its folder.
+    """
+    if out.exists():
+        tell(f"{out} is there already: nothing to do")
+        return out
+    archive = out.with_name(f"{out.name}.{PurePosixPath(source.url.split('?')[0]).name}")
+    try:
+        out.absolute().parent.mkdir(parents=True, exist_ok=True)
+        if not archive.is_file():
+            _download(source, archive, tell)
+        _unpack(archive, out, tell)
+        archive.unlink()
+    except OSError as error:
+        raise unwritable(out, error) from error
+    tell(f"{source.licence}\n{out} is complete")
+    return out
+
+
+def _download(source: Source, archive: Path, tell: Tell) -> None:
+    part = archive.with_name(f"{archive.name}.part")
+    for attempt in range(1, TRIES + 1):
+        try:
+            _continue(source.url, part, tell)
+            break
+        except urllib.error.HTTPError as error:
+            raise DataError(f"{source.url}: the server says {error.code} {error.reason}; check the address") from error
+        except (urllib.error.URLError, TimeoutError, ConnectionError, _BrokenError) as error:
+            if attempt == TRIES:
+                raise DataError(
+                    f"{source.url}: the connection broke {TRIES} times ({error}); run it again to go on from "
+                    f"{part.stat().st_size if part.exists() else 0} bytes"
+                ) from error
+            time.sleep(PAUSE)
+    with part.open("rb") as file:
+        seen = hashlib.file_digest(file, "sha256").hexdigest()
+    if source.sha256 and seen != source.sha256:
+        part.unlink()
+        raise DataError(f"{source.url}: sha256 is {seen}, expected {source.sha256}; the file was removed: try again")
+    if not source.sha256:
+        tell(f"sha256 {seen}: no checksum is known for this file, compare it with its publisher's")
+    part.rename(archive)
+
+
+class _BrokenError(Exception):
+    """Fewer bytes came than were promised."""
+
+
+def _continue(url: str, part: Path, tell: Tell) -> None:
+    """Add what is missing; a server that cannot begin in the middle begins anew."""
+    have = part.stat().st_size if part.exists() else 0
+    request = urllib.request.Request(url, headers={"Range": f"bytes={have}-"} if have else {})
+    try:
+        answer = urllib.request.urlopen(request, timeout=TIMEOUT)
+    except urllib.error.HTTPError as error:
+        if have and error.code == 416:  # nothing is missing, or the file has changed: its checksum will tell
+            return
+        raise
+    with answer:
+        if have and answer.status != 206:
+            have = 0
+        length = int(answer.headers.get("Content-Length") or 0)
+        whole, told = have + length, -1
+        with part.open("ab" if have else "wb") as file:
+            while chunk := answer.read(CHUNK):
+                file.write(chunk)
+                have += len(chunk)
+                tenth = 10 * have // whole if whole else 0
+                if tenth > told:
+                    told = tenth
+                    tell(f"{have / 1e6:,.0f} of {whole / 1e6:,.0f} MB")
+    if length and have < whole:
+        raise _BrokenError(f"{have} of {whole} bytes came")
+
+
+def _unpack(archive: Path, out: Path, tell: Tell) -> None:
+    """Unpack into a hidden folder beside, and rename it when it is whole."""
+    temporary = out.with_name(f".{out.name}.unpacking")
+    shutil.rmtree(temporary, ignore_errors=True)
+    try:
+        with _members(archive) as members:
+            total = sum(size for _, size, _ in members)
+            if total > LARGEST:
+                raise DataError(f"{archive}: would unpack to {total >> 30} GiB; expected at most {LARGEST >> 30}")
+            tell(f"unpacking {len(members)} files, {total / 1e6:,.0f} MB")
+            for name, size, opened in members:
+                target = temporary / _safe(archive, name)
+                target.parent.mkdir(parents=True, exist_ok=True)
+                with opened() as stream, target.open("wb") as file:
+                    _copy(stream, file, size, archive)
+        temporary.rename(out)
+    except (zipfile.BadZipFile, tarfile.TarError, EOFError) as error:
+        raise DataError(f"{archive}: not an archive, or a damaged one ({error}); remove it and fetch again") from error
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+@contextmanager
+def _members(archive: Path) -> Iterator[list[tuple[str, int, Callable[[], BinaryIO]]]]:
+    """Name, size and opener of every regular file; links and devices are left out."""
+    if zipfile.is_zipfile(archive):
+        with zipfile.ZipFile(archive) as zipped:
+            yield [
+                (info.filename, info.file_size, lambda info=info: zipped.open(info))  # type: ignore[misc]
+                for info in zipped.infolist()
+                if not info.is_dir() and (info.external_attr >> 28) != 0o12
+            ]
+    elif tarfile.is_tarfile(archive):
+        with tarfile.open(archive) as tarred:
+            yield [
+                (info.name, info.size, lambda info=info: tarred.extractfile(info))  # type: ignore[misc]
+                for info in tarred.getmembers()
+                if info.isreg()
+            ]
+    else:
+        raise DataError(f"{archive}: expected a ZIP or TAR archive; remove it and check the address")
+
+
+def _safe(archive: Path, name: str) -> PurePosixPath:
+    path = PureWindowsPath(name)
+    if path.anchor or ".." in path.parts or not path.parts:
+        raise DataError(f"{archive}: holds a file called '{name}', outside of its folder; do not trust it")
+    return PurePosixPath(*path.parts)
+
+
+def _copy(stream: BinaryIO, file: BinaryIO, size: int, archive: Path) -> None:
+    """Copy no more than was declared."""
+    left = size
+    while chunk := stream.read(min(CHUNK, left + 1)):
+        left -= len(chunk)
+        if left < 0:
+            raise DataError(f"{archive}: a file is larger than declared; do not trust it")
+        try:
+            file.write(chunk)
+        except OSError as error:
+            raise OutputError(f"{file.name}: cannot be written ({error.strerror}); check the space") from error

@@ -1,0 +1,58 @@
+"""Masks for a scene's photographs: from their alpha, or from a folder of masks made elsewhere."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.errors import DataError
+from clsplat.scene.detect import read_scene
+from clsplat.scene.images import load_mask, read_image, write_image
+from clsplat.scene.scene import View
+
+OPAQUE = 0.5  # of the largest value
+
+
+def write_masks(scene: Path, folder: Path | None = None, out: Path | None = None, threshold: float = OPAQUE) -> int:
+    """Write a mask for every photograph into `scene`/masks, or `out`: white where it counts; return their number.
+
+    With `folder` they are those of its files (NAME.png, or STEM.png), else where the photographs' alpha is at least
+    `threshold`.  Masks that are there already are left alone.  Raises DataError when one is missing, of another size
+    than its photograph, or without alpha.
+    """
+    views = read_scene(scene, holdout=0).views
+    sources = [None if folder is None else _file(folder, view.name) for view in views]
+    missing = [view.name for view, source in zip(views, sources, strict=True) if folder and source is None]
+    if missing:
+        raise DataError(
+            f"{folder}: has no masks for {len(missing)} of {len(views)} photographs: {', '.join(missing[:3])}; "
+            "expected the photograph's name with .png behind it or in place of its suffix"
+        )
+    target, written = out or scene / "masks", 0
+    for view, source in zip(views, sources, strict=True):
+        path = target / Path(view.name).with_suffix(".png")
+        if not path.is_file():
+            white = _from_alpha(view, threshold) if source is None else _from_file(view, source)
+            write_image(path, np.repeat(np.where(white, 255, 0).astype(np.uint8)[:, :, None], 3, axis=2))
+            written += 1
+    return written
+
+
+def _file(folder: Path, name: str) -> Path | None:
+    files = (folder / f"{name}.png", (folder / name).with_suffix(".png"))
+    return next((file for file in files if file.is_file()), None)
+
+
+def _from_alpha(view: View, threshold: float) -> NDArray[np.bool_]:
+    pixels = read_image(view.image_path)
+    if pixels.shape[2] < 4:
+        raise DataError(f"{view.image_path}: has no alpha; expected RGBA, or give the folder that holds the masks")
+    return np.asarray(pixels[:, :, 3] >= threshold * np.iinfo(pixels.dtype).max)
+
+
+def _from_file(view: View, source: Path) -> NDArray[np.bool_]:
+    """The mask as it is, once it is known to fit its photograph."""
+    load_mask(replace(view, mask_path=source))
+    pixels = read_image(source)
+    return np.asarray(pixels[:, :, 0] >= OPAQUE * np.iinfo(pixels.dtype).max)

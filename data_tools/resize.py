@@ -1,0 +1,47 @@
+"""Image pyramids beside a dataset's photographs: images_2, images_4, images_8, as Mip-NeRF 360 ships them."""
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.errors import DataError
+from clsplat.files import atomic
+from clsplat.scene.images import read_image
+
+SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"}
+QUALITY = 98  # of JPEG
+
+
+def write_pyramid(scene: Path, levels: int = 3) -> int:
+    """Write images_2, images_4, … beside `scene`/images; return the number of images written.
+
+    Means over areas; names, folders and file formats stay, sizes are rounded as cameras are when they are downscaled.
+    Images that are there already are left alone.  Raises DataError when there are none, or one cannot be read.
+    """
+    folder = scene / "images"
+    names = sorted(path.relative_to(folder) for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES)
+    if not names:
+        raise DataError(f"{folder}: holds no images; expected the folder above `images`")
+    written = 0
+    for name in names:
+        missing = [2**k for k in range(1, levels + 1) if not (scene / f"images_{2**k}" / name).is_file()]
+        pixels = read_image(folder / name) if missing else None
+        for factor in missing:
+            assert pixels is not None
+            _write(scene / f"images_{factor}" / name, pixels, factor)
+            written += 1
+    return written
+
+
+def _write(path: Path, pixels: NDArray[Any], factor: int) -> None:
+    height, width = pixels.shape[:2]
+    size = max(1, round(width / factor)), max(1, round(height / factor))
+    small = np.rint(cv2.resize(pixels.astype(np.float32), size, interpolation=cv2.INTER_AREA)).astype(pixels.dtype)
+    ordered = small.reshape(size[1], size[0], -1)[:, :, [2, 1, 0, 3][: pixels.shape[2]]]
+    options = [cv2.IMWRITE_JPEG_QUALITY, QUALITY] if path.suffix.lower() in (".jpg", ".jpeg") else []
+    _, encoded = cv2.imencode(path.suffix, np.ascontiguousarray(ordered), options)
+    with atomic(path) as file:
+        file.write(encoded.tobytes())

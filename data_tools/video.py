@@ -1,0 +1,72 @@
+"""Sharp, evenly spaced frames of a video."""
+
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.errors import DataError
+from clsplat.scene.images import write_image
+
+REDUCED = 480  # px: the side that sharpness is measured at; noise of the full size would count as detail
+
+
+def write_frames(video: Path, out: Path, frames: int = 100, long_side: int | None = None) -> int:
+    """Write the sharpest frame of each of `frames` equal parts of a video as PNG; return their number.
+
+    PNG, because features and colours should not pass through a second lossy coding.  Frames that are there already are
+    left alone.  Raises DataError when the video cannot be decoded.
+    """
+    sharpness = [_sharpness(image) for image in _decoded(video)]
+    chosen = sharpest(sharpness, frames)
+    wanted = {place: out / f"frame_{i:05d}.png" for i, place in enumerate(chosen, 1)}
+    if all(path.is_file() for path in wanted.values()):
+        return len(wanted)
+    for place, image in enumerate(_decoded(video)):
+        if place in wanted and not wanted[place].is_file():
+            write_image(wanted[place], np.ascontiguousarray(_limited(image, long_side)[:, :, ::-1]))
+    return len(wanted)
+
+
+def sharpest(sharpness: list[float], parts: int) -> list[int]:
+    """The index of the largest value in each of `parts` equal parts, the first of equals."""
+    edges = np.linspace(0, len(sharpness), min(parts, len(sharpness)) + 1).astype(int)
+    return [int(a + np.argmax(sharpness[a:b])) for a, b in pairwise(edges)]
+
+
+def _decoded(video: Path) -> Iterator[NDArray[np.uint8]]:
+    """The frames, [H, W, 3] BGR.  Raises DataError when there is none."""
+    if not video.is_file():
+        raise DataError(f"{video}: no such file; expected a video")
+    reader = cv2.VideoCapture(str(video))
+    try:
+        found = False
+        while True:
+            good, image = reader.read()
+            if not good:
+                break
+            found = True
+            yield np.asarray(image, np.uint8)
+    finally:
+        reader.release()
+    if not found:
+        raise DataError(f"{video}: not a video that OpenCV decodes; convert it to MP4 (H.264)")
+
+
+def _sharpness(image: NDArray[np.uint8]) -> float:
+    """Variance of the Laplacian of the reduced grey image."""
+    grey = cv2.cvtColor(_limited(image, REDUCED), cv2.COLOR_BGR2GRAY)
+    return float(cv2.Laplacian(grey, cv2.CV_64F).var())
+
+
+def _limited(image: NDArray[np.uint8], long_side: int | None) -> NDArray[np.uint8]:
+    """The image with no side longer than `long_side` px."""
+    height, width = image.shape[:2]
+    factor = max(height, width) / (long_side or max(height, width))
+    if factor <= 1:
+        return image
+    size = max(1, round(width / factor)), max(1, round(height / factor))
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)

@@ -1,0 +1,282 @@
+"""The small tools: frames of a video, image pyramids, masks, and data sets from the web."""
+
+import functools
+import hashlib
+import http.server
+import io
+import json
+import shutil
+import tarfile
+import threading
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from clsplat import cli
+from clsplat.errors import ConfigError
+from clsplat.scene.images import read_image
+from data_tools import fetch as fetching
+from data_tools.fetch import Source, fetch, named
+from data_tools.masks import write_masks
+from data_tools.resize import write_pyramid
+from data_tools.video import sharpest, write_frames
+from tests.refusals import refusal
+
+# ---- video
+
+
+@pytest.fixture
+def video(tmp_path: Path, rng: np.random.Generator) -> Path:
+    """Thirty frames whose grey tells their number; only every third is not blurred."""
+    path = tmp_path / "v.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10, (96, 64))
+    noise = rng.integers(0, 60, (64, 96, 1))
+    for i in range(30):
+        image = np.repeat(noise + 6 * i, 3, axis=2).astype(np.uint8)
+        writer.write(image if i % 3 == 1 else cv2.GaussianBlur(image, (0, 0), 3))
+    writer.release()
+    return path
+
+
+def test_the_sharp_frames_of_a_video(video, tmp_path):
+    assert write_frames(video, tmp_path / "frames", frames=10) == 10
+    files = sorted((tmp_path / "frames").iterdir())
+    assert [file.name for file in files] == [f"frame_{i:05d}.png" for i in range(1, 11)]
+    levels = [(read_image(file).mean() - 29.5) / 6 for file in files]
+    np.testing.assert_allclose(levels, np.arange(1, 30, 3), atol=0.6)
+
+
+def test_frames_are_not_taken_twice(video, tmp_path):
+    write_frames(video, tmp_path / "frames", frames=4, long_side=48)
+    files = sorted((tmp_path / "frames").iterdir())
+    assert read_image(files[0]).shape == (32, 48, 3)
+    kept = files[0].stat().st_mtime_ns
+    files[1].unlink()
+    assert write_frames(video, tmp_path / "frames", frames=4, long_side=48) == 4
+    assert files[0].stat().st_mtime_ns == kept
+    assert files[1].is_file()
+
+
+def test_not_a_video(tmp_path):
+    (tmp_path / "v.mp4").write_text("nothing")
+    assert "not a video that OpenCV decodes" in refusal(write_frames, tmp_path / "v.mp4", tmp_path / "out")
+    assert "no such file" in refusal(write_frames, tmp_path / "w.mp4", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(("values", "parts", "chosen"), [([1, 3, 2], 9, [0, 1, 2]), ([2, 2, 1, 5], 2, [0, 3])])
+def test_sharpest(values, parts, chosen):
+    assert sharpest(values, parts) == chosen
+
+
+# ---- pyramids
+
+
+def test_pyramids(tmp_path, rng):
+    pixels = rng.integers(0, 256, (21, 34, 3)).astype(np.uint8)
+    path = tmp_path / "images" / "a" / "b.png"
+    path.parent.mkdir(parents=True)
+    cv2.imwrite(str(path), pixels[:, :, ::-1])
+    assert write_pyramid(tmp_path, levels=2) == 2
+    half = read_image(tmp_path / "images_2" / "a" / "b.png")
+    assert half.shape == (10, 17, 3)
+    assert read_image(tmp_path / "images_4" / "a" / "b.png").shape == (5, 8, 3)
+    boxes = pixels[:20].reshape(10, 2, 17, 2, 3).mean(axis=(1, 3))
+    assert np.abs(half[0] - boxes[0]).mean() < 15
+    assert write_pyramid(tmp_path, levels=2) == 0
+    np.testing.assert_array_equal(read_image(path), pixels)
+    assert "holds no images" in refusal(write_pyramid, tmp_path / "images")
+
+
+# ---- masks
+
+
+def blender_scene(path: Path, channels: int) -> Path:
+    (path / "train").mkdir(parents=True)
+    frames = []
+    for i in range(2):
+        pixels = np.full((6, 8, channels), 250, np.uint8)
+        pixels[:, :3, 3:] = 100
+        cv2.imwrite(str(path / "train" / f"{i}.png"), pixels)
+        frames.append({"file_path": f"./train/{i}", "transform_matrix": np.eye(4).tolist()})
+    (path / "transforms_train.json").write_text(json.dumps({"camera_angle_x": 0.8, "frames": frames}))
+    return path
+
+
+def test_masks_from_alpha(tmp_path):
+    scene = blender_scene(tmp_path / "scene", 4)
+    assert write_masks(scene) == 2
+    mask = read_image(scene / "masks" / "train" / "0.png")[:, :, 0]
+    np.testing.assert_array_equal(mask, [[0] * 3 + [255] * 5] * 6)
+    assert write_masks(scene) == 0
+    assert write_masks(scene, out=tmp_path / "others", threshold=0.3) == 2
+    assert read_image(tmp_path / "others" / "train" / "0.png").min() == 255
+    assert "has no alpha" in refusal(write_masks, blender_scene(tmp_path / "opaque", 3))
+
+
+def test_masks_from_a_folder(tmp_path):
+    scene, folder = blender_scene(tmp_path / "scene", 3), tmp_path / "made" / "train"
+    folder.mkdir(parents=True)
+    cv2.imwrite(str(folder / "0.png"), np.full((6, 8), 255, np.uint8))
+    assert "no masks for 1 of 2 photographs: train/1" in refusal(write_masks, scene, tmp_path / "made")
+    cv2.imwrite(str(folder / "1.png"), np.zeros((5, 8), np.uint8))
+    assert "1.png: the image is 8x5 pixels, its camera 8x6" in refusal(write_masks, scene, tmp_path / "made")
+    cv2.imwrite(str(folder / "1.png"), np.zeros((6, 8), np.uint8))
+    shutil.rmtree(scene / "masks", ignore_errors=True)
+    assert write_masks(scene, tmp_path / "made") == 2
+    assert read_image(scene / "masks" / "train" / "1.png").max() == 0
+
+
+# ---- data sets from the web
+
+
+class Server(http.server.SimpleHTTPRequestHandler):
+    """Serves a folder; ranges on demand, and breaks off after some bytes as often as asked."""
+
+    ranges, breaks, after = True, 0, 1000
+    asked: list[str]
+
+    def do_GET(self) -> None:
+        path = Path(self.translate_path(self.path))
+        wanted = self.headers.get("Range", "")
+        type(self).asked.append(wanted)
+        if not path.is_file():
+            self.send_error(404)
+            return
+        content, start = path.read_bytes(), 0
+        if self.ranges and wanted:
+            start = int(wanted.removeprefix("bytes=").rstrip("-"))
+            if start >= len(content):
+                self.send_error(416)
+                return
+        self.send_response(206 if start else 200)
+        self.send_header("Content-Length", str(len(content) - start))
+        self.end_headers()
+        if type(self).breaks > 0:
+            type(self).breaks -= 1
+            self.wfile.write(content[start : start + self.after])
+            self.close_connection = True
+        else:
+            self.wfile.write(content[start:])
+
+    def log_message(self, format: str, *arguments: object) -> None:
+        pass
+
+
+@pytest.fixture
+def web(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Path, str, type[Server]]]:
+    """A folder, its address, and the server's behaviour."""
+    folder = tmp_path / "web"
+    folder.mkdir()
+    behaviour = type("Behaviour", (Server,), {"asked": []})
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(behaviour, directory=str(folder)))
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    monkeypatch.setattr(fetching, "PAUSE", 0)
+    monkeypatch.setenv("no_proxy", "127.0.0.1")
+    yield folder, f"http://127.0.0.1:{server.server_port}", behaviour
+    server.shutdown()
+    server.server_close()
+
+
+def archive(path: Path, names: tuple[str, ...] = ("scene/a.txt", "scene/ü/b.txt")) -> str:
+    """A ZIP of incompressible files; its checksum."""
+    rng = np.random.default_rng(0)
+    with zipfile.ZipFile(path, "w") as zipped:
+        for name in names:
+            zipped.writestr(name, rng.bytes(3000))
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def quietly(source: Source, out: Path) -> list[str]:
+    lines: list[str] = []
+    fetch(source, out, lines.append)
+    return lines
+
+
+def test_fetched(web, tmp_path):
+    folder, address, server = web
+    checksum = archive(folder / "d.zip")
+    quietly(Source(f"{address}/d.zip", "free", checksum), tmp_path / "data" / "d")
+    assert (tmp_path / "data" / "d" / "scene" / "ü" / "b.txt").stat().st_size == 3000
+    assert [path.name for path in (tmp_path / "data").iterdir()] == ["d"]
+    assert quietly(Source(f"{address}/d.zip", "free"), tmp_path / "data" / "d")[0].endswith("nothing to do")
+    assert len(server.asked) == 1
+
+
+@pytest.mark.parametrize("ranges", [True, False])
+def test_a_broken_download_goes_on(web, tmp_path, ranges):
+    folder, address, server = web
+    checksum = archive(folder / "d.zip")
+    server.breaks, server.ranges = 3, ranges
+    quietly(Source(f"{address}/d.zip", "free", checksum), tmp_path / "d")
+    assert (tmp_path / "d" / "scene" / "a.txt").is_file()
+    assert server.asked == ["", "bytes=1000-", "bytes=2000-", "bytes=3000-"] if ranges else ["", *["bytes=1000-"] * 3]
+
+
+def test_a_download_that_breaks_for_good_is_kept(web, tmp_path):
+    folder, address, server = web
+    checksum = archive(folder / "d.zip")
+    server.breaks = 5
+    source = Source(f"{address}/d.zip", "free", checksum)
+    assert "run it again to go on from 5000 bytes" in refusal(quietly, source, tmp_path / "d")
+    assert [path.name for path in tmp_path.iterdir() if path.name != "web"] == ["d.d.zip.part"]
+    quietly(source, tmp_path / "d")
+    assert server.asked[-1] == "bytes=5000-"
+
+
+def test_a_wrong_checksum(web, tmp_path):
+    folder, address, _ = web
+    archive(folder / "d.zip")
+    message = refusal(quietly, Source(f"{address}/d.zip", "free", "0" * 64), tmp_path / "d")
+    assert "expected 0000" in message
+    assert [path.name for path in tmp_path.iterdir()] == ["web"]
+    assert any("no checksum is known" in line for line in quietly(Source(f"{address}/d.zip", ""), tmp_path / "d"))
+
+
+@pytest.mark.parametrize("name", ["../evil.txt", "/evil.txt", "C:\\evil.txt", "a/../../evil.txt"])
+def test_archives_that_reach_out_of_their_folder(web, tmp_path, name):
+    folder, address, _ = web
+    archive(folder / "d.zip", ("scene/a.txt", name))
+    assert "outside of its folder" in refusal(quietly, Source(f"{address}/d.zip", ""), tmp_path / "d")
+    assert not (tmp_path / "d").exists()
+    assert not list(tmp_path.rglob("evil.txt"))
+
+
+def test_tar_links_are_left_out(web, tmp_path):
+    folder, address, _ = web
+    with tarfile.open(folder / "d.tar.gz", "w:gz") as tarred:
+        info = tarfile.TarInfo("scene/a.txt")
+        info.size = 3
+        tarred.addfile(info, io.BytesIO(b"abc"))
+        link = tarfile.TarInfo("scene/link")
+        link.type, link.linkname = tarfile.SYMTYPE, "/etc/passwd"
+        tarred.addfile(link)
+    quietly(Source(f"{address}/d.tar.gz", ""), tmp_path / "d")
+    assert [path.name for path in (tmp_path / "d" / "scene").iterdir()] == ["a.txt"]
+
+
+def test_what_cannot_be_fetched(web, tmp_path):
+    folder, address, _ = web
+    (folder / "page.html").write_text("hello")
+    assert "the server says 404" in refusal(quietly, Source(f"{address}/none.zip", ""), tmp_path / "d")
+    assert "expected a ZIP or TAR archive" in refusal(quietly, Source(f"{address}/page.html", ""), tmp_path / "d")
+    with pytest.raises(ConfigError, match="no data set named 'garden'; there are mipnerf360"):
+        named("garden")
+    assert not (tmp_path / "d").exists()
+
+
+# ---- on the command line
+
+
+def test_data_tools_are_commands(tmp_path):
+    scene = blender_scene(tmp_path / "scene", 4)
+    result = CliRunner().invoke(cli.app, ["data", "masks", str(scene)])
+    assert result.output == "2 masks written\n"
+    listing = CliRunner().invoke(cli.app, ["data", "--help"]).output
+    for name in ("photos", "video", "undistort", "resize", "masks", "multiscale", "synthetic", "fetch"):
+        assert name in listing
