@@ -75,15 +75,27 @@ class Init(Stage):
             points = self._swept(run)
         elif points is None:
             raise DataError(f"{run.scene.path}: has no points to start from; use init: {{source: sweep}}")
+        else:
+            require_ahead(points, run.scene)
         return from_points(points, self.opacity, degree)
 
     def _swept(self, run: Run) -> PointCloud:
-        views = run.scene.split("train")
+        views = [view for view in run.scene.split("train") if view.scale == run.scale]
         points = swept_points(views, centre_of(views), load_image, self.swept, run.seed)
         if len(points) < FEWEST:
             LOG.warning("the photographs agree on %d points only; starting from random ones", len(points))
             return random_points(run.scene, self.count, run.seed)
         return points
+
+
+def require_ahead(points: PointCloud, scene: Scene) -> None:
+    """Raise DataError when every point lies behind every training camera."""
+    poses = np.stack([view.world_to_camera for view in scene.split("train")])
+    if not any((points.positions @ pose[2, :3] + pose[2, 3] > 0).any() for pose in poses):
+        raise DataError(
+            f"{scene.path}: all {len(points)} points lie behind all training cameras; poses and points follow "
+            "different conventions: export both again, or use init: {source: sweep}"
+        )
 
 
 def from_points(points: PointCloud, opacity: float, degree: int) -> Parameters:
