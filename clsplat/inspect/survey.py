@@ -30,7 +30,7 @@ class CameraFacts:
     width: int
     height: int
     focal: tuple[float, float]  # px
-    bend: float  # px: the largest displacement by the lens at the border
+    bend: float | None  # px: the largest displacement by the lens at the border; None where it overflows
     kept: float  # share of the photograph that is left when it is straightened
     centred: bool  # whether the principal point lies in the photograph
 
@@ -127,8 +127,8 @@ def survey(parts: Parts) -> Facts:
     )
 
 
-def bend(lens: Lens) -> float:
-    """By how many pixels the lens moves what a pinhole shows at the border, at most; infinite where it overflows."""
+def bend(lens: Lens) -> float | None:
+    """By how many pixels the lens moves what a pinhole shows at the border, at most; None where it overflows."""
     camera, along = lens.camera, np.linspace(0, 1, BORDER)
     zeros, ones = np.zeros(BORDER), np.ones(BORDER)
     x = np.concatenate([along, along, zeros, ones]) * lens.width
@@ -136,7 +136,7 @@ def bend(lens: Lens) -> float:
     with np.errstate(all="ignore"):
         bent_x, bent_y = lens.bend((x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy)
         moved = float(np.hypot(bent_x - x, bent_y - y).max())
-    return moved if np.isfinite(moved) else float("inf")
+    return moved if np.isfinite(moved) else None
 
 
 def _relative(file: object, parts: Parts) -> str:
