@@ -25,8 +25,8 @@ def figures(facts: Facts) -> dict[str, str]:
         if points.error_mean is not None:
             lines["reprojection error"] = f"{points.error_mean:.2f} px on average, 90 % below {points.error_90:.2f} px"
         if points.in_two is not None and points.behind is not None:
-            lines["coverage"] = f"{points.in_two:.0%} of the points in two views or more"
-            lines["coverage"] += f", {points.behind:.0%} behind all cameras" if points.behind else ""
+            lines["coverage"] = f"{100 * points.in_two:.0f} % of the points in two views or more"
+            lines["coverage"] += f", {100 * points.behind:.0f} % behind all cameras" if points.behind else ""
     elif facts.registered:
         lines["points"] = "none"
     if counts := list(facts.seen.values()):
@@ -39,7 +39,7 @@ def camera_line(camera: CameraFacts) -> str:
     fx, fy = camera.focal
     focal = f"{fx:.1f}" if abs(fx - fy) < 0.05 else f"{fx:.1f}, {fy:.1f}"
     bent = "beyond all bounds" if camera.bend is None else f"up to {camera.bend:.1f} px"
-    lens = f", bends by {bent}, {camera.kept:.0%} kept" if camera.bend != 0 else ""
+    lens = f", bends by {bent}, {100 * camera.kept:.0f} % kept" if camera.bend != 0 else ""
     return f"{camera.model} {camera.width}x{camera.height}, focal length {focal} px{lens}; {camera.views} views"
 
 

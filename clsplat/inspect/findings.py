@@ -80,7 +80,7 @@ def _photographs(facts: Facts) -> Iterator[Finding]:
         yield Finding("error", fault, "copy or export them again")
     if photos.misfits:
         sizes = [f"{name} is {size}" for name, size in photos.misfits.items()]
-        fault = f"{_counted(len(sizes), 'image file')} not of the camera's size ({_few(sizes, 2)})"
+        fault = f"{_are(len(sizes), 'image file')} not of the camera's size ({_few(sizes, 2)})"
         mend = "use the images that the cameras were made from"
         if len(photos.turned) == len(sizes):
             mend = "they were turned by 90 degrees after the poses were found: " + mend
@@ -98,25 +98,26 @@ def _photographs(facts: Facts) -> Iterator[Finding]:
         if facts.registered:
             yield Finding("warning" if serious else "note", fault, mend)
     if photos.exif_turned:
-        fault = f"{_counted(len(photos.exif_turned), 'photograph')} to be turned says the EXIF data"
+        fault = f"{_are(len(photos.exif_turned), 'photograph')} to be turned, says the EXIF data"
         yield Finding(
             "note", fault, "clsplat and COLMAP take the pixels as they are stored, so views may lie on their side"
         )
     if photos.larger:
-        fault = f"{_counted(len(photos.larger), 'image file')} larger than the camera"
+        fault = f"{_are(len(photos.larger), 'image file')} larger than the camera"
         yield Finding("note", fault, "they are shrunk as they are read; smaller copies would load faster")
     for names in facts.same_but_case[:NAMED]:
         fault = f"{' and '.join(names)} differ only in upper and lower case"
         yield Finding("warning", fault, "they overwrite each other on Windows and macOS; rename one")
     if colmap and facts.same_base:
-        fault = f"{_counted(facts.same_base, 'file name')} in several folders"
+        fault = f"{_are(facts.same_base, 'file name')} in several folders"
         yield Finding("note", fault, "views keep the folder in their names; tools that drop it would mix them up")
 
 
 def _cameras(facts: Facts) -> Iterator[Finding]:
     sizes = {(camera.width, camera.height) for camera in facts.cameras}
     if len(sizes) > 1:
-        yield Finding("note", f"photographs of {len(sizes)} sizes", "that is allowed; a step costs what its view does")
+        mend = "that is allowed; a step takes as long as its view is large"
+        yield Finding("note", f"the photographs have {len(sizes)} sizes", mend)
     for camera in facts.cameras:
         name = f"the {_camera_name(camera)} of {_counted(camera.views, 'view')}"
         if not FOCAL[0] < camera.focal[0] / camera.width < FOCAL[1]:
@@ -125,7 +126,7 @@ def _cameras(facts: Facts) -> Iterator[Finding]:
         if not camera.centred:
             yield Finding("warning", f"{name} has its principal point outside the image", "calibrate it again")
         if camera.kept < KEPT:
-            fault = f"straightening {name} keeps only {camera.kept:.0%} of each photograph"
+            fault = f"straightening {name} keeps only {100 * camera.kept:.0f} % of each photograph"
             yield Finding("warning", fault, "use a narrower lens, or crop and undistort the images yourself")
 
 
@@ -138,15 +139,15 @@ def _poses(facts: Facts) -> Iterator[Finding]:
         mend = f"left out is {parts}; colmap model_merger may join them where they share images"
         yield Finding("warning" if large else "note", fault, mend)
     if facts.train is not None and facts.train < FEW_VIEWS:
-        fault = f"only {_counted(facts.train, 'training view')}"
+        fault = f"there {_are(facts.train, 'training view', 'only ')}"
         yield Finding("warning", fault, "expect floaters and blur away from the photographs; take 30 or more")
     if facts.test == 0:
-        yield Finding("note", "no test views", "quality will be measured on training views only")
+        yield Finding("note", "there are no test views", "quality will be measured on training views only")
     if facts.one_place:
         fault = "all cameras are at the same place"
         yield Finding("warning", fault, "depth cannot be told without moving; take photographs from different places")
     if facts.strayed:
-        fault = f"{_counted(len(facts.strayed), 'camera')} far away from all others ({_few(facts.strayed)})"
+        fault = f"{_are(len(facts.strayed), 'camera')} far away from all others ({_few(facts.strayed)})"
         yield Finding(
             "warning", fault, "the pose is probably wrong; remove the image from the dataset or place it again"
         )
@@ -155,8 +156,8 @@ def _poses(facts: Facts) -> Iterator[Finding]:
         yield Finding("note", fault, "copies of one photograph count double; keep one of them")
     if facts.few_seen:
         counted = [f"{name}: {facts.seen[name]}" for name in facts.few_seen]
-        fault = f"{_counted(len(counted), 'view')} with fewer than {FEW_SEEN} points ({_few(counted)})"
-        yield Finding("warning", fault, "such poses are unreliable; look at these renders, or remove the images")
+        fault = f"fewer than {FEW_SEEN} points are seen by {_counted(len(counted), 'view')} ({_few(counted)})"
+        yield Finding("warning", fault, "their poses are unreliable; look at their renders, or remove these images")
 
 
 def _points(facts: Facts) -> Iterator[Finding]:
@@ -164,15 +165,16 @@ def _points(facts: Facts) -> Iterator[Finding]:
     if points is None or points.count == 0:
         if facts.registered and not any("points3d" in fault.lower() for fault in facts.faults):
             mend = "training starts from random ones, which takes longer; clean backgrounds suffer least"
-            yield Finding("note", "no points", mend)
+            yield Finding("note", "there are no points", mend)
         return
     if points.count < FEW_POINTS:
-        yield Finding("warning", f"only {_counted(points.count, 'point')}", "try init: {source: random} as well")
+        fault = f"there {_are(points.count, 'point', 'only ')}"
+        yield Finding("warning", fault, "try init: {source: random} as well")
     if points.not_finite:
-        fault = f"{_counted(points.not_finite, 'point')} not finite"
-        yield Finding("warning", fault, "left out; the file may be damaged, so export it again")
+        fault = f"{_are(points.not_finite, 'point')} not finite"
+        yield Finding("warning", fault, "they are left out; the file may be damaged, so export it again")
     if points.distant:
-        fault = f"{_counted(points.distant, 'point')} over {DISTANT:g} times the cameras' extent away"
+        fault = f"{_are(points.distant, 'point')} more than {DISTANT:g} times the cameras' extent away"
         yield Finding("note", fault, "usually sky or wrong matches; they become very large Gaussians")
     yield from _coverage(points)
     if points.error_mean is not None and points.error_mean > IMPRECISE:
@@ -183,9 +185,11 @@ def _points(facts: Facts) -> Iterator[Finding]:
 def _coverage(points: PointFacts) -> Iterator[Finding]:
     axes = "the poses do not belong to these points, or their axes are flipped; export both together again"
     if points.behind is not None and points.behind > BEHIND:
-        yield Finding("warning", f"{points.behind:.0%} of the points lie behind all cameras", axes)
+        yield Finding("warning", f"{100 * points.behind:.0f} % of the points lie behind all cameras", axes)
     elif points.in_two is not None and points.in_two < IN_TWO:
-        yield Finding("warning", f"only {points.in_two:.0%} of the points lie in the image of two views or more", axes)
+        yield Finding(
+            "warning", f"only {100 * points.in_two:.0f} % of the points lie in the image of two views or more", axes
+        )
 
 
 def _camera_name(camera: CameraFacts) -> str:
@@ -194,6 +198,12 @@ def _camera_name(camera: CameraFacts) -> str:
 
 def _counted(count: int, word: str) -> str:
     return f"{count:,} {word}{'s' if count != 1 else ''}"
+
+
+def _are(count: int, word: str, before: str = "") -> str:
+    """A count with its verb: behind it, or before it where something stands between, as in `are only 3 views`."""
+    verb = "is" if count == 1 else "are"
+    return f"{verb} {before}{_counted(count, word)}" if before else f"{_counted(count, word)} {verb}"
 
 
 def _few(names: Sequence[str], most: int = NAMED) -> str:

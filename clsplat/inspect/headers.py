@@ -39,7 +39,7 @@ def read_header(path: Path) -> Header:
     found = None
     if head.startswith(PNG) and head[12:16] == b"IHDR" and len(head) >= 24:
         width, height = struct.unpack_from(">II", head, 16)
-        found = Header(width, height, complete=PNG_END in tail)
+        found = Header(width, height, complete=PNG_END in tail or PNG_END in path.read_bytes())
     elif head.startswith(JPEG):
         found = _jpeg(path, head, tail)
     if found is None or not found.width or not found.height:

@@ -1,9 +1,9 @@
 for (const box of document.querySelectorAll(".space")) {
-  const {points, colours, cameras, names} = JSON.parse(box.querySelector("script").textContent);
+  const {points, colours, cameras, names, shades} = JSON.parse(box.querySelector("script").textContent);
   const canvas = box.querySelector("canvas"), pen = canvas.getContext("2d"), told = box.querySelector("output");
-  const COLOURS = ["#63b3ed", "#f6ad55", "#fc5c5c"], UNIT = 1000;
+  const UNIT = 1000;
   const VIEWS = {oblique: [0.6, 0.45], top: [0, Math.PI / 2], side: [0, 0]};
-  let [yaw, pitch] = VIEWS.oblique, distance = 3.1 * UNIT, places = [], over = -1;
+  let [yaw, pitch] = VIEWS.oblique, distance = 2.7 * UNIT, places = [], over = -1;
 
   // Rotated about the up axis, then tilted towards the viewer; null behind the eye.
   function project(x, y, z, wide, high) {
@@ -34,7 +34,7 @@ for (const box of document.querySelectorAll(".space")) {
     for (let i = 0; i < colours.length; i++) {
       const place = project(points[3 * i], points[3 * i + 1], points[3 * i + 2], wide, high);
       if (!place) continue;
-      const size = Math.min(4, Math.max(1, 1.8 * distance / place[2]));
+      const size = Math.min(5, Math.max(1.2, 2.3 * distance / place[2]));
       pen.fillStyle = "#" + colours[i];
       pen.fillRect(place[0] - size / 2, place[1] - size / 2, size, size);
     }
@@ -43,11 +43,11 @@ for (const box of document.querySelectorAll(".space")) {
       for (let k = 1; k < 16; k += 3) corners.push(project(camera[k], camera[k + 1], camera[k + 2], wide, high));
       let centre = corners[0];
       const outside = !centre || centre[0] < 0 || centre[0] > wide || centre[1] < 0 || centre[1] > high;
-      pen.strokeStyle = pen.fillStyle = i === over ? "#ffffff" : COLOURS[camera[0]];
+      pen.strokeStyle = pen.fillStyle = i === over ? "#ffffff" : shades[camera[0]];
       pen.lineWidth = i === over ? 2 : 1.2;
       if (camera[0] === 2 && outside) {
         centre = clamped(camera, wide, high);
-        label(centre, names[i] + " ↗ outside", wide);
+        label(centre, names[i] + " (far outside)", wide);
       } else if (camera[0] === 2) label(centre, names[i], wide);
       else if (corners.every(Boolean)) frustum(corners);
       return centre;
@@ -97,7 +97,7 @@ for (const box of document.querySelectorAll(".space")) {
     const view = VIEWS[event.target.dataset.view];
     if (!view) return;
     [yaw, pitch] = view;
-    distance = 3.1 * UNIT;
+    distance = 2.7 * UNIT;
     draw();
   });
   addEventListener("resize", draw);

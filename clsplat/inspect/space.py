@@ -23,11 +23,7 @@ cursor:pointer}.space button:hover{background:#4a5568}
 .space output{position:absolute;left:.8rem;bottom:.6rem;color:#edf2f7;font-size:.82rem;pointer-events:none}
 .legend i{display:inline-block;width:.7rem;height:.7rem;border-radius:2px;margin:0 .3rem 0 1rem}
 """
-LEGEND = (
-    '<p class="sub legend">Drag to turn, scroll to zoom, point at a camera for its name.'
-    '<i style="background:#63b3ed"></i>training<i style="background:#f6ad55"></i>test'
-    '<i style="background:#fc5c5c"></i>far away from all others</p>'
-)
+KINDS = (("#63b3ed", "training"), ("#f6ad55", "test"), ("#fc5c5c", "far away from all others"))  # cameras
 
 
 def space(inspection: Inspection) -> str:
@@ -52,12 +48,15 @@ def space(inspection: Inspection) -> str:
             [kinds[view.name], *np.rint((_frustum(view, size) - origin) @ axes.T).astype(int).ravel().tolist()]
             for view in views
         ],
+        "shades": [shade for shade, _ in KINDS],
         "names": [view.name for view in views],
     }
+    shades = "".join(f'<i style="background:{KINDS[k][0]}"></i>{KINDS[k][1]}' for k in sorted(set(kinds.values())))
+    legend = f'<p class="sub legend">Drag to turn, scroll to zoom, point at a camera for its name.{shades}</p>'
     text = json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
     buttons = "".join(f"<button data-view={name}>{name}</button>" for name in ("oblique", "top", "side"))
     return (
-        f'<h2>Cameras and points</h2>{LEGEND}<div class=space><canvas aria-label="cameras and points"></canvas>'
+        f'<h2>Cameras and points</h2>{legend}<div class=space><canvas aria-label="cameras and points"></canvas>'
         f"<nav>{buttons}</nav><output></output><script type=application/json>{text}</script></div>"
     )
 
@@ -86,11 +85,16 @@ def _frame(centres: NDArray[np.floating], points: NDArray[np.float64]) -> tuple[
 
 
 def _axes(views: list[View]) -> NDArray[np.float64]:
-    """Rows: right, forward and up of the picture in world coordinates, from the cameras' mean orientation."""
+    """Rows: right, forward and up of the picture in world coordinates, from the cameras' mean orientation.
+
+    Forward is where most cameras look, so that the picture opens from behind them; without such a side it is arbitrary.
+    """
     up = -np.mean([view.world_to_camera[1, :3] for view in views], axis=0)
     up = up / np.linalg.norm(up) if np.linalg.norm(up) > 0.1 else np.array([0.0, 0.0, 1.0])
-    least = np.eye(3)[np.argmin(np.abs(up))]
-    right = np.cross(least, up)
+    forward = np.mean([view.world_to_camera[2, :3] for view in views], axis=0)
+    right = np.cross(forward, up)
+    if np.linalg.norm(right) < 0.2:
+        right = np.cross(np.eye(3)[np.argmin(np.abs(up))], up)
     right /= np.linalg.norm(right)
     return np.stack([right, np.cross(up, right), up])
 
