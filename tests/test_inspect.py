@@ -9,6 +9,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from clsplat.errors import DataError
@@ -16,11 +18,12 @@ from clsplat.inspect.inspection import Inspection
 from clsplat.inspect.page import inspection_page
 from clsplat.inspect.survey import bend
 from clsplat.scene.detect import read_scene
-from clsplat.scene.images import load_image
+from clsplat.scene.images import load_image, load_mask
 from clsplat.scene.lens import Lens
-from tests.colmap_writer import CameraEntry, ImageEntry, Model, PointEntry, write_model, write_scene
+from tests.colmap_writer import CameraEntry, ImageEntry, Model, PointEntry, tiny_model, write_model, write_scene
 from tests.data_sets import data_set
 from tests.test_cli import clsplat
+from tests.test_image_headers import with_exif
 
 COUNT = 24  # cameras on a circle of radius 4 that look at points in a ball of radius 1
 SIZE = (64, 48)
@@ -136,7 +139,9 @@ def test_a_missing_image(scene):
     assert inspection.facts.points.in_two == 1.0  # the rest is inspected all the same
 
 
-@pytest.mark.parametrize(("size", "word"), [((32, 20), "not of the camera's size"), ((48, 64), "turned by 90 degrees")])
+@pytest.mark.parametrize(
+    ("size", "word"), [((32, 20), "not of the camera's size"), ((48, 64), "they lie on their side")]
+)
 def test_images_of_another_size(scene, size, word):
     photograph(scene / "images" / "05.png", size)
     inspection = Inspection.of(scene)
@@ -201,6 +206,29 @@ def test_damaged_frames_are_named_one_by_one(tiny_scene, tmp_path):
     assert "frames[1]: transform_matrix" in "".join(faults)
     assert "frames[2]: it has no `file_path`" in "".join(faults)
     assert len(inspection.parts.views) == 8
+
+
+@pytest.mark.parametrize("kind", ["bin", "txt"])
+@given(data=st.data())
+@settings(max_examples=100, deadline=None)
+def test_trainable_is_what_the_readers_can_read(tmp_path_factory, kind: str, data: st.DataObject) -> None:
+    path = write(tmp_path_factory.mktemp("scene"), tiny_model(), kind)
+    files = [file for file in sorted(path.rglob("*")) if file.is_file()]
+    file = data.draw(st.sampled_from(files))
+    content = bytearray(file.read_bytes())
+    for _ in range(data.draw(st.integers(1, 4))):
+        content[data.draw(st.integers(0, min(len(content) - 1, 400)))] = data.draw(st.integers(0, 255))
+    file.write_bytes(content)
+    inspection = Inspection.of(path)
+    json.dumps(inspection.data(), allow_nan=False)
+    inspection_page(inspection)
+    try:
+        for view in read_scene(path).views:
+            load_image(view)
+    except DataError:
+        assert not inspection.trainable or file.suffix == ".jpg"  # whose pixels are not decoded
+    else:
+        assert inspection.trainable, inspection.verdict
 
 
 # ---- warnings and notes
@@ -312,12 +340,33 @@ def test_a_cut_image_and_one_on_its_side(tmp_path):
     path = write(tmp_path, replace(model, images=[replace(i, name=i.name[:2] + ".jpg") for i in model.images]))
     whole = (path / "images" / "05.jpg").read_bytes()
     (path / "images" / "05.jpg").write_bytes(whole[: len(whole) // 2])
-    exif = b"Exif\0\0" + b"MM\0*\0\0\0\x08\0\x01" + struct.pack(">HHIHH", 0x112, 3, 1, 6, 0)
-    turned = whole[:2] + b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif + whole[2:]
-    (path / "images" / "06.jpg").write_bytes(turned)
+    (path / "images" / "06.jpg").write_bytes(with_exif(whole, ">", 6))
     inspection = Inspection.of(path)
     assert "the end is missing from 1 image file (05.jpg)" in said(inspection, "warning")
     assert "1 photograph is to be turned" in said(inspection, "note")
+
+
+def test_images_on_their_side_that_the_reader_turns(tmp_path):
+    model = orbit()
+    path = write(tmp_path, replace(model, images=[replace(i, name=i.name[:2] + ".jpg") for i in model.images]))
+    photograph(path / "images" / "06.jpg", SIZE[::-1])
+    file = path / "images" / "06.jpg"
+    assert "they lie on their side" in said(Inspection.of(path), "error")
+    file.write_bytes(with_exif(file.read_bytes(), "<", 6))
+    assert Inspection.of(path).findings == []
+    assert load_image(read_scene(path).views[6]).shape == (48, 64, 3)
+
+
+def test_masks(scene):
+    (scene / "masks").mkdir()
+    photograph(scene / "masks" / "00.png")
+    assert (Inspection.of(scene).facts.photos.masks, Inspection.of(scene).findings) == (1, [])
+    photograph(scene / "masks" / "01.png", (32, 20))
+    assert "mask of 01.png is 32x20, its camera 64x48" in said(Inspection.of(scene), "error")
+    with pytest.raises(DataError):
+        load_mask(read_scene(scene).views[1])
+    (scene / "masks" / "01.png").write_bytes(b"no image")
+    assert "1 image file cannot be read (mask of 01.png)" in said(Inspection.of(scene), "error")
 
 
 def test_few_views(tmp_path):

@@ -50,4 +50,5 @@ def _images(facts: Facts) -> str:
     parts += [f"{len(facts.missing)} of them missing on disk"] if facts.missing else []
     parts += [f"{len(facts.unregistered)} more on disk without"] if facts.unregistered else []
     parts += [f"in {facts.folders} folders"] if facts.folders > 1 else []
+    parts += [f"{facts.photos.masks} with a mask"] if facts.photos.masks else []
     return ", ".join(parts)

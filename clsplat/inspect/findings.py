@@ -1,5 +1,6 @@
 """What the facts about a dataset mean for training, and what to do about it."""
 
+import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -57,11 +58,9 @@ def verdict(found: Sequence[Finding]) -> str:
 
 def _unreadable(facts: Facts) -> Iterator[Finding]:
     if facts.kind == "none" and facts.on_disk:
-        yield Finding(
-            "error",
-            f"{facts.path} holds {_counted(facts.on_disk, 'photograph')} but no camera poses",
-            "find them first, for example with COLMAP (colmap automatic_reconstructor), which writes sparse/0",
-        )
+        folder = os.path.dirname(os.path.join(facts.path, facts.unregistered[0]))
+        fault = f"{facts.path} holds {_counted(facts.on_disk, 'photograph')} but no camera poses"
+        yield Finding("error", fault, f"`clsplat run photos --scene {folder}` finds where they were taken")
     yield from (Finding("error", fault) for fault in facts.faults[:NAMED])
     if len(facts.faults) > NAMED:
         more = f"{_counted(len(facts.faults) - NAMED, 'more part')} of the dataset cannot be read"
@@ -82,8 +81,8 @@ def _photographs(facts: Facts) -> Iterator[Finding]:
         sizes = [f"{name} is {size}" for name, size in photos.misfits.items()]
         fault = f"{_are(len(sizes), 'image file')} not of the camera's size ({_few(sizes, 2)})"
         mend = "use the images that the cameras were made from"
-        if len(photos.turned) == len(sizes):
-            mend = "they were turned by 90 degrees after the poses were found: " + mend
+        if len(photos.on_side) == len(sizes):
+            mend = "they lie on their side as seen from the cameras: " + mend
         yield Finding("error", fault, mend)
     if photos.cut:
         fault = f"the end is missing from {_counted(len(photos.cut), 'image file')} ({_few(photos.cut)})"
@@ -100,7 +99,7 @@ def _photographs(facts: Facts) -> Iterator[Finding]:
     if photos.exif_turned:
         fault = f"{_are(len(photos.exif_turned), 'photograph')} to be turned, says the EXIF data"
         yield Finding(
-            "note", fault, "clsplat and COLMAP take the pixels as they are stored, so views may lie on their side"
+            "note", fault, "the pixels are taken as they are stored, as COLMAP does, so renders may lie on their side"
         )
     if photos.larger:
         fault = f"{_are(len(photos.larger), 'image file')} larger than the camera"

@@ -12,6 +12,7 @@ from clsplat.scene.scene import View
 
 SHOWN = 5000  # points
 UNIT = 1000  # the picture's radius in the numbers of the page
+WIDEST = 5.0  # half width of a frustum by its depth
 REACH = 30 * UNIT  # points beyond are left out
 SCRIPT = (Path(__file__).parent / "space.js").read_text(encoding="utf-8")
 STYLE = """
@@ -42,12 +43,9 @@ def space(inspection: Inspection) -> str:
     kinds = {view.name: 2 if view.name in away else 1 if view.name in test else 0 for view in views}
     size = 0.12 * float(np.median(np.linalg.norm(near - np.median(near, axis=0), axis=1))) or 0.1 * radius
     data = {
-        "points": np.rint(points[shown]).astype(int).ravel().tolist(),
+        "points": _whole(points[shown]),
         "colours": ["".join(f"{byte:02x}" for byte in rgb) for rgb in colours[shown].astype(int).tolist()],
-        "cameras": [
-            [kinds[view.name], *np.rint((_frustum(view, size) - origin) @ axes.T).astype(int).ravel().tolist()]
-            for view in views
-        ],
+        "cameras": [[kinds[view.name], *_whole((_frustum(view, size) - origin) @ axes.T)] for view in views],
         "shades": [shade for shade, _ in KINDS],
         "names": [view.name for view in views],
     }
@@ -59,6 +57,10 @@ def space(inspection: Inspection) -> str:
         f'<h2>Cameras and points</h2>{legend}<div class=space><canvas aria-label="cameras and points"></canvas>'
         f"<nav>{buttons}</nav><output></output><script type=application/json>{text}</script></div>"
     )
+
+
+def _whole(coordinates: NDArray[np.floating]) -> list[int]:
+    return list(np.rint(np.clip(coordinates, -(2**53), 2**53)).astype(int).ravel().tolist())
 
 
 def _points(inspection: Inspection) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -104,6 +106,6 @@ def _frustum(view: View, size: float) -> NDArray[np.float64]:
     camera = view.camera
     corners = [(0, 0), (camera.width, 0), (camera.width, camera.height), (0, camera.height)]
     rays = [((x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, 1.0) for x, y in corners]
-    local = np.array([(0.0, 0.0, 0.0), *rays]) * size
+    local = np.clip([(0.0, 0.0, 0.0), *rays], -WIDEST, WIDEST) * size
     rotation = view.world_to_camera[:, :3]
     return np.asarray(view.position + local @ rotation)

@@ -4,6 +4,7 @@ import os
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from clsplat.errors import DataError
 from clsplat.inspect.headers import read_header
 from clsplat.inspect.parts import Parts
-from clsplat.scene.images import fits
+from clsplat.scene.images import fits, read_image
 from clsplat.scene.lens import BORDER, Lens
 from clsplat.scene.points import FAR
 from clsplat.scene.scene import View, camera_extent, strayed
@@ -50,14 +51,15 @@ class PointFacts:
 
 @dataclass(frozen=True)
 class PhotoFacts:
-    """The image files of the views, by name."""
+    """The image files and masks of the views, by name."""
 
     unreadable: dict[str, str]  # the reason
     cut: list[str]  # the end of the file is missing
     misfits: dict[str, str]  # the sizes of file and camera
-    turned: list[str]  # misfits that would fit on their side
-    exif_turned: list[str]
+    on_side: list[str]  # misfits that would fit on their side
+    exif_turned: list[str]  # taken as stored although the Exif data say that they should be turned
     larger: list[str]  # will be shrunk to their cameras' size
+    masks: int
 
 
 @dataclass(frozen=True)
@@ -139,8 +141,8 @@ def bend(lens: Lens) -> float | None:
     return moved if np.isfinite(moved) else None
 
 
-def _relative(file: object, parts: Parts) -> str:
-    return os.path.relpath(str(file), parts.path).replace(os.sep, "/")
+def _relative(file: Path, parts: Parts) -> str:
+    return os.path.relpath(file, parts.path).replace(os.sep, "/")
 
 
 def _repeated(names: Sequence[str], keys: Iterable[object]) -> list[list[str]]:
@@ -167,28 +169,36 @@ def _cameras(parts: Parts) -> list[CameraFacts]:
     return sorted(found, key=lambda facts: -facts.views)
 
 
-def _photos(views: Sequence[View], missing: set[object]) -> PhotoFacts:
-    facts = PhotoFacts({}, [], {}, [], [], [])
+def _photos(views: Sequence[View], missing: set[Path]) -> PhotoFacts:
+    facts = PhotoFacts({}, [], {}, [], [], [], sum(view.mask_path is not None for view in views))
     for view in views:
-        if view.image_path in missing:
-            continue
-        try:
-            header = read_header(view.image_path)
-        except DataError as error:
-            facts.unreadable[view.name] = str(error)
-            continue
-        size, camera = (header.width, header.height), view.lens or view.camera
-        if not header.complete:
-            facts.cut.append(view.name)
-        if header.orientation > 1:
-            facts.exif_turned.append(view.name)
-        if not fits(view, size):
-            facts.misfits[view.name] = f"{size[0]}x{size[1]}, its camera {camera.width}x{camera.height}"
-            if fits(view, size[::-1]):
-                facts.turned.append(view.name)
-        elif size != (camera.width, camera.height):
-            facts.larger.append(view.name)
+        files = {view.name: view.image_path, f"mask of {view.name}": view.mask_path}
+        for name, file in files.items():
+            if file and file not in missing:
+                try:
+                    _photo(facts, view, name, file)
+                except DataError as error:
+                    facts.unreadable[name] = str(error)
     return facts
+
+
+def _photo(facts: PhotoFacts, view: View, name: str, file: Path) -> None:
+    """Note what is wrong with a view's photograph or mask.  Raises DataError when it cannot be read."""
+    header = read_header(file)
+    size, camera = (header.width, header.height), view.lens or view.camera
+    on_side = not fits(view, size) and fits(view, size[::-1])
+    if on_side and (header.orientation >= 5 or read_image(file, upright=True).shape[1::-1] == size[::-1]):
+        size = size[::-1]  # turned as it is read
+    elif header.orientation > 1:
+        facts.exif_turned.append(name)
+    if not header.complete:
+        facts.cut.append(name)
+    if not fits(view, size):
+        facts.misfits[name] = f"{size[0]}x{size[1]}, its camera {camera.width}x{camera.height}"
+        if on_side:
+            facts.on_side.append(name)
+    elif size != (camera.width, camera.height):
+        facts.larger.append(name)
 
 
 def _points(parts: Parts, extent: float | None, centres: NDArray[np.floating]) -> PointFacts:

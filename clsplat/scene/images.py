@@ -146,7 +146,7 @@ def read_image(path: Path, upright: bool = False) -> NDArray[Any]:
 
 
 def fits(view: View, size: tuple[int, int]) -> bool:
-    """Tell whether load_image takes a file of `size` (width, height) for a view."""
+    """Tell whether a file of `size` (width, height), turned upright or not, is the image of a view's camera."""
     if view.lens:
         return size == (view.lens.width, view.lens.height)
     return _scales_to(size, (view.camera.width, view.camera.height))
