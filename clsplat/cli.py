@@ -186,6 +186,29 @@ def data(context: typer.Context) -> None:
 
 
 @app.command()
+def inspect(
+    scene: Annotated[Path, typer.Argument(help="A COLMAP, Blender or nerfstudio folder.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    page: Annotated[Path | None, typer.Option("--html", help="Write a page with the cameras and points in 3D.")] = None,
+) -> None:
+    """Tell whether a dataset will train, and what is wrong with it; exit 3 when it cannot train."""
+    from clsplat.errors import DataError
+    from clsplat.inspect.inspection import Inspection
+    from clsplat.inspect.page import write_page
+    from clsplat.inspect.table import show
+
+    inspection = Inspection.of(scene)
+    if as_json:
+        print(json.dumps(inspection.data(), indent=1))
+    else:
+        show(inspection, CONSOLE)
+    if page is not None:
+        write_page(inspection, page)
+    if not inspection.trainable:
+        raise DataError(inspection.verdict)
+
+
+@app.command()
 def bench(
     scenes: Annotated[str, typer.Option(help="Fixed scenes, of A, B and C, separated by commas.")] = "A",
     model: Annotated[Path | None, typer.Option(help="Also time this splat or point cloud (PLY), at --scene.")] = None,

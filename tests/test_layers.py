@@ -14,7 +14,7 @@ ROWS = (  # from the top down; a module imports only from lower rows, or from it
     {"cli"},
     {"experiment", "schema"},
     {"matrix"},
-    {"runner", "model_file", "bench", "compare", "screen"},
+    {"runner", "model_file", "bench", "compare", "inspect", "screen"},
     {"pipeline"},
     {"stages", "prepare"},
     {"training"},

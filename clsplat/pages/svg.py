@@ -66,6 +66,33 @@ def curve(
     return "".join([*parts, "</svg>"])
 
 
+def histogram(title: str, values: Sequence[float], bins: int = 24) -> str:
+    """Draw how many of the values lie in each of some equal intervals from zero; no values, no chart: ""."""
+    if not values:
+        return ""
+    high = max(values) or 1.0
+    counts = [0] * bins
+    for value in values:
+        counts[min(bins - 1, int(bins * value / high))] += 1
+    width, height = WIDTH - LEFT - RIGHT, HEIGHT - BOTTOM - TOP
+    parts = [f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{html.escape(title)}">']
+    parts.append(f'<text x="{LEFT}" y="15" class="title">{html.escape(title)}</text>')
+    for tick in _ticks(0, max(counts)):
+        if tick % 1 == 0:
+            y = HEIGHT - BOTTOM - tick / max(counts) * height
+            parts.append(f'<line x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{y:.1f}" y2="{y:.1f}" class="grid"/>')
+            parts.append(f'<text x="{LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">{_number(tick)}</text>')
+    for i, count in enumerate(counts):
+        if count:
+            tall = count / max(counts) * height
+            place = f'x="{LEFT + i * width / bins + 1:.1f}" y="{HEIGHT - BOTTOM - tall:.1f}"'
+            parts.append(f'<rect {place} width="{width / bins - 2:.1f}" height="{tall:.1f}" fill="{COLOURS[0]}"/>')
+    for tick in _ticks(0, high):
+        x = LEFT + tick / high * width
+        parts.append(f'<text x="{x:.1f}" y="{HEIGHT - 10}" text-anchor="middle">{_number(tick)}</text>')
+    return "".join([*parts, "</svg>"])
+
+
 def _drawn(line: Line, logarithmic: bool) -> Line:
     """The line as the axes have it."""
     if not logarithmic:

@@ -2,7 +2,7 @@
 
 import logging
 import math
-from dataclasses import replace
+import os
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +18,7 @@ from clsplat.scene.colmap_files import (
     read_points,
 )
 from clsplat.scene.images import inside, require_files
-from clsplat.scene.lens import MODELS, Lens
+from clsplat.scene.lens import MODELS, Lens, shared
 from clsplat.scene.points import FAR
 from clsplat.scene.scene import Floats, Scene, View, every_nth, make_scene
 
@@ -35,9 +35,8 @@ def read_colmap(path: Path, holdout: int = 8) -> Scene:
     """
     model, images = _largest_model(path)
     cameras = read_cameras(model)
-    folder = _scene_folder(path) / "images"
-    views = sorted((_view(image, cameras, folder) for image in images), key=lambda view: view.name)
-    views = [replace(view, mask_path=_mask(folder.with_name("masks"), view.name)) for view in views]
+    folder = image_folder(path)
+    views = sorted((view_of(image, cameras, folder) for image in images), key=lambda view: view.name)
     require_files(path, (view.image_path for view in views))
     return make_scene(path, views, every_nth([view.name for view in views], holdout), read_points(model))
 
@@ -59,12 +58,12 @@ def _largest_model(path: Path) -> tuple[Path, list[ImageRecord]]:
     return best
 
 
-def _scene_folder(path: Path) -> Path:
-    """Return the folder above `sparse` when `path` is `sparse` or one of its models, else `path`."""
-    return next((folder.parent for folder in (path, path.parent) if folder.name == "sparse"), path)
+def image_folder(path: Path) -> Path:
+    """Return `images` beside `sparse` when `path` is `sparse` or one of its models, else `images` in `path`."""
+    return next((folder.parent for folder in (path, path.parent) if folder.name == "sparse"), path) / "images"
 
 
-def _view(image: ImageRecord, cameras: dict[int, CameraRecord], folder: Path) -> View:
+def view_of(image: ImageRecord, cameras: dict[int, CameraRecord], folder: Path) -> View:
     """Check one image and its camera.  Raises DataError."""
     image_path = inside(folder, image.name, image.where)
     if image.camera not in cameras:
@@ -78,16 +77,15 @@ def _view(image: ImageRecord, cameras: dict[int, CameraRecord], folder: Path) ->
             f"{image.translation}; expected finite numbers and a rotation: remove that image or {MEND}"
         )
     pose = np.column_stack([_rotation(image.quaternion), image.translation])
-    lens = _lens(image.camera, cameras[image.camera])
-    if lens.distorts:
-        return View(image.name, lens.pinhole, pose, image_path, lens=lens)
-    return View(image.name, lens.camera, pose, image_path)
+    lens = shared(_lens(image.camera, cameras[image.camera]))
+    camera, bent = (lens.pinhole, lens) if lens.distorts else (lens.camera, None)
+    return View(image.name, camera, pose, image_path, _mask(folder.with_name("masks"), image.name), lens=bent)
 
 
 def _mask(folder: Path, name: str) -> Path | None:
     """The mask of an image: its name with .png behind it (COLMAP) or in place of its suffix."""
     files = (folder / f"{name}.png", (folder / name).with_suffix(".png"))
-    return next((file for file in files if file.is_file()), None)
+    return next((file for file in files if os.path.isfile(file)), None)  # never raises
 
 
 def _rotation(quaternion: tuple[float, ...]) -> Floats:

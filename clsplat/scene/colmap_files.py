@@ -26,6 +26,7 @@ PARAMETERS = {
 }
 MODELS = list(PARAMETERS)
 MEND = "copy or export the model again"
+POINT2D = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
 POINT = np.dtype([("id", "<u8"), ("position", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("track", "<u8")])
 
 
@@ -40,13 +41,26 @@ class CameraRecord(NamedTuple):
 
 
 class ImageRecord(NamedTuple):
-    """A line of `images`: quaternion (w, x, y, z) and translation, world to camera."""
+    """A line of `images`: quaternion (w, x, y, z) and translation, world to camera.
+
+    `observed` counts its 2D points that show a 3D point.
+    """
 
     where: str
     name: str
     camera: int
     quaternion: tuple[float, ...]
     translation: tuple[float, ...]
+    observed: int = 0
+
+
+class PointTable(NamedTuple):
+    """The rows of `points3D` as they are: nothing is dropped."""
+
+    file: Path
+    positions: Floats  # [M, 3]
+    rgb: NDArray[Any]  # [M, 3], in 0..255
+    error: Floats  # [M], mean reprojection error in pixels; COLMAP writes -1 or 0 where it knows none
 
 
 def find_file(folder: Path, stem: str) -> Path | None:
@@ -74,12 +88,19 @@ def read_images(folder: Path) -> list[ImageRecord]:
 
 def read_points(folder: Path) -> PointCloud | None:
     """Return the points of a model, or None when there are none."""
+    table = read_point_table(folder)
+    if table is None:
+        return None
+    points = point_cloud(table.file, table.positions, table.rgb)
+    return points if len(points) else None
+
+
+def read_point_table(folder: Path) -> PointTable | None:
+    """Return the points of a model with their errors, or None when it has no such file."""
     file = find_file(folder, "points3D")
     if file is None:
         return None
-    positions, rgb = _points_binary(file) if file.suffix == ".bin" else _points_text(file)
-    points = point_cloud(file, positions, rgb)
-    return points if len(points) else None
+    return _points_binary(file) if file.suffix == ".bin" else _points_text(file)
 
 
 def _require_file(folder: Path, stem: str) -> Path:
@@ -146,13 +167,14 @@ def _images_binary(path: Path) -> Iterator[ImageRecord]:
         where = file.where
         _, *pose, camera = file.take("<I7dI", "an image")
         name = file.text("an image name")
-        file.skip(24 * file.count(24, "2D points"), "2D points")
-        yield ImageRecord(where, name, camera, tuple(pose[:4]), tuple(pose[4:]))
+        count = file.count(POINT2D.itemsize, "2D points")
+        start = file.skip(POINT2D.itemsize * count, "2D points")
+        observed = int(np.count_nonzero(np.frombuffer(file.data, POINT2D, count, start)["point"] >= 0))
+        yield ImageRecord(where, name, camera, tuple(pose[:4]), tuple(pose[4:]), observed)
     file.finish()
 
 
-def _points_binary(path: Path) -> tuple[Floats, NDArray[Any]]:
-    """Positions [M, 3] and colours [M, 3] in 0..255."""
+def _points_binary(path: Path) -> PointTable:
     file = _Binary(path)
     starts = np.empty(file.count(POINT.itemsize, "points"), np.int64)
     for i in range(len(starts)):  # a point ends where its track does, so only the walk is a loop
@@ -160,10 +182,10 @@ def _points_binary(path: Path) -> tuple[Floats, NDArray[Any]]:
         file.skip(8 * file.count(8, "track elements"), "track elements")
     file.finish()
     if len(starts) == 0:
-        return np.empty((0, 3)), np.empty((0, 3))
+        return PointTable(path, np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
     records = np.lib.stride_tricks.sliding_window_view(np.frombuffer(file.data, np.uint8), POINT.itemsize)
     table = records[starts].view(POINT)[:, 0]
-    return table["position"], table["rgb"]
+    return PointTable(path, table["position"], table["rgb"], table["error"])
 
 
 def _cameras_text(path: Path) -> Iterator[tuple[int, CameraRecord]]:
@@ -179,14 +201,18 @@ def _cameras_text(path: Path) -> Iterator[tuple[int, CameraRecord]]:
 def _images_text(path: Path) -> Iterator[ImageRecord]:
     layout = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
     kinds = (int, *[float] * 7, int, str)
-    after_image = False
+    image: ImageRecord | None = None  # whose points may follow
     for where, line in _lines(path):
-        if after_image and _is_points2d(line):
-            after_image = False
+        if image and _is_points2d(line):
+            yield image._replace(observed=sum(not word.startswith("-") for word in line.split()[2::3]))
+            image = None
         elif line:
+            if image:
+                yield image
             _, *pose, camera, name = _convert(where, line.split(maxsplit=9), kinds, layout)
-            yield ImageRecord(where, name, camera, tuple(pose[:4]), tuple(pose[4:]))
-            after_image = True
+            image = ImageRecord(where, name, camera, tuple(pose[:4]), tuple(pose[4:]))
+    if image:
+        yield image
 
 
 def _is_points2d(line: str) -> bool:
@@ -195,13 +221,12 @@ def _is_points2d(line: str) -> bool:
     return len(words) % 3 == 0 and (not words or words[-1].lstrip("-").isdecimal())
 
 
-def _points_text(path: Path) -> tuple[Floats, NDArray[Any]]:
-    """Positions [M, 3] and colours [M, 3] in 0..255."""
+def _points_text(path: Path) -> PointTable:
     kinds = (int, float, float, float, _byte, _byte, _byte, float)
     layout = "POINT3D_ID X Y Z R G B ERROR TRACK[]"
-    rows = [_convert(where, line.split(maxsplit=8)[:8], kinds, layout)[1:7] for where, line in _lines(path) if line]
-    table = np.array(rows, np.float64).reshape(-1, 6)
-    return table[:, :3], table[:, 3:]
+    rows = [_convert(where, line.split(maxsplit=8)[:8], kinds, layout)[1:] for where, line in _lines(path) if line]
+    table = np.array(rows, np.float64).reshape(-1, 7)
+    return PointTable(path, table[:, :3], table[:, 3:6], table[:, 6])
 
 
 def _lines(path: Path) -> Iterator[tuple[str, str]]:

@@ -145,6 +145,13 @@ def read_image(path: Path, upright: bool = False) -> NDArray[Any]:
     return np.ascontiguousarray(pixels[:, :, [2, 1, 0, 3][: pixels.shape[2]]])  # OpenCV decodes to BGR
 
 
+def fits(view: View, size: tuple[int, int]) -> bool:
+    """Tell whether a file of `size` (width, height), turned upright or not, is the image of a view's camera."""
+    if view.lens:
+        return size == (view.lens.width, view.lens.height)
+    return _scales_to(size, (view.camera.width, view.camera.height))
+
+
 def _scales_to(file: tuple[int, int], camera: tuple[int, int]) -> bool:
     """Tell whether one factor >= 1 takes the size of the file to that of the camera, as Camera.downscaled rounds."""
     smallest = max(1.0, *(f / (c + 0.5) for f, c in zip(file, camera, strict=True)))

@@ -6,7 +6,7 @@ point turn them into pixels.  Formulas are those of COLMAP's sources (sensor/mod
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import cv2
@@ -198,3 +198,9 @@ def _rays(camera: Camera) -> tuple[Floats, Floats]:
         (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy,
     )
     return u, v
+
+
+@lru_cache(maxsize=64)
+def shared(lens: Lens) -> Lens:
+    """Return the first lens that equals this one: it may know its pinhole already, which takes a while to find."""
+    return lens

@@ -40,6 +40,11 @@ def read_points_ply(path: Path) -> PointCloud:
 
     Raises DataError when the file is damaged, big-endian, or lacks these properties.
     """
+    return point_cloud(path, *read_ply_table(path))
+
+
+def read_ply_table(path: Path) -> tuple[Floats, NDArray[Any]]:
+    """Return positions [M, 3] and colours [M, 3] in 0..255 of a PLY file as they are; raises as read_points_ply."""
     data = read_file(path)
     form, count, dtype, start = _parse_header(path, data)
     missing = [name for name in POINT.names or () if name not in (dtype.names or ())]
@@ -49,7 +54,7 @@ def read_points_ply(path: Path) -> PointCloud:
     table = rows(path, data[start:], count, dtype)
     positions = np.stack([table[name] for name in "xyz"], axis=1)
     rgb = np.stack([table[name] for name in ("red", "green", "blue")], axis=1)
-    return point_cloud(path, positions, rgb)
+    return positions, rgb
 
 
 def write_points_ply(path: Path, points: PointCloud) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from clsplat.errors import DataError
 from clsplat.scene.images import image_size, inside, read_file, require_files
-from clsplat.scene.lens import Lens
+from clsplat.scene.lens import Lens, shared
 from clsplat.scene.points import FAR, read_points_ply
 from clsplat.scene.scene import Camera, Floats, PointCloud, View
 
@@ -73,26 +73,32 @@ class Transforms:
         require_files(self.path, [*images, *(mask for mask in masks if mask)])
         told = all(frame.number("w") and frame.number("h") for frame in self.frames)
         size = None if told else image_size(images[0])
-        views = []
-        for frame, image, mask in zip(self.frames, images, masks, strict=True):
-            lens = lens_of(frame, camera_of(frame, size))
-            camera, bent = (lens.pinhole, lens) if lens.distorts else (lens.camera, None)
-            views.append(View(view_name(frame.values["file_path"]), camera, pose_of(frame), image, mask, lens=bent))
-        return views
+        return [view_of(frame, size) for frame in self.frames]
 
     def points(self) -> PointCloud | None:
-        """Read `ply_file_path`, or else `points3d.ply` where that exists; None when there are no points."""
-        path = Frame(self.path.parent, str(self.path), self.table).file("ply_file_path")
+        """Read the points; None when there are none."""
+        path = self.points_path()
+        points = read_points_ply(path) if path else None
+        return points if points and len(points) else None
+
+    def points_path(self) -> Path | None:
+        """Return `ply_file_path`, or else `points3d.ply` where that exists."""
+        told = Frame(self.path.parent, str(self.path), self.table).file("ply_file_path")
         beside = self.path.parent / "points3d.ply"
-        if path is None and not beside.is_file():
-            return None
-        points = read_points_ply(path or beside)
-        return points if len(points) else None
+        return told or (beside if beside.is_file() else None)
 
 
 def view_name(file_path: str) -> str:
     """Return the name of a view: its `file_path` with forward slashes and without a leading `./`."""
     return PureWindowsPath(file_path).as_posix()
+
+
+def view_of(frame: Frame, size: tuple[int, int] | None) -> View:
+    """Return the view of a frame; `size` is that of images whose frame does not tell it.  Raises DataError."""
+    image, mask = image_path_of(frame), frame.file("mask_path")
+    lens = shared(lens_of(frame, camera_of(frame, size)))
+    camera, bent = (lens.pinhole, lens) if lens.distorts else (lens.camera, None)
+    return View(view_name(frame.values["file_path"]), camera, pose_of(frame), image, mask, lens=bent)
 
 
 def image_path_of(frame: Frame) -> Path:

@@ -1,0 +1,42 @@
+"""One look at a dataset: pieces, facts, findings and the verdict."""
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from clsplat.inspect.findings import Finding, findings, trainable, verdict
+from clsplat.inspect.parts import Parts, read_parts
+from clsplat.inspect.survey import Facts, survey
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """What was read, what was measured, what it means."""
+
+    parts: Parts
+    facts: Facts
+    findings: list[Finding]
+
+    @classmethod
+    def of(cls, path: Path) -> "Inspection":
+        """Inspect a COLMAP, Blender or nerfstudio folder.  Raises DataError only where there is no such folder."""
+        parts = read_parts(path)
+        facts = survey(parts)
+        return cls(parts, facts, findings(facts))
+
+    @property
+    def trainable(self) -> bool:
+        return trainable(self.findings)
+
+    @property
+    def verdict(self) -> str:
+        return verdict(self.findings)
+
+    def data(self) -> dict[str, Any]:
+        """All of it for JSON."""
+        return {
+            "verdict": self.verdict,
+            "trainable": self.trainable,
+            "findings": [{"level": finding.level, "text": finding.text} for finding in self.findings],
+            "facts": asdict(self.facts),
+        }

@@ -1,0 +1,238 @@
+"""The facts about a dataset that decide whether, and how well, it trains."""
+
+import os
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.errors import DataError
+from clsplat.inspect.headers import read_header
+from clsplat.inspect.parts import Parts
+from clsplat.scene.images import fits, read_image
+from clsplat.scene.lens import BORDER, Lens
+from clsplat.scene.points import FAR
+from clsplat.scene.scene import View, camera_extent, strayed
+
+SAMPLE = 20_000  # points that coverage is measured on
+DISTANT = 100.0  # camera extents from the middle of the cameras: nothing that a photograph resolves
+FEW_SEEN = 30  # points; COLMAP itself registers no image with fewer inliers
+
+
+@dataclass(frozen=True)
+class CameraFacts:
+    """Views of the same size, lens and focal length."""
+
+    views: int
+    model: str
+    width: int
+    height: int
+    focal: tuple[float, float]  # px
+    bend: float | None  # px: the largest displacement by the lens at the border; None where it overflows
+    kept: float  # share of the photograph that is left when it is straightened
+    centred: bool  # whether the principal point lies in the photograph
+
+
+@dataclass(frozen=True)
+class PointFacts:
+    """The sparse points.  Shares are of a sample of SAMPLE points, evenly spaced in the file."""
+
+    count: int
+    not_finite: int
+    distant: int  # beyond DISTANT camera extents
+    error_mean: float | None  # px
+    error_90: float | None  # px; 90 % of the points have less
+    in_two: float | None  # share that lies in the image of at least two views, hidden or not
+    behind: float | None  # share that lies behind all cameras
+
+
+@dataclass(frozen=True)
+class PhotoFacts:
+    """The image files and masks of the views, by name."""
+
+    unreadable: dict[str, str]  # the reason
+    cut: list[str]  # the end of the file is missing
+    misfits: dict[str, str]  # the sizes of file and camera
+    on_side: list[str]  # misfits that would fit on their side
+    exif_turned: list[str]  # taken as stored although the Exif data say that they should be turned
+    larger: list[str]  # will be shrunk to their cameras' size
+    masks: int
+
+
+@dataclass(frozen=True)
+class Facts:
+    """All that was found; names are those of the views, paths relative to the dataset."""
+
+    path: str
+    kind: str
+    registered: int
+    train: int | None  # None when the dataset cannot be read
+    test: int | None
+    on_disk: int
+    missing: list[str]
+    unregistered: list[str]
+    folders: int  # that the registered images lie in
+    submodels: dict[str, int]  # images of each COLMAP model; the first is used
+    cameras: list[CameraFacts]
+    photos: PhotoFacts
+    points: PointFacts | None
+    seen: dict[str, int]  # points seen by each view; empty where the dataset does not tell
+    extent: float | None  # scene units
+    strayed: list[str]
+    one_place: bool  # all cameras have the same centre
+    same_pose: list[list[str]]
+    same_but_case: list[list[str]]
+    same_base: int  # names that several folders hold
+    faults: list[str]  # why parts of it cannot be read
+    refusal: str  # why training would not start
+
+    @property
+    def few_seen(self) -> list[str]:
+        """Views that see fewer than FEW_SEEN points."""
+        return sorted((name for name, count in self.seen.items() if count < FEW_SEEN), key=lambda name: self.seen[name])
+
+
+def survey(parts: Parts) -> Facts:
+    """Measure a dataset that has been read in pieces."""
+    views, expected = parts.views, parts.expected
+    missing = [file for file in expected if not os.path.isfile(file)]
+    known = {*expected, *(view.mask_path for view in views)}
+    names = [view.name for view in views]
+    centres = np.stack([view.position for view in views]) if views else np.empty((0, 3))
+    extent = parts.scene.extent if parts.scene else camera_extent(views) if views else None
+    return Facts(
+        path=str(parts.path),
+        kind=parts.kind,
+        registered=len(expected),
+        train=len(parts.scene.train) if parts.scene else None,
+        test=len(parts.scene.test) if parts.scene else None,
+        on_disk=len(parts.on_disk),
+        missing=[_relative(file, parts) for file in missing],
+        unregistered=[_relative(file, parts) for file in parts.on_disk if file not in known],
+        folders=len({file.parent for file in expected}),
+        submodels=parts.submodels,
+        cameras=_cameras(parts),
+        photos=_photos(views, set(missing)),
+        points=_points(parts, extent, centres) if parts.points else None,
+        seen=parts.observed if any(parts.observed.values()) else {},
+        extent=extent,
+        strayed=[view.name for view, far in zip(views, strayed(views), strict=True) if far] if views else [],
+        one_place=len(views) > 1 and bool(np.allclose(centres, centres[0], rtol=0, atol=1e-9)),
+        same_pose=_repeated(names, [(view.scale, *view.world_to_camera.ravel().round(9)) for view in views]),
+        same_but_case=[group for group in _repeated(names, [n.casefold() for n in names]) if len(set(group)) > 1],
+        same_base=sum(count > 1 for count in Counter(file.name for file in set(expected)).values()),
+        faults=parts.faults,
+        refusal=parts.refusal,
+    )
+
+
+def bend(lens: Lens) -> float | None:
+    """By how many pixels the lens moves what a pinhole shows at the border, at most; None where it overflows."""
+    camera, along = lens.camera, np.linspace(0, 1, BORDER)
+    zeros, ones = np.zeros(BORDER), np.ones(BORDER)
+    x = np.concatenate([along, along, zeros, ones]) * lens.width
+    y = np.concatenate([zeros, ones, along, along]) * lens.height
+    with np.errstate(all="ignore"):
+        bent_x, bent_y = lens.bend((x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy)
+        moved = float(np.hypot(bent_x - x, bent_y - y).max())
+    return moved if np.isfinite(moved) else None
+
+
+def _relative(file: Path, parts: Parts) -> str:
+    return os.path.relpath(file, parts.path).replace(os.sep, "/")
+
+
+def _repeated(names: Sequence[str], keys: Iterable[object]) -> list[list[str]]:
+    """Names whose keys are equal, in groups of two and more."""
+    groups = defaultdict(list)
+    for name, key in zip(names, keys, strict=True):
+        groups[key].append(name)
+    return [group for group in groups.values() if len(group) > 1]
+
+
+def _cameras(parts: Parts) -> list[CameraFacts]:
+    grouped: dict[object, list[View]] = defaultdict(list)
+    for view in parts.views:
+        grouped[(view.lens or view.camera, parts.models.get(view.name))].append(view)
+    found = []
+    for views in grouped.values():
+        lens, camera = views[0].lens, views[0].camera
+        original = lens.camera if lens else camera
+        model = parts.models.get(views[0].name) or (lens.model if lens else "PINHOLE")
+        kept = camera.width * camera.height / (original.width * original.height)
+        centred = 0 <= original.cx <= original.width and 0 <= original.cy <= original.height
+        size, focal = (original.width, original.height), (original.fx, original.fy)
+        found.append(CameraFacts(len(views), model, *size, focal, bend(lens) if lens else 0.0, kept, centred))
+    return sorted(found, key=lambda facts: -facts.views)
+
+
+def _photos(views: Sequence[View], missing: set[Path]) -> PhotoFacts:
+    facts = PhotoFacts({}, [], {}, [], [], [], sum(view.mask_path is not None for view in views))
+    for view in views:
+        files = {view.name: view.image_path, f"mask of {view.name}": view.mask_path}
+        for name, file in files.items():
+            if file and file not in missing:
+                try:
+                    _photo(facts, view, name, file)
+                except DataError as error:
+                    facts.unreadable[name] = str(error)
+    return facts
+
+
+def _photo(facts: PhotoFacts, view: View, name: str, file: Path) -> None:
+    """Note what is wrong with a view's photograph or mask.  Raises DataError when it cannot be read."""
+    header = read_header(file)
+    size, camera = (header.width, header.height), view.lens or view.camera
+    on_side = not fits(view, size) and fits(view, size[::-1])
+    if on_side and (header.orientation >= 5 or read_image(file, upright=True).shape[1::-1] == size[::-1]):
+        size = size[::-1]  # turned as it is read
+    elif header.orientation > 1:
+        facts.exif_turned.append(name)
+    if not header.complete:
+        facts.cut.append(name)
+    if not fits(view, size):
+        facts.misfits[name] = f"{size[0]}x{size[1]}, its camera {camera.width}x{camera.height}"
+        if on_side:
+            facts.on_side.append(name)
+    elif size != (camera.width, camera.height):
+        facts.larger.append(name)
+
+
+def _points(parts: Parts, extent: float | None, centres: NDArray[np.floating]) -> PointFacts:
+    assert parts.points is not None
+    positions = parts.points.positions
+    finite = (np.abs(positions) < FAR).all(axis=1)
+    error = parts.points.error[finite] if len(parts.points.error) else np.empty(0)
+    known = error[np.isfinite(error) & (error > 0)]
+    if len(np.unique(known)) < 2:  # a placeholder
+        known = np.empty(0)
+    good = positions[finite].astype(np.float64)
+    distance = np.linalg.norm(good - np.median(centres, axis=0), axis=1) if len(centres) else np.empty(0)
+    sample = good[:: max(1, -(-len(good) // SAMPLE))]
+    in_two, behind = _coverage(sample, parts.views) if len(sample) and parts.views else (None, None)
+    return PointFacts(
+        count=len(positions),
+        not_finite=int(np.count_nonzero(~finite)),
+        distant=int(np.count_nonzero(distance > DISTANT * extent)) if extent else 0,
+        error_mean=float(known.mean()) if len(known) else None,
+        error_90=float(np.quantile(known, 0.9)) if len(known) else None,
+        in_two=in_two,
+        behind=behind,
+    )
+
+
+def _coverage(points: NDArray[np.float64], views: Sequence[View]) -> tuple[float, float]:
+    """Shares of points [M, 3] that project into at least two views, and that lie behind all of them."""
+    inside, ahead = np.zeros(len(points), int), np.zeros(len(points), bool)
+    for view in views:
+        camera = view.camera
+        x, y, z = view.world_to_camera[:, :3] @ points.T + view.world_to_camera[:, 3:]
+        front = z > 0
+        depth = np.where(front, z, 1)
+        u, v = camera.fx * x / depth + camera.cx, camera.fy * y / depth + camera.cy
+        inside += front & (u >= 0) & (u <= camera.width) & (v >= 0) & (v <= camera.height)
+        ahead |= front
+    return float((inside >= min(2, len(views))).mean()), float((~ahead).mean())
