@@ -163,7 +163,7 @@ def _points(facts: Facts) -> Iterator[Finding]:
     points = facts.points
     if points is None or points.count == 0:
         if facts.registered and not any("points3d" in fault.lower() for fault in facts.faults):
-            mend = "training starts from random ones, which takes longer; clean backgrounds suffer least"
+            mend = "training finds some by a plane sweep, or where photographs have alpha takes random ones"
             yield Finding("note", "there are no points", mend)
         return
     if points.count < FEW_POINTS:
