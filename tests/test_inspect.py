@@ -295,7 +295,11 @@ def test_points_behind_all_cameras(tmp_path):
     flipped = [replace(image, translation=(0.0, 0.0, -4.0)) for image in model.images]  # all look outwards
     inspection = Inspection.of(write(tmp_path, replace(model, images=flipped)))
     assert inspection.facts.points.behind == 1.0
-    assert "100 % of the points lie behind all cameras" in said(inspection, "warning")
+    assert "all 200 points lie behind all training cameras" in said(inspection, "error")
+    mended = replace(flipped[4], translation=(0.0, 0.0, 0.0))  # stands in the middle and sees some
+    inspection = Inspection.of(write(tmp_path, replace(model, images=[*flipped[:4], mended, *flipped[5:]])))
+    assert 0.1 < inspection.facts.points.behind < 0.9
+    assert "% of the points lie behind all cameras" in said(inspection, "warning")
 
 
 def test_points_beside_all_images(tmp_path):

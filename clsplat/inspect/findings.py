@@ -175,7 +175,8 @@ def _points(facts: Facts) -> Iterator[Finding]:
     if points.distant:
         fault = f"{_are(points.distant, 'point')} more than {DISTANT:g} times the cameras' extent away"
         yield Finding("note", fault, "usually sky or wrong matches; they become very large Gaussians")
-    yield from _coverage(points)
+    if not facts.refusal:
+        yield from _coverage(points)
     if points.error_mean is not None and points.error_mean > IMPRECISE:
         fault = f"the points miss their observations by {points.error_mean:.2f} px on average"
         yield Finding("warning", fault, "renders will be blurred; run bundle adjustment (colmap bundle_adjuster)")

@@ -21,6 +21,7 @@ from clsplat.scene.points import read_ply_table
 from clsplat.scene.scene import Scene, View
 from clsplat.scene.transforms import Transforms, image_path_of
 from clsplat.scene.transforms import view_of as frame_view
+from clsplat.stages.init import require_ahead
 
 LOG = logging.getLogger("clsplat")
 HOLDOUT = 8  # every so many views are for testing where the dataset does not tell: the default of pipelines
@@ -30,7 +31,10 @@ Result = TypeVar("Result")
 
 @dataclass
 class Parts:
-    """A dataset in pieces.  `scene` is what training would read; None when it refuses, for the reason `refusal`."""
+    """A dataset in pieces.
+
+    `scene` is what training would read, None when it cannot; `refusal` is why training would not start.
+    """
 
     path: Path
     kind: str = "none"
@@ -61,6 +65,8 @@ def read_parts(path: Path) -> Parts:
     with _silent():
         try:
             parts.scene = read_scene(path, HOLDOUT)
+            if parts.scene.points:
+                require_ahead(parts.scene.points, parts.scene)
         except DataError as error:
             if not path.is_dir():
                 raise
