@@ -134,8 +134,8 @@ static inline void gradient_of(
     const float near_plane, const float screen_variance, const float compensate, const uint degree,
     const uint stride, const uint i, gradient_t *g)
 {
-    const shape_t s = shape_of(means, quats, log_scales, filter_variance, camera, near_plane, screen_variance,
-                               compensate, stride, i);
+    shape_t s;
+    shape_of(means, quats, log_scales, filter_variance, camera, near_plane, screen_variance, compensate, stride, i, &s);
     VF m[MOMENTS];
     for (uint k = 0; k < MOMENTS; k++)
         m[k] = VLOAD(moments + k * stride + i);

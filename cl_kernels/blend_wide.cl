@@ -105,8 +105,8 @@ static inline void store_record(const moments_t m, __global float *record)
 }
 
 /* Walk one splat over the rows of its tile that it reaches, whole pairs of rows. */
-static inline moments_t moments_of(const float *splat, const uint tile_x, const uint tile_y,
-                                   grad_pixels_t (*pixels)[COLUMNS])
+static inline void moments_of(const float *splat, const uint tile_x, const uint tile_y,
+                              grad_pixels_t (*pixels)[COLUMNS], moments_t *sums)
 {
     const VF zero = (VF)(0.0f);
     moments_t moments = {zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero};
@@ -123,7 +123,7 @@ static inline moments_t moments_of(const float *splat, const uint tile_x, const 
             blend_backward_step(&pixels[y + 1][column], lower, pixel, splat + SPLAT_RED, &moments);
         }
     }
-    return moments;
+    *sums = moments;
 }
 
 /* Splats outside, rows inside: a splat's record is summed in registers and written once, at the pair's address; pairs
@@ -173,7 +173,8 @@ void blend_backward(
             vstore16(vload16(pair_splat[pairs[j]], splats), 0, segment[j]);
         }
         for (uint j = 0; j < length; j++) {
-            const moments_t moments = moments_of(segment[j], tile_x, tile_y, pixels);
+            moments_t moments;
+            moments_of(segment[j], tile_x, tile_y, pixels, &moments);
             store_record(moments, pair_moments + (size_t)pairs[j] * RECORD);
         }
     }

@@ -56,13 +56,15 @@ typedef struct {
     VF energy;                // factor of the opacity: what the two filters spread out
 } shape_t;
 
-static inline shape_t shape_of(
+/* By address: functions that return a structure are, once inlined, more than Oclgrind 21.10 knows. */
+static inline void shape_of(
     __global const float *means,            // [3,S] scene units
     __global const float *quats,            // [4,S] unnormalised
     __global const float *log_scales,       // [3,S] log of scene units
     __global const float *filter_variance,  // [S] scene units^2
     __constant camera_t *camera,
-    const float near_plane, const float screen_variance, const float compensate, const uint stride, const uint i)
+    const float near_plane, const float screen_variance, const float compensate, const uint stride, const uint i,
+    shape_t *shape)
 {
     __constant const float *w = camera->world_to_camera;
     shape_t s;
@@ -124,7 +126,7 @@ static inline shape_t shape_of(
     s.conic_xy = -s.xy / s.determinant;
     s.conic_yy = (s.xx + screen_variance) / s.determinant;
     s.energy = sqrt(energy2 * (1.0f + compensate * (s.ratio - 1.0f)));
-    return s;
+    *shape = s;
 }
 
 #endif

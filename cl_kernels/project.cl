@@ -46,8 +46,8 @@ void project_forward(
     const uint i = get_global_id(0) * LANES;
     if (i >= count)
         return;
-    const shape_t s = shape_of(means, quats, log_scales, filter_variance, camera, near_plane, screen_variance,
-                               compensate, stride, i);
+    shape_t s;
+    shape_of(means, quats, log_scales, filter_variance, camera, near_plane, screen_variance, compensate, stride, i, &s);
     const VI inside = (LANE_INDEX + (int)i) < (int)count;
     const VF u = camera->fx * s.x * s.inverse_z + camera->cx;
     const VF v = camera->fy * s.y * s.inverse_z + camera->cy;
