@@ -122,11 +122,8 @@ def test_files_render_as_the_run_does(finished, tiny_scene, name):
     for view in finished.scene.downscaled(1).split("test"):
         camera = finished.targets.camera(view)
         images = [
-            renderer.forward(model, camera, finished.targets.background_array).image.get()
-            for renderer, model in (
-                (finished.renderer, finished.trained),
-                (opened.renderer, on_device(finished, opened)),
-            )
+            finished.renderer.forward(model, camera, finished.targets.background_array).image.get()
+            for model in (finished.trained, on_device(finished, opened))
         ]
         difference = np.abs(images[0] - images[1])
         assert np.quantile(difference, 0.999) < 2e-5
