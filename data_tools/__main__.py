@@ -1,5 +1,6 @@
 """Dataset preparation: `clsplat data COMMAND …`, or `python -m data_tools COMMAND …`."""
 
+import logging
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -123,6 +124,7 @@ def fetch(
 
 def main() -> None:
     """Run the command line; an error that the user can mend is one line and its exit code."""
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
     try:
         app()
     except ClsplatError as error:

@@ -1,5 +1,6 @@
 """A scene as pinhole cameras would have taken it: straightened photographs, smaller ones if wanted, and their masks."""
 
+import logging
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +14,9 @@ from clsplat.scene.images import load_image, load_mask, write_image
 from clsplat.scene.scene import View
 from data_tools.colmap_writer import write_model
 
+LOG = logging.getLogger("clsplat")
 Blank = Literal["crop", "mask"]
+PROGRESS = 20  # photographs between lines
 
 
 def undistort_scene(source: Path, out: Path, long_side: int | None = None, blank: Blank = "crop") -> int:
@@ -26,7 +29,9 @@ def undistort_scene(source: Path, out: Path, long_side: int | None = None, blank
     scene = read_scene(source, holdout=0)
     names = _png_names([view.name for view in scene.views])
     views = []
-    for view, name in zip(scene.views, names, strict=True):
+    for number, (view, name) in enumerate(zip(scene.views, names, strict=True), 1):
+        if number % PROGRESS == 0:
+            LOG.info("straightened %d of %d photographs", number, len(names))
         wanted = replace(_sized(_shown(view, blank), long_side), alpha="mask")
         image, mask = out / "images" / name, out / "masks" / name
         if not image.is_file():

@@ -1,5 +1,6 @@
 """Sharp, evenly spaced frames of a video."""
 
+import logging
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from clsplat.errors import DataError
 from clsplat.scene.images import write_image
 
+LOG = logging.getLogger("clsplat")
 REDUCED = 480  # px: the side that sharpness is measured at; noise of the full size would count as detail
 
 
@@ -20,8 +22,10 @@ def write_frames(video: Path, out: Path, frames: int = 100, long_side: int | Non
     PNG, because features and colours should not pass through a second lossy coding.  Frames that are there already are
     left alone.  Raises DataError when the video cannot be decoded.
     """
+    LOG.info("%s: looking for sharp frames", video)
     sharpness = [_sharpness(image) for image in _decoded(video)]
     chosen = sharpest(sharpness, frames)
+    LOG.info("%d frames, of which %d are written", len(sharpness), len(chosen))
     wanted = {place: out / f"frame_{i:05d}.png" for i, place in enumerate(chosen, 1)}
     if all(path.is_file() for path in wanted.values()):
         return len(wanted)
