@@ -86,6 +86,11 @@ MATCHING = {
     for key in ("", ".after", ".statistic", ".as_many_as", ".gradient_above", *size)
 }
 SUBDIVIDE = (".after", ".at_most", ".beta", ".children", ".radius_above")
+THINNING = {
+    *(f"densify~{n}.{key}" for n in (2, 3) for key in ("every", "max_gaussians", "start", "stop")),
+    *(f"densify~2.rules.prune_unimportant{key}" for key in ("", ".after", ".share")),
+    *(f"densify~3.rules.merge_neighbours{key}" for key in ("", ".after", ".colour_below", ".distance_below")),
+}
 DIFFERENCES = {
     ("splat", "splat_7k"): TWIN,
     ("splat", "mip_splatting"): SMOOTHING | MIP | REFRESH,
@@ -106,13 +111,11 @@ DIFFERENCES = {
         *(f"densify.rules.split_oversized{key}" for key in ("", *SUBDIVIDE, ".pixels", ".rms_above")),
         *(f"losses.covariance_trace{key}" for key in ("", ".above", ".pixels", ".weight")),
         *("losses.l1.weight", "losses.l2", "losses.l2.weight"),
+        *("densify.rules.clone.gradient_above", "densify.rules.split.gradient_above"),
         *(f"stages.evaluate~2.{key}" for key in ("lpips", "lpips_input", "metrics", "scales", "split")),
     },
-    ("micro_splatting", "micro_splatting_v2"): {
-        *(f"densify~{n}.{key}" for n in (2, 3) for key in ("every", "max_gaussians", "start", "stop")),
-        *(f"densify~2.rules.prune_unimportant{key}" for key in ("", ".after", ".share")),
-        *(f"densify~3.rules.merge_neighbours{key}" for key in ("", ".after", ".colour_below", ".distance_below")),
-    },
+    ("micro_splatting", "micro_splatting_v2"): THINNING,
+    ("micro_splatting_7k", "micro_splatting_v2_7k"): THINNING,
     ("micro_splatting", "micro_splatting_7k"): TWIN | {"losses.l1.weight", "losses.l2.weight"},
     **{
         (name, f"{name}_7k"): TWIN | ({"refresh_filter.start", "refresh_filter.stop"} if refreshes else set())
