@@ -1,10 +1,12 @@
 """Whole runs with changing weights, penalties and subdividing rules: bits, resume, and what the report says of them."""
 
 import json
+import re
 
 import numpy as np
 import pytest
 
+from clsplat.pages.svg import Line, curve
 from clsplat.training.census import SHARES, census
 from tests.scenes import random_case
 from tests.test_training import train
@@ -36,6 +38,17 @@ def test_every_rule_and_penalty_acts(finished):
     page = (finished.out / "report.html").read_text()
     assert "anisotropy" in page
     assert "split_textured" in page
+    shown = re.findall(r"<figcaption>(\S+) ", page)
+    assert len(shown) == len(set(shown)) > 0, "a view is shown twice"
+
+
+def test_legends_stay_below_the_title_and_break_into_rows():
+    names = ["clone", "split_textured", "split_oversized", "prune_unimportant", "merge_neighbours", "prune_faint"]
+    chart = curve("Gaussians changed by each rule", [Line([(0.0, 0.0), (1.0, 1.0)], name) for name in names])
+    rows = re.findall(r'<text x="56" y="(\d+)">(<tspan.*?)</text>', chart)
+    assert [y for y, _ in rows] == ["29", "43"]
+    assert re.findall(r">(\w+)</tspan>", "".join(row for _, row in rows)) == names
+    assert "<tspan" not in curve("loss", [Line([(0.0, 0.0), (1.0, 1.0)], "alone")])
 
 
 def test_same_bits_and_exact_resume(finished, tiny_scene, tmp_path):

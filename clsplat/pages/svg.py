@@ -9,6 +9,7 @@ WIDTH, HEIGHT = 460, 220  # px
 LEFT, BOTTOM, TOP, RIGHT = 56, 30, 26, 12
 COLOURS = ("#2b6cb0", "#c05621", "#2f855a", "#805ad5", "#b83280", "#0f8a9d", "#8a6d1b", "#4a5568")
 FEW = 12  # a line of so few points shows each of them
+LEGEND_ROW, LEGEND_LETTERS = 14, 66  # px a row; about as many letters fit in one
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,8 @@ def curve(
     drawn = [line for line in drawn if line.points]
     if not drawn:
         return ""
+    legend = _legend(drawn)
+    top = TOP + LEGEND_ROW * len(legend)
     xs = [x for line in drawn for x, _ in line.points]
     ys = [y for line in drawn for _, y in line.points]
     x_low, x_high = 0.0, max(xs) or 1.0
@@ -41,10 +44,12 @@ def curve(
     def place(x: float, y: float) -> tuple[float, float]:
         across = (x - x_low) / (x_high - x_low)
         up = (y - y_low) / (y_high - y_low)
-        return LEFT + across * (WIDTH - LEFT - RIGHT), HEIGHT - BOTTOM - up * (HEIGHT - BOTTOM - TOP)
+        return LEFT + across * (WIDTH - LEFT - RIGHT), HEIGHT - BOTTOM - up * (HEIGHT - BOTTOM - top)
 
     parts = [f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{html.escape(title)}">']
     parts.append(f'<text x="{LEFT}" y="15" class="title">{html.escape(title)}</text>')
+    for i, row in enumerate(legend, 1):
+        parts.append(f'<text x="{LEFT}" y="{15 + LEGEND_ROW * i}">{row}</text>')
     for tick in _decade_ticks(y_low, y_high) if logarithmic else _ticks(y_low, y_high):
         _, y = place(x_low, tick)
         label = _number(10**tick if logarithmic else tick)
@@ -54,15 +59,12 @@ def curve(
         x, _ = place(tick, y_low)
         parts.append(f'<text x="{x:.1f}" y="{HEIGHT - 10}" text-anchor="middle">{html.escape(label)}</text>')
     for i, line in enumerate(drawn):
-        colour = line.colour or COLOURS[i % len(COLOURS)]
+        colour = _colour(line, i)
         places = [place(*point) for point in line.points]
         path = " ".join(f"{x:.1f},{y:.1f}" for x, y in places)
         parts.append(f'<polyline points="{path}" fill="none" stroke="{colour}" stroke-width="1.8"/>')
         if len(places) <= FEW:
             parts += [f'<circle cx="{x:.1f}" cy="{y:.1f}" r="2.6" fill="{colour}"/>' for x, y in places]
-        if line.name and len(drawn) > 1:
-            x = WIDTH - RIGHT - 100 * (len(drawn) - i)
-            parts.append(f'<text x="{x}" y="15" style="fill:{colour}">{html.escape(line.name)}</text>')
     return "".join([*parts, "</svg>"])
 
 
@@ -98,6 +100,26 @@ def _drawn(line: Line, logarithmic: bool) -> Line:
     if not logarithmic:
         return line
     return replace(line, points=[(x, math.log10(y)) for x, y in line.points if y > 0])
+
+
+def _colour(line: Line, index: int) -> str:
+    return line.colour or COLOURS[index % len(COLOURS)]
+
+
+def _legend(lines: Sequence[Line]) -> list[str]:
+    """Rows of names in their lines' colours; a single line needs none."""
+    rows: list[str] = []
+    room = 0
+    for i, line in enumerate(lines if len(lines) > 1 else []):
+        if not line.name:
+            continue
+        if len(line.name) > room:
+            rows.append("")
+            room = LEGEND_LETTERS
+        gap = ' dx="12"' if rows[-1] else ""
+        rows[-1] += f'<tspan{gap} style="fill:{_colour(line, i)}">{html.escape(line.name)}</tspan>'
+        room -= len(line.name) + 2
+    return rows
 
 
 def _ticks(low: float, high: float) -> list[float]:

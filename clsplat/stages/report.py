@@ -126,9 +126,10 @@ def _times(run: Run) -> str:
 
 def _views(run: Run) -> str:
     """The worst and the best views of the last evaluation: render, truth and four times their difference."""
-    lines = [r for r in run.records.read("view") if r["scale"] == run.scale and r["step"] == run.step]
     by_name = {view.name: view for view in run.scene.downscaled(run.scale).views}
-    ranked = sorted((r for r in lines if r["view"] in by_name), key=lambda r: r["psnr"])
+    lines = [r for r in run.records.read("view") if r["scale"] == run.scale and r["step"] == run.step]
+    last = {r["view"]: r for r in lines if r["view"] in by_name}  # it may have been measured twice after the same step
+    ranked = sorted(last.values(), key=lambda r: r["psnr"])
     if not ranked:
         return ""
     worst = ranked[:SHOWN]
