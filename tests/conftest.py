@@ -19,6 +19,20 @@ NAMES = [name.strip() for name in os.environ.get("CLSPLAT_TEST_DEVICES", "").spl
 TUNINGS = {"wide16": ("wide", 16), "wide8": ("wide", 8), "simt": ("simt", 1)}
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--one-each", action="store_true", help="of a test's parameters take those in the middle alone")
+
+
+@pytest.hookimpl(trylast=True)  # after -m and -k
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if config.getoption("--one-each"):
+        cases: dict[tuple[str, object], list[pytest.Item]] = {}
+        for item in items:
+            parameters = item.callspec.params if hasattr(item, "callspec") else {}
+            cases.setdefault((item.nodeid.partition("[")[0], parameters.get("device")), []).append(item)
+        items[:] = [same[len(same) // 2] for same in cases.values()]
+
+
 @pytest.fixture(
     scope="session", params=[(name, tuning) for name in NAMES for tuning in TUNINGS], ids=lambda p: "-".join(p)
 )
