@@ -19,7 +19,7 @@ from clsplat.gaussians.model import Gaussians
 from clsplat.render.tiles import Tiler
 from clsplat.settings import Settings
 from clsplat.training.statistics import SplatStats
-from clsplat.training.thresholds import Quantile, Threshold
+from clsplat.training.thresholds import PixelQuantile, Quantile, Threshold
 
 Positive = Annotated[float, Field(gt=0)]
 NEVER = 3.0e38  # a bound that no finite float passes
@@ -92,10 +92,10 @@ class Edit:
 
     def threshold(self, statistic: str, threshold: Threshold) -> float:
         """The number that a threshold on a statistic stands for."""
+        if isinstance(threshold, PixelQuantile):
+            return self.measures.texture_quantile(threshold.quantile)
         if not isinstance(threshold, Quantile):
             return threshold
-        if threshold.of == "pixels":
-            return self.measures.texture_quantile(threshold.quantile)
         mean = self.stats.mean(statistic)
         return max(float(np.quantile(mean, threshold.quantile)), LEAST) if len(mean) else LEAST
 
@@ -185,7 +185,7 @@ class Change:
 
     before: int
     after: int
-    causes: dict[str, int]  # Gaussians whose fate a rule decided, by the rule's name
+    causes: dict[str, int]  # Gaussians whose fate a rule decided in the end, by the rule's name
 
 
 def densify(
@@ -203,16 +203,20 @@ def densify(
     Growth stops at `most` Gaussians: those with the largest screen gradient (the first column) grow first.
     """
     edit = Edit(gaussians, stats, measures, step)
-    causes: dict[str, int] = {}
     before = gaussians.count
-    for rule in rules:
-        if step > rule.after:
-            rows = edit.rows()
-            rule.mark(edit)
-            name = getattr(rule, "type", "rule")
-            causes[name] = causes.get(name, 0) + int((edit.rows() != rows).sum())
+    acting = [rule for rule in rules if step > rule.after]
+    decided_by = np.full(before, -1)
+    for index, rule in enumerate(acting):
+        rows = edit.rows()
+        rule.mark(edit)
+        decided_by[edit.rows() != rows] = index
     if most is not None and int(edit.rows().sum(dtype=np.int64)) > most:
         edit.limit(most)
+    decided_by[edit.rows() == 1] = -1
+    causes: dict[str, int] = {}
+    for index, rule in enumerate(acting):
+        name = getattr(rule, "type", "rule")
+        causes[name] = causes.get(name, 0) + int((decided_by == index).sum())
     edit.apply(tiler, seed)
     stats.clear()
     return Change(before, gaussians.count, causes)

@@ -13,7 +13,7 @@ from pydantic import Field
 from clsplat.gaussians.model import INTERVAL2
 from clsplat.training.density import Edit, Positive, Rule
 from clsplat.training.statistics import SEEN, StatisticName
-from clsplat.training.thresholds import Quantile, Share, Threshold
+from clsplat.training.thresholds import PixelQuantile, Quantile, Share, Threshold
 
 BETA = 0.5  # Lee et al. 2025: a child's covariance is half its parent's
 
@@ -55,7 +55,7 @@ class SplitTextured(Subdivide):
 
     type: Literal["split_textured"] = "split_textured"
     texture: StatisticName = "texture"
-    texture_above: Threshold = Quantile(quantile=0.8, of="pixels")
+    texture_above: Threshold = PixelQuantile(quantile=0.8, of="pixels")
     gradient_above: Annotated[float, Field(ge=0)] = 1.0e-4
 
     @property
@@ -72,11 +72,12 @@ class SplitTextured(Subdivide):
 class SplitOversized(Subdivide):
     """Split Gaussians whose covariance trace passes τ = 3 s².
 
-    s is `rms_above` in extents, or, where `pixels` is given, what spans so many pixels at the nearest training view.
+    s is `rms_above` in extents, or the quantile of the Gaussians' own, or, where `pixels` is given, what spans so many
+    pixels at the nearest training view.
     """
 
     type: Literal["split_oversized"] = "split_oversized"
-    rms_above: Positive = 0.01
+    rms_above: Positive | Quantile = 0.01
     pixels: Positive | None = None  # px
 
     @property
@@ -87,6 +88,8 @@ class SplitOversized(Subdivide):
         rms = np.sqrt(np.exp(2 * edit.gaussians.get("log_scales")).mean(axis=1))
         if self.pixels:
             bound = self.pixels * np.sqrt(edit.gaussians.get(INTERVAL2)[:, 0])
+        elif isinstance(self.rms_above, Quantile):
+            bound = np.full_like(rms, np.quantile(rms, self.rms_above.quantile) if len(rms) else 0.0)
         else:
             bound = np.full_like(rms, self.rms_above * edit.measures.extent)
         self.subdivide(edit, rms > bound, rms / np.maximum(bound, 1e-30))

@@ -10,10 +10,17 @@ Share = Annotated[float, Field(ge=0, le=1)]
 
 
 class Quantile(Settings):
-    """What a share of all values stay below: of the training photographs' pixels, or of the Gaussians as they are."""
+    """What a share of the Gaussians' own values, as they are, stay below."""
 
     quantile: Share
-    of: Literal["pixels", "gaussians"] = "gaussians"
+    of: Literal["gaussians"] = "gaussians"
 
 
-Threshold = Annotated[float, Field(ge=0)] | Quantile
+class PixelQuantile(Settings):
+    """The texture that a share of the training photographs' pixels stay below."""
+
+    quantile: Share
+    of: Literal["pixels"]
+
+
+Threshold = Annotated[float, Field(ge=0)] | Quantile | PixelQuantile
