@@ -9,6 +9,7 @@ from clsplat import resource_dir
 from clsplat.errors import ConfigError
 from clsplat.pipeline import load
 from clsplat.schema import json_schema
+from clsplat.stages.optimize import Optimize
 from clsplat.yaml_file import read_yaml
 
 SHIPPED = sorted(path.stem for path in resource_dir("pipelines").glob("*.yaml"))
@@ -48,6 +49,15 @@ def test_shipped_pipelines_are_fine_and_resolve_to_themselves(name, write):
     assert pipeline.settings.name == name
     again = load(write(pipeline.text()))
     assert again.resolved() == pipeline.resolved()
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_every_scheduled_stage_of_a_shipped_pipeline_acts(name):
+    loops = [stage for stage in load(name).settings.stages if isinstance(stage, Optimize)]
+    for loop in loops:
+        for stage in loop.during:
+            steps = range(1, loop.steps + (0 if stage.edits else 1))  # nothing is edited after the last step
+            assert any(stage.due(step) for step in steps), f"{stage.stage}, every {stage.every}"
 
 
 def flat(value: object, place: str = "") -> dict[str, object]:
