@@ -169,13 +169,16 @@ def checked(path: Path, document: Document, overrides: Sequence[str] = ()) -> Pi
 def find(name: str) -> Path:
     """The file of a pipeline given by path or by the name of a shipped one."""
     path = Path(name)
-    if path.suffix in (".yaml", ".yml") or path.exists():
-        if not path.is_file():
-            raise ConfigError(f"{path}: no such pipeline file")
+    if path.is_file():
         return path
+    if path.suffix in (".yaml", ".yml"):
+        raise ConfigError(f"{path}: no such pipeline file")
     shipped = {file.stem: file for file in sorted(resource_dir("pipelines").glob("*.yaml"))}
     if name in shipped:
         return shipped[name]
+    if path.is_dir():
+        go_on = f"clsplat run PIPELINE --out {path} --resume"
+        raise ConfigError(f"{path}: is a folder, expected a pipeline file; to go on with a run: {go_on}")
     near = difflib.get_close_matches(name, shipped, n=1)
     hint = f"; did you mean '{near[0]}'?" if near else f"; there are {', '.join(shipped)}, or give a path"
     raise ConfigError(f"no pipeline named '{name}'{hint}")

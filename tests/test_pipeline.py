@@ -258,6 +258,14 @@ def test_unknown_pipelines_name_the_nearest():
         load("nowhere.yaml")
 
 
+def test_a_folder_is_no_pipeline_and_hides_none(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "splat").mkdir()
+    assert load("splat").settings.name == "splat"
+    with pytest.raises(ConfigError, match=r"is a folder.* clsplat run PIPELINE --out .* --resume"):
+        load(str(tmp_path))
+
+
 def test_schema_describes_the_file():
     schema = json_schema()
     assert json.loads(json.dumps(schema)) == schema
