@@ -6,6 +6,7 @@ import re
 import numpy as np
 import pytest
 
+from clsplat.gaussians.ply import read_ply
 from clsplat.pages.svg import Line, curve
 from clsplat.training.census import SHARES, census
 from tests.scenes import random_case
@@ -61,6 +62,30 @@ def test_same_bits_and_exact_resume(finished, tiny_scene, tmp_path):
     assert (again.out / "checkpoints" / "step_000020.npz").exists()
     resumed = train(tiny_scene, tmp_path / "again", *SETTINGS, resume=True)
     assert (resumed.out / "point_cloud.ply").read_bytes() == whole
+    assert resumed.records.read("densify") == finished.records.read("densify")
+
+
+@pytest.mark.parametrize("penalty", ["{type: covariance_trace, above: 0.0", "{type: anisotropy, above: 1.0"])
+def test_penalties_move_gaussians(tiny_scene, tmp_path, penalty):
+    """A heavy one shrinks what it is about; without weight the run is the same without it."""
+    measured = {}
+    for name, extra in (
+        ("none", ""),
+        ("zero", f", {penalty}, weight: 0.0}}"),
+        ("heavy", f", {penalty}, weight: 1000.0}}"),
+    ):
+        settings = f"optimize.losses=[{{type: l1}}{extra}]"
+        run = train(tiny_scene, tmp_path / name, settings, "densify.rules=[{type: prune_faint}]")
+        scales = np.exp(read_ply(run.out / "point_cloud.ply").parameters["log_scales"].astype(np.float64))
+        measured[name] = np.median((scales**2).sum(axis=1) if "trace" in penalty else np.ptp(np.log(scales), axis=1))
+    assert measured["zero"] == pytest.approx(measured["none"], rel=1e-3)
+    assert measured["heavy"] < 0.5 * measured["none"]
+
+
+def test_a_ramp_of_weights_needs_no_more_memory(finished, tiny_scene, tmp_path):
+    steady = LOSSES.replace("[[10, 0.8], [40, 0.4]]", "0.8")
+    run = train(tiny_scene, tmp_path / "run", steady, *SETTINGS[1:])
+    assert finished.renderer.workspace._arrays.keys() == run.renderer.workspace._arrays.keys()
 
 
 def test_census_of_known_gaussians(device, rng):

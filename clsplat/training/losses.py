@@ -116,7 +116,7 @@ LOSSES: dict[str, type[Loss]] = {"l1": L1, "l2": L2, "dssim": Dssim}
 def pixel_loss(comparison: Comparison, l1: float, l2: float) -> Array:
     """Add the gradient of weighted L1 and L2; return the sums of |x - y| and (x - y)² by row, [3, rows, 2]."""
     camera, values = comparison.camera, comparison.values
-    sums = comparison.workspace.array(f"pixel_sums {l1} {l2}", (3, camera.rows, 2))
+    sums = comparison.workspace.array("pixel_sums", (3, camera.rows, 2))  # the same for all terms of a step
     comparison.workspace.device.program("loss.cl").pixel_loss(
         groups=(1, camera.rows, 3),
         image=comparison.image,

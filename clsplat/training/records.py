@@ -17,9 +17,14 @@ class Records:
         self.path = out / "metrics.jsonl"
 
     def start(self, step: int) -> None:
-        """Keep the lines up to `step` and drop later ones, which a resumed run writes again."""
-        lines = [line for line in self.read() if line["step"] <= step] if step > 0 else []
-        write_text(self.path, "".join(json.dumps(line) + "\n" for line in lines))
+        """Keep the lines up to `step` and drop later ones, which a resumed run writes again.
+
+        What density control did after `step` goes, too: a checkpoint is from before the edit that is due at its step.
+        """
+        kept = [
+            line for line in self.read() if line["step"] < step or (line["step"] == step and line["kind"] != "densify")
+        ]
+        write_text(self.path, "".join(json.dumps(line) + "\n" for line in kept if step > 0))
 
     def add(self, step: int, kind: str, **values: Any) -> None:
         """Append one line."""

@@ -66,7 +66,8 @@ class ShapeLoss(Settings):
 class CovarianceTrace(ShapeLoss):
     """Mean over Gaussians of max(tr Σ - τ, 0), lengths by the scene's extent (Micro-splatting, Lee et al. 2025).
 
-    τ is `above`, or, where `pixels` is given, 3 s² for the s that spans so many pixels at the nearest training view.
+    τ is `above`, or, where `pixels` is given, 3 s² for the s that spans so many pixels at the nearest training view,
+    as it was at the last edit.
     """
 
     type: Literal["covariance_trace"] = "covariance_trace"
@@ -78,7 +79,7 @@ class CovarianceTrace(ShapeLoss):
         return {INTERVAL2} if self.pixels else set()
 
     def add(self, shapes: Shapes) -> Term:
-        gaussians, sums = shapes.gaussians, shapes.sums("covariance_trace")
+        gaussians, sums = shapes.gaussians, shapes.sums(f"covariance_trace {self.above} {self.pixels}")
         weight = at_step(self.weight, shapes.step) / max(1, gaussians.count) / shapes.extent**2
         gaussians.device.program("shape_loss.cl").covariance_trace(
             **shapes.arguments(),
@@ -99,7 +100,7 @@ class Anisotropy(ShapeLoss):
     above: Annotated[float, Field(ge=1)] = 10.0
 
     def add(self, shapes: Shapes) -> Term:
-        gaussians, sums = shapes.gaussians, shapes.sums("anisotropy")
+        gaussians, sums = shapes.gaussians, shapes.sums(f"anisotropy {self.above}")
         weight = at_step(self.weight, shapes.step) / max(1, gaussians.count)
         gaussians.device.program("shape_loss.cl").anisotropy(
             **shapes.arguments(), sums=sums, above=self.above, weight=weight

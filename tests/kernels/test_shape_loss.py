@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from clsplat.gaussians.model import Gradients
+from clsplat.gaussians.model import INTERVAL2, Gradients
 from clsplat.render.workspace import Workspace
 from clsplat.training.shape_losses import Anisotropy, CovarianceTrace, Shapes
 from tests import reference_shape as ref
@@ -41,6 +41,27 @@ def test_covariance_trace(device, rng, count):
     value, gradient = ref.covariance_trace(log_scales, 0.02 * EXTENT**2, EXTENT)
     assert count < 16 or 0 < np.count_nonzero(gradient) < gradient.size
     check(shapes, term, 3 * value, 3 * gradient)
+
+
+@pytest.mark.parametrize("count", COUNTS)
+def test_covariance_trace_in_pixels(device, rng, count):
+    """τ = 3 (pixels · interval)², each Gaussian's own."""
+    shapes, log_scales = shapes_of(device, rng, count)
+    interval = rng.uniform(0.01, 0.05, count).astype(np.float32)
+    shapes.gaussians.add(INTERVAL2, 1)
+    shapes.gaussians.set(INTERVAL2, interval[:, None] ** 2)
+    term = CovarianceTrace(weight=2.0, above=9.0, pixels=4.0).add(shapes)
+    each = [ref.covariance_trace(log_scales[n : n + 1], 3 * (4.0 * interval[n]) ** 2, EXTENT) for n in range(count)]
+    value, gradient = (sum(v for v, _ in each) / count, np.concatenate([g for _, g in each]) / count)
+    assert count < 16 or 0 < np.count_nonzero(gradient) < gradient.size
+    check(shapes, term, 2 * value, 2 * gradient)
+
+
+def test_two_bounds_keep_their_own_values(device, rng):
+    shapes, log_scales = shapes_of(device, rng, 50)
+    terms = [CovarianceTrace(above=above).add(shapes) for above in (0.02, 1e6)]
+    value, _ = ref.covariance_trace(log_scales, 0.02 * EXTENT**2, EXTENT)
+    assert [term.value() for term in terms] == [pytest.approx(value, rel=1e-5), 0]
 
 
 @pytest.mark.parametrize("count", COUNTS)
