@@ -57,20 +57,19 @@ void accumulate_sum(
     total[i] += half_width * fabs(planes[first * stride + i]) + half_height * fabs(planes[(first + 1) * stride + i]);
 }
 
-/* Add this view's mean texture under each Gaussian, weighted as it is blended. */
+/* Add one of this view's sums over pixels. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
-void accumulate_ratio(
-    __global const float *restrict moments,  // [MOMENTS,S] see splat.h; MOMENT_WEIGHT and MOMENT_TEXTURE are read
+void accumulate_moment(
+    __global const float *restrict moments,  // [>moment,S] see splat.h
     __global const float *restrict radius,   // [S] px, 0 = not seen
-    __global float *restrict total,          // [S] over views, px^-1
+    __global float *restrict total,          // [S] over views
+    const uint moment,
     const uint stride,
     const uint count)
 {
     const uint i = get_global_id(0);
-    if (i >= count || !(radius[i] > 0.0f))
-        return;
-    const float weight = moments[MOMENT_WEIGHT * stride + i];
-    total[i] += weight > 0.0f ? moments[MOMENT_TEXTURE * stride + i] / weight : 0.0f;
+    if (i < count && radius[i] > 0.0f)
+        total[i] += moments[moment * stride + i];
 }
 
 /* Add this view's radius. */
@@ -108,7 +107,7 @@ void mark_rule(
     __global const float *restrict log_scales,     // [3,S] log of scene units
     __global const float *restrict logit_opacity,  // [S]
     __global const float *restrict statistic,      // [S] sum over views
-    __global const float *restrict seen,           // [S] views
+    __global const float *restrict divisor,        // [S] of the mean: views, or another sum
     __global uint *restrict copies,                // [N]
     __global uint *restrict kept,                  // [N]
     __global float *restrict shrink,               // [N]
@@ -127,7 +126,7 @@ void mark_rule(
         return;
     const float size = exp(fmax(log_scales[i], fmax(log_scales[stride + i], log_scales[2 * stride + i]))) * shrink[i];
     const float opacity = 1.0f / (1.0f + exp(-logit_opacity[i]));
-    const float gradient = seen[i] > 0.0f ? statistic[i] / seen[i] : 0.0f;
+    const float gradient = divisor[i] > 0.0f ? statistic[i] / divisor[i] : 0.0f;
     if (gradient >= gradient_above && size > size_above && size <= size_below && opacity < opacity_below) {
         copies[i] = new_copies;
         kept[i] = new_kept;

@@ -18,7 +18,7 @@ from clsplat.errors import ConfigError
 from clsplat.gaussians.model import Gaussians
 from clsplat.render.tiles import Tiler
 from clsplat.settings import Settings
-from clsplat.training.statistics import SplatStats
+from clsplat.training.statistics import SEEN, SplatStats
 from clsplat.training.thresholds import PixelQuantile, Quantile, Threshold
 
 Positive = Annotated[float, Field(gt=0)]
@@ -68,7 +68,7 @@ class Edit:
             log_scales=gaussians["log_scales"],
             logit_opacity=gaussians["logit_opacity"],
             statistic=self.stats.total(statistic) if statistic else self.stats.seen,
-            seen=self.stats.seen,
+            divisor=self.stats.divisor(statistic) if statistic else self.stats.seen,
             copies=self.copies,
             kept=self.kept,
             shrink=self.shrink,
@@ -96,7 +96,7 @@ class Edit:
             return self.measures.texture_quantile(threshold.quantile)
         if not isinstance(threshold, Quantile):
             return threshold
-        mean = self.stats.mean(statistic)
+        mean = self.stats.mean(statistic)[self.gaussians.get(SEEN)[:, 0] > 0]
         return max(float(np.quantile(mean, threshold.quantile)), LEAST) if len(mean) else LEAST
 
     def choose(self, chosen: NDArray[np.bool_], copies: int, kept: int, shrink: float = 1.0) -> None:

@@ -1,7 +1,7 @@
 """What the views since the last edit said about each Gaussian, in named columns that density rules choose from.
 
-A column is a table `stats/<name>`: the sum of one number per view, over the views that saw the Gaussian.  Only columns
-that some rule names are summed, and only they cost time.
+A column is a table `stats/<name>`: the sum of one number per view, over the views that saw the Gaussian.  Its mean is
+by the number of those views, or by another column.  Only columns that some rule needs are summed and cost time.
 """
 
 from abc import ABC, abstractmethod
@@ -22,6 +22,7 @@ FOLDER = "stats/"
 SEEN = "stats/seen"
 ABS_X = int(constants("splat.h")["MOMENT_ABS_X"])
 WEIGHT = int(constants("splat.h")["MOMENT_WEIGHT"])
+TEXTURE = int(constants("splat.h")["MOMENT_TEXTURE"])
 StatisticName = Literal[
     "screen_grad", "screen_grad_abs", "screen_grad_abs_sum", "texture", "rendered_texture", "screen_radius"
 ]
@@ -31,6 +32,7 @@ class Statistic(ABC):
     """How one view adds to a column."""
 
     moments: ClassVar[int] = MOMENTS  # sums over pixels that the backward pass must make
+    by: ClassVar[str] = "seen"  # table that the column's mean is by
 
     @abstractmethod
     def add(self, gaussians: Gaussians, view: Differentiated, grad_mean2d: Array, total: Array) -> None:
@@ -71,20 +73,23 @@ class ScreenGradAbsSum(Statistic):
         )
 
 
-class Texture(Statistic):
-    """Mean of the photograph's gradient magnitude under the splat, weighted as it is blended, per px."""
+class BlendWeight(Statistic):
+    """How much of the image a splat is: its α T, summed over pixels."""
 
-    moments = WEIGHT + 2
+    moments = WEIGHT + 1
 
     def add(self, gaussians: Gaussians, view: Differentiated, grad_mean2d: Array, total: Array) -> None:
-        gaussians.device.program("density.cl").accumulate_ratio(
-            items=gaussians.count,
-            moments=view.moments,
-            radius=view.frame.radius,
-            total=total,
-            stride=gaussians.capacity,
-            count=gaussians.count,
-        )
+        _add_moment(gaussians, view, WEIGHT, total)
+
+
+class Texture(Statistic):
+    """The photograph's gradient magnitude under the splat, per px: Σ α T |∇I| / Σ α T over pixels of all views."""
+
+    moments = TEXTURE + 1
+    by = "blend_weight"
+
+    def add(self, gaussians: Gaussians, view: Differentiated, grad_mean2d: Array, total: Array) -> None:
+        _add_moment(gaussians, view, TEXTURE, total)
 
 
 class RenderedTexture(Statistic):
@@ -118,6 +123,7 @@ STATISTICS: dict[str, Statistic] = {
     "screen_grad": ScreenGrad(),
     "screen_grad_abs": ScreenGradAbs(),
     "screen_grad_abs_sum": ScreenGradAbsSum(),
+    "blend_weight": BlendWeight(),
     "texture": Texture(),
     "rendered_texture": RenderedTexture(),
     "screen_radius": ScreenRadius(),
@@ -128,9 +134,10 @@ class SplatStats:
     """The columns of a model, and how many views saw each Gaussian."""
 
     def __init__(self, gaussians: Gaussians, names: Collection[str] = ("screen_grad",)) -> None:
-        """Attach the columns `names` and drop any other; those that are there keep their sums."""
+        """Attach the columns `names` and those their means are by, drop any other; what is there keeps its sums."""
         self.gaussians = gaussians
-        self.names = tuple(sorted(names))
+        needed = {*names, *(STATISTICS[name].by for name in names)}
+        self.names = tuple(name for name in STATISTICS if name in needed)
         tables = [*(FOLDER + name for name in self.names), SEEN]
         for name in [name for name in gaussians.tables if name.startswith(FOLDER) and name not in tables]:
             del gaussians.tables[name]
@@ -147,6 +154,10 @@ class SplatStats:
         """A column's sums over views, [S]."""
         return self.gaussians[FOLDER + name]
 
+    def divisor(self, name: str) -> Array:
+        """What a column's mean is by, [S]."""
+        return self.gaussians[FOLDER + STATISTICS[name].by]
+
     @property
     def seen(self) -> Array:
         """Number of views that saw each Gaussian, [S]."""
@@ -162,14 +173,26 @@ class SplatStats:
             STATISTICS[name].add(gaussians, view, grad_mean2d, self.total(name))
 
     def mean(self, name: str) -> NDArray[np.float32]:
-        """A column's mean over the views that saw each Gaussian, on the host, [N]; 0 where none did."""
-        total, seen = (self.gaussians.get(table)[:, 0] for table in (FOLDER + name, SEEN))
-        return np.divide(total, seen, out=np.zeros_like(total), where=seen > 0)
+        """A column's mean for each Gaussian, on the host, [N]; 0 where no view gave it weight."""
+        total, by = (self.gaussians.get(FOLDER + table)[:, 0] for table in (name, STATISTICS[name].by))
+        return np.divide(total, by, out=np.zeros_like(total), where=by > 0)
 
     def clear(self) -> None:
         for name in self.gaussians.tables:
             if name.startswith(FOLDER):
                 self.gaussians[name].fill(0)
+
+
+def _add_moment(gaussians: Gaussians, view: Differentiated, moment: int, total: Array) -> None:
+    gaussians.device.program("density.cl").accumulate_moment(
+        items=gaussians.count,
+        moments=view.moments,
+        radius=view.frame.radius,
+        total=total,
+        moment=moment,
+        stride=gaussians.capacity,
+        count=gaussians.count,
+    )
 
 
 def _arguments(gaussians: Gaussians, frame: Frame) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from clsplat.gaussians.model import SH_C0
 from clsplat.training.density import Edit, Positive, Rule
 from clsplat.training.thresholds import Share
 
+TURNED = ("adam/log_scales/", "adam/quats/")  # tables in a Gaussian's own axes
 Floats = NDArray[np.float64]
 
 
@@ -33,8 +34,9 @@ class PruneUnimportant(Rule):
 class MergeNeighbours(Rule):
     """Replace two mutual nearest neighbours, close and of like colour, by one Gaussian with their moments.
 
-    The heavier one keeps its row, Adam's moments and statistics, and takes the mixture's mean and covariance, the mean
-    of the colours, and the opacity that keeps opacity times volume; weights are opacity times volume.
+    The heavier one keeps its row, statistics and Adam's moments, those of scales and rotation excepted, and takes the
+    mixture's mean and covariance, the mean of the colours, and the opacity that keeps opacity times volume; weights are
+    opacity times volume.
     """
 
     type: Literal["merge_neighbours"] = "merge_neighbours"
@@ -54,6 +56,10 @@ class MergeNeighbours(Rule):
         for name, values in merged(tables, first, second).items():
             tables[name][first] = values
             gaussians.set(name, tables[name])
+        for name in [name for name in gaussians.tables if name.startswith(TURNED)]:
+            table = gaussians.get(name)
+            table[first] = 0  # they were of other axes
+            gaussians.set(name, table)
         absorbed = np.zeros(gaussians.count, bool)
         absorbed[second] = True
         edit.choose(absorbed, copies=0, kept=0)
@@ -61,18 +67,20 @@ class MergeNeighbours(Rule):
     def _pairs(self, tables: dict[str, Floats]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Rows of mutual nearest neighbours that may merge, the heavier one first."""
         means, mass = tables["means"], mass_of(tables)
-        if len(means) < 2:
+        if len(means) < 2 or not np.isfinite(means).all():  # training stops at the next report
             return np.empty(0, np.int64), np.empty(0, np.int64)
-        distance, nearest = (column[:, 1] for column in cKDTree(means).query(means, k=2))
         rows = np.arange(len(means))
+        distances, found = cKDTree(means).query(means, k=2)
+        other = np.where(found[:, 0] == rows, 1, 0)  # of twins in one place, itself may come second
+        distance, nearest = distances[rows, other], found[rows, other]
         mutual = (nearest[nearest] == rows) & (rows < nearest)
         size = np.exp(tables["log_scales"].mean(axis=1))
         close = distance < self.distance_below * (size + size[nearest])
         colour = SH_C0 * np.abs(tables["sh_base"] - tables["sh_base"][nearest]).max(axis=1)
         one = rows[mutual & close & (colour < self.colour_below)]
-        other = nearest[one]
-        heavier = mass[one] >= mass[other]
-        return np.where(heavier, one, other), np.where(heavier, other, one)
+        two = nearest[one]
+        heavier = mass[one] >= mass[two]
+        return np.where(heavier, one, two), np.where(heavier, two, one)
 
 
 def mass_of(tables: dict[str, Floats]) -> Floats:

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from clsplat.gaussians.model import INTERVAL2
 from clsplat.render.renderer import Renderer
@@ -21,18 +22,18 @@ EXTENT = 2.0
 class Edited:
     """Gaussians with chosen statistics, before and after an edit."""
 
-    def __init__(self, device, rng, count: int, **columns) -> None:
+    def __init__(self, device, rng, count: int, names=COLUMNS, **columns) -> None:
         case = random_case(rng, count)
         self.gaussians = case.model(device).gaussians
         self.tiler = Renderer(device, "radix").tiler
         Adam(self.gaussians)
         for table in [name for name in self.gaussians.tables if "moment" in name]:
             self.gaussians.set(table, rng.uniform(1, 2, (count, self.gaussians.tables[table].components)))
-        self.stats = SplatStats(self.gaussians, COLUMNS)
+        self.stats = SplatStats(self.gaussians, names)
         self.gaussians.set(SEEN, np.full((count, 1), 2.0, np.float32))
-        for name in COLUMNS:
-            values = np.broadcast_to(columns.get(name, 10.0), count).astype(np.float32)
-            self.gaussians.set(f"stats/{name}", 2 * values[:, None])
+        for name in self.stats.names:
+            values = np.broadcast_to(columns.get(name, 1.0 if name == "blend_weight" else 10.0), count)
+            self.gaussians.set(f"stats/{name}", 2 * values.astype(np.float32)[:, None])
 
     def apply(self, *rules, most=None, texture_quantile=lambda share: 0.1 * share):
         self.before = {name: self.gaussians.get(name) for name in self.gaussians.tables}
@@ -99,6 +100,17 @@ def test_quantiles_are_of_pixels_or_of_gaussians(device, rng):
         assert case.apply(rule).after == 50 + expected
 
 
+def test_quantiles_are_of_those_that_were_seen(device, rng):
+    texture = np.where(np.arange(50) < 10, np.linspace(0.01, 0.1, 50), 0.0)
+    case = Edited(device, rng, 50, texture=texture)
+    case.gaussians.set(SEEN, 2.0 * (texture > 0)[:, None])
+    rule = SplitTextured(texture_above=Quantile(quantile=0.8), gradient_above=0.0, at_most=1.0)
+    assert case.apply(rule).after == 52
+    nobody = Edited(device, rng, 50)
+    nobody.gaussians.set(SEEN, np.zeros((50, 1)))
+    assert nobody.apply(rule).after == 50
+
+
 @pytest.mark.parametrize(("rms_above", "pixels"), [(0.01, None), (0.01, 4.0), (Quantile(quantile=0.8), None)])
 def test_oversized_ones_split(device, rng, rms_above, pixels):
     case = Edited(device, rng, 60)
@@ -133,7 +145,17 @@ def test_growth_stops_at_the_limit_and_the_largest_gradients_grow(device, rng):
     change = case.apply(Clone(size_below=1e9), most=58)
     assert (change.after, change.causes) == (58, {"clone": 8})
     assert {n for n in range(50) if len(case.rows_of(n)) == 2} == set(np.argsort(-gradient)[:8])
-    assert case.apply(Clone(size_below=1e9), most=10).after == 58  # nothing is removed to reach it
+    crowded = Edited(device, rng, 50, screen_grad=gradient)
+    assert crowded.apply(Clone(size_below=1e9), most=10).after == 50  # nothing is removed to reach it
+
+
+def test_the_limit_ranks_by_gradient_whatever_else_is_measured(device, rng):
+    gradient = rng.permutation(np.linspace(1e-3, 1, 50))
+    case = Edited(device, rng, 50, ("rendered_texture", "screen_grad", "screen_radius"))
+    case.gaussians.set("stats/screen_grad", 2 * gradient[:, None])
+    case.gaussians.set("stats/rendered_texture", 2 * (1 - gradient[:, None]))
+    case.apply(SplitTextured(texture="rendered_texture", texture_above=0.0, gradient_above=0.0, at_most=1.0), most=58)
+    assert {n for n in range(50) if len(case.rows_of(n)) == 2} == set(np.argsort(-gradient)[:8])
 
 
 def test_least_important_ones_go(device, rng):
@@ -155,7 +177,7 @@ def test_neighbours_merge_into_their_moments(device, rng):
     case.gaussians.set("log_scales", np.log(np.full((4, 3), [0.05, 0.04, 0.03], np.float32)))
     case.gaussians.set("logit_opacity", np.array([[-1.0], [-1.5], [1.0], [0.0]], np.float32))
     before = {name: case.gaussians.get(name).astype(np.float64) for name in ("quats", "log_scales", "logit_opacity")}
-    moment = case.gaussians.get("adam/means/moment1")
+    moment = {name: case.gaussians.get(f"adam/{name}/moment1") for name in ("means", "quats", "log_scales")}
     assert case.apply(MergeNeighbours()).after == 3
     tables = {**before, "means": means.astype(np.float64)}
     mass = mass_of(tables)[:2]
@@ -169,11 +191,30 @@ def test_neighbours_merge_into_their_moments(device, rng):
     np.testing.assert_allclose(covariance_of(got["quats"][:1], got["log_scales"][:1])[0], covariance, atol=1e-7)
     np.testing.assert_allclose(mass_of(got)[0], mass.sum(), rtol=1e-4)
     np.testing.assert_allclose(got["sh_base"][0], weights @ colours[:2], rtol=1e-5)
-    np.testing.assert_array_equal(case.gaussians.get("adam/means/moment1")[0], moment[0])  # the heavier one's
+    after = {name: case.gaussians.get(f"adam/{name}/moment1") for name in moment}
+    np.testing.assert_array_equal(after["means"][0], moment["means"][0])  # the heavier one's
+    for name in ("quats", "log_scales"):
+        assert (after[name][0] == 0).all(), "of axes that are no more"
+        np.testing.assert_array_equal(after[name][1:], moment[name][2:])
     np.testing.assert_array_equal(got["means"][1:], means[2:])
 
 
-def test_a_merged_covariance_is_a_covariance(rng):
+def test_twins_in_one_place_merge(device, rng):
+    case = Edited(device, rng, 40)
+    for name in ("means", "sh_base"):
+        case.gaussians.set(name, np.repeat(case.gaussians.get(name)[::2], 2, axis=0))
+    assert case.apply(MergeNeighbours()).after == 20
+
+
+def test_nothing_merges_where_a_mean_is_not_finite(device, rng):
+    case = Edited(device, rng, 4)
+    means = case.gaussians.get("means")
+    means[1] = np.nan
+    case.gaussians.set("means", means)
+    assert case.apply(MergeNeighbours(distance_below=1e9, colour_below=1e9)).after == 4
+
+
+def test_a_merged_covariance_is_that_of_the_mixture(rng):
     count = 50
     tables = {
         "means": rng.normal(0, 1, (2 * count, 3)),
@@ -186,5 +227,21 @@ def test_a_merged_covariance_is_a_covariance(rng):
     found = merged(tables, np.arange(count), np.arange(count, 2 * count))
     np.testing.assert_allclose(np.linalg.norm(found["quats"], axis=1), 1, rtol=1e-9)
     assert all(np.isfinite(values).all() for values in found.values())
-    again = covariance_of(found["quats"], found["log_scales"])
-    np.testing.assert_allclose(again, np.swapaxes(again, 1, 2), atol=1e-12)
+
+    def moments(values, rows):
+        axes = Rotation.from_quat(np.roll(values["quats"][rows], -1, axis=1)).as_matrix()
+        own = axes @ (np.exp(2 * values["log_scales"][rows])[:, :, None] * np.swapaxes(axes, 1, 2))
+        volume = np.exp(values["log_scales"][rows].sum(axis=1))
+        return values["means"][rows], own, volume / (1 + np.exp(-values["logit_opacity"][rows, 0]))
+
+    halves = [moments(tables, rows) for rows in (slice(0, count), slice(count, None))]
+    total = sum(mass for _, _, mass in halves)
+    mean = sum(mass[:, None] * mean for mean, _, mass in halves) / total[:, None]
+    second = sum(mass[:, None, None] * (own + _outer(mean)) for mean, own, mass in halves) / total[:, None, None]
+    got = moments(found, slice(None))
+    np.testing.assert_allclose(got[0], mean, rtol=1e-9)
+    np.testing.assert_allclose(got[1], second - _outer(mean), atol=1e-9 * np.abs(second).max())
+
+
+def _outer(means: np.ndarray) -> np.ndarray:
+    return means[:, :, None] * means[:, None, :]

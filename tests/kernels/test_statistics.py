@@ -1,6 +1,7 @@
 """The columns that density rules read, from the sums over pixels to the rules' decisions."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -197,3 +198,18 @@ def test_texture_under_splats(device, rng):
     assert seen.sum() > 10
     np.testing.assert_allclose(stats.mean("texture")[seen], textured[seen] / weight[seen], rtol=5e-3)
     np.testing.assert_allclose(stats.mean("screen_radius"), frame.radius.get()[:40], rtol=1e-6)
+    assert stats.moments == WEIGHT + 2
+
+
+def test_texture_counts_views_by_their_weight(device, rng):
+    """A view that hides a Gaussian says nothing of its texture, one that shows little says little."""
+    model = random_case(rng, 3).model(device)
+    capacity = model.gaussians.capacity
+    stats = SplatStats(model.gaussians, ["texture"])
+    for weights, textures in (((3.0, 2.0, 0.0), (0.2, 0.1, 0.0)), ((0.0, 6.0, 0.0), (0.0, 0.5, 0.0))):
+        moments, radius = np.zeros((WEIGHT + 2, capacity)), np.zeros(capacity)
+        moments[WEIGHT, :3], moments[WEIGHT + 1, :3], radius[:3] = weights, np.multiply(weights, textures), 5
+        view = Differentiated(SimpleNamespace(radius=device.upload(radius.astype(np.float32))), None, [],
+                              device.upload(moments.astype(np.float32)))  # fmt: skip
+        stats.add(view, device.zeros((2, capacity)))
+    np.testing.assert_allclose(stats.mean("texture"), [0.2, 0.4, 0.0], rtol=1e-6)
