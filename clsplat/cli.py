@@ -213,6 +213,7 @@ def bench(
     scenes: Annotated[str, typer.Option(help="Fixed scenes, of A, B and C, separated by commas.")] = "A",
     model: Annotated[Path | None, typer.Option(help="Also time this splat or point cloud (PLY), at --scene.")] = None,
     scene: Annotated[Path | None, typer.Option(help="The scene of --model.")] = None,
+    pipeline: Annotated[str, typer.Option(help="Whose losses and statistics a step has.")] = "splat",
     repeats: Annotated[int, typer.Option(min=1, help="Steps of each scene.")] = 20,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
     against: Annotated[Path | None, typer.Option(help="Compare with the JSON of an earlier run.")] = None,
@@ -227,7 +228,7 @@ def bench(
 
     from clsplat.bench.contest import run_bench
     from clsplat.bench.peaks import measure_peaks
-    from clsplat.bench.scenes import SIZES, contestant, grown, real_contestant
+    from clsplat.bench.scenes import SIZES, contestant, grown, real_contestant, steps_of
     from clsplat.bench.table import growth_chart, growth_table, table
     from clsplat.files import write_text
     from clsplat.opencl.device import Device, choose
@@ -237,17 +238,18 @@ def bench(
         raise ConfigError(f"--scenes: no scene named '{unknown[0]}'; there are {', '.join(SIZES)}")
     if (model is None) != (scene is None):
         raise ConfigError("bench: --model and --scene go together")
+    optimize = steps_of(pipeline)
     earlier = _read_json(against) if against else None
     opened = Device(choose(device), schedule)
     peaks = measure_peaks(opened)
     if growth is not None:
-        sizes = [run_bench({"": one}, peaks, repeats)[""] for one in grown(opened)]
+        sizes = [run_bench({"": one}, peaks, repeats)[""] for one in grown(opened, optimize)]
         write_text(growth, growth_chart(sizes))
         CONSOLE.print(f"device: {opened.text}\n{growth_table(sizes)}", markup=False)
         return
-    contestants = {name: contestant(opened, *SIZES[name]) for name in names}
+    contestants = {name: contestant(opened, *SIZES[name], optimize) for name in names}
     if model is not None and scene is not None:
-        contestants[model.stem] = real_contestant(opened, model, scene)
+        contestants[model.stem] = real_contestant(opened, model, scene, optimize)
     results = run_bench(contestants, peaks, repeats)
     if as_json:
         scenes_data = {name: asdict(result) for name, result in results.items()}

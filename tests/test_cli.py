@@ -162,10 +162,14 @@ def test_output_that_cannot_be_written(tiny_scene, tmp_path):
     assert (tmp_path / "file").read_text() == "in the way"
 
 
-def test_bench_times_a_point_cloud_and_counts_memory(tiny_scene):
+@pytest.mark.parametrize("pipeline", ["splat", "micro_splatting"])
+def test_bench_times_a_point_cloud_and_counts_memory(tiny_scene, pipeline):
     cloud = tiny_scene / "points3d.ply"
-    done = clsplat("bench", "--scenes", "", "--model", cloud, "--scene", tiny_scene, "--repeats", "2", "--json")
+    options = ("--scenes", "", "--model", cloud, "--scene", tiny_scene, "--repeats", "2", "--json")
+    done = clsplat("bench", *options, "--pipeline", pipeline)
     found = json.loads(done.stdout)["scenes"]["points3d"]
+    assert found["stages"].get("statistics", 0) > 0
+    assert "other" not in found["stages"]
     assert found["work"]["gaussians"] > 100
     assert set(found["floors"]) <= set(found["stages"])
     assert 0 < found["memory"] < 2 * found["planned"]

@@ -13,14 +13,14 @@ from clsplat.gaussians.model import Gaussians, Model
 from clsplat.gaussians.ply import Parameters
 from clsplat.opencl.device import Device
 from clsplat.render.renderer import RECORD, Frame, Renderer
+from clsplat.stages.optimize import Optimize
 from clsplat.training.adam import Adam, Rates
 from clsplat.training.basic_rules import PruneLarge
 from clsplat.training.density import Measures, densify
-from clsplat.training.losses import L1, Dssim
 from clsplat.training.memory import plan
 from clsplat.training.profile import stage_milliseconds
 from clsplat.training.statistics import SplatStats
-from clsplat.training.step import differentiate
+from clsplat.training.step import differentiate, update
 from clsplat.training.targets import Target
 
 WARM_UP = 3  # steps: kernels are compiled and buffers grown
@@ -41,18 +41,21 @@ class Result:
 
 
 class Contestant:
-    """One scene, ready to be stepped."""
+    """One scene, ready to be stepped with the losses and statistics of a pipeline."""
 
-    def __init__(self, device: Device, parameters: Parameters, target: Target, background: str) -> None:
-        self.device, self.target = device, target
+    def __init__(
+        self, device: Device, parameters: Parameters, target: Target, background: str, optimize: Optimize
+    ) -> None:
+        self.device, self.target, self.optimize = device, target, optimize
         self._before = device.peak = device.allocated
         self.renderer = Renderer(device, "radix")
         gaussians = Gaussians(device, parameters)
         self.model = Model(gaussians, gaussians.sh_degree)
-        self.adam, self.stats = Adam(gaussians), SplatStats(gaussians)
+        self.adam, self.stats = Adam(gaussians), SplatStats(gaussians, optimize.statistics)
+        for name in sorted(optimize.tables):
+            gaussians.add(name, 1)
         self.background = device.zeros(3)
         self.background.fill(1.0 if background == "white" else 0.0)
-        self.losses = (L1(weight=0.8), Dssim(weight=0.2))
         self.rates = dict.fromkeys(Rates().at(1, 1.0), 0.0)  # nothing moves: every step does the same work
         self.clock: list[float] = []
         self.stages: dict[str, list[float]] = defaultdict(list)
@@ -68,8 +71,9 @@ class Contestant:
         self.device.finish()
         self.device.timings.sampling = record
         start = time.perf_counter()
-        view = differentiate(self.renderer, self.model, self.target, self.background, self.losses)
-        self.stats.add(view, self.adam.update(self.model, view.frame, view.moments, self.rates))
+        losses, penalties = self.optimize.comparisons, self.optimize.penalties
+        view = differentiate(self.renderer, self.model, self.target, self.background, losses, count=self.stats.moments)
+        self.stats.add(view, update(self.renderer, self.model, self.adam, view, self.rates, penalties))
         self.device.finish()
         seconds = time.perf_counter() - start
         self.device.timings.sampling = False
@@ -99,7 +103,8 @@ class Contestant:
     def _planned(self) -> int:
         camera = self.target.camera
         gaussians = self.model.gaussians
-        return plan(gaussians, self.target.pixels.nbytes, camera.stride * camera.rows).needed(gaussians.count)
+        pixels, moments = camera.stride * camera.rows, self.stats.moments
+        return plan(gaussians, self.target.pixels.nbytes, pixels, moments).needed(gaussians.count)
 
     def _work(self) -> Work:
         assert self.frame is not None

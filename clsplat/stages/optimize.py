@@ -20,9 +20,9 @@ from clsplat.training.census import census
 from clsplat.training.losses import L1, L2, Dssim, Loss, pixel_loss
 from clsplat.training.profile import stage_milliseconds
 from clsplat.training.run import Progress, Run
-from clsplat.training.shape_losses import Anisotropy, CovarianceTrace, ShapeLoss, Shapes
+from clsplat.training.shape_losses import Anisotropy, CovarianceTrace, ShapeLoss
 from clsplat.training.statistics import SplatStats
-from clsplat.training.step import Differentiated, differentiate
+from clsplat.training.step import Differentiated, differentiate, update
 
 LOG = logging.getLogger("clsplat")
 CENSUS_EVERY = 5  # reports
@@ -72,7 +72,7 @@ class Optimize(Stage):
     def run(self, run: Run) -> None:
         model = run.trained
         run.adam = run.adam or Adam(model.gaussians)
-        run.stats = SplatStats(model.gaussians, self._statistics())
+        run.stats = SplatStats(model.gaussians, self.statistics)
         self._attach(run)
         memory = run.memory_plan()
         LOG.info(memory.text(model.gaussians.count))
@@ -99,25 +99,36 @@ class Optimize(Stage):
                 raise Interrupted(f"stopped at step {run.step}, saved in {path}; --resume goes on from there")
 
     @property
+    def comparisons(self) -> list[Loss]:
+        """Losses that compare images."""
+        return [loss for loss in self.losses if isinstance(loss, Loss)]
+
+    @property
+    def penalties(self) -> list[ShapeLoss]:
+        """Losses that look at Gaussians."""
+        return [loss for loss in self.losses if isinstance(loss, ShapeLoss)]
+
+    @property
     def _edits(self) -> list[Densify]:
         return [stage for stage in self.during if isinstance(stage, Densify)]
 
-    def _statistics(self) -> set[str]:
+    @property
+    def statistics(self) -> set[str]:
         """Columns that some density rule reads."""
         return {name for stage in self._edits for name in stage.statistics}
+
+    @property
+    def tables(self) -> set[str]:
+        """Tables of the Gaussians that losses and rules read beside the parameters."""
+        parts: list[ShapeLoss | Densify] = [*self.penalties, *self._edits]
+        return {name for part in parts for name in part.tables}
 
     def _attach(self, run: Run) -> None:
         """Add the tables that losses and rules read; a resumed run has them."""
         gaussians = run.trained.gaussians
-        parts: list[ShapeLoss | Densify] = [*self._penalties, *self._edits]
-        wanted = {name for part in parts for name in part.tables}
-        for name in sorted(wanted - gaussians.tables.keys()):
+        for name in sorted(self.tables - gaussians.tables.keys()):
             gaussians.add(name, 1)
             run.refresh_filter()
-
-    @property
-    def _penalties(self) -> list[ShapeLoss]:
-        return [loss for loss in self.losses if isinstance(loss, ShapeLoss)]
 
     def _edit(self, run: Run) -> None:
         """What was due at the step before."""
@@ -135,21 +146,13 @@ class Optimize(Stage):
         model, target = run.trained, run.targets.get(run.train_view())
         run.announce_views()
         background, moments = run.targets.background_array, run.stats.moments
-        images = [loss for loss in self.losses if isinstance(loss, Loss)]
-        view = differentiate(run.renderer, model, target, background, images, run.step, moments)
+        view = differentiate(run.renderer, model, target, background, self.comparisons, run.step, moments)
         stale = {name for stage in self.during if stage.due(run.step) for name in stage.stale(run)}
         if run.stage_step == self.steps:
             stale = set()
-        rates = self.rates.at(run.step, run.scene.extent)
-        if stale or self._penalties:
-            gradients = run.renderer.gradients(model, view.frame, view.moments)
-            shapes = Shapes(run.renderer.workspace, model.gaussians, gradients, run.scene.extent, run.step)
-            view.terms.extend(penalty.add(shapes) for penalty in self._penalties)
-            run.adam.step(model, gradients, rates, without=stale)
-            grad_mean2d = gradients.mean2d
-        else:
-            grad_mean2d = run.adam.update(model, view.frame, view.moments, rates)
-        run.stats.add(view, grad_mean2d)
+        extent = run.scene.extent
+        rates = self.rates.at(run.step, extent)
+        run.stats.add(view, update(run.renderer, model, run.adam, view, rates, self.penalties, stale, extent))
         run.device.timings.sampling = False
         return view
 

@@ -14,9 +14,12 @@ from clsplat.opencl.device import DeviceInfo
 from clsplat.render.renderer import MOMENTS, RECORD
 
 PAIRS = 5  # (tile, Gaussian) pairs of a Gaussian, where nothing is known yet; trained scenes have 1.5 to 4
-FRAME_GAUSSIAN = 4 * (RECORD + MOMENTS + 2 + 5 + 7)  # records, moments, mean2d; keys and radius; sorting by depth
+FRAME_GAUSSIAN = 4 * (RECORD + 2 + 5 + 7)  # records, mean2d; keys and radius; sorting by depth
+GRADIENTS = 4 * (3 + 4 + 3 + 1 + 3 + 45 + 2)  # apart from the update: where penalties or edits are
 FRAME_PAIR = 4 * (RECORD + 6)  # gradient record; tile and Gaussian of the pair, sorting by tile
-FRAME_PIXEL = 4 * (4 * 3 + 1 + 9)  # image, target, gradient, rendered again; transmittance; derivatives of SSIM
+FRAME_PIXEL = 4 * (
+    4 * 3 + 2 + 9
+)  # image, target, gradient, rendered again; transmittance, texture; derivatives of SSIM
 
 
 @dataclass(frozen=True)
@@ -60,12 +63,14 @@ class MemoryPlan:
             )
 
 
-def plan(gaussians: Gaussians, photographs: int, pixels: int) -> MemoryPlan:
+def plan(gaussians: Gaussians, photographs: int, pixels: int, moments: int = MOMENTS) -> MemoryPlan:
     """Plan for the tables that the Gaussians have.
 
-    photographs: bytes of them on the device; pixels: of the largest view, whole tiles.
+    photographs: bytes of them on the device; pixels: of the largest view, whole tiles; moments: what the backward pass
+    sums for each Gaussian.
     """
     info: DeviceInfo = gaussians.device.info
     sizes = [4 * table.components for table in gaussians.tables.values()]
+    gaussian = int(np.sum(sizes)) + FRAME_GAUSSIAN + 4 * moments + GRADIENTS
     fixed = photographs + FRAME_PIXEL * pixels
-    return MemoryPlan(int(np.sum(sizes)) + FRAME_GAUSSIAN, FRAME_PAIR, fixed, max(sizes), info.memory, info.allocation)
+    return MemoryPlan(gaussian, FRAME_PAIR, fixed, max(sizes), info.memory, info.allocation)

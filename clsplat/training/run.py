@@ -9,7 +9,7 @@ from typing import Any
 from clsplat.errors import ConfigError
 from clsplat.gaussians.model import INTERVAL2, Model
 from clsplat.opencl.device import Device
-from clsplat.render.renderer import Renderer
+from clsplat.render.renderer import MOMENTS, Renderer
 from clsplat.scene.scene import Scene, View
 from clsplat.training.adam import Adam
 from clsplat.training.filters import FilterViews, ModelSettings, measure_intervals
@@ -92,7 +92,8 @@ class Run:
         bytes_held = min(self.targets.budget, sum(3 * view.camera.width * view.camera.height for view in views))
         tile = int(self.device.tuning["TILE"])
         pixels = max((-(-v.camera.width // tile)) * (-(-v.camera.height // tile)) * tile**2 for v in views)
-        return plan(self.trained.gaussians, bytes_held, pixels)
+        moments = MOMENTS if self.stats is None else self.stats.moments
+        return plan(self.trained.gaussians, bytes_held, pixels, moments)
 
     def announce_views(self) -> None:
         """Let the photographs of the next steps be read ahead."""

@@ -1,15 +1,17 @@
-"""The heart of a training step: render a view, compare it with its photograph, differentiate."""
+"""The heart of a training step: render a view, compare it with its photograph, differentiate, update."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 from clsplat.gaussians.model import Model
 from clsplat.opencl.device import Array
 from clsplat.opencl.program import constants
 from clsplat.render.renderer import MOMENTS, Frame, Renderer
+from clsplat.training.adam import Adam
 from clsplat.training.losses import Comparison, Loss, Term
+from clsplat.training.shape_losses import ShapeLoss, Shapes
 from clsplat.training.targets import Target, cover, unpack
-from clsplat.training.texture import image_gradient
+from clsplat.training.texture import photograph_texture
 
 TEXTURE = int(constants("splat.h")["MOMENT_TEXTURE"])
 
@@ -45,5 +47,28 @@ def differentiate(
     terms = [loss.add(comparison) for loss in losses]
     if target.masked:
         cover(workspace, camera, gradient, photograph)
-    texture = image_gradient(workspace, camera, photograph) if count > TEXTURE else None
+    texture = photograph_texture(workspace, camera, photograph) if count > TEXTURE else None
     return Differentiated(frame, comparison, terms, renderer.moments(model, frame, gradient, count, texture))
+
+
+def update(
+    renderer: Renderer,
+    model: Model,
+    adam: Adam,
+    view: Differentiated,
+    rates: dict[str, float],
+    penalties: Sequence[ShapeLoss] = (),
+    without: Collection[str] = (),
+    extent: float = 1.0,
+) -> Array:
+    """Update every parameter but those named in `without`, and add the penalties to the view's losses.
+
+    Returns the gradient of the projected means, [2, S] px⁻¹.  Gradients go through memory only where they must.
+    """
+    if not (penalties or without):
+        return adam.update(model, view.frame, view.moments, rates)
+    gradients = renderer.gradients(model, view.frame, view.moments)
+    shapes = Shapes(renderer.workspace, model.gaussians, gradients, extent, view.comparison.step)
+    view.terms.extend(penalty.add(shapes) for penalty in penalties)
+    adam.step(model, gradients, rates, without)
+    return gradients.mean2d

@@ -29,13 +29,30 @@ def image_gradient(workspace: Workspace, camera: DeviceCamera, image: Array, nam
     return magnitude
 
 
+def photograph_texture(workspace: Workspace, camera: DeviceCamera, photograph: Array, unknown: float = 0.0) -> Array:
+    """The same of a photograph, [3 or 4, rows, stride]; `unknown` at pixels that its mask hides, and beside them."""
+    magnitude = image_gradient(workspace, camera, photograph)
+    if photograph.shape[0] == 4:
+        workspace.device.program("texture.cl").hide_masked(
+            items=(camera.width, camera.height),
+            target=photograph,
+            magnitude=magnitude,
+            unknown=unknown,
+            width=camera.width,
+            height=camera.height,
+            rows=camera.rows,
+            stride=camera.stride,
+        )
+    return magnitude
+
+
 def texture_quantile(workspace: Workspace, targets: Iterable[Target], share: float) -> float:
-    """The magnitude, per px, that `share` of all pixels of the photographs stay below, to 1 / 4000."""
+    """The magnitude, per px, that `share` of all pixels of the photographs that count stay below, to 1 / 4000."""
     counts = np.zeros(BINS, np.int64)
     for target in targets:
         camera = target.camera
-        magnitude = image_gradient(workspace, camera, unpack(workspace, camera, target.pixels)).get()
-        inside = magnitude[: camera.height, : camera.width]
-        counts += np.histogram(inside, BINS, (0, STEEPEST))[0]
+        photograph = unpack(workspace, camera, target.pixels)
+        inside = photograph_texture(workspace, camera, photograph, unknown=-1.0).get()[: camera.height, : camera.width]
+        counts += np.histogram(inside, BINS, (0, STEEPEST))[0]  # which leaves out what is below 0
     below = np.searchsorted(np.cumsum(counts), share * counts.sum())
     return float(below + 1) * STEEPEST / BINS

@@ -5,6 +5,9 @@ import pytest
 from scipy import ndimage
 
 from clsplat.render.renderer import Renderer
+from clsplat.render.workspace import Workspace
+from clsplat.training.targets import Target, unpack
+from clsplat.training.texture import photograph_texture, texture_quantile
 from tests.kernels.test_loss import camera_of
 from tests.scenes import random_case
 
@@ -39,6 +42,29 @@ def test_image_gradient(device, rng, width, height):
     np.testing.assert_allclose(found[:height, :width], magnitude_of(image), atol=1e-6)
     found[:height, :width] = 0
     assert (found == 0).all()
+
+
+@pytest.mark.parametrize(("width", "height"), SIZES)
+def test_what_is_masked_has_no_texture(device, rng, width, height):
+    """Nor have its neighbours, and neither the texture nor its quantiles depend on what is hidden."""
+    camera, workspace = camera_of(device, width, height), Workspace(device)
+    mask = rng.random((height, width)) < 0.9
+    known = ndimage.minimum_filter(mask, 3, mode="nearest")
+    found = []
+    for filling in (rng.integers(0, 256, (3, height, width)) for _ in range(2)):
+        pixels = np.where(mask, np.arange(3 * width * height).reshape(3, height, width) * 37 % 256, filling)
+        target = Target(camera, device.upload(np.concatenate([pixels, mask[None]]).astype(np.uint8)))
+        photograph = unpack(workspace, camera, target.pixels)
+        texture = photograph_texture(workspace, camera, photograph).get()
+        np.testing.assert_allclose(texture[:height, :width], magnitude_of(pixels / 255) * known, atol=1e-6)
+        texture[:height, :width] = 0
+        assert (texture == 0).all()
+        found.append(texture_quantile(workspace, [target], 0.5))
+    assert found[0] == found[1]
+    if known.any():
+        assert found[0] == pytest.approx(
+            np.quantile(magnitude_of(pixels / 255)[known], 0.5, method="inverted_cdf"), abs=3e-4
+        )
 
 
 @pytest.mark.parametrize("count", [1, 63, 64, 65, 150])
