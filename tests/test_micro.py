@@ -31,14 +31,17 @@ def finished(tiny_scene, tmp_path_factory):
 def test_every_rule_and_penalty_acts(finished):
     lines = [json.loads(line) for line in (finished.out / "metrics.jsonl").read_text().splitlines()]
     edits = [line for line in lines if line["kind"] == "densify"]
-    for name in ("clone", "split_textured", "split_oversized", "merge_neighbours", "prune_unimportant"):
-        assert sum(edit["causes"][name] for edit in edits) > 0, name
+    growing, thinning = ("clone", "split_textured", "split_oversized"), ("merge_neighbours", "prune_unimportant")
+    for name in (*growing, *thinning):
+        total, grown = (sum(edit[key][name] for edit in edits) for key in ("causes", "grown"))
+        assert total > 0, name
+        assert 0 < grown <= total if name in growing else grown == 0, name
     found = [line for line in lines if line["kind"] == "census"]
     assert found[-1]["step"] == 50
     assert all(len(line["anisotropy"]) == len(SHARES) for line in found)
     page = (finished.out / "report.html").read_text()
     assert "anisotropy" in page
-    assert "split_textured" in page
+    assert re.search("share of growth.*split_oversized", page)
     shown = re.findall(r"<figcaption>(\S+) ", page)
     assert len(shown) == len(set(shown)) > 0, "a view is shown twice"
 

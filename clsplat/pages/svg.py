@@ -14,7 +14,7 @@ LEGEND_ROW, LEGEND_LETTERS = 14, 66  # px a row; about as many letters fit in on
 
 @dataclass(frozen=True)
 class Line:
-    """Points (x, y) in order of x."""
+    """Points (x, y) in the order in which they are joined."""
 
     points: Sequence[tuple[float, float]]
     name: str = ""  # in the legend

@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Collection
+from dataclasses import asdict
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
@@ -51,7 +52,7 @@ class Densify(Stage):
         run.refresh_filter()
         if change.after == fits:
             LOG.warning("step %d: growth stops at %d Gaussians, all that fit in the device's memory", run.step, fits)
-        run.records.add(run.step, "densify", before=change.before, after=change.after, causes=change.causes)
+        run.records.add(run.step, "densify", **asdict(change))
         LOG.debug("step %d: %d -> %d Gaussians", run.step, change.before, change.after)
         if change.after == 0:
             raise NumericError(f"step {run.step}: every Gaussian was pruned; weaken the prune rules or lower the rates")

@@ -82,25 +82,34 @@ def _census(run: Run) -> str:
         curve("size (rms scale, scene units), quantiles", spread("size"), logarithmic=True),
         curve("anisotropy (longest by shortest axis), quantiles", spread("anisotropy"), logarithmic=True),
         curve("opacity, quantiles", spread("opacity")),
-        curve("Gaussians changed by each rule, in all", _causes(run)),
+        curve("Gaussians changed by each rule, in all", _totals(run, "causes")),
+        curve("share of growth so far, by rule", _shares(_totals(run, "grown"))),
         curve("test PSNR, dB, over thousands of Gaussians", [Line(_psnr_by_gaussians(run))]),
     ]
     return f"<h2>The Gaussians</h2><div class=curves>{''.join(charts)}</div>"
 
 
-def _causes(run: Run) -> list[Line]:
-    """Gaussians that each rule of density control has taken so far."""
+def _totals(run: Run, what: str) -> list[Line]:
+    """Gaussians that each rule of density control has taken so far, or made grow."""
     edits = run.records.read("densify")
-    names = dict.fromkeys(name for edit in edits for name in edit.get("causes", {}))
-    totals = {name: np.cumsum([edit["causes"].get(name, 0) for edit in edits]) for name in names}
+    names = dict.fromkeys(name for edit in edits for name in edit.get(what, {}))
+    totals = {name: np.cumsum([edit[what].get(name, 0) for edit in edits]) for name in names}
     steps = [edit["step"] for edit in edits]
     return [Line(list(zip(steps, map(float, total), strict=True)), name) for name, total in totals.items()]
 
 
+def _shares(lines: list[Line]) -> list[Line]:
+    """The lines by their sum, from where it is not zero; those that stay at zero are left out."""
+    sums = np.sum([[y for _, y in line.points] for line in lines], axis=0) if lines else []
+    shares = [[(x, y / total) for (x, y), total in zip(line.points, sums, strict=True) if total > 0] for line in lines]
+    return [Line(points, line.name) for points, line in zip(shares, lines, strict=True) if any(y for _, y in points)]
+
+
 def _psnr_by_gaussians(run: Run) -> list[tuple[float, float]]:
+    """In order of steps: where Gaussians are thinned out, the line turns back."""
     counts = {r["step"]: r["gaussians"] for r in run.records.read("train")}
     tests = [r for r in run.records.read("evaluate") if r["split"] == "test" and r["scale"] == run.scale]
-    return sorted((counts[r["step"]] / 1e3, r["psnr"]) for r in tests if r["step"] in counts)
+    return [(counts[r["step"]] / 1e3, r["psnr"]) for r in tests if r["step"] in counts]
 
 
 def _times(run: Run) -> str:

@@ -50,9 +50,9 @@ class ResetOpacity(Stage):
 
 
 class RefreshFilter(Stage):
-    """Let the world filter follow the Gaussians as they move.
+    """Let the world filter, and the sampling intervals that sizes in pixels go by, follow the Gaussians as they move.
 
-    It also does so when they are made and after every density edit; a model without a world filter has nothing to do.
+    They also do so when Gaussians are made and after every density edit; a model that has neither has nothing to do.
     """
 
     stage: Literal["refresh_filter"] = "refresh_filter"

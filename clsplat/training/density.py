@@ -186,6 +186,7 @@ class Change:
     before: int
     after: int
     causes: dict[str, int]  # Gaussians whose fate a rule decided in the end, by the rule's name
+    grown: dict[str, int]  # of these, the ones that became several
 
 
 def densify(
@@ -212,14 +213,17 @@ def densify(
         decided_by[edit.rows() != rows] = index
     if most is not None and int(edit.rows().sum(dtype=np.int64)) > most:
         edit.limit(most)
-    decided_by[edit.rows() == 1] = -1
+    rows = edit.rows()
+    decided_by[rows == 1] = -1
     causes: dict[str, int] = {}
+    grown: dict[str, int] = {}
     for index, rule in enumerate(acting):
         name = getattr(rule, "type", "rule")
         causes[name] = causes.get(name, 0) + int((decided_by == index).sum())
+        grown[name] = grown.get(name, 0) + int(((decided_by == index) & (rows > 1)).sum())
     edit.apply(tiler, seed)
     stats.clear()
-    return Change(before, gaussians.count, causes)
+    return Change(before, gaussians.count, causes, grown)
 
 
 def cap_opacity(gaussians: Gaussians, limit: float) -> None:
