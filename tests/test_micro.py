@@ -55,6 +55,11 @@ def test_legends_stay_below_the_title_and_break_into_rows():
     assert "<tspan" not in curve("loss", [Line([(0.0, 0.0), (1.0, 1.0)], "alone")])
 
 
+def test_a_narrow_logarithmic_axis_has_numbers():
+    chart = curve("anisotropy", [Line([(0.0, 1.05), (1.0, 1.7)])], logarithmic=True)
+    assert re.findall(r'text-anchor="end">([\d.]+)<', chart) == ["1.2", "1.4", "1.6"]
+
+
 def test_same_bits_and_exact_resume(finished, tiny_scene, tmp_path):
     whole = (finished.out / "point_cloud.ply").read_bytes()
     again = train(tiny_scene, tmp_path / "again", *SETTINGS)

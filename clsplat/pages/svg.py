@@ -132,9 +132,10 @@ def _ticks(low: float, high: float) -> list[float]:
 
 
 def _decade_ticks(low: float, high: float) -> list[float]:
-    """Logarithms of 1, 2 and 5 times powers of ten between low and high."""
+    """Logarithms of 1, 2 and 5 times powers of ten between low and high, or, if there are not two, of round numbers."""
     powers = range(math.floor(low), math.ceil(high) + 1)
-    return [t for p in powers for m in (1, 2, 5) if low <= (t := p + math.log10(m)) <= high]
+    ticks = [t for p in powers for m in (1, 2, 5) if low <= (t := p + math.log10(m)) <= high]
+    return ticks if len(ticks) > 1 else [math.log10(tick) for tick in _ticks(10**low, 10**high)]
 
 
 def _number(value: float) -> str:
