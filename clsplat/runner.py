@@ -105,7 +105,7 @@ def execute(pipeline: Pipeline, run: Run, resume: bool, show: Callable[[Progress
     write_text(run.out / "pipeline.yaml", f"# resolved from {pipeline.path.name}\n{pipeline.text()}")
     if run.prepared:
         write_text(run.out / NOTE, json.dumps(run.prepared) + "\n")
-    run.records.start(run.step)
+    run.records.start(run.step, edit_due=run.stage_step > 0)
     try:
         with _finishing_on_interrupt(run):
             _run_stages(pipeline, run)

@@ -168,6 +168,16 @@ def test_a_damaged_checkpoint_is_passed_over(finished, tiny_scene, tmp_path):
     assert digest(out) == digest(finished)
 
 
+def test_a_checkpoint_of_another_format_is_refused(tiny_scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(checkpoint, "FORMAT", 1)
+    train(tiny_scene, tmp_path)
+    monkeypatch.undo()
+    before = (tmp_path / "metrics.jsonl").read_bytes()
+    with pytest.raises(ConfigError, match=r"has format 1, expected 2.*use another --out"):
+        train(tiny_scene, tmp_path, resume=True)
+    assert (tmp_path / "metrics.jsonl").read_bytes() == before
+
+
 def test_other_settings_are_refused_on_resume(tiny_scene, tmp_path):
     train(tiny_scene, tmp_path)
     with pytest.raises(ConfigError, match=r"stages\[1\].optimize.rates.quats was 0.005, is 0.1"):

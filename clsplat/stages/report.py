@@ -93,7 +93,7 @@ def _totals(run: Run, what: str) -> list[Line]:
     """Gaussians that each rule of density control has taken so far, or made grow."""
     edits = run.records.read("densify")
     names = dict.fromkeys(name for edit in edits for name in edit.get(what, {}))
-    totals = {name: np.cumsum([edit[what].get(name, 0) for edit in edits]) for name in names}
+    totals = {name: np.cumsum([edit.get(what, {}).get(name, 0) for edit in edits]) for name in names}
     steps = [edit["step"] for edit in edits]
     return [Line(list(zip(steps, map(float, total), strict=True)), name) for name, total in totals.items()]
 

@@ -22,7 +22,7 @@ from clsplat.training.run import Run
 from clsplat.training.statistics import FOLDER as STATS_FOLDER
 from clsplat.training.statistics import SEEN, SplatStats
 
-FORMAT = 1
+FORMAT = 2
 FOLDER = "checkpoints"
 LOG = logging.getLogger("clsplat")
 Tables = dict[str, NDArray[np.float32]]
@@ -87,7 +87,10 @@ def _load(path: Path) -> tuple[dict[str, Any], Tables]:
         meta = json.loads(str(archive["meta"]))
         tables = {name: archive[name] for name in archive.files if name != "meta"}
     if meta["format"] != FORMAT:
-        raise DataError(f"format {meta['format']}, expected {FORMAT}")
+        raise ConfigError(
+            f"{path} has format {meta['format']}, expected {FORMAT}: made by clsplat {meta['version']}, this is "
+            f"{__version__}; go on with that version, or use another --out"
+        )
     missing = [name for name in PARAMETERS if _key(name) not in tables]
     if missing:
         raise DataError(f"lacks {', '.join(missing)}")

@@ -16,15 +16,14 @@ class Records:
         self.out = out
         self.path = out / "metrics.jsonl"
 
-    def start(self, step: int) -> None:
+    def start(self, step: int, edit_due: bool = False) -> None:
         """Keep the lines up to `step` and drop later ones, which a resumed run writes again.
 
-        What density control did after `step` goes, too: a checkpoint is from before the edit that is due at its step.
+        Where the checkpoint is from before the edit that is due at its step, the line of that edit goes, too.
         """
-        kept = [
-            line for line in self.read() if line["step"] < step or (line["step"] == step and line["kind"] != "densify")
-        ]
-        write_text(self.path, "".join(json.dumps(line) + "\n" for line in kept if step > 0))
+        before = [line for line in self.read() if line["step"] <= step] if step > 0 else []
+        kept = [line for line in before if not (edit_due and line["kind"] == "densify" and line["step"] == step)]
+        write_text(self.path, "".join(json.dumps(line) + "\n" for line in kept))
 
     def add(self, step: int, kind: str, **values: Any) -> None:
         """Append one line."""
