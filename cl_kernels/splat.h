@@ -34,8 +34,8 @@
 #define MOMENT_RED 6       // w dL/dcolour; then green, blue
 #define MOMENT_ABS_X 9     // |dL/dx| of the mean, px^-1; from here on only where MOMENTS says so
 #define MOMENT_ABS_Y 10
-#define MOMENT_WEIGHT 11   // w
-#define MOMENT_TEXTURE 12  // w times the texture at the pixel
+#define MOMENT_WEIGHT 11   // w, where the texture is known: not below 0
+#define MOMENT_TEXTURE 12  // w times the texture at the pixel, there
 
 /* The same sums while they grow, one set per lane. */
 typedef struct {
@@ -147,8 +147,9 @@ static inline void blend_backward_step(grad_pixels_t *p, const row_splat_t s, co
     m->abs_y += magnitude(power * (s.xy * k.dx + s.slope));
 #endif
 #if MOMENTS > MOMENT_WEIGHT
-    m->weight += k.weight;
-    m->texture += k.weight * p->texture;
+    const VF known = p->texture >= zero ? k.weight : zero;
+    m->weight += known;
+    m->texture += known * p->texture;
 #endif
 }
 

@@ -54,13 +54,11 @@ void image_gradient(
     VSTORE(inside * 0.125f * sqrt(across * across + down * down), magnitude + y * stride + x);
 }
 
-/* What is masked is not known, nor is a change beside it: such pixels get the magnitude `unknown`.  One item = one
- * pixel. */
+/* What is masked is not known, nor is a change beside it: such pixels get the magnitude -1.  One item = one pixel. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void hide_masked(
     __global const float *restrict target,  // [4,H',stride], the last is the mask
     __global float *restrict magnitude,     // [H',stride] per px
-    const float unknown,
     const uint width,
     const uint height,
     const uint rows,                        // H'
@@ -76,13 +74,14 @@ void hide_masked(
         known &= (counts[row * stride + left] > 0.0f) & (counts[row * stride + x] > 0.0f) &
                  (counts[row * stride + right] > 0.0f);
     if (!known)
-        magnitude[y * stride + x] = unknown;
+        magnitude[y * stride + x] = -1.0f;
 }
 
-/* Add to each Gaussian that is drawn the magnitude at its projected mean, taken from the nearest pixel of the image. */
+/* Add to each Gaussian that is drawn the magnitude at its projected mean, taken from the nearest pixel of the image;
+ * nothing where it is not known. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void sample_magnitude(
-    __global const float *restrict magnitude,  // [H',stride]
+    __global const float *restrict magnitude,  // [H',stride] per px, below 0: not known
     __global const float *restrict splats,     // [N,RECORD] see splat.h
     __global const float *restrict radius,     // [S] px, 0 = not seen
     __global float *restrict total,            // [S]
@@ -98,5 +97,6 @@ void sample_magnitude(
     const float x = splat[SPLAT_X], y = splat[SPLAT_Y], right = (float)(width - 1), bottom = (float)(height - 1);
     const uint column = (uint)(x > 0.0f ? (x < right ? x : right) : 0.0f);
     const uint row = (uint)(y > 0.0f ? (y < bottom ? y : bottom) : 0.0f);
-    total[i] += magnitude[row * stride + column];
+    const float found = magnitude[row * stride + column];
+    total[i] += found > 0.0f ? found : 0.0f;
 }

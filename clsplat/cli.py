@@ -213,7 +213,7 @@ def bench(
     scenes: Annotated[str, typer.Option(help="Fixed scenes, of A, B and C, separated by commas.")] = "A",
     model: Annotated[Path | None, typer.Option(help="Also time this splat or point cloud (PLY), at --scene.")] = None,
     scene: Annotated[Path | None, typer.Option(help="The scene of --model.")] = None,
-    pipeline: Annotated[str, typer.Option(help="Whose losses and statistics a step has.")] = "splat",
+    pipeline: Annotated[str, typer.Option(help="What a step is of: losses, statistics, filter.")] = "splat",
     repeats: Annotated[int, typer.Option(min=1, help="Steps of each scene.")] = 20,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
     against: Annotated[Path | None, typer.Option(help="Compare with the JSON of an earlier run.")] = None,
@@ -228,32 +228,35 @@ def bench(
 
     from clsplat.bench.contest import run_bench
     from clsplat.bench.peaks import measure_peaks
-    from clsplat.bench.scenes import SIZES, contestant, grown, real_contestant, steps_of
+    from clsplat.bench.scenes import SIZES, contestant, grown, real_contestant
     from clsplat.bench.table import growth_chart, growth_table, table
     from clsplat.files import write_text
     from clsplat.opencl.device import Device, choose
+    from clsplat.pipeline import load
 
     names = [name for name in scenes.split(",") if name]
     if unknown := [name for name in names if name not in SIZES]:
         raise ConfigError(f"--scenes: no scene named '{unknown[0]}'; there are {', '.join(SIZES)}")
     if (model is None) != (scene is None):
         raise ConfigError("bench: --model and --scene go together")
-    optimize = steps_of(pipeline)
+    settings = load(pipeline).settings
     earlier = _read_json(against) if against else None
+    if earlier and (was := earlier.get("pipeline", "splat")) != settings.name:
+        raise ConfigError(f"{against}: expected the pipeline '{settings.name}', it has '{was}'; use --pipeline {was}")
     opened = Device(choose(device), schedule)
     peaks = measure_peaks(opened)
     if growth is not None:
-        sizes = [run_bench({"": one}, peaks, repeats)[""] for one in grown(opened, optimize)]
+        sizes = [run_bench({"": one}, peaks, repeats)[""] for one in grown(opened, settings)]
         write_text(growth, growth_chart(sizes))
         CONSOLE.print(f"device: {opened.text}\n{growth_table(sizes)}", markup=False)
         return
-    contestants = {name: contestant(opened, *SIZES[name], optimize) for name in names}
+    contestants = {name: contestant(opened, *SIZES[name], settings) for name in names}
     if model is not None and scene is not None:
-        contestants[model.stem] = real_contestant(opened, model, scene, optimize)
+        contestants[model.stem] = real_contestant(opened, model, scene, settings)
     results = run_bench(contestants, peaks, repeats)
     if as_json:
-        scenes_data = {name: asdict(result) for name, result in results.items()}
-        print(json.dumps({"device": opened.text, "peaks": asdict(peaks), "scenes": scenes_data}, indent=1))
+        data = {"device": opened.text, "pipeline": settings.name, "peaks": asdict(peaks)}
+        print(json.dumps({**data, "scenes": {name: asdict(result) for name, result in results.items()}}, indent=1))
         return
     CONSOLE.print(f"device: {opened.text}", markup=False)
     CONSOLE.print(f"peaks: {peaks.gflops:.0f} GFLOP/s, {peaks.gexp:.1f} Gexp/s, copy {peaks.gbytes:.1f} GB/s")

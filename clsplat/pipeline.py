@@ -33,6 +33,7 @@ from clsplat.settings import Settings
 from clsplat.settings_errors import explain
 from clsplat.stages import STAGES, AnyStage
 from clsplat.stages.base import Stage
+from clsplat.stages.optimize import Optimize
 from clsplat.training.filters import ModelSettings
 from clsplat.training.sampling import Sampling
 from clsplat.yaml_file import Document, parse_scalar, read_yaml
@@ -102,6 +103,14 @@ class PipelineFile(Settings):
     rasterizer: RasterizerSettings = RasterizerSettings()
     prepare: list[Annotated[AnyStep, Field(discriminator="stage")]] = Field([])  # photographs -> scene, done once
     stages: Annotated[list[Annotated[AnyStage, Field(discriminator="stage")]], Field(min_length=1)]
+
+    @property
+    def training(self) -> Optimize:
+        """The first stage that trains.  Raises ConfigError when none does."""
+        for stage in self.stages:
+            if isinstance(stage, Optimize):
+                return stage
+        raise ConfigError(f"{self.name}: expected a stage 'optimize', whose steps can be timed")
 
 
 @dataclass(frozen=True)

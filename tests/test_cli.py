@@ -168,8 +168,13 @@ def test_bench_times_a_point_cloud_and_counts_memory(tiny_scene, pipeline):
     options = ("--scenes", "", "--model", cloud, "--scene", tiny_scene, "--repeats", "2", "--json")
     done = clsplat("bench", *options, "--pipeline", pipeline)
     found = json.loads(done.stdout)["scenes"]["points3d"]
-    assert found["stages"].get("statistics", 0) > 0
+    assert "statistics" in found["stages"]
     assert "other" not in found["stages"]
+    (tiny_scene / "bench.json").write_text(done.stdout)
+    again = ("bench", *options, "--against", tiny_scene / "bench.json", "--pipeline")
+    clsplat(*again, pipeline)
+    refused = clsplat(*again, "absgs", expect=2)
+    assert f"expected the pipeline 'absgs', it has '{pipeline}'" in refused.stderr
     assert found["work"]["gaussians"] > 100
     assert set(found["floors"]) <= set(found["stages"])
     assert 0 < found["memory"] < 2 * found["planned"]

@@ -9,11 +9,11 @@ import numpy as np
 
 from clsplat.bench.floors import Work, floors
 from clsplat.bench.peaks import Peaks
-from clsplat.gaussians.model import Gaussians, Model
+from clsplat.gaussians.model import Gaussians
 from clsplat.gaussians.ply import Parameters
 from clsplat.opencl.device import Device
+from clsplat.pipeline import PipelineFile
 from clsplat.render.renderer import RECORD, Frame, Renderer
-from clsplat.stages.optimize import Optimize
 from clsplat.training.adam import Adam, Rates
 from clsplat.training.basic_rules import PruneLarge
 from clsplat.training.density import Measures, densify
@@ -41,18 +41,21 @@ class Result:
 
 
 class Contestant:
-    """One scene, ready to be stepped with the losses and statistics of a pipeline."""
+    """One scene, ready to be stepped with a pipeline's losses and statistics, rendered as it says.
+
+    World filters are in the scales of an exported model; here they cost nothing.
+    """
 
     def __init__(
-        self, device: Device, parameters: Parameters, target: Target, background: str, optimize: Optimize
+        self, device: Device, parameters: Parameters, target: Target, background: str, settings: PipelineFile
     ) -> None:
-        self.device, self.target, self.optimize = device, target, optimize
+        self.device, self.target, self.optimize = device, target, settings.training
         self._before = device.peak = device.allocated
         self.renderer = Renderer(device, "radix")
         gaussians = Gaussians(device, parameters)
-        self.model = Model(gaussians, gaussians.sh_degree)
-        self.adam, self.stats = Adam(gaussians), SplatStats(gaussians, optimize.statistics)
-        for name in sorted(optimize.tables):
+        self.model = settings.model.model(gaussians, gaussians.sh_degree)
+        self.adam, self.stats = Adam(gaussians), SplatStats(gaussians, self.optimize.statistics)
+        for name in sorted(self.optimize.tables):
             gaussians.add(name, 1)
         self.background = device.zeros(3)
         self.background.fill(1.0 if background == "white" else 0.0)

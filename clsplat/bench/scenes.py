@@ -8,16 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.bench.contest import Contestant
-from clsplat.errors import ConfigError
 from clsplat.gaussians.model import SH_C0
 from clsplat.gaussians.ply import Parameters, is_splat, read_ply
 from clsplat.opencl.device import Device
-from clsplat.pipeline import load
-from clsplat.scene.detect import read_scene
+from clsplat.pipeline import PipelineFile
 from clsplat.scene.points import read_points_ply
 from clsplat.scene.scene import Camera, View
 from clsplat.stages.init import from_points
-from clsplat.stages.optimize import Optimize
 from clsplat.training.targets import Target, Targets
 
 FOCAL = 400.0  # px, of the synthetic scenes
@@ -48,35 +45,27 @@ def synthetic(width: int, height: int, count: int, size: float = SIZE) -> tuple[
     return parameters, View("bench", camera, np.eye(4)[:3], Path("bench"))
 
 
-def steps_of(pipeline: str) -> Optimize:
-    """The training that a pipeline begins with.  Raises ConfigError when it has none."""
-    for stage in load(pipeline).settings.stages:
-        if isinstance(stage, Optimize):
-            return stage
-    raise ConfigError(f"{pipeline}: expected a stage 'optimize', whose steps can be timed")
-
-
 def contestant(
-    device: Device, width: int, height: int, count: int, optimize: Optimize, size: float = SIZE
+    device: Device, width: int, height: int, count: int, settings: PipelineFile, size: float = SIZE
 ) -> Contestant:
     """Open a synthetic scene with a noise image for its photograph."""
     parameters, view = synthetic(width, height, count, size)
     targets = Targets(device, "black")
     shape = (3, height, width)
     pixels = np.random.default_rng(1).integers(0, 256, shape, dtype=np.uint8)
-    return Contestant(device, parameters, Target(targets.camera(view), device.upload(pixels)), "black", optimize)
+    return Contestant(device, parameters, Target(targets.camera(view), device.upload(pixels)), "black", settings)
 
 
-def real_contestant(device: Device, model: Path, scene: Path, optimize: Optimize) -> Contestant:
+def real_contestant(device: Device, model: Path, scene: Path, settings: PipelineFile) -> Contestant:
     """Open a splat PLY, or a point cloud as `init` would begin with it, at the first training view of a scene."""
-    opened = read_scene(scene)
-    targets = Targets(device, opened.background)
+    opened, background = settings.scene.read(scene)
+    targets = Targets(device, background)
     parameters = read_ply(model).parameters if is_splat(model) else from_points(read_points_ply(model), 0.1, 3)
-    return Contestant(device, parameters, targets.get(opened.split("train")[0]), opened.background, optimize)
+    return Contestant(device, parameters, targets.get(opened.split("train")[0]), background, settings)
 
 
-def grown(device: Device, optimize: Optimize) -> Iterator[Contestant]:
+def grown(device: Device, settings: PipelineFile) -> Iterator[Contestant]:
     """Open scenes of 50 000 to a million Gaussians over one image, as much smaller as there are more of them."""
     width, height, most = SIZES["C"]
     for count in GROWTH_COUNTS:
-        yield contestant(device, width, height, count, optimize, SIZE * (most / count) ** 0.5)
+        yield contestant(device, width, height, count, settings, SIZE * (most / count) ** 0.5)

@@ -16,7 +16,7 @@ class Grow(Rule):
     """
 
     statistic: StatisticName = "screen_grad"
-    gradient_above: Positive = 2.0e-4  # mean over views, at least
+    gradient_above: Positive = 2.0e-4  # mean of the statistic, at least
     as_many_as: StatisticName | None = None
 
     @property

@@ -9,13 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from clsplat.errors import MemoryLimitError
-from clsplat.gaussians.model import GROWTH, Gaussians
+from clsplat.gaussians.model import GROWTH, PARAMETERS, Gaussians
 from clsplat.opencl.device import DeviceInfo
 from clsplat.render.renderer import MOMENTS, RECORD
 
 PAIRS = 5  # (tile, Gaussian) pairs of a Gaussian, where nothing is known yet; trained scenes have 1.5 to 4
 FRAME_GAUSSIAN = 4 * (RECORD + 2 + 5 + 7)  # records, mean2d; keys and radius; sorting by depth
-GRADIENTS = 4 * (3 + 4 + 3 + 1 + 3 + 45 + 2)  # apart from the update: where penalties or edits are
 FRAME_PAIR = 4 * (RECORD + 6)  # gradient record; tile and Gaussian of the pair, sorting by tile
 FRAME_PIXEL = 4 * (
     4 * 3 + 2 + 9
@@ -71,6 +70,7 @@ def plan(gaussians: Gaussians, photographs: int, pixels: int, moments: int = MOM
     """
     info: DeviceInfo = gaussians.device.info
     sizes = [4 * table.components for table in gaussians.tables.values()]
-    gaussian = int(np.sum(sizes)) + FRAME_GAUSSIAN + 4 * moments + GRADIENTS
+    gradients = sum(4 * gaussians.tables[name].components for name in PARAMETERS) + 8  # where penalties or edits are
+    gaussian = int(np.sum(sizes)) + FRAME_GAUSSIAN + 4 * moments + gradients
     fixed = photographs + FRAME_PIXEL * pixels
     return MemoryPlan(gaussian, FRAME_PAIR, fixed, max(sizes), info.memory, info.allocation)

@@ -16,7 +16,7 @@ from clsplat.opencl.device import Array
 from clsplat.opencl.program import constants
 from clsplat.render.renderer import MOMENTS, Frame
 from clsplat.training.step import Differentiated
-from clsplat.training.texture import image_gradient
+from clsplat.training.texture import known_gradient
 
 FOLDER = "stats/"
 SEEN = "stats/seen"
@@ -74,16 +74,19 @@ class ScreenGradAbsSum(Statistic):
 
 
 class BlendWeight(Statistic):
-    """How much of the image a splat is: its α T, summed over pixels."""
+    """How much of the image a splat is: its α T, summed over pixels whose texture is known."""
 
-    moments = WEIGHT + 1
+    moments = TEXTURE + 1
 
     def add(self, gaussians: Gaussians, view: Differentiated, grad_mean2d: Array, total: Array) -> None:
         _add_moment(gaussians, view, WEIGHT, total)
 
 
 class Texture(Statistic):
-    """The photograph's gradient magnitude under the splat, per px: Σ α T |∇I| / Σ α T over pixels of all views."""
+    """The photograph's gradient magnitude under the splat, per px: Σ α T |∇I| / Σ α T over pixels of all views.
+
+    What a mask hides is left out of both sums.
+    """
 
     moments = TEXTURE + 1
     by = "blend_weight"
@@ -99,7 +102,7 @@ class RenderedTexture(Statistic):
         frame, comparison = view.frame, view.comparison
         gaussians.device.program("texture.cl").sample_magnitude(
             items=gaussians.count,
-            magnitude=image_gradient(comparison.workspace, frame.camera, frame.image),
+            magnitude=known_gradient(comparison.workspace, frame.camera, frame.image, comparison.target),
             splats=frame.splats,
             radius=frame.radius,
             total=total,
@@ -123,10 +126,10 @@ STATISTICS: dict[str, Statistic] = {
     "screen_grad": ScreenGrad(),
     "screen_grad_abs": ScreenGradAbs(),
     "screen_grad_abs_sum": ScreenGradAbsSum(),
-    "blend_weight": BlendWeight(),
     "texture": Texture(),
     "rendered_texture": RenderedTexture(),
     "screen_radius": ScreenRadius(),
+    "blend_weight": BlendWeight(),
 }
 
 

@@ -11,7 +11,7 @@ from clsplat.training.adam import Adam
 from clsplat.training.losses import Comparison, Loss, Term
 from clsplat.training.shape_losses import ShapeLoss, Shapes
 from clsplat.training.targets import Target, cover, unpack
-from clsplat.training.texture import photograph_texture
+from clsplat.training.texture import known_gradient
 
 TEXTURE = int(constants("splat.h")["MOMENT_TEXTURE"])
 
@@ -47,7 +47,7 @@ def differentiate(
     terms = [loss.add(comparison) for loss in losses]
     if target.masked:
         cover(workspace, camera, gradient, photograph)
-    texture = photograph_texture(workspace, camera, photograph) if count > TEXTURE else None
+    texture = known_gradient(workspace, camera, photograph, photograph) if count > TEXTURE else None
     return Differentiated(frame, comparison, terms, renderer.moments(model, frame, gradient, count, texture))
 
 

@@ -29,15 +29,14 @@ def image_gradient(workspace: Workspace, camera: DeviceCamera, image: Array, nam
     return magnitude
 
 
-def photograph_texture(workspace: Workspace, camera: DeviceCamera, photograph: Array, unknown: float = 0.0) -> Array:
-    """The same of a photograph, [3 or 4, rows, stride]; `unknown` at pixels that its mask hides, and beside them."""
-    magnitude = image_gradient(workspace, camera, photograph)
-    if photograph.shape[0] == 4:
+def known_gradient(workspace: Workspace, camera: DeviceCamera, image: Array, target: Array) -> Array:
+    """The same, but -1 at pixels that the mask of `target`, [3 or 4, rows, stride], hides, and beside them."""
+    magnitude = image_gradient(workspace, camera, image)
+    if target.shape[0] == 4:
         workspace.device.program("texture.cl").hide_masked(
             items=(camera.width, camera.height),
-            target=photograph,
+            target=target,
             magnitude=magnitude,
-            unknown=unknown,
             width=camera.width,
             height=camera.height,
             rows=camera.rows,
@@ -52,7 +51,7 @@ def texture_quantile(workspace: Workspace, targets: Iterable[Target], share: flo
     for target in targets:
         camera = target.camera
         photograph = unpack(workspace, camera, target.pixels)
-        inside = photograph_texture(workspace, camera, photograph, unknown=-1.0).get()[: camera.height, : camera.width]
+        inside = known_gradient(workspace, camera, photograph, photograph).get()[: camera.height, : camera.width]
         counts += np.histogram(inside, BINS, (0, STEEPEST))[0]  # which leaves out what is below 0
     below = np.searchsorted(np.cumsum(counts), share * counts.sum())
     return float(below + 1) * STEEPEST / BINS

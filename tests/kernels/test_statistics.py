@@ -178,7 +178,7 @@ def test_texture_under_splats(device, rng):
     case = random_case(rng, 40, 48, 32)
     renderer, model, camera = Renderer(device, "radix"), case.model(device), case.device_camera(device)
     texture = np.zeros((camera.rows, camera.stride), np.float32)
-    texture[:32, :48] = rng.uniform(0, 0.5, (32, 48))
+    texture[:32, :48] = np.where(rng.random((32, 48)) < 0.9, rng.uniform(0, 0.5, (32, 48)), -1)  # a tenth is masked
     weights = np.zeros((3, camera.rows, camera.stride), np.float32)
     weights[:, :32, :48] = rng.normal(size=(3, 32, 48))
     frame = renderer.forward(model, camera, device.zeros(3))
@@ -187,6 +187,7 @@ def test_texture_under_splats(device, rng):
     moments = renderer.moments(model, frame, planes, WEIGHT + 2, device.upload(texture))
     assert relative_error(moments.get()[:MOMENTS, :40], few) < 1e-6
     blended = ref_blend.blend_weights(case.project(), 48, 32)
+    blended *= texture[:32, :48] >= 0
     weight, textured = blended.sum(axis=(1, 2)), (blended * texture[:32, :48]).sum(axis=(1, 2))
     assert relative_error(moments.get()[WEIGHT, :40], weight) < 1e-3  # pixels at thresholds
     assert relative_error(moments.get()[WEIGHT + 1, :40], textured) < 1e-3

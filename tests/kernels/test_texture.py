@@ -7,7 +7,7 @@ from scipy import ndimage
 from clsplat.render.renderer import Renderer
 from clsplat.render.workspace import Workspace
 from clsplat.training.targets import Target, unpack
-from clsplat.training.texture import photograph_texture, texture_quantile
+from clsplat.training.texture import known_gradient, texture_quantile
 from tests.kernels.test_loss import camera_of
 from tests.scenes import random_case
 
@@ -55,8 +55,9 @@ def test_what_is_masked_has_no_texture(device, rng, width, height):
         pixels = np.where(mask, np.arange(3 * width * height).reshape(3, height, width) * 37 % 256, filling)
         target = Target(camera, device.upload(np.concatenate([pixels, mask[None]]).astype(np.uint8)))
         photograph = unpack(workspace, camera, target.pixels)
-        texture = photograph_texture(workspace, camera, photograph).get()
-        np.testing.assert_allclose(texture[:height, :width], magnitude_of(pixels / 255) * known, atol=1e-6)
+        texture = known_gradient(workspace, camera, photograph, photograph).get()
+        expected = np.where(known, magnitude_of(pixels / 255), -1)
+        np.testing.assert_allclose(texture[:height, :width], expected, atol=1e-6)
         texture[:height, :width] = 0
         assert (texture == 0).all()
         found.append(texture_quantile(workspace, [target], 0.5))
@@ -73,6 +74,7 @@ def test_sample_at_projected_means(device, rng, count):
     renderer = Renderer(device, "radix")
     frame = renderer.forward(case.model(device), case.device_camera(device), device.zeros(3))
     magnitude = rng.uniform(0, 1, (frame.camera.rows, frame.camera.stride)).astype(np.float32)
+    magnitude[rng.random(magnitude.shape) < 0.2] = -1
     total = device.zeros(frame.radius.shape)
     for _ in range(2):
         device.program("texture.cl").sample_magnitude(
@@ -89,4 +91,4 @@ def test_sample_at_projected_means(device, rng, count):
     x, y = frame.splats.get()[:count, :2].T
     column, row = np.clip(x, 0, 39).astype(int), np.clip(y, 0, 29).astype(int)
     seen = frame.radius.get()[:count] > 0
-    np.testing.assert_allclose(total.get()[:count], 2 * magnitude[row, column] * seen, rtol=1e-6)
+    np.testing.assert_allclose(total.get()[:count], 2 * np.maximum(magnitude[row, column], 0) * seen, rtol=1e-6)
