@@ -3,13 +3,14 @@
 import statistics
 import time
 from collections import defaultdict
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
 
 from clsplat.bench.floors import Work, floors
 from clsplat.bench.peaks import Peaks
-from clsplat.gaussians.model import Gaussians
+from clsplat.gaussians.model import PARAMETERS, Gaussians
 from clsplat.gaussians.ply import Parameters
 from clsplat.opencl.device import Device
 from clsplat.pipeline import PipelineFile
@@ -66,17 +67,18 @@ class Contestant:
         self.frame: Frame | None = None
         for _ in range(WARM_UP):
             self.step(record=False)
+        self.step(record=False, without=PARAMETERS)  # as where an edit is due: its gradients stay on the device
         self.edit()
         self.memory = device.peak - self._before
 
-    def step(self, record: bool) -> None:
-        """One training step; `record` keeps its times."""
+    def step(self, record: bool, without: Collection[str] = ()) -> None:
+        """One training step; `record` keeps its times, parameters `without` stay as they are."""
         self.device.finish()
         self.device.timings.sampling = record
         start = time.perf_counter()
         losses, penalties = self.optimize.comparisons, self.optimize.penalties
         view = differentiate(self.renderer, self.model, self.target, self.background, losses, count=self.stats.moments)
-        self.stats.add(view, update(self.renderer, self.model, self.adam, view, self.rates, penalties))
+        self.stats.add(view, update(self.renderer, self.model, self.adam, view, self.rates, penalties, without))
         self.device.finish()
         seconds = time.perf_counter() - start
         self.device.timings.sampling = False
