@@ -163,15 +163,15 @@ def test_output_that_cannot_be_written(tiny_scene, tmp_path):
 
 
 @pytest.mark.parametrize("pipeline", ["splat", "micro_splatting"])
-def test_bench_times_a_point_cloud_and_counts_memory(tiny_scene, pipeline):
+def test_bench_times_a_point_cloud_and_counts_memory(tiny_scene, tmp_path, pipeline):
     cloud = tiny_scene / "points3d.ply"
     options = ("--scenes", "", "--model", cloud, "--scene", tiny_scene, "--repeats", "2", "--json")
     done = clsplat("bench", *options, "--pipeline", pipeline)
     found = json.loads(done.stdout)["scenes"]["points3d"]
     assert "statistics" in found["stages"]
     assert "other" not in found["stages"]
-    (tiny_scene / "bench.json").write_text(done.stdout)
-    again = ("bench", *options, "--against", tiny_scene / "bench.json", "--pipeline")
+    (tmp_path / "bench.json").write_text(done.stdout)
+    again = ("bench", *options, "--against", tmp_path / "bench.json", "--pipeline")
     clsplat(*again, pipeline)
     refused = clsplat(*again, "absgs", expect=2)
     assert f"expected the pipeline 'absgs', it has '{pipeline}'" in refused.stderr

@@ -56,6 +56,10 @@ class DeviceCamera:
         """Rows of a plane."""
         return self.tiles_y * self.tile
 
+    def plane_arguments(self) -> dict[str, int]:
+        """What kernels take that work on planes, by the names of their arguments."""
+        return {"width": self.width, "height": self.height, "rows": self.rows, "stride": self.stride}
+
 
 def upload_camera(device: Device, view: View) -> DeviceCamera:
     """Put a view's camera on the device."""

@@ -43,10 +43,6 @@ class Comparison:
         """Number of values in pixels that count; waits for the device where there is a mask."""
         return 3 * int(self.target.get()[3].sum()) if self.target.shape[0] == 4 else self.values
 
-    def shape_arguments(self) -> dict[str, int]:
-        camera = self.camera
-        return {"width": camera.width, "height": camera.height, "rows": camera.rows, "stride": camera.stride}
-
 
 @dataclass(frozen=True)
 class Term:
@@ -104,7 +100,7 @@ class Dssim(Loss):
             gradient=comparison.gradient,
             scale=-weight / comparison.values,
             accumulate=int(comparison.accumulate),
-            **comparison.shape_arguments(),
+            **comparison.camera.plane_arguments(),
         )
         comparison.accumulate = True
         return Term("dssim", lambda: weight * (1.0 - float(sums.get().sum(dtype=np.float64)) / comparison.values))
@@ -126,7 +122,7 @@ def pixel_loss(comparison: Comparison, l1: float, l2: float) -> Array:
         l1=l1 / values,
         l2=l2 / values,
         accumulate=int(comparison.accumulate),
-        **comparison.shape_arguments(),
+        **comparison.camera.plane_arguments(),
     )
     comparison.accumulate = True
     return sums
@@ -144,6 +140,6 @@ def ssim_maps(comparison: Comparison) -> tuple[Array, Array]:
         target=comparison.target,
         maps=maps,
         block_sums=sums,
-        **comparison.shape_arguments(),
+        **comparison.camera.plane_arguments(),
     )
     return maps, sums

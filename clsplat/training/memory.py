@@ -16,9 +16,7 @@ from clsplat.render.renderer import MOMENTS, RECORD
 PAIRS = 5  # (tile, Gaussian) pairs of a Gaussian, where nothing is known yet; trained scenes have 1.5 to 4
 FRAME_GAUSSIAN = 4 * (RECORD + 2 + 5 + 7)  # records, mean2d; keys and radius; sorting by depth
 FRAME_PAIR = 4 * (RECORD + 6)  # gradient record; tile and Gaussian of the pair, sorting by tile
-FRAME_PIXEL = 4 * (
-    4 * 3 + 2 + 9
-)  # image, target, gradient, rendered again; transmittance, texture; derivatives of SSIM
+FRAME_PIXEL = 4 * (4 * 3 + 2 + 9)  # image, target, gradient, rendered again; transmittance, texture; SSIM's derivatives
 
 
 @dataclass(frozen=True)

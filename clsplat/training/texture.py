@@ -21,10 +21,7 @@ def image_gradient(workspace: Workspace, camera: DeviceCamera, image: Array, nam
         items=(-(-camera.stride // int(device.tuning["LANES"])), camera.rows),
         image=image,
         magnitude=magnitude,
-        width=camera.width,
-        height=camera.height,
-        rows=camera.rows,
-        stride=camera.stride,
+        **camera.plane_arguments(),
     )
     return magnitude
 
@@ -37,10 +34,7 @@ def known_gradient(workspace: Workspace, camera: DeviceCamera, image: Array, tar
             items=(camera.width, camera.height),
             target=target,
             magnitude=magnitude,
-            width=camera.width,
-            height=camera.height,
-            rows=camera.rows,
-            stride=camera.stride,
+            **camera.plane_arguments(),
         )
     return magnitude
 
