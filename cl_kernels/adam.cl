@@ -47,7 +47,7 @@ static inline void update_plane(__global float *values, __global float *moment1,
                      table##_rate, table##_correction2);                                                      \
     } while (0)
 
-/* The update of all tables from the moments of the pixels.  Rates are divided by 1 - BETA1^t.
+/* The update of all tables from the sums over pixels.  Rates are divided by 1 - BETA1^t.
  *
  * One item = VECTORS vectors of Gaussians, plane by plane, so that memory is walked in runs.  Private memory:
  * VECTORS * LANES * 200 bytes. */
@@ -74,7 +74,7 @@ void update_gaussians(
     __global const float *restrict filter_variance,  // [S] scene units^2
     __constant camera_t *restrict camera,            // [1]
     __global const float *restrict splats,           // [N,RECORD] see splat.h
-    __global const float *restrict moments,          // [MOMENTS,S] see splat.h
+    __global const float *restrict pixel_sums,       // [PIXEL_SUMS,S] see splat.h
     __global float *restrict grad_mean2d,            // [2,S] px^-1
     const float near_plane,                          // scene units
     const float screen_variance,                     // px^2
@@ -102,12 +102,12 @@ void update_gaussians(
     gradient_t g[VECTORS];
     VF weights[VECTORS][16];
     for (uint v = 0; v < vectors; v++)
-        colour_backward(splats, moments, stride, count, i + v * LANES, g + v);
+        colour_backward(splats, pixel_sums, stride, count, i + v * LANES, g + v);
     weigh_harmonics(sh_rest, g, vectors, degree, stride, i, weights);
     for (uint v = 0; v < vectors; v++) {
         const uint at = i + v * LANES;
-        gradient_of(means, quats, log_scales, logit_opacity, filter_variance, camera, moments, weights[v], near_plane,
-                    screen_variance, compensate, degree, stride, at, g + v);
+        gradient_of(means, quats, log_scales, logit_opacity, filter_variance, camera, pixel_sums, weights[v],
+                    near_plane, screen_variance, compensate, degree, stride, at, g + v);
         for (uint k = 0; k < 2; k++)
             VSTORE((g[v].touched ? g[v].mean2d[k] : (VF)(0.0f)), grad_mean2d + k * stride + at);
     }

@@ -1,4 +1,4 @@
-/* Gradients of a Gaussian's parameters from the summed moments of its pixels: the reverse of projection and colour,
+/* Gradients of a Gaussian's parameters from its sums over pixels: the reverse of projection and colour,
  * recomputing what the forward pass had.  Both ways of updating parameters use it, so they give the same bits. */
 #ifndef CLSPLAT_BACKWARD_H
 #define CLSPLAT_BACKWARD_H
@@ -21,21 +21,21 @@ static inline VF view_direction(
     return inverse;
 }
 
-/* Gradients of the mean, quaternion and log-scales from the summed moments of a Gaussian's pixels. */
+/* Gradients of the mean, quaternion and log-scales from the sums over pixels of a Gaussian. */
 static inline void shape_backward(const shape_t *s, __constant camera_t *camera, const VF *m,
                                   const float compensate, VF *grad_mean2d, VF *grad_mean, VF *grad_quat, VF *grad_scale)
 {
     __constant const float *w = camera->world_to_camera;
     const VF a = s->conic_xx, b = s->conic_xy, c = s->conic_yy;
-    const VF gu = -(a * m[MOMENT_X] + b * m[MOMENT_Y]);
-    const VF gv = -(b * m[MOMENT_X] + c * m[MOMENT_Y]);
+    const VF gu = -(a * m[SUM_X] + b * m[SUM_Y]);
+    const VF gv = -(b * m[SUM_X] + c * m[SUM_Y]);
 
     /* conic -> covariance: -K G K with G = ((gA, gB/2), (gB/2, gC)) */
-    const VF ga = -0.5f * m[MOMENT_XX], gb = -0.5f * m[MOMENT_XY], gc = -0.5f * m[MOMENT_YY];
+    const VF ga = -0.5f * m[SUM_XX], gb = -0.5f * m[SUM_XY], gc = -0.5f * m[SUM_YY];
     const VF k00 = a * ga + b * gb, k01 = a * gb + b * gc, k10 = b * ga + c * gb, k11 = b * gb + c * gc;
     /* energy of the screen filter: ratio = det0 / det1, d ratio = tr((adj(V0) / det1 - ratio K) dV) */
     const VF energy2 = larger(1.0f + compensate * (s->ratio - 1.0f), (VF)(1.0e-12f));
-    const VF g_ratio = compensate * 0.5f * m[MOMENT_POWER] / energy2;
+    const VF g_ratio = compensate * 0.5f * m[SUM_POWER] / energy2;
     const VF g00 = g_ratio * (s->yy / s->determinant - s->ratio * a) - (k00 * a + k01 * b);
     const VF g01 = g_ratio * (-s->xy / s->determinant - s->ratio * b) - (k00 * b + k01 * c);
     const VF g11 = g_ratio * (s->xx / s->determinant - s->ratio * c) - (k10 * b + k11 * c);
@@ -55,7 +55,7 @@ static inline void shape_backward(const shape_t *s, __constant camera_t *camera,
             gr[3 * j + k] = gm * s->filtered[k];
         }
         const VF inverse = 1.0f / s->filtered[k];
-        grad_scale[k] = (g_filtered * s->scale2[k] + m[MOMENT_POWER] * s->filter * inverse) * inverse;
+        grad_scale[k] = (g_filtered * s->scale2[k] + m[SUM_POWER] * s->filter * inverse) * inverse;
     }
     rotation_backward(s->unit, s->inverse_norm, gr, grad_quat);
 
@@ -91,8 +91,8 @@ typedef struct {
 
 /* Which Gaussians were drawn, and the gradients of their colours. */
 static inline void colour_backward(
-    __global const float *splats,   // [N,RECORD] see splat.h
-    __global const float *moments,  // [MOMENTS,S] see splat.h
+    __global const float *splats,      // [N,RECORD] see splat.h
+    __global const float *pixel_sums,  // [PIXEL_SUMS,S] see splat.h
     const uint stride, const uint count, const uint i, gradient_t *g)
 {
     float table[4][LANES];
@@ -102,7 +102,7 @@ static inline void colour_backward(
     g->touched = VLOAD(table[0]) > 0.0f;  // culled records are all zero
     for (uint channel = 0; channel < 3; channel++)  // max(0, .) passes no gradient where it clamped
         g->colour[channel] = VLOAD(table[1 + channel]) > 0.0f
-                                 ? VLOAD(moments + (MOMENT_RED + channel) * stride + i) : (VF)(0.0f);
+                                 ? VLOAD(pixel_sums + (SUM_RED + channel) * stride + i) : (VF)(0.0f);
 }
 
 /* The weight of each basis function in the derivative by direction, c_k . g, for a block of vectors: plane by plane, so
@@ -129,16 +129,16 @@ static inline void gradient_of(
     __global const float *logit_opacity,    // [S]
     __global const float *filter_variance,  // [S] scene units^2
     __constant camera_t *camera,            // [1]
-    __global const float *moments,          // [MOMENTS,S] see splat.h
+    __global const float *pixel_sums,       // [PIXEL_SUMS,S] see splat.h
     const VF *weights,                      // [16]
     const float near_plane, const float screen_variance, const float compensate, const uint degree,
     const uint stride, const uint i, gradient_t *g)
 {
     shape_t s;
     shape_of(means, quats, log_scales, filter_variance, camera, near_plane, screen_variance, compensate, stride, i, &s);
-    VF m[MOMENTS];
-    for (uint k = 0; k < MOMENTS; k++)
-        m[k] = VLOAD(moments + k * stride + i);
+    VF m[PIXEL_SUMS];
+    for (uint k = 0; k < PIXEL_SUMS; k++)
+        m[k] = VLOAD(pixel_sums + k * stride + i);
     shape_backward(&s, camera, m, compensate, g->mean2d, g->means, g->quats, g->log_scales);
     VF d[3], gd[3] = {0.0f, 0.0f, 0.0f};
     const VF inverse_distance = view_direction(means, camera, stride, i, d);
@@ -147,7 +147,7 @@ static inline void gradient_of(
     const VF along = d[0] * gd[0] + d[1] * gd[1] + d[2] * gd[2];
     for (uint k = 0; k < 3; k++)
         g->means[k] += (gd[k] - d[k] * along) * inverse_distance;
-    g->logit_opacity = m[MOMENT_POWER] * (1.0f - sigmoid(VLOAD(logit_opacity + i)));
+    g->logit_opacity = m[SUM_POWER] * (1.0f - sigmoid(VLOAD(logit_opacity + i)));
 }
 
 #endif

@@ -77,9 +77,9 @@ void blend_backward(
     __constant camera_t *restrict camera,       // [1]
     __global const float *restrict image,       // [3,tiles_y*TILE,tiles_x*TILE]
     __global const float *restrict grad_image,  // [3,tiles_y*TILE,tiles_x*TILE]
-    __global const float *restrict texture,     // [tiles_y*TILE,tiles_x*TILE] read where MOMENTS says so
+    __global const float *restrict texture,     // [tiles_y*TILE,tiles_x*TILE] read where PIXEL_SUMS says so
     __global const uint *restrict tile_last,    // [T]
-    __global float *restrict pair_moments,      // [P,RECORD] in emission order
+    __global float *restrict pair_sums,         // [P,RECORD] in emission order
     const uint first_tile)                      // of this launch
 {
     __local grad_pixels_t pixels[PIXELS];
@@ -94,7 +94,7 @@ void blend_backward(
         p.green = grad_image[plane + at];
         p.blue = grad_image[2 * plane + at];
         p.rest = p.red * image[at] + p.green * image[plane + at] + p.blue * image[2 * plane + at];
-#if MOMENTS > MOMENT_WEIGHT
+#if PIXEL_SUMS > SUM_WEIGHT
         p.texture = texture[at];
 #endif
         pixels[i] = p;
@@ -105,7 +105,7 @@ void blend_backward(
         const bool owns = begin + item < end, active = begin + item < last;
         const uint pair = owns ? tile_pairs[begin + item] : 0;
         float splat[RECORD] = {0.0f};
-        moments_t m = {0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f};
+        pixel_sums_t m = {0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f};
         if (active)
             for (uint k = 0; k < RECORD; k++)
                 splat[k] = splats[(size_t)pair_splat[pair] * RECORD + k];
@@ -123,6 +123,6 @@ void blend_backward(
             }
         if (owns)
             vstore16((float16)(m.power, m.x, m.y, m.xx, m.xy, m.yy, m.red, m.green, m.blue,
-                               m.abs_x, m.abs_y, m.weight, m.texture, 0.0f, 0.0f, 0.0f), pair, pair_moments);
+                               m.abs_x, m.abs_y, m.weight, m.texture, 0.0f, 0.0f, 0.0f), pair, pair_sums);
     }
 }

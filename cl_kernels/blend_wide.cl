@@ -94,8 +94,8 @@ void blend_forward(
         }
 }
 
-/* Sum the lanes of each moment and write one record. */
-static inline void store_record(const moments_t m, __global float *record)
+/* Sum the lanes of each sum over pixels and write one record. */
+static inline void store_record(const pixel_sums_t m, __global float *record)
 {
     const float16 sums = (float16)(
         sum_lanes(m.power), sum_lanes(m.x), sum_lanes(m.y), sum_lanes(m.xx), sum_lanes(m.xy), sum_lanes(m.yy),
@@ -105,11 +105,11 @@ static inline void store_record(const moments_t m, __global float *record)
 }
 
 /* Walk one splat over the rows of its tile that it reaches, whole pairs of rows. */
-static inline void moments_of(const float *splat, const uint tile_x, const uint tile_y,
-                              grad_pixels_t (*pixels)[COLUMNS], moments_t *sums)
+static inline void pixel_sums_of(const float *splat, const uint tile_x, const uint tile_y,
+                                 grad_pixels_t (*pixels)[COLUMNS], pixel_sums_t *sums)
 {
     const VF zero = (VF)(0.0f);
-    moments_t moments = {zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero};
+    pixel_sums_t pixel_sums = {zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero};
     const float top = tile_y * TILE + 0.5f;
     const float low = splat[SPLAT_Y_MIN] - top, high = splat[SPLAT_Y_MAX] - top;
     const uint y_first = low > 0.0f ? (uint)low : 0u;
@@ -119,11 +119,11 @@ static inline void moments_of(const float *splat, const uint tile_x, const uint 
         const row_splat_t upper = splat_at_row(splat, top + y), lower = splat_at_row(splat, top + y + 1.0f);
         for (uint column = 0; column < COLUMNS; column++) {
             const VF pixel = pixel_centres(tile_x, column);
-            blend_backward_step(&pixels[y][column], upper, pixel, splat + SPLAT_RED, &moments);
-            blend_backward_step(&pixels[y + 1][column], lower, pixel, splat + SPLAT_RED, &moments);
+            blend_backward_step(&pixels[y][column], upper, pixel, splat + SPLAT_RED, &pixel_sums);
+            blend_backward_step(&pixels[y + 1][column], lower, pixel, splat + SPLAT_RED, &pixel_sums);
         }
     }
-    *sums = moments;
+    *sums = pixel_sums;
 }
 
 /* Splats outside, rows inside: a splat's record is summed in registers and written once, at the pair's address; pairs
@@ -138,9 +138,9 @@ void blend_backward(
     __constant camera_t *restrict camera,       // [1]
     __global const float *restrict image,       // [3,tiles_y*TILE,tiles_x*TILE]
     __global const float *restrict grad_image,  // [3,tiles_y*TILE,tiles_x*TILE]
-    __global const float *restrict texture,     // [tiles_y*TILE,tiles_x*TILE] read where MOMENTS says so
+    __global const float *restrict texture,     // [tiles_y*TILE,tiles_x*TILE] read where PIXEL_SUMS says so
     __global const uint *restrict tile_last,    // [T]
-    __global float *restrict pair_moments,      // [P,RECORD] in emission order
+    __global float *restrict pair_sums,         // [P,RECORD] in emission order
     const uint first_tile)                      // of this launch
 {
     const uint tile = first_tile + get_global_id(0);
@@ -157,7 +157,7 @@ void blend_backward(
             p.blue = VLOAD(grad_image + 2 * plane + at);
             p.rest = p.red * VLOAD(image + at) + p.green * VLOAD(image + plane + at) +
                      p.blue * VLOAD(image + 2 * plane + at);
-#if MOMENTS > MOMENT_WEIGHT
+#if PIXEL_SUMS > SUM_WEIGHT
             p.texture = VLOAD(texture + at);
 #endif
             pixels[y][column] = p;
@@ -173,11 +173,11 @@ void blend_backward(
             vstore16(vload16(pair_splat[pairs[j]], splats), 0, segment[j]);
         }
         for (uint j = 0; j < length; j++) {
-            moments_t moments;
-            moments_of(segment[j], tile_x, tile_y, pixels, &moments);
-            store_record(moments, pair_moments + (size_t)pairs[j] * RECORD);
+            pixel_sums_t pixel_sums;
+            pixel_sums_of(segment[j], tile_x, tile_y, pixels, &pixel_sums);
+            store_record(pixel_sums, pair_sums + (size_t)pairs[j] * RECORD);
         }
     }
     for (uint j = last; j < end; j++)
-        vstore16((float16)(0.0f), tile_pairs[j], pair_moments);
+        vstore16((float16)(0.0f), tile_pairs[j], pair_sums);
 }

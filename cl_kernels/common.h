@@ -33,8 +33,8 @@
 #ifndef SPLAT_GROUP
 #define SPLAT_GROUP 32  // splats per batch of the simt backward pass
 #endif
-#ifndef MOMENTS
-#define MOMENTS 9  // sums over pixels in a gradient record (splat.h): 11 or 13 where density statistics want the last
+#ifndef PIXEL_SUMS
+#define PIXEL_SUMS 9  // sums in a gradient record (splat.h): 11 or 13 where density statistics want the last ones
 #endif
 
 /* ---- constants of the method (Kerbl et al. 2023); tests override the first three to make blending smooth ---- */

@@ -59,17 +59,17 @@ void accumulate_sum(
 
 /* Add one of this view's sums over pixels. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
-void accumulate_moment(
-    __global const float *restrict moments,  // [>moment,S] see splat.h
-    __global const float *restrict radius,   // [S] px, 0 = not seen
-    __global float *restrict total,          // [S] over views
-    const uint moment,
+void accumulate_pixel_sum(
+    __global const float *restrict pixel_sums,  // [>pixel_sum,S] see splat.h
+    __global const float *restrict radius,      // [S] px, 0 = not seen
+    __global float *restrict total,             // [S] over views
+    const uint pixel_sum,
     const uint stride,
     const uint count)
 {
     const uint i = get_global_id(0);
     if (i < count && radius[i] > 0.0f)
-        total[i] += moments[moment * stride + i];
+        total[i] += pixel_sums[pixel_sum * stride + i];
 }
 
 /* Add this view's radius. */

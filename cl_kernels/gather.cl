@@ -5,11 +5,11 @@
 /* One item = LANES Gaussians; the pairs of a Gaussian are contiguous and summed in order: deterministic. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void sum_records(
-    __global const float *restrict pair_moments,  // [P,RECORD]
-    __global const uint *restrict first_pair,     // [N]
-    __global const uint *restrict tile_count,     // [N]
-    __global float *restrict moments,             // [MOMENTS,S]
-    const uint accumulate,                        // 1: go on from the sums that are there
+    __global const float *restrict pair_sums,  // [P,RECORD]
+    __global const uint *restrict first_pair,  // [N]
+    __global const uint *restrict tile_count,  // [N]
+    __global float *restrict pixel_sums,       // [PIXEL_SUMS,S]
+    const uint accumulate,                     // 1: go on from the sums that are there
     const uint stride,
     const uint count)
 {
@@ -19,20 +19,20 @@ void sum_records(
     float table[LANES][RECORD];
     for (uint lane = 0; lane < LANES; lane++) {
         vstore16((float16)(0.0f), 0, table[lane]);
-        for (uint k = 0; k < MOMENTS && accumulate; k++)
-            table[lane][k] = moments[k * stride + i + lane];
+        for (uint k = 0; k < PIXEL_SUMS && accumulate; k++)
+            table[lane][k] = pixel_sums[k * stride + i + lane];
         float16 sum = vload16(0, table[lane]);
         const uint pairs = i + lane < count ? tile_count[i + lane] : 0;
         const uint first = pairs > 0 ? first_pair[i + lane] : 0;
         for (uint pair = first; pair < first + pairs; pair++)
-            sum += vload16(pair, pair_moments);
+            sum += vload16(pair, pair_sums);
         vstore16(sum, 0, table[lane]);
     }
-    for (uint k = 0; k < MOMENTS; k++) {
+    for (uint k = 0; k < PIXEL_SUMS; k++) {
         float lanes[LANES];
         for (uint lane = 0; lane < LANES; lane++)
             lanes[lane] = table[lane][k];
-        VSTORE(VLOAD(lanes), moments + k * stride + i);
+        VSTORE(VLOAD(lanes), pixel_sums + k * stride + i);
     }
 }
 

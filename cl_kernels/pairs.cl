@@ -29,16 +29,16 @@ static inline void emit_large(__global const float *splat, uint pair, const uint
 /* One item = one place of `order`.  No local memory. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void emit_pairs(
-    __global const float *restrict splats,       // [N,RECORD]
-    __global const uint *restrict tile_box,      // [S] see tiles.h
-    __global const uint *restrict tile_mask,     // [S] see tiles.h
-    __global const uint *restrict order,         // [N] Gaussian at each place
-    __global const uint *restrict pair_offset,   // [N+1] first pair of each place
-    __global uint *restrict pair_tile,           // [P]
-    __global uint *restrict pair_splat,          // [P]
-    __global uint *restrict first_pair,          // [N] first pair of each Gaussian
+    __global const float *restrict splats,      // [N,RECORD]
+    __global const uint *restrict tile_box,     // [S] see tiles.h
+    __global const uint *restrict tile_mask,    // [S] see tiles.h
+    __global const uint *restrict order,        // [N] Gaussian at each place
+    __global const uint *restrict pair_offset,  // [N+1] first pair of each place
+    __global uint *restrict pair_tile,          // [P]
+    __global uint *restrict pair_splat,         // [P]
+    __global uint *restrict first_pair,         // [N] first pair of each Gaussian
     const uint tiles_x,
-    const uint row_begin,                        // of the band of tiles
+    const uint row_begin,                       // of the band of tiles
     const uint row_end,
     const uint count)
 {

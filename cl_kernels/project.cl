@@ -112,7 +112,7 @@ static inline void store_planes(__global float *planes, const VF *values, const 
         VSTORE((touched ? values[k] : (VF)(0.0f)), planes + k * stride + i);
 }
 
-/* Gradients of all parameters from the moments; zero for Gaussians that were culled. */
+/* Gradients of all parameters from the sums over pixels; zero for Gaussians that were culled. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void project_backward(
     __global const float *restrict means,            // [3,S] scene units
@@ -123,7 +123,7 @@ void project_backward(
     __global const float *restrict filter_variance,  // [S] scene units^2
     __constant camera_t *restrict camera,            // [1]
     __global const float *restrict splats,           // [N,RECORD] see splat.h
-    __global const float *restrict moments,          // [MOMENTS,S] see splat.h
+    __global const float *restrict pixel_sums,       // [PIXEL_SUMS,S] see splat.h
     __global float *restrict grad_means,             // [3,S]
     __global float *restrict grad_quats,             // [4,S]
     __global float *restrict grad_log_scales,        // [3,S]
@@ -143,9 +143,9 @@ void project_backward(
         return;
     gradient_t g;
     VF weights[1][16];
-    colour_backward(splats, moments, stride, count, i, &g);
+    colour_backward(splats, pixel_sums, stride, count, i, &g);
     weigh_harmonics(sh_rest, &g, 1, degree, stride, i, weights);
-    gradient_of(means, quats, log_scales, logit_opacity, filter_variance, camera, moments, weights[0], near_plane,
+    gradient_of(means, quats, log_scales, logit_opacity, filter_variance, camera, pixel_sums, weights[0], near_plane,
                 screen_variance, compensate, degree, stride, i, &g);
     store_planes(grad_means, g.means, g.touched, 3, stride, i);
     store_planes(grad_quats, g.quats, g.touched, 4, stride, i);

@@ -25,22 +25,22 @@
 #define SPLAT_POWER_MIN 13 // ln(ALPHA_MIN / opacity)
 
 /* fields of a gradient record, [RECORD] floats: sums over pixels, with p = dL/dpower and w = alpha T */
-#define MOMENT_POWER 0     // p; divided by the opacity it is dL/dopacity
-#define MOMENT_X 1         // p dx
-#define MOMENT_Y 2         // p dy
-#define MOMENT_XX 3        // p dx dx
-#define MOMENT_XY 4        // p dx dy
-#define MOMENT_YY 5        // p dy dy
-#define MOMENT_RED 6       // w dL/dcolour; then green, blue
-#define MOMENT_ABS_X 9     // |dL/dx| of the mean, px^-1; from here on only where MOMENTS says so
-#define MOMENT_ABS_Y 10
-#define MOMENT_WEIGHT 11   // w, where the texture is known: not below 0
-#define MOMENT_TEXTURE 12  // w times the texture at the pixel, there
+#define SUM_POWER 0    // p; divided by the opacity it is dL/dopacity
+#define SUM_X 1        // p dx
+#define SUM_Y 2        // p dy
+#define SUM_XX 3       // p dx dx
+#define SUM_XY 4       // p dx dy
+#define SUM_YY 5       // p dy dy
+#define SUM_RED 6      // w dL/dcolour; then green, blue
+#define SUM_ABS_X 9    // |dL/dx| of the mean, px^-1; from here on only where PIXEL_SUMS says so
+#define SUM_ABS_Y 10
+#define SUM_WEIGHT 11  // w, where the texture is known: not below 0
+#define SUM_TEXTURE 12 // w times the texture at the pixel, there
 
 /* The same sums while they grow, one set per lane. */
 typedef struct {
     VF power, x, y, xx, xy, yy, red, green, blue, abs_x, abs_y, weight, texture;
-} moments_t;
+} pixel_sums_t;
 
 /* A splat seen from one row of pixels. */
 typedef struct {
@@ -116,13 +116,13 @@ static inline VF magnitude(VF t) { return as_VF(as_VI(t) & 0x7fffffff); }
  * no division to undo the transmittance. */
 typedef struct {
     VF t, rest, red, green, blue;
-#if MOMENTS > MOMENT_WEIGHT
+#if PIXEL_SUMS > SUM_WEIGHT
     VF texture;
 #endif
 } grad_pixels_t;
 
 static inline void blend_backward_step(grad_pixels_t *p, const row_splat_t s, const VF pixel, const float *colour,
-                                       moments_t *m)
+                                       pixel_sums_t *m)
 {
     const VF zero = (VF)(0.0f);
     const contribution_t k = contribution_of(s, pixel, p->t);
@@ -142,11 +142,11 @@ static inline void blend_backward_step(grad_pixels_t *p, const row_splat_t s, co
     m->red += k.weight * p->red;
     m->green += k.weight * p->green;
     m->blue += k.weight * p->blue;
-#if MOMENTS > MOMENT_ABS_X
+#if PIXEL_SUMS > SUM_ABS_X
     m->abs_x += magnitude(power * (s.b - 2.0f * s.a * k.dx));
     m->abs_y += magnitude(power * (s.xy * k.dx + s.slope));
 #endif
-#if MOMENTS > MOMENT_WEIGHT
+#if PIXEL_SUMS > SUM_WEIGHT
     const VF known = p->texture >= zero ? k.weight : zero;
     m->weight += known;
     m->texture += known * p->texture;

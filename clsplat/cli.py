@@ -7,9 +7,9 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from clsplat import screen
+from clsplat import terminal
 from clsplat.errors import ClsplatError, ConfigError, DeviceError
-from clsplat.screen import CONSOLE, ERRORS
+from clsplat.terminal import CONSOLE, ERRORS
 
 app = typer.Typer(
     help="3D Gaussian Splatting on any OpenCL device.",
@@ -29,7 +29,7 @@ debugging = False
 def common(debug: Annotated[bool, typer.Option(help="Show tracebacks and every log line.")] = False) -> None:
     global debugging
     debugging = debug
-    screen.start_logging(debug)
+    terminal.start_logging(debug)
 
 
 @app.command()
@@ -66,7 +66,7 @@ def run(
         CONSOLE.print(f"{folder}: up to date; change a setting, or give another --out, to run again", markup=False)
     else:
         experiment.run_pipeline(checked, folder, device, resume)
-    screen.summary(folder)
+    terminal.summary(folder)
 
 
 @app.command()
@@ -109,7 +109,7 @@ def devices(
         print(json.dumps([{**asdict(info), "fault": fault} for info, fault in found], indent=1))
     else:
         for info, fault in found:
-            CONSOLE.print(screen.device_text(info, fault), markup=False)
+            CONSOLE.print(terminal.device_text(info, fault), markup=False)
     if all(fault for _, fault in found):
         raise DeviceError(
             "no OpenCL device works; install a runtime: pip install 'clsplat[pocl]', pip install 'clsplat[intel]', "
@@ -150,8 +150,8 @@ def evaluate(
 ) -> None:
     """Measure a model on a scene's test and training views."""
     from clsplat.files import write_text
+    from clsplat.metrics.perceptual import Perceptual, metric_names
     from clsplat.model_file import ModelFile
-    from clsplat.training.perceptual import Perceptual, metric_names
 
     try:
         factors = [float(text) for text in scales.split(",")]
@@ -226,9 +226,9 @@ def bench(
     """Time the stages of a training step on fixed scenes, beside the device's measured peaks."""
     from dataclasses import asdict
 
-    from clsplat.bench.contest import run_bench
+    from clsplat.bench.cases import run_bench
     from clsplat.bench.peaks import measure_peaks
-    from clsplat.bench.scenes import SIZES, contestant, grown, real_contestant
+    from clsplat.bench.scenes import SIZES, case, grown, real_case
     from clsplat.bench.table import growth_chart, growth_table, table
     from clsplat.files import write_text
     from clsplat.opencl.device import Device, choose
@@ -250,10 +250,10 @@ def bench(
         write_text(growth, growth_chart(sizes))
         CONSOLE.print(f"device: {opened.text}\n{growth_table(sizes)}", markup=False)
         return
-    contestants = {name: contestant(opened, *SIZES[name], settings) for name in names}
+    cases = {name: case(opened, *SIZES[name], settings) for name in names}
     if model is not None and scene is not None:
-        contestants[model.stem] = real_contestant(opened, model, scene, settings)
-    results = run_bench(contestants, peaks, repeats)
+        cases[model.stem] = real_case(opened, model, scene, settings)
+    results = run_bench(cases, peaks, repeats)
     if as_json:
         data = {"device": opened.text, "pipeline": settings.name, "peaks": asdict(peaks)}
         print(json.dumps({**data, "scenes": {name: asdict(result) for name, result in results.items()}}, indent=1))

@@ -6,7 +6,7 @@ import os
 import time
 from pathlib import Path
 
-from clsplat import runner, screen
+from clsplat import runner, terminal
 from clsplat.compare.page import write_comparison
 from clsplat.errors import ClsplatError, ConfigError, Interrupted, MemoryLimitError
 from clsplat.files import write_text
@@ -21,14 +21,14 @@ PAGE = "compare.html"
 
 def run_pipeline(pipeline: Pipeline, out: Path, device: str | None, resume: bool) -> None:
     """Run one pipeline in its folder, with a log and a progress bar."""
-    runner.prepare_folder(out, resume)
-    with screen.logging_to(out / "log.txt"):
+    runner.make_run_folder(out, resume)
+    with terminal.logging_to(out / "log.txt"):
         try:
             state = runner.open_run(pipeline, out, device)
         except ClsplatError as error:
             runner.give_up(out, error)
             raise
-        with screen.progress_bar() as show:
+        with terminal.progress_bar() as show:
             runner.execute(pipeline, state, resume, show)
 
 
@@ -40,7 +40,7 @@ def run(experiment: Experiment, out: Path, device: str | None, resume: bool) -> 
     """
     if resume and (out / "pipeline.yaml").exists() and "matrix" not in (read_yaml(out / "pipeline.yaml").data or {}):
         raise ConfigError(f"{out}: holds a single run, not those of a matrix; give another --out")
-    runner.prepare_folder(out, resume)
+    runner.make_run_folder(out, resume)
     write_text(out / "pipeline.yaml", experiment.text)
     failures: dict[str, ClsplatError] = {}
     for number, cell in enumerate(experiment.cells, 1):

@@ -9,17 +9,17 @@ import numpy as np
 
 from clsplat.errors import DataError
 from clsplat.files import atomic
-from clsplat.gaussians.model import Gaussians
+from clsplat.filters import Dilation, Mip, ModelSettings
 from clsplat.gaussians.ply import read_ply
+from clsplat.gaussians.tables import Gaussians
+from clsplat.metrics.perceptual import Perceptual
+from clsplat.metrics.views import PSNR_AND_SSIM, mean, measure, render_view
 from clsplat.opencl.device import Device, choose
-from clsplat.render.renderer import Renderer
+from clsplat.render.rasterizer import Rasterizer
 from clsplat.scene.detect import read_scene
 from clsplat.scene.images import write_image
 from clsplat.stages.render import image_path
-from clsplat.training.filters import Dilation, Mip, ModelSettings
-from clsplat.training.metrics import NOTHING_MORE, mean, measure, render_view
-from clsplat.training.perceptual import Perceptual
-from clsplat.training.targets import BACKGROUNDS, Targets
+from clsplat.views.photographs import BACKGROUNDS, Photographs
 
 LOG = logging.getLogger("clsplat")
 
@@ -47,11 +47,11 @@ class ModelFile:
                 setattr(self.model, name, float(file.rendering[name]))
         background = file.rendering.get("background")
         self.background = background if background in BACKGROUNDS else self.scene.background
-        self.renderer = Renderer(self.device)
+        self.rasterizer = Rasterizer(self.device)
 
     def render(self, split: str, out: Path, kind: str) -> int:
         """Write an image for each view of a split; return their number."""
-        targets = Targets(self.device, self.background)
+        targets = Photographs(self.device, self.background)
         views = self.scene.split(split)
         if not views:
             raise DataError(f"{self.scene.path}: has no {split} views")
@@ -59,9 +59,9 @@ class ModelFile:
             camera = targets.camera(view)
             path = image_path(out, view.name, f".{kind}")
             if kind == "png":
-                write_image(path, render_view(self.renderer, self.model, camera, targets.background_array))
+                write_image(path, render_view(self.rasterizer, self.model, camera, targets.background_array))
             else:
-                frame = self.renderer.forward(self.model, camera, targets.background_array)
+                frame = self.rasterizer.forward(self.model, camera, targets.background_array)
                 planes = frame.image.get()[:, : camera.height, : camera.width]
                 buffer = io.BytesIO()
                 np.save(buffer, np.ascontiguousarray(planes.transpose(1, 2, 0)), allow_pickle=False)
@@ -69,14 +69,14 @@ class ModelFile:
                     stream.write(buffer.getvalue())
         return len(views)
 
-    def evaluate(self, scales: list[float], perceptual: Perceptual = NOTHING_MORE) -> dict[str, Any]:
+    def evaluate(self, scales: list[float], perceptual: Perceptual = PSNR_AND_SSIM) -> dict[str, Any]:
         """Metrics by split and scale, by what the photographs' sizes are divided, with the keys of metrics.json."""
         metrics: dict[str, Any] = {"test": {}, "train": {}}
         for scale in scales:
             scene = self.photographs.downscaled(scale)
-            targets = Targets(self.device, self.background)
+            targets = Photographs(self.device, self.background)
             for split in ("test", "train"):
                 if scene.split(split):
-                    results = measure(self.renderer, self.model, scene.split(split), targets, perceptual)
+                    results = measure(self.rasterizer, self.model, scene.split(split), targets, perceptual)
                     metrics[split][f"{scale:g}"] = mean(results, perceptual)
         return {**metrics, "gaussians": self.model.gaussians.count, "device": self.device.text}

@@ -22,10 +22,11 @@ from ruamel.yaml import YAML
 
 from clsplat import resource_dir
 from clsplat.errors import ConfigError
+from clsplat.filters import ModelSettings
 from clsplat.opencl.device import Schedule
 from clsplat.prepare.cache import Planned, plan
 from clsplat.prepare.steps import STEPS, AnyStep
-from clsplat.render.renderer import RECORD, UNLIMITED, Budget
+from clsplat.render.rasterizer import RECORD, UNLIMITED, Budget
 from clsplat.render.tiles import Sort
 from clsplat.scene.detect import read_scene
 from clsplat.scene.scene import Alpha, Background, Scene
@@ -34,8 +35,7 @@ from clsplat.settings_errors import explain
 from clsplat.stages import STAGES, AnyStage
 from clsplat.stages.base import Stage
 from clsplat.stages.optimize import Optimize
-from clsplat.training.filters import ModelSettings
-from clsplat.training.sampling import Sampling
+from clsplat.views.order import Sampling
 from clsplat.yaml_file import Document, parse_scalar, read_yaml
 
 LOG = logging.getLogger("clsplat")
@@ -82,7 +82,7 @@ class RasterizerSettings(Settings):
     launch_tiles: Annotated[int, Field(ge=0)] = 0  # tiles blended by one launch, for watchdogs of displays; 0: all
 
     def budget(self) -> Budget | None:
-        """How much the renderer does at a time."""
+        """How much the rasterizer does at a time."""
         if self.pair_budget is None and self.launch_tiles == 0:
             return None
         records = UNLIMITED if self.pair_budget is None else (self.pair_budget << 20) // (4 * RECORD)

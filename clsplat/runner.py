@@ -14,19 +14,19 @@ from clsplat.files import unwritable, write_text
 from clsplat.opencl.device import Device, choose
 from clsplat.pipeline import Pipeline, load, prepared_beside
 from clsplat.prepare.cache import NOTE, Planned, note, noted, prepare
-from clsplat.render.renderer import Renderer
+from clsplat.render.rasterizer import Rasterizer
 from clsplat.stages.evaluate import Evaluate
 from clsplat.stages.export import Export
 from clsplat.stages.optimize import Optimize
 from clsplat.training import checkpoint
 from clsplat.training.records import Records
 from clsplat.training.run import Progress, Run
-from clsplat.training.targets import Targets
+from clsplat.views.photographs import Photographs
 
 LOG = logging.getLogger("clsplat")
 
 
-def prepare_folder(out: Path, resume: bool) -> None:
+def make_run_folder(out: Path, resume: bool) -> None:
     """Make the run folder.  Raises ConfigError when it holds another run, OutputError when it cannot be written."""
     if (out / "pipeline.yaml").exists() and not resume:
         raise ConfigError(f"{out}: already holds a run; --resume goes on with it, or give another --out")
@@ -88,8 +88,8 @@ def open_run(pipeline: Pipeline, out: Path, words: str | None) -> Run:
         name=settings.name,
         seed=settings.seed,
         pipeline=pipeline.resolved(),
-        renderer=Renderer(device, settings.rasterizer.sort, settings.rasterizer.budget()),
-        targets=Targets(device, background, None if budget is None else budget << 20, out / "straightened"),
+        rasterizer=Rasterizer(device, settings.rasterizer.sort, settings.rasterizer.budget()),
+        targets=Photographs(device, background, None if budget is None else budget << 20, out / "straightened"),
         model_settings=settings.model,
         sampling=settings.scene.sampling,
         prepared=note(planned) if planned else None,

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
-from clsplat.gaussians.model import Gaussians, Model
+from clsplat.gaussians.tables import DeviceModel, Gaussians
 from clsplat.opencl.device import Device
-from clsplat.render.renderer import DeviceCamera, upload_camera
+from clsplat.render.rasterizer import DeviceCamera, upload_camera
 from clsplat.scene.scene import Camera, View
 from tests import reference as ref
 
@@ -30,9 +30,9 @@ class Case:
     def size(self) -> tuple[int, int]:
         return self.view.camera.width, self.view.camera.height
 
-    def model(self, device: Device) -> Model:
+    def model(self, device: Device) -> DeviceModel:
         gaussians = Gaussians(device, self.parameters)
-        return Model(gaussians, self.degree, self.near, self.variance, self.compensate)
+        return DeviceModel(gaussians, self.degree, self.near, self.variance, self.compensate)
 
     def device_camera(self, device: Device) -> DeviceCamera:
         return upload_camera(device, self.view)

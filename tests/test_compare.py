@@ -114,7 +114,7 @@ def test_the_page_shows_the_differing_settings_only(make_run, tmp_path):
 
 def crops_of(*folders: Path) -> str:
     runs = [RunFolder.read(folder) for folder in folders]
-    return crops.crops([crops.Contestant("run", run) for run in runs], *runs[0].scene.read(runs[0].photographs))
+    return crops.crops([crops.Case("run", run) for run in runs], *runs[0].scene.read(runs[0].photographs))
 
 
 def test_crops_are_where_the_runs_differ(make_run, monkeypatch):

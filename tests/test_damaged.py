@@ -21,21 +21,21 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.colmap_writer import CameraEntry, ImageEntry, Model, PointEntry, write_scene
+from tests.colmap_writer import CameraEntry, DeviceModel, ImageEntry, PointEntry, write_scene
 
 SECONDS, BYTES = 5.0, 1 << 30
 CAMERA = CameraEntry(1, "PINHOLE", 64, 48, (60.0, 60.0, 32.0, 24.0))
 NAMES = [f"{i}.png" for i in range(6)]
 
 
-def healthy(**changes: object) -> Model:
+def healthy(**changes: object) -> DeviceModel:
     """Six cameras in a row that look at points four units away."""
     images = [ImageEntry(name, translation=(0.3 * i - 0.8, 0.0, 4.0)) for i, name in enumerate(NAMES)]
     points = [PointEntry((0.2 * (i % 7) - 0.6, 0.2 * (i // 7) - 0.6, 0.05 * (i % 3))) for i in range(49)]
-    return replace(Model([CAMERA], images, points), **changes)
+    return replace(DeviceModel([CAMERA], images, points), **changes)
 
 
-def scene(path: Path, model: Model | None = None, kind: str = "bin", newline: str = "\n") -> Path:
+def scene(path: Path, model: DeviceModel | None = None, kind: str = "bin", newline: str = "\n") -> Path:
     """Write a model and a photograph for each image."""
     model = model or healthy()
     write_scene(path, model, kind, newline)
@@ -214,7 +214,7 @@ CASES: dict[str, tuple[Callable[[Path], object], int, str]] = {
 }
 
 
-def named(pattern: str) -> Model:
+def named(pattern: str) -> DeviceModel:
     model = healthy()
     return replace(model, images=[replace(image, name=pattern.format(i)) for i, image in enumerate(model.images)])
 
@@ -263,9 +263,9 @@ def test_damaged_dataset(said, name):
 
 def main(base: Path, count: int) -> None:
     """Give every dataset to the command line, in this process."""
-    from clsplat import screen
+    from clsplat import terminal
 
-    screen.ERRORS.width = 10_000
+    terminal.ERRORS.width = 10_000
     cases = []
     for i in range(count):
         start = time.process_time()  # waiting for other processes does not count
@@ -279,11 +279,11 @@ def main(base: Path, count: int) -> None:
 
 def one_run(arguments: list[str]) -> dict[str, object]:
     """Run the command line; catch what it prints as errors, and how it ends."""
-    from clsplat import cli, screen
+    from clsplat import cli, terminal
 
     code: object = 0
     sys.argv = ["clsplat", *arguments]
-    with screen.ERRORS.capture() as errors, contextlib.redirect_stdout(io.StringIO()):
+    with terminal.ERRORS.capture() as errors, contextlib.redirect_stdout(io.StringIO()):
         try:
             cli.main()
         except SystemExit as end:

@@ -8,12 +8,12 @@ import pytest
 
 from clsplat import runner
 from clsplat.errors import Interrupted
-from clsplat.gaussians.model import PARAMETERS
 from clsplat.gaussians.ply import read_ply, write_ply
+from clsplat.gaussians.tables import PARAMETERS
+from clsplat.metrics.views import render_view
 from clsplat.model_file import ModelFile
 from clsplat.pipeline import load
 from clsplat.stages.export import baked
-from clsplat.training.metrics import render_view
 from clsplat.training.run import Progress, Run
 from tests.reference_filter import filtered
 from tests.scenes import random_case, with_world_filter
@@ -62,7 +62,7 @@ def test_the_filter_follows_and_then_stays(finished):
 def test_the_same_bits_and_the_same_after_an_interruption(finished, tiny_scene, pipeline, tmp_path):
     """Stopped just after a density edit and just after a refresh."""
     checked = load(pipeline, [f"scene.path='{tiny_scene}'", *MIP, *LEVELS])
-    runner.prepare_folder(tmp_path, resume=False)
+    runner.make_run_folder(tmp_path, resume=False)
     stops = [21, 33]
     while stops:
         run = runner.open_run(checked, tmp_path, None)
@@ -125,14 +125,14 @@ def test_files_render_as_the_run_does(finished, tiny_scene, name):
     for view in finished.scene.downscaled(1).split("test"):
         camera = finished.targets.camera(view)
         images = [
-            finished.renderer.forward(model, camera, finished.targets.background_array).image.get()
+            finished.rasterizer.forward(model, camera, finished.targets.background_array).image.get()
             for model in (finished.trained, on_device(finished, opened))
         ]
         difference = np.abs(images[0] - images[1])
         assert np.quantile(difference, 0.999) < 2e-5
         assert difference.max() < 2 / 255
-        eight_bits = render_view(finished.renderer, finished.trained, camera, finished.targets.background_array)
-        other = render_view(finished.renderer, on_device(finished, opened), camera, finished.targets.background_array)
+        eight_bits = render_view(finished.rasterizer, finished.trained, camera, finished.targets.background_array)
+        other = render_view(finished.rasterizer, on_device(finished, opened), camera, finished.targets.background_array)
         assert np.abs(eight_bits.astype(int) - other).max() <= 1
     measured = opened.evaluate([1, 2, 4])["test"]
     for scale, values in finished.metrics["test"].items():

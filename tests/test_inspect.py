@@ -20,7 +20,7 @@ from clsplat.inspect.survey import bend
 from clsplat.scene.detect import read_scene
 from clsplat.scene.images import load_image, load_mask
 from clsplat.scene.lens import Lens
-from tests.colmap_writer import CameraEntry, ImageEntry, Model, PointEntry, tiny_model, write_model, write_scene
+from tests.colmap_writer import CameraEntry, DeviceModel, ImageEntry, PointEntry, tiny_model, write_model, write_scene
 from tests.data_sets import data_set
 from tests.test_cli import clsplat
 from tests.test_image_headers import with_exif
@@ -29,7 +29,7 @@ COUNT = 24  # cameras on a circle of radius 4 that look at points in a ball of r
 SIZE = (64, 48)
 
 
-def orbit() -> Model:
+def orbit() -> DeviceModel:
     images = []
     for i, angle in enumerate(np.linspace(0, 2 * np.pi, COUNT, endpoint=False)):
         backwards = np.array([np.cos(angle), np.sin(angle), 0.0])
@@ -39,10 +39,10 @@ def orbit() -> Model:
         images.append(ImageEntry(f"{i:02}.png", 1, (w, x, y, z), (0.0, 0.0, 4.0)))
     places = np.random.default_rng(0).uniform(-0.5, 0.5, (200, 3))
     camera = CameraEntry(1, "PINHOLE", *SIZE, (60.0, 60.0, 32.0, 24.0))
-    return Model([camera], images, [PointEntry(place) for place in places.tolist()])
+    return DeviceModel([camera], images, [PointEntry(place) for place in places.tolist()])
 
 
-def write(path: Path, model: Model, kind: str = "bin", size: tuple[int, int] = SIZE) -> Path:
+def write(path: Path, model: DeviceModel, kind: str = "bin", size: tuple[int, int] = SIZE) -> Path:
     """Write a scene with a real photograph for each image."""
     write_scene(path, model, kind)
     for image in model.images:

@@ -10,15 +10,15 @@ import cv2
 import numpy as np
 import pytest
 
+from clsplat.metrics.perceptual import ssim_map
+from clsplat.metrics.views import psnr
 from clsplat.render.workspace import Workspace
 from clsplat.scene.colmap import read_colmap
 from clsplat.scene.images import load_image, load_mask
 from clsplat.scene.lens import Lens
 from clsplat.scene.photographs import load_photograph
 from clsplat.scene.scene import Camera, View
-from clsplat.training.metrics import psnr
-from clsplat.training.perceptual import ssim_map
-from clsplat.training.targets import cover, unpack
+from clsplat.views.photographs import cover, unpack
 from tests import reference_loss as ref_loss
 from tests.data_sets import data_set
 from tests.kernels.test_loss import SIZES, camera_of

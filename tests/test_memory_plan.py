@@ -3,7 +3,7 @@
 import pytest
 
 from clsplat.errors import MemoryLimitError
-from clsplat.gaussians.model import Gradients
+from clsplat.gaussians.tables import Gradients
 from clsplat.training.memory import FRAME_GAUSSIAN, MemoryPlan, plan
 from tests.scenes import random_case
 from tests.test_cli import clsplat
@@ -21,7 +21,7 @@ def test_bytes_come_from_the_tables(device, rng):
     held = sum(array.nbytes for array in (*gradients.arrays.values(), gradients.mean2d))
     frame = FRAME_GAUSSIAN + 4 * 9 + held // gaussians.capacity
     assert plan(gaussians, 0, 0).gaussian == parameters + frame
-    assert plan(gaussians, 0, 0, moments=13).gaussian == parameters + frame + 4 * 4
+    assert plan(gaussians, 0, 0, pixel_sums=13).gaussian == parameters + frame + 4 * 4
     gaussians.add("more", 7)
     assert plan(gaussians, 0, 0).gaussian == parameters + frame + 28
     assert plan(gaussians, 1000, 256).fixed == 1000 + 256 * 92
@@ -55,7 +55,7 @@ def test_growth_stops_where_memory_ends(tiny_scene, tmp_path, monkeypatch):
 
 def test_photographs_read_again_and_again_train_to_the_same_bits(tiny_scene, tmp_path, monkeypatch):
     train(tiny_scene, tmp_path / "held")
-    monkeypatch.setattr("clsplat.training.targets.BUDGET_SHARE", 1e-9)
+    monkeypatch.setattr("clsplat.views.photographs.BUDGET_SHARE", 1e-9)
     assert train(tiny_scene, tmp_path / "tight").targets.budget < 100
     held, tight = ((tmp_path / name / "point_cloud.ply").read_bytes() for name in ("held", "tight"))
     assert held == tight
@@ -70,6 +70,6 @@ def test_dry_run_says_what_fits(tiny_scene, tmp_path):
 def test_bands_and_short_launches_train_to_the_same_bits(tiny_scene, tmp_path):
     train(tiny_scene, tmp_path / "whole")
     cut = train(tiny_scene, tmp_path / "cut", "rasterizer.pair_budget=1", "rasterizer.launch_tiles=2")
-    assert len(cut.renderer._split(cut.targets.camera(cut.scene.views[0]))) > 1
+    assert len(cut.rasterizer._split(cut.targets.camera(cut.scene.views[0]))) > 1
     whole, banded = ((tmp_path / name / "point_cloud.ply").read_bytes() for name in ("whole", "cut"))
     assert whole == banded

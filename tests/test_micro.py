@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from clsplat.gaussians.ply import read_ply
+from clsplat.metrics.distribution import SHARES, distribution
 from clsplat.pages.svg import Line, curve
-from clsplat.training.census import SHARES, census
 from tests.scenes import random_case
 from tests.test_training import train
 
@@ -36,7 +36,7 @@ def test_every_rule_and_penalty_acts(finished):
         total, grown = (sum(edit[key][name] for edit in edits) for key in ("causes", "grown"))
         assert total > 0, name
         assert 0 < grown <= total if name in growing else grown == 0, name
-    found = [line for line in lines if line["kind"] == "census"]
+    found = [line for line in lines if line["kind"] == "distribution"]
     assert found[-1]["step"] == 50
     assert all(len(line["anisotropy"]) == len(SHARES) for line in found)
     page = (finished.out / "report.html").read_text()
@@ -93,14 +93,14 @@ def test_penalties_move_gaussians(tiny_scene, tmp_path, penalty):
 def test_a_ramp_of_weights_needs_no_more_memory(finished, tiny_scene, tmp_path):
     steady = LOSSES.replace("[[10, 0.8], [40, 0.4]]", "0.8")
     run = train(tiny_scene, tmp_path / "run", steady, *SETTINGS[1:])
-    assert finished.renderer.workspace._arrays.keys() == run.renderer.workspace._arrays.keys()
+    assert finished.rasterizer.workspace._arrays.keys() == run.rasterizer.workspace._arrays.keys()
 
 
 def test_census_of_known_gaussians(device, rng):
     case = random_case(rng, 5)
     case.parameters["log_scales"][:] = np.log([[1, 1, 1], [1, 1, 2], [1, 1, 3], [1, 1, 4], [1, 1, 5]])
     case.parameters["logit_opacity"][:] = 0
-    found = census(case.model(device).gaussians)
+    found = distribution(case.model(device).gaussians)
     np.testing.assert_allclose(found["anisotropy"], np.quantile([1, 2, 3, 4, 5], SHARES), rtol=1e-6)
     np.testing.assert_allclose(found["size"][2], np.sqrt(11 / 3), rtol=1e-6)
     assert found["opacity"] == [0.5] * 5

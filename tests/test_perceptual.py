@@ -8,9 +8,9 @@ import pytest
 from pydantic import ValidationError
 
 from clsplat.errors import ConfigError, DataError
+from clsplat.metrics.lpips import Lpips
+from clsplat.metrics.perceptual import Perceptual, flip, metric_names, ms_ssim, ms_ssim_scales
 from clsplat.stages.evaluate import Evaluate
-from clsplat.training.lpips import Lpips
-from clsplat.training.perceptual import Perceptual, flip, metric_names, ms_ssim, ms_ssim_scales
 from tests import reference_loss as ref_loss
 from tests.onnx_writer import distance_network
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from clsplat.errors import DataError, OutputError
-from clsplat.gaussians.model import PARAMETERS
 from clsplat.gaussians.ply import read_ply, write_ply
+from clsplat.gaussians.tables import PARAMETERS
 from tests.data_sets import data_set
 from tests.scenes import random_case
 

@@ -593,7 +593,7 @@ def test_ssim_border_is_zero_padded():
 
 
 def test_adam_is_the_sum_it_stands_for(rng):
-    """Moments after t steps: (1-β) Σ β^(t-k) g_k^p, divided by 1-β^t."""
+    """Pixel sums after t steps: (1-β) Σ β^(t-k) g_k^p, divided by 1-β^t."""
     steps, rate = 6, 0.01
     gradients = rng.normal(0, 1, (steps, 4))
     parameter, moment1, moment2 = np.ones(4), np.zeros(4), np.zeros(4)

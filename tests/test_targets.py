@@ -7,7 +7,7 @@ import pytest
 
 from clsplat.errors import DataError
 from clsplat.scene.detect import read_scene
-from clsplat.training.targets import Targets
+from clsplat.views.photographs import Photographs
 
 
 def test_buffers_are_counted_while_they_live(device):
@@ -26,7 +26,7 @@ def test_buffers_are_counted_while_they_live(device):
 def test_photographs_keep_to_the_budget(device, tiny_scene, kept):
     views = read_scene(tiny_scene).split("train")
     size = 3 * views[0].camera.width * views[0].camera.height
-    targets, plenty = Targets(device, "white", budget=kept * size), Targets(device, "white")
+    targets, plenty = Photographs(device, "white", budget=kept * size), Photographs(device, "white")
     for turn in range(3):
         targets.announce(views[turn : turn + 2])
         for view in views:
@@ -40,7 +40,7 @@ def test_a_damaged_photograph_read_ahead_is_reported_when_it_is_asked_for(device
     damaged = tmp_path / "damaged.png"
     damaged.write_bytes(b"not an image")
     view = replace(read_scene(tiny_scene).split("train")[0], image_path=damaged)
-    targets = Targets(device, "white")
+    targets = Photographs(device, "white")
     targets.announce([view])
     with pytest.raises(DataError, match=r"damaged\.png"):
         targets.get(view)

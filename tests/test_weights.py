@@ -3,8 +3,8 @@
 import pytest
 from pydantic import ValidationError
 
-from clsplat.training.losses import L1
-from clsplat.training.weights import at_step
+from clsplat.losses.image import L1
+from clsplat.schedule import at_step
 
 RAMP = [[100, 0.8], [200, 0.4], [300, 4.0]]
 

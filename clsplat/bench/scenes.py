@@ -7,15 +7,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.bench.contest import Contestant
-from clsplat.gaussians.model import SH_C0
+from clsplat.bench.cases import Case
 from clsplat.gaussians.ply import Parameters, is_splat, read_ply
+from clsplat.gaussians.tables import SH_C0
 from clsplat.opencl.device import Device
 from clsplat.pipeline import PipelineFile
 from clsplat.scene.points import read_points_ply
 from clsplat.scene.scene import Camera, View
 from clsplat.stages.init import from_points
-from clsplat.training.targets import Target, Targets
+from clsplat.views.photographs import Photograph, Photographs
 
 FOCAL = 400.0  # px, of the synthetic scenes
 SIZE = 2.2  # px, standard deviation of their splats
@@ -45,27 +45,25 @@ def synthetic(width: int, height: int, count: int, size: float = SIZE) -> tuple[
     return parameters, View("bench", camera, np.eye(4)[:3], Path("bench"))
 
 
-def contestant(
-    device: Device, width: int, height: int, count: int, settings: PipelineFile, size: float = SIZE
-) -> Contestant:
+def case(device: Device, width: int, height: int, count: int, settings: PipelineFile, size: float = SIZE) -> Case:
     """Open a synthetic scene with a noise image for its photograph."""
     parameters, view = synthetic(width, height, count, size)
-    targets = Targets(device, "black")
+    targets = Photographs(device, "black")
     shape = (3, height, width)
     pixels = np.random.default_rng(1).integers(0, 256, shape, dtype=np.uint8)
-    return Contestant(device, parameters, Target(targets.camera(view), device.upload(pixels)), "black", settings)
+    return Case(device, parameters, Photograph(targets.camera(view), device.upload(pixels)), "black", settings)
 
 
-def real_contestant(device: Device, model: Path, scene: Path, settings: PipelineFile) -> Contestant:
+def real_case(device: Device, model: Path, scene: Path, settings: PipelineFile) -> Case:
     """Open a splat PLY, or a point cloud as `init` would begin with it, at the first training view of a scene."""
     opened, background = settings.scene.read(scene)
-    targets = Targets(device, background)
+    targets = Photographs(device, background)
     parameters = read_ply(model).parameters if is_splat(model) else from_points(read_points_ply(model), 0.1, 3)
-    return Contestant(device, parameters, targets.get(opened.split("train")[0]), background, settings)
+    return Case(device, parameters, targets.get(opened.split("train")[0]), background, settings)
 
 
-def grown(device: Device, settings: PipelineFile) -> Iterator[Contestant]:
+def grown(device: Device, settings: PipelineFile) -> Iterator[Case]:
     """Open scenes of 50 000 to a million Gaussians over one image, as much smaller as there are more of them."""
     width, height, most = SIZES["C"]
     for count in GROWTH_COUNTS:
-        yield contestant(device, width, height, count, settings, SIZE * (most / count) ** 0.5)
+        yield case(device, width, height, count, settings, SIZE * (most / count) ** 0.5)

@@ -4,7 +4,7 @@ import statistics
 from collections.abc import Sequence
 from typing import Any
 
-from clsplat.bench.contest import Result
+from clsplat.bench.cases import Result
 from clsplat.pages.svg import Line, curve
 
 STANDALONE = 'xmlns="http://www.w3.org/2000/svg" width="460" height="220"'

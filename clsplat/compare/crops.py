@@ -9,13 +9,13 @@ import cv2
 import numpy as np
 
 from clsplat.compare.run_folder import RunFolder
+from clsplat.metrics.perceptual import Image
+from clsplat.metrics.views import psnr
 from clsplat.pages.page import embedded
 from clsplat.scene.images import load_image
 from clsplat.scene.scene import Background, Scene, View
 from clsplat.stages.render import image_path
-from clsplat.training.metrics import psnr
-from clsplat.training.perceptual import Image
-from clsplat.training.targets import BACKGROUNDS
+from clsplat.views.photographs import BACKGROUNDS
 
 LARGEST, SMALLEST = 192, 48  # px, side of a crop: a third of the image within these limits
 SHOWN = 4  # crops of a scene, each of another view
@@ -45,7 +45,7 @@ document.addEventListener("input", event => {
 
 
 @dataclass(frozen=True)
-class Contestant:
+class Case:
     """A run under the name that the page gives it."""
 
     name: str  # HTML
@@ -58,7 +58,7 @@ class Crop:
 
     view: View
     truth: Image
-    renders: list[Image]  # whole, by contestant
+    renders: list[Image]  # whole, by case
     x: int
     y: int
     side: int
@@ -68,18 +68,18 @@ class Crop:
         return np.ascontiguousarray(image[self.y : self.y + self.side, self.x : self.x + self.side])
 
 
-def crops(contestants: Sequence[Contestant], scene: Scene, background: Background) -> str:
+def crops(cases: Sequence[Case], scene: Scene, background: Background) -> str:
     """Crops of the views that all runs of one scene rendered, where the renders differ most; "" when there is none.
 
     Raises DataError when a render or a photograph is damaged.
     """
-    matched = [view for view in scene.views if all(_file(c.run, view).is_file() for c in contestants)]
+    matched = [view for view in scene.views if all(_file(c.run, view).is_file() for c in cases)]
     chosen: list[Crop] = []  # one view at a time in memory, and the best ones
     for view in matched:
-        renders = [load_image(replace(view, image_path=_file(c.run, view))) for c in contestants]
+        renders = [load_image(replace(view, image_path=_file(c.run, view))) for c in cases]
         chosen.append(_largest_difference(view, load_image(view, BACKGROUNDS[background]), renders))
         chosen = sorted(chosen, key=lambda crop: -crop.spread)[:SHOWN]
-    return "".join(_section(crop, contestants) for crop in chosen)
+    return "".join(_section(crop, cases) for crop in chosen)
 
 
 def _file(run: RunFolder, view: View) -> Path:
@@ -98,7 +98,7 @@ def _largest_difference(view: View, truth: Image, renders: list[Image]) -> Crop:
     return Crop(view, truth, renders, int(x), int(y), side, float(inside.max()))
 
 
-def _section(crop: Crop, contestants: Sequence[Contestant]) -> str:
+def _section(crop: Crop, cases: Sequence[Case]) -> str:
     height, width = crop.truth.shape[:2]
     place = (
         f"left:{100 * crop.x / width:.2f}%;top:{100 * crop.y / height:.2f}%;"
@@ -110,13 +110,13 @@ def _section(crop: Crop, contestants: Sequence[Contestant]) -> str:
     cells = [
         f'<div><div class=whole><img src="{embedded(small)}" alt=""><i style="{place}"></i></div><p>photograph</div>'
     ]
-    for contestant, image in zip(contestants, crop.renders, strict=True):
+    for case, image in zip(cases, crop.renders, strict=True):
         render = crop.of(image)
         slider = '<input type=range value=50 aria-label="share of the render; the rest is the photograph">'
         tags = "<b>render</b><b>photograph</b>"
         cells.append(
             f'<div><div class=slider><img src="{embedded(render, ".png")}" alt="">{slider}{tags}</div>'
-            f"<p>{contestant.name}<br>{psnr(render, truth):.2f} dB in this crop</div>"
+            f"<p>{case.name}<br>{psnr(render, truth):.2f} dB in this crop</div>"
         )
     name = html.escape(crop.view.name)
     style = f"--truth:url({embedded(truth, '.png')})"

@@ -82,7 +82,7 @@ def _scale_charts(rows: Sequence[Row], split: str) -> list[str]:
 
 def _crops(rows: Sequence[Row]) -> str:
     """Crops of each row's first run; a scene that has moved away since leaves a remark."""
-    contestants = [crops.Contestant(tables.label(row.variant), row.runs[0]) for row in rows]
+    cases = [crops.Case(tables.label(row.variant), row.runs[0]) for row in rows]
     try:
         settings = rows[0].runs[0].scene
         photographs, background = settings.read(rows[0].runs[0].photographs)
@@ -90,7 +90,7 @@ def _crops(rows: Sequence[Row]) -> str:
     except (DataError, ConfigError) as error:
         LOG.warning("no crops: %s", error)
         return f"<p class=note>no crops: {html.escape(str(error))}</p>"
-    shown = crops.crops(contestants, scene, background)
+    shown = crops.crops(cases, scene, background)
     if not shown:
         return "<p class=note>no crops: no view that all runs rendered; `- render` among the stages does it</p>"
     place = "the runs differ most" if len(rows) > 1 else "the run differs most from the photograph"

@@ -4,7 +4,7 @@
 
 f_rest is channel-major (all red, all green, all blue); opacity is a logit, scales are logarithms, rot is (w, x, y, z).
 Normals are written as zeros.  Where a world filter is not yet part of scales and opacity, `filter_3D` follows, its
-standard deviation (Mip-Splatting).  Comments carry the numbers a renderer needs, and the mode by which viewers know
+standard deviation (Mip-Splatting).  Comments carry the numbers a rasterizer needs, and the mode by which viewers know
 that opacities lose what a filter on the screen spreads out: `SplatRenderMode: mip`, else `default`.
 """
 
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from clsplat.errors import DataError
 from clsplat.files import atomic
-from clsplat.gaussians.model import PARAMETERS, sh_coefficients
+from clsplat.gaussians.tables import PARAMETERS, sh_coefficients
 
 HEADER_LIMIT = 1 << 16  # bytes; real headers have about 1.5 KB
 COMMENT = "comment clsplat "

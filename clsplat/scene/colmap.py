@@ -1,4 +1,4 @@
-"""Read COLMAP folders: which model, which photographs, which cameras a pinhole renderer can use."""
+"""Read COLMAP folders: which model, which photographs, which cameras a pinhole rasterizer can use."""
 
 import logging
 import math

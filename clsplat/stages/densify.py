@@ -7,11 +7,11 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
+from clsplat.density.edit import SceneScale, densify
+from clsplat.density.rules import AnyRule
 from clsplat.errors import NumericError
-from clsplat.gaussians.model import PARAMETERS
+from clsplat.gaussians.tables import PARAMETERS
 from clsplat.stages.base import Stage
-from clsplat.training.density import Measures, densify
-from clsplat.training.rules import AnyRule
 from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
@@ -44,8 +44,8 @@ class Densify(Stage):
         if run.stats is None:
             return
         gaussians = run.trained.gaussians
-        measures = Measures(run.scene.extent, run.texture_quantile)
-        tiler = run.renderer.tiler
+        measures = SceneScale(run.scene.extent, run.texture_quantile)
+        tiler = run.rasterizer.tiler
         fits = run.memory_plan().most
         most = min(fits, self.max_gaussians or fits)
         change = densify(gaussians, run.stats, self.rules, tiler, measures, run.step, run.seed, most)

@@ -5,10 +5,10 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, field_validator
 
+from clsplat.metrics.lpips import InputRange
+from clsplat.metrics.perceptual import Metric, Perceptual
+from clsplat.metrics.views import mean, measure
 from clsplat.stages.base import Stage
-from clsplat.training.lpips import InputRange
-from clsplat.training.metrics import mean, measure
-from clsplat.training.perceptual import Metric, Perceptual
 from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
@@ -54,7 +54,7 @@ class Evaluate(Stage):
             views = run.photographs.downscaled(scale).split(self.split)
             trained = scale in run.scene.scales
             targets = run.targets if trained else run.targets.fresh()
-            results = measure(run.renderer, run.trained, views, targets, perceptual)
+            results = measure(run.rasterizer, run.trained, views, targets, perceptual)
             for result in results:
                 run.records.add(run.step, "view", split=self.split, scale=scale, **result.line())
             averages = mean(results, perceptual)

@@ -6,8 +6,8 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from clsplat import __version__
-from clsplat.gaussians.model import PARAMETERS
 from clsplat.gaussians.ply import Parameters, read_ply, write_ply
+from clsplat.gaussians.tables import PARAMETERS
 from clsplat.stages.base import Stage
 from clsplat.training.run import Run
 

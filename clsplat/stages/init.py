@@ -12,8 +12,8 @@ from pydantic import Field
 from scipy.spatial import cKDTree
 
 from clsplat.errors import DataError
-from clsplat.gaussians.model import SH_C0, Gaussians, sh_coefficients
 from clsplat.gaussians.ply import Parameters, read_ply
+from clsplat.gaussians.tables import SH_C0, Gaussians, sh_coefficients
 from clsplat.scene.images import load_image, read_image
 from clsplat.scene.plane_sweep import swept_points
 from clsplat.scene.scene import PointCloud, Scene, View
@@ -22,7 +22,7 @@ from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
 DISTANCE2_MIN = 1.0e-7  # scene units²: coincident points still get a size
-FEWEST = 100  # points of a sweep that are worth starting from
+MIN_SWEPT_POINTS = 100  # points of a sweep that are worth starting from
 RANDOM_BOX = 1.3 / 4.03  # half side of the box by camera distance: what 3DGS takes for the Blender scenes
 
 
@@ -82,7 +82,7 @@ class Init(Stage):
     def _swept(self, run: Run) -> PointCloud:
         views = [view for view in run.scene.split("train") if view.scale == run.scale]
         points = swept_points(views, centre_of(views), load_image, self.swept, run.seed)
-        if len(points) < FEWEST:
+        if len(points) < MIN_SWEPT_POINTS:
             LOG.warning("the photographs agree on %d points only; starting from random ones", len(points))
             return random_points(run.scene, self.count, run.seed)
         return points

@@ -7,7 +7,11 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, field_validator
 
+from clsplat.density.statistics import SplatStats
 from clsplat.errors import Interrupted, NumericError
+from clsplat.losses.image import L1, L2, Dssim, Loss, pixel_loss
+from clsplat.losses.penalties import Anisotropy, CovarianceTrace, Penalty
+from clsplat.metrics.distribution import distribution
 from clsplat.stages.base import Stage
 from clsplat.stages.checkpoint import Checkpoint
 from clsplat.stages.densify import Densify
@@ -16,16 +20,13 @@ from clsplat.stages.export import Export
 from clsplat.stages.schedule import RaiseSh, RefreshFilter, ResetOpacity
 from clsplat.training import checkpoint
 from clsplat.training.adam import Adam, Rates
-from clsplat.training.census import census
-from clsplat.training.losses import L1, L2, Dssim, Loss, pixel_loss
 from clsplat.training.profile import stage_milliseconds
 from clsplat.training.run import Progress, Run
-from clsplat.training.shape_losses import Anisotropy, CovarianceTrace, ShapeLoss
-from clsplat.training.statistics import SplatStats
-from clsplat.training.step import Differentiated, differentiate, update
+from clsplat.losses.image import ViewGradients
+from clsplat.training.step import differentiate, update
 
 LOG = logging.getLogger("clsplat")
-CENSUS_EVERY = 5  # reports
+DISTRIBUTION_EVERY = 5  # reports
 Scheduled = Annotated[
     RaiseSh | Densify | ResetOpacity | RefreshFilter | Checkpoint | Evaluate | Export, Field(discriminator="stage")
 ]
@@ -104,9 +105,9 @@ class Optimize(Stage):
         return [loss for loss in self.losses if isinstance(loss, Loss)]
 
     @property
-    def penalties(self) -> list[ShapeLoss]:
+    def penalties(self) -> list[Penalty]:
         """Losses that look at Gaussians."""
-        return [loss for loss in self.losses if isinstance(loss, ShapeLoss)]
+        return [loss for loss in self.losses if isinstance(loss, Penalty)]
 
     @property
     def _edits(self) -> list[Densify]:
@@ -120,7 +121,7 @@ class Optimize(Stage):
     @property
     def tables(self) -> set[str]:
         """Tables of the Gaussians that losses and rules read beside the parameters."""
-        parts: list[ShapeLoss | Densify] = [*self.penalties, *self._edits]
+        parts: list[Penalty | Densify] = [*self.penalties, *self._edits]
         return {name for part in parts for name in part.tables}
 
     def _attach(self, run: Run) -> None:
@@ -136,7 +137,7 @@ class Optimize(Stage):
             if stage.edits and stage.due(run.step):
                 stage.run(run)
 
-    def _step(self, run: Run) -> Differentiated:
+    def _step(self, run: Run) -> ViewGradients:
         """One view; halfway between reports, where no density control is due, the kernels are timed."""
         assert run.stats is not None
         assert run.adam is not None
@@ -145,18 +146,18 @@ class Optimize(Stage):
         run.device.timings.sampling = run.step % self.log_every == self.log_every // 2
         model, target = run.trained, run.targets.get(run.train_view())
         run.announce_views()
-        background, moments = run.targets.background_array, run.stats.moments
-        view = differentiate(run.renderer, model, target, background, self.comparisons, run.step, moments)
+        background, pixel_sums = run.targets.background_array, run.stats.pixel_sums
+        view = differentiate(run.rasterizer, model, target, background, self.comparisons, run.step, pixel_sums)
         stale = {name for stage in self.during if stage.due(run.step) for name in stage.stale(run)}
         if run.stage_step == self.steps:
             stale = set()
         extent = run.scene.extent
         rates = self.rates.at(run.step, extent)
-        run.stats.add(view, update(run.renderer, model, run.adam, view, rates, self.penalties, stale, extent))
+        run.stats.add(view, update(run.rasterizer, model, run.adam, view, rates, self.penalties, stale, extent))
         run.device.timings.sampling = False
         return view
 
-    def _values(self, run: Run, view: Differentiated) -> tuple[float, float]:
+    def _values(self, run: Run, view: ViewGradients) -> tuple[float, float]:
         """Read the step's loss and PSNR.  Raises NumericError, after saving the state, when they are not finite."""
         loss = sum(term.value() for term in view.terms)
         squared = float(pixel_loss(view.comparison, l1=0.0, l2=0.0).get()[..., 1].sum(dtype="float64"))
@@ -174,7 +175,7 @@ class Optimize(Stage):
         count = run.trained.gaussians.count
         stages = stage_milliseconds(run.device.timings)
         run.records.add(run.step, "train", loss=loss, psnr=psnr, gaussians=count, ms=1e3 * seconds, stages=stages)
-        if run.step % (CENSUS_EVERY * self.log_every) == 0 or run.step == last_step:
-            run.records.add(run.step, "census", gaussians=count, **census(run.trained.gaussians))
+        if run.step % (DISTRIBUTION_EVERY * self.log_every) == 0 or run.step == last_step:
+            run.records.add(run.step, "distribution", gaussians=count, **distribution(run.trained.gaussians))
         run.records.status("running", run.step, steps=last_step, gaussians=count)
         run.show(Progress(run.step, last_step, loss, psnr, count, 1e3 * seconds, seconds * (last_step - run.step)))

@@ -4,9 +4,9 @@ import logging
 from pathlib import Path, PurePosixPath
 from typing import ClassVar, Literal
 
+from clsplat.metrics.views import render_view
 from clsplat.scene.images import write_image
 from clsplat.stages.base import Stage
-from clsplat.training.metrics import render_view
 from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
@@ -26,7 +26,7 @@ class Render(Stage):
         views = run.scene.downscaled(run.scale).split(self.split)
         for view in views:
             camera = run.targets.camera(view)
-            image = render_view(run.renderer, run.trained, camera, run.targets.background_array)
+            image = render_view(run.rasterizer, run.trained, camera, run.targets.background_array)
             write_image(image_path(run.out / self.folder, view.name), image)
         LOG.info("%d images written to %s", len(views), run.out / self.folder)
 

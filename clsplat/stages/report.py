@@ -8,12 +8,12 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from clsplat.files import write_text
+from clsplat.metrics.distribution import SHARES
+from clsplat.metrics.perceptual import Image
+from clsplat.metrics.views import render_view
 from clsplat.pages.page import duration, embedded, figures, page
 from clsplat.pages.svg import Line, curve
 from clsplat.stages.base import Stage
-from clsplat.training.census import SHARES
-from clsplat.training.metrics import render_view
-from clsplat.training.perceptual import Image
 from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
@@ -70,7 +70,7 @@ def _curves(run: Run) -> str:
 
 def _census(run: Run) -> str:
     """How sizes, shapes and opacities are spread over training, what density rules did, and PSNR by Gaussians."""
-    lines = run.records.read("census")
+    lines = run.records.read("distribution")
     if len(lines) < 2:
         return ""
     shares = [f"{share:.0%}" for share in SHARES]
@@ -148,7 +148,7 @@ def _views(run: Run) -> str:
         text += f"<h3>{title}</h3>" if chosen else ""
         for record in chosen:
             target = run.targets.get(by_name[record["view"]])
-            image = render_view(run.renderer, run.trained, target.camera, run.targets.background_array)
+            image = render_view(run.rasterizer, run.trained, target.camera, run.targets.background_array)
             text += _figure(record, image, target.image())
     return text
 

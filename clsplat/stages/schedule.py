@@ -5,8 +5,8 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
+from clsplat.density.edit import cap_opacity
 from clsplat.stages.base import Stage
-from clsplat.training.density import cap_opacity
 from clsplat.training.run import Run
 
 

@@ -6,10 +6,10 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
-from clsplat.gaussians.model import PARAMETERS, Gaussians, Gradients, Model, sh_coefficients
+from clsplat.gaussians.tables import PARAMETERS, DeviceModel, Gaussians, Gradients, sh_coefficients
 from clsplat.opencl.device import Array
 from clsplat.opencl.program import constants
-from clsplat.render.renderer import Frame, shape_arguments
+from clsplat.render.rasterizer import Frame, shape_arguments
 from clsplat.settings import Settings
 
 Rate = Annotated[float, Field(ge=0)]
@@ -57,8 +57,8 @@ class Adam:
             for moment in self._moments(name):
                 gaussians.add(moment, gaussians.tables[name].components, zero_fresh=True)
 
-    def update(self, model: Model, frame: Frame, moments: Array, rates: dict[str, float]) -> Array:
-        """Update every parameter from the moments of the frame's pixels, [MOMENTS, S].
+    def update(self, model: DeviceModel, frame: Frame, pixel_sums: Array, rates: dict[str, float]) -> Array:
+        """Update every parameter from the frame's sums over pixels, [PIXEL_SUMS, S].
 
         Returns the gradient of the projected means, [2, S] px⁻¹.
         """
@@ -75,12 +75,14 @@ class Adam:
             **shape_arguments(model, frame.camera),
             **arguments,
             splats=frame.splats,
-            moments=moments,
+            pixel_sums=pixel_sums,
             grad_mean2d=grad_mean2d,
         )
         return grad_mean2d
 
-    def step(self, model: Model, gradients: Gradients, rates: dict[str, float], without: Collection[str] = ()) -> None:
+    def step(
+        self, model: DeviceModel, gradients: Gradients, rates: dict[str, float], without: Collection[str] = ()
+    ) -> None:
         """Update every parameter but those named in `without` from gradients in memory.
 
         Bands above the active SH degree have neither gradient nor moments, so leaving them out changes nothing.

@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat import __version__
+from clsplat.density.statistics import FOLDER as STATS_FOLDER
+from clsplat.density.statistics import SEEN, SplatStats
 from clsplat.errors import ConfigError, DataError
 from clsplat.files import atomic
-from clsplat.gaussians.model import PARAMETERS, Gaussians
+from clsplat.gaussians.tables import PARAMETERS, Gaussians
 from clsplat.training.adam import Adam
 from clsplat.training.run import Run
-from clsplat.training.statistics import FOLDER as STATS_FOLDER
-from clsplat.training.statistics import SEEN, SplatStats
 
 FORMAT = 2
 FOLDER = "checkpoints"

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from clsplat.errors import MemoryLimitError
-from clsplat.gaussians.model import GROWTH, PARAMETERS, Gaussians
+from clsplat.gaussians.tables import GROWTH, PARAMETERS, Gaussians
 from clsplat.opencl.device import DeviceInfo
-from clsplat.render.renderer import MOMENTS, RECORD
+from clsplat.render.rasterizer import PIXEL_SUMS, RECORD
 
 PAIRS = 5  # (tile, Gaussian) pairs of a Gaussian, where nothing is known yet; trained scenes have 1.5 to 4
 FRAME_GAUSSIAN = 4 * (RECORD + 2 + 5 + 7)  # records, mean2d; keys and radius; sorting by depth
@@ -60,15 +60,15 @@ class MemoryPlan:
             )
 
 
-def plan(gaussians: Gaussians, photographs: int, pixels: int, moments: int = MOMENTS) -> MemoryPlan:
+def plan(gaussians: Gaussians, photographs: int, pixels: int, pixel_sums: int = PIXEL_SUMS) -> MemoryPlan:
     """Plan for the tables that the Gaussians have.
 
-    photographs: bytes of them on the device; pixels: of the largest view, whole tiles; moments: what the backward pass
+    photographs: bytes of them on the device; pixels: of the largest view, whole tiles; pixel_sums: what the backward pass
     sums for each Gaussian.
     """
     info: DeviceInfo = gaussians.device.info
     sizes = [4 * table.components for table in gaussians.tables.values()]
     gradients = sum(4 * gaussians.tables[name].components for name in PARAMETERS) + 8  # where penalties or edits are
-    gaussian = int(np.sum(sizes)) + FRAME_GAUSSIAN + 4 * moments + gradients
+    gaussian = int(np.sum(sizes)) + FRAME_GAUSSIAN + 4 * pixel_sums + gradients
     fixed = photographs + FRAME_PIXEL * pixels
     return MemoryPlan(gaussian, FRAME_PAIR, fixed, max(sizes), info.memory, info.allocation)

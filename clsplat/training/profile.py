@@ -33,7 +33,7 @@ STAGES = {
     "count_seen": "statistics",
     "accumulate_norm": "statistics",
     "accumulate_sum": "statistics",
-    "accumulate_moment": "statistics",
+    "accumulate_pixel_sum": "statistics",
     "accumulate_radius": "statistics",
     "sample_magnitude": "statistics",
     "image_gradient": "statistics",

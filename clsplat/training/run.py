@@ -6,19 +6,19 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from clsplat.density.statistics import SplatStats
 from clsplat.errors import ConfigError
-from clsplat.gaussians.model import INTERVAL2, Model
+from clsplat.filters import FilterViews, ModelSettings, measure_intervals
+from clsplat.gaussians.tables import INTERVAL2, DeviceModel
 from clsplat.opencl.device import Device
-from clsplat.render.renderer import MOMENTS, Renderer
+from clsplat.render.rasterizer import PIXEL_SUMS, Rasterizer
 from clsplat.scene.scene import Scene, View
 from clsplat.training.adam import Adam
-from clsplat.training.filters import FilterViews, ModelSettings, measure_intervals
 from clsplat.training.memory import MemoryPlan, plan
 from clsplat.training.records import Records
-from clsplat.training.sampling import Sampling, ViewOrder
-from clsplat.training.statistics import SplatStats
-from clsplat.training.targets import Targets
-from clsplat.training.texture import texture_quantile
+from clsplat.views.order import Sampling, ViewOrder
+from clsplat.views.photographs import Photographs
+from clsplat.views.texture import texture_quantile
 
 READ_AHEAD = 4  # photographs
 LOG = logging.getLogger("clsplat")
@@ -48,12 +48,12 @@ class Run:
     name: str
     seed: int
     pipeline: dict[str, Any]  # resolved settings, as written to pipeline.yaml
-    renderer: Renderer
-    targets: Targets
+    rasterizer: Rasterizer
+    targets: Photographs
     model_settings: ModelSettings
     sampling: Sampling = "uniform"
     prepared: dict[str, str] | None = None  # what `prepare:` made the photographs of, and where they lie
-    model: Model | None = None
+    model: DeviceModel | None = None
     adam: Adam | None = None
     stats: SplatStats | None = None
     step: int = 0  # updates done, or in progress
@@ -71,7 +71,7 @@ class Run:
         self._texture_quantiles: dict[float, float] = {}
 
     @property
-    def trained(self) -> Model:
+    def trained(self) -> DeviceModel:
         """The model.  Raises ConfigError when no stage has made one."""
         if self.model is None:
             raise ConfigError("no model yet: an init stage must come first")
@@ -92,8 +92,8 @@ class Run:
         bytes_held = min(self.targets.budget, sum(3 * view.camera.width * view.camera.height for view in views))
         tile = int(self.device.tuning["TILE"])
         pixels = max((-(-v.camera.width // tile)) * (-(-v.camera.height // tile)) * tile**2 for v in views)
-        moments = MOMENTS if self.stats is None else self.stats.moments
-        return plan(self.trained.gaussians, bytes_held, pixels, moments)
+        pixel_sums = PIXEL_SUMS if self.stats is None else self.stats.pixel_sums
+        return plan(self.trained.gaussians, bytes_held, pixels, pixel_sums)
 
     def announce_views(self) -> None:
         """Let the photographs of the next steps be read ahead."""
@@ -112,7 +112,7 @@ class Run:
         """The gradient magnitude, per px, that `share` of the training photographs' pixels stay below."""
         if share not in self._texture_quantiles:
             targets = (self.targets.get(view) for view in self.scene.split("train"))
-            self._texture_quantiles[share] = texture_quantile(self.renderer.workspace, targets, share)
+            self._texture_quantiles[share] = texture_quantile(self.rasterizer.workspace, targets, share)
         return self._texture_quantiles[share]
 
     def rendering(self) -> dict[str, Any]:

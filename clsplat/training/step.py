@@ -1,43 +1,32 @@
 """The heart of a training step: render a view, compare it with its photograph, differentiate, update."""
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
 
-from clsplat.gaussians.model import Model
+from clsplat.gaussians.tables import DeviceModel
+from clsplat.losses.image import Comparison, Loss, ViewGradients
+from clsplat.losses.penalties import Penalty, PenaltyInputs
 from clsplat.opencl.device import Array
 from clsplat.opencl.program import constants
-from clsplat.render.renderer import MOMENTS, Frame, Renderer
+from clsplat.render.rasterizer import PIXEL_SUMS, Rasterizer
 from clsplat.training.adam import Adam
-from clsplat.training.losses import Comparison, Loss, Term
-from clsplat.training.shape_losses import ShapeLoss, Shapes
-from clsplat.training.targets import Target, cover, unpack
-from clsplat.training.texture import known_gradient
+from clsplat.views.photographs import Photograph, cover, unpack
+from clsplat.views.texture import known_gradient
 
-TEXTURE = int(constants("splat.h")["MOMENT_TEXTURE"])
-
-
-@dataclass(frozen=True)
-class Differentiated:
-    """A view's frame, its losses and what their gradients are made of; valid until the next one."""
-
-    frame: Frame
-    comparison: Comparison
-    terms: list[Term]
-    moments: Array  # [count, S]
+TEXTURE = int(constants("splat.h")["SUM_TEXTURE"])
 
 
 def differentiate(
-    renderer: Renderer,
-    model: Model,
-    target: Target,
+    rasterizer: Rasterizer,
+    model: DeviceModel,
+    target: Photograph,
     background: Array,
     losses: Sequence[Loss],
     step: int = 1,
-    count: int = MOMENTS,
-) -> Differentiated:
-    """Return the derivative of the sum of `losses` at one view, as `count` moments of pixels.  background: [3]."""
-    workspace, camera = renderer.workspace, target.camera
-    frame = renderer.forward(model, camera, background)
+    count: int = PIXEL_SUMS,
+) -> ViewGradients:
+    """Return the derivative of the sum of `losses` at one view, as `count` pixel_sums of pixels.  background: [3]."""
+    workspace, camera = rasterizer.workspace, target.camera
+    frame = rasterizer.forward(model, camera, background)
     photograph = unpack(workspace, camera, target.pixels)
     gradient = workspace.array("grad_image", (3, camera.rows, camera.stride))
     comparison = Comparison(workspace, camera, frame.image, photograph, gradient, step)
@@ -48,16 +37,16 @@ def differentiate(
     if target.masked:
         cover(workspace, camera, gradient, photograph)
     texture = known_gradient(workspace, camera, photograph, photograph) if count > TEXTURE else None
-    return Differentiated(frame, comparison, terms, renderer.moments(model, frame, gradient, count, texture))
+    return ViewGradients(frame, comparison, terms, rasterizer.pixel_sums(model, frame, gradient, count, texture))
 
 
 def update(
-    renderer: Renderer,
-    model: Model,
+    rasterizer: Rasterizer,
+    model: DeviceModel,
     adam: Adam,
-    view: Differentiated,
+    view: ViewGradients,
     rates: dict[str, float],
-    penalties: Sequence[ShapeLoss] = (),
+    penalties: Sequence[Penalty] = (),
     without: Collection[str] = (),
     extent: float = 1.0,
 ) -> Array:
@@ -66,9 +55,9 @@ def update(
     Returns the gradient of the projected means, [2, S] px⁻¹.  Gradients go through memory only where they must.
     """
     if not (penalties or without):
-        return adam.update(model, view.frame, view.moments, rates)
-    gradients = renderer.gradients(model, view.frame, view.moments)
-    shapes = Shapes(renderer.workspace, model.gaussians, gradients, extent, view.comparison.step)
+        return adam.update(model, view.frame, view.pixel_sums, rates)
+    gradients = rasterizer.gradients(model, view.frame, view.pixel_sums)
+    shapes = PenaltyInputs(rasterizer.workspace, model.gaussians, gradients, extent, view.comparison.step)
     view.terms.extend(penalty.add(shapes) for penalty in penalties)
     adam.step(model, gradients, rates, without)
     return gradients.mean2d

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from clsplat.gaussians.model import PARAMETERS, Gradients
-from clsplat.render.renderer import Renderer
+from clsplat.gaussians.tables import PARAMETERS, Gradients
+from clsplat.render.rasterizer import Rasterizer
 from clsplat.training.adam import Adam, Rates
 from tests import reference_loss as ref_loss
 from tests.scenes import random_case, with_world_filter
@@ -53,16 +53,18 @@ def test_update_on_the_way_equals_gradients_in_memory(device, rng, count, degree
     weights[:, 30:], weights[:, :, 40:] = 0, 0
     tables = []
     for fused in (False, True):
-        renderer, model = Renderer(device, "radix"), case.model(device)
+        rasterizer, model = Rasterizer(device, "radix"), case.model(device)
         camera = case.device_camera(device)
         adam, rates = Adam(model.gaussians), Rates().at(3, extent=2.0)
         for _ in range(2):
-            frame = renderer.forward(model, camera, device.zeros(3))
-            moments = renderer.moments(model, frame, device.upload(weights[:, : camera.rows, : camera.stride].copy()))
+            frame = rasterizer.forward(model, camera, device.zeros(3))
+            pixel_sums = rasterizer.pixel_sums(
+                model, frame, device.upload(weights[:, : camera.rows, : camera.stride].copy())
+            )
             if fused:
-                grad_mean2d = adam.update(model, frame, moments, rates)
+                grad_mean2d = adam.update(model, frame, pixel_sums, rates)
             else:
-                gradients = renderer.gradients(model, frame, moments)
+                gradients = rasterizer.gradients(model, frame, pixel_sums)
                 adam.step(model, gradients, rates)
                 grad_mean2d = gradients.mean2d
         mean2d = grad_mean2d.get()[:, :count]

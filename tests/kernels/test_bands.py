@@ -3,18 +3,18 @@
 import numpy as np
 import pytest
 
-from clsplat.render.renderer import UNLIMITED, Budget, Renderer
+from clsplat.render.rasterizer import UNLIMITED, Budget, Rasterizer
 from tests.scenes import random_case
 
 
 def results(device, case, weights, budget=None, sort="radix"):
-    renderer, model, camera = Renderer(device, sort, budget), case.model(device), case.device_camera(device)
-    frame = renderer.forward(model, camera, device.upload(np.array([0.2, 0.5, 0.9], np.float32)))
+    rasterizer, model, camera = Rasterizer(device, sort, budget), case.model(device), case.device_camera(device)
+    frame = rasterizer.forward(model, camera, device.upload(np.array([0.2, 0.5, 0.9], np.float32)))
     planes = np.zeros((3, camera.rows, camera.stride), np.float32)
     planes[:, : camera.height, : camera.width] = weights
     image = frame.image.get()
-    moments = renderer.moments(model, frame, device.upload(planes)).get()[:, : model.gaussians.count]
-    return image, moments, frame
+    pixel_sums = rasterizer.pixel_sums(model, frame, device.upload(planes)).get()[:, : model.gaussians.count]
+    return image, pixel_sums, frame
 
 
 @pytest.mark.parametrize("sort", ["radix", "bitonic"])
@@ -27,14 +27,14 @@ def test_image_and_moments_are_the_same_bits(device, rng, budget, bands, sort):
     case = random_case(rng, 300, 60, 70)
     case.parameters["log_scales"][:20] += 1.5  # some over many rows of tiles, and too many tiles for a mask
     weights = rng.normal(size=(3, 70, 60)).astype(np.float32)
-    image, moments, frame = results(device, case, weights)
+    image, pixel_sums, frame = results(device, case, weights)
     assert frame.lists.pairs > 600
-    banded_image, banded_moments, banded = results(device, case, weights, budget, sort)
+    banded_image, banded_sums, banded = results(device, case, weights, budget, sort)
     if device.tuning["TILE"] == 16 and bands in (1, 5):
         assert len(banded.bands) == bands
     assert (len(banded.bands) > 1) == (bands > 1)
     np.testing.assert_array_equal(banded_image, image)
-    np.testing.assert_array_equal(banded_moments, moments)
+    np.testing.assert_array_equal(banded_sums, pixel_sums)
 
 
 def test_nothing_in_a_band(device, rng):

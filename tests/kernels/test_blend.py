@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from clsplat.opencl.device import Device
-from clsplat.render.renderer import Renderer
+from clsplat.render.rasterizer import Rasterizer
 from tests import reference as ref
 from tests import reference_blend as ref_blend
 from tests.scenes import Case, random_case
@@ -15,7 +15,7 @@ SIZES = ((16, 16), (15, 17), (33, 31), (40, 30), (5, 3), (64, 48))
 
 def render(device: Device, case: Case, sort: str = "radix") -> tuple[np.ndarray, np.ndarray]:
     """Image [3, H, W] and transmittance [H, W]; checks that the planes are zero outside the image."""
-    frame = Renderer(device, sort).forward(case.model(device), case.device_camera(device), device.upload(BACKGROUND))
+    frame = Rasterizer(device, sort).forward(case.model(device), case.device_camera(device), device.upload(BACKGROUND))
     image, transmittance = frame.image.get(), frame.transmittance.get()
     width, height = case.size
     for plane in (*image, transmittance):

@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from clsplat.gaussians.model import INTERVAL2
-from clsplat.render.renderer import Renderer
+from clsplat.density.basic import Clone, PruneFaint
+from clsplat.density.detail import SplitOversized, SplitTextured, largest
+from clsplat.density.edit import SceneScale, densify
+from clsplat.density.statistics import SEEN, SplatStats
+from clsplat.density.thinning import MergeNeighbours, PruneUnimportant, covariance_of, mass_of, merged
+from clsplat.density.thresholds import PixelQuantile, Quantile
+from clsplat.gaussians.tables import INTERVAL2
+from clsplat.render.rasterizer import Rasterizer
 from clsplat.training.adam import Adam
-from clsplat.training.basic_rules import Clone, PruneFaint
-from clsplat.training.density import Measures, densify
-from clsplat.training.detail_rules import SplitOversized, SplitTextured, largest
-from clsplat.training.statistics import SEEN, SplatStats
-from clsplat.training.thinning_rules import MergeNeighbours, PruneUnimportant, covariance_of, mass_of, merged
-from clsplat.training.thresholds import PixelQuantile, Quantile
 from tests.scenes import random_case
 
 COLUMNS = ["screen_grad", "texture", "screen_radius"]
@@ -25,9 +25,9 @@ class Edited:
     def __init__(self, device, rng, count: int, names=COLUMNS, **columns) -> None:
         case = random_case(rng, count)
         self.gaussians = case.model(device).gaussians
-        self.tiler = Renderer(device, "radix").tiler
+        self.tiler = Rasterizer(device, "radix").tiler
         Adam(self.gaussians)
-        for table in [name for name in self.gaussians.tables if "moment" in name]:
+        for table in [name for name in self.gaussians.tables if "pixel_sum" in name]:
             self.gaussians.set(table, rng.uniform(1, 2, (count, self.gaussians.tables[table].components)))
         self.stats = SplatStats(self.gaussians, names)
         self.gaussians.set(SEEN, np.full((count, 1), 2.0, np.float32))
@@ -37,7 +37,7 @@ class Edited:
 
     def apply(self, *rules, most=None, texture_quantile=lambda share: 0.1 * share):
         self.before = {name: self.gaussians.get(name) for name in self.gaussians.tables}
-        measures = Measures(EXTENT, texture_quantile)
+        measures = SceneScale(EXTENT, texture_quantile)
         return densify(self.gaussians, self.stats, rules, self.tiler, measures, 700, seed=4, most=most)
 
     def rows_of(self, source: int) -> np.ndarray:
@@ -61,7 +61,7 @@ def test_texture_splits_and_children_are_half_as_large(device, rng):
         np.testing.assert_allclose(np.exp(2 * (children - parent)), 0.5, rtol=1e-4)  # β
         assert (case.gaussians.get("means")[rows] != case.before["means"][source]).any(axis=1).all()
         for table in case.gaussians.tables:
-            if "moment" in table or table.startswith("stats/"):
+            if "pixel_sum" in table or table.startswith("stats/"):
                 assert (case.gaussians.get(table)[rows] == 0).all(), table
 
 
@@ -177,7 +177,7 @@ def test_neighbours_merge_into_their_moments(device, rng):
     case.gaussians.set("log_scales", np.log(np.full((4, 3), [0.05, 0.04, 0.03], np.float32)))
     case.gaussians.set("logit_opacity", np.array([[-1.0], [-1.5], [1.0], [0.0]], np.float32))
     before = {name: case.gaussians.get(name).astype(np.float64) for name in ("quats", "log_scales", "logit_opacity")}
-    moment = {name: case.gaussians.get(f"adam/{name}/moment1") for name in ("means", "quats", "log_scales")}
+    pixel_sum = {name: case.gaussians.get(f"adam/{name}/moment1") for name in ("means", "quats", "log_scales")}
     assert case.apply(MergeNeighbours()).after == 3
     tables = {**before, "means": means.astype(np.float64)}
     mass = mass_of(tables)[:2]
@@ -191,11 +191,11 @@ def test_neighbours_merge_into_their_moments(device, rng):
     np.testing.assert_allclose(covariance_of(got["quats"][:1], got["log_scales"][:1])[0], covariance, atol=1e-7)
     np.testing.assert_allclose(mass_of(got)[0], mass.sum(), rtol=1e-4)
     np.testing.assert_allclose(got["sh_base"][0], weights @ colours[:2], rtol=1e-5)
-    after = {name: case.gaussians.get(f"adam/{name}/moment1") for name in moment}
-    np.testing.assert_array_equal(after["means"][0], moment["means"][0])  # the heavier one's
+    after = {name: case.gaussians.get(f"adam/{name}/moment1") for name in pixel_sum}
+    np.testing.assert_array_equal(after["means"][0], pixel_sum["means"][0])  # the heavier one's
     for name in ("quats", "log_scales"):
         assert (after[name][0] == 0).all(), "of axes that are no more"
-        np.testing.assert_array_equal(after[name][1:], moment[name][2:])
+        np.testing.assert_array_equal(after[name][1:], pixel_sum[name][2:])
     np.testing.assert_array_equal(got["means"][1:], means[2:])
 
 
@@ -228,17 +228,17 @@ def test_a_merged_covariance_is_that_of_the_mixture(rng):
     np.testing.assert_allclose(np.linalg.norm(found["quats"], axis=1), 1, rtol=1e-9)
     assert all(np.isfinite(values).all() for values in found.values())
 
-    def moments(values, rows):
+    def pixel_sums(values, rows):
         axes = Rotation.from_quat(np.roll(values["quats"][rows], -1, axis=1)).as_matrix()
         own = axes @ (np.exp(2 * values["log_scales"][rows])[:, :, None] * np.swapaxes(axes, 1, 2))
         volume = np.exp(values["log_scales"][rows].sum(axis=1))
         return values["means"][rows], own, volume / (1 + np.exp(-values["logit_opacity"][rows, 0]))
 
-    halves = [moments(tables, rows) for rows in (slice(0, count), slice(count, None))]
+    halves = [pixel_sums(tables, rows) for rows in (slice(0, count), slice(count, None))]
     total = sum(mass for _, _, mass in halves)
     mean = sum(mass[:, None] * mean for mean, _, mass in halves) / total[:, None]
     second = sum(mass[:, None, None] * (own + _outer(mean)) for mean, own, mass in halves) / total[:, None, None]
-    got = moments(found, slice(None))
+    got = pixel_sums(found, slice(None))
     np.testing.assert_allclose(got[0], mean, rtol=1e-9)
     np.testing.assert_allclose(got[1], second - _outer(mean), atol=1e-9 * np.abs(second).max())
 

@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from clsplat.gaussians.model import Gaussians, Model
+from clsplat.filters import Dilation, Ewa, FilterViews, Mip, NoWorldFilter, Smoothing
+from clsplat.gaussians.tables import DeviceModel, Gaussians
 from clsplat.opencl.device import Device
-from clsplat.render.renderer import Renderer, upload_camera
+from clsplat.render.rasterizer import Rasterizer, upload_camera
 from clsplat.scene.scene import Camera, View
-from clsplat.training.filters import Dilation, Ewa, FilterViews, Mip, NoWorldFilter, Smoothing
 from tests import reference as ref
 from tests.reference_filter import sampling_interval
 from tests.scenes import Case, random_case
@@ -103,8 +103,8 @@ def grid_of_specks(device: Device, screen: Dilation | Ewa | Mip, scale: int) -> 
     gaussians = Gaussians(device, {name: table.astype(np.float32) for name, table in parameters.items()})
     camera = Camera(size, size, focal, focal, size / 2, size / 2).downscaled(scale)
     view = View("view", camera, np.eye(4)[:3], None)
-    model = Model(gaussians, 0, 0.2, screen.variance, screen.compensate)
-    frame = Renderer(device, "radix").forward(model, upload_camera(device, view), device.zeros(3))
+    model = DeviceModel(gaussians, 0, 0.2, screen.variance, screen.compensate)
+    frame = Rasterizer(device, "radix").forward(model, upload_camera(device, view), device.zeros(3))
     return float(frame.image.get().sum(dtype=np.float64)) * scale**2
 
 

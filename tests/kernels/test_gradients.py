@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from clsplat.opencl.device import Device
-from clsplat.render.renderer import MOMENTS, Frame, Renderer
+from clsplat.render.rasterizer import PIXEL_SUMS, Frame, Rasterizer
 from tests import reference as ref
 from tests import reference_blend as ref_blend
 from tests.scenes import SHARP, Case, random_case, relative_error, with_world_filter
@@ -14,17 +14,19 @@ from tests.scenes import SHARP, Case, random_case, relative_error, with_world_fi
 BACKGROUND = np.array([0.2, 0.5, 0.9], np.float32)
 
 
-def gradients_of(device: Device, case: Case, weights: np.ndarray, sort: str = "radix") -> tuple[dict, Frame, Renderer]:
+def gradients_of(
+    device: Device, case: Case, weights: np.ndarray, sort: str = "radix"
+) -> tuple[dict, Frame, Rasterizer]:
     """Gradients [N, components] of sum(weights * image)."""
-    renderer, model, camera = Renderer(device, sort), case.model(device), case.device_camera(device)
-    frame = renderer.forward(model, camera, device.upload(BACKGROUND))
+    rasterizer, model, camera = Rasterizer(device, sort), case.model(device), case.device_camera(device)
+    frame = rasterizer.forward(model, camera, device.upload(BACKGROUND))
     planes = np.zeros((3, camera.rows, camera.stride), np.float32)
     planes[:, : camera.height, : camera.width] = weights
-    gradients = renderer.gradients(model, frame, renderer.moments(model, frame, device.upload(planes)))
+    gradients = rasterizer.gradients(model, frame, rasterizer.pixel_sums(model, frame, device.upload(planes)))
     count = model.gaussians.count
     values = {name: array.get()[:, :count].T for name, array in gradients.arrays.items()}
     values["mean2d"] = gradients.mean2d.get()[:, :count].T
-    return values, frame, renderer
+    return values, frame, rasterizer
 
 
 def expected_gradients(case: Case, weights: np.ndarray, thresholds: ref.Thresholds = SHARP) -> dict:
@@ -107,10 +109,10 @@ def test_finite_differences_on_the_device(device, rng):
     case = random_case(rng, 6, 24, 20)
     weights = rng.normal(size=(3, 20, 24)).astype(np.float32)
     values, *_ = gradients_of(smooth, case, weights)
-    renderer, camera, background = Renderer(smooth, "radix"), case.device_camera(smooth), smooth.upload(BACKGROUND)
+    rasterizer, camera, background = Rasterizer(smooth, "radix"), case.device_camera(smooth), smooth.upload(BACKGROUND)
 
     def loss(parameters: dict) -> float:
-        frame = renderer.forward(replace(case, parameters=parameters).model(smooth), camera, background)
+        frame = rasterizer.forward(replace(case, parameters=parameters).model(smooth), camera, background)
         image = frame.image.get()[:, :20, :24].astype(np.float64)
         return float((image * weights).sum())
 
@@ -142,12 +144,12 @@ def test_sorts_give_the_same_bits(device, rng):
         np.testing.assert_array_equal(radix[name], bitonic[name])
 
 
-def moments_of(result: tuple[dict, Frame, Renderer]) -> np.ndarray:
-    """The sums over pixels of every Gaussian, [MOMENTS, N], each kind of moment scaled to 1."""
-    gradients, _, renderer = result
+def pixel_sums_of(result: tuple[dict, Frame, Rasterizer]) -> np.ndarray:
+    """The sums over pixels of every Gaussian, [PIXEL_SUMS, N], each kind of pixel_sum scaled to 1."""
+    gradients, _, rasterizer = result
     count = len(gradients["means"])
-    moments = renderer.workspace.array("moments", (MOMENTS, -(-count // 64) * 64)).get()[:, :count]
-    return moments / np.linalg.norm(moments, axis=1, keepdims=True)
+    pixel_sums = rasterizer.workspace.array("pixel_sums", (PIXEL_SUMS, -(-count // 64) * 64)).get()[:, :count]
+    return pixel_sums / np.linalg.norm(pixel_sums, axis=1, keepdims=True)
 
 
 def test_schedules_agree(device, rng):
@@ -157,7 +159,7 @@ def test_schedules_agree(device, rng):
     weights = rng.normal(size=(3, 70, 90)).astype(np.float32)
     other = Device(device.info, "simt" if device.schedule == "wide" else "wide")
     mine, theirs = gradients_of(device, case, weights), gradients_of(other, case, weights)
-    assert relative_error(moments_of(mine), moments_of(theirs)) < 1e-6
+    assert relative_error(pixel_sums_of(mine), pixel_sums_of(theirs)) < 1e-6
     for name in mine[0]:
         assert relative_error(mine[0][name], theirs[0][name]) < 2e-5, name
 

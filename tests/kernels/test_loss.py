@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from clsplat.render.renderer import DeviceCamera
+from clsplat.losses.image import L1, L2, LOSSES, Comparison, Dssim, ssim_maps
+from clsplat.render.rasterizer import DeviceCamera
 from clsplat.render.workspace import Workspace
-from clsplat.training.losses import L1, L2, LOSSES, Comparison, Dssim, ssim_maps
-from clsplat.training.targets import unpack
+from clsplat.views.photographs import unpack
 from tests import reference_loss as ref_loss
 
 # around the window (11), vectors (8, 16), tiles (16) and the columns of a group (256)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from clsplat.render.renderer import CAMERA, MOMENTS, RECORD, Renderer
+from clsplat.render.rasterizer import CAMERA, PIXEL_SUMS, RECORD, Rasterizer
 from tests import reference as ref
 from tests.scenes import Case, random_case, relative_error, with_world_filter
 
@@ -13,9 +13,9 @@ TOLERANCE = 2e-5  # float32, about 300 operations, determinants that cancel
 
 def splats_of(device, case: Case) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Records [N, RECORD], depth keys [N] and radii [N] of the kernel."""
-    renderer = Renderer(device, "radix")
-    frame = renderer.forward(case.model(device), case.device_camera(device), device.zeros(3))
-    keys = renderer.workspace.array("depth_key", len(case.parameters["means"]), np.uint32).get()
+    rasterizer = Rasterizer(device, "radix")
+    frame = rasterizer.forward(case.model(device), case.device_camera(device), device.zeros(3))
+    keys = rasterizer.workspace.array("depth_key", len(case.parameters["means"]), np.uint32).get()
     return frame.splats.get(), keys, frame.radius.get()[: len(keys)]
 
 
@@ -101,15 +101,15 @@ def test_camera_struct_has_the_kernels_layout(device):
 def backward_case(device, rng, case: Case) -> None:
     """Feed both sides the same sums of a Gaussian's pixels."""
     model, camera = case.model(device), case.device_camera(device)
-    renderer = Renderer(device, "radix")
-    frame = renderer.forward(model, camera, device.zeros(3))
+    rasterizer = Rasterizer(device, "radix")
+    frame = rasterizer.forward(model, camera, device.zeros(3))
     gaussians = model.gaussians
     truth = case.project()
     drawn = frame.splats.get()[:, 5] > 0
-    moments = np.zeros((MOMENTS, gaussians.capacity), np.float32)
-    moments[:, : gaussians.count] = rng.normal(size=(MOMENTS, gaussians.count)) * drawn
-    gradients = renderer.gradients(model, frame, device.upload(moments))
-    m = moments[:, : gaussians.count].astype(np.float64).T
+    pixel_sums = np.zeros((PIXEL_SUMS, gaussians.capacity), np.float32)
+    pixel_sums[:, : gaussians.count] = rng.normal(size=(PIXEL_SUMS, gaussians.count)) * drawn
+    gradients = rasterizer.gradients(model, frame, device.upload(pixel_sums))
+    m = pixel_sums[:, : gaussians.count].astype(np.float64).T
     a, b, c = truth.conic.T
     grad_mean2d = -np.stack([a * m[:, 1] + b * m[:, 2], b * m[:, 1] + c * m[:, 2]], axis=1)
     grad_conic = np.stack([-0.5 * m[:, 3], -m[:, 4], -0.5 * m[:, 5]], axis=1)

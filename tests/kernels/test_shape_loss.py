@@ -1,11 +1,11 @@
-"""shape_loss.cl against the oracle, and the oracle against finite differences."""
+"""penalty.cl against the oracle, and the oracle against finite differences."""
 
 import numpy as np
 import pytest
 
-from clsplat.gaussians.model import INTERVAL2, Gradients
+from clsplat.gaussians.tables import INTERVAL2, Gradients
+from clsplat.losses.penalties import Anisotropy, CovarianceTrace, PenaltyInputs
 from clsplat.render.workspace import Workspace
-from clsplat.training.shape_losses import Anisotropy, CovarianceTrace, Shapes
 from tests import reference_shape as ref
 from tests.scenes import random_case
 
@@ -13,7 +13,7 @@ COUNTS = (1, 7, 8, 15, 16, 17, 64, 65, 200)
 EXTENT = 2.5
 
 
-def shapes_of(device, rng, count: int) -> tuple[Shapes, np.ndarray]:
+def shapes_of(device, rng, count: int) -> tuple[PenaltyInputs, np.ndarray]:
     """Gaussians of many sizes and forms, with gradients that are not zero to begin with."""
     case = random_case(rng, count)
     case.parameters["log_scales"][:] = rng.normal(-2, 1.5, (count, 3))
@@ -22,11 +22,11 @@ def shapes_of(device, rng, count: int) -> tuple[Shapes, np.ndarray]:
     planes = np.zeros((3, gaussians.capacity), np.float32)
     planes[:, :count] = 0.25
     gradients["log_scales"].set(planes)
-    shapes = Shapes(Workspace(device), gaussians, gradients, EXTENT, step=1)
+    shapes = PenaltyInputs(Workspace(device), gaussians, gradients, EXTENT, step=1)
     return shapes, case.parameters["log_scales"].astype(np.float64)
 
 
-def check(shapes: Shapes, term, value: float, gradient: np.ndarray) -> None:
+def check(shapes: PenaltyInputs, term, value: float, gradient: np.ndarray) -> None:
     assert term.value() == pytest.approx(value, rel=1e-5, abs=1e-12)
     planes, count = shapes.gradients["log_scales"].get(), shapes.gaussians.count
     added = planes[:, :count].T.astype(np.float64) - 0.25

@@ -6,12 +6,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from clsplat.density.basic import Clone, PruneFaint, Split
+from clsplat.density.edit import SceneScale, densify
+from clsplat.density.statistics import ABS_X, SEEN, WEIGHT, SplatStats
 from clsplat.opencl.device import Device
-from clsplat.render.renderer import MOMENTS, Renderer
-from clsplat.training.basic_rules import Clone, PruneFaint, Split
-from clsplat.training.density import Measures, densify
-from clsplat.training.statistics import ABS_X, SEEN, WEIGHT, SplatStats
-from clsplat.training.step import Differentiated
+from clsplat.render.rasterizer import PIXEL_SUMS, Rasterizer
+from clsplat.training.step import ViewGradients
 from tests import reference_blend as ref_blend
 from tests import reference_loss as ref_loss
 from tests.scenes import Case, random_case, relative_error, with_world_filter
@@ -20,13 +20,13 @@ BACKGROUND = np.array([0.3, 0.6, 0.1], np.float32)
 ALL = ABS_X + 2
 
 
-def moments_of(device: Device, case: Case, weights: np.ndarray, count: int) -> np.ndarray:
+def pixel_sums_of(device: Device, case: Case, weights: np.ndarray, count: int) -> np.ndarray:
     """Sums over each Gaussian's pixels under the loss Σ weights · image, [N, count]."""
-    renderer, model, camera = Renderer(device, "radix"), case.model(device), case.device_camera(device)
-    frame = renderer.forward(model, camera, device.upload(BACKGROUND))
+    rasterizer, model, camera = Rasterizer(device, "radix"), case.model(device), case.device_camera(device)
+    frame = rasterizer.forward(model, camera, device.upload(BACKGROUND))
     planes = np.zeros((3, camera.rows, camera.stride), np.float32)
     planes[:, : camera.height, : camera.width] = weights
-    return renderer.moments(model, frame, device.upload(planes), count).get()[:, : model.gaussians.count].T
+    return rasterizer.pixel_sums(model, frame, device.upload(planes), count).get()[:, : model.gaussians.count].T
 
 
 def expected_abs(case: Case, weights: np.ndarray) -> np.ndarray:
@@ -41,16 +41,16 @@ def expected_abs(case: Case, weights: np.ndarray) -> np.ndarray:
 def test_absolute_gradients(device, rng, count, width, height):
     case = with_world_filter(random_case(rng, count, width, height, variance=0.1, compensate=1.0), rng)
     weights = rng.normal(size=(3, height, width)).astype(np.float32)
-    moments = moments_of(device, case, weights, ALL)
-    assert relative_error(moments[:, ABS_X:], expected_abs(case, weights)) < 2e-3  # pixels at thresholds
-    assert relative_error(moments[:, :MOMENTS], moments_of(device, case, weights, MOMENTS)) < 1e-6
+    pixel_sums = pixel_sums_of(device, case, weights, ALL)
+    assert relative_error(pixel_sums[:, ABS_X:], expected_abs(case, weights)) < 2e-3  # pixels at thresholds
+    assert relative_error(pixel_sums[:, :PIXEL_SUMS], pixel_sums_of(device, case, weights, PIXEL_SUMS)) < 1e-6
 
 
 def test_schedules_agree(device, rng):
     case = random_case(rng, 400, 90, 70)
     weights = rng.normal(size=(3, 70, 90)).astype(np.float32)
     other = Device(device.info, "simt" if device.schedule == "wide" else "wide")
-    mine, theirs = moments_of(device, case, weights, ALL), moments_of(other, case, weights, ALL)
+    mine, theirs = pixel_sums_of(device, case, weights, ALL), pixel_sums_of(other, case, weights, ALL)
     assert relative_error(mine[:, ABS_X:], theirs[:, ABS_X:]) < 1e-6
 
 
@@ -66,9 +66,9 @@ def test_absolute_sums_do_not_cancel(device):
     p["quats"][:] = (1, 0, 0, 0)
     weights = np.zeros((3, 48, 48), np.float32)
     weights[:, :, :] = np.where(np.abs(np.arange(48) - 23.5) > 6, 1, -1)  # symmetric: the halves pull apart
-    moments = moments_of(device, case, weights, ALL)[0].astype(np.float64)
-    assert abs(moments[1]) < 1e-4 * moments[ABS_X]
-    np.testing.assert_allclose(moments[ABS_X:], expected_abs(case, weights)[0], rtol=2e-3)
+    pixel_sums = pixel_sums_of(device, case, weights, ALL)[0].astype(np.float64)
+    assert abs(pixel_sums[1]) < 1e-4 * pixel_sums[ABS_X]
+    np.testing.assert_allclose(pixel_sums[ABS_X:], expected_abs(case, weights)[0], rtol=2e-3)
 
 
 OF_GRADIENTS = ("screen_grad", "screen_grad_abs", "screen_grad_abs_sum")
@@ -79,13 +79,13 @@ def test_columns(device, rng, names):
     case = random_case(rng, 65)
     case.parameters["means"][::4] -= 20 * case.view.world_to_camera[2, :3]  # behind the camera
     model = case.model(device)
-    frame = Renderer(device, "radix").forward(model, case.device_camera(device), device.zeros(3))
+    frame = Rasterizer(device, "radix").forward(model, case.device_camera(device), device.zeros(3))
     gaussians, (width, height) = model.gaussians, case.size
     stats = SplatStats(gaussians, names)
-    assert stats.moments == (ALL if len(names) > 1 else MOMENTS)
+    assert stats.pixel_sums == (ALL if len(names) > 1 else PIXEL_SUMS)
     planes = rng.normal(size=(ALL, gaussians.capacity)).astype(np.float32)
     planes[ABS_X:] = np.abs(planes[ABS_X:])
-    view = Differentiated(frame, None, [], device.upload(planes))
+    view = ViewGradients(frame, None, [], device.upload(planes))
     for _ in range(2):
         stats.add(view, device.upload(planes[:2]))
     seen = frame.radius.get()[:65] > 0
@@ -128,7 +128,7 @@ def made(device: Device, screen_grad: list[float], absolute: list[float], size: 
     for name, means in (("screen_grad", screen_grad), ("screen_grad_abs", absolute), ("screen_grad_abs_sum", absolute)):
         if name in stats.names:
             gaussians.set(f"stats/{name}", 2 * np.array(means)[:, None])
-    densify(gaussians, stats, rules, Renderer(device, "radix").tiler, Measures(1.0), 600, seed=0)
+    densify(gaussians, stats, rules, Rasterizer(device, "radix").tiler, SceneScale(1.0), 600, seed=0)
     return np.bincount(gaussians.get("sh_base")[:, 0].astype(int), minlength=count).tolist()
 
 
@@ -174,32 +174,32 @@ def test_as_many_as_never_takes_those_without_any(device):
 
 
 def test_texture_under_splats(device, rng):
-    """Σ w texture / Σ w against the oracle's blend weights; the other moments stay as they are."""
+    """Σ w texture / Σ w against the oracle's blend weights; the other pixel_sums stay as they are."""
     case = random_case(rng, 40, 48, 32)
-    renderer, model, camera = Renderer(device, "radix"), case.model(device), case.device_camera(device)
+    rasterizer, model, camera = Rasterizer(device, "radix"), case.model(device), case.device_camera(device)
     texture = np.zeros((camera.rows, camera.stride), np.float32)
     texture[:32, :48] = np.where(rng.random((32, 48)) < 0.9, rng.uniform(0, 0.5, (32, 48)), -1)  # a tenth is masked
     weights = np.zeros((3, camera.rows, camera.stride), np.float32)
     weights[:, :32, :48] = rng.normal(size=(3, 32, 48))
-    frame = renderer.forward(model, camera, device.zeros(3))
+    frame = rasterizer.forward(model, camera, device.zeros(3))
     planes = device.upload(weights)
-    few = renderer.moments(model, frame, planes).get()[:, :40]
-    moments = renderer.moments(model, frame, planes, WEIGHT + 2, device.upload(texture))
-    assert relative_error(moments.get()[:MOMENTS, :40], few) < 1e-6
+    few = rasterizer.pixel_sums(model, frame, planes).get()[:, :40]
+    pixel_sums = rasterizer.pixel_sums(model, frame, planes, WEIGHT + 2, device.upload(texture))
+    assert relative_error(pixel_sums.get()[:PIXEL_SUMS, :40], few) < 1e-6
     blended = ref_blend.blend_weights(case.project(), 48, 32)
     blended *= texture[:32, :48] >= 0
     weight, textured = blended.sum(axis=(1, 2)), (blended * texture[:32, :48]).sum(axis=(1, 2))
-    assert relative_error(moments.get()[WEIGHT, :40], weight) < 1e-3  # pixels at thresholds
-    assert relative_error(moments.get()[WEIGHT + 1, :40], textured) < 1e-3
+    assert relative_error(pixel_sums.get()[WEIGHT, :40], weight) < 1e-3  # pixels at thresholds
+    assert relative_error(pixel_sums.get()[WEIGHT + 1, :40], textured) < 1e-3
 
     stats = SplatStats(model.gaussians, ["texture", "screen_radius"])
     for _ in range(3):
-        stats.add(Differentiated(frame, None, [], moments), device.zeros((2, model.gaussians.capacity)))
+        stats.add(ViewGradients(frame, None, [], pixel_sums), device.zeros((2, model.gaussians.capacity)))
     seen = (frame.radius.get()[:40] > 0) & (weight > 0.1)
     assert seen.sum() > 10
     np.testing.assert_allclose(stats.mean("texture")[seen], textured[seen] / weight[seen], rtol=5e-3)
     np.testing.assert_allclose(stats.mean("screen_radius"), frame.radius.get()[:40], rtol=1e-6)
-    assert stats.moments == WEIGHT + 2
+    assert stats.pixel_sums == WEIGHT + 2
 
 
 def test_texture_counts_views_by_their_weight(device, rng):
@@ -208,9 +208,9 @@ def test_texture_counts_views_by_their_weight(device, rng):
     capacity = model.gaussians.capacity
     stats = SplatStats(model.gaussians, ["texture"])
     for weights, textures in (((3.0, 2.0, 0.0), (0.2, 0.1, 0.0)), ((0.0, 6.0, 0.0), (0.0, 0.5, 0.0))):
-        moments, radius = np.zeros((WEIGHT + 2, capacity)), np.zeros(capacity)
-        moments[WEIGHT, :3], moments[WEIGHT + 1, :3], radius[:3] = weights, np.multiply(weights, textures), 5
-        view = Differentiated(SimpleNamespace(radius=device.upload(radius.astype(np.float32))), None, [],
-                              device.upload(moments.astype(np.float32)))  # fmt: skip
+        pixel_sums, radius = np.zeros((WEIGHT + 2, capacity)), np.zeros(capacity)
+        pixel_sums[WEIGHT, :3], pixel_sums[WEIGHT + 1, :3], radius[:3] = weights, np.multiply(weights, textures), 5
+        view = ViewGradients(SimpleNamespace(radius=device.upload(radius.astype(np.float32))), None, [],
+                              device.upload(pixel_sums.astype(np.float32)))  # fmt: skip
         stats.add(view, device.zeros((2, capacity)))
     np.testing.assert_allclose(stats.mean("texture"), [0.2, 0.4, 0.0], rtol=1e-6)

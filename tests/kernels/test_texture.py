@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from clsplat.render.renderer import Renderer
+from clsplat.render.rasterizer import Rasterizer
 from clsplat.render.workspace import Workspace
-from clsplat.training.targets import Target, unpack
-from clsplat.training.texture import known_gradient, texture_quantile
+from clsplat.views.photographs import Photograph, unpack
+from clsplat.views.texture import known_gradient, texture_quantile
 from tests.kernels.test_loss import camera_of
 from tests.scenes import random_case
 
@@ -53,7 +53,7 @@ def test_what_is_masked_has_no_texture(device, rng, width, height):
     found = []
     for filling in (rng.integers(0, 256, (3, height, width)) for _ in range(2)):
         pixels = np.where(mask, np.arange(3 * width * height).reshape(3, height, width) * 37 % 256, filling)
-        target = Target(camera, device.upload(np.concatenate([pixels, mask[None]]).astype(np.uint8)))
+        target = Photograph(camera, device.upload(np.concatenate([pixels, mask[None]]).astype(np.uint8)))
         photograph = unpack(workspace, camera, target.pixels)
         texture = known_gradient(workspace, camera, photograph, photograph).get()
         expected = np.where(known, magnitude_of(pixels / 255), -1)
@@ -71,8 +71,8 @@ def test_what_is_masked_has_no_texture(device, rng, width, height):
 @pytest.mark.parametrize("count", [1, 63, 64, 65, 150])
 def test_sample_at_projected_means(device, rng, count):
     case = random_case(rng, count, 40, 30)
-    renderer = Renderer(device, "radix")
-    frame = renderer.forward(case.model(device), case.device_camera(device), device.zeros(3))
+    rasterizer = Rasterizer(device, "radix")
+    frame = rasterizer.forward(case.model(device), case.device_camera(device), device.zeros(3))
     magnitude = rng.uniform(0, 1, (frame.camera.rows, frame.camera.stride)).astype(np.float32)
     magnitude[rng.random(magnitude.shape) < 0.2] = -1
     total = device.zeros(frame.radius.shape)

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from clsplat.render.renderer import Renderer
+from clsplat.render.rasterizer import Rasterizer
 from tests.scenes import random_case
 
 
 def lists_of(device, case, sort):
-    renderer = Renderer(device, sort)
-    frame = renderer.forward(case.model(device), case.device_camera(device), device.zeros(3))
+    rasterizer = Rasterizer(device, sort)
+    frame = rasterizer.forward(case.model(device), case.device_camera(device), device.zeros(3))
     lists = frame.lists
     tiles = frame.camera.tiles
     splats = lists.pair_splat.get()

@@ -18,7 +18,7 @@ CONSOLE = Console(highlight=False, soft_wrap=True)
 ERRORS = Console(stderr=True, highlight=False, soft_wrap=True)
 
 
-class _ScreenHandler(logging.Handler):
+class _TerminalHandler(logging.Handler):
     """Log lines above the progress bar: remarks to stdout, warnings to stderr."""
 
     def emit(self, record: logging.LogRecord) -> None:
@@ -31,7 +31,7 @@ def start_logging(debug: bool) -> None:
     """Send the log to the screen."""
     LOG.setLevel(logging.DEBUG)
     LOG.handlers.clear()
-    handler = _ScreenHandler()
+    handler = _TerminalHandler()
     handler.setLevel(logging.DEBUG if debug else logging.INFO)
     LOG.addHandler(handler)
 

@@ -9,10 +9,10 @@ import numpy as np
 
 from clsplat.opencl.device import Array
 from clsplat.opencl.program import constants
-from clsplat.render.renderer import DeviceCamera
+from clsplat.render.rasterizer import DeviceCamera, Frame
 from clsplat.render.workspace import Workspace
+from clsplat.schedule import Weight, at_step
 from clsplat.settings import Settings
-from clsplat.training.weights import Weight, at_step
 
 SSIM_BLOCK = int(constants("loss.cl")["BLOCK"])
 
@@ -45,11 +45,21 @@ class Comparison:
 
 
 @dataclass(frozen=True)
-class Term:
+class LossValue:
     """A loss of one step.  Reading its value waits for the device."""
 
     name: str
     value: Callable[[], float]  # weight included
+
+
+@dataclass(frozen=True)
+class ViewGradients:
+    """A view's frame, its losses and what their gradients are made of; valid until the next one."""
+
+    frame: Frame
+    comparison: Comparison
+    terms: list[LossValue]
+    pixel_sums: Array  # [count, S]
 
 
 class Loss(Settings):
@@ -58,7 +68,7 @@ class Loss(Settings):
     weight: Weight = 1.0  # a number, or [[step, weight], ...] with straight lines between
 
     @abstractmethod
-    def add(self, comparison: Comparison) -> Term:
+    def add(self, comparison: Comparison) -> LossValue:
         """Add weight · d(loss)/d(image) to the gradient."""
 
 
@@ -67,10 +77,10 @@ class L1(Loss):
 
     type: Literal["l1"] = "l1"
 
-    def add(self, comparison: Comparison) -> Term:
+    def add(self, comparison: Comparison) -> LossValue:
         weight = at_step(self.weight, comparison.step)
         sums = pixel_loss(comparison, l1=weight, l2=0.0)
-        return Term("l1", lambda: weight * float(sums.get()[..., 0].sum(dtype=np.float64)) / comparison.values)
+        return LossValue("l1", lambda: weight * float(sums.get()[..., 0].sum(dtype=np.float64)) / comparison.values)
 
 
 class L2(Loss):
@@ -78,10 +88,10 @@ class L2(Loss):
 
     type: Literal["l2"] = "l2"
 
-    def add(self, comparison: Comparison) -> Term:
+    def add(self, comparison: Comparison) -> LossValue:
         weight = at_step(self.weight, comparison.step)
         sums = pixel_loss(comparison, l1=0.0, l2=weight)
-        return Term("l2", lambda: weight * float(sums.get()[..., 1].sum(dtype=np.float64)) / comparison.values)
+        return LossValue("l2", lambda: weight * float(sums.get()[..., 1].sum(dtype=np.float64)) / comparison.values)
 
 
 class Dssim(Loss):
@@ -89,7 +99,7 @@ class Dssim(Loss):
 
     type: Literal["dssim"] = "dssim"
 
-    def add(self, comparison: Comparison) -> Term:
+    def add(self, comparison: Comparison) -> LossValue:
         weight = at_step(self.weight, comparison.step)
         maps, sums = ssim_maps(comparison)
         comparison.workspace.device.program("loss.cl").ssim_gradient(
@@ -103,7 +113,7 @@ class Dssim(Loss):
             **comparison.camera.plane_arguments(),
         )
         comparison.accumulate = True
-        return Term("dssim", lambda: weight * (1.0 - float(sums.get().sum(dtype=np.float64)) / comparison.values))
+        return LossValue("dssim", lambda: weight * (1.0 - float(sums.get().sum(dtype=np.float64)) / comparison.values))
 
 
 LOSSES: dict[str, type[Loss]] = {"l1": L1, "l2": L2, "dssim": Dssim}
@@ -112,7 +122,7 @@ LOSSES: dict[str, type[Loss]] = {"l1": L1, "l2": L2, "dssim": Dssim}
 def pixel_loss(comparison: Comparison, l1: float, l2: float) -> Array:
     """Add the gradient of weighted L1 and L2; return the sums of |x - y| and (x - y)² by row, [3, rows, 2]."""
     camera, values = comparison.camera, comparison.values
-    sums = comparison.workspace.array("pixel_sums", (3, camera.rows, 2))  # the same for all terms of a step
+    sums = comparison.workspace.array("row_sums", (3, camera.rows, 2))  # the same for all terms of a step
     comparison.workspace.device.program("loss.cl").pixel_loss(
         groups=(1, camera.rows, 3),
         image=comparison.image,

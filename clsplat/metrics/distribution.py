@@ -2,12 +2,12 @@
 
 import numpy as np
 
-from clsplat.gaussians.model import Gaussians
+from clsplat.gaussians.tables import Gaussians
 
 SHARES = (0.05, 0.25, 0.5, 0.75, 0.95)
 
 
-def census(gaussians: Gaussians) -> dict[str, list[float]]:
+def distribution(gaussians: Gaussians) -> dict[str, list[float]]:
     """Quantiles, at SHARES, of size (rms scale, scene units), anisotropy (longest by shortest axis) and opacity."""
     log_scales = gaussians.get("log_scales").astype(np.float64)
     columns = {

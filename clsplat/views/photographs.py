@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.opencl.device import Array, Device
-from clsplat.render.renderer import DeviceCamera, upload_camera
+from clsplat.render.rasterizer import DeviceCamera, upload_camera
 from clsplat.render.workspace import Workspace
 from clsplat.scene.photographs import load_photograph
 from clsplat.scene.scene import Background, View
@@ -21,7 +21,7 @@ BUDGET_SHARE = 0.25  # of the device's memory, when no budget is given
 
 
 @dataclass(frozen=True)
-class Target:
+class Photograph:
     """One photograph and its camera."""
 
     camera: DeviceCamera
@@ -43,7 +43,7 @@ class Target:
 Key = tuple[str, float]  # name and scale of a view
 
 
-class Targets:
+class Photographs:
     """The photographs of a scene by view, on the device as long as `budget` bytes hold them, else read again.
 
     Views that are announced are read ahead by a thread; what a view looks like does not depend on who read it.
@@ -58,13 +58,13 @@ class Targets:
         self.background_array = device.upload(np.array(BACKGROUNDS[background], np.float32))
         self.budget = int(device.info.memory * BUDGET_SHARE) if budget is None else budget
         self._cameras: dict[Key, DeviceCamera] = {}
-        self._targets: dict[Key, Target] = {}  # least recently used first
+        self._targets: dict[Key, Photograph] = {}  # least recently used first
         self._reading: dict[Key, Future[NDArray[Any]]] = {}
         self._reader: ThreadPoolExecutor | None = None
 
-    def fresh(self) -> "Targets":
+    def fresh(self) -> "Photographs":
         """Return the same with nothing held, for views that are wanted once."""
-        return Targets(self.device, self.background_name, straightened=self.straightened)
+        return Photographs(self.device, self.background_name, straightened=self.straightened)
 
     def camera(self, view: View) -> DeviceCamera:
         """Return the camera of a view."""
@@ -73,7 +73,7 @@ class Targets:
             self._cameras[key] = upload_camera(self.device, view)
         return self._cameras[key]
 
-    def get(self, view: View) -> Target:
+    def get(self, view: View) -> Photograph:
         """Return the photograph of a view.  Raises DataError when its file cannot be read."""
         key = view.name, view.scale
         target = self._targets.pop(key, None)
@@ -81,7 +81,7 @@ class Targets:
             reading = self._reading.pop(key, None)
             pixels = reading.result() if reading else self._read(view)
             self._make_room(pixels.nbytes)
-            target = Target(self.camera(view), self.device.upload(pixels))
+            target = Photograph(self.camera(view), self.device.upload(pixels))
         self._targets[key] = target
         return target
 

@@ -1,4 +1,4 @@
-"""Scenes that take turns at whole training steps, so that a slow moment of the machine meets all; medians count."""
+"""Scenes that take turns at whole training steps, so that a slow pixel_sum of the machine meets all; medians count."""
 
 import statistics
 import time
@@ -10,19 +10,19 @@ import numpy as np
 
 from clsplat.bench.floors import Work, floors
 from clsplat.bench.peaks import Peaks
-from clsplat.gaussians.model import PARAMETERS, Gaussians
+from clsplat.density.basic import PruneLarge
+from clsplat.density.edit import SceneScale, densify
+from clsplat.density.statistics import SplatStats
 from clsplat.gaussians.ply import Parameters
+from clsplat.gaussians.tables import PARAMETERS, Gaussians
 from clsplat.opencl.device import Device
 from clsplat.pipeline import PipelineFile
-from clsplat.render.renderer import RECORD, Frame, Renderer
+from clsplat.render.rasterizer import RECORD, Frame, Rasterizer
 from clsplat.training.adam import Adam, Rates
-from clsplat.training.basic_rules import PruneLarge
-from clsplat.training.density import Measures, densify
 from clsplat.training.memory import plan
 from clsplat.training.profile import stage_milliseconds
-from clsplat.training.statistics import SplatStats
 from clsplat.training.step import differentiate, update
-from clsplat.training.targets import Target
+from clsplat.views.photographs import Photograph
 
 WARM_UP = 3  # steps: kernels are compiled and buffers grown
 
@@ -41,18 +41,18 @@ class Result:
     planned: int  # bytes, as training would plan them
 
 
-class Contestant:
+class Case:
     """One scene, ready to be stepped with a pipeline's losses and statistics, rendered as it says.
 
     World filters are in the scales of an exported model; here they cost nothing.
     """
 
     def __init__(
-        self, device: Device, parameters: Parameters, target: Target, background: str, settings: PipelineFile
+        self, device: Device, parameters: Parameters, target: Photograph, background: str, settings: PipelineFile
     ) -> None:
         self.device, self.target, self.optimize = device, target, settings.training
         self._before = device.peak = device.allocated
-        self.renderer = Renderer(device, "radix")
+        self.rasterizer = Rasterizer(device, "radix")
         gaussians = Gaussians(device, parameters)
         self.model = settings.model.model(gaussians, gaussians.sh_degree)
         self.adam, self.stats = Adam(gaussians), SplatStats(gaussians, self.optimize.statistics)
@@ -77,8 +77,10 @@ class Contestant:
         self.device.timings.sampling = record
         start = time.perf_counter()
         losses, penalties = self.optimize.comparisons, self.optimize.penalties
-        view = differentiate(self.renderer, self.model, self.target, self.background, losses, count=self.stats.moments)
-        self.stats.add(view, update(self.renderer, self.model, self.adam, view, self.rates, penalties, without))
+        view = differentiate(
+            self.rasterizer, self.model, self.target, self.background, losses, count=self.stats.pixel_sums
+        )
+        self.stats.add(view, update(self.rasterizer, self.model, self.adam, view, self.rates, penalties, without))
         self.device.finish()
         seconds = time.perf_counter() - start
         self.device.timings.sampling = False
@@ -93,7 +95,7 @@ class Contestant:
         self.device.finish()
         start = time.perf_counter()
         never = [PruneLarge(size_above=1e30)]
-        densify(self.model.gaussians, self.stats, list(never), self.renderer.tiler, Measures(1.0), 1, 0)
+        densify(self.model.gaussians, self.stats, list(never), self.rasterizer.tiler, SceneScale(1.0), 1, 0)
         self.device.finish()
         self.densify.append(1e3 * (time.perf_counter() - start))
 
@@ -108,8 +110,8 @@ class Contestant:
     def _planned(self) -> int:
         camera = self.target.camera
         gaussians = self.model.gaussians
-        pixels, moments = camera.stride * camera.rows, self.stats.moments
-        return plan(gaussians, self.target.pixels.nbytes, pixels, moments).needed(gaussians.count)
+        pixels, pixel_sums = camera.stride * camera.rows, self.stats.pixel_sums
+        return plan(gaussians, self.target.pixels.nbytes, pixels, pixel_sums).needed(gaussians.count)
 
     def _work(self) -> Work:
         assert self.frame is not None
@@ -125,12 +127,12 @@ class Contestant:
         return Work(self.model.gaussians.count, lists.pairs, rows, camera.width * camera.height)
 
 
-def run_bench(contestants: dict[str, Contestant], peaks: Peaks, repeats: int) -> dict[str, Result]:
+def run_bench(cases: dict[str, Case], peaks: Peaks, repeats: int) -> dict[str, Result]:
     """Step every scene `repeats` times, in turns."""
     for _ in range(repeats):
-        for contender in contestants.values():
-            contender.step(record=True)
-    for contender in contestants.values():
+        for case in cases.values():
+            case.step(record=True)
+    for case in cases.values():
         for _ in range(3):
-            contender.edit()
-    return {name: contender.result(peaks) for name, contender in contestants.items()}
+            case.edit()
+    return {name: case.result(peaks) for name, case in cases.items()}

@@ -11,18 +11,18 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.gaussians.model import Gaussians
+from clsplat.gaussians.tables import Gaussians
+from clsplat.losses.image import ViewGradients
 from clsplat.opencl.device import Array
 from clsplat.opencl.program import constants
-from clsplat.render.renderer import MOMENTS, Frame
-from clsplat.training.step import Differentiated
-from clsplat.training.texture import known_gradient
+from clsplat.render.rasterizer import PIXEL_SUMS, Frame
+from clsplat.views.texture import known_gradient
 
 FOLDER = "stats/"
 SEEN = "stats/seen"
-ABS_X = int(constants("splat.h")["MOMENT_ABS_X"])
-WEIGHT = int(constants("splat.h")["MOMENT_WEIGHT"])
-TEXTURE = int(constants("splat.h")["MOMENT_TEXTURE"])
+ABS_X = int(constants("splat.h")["SUM_ABS_X"])
+WEIGHT = int(constants("splat.h")["SUM_WEIGHT"])
+TEXTURE = int(constants("splat.h")["SUM_TEXTURE"])
 StatisticName = Literal[
     "screen_grad", "screen_grad_abs", "screen_grad_abs_sum", "texture", "rendered_texture", "screen_radius"
 ]
@@ -31,11 +31,11 @@ StatisticName = Literal[
 class Statistic(ABC):
     """How one view adds to a column."""
 
-    moments: ClassVar[int] = MOMENTS  # sums over pixels that the backward pass must make
+    pixel_sums: ClassVar[int] = PIXEL_SUMS  # sums over pixels that the backward pass must make
     by: ClassVar[str] = "seen"  # table that the column's mean is by
 
     @abstractmethod
-    def add(self, gaussians: Gaussians, view: Differentiated, grad_mean2d: Array, total: Array) -> None:
+    def add(self, gaussians: Gaussians, view: ViewGradients, grad_mean2d: Array, total: Array) -> None:
         """Add a view to `total`, [S].  grad_mean2d: [2, S] px⁻¹."""
 
 
@@ -45,7 +45,7 @@ class ScreenGrad(Statistic):
     Gradients count in normalised device coordinates, as the published thresholds do.
     """
 
-    def add(self, gaussians: Gaussians, view: Differentiated, grad_mean2d: Array, total: Array) -> None:
+    def add(self, gaussians: Gaussians, view: ViewGradients, grad_mean2d: Array, total: Array) -> None:
         gaussians.device.program("density.cl").accumulate_norm(
             **_arguments(gaussians, view.frame), planes=grad_mean2d, first=0, total=total
         )
@@ -54,32 +54,32 @@ class ScreenGrad(Statistic):
 class ScreenGradAbs(Statistic):
     """The same of sums of absolute values over pixels, which do not cancel (AbsGS, Ye et al. 2024)."""
 
-    moments = ABS_X + 2
+    pixel_sums = ABS_X + 2
 
-    def add(self, gaussians: Gaussians, view: Differentiated, grad_mean2d: Array, total: Array) -> None:
+    def add(self, gaussians: Gaussians, view: ViewGradients, grad_mean2d: Array, total: Array) -> None:
         gaussians.device.program("density.cl").accumulate_norm(
-            **_arguments(gaussians, view.frame), planes=view.moments, first=ABS_X, total=total
+            **_arguments(gaussians, view.frame), planes=view.pixel_sums, first=ABS_X, total=total
         )
 
 
 class ScreenGradAbsSum(Statistic):
     """Those sums of absolute values in x and in y added up (Gaussian Opacity Fields, Yu et al. 2024)."""
 
-    moments = ABS_X + 2
+    pixel_sums = ABS_X + 2
 
-    def add(self, gaussians: Gaussians, view: Differentiated, grad_mean2d: Array, total: Array) -> None:
+    def add(self, gaussians: Gaussians, view: ViewGradients, grad_mean2d: Array, total: Array) -> None:
         gaussians.device.program("density.cl").accumulate_sum(
-            **_arguments(gaussians, view.frame), planes=view.moments, first=ABS_X, total=total
+            **_arguments(gaussians, view.frame), planes=view.pixel_sums, first=ABS_X, total=total
         )
 
 
 class BlendWeight(Statistic):
     """How much of the image a splat is: its α T, summed over pixels whose texture is known."""
 
-    moments = TEXTURE + 1
+    pixel_sums = TEXTURE + 1
 
-    def add(self, gaussians: Gaussians, view: Differentiated, grad_mean2d: Array, total: Array) -> None:
-        _add_moment(gaussians, view, WEIGHT, total)
+    def add(self, gaussians: Gaussians, view: ViewGradients, grad_mean2d: Array, total: Array) -> None:
+        _add_pixel_sum(gaussians, view, WEIGHT, total)
 
 
 class Texture(Statistic):
@@ -88,17 +88,17 @@ class Texture(Statistic):
     What a mask hides is left out of both sums.
     """
 
-    moments = TEXTURE + 1
+    pixel_sums = TEXTURE + 1
     by = "blend_weight"
 
-    def add(self, gaussians: Gaussians, view: Differentiated, grad_mean2d: Array, total: Array) -> None:
-        _add_moment(gaussians, view, TEXTURE, total)
+    def add(self, gaussians: Gaussians, view: ViewGradients, grad_mean2d: Array, total: Array) -> None:
+        _add_pixel_sum(gaussians, view, TEXTURE, total)
 
 
 class RenderedTexture(Statistic):
     """The rendered image's gradient magnitude at the projected mean, per px (Micro-splatting, Lee et al. 2025)."""
 
-    def add(self, gaussians: Gaussians, view: Differentiated, grad_mean2d: Array, total: Array) -> None:
+    def add(self, gaussians: Gaussians, view: ViewGradients, grad_mean2d: Array, total: Array) -> None:
         frame, comparison = view.frame, view.comparison
         gaussians.device.program("texture.cl").sample_magnitude(
             items=gaussians.count,
@@ -116,7 +116,7 @@ class RenderedTexture(Statistic):
 class ScreenRadius(Statistic):
     """Three standard deviations on the screen, px."""
 
-    def add(self, gaussians: Gaussians, view: Differentiated, grad_mean2d: Array, total: Array) -> None:
+    def add(self, gaussians: Gaussians, view: ViewGradients, grad_mean2d: Array, total: Array) -> None:
         gaussians.device.program("density.cl").accumulate_radius(
             items=gaussians.count, radius=view.frame.radius, total=total, count=gaussians.count
         )
@@ -149,9 +149,9 @@ class SplatStats:
                 gaussians.add(name, 1, zero_fresh=True)
 
     @property
-    def moments(self) -> int:
+    def pixel_sums(self) -> int:
         """How many sums over pixels the backward pass must make for these columns."""
-        return max((STATISTICS[name].moments for name in self.names), default=MOMENTS)
+        return max((STATISTICS[name].pixel_sums for name in self.names), default=PIXEL_SUMS)
 
     def total(self, name: str) -> Array:
         """A column's sums over views, [S]."""
@@ -166,7 +166,7 @@ class SplatStats:
         """Number of views that saw each Gaussian, [S]."""
         return self.gaussians[SEEN]
 
-    def add(self, view: Differentiated, grad_mean2d: Array) -> None:
+    def add(self, view: ViewGradients, grad_mean2d: Array) -> None:
         """Add one view.  grad_mean2d: [2, S] px⁻¹."""
         gaussians = self.gaussians
         gaussians.device.program("density.cl").count_seen(
@@ -186,13 +186,13 @@ class SplatStats:
                 self.gaussians[name].fill(0)
 
 
-def _add_moment(gaussians: Gaussians, view: Differentiated, moment: int, total: Array) -> None:
-    gaussians.device.program("density.cl").accumulate_moment(
+def _add_pixel_sum(gaussians: Gaussians, view: ViewGradients, pixel_sum: int, total: Array) -> None:
+    gaussians.device.program("density.cl").accumulate_pixel_sum(
         items=gaussians.count,
-        moments=view.moments,
+        pixel_sums=view.pixel_sums,
         radius=view.frame.radius,
         total=total,
-        moment=moment,
+        pixel_sum=pixel_sum,
         stride=gaussians.capacity,
         count=gaussians.count,
     )

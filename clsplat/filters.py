@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from clsplat.gaussians.model import Gaussians, Model
+from clsplat.gaussians.tables import DeviceModel, Gaussians
 from clsplat.opencl.device import Array, Device
-from clsplat.render.renderer import camera_values
+from clsplat.render.rasterizer import camera_values
 from clsplat.scene.scene import View
 from clsplat.settings import Settings
 
@@ -128,7 +128,7 @@ class ModelSettings(Settings):
     world_filter: AnyWorldFilter = NoWorldFilter()
     screen_filter: AnyScreenFilter = Dilation()
 
-    def model(self, gaussians: Gaussians, degree: int) -> Model:
+    def model(self, gaussians: Gaussians, degree: int) -> DeviceModel:
         """Return the Gaussians with the numbers of these settings; `degree` is the active one."""
         screen = self.screen_filter
-        return Model(gaussians, degree, self.near, screen.variance, float(screen.compensate))
+        return DeviceModel(gaussians, degree, self.near, screen.variance, float(screen.compensate))

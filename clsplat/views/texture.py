@@ -5,11 +5,11 @@ from collections.abc import Iterable
 import numpy as np
 
 from clsplat.opencl.device import Array
-from clsplat.render.renderer import DeviceCamera
+from clsplat.render.rasterizer import DeviceCamera
 from clsplat.render.workspace import Workspace
-from clsplat.training.targets import Target, unpack
+from clsplat.views.photographs import Photograph, unpack
 
-STEEPEST = 0.75  # per px: above the largest possible magnitude
+MAX_MAGNITUDE = 0.75  # per px: above the largest possible magnitude
 BINS = 3000
 
 
@@ -39,13 +39,13 @@ def known_gradient(workspace: Workspace, camera: DeviceCamera, image: Array, tar
     return magnitude
 
 
-def texture_quantile(workspace: Workspace, targets: Iterable[Target], share: float) -> float:
+def texture_quantile(workspace: Workspace, targets: Iterable[Photograph], share: float) -> float:
     """The magnitude, per px, that `share` of all pixels of the photographs that count stay below, to 1 / 4000."""
     counts = np.zeros(BINS, np.int64)
     for target in targets:
         camera = target.camera
         photograph = unpack(workspace, camera, target.pixels)
         inside = known_gradient(workspace, camera, photograph, photograph).get()[: camera.height, : camera.width]
-        counts += np.histogram(inside, BINS, (0, STEEPEST))[0]  # which leaves out what is below 0
+        counts += np.histogram(inside, BINS, (0, MAX_MAGNITUDE))[0]  # which leaves out what is below 0
     below = np.searchsorted(np.cumsum(counts), share * counts.sum())
-    return float(below + 1) * STEEPEST / BINS
+    return float(below + 1) * MAX_MAGNITUDE / BINS

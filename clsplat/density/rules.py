@@ -4,10 +4,10 @@ from typing import Annotated
 
 from pydantic import Field
 
-from clsplat.training.basic_rules import Clone, PruneFaint, PruneLarge, Split
-from clsplat.training.density import Rule
-from clsplat.training.detail_rules import SplitOversized, SplitTextured
-from clsplat.training.thinning_rules import MergeNeighbours, PruneUnimportant
+from clsplat.density.basic import Clone, PruneFaint, PruneLarge, Split
+from clsplat.density.detail import SplitOversized, SplitTextured
+from clsplat.density.edit import Rule
+from clsplat.density.thinning import MergeNeighbours, PruneUnimportant
 
 RULES: dict[str, type[Rule]] = {
     "clone": Clone,

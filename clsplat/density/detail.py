@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from clsplat.gaussians.model import INTERVAL2
-from clsplat.training.density import Edit, Positive, Rule
-from clsplat.training.statistics import SEEN, StatisticName
-from clsplat.training.thresholds import PixelQuantile, Quantile, Share, Threshold
+from clsplat.density.edit import Edit, Positive, Rule
+from clsplat.density.statistics import SEEN, StatisticName
+from clsplat.density.thresholds import PixelQuantile, Quantile, Share, Threshold
+from clsplat.gaussians.tables import INTERVAL2
 
 BETA = 0.5  # Lee et al. 2025: a child's covariance is half its parent's
 

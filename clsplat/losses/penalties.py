@@ -10,18 +10,18 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from clsplat.gaussians.model import INTERVAL2, Gaussians, Gradients
+from clsplat.gaussians.tables import INTERVAL2, Gaussians, Gradients
+from clsplat.losses.image import LossValue
 from clsplat.opencl.device import Array
 from clsplat.render.workspace import Workspace
+from clsplat.schedule import Weight, at_step
 from clsplat.settings import Settings
-from clsplat.training.losses import Term
-from clsplat.training.weights import Weight, at_step
 
 Positive = Annotated[float, Field(gt=0)]
 
 
 @dataclass(frozen=True)
-class Shapes:
+class PenaltyInputs:
     """What a penalty works on: Gaussians, the gradients it adds to, and the scene's measures."""
 
     workspace: Workspace
@@ -48,7 +48,7 @@ class Shapes:
         }
 
 
-class ShapeLoss(Settings):
+class Penalty(Settings):
     """A term of the training loss that looks at Gaussians, not at an image."""
 
     weight: Weight = 1.0
@@ -59,11 +59,11 @@ class ShapeLoss(Settings):
         return set()
 
     @abstractmethod
-    def add(self, shapes: Shapes) -> Term:
+    def add(self, shapes: PenaltyInputs) -> LossValue:
         """Add weight · d(loss)/d(log_scales) to the gradients."""
 
 
-class CovarianceTrace(ShapeLoss):
+class CovarianceTrace(Penalty):
     """Mean over Gaussians of max(tr Σ - τ, 0), lengths by the scene's extent (Micro-splatting, Lee et al. 2025).
 
     τ is `above`, or, where `pixels` is given, 3 s² for the s that spans so many pixels at the nearest training view,
@@ -78,10 +78,10 @@ class CovarianceTrace(ShapeLoss):
     def tables(self) -> set[str]:
         return {INTERVAL2} if self.pixels else set()
 
-    def add(self, shapes: Shapes) -> Term:
+    def add(self, shapes: PenaltyInputs) -> LossValue:
         gaussians, sums = shapes.gaussians, shapes.sums(f"covariance_trace {self.above} {self.pixels}")
         weight = at_step(self.weight, shapes.step) / max(1, gaussians.count) / shapes.extent**2
-        gaussians.device.program("shape_loss.cl").covariance_trace(
+        gaussians.device.program("penalty.cl").covariance_trace(
             **shapes.arguments(),
             nearest2=gaussians[INTERVAL2] if self.pixels else gaussians["filter_variance"],  # without pixels: times 0
             sums=sums,
@@ -89,23 +89,23 @@ class CovarianceTrace(ShapeLoss):
             pixels2=3.0 * (self.pixels or 0.0) ** 2,
             weight=weight,
         )
-        return Term("covariance_trace", lambda: weight * float(sums.get().sum(dtype=np.float64)))
+        return LossValue("covariance_trace", lambda: weight * float(sums.get().sum(dtype=np.float64)))
 
 
-class Anisotropy(ShapeLoss):
+class Anisotropy(Penalty):
     """Mean over Gaussians of max(longest / shortest axis - r, 0), with r = `above` (the form of PhysGaussian, Xie et
     al. 2024)."""
 
     type: Literal["anisotropy"] = "anisotropy"
     above: Annotated[float, Field(ge=1)] = 10.0
 
-    def add(self, shapes: Shapes) -> Term:
+    def add(self, shapes: PenaltyInputs) -> LossValue:
         gaussians, sums = shapes.gaussians, shapes.sums(f"anisotropy {self.above}")
         weight = at_step(self.weight, shapes.step) / max(1, gaussians.count)
-        gaussians.device.program("shape_loss.cl").anisotropy(
+        gaussians.device.program("penalty.cl").anisotropy(
             **shapes.arguments(), sums=sums, above=self.above, weight=weight
         )
-        return Term("anisotropy", lambda: weight * float(sums.get().sum(dtype=np.float64)))
+        return LossValue("anisotropy", lambda: weight * float(sums.get().sum(dtype=np.float64)))
 
 
-SHAPE_LOSSES: dict[str, type[ShapeLoss]] = {"covariance_trace": CovarianceTrace, "anisotropy": Anisotropy}
+SHAPE_LOSSES: dict[str, type[Penalty]] = {"covariance_trace": CovarianceTrace, "anisotropy": Anisotropy}

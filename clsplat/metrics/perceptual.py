@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import correlate1d
 
 from clsplat.errors import ConfigError
-from clsplat.training.lpips import InputRange, Lpips
+from clsplat.metrics.lpips import InputRange, Lpips
 
 Metric = Literal["psnr", "ssim", "ms_ssim", "flip"]
 METRICS: tuple[Metric, ...] = get_args(Metric)

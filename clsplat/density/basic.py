@@ -4,8 +4,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from clsplat.training.density import Edit, Positive, Rule
-from clsplat.training.statistics import StatisticName
+from clsplat.density.edit import Edit, Positive, Rule
+from clsplat.density.statistics import StatisticName
 
 
 class Grow(Rule):

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from clsplat.gaussians.model import SH_C0
-from clsplat.training.density import Edit, Positive, Rule
-from clsplat.training.thresholds import Share
+from clsplat.density.edit import Edit, Positive, Rule
+from clsplat.density.thresholds import Share
+from clsplat.gaussians.tables import SH_C0
 
 TURNED = ("adam/log_scales/", "adam/quats/")  # tables in a Gaussian's own axes
 Floats = NDArray[np.float64]

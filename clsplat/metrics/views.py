@@ -7,16 +7,16 @@ from typing import Any
 
 import numpy as np
 
-from clsplat.gaussians.model import Model
+from clsplat.gaussians.tables import DeviceModel
+from clsplat.losses.image import Comparison, ssim_maps
+from clsplat.metrics.perceptual import Image, Perceptual, ssim_map
 from clsplat.opencl.device import Array
-from clsplat.render.renderer import DeviceCamera, Renderer
+from clsplat.render.rasterizer import DeviceCamera, Rasterizer
 from clsplat.scene.scene import View
-from clsplat.training.losses import Comparison, ssim_maps
-from clsplat.training.perceptual import Image, Perceptual, ssim_map
-from clsplat.training.targets import Mask, Target, Targets, unpack
+from clsplat.views.photographs import Mask, Photograph, Photographs, unpack
 
 PSNR_CAP = 100.0  # dB, for equal images
-NOTHING_MORE = Perceptual()
+PSNR_AND_SSIM = Perceptual()
 
 
 @dataclass(frozen=True)
@@ -33,9 +33,9 @@ class ViewMetrics:
         return {"view": self.view, "psnr": self.psnr, "ssim": self.ssim, **self.perceptual}
 
 
-def render_view(renderer: Renderer, model: Model, camera: DeviceCamera, background: Array) -> Image:
+def render_view(rasterizer: Rasterizer, model: DeviceModel, camera: DeviceCamera, background: Array) -> Image:
     """Render to 8 bits, [height, width, 3]: clamped to [0, 1], rounded to the nearest.  background: [3]."""
-    frame = renderer.forward(model, camera, background)
+    frame = rasterizer.forward(model, camera, background)
     image = frame.image.get()[:, : camera.height, : camera.width]
     return np.ascontiguousarray((np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8).transpose(1, 2, 0))
 
@@ -47,10 +47,10 @@ def psnr(image: Image, truth: Image, mask: Mask | None = None) -> float:
     return PSNR_CAP if error == 0 else 10 * math.log10(1 / error)
 
 
-def ssim(renderer: Renderer, target: Target, image: Image) -> float:
+def ssim(rasterizer: Rasterizer, target: Photograph, image: Image) -> float:
     """Structural similarity of an 8-bit image, [height, width, 3], and the photograph."""
-    workspace, camera = renderer.workspace, target.camera
-    pixels = renderer.device.upload(np.ascontiguousarray(image.transpose(2, 0, 1)))
+    workspace, camera = rasterizer.workspace, target.camera
+    pixels = rasterizer.device.upload(np.ascontiguousarray(image.transpose(2, 0, 1)))
     planes = unpack(workspace, camera, pixels, "rendered")
     truth = unpack(workspace, camera, target.pixels)
     comparison = Comparison(workspace, camera, planes, truth, gradient=planes)
@@ -59,7 +59,11 @@ def ssim(renderer: Renderer, target: Target, image: Image) -> float:
 
 
 def measure(
-    renderer: Renderer, model: Model, views: Sequence[View], targets: Targets, perceptual: Perceptual = NOTHING_MORE
+    rasterizer: Rasterizer,
+    model: DeviceModel,
+    views: Sequence[View],
+    targets: Photographs,
+    perceptual: Perceptual = PSNR_AND_SSIM,
 ) -> list[ViewMetrics]:
     """Return the metrics of every view.
 
@@ -68,10 +72,10 @@ def measure(
     results = []
     for view in views:
         target = targets.get(view)
-        image = render_view(renderer, model, target.camera, targets.background_array)
+        image = render_view(rasterizer, model, target.camera, targets.background_array)
         truth, mask = target.image(), target.mask()
         if mask is None:
-            similarity = ssim(renderer, target, image)
+            similarity = ssim(rasterizer, target, image)
         else:
             image, truth = image * mask[..., None], truth * mask[..., None]
             similarity = float(ssim_map(image, truth)[mask].mean())
@@ -80,7 +84,7 @@ def measure(
     return results
 
 
-def mean(results: Sequence[ViewMetrics], perceptual: Perceptual = NOTHING_MORE) -> dict[str, Any]:
+def mean(results: Sequence[ViewMetrics], perceptual: Perceptual = PSNR_AND_SSIM) -> dict[str, Any]:
     """Averages over views, with the keys of metrics.json."""
     return {
         "psnr": float(np.mean([r.psnr for r in results])),

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.gaussians.model import Gradients, Model
+from clsplat.gaussians.tables import DeviceModel, Gradients
 from clsplat.opencl.device import Array, Device
 from clsplat.opencl.program import constants
 from clsplat.render.tiles import Band, Footprints, Sort, TileLists, Tiler, TooManyPairs
@@ -15,7 +15,7 @@ from clsplat.render.workspace import Workspace
 from clsplat.scene.scene import View
 
 RECORD = int(constants()["RECORD"])
-MOMENTS = int(constants()["MOMENTS"])
+PIXEL_SUMS = int(constants()["PIXEL_SUMS"])
 UNLIMITED = 2**31  # pairs
 RAY_MARGIN = constants()["RAY_MARGIN"]
 
@@ -112,7 +112,7 @@ class Budget:
     tiles: int = 0  # of a launch; 0: all
 
 
-class Renderer:
+class Rasterizer:
     """Renders one frame at a time; its buffers are reused from frame to frame."""
 
     def __init__(self, device: Device, sort: Sort = "auto", budget: Budget | None = None) -> None:
@@ -126,7 +126,7 @@ class Renderer:
         self._lanes = int(device.tuning["LANES"])
         self._gradients: Gradients | None = None  # made when somebody asks for them
 
-    def forward(self, model: Model, camera: DeviceCamera, background: Array) -> Frame:
+    def forward(self, model: DeviceModel, camera: DeviceCamera, background: Array) -> Frame:
         """Render the model.  background: [3].
 
         Where the pairs of all tiles together pass the budget, fewer rows of tiles are done at a time: the same bits.
@@ -137,7 +137,7 @@ class Renderer:
             except TooManyPairs:
                 self._bands[camera.tiles_y] = 2 * self._bands.get(camera.tiles_y, 1)
 
-    def _forward(self, model: Model, camera: DeviceCamera, background: Array) -> Frame:
+    def _forward(self, model: DeviceModel, camera: DeviceCamera, background: Array) -> Frame:
         array = self.workspace.array
         splats = array("splats", (model.gaussians.count, RECORD))
         radius = array("radius", model.gaussians.capacity)
@@ -173,7 +173,9 @@ class Renderer:
         end = band.first_tile + band.tiles_inside
         return [(first, min(step, end - first)) for first in range(band.first_tile, end, step)]
 
-    def _project_band(self, model: Model, camera: DeviceCamera, band: Band, splats: Array, radius: Array) -> TileLists:
+    def _project_band(
+        self, model: DeviceModel, camera: DeviceCamera, band: Band, splats: Array, radius: Array
+    ) -> TileLists:
         gaussians = model.gaussians
         count, stride = gaussians.count, gaussians.capacity
         arrays = (self.workspace.array(field.name, stride, np.uint32) for field in fields(Footprints))
@@ -191,22 +193,22 @@ class Renderer:
         single = band.row_end - band.row_begin == 1  # it cannot be split further
         return self.tiler.build(splats, footprints, band, count, UNLIMITED if single else self.budget.pairs)
 
-    def moments(
-        self, model: Model, frame: Frame, grad_image: Array, count: int = MOMENTS, texture: Array | None = None
+    def pixel_sums(
+        self, model: DeviceModel, frame: Frame, grad_image: Array, count: int = PIXEL_SUMS, texture: Array | None = None
     ) -> Array:
         """Sums over each Gaussian's pixels that its gradients are made of, [count, S]; see cl_kernels/splat.h.
 
-        grad_image: [3, rows, stride], zero outside the image.  More than MOMENTS of them cost more time; the last are
+        grad_image: [3, rows, stride], zero outside the image.  More than PIXEL_SUMS of them cost more time; the last are
         of `texture`, [rows, stride].
         """
         gaussians = model.gaussians
-        defines = {} if count == MOMENTS else {"MOMENTS": count}
-        moments = self.workspace.array("moments", (count, gaussians.capacity))
+        defines = {} if count == PIXEL_SUMS else {"PIXEL_SUMS": count}
+        pixel_sums = self.workspace.array("pixel_sums", (count, gaussians.capacity))
         for number, band in enumerate(frame.bands):
             lists = frame.lists
             if len(frame.bands) > 1:
                 lists = self._project_band(model, frame.camera, band, frame.splats, frame.radius)
-            pair_moments = self.workspace.array("pair_moments", (lists.pairs, RECORD))
+            pair_sums = self.workspace.array("pair_sums", (lists.pairs, RECORD))
             for first_tile, groups in self._launches(band):
                 self.device.program(f"blend_{self.device.schedule}.cl", **defines).blend_backward(
                     groups=groups,
@@ -219,22 +221,22 @@ class Renderer:
                     grad_image=grad_image,
                     texture=texture or frame.transmittance,  # without a texture the kernel reads none
                     tile_last=frame.tile_last,
-                    pair_moments=pair_moments,
+                    pair_sums=pair_sums,
                     first_tile=first_tile,
                 )
             self.device.program("gather.cl", **defines).sum_records(
                 items=-(-gaussians.count // self._lanes),
-                pair_moments=pair_moments,
+                pair_sums=pair_sums,
                 first_pair=lists.first_pair,
                 tile_count=lists.tile_count,
-                moments=moments,
+                pixel_sums=pixel_sums,
                 accumulate=int(number > 0),
                 stride=gaussians.capacity,
                 count=gaussians.count,
             )
-        return moments
+        return pixel_sums
 
-    def gradients(self, model: Model, frame: Frame, moments: Array) -> Gradients:
+    def gradients(self, model: DeviceModel, frame: Frame, pixel_sums: Array) -> Gradients:
         """Derivatives of the loss by every parameter of the model that made the frame; valid until the next ones."""
         if self._gradients is None or self._gradients.capacity != model.gaussians.capacity:
             self._gradients = Gradients(model.gaussians)
@@ -243,13 +245,13 @@ class Renderer:
             items=-(-model.gaussians.count // self._lanes),
             **shape_arguments(model, frame.camera),
             splats=frame.splats,
-            moments=moments,
+            pixel_sums=pixel_sums,
             **gradients.arguments(),
         )
         return gradients
 
 
-def shape_arguments(model: Model, camera: DeviceCamera) -> dict[str, Any]:
+def shape_arguments(model: DeviceModel, camera: DeviceCamera) -> dict[str, Any]:
     """What every kernel takes that projects Gaussians, by the names of its arguments."""
     gaussians = model.gaussians
     names = ("means", "quats", "log_scales", "logit_opacity", "sh_rest", "filter_variance")

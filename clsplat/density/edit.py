@@ -14,16 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from clsplat.density.statistics import SEEN, SplatStats
+from clsplat.density.thresholds import PixelQuantile, Quantile, Threshold
 from clsplat.errors import ConfigError
-from clsplat.gaussians.model import Gaussians
+from clsplat.gaussians.tables import Gaussians
 from clsplat.render.tiles import Tiler
 from clsplat.settings import Settings
-from clsplat.training.statistics import SEEN, SplatStats
-from clsplat.training.thresholds import PixelQuantile, Quantile, Threshold
 
 Positive = Annotated[float, Field(gt=0)]
-NEVER = 3.0e38  # a bound that no finite float passes
-LEAST = 1.2e-38  # the smallest normal float: a bound that only zero misses
+MAX_BOUND = 3.0e38  # a bound that no finite float passes
+MIN_BOUND = 1.2e-38  # the smallest normal float: a bound that only zero misses
 
 
 def _no_photographs(share: float) -> float:
@@ -31,7 +31,7 @@ def _no_photographs(share: float) -> float:
 
 
 @dataclass(frozen=True)
-class Measures:
+class SceneScale:
     """What rules measure Gaussians by: the scene's extent in scene units, and the texture of its photographs."""
 
     extent: float
@@ -41,7 +41,7 @@ class Measures:
 class Edit:
     """What will become of each Gaussian: how many rows, how many of them the old one, by what fresh scales shrink."""
 
-    def __init__(self, gaussians: Gaussians, stats: SplatStats, measures: Measures, step: int) -> None:
+    def __init__(self, gaussians: Gaussians, stats: SplatStats, measures: SceneScale, step: int) -> None:
         device, count = gaussians.device, gaussians.count
         self.gaussians, self.stats, self.measures, self.step = gaussians, stats, measures, step
         self.copies = device.empty(count, np.uint32)
@@ -74,8 +74,8 @@ class Edit:
             shrink=self.shrink,
             gradient_above=gradient_above,
             size_above=size_above * self.measures.extent,
-            size_below=NEVER if size_below is None else size_below * self.measures.extent,
-            opacity_below=min(opacity_below, NEVER),
+            size_below=MAX_BOUND if size_below is None else size_below * self.measures.extent,
+            opacity_below=min(opacity_below, MAX_BOUND),
             new_shrink=shrink,
             new_copies=copies,
             new_kept=kept,
@@ -86,9 +86,9 @@ class Edit:
     def matching(self, statistic: str, other: str, gradient_above: float) -> float:
         """The threshold that as many Gaussians reach in `statistic` as reach `gradient_above` in `other`."""
         if self.gaussians.count == 0:
-            return LEAST
+            return MIN_BOUND
         share = float(np.mean(self.stats.mean(other) >= np.float32(gradient_above)))
-        return max(float(np.quantile(self.stats.mean(statistic), 1 - share)), LEAST)
+        return max(float(np.quantile(self.stats.mean(statistic), 1 - share)), MIN_BOUND)
 
     def threshold(self, statistic: str, threshold: Threshold) -> float:
         """The number that a threshold on a statistic stands for."""
@@ -97,7 +97,7 @@ class Edit:
         if not isinstance(threshold, Quantile):
             return threshold
         mean = self.stats.mean(statistic)[self.gaussians.get(SEEN)[:, 0] > 0]
-        return max(float(np.quantile(mean, threshold.quantile)), LEAST) if len(mean) else LEAST
+        return max(float(np.quantile(mean, threshold.quantile)), MIN_BOUND) if len(mean) else MIN_BOUND
 
     def choose(self, chosen: NDArray[np.bool_], copies: int, kept: int, shrink: float = 1.0) -> None:
         """Give the Gaussians that the host has chosen, [N], their outcome."""
@@ -194,7 +194,7 @@ def densify(
     stats: SplatStats,
     rules: Sequence[Rule],
     tiler: Tiler,
-    measures: Measures,
+    measures: SceneScale,
     step: int,
     seed: int,
     most: int | None = None,

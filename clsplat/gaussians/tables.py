@@ -137,7 +137,7 @@ class Gradients:
 
 
 @dataclass
-class Model:
+class DeviceModel:
     """Gaussians and the numbers with which they are rendered."""
 
     gaussians: Gaussians
