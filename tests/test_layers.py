@@ -1,6 +1,7 @@
 """Imports go down the layers only.
 
-cli · runner, pipeline · stages · training · density, metrics · losses · views · render · gaussians, scene · opencl · errors
+cli · runner, pipeline · stages · training · density, metrics · losses · views, filters · render · gaussians, scene ·
+opencl · errors, files, settings
 """
 
 import ast

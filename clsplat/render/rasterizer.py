@@ -198,8 +198,8 @@ class Rasterizer:
     ) -> Array:
         """Sums over each Gaussian's pixels that its gradients are made of, [count, S]; see cl_kernels/splat.h.
 
-        grad_image: [3, rows, stride], zero outside the image.  More than PIXEL_SUMS of them cost more time; the last are
-        of `texture`, [rows, stride].
+        grad_image: [3, rows, stride], zero outside the image.  More than PIXEL_SUMS of them cost more time; the last
+        are of `texture`, [rows, stride].
         """
         gaussians = model.gaussians
         defines = {} if count == PIXEL_SUMS else {"PIXEL_SUMS": count}

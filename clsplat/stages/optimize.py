@@ -9,7 +9,7 @@ from pydantic import Field, field_validator
 
 from clsplat.density.statistics import SplatStats
 from clsplat.errors import Interrupted, NumericError
-from clsplat.losses.image import L1, L2, Dssim, Loss, pixel_loss
+from clsplat.losses.image import L1, L2, Dssim, Loss, ViewGradients, pixel_loss
 from clsplat.losses.penalties import Anisotropy, CovarianceTrace, Penalty
 from clsplat.metrics.distribution import distribution
 from clsplat.stages.base import Stage
@@ -22,7 +22,6 @@ from clsplat.training import checkpoint
 from clsplat.training.adam import Adam, Rates
 from clsplat.training.profile import stage_milliseconds
 from clsplat.training.run import Progress, Run
-from clsplat.losses.image import ViewGradients
 from clsplat.training.step import differentiate, update
 
 LOG = logging.getLogger("clsplat")

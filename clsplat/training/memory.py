@@ -63,8 +63,8 @@ class MemoryPlan:
 def plan(gaussians: Gaussians, photographs: int, pixels: int, pixel_sums: int = PIXEL_SUMS) -> MemoryPlan:
     """Plan for the tables that the Gaussians have.
 
-    photographs: bytes of them on the device; pixels: of the largest view, whole tiles; pixel_sums: what the backward pass
-    sums for each Gaussian.
+    photographs: bytes of them on the device; pixels: of the largest view, whole tiles; pixel_sums: how many the backward
+    pass makes for each Gaussian.
     """
     info: DeviceInfo = gaussians.device.info
     sizes = [4 * table.components for table in gaussians.tables.values()]
