@@ -137,21 +137,20 @@ void mark_rule(
 /* Apply one rule to the Gaussians that the host has chosen, with the same precedence. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void mark_chosen(
-    __global const uint *restrict chosen,  // [N] 0 or 1
-    __global uint *restrict copies,        // [N]
-    __global uint *restrict kept,          // [N]
-    __global float *restrict shrink,       // [N]
+    __global const uint *restrict outcome,  // [N] new copies + 1; 0: not chosen
+    __global uint *restrict copies,         // [N]
+    __global uint *restrict kept,           // [N]
+    __global float *restrict shrink,        // [N]
     const float new_shrink,
-    const uint new_copies,
     const uint new_kept,
     const uint count)
 {
     const uint i = get_global_id(0);
-    if (i >= count || chosen[i] == 0 || !(new_copies == 0 || copies[i] == 1))
+    if (i >= count || outcome[i] == 0 || !(outcome[i] == 1 || copies[i] == 1))
         return;
-    copies[i] = new_copies;
-    kept[i] = new_kept;
-    shrink[i] = new_copies == 0 ? shrink[i] : new_shrink;
+    copies[i] = outcome[i] - 1;
+    kept[i] = new_kept < copies[i] ? new_kept : copies[i];
+    shrink[i] = copies[i] == 0 ? shrink[i] : new_shrink;
 }
 
 /* Which row each new row comes from, in the old order: a Gaussian's offspring stay beside it. */

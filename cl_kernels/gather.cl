@@ -1,5 +1,5 @@
-/* Moving rows: the sum of each Gaussian's gradient records, and any per-Gaussian table in another order.  No local
- * memory.  Deterministic: every value has one writer and sums have one order. */
+/* Rows of tables: the sum of each Gaussian's gradient records, any per-Gaussian table in another order, and rows that the
+ * host sets.  No local memory.  Deterministic: every value has one writer and sums have one order. */
 #include "splat.h"
 
 /* One item = LANES Gaussians; the pairs of a Gaussian are contiguous and summed in order: deterministic. */
@@ -53,4 +53,32 @@ void gather_rows(
     if (i >= count)
         return;
     moved[plane * moved_stride + i] = zero_fresh && fresh[i] ? 0.0f : table[plane * table_stride + source[i]];
+}
+
+/* Write rows from the host; no row is named twice.  One item = one value; dimensions row, plane. */
+__kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
+void set_rows(
+    __global const uint *restrict rows,     // [count]
+    __global const float *restrict values,  // [count,components]
+    __global float *restrict table,         // [components,stride]
+    const uint components,
+    const uint stride,
+    const uint count)
+{
+    const uint i = get_global_id(0), plane = get_global_id(1);
+    if (i < count)
+        table[plane * stride + rows[i]] = values[i * components + plane];
+}
+
+/* Set rows to zero.  One item = one value; dimensions row, plane. */
+__kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
+void zero_rows(
+    __global const uint *restrict rows,  // [count]
+    __global float *restrict table,      // [components,stride]
+    const uint stride,
+    const uint count)
+{
+    const uint i = get_global_id(0), plane = get_global_id(1);
+    if (i < count)
+        table[plane * stride + rows[i]] = 0.0f;
 }

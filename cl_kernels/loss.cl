@@ -22,49 +22,49 @@ static inline VF inside_row(const uint column, const uint width)
     return (LANE_INDEX + (int)column) < (int)width ? (VF)(1.0f) : (VF)(0.0f);
 }
 
-/* 8-bit pixels to float planes; a fourth channel, the mask, is 0 or 1.  One item = one pixel of one channel;
- * dimensions x, y, channel. */
+/* 8-bit pixels times a factor to float planes.  One item = one pixel of one channel; dimensions x, y, channel. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
-void unpack_target(
-    __global const uchar *restrict pixels,  // [3 or 4,height,width]
-    __global float *restrict target,        // [3 or 4,H',stride]
+void unpack_pixels(
+    __global const uchar *restrict pixels,  // [channels,height,width]
+    __global float *restrict planes,        // [channels,H',stride]
+    const float factor,                     // 1/255 for colours, 1 for a mask
     const uint width,
     const uint height,
     const uint stride)
 {
     const uint x = get_global_id(0), y = get_global_id(1), channel = get_global_id(2);
     if (x < width)
-        target[(channel * get_global_size(1) + y) * stride + x] =
-            y < height ? pixels[(channel * height + y) * width + x] * (channel < 3 ? 1.0f / 255.0f : 1.0f) : 0.0f;
+        planes[(channel * get_global_size(1) + y) * stride + x] =
+            y < height ? pixels[(channel * height + y) * width + x] * factor : 0.0f;
     else if (x < stride)
-        target[(channel * get_global_size(1) + y) * stride + x] = 0.0f;
+        planes[(channel * get_global_size(1) + y) * stride + x] = 0.0f;
 }
 
 /* Pixels that the mask leaves out become zero.  One item = one pixel of one channel; dimensions pixel, channel. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void apply_mask(
-    __global float *restrict planes,        // [3,H',stride]
-    __global const float *restrict target,  // [4,H',stride], the last is the mask
-    const uint pixels)                      // H' * stride
+    __global float *restrict planes,      // [3,H',stride]
+    __global const float *restrict mask,  // [H',stride] 0 or 1
+    const uint pixels)                    // H' * stride
 {
     const uint pixel = get_global_id(0), channel = get_global_id(1);
-    if (pixel < pixels && target[3 * pixels + pixel] == 0.0f)
+    if (pixel < pixels && mask[pixel] == 0.0f)
         planes[channel * pixels + pixel] = 0.0f;
 }
 
 /* gradient (+)= l1 sign(x - y) + l2 2 (x - y).  Local memory: TEAM * 8 bytes. */
 __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
 void pixel_loss(
-    __global const float *restrict image,   // [3,H',stride]
-    __global const float *restrict target,  // [3,H',stride]
-    __global float *restrict gradient,      // [3,H',stride]
-    __global float *restrict row_sums,      // [3,H',2] sums of |x - y| and (x - y)^2
-    const float l1,                         // weight / values in the image
-    const float l2,                         // weight / values in the image
-    const uint accumulate,                  // 0: overwrite the gradient
+    __global const float *restrict image,       // [3,H',stride]
+    __global const float *restrict photograph,  // [3,H',stride]
+    __global float *restrict gradient,          // [3,H',stride]
+    __global float *restrict row_sums,          // [3,H',2] sums of |x - y| and (x - y)^2
+    const float l1,                             // weight / values in the image
+    const float l2,                             // weight / values in the image
+    const uint accumulate,                      // 0: overwrite the gradient
     const uint width,
     const uint height,
-    const uint rows,                        // H'
+    const uint rows,                            // H'
     const uint stride)
 {
     __local float sums[TEAM][2];
@@ -74,7 +74,7 @@ void pixel_loss(
     VF absolute = zero, squared = zero;
     for (uint x = item * LANES; x < stride; x += TEAM * LANES) {
         const VF inside = inside_row(x, columns);
-        const VF difference = VLOAD(image + row + x) - VLOAD(target + row + x);
+        const VF difference = VLOAD(image + row + x) - VLOAD(photograph + row + x);
         const VF sign = difference > 0.0f ? inside : (difference < 0.0f ? -inside : zero);
         const VF g = l1 * sign + (2.0f * l2) * (difference * inside);
         VSTORE((accumulate ? VLOAD(gradient + row + x) + g : g), gradient + row + x);
@@ -100,13 +100,13 @@ void pixel_loss(
  * Vertical sums go to local memory (SPAN * 20 bytes + TEAM * 4), the horizontal pass reads them. */
 __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
 void ssim_maps(
-    __global const float *restrict image,   // [3,H',stride]
-    __global const float *restrict target,  // [3,H',stride]
-    __global float *restrict maps,          // [3,3,H',stride] derivative, channel, row, column
-    __global float *restrict block_sums,    // [3,height,blocks] sums of the SSIM map
+    __global const float *restrict image,       // [3,H',stride]
+    __global const float *restrict photograph,  // [3,H',stride]
+    __global float *restrict maps,              // [3,3,H',stride] derivative, channel, row, column
+    __global float *restrict block_sums,        // [3,height,blocks] sums of the SSIM map
     const uint width,
     const uint height,
-    const uint rows,                        // H'
+    const uint rows,                            // H'
     const uint stride)
 {
     __local float vertical[5][SPAN];
@@ -123,7 +123,7 @@ void ssim_maps(
                 if (row >= height)
                     continue;
                 const uint at = channel * plane + row * stride + x;
-                const VF a = VLOAD(image + at), b = VLOAD(target + at);
+                const VF a = VLOAD(image + at), b = VLOAD(photograph + at);
                 const VF wa = WINDOW[k] * a, wb = WINDOW[k] * b;
                 mx += wa;
                 my += wb;
@@ -175,15 +175,15 @@ void ssim_maps(
  * Local memory: SPAN * 12 bytes. */
 __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
 void ssim_gradient(
-    __global const float *restrict maps,    // [3,3,H',stride]
-    __global const float *restrict image,   // [3,H',stride]
-    __global const float *restrict target,  // [3,H',stride]
-    __global float *restrict gradient,      // [3,H',stride]
-    const float scale,                      // -weight / values in the image, for 1 - mean SSIM
-    const uint accumulate,                  // 0: overwrite the gradient
+    __global const float *restrict maps,        // [3,3,H',stride]
+    __global const float *restrict image,       // [3,H',stride]
+    __global const float *restrict photograph,  // [3,H',stride]
+    __global float *restrict gradient,          // [3,H',stride]
+    const float scale,                          // -weight / values in the image, for 1 - mean SSIM
+    const uint accumulate,                      // 0: overwrite the gradient
     const uint width,
     const uint height,
-    const uint rows,                        // H'
+    const uint rows,                            // H'
     const uint stride)
 {
     __local float vertical[3][SPAN];
@@ -219,7 +219,7 @@ void ssim_gradient(
         }
         const uint at = channel * plane + y * stride + first + v;
         const VF g = (scale * inside_row(first + v, columns)) *
-                     (mean + 2.0f * VLOAD(image + at) * variance + VLOAD(target + at) * covariance);
+                     (mean + 2.0f * VLOAD(image + at) * variance + VLOAD(photograph + at) * covariance);
         VSTORE((accumulate ? VLOAD(gradient + at) + g : g), gradient + at);
     }
 }

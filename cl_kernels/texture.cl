@@ -57,22 +57,20 @@ void image_gradient(
 /* What is masked is not known, nor is a change beside it: such pixels get the magnitude -1.  One item = one pixel. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void hide_masked(
-    __global const float *restrict target,  // [4,H',stride], the last is the mask
-    __global float *restrict magnitude,     // [H',stride] per px
+    __global const float *restrict mask,  // [H',stride] 0 or 1
+    __global float *restrict magnitude,   // [H',stride] per px
     const uint width,
     const uint height,
-    const uint rows,                        // H'
     const uint stride)
 {
     const uint x = get_global_id(0), y = get_global_id(1);
     if (x >= width || y >= height)
         return;
-    __global const float *counts = target + 3 * (size_t)rows * stride;
     const uint left = x > 0 ? x - 1 : 0, right = x + 1 < width ? x + 1 : x;
     bool known = true;
     for (uint row = y > 0 ? y - 1 : 0; row <= y + 1 && row < height; row++)
-        known &= (counts[row * stride + left] > 0.0f) & (counts[row * stride + x] > 0.0f) &
-                 (counts[row * stride + right] > 0.0f);
+        known &= (mask[row * stride + left] > 0.0f) & (mask[row * stride + x] > 0.0f) &
+                 (mask[row * stride + right] > 0.0f);
     if (!known)
         magnitude[y * stride + x] = -1.0f;
 }

@@ -91,7 +91,7 @@ def check(
         )
         return
     checked = load(pipeline)
-    names = [stage.stage for stage in (*checked.settings.prepare, *checked.settings.stages)]
+    names = [*(step.stage for step in checked.settings.prepare), *(stage.stage for stage in checked.stages)]
     CONSOLE.print(f"{checked.path}: {', '.join(names)}: fine", markup=False)
 
 

@@ -16,7 +16,7 @@ from clsplat.gaussians.tables import DeviceModel, Gaussians
 from clsplat.opencl.device import Array, Device
 from clsplat.render.rasterizer import camera_values
 from clsplat.scene.scene import View
-from clsplat.settings import Settings
+from clsplat.settings import OneOf, Settings
 
 
 class FilterViews:
@@ -53,8 +53,10 @@ class Smoothing(WorldFilter):
     """
 
     type: Literal["smoothing"] = "smoothing"
-    variance: Annotated[float, Field(ge=0)] = 0.2  # in sampling intervals²
+    variance: Annotated[float, Field(ge=0)] = 0.2
+    """Added to the squared scales, in sampling intervals²."""
     focal: Literal["per_camera", "global_max"] = "per_camera"
+    """Focal length of the interval: of each view, or the largest of all."""
 
     def refresh(self, gaussians: Gaussians, views: FilterViews, near: float) -> None:
         focal = np.full_like(views.focal, views.focal.max()) if self.focal == "global_max" else views.focal
@@ -86,8 +88,10 @@ def measure_intervals(
 class ScreenFilter(Settings):
     """How splats are blurred on the screen."""
 
-    variance: Annotated[float, Field(ge=0)]  # px²
-    compensate: Literal[0, 1]  # 1: opacity loses what the filter spreads out
+    variance: Annotated[float, Field(ge=0)]
+    """Added to the variance of every splat, px²."""
+    compensate: Literal[0, 1]
+    """1: the opacity falls as the area grows, so that a splat keeps its energy."""
 
 
 class Dilation(ScreenFilter):
@@ -95,7 +99,9 @@ class Dilation(ScreenFilter):
 
     type: Literal["dilation"] = "dilation"
     variance: Annotated[float, Field(ge=0)] = 0.3
+    """Added to the variance of every splat, px²."""
     compensate: Literal[0, 1] = 0
+    """1: the opacity falls as the area grows, so that a splat keeps its energy."""
 
 
 class Ewa(ScreenFilter):
@@ -103,7 +109,9 @@ class Ewa(ScreenFilter):
 
     type: Literal["ewa"] = "ewa"
     variance: Annotated[float, Field(ge=0)] = 0.3
+    """Added to the variance of every splat, px²."""
     compensate: Literal[0, 1] = 1
+    """1: the opacity falls as the area grows, so that a splat keeps its energy."""
 
 
 class Mip(ScreenFilter):
@@ -111,22 +119,22 @@ class Mip(ScreenFilter):
 
     type: Literal["mip"] = "mip"
     variance: Annotated[float, Field(ge=0)] = 0.1
+    """Added to the variance of every splat, px²."""
     compensate: Literal[0, 1] = 1
-
-
-WORLD_FILTERS: dict[str, type[WorldFilter]] = {"none": NoWorldFilter, "smoothing": Smoothing}
-SCREEN_FILTERS: dict[str, type[ScreenFilter]] = {"dilation": Dilation, "ewa": Ewa, "mip": Mip}
-AnyWorldFilter = Annotated[NoWorldFilter | Smoothing, Field(discriminator="type")]
-AnyScreenFilter = Annotated[Dilation | Ewa | Mip, Field(discriminator="type")]
+    """1: the opacity falls as the area grows, so that a splat keeps its energy."""
 
 
 class ModelSettings(Settings):
     """How Gaussians are rendered."""
 
     sh_degree: Annotated[int, Field(ge=0, le=3)] = 3
-    near: Annotated[float, Field(gt=0)] = 0.2  # scene units; nearer Gaussians are not drawn
-    world_filter: AnyWorldFilter = NoWorldFilter()
-    screen_filter: AnyScreenFilter = Dilation()
+    """Highest degree of the spherical harmonics."""
+    near: Annotated[float, Field(gt=0)] = 0.2
+    """Smallest depth in scene units that is drawn."""
+    world_filter: OneOf[WorldFilter] = NoWorldFilter()
+    """Blur of Gaussians in the world."""
+    screen_filter: OneOf[ScreenFilter] = Dilation()
+    """Blur of splats on the screen."""
 
     def model(self, gaussians: Gaussians, degree: int) -> DeviceModel:
         """Return the Gaussians with the numbers of these settings; `degree` is the active one."""

@@ -51,17 +51,17 @@ class ModelFile:
 
     def render(self, split: str, out: Path, kind: str) -> int:
         """Write an image for each view of a split; return their number."""
-        targets = Photographs(self.device, self.background)
+        photographs = Photographs(self.device, self.background)
         views = self.scene.split(split)
         if not views:
             raise DataError(f"{self.scene.path}: has no {split} views")
         for view in views:
-            camera = targets.camera(view)
+            camera = photographs.camera(view)
             path = image_path(out, view.name, f".{kind}")
             if kind == "png":
-                write_image(path, render_view(self.rasterizer, self.model, camera, targets.background_array))
+                write_image(path, render_view(self.rasterizer, self.model, camera, photographs.background))
             else:
-                frame = self.rasterizer.forward(self.model, camera, targets.background_array)
+                frame = self.rasterizer.forward(self.model, camera, photographs.background)
                 planes = frame.image.get()[:, : camera.height, : camera.width]
                 buffer = io.BytesIO()
                 np.save(buffer, np.ascontiguousarray(planes.transpose(1, 2, 0)), allow_pickle=False)
@@ -74,9 +74,9 @@ class ModelFile:
         metrics: dict[str, Any] = {"test": {}, "train": {}}
         for scale in scales:
             scene = self.photographs.downscaled(scale)
-            targets = Photographs(self.device, self.background)
+            photographs = Photographs(self.device, self.background)
             for split in ("test", "train"):
                 if scene.split(split):
-                    results = measure(self.rasterizer, self.model, scene.split(split), targets, perceptual)
+                    results = measure(self.rasterizer, self.model, scene.split(split), photographs, perceptual)
                     metrics[split][f"{scale:g}"] = mean(results, perceptual)
         return {**metrics, "gaussians": self.model.gaussians.count, "device": self.device.text}

@@ -25,17 +25,16 @@ from clsplat.errors import ConfigError
 from clsplat.filters import ModelSettings
 from clsplat.opencl.device import Schedule
 from clsplat.prepare.cache import Planned, plan
-from clsplat.prepare.steps import STEPS, AnyStep
+from clsplat.prepare.steps import Step
+from clsplat.renamed import with_new_names
 from clsplat.render.rasterizer import RECORD, UNLIMITED, Budget
 from clsplat.render.tiles import Sort
 from clsplat.scene.detect import read_scene
 from clsplat.scene.scene import Alpha, Background, Scene
-from clsplat.settings import Settings
+from clsplat.settings import OneOf, Settings, variants
 from clsplat.settings_errors import explain
-from clsplat.stages import STAGES, AnyStage
-from clsplat.stages.base import Stage
+from clsplat.stages.base import Scheduled, Stage
 from clsplat.stages.optimize import Optimize
-from clsplat.views.order import Sampling
 from clsplat.yaml_file import Document, parse_scalar, read_yaml
 
 LOG = logging.getLogger("clsplat")
@@ -44,25 +43,29 @@ LOG = logging.getLogger("clsplat")
 class SceneSettings(Settings):
     """Which photographs, and how they are read."""
 
-    path: str | None = None  # usually given by --scene
-    downscale: Annotated[float, Field(ge=1)] = 1  # image sizes are divided by this
-    levels: Annotated[int, Field(ge=1, le=8)] = 1  # scales to train on: downscale, and twice, four times, … that
-    sampling: Sampling = "uniform"  # of views among several levels
-    alpha: Alpha = "transparency"  # of photographs: blended with the background, or a mask of what counts
-    background: Literal["auto", "black", "white"] = "auto"  # auto: white for Blender scenes, else black
-    image_budget: Annotated[int, Field(gt=0)] | None = (
-        None  # MiB of photographs on the device; default: a quarter of it
-    )
-    holdout: Annotated[int, Field(ge=0)] = 8  # every n-th image, by name, is a test view; 0: none
+    path: str | None = None
+    """Folder of the dataset; usually given by --scene."""
+    downscale: Annotated[float, Field(ge=1)] = 1
+    """Divisor of the photographs' size."""
+    levels: Annotated[int, Field(ge=1, le=8)] = 1
+    """Number of sizes to train on: downscale, and twice, four times, … that."""
+    alpha: Alpha = "transparency"
+    """Fourth channel of photographs: blended with the background, or a mask of what counts."""
+    background: Literal["auto", "black", "white"] = "auto"
+    """Colour behind the scene; auto: white for Blender scenes, else black."""
+    image_budget: Annotated[int, Field(gt=0)] | None = None
+    """MiB of photographs on the device; without it, a quarter of its memory."""
+    holdout: Annotated[int, Field(ge=0)] = 8
+    """Every n-th image, by name, is a test view; 0: none."""
 
     @property
     def scales(self) -> tuple[float, ...]:
-        """What the original photographs' sizes are divided by for training, from the finest."""
+        """Divisors of the original photographs' size to train on, from the finest."""
         return tuple(self.downscale * 2**level for level in range(self.levels))
 
     @property
     def folder(self) -> Path:
-        """Where the photographs lie.  Raises ConfigError when nobody said so."""
+        """Where the photographs lie.  Raises ConfigError when it was not given."""
         if self.path is None:
             raise ConfigError("no scene given; use --scene DIR, or scene: {path: DIR} in the pipeline file")
         return Path(self.path)
@@ -77,9 +80,13 @@ class RasterizerSettings(Settings):
     """How the device works; results do not depend on it."""
 
     schedule: Schedule = "auto"
+    """Schedule of blending: wide for CPUs, simt for GPUs."""
     sort: Sort = "auto"
-    pair_budget: Annotated[int, Field(gt=0)] | None = None  # MiB of gradient records; default: the largest buffer
-    launch_tiles: Annotated[int, Field(ge=0)] = 0  # tiles blended by one launch, for watchdogs of displays; 0: all
+    """Way to order splats by tile and depth; auto: the faster one on the first frame."""
+    pair_budget: Annotated[int, Field(gt=0)] | None = None
+    """MiB of gradient records; without it, the largest buffer of the device."""
+    launch_tiles: Annotated[int, Field(ge=0)] = 0
+    """Tiles blended by one launch, for watchdogs of displays; 0: all."""
 
     def budget(self) -> Budget | None:
         """How much the rasterizer does at a time."""
@@ -97,12 +104,19 @@ class PipelineFile(Settings):
     """All that a pipeline file can say."""
 
     name: Name
+    """Name of the pipeline, and of its run folder."""
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
+    """Seed of all random numbers."""
     scene: SceneSettings = SceneSettings()
+    """Which photographs."""
     model: ModelSettings = ModelSettings()
+    """How Gaussians are rendered."""
     rasterizer: RasterizerSettings = RasterizerSettings()
-    prepare: list[Annotated[AnyStep, Field(discriminator="stage")]] = Field([])  # photographs -> scene, done once
-    stages: Annotated[list[Annotated[AnyStage, Field(discriminator="stage")]], Field(min_length=1)]
+    """How the device works."""
+    prepare: list[OneOf[Step]] = Field([])
+    """Steps from photographs to a scene, each done once."""
+    stages: Annotated[list[OneOf[Stage]], Field(min_length=1)]
+    """What is done with the scene, in order."""
 
     @property
     def training(self) -> Optimize:
@@ -167,6 +181,7 @@ def checked(path: Path, document: Document, overrides: Sequence[str] = ()) -> Pi
     data = _tagged_file(Document(copy.deepcopy(document.data), document.lines), path)
     for override in overrides:
         _override(data, override)
+    data = with_new_names(data, str(path))
     try:
         settings = PipelineFile.model_validate(data)
     except ValidationError as error:
@@ -261,7 +276,7 @@ def _descend(node: Any, name: str, text: str, top: bool) -> Any:
     if name in node:
         return node[name]
     if top and name not in PipelineFile.model_fields:
-        known = [*PipelineFile.model_fields, *STAGES, *STEPS]
+        known = [*PipelineFile.model_fields, *variants(Stage), *variants(Step)]
         near = difflib.get_close_matches(name, known, n=1)
         raise ConfigError(f"--set {text}: no '{name}' in this pipeline{f'; did you mean {near[0]}?' if near else ''}")
     node[name] = {}
@@ -272,10 +287,10 @@ def _check_order(path: Path, settings: PipelineFile) -> None:
     """Every stage finds what it needs made before it."""
     made = {"scene"}
     for i, stage in enumerate(settings.stages):
-        if stage.every is not None:
+        if isinstance(stage, Scheduled) and stage.every is not None:
             raise ConfigError(f"{path}: stages[{i}] {stage.stage}: 'every' belongs inside optimize.during")
         for need in sorted(stage.needs - made):
-            makers = ", ".join(name for name, kind in STAGES.items() if need in kind.makes)
+            makers = ", ".join(name for name, kind in variants(Stage).items() if need in kind.makes)
             raise ConfigError(
                 f"{path}: stages[{i}] {stage.stage} needs '{need}', which no earlier stage makes ({makers} makes it)"
             )

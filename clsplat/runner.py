@@ -73,8 +73,8 @@ def open_run(pipeline: Pipeline, out: Path, words: str | None) -> Run:
     planned = pipeline.preparation(out)
     if planned and noted(out) not in (None, note(planned)):
         raise ConfigError(f"{out}: began with other photographs, or other settings to prepare them; give another --out")
-    photographs, background = settings.scene.read(prepare(planned, settings.scene.folder, prepared_beside(out)))
-    scene = photographs.downscaled(*settings.scene.scales)
+    original, background = settings.scene.read(prepare(planned, settings.scene.folder, prepared_beside(out)))
+    scene = original.downscaled(*settings.scene.scales)
     camera, budget = scene.views[0].camera, settings.scene.image_budget
     LOG.info(
         "scene: %s, %d training and %d test views, %d x %d px, %s background, extent %.3g",
@@ -83,15 +83,14 @@ def open_run(pipeline: Pipeline, out: Path, words: str | None) -> Run:
     return Run(
         device=device,
         scene=scene,
-        photographs=photographs,
+        original=original,
         out=out,
         name=settings.name,
         seed=settings.seed,
         pipeline=pipeline.resolved(),
         rasterizer=Rasterizer(device, settings.rasterizer.sort, settings.rasterizer.budget()),
-        targets=Photographs(device, background, None if budget is None else budget << 20, out / "straightened"),
+        photographs=Photographs(device, background, None if budget is None else budget << 20, out / "straightened"),
         model_settings=settings.model,
-        sampling=settings.scene.sampling,
         prepared=note(planned) if planned else None,
     )
 
@@ -156,7 +155,7 @@ def _write_metrics(run: Run) -> None:
     metrics = {
         "test": run.metrics.get("test", {}),
         "train": run.metrics.get("train", {}),
-        "gaussians": run.trained.gaussians.count,
+        "gaussians": run.model.gaussians.count,
         "steps": run.step,
         "train_seconds": round(run.train_seconds, 3),
         "seed": run.seed,
@@ -189,7 +188,7 @@ def describe(pipeline: Pipeline, out: Path, device: str | None) -> str:
             cadences = (f"{inner.stage} every {inner.every}" for inner in stage.during)
             detail = f"{stage.steps} steps; " + ", ".join(cadences)
         elif isinstance(stage, Evaluate) and run:
-            views = run.photographs.downscaled(run.scale).split(stage.split)
+            views = run.original.downscaled(run.scale).split(stage.split)
             scales = ", ".join(f"1/{scale:g}" for scale in stage.scales or [run.scale])
             detail = f"{len(views)} {stage.split} views at {scales}"
         lines.append(f"  {stage.stage:<14} {detail}".rstrip())

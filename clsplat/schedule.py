@@ -1,31 +1,125 @@
-"""Weights that may change over training: a number, or points with straight lines between them."""
+"""Numbers that may change over training, in one notation for weights, rates, sizes, blur and thresholds.
 
-from typing import Annotated
+0.8                                                     the same at every step
+[[0, 4.0], [1000, 1.0]]                                 points (global step, value), straight lines between
+{points: [[0, 4.0], [1000, 1.0]], between: steps}       each value from its step on, until the next
+{initial: 1.6e-4, final: 1.6e-6, over: 30000, start: 0} exponential decay over a number of steps from a step on
+"""
 
-from pydantic import AfterValidator, Field
+import math
+from collections.abc import Callable
+from typing import Annotated, Any, Literal
 
-Point = Annotated[list[float], Field(min_length=2, max_length=2)]  # global step, weight
+from pydantic import AfterValidator, Field, ValidationError, WrapValidator
+
+from clsplat.settings import Settings
+
+Point = Annotated[list[float], Field(min_length=2, max_length=2)]  # global step, value
 
 
 def _in_order(points: list[Point]) -> list[Point]:
     steps = [step for step, _ in points]
     if not points or steps != sorted(set(steps)):
-        raise ValueError("expected points [step, weight] with growing steps")
+        raise ValueError("expected points [step, value] with growing steps")
     return points
 
 
-Weight = float | Annotated[list[Point], AfterValidator(_in_order)]
-
-
-def at_step(weight: Weight, step: int) -> float:
-    """The weight at a global step; before the first point and after the last it stays as there."""
-    if not isinstance(weight, list):
-        return weight
-    (first, value), *rest = weight
+def _between(points: list[Point], step: int, linear: bool) -> float:
+    (first, value), *rest = points
     for until, following in rest:
         if step <= first:
             break
         if step < until:
-            return value + (following - value) * (step - first) / (until - first)
+            return value + (following - value) * (step - first) / (until - first) if linear else value
         first, value = until, following
     return value
+
+
+PointList = Annotated[list[Point], AfterValidator(_in_order)]
+
+
+class Points(Settings):
+    """Values at steps; before the first point and after the last the value stays as there."""
+
+    points: PointList
+    """[global step, value], with growing steps."""
+    between: Literal["linear", "steps"] = "linear"
+    """What lies between two points: a straight line, or the value of the point before."""
+
+    def at(self, step: int) -> float:
+        """Return the value at a global step."""
+        return _between(self.points, step, linear=self.between == "linear")
+
+    @property
+    def values(self) -> list[float]:
+        """Every value that is named."""
+        return [value for _, value in self.points]
+
+
+class Decay(Settings):
+    """A value that falls or grows exponentially (Kerbl et al. 2023)."""
+
+    initial: Annotated[float, Field(gt=0)]
+    """The value up to `start`."""
+    final: Annotated[float, Field(gt=0)]
+    """The value from `start + over` on."""
+    over: Annotated[int, Field(gt=0)]
+    """Steps from the one value to the other."""
+    start: Annotated[int, Field(ge=0)] = 0
+    """Global step at which the decay begins."""
+
+    def at(self, step: int) -> float:
+        """Return the value at a global step."""
+        share = min(max(step - self.start, 0) / self.over, 1.0)
+        return math.exp((1 - share) * math.log(self.initial) + share * math.log(self.final))
+
+    @property
+    def values(self) -> list[float]:
+        """Every value that is named."""
+        return [self.initial, self.final]
+
+
+def _explained(value: Any, validate: Callable[[Any], Any]) -> Any:
+    """Say in one sentence what is wrong with a schedule, not once for each notation."""
+    try:
+        return validate(value)
+    except ValidationError as error:
+        messages = [one["msg"].removeprefix("Value error, ") for one in error.errors() if one["type"] == "value_error"]
+        expected = "expected a number, points [[step, value], …] with growing steps, {points, between} or "
+        raise ValueError(messages[0] if messages else f"{expected}{{initial, final, over, start}}") from None
+
+
+Schedule = Annotated[float | PointList | Points | Decay, WrapValidator(_explained)]
+
+
+def values_of(schedule: Schedule) -> list[float]:
+    """Every value that a schedule names."""
+    if isinstance(schedule, list):
+        return [value for _, value in schedule]
+    return schedule.values if isinstance(schedule, Points | Decay) else [schedule]
+
+
+class Bounded:
+    """Requires every value of a schedule to be at least `lowest`, or, where `above`, larger."""
+
+    def __init__(self, lowest: float, above: bool = False) -> None:
+        self.lowest, self.above = lowest, above
+
+    def __call__(self, schedule: Any) -> Any:
+        lowest = min(values_of(schedule))
+        if lowest < self.lowest or (self.above and lowest == self.lowest):
+            bound = "larger than" if self.above else "at least"
+            raise ValueError(f"expected values {bound} {self.lowest:g}")
+        return schedule
+
+
+NonNegative = Annotated[Schedule, AfterValidator(Bounded(0))]
+Positive = Annotated[Schedule, AfterValidator(Bounded(0, above=True))]
+AtLeastOne = Annotated[Schedule, AfterValidator(Bounded(1))]
+
+
+def at_step(schedule: Schedule, step: int) -> float:
+    """Return the value of a schedule at a global step."""
+    if isinstance(schedule, list):
+        return _between(schedule, step, linear=True)
+    return schedule.at(step) if isinstance(schedule, Points | Decay) else schedule

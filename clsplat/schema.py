@@ -4,16 +4,16 @@ from typing import Any
 
 from clsplat.matrix import Matrix
 from clsplat.pipeline import PipelineFile
-from clsplat.prepare.steps import STEPS
-from clsplat.stages import STAGES
+from clsplat.prepare.steps import Step
+from clsplat.settings import Settings, variants
+from clsplat.stages.base import Scheduled, Stage
 
 
 def json_schema() -> dict[str, Any]:
     """Return the schema in the shape of the file: a stage is its name, or its name with settings."""
     schema = PipelineFile.model_json_schema()
     definitions = schema["$defs"]
-    stages = {kind.__name__: name for name, kind in STAGES.items()}
-    steps = {kind.__name__: name for name, kind in STEPS.items()}
+    stages, scheduled, steps = (_titles(base) for base in (Stage, Scheduled, Step))
     for title in (*stages, *steps):
         definitions[title]["properties"].pop("stage", None)
     schema["properties"]["stages"]["items"] = _items(stages)
@@ -26,8 +26,13 @@ def json_schema() -> dict[str, Any]:
         {"required": ["stages"]},
         {"required": ["matrix"], "properties": {"matrix": {"required": ["pipelines"]}}},
     ]
-    definitions["Optimize"]["properties"]["during"]["items"] = _items(stages)
+    definitions["Optimize"]["properties"]["during"]["items"] = _items(scheduled)
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
+
+
+def _titles(base: type[Settings]) -> dict[str, str]:
+    """Names of the variants by the titles of their definitions."""
+    return {kind.__name__: name for name, kind in variants(base).items()}
 
 
 def _items(stages: dict[str, str]) -> dict[str, Any]:

@@ -1,9 +1,108 @@
-"""Settings: frozen models whose fields are the keys of a pipeline file."""
+"""Settings: frozen models whose fields are the keys of a pipeline file, and the variants that a key chooses from.
 
-from pydantic import BaseModel, ConfigDict
+A variant is a subclass with a name: the literal in its field `type`, or `stage` for stages.  It is known as soon as its
+class is defined, in the package or in a plug-in; nothing is listed twice.
+"""
+
+import importlib
+import pkgutil
+import typing
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, TypeVar
+
+from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler
+from pydantic_core import CoreSchema, core_schema
+
+from clsplat.errors import ConfigError
+
+TAGS = ("stage", "type")  # fields that hold a variant's name
+Base = TypeVar("Base", bound="Settings")
 
 
 class Settings(BaseModel):
     """Base of everything that a pipeline file can say: unknown keys and wrong types are errors."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", strict=True, allow_inf_nan=False, use_attribute_docstrings=True
+    )
+    defined: ClassVar[list[type["Settings"]]] = []  # every subclass, in the order of definition
+
+    @classmethod
+    def __pydantic_init_subclass__(cls, **options: Any) -> None:
+        Settings.defined.append(cls)
+
+
+def tag_of(kind: type[Settings]) -> tuple[str, str] | None:
+    """The field that names a variant, and its name; None for a class that is only a base of variants."""
+    for tag in TAGS:
+        if tag in kind.model_fields and (names := typing.get_args(kind.model_fields[tag].annotation)):
+            return tag, str(names[0])
+    return None
+
+
+def variants(base: type[Base]) -> dict[str, type[Base]]:
+    """The subclasses of `base` that have a name, by name.  Raises ConfigError when two have the same one."""
+    found: dict[str, type[Base]] = {}
+    for kind in Settings.defined:
+        if not issubclass(kind, base) or (tag := tag_of(kind)) is None:
+            continue
+        if tag[1] in found:
+            places = " and ".join(f"{one.__module__}.{one.__name__}" for one in (found[tag[1]], kind))
+            raise ConfigError(f"two variants of {base.__name__} have the name '{tag[1]}': {places}; rename one")
+        found[tag[1]] = kind
+    return found
+
+
+class Variants:
+    """Marks a field that takes one of the variants of a base: a mapping with its name, or the name alone."""
+
+    def __init__(self, base: type[Settings]) -> None:
+        self.base = base
+
+    @property
+    def tag(self) -> str:
+        """The field that names the variants."""
+        return next((tag[0] for kind in variants(self.base).values() if (tag := tag_of(kind))), TAGS[-1])
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        tag = self.tag
+        choices = {name: handler.generate_schema(kind) for name, kind in variants(self.base).items()}
+
+        def with_tag(value: Any) -> Any:
+            return {tag: value} if isinstance(value, str) else value
+
+        union = core_schema.tagged_union_schema(choices, discriminator=tag)
+        return core_schema.no_info_before_validator_function(with_tag, union)
+
+
+class VariantName:
+    """Marks a field that takes the name of one of the variants of a base."""
+
+    def __init__(self, base: type[Settings]) -> None:
+        self.base = base
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return core_schema.literal_schema(list(variants(self.base)))
+
+
+if TYPE_CHECKING:
+    OneOf = Annotated[Base, ...]
+else:
+
+    class OneOf:
+        """`OneOf[Rule]`: any variant of Rule."""
+
+        def __class_getitem__(cls, base: type[Settings]) -> Any:
+            return Annotated[base, Variants(base)]
+
+
+def import_modules(package: str, path: Iterable[str]) -> None:
+    """Import every module of a package, so that the variants in them are defined."""
+    for module in pkgutil.iter_modules(path):
+        importlib.import_module(f"{package}.{module.name}")
+
+
+def rebuild() -> None:
+    """Let fields of variants know those that were defined since: after a plug-in was loaded."""
+    for kind in Settings.defined:
+        kind.model_rebuild(force=True)

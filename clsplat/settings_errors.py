@@ -8,6 +8,7 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
+from clsplat.settings import Variants, variants
 from clsplat.yaml_file import Document, Place
 
 KINDS = {
@@ -107,7 +108,9 @@ def _models(annotation: Any) -> list[type[BaseModel]]:
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
     if typing.get_origin(annotation) is typing.Annotated:
-        return _models(typing.get_args(annotation)[0])
+        inner, *marks = typing.get_args(annotation)
+        bases = [mark.base for mark in marks if isinstance(mark, Variants)]
+        return list(variants(bases[0]).values()) if bases else _models(inner)
     if typing.get_origin(annotation) in (typing.Union, types.UnionType):
         return [model for argument in typing.get_args(annotation) for model in _models(argument)]
     return []

@@ -11,19 +11,21 @@ import numpy as np
 from clsplat.bench.floors import Work, floors
 from clsplat.bench.peaks import Peaks
 from clsplat.density.basic import PruneLarge
-from clsplat.density.edit import SceneScale, densify
+from clsplat.density.edit import Edit, SceneScale, densify
 from clsplat.density.statistics import SplatStats
 from clsplat.gaussians.ply import Parameters
 from clsplat.gaussians.tables import PARAMETERS, Gaussians
 from clsplat.opencl.device import Device
+from clsplat.opencl.program import constants
 from clsplat.pipeline import PipelineFile
 from clsplat.render.rasterizer import RECORD, Frame, Rasterizer
 from clsplat.training.adam import Adam, Rates
 from clsplat.training.memory import plan
 from clsplat.training.profile import stage_milliseconds
-from clsplat.training.step import differentiate, update
+from clsplat.training.trainer import Trainer
 from clsplat.views.photographs import Photograph
 
+SPLAT_Y_MIN, SPLAT_Y_MAX = (int(constants("splat.h")[name]) for name in ("SPLAT_Y_MIN", "SPLAT_Y_MAX"))
 WARM_UP = 3  # steps: kernels are compiled and buffers grown
 
 
@@ -42,45 +44,48 @@ class Result:
 
 
 class Case:
-    """One scene, ready to be stepped with a pipeline's losses and statistics, rendered as it says.
+    """One scene, ready for training steps with a pipeline's losses and statistics, rendered as it says.
 
     World filters are in the scales of an exported model; here they cost nothing.
     """
 
     def __init__(
-        self, device: Device, parameters: Parameters, target: Photograph, background: str, settings: PipelineFile
+        self, device: Device, parameters: Parameters, photograph: Photograph, background: str, settings: PipelineFile
     ) -> None:
-        self.device, self.target, self.optimize = device, target, settings.training
+        self.device, self.photograph, optimize = device, photograph, settings.training
         self._before = device.peak = device.allocated
-        self.rasterizer = Rasterizer(device, "radix")
         gaussians = Gaussians(device, parameters)
-        self.model = settings.model.model(gaussians, gaussians.sh_degree)
-        self.adam, self.stats = Adam(gaussians), SplatStats(gaussians, self.optimize.statistics)
-        for name in sorted(self.optimize.tables):
+        for name in sorted(optimize.tables):
             gaussians.add(name, 1)
-        self.background = device.zeros(3)
-        self.background.fill(1.0 if background == "white" else 0.0)
-        self.rates = dict.fromkeys(Rates().at(1, 1.0), 0.0)  # nothing moves: every step does the same work
+        colour = device.zeros(3)
+        colour.fill(1.0 if background == "white" else 0.0)
+        model = settings.model.model(gaussians, gaussians.sh_degree)
+        still = Rates(**dict.fromkeys(PARAMETERS, 0.0))  # every step does the same work
+        self.trainer = Trainer(
+            Rasterizer(device, "radix"),
+            model,
+            Adam(gaussians),
+            SplatStats(gaussians, optimize.statistics),
+            colour,
+            optimize.losses,
+            still,
+        )
         self.clock: list[float] = []
         self.stages: dict[str, list[float]] = defaultdict(list)
         self.densify: list[float] = []
         self.frame: Frame | None = None
         for _ in range(WARM_UP):
             self.step(record=False)
-        self.step(record=False, without=PARAMETERS)  # as where an edit is due: its gradients stay on the device
+        self.step(record=False, stale=PARAMETERS)  # as where an edit is due: its gradients stay on the device
         self.edit()
         self.memory = device.peak - self._before
 
-    def step(self, record: bool, without: Collection[str] = ()) -> None:
-        """One training step; `record` keeps its times, parameters `without` stay as they are."""
+    def step(self, record: bool, stale: Collection[str] = ()) -> None:
+        """Do one training step; `record` keeps its times, parameters in `stale` are not updated."""
         self.device.finish()
         self.device.timings.sampling = record
         start = time.perf_counter()
-        losses, penalties = self.optimize.comparisons, self.optimize.penalties
-        view = differentiate(
-            self.rasterizer, self.model, self.target, self.background, losses, count=self.stats.pixel_sums
-        )
-        self.stats.add(view, update(self.rasterizer, self.model, self.adam, view, self.rates, penalties, without))
+        view = self.trainer.step(self.photograph, stale=stale)
         self.device.finish()
         seconds = time.perf_counter() - start
         self.device.timings.sampling = False
@@ -91,11 +96,11 @@ class Case:
                 self.stages[name].append(milliseconds)
 
     def edit(self) -> None:
-        """One density edit that moves every table and changes nothing."""
+        """Do one density edit that moves every table and changes nothing."""
         self.device.finish()
         start = time.perf_counter()
-        never = [PruneLarge(size_above=1e30)]
-        densify(self.model.gaussians, self.stats, list(never), self.rasterizer.tiler, SceneScale(1.0), 1, 0)
+        edit = Edit(self.trainer.model.gaussians, self.trainer.stats, SceneScale(1.0), step=1, seed=0)
+        densify(edit, [PruneLarge(size_above=1e30)], self.trainer.rasterizer.tiler)
         self.device.finish()
         self.densify.append(1e3 * (time.perf_counter() - start))
 
@@ -108,10 +113,10 @@ class Case:
         return Result(work, stages, floors(work, peaks), clock, densify_ms, host, self.memory, planned)
 
     def _planned(self) -> int:
-        camera = self.target.camera
-        gaussians = self.model.gaussians
-        pixels, pixel_sums = camera.stride * camera.rows, self.stats.pixel_sums
-        return plan(gaussians, self.target.pixels.nbytes, pixels, pixel_sums).needed(gaussians.count)
+        camera = self.photograph.camera
+        gaussians = self.trainer.model.gaussians
+        pixels, pixel_sums = camera.stride * camera.rows, self.trainer.stats.pixel_sums
+        return plan(gaussians, self.photograph.nbytes, pixels, pixel_sums).needed(gaussians.count)
 
     def _work(self) -> Work:
         assert self.frame is not None
@@ -121,10 +126,10 @@ class Case:
         tiles = np.empty(lists.pairs, np.int64)
         tiles[lists.tile_pairs.get()[: lists.pairs]] = np.repeat(np.arange(camera.tiles), np.diff(offsets))
         top = tiles // camera.tiles_x * camera.tile + 0.5
-        first = np.maximum(np.ceil(records[:, 9] - top), 0)
-        last = np.minimum(np.floor(records[:, 10] - top), camera.tile - 1)
+        first = np.maximum(np.ceil(records[:, SPLAT_Y_MIN] - top), 0)
+        last = np.minimum(np.floor(records[:, SPLAT_Y_MAX] - top), camera.tile - 1)
         rows = int(np.maximum(last - first + 1, 0).sum()) * camera.tile // 16
-        return Work(self.model.gaussians.count, lists.pairs, rows, camera.width * camera.height)
+        return Work(self.trainer.model.gaussians.count, lists.pairs, rows, camera.width * camera.height)
 
 
 def run_bench(cases: dict[str, Case], peaks: Peaks, repeats: int) -> dict[str, Result]:

@@ -12,6 +12,7 @@ from clsplat.gaussians.ply import Parameters, is_splat, read_ply
 from clsplat.gaussians.tables import SH_C0
 from clsplat.opencl.device import Device
 from clsplat.pipeline import PipelineFile
+from clsplat.render.rasterizer import upload_camera
 from clsplat.scene.points import read_points_ply
 from clsplat.scene.scene import Camera, View
 from clsplat.stages.init import from_points
@@ -48,18 +49,18 @@ def synthetic(width: int, height: int, count: int, size: float = SIZE) -> tuple[
 def case(device: Device, width: int, height: int, count: int, settings: PipelineFile, size: float = SIZE) -> Case:
     """Open a synthetic scene with a noise image for its photograph."""
     parameters, view = synthetic(width, height, count, size)
-    targets = Photographs(device, "black")
+    camera = upload_camera(device, view)
     shape = (3, height, width)
     pixels = np.random.default_rng(1).integers(0, 256, shape, dtype=np.uint8)
-    return Case(device, parameters, Photograph(targets.camera(view), device.upload(pixels)), "black", settings)
+    return Case(device, parameters, Photograph(camera, device.upload(pixels)), "black", settings)
 
 
 def real_case(device: Device, model: Path, scene: Path, settings: PipelineFile) -> Case:
     """Open a splat PLY, or a point cloud as `init` would begin with it, at the first training view of a scene."""
     opened, background = settings.scene.read(scene)
-    targets = Photographs(device, background)
+    photographs = Photographs(device, background)
     parameters = read_ply(model).parameters if is_splat(model) else from_points(read_points_ply(model), 0.1, 3)
-    return Case(device, parameters, targets.get(opened.split("train")[0]), background, settings)
+    return Case(device, parameters, photographs.get(opened.split("train")[0]), background, settings)
 
 
 def grown(device: Device, settings: PipelineFile) -> Iterator[Case]:

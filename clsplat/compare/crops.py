@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 
 from clsplat.compare.run_folder import RunFolder
+from clsplat.metrics.images import psnr
 from clsplat.metrics.perceptual import Image
-from clsplat.metrics.views import psnr
 from clsplat.pages.page import embedded
 from clsplat.scene.images import load_image
 from clsplat.scene.scene import Background, Scene, View

@@ -4,20 +4,24 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from clsplat.density.edit import Edit, Positive, Rule
+from clsplat.density.edit import Edit, Rule
 from clsplat.density.statistics import StatisticName
+from clsplat.schedule import Positive
 
 
 class Grow(Rule):
-    """What rules have in common that act where the mean of a statistic is large.
+    """Base of rules that act where the mean of a statistic is large.
 
     With `as_many_as` the threshold is not `gradient_above` itself but the value that as many Gaussians reach in
     `statistic` as reach `gradient_above` in that other one (Gaussian Opacity Fields, Yu et al. 2024).
     """
 
     statistic: StatisticName = "screen_grad"
-    gradient_above: Positive = 2.0e-4  # mean of the statistic, at least
+    """Column whose mean is compared."""
+    gradient_above: Positive = 2.0e-4
+    """Lowest mean of the statistic; by step."""
     as_many_as: StatisticName | None = None
+    """Column whose count at `gradient_above` sets the threshold."""
 
     @property
     def statistics(self) -> set[str]:
@@ -25,7 +29,7 @@ class Grow(Rule):
 
     def condition(self, edit: Edit) -> dict[str, Any]:
         """The rule's part of Edit.mark."""
-        above = self.gradient_above
+        above = edit.at(self.gradient_above)
         if self.as_many_as:
             above = edit.matching(self.statistic, self.as_many_as, above)
         return {"statistic": self.statistic, "gradient_above": above}
@@ -36,9 +40,10 @@ class Clone(Grow):
 
     type: Literal["clone"] = "clone"
     size_below: Positive = 0.01
+    """Largest size, a share of the scene's extent; by step."""
 
     def mark(self, edit: Edit) -> None:
-        edit.mark(copies=2, kept=1, size_below=self.size_below, **self.condition(edit))
+        edit.mark(copies=2, kept=1, size_below=edit.at(self.size_below), **self.condition(edit))
 
 
 class Split(Grow):
@@ -46,15 +51,18 @@ class Split(Grow):
 
     type: Literal["split"] = "split"
     size_above: Positive = 0.01
+    """Smallest size, a share of the scene's extent; by step."""
     children: Annotated[int, Field(ge=2, le=8)] = 2
-    shrink: Annotated[float, Field(ge=1)] = 1.6  # children's scales are divided by this
+    """Gaussians that take the place of one."""
+    shrink: Annotated[float, Field(ge=1)] = 1.6
+    """Divisor of the children's scales."""
 
     def mark(self, edit: Edit) -> None:
         edit.mark(
             copies=self.children,
             kept=0,
             shrink=1.0 / self.shrink,
-            size_above=self.size_above,
+            size_above=edit.at(self.size_above),
             **self.condition(edit),
         )
 
@@ -64,9 +72,10 @@ class PruneFaint(Rule):
 
     type: Literal["prune_faint"] = "prune_faint"
     opacity_below: Positive = 0.005
+    """Opacity below which a Gaussian is removed; by step."""
 
     def mark(self, edit: Edit) -> None:
-        edit.mark(copies=0, kept=0, opacity_below=self.opacity_below)
+        edit.mark(copies=0, kept=0, opacity_below=edit.at(self.opacity_below))
 
 
 class PruneLarge(Rule):
@@ -74,6 +83,7 @@ class PruneLarge(Rule):
 
     type: Literal["prune_large"] = "prune_large"
     size_above: Positive = 0.1
+    """Size above which a Gaussian is removed, a share of the scene's extent; by step."""
 
     def mark(self, edit: Edit) -> None:
-        edit.mark(copies=0, kept=0, size_above=self.size_above)
+        edit.mark(copies=0, kept=0, size_above=edit.at(self.size_above))

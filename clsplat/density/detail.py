@@ -10,21 +10,26 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from clsplat.density.edit import Edit, Positive, Rule
+from clsplat.density.edit import Edit, Rule
 from clsplat.density.statistics import SEEN, StatisticName
 from clsplat.density.thresholds import PixelQuantile, Quantile, Share, Threshold
 from clsplat.gaussians.tables import INTERVAL2
+from clsplat.schedule import NonNegative, Positive
 
 BETA = 0.5  # Lee et al. 2025: a child's covariance is half its parent's
 
 
 class Subdivide(Rule):
-    """What rules have in common that replace Gaussians by smaller ones, a limited share of them at a time."""
+    """Base of rules that replace Gaussians by smaller ones, a limited share of them at a time."""
 
     children: Annotated[int, Field(ge=2, le=8)] = 2
-    beta: Annotated[float, Field(gt=0, le=1)] = BETA  # a child's covariance by its parent's
-    at_most: Share = 0.05  # of all Gaussians in one edit, those with the largest score
-    radius_above: Annotated[float, Field(ge=0)] = 2.0  # px, three standard deviations, mean over views
+    """Gaussians that take the place of one."""
+    beta: Annotated[float, Field(gt=0, le=1)] = BETA
+    """A child's covariance divided by its parent's."""
+    at_most: Share = 0.05
+    """Largest share of all Gaussians that one edit splits; those with the largest score come first."""
+    radius_above: Annotated[float, Field(ge=0)] = 2.0
+    """Smallest mean radius on the screen, three standard deviations, px."""
 
     @property
     def statistics(self) -> set[str]:
@@ -37,12 +42,12 @@ class Subdivide(Rule):
         edit.choose(chosen, copies=self.children, kept=0, shrink=self.beta**0.5)
 
 
-def largest(wanted: NDArray[np.bool_], score: NDArray[np.float32], most: int) -> NDArray[np.bool_]:
-    """Of the wanted ones the `most` with the largest score, ties by index."""
+def largest(wanted: NDArray[np.bool_], score: NDArray[np.float32], limit: int) -> NDArray[np.bool_]:
+    """Of the wanted ones at most `limit`, those with the largest score, ties by index."""
     places = np.flatnonzero(wanted)
     order = np.argsort(-score[places], kind="stable")
     chosen = np.zeros_like(wanted)
-    chosen[places[order[:most]]] = True
+    chosen[places[order[:limit]]] = True
     return chosen
 
 
@@ -55,8 +60,11 @@ class SplitTextured(Subdivide):
 
     type: Literal["split_textured"] = "split_textured"
     texture: StatisticName = "texture"
+    """Column whose mean is the texture."""
     texture_above: Threshold = PixelQuantile(quantile=0.8, of="pixels")
-    gradient_above: Annotated[float, Field(ge=0)] = 1.0e-4
+    """Lowest texture: a number by step, or a quantile."""
+    gradient_above: NonNegative = 1.0e-4
+    """Lowest mean of `screen_grad`; by step."""
 
     @property
     def statistics(self) -> set[str]:
@@ -66,7 +74,8 @@ class SplitTextured(Subdivide):
         texture, gradient = edit.stats.mean(self.texture), edit.stats.mean("screen_grad")
         above = edit.threshold(self.texture, self.texture_above)
         seen = edit.gaussians.get(SEEN)[:, 0] > 0
-        self.subdivide(edit, seen & (texture >= above) & (gradient >= self.gradient_above), texture)
+        wanted = seen & (texture >= above) & (gradient >= edit.at(self.gradient_above))
+        self.subdivide(edit, wanted, texture)
 
 
 class SplitOversized(Subdivide):
@@ -77,8 +86,10 @@ class SplitOversized(Subdivide):
     """
 
     type: Literal["split_oversized"] = "split_oversized"
-    rms_above: Positive | Quantile = 0.01
-    pixels: Positive | None = None  # px
+    rms_above: Quantile | Positive = 0.01
+    """Smallest rms scale, a share of the scene's extent by step, or a quantile of the Gaussians' own."""
+    pixels: Annotated[float, Field(gt=0)] | None = None
+    """Smallest rms scale in px of the nearest training view; takes the place of `rms_above`."""
 
     @property
     def tables(self) -> set[str]:
@@ -91,5 +102,5 @@ class SplitOversized(Subdivide):
         elif isinstance(self.rms_above, Quantile):
             bound = np.full_like(rms, np.quantile(rms, self.rms_above.quantile) if len(rms) else 0.0)
         else:
-            bound = np.full_like(rms, self.rms_above * edit.measures.extent)
+            bound = np.full_like(rms, edit.at(self.rms_above) * edit.scale.extent)
         self.subdivide(edit, rms > bound, rms / np.maximum(bound, 1e-30))

@@ -1,12 +1,13 @@
 """Density control: rules that say which Gaussians grow or go (Kerbl et al. 2023, section 5).
 
-A rule is a box in (mean of a statistic, size, opacity) with an outcome; one kernel serves them all.  Sizes are the
-largest standard deviation as a share of the scene's extent.  Growing rules take a Gaussian in their order, the first
-that wants it; pruning rules override growth and judge the size that a split leaves.
+A rule gives Gaussians an outcome: how many rows each becomes.  Most rules are a box in (mean of a statistic, size,
+opacity), and one kernel serves them all; others choose on the host.  Sizes are the largest standard deviation as a
+share of the scene's extent.  The first growing rule whose box holds a Gaussian decides; pruning rules override growth
+and judge the size that a split leaves.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -17,11 +18,11 @@ from pydantic import Field
 from clsplat.density.statistics import SEEN, SplatStats
 from clsplat.density.thresholds import PixelQuantile, Quantile, Threshold
 from clsplat.errors import ConfigError
-from clsplat.gaussians.tables import Gaussians
+from clsplat.gaussians.tables import PARAMETERS, Gaussians, moment_tables
 from clsplat.render.tiles import Tiler
+from clsplat.schedule import Schedule, at_step
 from clsplat.settings import Settings
 
-Positive = Annotated[float, Field(gt=0)]
 MAX_BOUND = 3.0e38  # a bound that no finite float passes
 MIN_BOUND = 1.2e-38  # the smallest normal float: a bound that only zero misses
 
@@ -32,23 +33,35 @@ def _no_photographs(share: float) -> float:
 
 @dataclass(frozen=True)
 class SceneScale:
-    """What rules measure Gaussians by: the scene's extent in scene units, and the texture of its photographs."""
+    """The yardsticks of rules: the scene's extent in scene units, and the texture of its photographs."""
 
     extent: float
     texture_quantile: Callable[[float], float] = _no_photographs
 
 
 class Edit:
-    """What will become of each Gaussian: how many rows, how many of them the old one, by what fresh scales shrink."""
+    """The outcome of each Gaussian: its number of rows, how many of them are the old one, the shrink of fresh scales.
 
-    def __init__(self, gaussians: Gaussians, stats: SplatStats, measures: SceneScale, step: int) -> None:
+    Everything random in it depends on `seed`, `step` and the rule alone.
+    """
+
+    def __init__(self, gaussians: Gaussians, stats: SplatStats, scale: SceneScale, step: int, seed: int) -> None:
         device, count = gaussians.device, gaussians.count
-        self.gaussians, self.stats, self.measures, self.step = gaussians, stats, measures, step
+        self.gaussians, self.stats, self.scale, self.step, self.seed = gaussians, stats, scale, step, seed
         self.copies = device.empty(count, np.uint32)
         self.kept = device.empty(count, np.uint32)
         self.shrink = device.empty(count)
+        self.rule = 0  # number of the rule that acts
         self._program = device.program("density.cl")
         self._program.start_edit(items=count, copies=self.copies, kept=self.kept, shrink=self.shrink, count=count)
+
+    def at(self, schedule: Schedule) -> float:
+        """Return the value of a schedule at the step of the edit."""
+        return at_step(schedule, self.step)
+
+    def random(self) -> np.random.Generator:
+        """Return random numbers that depend on the seed, the step and the acting rule alone."""
+        return np.random.default_rng([self.seed, self.step, self.rule])
 
     def mark(
         self,
@@ -73,8 +86,8 @@ class Edit:
             kept=self.kept,
             shrink=self.shrink,
             gradient_above=gradient_above,
-            size_above=size_above * self.measures.extent,
-            size_below=MAX_BOUND if size_below is None else size_below * self.measures.extent,
+            size_above=size_above * self.scale.extent,
+            size_below=MAX_BOUND if size_below is None else size_below * self.scale.extent,
             opacity_below=min(opacity_below, MAX_BOUND),
             new_shrink=shrink,
             new_copies=copies,
@@ -93,43 +106,58 @@ class Edit:
     def threshold(self, statistic: str, threshold: Threshold) -> float:
         """The number that a threshold on a statistic stands for."""
         if isinstance(threshold, PixelQuantile):
-            return self.measures.texture_quantile(threshold.quantile)
+            return self.scale.texture_quantile(threshold.quantile)
         if not isinstance(threshold, Quantile):
-            return threshold
+            return self.at(threshold)
         mean = self.stats.mean(statistic)[self.gaussians.get(SEEN)[:, 0] > 0]
         return max(float(np.quantile(mean, threshold.quantile)), MIN_BOUND) if len(mean) else MIN_BOUND
 
-    def choose(self, chosen: NDArray[np.bool_], copies: int, kept: int, shrink: float = 1.0) -> None:
-        """Give the Gaussians that the host has chosen, [N], their outcome."""
+    def choose(
+        self, chosen: NDArray[np.bool_], copies: int | NDArray[np.integer], kept: int, shrink: float = 1.0
+    ) -> None:
+        """Give the Gaussians that the host has chosen, [N], their outcome.
+
+        copies: rows that each becomes, one number or [N]; kept: how many of them are the old row, with its moments and
+        statistics; the others are fresh.
+        """
+        outcome = np.where(chosen, np.asarray(copies, np.int64) + 1, 0)
         self._program.mark_chosen(
             items=self.gaussians.count,
-            chosen=self.gaussians.device.upload(chosen.astype(np.uint32)),
+            outcome=self.gaussians.device.upload(outcome.astype(np.uint32)),
             copies=self.copies,
             kept=self.kept,
             shrink=self.shrink,
             new_shrink=shrink,
-            new_copies=copies,
             new_kept=kept,
             count=self.gaussians.count,
         )
+
+    def set_rows(self, name: str, rows: NDArray[np.integer], values: NDArray[np.floating]) -> None:
+        """Write values [n, components] into some rows, [n], of a table; fresh rows copy them."""
+        self.gaussians.set_rows(name, rows, values)
+
+    def zero_moments(self, rows: NDArray[np.integer], parameters: Collection[str] = PARAMETERS) -> None:
+        """Set Adam's moments of some rows, [n], to zero."""
+        names = [table for parameter in parameters for table in moment_tables(parameter)]
+        self.gaussians.zero_rows([name for name in names if name in self.gaussians.tables], rows)
 
     def rows(self) -> NDArray[np.uint32]:
         """How many rows each Gaussian will have, [N]."""
         return self.copies.get()
 
-    def limit(self, most: int) -> None:
-        """Take growth back until at most `most` rows remain: from the smallest values of the first column on."""
+    def limit(self, limit: int) -> None:
+        """Take growth back until at most `limit` rows remain: from the smallest values of the first column on."""
         rows, kept = self.rows().astype(np.int64), self.kept.get()
         growing = np.flatnonzero(rows > 1)
         score = self.stats.mean(self.stats.names[0]) if self.stats.names else np.zeros(len(rows), np.float32)
         order = growing[np.argsort(-score[growing], kind="stable")]
         total = int(np.minimum(rows, 1).sum()) + np.cumsum(rows[order] - 1)
-        refused = order[total > most]
+        refused = order[total > limit]
         rows[refused], kept[refused] = 1, 1
         self.copies.set(rows.astype(np.uint32))
         self.kept.set(kept)
 
-    def apply(self, tiler: Tiler, seed: int) -> None:
+    def apply(self, tiler: Tiler) -> None:
         """Move all tables at once and place the children of split Gaussians."""
         gaussians, device, count = self.gaussians, self.gaussians.device, self.gaussians.count
         row_offset = tiler.scan(self.copies, count, "row_offset")
@@ -153,7 +181,7 @@ class Edit:
             quats=gaussians["quats"],
             means=gaussians["means"],
             log_scales=gaussians["log_scales"],
-            seed=seed,
+            seed=self.seed,
             step=self.step,
             stride=gaussians.capacity,
             count=rows,
@@ -161,9 +189,10 @@ class Edit:
 
 
 class Rule(Settings):
-    """A condition and what it does to the Gaussians that meet it."""
+    """A condition and the outcome of the Gaussians that meet it."""
 
-    after: Annotated[int, Field(ge=0)] = 0  # global step from which, exclusive, the rule acts
+    start: Annotated[int, Field(ge=0)] = 0
+    """Global step from which, exclusive, the rule acts."""
 
     @property
     def statistics(self) -> set[str]:
@@ -176,6 +205,7 @@ class Rule(Settings):
         return set()
 
     def mark(self, edit: Edit) -> None:
+        """Give outcomes by `edit.mark` or `edit.choose`; rows of tables may be changed by `edit.set_rows`."""
         raise NotImplementedError
 
 
@@ -185,44 +215,35 @@ class Change:
 
     before: int
     after: int
-    causes: dict[str, int]  # Gaussians whose fate a rule decided in the end, by the rule's name
+    causes: dict[str, int]  # Gaussians whose outcome a rule decided in the end, by the rule's name
     grown: dict[str, int]  # of these, the ones that became several
 
 
-def densify(
-    gaussians: Gaussians,
-    stats: SplatStats,
-    rules: Sequence[Rule],
-    tiler: Tiler,
-    measures: SceneScale,
-    step: int,
-    seed: int,
-    most: int | None = None,
-) -> Change:
+def densify(edit: Edit, rules: Sequence[Rule], tiler: Tiler, limit: int | None = None) -> Change:
     """Apply the rules in their order, as one rearrangement, and start the statistics anew.
 
-    Growth stops at `most` Gaussians: those with the largest screen gradient (the first column) grow first.
+    Growth stops at `limit` Gaussians: those with the largest screen gradient (the first column) grow first.
     """
-    edit = Edit(gaussians, stats, measures, step)
+    gaussians = edit.gaussians
     before = gaussians.count
-    acting = [rule for rule in rules if step > rule.after]
+    acting = [(number, rule) for number, rule in enumerate(rules) if edit.step > rule.start]
     decided_by = np.full(before, -1)
-    for index, rule in enumerate(acting):
+    for edit.rule, rule in acting:
         rows = edit.rows()
         rule.mark(edit)
-        decided_by[edit.rows() != rows] = index
-    if most is not None and int(edit.rows().sum(dtype=np.int64)) > most:
-        edit.limit(most)
+        decided_by[edit.rows() != rows] = edit.rule
+    if limit is not None and int(edit.rows().sum(dtype=np.int64)) > limit:
+        edit.limit(limit)
     rows = edit.rows()
     decided_by[rows == 1] = -1
     causes: dict[str, int] = {}
     grown: dict[str, int] = {}
-    for index, rule in enumerate(acting):
+    for number, rule in acting:
         name = getattr(rule, "type", "rule")
-        causes[name] = causes.get(name, 0) + int((decided_by == index).sum())
-        grown[name] = grown.get(name, 0) + int(((decided_by == index) & (rows > 1)).sum())
-    edit.apply(tiler, seed)
-    stats.clear()
+        causes[name] = causes.get(name, 0) + int((decided_by == number).sum())
+        grown[name] = grown.get(name, 0) + int(((decided_by == number) & (rows > 1)).sum())
+    edit.apply(tiler)
+    edit.stats.clear()
     return Change(before, gaussians.count, causes, grown)
 
 

@@ -1,21 +1,22 @@
 """What the views since the last edit said about each Gaussian, in named columns that density rules choose from.
 
-A column is a table `stats/<name>`: the sum of one number per view, over the views that saw the Gaussian.  Its mean is
-by the number of those views, or by another column.  Only columns that some rule needs are summed and cost time.
+A column is a table `stats/<name>`: the sum of one number per view, over the views that saw the Gaussian.  Its mean
+divides the sum by the number of those views, or by another column.  Only columns that a rule reads are summed.
 """
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Collection
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.gaussians.tables import Gaussians
-from clsplat.losses.image import ViewGradients
+from clsplat.losses.base import ViewGradients
 from clsplat.opencl.device import Array
 from clsplat.opencl.program import constants
 from clsplat.render.rasterizer import PIXEL_SUMS, Frame
+from clsplat.settings import Settings, VariantName, variants
 from clsplat.views.texture import known_gradient
 
 FOLDER = "stats/"
@@ -23,16 +24,13 @@ SEEN = "stats/seen"
 ABS_X = int(constants("splat.h")["SUM_ABS_X"])
 WEIGHT = int(constants("splat.h")["SUM_WEIGHT"])
 TEXTURE = int(constants("splat.h")["SUM_TEXTURE"])
-StatisticName = Literal[
-    "screen_grad", "screen_grad_abs", "screen_grad_abs_sum", "texture", "rendered_texture", "screen_radius"
-]
 
 
-class Statistic(ABC):
+class Statistic(Settings):
     """How one view adds to a column."""
 
     pixel_sums: ClassVar[int] = PIXEL_SUMS  # sums over pixels that the backward pass must make
-    by: ClassVar[str] = "seen"  # table that the column's mean is by
+    divisor: ClassVar[str] = "seen"  # column by which the mean divides: views that saw the Gaussian, or another sum
 
     @abstractmethod
     def add(self, gaussians: Gaussians, view: ViewGradients, grad_mean2d: Array, total: Array) -> None:
@@ -45,6 +43,8 @@ class ScreenGrad(Statistic):
     Gradients count in normalised device coordinates, as the published thresholds do.
     """
 
+    type: Literal["screen_grad"] = "screen_grad"
+
     def add(self, gaussians: Gaussians, view: ViewGradients, grad_mean2d: Array, total: Array) -> None:
         gaussians.device.program("density.cl").accumulate_norm(
             **_arguments(gaussians, view.frame), planes=grad_mean2d, first=0, total=total
@@ -54,6 +54,7 @@ class ScreenGrad(Statistic):
 class ScreenGradAbs(Statistic):
     """The same of sums of absolute values over pixels, which do not cancel (AbsGS, Ye et al. 2024)."""
 
+    type: Literal["screen_grad_abs"] = "screen_grad_abs"
     pixel_sums = ABS_X + 2
 
     def add(self, gaussians: Gaussians, view: ViewGradients, grad_mean2d: Array, total: Array) -> None:
@@ -65,6 +66,7 @@ class ScreenGradAbs(Statistic):
 class ScreenGradAbsSum(Statistic):
     """Those sums of absolute values in x and in y added up (Gaussian Opacity Fields, Yu et al. 2024)."""
 
+    type: Literal["screen_grad_abs_sum"] = "screen_grad_abs_sum"
     pixel_sums = ABS_X + 2
 
     def add(self, gaussians: Gaussians, view: ViewGradients, grad_mean2d: Array, total: Array) -> None:
@@ -73,23 +75,15 @@ class ScreenGradAbsSum(Statistic):
         )
 
 
-class BlendWeight(Statistic):
-    """How much of the image a splat is: its α T, summed over pixels whose texture is known."""
-
-    pixel_sums = TEXTURE + 1
-
-    def add(self, gaussians: Gaussians, view: ViewGradients, grad_mean2d: Array, total: Array) -> None:
-        _add_pixel_sum(gaussians, view, WEIGHT, total)
-
-
 class Texture(Statistic):
     """The photograph's gradient magnitude under the splat, per px: Σ α T |∇I| / Σ α T over pixels of all views.
 
     What a mask hides is left out of both sums.
     """
 
+    type: Literal["texture"] = "texture"
     pixel_sums = TEXTURE + 1
-    by = "blend_weight"
+    divisor = "blend_weight"
 
     def add(self, gaussians: Gaussians, view: ViewGradients, grad_mean2d: Array, total: Array) -> None:
         _add_pixel_sum(gaussians, view, TEXTURE, total)
@@ -98,11 +92,13 @@ class Texture(Statistic):
 class RenderedTexture(Statistic):
     """The rendered image's gradient magnitude at the projected mean, per px (Micro-splatting, Lee et al. 2025)."""
 
+    type: Literal["rendered_texture"] = "rendered_texture"
+
     def add(self, gaussians: Gaussians, view: ViewGradients, grad_mean2d: Array, total: Array) -> None:
         frame, comparison = view.frame, view.comparison
         gaussians.device.program("texture.cl").sample_magnitude(
             items=gaussians.count,
-            magnitude=known_gradient(comparison.workspace, frame.camera, frame.image, comparison.target),
+            magnitude=known_gradient(comparison.workspace, frame.camera, frame.image, comparison.mask),
             splats=frame.splats,
             radius=frame.radius,
             total=total,
@@ -116,32 +112,37 @@ class RenderedTexture(Statistic):
 class ScreenRadius(Statistic):
     """Three standard deviations on the screen, px."""
 
+    type: Literal["screen_radius"] = "screen_radius"
+
     def add(self, gaussians: Gaussians, view: ViewGradients, grad_mean2d: Array, total: Array) -> None:
         gaussians.device.program("density.cl").accumulate_radius(
             items=gaussians.count, radius=view.frame.radius, total=total, count=gaussians.count
         )
 
 
-STATISTICS: dict[str, Statistic] = {
-    "screen_grad": ScreenGrad(),
-    "screen_grad_abs": ScreenGradAbs(),
-    "screen_grad_abs_sum": ScreenGradAbsSum(),
-    "texture": Texture(),
-    "rendered_texture": RenderedTexture(),
-    "screen_radius": ScreenRadius(),
-    "blend_weight": BlendWeight(),
-}
+class BlendWeight(Statistic):
+    """How much of the image a splat is: its α T, summed over pixels whose texture is known."""
+
+    type: Literal["blend_weight"] = "blend_weight"
+    pixel_sums = TEXTURE + 1
+
+    def add(self, gaussians: Gaussians, view: ViewGradients, grad_mean2d: Array, total: Array) -> None:
+        _add_pixel_sum(gaussians, view, WEIGHT, total)
+
+
+StatisticName = Annotated[str, VariantName(Statistic)]
 
 
 class SplatStats:
     """The columns of a model, and how many views saw each Gaussian."""
 
     def __init__(self, gaussians: Gaussians, names: Collection[str] = ("screen_grad",)) -> None:
-        """Attach the columns `names` and those their means are by, drop any other; what is there keeps its sums."""
+        """Attach the columns `names` and those that divide them, drop any other; what is there keeps its sums."""
         self.gaussians = gaussians
-        needed = {*names, *(STATISTICS[name].by for name in names)}
-        self.names = tuple(name for name in STATISTICS if name in needed)
-        tables = [*(FOLDER + name for name in self.names), SEEN]
+        known = variants(Statistic)
+        needed = {*names, *(known[name].divisor for name in names)}
+        self.columns = {name: kind() for name, kind in known.items() if name in needed}
+        tables = [*(FOLDER + name for name in self.columns), SEEN]
         for name in [name for name in gaussians.tables if name.startswith(FOLDER) and name not in tables]:
             del gaussians.tables[name]
         for name in tables:
@@ -149,17 +150,22 @@ class SplatStats:
                 gaussians.add(name, 1, zero_fresh=True)
 
     @property
+    def names(self) -> tuple[str, ...]:
+        """The columns, in the order in which their classes are defined."""
+        return tuple(self.columns)
+
+    @property
     def pixel_sums(self) -> int:
         """How many sums over pixels the backward pass must make for these columns."""
-        return max((STATISTICS[name].pixel_sums for name in self.names), default=PIXEL_SUMS)
+        return max((column.pixel_sums for column in self.columns.values()), default=PIXEL_SUMS)
 
     def total(self, name: str) -> Array:
         """A column's sums over views, [S]."""
         return self.gaussians[FOLDER + name]
 
     def divisor(self, name: str) -> Array:
-        """What a column's mean is by, [S]."""
-        return self.gaussians[FOLDER + STATISTICS[name].by]
+        """The sums by which a column's mean divides, [S]."""
+        return self.gaussians[FOLDER + self.columns[name].divisor]
 
     @property
     def seen(self) -> Array:
@@ -172,13 +178,13 @@ class SplatStats:
         gaussians.device.program("density.cl").count_seen(
             items=gaussians.count, radius=view.frame.radius, seen=self.seen, count=gaussians.count
         )
-        for name in self.names:
-            STATISTICS[name].add(gaussians, view, grad_mean2d, self.total(name))
+        for name, column in self.columns.items():
+            column.add(gaussians, view, grad_mean2d, self.total(name))
 
     def mean(self, name: str) -> NDArray[np.float32]:
         """A column's mean for each Gaussian, on the host, [N]; 0 where no view gave it weight."""
-        total, by = (self.gaussians.get(FOLDER + table)[:, 0] for table in (name, STATISTICS[name].by))
-        return np.divide(total, by, out=np.zeros_like(total), where=by > 0)
+        total, divisor = (self.gaussians.get(FOLDER + table)[:, 0] for table in (name, self.columns[name].divisor))
+        return np.divide(total, divisor, out=np.zeros_like(total), where=divisor > 0)
 
     def clear(self) -> None:
         for name in self.gaussians.tables:

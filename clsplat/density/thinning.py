@@ -1,4 +1,4 @@
-"""Rules that need fewer Gaussians for the same picture (the refinement of Micro-splatting's second version, Lee et al.
+"""Rules that show the same scene with fewer Gaussians (the refinement of Micro-splatting's second version, Lee et al.
 2025b; thresholds and formulas are ours)."""
 
 from typing import Literal
@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from clsplat.density.edit import Edit, Positive, Rule
+from clsplat.density.edit import Edit, Rule
 from clsplat.density.thresholds import Share
 from clsplat.gaussians.tables import SH_C0
+from clsplat.schedule import Positive
 
-TURNED = ("adam/log_scales/", "adam/quats/")  # tables in a Gaussian's own axes
 Floats = NDArray[np.float64]
 
 
@@ -21,6 +21,7 @@ class PruneUnimportant(Rule):
 
     type: Literal["prune_unimportant"] = "prune_unimportant"
     share: Share = 0.05
+    """Share of all Gaussians that is removed."""
 
     def mark(self, edit: Edit) -> None:
         gaussians = edit.gaussians
@@ -32,52 +33,50 @@ class PruneUnimportant(Rule):
 
 
 class MergeNeighbours(Rule):
-    """Replace two mutual nearest neighbours, close and of like colour, by one Gaussian with their moments.
+    """Replace two mutual nearest neighbours, close and of like colour, by one Gaussian.
 
-    The heavier one keeps its row, statistics and Adam's moments, those of scales and rotation excepted, and takes the
-    mixture's mean and covariance, the mean of the colours, and the opacity that keeps opacity times volume; weights are
-    opacity times volume.
+    It has the mean and covariance of their mixture, the mean of their colours, and the opacity that keeps opacity times
+    volume; weights are opacity times volume.  The heavier one keeps its row, its statistics and Adam's moments, except
+    those of scales and rotation.
     """
 
     type: Literal["merge_neighbours"] = "merge_neighbours"
-    distance_below: Positive = 0.5  # of the sum of their mean scales
-    colour_below: Positive = 0.05  # largest difference of a base colour's channel, in [0, 1]
+    distance_below: Positive = 0.5
+    """Largest distance, a share of the sum of their mean scales; by step."""
+    colour_below: Positive = 0.05
+    """Largest difference of a channel of the base colours, in [0, 1]; by step."""
 
     def mark(self, edit: Edit) -> None:
         gaussians = edit.gaussians
         names = ("means", "quats", "log_scales", "logit_opacity", "sh_base", "sh_rest")
         tables = {name: gaussians.get(name).astype(np.float64) for name in names}
-        first, second = self._pairs(tables)
+        first, second = self._pairs(edit, tables)
         alone = edit.rows() == 1
         usable = alone[first] & alone[second]
         first, second = first[usable], second[usable]
         if not len(first):
             return
         for name, values in merged(tables, first, second).items():
-            tables[name][first] = values
-            gaussians.set(name, tables[name])
-        for name in [name for name in gaussians.tables if name.startswith(TURNED)]:
-            table = gaussians.get(name)
-            table[first] = 0  # they were of other axes
-            gaussians.set(name, table)
+            edit.set_rows(name, first, values)
+        edit.zero_moments(first, ("log_scales", "quats"))  # they were of other axes
         absorbed = np.zeros(gaussians.count, bool)
         absorbed[second] = True
         edit.choose(absorbed, copies=0, kept=0)
 
-    def _pairs(self, tables: dict[str, Floats]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def _pairs(self, edit: Edit, tables: dict[str, Floats]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Rows of mutual nearest neighbours that may merge, the heavier one first."""
         means, mass = tables["means"], mass_of(tables)
-        if len(means) < 2 or not np.isfinite(means).all():  # training stops at the next report
+        if len(means) < 2 or not np.isfinite(means).all():  # the next report stops the training
             return np.empty(0, np.int64), np.empty(0, np.int64)
         rows = np.arange(len(means))
         distances, found = cKDTree(means).query(means, k=2)
-        other = np.where(found[:, 0] == rows, 1, 0)  # of twins in one place, itself may come second
+        other = np.where(found[:, 0] == rows, 1, 0)  # of two in one place, the row itself may come second
         distance, nearest = distances[rows, other], found[rows, other]
         mutual = (nearest[nearest] == rows) & (rows < nearest)
         size = np.exp(tables["log_scales"].mean(axis=1))
-        close = distance < self.distance_below * (size + size[nearest])
+        close = distance < edit.at(self.distance_below) * (size + size[nearest])
         colour = SH_C0 * np.abs(tables["sh_base"] - tables["sh_base"][nearest]).max(axis=1)
-        one = rows[mutual & close & (colour < self.colour_below)]
+        one = rows[mutual & close & (colour < edit.at(self.colour_below))]
         two = nearest[one]
         heavier = mass[one] >= mass[two]
         return np.where(heavier, one, two), np.where(heavier, two, one)
@@ -90,7 +89,7 @@ def mass_of(tables: dict[str, Floats]) -> Floats:
 
 
 def merged(tables: dict[str, Floats], first: NDArray[np.int64], second: NDArray[np.int64]) -> dict[str, Floats]:
-    """The Gaussians with the first two moments of the mixtures of `first` and `second`, by parameter, [pairs, ...]."""
+    """The Gaussians with the mean and covariance of mixtures of `first` and `second`, by parameter, [pairs, ...]."""
     mass = mass_of(tables)
     total = mass[first] + mass[second]
     share = (mass[second] / total)[:, None]

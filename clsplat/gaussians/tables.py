@@ -8,7 +8,7 @@ table here, parameters, Adam moments and statistics alike, so that nothing can g
     filter_variance [1] scene units², the world filter; zero when there is none, never optimised
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from clsplat.opencl.device import Array, Device
 
 PARAMETERS = ("means", "quats", "log_scales", "logit_opacity", "sh_base", "sh_rest")
-INTERVAL2 = "sampling_interval2"  # scene units², of the training view that samples finest; only where somebody asks
+INTERVAL2 = "sampling_interval2"  # scene units², at the training view that samples finest; only where it is read
 ALIGNMENT = 64  # capacity is a multiple of this: wide kernels need no tail
 GROWTH = 1.5
 SH_C0 = 0.28209479177387814  # basis function of band 0
@@ -78,6 +78,34 @@ class Gaussians:
         planes = np.zeros((table.components, self.capacity), np.float32)
         planes[:, : self.count] = values.T
         table.array.set(planes)
+
+    def set_rows(self, name: str, rows: NDArray[np.integer], values: NDArray[Any]) -> None:
+        """Write [n, components] from the host into some rows, [n], of a table; no row may be named twice."""
+        table = self.tables[name]
+        if values.shape != (len(rows), table.components):
+            raise ValueError(f"{name}: expected {(len(rows), table.components)}, got {values.shape}")
+        self._rows.set_rows(
+            items=(len(rows), table.components),
+            rows=self.device.upload(rows.astype(np.uint32)),
+            values=self.device.upload(np.ascontiguousarray(values, np.float32)),
+            table=table.array,
+            components=table.components,
+            stride=self.capacity,
+            count=len(rows),
+        )
+
+    def zero_rows(self, names: Collection[str], rows: NDArray[np.integer]) -> None:
+        """Set some rows, [n], of tables to zero."""
+        uploaded = self.device.upload(rows.astype(np.uint32))
+        for name in names:
+            table = self.tables[name]
+            self._rows.zero_rows(
+                items=(len(rows), table.components),
+                rows=uploaded,
+                table=table.array,
+                stride=self.capacity,
+                count=len(rows),
+            )
 
     def not_finite(self) -> list[str]:
         """Names of the parameters that hold NaN or infinity."""
@@ -145,6 +173,11 @@ class DeviceModel:
     near: float = 0.2  # scene units
     screen_variance: float = 0.3  # px²
     compensate: float = 0.0  # 1: opacity loses what the screen filter spreads out
+
+
+def moment_tables(parameter: str) -> tuple[str, str]:
+    """Names of the tables that hold Adam's two moments of a parameter."""
+    return f"adam/{parameter}/moment1", f"adam/{parameter}/moment2"
 
 
 def _aligned(count: int) -> int:

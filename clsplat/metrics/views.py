@@ -1,6 +1,5 @@
-"""Image metrics as papers quote them: of 8-bit images, PSNR over all channels, SSIM with an 11 x 11 Gaussian window."""
+"""The metrics of a model at the views of a scene, and their means."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -8,14 +7,15 @@ from typing import Any
 import numpy as np
 
 from clsplat.gaussians.tables import DeviceModel
-from clsplat.losses.image import Comparison, ssim_maps
-from clsplat.metrics.perceptual import Image, Perceptual, ssim_map
+from clsplat.losses.base import Comparison
+from clsplat.losses.image import ssim_maps
+from clsplat.metrics.images import psnr, ssim, to_8_bits
+from clsplat.metrics.perceptual import Image, Perceptual
 from clsplat.opencl.device import Array
 from clsplat.render.rasterizer import DeviceCamera, Rasterizer
 from clsplat.scene.scene import View
-from clsplat.views.photographs import Mask, Photograph, Photographs, unpack
+from clsplat.views.photographs import Photograph, Photographs, unpack
 
-PSNR_CAP = 100.0  # dB, for equal images
 PSNR_AND_SSIM = Perceptual()
 
 
@@ -37,32 +37,24 @@ def render_view(rasterizer: Rasterizer, model: DeviceModel, camera: DeviceCamera
     """Render to 8 bits, [height, width, 3]: clamped to [0, 1], rounded to the nearest.  background: [3]."""
     frame = rasterizer.forward(model, camera, background)
     image = frame.image.get()[:, : camera.height, : camera.width]
-    return np.ascontiguousarray((np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8).transpose(1, 2, 0))
+    return np.ascontiguousarray(to_8_bits(image).transpose(1, 2, 0))
 
 
-def psnr(image: Image, truth: Image, mask: Mask | None = None) -> float:
-    """Peak signal-to-noise ratio in dB of two 8-bit images, over the pixels that count."""
-    squared = (image.astype(np.float64) - truth) ** 2
-    error = float(np.mean(squared if mask is None else squared[mask])) / 255**2
-    return PSNR_CAP if error == 0 else 10 * math.log10(1 / error)
-
-
-def ssim(rasterizer: Rasterizer, target: Photograph, image: Image) -> float:
-    """Structural similarity of an 8-bit image, [height, width, 3], and the photograph."""
-    workspace, camera = rasterizer.workspace, target.camera
+def device_ssim(rasterizer: Rasterizer, photograph: Photograph, image: Image) -> float:
+    """Structural similarity of an 8-bit image, [height, width, 3], and the photograph, computed on the device."""
+    workspace, camera = rasterizer.workspace, photograph.camera
     pixels = rasterizer.device.upload(np.ascontiguousarray(image.transpose(2, 0, 1)))
-    planes = unpack(workspace, camera, pixels, "rendered")
-    truth = unpack(workspace, camera, target.pixels)
-    comparison = Comparison(workspace, camera, planes, truth, gradient=planes)
-    _, sums = ssim_maps(comparison)
-    return float(sums.get().sum(dtype=np.float64)) / comparison.values
+    rendered = unpack(workspace, camera, pixels, 1 / 255, "rendered")
+    planes = photograph.planes(workspace)
+    _, sums = ssim_maps(Comparison(workspace, camera, rendered, planes.colours, gradient=rendered))
+    return float(sums.get().sum(dtype=np.float64)) / (3 * camera.width * camera.height)
 
 
 def measure(
     rasterizer: Rasterizer,
     model: DeviceModel,
     views: Sequence[View],
-    targets: Photographs,
+    photographs: Photographs,
     perceptual: Perceptual = PSNR_AND_SSIM,
 ) -> list[ViewMetrics]:
     """Return the metrics of every view.
@@ -71,16 +63,16 @@ def measure(
     """
     results = []
     for view in views:
-        target = targets.get(view)
-        image = render_view(rasterizer, model, target.camera, targets.background_array)
-        truth, mask = target.image(), target.mask()
+        photograph = photographs.get(view)
+        rendered = render_view(rasterizer, model, photograph.camera, photographs.background)
+        image, mask = photograph.image(), photograph.counted()
         if mask is None:
-            similarity = ssim(rasterizer, target, image)
+            similarity = device_ssim(rasterizer, photograph, rendered)
         else:
-            image, truth = image * mask[..., None], truth * mask[..., None]
-            similarity = float(ssim_map(image, truth)[mask].mean())
-        more = perceptual.measure(image, truth)
-        results.append(ViewMetrics(view.name, psnr(image, truth, mask), similarity, more))
+            rendered, image = rendered * mask[..., None], image * mask[..., None]
+            similarity = ssim(rendered, image, mask)
+        more = perceptual.measure(rendered, image)
+        results.append(ViewMetrics(view.name, psnr(rendered, image, mask), similarity, more))
     return results
 
 

@@ -12,17 +12,18 @@ class Timings:
 
     def __init__(self) -> None:
         self.sampling = False
-        self._events: list[tuple[str, Any]] = []
+        self.section = "other"  # part of a training step to which kernels count that `profile` does not know by name
+        self._events: list[tuple[str, str, Any]] = []
 
     def add(self, name: str, event: Any) -> None:
         if self.sampling:
-            self._events.append((name, event))
+            self._events.append((name, self.section, event))
 
-    def take(self) -> dict[str, list[float]]:
-        """Return the seconds of every launch by kernel since the last call; waits for the launches."""
-        seconds: dict[str, list[float]] = defaultdict(list)
-        for name, event in self._events:
+    def take(self) -> dict[tuple[str, str], list[float]]:
+        """Return the seconds of every launch by kernel and section since the last call; waits for the launches."""
+        seconds: dict[tuple[str, str], list[float]] = defaultdict(list)
+        for name, section, event in self._events:
             event.wait()
-            seconds[name].append((event.profile.end - event.profile.start) * 1e-9)
+            seconds[name, section].append((event.profile.end - event.profile.start) * 1e-9)
         self._events.clear()
         return seconds

@@ -86,12 +86,3 @@ class Undistort(Step):
 
     def make(self, source: Path, out: Path, without: Path) -> dict[str, Any]:
         return {"images": undistort_scene(source, out, self.long_side, self.blank)}
-
-
-STEPS: dict[str, type[Step]] = {
-    "find_features": FindFeatures,
-    "match_features": MatchFeatures,
-    "map_cameras": MapCameras,
-    "undistort": Undistort,
-}
-AnyStep = FindFeatures | MatchFeatures | MapCameras | Undistort

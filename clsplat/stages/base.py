@@ -11,19 +11,36 @@ from clsplat.training.run import Run
 
 
 class Stage(Settings):
-    """One step of a pipeline.  It changes the run and returns nothing.
-
-    Inside `optimize.during` a stage runs at every step that is a multiple of `every`, after `start` and before `stop`.
-    """
+    """One step of a pipeline.  It changes the run and returns nothing."""
 
     needs: ClassVar[frozenset[str]] = frozenset()  # parts of the run that must exist
     makes: ClassVar[frozenset[str]] = frozenset()  # parts that exist afterwards
+
+    stage: str
+    """Name of the stage."""
+
+    def check(self) -> None:
+        """Raise now what would stop the stage later, such as a missing file."""
+
+    @abstractmethod
+    def run(self, run: Run) -> None:
+        """Do it."""
+
+
+class Scheduled(Stage):
+    """A stage that may stand inside `optimize.during`, where it runs at a cadence.
+
+    It runs at every step that is a multiple of `every`, after `start` and before `stop`.
+    """
+
     edits: ClassVar[bool] = False  # changes the model: acts between a step and the next
 
-    stage: str  # the name in a pipeline file
-    every: Annotated[int, Field(gt=0)] | None = None  # steps
-    start: Annotated[int, Field(ge=0)] = 0  # global step, exclusive
-    stop: Annotated[int, Field(gt=0)] | None = None  # global step, exclusive
+    every: Annotated[int, Field(gt=0)] | None = None
+    """Steps from one run of the stage to the next; inside `during` only."""
+    start: Annotated[int, Field(ge=0)] = 0
+    """Global step after which the stage runs."""
+    stop: Annotated[int, Field(gt=0)] | None = None
+    """Global step before which the stage runs."""
 
     def due(self, step: int) -> bool:
         """Whether the stage runs at a global step, counted from 1."""
@@ -34,10 +51,3 @@ class Stage(Settings):
     def stale(self, run: Run) -> Collection[str]:
         """Parameters whose gradients the edit makes meaningless."""
         return ()
-
-    def check(self) -> None:
-        """Raise now what would stop the stage later, such as a missing file."""
-
-    @abstractmethod
-    def run(self, run: Run) -> None:
-        """Do it."""

@@ -3,29 +3,30 @@
 import logging
 from collections.abc import Collection
 from dataclasses import asdict
-from typing import Annotated, ClassVar, Literal
+from typing import ClassVar, Literal
 
-from pydantic import Field
-
-from clsplat.density.edit import SceneScale, densify
-from clsplat.density.rules import AnyRule
+from clsplat.density.edit import Edit, Rule, SceneScale, densify
 from clsplat.errors import NumericError
 from clsplat.gaussians.tables import PARAMETERS
-from clsplat.stages.base import Stage
+from clsplat.schedule import AtLeastOne
+from clsplat.settings import OneOf
+from clsplat.stages.base import Scheduled
 from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
 
 
-class Densify(Stage):
+class Densify(Scheduled):
     """Apply rules that clone, split and prune Gaussians, as one rearrangement of all tables."""
 
     stage: Literal["densify"] = "densify"
     needs: ClassVar[frozenset[str]] = frozenset({"model", "stats"})
     edits: ClassVar[bool] = True
 
-    rules: list[AnyRule]
-    max_gaussians: Annotated[int, Field(gt=0)] | None = None  # growth stops here, or where memory ends; pruning goes on
+    rules: list[OneOf[Rule]]
+    """Which Gaussians grow or go; the first growing rule takes a Gaussian, pruning rules come before growth."""
+    max_gaussians: AtLeastOne | None = None
+    """Number at which growth stops, by step; without it, where memory ends.  Pruning goes on."""
 
     @property
     def statistics(self) -> set[str]:
@@ -43,12 +44,11 @@ class Densify(Stage):
     def run(self, run: Run) -> None:
         if run.stats is None:
             return
-        gaussians = run.trained.gaussians
-        measures = SceneScale(run.scene.extent, run.texture_quantile)
-        tiler = run.rasterizer.tiler
-        fits = run.memory_plan().most
-        most = min(fits, self.max_gaussians or fits)
-        change = densify(gaussians, run.stats, self.rules, tiler, measures, run.step, run.seed, most)
+        scale = SceneScale(run.scene.extent, run.texture_quantile)
+        edit = Edit(run.model.gaussians, run.stats, scale, run.step, run.seed)
+        fits = run.memory_plan().limit
+        limit = fits if self.max_gaussians is None else min(fits, int(edit.at(self.max_gaussians)))
+        change = densify(edit, self.rules, run.rasterizer.tiler, limit)
         run.refresh_filter()
         if change.after == fits:
             LOG.warning("step %d: growth stops at %d Gaussians, all that fit in the device's memory", run.step, fits)

@@ -8,14 +8,14 @@ from pydantic import Field, field_validator
 from clsplat.metrics.lpips import InputRange
 from clsplat.metrics.perceptual import Metric, Perceptual
 from clsplat.metrics.views import mean, measure
-from clsplat.stages.base import Stage
+from clsplat.stages.base import Scheduled
 from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
 Scale = Annotated[float, Field(ge=1)]
 
 
-class Evaluate(Stage):
+class Evaluate(Scheduled):
     """Render the views of a split and compare them, as 8-bit images, with the photographs.
 
     Each of `scales` divides the size of the original photographs, whatever size was trained on: a scene trained at
@@ -27,10 +27,15 @@ class Evaluate(Stage):
     makes: ClassVar[frozenset[str]] = frozenset({"metrics"})
 
     split: Literal["test", "train"] = "test"
-    scales: Annotated[list[Scale], Field(min_length=1)] | None = None  # of the photographs; None: the finest trained on
+    """Views that are measured."""
+    scales: Annotated[list[Scale], Field(min_length=1)] | None = None
+    """Divisors of the photographs' size; without it, the finest that is trained on."""
     metrics: list[Metric] = Field(["psnr", "ssim"])
-    lpips: str | None = None  # ONNX file
-    lpips_input: InputRange = "-1..1"  # 0..1: as in the tables of 3DGS and Mip-Splatting
+    """Metrics beside LPIPS; psnr and ssim must be among them."""
+    lpips: str | None = None
+    """ONNX file of LPIPS."""
+    lpips_input: InputRange = "-1..1"
+    """Values that LPIPS is given; 0..1 as in the tables of 3DGS and Mip-Splatting."""
 
     @field_validator("metrics")
     @classmethod
@@ -51,10 +56,9 @@ class Evaluate(Stage):
             return
         perceptual = self._perceptual()
         for scale in self.scales or [run.scale]:
-            views = run.photographs.downscaled(scale).split(self.split)
-            trained = scale in run.scene.scales
-            targets = run.targets if trained else run.targets.fresh()
-            results = measure(run.rasterizer, run.trained, views, targets, perceptual)
+            views = run.original.downscaled(scale).split(self.split)
+            photographs = run.photographs if scale in run.scene.scales else run.photographs.fresh()
+            results = measure(run.rasterizer, run.model, views, photographs, perceptual)
             for result in results:
                 run.records.add(run.step, "view", split=self.split, scale=scale, **result.line())
             averages = mean(results, perceptual)

@@ -8,14 +8,14 @@ import numpy as np
 from clsplat import __version__
 from clsplat.gaussians.ply import Parameters, read_ply, write_ply
 from clsplat.gaussians.tables import PARAMETERS
-from clsplat.stages.base import Stage
+from clsplat.stages.base import Scheduled
 from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
-LOGIT_MIN = -80.0  # of an opacity that the filter spreads out to nothing: as little as the kernels know
+MIN_LOGIT = -80.0  # of an opacity that the filter spreads out to nothing: as little as the kernels know
 
 
-class Export(Stage):
+class Export(Scheduled):
     """Write a PLY in the reference's layout and read it back.
 
     A world filter becomes part of its scales and opacities, so that any viewer can show it; the model as it was
@@ -25,10 +25,11 @@ class Export(Stage):
     stage: Literal["export"] = "export"
     needs: ClassVar[frozenset[str]] = frozenset({"model"})
 
-    file: str = "point_cloud.ply"  # inside the run folder
+    file: str = "point_cloud.ply"
+    """Path inside the run folder."""
 
     def run(self, run: Run) -> None:
-        gaussians = run.trained.gaussians
+        gaussians = run.model.gaussians
         path = run.out / self.file
         parameters = {name: gaussians.get(name) for name in (*PARAMETERS, "filter_variance")}
         files = {path: baked(parameters)}
@@ -52,5 +53,5 @@ def baked(parameters: Parameters) -> Parameters:
         with np.errstate(divide="ignore"):
             logit = np.log(opacity) - np.log1p(-opacity)
         tables["log_scales"] = (0.5 * np.log(filtered2)).astype(np.float32)
-        tables["logit_opacity"] = np.maximum(logit, LOGIT_MIN).astype(np.float32)
+        tables["logit_opacity"] = np.maximum(logit, MIN_LOGIT).astype(np.float32)
     return tables

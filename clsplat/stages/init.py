@@ -21,7 +21,7 @@ from clsplat.stages.base import Stage
 from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
-DISTANCE2_MIN = 1.0e-7  # scene units²: coincident points still get a size
+MIN_DISTANCE2 = 1.0e-7  # scene units²: coincident points still get a size
 MIN_SWEPT_POINTS = 100  # points of a sweep that are worth starting from
 RANDOM_BOX = 1.3 / 4.03  # half side of the box by camera distance: what 3DGS takes for the Blender scenes
 
@@ -37,10 +37,15 @@ class Init(Stage):
     makes: ClassVar[frozenset[str]] = frozenset({"model"})
 
     source: Literal["auto", "points", "sweep", "random", "ply"] = "auto"
+    """Where the first Gaussians come from."""
     opacity: Annotated[float, Field(gt=0, lt=1)] = 0.1
-    count: Annotated[int, Field(gt=0)] = 100_000  # of random points
-    swept: Annotated[int, Field(gt=0)] = 20_000  # points at most of a sweep
-    file: str | None = None  # for `source: ply`
+    """Opacity of the first Gaussians."""
+    count: Annotated[int, Field(gt=0)] = 100_000
+    """Number of random points."""
+    swept: Annotated[int, Field(gt=0)] = 20_000
+    """Largest number of points of a sweep."""
+    file: str | None = None
+    """Model file for `source: ply`."""
 
     def run(self, run: Run) -> None:
         degree = run.model_settings.sh_degree
@@ -121,7 +126,7 @@ def neighbour_distance2(positions: NDArray[np.floating]) -> NDArray[np.float64]:
         return np.full(len(positions), 1.0)
     distance = cKDTree(positions).query(positions, k=neighbours, workers=-1)[0]
     squared: NDArray[np.float64] = np.square(distance[:, 1:]).mean(axis=1)
-    return np.maximum(squared, DISTANCE2_MIN)
+    return np.maximum(squared, MIN_DISTANCE2)
 
 
 def random_points(scene: Scene, count: int, seed: int) -> PointCloud:

@@ -3,41 +3,37 @@
 import logging
 import math
 import time
+from collections.abc import Iterator
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, field_validator
 
 from clsplat.density.statistics import SplatStats
 from clsplat.errors import Interrupted, NumericError
-from clsplat.losses.image import L1, L2, Dssim, Loss, ViewGradients, pixel_loss
-from clsplat.losses.penalties import Anisotropy, CovarianceTrace, Penalty
+from clsplat.losses.base import ImageLoss, Loss, Penalty, ViewGradients
+from clsplat.losses.image import pixel_loss
 from clsplat.metrics.distribution import distribution
-from clsplat.stages.base import Stage
-from clsplat.stages.checkpoint import Checkpoint
+from clsplat.settings import OneOf
+from clsplat.stages.base import Scheduled, Stage
 from clsplat.stages.densify import Densify
-from clsplat.stages.evaluate import Evaluate
-from clsplat.stages.export import Export
-from clsplat.stages.schedule import RaiseSh, RefreshFilter, ResetOpacity
 from clsplat.training import checkpoint
 from clsplat.training.adam import Adam, Rates
 from clsplat.training.profile import stage_milliseconds
 from clsplat.training.run import Progress, Run
-from clsplat.training.step import differentiate, update
+from clsplat.training.trainer import Trainer
+from clsplat.views.sampling import Sampler, ViewSettings
 
 LOG = logging.getLogger("clsplat")
 DISTRIBUTION_EVERY = 5  # reports
-Scheduled = Annotated[
-    RaiseSh | Densify | ResetOpacity | RefreshFilter | Checkpoint | Evaluate | Export, Field(discriminator="stage")
-]
-AnyTerm = Annotated[L1 | L2 | Dssim | CovarianceTrace | Anisotropy, Field(discriminator="type")]
+READ_AHEAD = 4  # photographs
 
 
 class Optimize(Stage):
     """Train for a number of steps, one view each (Kerbl et al. 2023).
 
-    Stages in `during` that edit parameters act between a step and the next, so whatever else is due at that step sees
-    what training has settled, and nothing is edited after the last step.  As in the reference, a gradient whose
-    parameter is about to be edited is not applied.
+    Stages in `during` that edit parameters act between a step and the next: stages that only look see what training has
+    settled, and nothing is edited after the last step.  As in the reference, a gradient whose parameter is about to be
+    edited is not applied.
     """
 
     stage: Literal["optimize"] = "optimize"
@@ -45,24 +41,31 @@ class Optimize(Stage):
     makes: ClassVar[frozenset[str]] = frozenset({"adam", "stats"})
 
     steps: Annotated[int, Field(gt=0)]
+    """Number of training steps."""
     rates: Rates = Rates()
-    losses: list[AnyTerm]
-    during: list[Scheduled] = Field([])
-    log_every: Annotated[int, Field(gt=0)] = 100  # steps between lines of metrics.jsonl
+    """Learning rates."""
+    views: ViewSettings = ViewSettings()
+    """What each step compares with."""
+    losses: list[OneOf[Loss]]
+    """What is minimised: the sum of losses and penalties."""
+    during: list[OneOf[Scheduled]] = Field([])
+    """Stages that run every so many steps."""
+    log_every: Annotated[int, Field(gt=0)] = 100
+    """Steps between lines of metrics.jsonl."""
 
     @field_validator("losses")
     @classmethod
-    def _of_an_image(cls, losses: list[AnyTerm]) -> list[AnyTerm]:
-        if not any(isinstance(loss, Loss) for loss in losses):
+    def _of_an_image(cls, losses: list[Loss]) -> list[Loss]:
+        if not any(isinstance(loss, ImageLoss) for loss in losses):
             raise ValueError("expected at least one loss that compares images: l1, l2 or dssim")
         return losses
 
     @field_validator("during")
     @classmethod
-    def _on_a_cadence(cls, during: list[Stage]) -> list[Stage]:
+    def _on_a_cadence(cls, during: list[Scheduled]) -> list[Scheduled]:
         for stage in during:
             if stage.every is None:
-                raise ValueError(f"'{getattr(stage, 'stage', '')}' needs 'every' inside 'during'")
+                raise ValueError(f"'{stage.stage}' needs 'every' inside 'during'")
         return during
 
     def check(self) -> None:
@@ -70,22 +73,24 @@ class Optimize(Stage):
             stage.check()
 
     def run(self, run: Run) -> None:
-        model = run.trained
-        run.adam = run.adam or Adam(model.gaussians)
-        run.stats = SplatStats(model.gaussians, self.statistics)
-        self._attach(run)
-        memory = run.memory_plan()
-        LOG.info(memory.text(model.gaussians.count))
-        memory.check(model.gaussians.count)
+        for _ in self.iterate(run):
+            pass
+
+    def iterate(self, run: Run) -> Iterator[ViewGradients]:
+        """Train step by step; what a step yields is valid until the next."""
+        trainer, sampler = self._trainer(run), Sampler(run.scene.split("train"), self.views, run.seed)
+        memory, count = run.memory_plan(), run.model.gaussians.count
+        LOG.info(memory.text(count))
+        memory.check(count)
         last_step = run.step - run.stage_step + self.steps
         seconds: list[float] = []  # of the steps since the last report
         while run.stage_step < self.steps:
             start = time.perf_counter()
             if run.stage_step > 0:
                 self._edit(run)
-            view = self._step(run)
+            view = self._step(run, trainer, sampler)
             report = run.step % self.log_every == 0 or run.stage_step == self.steps or run.interrupted
-            loss, psnr = self._values(run, view) if report else (0.0, 0.0)
+            loss, psnr = self._values(run, view, sampler) if report else (0.0, 0.0)
             seconds.append(time.perf_counter() - start)
             run.train_seconds += seconds[-1]
             if report:
@@ -97,38 +102,35 @@ class Optimize(Stage):
             if run.interrupted:
                 path = checkpoint.save(run, keep=2)
                 raise Interrupted(f"stopped at step {run.step}, saved in {path}; --resume goes on from there")
-
-    @property
-    def comparisons(self) -> list[Loss]:
-        """Losses that compare images."""
-        return [loss for loss in self.losses if isinstance(loss, Loss)]
-
-    @property
-    def penalties(self) -> list[Penalty]:
-        """Losses that look at Gaussians."""
-        return [loss for loss in self.losses if isinstance(loss, Penalty)]
-
-    @property
-    def _edits(self) -> list[Densify]:
-        return [stage for stage in self.during if isinstance(stage, Densify)]
+            yield view
 
     @property
     def statistics(self) -> set[str]:
         """Columns that some density rule reads."""
-        return {name for stage in self._edits for name in stage.statistics}
+        return {name for stage in self._density for name in stage.statistics}
 
     @property
     def tables(self) -> set[str]:
-        """Tables of the Gaussians that losses and rules read beside the parameters."""
-        parts: list[Penalty | Densify] = [*self.penalties, *self._edits]
+        """Tables of the Gaussians that penalties and rules read beside the parameters."""
+        parts: list[Penalty | Densify] = [*(loss for loss in self.losses if isinstance(loss, Penalty)), *self._density]
         return {name for part in parts for name in part.tables}
 
-    def _attach(self, run: Run) -> None:
-        """Add the tables that losses and rules read; a resumed run has them."""
-        gaussians = run.trained.gaussians
+    @property
+    def _density(self) -> list[Densify]:
+        return [stage for stage in self.during if isinstance(stage, Densify)]
+
+    def _trainer(self, run: Run) -> Trainer:
+        """Attach what training needs to the run's Gaussians; a resumed run has it."""
+        gaussians, photographs = run.model.gaussians, run.photographs
+        run.adam = run.adam or Adam(gaussians)
+        run.stats = SplatStats(gaussians, self.statistics)
         for name in sorted(self.tables - gaussians.tables.keys()):
             gaussians.add(name, 1)
             run.refresh_filter()
+        losses = [*self.losses, *run.losses]
+        return Trainer(
+            run.rasterizer, run.model, run.adam, run.stats, photographs.background, losses, self.rates, run.scene.extent
+        )
 
     def _edit(self, run: Run) -> None:
         """What was due at the step before."""
@@ -136,45 +138,40 @@ class Optimize(Stage):
             if stage.edits and stage.due(run.step):
                 stage.run(run)
 
-    def _step(self, run: Run) -> ViewGradients:
+    def _step(self, run: Run, trainer: Trainer, sampler: Sampler) -> ViewGradients:
         """One view; halfway between reports, where no density control is due, the kernels are timed."""
-        assert run.stats is not None
-        assert run.adam is not None
         run.step += 1
         run.stage_step += 1
         run.device.timings.sampling = run.step % self.log_every == self.log_every // 2
-        model, target = run.trained, run.targets.get(run.train_view())
-        run.announce_views()
-        background, pixel_sums = run.targets.background_array, run.stats.pixel_sums
-        view = differentiate(run.rasterizer, model, target, background, self.comparisons, run.step, pixel_sums)
+        sample = sampler.at(run.step)
+        photograph = run.photographs.get(sample.view)
+        run.photographs.announce(sampler.at(run.step + ahead).view for ahead in range(1, READ_AHEAD + 1))
         stale = {name for stage in self.during if stage.due(run.step) for name in stage.stale(run)}
         if run.stage_step == self.steps:
             stale = set()
-        extent = run.scene.extent
-        rates = self.rates.at(run.step, extent)
-        run.stats.add(view, update(run.rasterizer, model, run.adam, view, rates, self.penalties, stale, extent))
+        view = trainer.step(photograph, run.step, sample.transforms, stale)
         run.device.timings.sampling = False
         return view
 
-    def _values(self, run: Run, view: ViewGradients) -> tuple[float, float]:
+    def _values(self, run: Run, view: ViewGradients, sampler: Sampler) -> tuple[float, float]:
         """Read the step's loss and PSNR.  Raises NumericError, after saving the state, when they are not finite."""
-        loss = sum(term.value() for term in view.terms)
+        loss = view.loss
         squared = float(pixel_loss(view.comparison, l1=0.0, l2=0.0).get()[..., 1].sum(dtype="float64"))
         error = squared / view.comparison.counted
-        broken = run.trained.gaussians.not_finite()
+        broken = run.model.gaussians.not_finite()
         if broken or not math.isfinite(loss):
             path = checkpoint.save(run, keep=2)
             raise NumericError(
-                f"step {run.step}, view '{run.train_view().name}': the loss is {loss}, not finite: "
+                f"step {run.step}, view '{sampler.at(run.step).view.name}': the loss is {loss}, not finite: "
                 f"{', '.join(broken) or 'none of the parameters'}; the state is in {path}; lower the learning rates"
             )
         return loss, -10 * math.log10(max(error, 1e-10))
 
     def _report(self, run: Run, last_step: int, loss: float, psnr: float, seconds: float) -> None:
-        count = run.trained.gaussians.count
+        count = run.model.gaussians.count
         stages = stage_milliseconds(run.device.timings)
         run.records.add(run.step, "train", loss=loss, psnr=psnr, gaussians=count, ms=1e3 * seconds, stages=stages)
         if run.step % (DISTRIBUTION_EVERY * self.log_every) == 0 or run.step == last_step:
-            run.records.add(run.step, "distribution", gaussians=count, **distribution(run.trained.gaussians))
+            run.records.add(run.step, "distribution", gaussians=count, **distribution(run.model.gaussians))
         run.records.status("running", run.step, steps=last_step, gaussians=count)
         run.show(Progress(run.step, last_step, loss, psnr, count, 1e3 * seconds, seconds * (last_step - run.step)))

@@ -20,13 +20,15 @@ class Render(Stage):
     needs: ClassVar[frozenset[str]] = frozenset({"model"})
 
     split: Literal["test", "train", "all"] = "test"
-    folder: str = "renders"  # inside the run folder
+    """Views that are rendered."""
+    folder: str = "renders"
+    """Path inside the run folder."""
 
     def run(self, run: Run) -> None:
         views = run.scene.downscaled(run.scale).split(self.split)
         for view in views:
-            camera = run.targets.camera(view)
-            image = render_view(run.rasterizer, run.trained, camera, run.targets.background_array)
+            camera = run.photographs.camera(view)
+            image = render_view(run.rasterizer, run.model, camera, run.photographs.background)
             write_image(image_path(run.out / self.folder, view.name), image)
         LOG.info("%d images written to %s", len(views), run.out / self.folder)
 

@@ -26,7 +26,8 @@ class Report(Stage):
     stage: Literal["report"] = "report"
     needs: ClassVar[frozenset[str]] = frozenset({"model", "metrics"})
 
-    file: str = "report.html"  # inside the run folder
+    file: str = "report.html"
+    """Path inside the run folder."""
 
     def run(self, run: Run) -> None:
         sections = [_figures(run), _curves(run), _census(run), _times(run), _views(run), _settings(run)]
@@ -42,7 +43,7 @@ def _figures(run: Run) -> str:
             suffix = "" if scale == f"{run.scale:g}" else f" at 1/{scale}"
             values[f"{split} PSNR{suffix} ({averages['views']} views)"] = f"{averages['psnr']:.2f} dB"
             values[f"{split} SSIM{suffix}"] = f"{averages['ssim']:.4f}"
-    values["Gaussians"] = f"{run.trained.gaussians.count:,}"
+    values["Gaussians"] = f"{run.model.gaussians.count:,}"
     values["steps"] = f"{run.step:,}"
     values["training"] = duration(run.train_seconds)
     return figures(values)
@@ -147,8 +148,8 @@ def _views(run: Run) -> str:
     for title, chosen in (("Worst", worst), ("Best", best)):
         text += f"<h3>{title}</h3>" if chosen else ""
         for record in chosen:
-            target = run.targets.get(by_name[record["view"]])
-            image = render_view(run.rasterizer, run.trained, target.camera, run.targets.background_array)
+            target = run.photographs.get(by_name[record["view"]])
+            image = render_view(run.rasterizer, run.model, target.camera, run.photographs.background)
             text += _figure(record, image, target.image())
     return text
 

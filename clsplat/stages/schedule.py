@@ -6,11 +6,11 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field
 
 from clsplat.density.edit import cap_opacity
-from clsplat.stages.base import Stage
+from clsplat.stages.base import Scheduled
 from clsplat.training.run import Run
 
 
-class RaiseSh(Stage):
+class RaiseSh(Scheduled):
     """Let the colours use one more band of spherical harmonics."""
 
     stage: Literal["raise_sh"] = "raise_sh"
@@ -18,11 +18,11 @@ class RaiseSh(Stage):
     edits: ClassVar[bool] = True
 
     def run(self, run: Run) -> None:
-        model = run.trained
+        model = run.model
         model.degree = min(model.degree + 1, model.gaussians.sh_degree)
 
 
-class ResetOpacity(Stage):
+class ResetOpacity(Scheduled):
     """Make every Gaussian almost transparent; those that are needed come back, floaters do not (Kerbl et al. 2023).
 
     `to` is the opacity after the world filter (Yu et al. 2024).
@@ -33,7 +33,9 @@ class ResetOpacity(Stage):
     edits: ClassVar[bool] = True
 
     to: Annotated[float, Field(gt=0, lt=1)] = 0.01
-    when_background: Literal["black", "white"] | None = None  # act on this background only
+    """Largest opacity afterwards."""
+    when_background: Literal["black", "white"] | None = None
+    """Background on which the stage acts; without it, on both."""
 
     def stale(self, run: Run) -> Collection[str]:
         return ("logit_opacity",) if self._acts(run) else ()
@@ -41,15 +43,15 @@ class ResetOpacity(Stage):
     def run(self, run: Run) -> None:
         if not self._acts(run):
             return
-        cap_opacity(run.trained.gaussians, self.to)
+        cap_opacity(run.model.gaussians, self.to)
         if run.adam is not None:
             run.adam.forget("logit_opacity")
 
     def _acts(self, run: Run) -> bool:
-        return self.when_background in (None, run.targets.background_name)
+        return self.when_background in (None, run.photographs.background_name)
 
 
-class RefreshFilter(Stage):
+class RefreshFilter(Scheduled):
     """Let the world filter, and the sampling intervals that sizes in pixels go by, follow the Gaussians as they move.
 
     They also do so when Gaussians are made and after every density edit; a model that has neither has nothing to do.

@@ -1,46 +1,36 @@
 """Adam on the tables of a Gaussians struct, with a learning rate for each."""
 
-import math
 from collections.abc import Collection
-from typing import Annotated, Any
+from typing import Any
 
-from pydantic import Field
-
-from clsplat.gaussians.tables import PARAMETERS, DeviceModel, Gaussians, Gradients, sh_coefficients
+from clsplat.gaussians.tables import PARAMETERS, DeviceModel, Gaussians, Gradients, moment_tables, sh_coefficients
 from clsplat.opencl.device import Array
 from clsplat.opencl.program import constants
 from clsplat.render.rasterizer import Frame, shape_arguments
+from clsplat.schedule import Decay, NonNegative, at_step
 from clsplat.settings import Settings
-
-Rate = Annotated[float, Field(ge=0)]
-
-
-class Decay(Settings):
-    """A rate that falls exponentially from `start` to `stop` over a number of steps (Kerbl et al. 2023)."""
-
-    start: Annotated[float, Field(gt=0)]
-    stop: Annotated[float, Field(gt=0)]
-    over: Annotated[int, Field(gt=0)]  # global steps
-
-    def at(self, step: int) -> float:
-        share = min(step / self.over, 1.0)
-        return math.exp((1 - share) * math.log(self.start) + share * math.log(self.stop))
 
 
 class Rates(Settings):
-    """Learning rates by parameter.  Those of `means` are multiplied by the scene's extent."""
+    """Learning rates by parameter, each by step.  Those of `means` are multiplied by the scene's extent."""
 
-    means: Decay = Decay(start=1.6e-4, stop=1.6e-6, over=30_000)
-    quats: Rate = 1.0e-3
-    log_scales: Rate = 5.0e-3
-    logit_opacity: Rate = 5.0e-2
-    sh_base: Rate = 2.5e-3
-    sh_rest: Rate = 1.25e-4
+    means: NonNegative = Decay(initial=1.6e-4, final=1.6e-6, over=30_000)
+    """Of the means, as shares of the scene's extent."""
+    quats: NonNegative = 1.0e-3
+    """Of the quaternions."""
+    log_scales: NonNegative = 5.0e-3
+    """Of the logarithms of the scales."""
+    logit_opacity: NonNegative = 5.0e-2
+    """Of the logits of the opacities."""
+    sh_base: NonNegative = 2.5e-3
+    """Of band 0 of the spherical harmonics."""
+    sh_rest: NonNegative = 1.25e-4
+    """Of the other bands."""
 
     def at(self, step: int, extent: float) -> dict[str, float]:
-        """Rates of a step, by the names of PARAMETERS."""
-        fixed = {name: getattr(self, name) for name in PARAMETERS if name != "means"}
-        return {"means": self.means.at(step) * extent, **fixed}
+        """Return the rates of a global step, by the names of PARAMETERS."""
+        rates = {name: at_step(getattr(self, name), step) for name in PARAMETERS}
+        return {**rates, "means": rates["means"] * extent}
 
 
 class Adam:
@@ -54,7 +44,7 @@ class Adam:
         self._vectors = int(gaussians.device.tuning["VECTORS"])
         self._beta1, self._beta2 = constants("adam.h")["BETA1"], constants("adam.h")["BETA2"]
         for name in PARAMETERS:
-            for moment in self._moments(name):
+            for moment in moment_tables(name):
                 gaussians.add(moment, gaussians.tables[name].components, zero_fresh=True)
 
     def update(self, model: DeviceModel, frame: Frame, pixel_sums: Array, rates: dict[str, float]) -> Array:
@@ -66,7 +56,7 @@ class Adam:
         grad_mean2d = gaussians.device.empty((2, gaussians.capacity))
         arguments: dict[str, Any] = {"sh_base": gaussians["sh_base"]}
         for name in PARAMETERS:
-            moment1, moment2 = self._moments(name)
+            moment1, moment2 = moment_tables(name)
             rate, correction2 = self._factors(name, rates)
             arguments |= {f"{name}_moment1": gaussians[moment1], f"{name}_moment2": gaussians[moment2]}
             arguments |= {f"{name}_rate": rate, f"{name}_correction2": correction2}
@@ -94,7 +84,7 @@ class Adam:
             components = gaussians.tables[name].components
             if name == "sh_rest":
                 components = 3 * (sh_coefficients(model.degree) - 1)
-            moment1, moment2 = self._moments(name)
+            moment1, moment2 = moment_tables(name)
             rate, correction2 = self._factors(name, rates)
             self._program.adam_step(
                 items=(-(-gaussians.count // self._lanes), components),
@@ -116,9 +106,5 @@ class Adam:
 
     def forget(self, name: str) -> None:
         """Zero the moments of one parameter."""
-        for moment in self._moments(name):
+        for moment in moment_tables(name):
             self.gaussians[moment].fill(0)
-
-    @staticmethod
-    def _moments(name: str) -> tuple[str, str]:
-        return f"adam/{name}/moment1", f"adam/{name}/moment2"

@@ -22,7 +22,7 @@ from clsplat.gaussians.tables import PARAMETERS, Gaussians
 from clsplat.training.adam import Adam
 from clsplat.training.run import Run
 
-FORMAT = 2
+FORMAT = 3
 FOLDER = "checkpoints"
 LOG = logging.getLogger("clsplat")
 Tables = dict[str, NDArray[np.float32]]
@@ -30,7 +30,7 @@ Tables = dict[str, NDArray[np.float32]]
 
 def save(run: Run, keep: int) -> Path:
     """Write checkpoints/step_N.npz, whole or not at all, and remove all but the `keep` newest."""
-    model = run.trained
+    model = run.model
     tables = {_key(name): model.gaussians.get(name) for name in model.gaussians.tables}
     meta = {
         "format": FORMAT,

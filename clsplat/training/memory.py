@@ -27,7 +27,7 @@ class MemoryPlan:
     pair: int
     fixed: int  # photographs and planes of pixels
     largest_table: int  # for each Gaussian, in the largest single buffer
-    limit: int  # of the device
+    memory: int  # of the device
     allocation: int  # of a single buffer
 
     def needed(self, gaussians: int) -> int:
@@ -36,9 +36,9 @@ class MemoryPlan:
         return self.fixed + int(gaussians * grown)
 
     @property
-    def most(self) -> int:
+    def limit(self) -> int:
         """The largest number of Gaussians that fits, in all and in single buffers."""
-        by_total = (self.limit - self.fixed) / (GROWTH * self.gaussian + self.largest_table + PAIRS * self.pair)
+        by_total = (self.memory - self.fixed) / (GROWTH * self.gaussian + self.largest_table + PAIRS * self.pair)
         by_buffer = self.allocation / max(GROWTH * self.largest_table, PAIRS * 4 * RECORD)
         return max(0, int(min(by_total, by_buffer)))
 
@@ -47,13 +47,13 @@ class MemoryPlan:
         mib = 2**20
         return (
             f"memory: {self.needed(gaussians) / mib:,.0f} MiB for {gaussians:,} Gaussians ({self.gaussian} bytes each "
-            f"and {self.pair} a pair, photographs and planes {self.fixed / mib:,.0f} MiB); {self.most:,} fit in "
-            f"{self.limit / mib:,.0f} MiB with buffers up to {self.allocation / mib:,.0f} MiB"
+            f"and {self.pair} a pair, photographs and planes {self.fixed / mib:,.0f} MiB); {self.limit:,} fit in "
+            f"{self.memory / mib:,.0f} MiB with buffers up to {self.allocation / mib:,.0f} MiB"
         )
 
     def check(self, gaussians: int) -> None:
         """Raise MemoryLimitError when that many Gaussians do not fit."""
-        if gaussians > self.most:
+        if gaussians > self.limit:
             raise MemoryLimitError(
                 f"{self.text(gaussians)}: start from fewer points, use smaller images (scene.downscale) or fewer "
                 "of them on the device (scene.image_budget)"
@@ -63,8 +63,8 @@ class MemoryPlan:
 def plan(gaussians: Gaussians, photographs: int, pixels: int, pixel_sums: int = PIXEL_SUMS) -> MemoryPlan:
     """Plan for the tables that the Gaussians have.
 
-    photographs: bytes of them on the device; pixels: of the largest view, whole tiles; pixel_sums: how many the backward
-    pass makes for each Gaussian.
+    photographs: bytes of them on the device; pixels: of the largest view, whole tiles; pixel_sums: how many the
+    backward pass makes for each Gaussian.
     """
     info: DeviceInfo = gaussians.device.info
     sizes = [4 * table.components for table in gaussians.tables.values()]

@@ -18,7 +18,7 @@ STAGES = {
     "fill_tiles": "sort",
     "sort_tiles": "sort",
     "blend_forward": "blend",
-    "unpack_target": "loss",
+    "unpack_pixels": "loss",
     "pixel_loss": "loss",
     "ssim_maps": "loss",
     "ssim_gradient": "loss",
@@ -47,6 +47,6 @@ ORDER = tuple(dict.fromkeys(STAGES.values()))
 def stage_milliseconds(timings: Timings, steps: int = 1) -> dict[str, float]:
     """Average milliseconds of each stage over the `steps` sampled since the last call, in order of a step."""
     totals: dict[str, float] = defaultdict(float)
-    for label, seconds in timings.take().items():
-        totals[STAGES.get(label.partition(":")[2], "other")] += 1e3 * sum(seconds) / steps
+    for (label, section), seconds in timings.take().items():
+        totals[STAGES.get(label.partition(":")[2], section)] += 1e3 * sum(seconds) / steps
     return {name: totals[name] for name in (*ORDER, "other") if name in totals}

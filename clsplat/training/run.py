@@ -10,23 +10,22 @@ from clsplat.density.statistics import SplatStats
 from clsplat.errors import ConfigError
 from clsplat.filters import FilterViews, ModelSettings, measure_intervals
 from clsplat.gaussians.tables import INTERVAL2, DeviceModel
+from clsplat.losses.base import Loss
 from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import PIXEL_SUMS, Rasterizer
-from clsplat.scene.scene import Scene, View
+from clsplat.scene.scene import Scene
 from clsplat.training.adam import Adam
 from clsplat.training.memory import MemoryPlan, plan
 from clsplat.training.records import Records
-from clsplat.views.order import Sampling, ViewOrder
 from clsplat.views.photographs import Photographs
 from clsplat.views.texture import texture_quantile
 
-READ_AHEAD = 4  # photographs
 LOG = logging.getLogger("clsplat")
 
 
 @dataclass(frozen=True)
 class Progress:
-    """What the screen shows while training."""
+    """The state of training, for the terminal."""
 
     step: int
     steps: int
@@ -43,17 +42,16 @@ class Run:
 
     device: Device
     scene: Scene  # as trained on: at one scale or several
-    photographs: Scene  # as read
+    original: Scene  # as read
     out: Path
     name: str
     seed: int
     pipeline: dict[str, Any]  # resolved settings, as written to pipeline.yaml
     rasterizer: Rasterizer
-    targets: Photographs
+    photographs: Photographs
     model_settings: ModelSettings
-    sampling: Sampling = "uniform"
-    prepared: dict[str, str] | None = None  # what `prepare:` made the photographs of, and where they lie
-    model: DeviceModel | None = None
+    prepared: dict[str, str] | None = None  # hash of what the photographs were prepared from, and their folder
+    losses: list[Loss] = field(default_factory=list)  # added from Python, beside those of the pipeline
     adam: Adam | None = None
     stats: SplatStats | None = None
     step: int = 0  # updates done, or in progress
@@ -66,44 +64,40 @@ class Run:
 
     def __post_init__(self) -> None:
         self.records = Records(self.out)
-        self._order = ViewOrder(self.scene.split("train"), self.sampling, self.seed)
+        self._model: DeviceModel | None = None
         self._filter_views: FilterViews | None = None
         self._texture_quantiles: dict[float, float] = {}
 
     @property
-    def trained(self) -> DeviceModel:
+    def model(self) -> DeviceModel:
         """The model.  Raises ConfigError when no stage has made one."""
-        if self.model is None:
+        if self._model is None:
             raise ConfigError("no model yet: an init stage must come first")
-        return self.model
+        return self._model
+
+    @model.setter
+    def model(self, model: DeviceModel) -> None:
+        self._model = model
 
     @property
     def scale(self) -> float:
-        """The finest scale that is trained on: by what the photographs' size is divided."""
+        """The smallest divisor of the photographs' size that is trained on."""
         return self.scene.scales[0]
-
-    def train_view(self) -> View:
-        """The view of the current step."""
-        return self._order.at(self.step)
 
     def memory_plan(self) -> MemoryPlan:
         """What training with the present tables takes of the device's memory."""
         views = self.scene.split("train")
-        bytes_held = min(self.targets.budget, sum(3 * view.camera.width * view.camera.height for view in views))
+        bytes_held = min(self.photographs.budget, sum(3 * view.camera.width * view.camera.height for view in views))
         tile = int(self.device.tuning["TILE"])
         pixels = max((-(-v.camera.width // tile)) * (-(-v.camera.height // tile)) * tile**2 for v in views)
         pixel_sums = PIXEL_SUMS if self.stats is None else self.stats.pixel_sums
-        return plan(self.trained.gaussians, bytes_held, pixels, pixel_sums)
-
-    def announce_views(self) -> None:
-        """Let the photographs of the next steps be read ahead."""
-        self.targets.announce(self._order.at(self.step + ahead) for ahead in range(1, READ_AHEAD + 1))
+        return plan(self.model.gaussians, bytes_held, pixels, pixel_sums)
 
     def refresh_filter(self) -> None:
         """Let the world filter follow the Gaussians: after they are made, and after their number changes."""
         if self._filter_views is None:
             self._filter_views = FilterViews(self.device, self.scene.split("train"))
-        model, views = self.trained, self._filter_views
+        model, views = self.model, self._filter_views
         self.model_settings.world_filter.refresh(model.gaussians, views, model.near)
         if INTERVAL2 in model.gaussians.tables:
             measure_intervals(model.gaussians, views, views.focal, model.near, 1.0, model.gaussians[INTERVAL2])
@@ -111,17 +105,17 @@ class Run:
     def texture_quantile(self, share: float) -> float:
         """The gradient magnitude, per px, that `share` of the training photographs' pixels stay below."""
         if share not in self._texture_quantiles:
-            targets = (self.targets.get(view) for view in self.scene.split("train"))
-            self._texture_quantiles[share] = texture_quantile(self.rasterizer.workspace, targets, share)
+            photographs = (self.photographs.get(view) for view in self.scene.split("train"))
+            self._texture_quantiles[share] = texture_quantile(self.rasterizer.workspace, photographs, share)
         return self._texture_quantiles[share]
 
     def rendering(self) -> dict[str, Any]:
         """The numbers that a model file needs to be rendered as it was trained."""
-        model = self.trained
+        model = self.model
         return {
             "near": model.near,
             "screen_variance": model.screen_variance,
             "compensate": model.compensate,
-            "background": self.targets.background_name,
-            "alpha": self.photographs.views[0].alpha,
+            "background": self.photographs.background_name,
+            "alpha": self.original.views[0].alpha,
         }

@@ -1,5 +1,6 @@
 """The view of each training step, a function of the seed and the step alone: a resumed run goes on with the same."""
 
+from abc import abstractmethod
 from collections.abc import Sequence
 from typing import Any, Literal
 
@@ -7,39 +8,71 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.scene.scene import View
+from clsplat.settings import Settings
 
-Sampling = Literal["uniform", "paper", "code"]
-FULL_SHARE = 0.3  # of the steps, `code` overrides the order by a view of the finest scale
+FINEST_SHARE = 0.3  # of the steps, at which `code` takes a view of the finest size (released code of Mip-Splatting)
 
 
-class ViewOrder:
-    """All training views in a random order, then all in another; they may come at several scales.
+class ViewPool:
+    """The training views, which may come at several sizes, and permutations of them."""
 
-    `uniform` shows every view of every scale equally often.  `paper` shows those of the finest scale twice as often
-    as the others: 40, 20, 20, 20 % for four scales (Barron et al. 2021, whose protocol Mip-Splatting follows).
-    `code` puts a random view of the finest scale in the place of 30 % of the steps: 47.5, 17.5, 17.5, 17.5 %, as the
-    released code of Mip-Splatting does.
-    """
-
-    def __init__(self, views: Sequence[View], sampling: Sampling, seed: int) -> None:
-        self.views, self.sampling, self.seed = views, sampling, seed
+    def __init__(self, views: Sequence[View], seed: int) -> None:
         finest = min(view.scale for view in views)
-        self._full = [i for i, view in enumerate(views) if view.scale == finest]
-        self._entries = [*range(len(views)), *(self._full if sampling == "paper" else [])]
-        self._epoch, self._order = -1, np.empty(0, np.int64)
+        self.views, self.seed = views, seed
+        self.finest = [i for i, view in enumerate(views) if view.scale == finest]  # indices into `views`
+        self._epoch, self._permutation = (-1, -1), np.empty(0, np.int64)
 
-    def at(self, step: int) -> View:
-        """Return the view of a step, counted from 1."""
-        if self.sampling == "code":
-            rng = np.random.default_rng([self.seed, step, len(self.views)])
-            if rng.random() < FULL_SHARE:
-                return self.views[self._full[int(rng.integers(len(self._full)))]]
-        epoch, place = divmod(step - 1, len(self._entries))
-        entry: int = self._entries[int(self._shuffled(epoch)[place])]
-        return self.views[entry]
+    def shuffled(self, entries: Sequence[int], step: int) -> View:
+        """Return the view of a step; all `entries`, indices into `views`, come in one random order after another."""
+        epoch, place = divmod(step - 1, len(entries))
+        return self.views[entries[int(self._shuffle(epoch, len(entries))[place])]]
 
-    def _shuffled(self, epoch: int) -> NDArray[Any]:
-        if self._epoch != epoch:
-            self._epoch = epoch
-            self._order = np.random.default_rng([self.seed, epoch]).permutation(len(self._entries))
-        return self._order
+    def random(self, step: int) -> np.random.Generator:
+        """Return random numbers that depend on the seed and the step alone."""
+        return np.random.default_rng([self.seed, step, len(self.views)])
+
+    def _shuffle(self, epoch: int, count: int) -> NDArray[Any]:
+        if self._epoch != (epoch, count):
+            self._epoch = epoch, count
+            self._permutation = np.random.default_rng([self.seed, epoch]).permutation(count)
+        return self._permutation
+
+
+class Order(Settings):
+    """Which view a step trains on."""
+
+    @abstractmethod
+    def at(self, pool: ViewPool, step: int) -> View:
+        """Return the view of a step, counted from 1; it may depend on the pool, its seed and the step only."""
+
+
+class Uniform(Order):
+    """All views of every size, in a random order, then in another."""
+
+    type: Literal["uniform"] = "uniform"
+
+    def at(self, pool: ViewPool, step: int) -> View:
+        return pool.shuffled(range(len(pool.views)), step)
+
+
+class Paper(Order):
+    """Views of the finest size twice as often as the others: 40, 20, 20, 20 % for four sizes (Barron et al. 2021, whose
+    protocol Mip-Splatting follows)."""
+
+    type: Literal["paper"] = "paper"
+
+    def at(self, pool: ViewPool, step: int) -> View:
+        return pool.shuffled([*range(len(pool.views)), *pool.finest], step)
+
+
+class Code(Order):
+    """A random view of the finest size in the place of 30 % of the steps: 47.5, 17.5, 17.5, 17.5 % for four sizes (the
+    released code of Mip-Splatting)."""
+
+    type: Literal["code"] = "code"
+
+    def at(self, pool: ViewPool, step: int) -> View:
+        rng = pool.random(step)
+        if rng.random() < FINEST_SHARE:
+            return pool.views[pool.finest[int(rng.integers(len(pool.finest)))]]
+        return pool.shuffled(range(len(pool.views)), step)

@@ -1,6 +1,6 @@
 """Photographs on the device, 8 bits a channel, and the float planes that losses compare with."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,11 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.errors import DataError
 from clsplat.opencl.device import Array, Device
 from clsplat.render.rasterizer import DeviceCamera, upload_camera
 from clsplat.render.workspace import Workspace
 from clsplat.scene.photographs import load_photograph
 from clsplat.scene.scene import Background, View
+from clsplat.views.transforms import PhotographTransform, Planes
 
 Mask = NDArray[np.bool_]
 BACKGROUNDS: dict[Background, tuple[float, float, float]] = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
@@ -22,25 +24,39 @@ BUDGET_SHARE = 0.25  # of the device's memory, when no budget is given
 
 @dataclass(frozen=True)
 class Photograph:
-    """One photograph and its camera."""
+    """One photograph on the device, and its camera."""
 
     camera: DeviceCamera
-    pixels: Array  # [3, height, width] uint8, with a fourth plane of 0 and 1 where a mask says what counts
+    colours: Array  # [3, height, width] uint8
+    mask: Array | None = None  # [1, height, width] uint8 of 0 and 1, where a mask says which pixels count
 
     @property
-    def masked(self) -> bool:
-        return bool(self.pixels.shape[0] == 4)
+    def nbytes(self) -> int:
+        return self.colours.nbytes + (self.mask.nbytes if self.mask else 0)
 
     def image(self) -> NDArray[np.uint8]:
         """The colours on the host, [height, width, 3]."""
-        return np.asarray(self.pixels.get()[:3].transpose(1, 2, 0))
+        return np.asarray(self.colours.get().transpose(1, 2, 0))
 
-    def mask(self) -> Mask | None:
+    def counted(self) -> Mask | None:
         """Which pixels count, [height, width], or None where all do."""
-        return np.asarray(self.pixels.get()[3] > 0) if self.masked else None
+        return np.asarray(self.mask.get()[0] > 0) if self.mask else None
+
+    def planes(self, workspace: Workspace, transforms: Sequence[PhotographTransform] = (), step: int = 0) -> Planes:
+        """Return the photograph as float planes of whole tiles, after the transforms of a global step."""
+        colours = unpack(workspace, self.camera, self.colours, 1 / 255, "photograph")
+        mask = unpack(workspace, self.camera, self.mask, 1.0, "mask") if self.mask else None
+        planes = Planes(workspace, self.camera, colours, mask)
+        for transform in transforms:
+            planes = transform.apply(planes, step)
+        return planes
 
 
-Key = tuple[str, float]  # name and scale of a view
+Key = tuple[str, int, int]  # name, width and height of a view
+
+
+def _key(view: View) -> Key:
+    return view.name, view.camera.width, view.camera.height
 
 
 class Photographs:
@@ -53,12 +69,12 @@ class Photographs:
         self, device: Device, background: Background, budget: int | None = None, straightened: Path | None = None
     ) -> None:
         self.device = device
-        self.straightened = straightened  # folder that keeps photographs of distorting lenses
+        self.straightened = straightened  # folder that keeps undistorted photographs
         self.background_name = background
-        self.background_array = device.upload(np.array(BACKGROUNDS[background], np.float32))
+        self.background = device.upload(np.array(BACKGROUNDS[background], np.float32))  # [3]
         self.budget = int(device.info.memory * BUDGET_SHARE) if budget is None else budget
         self._cameras: dict[Key, DeviceCamera] = {}
-        self._targets: dict[Key, Photograph] = {}  # least recently used first
+        self._held: dict[Key, Photograph] = {}  # least recently used first
         self._reading: dict[Key, Future[NDArray[Any]]] = {}
         self._reader: ThreadPoolExecutor | None = None
 
@@ -68,53 +84,58 @@ class Photographs:
 
     def camera(self, view: View) -> DeviceCamera:
         """Return the camera of a view."""
-        key = view.name, view.scale
-        if key not in self._cameras:
-            self._cameras[key] = upload_camera(self.device, view)
-        return self._cameras[key]
+        if _key(view) not in self._cameras:
+            self._cameras[_key(view)] = upload_camera(self.device, view)
+        return self._cameras[_key(view)]
 
     def get(self, view: View) -> Photograph:
         """Return the photograph of a view.  Raises DataError when its file cannot be read."""
-        key = view.name, view.scale
-        target = self._targets.pop(key, None)
-        if target is None:
+        key = _key(view)
+        photograph = self._held.pop(key, None)
+        if photograph is None:
             reading = self._reading.pop(key, None)
             pixels = reading.result() if reading else self._read(view)
             self._make_room(pixels.nbytes)
-            target = Photograph(self.camera(view), self.device.upload(pixels))
-        self._targets[key] = target
-        return target
+            colours, mask = pixels[:3], pixels[3:]
+            photograph = Photograph(
+                self.camera(view), self.device.upload(colours), self.device.upload(mask) if len(mask) else None
+            )
+        self._held[key] = photograph
+        return photograph
 
     def announce(self, views: Iterable[View]) -> None:
         """Read ahead what will be asked for next; nothing when it is there already."""
         for view in views:
-            key = view.name, view.scale
-            if key not in self._targets and key not in self._reading:
+            key = _key(view)
+            if key not in self._held and key not in self._reading:
                 self._reader = self._reader or ThreadPoolExecutor(1, "photographs")
                 self._reading[key] = self._reader.submit(self._read, view)
 
     def _read(self, view: View) -> NDArray[Any]:
-        """Pixels [3 or 4, height, width] uint8."""
+        """Colours and, where there is one, the mask: [3 or 4, height, width] uint8."""
         image = load_photograph(view, BACKGROUNDS[self.background_name], self.straightened)
+        if image.shape[2] == 4 and not image[:, :, 3].any():
+            raise DataError(
+                f"{view.mask_path or view.image_path}: the mask leaves out every pixel of '{view.name}'; expected some "
+                "that count: remove the photograph from the dataset, or fix its mask"
+            )
         return np.ascontiguousarray(image.transpose(2, 0, 1))
 
     def _make_room(self, size: int) -> None:
-        held = sum(target.pixels.nbytes for target in self._targets.values())
-        while self._targets and held + size > self.budget:
-            held -= self._targets.pop(next(iter(self._targets))).pixels.nbytes
+        held = sum(photograph.nbytes for photograph in self._held.values())
+        while self._held and held + size > self.budget:
+            held -= self._held.pop(next(iter(self._held))).nbytes
 
 
-def unpack(workspace: Workspace, camera: DeviceCamera, pixels: Array, name: str = "target") -> Array:
-    """Return 8-bit pixels [C, height, width] as float planes [C, rows, stride], zero outside the image.
-
-    The first three are colours by 255; a fourth, the mask, stays 0 and 1.
-    """
+def unpack(workspace: Workspace, camera: DeviceCamera, pixels: Array, factor: float, name: str) -> Array:
+    """Return 8-bit pixels [C, height, width] times `factor` as float planes [C, rows, stride], zero outside."""
     channels = pixels.shape[0]
     planes = workspace.array(name, (channels, camera.rows, camera.stride))
-    workspace.device.program("loss.cl").unpack_target(
+    workspace.device.program("loss.cl").unpack_pixels(
         items=(camera.stride, camera.rows, channels),
         pixels=pixels,
-        target=planes,
+        planes=planes,
+        factor=factor,
         width=camera.width,
         height=camera.height,
         stride=camera.stride,
@@ -122,8 +143,8 @@ def unpack(workspace: Workspace, camera: DeviceCamera, pixels: Array, name: str 
     return planes
 
 
-def cover(workspace: Workspace, camera: DeviceCamera, planes: Array, target: Array) -> None:
-    """Set `planes` [3, rows, stride] to zero where the fourth plane of `target` [4, rows, stride] is."""
+def apply_mask(workspace: Workspace, camera: DeviceCamera, planes: Array, mask: Array) -> None:
+    """Set `planes` [3, rows, stride] to zero where the mask [1, rows, stride] is."""
     workspace.device.program("loss.cl").apply_mask(
-        items=(camera.rows * camera.stride, 3), planes=planes, target=target, pixels=camera.rows * camera.stride
+        items=(camera.rows * camera.stride, 3), planes=planes, mask=mask, pixels=camera.rows * camera.stride
     )

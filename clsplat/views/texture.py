@@ -7,7 +7,7 @@ import numpy as np
 from clsplat.opencl.device import Array
 from clsplat.render.rasterizer import DeviceCamera
 from clsplat.render.workspace import Workspace
-from clsplat.views.photographs import Photograph, unpack
+from clsplat.views.photographs import Photograph
 
 MAX_MAGNITUDE = 0.75  # per px: above the largest possible magnitude
 BINS = 3000
@@ -26,26 +26,27 @@ def image_gradient(workspace: Workspace, camera: DeviceCamera, image: Array, nam
     return magnitude
 
 
-def known_gradient(workspace: Workspace, camera: DeviceCamera, image: Array, target: Array) -> Array:
-    """The same, but -1 at pixels that the mask of `target`, [3 or 4, rows, stride], hides, and beside them."""
+def known_gradient(workspace: Workspace, camera: DeviceCamera, image: Array, mask: Array | None) -> Array:
+    """The same, but -1 at pixels that the mask, [1, rows, stride], leaves out, and beside them."""
     magnitude = image_gradient(workspace, camera, image)
-    if target.shape[0] == 4:
+    if mask is not None:
         workspace.device.program("texture.cl").hide_masked(
             items=(camera.width, camera.height),
-            target=target,
+            mask=mask,
             magnitude=magnitude,
-            **camera.plane_arguments(),
+            width=camera.width,
+            height=camera.height,
+            stride=camera.stride,
         )
     return magnitude
 
 
-def texture_quantile(workspace: Workspace, targets: Iterable[Photograph], share: float) -> float:
+def texture_quantile(workspace: Workspace, photographs: Iterable[Photograph], share: float) -> float:
     """The magnitude, per px, that `share` of all pixels of the photographs that count stay below, to 1 / 4000."""
     counts = np.zeros(BINS, np.int64)
-    for target in targets:
-        camera = target.camera
-        photograph = unpack(workspace, camera, target.pixels)
-        inside = known_gradient(workspace, camera, photograph, photograph).get()[: camera.height, : camera.width]
-        counts += np.histogram(inside, BINS, (0, MAX_MAGNITUDE))[0]  # which leaves out what is below 0
+    for photograph in photographs:
+        camera, planes = photograph.camera, photograph.planes(workspace)
+        inside = known_gradient(workspace, camera, planes.colours, planes.mask).get()[: camera.height, : camera.width]
+        counts += np.histogram(inside, BINS, (0, MAX_MAGNITUDE))[0]  # leaves out what is below 0
     below = np.searchsorted(np.cumsum(counts), share * counts.sum())
     return float(below + 1) * MAX_MAGNITUDE / BINS

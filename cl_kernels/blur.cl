@@ -1,0 +1,62 @@
+/* A Gaussian blur of an image: the mean of the pixels that count, by their weights, so that neither the image's edge nor
+ * a mask darkens it.
+ *
+ *   blurred(x) = sum_k w(k) m(x + k) v(x + k) / sum_k w(k) m(x + k),  w(k) = exp(-k^2 / (2 sigma^2)),  |k| <= reach
+ *
+ * along rows and then along columns, with m the mask, or 1 inside the image.  The first pass keeps numerator and
+ * denominator apart.  One item = one pixel; dimensions x, y.  No local memory.  Deterministic. */
+#include "common.h"
+
+/* Sums along rows: three channels times the mask, and the mask itself. */
+__kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
+void blur_rows(
+    __global const float *restrict image,    // [3,H',stride]
+    __global const float *restrict mask,     // [H',stride] 0 or 1; read where `masked`
+    __global const float *restrict weights,  // [reach+1] w(k)
+    __global float *restrict sums,           // [4,H',stride] channels, then the mask
+    const uint masked,
+    const uint reach,                        // px
+    const uint width,
+    const uint height,
+    const uint rows,                         // H'
+    const uint stride)
+{
+    const uint x = get_global_id(0), y = get_global_id(1), plane = rows * stride;
+    if (x >= width || y >= height)
+        return;
+    const uint first = x > reach ? x - reach : 0, last = x + reach < width ? x + reach : width - 1;
+    float total[4] = {0.0f, 0.0f, 0.0f, 0.0f};
+    for (uint column = first; column <= last; column++) {
+        const uint at = y * stride + column;
+        const float weight = weights[column < x ? x - column : column - x] * (masked ? mask[at] : 1.0f);
+        for (uint channel = 0; channel < 3; channel++)
+            total[channel] += weight * image[channel * plane + at];
+        total[3] += weight;
+    }
+    for (uint channel = 0; channel < 4; channel++)
+        sums[channel * plane + y * stride + x] = total[channel];
+}
+
+/* The same along columns, and the division; pixels without a neighbour that counts keep their value. */
+__kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
+void blur_columns(
+    __global const float *restrict sums,     // [4,H',stride]
+    __global const float *restrict weights,  // [reach+1] w(k)
+    __global float *restrict image,          // [3,H',stride]
+    const uint reach,                        // px
+    const uint width,
+    const uint height,
+    const uint rows,                         // H'
+    const uint stride)
+{
+    const uint x = get_global_id(0), y = get_global_id(1), plane = rows * stride;
+    if (x >= width || y >= height)
+        return;
+    const uint first = y > reach ? y - reach : 0, last = y + reach < height ? y + reach : height - 1;
+    float total[4] = {0.0f, 0.0f, 0.0f, 0.0f};
+    for (uint row = first; row <= last; row++)
+        for (uint channel = 0; channel < 4; channel++)
+            total[channel] += weights[row < y ? y - row : row - y] * sums[channel * plane + row * stride + x];
+    for (uint channel = 0; channel < 3 && total[3] > 0.0f; channel++)
+        image[channel * plane + y * stride + x] = total[channel] / total[3];
+}

@@ -1,0 +1,160 @@
+"""What losses work on and give back: each adds its share to a gradient, and tells its value on request."""
+
+from abc import abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import PrivateAttr
+
+from clsplat.gaussians.tables import Gaussians, Gradients
+from clsplat.opencl.device import Array
+from clsplat.render.rasterizer import DeviceCamera, Frame
+from clsplat.render.workspace import Workspace
+from clsplat.schedule import Schedule, at_step
+from clsplat.settings import Settings
+
+
+@dataclass
+class Comparison:
+    """A rendered image beside its photograph, float planes [3, rows, stride], and the gradient that losses add to.
+
+    Losses are means over the whole image, masked or not, so that a threshold means the same with and without a mask.
+    """
+
+    workspace: Workspace
+    camera: DeviceCamera
+    image: Array
+    photograph: Array
+    gradient: Array
+    mask: Array | None = None  # [1, rows, stride] 0 or 1
+    step: int = 0  # global; schedules are taken at it
+    accumulate: bool = False  # False: the next loss overwrites the gradient
+
+    @property
+    def values(self) -> int:
+        """Number of values in the image."""
+        return 3 * self.camera.width * self.camera.height
+
+    @property
+    def counted(self) -> int:
+        """Number of values in pixels that count; waits for the device where there is a mask."""
+        return self.values if self.mask is None else 3 * int(self.mask.get().sum())
+
+
+@dataclass(frozen=True)
+class LossValue:
+    """The value of a loss at one step.  Reading it waits for the device."""
+
+    name: str
+    value: Callable[[], float]  # weight included
+
+
+@dataclass(frozen=True)
+class ViewGradients:
+    """A view's frame, its losses and the sums over pixels that gradients are made of; valid until the next one."""
+
+    frame: Frame
+    comparison: Comparison
+    losses: list[LossValue]
+    pixel_sums: Array  # [PIXEL_SUMS or more, S]
+
+    @property
+    def loss(self) -> float:
+        """The sum of the losses, penalties included; waits for the device."""
+        return sum(loss.value() for loss in self.losses)
+
+
+class Loss(Settings):
+    """A part of what training minimises."""
+
+    weight: Schedule = 1.0
+    """Factor of the loss; by step."""
+
+
+class ImageLoss(Loss):
+    """A loss that compares the rendered image with the photograph."""
+
+    @abstractmethod
+    def add(self, comparison: Comparison) -> LossValue:
+        """Add weight · d(loss)/d(image) to the gradient."""
+
+
+@dataclass(frozen=True)
+class PenaltyInputs:
+    """What a penalty works on: Gaussians and the gradients that it adds to."""
+
+    workspace: Workspace
+    gaussians: Gaussians
+    gradients: Gradients
+    extent: float  # scene units
+    step: int  # global
+
+    @property
+    def items(self) -> int:
+        """Work-items of a kernel whose item is LANES Gaussians."""
+        return -(-self.gaussians.count // int(self.gaussians.device.tuning["LANES"]))
+
+    def sums(self, name: str) -> Array:
+        """An array for the sum of each item, [items]; `name` tells the penalties of a step apart."""
+        return self.workspace.array(f"{name} sums", self.items)
+
+    def arguments(self, parameter: str) -> dict[str, Any]:
+        """What a penalty's kernel takes, by the names of its arguments: `<parameter>`, `grad_<parameter>`, sizes."""
+        return {
+            "items": self.items,
+            parameter: self.gaussians[parameter],
+            f"grad_{parameter}": self.gradients[parameter],
+            "stride": self.gaussians.capacity,
+            "count": self.gaussians.count,
+        }
+
+
+class Penalty(Loss):
+    """A loss that looks at Gaussians, not at an image."""
+
+    @property
+    def tables(self) -> set[str]:
+        """Tables of the Gaussians that the penalty reads beside the parameters."""
+        return set()
+
+    @abstractmethod
+    def add(self, inputs: PenaltyInputs) -> LossValue:
+        """Add weight · d(penalty)/d(parameter) to the gradients of the parameters that the penalty is about."""
+
+
+HostFunction = Callable[[NDArray[np.float32], NDArray[np.float32]], tuple[float, NDArray[np.floating]]]
+
+
+class HostLoss(ImageLoss):
+    """A loss in NumPy: `function(image, photograph)` returns its value and its derivative by the image.
+
+    Arrays are [height, width, 3] float32.  Each step copies both images to the host and the derivative back.
+    """
+
+    _function: HostFunction = PrivateAttr()
+
+    def __init__(self, function: HostFunction, weight: Schedule = 1.0) -> None:
+        super().__init__(weight=weight)
+        self._function = function
+
+    def add(self, comparison: Comparison) -> LossValue:
+        camera, weight = comparison.camera, at_step(self.weight, comparison.step)
+        height, width = camera.height, camera.width
+        image, photograph = (
+            np.ascontiguousarray(planes.get()[:3, :height, :width].transpose(1, 2, 0))
+            for planes in (comparison.image, comparison.photograph)
+        )
+        value, derivative = self._function(image, photograph)
+        derivative = np.asarray(derivative, np.float32)
+        if derivative.shape != image.shape:
+            raise ValueError(
+                f"the loss returned a derivative of {derivative.shape}; expected {image.shape}, as the image"
+            )
+        planes = comparison.gradient.get() if comparison.accumulate else np.zeros(comparison.gradient.shape, np.float32)
+        planes[:, :height, :width] += np.float32(weight) * derivative.transpose(2, 0, 1)
+        comparison.gradient.set(planes)
+        comparison.accumulate = True
+        return LossValue(getattr(self._function, "__name__", "host"), lambda: weight * float(value))

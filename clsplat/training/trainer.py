@@ -1,0 +1,87 @@
+"""One training step: render a view, compare it with its photograph, differentiate, update, count."""
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+
+from clsplat.density.statistics import SplatStats
+from clsplat.gaussians.tables import DeviceModel
+from clsplat.losses.base import Comparison, ImageLoss, Loss, Penalty, PenaltyInputs, ViewGradients
+from clsplat.opencl.device import Array
+from clsplat.opencl.program import constants
+from clsplat.render.rasterizer import Rasterizer
+from clsplat.training.adam import Adam, Rates
+from clsplat.views.photographs import Photograph, apply_mask
+from clsplat.views.texture import known_gradient
+from clsplat.views.transforms import PhotographTransform
+
+TEXTURE = int(constants("splat.h")["SUM_TEXTURE"])
+
+
+@dataclass
+class Trainer:
+    """All that a step needs: `step` is one call, the same for pipelines, benchmarks and notebooks."""
+
+    rasterizer: Rasterizer
+    model: DeviceModel
+    adam: Adam
+    stats: SplatStats
+    background: Array  # [3] in [0, 1]
+    losses: Sequence[Loss]
+    rates: Rates
+    extent: float = 1.0  # scene units
+
+    def step(
+        self,
+        photograph: Photograph,
+        step: int = 1,
+        transforms: Sequence[PhotographTransform] = (),
+        stale: Collection[str] = (),
+    ) -> ViewGradients:
+        """Train on one view at a global step; parameters named in `stale` are not updated.
+
+        Returns the view's losses and gradients, which are valid until the next step.
+        """
+        view = self.differentiate(photograph, step, transforms)
+        grad_mean2d = self._update(view, stale)
+        self.rasterizer.device.timings.section = "statistics"
+        self.stats.add(view, grad_mean2d)
+        return view
+
+    def differentiate(
+        self, photograph: Photograph, step: int = 1, transforms: Sequence[PhotographTransform] = ()
+    ) -> ViewGradients:
+        """Return the derivative of the losses at one view, as sums over pixels; nothing is updated."""
+        workspace, camera, timings = self.rasterizer.workspace, photograph.camera, self.rasterizer.device.timings
+        frame = self.rasterizer.forward(self.model, camera, self.background)
+        timings.section = "loss"
+        planes = photograph.planes(workspace, transforms, step)
+        gradient = workspace.array("grad_image", (3, camera.rows, camera.stride))
+        comparison = Comparison(workspace, camera, frame.image, planes.colours, gradient, planes.mask, step)
+        if planes.mask is not None:  # pixels that do not count are black in both images and have no gradient
+            apply_mask(workspace, camera, frame.image, planes.mask)
+            apply_mask(workspace, camera, planes.colours, planes.mask)
+        values = [loss.add(comparison) for loss in self.losses if isinstance(loss, ImageLoss)]
+        if planes.mask is not None:
+            apply_mask(workspace, camera, gradient, planes.mask)
+        count = self.stats.pixel_sums
+        timings.section = "statistics"
+        texture = known_gradient(workspace, camera, planes.colours, planes.mask) if count > TEXTURE else None
+        pixel_sums = self.rasterizer.pixel_sums(self.model, frame, gradient, count, texture)
+        return ViewGradients(frame, comparison, values, pixel_sums)
+
+    def _update(self, view: ViewGradients, stale: Collection[str]) -> Array:
+        """Update the parameters and add the penalties to the view's losses.
+
+        Returns the gradient of the projected means, [2, S] px⁻¹.  Gradients go through memory only where they must.
+        """
+        penalties = [loss for loss in self.losses if isinstance(loss, Penalty)]
+        step = view.comparison.step
+        rates = self.rates.at(step, self.extent)
+        if not (penalties or stale):
+            return self.adam.update(self.model, view.frame, view.pixel_sums, rates)
+        gradients = self.rasterizer.gradients(self.model, view.frame, view.pixel_sums)
+        inputs = PenaltyInputs(self.rasterizer.workspace, self.model.gaussians, gradients, self.extent, step)
+        self.rasterizer.device.timings.section = "loss"
+        view.losses.extend(penalty.add(inputs) for penalty in penalties)
+        self.adam.step(self.model, gradients, rates, stale)
+        return gradients.mean2d

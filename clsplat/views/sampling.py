@@ -1,0 +1,44 @@
+"""What a training step compares with: a view, at a size, with transforms of its photograph."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from pydantic import Field
+
+from clsplat.scene.scene import View
+from clsplat.schedule import AtLeastOne, at_step
+from clsplat.settings import OneOf, Settings
+from clsplat.views.order import Order, Uniform, ViewPool
+from clsplat.views.transforms import PhotographTransform
+
+
+class ViewSettings(Settings):
+    """How a step is turned into a sample."""
+
+    order: OneOf[Order] = Uniform()
+    """Which view a step trains on."""
+    resolution: AtLeastOne = 1.0
+    """Divisor of the size that is trained on, at least 1; by step."""
+    transforms: list[OneOf[PhotographTransform]] = Field(default=[])
+    """Changes of the photograph, one after the other."""
+
+
+@dataclass(frozen=True)
+class Sample:
+    """What a step compares with."""
+
+    view: View  # at the size of the step
+    transforms: Sequence[PhotographTransform]
+    step: int  # global
+
+
+class Sampler:
+    """Turns steps into samples: a function of the views, the seed and the step."""
+
+    def __init__(self, views: Sequence[View], settings: ViewSettings, seed: int) -> None:
+        self.settings, self._pool = settings, ViewPool(views, seed)
+
+    def at(self, step: int) -> Sample:
+        """Return the sample of a global step, counted from 1."""
+        view, divisor = self.settings.order.at(self._pool, step), at_step(self.settings.resolution, step)
+        return Sample(view.at(view.scale * divisor), self.settings.transforms, step)

@@ -1,0 +1,64 @@
+"""Transforms of the photograph that a step compares with: each is a function of the photograph and the step."""
+
+import math
+from abc import abstractmethod
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from clsplat.opencl.device import Array
+from clsplat.render.rasterizer import DeviceCamera
+from clsplat.render.workspace import Workspace
+from clsplat.schedule import NonNegative, at_step
+from clsplat.settings import Settings
+
+REACH = 3  # standard deviations of a blur's window
+
+
+@dataclass(frozen=True)
+class Planes:
+    """A photograph as floats on the device, zero outside the image; valid until the next step."""
+
+    workspace: Workspace
+    camera: DeviceCamera
+    colours: Array  # [3, rows, stride] in [0, 1]
+    mask: Array | None  # [1, rows, stride] 0 or 1, where a mask says which pixels count
+
+
+class PhotographTransform(Settings):
+    """Changes the photograph before it is compared with the rendered image; the file stays as it is."""
+
+    @abstractmethod
+    def apply(self, planes: Planes, step: int) -> Planes:
+        """Return the photograph of a global step; it may depend on its arguments only."""
+
+
+class Blur(PhotographTransform):
+    """Blur the photograph by a Gaussian; what a mask leaves out does not count."""
+
+    type: Literal["blur"] = "blur"
+    sigma: NonNegative
+    """Standard deviation in px of the photograph as it is trained on; by step."""
+
+    def apply(self, planes: Planes, step: int) -> Planes:
+        camera, sigma = planes.camera, at_step(self.sigma, step)
+        reach = math.ceil(REACH * sigma)
+        if reach == 0:
+            return planes
+        device = planes.workspace.device
+        weights = device.upload(np.exp(-0.5 * np.square(np.arange(reach + 1) / sigma)).astype(np.float32))
+        sums = planes.workspace.array("blur", (4, camera.rows, camera.stride))
+        items, size = (camera.width, camera.height), {"reach": reach, **camera.plane_arguments()}
+        program, masked = device.program("blur.cl"), planes.mask is not None
+        program.blur_rows(
+            items=items,
+            image=planes.colours,
+            mask=planes.mask or sums,
+            weights=weights,
+            sums=sums,
+            masked=int(masked),
+            **size,
+        )
+        program.blur_columns(items=items, sums=sums, weights=weights, image=planes.colours, **size)
+        return planes
