@@ -26,10 +26,18 @@ debugging = False
 
 
 @app.callback()
-def common(debug: Annotated[bool, typer.Option(help="Show tracebacks and every log line.")] = False) -> None:
+def common(
+    debug: Annotated[bool, typer.Option(help="Show tracebacks and every log line.")] = False,
+    plugin: Annotated[list[Path] | None, typer.Option(help="A Python file with variants; may be repeated.")] = None,
+) -> None:
+    from clsplat import plugins
+
     global debugging
     debugging = debug
     terminal.start_logging(debug)
+    plugins.load_installed()
+    for file in plugin or []:
+        plugins.load_file(file)
 
 
 @app.command()

@@ -20,7 +20,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, ValidationError
 from ruamel.yaml import YAML
 
-from clsplat import resource_dir
+from clsplat import plugins, resource_dir
 from clsplat.errors import ConfigError
 from clsplat.filters import ModelSettings
 from clsplat.opencl.device import Schedule
@@ -117,6 +117,8 @@ class PipelineFile(Settings):
     """Steps from photographs to a scene, each done once."""
     stages: Annotated[list[OneOf[Stage]], Field(min_length=1)]
     """What is done with the scene, in order."""
+    plugins: dict[str, str] = Field(default={})
+    """Plug-ins that the run was made with: name and sha256; written by a run, and then required."""
 
     @property
     def training(self) -> Optimize:
@@ -147,7 +149,7 @@ class Pipeline:
         """Every setting with its value, as plain data in the shape of a file."""
         data = self.settings.model_dump(mode="json")
         data |= {key: [_untagged(stage) for stage in data[key]] for key in LISTS}
-        return data
+        return data if data["plugins"] else {key: value for key, value in data.items() if key != "plugins"}
 
     def text(self) -> str:
         """The resolved file."""
@@ -182,12 +184,14 @@ def checked(path: Path, document: Document, overrides: Sequence[str] = ()) -> Pi
     for override in overrides:
         _override(data, override)
     data = with_new_names(data, str(path))
+    if isinstance(recorded := data.get("plugins"), dict):
+        plugins.require({str(name): str(digest) for name, digest in recorded.items()}, str(path))
     try:
         settings = PipelineFile.model_validate(data)
     except ValidationError as error:
         raise ConfigError(explain(error, PipelineFile, path, document)) from error
     _check_order(path, settings)
-    return Pipeline(path, settings)
+    return Pipeline(path, settings.model_copy(update={"plugins": plugins.used_by(settings)}))
 
 
 def find(name: str) -> Path:

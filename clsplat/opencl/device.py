@@ -10,6 +10,7 @@ import os
 import warnings
 import weakref
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -237,11 +238,14 @@ class Device:
         array.set(values)
         return array
 
-    def program(self, file: str, **defines: int | str) -> "Program":
-        """Build `cl_kernels/<file>` with this device's tuning and `defines`, once."""
+    def program(self, file: str | Path, **defines: int | str) -> "Program":
+        """Build `cl_kernels/<file>`, or a file given by its absolute path, with this device's tuning and `defines`, once.
+
+        Raises KernelError when it does not build, FileNotFoundError when it is missing.
+        """
         from clsplat.opencl.program import Program
 
-        key = (file, *sorted(defines.items()))
+        key = (str(file), *sorted(defines.items()))
         if key not in self._programs:
             self._programs[key] = Program(self, file, {**self.tuning, **defines})
         return self._programs[key]

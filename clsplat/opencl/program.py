@@ -48,6 +48,8 @@ def flatten(path: Path, seen: set[Path] | None = None) -> str:
             text.append(line)
             continue
         header = path.parent / match[1]
+        if not header.is_file():  # kernels of a plug-in may include the package's headers
+            header = resource_dir("cl_kernels") / match[1]
         if header not in seen:
             seen.add(header)
             text.append(flatten(header, seen))
@@ -152,8 +154,8 @@ class Kernel:
 class Program:
     """One .cl file, built; its kernels are attributes."""
 
-    def __init__(self, device: "Device", file: str, defines: dict[str, int | str]) -> None:
-        path = resource_dir("cl_kernels") / file
+    def __init__(self, device: "Device", file: str | Path, defines: dict[str, int | str]) -> None:
+        path = resource_dir("cl_kernels") / file  # an absolute path stays as it is
         source = flatten(path)
         options = [*BUILD_OPTIONS, *(f"-D{name}={value}" for name, value in sorted(defines.items()))]
         try:
@@ -163,7 +165,7 @@ class Program:
                 f"{file} does not build on {device.text} with {' '.join(options)}: {_first_error(error)}"
             ) from error
         self.kernels = {
-            name: Kernel(device, f"{file}:{name}", cl.Kernel(program, name), arguments)
+            name: Kernel(device, f"{path.name}:{name}", cl.Kernel(program, name), arguments)
             for name, arguments in parse_kernels(source).items()
         }
 

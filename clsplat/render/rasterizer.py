@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, fields
 from itertools import pairwise
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -90,6 +90,9 @@ def camera_values(view: View, tile: int) -> NDArray[Any]:
     return np.array(values, CAMERA)
 
 
+Content = Literal["colour", "depth"]  # what splats show: colour, or (depth of the mean in scene units, 1, 0)
+
+
 @dataclass(frozen=True)
 class Frame:
     """What a forward pass leaves behind for the losses and for the backward pass; valid until the next one."""
@@ -102,6 +105,7 @@ class Frame:
     image: Array  # [3, rows, stride], zero outside the image
     transmittance: Array  # [rows, stride]
     bands: list[Band]  # of which `lists` are those of the last
+    content: Content  # what was blended
 
 
 @dataclass(frozen=True)
@@ -124,20 +128,22 @@ class Rasterizer:
         self._project = device.program("project.cl")
         self._blend = device.program(f"blend_{device.schedule}.cl")
         self._lanes = int(device.tuning["LANES"])
-        self._gradients: Gradients | None = None  # made when somebody asks for them
+        self._gradients: Gradients | None = None  # made when they are first needed
 
-    def forward(self, model: DeviceModel, camera: DeviceCamera, background: Array) -> Frame:
+    def forward(
+        self, model: DeviceModel, camera: DeviceCamera, background: Array, content: Content = "colour"
+    ) -> Frame:
         """Render the model.  background: [3].
 
         Where the pairs of all tiles together pass the budget, fewer rows of tiles are done at a time: the same bits.
         """
         while True:
             try:
-                return self._forward(model, camera, background)
+                return self._forward(model, camera, background, content)
             except TooManyPairs:
                 self._bands[camera.tiles_y] = 2 * self._bands.get(camera.tiles_y, 1)
 
-    def _forward(self, model: DeviceModel, camera: DeviceCamera, background: Array) -> Frame:
+    def _forward(self, model: DeviceModel, camera: DeviceCamera, background: Array, content: Content) -> Frame:
         array = self.workspace.array
         splats = array("splats", (model.gaussians.count, RECORD))
         radius = array("radius", model.gaussians.capacity)
@@ -146,7 +152,7 @@ class Rasterizer:
         tile_last = array("tile_last", camera.tiles, np.uint32)
         bands = self._split(camera)
         for band in bands:
-            lists = self._project_band(model, camera, band, splats, radius)
+            lists = self._project_band(model, camera, band, splats, radius, content)
             for first_tile, groups in self._launches(band):
                 self._blend.blend_forward(
                     groups=groups,
@@ -161,7 +167,7 @@ class Rasterizer:
                     tile_last=tile_last,
                     first_tile=first_tile,
                 )
-        return Frame(camera, splats, radius, lists, tile_last, image, transmittance, bands)
+        return Frame(camera, splats, radius, lists, tile_last, image, transmittance, bands, content)
 
     def _split(self, camera: DeviceCamera) -> list[Band]:
         rows = np.linspace(0, camera.tiles_y, min(self._bands.get(camera.tiles_y, 1), camera.tiles_y) + 1).astype(int)
@@ -174,7 +180,7 @@ class Rasterizer:
         return [(first, min(step, end - first)) for first in range(band.first_tile, end, step)]
 
     def _project_band(
-        self, model: DeviceModel, camera: DeviceCamera, band: Band, splats: Array, radius: Array
+        self, model: DeviceModel, camera: DeviceCamera, band: Band, splats: Array, radius: Array, content: Content
     ) -> TileLists:
         gaussians = model.gaussians
         count, stride = gaussians.count, gaussians.capacity
@@ -190,6 +196,10 @@ class Rasterizer:
             row_begin=band.row_begin,
             row_end=band.row_end,
         )
+        if content == "depth":
+            self.device.program("depth.cl").paint_depth(
+                items=count, means=gaussians["means"], camera=camera.array, splats=splats, stride=stride, count=count
+            )
         single = band.row_end - band.row_begin == 1  # it cannot be split further
         return self.tiler.build(splats, footprints, band, count, UNLIMITED if single else self.budget.pairs)
 
@@ -207,7 +217,7 @@ class Rasterizer:
         for number, band in enumerate(frame.bands):
             lists = frame.lists
             if len(frame.bands) > 1:
-                lists = self._project_band(model, frame.camera, band, frame.splats, frame.radius)
+                lists = self._project_band(model, frame.camera, band, frame.splats, frame.radius, frame.content)
             pair_sums = self.workspace.array("pair_sums", (lists.pairs, RECORD))
             for first_tile, groups in self._launches(band):
                 self.device.program(f"blend_{self.device.schedule}.cl", **defines).blend_backward(

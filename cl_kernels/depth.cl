@@ -1,0 +1,23 @@
+/* Depth instead of colour: blending then gives sums over splats of weight times depth, and of weight.
+ *
+ * One item = one Gaussian.  No local memory.  Deterministic. */
+#include "splat.h"
+
+/* Red becomes the depth of the mean, green 1, blue 0; blended on black they are the mean depth times alpha, and alpha. */
+__kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
+void paint_depth(
+    __global const float *restrict means,      // [3,S] scene units
+    __global const camera_t *restrict camera,  // [1]
+    __global float *restrict splats,           // [N,RECORD] see splat.h
+    const uint stride,
+    const uint count)
+{
+    const uint i = get_global_id(0);
+    if (i >= count)
+        return;
+    __global const float *row = camera->world_to_camera + 8;
+    __global float *splat = splats + (size_t)i * RECORD;
+    splat[SPLAT_RED] = row[0] * means[i] + row[1] * means[stride + i] + row[2] * means[2 * stride + i] + row[3];
+    splat[SPLAT_RED + 1] = 1.0f;
+    splat[SPLAT_RED + 2] = 0.0f;
+}
