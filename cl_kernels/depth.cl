@@ -7,7 +7,7 @@
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void paint_depth(
     __global const float *restrict means,      // [3,S] scene units
-    __global const camera_t *restrict camera,  // [1]
+    __constant camera_t *restrict camera,       // [1]
     __global float *restrict splats,           // [N,RECORD] see splat.h
     const uint stride,
     const uint count)
@@ -15,7 +15,7 @@ void paint_depth(
     const uint i = get_global_id(0);
     if (i >= count)
         return;
-    __global const float *row = camera->world_to_camera + 8;
+    __constant float *row = camera->world_to_camera + 8;
     __global float *splat = splats + (size_t)i * RECORD;
     splat[SPLAT_RED] = row[0] * means[i] + row[1] * means[stride + i] + row[2] * means[2 * stride + i] + row[3];
     splat[SPLAT_RED + 1] = 1.0f;

@@ -46,7 +46,9 @@ def load_file(path: Path) -> Plugin:
     if (before := _loaded.get(plugin.name)) is not None:
         if before == plugin:
             return before
-        raise ConfigError(f"--plugin {path}: a plug-in named '{plugin.name}' is loaded from {before.path}; rename the file")
+        raise ConfigError(
+            f"--plugin {path}: a plug-in named '{plugin.name}' is loaded from {before.path}; rename the file"
+        )
     spec = importlib.util.spec_from_file_location(module, path)
     if spec is None or spec.loader is None:
         raise ConfigError(f"--plugin {path}: expected a Python file with the suffix .py")

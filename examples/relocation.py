@@ -34,7 +34,9 @@ class Relocate(Rule):
         sources = np.flatnonzero(drawn)
         copies = np.minimum(drawn[sources] + 1, 50)
         new = np.clip(1 - (1 - opacity[sources]) ** (1 / copies), edit.at(self.opacity_below), 1 - 1e-6)
-        terms = [comb(copies, j) * (-1.0) ** (j - 1) * new**j / np.sqrt(j) for j in range(1, int(copies.max(initial=1)) + 1)]
+        terms = [
+            comb(copies, j) * (-1.0) ** (j - 1) * new**j / np.sqrt(j) for j in range(1, int(copies.max(initial=1)) + 1)
+        ]
         edit.set_rows("logit_opacity", sources, np.log(new / (1 - new))[:, None])
         edit.set_rows("log_scales", sources, log_scales[sources] + np.log(opacity[sources] / sum(terms))[:, None])
         edit.zero_moments(sources)

@@ -1,0 +1,35 @@
+"""The device of a notebook."""
+
+from functools import cache
+from types import TracebackType
+
+from clsplat.opencl import device as opencl
+from clsplat.opencl.device import Schedule
+
+
+class Device(opencl.Device):
+    """An open OpenCL device; also a context manager.
+
+    `name` is a part of a runtime's or device's name, as `clsplat devices` prints them; without it CLSPLAT_DEVICE, else
+    the first GPU that works, else the first CPU.  Raises DeviceError when there is none.
+    """
+
+    def __init__(self, name: str | None = None, schedule: Schedule = "auto") -> None:
+        super().__init__(opencl.choose(name), schedule)
+
+    def __enter__(self) -> "Device":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.finish()
+
+    def __repr__(self) -> str:
+        return f"Device({self.text!r})"
+
+
+@cache
+def default_device() -> Device:
+    """Return the device that is taken where none is given; opened on first use."""
+    return Device()

@@ -1,0 +1,141 @@
+"""Rendering and its derivatives with NumPy in and out."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.api.device import default_device
+from clsplat.gaussians.model import Model
+from clsplat.gaussians.tables import PARAMETERS, DeviceModel, Gaussians
+from clsplat.metrics.images import to_8_bits
+from clsplat.opencl.device import Array, Device
+from clsplat.render.rasterizer import Content, DeviceCamera, Frame, Rasterizer, upload_camera
+from clsplat.scene.scene import View
+
+Floats = NDArray[np.float32]
+Colour = float | Sequence[float]
+GEOMETRY = 6  # of the sums over pixels, the ones that do not belong to the colour (cl_kernels/splat.h)
+BACKGROUNDS = {"black": 0.0, "white": 1.0}
+
+
+@dataclass(frozen=True)
+class Gradients:
+    """Derivatives by the parameters before activation, with their shapes, [N, components] float32."""
+
+    means: Floats
+    quats: Floats
+    log_scales: Floats
+    logit_opacity: Floats
+    sh_base: Floats
+    sh_rest: Floats
+    mean2d: Floats  # [N, 2] px⁻¹, by the projected mean
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A rendered view; the arrays are the caller's own."""
+
+    image: Floats  # [height, width, 3], background included
+    alpha: Floats  # [height, width] in [0, 1], how much of a pixel the Gaussians cover
+    depth: Floats | None  # [height, width] scene units, mean depth of what covers a pixel; 0 where nothing does
+    view: View
+    background: Floats  # [3]
+    renderer: "Renderer"
+
+    def backward(self, image: Floats | None = None, alpha: Floats | None = None) -> Gradients:
+        """Return the gradients of a loss by every parameter, from its derivatives by the picture.
+
+        image: [height, width, 3] dL/d image; alpha: [height, width] dL/d alpha.  The model must be the one that was
+        rendered.  Raises ValueError for other shapes.
+        """
+        return self.renderer.backward(self, image, alpha)
+
+    def _repr_png_(self) -> bytes:
+        _, data = cv2.imencode(".png", to_8_bits(self.image)[:, :, ::-1])
+        return bytes(data)
+
+
+class Renderer:
+    """A model on a device.  It renders one picture at a time, so threads must not share it."""
+
+    def __init__(self, model: Model, device: Device | None = None) -> None:
+        self.device = device or default_device()
+        self.rasterizer = Rasterizer(self.device)
+        self.update(model)
+
+    def update(self, model: Model) -> None:
+        """Take another model, or the same with other numbers."""
+        self.model = model
+        gaussians, rendering = Gaussians(self.device, model.tables()), model.rendering
+        self._model = DeviceModel(
+            gaussians, model.sh_degree, rendering.near, rendering.screen_variance, rendering.compensate
+        )
+
+    def render(self, view: View, background: Colour | None = None, depth: bool = False) -> Picture:
+        """Render a view.
+
+        background: a colour in [0, 1], one number or three; by default that of the model, else black.
+        """
+        camera, colour = upload_camera(self.device, view), self._colour(background)
+        frame = self._forward(camera, colour)
+        image = _inside(frame, frame.image.get())
+        alpha = _inside(frame, 1 - np.abs(frame.transmittance.get())[None])[:, :, 0]
+        mean = self._depth(camera) if depth else None
+        return Picture(image, alpha, mean, view, colour, self)
+
+    def backward(self, picture: Picture, image: Floats | None, alpha: Floats | None) -> Gradients:
+        """Return the gradients of a loss, as Picture.backward does."""
+        camera, gaussians = upload_camera(self.device, picture.view), self._model.gaussians
+        size = camera.height, camera.width
+        sums = np.zeros((0, 0), np.float32)
+        if alpha is not None:  # alpha is the second channel of a picture that shows (depth, 1, 0) on black
+            planes = np.zeros((*size, 3), np.float32)
+            planes[:, :, 1] = _checked("alpha", alpha, size)
+            sums = self._pixel_sums(self._forward(camera, np.zeros(3, np.float32), "depth"), planes).get()[:GEOMETRY]
+        frame = self._forward(camera, picture.background)
+        planes = np.zeros((*size, 3), np.float32) if image is None else _checked("image", image, (*size, 3))
+        pixel_sums = self._pixel_sums(frame, planes)
+        if alpha is not None:
+            both = pixel_sums.get()
+            both[:GEOMETRY] += sums
+            pixel_sums.set(both)
+        gradients = self.rasterizer.gradients(self._model, frame, pixel_sums)
+        arrays = {**{name: gradients[name] for name in PARAMETERS}, "mean2d": gradients.mean2d}
+        count = gaussians.count
+        return Gradients(**{name: np.ascontiguousarray(a.get()[:, :count].T) for name, a in arrays.items()})
+
+    def _forward(self, camera: DeviceCamera, background: Floats, content: Content = "colour") -> Frame:
+        return self.rasterizer.forward(self._model, camera, self.device.upload(background), content)
+
+    def _depth(self, camera: DeviceCamera) -> Floats:
+        frame = self._forward(camera, np.zeros(3, np.float32), "depth")
+        planes = _inside(frame, frame.image.get())
+        weight = planes[:, :, 1]
+        return np.divide(planes[:, :, 0], weight, out=np.zeros_like(weight), where=weight > 0)
+
+    def _pixel_sums(self, frame: Frame, derivative: Floats) -> Array:
+        camera = frame.camera
+        planes = np.zeros((3, camera.rows, camera.stride), np.float32)
+        planes[:, : camera.height, : camera.width] = derivative.transpose(2, 0, 1)
+        return self.rasterizer.pixel_sums(self._model, frame, self.device.upload(planes))
+
+    def _colour(self, background: Colour | None) -> Floats:
+        if background is None:
+            background = BACKGROUNDS[self.model.rendering.background or "black"]
+        colour = np.broadcast_to(np.asarray(background, np.float32), (3,))
+        return np.ascontiguousarray(colour)
+
+
+def _inside(frame: Frame, planes: Floats) -> Floats:
+    """[channels, rows, stride] -> [height, width, channels]."""
+    return np.ascontiguousarray(planes[:, : frame.camera.height, : frame.camera.width].transpose(1, 2, 0))
+
+
+def _checked(name: str, derivative: Floats, shape: tuple[int, ...]) -> Floats:
+    array = np.asarray(derivative, np.float32)
+    if array.shape != shape:
+        raise ValueError(f"the derivative by {name} has shape {array.shape}; expected {shape}, as the picture")
+    return array

@@ -1,0 +1,176 @@
+"""A model on the host: NumPy arrays in the units of model files, and the numbers with which they are rendered."""
+
+import html
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.gaussians.ply import read_ply, write_ply
+from clsplat.gaussians.sh import rotated_sh
+from clsplat.gaussians.tables import PARAMETERS, SH_C0, sh_coefficients
+
+Floats = NDArray[np.float32]
+MIP_VARIANCE = 0.1  # px², of files that say no more than `mip` (Yu et al. 2024)
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """The numbers with which a model is rendered."""
+
+    near: float = 0.2  # scene units; nearer Gaussians are not drawn
+    screen_variance: float = 0.3  # px², added to every splat
+    compensate: float = 0.0  # 1: the opacity falls as that variance spreads a splat out
+    background: str | None = None  # black or white; None: what the scene says
+    alpha: str = "transparency"  # what the fourth channel of its photographs was
+    notes: Mapping[str, Any] = field(default_factory=dict)  # what else the file says
+
+    @classmethod
+    def of(cls, comment: Mapping[str, Any], mode: str) -> "Rendering":
+        """Take the numbers from a file's comment; files of other programs get those of 3DGS or Mip-Splatting."""
+        mip = {"screen_variance": MIP_VARIANCE, "compensate": 1.0} if mode == "mip" else {}
+        told = {
+            name: float(comment[name]) for name in ("near", "screen_variance", "compensate") if _number(comment, name)
+        }
+        background = comment.get("background") if comment.get("background") in ("black", "white") else None
+        alpha = "mask" if comment.get("alpha") == "mask" else "transparency"
+        return cls(**{**mip, **told}, background=background, alpha=alpha, notes=dict(comment))
+
+    def comment(self) -> dict[str, Any]:
+        """What a model file says about rendering."""
+        numbers = {"near": self.near, "screen_variance": self.screen_variance, "compensate": self.compensate}
+        return {**self.notes, **numbers, "background": self.background or "black", "alpha": self.alpha}
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """N Gaussians before activation, float32, with the names that pipelines, kernels and checkpoints have."""
+
+    means: Floats  # [N, 3] scene units
+    quats: Floats  # [N, 4] (w, x, y, z), unnormalised
+    log_scales: Floats  # [N, 3] log of scene units
+    logit_opacity: Floats  # [N, 1]
+    sh_base: Floats  # [N, 3] band 0
+    sh_rest: Floats  # [N, (K-1)*3] the other bands, coefficient-major
+    filter_variance: Floats | None = (
+        None  # [N, 1] scene units², the world filter where it is not yet part of the scales
+    )
+    rendering: Rendering = Rendering()
+
+    def __post_init__(self) -> None:
+        count = len(self.means)
+        widths = {"means": 3, "quats": 4, "log_scales": 3, "logit_opacity": 1, "sh_base": 3}
+        for name, table in self.tables().items():
+            object.__setattr__(self, name, np.ascontiguousarray(table, np.float32))
+            width = widths.get(name, 1 if name == "filter_variance" else 3 * (sh_coefficients(self.sh_degree) - 1))
+            if table.shape != (count, width):
+                raise ValueError(f"{name} has shape {table.shape}; expected {(count, width)}")
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    def tables(self) -> dict[str, Floats]:
+        """The arrays by name; filter_variance where there is one."""
+        names = (*PARAMETERS, *(() if self.filter_variance is None else ("filter_variance",)))
+        return {name: getattr(self, name) for name in names}
+
+    @property
+    def sh_degree(self) -> int:
+        """Highest degree of the spherical harmonics."""
+        return round((1 + self.sh_rest.shape[1] / 3) ** 0.5) - 1
+
+    @property
+    def scales(self) -> Floats:
+        """Standard deviations along the axes, [N, 3] scene units."""
+        return np.exp(self.log_scales)
+
+    @property
+    def opacities(self) -> Floats:
+        """Opacities in (0, 1), [N]."""
+        return np.asarray(1 / (1 + np.exp(-self.logit_opacity[:, 0].astype(np.float64))), np.float32)
+
+    @property
+    def colours(self) -> Floats:
+        """Colours of band 0, [N, 3]; in [0, 1] where they can be shown."""
+        return np.asarray(self.sh_base * SH_C0 + 0.5, np.float32)
+
+    def __getitem__(self, chosen: Any) -> "Model":
+        """Return some of the Gaussians, by a mask, indices or a slice."""
+        return replace(self, **{name: np.atleast_2d(table[chosen]) for name, table in self.tables().items()})
+
+    def transformed(
+        self, scale: float = 1.0, rotation: NDArray[np.floating] | None = None, translation: Any = (0, 0, 0)
+    ) -> "Model":
+        """Return the model after x -> scale · rotation x + translation; colours turn with it.
+
+        rotation: [3, 3]; translation: [3] scene units.  Raises ValueError for a rotation that is none.
+        """
+        turn = np.eye(3) if rotation is None else np.asarray(rotation, np.float64)
+        if scale <= 0 or turn.shape != (3, 3) or not np.allclose(turn @ turn.T, np.eye(3), atol=1e-5):
+            raise ValueError("expected a positive scale and a rotation matrix [3, 3]")
+        if np.linalg.det(turn) < 0:
+            raise ValueError("expected a rotation; this matrix mirrors")
+        changed: dict[str, Any] = {
+            "means": scale * self.means.astype(np.float64) @ turn.T + np.asarray(translation, np.float64),
+            "quats": _product(_quaternion(turn), self.quats.astype(np.float64)),
+            "log_scales": self.log_scales + np.log(scale),
+            "sh_rest": rotated_sh(self.sh_rest, turn),
+        }
+        if self.filter_variance is not None:
+            changed["filter_variance"] = self.filter_variance * scale**2
+        rendering = replace(self.rendering, near=self.rendering.near * scale)
+        return replace(self, **{k: v.astype(np.float32) for k, v in changed.items()}, rendering=rendering)
+
+    def save(self, path: str | Path) -> None:
+        """Write a PLY in the layout of 3DGS.  Raises OutputError when it cannot be written."""
+        write_ply(Path(path), self.tables(), self.rendering.comment())
+
+    def __repr__(self) -> str:
+        return f"Model({len(self):,} Gaussians, SH degree {self.sh_degree})"
+
+    def _repr_html_(self) -> str:
+        low, high = (self.means.min(axis=0), self.means.max(axis=0)) if len(self) else (np.zeros(3), np.zeros(3))
+        rows = {
+            "Gaussians": f"{len(self):,}",
+            "spherical harmonics": f"degree {self.sh_degree}",
+            "box, scene units": f"({', '.join(f'{v:.3g}' for v in low)}) to ({', '.join(f'{v:.3g}' for v in high)})",
+            "median scale": f"{float(np.median(self.scales)):.3g} scene units" if len(self) else "–",
+            "median opacity": f"{float(np.median(self.opacities)):.3g}" if len(self) else "–",
+            "size as PLY": f"{sum(table.nbytes for table in self.tables().values()) / 2**20:,.1f} MiB",
+        }
+        cells = "".join(f"<tr><th>{html.escape(k)}</th><td>{html.escape(v)}</td></tr>" for k, v in rows.items())
+        return f"<table>{cells}</table>"
+
+
+def load(path: str | Path) -> Model:
+    """Read a model file, or the model of a run folder.  Raises DataError when it is missing, damaged or not a splat."""
+    path = Path(path)
+    file = read_ply(path / "point_cloud.ply" if path.is_dir() else path)
+    return Model(**file.parameters, rendering=Rendering.of(file.rendering, file.mode))
+
+
+def _number(values: Mapping[str, Any], name: str) -> bool:
+    return isinstance(values.get(name), int | float)
+
+
+def _quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(w, x, y, z) of a rotation matrix."""
+    from scipy.spatial.transform import Rotation
+
+    return np.roll(Rotation.from_matrix(rotation).as_quat(), 1)
+
+
+def _product(left: NDArray[np.float64], right: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Products of a quaternion, [4], and many, [N, 4]."""
+    w, x, y, z = left
+    a, b, c, d = right.T
+    parts = [
+        w * a - x * b - y * c - z * d,
+        w * b + x * a + y * d - z * c,
+        w * c - x * d + y * a + z * b,
+        w * d + x * c - y * b + z * a,
+    ]
+    return np.stack(parts, axis=1)

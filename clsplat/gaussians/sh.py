@@ -1,0 +1,43 @@
+"""Real spherical harmonics as the kernels have them (cl_kernels/harmonics.h), and their rotation."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+DIRECTIONS = 64  # more than enough to tell the functions of a band apart
+
+
+def basis(directions: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Values of the bands 1 to 3 at unit directions, [M, 15]."""
+    x, y, z = directions.astype(np.float64).T
+    xx, yy, zz = x * x, y * y, z * z
+    values = [
+        *(-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x),
+        *(1.0925484305920792 * x * y, -1.0925484305920792 * y * z, 0.31539156525252005 * (2 * zz - xx - yy)),
+        *(-1.0925484305920792 * x * z, 0.5462742152960396 * (xx - yy)),
+        *(-0.5900435899266435 * y * (3 * xx - yy), 2.890611442640554 * x * y * z),
+        *(-0.4570457994644658 * y * (4 * zz - xx - yy), 0.3731763325901154 * z * (2 * zz - 3 * xx - 3 * yy)),
+        *(-0.4570457994644658 * x * (4 * zz - xx - yy), 1.445305721320277 * z * (xx - yy)),
+        -0.5900435899266435 * x * (xx - 3 * yy),
+    ]
+    return np.stack(values, axis=1)
+
+
+def rotated_sh(sh_rest: NDArray[np.floating], rotation: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Coefficients [N, (K-1)*3], coefficient-major, of the same colours seen in a world that is turned by [3, 3].
+
+    A rotation maps each band onto itself, so each band's matrix follows from values at a few directions.
+    """
+    count, coefficients = len(sh_rest), sh_rest.shape[1] // 3
+    directions = np.random.default_rng(0).normal(size=(DIRECTIONS, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    before, after = basis(directions @ rotation), basis(directions)  # rows of d R are R^T d
+    table = sh_rest.astype(np.float64).reshape(count, coefficients, 3)
+    turned, first = np.empty_like(table), 0
+    for size in (3, 5, 7):
+        if first + size > coefficients:
+            break
+        band = slice(first, first + size)
+        matrix = np.linalg.lstsq(after[:, band], before[:, band], rcond=None)[0]  # old functions by new ones
+        turned[:, band] = np.einsum("ij,njc->nic", matrix, table[:, band])
+        first += size
+    return turned.reshape(count, 3 * coefficients)
