@@ -76,7 +76,7 @@ def loaded() -> list[Plugin]:
 
 
 def used_by(settings: BaseModel) -> dict[str, str]:
-    """Return name and content hash of the plug-ins of a run: those given by a file, and those its settings come from."""
+    """Return name and content hash of a run's plug-ins: those given by a file, and those its settings come from."""
     modules = _modules(settings)
     return {p.name: p.digest for p in loaded() if not p.installed or any(m.startswith(p.module) for m in modules)}
 

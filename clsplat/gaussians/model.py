@@ -37,7 +37,7 @@ class Rendering:
         }
         background = comment.get("background") if comment.get("background") in ("black", "white") else None
         alpha = "mask" if comment.get("alpha") == "mask" else "transparency"
-        return cls(**{**mip, **told}, background=background, alpha=alpha, notes=dict(comment))
+        return cls(**{**mip, **given}, background=background, alpha=alpha, notes=dict(comment))
 
     def comment(self) -> dict[str, Any]:
         """What a model file says about rendering."""
@@ -80,7 +80,7 @@ class Model:
     @property
     def sh_degree(self) -> int:
         """Highest degree of the spherical harmonics."""
-        return round((1 + self.sh_rest.shape[1] / 3) ** 0.5) - 1
+        return int(round((1 + self.sh_rest.shape[1] / 3) ** 0.5)) - 1
 
     @property
     def scales(self) -> Floats:
@@ -99,7 +99,8 @@ class Model:
 
     def __getitem__(self, chosen: Any) -> "Model":
         """Return some of the Gaussians, by a mask, indices or a slice."""
-        return replace(self, **{name: np.atleast_2d(table[chosen]) for name, table in self.tables().items()})
+        tables: dict[str, Any] = {name: np.atleast_2d(table[chosen]) for name, table in self.tables().items()}
+        return replace(self, **tables)
 
     def transformed(
         self, scale: float = 1.0, rotation: NDArray[np.floating] | None = None, translation: Any = (0, 0, 0)
@@ -150,10 +151,6 @@ def load(path: str | Path) -> Model:
     path = Path(path)
     file = read_ply(path / "point_cloud.ply" if path.is_dir() else path)
     return Model(**file.parameters, rendering=Rendering.of(file.rendering, file.mode))
-
-
-def _number(values: Mapping[str, Any], name: str) -> bool:
-    return isinstance(values.get(name), int | float)
 
 
 def _quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -239,7 +239,7 @@ class Device:
         return array
 
     def program(self, file: str | Path, **defines: int | str) -> "Program":
-        """Build `cl_kernels/<file>`, or a file given by its absolute path, with this device's tuning and `defines`, once.
+        """Build `cl_kernels/<file>`, or a file by its absolute path, with this device's tuning and `defines`, once.
 
         Raises KernelError when it does not build, FileNotFoundError when it is missing.
         """
