@@ -32,9 +32,8 @@ class Rendering:
     def of(cls, comment: Mapping[str, Any], mode: str) -> "Rendering":
         """Take the numbers from a file's comment; files of other programs get those of 3DGS or Mip-Splatting."""
         mip = {"screen_variance": MIP_VARIANCE, "compensate": 1.0} if mode == "mip" else {}
-        told = {
-            name: float(comment[name]) for name in ("near", "screen_variance", "compensate") if _number(comment, name)
-        }
+        names = ("near", "screen_variance", "compensate")
+        given = {name: float(comment[name]) for name in names if isinstance(comment.get(name), int | float)}
         background = comment.get("background") if comment.get("background") in ("black", "white") else None
         alpha = "mask" if comment.get("alpha") == "mask" else "transparency"
         return cls(**{**mip, **given}, background=background, alpha=alpha, notes=dict(comment))
@@ -80,7 +79,8 @@ class Model:
     @property
     def sh_degree(self) -> int:
         """Highest degree of the spherical harmonics."""
-        return int(round((1 + self.sh_rest.shape[1] / 3) ** 0.5)) - 1
+        degree: int = round((1 + self.sh_rest.shape[1] / 3) ** 0.5) - 1
+        return degree
 
     @property
     def scales(self) -> Floats:
