@@ -1,7 +1,7 @@
 for (const box of document.querySelectorAll(".space")) {
   const {points, colours, cameras, names, shades} = JSON.parse(box.querySelector("script").textContent);
-  const canvas = box.querySelector("canvas"), pen = canvas.getContext("2d"), told = box.querySelector("output");
-  const UNIT = 1000;
+  const canvas = box.querySelector("canvas"), pen = canvas.getContext("2d"), caption = box.querySelector("output");
+  const UNIT = 1000;  // radius of the scene
   const VIEWS = {oblique: [0.6, 0.45], top: [0, Math.PI / 2], side: [0, 0]};
   let [yaw, pitch] = VIEWS.oblique, distance = 2.7 * UNIT, places = [], over = -1;
 
@@ -14,7 +14,7 @@ for (const box of document.querySelectorAll(".space")) {
     return [wide / 2 + a * scale, high / 2 - (Math.sin(pitch) * b + Math.cos(pitch) * z) * scale, depth];
   }
 
-  // Where a camera outside of the picture lies: the crossing of the border with the way from the middle.
+  // The place of a camera outside the canvas: where the line from the middle to it crosses the border.
   function clamped(camera, wide, high) {
     const a = Math.cos(yaw) * camera[1] - Math.sin(yaw) * camera[2];
     const b = Math.sin(yaw) * camera[1] + Math.cos(yaw) * camera[2];
@@ -52,8 +52,8 @@ for (const box of document.querySelectorAll(".space")) {
       else if (corners.every(Boolean)) frustum(corners);
       return centre;
     });
-    if (over >= 0 && places[over]) told.textContent = names[over];
-    else told.textContent = "";
+    if (over >= 0 && places[over]) caption.textContent = names[over];
+    else caption.textContent = "";
   }
 
   function frustum([centre, ...corners]) {
