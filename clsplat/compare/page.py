@@ -13,7 +13,7 @@ from clsplat.compare.comparison import Comparison, Row, Variant
 from clsplat.compare.crops import Crop, find_crops
 from clsplat.errors import ConfigError, DataError
 from clsplat.files import write_text
-from clsplat.pages.page import charts, embedded, render
+from clsplat.pages.page import charts, counted, embedded, render
 from clsplat.pages.svg import Line, curve
 
 LOG = logging.getLogger("clsplat")
@@ -64,8 +64,8 @@ def comparison_page(comparison: Comparison, title: str, remarks: Sequence[str]) 
     device = f"device: {devices.pop()}" if len(devices) == 1 else "several devices"
     return render(
         "compare.html.j2",
-        title=f"{title}: {_counted(len(runs), 'run')}",
-        subtitle=f"{_counted(len(variants), 'variant')} on {_counted(len(scenes), 'scene')}; {device}",
+        title=f"{title}: {counted(len(runs), 'run')}",
+        subtitle=f"{counted(len(variants), 'variant')} on {counted(len(scenes), 'scene')}; {device}",
         remarks=remarks,
         means=tables.means_over_scenes(comparison) if len(scenes) > 1 else None,
         scenes=[_section(name, rows) for name, rows in scenes.items()],
@@ -73,10 +73,6 @@ def comparison_page(comparison: Comparison, title: str, remarks: Sequence[str]) 
         settings=tables.differing_settings(variants),
         runs=[(comparison.variant(run), str(run.path), run.metrics.seed) for run in runs],
     )
-
-
-def _counted(count: int, word: str) -> str:
-    return f"{count} {word}{'s' if count != 1 else ''}"
 
 
 def _section(name: str, rows: Sequence[Row]) -> SceneSection:

@@ -19,7 +19,7 @@ def figures(facts: Facts) -> dict[str, str]:
     if facts.extent is not None:
         lines["extent"] = f"{facts.extent:.4g} scene units around the cameras"
         if facts.strayed:
-            lines["extent"] += f", without {len(facts.strayed)} far away"
+            lines["extent"] += f", without {len(facts.strayed)} far away from all others"
     if points := facts.points:
         lines["points"] = f"{points.count:,}"
         if points.error_mean is not None:
@@ -48,7 +48,7 @@ def _images(facts: Facts) -> str:
         return f"{facts.on_disk} on disk"
     parts = [f"{facts.registered} with a pose"]
     parts += [f"{len(facts.missing)} of them missing on disk"] if facts.missing else []
-    parts += [f"{len(facts.unregistered)} more on disk without"] if facts.unregistered else []
+    parts += [f"{len(facts.unregistered)} more on disk without a pose"] if facts.unregistered else []
     parts += [f"in {facts.folders} folders"] if facts.folders > 1 else []
     parts += [f"{facts.photos.masks} with a mask"] if facts.photos.masks else []
     return ", ".join(parts)

@@ -11,7 +11,7 @@ from clsplat.scene.points import FAR
 from clsplat.scene.scene import View
 
 MAX_POINTS = 5000
-RADIUS = 1000  # of the scene as it is drawn, in the numbers of the page: UNIT of space.js
+RADIUS = 1000  # of the scene, in the numbers of the page
 MAX_COORDINATE = 30 * RADIUS  # points beyond are left out
 MAX_SLOPE = 5.0  # of a frustum's edges: half width by depth
 
@@ -55,6 +55,7 @@ def space(inspection: Inspection) -> Space | None:
         "cameras": [[kinds[view.name], *_integers((_frustum(view, size) - origin) @ axes.T)] for view in views],
         "shades": [kind.colour for kind in KINDS],
         "names": [view.name for view in views],
+        "radius": RADIUS,
     }
     return Space([KINDS[index] for index in sorted(set(kinds.values()))], data)
 

@@ -13,7 +13,7 @@ from clsplat.files import write_text
 from clsplat.metrics.distribution import SHARES
 from clsplat.metrics.perceptual import Image
 from clsplat.metrics.views import render_view
-from clsplat.pages.page import charts, duration, embedded, render
+from clsplat.pages.page import charts, counted, duration, embedded, render
 from clsplat.pages.svg import Line, curve
 from clsplat.stages.base import Stage
 from clsplat.training.run import Run
@@ -77,16 +77,12 @@ def _figures(run: Run) -> dict[str, str]:
     for split, scales in run.metrics.items():
         for scale, averages in scales.items():
             suffix = "" if scale == f"{run.scale:g}" else f" at 1/{scale}"
-            values[f"{split} PSNR{suffix} ({_counted(averages['views'], 'view')})"] = f"{averages['psnr']:.2f} dB"
+            values[f"{split} PSNR{suffix} ({counted(averages['views'], 'view')})"] = f"{averages['psnr']:.2f} dB"
             values[f"{split} SSIM{suffix}"] = f"{averages['ssim']:.4f}"
     values["Gaussians"] = f"{run.trained.gaussians.count:,}"
     values["steps"] = f"{run.step:,}"
     values["training"] = duration(run.train_seconds)
     return values
-
-
-def _counted(count: int, word: str) -> str:
-    return f"{count} {word}{'s' if count != 1 else ''}"
 
 
 def _training_charts(run: Run) -> list[Markup]:
@@ -127,7 +123,7 @@ def _gaussians_charts(run: Run) -> list[Markup]:
             curve("opacity, quantiles", quantiles("opacity")),
             curve("Gaussians changed by each rule, in all", _totals(run, "causes")),
             curve("share of growth so far, by rule", _shares(_totals(run, "grown"))),
-            curve("test PSNR, dB, over thousands of Gaussians", [Line(_psnr_by_gaussians(run))]),
+            curve("test PSNR, dB, over thousands of Gaussians", _psnr_by_gaussians(run)),
         ]
     )
 
@@ -148,11 +144,12 @@ def _shares(lines: Sequence[Line]) -> list[Line]:
     return [Line(points, line.name) for points, line in zip(shares, lines, strict=True) if any(y for _, y in points)]
 
 
-def _psnr_by_gaussians(run: Run) -> list[tuple[float, float]]:
-    """In order of steps: where Gaussians are thinned out, the line turns back."""
+def _psnr_by_gaussians(run: Run) -> list[Line]:
+    """In order of steps: where Gaussians are thinned out, the line turns back.  A single point is left out."""
     counts = {r["step"]: r["gaussians"] for r in run.records.read("train")}
     tests = [r for r in run.records.read("evaluate") if r["split"] == "test" and r["scale"] == run.scale]
-    return [(counts[r["step"]] / 1e3, r["psnr"]) for r in tests if r["step"] in counts]
+    points = {r["step"]: (counts[r["step"]] / 1e3, r["psnr"]) for r in tests if r["step"] in counts}
+    return [Line(list(points.values()))] if len(points) > 1 else []
 
 
 def _times(run: Run) -> Times | None:
