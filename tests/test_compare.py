@@ -19,6 +19,7 @@ from clsplat.errors import ClsplatError, ConfigError, DataError
 from clsplat.pipeline import load
 from clsplat.scene.detect import read_scene
 from clsplat.scene.images import load_image, write_image
+from tests.html_page import HOSTILE, Page
 from tests.test_cli import clsplat
 
 WHITE = (1.0, 1.0, 1.0)  # behind the photographs of a Blender scene
@@ -73,7 +74,7 @@ def test_seeds_are_one_row_with_mean_and_deviation(make_run, tmp_path):
     assert [row.variant.name for row in rows] == ["smoke, opacity 0.1", "smoke, opacity 0.3"]
     page = page_of(tmp_path, *seeds, other)
     assert "<td>21.00 <small>± 1.00</small>" in page  # of 20, 21, 22
-    assert "<td class=best>24.00<td" in page, "the best is bold, one run has no deviation"
+    assert '<td class="best">24.00</td>' in page, "the best is bold, one run has no deviation"
     assert "<td>22.00 <small>± 1.00</small>" in page, "at half size, where each is one higher"
     assert page.count("<polyline") == 4 + 4 + 2 + 2, "PSNR and Gaussians by run, PSNR and SSIM by size and variant"
     assert "LPIPS" not in page, "nobody measured it"
@@ -88,9 +89,9 @@ def test_another_scene_or_size_is_another_table(make_run, tiny_scene, tmp_path):
     assert list(comparison.scenes) == ["tiny", "second", "tiny at 1/2"]
     assert len(comparison.variants) == 1, "the scene does not make a variant"
     page = page_of(tmp_path, one, two, half)
-    assert "Mean of 3 scenes</h2><p class=sub>test views, at the size trained on" in page
+    assert '<h2>Mean of 3 scenes</h2>\n<p class="sub">test views, at the size trained on</p>' in page
     assert "<td>30.00" in page[: page.index("<h2>tiny</h2>")]
-    assert page.count("<p class=note>no crops: ") == 1, "only the run without renders has none"
+    assert page.count("No crops: ") == 1, "only the run without renders has none"
 
 
 def test_differing_settings_are_found_by_name_not_by_place():
@@ -109,44 +110,92 @@ def test_differing_settings_are_found_by_name_not_by_place():
 def test_the_page_shows_the_differing_settings_only(make_run, tmp_path):
     page = page_of(tmp_path, make_run("a"), make_run("b", "optimize.densify.every=20"))
     table = page[page.index("Settings that differ") : page.index("<h2>Runs")]
-    assert re.findall(r"<tr><td>([^<]*)<td>([^<]*)<td>([^<]*)", table) == [("optimize.densify.every", "10", "20")]
+    rows = re.findall(r"<tr><td>(.*?)</td><td>(.*?)</td><td>(.*?)</td>", table)
+    assert rows == [("optimize.densify.every", "10", "20")]
 
 
-def crops_of(*folders: Path) -> str:
+def crops_of(*folders: Path) -> list[crops.Crop]:
     runs = [RunFolder.read(folder) for folder in folders]
-    return crops.crops([crops.Case("run", run) for run in runs], *runs[0].scene.read(runs[0].photographs))
+    return crops.find_crops(runs, *runs[0].scene.read(runs[0].photographs))
 
 
 def test_crops_are_where_the_runs_differ(make_run, monkeypatch):
     """One run is the photograph, the other is darker in the lower right quarter."""
-    monkeypatch.setattr(crops, "SMALLEST", 12)
-    text = crops_of(make_run("truth", error=0), make_run("darker", error=60))
-    places = [tuple(map(float, found)) for found in re.findall(r"left:([\d.]+)%;top:([\d.]+)%", text)]
-    assert len(places) == 2, "one of each test view"
-    assert all(50 <= left <= 70 and 50 <= top <= 70 for left, top in places)
-    assert text.count("100.00 dB in this crop") == 2
-    assert text.count("<input type=range") == 4
+    monkeypatch.setattr(crops, "MIN_SIDE", 12)
+    found = crops_of(make_run("equal", error=0), make_run("darker", error=60))
+    assert len(found) == 2, "one of each test view"
+    for crop in found:
+        assert 20 <= crop.x <= 28, "from the middle to the right"
+        assert 20 <= crop.y <= 28
+        assert crop.frame == {"left": crop.x / 0.4, "top": crop.y / 0.4, "width": 32.5, "height": 32.5}
+        same, darker = crop.psnrs
+        assert (same, darker) == (100, pytest.approx(12.6, abs=0.2)), "20 log10(255 / 60)"
+        np.testing.assert_array_equal(crop.renders[0], crop.photograph)
 
 
 def test_a_single_run_is_held_against_the_photograph(make_run):
-    text = crops_of(make_run("alone", error=60))
-    assert text.count("<input type=range") == 2
-    assert "100.00 dB" not in text
+    found = crops_of(make_run("alone", error=60))
+    assert len(found) == 2
+    assert all(len(crop.psnrs) == 1 and crop.psnrs[0] < 20 for crop in found)
+
+
+def test_the_page_of_a_single_run_speaks_of_no_best_and_no_seeds(make_run, tmp_path):
+    page = page_of(tmp_path, make_run("alone"))
+    assert "Where the run differs most from the photograph" in page
+    assert page.count('<input type="range"') == 2, "one of each test view"
+    text = Page(page).text
+    assert not any(words in text for words in ("bold", "deviation", "several seeds", "All runs"))
+
+
+def test_without_records_there_are_no_curves(make_run, tmp_path):
+    folder = make_run("run")
+    (folder / "metrics.jsonl").unlink()
+    metrics = json.loads((folder / "metrics.json").read_text())
+    del metrics["test"]["2"]
+    (folder / "metrics.json").write_text(json.dumps(metrics))
+    page = page_of(tmp_path, folder)
+    assert "No curves: the runs have no metrics.jsonl." in page
+    assert "20.00" in page
+
+
+def test_remarks_stand_at_the_top(make_run, tmp_path):
+    write_comparison([make_run("run")], tmp_path / "page.html", "ablation", ["one failed", HOSTILE])
+    text = Page((tmp_path / "page.html").read_text()).text
+    assert text.index("ablation: 1 run") < text.index("one failed") < text.index(HOSTILE) < text.index("tiny")
 
 
 def test_the_page_needs_nothing_else(make_run, tmp_path):
     page = page_of(tmp_path, make_run("a"), make_run("b", "init.opacity=0.3"))
     assert not re.search(r"https?://|<link|src=\"(?!data:)|@import", page)
-    first = re.search(r'class=slider><img src="data:image/png;base64,([^"]+)', page)
+    first = re.search(r'class="slider tagged"><img src="data:image/png;base64,([^"]+)', page)
     pixels = cv2.imdecode(np.frombuffer(base64.b64decode(first[1]), np.uint8), cv2.IMREAD_COLOR)
     assert pixels.shape == (40, 40, 3), "crops keep every bit"
 
 
-def test_names_are_escaped(make_run, tmp_path):
-    folder = make_run("<b>x", device="<i>y", pipeline="<u>z")
-    page = page_of(tmp_path, folder)
-    assert not re.search(r"<b>x|<i>y|<u>z", page)
-    assert "&lt;b&gt;x" in page
+def test_markup_in_names_is_shown_as_text(make_run, tmp_path):
+    """In the names of a scene, its views, a run's folder, its device and pipeline, and in settings."""
+    folder = make_run(HOSTILE, device=f"{HOSTILE} device", pipeline=f"{HOSTILE} pipeline")
+    other = make_run("other", "init.opacity=0.3")
+    for run in (folder, other):
+        settings = (run / "pipeline.yaml").read_text().replace("name: smoke", f"name: {json.dumps(HOSTILE)}")
+        (run / "pipeline.yaml").write_text(settings)
+    page = Page(page_of(tmp_path, folder, other))
+    assert page.elements["script"] == 1, "that of the sliders"
+    assert f"{HOSTILE} pipeline" in page.text
+    assert str(folder) in page.text
+    assert f"{HOSTILE}, opacity 0.3" in page.text, "a variant's name"
+    assert f"{HOSTILE} device" in page.text, "among the settings that differ"
+
+
+def test_the_same_runs_give_the_same_bytes(make_run, tmp_path, monkeypatch):
+    """Sets of strings have another order in each of these processes."""
+    folders = [make_run("a"), make_run("b", "init.opacity=0.3"), make_run("c", "seed=1", device="another")]
+    pages = []
+    for seed in ("1", "2", "3"):
+        monkeypatch.setenv("PYTHONHASHSEED", seed)
+        clsplat("compare", *folders, "--out", tmp_path / "page.html")
+        pages.append((tmp_path / "page.html").read_bytes())
+    assert len(set(pages)) == 1
 
 
 def test_lpips_of_different_ranges_is_marked(make_run, tmp_path):
@@ -214,7 +263,7 @@ def test_without_the_photographs_the_rest_is_shown(make_run, tmp_path):
     text = (folder / "pipeline.yaml").read_text()
     (folder / "pipeline.yaml").write_text(re.sub(r"path: .*tiny.*?,", "path: /nowhere,", text))
     page = page_of(tmp_path, folder)
-    assert "no crops: /nowhere: no such folder" in page
+    assert "No crops: /nowhere: no such folder" in page
     assert "20.00" in page
 
 

@@ -15,13 +15,14 @@ from scipy.spatial.transform import Rotation
 
 from clsplat.errors import DataError
 from clsplat.inspect.inspection import Inspection
-from clsplat.inspect.page import inspection_page
+from clsplat.inspect.page import MAX_NAMES, inspection_page
 from clsplat.inspect.survey import bend
 from clsplat.scene.detect import read_scene
 from clsplat.scene.images import load_image, load_mask
 from clsplat.scene.lens import Lens
 from tests.colmap_writer import CameraEntry, DeviceModel, ImageEntry, PointEntry, tiny_model, write_model, write_scene
 from tests.data_sets import data_set
+from tests.html_page import HOSTILE, Page
 from tests.test_cli import clsplat
 from tests.test_image_headers import with_exif
 
@@ -388,10 +389,10 @@ def test_the_command_line(scene, tmp_path):
     assert "reprojection" not in done.stdout  # the writer's errors are all the same: a placeholder
     page = (tmp_path / "page.html").read_text()
     assert "Ready to train" in page
-    data = json.loads(page.partition("<script type=application/json>")[2].partition("</script>")[0])
+    data = json.loads(page.partition('<script type="application/json">')[2].partition("</script>")[0])
     assert (len(data["names"]), len(data["cameras"]), len(data["colours"])) == (24, 24, 200)
     assert sorted({camera[0] for camera in data["cameras"]}) == [0, 1]
-    assert "http" not in page.replace("http://www.w3.org", "")  # nothing from outside
+    assert "://" not in page  # nothing from outside
 
 
 def test_json_and_the_exit_code(scene):
@@ -405,8 +406,28 @@ def test_json_and_the_exit_code(scene):
     assert done.stderr.startswith("error: cannot train: 1 of 24")
 
 
-def test_names_are_escaped(tmp_path):
+def test_markup_in_names_is_shown_as_text(tmp_path):
+    """In the names of the folder, of views, and of files on disk: in findings, lists and data."""
     model = orbit()
-    name = "</script><b>.png"
-    scene = write_scene(tmp_path, replace(model, images=changed(model.images, 3, name=name)))
-    assert "<b>.png" not in inspection_page(Inspection.of(scene))
+    name = f"</script>{HOSTILE}.png"
+    path = write_scene(tmp_path / HOSTILE, replace(model, images=changed(model.images, 3, name=name)))
+    photograph(path / "images" / f"{HOSTILE}.png")
+    inspection = Inspection.of(path)
+    page = Page(inspection_page(inspection))
+    assert page.elements["script"] == 2, "the data and the code"
+    assert f"images/{HOSTILE}.png" in page.text, "in the list of images without a pose"
+    assert name in page.text, "in a finding: the file is empty"
+    assert f"{HOSTILE}: inspection of the dataset" in page.text
+    data = json.loads(next(code for code in page.code if code.startswith("{")))
+    assert name in data["names"]
+
+
+def test_long_lists_of_names_are_cut(tmp_path):
+    path = write(tmp_path, orbit())
+    for i in range(MAX_NAMES + 5):
+        photograph(path / "images" / f"more{i:03}.png", (4, 4))
+    text = Page(inspection_page(Inspection.of(path))).text
+    assert f"on disk but without a pose ({MAX_NAMES + 5})" in text
+    assert f"more{MAX_NAMES - 1:03}.png" in text
+    assert f"more{MAX_NAMES:03}.png" not in text
+    assert "… and 5 more" in text

@@ -209,7 +209,7 @@ def test_every_cell_is_a_run_of_its_own(finished):
     page = (out / "compare.html").read_text()
     assert "sweep: 4 runs" in page
     assert "2 variants on 1 scene" in page
-    assert "<td>optimize.steps<td>4<td>6" in page
+    assert "<td>optimize.steps</td><td>4</td><td>6</td>" in page
 
 
 def test_the_folder_of_a_matrix_stands_for_its_cells(finished, tmp_path):

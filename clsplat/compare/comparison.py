@@ -1,4 +1,4 @@
-"""Runs sorted for a comparison.
+"""Runs, sorted into variants and rows.
 
 Runs with the same settings are one variant, whatever their scene and seed.  Runs of a variant on one scene are one row:
 their mean, and the deviation between seeds.
@@ -15,7 +15,7 @@ from clsplat.compare.run_folder import RunFolder, read_settings
 from clsplat.errors import ConfigError, DataError
 from clsplat.pages.svg import COLOURS
 
-NAMED = 3  # differing settings in a variant's name
+MAX_SETTINGS = 3  # differing ones in a variant's name
 
 
 @dataclass(frozen=True)
@@ -36,18 +36,18 @@ class Row:
     runs: list[RunFolder]
 
     @property
-    def scale(self) -> str:
-        """The downscale factor of the finest images trained on."""
+    def downscale(self) -> str:
+        """The divisor of the size of the largest images trained on."""
         return f"{self.runs[0].scene.downscale:g}"
 
-    def scales(self, split: str) -> list[str]:
-        """The downscale factors at which every run was measured, from full size down."""
+    def downscales(self, split: str) -> set[str]:
+        """The divisors of the image sizes at which every run was measured."""
         measured: list[set[str]] = [set(getattr(run.metrics, split)) for run in self.runs]
-        return sorted(set.intersection(*measured), key=float)
+        return set.intersection(*measured)
 
-    def figures(self, split: str, scale: str, metric: str) -> list[float]:
+    def figures(self, split: str, downscale: str, metric: str) -> list[float]:
         """A metric of the runs; none when a run lacks it."""
-        averages = [getattr(run.metrics, split).get(scale) for run in self.runs]
+        averages = [getattr(run.metrics, split).get(downscale) for run in self.runs]
         values = [found.figure(metric) if found else None for found in averages]
         present = [value for value in values if value is not None]
         return present if len(present) == len(values) else []
@@ -55,7 +55,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Comparison:
-    """All runs."""
+    """All runs, sorted into variants and rows."""
 
     runs: list[RunFolder]
 
@@ -123,12 +123,12 @@ def _settings(run: RunFolder) -> dict[str, str]:
 def _name(settings: dict[str, str], distinct: Sequence[dict[str, str]]) -> str:
     """The pipeline's name, and the settings that tell variants of the same name apart."""
     places = differing([other for other in distinct if other.get("name") == settings.get("name")])
-    parts = [f"{place.rpartition('.')[2]} {settings.get(place, 'unset')}" for place in places[:NAMED]]
-    return ", ".join([settings.get("name", "unnamed"), *parts, *(["…"] if len(places) > NAMED else [])])
+    parts = [f"{place.rpartition('.')[2]} {settings.get(place, 'unset')}" for place in places[:MAX_SETTINGS]]
+    return ", ".join([settings.get("name", "unnamed"), *parts, *(["…"] if len(places) > MAX_SETTINGS else [])])
 
 
 def _scene_names(runs: Sequence[RunFolder]) -> list[str]:
-    """The folder's name and size; what else tells scenes apart only where there are several of that name."""
+    """The folder's name and the size of images; where several scenes share both, all their settings too."""
     names = []
     for run in runs:
         size = f" at 1/{run.scene.downscale:g}" if run.scene.downscale != 1 else ""

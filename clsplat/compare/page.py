@@ -1,19 +1,51 @@
-"""Runs side by side, as one page that opens offline: metrics, curves, scales, crops, differing settings."""
+"""Runs side by side, as one page that opens offline: metrics, curves, crops, differing settings."""
 
-import html
 import logging
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
 
-from clsplat.compare import crops, tables
-from clsplat.compare.comparison import Comparison, Row
+from markupsafe import Markup
+
+from clsplat.compare import tables
+from clsplat.compare.comparison import Comparison, Row, Variant
+from clsplat.compare.crops import Crop, find_crops
 from clsplat.errors import ConfigError, DataError
 from clsplat.files import write_text
-from clsplat.pages.page import page
+from clsplat.pages.page import charts, counted, embedded, render
 from clsplat.pages.svg import Line, curve
 
 LOG = logging.getLogger("clsplat")
+MAX_NAMES = 4  # of pipelines, in the title
+
+
+@dataclass(frozen=True)
+class CropFigure:
+    """A crop with its images as addresses that hold them."""
+
+    view: str
+    overview: str
+    frame: dict[str, float]  # percent of the overview
+    photograph: str
+    renders: list[str]  # by variant
+    psnrs: list[float]  # dB, by variant
+
+
+@dataclass(frozen=True)
+class SceneSection:
+    """What the page shows of one scene."""
+
+    name: str
+    variants: list[Variant]
+    several_seeds: bool
+    explanations: list[str]  # of the tables
+    remarks: list[str]
+    main: tables.Table
+    other: tables.Table | None
+    curves: list[Markup]
+    crops: list[CropFigure]
+    no_crops: str  # the reason
 
 
 def write_comparison(paths: Sequence[Path], out: Path, title: str = "", remarks: Sequence[str] = ()) -> int:
@@ -25,76 +57,95 @@ def write_comparison(paths: Sequence[Path], out: Path, title: str = "", remarks:
 
 def comparison_page(comparison: Comparison, title: str, remarks: Sequence[str]) -> str:
     """Return the page; its title is by default the names of the pipelines, and `remarks` stand at its top."""
-    sections = [f"<p class=note>{html.escape(remark)}</p>" for remark in remarks]
-    if len(comparison.scenes) > 1:
-        sections.append(tables.over_scenes(comparison))
-    for scene, rows in comparison.scenes.items():
-        sections += [f"<h2>{html.escape(scene)}</h2>", tables.metrics(rows), _curves(rows), _crops(rows)]
-    sections += [tables.settings(comparison.variants), tables.folders(comparison)]
-    names = list(dict.fromkeys(run.metrics.pipeline for run in comparison.runs))
-    title = title or f"{' · '.join(names[:4])}{' · …' if len(names) > 4 else ''}"
-    title += f": {_counted(len(comparison.runs), 'run')}"
-    subtitle = f"{_counted(len(comparison.variants), 'variant')} on {_counted(len(comparison.scenes), 'scene')}"
-    devices = {run.metrics.device for run in comparison.runs}
-    subtitle += f"; device: {devices.pop()}" if len(devices) == 1 else "; several devices"
-    return page(title, subtitle, sections, tables.STYLE + crops.STYLE, crops.SCRIPT)
+    runs, scenes, variants = comparison.runs, comparison.scenes, comparison.variants
+    names = list(dict.fromkeys(run.metrics.pipeline for run in runs))
+    title = title or " · ".join([*names[:MAX_NAMES], *(["…"] if len(names) > MAX_NAMES else [])])
+    devices = {run.metrics.device for run in runs}
+    device = f"device: {devices.pop()}" if len(devices) == 1 else "several devices"
+    return render(
+        "compare.html.j2",
+        title=f"{title}: {counted(len(runs), 'run')}",
+        subtitle=f"{counted(len(variants), 'variant')} on {counted(len(scenes), 'scene')}; {device}",
+        remarks=remarks,
+        means=tables.means_over_scenes(comparison) if len(scenes) > 1 else None,
+        scenes=[_section(name, rows) for name, rows in scenes.items()],
+        variants=variants,
+        settings=tables.differing_settings(variants),
+        runs=[(comparison.variant(run), str(run.path), run.metrics.seed) for run in runs],
+    )
 
 
-def _counted(count: int, word: str) -> str:
-    return f"{count} {word}{'s' if count != 1 else ''}"
+def _section(name: str, rows: Sequence[Row]) -> SceneSection:
+    crops, no_crops = _crops(rows)
+    several_seeds = any(len(row.runs) > 1 for row in rows)
+    explanations = ["mean ± standard deviation over seeds"] if several_seeds else []
+    return SceneSection(
+        name=name,
+        variants=[row.variant for row in rows],
+        several_seeds=several_seeds,
+        explanations=explanations + (["bold: the best"] if len(rows) > 1 else []),
+        remarks=list(tables.differing_conditions(rows)),
+        main=tables.main_table(rows),
+        other=tables.other_table(rows),
+        curves=_curves(rows),
+        crops=[_figure(crop) for crop in crops],
+        no_crops=no_crops,
+    )
 
 
-def _curves(rows: Sequence[Row]) -> str:
+def _curves(rows: Sequence[Row]) -> list[Markup]:
     """PSNR and Gaussians over steps, a line for each run; then quality over image sizes."""
 
     def lines(kind: str, figure: str, **where: object) -> list[Line]:
         found = [(row.variant.colour, run.points(kind, figure, **where)) for row in rows for run in row.runs]
         return [Line(points, colour=colour) for colour, points in found if len(points) > 1]
 
-    charts = [
-        curve(
-            "test PSNR over steps, dB", lines("evaluate", "psnr", split="test", scale=rows[0].runs[0].scene.downscale)
-        ),
+    downscale = rows[0].runs[0].scene.downscale
+    drawings = [
+        curve("test PSNR over steps, dB", lines("evaluate", "psnr", split="test", scale=downscale)),
         curve("PSNR of single training views over steps, dB", lines("train", "psnr")),
         curve("Gaussians over steps", lines("train", "gaussians")),
-        *(chart for split in ("test", "train") for chart in _scale_charts(rows, split)),
     ]
-    if not any(charts):
-        return "<p class=note>no curves: the runs have no metrics.jsonl</p>"
-    legend = " &ensp; ".join(tables.label(row.variant) for row in rows)
-    return f"<h3>Curves</h3><p class=sub>{legend}</p><div class=curves>{''.join(charts)}</div>"
+    return charts(drawings + _size_charts(rows, "test") + _size_charts(rows, "train"))
 
 
-def _scale_charts(rows: Sequence[Row], split: str) -> list[str]:
-    scales = tables.scales(rows, split)
-    if len(scales) < 2:
+def _size_charts(rows: Sequence[Row], split: str) -> list[str]:
+    """PSNR and SSIM over image sizes, a line for each variant."""
+    sizes = tables.downscales(rows, split)
+    if len(sizes) < 2:
         return []
-    ticks = {float(i): "full size" if scale == "1" else f"1/{scale}" for i, scale in enumerate(scales)}
-    charts = []
+    ticks = {float(i): "full size" if size == "1" else f"1/{size}" for i, size in enumerate(sizes)}
+    drawings = []
     for metric, title in (("psnr", f"{split} PSNR by image size, dB"), ("ssim", f"{split} SSIM by image size")):
         lines = []
         for row in rows:
-            means = [(float(i), row.figures(split, scale, metric)) for i, scale in enumerate(scales)]
-            lines.append(Line([(i, fmean(values)) for i, values in means if values], colour=row.variant.colour))
-        charts.append(curve(title, lines, ticks=ticks))
-    return charts
+            found = [(float(i), row.figures(split, size, metric)) for i, size in enumerate(sizes)]
+            lines.append(Line([(i, fmean(values)) for i, values in found if values], colour=row.variant.colour))
+        drawings.append(curve(title, lines, ticks=ticks))
+    return drawings
 
 
-def _crops(rows: Sequence[Row]) -> str:
-    """Crops of each row's first run; a scene that has moved away since leaves a remark."""
-    cases = [crops.Case(tables.label(row.variant), row.runs[0]) for row in rows]
+def _crops(rows: Sequence[Row]) -> tuple[list[Crop], str]:
+    """Crops of each row's first run, or the reason why there are none, such as photographs that have moved."""
+    runs = [row.runs[0] for row in rows]
+    settings = runs[0].scene
     try:
-        settings = rows[0].runs[0].scene
-        photographs, background = settings.read(rows[0].runs[0].photographs)
+        photographs, background = settings.read(runs[0].photographs)
         scene = photographs.downscaled(settings.downscale)
     except (DataError, ConfigError) as error:
         LOG.warning("no crops: %s", error)
-        return f"<p class=note>no crops: {html.escape(str(error))}</p>"
-    shown = crops.crops(cases, scene, background)
-    if not shown:
-        return "<p class=note>no crops: no view that all runs rendered; `- render` among the stages does it</p>"
-    place = "the runs differ most" if len(rows) > 1 else "the run differs most from the photograph"
-    return (
-        f"<h3>Where {place}</h3><p class=sub>Drag across a picture: left of the line is the render, right of it the "
-        f"photograph.  Of several seeds the first is shown.</p>{shown}"
+        return [], str(error)
+    crops = find_crops(runs, scene, background)
+    return crops, "" if crops else "there is no view that all runs rendered; add `- render` to the stages"
+
+
+def _figure(crop: Crop) -> CropFigure:
+    """Its squares keep every bit."""
+    return CropFigure(
+        view=crop.view,
+        overview=embedded(crop.overview),
+        frame=crop.frame,
+        photograph=embedded(crop.photograph, ".png"),
+        renders=[embedded(image, ".png") for image in crop.renders],
+        psnrs=crop.psnrs,
     )

@@ -1,4 +1,4 @@
-"""A finished run as its folder tells it: settings, metrics, records, renders."""
+"""A finished run, read from its folder: settings, metrics, records, renders."""
 
 import json
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ from clsplat.yaml_file import read_yaml
 
 
 class Averages(BaseModel):
-    """Metrics of a split at one scale; perceptual ones and remarks on them stand beside."""
+    """Metrics of a split at one size; perceptual metrics and remarks on them are extra fields."""
 
     model_config = ConfigDict(extra="allow", allow_inf_nan=False)
 
@@ -75,7 +75,7 @@ class RunFolder:
 
     @property
     def photographs(self) -> Path:
-        """The folder that it trained on.  Raises ConfigError when nobody said so."""
+        """The folder with the photographs that the run trained on.  Raises ConfigError when no scene is named."""
         prepared = noted(self.path)
         return Path(prepared["folder"]) if prepared else self.scene.folder
 

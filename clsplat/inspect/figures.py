@@ -1,10 +1,10 @@
-"""The facts as short lines of text, for the terminal and the page alike."""
+"""The facts as short lines of text, for the terminal and the page."""
 
 from statistics import median
 
 from clsplat.inspect.survey import CameraFacts, Facts
 
-SHOWN = 4  # cameras, by the number of their views
+MAX_CAMERAS = 4
 
 
 def figures(facts: Facts) -> dict[str, str]:
@@ -14,12 +14,12 @@ def figures(facts: Facts) -> dict[str, str]:
         lines["views"] = f"{facts.train} for training, {facts.test} for testing"
     if len(facts.submodels) > 1:
         lines["models"] = ", ".join(f"{name} ({count} images)" for name, count in facts.submodels.items())
-    for i, camera in enumerate(facts.cameras[:SHOWN]):
+    for i, camera in enumerate(facts.cameras[:MAX_CAMERAS]):
         lines["camera" if len(facts.cameras) == 1 else f"camera {i + 1} of {len(facts.cameras)}"] = camera_line(camera)
     if facts.extent is not None:
         lines["extent"] = f"{facts.extent:.4g} scene units around the cameras"
         if facts.strayed:
-            lines["extent"] += f", without {len(facts.strayed)} far away"
+            lines["extent"] += f", without {len(facts.strayed)} far away from all others"
     if points := facts.points:
         lines["points"] = f"{points.count:,}"
         if points.error_mean is not None:
@@ -38,8 +38,8 @@ def camera_line(camera: CameraFacts) -> str:
     """A camera on one line."""
     fx, fy = camera.focal
     focal = f"{fx:.1f}" if abs(fx - fy) < 0.05 else f"{fx:.1f}, {fy:.1f}"
-    bent = "beyond all bounds" if camera.bend is None else f"up to {camera.bend:.1f} px"
-    lens = f", bends by {bent}, {100 * camera.kept:.0f} % kept" if camera.bend != 0 else ""
+    distortion = "without limit" if camera.bend is None else f"up to {camera.bend:.1f} px"
+    lens = f", distortion {distortion}, {100 * camera.kept:.0f} % kept when undistorted" if camera.bend != 0 else ""
     return f"{camera.model} {camera.width}x{camera.height}, focal length {focal} px{lens}; {camera.views} views"
 
 
@@ -48,7 +48,7 @@ def _images(facts: Facts) -> str:
         return f"{facts.on_disk} on disk"
     parts = [f"{facts.registered} with a pose"]
     parts += [f"{len(facts.missing)} of them missing on disk"] if facts.missing else []
-    parts += [f"{len(facts.unregistered)} more on disk without"] if facts.unregistered else []
+    parts += [f"{len(facts.unregistered)} more on disk without a pose"] if facts.unregistered else []
     parts += [f"in {facts.folders} folders"] if facts.folders > 1 else []
     parts += [f"{facts.photos.masks} with a mask"] if facts.photos.masks else []
     return ", ".join(parts)

@@ -1,9 +1,8 @@
 for (const box of document.querySelectorAll(".space")) {
-  const {points, colours, cameras, names, shades} = JSON.parse(box.querySelector("script").textContent);
-  const canvas = box.querySelector("canvas"), pen = canvas.getContext("2d"), told = box.querySelector("output");
-  const UNIT = 1000;
+  const {points, colours, cameras, names, shades, radius} = JSON.parse(box.querySelector("script").textContent);
+  const canvas = box.querySelector("canvas"), pen = canvas.getContext("2d"), caption = box.querySelector("output");
   const VIEWS = {oblique: [0.6, 0.45], top: [0, Math.PI / 2], side: [0, 0]};
-  let [yaw, pitch] = VIEWS.oblique, distance = 2.7 * UNIT, places = [], over = -1;
+  let [yaw, pitch] = VIEWS.oblique, distance = 2.7 * radius, places = [], over = -1;
 
   // Rotated about the up axis, then tilted towards the viewer; null behind the eye.
   function project(x, y, z, wide, high) {
@@ -14,7 +13,7 @@ for (const box of document.querySelectorAll(".space")) {
     return [wide / 2 + a * scale, high / 2 - (Math.sin(pitch) * b + Math.cos(pitch) * z) * scale, depth];
   }
 
-  // Where a camera outside of the picture lies: the crossing of the border with the way from the middle.
+  // The place of a camera outside the canvas: where the line from the middle to it crosses the border.
   function clamped(camera, wide, high) {
     const a = Math.cos(yaw) * camera[1] - Math.sin(yaw) * camera[2];
     const b = Math.sin(yaw) * camera[1] + Math.cos(yaw) * camera[2];
@@ -52,8 +51,8 @@ for (const box of document.querySelectorAll(".space")) {
       else if (corners.every(Boolean)) frustum(corners);
       return centre;
     });
-    if (over >= 0 && places[over]) told.textContent = names[over];
-    else told.textContent = "";
+    if (over >= 0 && places[over]) caption.textContent = names[over];
+    else caption.textContent = "";
   }
 
   function frustum([centre, ...corners]) {
@@ -90,14 +89,14 @@ for (const box of document.querySelectorAll(".space")) {
   });
   canvas.addEventListener("wheel", event => {
     event.preventDefault();
-    distance = Math.max(0.2 * UNIT, Math.min(300 * UNIT, distance * Math.exp(event.deltaY / 600)));
+    distance = Math.max(0.2 * radius, Math.min(300 * radius, distance * Math.exp(event.deltaY / 600)));
     draw();
   }, {passive: false});
   box.querySelector("nav").addEventListener("click", event => {
     const view = VIEWS[event.target.dataset.view];
     if (!view) return;
     [yaw, pitch] = view;
-    distance = 2.7 * UNIT;
+    distance = 2.7 * radius;
     draw();
   });
   addEventListener("resize", draw);
