@@ -54,7 +54,7 @@ def _shown(view: View, blank: Blank) -> View:
 def _sized(view: View, long_side: int | None) -> View:
     """The view with no side longer than `long_side` px."""
     longest = max(view.camera.width, view.camera.height)
-    return view if long_side is None else view.at(max(1.0, longest / long_side))
+    return view if long_side is None else view.resized(max(1.0, longest / long_side))
 
 
 def _png_names(names: list[str]) -> list[str]:

@@ -121,7 +121,7 @@ def survey(parts: Parts) -> Facts:
         extent=extent,
         strayed=[view.name for view, far in zip(views, strayed(views), strict=True) if far] if views else [],
         one_place=len(views) > 1 and bool(np.allclose(centres, centres[0], rtol=0, atol=1e-9)),
-        same_pose=_repeated(names, [(view.scale, *view.world_to_camera.ravel().round(9)) for view in views]),
+        same_pose=_repeated(names, [(view.downscale, *view.world_to_camera.ravel().round(9)) for view in views]),
         same_but_case=[group for group in _repeated(names, [n.casefold() for n in names]) if len(set(group)) > 1],
         same_base=sum(count > 1 for count in Counter(file.name for file in set(expected)).values()),
         faults=parts.faults,

@@ -46,6 +46,6 @@ def _views(path: Path, splits: Any, name: str) -> list[View]:
                 f"{frame.where}: label is {label!r}; expected how often the image was halved: make it again"
             )
         image = image_path_of(frame)
-        view = View(view_name(file), camera_of(frame, None), pose_of(frame), image, scale=2**level)
+        view = View(view_name(file), camera_of(frame, None), pose_of(frame), image, downscale=2**level)
         views.append(view)
     return views

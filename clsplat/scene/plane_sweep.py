@@ -31,7 +31,10 @@ def swept_points(
 
     centre: what the cameras look at, [3].  `load` returns the photograph of a view, [H, W, 3].
     """
-    small = [view.at(view.scale * max(1.0, max(view.camera.width, view.camera.height) / LONG_SIDE)) for view in views]
+    small = [
+        view.resized(view.downscale * max(1.0, max(view.camera.width, view.camera.height) / LONG_SIDE))
+        for view in views
+    ]
     images = [load(view).astype(np.float32) / 255 for view in small]
     near = [_neighbours(i, small) for i in range(len(small))]
     distance = float(np.median([np.linalg.norm(view.position - centre) for view in small]))

@@ -38,7 +38,7 @@ class View:
     mask_path: Path | None = None  # an image of the photograph's size, white where it counts
     alpha: Alpha = "transparency"
     lens: Lens | None = None  # of the photograph on disk, where it is not `camera`'s pinhole
-    scale: float = 1  # by what the original photograph's size was divided
+    downscale: float = 1  # divisor of the original photograph's size
 
     @property
     def position(self) -> Floats:
@@ -46,11 +46,11 @@ class View:
         rotation, translation = self.world_to_camera[:, :3], self.world_to_camera[:, 3]
         return -rotation.T @ translation
 
-    def at(self, scale: float) -> "View":
-        """Return the same photograph at another scale."""
-        if scale == self.scale:
+    def resized(self, downscale: float) -> "View":
+        """Return the same photograph with 1 / `downscale` of its original size."""
+        if downscale == self.downscale:
             return self
-        return replace(self, camera=self.camera.downscaled(scale / self.scale), scale=scale)
+        return replace(self, camera=self.camera.downscaled(downscale / self.downscale), downscale=downscale)
 
 
 @dataclass(frozen=True)
@@ -87,31 +87,32 @@ class Scene:
         return replace(self, views=tuple(replace(view, alpha=alpha) for view in self.views))
 
     @property
-    def scales(self) -> tuple[float, ...]:
-        """The scales of the views, from the finest."""
-        return tuple(sorted({view.scale for view in self.views}))
+    def downscales(self) -> tuple[float, ...]:
+        """The downscales of the views, the largest photographs first."""
+        return tuple(sorted({view.downscale for view in self.views}))
 
-    def downscaled(self, *factors: float) -> "Scene":
-        """Return the scene with every photograph at 1/factor of its original size, at each of the `factors`.
+    def downscaled(self, *downscales: float) -> "Scene":
+        """Return the scene with every photograph at 1 / downscale of its original size, for each of `downscales`.
 
-        Views that have the scale already are taken; where there is none, those of the finest scale are resampled.
-        Raises DataError for a scale finer than any there is.
+        Views of that size are taken where the dataset has them; otherwise the largest photographs are resampled.
+        Raises DataError for a size larger than the largest in the dataset.
         """
-        if factors == self.scales:
+        if downscales == self.downscales:
             return self
         views: list[View] = []
         splits: dict[str, list[int]] = {"train": [], "test": []}
-        for factor in factors:
-            finest = min(self.scales)
-            if factor < finest:
+        smallest = min(self.downscales)
+        for downscale in downscales:
+            if downscale < smallest:
                 raise DataError(
-                    f"{self.path}: the finest images have 1/{finest:g} of their full size; expected 1/{factor:g}"
+                    f"{self.path}: the largest images have 1/{smallest:g} of their full size; "
+                    f"expected 1/{downscale:g}: raise the downscale to {smallest:g}"
                 )
-            taken = factor if factor in self.scales else finest
+            source = downscale if downscale in self.downscales else smallest
             for name, indices in splits.items():
-                found = [view for view in self.split(name) if view.scale == taken]
+                found = [view for view in self.split(name) if view.downscale == source]
                 indices += range(len(views), len(views) + len(found))
-                views += [view.at(factor) for view in found]
+                views += [view.resized(downscale) for view in found]
         return replace(self, views=tuple(views), train=tuple(splits["train"]), test=tuple(splits["test"]))
 
 

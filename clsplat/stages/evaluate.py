@@ -52,7 +52,7 @@ class Evaluate(Stage):
         perceptual = self._perceptual()
         for scale in self.scales or [run.scale]:
             views = run.photographs.downscaled(scale).split(self.split)
-            trained = scale in run.scene.scales
+            trained = scale in run.scene.downscales
             targets = run.targets if trained else run.targets.fresh()
             results = measure(run.rasterizer, run.trained, views, targets, perceptual)
             for result in results:

@@ -80,7 +80,7 @@ class Run:
     @property
     def scale(self) -> float:
         """The finest scale that is trained on: by what the photographs' size is divided."""
-        return self.scene.scales[0]
+        return self.scene.downscales[0]
 
     def train_view(self) -> View:
         """The view of the current step."""

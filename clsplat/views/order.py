@@ -23,8 +23,8 @@ class ViewOrder:
 
     def __init__(self, views: Sequence[View], sampling: Sampling, seed: int) -> None:
         self.views, self.sampling, self.seed = views, sampling, seed
-        finest = min(view.scale for view in views)
-        self._full = [i for i, view in enumerate(views) if view.scale == finest]
+        finest = min(view.downscale for view in views)
+        self._full = [i for i, view in enumerate(views) if view.downscale == finest]
         self._entries = [*range(len(views)), *(self._full if sampling == "paper" else [])]
         self._epoch, self._order = -1, np.empty(0, np.int64)
 

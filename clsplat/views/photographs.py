@@ -40,7 +40,7 @@ class Photograph:
         return np.asarray(self.pixels.get()[3] > 0) if self.masked else None
 
 
-Key = tuple[str, float]  # name and scale of a view
+Key = tuple[str, float]  # name and downscale of a view
 
 
 class Photographs:
@@ -68,14 +68,14 @@ class Photographs:
 
     def camera(self, view: View) -> DeviceCamera:
         """Return the camera of a view."""
-        key = view.name, view.scale
+        key = view.name, view.downscale
         if key not in self._cameras:
             self._cameras[key] = upload_camera(self.device, view)
         return self._cameras[key]
 
     def get(self, view: View) -> Photograph:
         """Return the photograph of a view.  Raises DataError when its file cannot be read."""
-        key = view.name, view.scale
+        key = view.name, view.downscale
         target = self._targets.pop(key, None)
         if target is None:
             reading = self._reading.pop(key, None)
@@ -88,7 +88,7 @@ class Photographs:
     def announce(self, views: Iterable[View]) -> None:
         """Read ahead what will be asked for next; nothing when it is there already."""
         for view in views:
-            key = view.name, view.scale
+            key = view.name, view.downscale
             if key not in self._targets and key not in self._reading:
                 self._reader = self._reader or ThreadPoolExecutor(1, "photographs")
                 self._reading[key] = self._reader.submit(self._read, view)
