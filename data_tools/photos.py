@@ -22,14 +22,13 @@ import cv2
 import numpy as np
 
 from clsplat.errors import ConfigError, DataError
-from clsplat.scene.images import read_image
+from clsplat.scene.images import IMAGE_SUFFIXES, read_image
 from data_tools.vocabulary import alike
 
 LOG = logging.getLogger("clsplat")
 Matching = Literal["auto", "exhaustive", "sequential", "vocabulary"]
 Mapper = Literal["incremental", "global"]
 Cameras = Literal["auto", "one", "per_folder", "per_image"]
-SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"}
 STRANGE = {".heic", ".heif", ".avif", ".dng", ".cr2", ".nef", ".arw"}  # photographs that OpenCV does not read
 FEWEST = 3  # photographs, and registered images of a model
 EXHAUSTIVE = 200  # photographs, at most, whose pairs are all matched: beyond that their number hurts
@@ -50,15 +49,14 @@ def list_photos(folder: Path, without: Path | None = None) -> list[str]:
         folders[:] = sorted(f for f in folders if f[0] != "." and (Path(base) / f).resolve() != without)
         for file in files:
             suffix = Path(file).suffix.lower()
-            if file[0] != "." and suffix in SUFFIXES | STRANGE:
+            if file[0] != "." and suffix in IMAGE_SUFFIXES | STRANGE:
                 name = (Path(base) / file).relative_to(folder).as_posix()
-                (names if suffix in SUFFIXES else strange).append(name)
+                (names if suffix in IMAGE_SUFFIXES else strange).append(name)
     if strange:
         LOG.warning("%s: %d files such as %s are left out: convert them to JPEG", folder, len(strange), strange[0])
     if len(names) < FEWEST:
-        raise DataError(
-            f"{folder}: found {len(names)} photographs; expected at least {FEWEST}, of {', '.join(sorted(SUFFIXES))}"
-        )
+        suffixes = ", ".join(sorted(IMAGE_SUFFIXES))
+        raise DataError(f"{folder}: found {len(names)} photographs; expected at least {FEWEST}, of {suffixes}")
     return sorted(names)
 
 

@@ -15,7 +15,7 @@ from clsplat.inspect.headers import read_header
 from clsplat.scene.colmap import find_models, image_folder, view_of
 from clsplat.scene.colmap_files import PointTable, read_cameras, read_images, read_point_table
 from clsplat.scene.detect import read_scene
-from clsplat.scene.images import inside
+from clsplat.scene.images import inside, is_image
 from clsplat.scene.multiscale import FILE, read_multiscale
 from clsplat.scene.points import read_ply_table
 from clsplat.scene.scene import Scene, View
@@ -25,7 +25,6 @@ from clsplat.stages.init import require_ahead
 
 LOG = logging.getLogger("clsplat")
 HOLDOUT = 8  # every so many views are for testing where the dataset does not tell: the default of pipelines
-SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"}
 Result = TypeVar("Result")
 
 
@@ -101,7 +100,7 @@ def image_files(folder: Path, deep: bool) -> Iterator[Path]:
 
 
 def _is_image(name: str) -> bool:
-    return Path(name).suffix.lower() in SUFFIXES and not name.startswith(".")
+    return is_image(Path(name)) and not name.startswith(".")
 
 
 def _colmap(parts: Parts) -> None:

@@ -1,15 +1,12 @@
 """Read COLMAP folders: which model, which photographs, which cameras a pinhole rasterizer can use."""
 
 import logging
-import math
 import os
 from pathlib import Path
 
-import numpy as np
-
 from clsplat.errors import DataError
 from clsplat.scene.colmap_files import (
-    MEND,
+    REMEDY,
     CameraRecord,
     ImageRecord,
     find_file,
@@ -20,7 +17,8 @@ from clsplat.scene.colmap_files import (
 from clsplat.scene.images import inside, require_files
 from clsplat.scene.lens import MODELS, Lens, shared
 from clsplat.scene.points import FAR
-from clsplat.scene.scene import Floats, Scene, View, every_nth, make_scene
+from clsplat.scene.quaternion import pose_matrix
+from clsplat.scene.scene import Scene, View, every_nth, make_scene
 
 logger = logging.getLogger("clsplat")
 
@@ -69,14 +67,14 @@ def view_of(image: ImageRecord, cameras: dict[int, CameraRecord], folder: Path) 
     if image.camera not in cameras:
         raise DataError(
             f"{image.where}: image '{image.name}' names camera {image.camera}; expected one of the cameras file, "
-            f"{sorted(cameras)[:8]}: {MEND}"
+            f"{sorted(cameras)[:8]}: {REMEDY}"
         )
-    if not all(abs(t) < FAR for t in image.translation) or not 0 < math.hypot(*image.quaternion) < math.inf:
+    try:
+        pose = pose_matrix(image.quaternion, image.translation)
+    except ValueError as error:
         raise DataError(
-            f"{image.where}: the pose of '{image.name}' is quaternion {image.quaternion}, translation "
-            f"{image.translation}; expected finite numbers and a rotation: remove that image or {MEND}"
-        )
-    pose = np.column_stack([_rotation(image.quaternion), image.translation])
+            f"{image.where}: the pose of '{image.name}' is {error}: remove that image or {REMEDY}"
+        ) from error
     lens = shared(_lens(image.camera, cameras[image.camera]))
     camera, bent = (lens.pinhole, lens) if lens.distorts else (lens.camera, None)
     return View(image.name, camera, pose, image_path, _mask(folder.with_name("masks"), image.name), lens=bent)
@@ -86,19 +84,6 @@ def _mask(folder: Path, name: str) -> Path | None:
     """The mask of an image: its name with .png behind it (COLMAP) or in place of its suffix."""
     files = (folder / f"{name}.png", (folder / name).with_suffix(".png"))
     return next((file for file in files if os.path.isfile(file)), None)  # never raises
-
-
-def _rotation(quaternion: tuple[float, ...]) -> Floats:
-    """Rotation matrix [3, 3] of a quaternion (w, x, y, z) of any length but zero."""
-    length = math.hypot(*quaternion)
-    w, x, y, z = (part / length for part in quaternion)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
 
 
 def _lens(number: int, camera: CameraRecord) -> Lens:
@@ -113,6 +98,6 @@ def _lens(number: int, camera: CameraRecord) -> Lens:
     ):
         raise DataError(
             f"{camera.where}: camera {number} is {camera.width}x{camera.height} with parameters {camera.params[:4]}; "
-            f"expected a positive size and focal length and finite numbers: {MEND}"
+            f"expected a positive size and focal length and finite numbers: {REMEDY}"
         )
     return Lens(camera.width, camera.height, camera.model, camera.params)

@@ -5,12 +5,12 @@ from pathlib import Path
 from clsplat.errors import DataError
 from clsplat.scene.blender import read_blender
 from clsplat.scene.colmap import find_models, read_colmap
+from clsplat.scene.images import is_image
 from clsplat.scene.multiscale import FILE, read_multiscale
 from clsplat.scene.nerfstudio import read_nerfstudio
 from clsplat.scene.scene import Scene
 
 FILES = ("transforms_train.json", FILE, "transforms.json")  # besides COLMAP's
-PHOTOS = (".jpg", ".jpeg", ".png")
 
 
 def holds_scene(path: Path) -> bool:
@@ -34,7 +34,7 @@ def read_scene(path: Path, holdout: int = 8) -> Scene:
         return read_multiscale(path)
     if (path / "transforms.json").is_file():
         return read_nerfstudio(path, holdout)
-    if any(file.suffix.lower() in PHOTOS for file in path.iterdir()):
+    if any(is_image(file) for file in path.iterdir()):
         raise DataError(
             f"{path}: photographs without cameras; `clsplat run photos --scene {path}` finds where they were taken"
         )

@@ -3,7 +3,7 @@
 import operator
 import os
 from collections.abc import Iterable
-from pathlib import Path, PureWindowsPath
+from pathlib import Path, PurePath, PureWindowsPath
 from typing import Any
 
 import cv2
@@ -14,6 +14,7 @@ from clsplat.errors import DataError
 from clsplat.files import atomic
 from clsplat.scene.scene import View
 
+IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"})  # in lower case
 BLACK = (0.0, 0.0, 0.0)
 WHITE = 0.99  # of the largest value: a mask that was stored as JPEG is never quite white
 
@@ -85,6 +86,11 @@ def _as_taken(view: View, path: Path) -> NDArray[Any]:
             f"{'' if lens else ', or a larger image of the same shape'}: use the images the cameras were made from"
         )
     return lens.undistort(pixels) if lens else pixels
+
+
+def is_image(path: PurePath) -> bool:
+    """Tell whether a file name has the suffix of an image."""
+    return path.suffix.lower() in IMAGE_SUFFIXES
 
 
 def write_image(path: Path, rgb: NDArray[np.uint8]) -> None:
