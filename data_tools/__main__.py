@@ -8,10 +8,13 @@ from typing import Annotated
 import typer
 
 from clsplat.errors import ClsplatError
+from clsplat.scene.detect import format_names
 from data_tools.multiscale import write_multiscale
 from data_tools.photos import Mapper, Matching
 from data_tools.synthetic import Options, write_dataset
 from data_tools.undistort import Blank
+
+DATASET = f"The folder of a dataset: {format_names()}."
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False)
 
@@ -74,7 +77,7 @@ def video(
 
 @app.command()
 def undistort(
-    scene: Annotated[Path, typer.Argument(help="A COLMAP or nerfstudio folder.")],
+    scene: Annotated[Path, typer.Argument(help=DATASET)],
     out: Annotated[Path, typer.Argument(help="Folder for the scene of pinhole cameras.")],
     long_side: Annotated[int | None, typer.Option(min=16, help="Pixels, at most.")] = None,
     blank: Annotated[Blank, typer.Option(help="Cut blank pixels off, or keep and mask them.")] = "crop",
@@ -98,7 +101,7 @@ def resize(
 
 @app.command()
 def masks(
-    scene: Annotated[Path, typer.Argument(help="A COLMAP, Blender or nerfstudio folder.")],
+    scene: Annotated[Path, typer.Argument(help=DATASET)],
     folder: Annotated[Path | None, typer.Option(help="Masks made elsewhere; default: from the images' alpha.")] = None,
     out: Annotated[Path | None, typer.Option(help="Where to; default: SCENE/masks.")] = None,
     threshold: Annotated[float, typer.Option(min=0, max=1, help="Alpha that counts.")] = 0.5,

@@ -13,7 +13,7 @@ import pytest
 from clsplat.metrics.perceptual import ssim_map
 from clsplat.metrics.views import psnr
 from clsplat.render.workspace import Workspace
-from clsplat.scene.colmap import read_colmap
+from clsplat.scene.detect import read_scene
 from clsplat.scene.images import load_image, load_mask
 from clsplat.scene.lens import Lens
 from clsplat.scene.photographs import load_photograph
@@ -78,12 +78,12 @@ def test_masks_beside_a_colmap_scene(tmp_path, name):
     source = data_set("brighton")
     shutil.copytree(source / "sparse", tmp_path / "sparse")
     (tmp_path / "images").symlink_to(source / "images")
-    views = read_colmap(tmp_path).views
+    views = read_scene(tmp_path).views
     assert all(view.mask_path is None for view in views)
     first = views[0]
     file = name.replace("IMG_01", Path(first.name).stem).replace(".jpg", Path(first.name).suffix)
     mask = store(tmp_path / "masks" / file, np.zeros((first.camera.height, first.camera.width), np.uint8))
-    masked = [view for view in read_colmap(tmp_path).views if view.mask_path is not None]
+    masked = [view for view in read_scene(tmp_path).views if view.mask_path is not None]
     assert [(view.name, view.mask_path) for view in masked] == [(first.name, mask)]
     assert not load_mask(masked[0]).any()
 

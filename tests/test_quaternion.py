@@ -43,6 +43,8 @@ def test_a_pose_takes_a_quaternion_of_any_length():
         ((float("inf"), 0, 0, 1), (0, 0, 0)),
         ((1, 0, 0, 0), (0, float("nan"), 0)),
         ((1, 0, 0, 0), (0, 1e16, 0)),
+        ((1, 0, 0), (0, 0, 0)),
+        ((1, 0, 0, 0), (0, 0)),
     ],
 )
 def test_a_pose_that_is_none_is_refused(quaternion, translation):

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.errors import DataError
-from clsplat.inspect.headers import read_header
-from clsplat.inspect.parts import Parts
+from clsplat.scene.image_headers import read_header
 from clsplat.scene.images import fits, read_image
 from clsplat.scene.lens import BORDER, Lens
+from clsplat.scene.parts import Parts
 from clsplat.scene.points import FAR
 from clsplat.scene.scene import View, camera_extent, strayed
 

@@ -12,31 +12,57 @@ from clsplat.scene.colmap_files import (
     find_file,
     read_cameras,
     read_images,
+    read_point_table,
     read_points,
 )
 from clsplat.scene.images import inside, require_files
 from clsplat.scene.lens import MODELS, Lens, shared
+from clsplat.scene.parts import Parts
 from clsplat.scene.points import FAR
 from clsplat.scene.quaternion import pose_matrix
+from clsplat.scene.readers import Reader
 from clsplat.scene.scene import Scene, View, every_nth, make_scene
 
 logger = logging.getLogger("clsplat")
 
 
-def read_colmap(path: Path, holdout: int = 8) -> Scene:
-    """Read a COLMAP scene: models in `sparse/N`, `sparse` or `path` itself, photographs in `images`.
+class ColmapReader(Reader):
+    """A COLMAP scene: models in `sparse/N`, `sparse` or the folder itself, photographs in `images`.
 
     Of several models the one with most images is taken.  Every `holdout`-th view by name is for testing.
-    Photographs of cameras with distortion are straightened as they are read.  Masks are taken from the
-    folder `masks`: an image's name with .png behind it or in place of its suffix.  Raises DataError when a file is
-    missing, damaged or not supported.
+    Photographs of cameras with distortion are undistorted as they are read.  Masks are taken from the
+    folder `masks`: an image's name with .png behind it or in place of its suffix.
     """
-    model, images = _largest_model(path)
-    cameras = read_cameras(model)
-    folder = image_folder(path)
-    views = sorted((view_of(image, cameras, folder) for image in images), key=lambda view: view.name)
-    require_files(path, (view.image_path for view in views))
-    return make_scene(path, views, every_nth([view.name for view in views], holdout), read_points(model))
+
+    name = "COLMAP"
+    expects = "sparse/0/cameras.bin or .txt"
+
+    def matches(self, path: Path) -> bool:
+        return bool(find_models(path))
+
+    def read(self, path: Path, holdout: int) -> Scene:
+        model, images = _largest_model(path)
+        cameras = read_cameras(model)
+        folder = image_folder(path)
+        views = sorted((view_of(image, cameras, folder) for image in images), key=lambda view: view.name)
+        require_files(path, (view.image_path for view in views))
+        return make_scene(path, views, every_nth([view.name for view in views], holdout), read_points(model))
+
+    def list_parts(self, parts: Parts) -> None:
+        found = [(folder, parts.attempt(read_images, folder) or []) for folder in find_models(parts.path)]
+        found.sort(key=lambda model: -len(model[1]))  # `read` takes the first of the largest, and sorting is stable
+        parts.submodels = {str(folder.relative_to(parts.path)): len(images) for folder, images in found}
+        model, images = found[0]
+        cameras = parts.attempt(read_cameras, model)
+        parts.points = parts.attempt(read_point_table, model)
+        parts.image_folder = folder = image_folder(parts.path)
+        files = [parts.attempt(inside, folder, image.name, image.where) for image in images]
+        parts.expected = [file for file in files if file]
+        for image in images if cameras else []:
+            if view := parts.attempt(view_of, image, cameras, folder):
+                parts.views.append(view)
+                parts.models[view.name] = cameras[image.camera].model if cameras else ""
+                parts.observed[view.name] = image.observed
 
 
 def find_models(path: Path) -> list[Path]:

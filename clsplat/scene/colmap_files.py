@@ -10,12 +10,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from clsplat.errors import DataError
 from clsplat.scene.images import read_file
-from clsplat.scene.points import point_cloud
-from clsplat.scene.scene import Floats, PointCloud
+from clsplat.scene.points import PointTable
+from clsplat.scene.scene import PointCloud
 
 # Camera models in order of their ids, with the number of parameters (COLMAP 4, sensor/models.h).
 PARAMETERS = {
@@ -54,15 +53,6 @@ class ImageRecord(NamedTuple):
     observed: int = 0
 
 
-class PointTable(NamedTuple):
-    """The rows of `points3D` as they are: nothing is dropped."""
-
-    file: Path
-    positions: Floats  # [M, 3]
-    rgb: NDArray[Any]  # [M, 3], in 0..255
-    error: Floats  # [M], mean reprojection error in pixels; COLMAP writes -1 or 0 where it knows none
-
-
 def find_file(folder: Path, stem: str) -> Path | None:
     """Return `stem`.bin or else `stem`.txt in a folder, or None."""
     files = (folder / f"{stem}.bin", folder / f"{stem}.txt")
@@ -91,7 +81,7 @@ def read_points(folder: Path) -> PointCloud | None:
     table = read_point_table(folder)
     if table is None:
         return None
-    points = point_cloud(table.file, table.positions, table.rgb)
+    points = table.cloud()
     return points if len(points) else None
 
 

@@ -3,7 +3,7 @@
 import io
 import logging
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,12 +21,21 @@ RGB = ("red", "green", "blue")
 POINT = np.dtype([(name, "<f4") for name in "xyz"] + [(name, "u1") for name in RGB])
 
 
-def point_cloud(path: Path, positions: Floats, rgb: NDArray[Any]) -> PointCloud:
-    """Return points from positions [M, 3] and colours [M, 3] in 0..255; those not finite are dropped and logged."""
-    kept = (np.abs(positions) < FAR).all(axis=1)
-    if not kept.all():
-        logger.warning("%s: dropped %d points that are not finite", path, np.count_nonzero(~kept))
-    return PointCloud(np.asarray(positions[kept], np.float32), np.asarray(rgb[kept], np.float32) / np.float32(255))
+class PointTable(NamedTuple):
+    """The points of a dataset as they are: nothing is dropped."""
+
+    file: Path
+    positions: Floats  # [M, 3]
+    rgb: NDArray[Any]  # [M, 3], in 0..255
+    error: Floats = np.empty(0)  # [M], mean reprojection error in pixels, or [0]; COLMAP writes -1 or 0 for unknown
+
+    def cloud(self) -> PointCloud:
+        """Return the points that are finite; the number of the others is logged."""
+        kept = (np.abs(self.positions) < FAR).all(axis=1)
+        if not kept.all():
+            logger.warning("%s: dropped %d points that are not finite", self.file, np.count_nonzero(~kept))
+        colours = np.asarray(self.rgb[kept], np.float32) / np.float32(255)
+        return PointCloud(np.asarray(self.positions[kept], np.float32), colours)
 
 
 def read_points_ply(path: Path) -> PointCloud:
@@ -34,11 +43,11 @@ def read_points_ply(path: Path) -> PointCloud:
 
     Raises DataError when the file is damaged, big-endian, or lacks these properties.
     """
-    return point_cloud(path, *read_ply_table(path))
+    return read_ply_table(path).cloud()
 
 
-def read_ply_table(path: Path) -> tuple[Floats, NDArray[Any]]:
-    """Return positions [M, 3] and colours [M, 3] in 0..255 of a PLY file as they are; raises as read_points_ply."""
+def read_ply_table(path: Path) -> PointTable:
+    """Return all points of a PLY file; raises as read_points_ply."""
     data = read_file(path)
     header = parse_ply_header(path, data)
     if header.format == "binary_big_endian":
@@ -47,7 +56,8 @@ def read_ply_table(path: Path) -> tuple[Floats, NDArray[Any]]:
     if not set(POINT.names or ()) <= set(names) or any(header.dtype[name] != np.uint8 for name in RGB):
         raise DataError(f"{path}: expected x y z and uchar red green blue of each vertex, found {names}")
     table = _read_ascii(path, data, header) if header.format == "ascii" else _read_binary(path, data, header)
-    return np.stack([table[name] for name in "xyz"], axis=1), np.stack([table[name] for name in RGB], axis=1)
+    positions, rgb = (np.stack([table[name] for name in names], axis=1) for names in ("xyz", RGB))
+    return PointTable(path, positions, rgb)
 
 
 def write_points_ply(path: Path, points: PointCloud) -> None:

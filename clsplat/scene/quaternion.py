@@ -32,10 +32,11 @@ def unit_quaternions(rotations: NDArray[np.floating]) -> Floats:
 def pose_matrix(quaternion: Sequence[float], translation: Sequence[float]) -> Floats:
     """Return the pose [3, 4] of a quaternion of any length but zero and a translation in scene units.
 
-    Raises ValueError when a number is not finite or the quaternion is zero.
+    Raises ValueError when numbers are missing or not finite, or the quaternion is zero.
     """
     length = math.hypot(*quaternion)
-    if not 0 < length < math.inf or not all(abs(part) < FAR for part in translation):
+    sizes = len(quaternion), len(translation)
+    if sizes != (4, 3) or not 0 < length < math.inf or not all(abs(part) < FAR for part in translation):
         raise ValueError(
             f"quaternion {tuple(quaternion)}, translation {tuple(translation)}; expected finite numbers and a rotation"
         )

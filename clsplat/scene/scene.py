@@ -23,6 +23,7 @@ from clsplat.scene.lens import Lens
 Floats = NDArray[np.floating]
 Background = Literal["black", "white"]
 Alpha = Literal["transparency", "mask"]  # what the fourth channel of a photograph is
+HOLDOUT = 8  # every so many views are for testing where the dataset does not say which: the default of pipelines
 STRAY = 10.0  # a walk of evenly spaced cameras has 2, an orbit 1, a close-up among overviews about 4
 STRAY_SHARE = 0.2
 
@@ -121,7 +122,7 @@ def make_scene(
 ) -> Scene:
     """Check `views`, order the split and measure the extent.
 
-    Raises DataError when there is no view, when names repeat or when a pose is not finite.
+    Raises DataError when there is no view, when names repeat or when a pose or a camera is impossible.
     """
     if not views:
         raise DataError(f"{path}: the dataset holds no images; expected at least one posed image")
@@ -131,7 +132,11 @@ def make_scene(
             raise DataError(f"{path}: two images are called '{view.name}'; names must differ")
         seen.add(view.name)
         if not np.isfinite(view.world_to_camera).all():
-            raise DataError(f"{path}: the pose of '{view.name}' is not finite; remove that image or mend its pose")
+            raise DataError(f"{path}: the pose of '{view.name}' is not finite; remove that image or fix its pose")
+        try:
+            view.camera.check()
+        except ValueError as error:
+            raise DataError(f"{path}: '{view.name}': {error}; remove that image or fix its camera") from error
     train = tuple(i for i in range(len(views)) if i not in test)
     if not train:
         raise DataError(f"{path}: every image is held out for testing; raise scene.holdout or add images")

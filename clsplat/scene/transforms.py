@@ -2,15 +2,18 @@
 
 import json
 import math
+import os
 from pathlib import Path, PureWindowsPath
 from typing import Any
 
 import numpy as np
 
 from clsplat.errors import DataError
+from clsplat.scene.image_headers import read_header
 from clsplat.scene.images import image_size, inside, read_file, require_files
 from clsplat.scene.lens import Lens, shared
-from clsplat.scene.points import FAR, read_points_ply
+from clsplat.scene.parts import Parts
+from clsplat.scene.points import FAR, read_ply_table, read_points_ply
 from clsplat.scene.scene import Camera, Floats, PointCloud, View
 
 DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
@@ -86,6 +89,24 @@ class Transforms:
         told = Frame(self.path.parent, str(self.path), self.table).file("ply_file_path")
         beside = self.path.parent / "points3d.ply"
         return told or (beside if beside.is_file() else None)
+
+
+def list_frames(parts: Parts, *names: str) -> None:
+    """Add the frames of those of the files `names` that exist to `parts`, and the points of the first file."""
+    files = [parts.attempt(Transforms, parts.path / name) for name in names if (parts.path / name).is_file()]
+    for transforms in filter(None, files):
+        frames = [(frame, parts.attempt(image_path_of, frame)) for frame in transforms.frames]
+        paths = [path for _, path in frames if path]
+        parts.expected += paths
+        if parts.scene is None:
+            first = next((path for path in paths if os.path.isfile(path)), None)
+            header = parts.attempt(read_header, first) if first else None
+            size = (header.width, header.height) if header else None
+            views = [parts.attempt(view_of, frame, size) for frame, path in frames if path]
+            parts.views += [view for view in views if view]
+    if files and files[0]:
+        place = parts.attempt(files[0].points_path)
+        parts.points = parts.attempt(read_ply_table, place) if place else None
 
 
 def view_name(file_path: str) -> str:
