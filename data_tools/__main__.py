@@ -10,7 +10,7 @@ import typer
 from clsplat.errors import ClsplatError
 from clsplat.scene.detect import format_names
 from data_tools.multiscale import write_multiscale
-from data_tools.photos import Mapper, Matching
+from data_tools.photos import CameraModel, Mapper, Matching
 from data_tools.synthetic import Options, write_dataset
 from data_tools.undistort import Blank
 
@@ -51,15 +51,15 @@ def photos(
     source: Annotated[Path, typer.Argument(help="Folder of photographs; it is not written to.")],
     out: Annotated[Path, typer.Argument(help="Folder for the scene; what it holds already is not made again.")],
     long_side: Annotated[int, typer.Option(min=64, help="Pixels to look for features at.")] = 1600,
-    camera_model: Annotated[str, typer.Option(help="SIMPLE_RADIAL, OPENCV, OPENCV_FISHEYE, …")] = "SIMPLE_RADIAL",
+    camera_model: Annotated[CameraModel, typer.Option(help="What the lens is taken for.")] = "SIMPLE_RADIAL",
     matching: Annotated[Matching, typer.Option(help="Which photographs are compared.")] = "auto",
     mapper: Annotated[Mapper, typer.Option(help="How cameras are placed.")] = "incremental",
 ) -> None:
     """Find the cameras of photographs: features, matches, structure from motion; a COLMAP folder."""
-    from data_tools.photos import place_photos
+    from clsplat.prepare.place import place_photographs
 
-    told = place_photos(source, out, long_side, camera_model, matching, mapper)
-    print("\n".join(f"{name}: {value}" for name, value in told.items()))
+    count = place_photographs(source, out, long_side, camera_model, matching, mapper)
+    print(f"{count} photographs placed, a COLMAP folder in {out}")
 
 
 @app.command()

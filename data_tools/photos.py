@@ -12,7 +12,7 @@ runs in one thread unless told otherwise.
 import logging
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
@@ -29,6 +29,7 @@ LOG = logging.getLogger("clsplat")
 Matching = Literal["auto", "exhaustive", "sequential", "vocabulary"]
 Mapper = Literal["incremental", "global"]
 Cameras = Literal["auto", "one", "per_folder", "per_image"]
+CameraModel = Literal["SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "PINHOLE", "SIMPLE_PINHOLE"]
 STRANGE = {".heic", ".heif", ".avif", ".dng", ".cr2", ".nef", ".arw"}  # photographs that OpenCV does not read
 FEWEST = 3  # photographs, and registered images of a model
 EXHAUSTIVE = 200  # photographs, at most, whose pairs are all matched: beyond that their number hurts
@@ -60,45 +61,12 @@ def list_photos(folder: Path, without: Path | None = None) -> list[str]:
     return sorted(names)
 
 
-def place_photos(
-    photos: Path,
-    out: Path,
-    long_side: int = 1600,
-    camera_model: str = "SIMPLE_RADIAL",
-    matching: Matching = "auto",
-    mapper: Mapper = "incremental",
-) -> dict[str, Any]:
-    """Do all three steps into `out`, a COLMAP folder whose hidden folder `.steps` lets a killed run go on.
-
-    Raises what they raise.
-    """
-    steps: list[tuple[str, Callable[[Path, Path], dict[str, Any]]]] = [
-        ("features", lambda source, to: find_features(source, to, long_side, camera_model=camera_model)),
-        ("matches", lambda source, to: match_features(source, to, matching)),
-        ("cameras", lambda source, to: map_cameras(source, to, mapper)),
-    ]
-    if (out / "sparse" / "0").is_dir():
-        raise DataError(f"{out}: holds a model already; remove it, or give another folder")
-    source, told = photos, dict[str, Any]()
-    for name, step in steps:
-        folder, temporary = out / ".steps" / name, out / ".steps" / f"{name}.part"
-        if not folder.is_dir():
-            shutil.rmtree(temporary, ignore_errors=True)
-            temporary.mkdir(parents=True)
-            told |= step(source.resolve(), temporary)
-            temporary.rename(folder)
-        source = folder
-    _link(source / IMAGES, out / IMAGES)
-    (source / "sparse").rename(out / "sparse")
-    return told
-
-
 def find_features(
     photos: Path,
     out: Path,
     long_side: int = 1600,
     features: int = 8192,
-    camera_model: str = "SIMPLE_RADIAL",
+    camera_model: CameraModel = "SIMPLE_RADIAL",
     cameras: Cameras = "auto",
     without: Path | None = None,
 ) -> dict[str, Any]:
@@ -139,7 +107,7 @@ def match_features(source: Path, out: Path, matching: Matching = "auto", neighbo
     matches.
     """
     pycolmap = _pycolmap()
-    _link(source / IMAGES, out / IMAGES)
+    link(source / IMAGES, out / IMAGES)
     shutil.copyfile(source / DATABASE, out / DATABASE)
     database = out / DATABASE
     count = len(_image_names(pycolmap, database))
@@ -181,7 +149,7 @@ def map_cameras(source: Path, out: Path, mapper: Mapper = "incremental", threads
     Raises DataError when no model of three images comes out.
     """
     pycolmap = _pycolmap()
-    _link(source / IMAGES, out / IMAGES)
+    link(source / IMAGES, out / IMAGES)
     work = out / ".models"
     work.mkdir()
     names = _image_names(pycolmap, source / DATABASE)
@@ -240,7 +208,7 @@ def _gather(photos: Path, images: Path, names: list[str]) -> list[str]:
             continue
         (images / name).parent.mkdir(parents=True, exist_ok=True)
         if stored.shape[:2] == upright.shape[:2] and (stored[:, :, :3] == upright[:, :, :3]).all():
-            _link(photos / name, images / name)
+            link(photos / name, images / name)
         else:
             _, encoded = cv2.imencode(".jpg", np.ascontiguousarray(upright[:, :, ::-1]), [cv2.IMWRITE_JPEG_QUALITY, 98])
             (images / name).write_bytes(encoded.tobytes())
@@ -250,7 +218,7 @@ def _gather(photos: Path, images: Path, names: list[str]) -> list[str]:
     return kept
 
 
-def _link(source: Path, target: Path) -> None:
+def link(source: Path, target: Path) -> None:
     """Link a file or folder, or copy it where links are not to be had."""
     try:
         target.symlink_to(source.resolve(), target_is_directory=source.is_dir())
