@@ -82,7 +82,7 @@ def undistort(
     long_side: Annotated[int | None, typer.Option(min=16, help="Pixels, at most.")] = None,
     blank: Annotated[Blank, typer.Option(help="Cut blank pixels off, or keep and mask them.")] = "crop",
 ) -> None:
-    """Straighten the photographs of distorting lenses, fisheyes too."""
+    """Undistort the photographs of a scene, of fisheye lenses too."""
     from data_tools.undistort import undistort_scene
 
     print(f"{undistort_scene(scene, out, long_side, blank)} images in {out}")
@@ -126,7 +126,7 @@ def fetch(
 
 
 def main() -> None:
-    """Run the command line; an error that the user can mend is one line and its exit code."""
+    """Run the command line; an error that the user can fix is one line and its exit code."""
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     try:
         app()

@@ -1,4 +1,4 @@
-"""A scene as pinhole cameras would have taken it: straightened photographs, smaller ones if wanted, and their masks."""
+"""A scene as pinhole cameras would have taken it: undistorted photographs, smaller ones if wanted, and their masks."""
 
 import logging
 from collections import Counter
@@ -31,7 +31,7 @@ def undistort_scene(source: Path, out: Path, long_side: int | None = None, blank
     views = []
     for number, (view, name) in enumerate(zip(scene.views, names, strict=True), 1):
         if number % PROGRESS == 0:
-            LOG.info("straightened %d of %d photographs", number, len(names))
+            LOG.info("undistorted %d of %d photographs", number, len(names))
         wanted = replace(_sized(_shown(view, blank), long_side), alpha="mask")
         image, mask = out / "images" / name, out / "masks" / name
         if not image.is_file():

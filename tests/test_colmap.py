@@ -89,7 +89,7 @@ def test_every_camera_model_equals_pycolmap(name: str, kind: str) -> None:
     assert_same_points(folder, reconstruction)
 
 
-def test_distorted_real_photographs_are_straightened() -> None:
+def test_distorted_real_photographs_are_undistorted() -> None:
     scene, undistorted = read_scene(data_set("fox_opencv")), read_scene(data_set("fox"))
     assert all(view.lens and view.lens.model == "OPENCV" for view in scene.views)
     view = scene.views[3]

@@ -13,7 +13,8 @@ from clsplat.scene.images import load_image, load_mask
 from clsplat.scene.lens import Lens
 from clsplat.scene.scene import Camera, View
 from data_tools.colmap_writer import write_model
-from data_tools.photos import find_features, list_photos, map_cameras, match_features
+from data_tools.gather import list_photographs
+from data_tools.photos import find_features, map_cameras, match_features
 from data_tools.undistort import undistort_scene
 from data_tools.vocabulary import alike
 from tests.colmap_writer import CameraEntry, DeviceModel, ImageEntry, PointEntry
@@ -95,9 +96,9 @@ def test_photographs_are_found_below_the_folder(tmp_path):
     (tmp_path / "runs").mkdir()
     for name in ("b.JPG", "a/ü 1.png", "a/.hidden/x.jpg", ".y.png", "runs/r.png", "K.txt", "c.tif"):
         (tmp_path / name).touch()
-    assert list_photos(tmp_path, tmp_path / "runs") == ["a/ü 1.png", "b.JPG", "c.tif"]
+    assert list_photographs(tmp_path, tmp_path / "runs") == ["a/ü 1.png", "b.JPG", "c.tif"]
     (tmp_path / "c.tif").unlink()
-    assert "found 2 photographs; expected at least 3" in refusal(list_photos, tmp_path, tmp_path / "runs")
+    assert "found 2 photographs; expected at least 3" in refusal(list_photographs, tmp_path, tmp_path / "runs")
 
 
 def test_damaged_photographs_are_left_out_and_turned_ones_turned(tmp_path, caplog):
@@ -161,7 +162,7 @@ def test_undistorted_scene(tmp_path, lens, blank):
     """A pattern that depends on the ray is seen along the pinhole's own rays; what is blank is masked."""
     columns, rows = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
     (tmp_path / "images").mkdir()
-    photograph = np.nan_to_num(pattern(*lens.unbend(columns, rows)))
+    photograph = np.nan_to_num(pattern(*lens.undistort(columns, rows)))
     cv2.imwrite(str(tmp_path / "images" / "a.png"), np.rint(photograph).astype(np.uint8))
     entry = CameraEntry(1, lens.model, lens.width, lens.height, lens.params)
     write_test_model(tmp_path / "sparse" / "0", DeviceModel([entry], [ImageEntry("a.png")], [PointEntry((0, 0, 3))]))
@@ -178,7 +179,7 @@ def test_undistorted_scene(tmp_path, lens, blank):
         assert view.camera.width * view.camera.height > lens.pinhole.width * lens.pinhole.height
     y, x = np.nonzero(mask)
     u, v = (x + 0.5 - view.camera.cx) / view.camera.fx, (y + 0.5 - view.camera.cy) / view.camera.fy
-    px, py = lens.bend(u, v)
+    px, py = lens.distort(u, v)
     inside = (px > 0.5) & (py > 0.5) & (px < lens.width - 0.5) & (py < lens.height - 0.5)  # between pixel centres
     assert inside.mean() > 0.95
     assert np.abs(shown[y, x, 0] - pattern(u, v))[inside].max() < 1

@@ -222,7 +222,7 @@ def test_photographs_are_placed_from_where_a_run_stopped(photos, tmp_path, done)
 def test_photographs_are_not_placed_from_steps_with_other_settings(photos, tmp_path, done):
     out = tmp_path / "out"
     place_photographs(photos, out)
-    assert "holds a model or images already" in refusal(place_photographs, photos, out)
+    assert "holds a model already" in refusal(place_photographs, photos, out)
     shutil.rmtree(out / "sparse")
     done.clear()
     assert place_photographs(photos, out, matching="sequential") == 5
@@ -231,5 +231,5 @@ def test_photographs_are_not_placed_from_steps_with_other_settings(photos, tmp_p
 
 def test_images_of_the_user_are_not_overwritten(photos, tmp_path, done):
     (tmp_path / "out" / "images").mkdir(parents=True)
-    assert "holds a model or images already" in refusal(place_photographs, photos, tmp_path / "out")
+    assert "holds `images` already" in refusal(place_photographs, photos, tmp_path / "out")
     assert done == []

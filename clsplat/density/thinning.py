@@ -1,4 +1,4 @@
-"""Rules that need fewer Gaussians for the same picture (the refinement of Micro-splatting's second version, Lee et al.
+"""Rules that need fewer Gaussians for the same image (the refinement of Micro-splatting's second version, Lee et al.
 2025b; thresholds and formulas are ours)."""
 
 from typing import Literal
@@ -12,7 +12,7 @@ from clsplat.density.thresholds import Share
 from clsplat.gaussians.tables import SH_C0
 from clsplat.scene.quaternion import rotation_matrix, unit_quaternions
 
-TURNED = ("adam/log_scales/", "adam/quats/")  # tables in a Gaussian's own axes
+TABLES_ALONG_AXES = ("adam/log_scales/", "adam/quats/")  # tables in a Gaussian's own axes
 Floats = NDArray[np.float64]
 
 
@@ -56,9 +56,9 @@ class MergeNeighbours(Rule):
         for name, values in merged(tables, first, second).items():
             tables[name][first] = values
             gaussians.set(name, tables[name])
-        for name in [name for name in gaussians.tables if name.startswith(TURNED)]:
+        for name in [name for name in gaussians.tables if name.startswith(TABLES_ALONG_AXES)]:
             table = gaussians.get(name)
-            table[first] = 0  # they were of other axes
+            table[first] = 0  # the axes have changed
             gaussians.set(name, table)
         absorbed = np.zeros(gaussians.count, bool)
         absorbed[second] = True

@@ -4,7 +4,7 @@ from statistics import median
 
 from clsplat.inspect.survey import CameraFacts, Facts
 
-SHOWN = 4  # cameras, by the number of their views
+MAX_CAMERAS = 4  # cameras, by the number of their views
 
 
 def figures(facts: Facts) -> dict[str, str]:
@@ -14,7 +14,7 @@ def figures(facts: Facts) -> dict[str, str]:
         lines["views"] = f"{facts.train} for training, {facts.test} for testing"
     if len(facts.submodels) > 1:
         lines["models"] = ", ".join(f"{name} ({count} images)" for name, count in facts.submodels.items())
-    for i, camera in enumerate(facts.cameras[:SHOWN]):
+    for i, camera in enumerate(facts.cameras[:MAX_CAMERAS]):
         lines["camera" if len(facts.cameras) == 1 else f"camera {i + 1} of {len(facts.cameras)}"] = camera_line(camera)
     if facts.extent is not None:
         lines["extent"] = f"{facts.extent:.4g} scene units around the cameras"
@@ -38,8 +38,8 @@ def camera_line(camera: CameraFacts) -> str:
     """A camera on one line."""
     fx, fy = camera.focal
     focal = f"{fx:.1f}" if abs(fx - fy) < 0.05 else f"{fx:.1f}, {fy:.1f}"
-    bent = "beyond all bounds" if camera.bend is None else f"up to {camera.bend:.1f} px"
-    lens = f", bends by {bent}, {100 * camera.kept:.0f} % kept" if camera.bend != 0 else ""
+    amount = "without bounds" if camera.distortion is None else f"up to {camera.distortion:.1f} px"
+    lens = f", distortion {amount}, {100 * camera.kept:.0f} % kept" if camera.distortion != 0 else ""
     return f"{camera.model} {camera.width}x{camera.height}, focal length {focal} px{lens}; {camera.views} views"
 
 

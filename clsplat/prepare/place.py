@@ -8,7 +8,8 @@ from clsplat.errors import DataError
 from clsplat.files import unwritable
 from clsplat.prepare.cache import RECORD, plan, prepare
 from clsplat.prepare.steps import FindFeatures, MapCameras, MatchFeatures, Step
-from data_tools.photos import IMAGES, CameraModel, Mapper, Matching, link
+from data_tools.gather import link
+from data_tools.photos import IMAGES, CameraModel, Mapper, Matching
 
 STEPS = ".steps"  # in the folder of the scene: what a run that was killed goes on from
 
@@ -26,10 +27,10 @@ def place_photographs(
     Raises DataError when `out` holds a model, or images of another origin, and what the steps raise.
     """
     images, sparse = out / IMAGES, out / "sparse"
-    if sparse.exists() or (images.exists() and not images.is_symlink()):
-        raise DataError(
-            f"{out}: holds a model or images already; remove `sparse` and `{IMAGES}`, or give another folder"
-        )
+    if sparse.exists():
+        raise DataError(f"{out}: holds a model already, `sparse`; remove it, or give another folder")
+    if images.exists() and not images.is_symlink():
+        raise DataError(f"{out}: holds `{IMAGES}` already; give another folder")
     steps: list[Step] = [
         FindFeatures(long_side=long_side, camera_model=camera_model),
         MatchFeatures(matching=matching),

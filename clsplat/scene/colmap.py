@@ -102,8 +102,8 @@ def view_of(image: ImageRecord, cameras: dict[int, CameraRecord], folder: Path) 
             f"{image.where}: the pose of '{image.name}' is {error}: remove that image or {REMEDY}"
         ) from error
     lens = shared(_lens(image.camera, cameras[image.camera]))
-    camera, bent = (lens.pinhole, lens) if lens.distorts else (lens.camera, None)
-    return View(image.name, camera, pose, image_path, _mask(folder.with_name("masks"), image.name), lens=bent)
+    camera, distortion = (lens.pinhole, lens) if lens.distorts else (lens.camera, None)
+    return View(image.name, camera, pose, image_path, _mask(folder.with_name("masks"), image.name), lens=distortion)
 
 
 def _mask(folder: Path, name: str) -> Path | None:

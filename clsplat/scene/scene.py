@@ -24,8 +24,8 @@ Floats = NDArray[np.floating]
 Background = Literal["black", "white"]
 Alpha = Literal["transparency", "mask"]  # what the fourth channel of a photograph is
 HOLDOUT = 8  # every so many views are for testing where the dataset does not say which: the default of pipelines
-STRAY = 10.0  # a walk of evenly spaced cameras has 2, an orbit 1, a close-up among overviews about 4
-STRAY_SHARE = 0.2
+MAX_DISTANCE = 10.0  # by the median one: a walk of evenly spaced cameras has 2, an orbit 1, a close-up about 4
+MAX_STRAYED_SHARE = 0.2  # of the cameras
 
 
 @dataclass(frozen=True)
@@ -147,7 +147,7 @@ def make_scene(
 def camera_extent(views: list[View]) -> float:
     """Radius of the cameras: 1.1 x the largest distance of a centre from their mean (Kerbl et al. 2023).
 
-    Strayed cameras do not count: one wrong pose would scale every size and rate of the scene.
+    Cameras far away from all others do not count: one wrong pose would scale every size and rate of the scene.
     """
     centres = np.stack([v.position for v in views])[~strayed(views)]
     radius = 1.1 * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
@@ -155,14 +155,14 @@ def camera_extent(views: list[View]) -> float:
 
 
 def strayed(views: Sequence[View]) -> NDArray[np.bool_]:
-    """Which cameras, [N], lie more than STRAY times the median distance from the median centre.
+    """Which cameras, [N], lie more than MAX_DISTANCE times the median distance from the median centre.
 
-    None do when those are more than STRAY_SHARE of all: then the scene is like that.
+    None when more than MAX_STRAYED_SHARE of all do: such a scene has several groups of cameras.
     """
     centres = np.stack([v.position for v in views])
     distance = np.linalg.norm(centres - np.median(centres, axis=0), axis=1)
-    far = distance > STRAY * np.median(distance)
-    return far if np.median(distance) > 0 and far.mean() <= STRAY_SHARE else np.zeros(len(views), bool)
+    far = distance > MAX_DISTANCE * np.median(distance)
+    return far if np.median(distance) > 0 and far.mean() <= MAX_STRAYED_SHARE else np.zeros(len(views), bool)
 
 
 def every_nth(names: list[str], holdout: int) -> set[int]:
