@@ -89,7 +89,7 @@ def open_run(pipeline: Pipeline, out: Path, words: str | None) -> Run:
         seed=settings.seed,
         pipeline=pipeline.resolved(),
         rasterizer=Rasterizer(device, settings.rasterizer.sort, settings.rasterizer.budget()),
-        photographs=Photographs(device, background, None if budget is None else budget << 20, out / "straightened"),
+        photographs=Photographs(device, background, None if budget is None else budget << 20, out / "undistorted"),
         model_settings=settings.model,
         prepared=note(planned) if planned else None,
     )

@@ -8,10 +8,13 @@ from typing import Annotated
 import typer
 
 from clsplat.errors import ClsplatError
+from clsplat.scene.detect import format_names
 from data_tools.multiscale import write_multiscale
-from data_tools.photos import Mapper, Matching
+from data_tools.photos import CameraModel, Mapper, Matching
 from data_tools.synthetic import Options, write_dataset
 from data_tools.undistort import Blank
+
+DATASET = f"The folder of a dataset: {format_names()}."
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False)
 
@@ -48,15 +51,15 @@ def photos(
     source: Annotated[Path, typer.Argument(help="Folder of photographs; it is not written to.")],
     out: Annotated[Path, typer.Argument(help="Folder for the scene; what it holds already is not made again.")],
     long_side: Annotated[int, typer.Option(min=64, help="Pixels to look for features at.")] = 1600,
-    camera_model: Annotated[str, typer.Option(help="SIMPLE_RADIAL, OPENCV, OPENCV_FISHEYE, …")] = "SIMPLE_RADIAL",
+    camera_model: Annotated[CameraModel, typer.Option(help="What the lens is taken for.")] = "SIMPLE_RADIAL",
     matching: Annotated[Matching, typer.Option(help="Which photographs are compared.")] = "auto",
     mapper: Annotated[Mapper, typer.Option(help="How cameras are placed.")] = "incremental",
 ) -> None:
     """Find the cameras of photographs: features, matches, structure from motion; a COLMAP folder."""
-    from data_tools.photos import place_photos
+    from clsplat.prepare.place import place_photographs
 
-    told = place_photos(source, out, long_side, camera_model, matching, mapper)
-    print("\n".join(f"{name}: {value}" for name, value in told.items()))
+    count = place_photographs(source, out, long_side, camera_model, matching, mapper)
+    print(f"{count} photographs placed, a COLMAP folder in {out}")
 
 
 @app.command()
@@ -74,12 +77,12 @@ def video(
 
 @app.command()
 def undistort(
-    scene: Annotated[Path, typer.Argument(help="A COLMAP or nerfstudio folder.")],
+    scene: Annotated[Path, typer.Argument(help=DATASET)],
     out: Annotated[Path, typer.Argument(help="Folder for the scene of pinhole cameras.")],
     long_side: Annotated[int | None, typer.Option(min=16, help="Pixels, at most.")] = None,
     blank: Annotated[Blank, typer.Option(help="Cut blank pixels off, or keep and mask them.")] = "crop",
 ) -> None:
-    """Straighten the photographs of distorting lenses, fisheyes too."""
+    """Undistort the photographs of a scene, of fisheye lenses too."""
     from data_tools.undistort import undistort_scene
 
     print(f"{undistort_scene(scene, out, long_side, blank)} images in {out}")
@@ -98,7 +101,7 @@ def resize(
 
 @app.command()
 def masks(
-    scene: Annotated[Path, typer.Argument(help="A COLMAP, Blender or nerfstudio folder.")],
+    scene: Annotated[Path, typer.Argument(help=DATASET)],
     folder: Annotated[Path | None, typer.Option(help="Masks made elsewhere; default: from the images' alpha.")] = None,
     out: Annotated[Path | None, typer.Option(help="Where to; default: SCENE/masks.")] = None,
     threshold: Annotated[float, typer.Option(min=0, max=1, help="Alpha that counts.")] = 0.5,
@@ -123,7 +126,7 @@ def fetch(
 
 
 def main() -> None:
-    """Run the command line; an error that the user can mend is one line and its exit code."""
+    """Run the command line; an error that the user can fix is one line and its exit code."""
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     try:
         app()

@@ -5,9 +5,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from clsplat.files import atomic
+from clsplat.scene.quaternion import unit_quaternions
 from clsplat.scene.scene import Camera, PointCloud, View
 
 PINHOLE = 1  # COLMAP's number of the model
@@ -38,8 +38,8 @@ def _camera(number: int, camera: Camera) -> bytes:
 
 
 def _image(number: int, view: View, camera: int) -> bytes:
-    x, y, z, w = Rotation.from_matrix(view.world_to_camera[:, :3]).as_quat()
-    pose = struct.pack("<I7dI", number, w, x, y, z, *view.world_to_camera[:, 3], camera)
+    quaternion = unit_quaternions(view.world_to_camera[:, :3])
+    pose = struct.pack("<I7dI", number, *quaternion, *view.world_to_camera[:, 3], camera)
     return pose + view.name.encode() + b"\0" + struct.pack("<Q", 0)
 
 

@@ -17,16 +17,16 @@ from clsplat.errors import ConfigError, DataError, OutputError
 from clsplat.files import unwritable
 
 CHUNK = 1 << 20  # bytes
-TRIES = 5  # of one download
+MAX_TRIES = 5  # of one download
 PAUSE = 1.0  # s between them
 TIMEOUT = 30  # s without a byte
-LARGEST = 200 << 30  # bytes that an archive may unpack to
-Tell = Callable[[str], None]
+MAX_UNPACKED_SIZE = 200 << 30  # bytes that an archive may unpack to
+Report = Callable[[str], None]
 
 
 @dataclass(frozen=True)
 class Source:
-    """An archive on the web.  Without a checksum the one that is seen is told, so that it can be compared."""
+    """An archive on the web.  Without a checksum that of the file is reported, to be compared."""
 
     url: str
     licence: str
@@ -52,40 +52,40 @@ def named(name: str) -> Source:
     return SOURCES[name]
 
 
-def fetch(source: Source, out: Path, tell: Tell = print) -> Path:
+def fetch(source: Source, out: Path, report: Report = print) -> Path:
     """Download an archive and unpack it as the folder `out`; a folder that is there already is left alone.
 
     What was downloaded before a connection broke, or the process was killed, is kept beside as `….part` and continued.
     Raises DataError when the archive cannot be had, is not what was expected or would write outside of its folder.
     """
     if out.exists():
-        tell(f"{out} is there already: nothing to do")
+        report(f"{out} is there already: nothing to do")
         return out
     archive = out.with_name(f"{out.name}.{PurePosixPath(source.url.split('?')[0]).name}")
     try:
         out.absolute().parent.mkdir(parents=True, exist_ok=True)
         if not archive.is_file():
-            _download(source, archive, tell)
-        _unpack(archive, out, tell)
+            _download(source, archive, report)
+        _unpack(archive, out, report)
         archive.unlink()
     except OSError as error:
         raise unwritable(out, error) from error
-    tell(f"{source.licence}\n{out} is complete")
+    report(f"{source.licence}\n{out} is complete")
     return out
 
 
-def _download(source: Source, archive: Path, tell: Tell) -> None:
+def _download(source: Source, archive: Path, report: Report) -> None:
     part = archive.with_name(f"{archive.name}.part")
-    for attempt in range(1, TRIES + 1):
+    for attempt in range(1, MAX_TRIES + 1):
         try:
-            _continue(source.url, part, tell)
+            _continue(source.url, part, report)
             break
         except urllib.error.HTTPError as error:
             raise DataError(f"{source.url}: the server says {error.code} {error.reason}; check the address") from error
         except (urllib.error.URLError, TimeoutError, ConnectionError, _BrokenError) as error:
-            if attempt == TRIES:
+            if attempt == MAX_TRIES:
                 raise DataError(
-                    f"{source.url}: the connection broke {TRIES} times ({error}); run it again to go on from "
+                    f"{source.url}: the connection broke {MAX_TRIES} times ({error}); run it again to go on from "
                     f"{part.stat().st_size if part.exists() else 0} bytes"
                 ) from error
             time.sleep(PAUSE)
@@ -95,7 +95,7 @@ def _download(source: Source, archive: Path, tell: Tell) -> None:
         part.unlink()
         raise DataError(f"{source.url}: sha256 is {seen}, expected {source.sha256}; the file was removed: try again")
     if not source.sha256:
-        tell(f"sha256 {seen}: no checksum is known for this file, compare it with its publisher's")
+        report(f"sha256 {seen}: no checksum is known for this file, compare it with its publisher's")
     part.rename(archive)
 
 
@@ -103,43 +103,45 @@ class _BrokenError(Exception):
     """Fewer bytes came than were promised."""
 
 
-def _continue(url: str, part: Path, tell: Tell) -> None:
+def _continue(url: str, part: Path, report: Report) -> None:
     """Add what is missing; a server that cannot begin in the middle begins anew."""
     have = part.stat().st_size if part.exists() else 0
     request = urllib.request.Request(url, headers={"Range": f"bytes={have}-"} if have else {})
     try:
         answer = urllib.request.urlopen(request, timeout=TIMEOUT)
     except urllib.error.HTTPError as error:
-        if have and error.code == 416:  # nothing is missing, or the file has changed: its checksum will tell
+        if have and error.code == 416:  # nothing is missing, or the file has changed: its checksum shows which
             return
         raise
     with answer:
         if have and answer.status != 206:
             have = 0
         length = int(answer.headers.get("Content-Length") or 0)
-        whole, told = have + length, -1
+        whole, reported = have + length, -1
         with part.open("ab" if have else "wb") as file:
             while chunk := answer.read(CHUNK):
                 file.write(chunk)
                 have += len(chunk)
                 tenth = 10 * have // whole if whole else 0
-                if tenth > told:
-                    told = tenth
-                    tell(f"{have / 1e6:,.0f} of {whole / 1e6:,.0f} MB")
+                if tenth > reported:
+                    reported = tenth
+                    report(f"{have / 1e6:,.0f} of {whole / 1e6:,.0f} MB")
     if length and have < whole:
         raise _BrokenError(f"{have} of {whole} bytes came")
 
 
-def _unpack(archive: Path, out: Path, tell: Tell) -> None:
+def _unpack(archive: Path, out: Path, report: Report) -> None:
     """Unpack into a hidden folder beside, and rename it when it is whole."""
     temporary = out.with_name(f".{out.name}.unpacking")
     shutil.rmtree(temporary, ignore_errors=True)
     try:
         with _members(archive) as members:
             total = sum(size for _, size, _ in members)
-            if total > LARGEST:
-                raise DataError(f"{archive}: would unpack to {total >> 30} GiB; expected at most {LARGEST >> 30}")
-            tell(f"unpacking {len(members)} files, {total / 1e6:,.0f} MB")
+            if total > MAX_UNPACKED_SIZE:
+                raise DataError(
+                    f"{archive}: would unpack to {total >> 30} GiB; expected at most {MAX_UNPACKED_SIZE >> 30}"
+                )
+            report(f"unpacking {len(members)} files, {total / 1e6:,.0f} MB")
             for name, size, opened in members:
                 target = temporary / _safe(archive, name)
                 target.parent.mkdir(parents=True, exist_ok=True)

@@ -11,10 +11,10 @@ from clsplat.scene.detect import read_scene
 from clsplat.scene.images import load_mask, read_image, write_image
 from clsplat.scene.scene import View
 
-OPAQUE = 0.5  # of the largest value
+MIN_ALPHA = 0.5  # of the largest value
 
 
-def write_masks(scene: Path, folder: Path | None = None, out: Path | None = None, threshold: float = OPAQUE) -> int:
+def write_masks(scene: Path, folder: Path | None = None, out: Path | None = None, threshold: float = MIN_ALPHA) -> int:
     """Write a mask for every photograph into `scene`/masks, or `out`: white where it counts; return their number.
 
     With `folder` they are those of its files (NAME.png, or STEM.png), else where the photographs' alpha is at least
@@ -55,4 +55,4 @@ def _from_file(view: View, source: Path) -> NDArray[np.bool_]:
     """The mask as it is, once it is known to fit its photograph."""
     load_mask(replace(view, mask_path=source))
     pixels = read_image(source)
-    return np.asarray(pixels[:, :, 0] >= OPAQUE * np.iinfo(pixels.dtype).max)
+    return np.asarray(pixels[:, :, 0] >= MIN_ALPHA * np.iinfo(pixels.dtype).max)

@@ -6,101 +6,39 @@
 
 Each writes into an empty folder and leaves what it reads alone.  The same photographs and settings give the same files:
 images are registered in order of their names before threads look at them, every random number has a seed, and mapping
-runs in one thread unless told otherwise.
+runs in one thread by default.
 """
 
 import logging
-import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Literal
 
-import cv2
 import numpy as np
 
 from clsplat.errors import ConfigError, DataError
-from clsplat.scene.images import read_image
+from data_tools.gather import MIN_PHOTOGRAPHS, gather, link, list_photographs
 from data_tools.vocabulary import alike
 
 LOG = logging.getLogger("clsplat")
 Matching = Literal["auto", "exhaustive", "sequential", "vocabulary"]
 Mapper = Literal["incremental", "global"]
 Cameras = Literal["auto", "one", "per_folder", "per_image"]
-SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"}
-STRANGE = {".heic", ".heif", ".avif", ".dng", ".cr2", ".nef", ".arw"}  # photographs that OpenCV does not read
-FEWEST = 3  # photographs, and registered images of a model
-EXHAUSTIVE = 200  # photographs, at most, whose pairs are all matched: beyond that their number hurts
+CameraModel = Literal["SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "PINHOLE", "SIMPLE_PINHOLE"]
+MAX_EXHAUSTIVE = 200  # photographs whose pairs are all matched: the time grows with the square of their number
 CHUNK = 10  # photographs between lines of progress
 DATABASE, IMAGES = "database.db", "images"
 
 
-def list_photos(folder: Path, without: Path | None = None) -> list[str]:
-    """Names of the photographs below a folder, sorted, hidden ones and those below `without` left out.
-
-    Raises DataError when there are too few of them.
-    """
-    if not folder.is_dir():
-        raise DataError(f"{folder}: no such folder; expected one with photographs")
-    names: list[str] = []
-    strange: list[str] = []
-    for base, folders, files in os.walk(folder):
-        folders[:] = sorted(f for f in folders if f[0] != "." and (Path(base) / f).resolve() != without)
-        for file in files:
-            suffix = Path(file).suffix.lower()
-            if file[0] != "." and suffix in SUFFIXES | STRANGE:
-                name = (Path(base) / file).relative_to(folder).as_posix()
-                (names if suffix in SUFFIXES else strange).append(name)
-    if strange:
-        LOG.warning("%s: %d files such as %s are left out: convert them to JPEG", folder, len(strange), strange[0])
-    if len(names) < FEWEST:
-        raise DataError(
-            f"{folder}: found {len(names)} photographs; expected at least {FEWEST}, of {', '.join(sorted(SUFFIXES))}"
-        )
-    return sorted(names)
-
-
-def place_photos(
-    photos: Path,
-    out: Path,
-    long_side: int = 1600,
-    camera_model: str = "SIMPLE_RADIAL",
-    matching: Matching = "auto",
-    mapper: Mapper = "incremental",
-) -> dict[str, Any]:
-    """Do all three steps into `out`, a COLMAP folder whose hidden folder `.steps` lets a killed run go on.
-
-    Raises what they raise.
-    """
-    steps: list[tuple[str, Callable[[Path, Path], dict[str, Any]]]] = [
-        ("features", lambda source, to: find_features(source, to, long_side, camera_model=camera_model)),
-        ("matches", lambda source, to: match_features(source, to, matching)),
-        ("cameras", lambda source, to: map_cameras(source, to, mapper)),
-    ]
-    if (out / "sparse" / "0").is_dir():
-        raise DataError(f"{out}: holds a model already; remove it, or give another folder")
-    source, told = photos, dict[str, Any]()
-    for name, step in steps:
-        folder, temporary = out / ".steps" / name, out / ".steps" / f"{name}.part"
-        if not folder.is_dir():
-            shutil.rmtree(temporary, ignore_errors=True)
-            temporary.mkdir(parents=True)
-            told |= step(source.resolve(), temporary)
-            temporary.rename(folder)
-        source = folder
-    _link(source / IMAGES, out / IMAGES)
-    (source / "sparse").rename(out / "sparse")
-    return told
-
-
 def find_features(
-    photos: Path,
+    photographs: Path,
     out: Path,
     long_side: int = 1600,
     features: int = 8192,
-    camera_model: str = "SIMPLE_RADIAL",
+    camera_model: CameraModel = "SIMPLE_RADIAL",
     cameras: Cameras = "auto",
     without: Path | None = None,
 ) -> dict[str, Any]:
@@ -110,13 +48,13 @@ def find_features(
     size and focal length share a camera.  Raises DataError when fewer than three can be read.
     """
     pycolmap = _pycolmap()
-    names = _gather(photos, out / IMAGES, list_photos(photos, without))
+    names = gather(photographs, out / IMAGES, list_photographs(photographs, without))
     database, mode = str(out / DATABASE), {"auto": "AUTO", "one": "SINGLE"}.get(cameras, cameras.upper())
     reader, extraction = pycolmap.ImageReaderOptions(), pycolmap.FeatureExtractionOptions()
     reader.camera_model = camera_model
     extraction.max_image_size, extraction.use_gpu = long_side, False
     extraction.sift.max_num_features = features
-    with _explained(photos, "find features"):
+    with _explained(photographs, "find features"):
         pycolmap.Database.open(database).close()
         pycolmap.import_images(
             database, str(out / IMAGES), getattr(pycolmap.CameraMode, mode), image_names=names, options=reader
@@ -141,11 +79,11 @@ def match_features(source: Path, out: Path, matching: Matching = "auto", neighbo
     matches.
     """
     pycolmap = _pycolmap()
-    _link(source / IMAGES, out / IMAGES)
+    link(source / IMAGES, out / IMAGES)
     shutil.copyfile(source / DATABASE, out / DATABASE)
     database = out / DATABASE
     count = len(_image_names(pycolmap, database))
-    chosen = ("exhaustive" if count <= EXHAUSTIVE else "vocabulary") if matching == "auto" else matching
+    chosen = ("exhaustive" if count <= MAX_EXHAUSTIVE else "vocabulary") if matching == "auto" else matching
     options, verification = pycolmap.FeatureMatchingOptions(), pycolmap.TwoViewGeometryOptions()
     options.use_gpu, verification.ransac.random_seed = False, 0
     common = {
@@ -177,13 +115,13 @@ def match_features(source: Path, out: Path, matching: Matching = "auto", neighbo
 
 
 def map_cameras(source: Path, out: Path, mapper: Mapper = "incremental", threads: int = 1) -> dict[str, Any]:
-    """Place cameras and points; keep the largest model as sparse/0 and tell of the others.
+    """Place cameras and points; keep the largest model as sparse/0 and log the others.
 
     `mapper: global` is faster for many photographs; more than one thread is faster and not repeatable to the bit.
     Raises DataError when no model of three images comes out.
     """
     pycolmap = _pycolmap()
-    _link(source / IMAGES, out / IMAGES)
+    link(source / IMAGES, out / IMAGES)
     work = out / ".models"
     work.mkdir()
     names = _image_names(pycolmap, source / DATABASE)
@@ -191,7 +129,7 @@ def map_cameras(source: Path, out: Path, mapper: Mapper = "incremental", threads
     options = pycolmap.GlobalPipelineOptions() if is_global else pycolmap.IncrementalPipelineOptions()
     options.num_threads = options.mapper.num_threads = threads
     options.random_seed = options.mapper.random_seed = 0
-    options.min_model_size = FEWEST
+    options.min_model_size = MIN_PHOTOGRAPHS
     pycolmap.set_random_seed(0)
     with _explained(source / IMAGES, "place the cameras"):
         function = pycolmap.global_mapping if is_global else pycolmap.incremental_mapping
@@ -207,7 +145,7 @@ def map_cameras(source: Path, out: Path, mapper: Mapper = "incremental", threads
         models = list(function(*paths, options=options, **watched).values())
     shutil.rmtree(work)
     models.sort(key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
-    if not models or models[0].num_reg_images() < FEWEST:
+    if not models or models[0].num_reg_images() < MIN_PHOTOGRAPHS:
         raise DataError(
             f"{source / IMAGES}: the {len(names)} photographs could not be placed; take more of them, sharp, from "
             "places a step apart, of a scene with texture that stands still"
@@ -229,35 +167,6 @@ def map_cameras(source: Path, out: Path, mapper: Mapper = "incremental", threads
         "points": best.num_points3D(),
         "error_px": round(best.compute_mean_reprojection_error(), 3),
     }
-
-
-def _gather(photos: Path, images: Path, names: list[str]) -> list[str]:
-    """Link photographs into a folder, or copy them upright; return the names of those that can be read."""
-    kept = []
-    for name in names:
-        try:
-            stored, upright = read_image(photos / name), read_image(photos / name, upright=True)
-        except DataError as error:
-            LOG.warning("%s; left out", error)
-            continue
-        (images / name).parent.mkdir(parents=True, exist_ok=True)
-        if stored.shape[:2] == upright.shape[:2] and (stored[:, :, :3] == upright[:, :, :3]).all():
-            _link(photos / name, images / name)
-        else:
-            _, encoded = cv2.imencode(".jpg", np.ascontiguousarray(upright[:, :, ::-1]), [cv2.IMWRITE_JPEG_QUALITY, 98])
-            (images / name).write_bytes(encoded.tobytes())
-        kept.append(name)
-    if len(kept) < FEWEST:
-        raise DataError(f"{photos}: only {len(kept)} of {len(names)} photographs can be read; export them again")
-    return kept
-
-
-def _link(source: Path, target: Path) -> None:
-    """Link a file or folder, or copy it where links are not to be had."""
-    try:
-        target.symlink_to(source.resolve(), target_is_directory=source.is_dir())
-    except OSError:
-        (shutil.copytree if source.is_dir() else shutil.copyfile)(source, target)
 
 
 def _alike_pairs(pycolmap: ModuleType, database: Path, neighbours: int) -> list[tuple[str, str]]:

@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 
 from clsplat.errors import DataError
 from clsplat.files import atomic
-from clsplat.scene.images import read_image
+from clsplat.scene.images import is_image, read_image
 
-SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"}
 QUALITY = 98  # of JPEG
 
 
@@ -22,7 +21,7 @@ def write_pyramid(scene: Path, levels: int = 3) -> int:
     Images that are there already are left alone.  Raises DataError when there are none, or one cannot be read.
     """
     folder = scene / "images"
-    names = sorted(path.relative_to(folder) for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES)
+    names = sorted(path.relative_to(folder) for path in folder.rglob("*") if is_image(path))
     if not names:
         raise DataError(f"{folder}: holds no images; expected the folder above `images`")
     written = 0

@@ -1,4 +1,4 @@
-"""A scene as pinhole cameras would have taken it: straightened photographs, smaller ones if wanted, and their masks."""
+"""A scene as pinhole cameras would have taken it: undistorted photographs, smaller ones if wanted, and their masks."""
 
 import logging
 from collections import Counter
@@ -31,7 +31,7 @@ def undistort_scene(source: Path, out: Path, long_side: int | None = None, blank
     views = []
     for number, (view, name) in enumerate(zip(scene.views, names, strict=True), 1):
         if number % PROGRESS == 0:
-            LOG.info("straightened %d of %d photographs", number, len(names))
+            LOG.info("undistorted %d of %d photographs", number, len(names))
         wanted = replace(_sized(_shown(view, blank), long_side), alpha="mask")
         image, mask = out / "images" / name, out / "masks" / name
         if not image.is_file():
@@ -54,7 +54,7 @@ def _shown(view: View, blank: Blank) -> View:
 def _sized(view: View, long_side: int | None) -> View:
     """The view with no side longer than `long_side` px."""
     longest = max(view.camera.width, view.camera.height)
-    return view if long_side is None else view.at(max(1.0, longest / long_side))
+    return view if long_side is None else view.resized(max(1.0, longest / long_side))
 
 
 def _png_names(names: list[str]) -> list[str]:

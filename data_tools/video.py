@@ -13,7 +13,7 @@ from clsplat.errors import DataError
 from clsplat.scene.images import write_image
 
 LOG = logging.getLogger("clsplat")
-REDUCED = 480  # px: the side that sharpness is measured at; noise of the full size would count as detail
+SHARPNESS_SIDE = 480  # px: the side that sharpness is measured at; noise of the full size would count as detail
 
 
 def write_frames(video: Path, out: Path, frames: int = 100, long_side: int | None = None) -> int:
@@ -62,7 +62,7 @@ def _decoded(video: Path) -> Iterator[NDArray[np.uint8]]:
 
 def _sharpness(image: NDArray[np.uint8]) -> float:
     """Variance of the Laplacian of the reduced grey image."""
-    grey = cv2.cvtColor(_limited(image, REDUCED), cv2.COLOR_BGR2GRAY)
+    grey = cv2.cvtColor(_limited(image, SHARPNESS_SIDE), cv2.COLOR_BGR2GRAY)
     return float(cv2.Laplacian(grey, cv2.CV_64F).var())
 
 

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 
-from clsplat.scene.colmap import read_colmap
 from clsplat.scene.colmap_files import MODELS, PARAMETERS, read_cameras, read_images, read_points
 from clsplat.scene.detect import read_scene
 from clsplat.scene.images import load_image
@@ -64,7 +63,7 @@ def assert_same_points(folder: Path, reconstruction) -> None:
 def test_real_scene_equals_pycolmap(name: str) -> None:
     pycolmap = pytest.importorskip("pycolmap")
     path = data_set(name)
-    scene = read_colmap(path)
+    scene = read_scene(path)
     reconstruction = pycolmap.Reconstruction(path / "sparse" / "0")
     theirs = {image.name: image for image in reconstruction.images.values()}
     assert [view.name for view in scene.views] == sorted(theirs)
@@ -90,8 +89,8 @@ def test_every_camera_model_equals_pycolmap(name: str, kind: str) -> None:
     assert_same_points(folder, reconstruction)
 
 
-def test_distorted_real_photographs_are_straightened() -> None:
-    scene, undistorted = read_colmap(data_set("fox_opencv")), read_colmap(data_set("fox"))
+def test_distorted_real_photographs_are_undistorted() -> None:
+    scene, undistorted = read_scene(data_set("fox_opencv")), read_scene(data_set("fox"))
     assert all(view.lens and view.lens.model == "OPENCV" for view in scene.views)
     view = scene.views[3]
     assert load_image(view).shape == (view.camera.height, view.camera.width, 3)
@@ -197,7 +196,7 @@ def test_the_model_folder_itself_may_be_named(tmp_path: Path, place: str) -> Non
     path = write_model(tmp_path / place, tiny_model())
     write_scene(tmp_path / "other", tiny_model())
     (tmp_path / "other" / "images").rename(tmp_path / "images")
-    assert read_colmap(path).views[0].image_path == tmp_path / "images" / "a.jpg"
+    assert read_scene(path).views[0].image_path == tmp_path / "images" / "a.jpg"
 
 
 def test_largest_model_is_taken_and_the_others_logged(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -206,7 +205,7 @@ def test_largest_model_is_taken_and_the_others_logged(tmp_path: Path, caplog: py
     (tmp_path / "one" / "sparse" / "0").rename(tmp_path / "sparse" / "1")
     (tmp_path / "images" / "c.jpg").touch()
     with caplog.at_level(logging.INFO, "clsplat"):
-        assert len(read_colmap(tmp_path).views) == 3
+        assert len(read_scene(tmp_path).views) == 3
     assert "sparse/1: 3 images" in caplog.text
     assert "sparse/0 (2)" in caplog.text
 
@@ -214,13 +213,13 @@ def test_largest_model_is_taken_and_the_others_logged(tmp_path: Path, caplog: py
 def test_binary_is_preferred_to_text(tmp_path: Path) -> None:
     write_scene(tmp_path, tiny_model(), "bin")
     write_scene(tmp_path, replace(tiny_model(), images=[ImageEntry("text.jpg")]), "txt")
-    assert [view.name for view in read_colmap(tmp_path).views] == ["a.jpg", "b.jpg", "c.jpg"]
+    assert [view.name for view in read_scene(tmp_path).views] == ["a.jpg", "b.jpg", "c.jpg"]
 
 
 @pytest.mark.parametrize("holdout", [0, 2, 8])
 def test_every_nth_view_by_name_is_for_testing(tmp_path: Path, holdout: int) -> None:
     model = DeviceModel([PINHOLE], [ImageEntry(f"{i:02}.jpg") for i in reversed(range(17))])
-    scene = read_colmap(write_scene(tmp_path, model), holdout)
+    scene = read_scene(write_scene(tmp_path, model), holdout)
     expected = {0: [], 2: list(range(0, 17, 2)), 8: [0, 8, 16]}[holdout]
     assert [view.name for view in scene.split("test")] == [f"{i:02}.jpg" for i in expected]
     assert len(scene.train) + len(scene.test) == 17
@@ -228,20 +227,20 @@ def test_every_nth_view_by_name_is_for_testing(tmp_path: Path, holdout: int) -> 
 
 def test_same_file_name_in_two_folders_makes_two_views(tmp_path: Path) -> None:
     model = DeviceModel([PINHOLE], [ImageEntry("b/1.jpg"), ImageEntry("a/1.jpg", translation=(1, 0, 0))])
-    assert [view.name for view in read_colmap(write_scene(tmp_path, model)).views] == ["a/1.jpg", "b/1.jpg"]
+    assert [view.name for view in read_scene(write_scene(tmp_path, model)).views] == ["a/1.jpg", "b/1.jpg"]
 
 
 def test_points_may_be_missing(tmp_path: Path) -> None:
     write_scene(tmp_path, tiny_model())
     (tmp_path / "sparse" / "0" / "points3D.bin").unlink()
-    assert read_colmap(tmp_path).points is None
+    assert read_scene(tmp_path).points is None
 
 
 @pytest.mark.parametrize("kind", ["bin", "txt"])
 def test_points_that_are_not_finite_are_dropped(tmp_path: Path, kind: str, caplog: pytest.LogCaptureFixture) -> None:
     positions = [(1.0, math.nan, 3.0), (1.0, 2.0, 3.0), (math.inf, 0.0, 0.0), (1e300, 0.0, 0.0)]
     model = replace(tiny_model(), points=[PointEntry(position) for position in positions])
-    points = read_colmap(write_scene(tmp_path, model, kind)).points
+    points = read_scene(write_scene(tmp_path, model, kind)).points
     assert points is not None
     np.testing.assert_array_equal(points.positions, [[1, 2, 3]])
     assert "dropped 3 points" in caplog.text

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from clsplat.errors import DataError
-from clsplat.scene.colmap import read_colmap
+from clsplat.scene.colmap import ColmapReader
 from clsplat.scene.detect import read_scene
 from tests.colmap_writer import PINHOLE, CameraEntry, DeviceModel, ImageEntry, tiny_model, write_model, write_scene
 from tests.refusals import refusal
@@ -25,7 +25,7 @@ def test_cut_anywhere_is_a_data_error(tmp_path: Path, stem: str) -> None:
     data = file.read_bytes()
     for length in range(len(data)):
         file.write_bytes(data[:length])
-        message = refusal(read_colmap, tmp_path)
+        message = refusal(read_scene, tmp_path)
         assert f"{stem}.bin: byte " in message, length
         assert "expected" in message
 
@@ -34,7 +34,7 @@ def test_cut_anywhere_is_a_data_error(tmp_path: Path, stem: str) -> None:
 def test_bytes_after_the_last_record_are_a_data_error(tmp_path: Path, stem: str) -> None:
     file = write_scene(tmp_path, tiny_model()) / "sparse" / "0" / f"{stem}.bin"
     file.write_bytes(file.read_bytes() + b"\0")
-    assert "1 bytes follow" in refusal(read_colmap, tmp_path)
+    assert "1 bytes follow" in refusal(read_scene, tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -48,14 +48,14 @@ def test_huge_count_allocates_nothing(tmp_path: Path, stem: str, offset: int, co
     assert struct.unpack_from("<Q", data, offset)[0] <= 3  # a count, indeed
     struct.pack_into("<Q", data, offset, count)
     file.write_bytes(data)
-    message = refusal(read_colmap, tmp_path)
+    message = refusal(read_scene, tmp_path)
     assert f"{stem}.bin: byte {offset + 8}" in message
 
 
 def test_name_without_end(tmp_path: Path) -> None:
     file = write_scene(tmp_path, DeviceModel([PINHOLE], [ImageEntry("abcdefgh")])) / "sparse" / "0" / "images.bin"
     file.write_bytes(file.read_bytes().replace(b"\0" * 9, b"\1" * 9))  # the end of the name and the count after it
-    assert "image name" in refusal(read_colmap, tmp_path)
+    assert "image name" in refusal(read_scene, tmp_path)
 
 
 @pytest.mark.parametrize("kind", ["bin", "txt"])
@@ -69,7 +69,7 @@ def test_random_damage_raises_nothing_else(tmp_path_factory, kind: str, data: st
         content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
     file.write_bytes(content)
     try:
-        scene = read_colmap(path)
+        scene = read_scene(path)
     except DataError:
         return
     assert all(np.isfinite(view.world_to_camera).all() for view in scene.views)
@@ -83,7 +83,7 @@ def test_random_damage_raises_nothing_else(tmp_path_factory, kind: str, data: st
 )
 def test_name_that_leaves_the_image_folder(tmp_path: Path, name: str) -> None:
     write_model(tmp_path / "sparse" / "0", replace(tiny_model(), images=[ImageEntry(name), ImageEntry("a.jpg")]))
-    assert "not a path below" in refusal(read_colmap, tmp_path)
+    assert "not a path below" in refusal(read_scene, tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -100,12 +100,12 @@ def test_name_that_leaves_the_image_folder(tmp_path: Path, name: str) -> None:
 )
 def test_pose_that_is_none(tmp_path: Path, quaternion: tuple[float, ...], translation: tuple[float, ...]) -> None:
     images = [*tiny_model().images, ImageEntry("bad.jpg", 1, quaternion, translation)]
-    assert "the pose of 'bad.jpg'" in refusal(read_colmap, write_scene(tmp_path, replace(tiny_model(), images=images)))
+    assert "the pose of 'bad.jpg'" in refusal(read_scene, write_scene(tmp_path, replace(tiny_model(), images=images)))
 
 
 def test_unknown_camera(tmp_path: Path) -> None:
     images = [*tiny_model().images, ImageEntry("d.jpg", camera=7)]
-    message = refusal(read_colmap, write_scene(tmp_path, replace(tiny_model(), images=images)))
+    message = refusal(read_scene, write_scene(tmp_path, replace(tiny_model(), images=images)))
     assert "'d.jpg' names camera 7" in message
 
 
@@ -113,7 +113,7 @@ def test_unknown_camera(tmp_path: Path) -> None:
 def test_lenses_that_are_not_supported_are_refused(tmp_path: Path, model: str, params: tuple[float, ...]) -> None:
     camera = CameraEntry(3, model, 64, 48, params)
     message = refusal(
-        read_colmap, write_scene(tmp_path, DeviceModel([camera], [ImageEntry("a.jpg", 3), ImageEntry("b.jpg", 3)]))
+        read_scene, write_scene(tmp_path, DeviceModel([camera], [ImageEntry("a.jpg", 3), ImageEntry("b.jpg", 3)]))
     )
     assert "camera 3" in message
     assert model in message
@@ -122,13 +122,13 @@ def test_lenses_that_are_not_supported_are_refused(tmp_path: Path, model: str, p
 
 def test_distortion_that_is_not_a_number_is_refused(tmp_path: Path) -> None:
     camera = CameraEntry(3, "OPENCV", 64, 48, (50, 50, 32, 24, math.nan, 0, 0, 0))
-    message = refusal(read_colmap, write_scene(tmp_path, DeviceModel([camera], [ImageEntry("a.jpg", 3)])))
+    message = refusal(read_scene, write_scene(tmp_path, DeviceModel([camera], [ImageEntry("a.jpg", 3)])))
     assert "finite numbers" in message
 
 
 def test_distorted_camera_without_images_does_no_harm(tmp_path: Path) -> None:
     fisheye = CameraEntry(9, "OPENCV_FISHEYE", 64, 48, (50, 50, 32, 24, 0.1, 0, 0, 0))
-    scene = read_colmap(write_scene(tmp_path, replace(tiny_model(), cameras=[PINHOLE, fisheye])))
+    scene = read_scene(write_scene(tmp_path, replace(tiny_model(), cameras=[PINHOLE, fisheye])))
     assert len(scene.views) == 3
 
 
@@ -146,7 +146,7 @@ def test_distorted_camera_without_images_does_no_harm(tmp_path: Path) -> None:
 )
 def test_camera_that_is_none(tmp_path: Path, camera: CameraEntry) -> None:
     assert "expected a positive size" in refusal(
-        read_colmap, write_scene(tmp_path, replace(tiny_model(), cameras=[camera]))
+        read_scene, write_scene(tmp_path, replace(tiny_model(), cameras=[camera]))
     )
 
 
@@ -156,22 +156,22 @@ def test_unknown_camera_model(tmp_path: Path, number: int) -> None:
     data = bytearray(file.read_bytes())
     struct.pack_into("<i", data, 12, number)
     file.write_bytes(data)
-    assert f"unknown camera model '{number}'" in refusal(read_colmap, tmp_path)
+    assert f"unknown camera model '{number}'" in refusal(read_scene, tmp_path)
 
 
 def test_missing_images_are_counted_and_named(tmp_path: Path) -> None:
     write_scene(tmp_path, DeviceModel([PINHOLE], [ImageEntry(f"{i}.jpg") for i in range(9)]))
     for i in range(5):
         (tmp_path / "images" / f"{i}.jpg").unlink()
-    message = refusal(read_colmap, tmp_path)
+    message = refusal(read_scene, tmp_path)
     assert "5 of 9" in message
     assert str(tmp_path / "images" / "0.jpg") in message
     assert "4.jpg" not in message
 
 
 def test_model_without_images_or_folder(tmp_path: Path) -> None:
-    assert "no COLMAP model" in refusal(read_colmap, tmp_path)
-    assert "no images" in refusal(read_colmap, write_scene(tmp_path / "empty", replace(tiny_model(), images=[])))
+    assert "no COLMAP model" in refusal(ColmapReader().read, tmp_path, 8)
+    assert "no images" in refusal(read_scene, write_scene(tmp_path / "empty", replace(tiny_model(), images=[])))
 
 
 def test_detect_says_what_it_looked_for(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from clsplat.scene.colmap import read_colmap
+from clsplat.scene.detect import read_scene
 from tests.refusals import refusal
 
 TEXT = {
@@ -41,7 +41,7 @@ def write_text(path: Path, **changes: str) -> Path:
 )
 def test_text_dialects(tmp_path: Path, edit) -> None:
     files = {name.removesuffix(".txt"): edit(text) for name, text in TEXT.items()}
-    scene = read_colmap(write_text(tmp_path, **files))
+    scene = read_scene(write_text(tmp_path, **files))
     assert [view.name for view in scene.views] == ["a.jpg", "b c.jpg"]
     np.testing.assert_allclose(scene.views[1].world_to_camera[:, :3], np.diag([1, -1, -1]))
     assert scene.points is not None
@@ -75,10 +75,10 @@ def test_text_dialects(tmp_path: Path, edit) -> None:
 def test_text_error_names_the_line(tmp_path: Path, file: str, old: str, new: str, place: str) -> None:
     text = TEXT[f"{file}.txt"]
     assert text.count(old) == 1
-    assert place in refusal(read_colmap, write_text(tmp_path, **{file: text.replace(old, new)}))
+    assert place in refusal(read_scene, write_text(tmp_path, **{file: text.replace(old, new)}))
 
 
 def test_text_that_is_not_utf8(tmp_path: Path) -> None:
     write_text(tmp_path)
     (tmp_path / "sparse" / "0" / "images.txt").write_bytes(b"1 1 0 0 0 0 0 1 1 \xff.jpg\n")
-    assert "images.txt: not UTF-8" in refusal(read_colmap, tmp_path)
+    assert "images.txt: not UTF-8" in refusal(read_scene, tmp_path)

@@ -92,8 +92,8 @@ def test_metrics_of_every_scale(finished):
 
 
 def test_training_saw_every_level(finished):
-    assert finished.scene.scales == (1, 2, 4)
-    assert {finished._order.at(step).scale for step in range(1, 51)} == {1, 2, 4}
+    assert finished.scene.downscales == (1, 2, 4)
+    assert {finished._order.at(step).downscale for step in range(1, 51)} == {1, 2, 4}
 
 
 def test_zooming_in(tiny_scene, tmp_path):

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from clsplat.errors import DataError
-from clsplat.inspect.headers import Header, read_header
+from clsplat.scene.image_headers import Header, read_header
 from clsplat.scene.images import image_size
 from tests.data_sets import data_set
 

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from clsplat.errors import DataError
 from clsplat.inspect.inspection import Inspection
 from clsplat.inspect.page import MAX_NAMES, inspection_page
-from clsplat.inspect.survey import bend
+from clsplat.inspect.survey import distortion
 from clsplat.scene.detect import read_scene
 from clsplat.scene.images import load_image, load_mask
 from clsplat.scene.lens import Lens
@@ -84,7 +84,7 @@ def test_a_healthy_scene_is_ready(scene):
     assert (facts.points.count, facts.points.in_two, facts.points.behind) == (200, 1.0, 0.0)
     (camera,) = facts.cameras
     assert (camera.views, camera.model, camera.width, camera.height, camera.focal) == (24, "PINHOLE", 64, 48, (60, 60))
-    assert (camera.bend, camera.kept) == (0, 1)
+    assert (camera.distortion, camera.kept) == (0, 1)
 
 
 @pytest.mark.parametrize("name", ["fox", "fox_opencv", "fox_peers", "fox_nerfstudio", "lego_200", "kitchen", "lund"])
@@ -120,11 +120,11 @@ def test_blender_and_nerfstudio(tiny_scene):
     assert facts.points.count > 0
 
 
-def test_bend_is_the_displacement_at_the_corner():
-    assert bend(Lens(200, 100, "SIMPLE_RADIAL", (100.0, 100.0, 50.0, 0.1))) == pytest.approx(
+def test_distortion_is_the_displacement_at_the_corner():
+    assert distortion(Lens(200, 100, "SIMPLE_RADIAL", (100.0, 100.0, 50.0, 0.1))) == pytest.approx(
         100 * 0.1 * np.hypot(1, 0.5) ** 3
     )
-    assert bend(Lens(200, 100, "SIMPLE_RADIAL", (1e-300, 100.0, 50.0, 0.1))) is None
+    assert distortion(Lens(200, 100, "SIMPLE_RADIAL", (1e-300, 100.0, 50.0, 0.1))) is None
 
 
 # ---- errors: what the reader refuses too

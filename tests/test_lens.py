@@ -1,4 +1,4 @@
-"""Camera models against pycolmap's projections, and straightened photographs against the lens."""
+"""Camera models against pycolmap's projections, and undistorted photographs against the lens."""
 
 import json
 from dataclasses import replace
@@ -23,18 +23,18 @@ def test_every_model_projects_as_colmap_does():
         pixels = np.array(case["pixels"])
         error = np.abs(lens.project(np.array(case["points_cam"])) - pixels).max()
         assert error < (0.02 if name == "FOV_fitted" else 1e-9), name
-        back = np.stack(lens.unbend(*pixels.T), axis=1)
+        back = np.stack(lens.undistort(*pixels.T), axis=1)
         np.testing.assert_allclose(back, case["normalized_back"], atol=1e-8, err_msg=name)
 
 
 @pytest.mark.parametrize("lens", [STRONG, FISHEYE])
-def test_straightened_photographs_agree_with_the_lens(lens):
+def test_undistorted_photographs_agree_with_the_lens(lens):
     """A photograph of directions: what a pixel of the pinhole shows is its own ray, to 0.1 px at the corners."""
     y, x = np.meshgrid(np.arange(lens.height) + 0.5, np.arange(lens.width) + 0.5, indexing="ij")
-    u, v = lens.unbend(x.ravel(), y.ravel())
+    u, v = lens.undistort(x.ravel(), y.ravel())
     photograph = np.stack([u, v, np.zeros_like(u)], axis=1).reshape(lens.height, lens.width, 3).astype(np.float32)
     camera = lens.pinhole
-    shown = lens.undistort(photograph)
+    shown = lens.undistort_image(photograph)
     rows, columns = np.array([0, 0, -1, -1, 40]), np.array([0, -1, 0, -1, 50])
     px = (np.arange(camera.width) + 0.5)[columns]
     py = (np.arange(camera.height) + 0.5)[rows]
@@ -47,7 +47,7 @@ def test_the_whole_photograph(lens):
     """Every ray within 60 degrees and twice the size is in the wide pinhole; it shows what its mask says, to 0.1 px."""
     lens = replace(lens, whole=True)
     y, x = np.meshgrid(np.arange(lens.height) + 0.5, np.arange(lens.width) + 0.5, indexing="ij")
-    u, v = lens.unbend(x, y)
+    u, v = lens.undistort(x, y)
     camera = lens.pinhole
     columns, rows = u * camera.fx + camera.cx, v * camera.fy + camera.cy
     near = (np.maximum(np.abs(u), np.abs(v)) < 3**0.5) & (np.abs(u) < 200 / camera.fx) & (np.abs(v) < 150 / camera.fy)
@@ -55,14 +55,14 @@ def test_the_whole_photograph(lens):
     assert rows[near].min() > -1
     assert columns[near].max() < camera.width + 1
     assert rows[near].max() < camera.height + 1
-    seen = lens.undistort(np.stack([u, v, v], axis=2).astype(np.float32))
+    seen = lens.undistort_image(np.stack([u, v, v], axis=2).astype(np.float32))
     py, px = np.nonzero(lens.shown)
     assert 0.5 < lens.shown.mean() < 1
     inner = (py % 7 == 0) | (px % 7 == 0)
     py, px = py[inner], px[inner]
     found = seen[py, px, :2] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
     error = np.abs(found - np.stack([px + 0.5, py + 0.5], axis=1)).max(axis=1)
-    x, y = lens.bend((px + 0.5 - camera.cx) / camera.fx, (py + 0.5 - camera.cy) / camera.fy)
+    x, y = lens.distort((px + 0.5 - camera.cx) / camera.fx, (py + 0.5 - camera.cy) / camera.fy)
     whole = (x > 0.5) & (y > 0.5) & (x < lens.width - 0.5) & (y < lens.height - 0.5)  # not on the last half pixel
     assert error[whole].max() < 0.1
 
@@ -72,7 +72,7 @@ def test_no_pixel_of_the_pinhole_is_blank(lens):
     camera = lens.pinhole
     columns, rows = np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5
     u, v = np.meshgrid((columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy)
-    x, y = lens.bend(u, v)
+    x, y = lens.distort(u, v)
     assert x.min() > -0.5
     assert y.min() > -0.5
     assert x.max() < lens.width + 0.5

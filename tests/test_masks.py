@@ -1,4 +1,4 @@
-"""Masks, alpha as mask, turned and straightened photographs: which pixels count, and that the others do not."""
+"""Masks, alpha as mask, turned and undistorted photographs: which pixels count, and that the others do not."""
 
 import json
 import shutil
@@ -13,7 +13,7 @@ import pytest
 from clsplat.metrics.perceptual import ssim_map
 from clsplat.metrics.views import psnr
 from clsplat.render.workspace import Workspace
-from clsplat.scene.colmap import read_colmap
+from clsplat.scene.detect import read_scene
 from clsplat.scene.images import load_image, load_mask
 from clsplat.scene.lens import Lens
 from clsplat.scene.photographs import load_photograph
@@ -78,12 +78,12 @@ def test_masks_beside_a_colmap_scene(tmp_path, name):
     source = data_set("brighton")
     shutil.copytree(source / "sparse", tmp_path / "sparse")
     (tmp_path / "images").symlink_to(source / "images")
-    views = read_colmap(tmp_path).views
+    views = read_scene(tmp_path).views
     assert all(view.mask_path is None for view in views)
     first = views[0]
     file = name.replace("IMG_01", Path(first.name).stem).replace(".jpg", Path(first.name).suffix)
     mask = store(tmp_path / "masks" / file, np.zeros((first.camera.height, first.camera.width), np.uint8))
-    masked = [view for view in read_colmap(tmp_path).views if view.mask_path is not None]
+    masked = [view for view in read_scene(tmp_path).views if view.mask_path is not None]
     assert [(view.name, view.mask_path) for view in masked] == [(first.name, mask)]
     assert not load_mask(masked[0]).any()
 
@@ -166,37 +166,37 @@ def test_turned_photographs(tmp_path):
     assert "16x8" in refusal(load_image, view_of(path, 9, 16))
 
 
-# ---- straightened photographs
+# ---- undistorted photographs
 
 
-def bent_view(tmp_path: Path, rng: np.random.Generator) -> View:
+def distorted_view(tmp_path: Path, rng: np.random.Generator) -> View:
     lens = Lens(60, 40, "SIMPLE_RADIAL", (50.0, 30.0, 20.0, -0.1))
     photo = store(tmp_path / "a.png", rng.integers(0, 256, (40, 60, 3)).astype(np.uint8))
     return View("b/a.png", lens.pinhole, np.eye(3, 4), photo, lens=lens)
 
 
-def test_straightened_once(tmp_path, rng, monkeypatch):
-    view, folder = bent_view(tmp_path, rng), tmp_path / "straightened"
+def test_undistorted_once(tmp_path, rng, monkeypatch):
+    view, folder = distorted_view(tmp_path, rng), tmp_path / "undistorted"
     first = load_photograph(view, BLACK, folder)
     np.testing.assert_array_equal(first, load_photograph(view, BLACK))
-    monkeypatch.setattr(Lens, "undistort", None)
+    monkeypatch.setattr(Lens, "undistort_image", None)
     np.testing.assert_array_equal(load_photograph(view, BLACK, folder), first)
 
 
-def test_straightened_again_when_the_photograph_changes(tmp_path, rng):
-    view, folder = bent_view(tmp_path, rng), tmp_path / "straightened"
+def test_undistorted_again_when_the_photograph_changes(tmp_path, rng):
+    view, folder = distorted_view(tmp_path, rng), tmp_path / "undistorted"
     first = load_photograph(view, BLACK, folder)
     store(view.image_path, np.zeros((40, 60, 3), np.uint8))
     assert load_photograph(view, BLACK, folder).max() == 0 < first.max()
 
 
-def test_straightened_masks(tmp_path, rng):
-    view = bent_view(tmp_path, rng)
+def test_undistorted_masks(tmp_path, rng):
+    view = distorted_view(tmp_path, rng)
     white = np.full((40, 60), 255, np.uint8)
     white[:, :30] = 0
     view = replace(view, mask_path=store(tmp_path / "m.png", white))
     for _ in range(2):  # the second time from the folder
-        mask = load_photograph(view, BLACK, tmp_path / "straightened")[:, :, 3]
+        mask = load_photograph(view, BLACK, tmp_path / "undistorted")[:, :, 3]
         assert mask.shape == (view.camera.height, view.camera.width)
         edge = round(view.camera.cx)
         assert mask[:, : edge - 2].max() == 0

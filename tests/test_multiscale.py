@@ -59,7 +59,7 @@ def test_metadata(folders):
 def test_the_dataset_reads_back(folders):
     """The full scale is the single-scale dataset, bit for bit; the others are what scaling on the way gives."""
     single, multi = (read_scene(folder) for folder in folders)
-    assert multi.scales == (1, 2, 4, 8)
+    assert multi.downscales == (1, 2, 4, 8)
     assert (len(multi.train), len(multi.test)) == (32, 8)
     assert multi.background == "white"
     assert multi.extent == pytest.approx(single.extent)
@@ -69,7 +69,7 @@ def test_the_dataset_reads_back(folders):
             on_disk, on_the_way = multi.downscaled(scale).split(split), single.downscaled(scale).split(split)
             assert len(on_disk) == len(on_the_way)
             for one, other in zip(on_disk, on_the_way, strict=True):
-                assert one.scale == other.scale == scale
+                assert one.downscale == other.downscale == scale
                 np.testing.assert_allclose(one.world_to_camera, other.world_to_camera)
                 cameras = [list(vars(view.camera).values()) for view in (one, other)]
                 np.testing.assert_allclose(*cameras)
@@ -111,12 +111,12 @@ def test_scales_are_those_of_the_photographs(tiny_scene):
     assert scene.downscaled(1) is scene
     assert scene.downscaled(4).views[0].camera.width == 10
     several = scene.downscaled(2, 4, 8)
-    assert several.scales == (2, 4, 8)
+    assert several.downscales == (2, 4, 8)
     assert len(several.train) == 3 * len(scene.train)
     assert [view.camera.width for view in several.downscaled(8).views] == [5] * len(scene.views)
     assert several.downscaled(8).views[0].camera.fx == pytest.approx(scene.views[0].camera.fx / 8)
     assert several.extent == scene.extent
-    with pytest.raises(DataError, match="the finest images have 1/2 of their full size; expected 1/1"):
+    with pytest.raises(DataError, match="the largest images have 1/2 of their full size; expected 1/1"):
         several.downscaled(1)
 
 
@@ -128,7 +128,7 @@ def views_of(count: int, *scales: float) -> list[View]:
 
 def shares(views: list[View], sampling: str, steps: int) -> dict[float, float]:
     order = ViewOrder(views, sampling, seed=0)
-    drawn = Counter(order.at(step).scale for step in range(1, steps + 1))
+    drawn = Counter(order.at(step).downscale for step in range(1, steps + 1))
     return {scale: count / steps for scale, count in drawn.items()}
 
 
@@ -155,4 +155,4 @@ def test_every_view_comes_once_before_any_twice():
     views = views_of(7, 1, 2)
     drawn = [ViewOrder(views, "uniform", 0).at(step) for step in range(1, 29)]
     for epoch in (drawn[:14], drawn[14:]):
-        assert len({(view.name, view.scale) for view in epoch}) == 14
+        assert len({(view.name, view.downscale) for view in epoch}) == 14

@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 from clsplat.errors import DataError
-from clsplat.scene.colmap import read_colmap
+from clsplat.scene.detect import read_scene
 from clsplat.scene.images import load_image, load_mask
 from clsplat.scene.lens import Lens
 from clsplat.scene.scene import Camera, View
 from data_tools.colmap_writer import write_model
-from data_tools.photos import find_features, list_photos, map_cameras, match_features
+from data_tools.gather import list_photographs
+from data_tools.photos import find_features, map_cameras, match_features
 from data_tools.undistort import undistort_scene
 from data_tools.vocabulary import alike
 from tests.colmap_writer import CameraEntry, DeviceModel, ImageEntry, PointEntry
@@ -38,7 +39,7 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
     pytest.importorskip("pycolmap")
     source = data_set("fox_opencv")
     folder = tmp_path_factory.mktemp("photos")
-    for view in sorted(read_colmap(source).views, key=lambda view: view.name)[:14]:
+    for view in sorted(read_scene(source).views, key=lambda view: view.name)[:14]:
         shutil.copy(view.image_path, folder)
     return folder
 
@@ -58,8 +59,8 @@ def aligned_errors(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 
 def test_cameras_are_where_they_were(placed):
-    truth = {view.name: view.position for view in read_colmap(data_set("fox_opencv")).views}
-    views = read_colmap(placed).views
+    truth = {view.name: view.position for view in read_scene(data_set("fox_opencv")).views}
+    views = read_scene(placed).views
     assert len(views) == 14
     errors = aligned_errors(np.stack([v.position for v in views]), np.stack([truth[v.name] for v in views]))
     reach = np.linalg.norm(np.ptp([truth[v.name] for v in views], axis=0))
@@ -76,7 +77,7 @@ def test_the_same_photographs_give_the_same_cameras(photos, placed, tmp_path):
 @pytest.mark.parametrize("matching", ["sequential", "vocabulary"])
 def test_other_ways_to_match(photos, tmp_path, matching):
     placed = place(photos, tmp_path, matching=matching, neighbours=3)
-    assert len(read_colmap(placed).views) >= 12
+    assert len(read_scene(placed).views) >= 12
 
 
 def test_photographs_that_show_nothing(tmp_path):
@@ -95,9 +96,9 @@ def test_photographs_are_found_below_the_folder(tmp_path):
     (tmp_path / "runs").mkdir()
     for name in ("b.JPG", "a/ü 1.png", "a/.hidden/x.jpg", ".y.png", "runs/r.png", "K.txt", "c.tif"):
         (tmp_path / name).touch()
-    assert list_photos(tmp_path, tmp_path / "runs") == ["a/ü 1.png", "b.JPG", "c.tif"]
+    assert list_photographs(tmp_path, tmp_path / "runs") == ["a/ü 1.png", "b.JPG", "c.tif"]
     (tmp_path / "c.tif").unlink()
-    assert "found 2 photographs; expected at least 3" in refusal(list_photos, tmp_path, tmp_path / "runs")
+    assert "found 2 photographs; expected at least 3" in refusal(list_photographs, tmp_path, tmp_path / "runs")
 
 
 def test_damaged_photographs_are_left_out_and_turned_ones_turned(tmp_path, caplog):
@@ -143,7 +144,7 @@ def test_a_written_model_reads_back(tmp_path, rng):
         path = tmp_path / "images" / view.name
         path.parent.mkdir(parents=True, exist_ok=True)
         cv2.imwrite(str(path), np.zeros((view.camera.height, view.camera.width, 3), np.uint8))
-    for view, read in zip(sorted(views, key=lambda v: v.name), read_colmap(tmp_path).views, strict=True):
+    for view, read in zip(sorted(views, key=lambda v: v.name), read_scene(tmp_path).views, strict=True):
         assert (read.name, read.camera) == (view.name, view.camera)
         np.testing.assert_allclose(read.world_to_camera, view.world_to_camera, atol=1e-12)
 
@@ -161,12 +162,12 @@ def test_undistorted_scene(tmp_path, lens, blank):
     """A pattern that depends on the ray is seen along the pinhole's own rays; what is blank is masked."""
     columns, rows = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
     (tmp_path / "images").mkdir()
-    photograph = np.nan_to_num(pattern(*lens.unbend(columns, rows)))
+    photograph = np.nan_to_num(pattern(*lens.undistort(columns, rows)))
     cv2.imwrite(str(tmp_path / "images" / "a.png"), np.rint(photograph).astype(np.uint8))
     entry = CameraEntry(1, lens.model, lens.width, lens.height, lens.params)
     write_test_model(tmp_path / "sparse" / "0", DeviceModel([entry], [ImageEntry("a.png")], [PointEntry((0, 0, 3))]))
     assert undistort_scene(tmp_path, tmp_path / "out", blank=blank) == 1
-    (view,) = read_colmap(tmp_path / "out", 0).views
+    (view,) = read_scene(tmp_path / "out", 0).views
     assert view.lens is None
     shown, mask = load_image(view), load_mask(view)
     if blank == "crop":
@@ -178,7 +179,7 @@ def test_undistorted_scene(tmp_path, lens, blank):
         assert view.camera.width * view.camera.height > lens.pinhole.width * lens.pinhole.height
     y, x = np.nonzero(mask)
     u, v = (x + 0.5 - view.camera.cx) / view.camera.fx, (y + 0.5 - view.camera.cy) / view.camera.fy
-    px, py = lens.bend(u, v)
+    px, py = lens.distort(u, v)
     inside = (px > 0.5) & (py > 0.5) & (px < lens.width - 0.5) & (py < lens.height - 0.5)  # between pixel centres
     assert inside.mean() > 0.95
     assert np.abs(shown[y, x, 0] - pattern(u, v))[inside].max() < 1
@@ -192,8 +193,8 @@ def pattern(u: np.ndarray, v: np.ndarray) -> np.ndarray:
 def test_undistorted_photographs_are_smaller_and_kept(tmp_path):
     source = data_set("brighton")
     count = undistort_scene(source, tmp_path / "out", long_side=120)
-    views = read_colmap(tmp_path / "out").views
-    assert len(views) == count == len(read_colmap(source).views)
+    views = read_scene(tmp_path / "out").views
+    assert len(views) == count == len(read_scene(source).views)
     assert {max(view.camera.width, view.camera.height) for view in views} == {120}
     times = {view.image_path: view.image_path.stat().st_mtime_ns for view in views}
     undistort_scene(source, tmp_path / "out", long_side=120)

@@ -84,6 +84,21 @@ def test_reads_any_order_and_types(tmp_path, rng):
         np.testing.assert_array_equal(file.parameters[name], p[name])
 
 
+def test_other_elements_may_surround_the_vertices(tmp_path, rng):
+    p, path = parameters(rng, 4, degree=1), tmp_path / "model.ply"
+    write_ply(path, p, {"near": 0.2})
+    header, body = path.read_bytes().split(b"end_header\n", 1)
+    before, vertex = header.split(b"element vertex")
+    before += b"element camera 3\nproperty double focal\nproperty short kind\n"
+    after = b"element face 1\nproperty list uchar int vertices\nend_header\n"
+    faces = b"\x01\0\0\0\0"
+    path.write_bytes(before + b"element vertex" + vertex + after + b"\7" * 30 + body + faces)
+    file = read_ply(path)
+    assert file.rendering == {"near": 0.2}
+    for name in PARAMETERS:
+        np.testing.assert_array_equal(file.parameters[name], p[name])
+
+
 def test_refusals(tmp_path, rng):
     good = tmp_path / "good.ply"
     write_ply(good, parameters(rng), {})
@@ -97,6 +112,7 @@ def test_refusals(tmp_path, rng):
         "ascii": (data.replace(b"binary_little_endian", b"ascii"), "binary"),
         "points only": (data.replace(b"property float opacity", b"property float intensity"), "not a splat"),
         "odd f_rest": (data.replace(b"property float f_rest_44", b"property float extra"), "44 f_rest"),
+        "no vertices": (data.replace(b"element vertex", b"element point"), "no vertices"),
         "lists": (data.replace(b"property float nx", b"property list uchar int nx"), "cannot read"),
         "twice": (data.replace(b"property float nx", b"property float ny"), "twice"),
     }

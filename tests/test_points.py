@@ -60,6 +60,22 @@ def test_ply_with_crlf_header_and_faces(tmp_path: Path) -> None:
     assert len(read_points_ply(path)) == 2
 
 
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
+def test_ply_with_other_elements_before_the_vertices(tmp_path: Path, form: str) -> None:
+    header, body = ply(form, PLAIN, ROWS).split(b"end_header\n")
+    before, vertex = header.split(b"element vertex")
+    cameras = b"element camera 2\nproperty float focal\nproperty uchar kind\n"
+    values = b"1.5 1\n2.5 0\n" if form == "ascii" else struct.pack("<fBfB", 1.5, 1, 2.5, 0)
+    path = tmp_path / "p.ply"
+    path.write_bytes(before + cameras + b"element vertex" + vertex + b"end_header\n" + values + body)
+    np.testing.assert_array_equal(read_points_ply(path).positions, np.float32(ROWS[:, :3]))
+    path.write_bytes(path.read_bytes().replace(b"camera 2", b"camera 999999999999999999"))
+    refusal(read_points_ply, path)
+    lists = cameras.replace(b"property uchar", b"property list uchar int")
+    path.write_bytes(before + lists + b"element vertex" + vertex + b"end_header\n" + values + body)
+    assert "'camera', with a list, stands before the vertices" in refusal(read_points_ply, path)
+
+
 def test_ply_written_and_read(tmp_path: Path) -> None:
     cloud = PointCloud(np.float32(ROWS[:, :3]), np.float32(ROWS[:, 3:] / 255))
     write_points_ply(tmp_path / "new" / "p.ply", cloud)

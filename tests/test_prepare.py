@@ -13,6 +13,7 @@ from clsplat.errors import ConfigError, DataError
 from clsplat.pipeline import load
 from clsplat.prepare import steps as prepare_steps
 from clsplat.prepare.cache import fingerprint, plan, prepare
+from clsplat.prepare.place import place_photographs
 from clsplat.prepare.steps import Step
 from tests.refusals import refusal
 
@@ -183,3 +184,52 @@ def test_the_note_of_a_run_names_its_photographs(pipeline, photos, tmp_path):
     run(pipeline, photos)
     note = json.loads((tmp_path / "runs" / "smoke" / "prepared.json").read_text())
     assert (Path(note["folder"]) / "transforms_train.json").is_file()
+
+
+# ---- without a pipeline
+
+
+@pytest.fixture
+def done(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The steps from photographs to cameras, replaced by ones that only write files and note that they ran."""
+    ran: list[str] = []
+
+    def make(step: Step, source: Path, out: Path, without: Path) -> dict[str, Any]:
+        ran.append(step.stage)
+        (out / "images").mkdir()
+        if isinstance(step, prepare_steps.MapCameras):
+            if step.mapper == "global":
+                raise DataError("broken")
+            (out / "sparse" / "0").mkdir(parents=True)
+            (out / "sparse" / "0" / "cameras.bin").write_text(str(len(ran)))
+        return {"registered": 5}
+
+    for step in (prepare_steps.FindFeatures, prepare_steps.MatchFeatures, prepare_steps.MapCameras):
+        monkeypatch.setattr(step, "make", make)
+    return ran
+
+
+def test_photographs_are_placed_from_where_a_run_stopped(photos, tmp_path, done):
+    out = tmp_path / "out"
+    assert refusal(place_photographs, photos, out, 1600, "SIMPLE_RADIAL", "auto", "global") == "broken"
+    assert not (out / "sparse").exists()
+    assert place_photographs(photos, out) == 5
+    assert done == ["find_features", "match_features", "map_cameras", "map_cameras"]
+    assert (out / "sparse" / "0" / "cameras.bin").read_text() == "4"
+    assert (out / "images").is_dir()
+
+
+def test_photographs_are_not_placed_from_steps_with_other_settings(photos, tmp_path, done):
+    out = tmp_path / "out"
+    place_photographs(photos, out)
+    assert "holds a model already" in refusal(place_photographs, photos, out)
+    shutil.rmtree(out / "sparse")
+    done.clear()
+    assert place_photographs(photos, out, matching="sequential") == 5
+    assert done == ["match_features", "map_cameras"]
+
+
+def test_images_of_the_user_are_not_overwritten(photos, tmp_path, done):
+    (tmp_path / "out" / "images").mkdir(parents=True)
+    assert "holds `images` already" in refusal(place_photographs, photos, tmp_path / "out")
+    assert done == []

@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 import pytest
 
-from clsplat.scene.colmap import read_colmap
 from clsplat.scene.detect import read_scene
 from clsplat.scene.images import load_image
 from clsplat.scene.scene import Camera
@@ -81,7 +80,7 @@ def test_fox_has_the_poses_of_its_colmap_model(tmp_path: Path) -> None:
     table = json.loads((path / "transforms.json").read_text())
     (tmp_path / "transforms.json").write_text(json.dumps(table | dict.fromkeys(("k1", "k2", "p1", "p2"), 0)))
     (tmp_path / "images").symlink_to(path / "images")
-    ours, theirs = read_scene(tmp_path), read_colmap(data_set("fox"))
+    ours, theirs = read_scene(tmp_path), read_scene(data_set("fox"))
     assert ours.test == theirs.test
     for one, other in zip(ours.views, theirs.views, strict=True):
         assert one.name == f"images/{other.name}"

@@ -6,11 +6,11 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 
 from clsplat.density.edit import Edit, Rule
 from clsplat.density.thresholds import Share
 from clsplat.gaussians.tables import SH_C0
+from clsplat.scene.quaternion import rotation_matrix, unit_quaternions
 from clsplat.schedule import Positive
 
 Floats = NDArray[np.float64]
@@ -108,7 +108,7 @@ def merged(tables: dict[str, Floats], first: NDArray[np.int64], second: NDArray[
     }
     return {
         "means": means,
-        "quats": quats_of(axes),
+        "quats": unit_quaternions(axes),
         "log_scales": log_scales,
         "logit_opacity": np.log(opacity / (1 - opacity))[:, None],
         **colours,
@@ -117,18 +117,7 @@ def merged(tables: dict[str, Floats], first: NDArray[np.int64], second: NDArray[
 
 def covariance_of(quats: Floats, log_scales: Floats) -> Floats:
     """R diag(s²) Rᵀ, [N, 3, 3]."""
-    w, x, y, z = (quats / np.linalg.norm(quats, axis=1, keepdims=True)).T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    axes = np.moveaxis(np.array(rows), -1, 0) * np.exp(log_scales)[:, None, :]
+    rotations = rotation_matrix(*(quats / np.linalg.norm(quats, axis=1, keepdims=True)).T)
+    axes = rotations * np.exp(log_scales)[:, None, :]
     covariance: Floats = np.einsum("nij,nkj->nik", axes, axes)
     return covariance
-
-
-def quats_of(rotations: Floats) -> Floats:
-    """Unit quaternions (w, x, y, z) of rotation matrices [N, 3, 3]."""
-    quats: Floats = np.roll(Rotation.from_matrix(rotations).as_quat(), 1, axis=1)
-    return quats

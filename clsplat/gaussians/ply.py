@@ -9,7 +9,6 @@ that opacities lose what a filter on the screen spreads out: `SplatRenderMode: m
 """
 
 import json
-import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,22 +19,11 @@ from numpy.typing import NDArray
 from clsplat.errors import DataError
 from clsplat.files import atomic
 from clsplat.gaussians.tables import PARAMETERS, sh_coefficients
+from clsplat.ply_header import MAX_HEADER, PlyHeader, parse_ply_header
 
-HEADER_LIMIT = 1 << 16  # bytes; real headers have about 1.5 KB
-COMMENT = "comment clsplat "
-MODE = "comment SplatRenderMode: "
+RENDERING, MODE = "clsplat ", "SplatRenderMode: "  # comments
 FILTER = "filter_3D"
 MAX_DEGREE = 3
-_TYPES = {
-    **dict.fromkeys(("char", "int8"), "i1"),
-    **dict.fromkeys(("uchar", "uint8"), "u1"),
-    **dict.fromkeys(("short", "int16"), "i2"),
-    **dict.fromkeys(("ushort", "uint16"), "u2"),
-    **dict.fromkeys(("int", "int32"), "i4"),
-    **dict.fromkeys(("uint", "uint32"), "u4"),
-    **dict.fromkeys(("float", "float32"), "f4"),
-    **dict.fromkeys(("double", "float64"), "f8"),
-}
 _COLUMNS = {
     "means": ("x", "y", "z"),
     "sh_base": ("f_dc_0", "f_dc_1", "f_dc_2"),
@@ -56,42 +44,35 @@ class SplatFile:
     mode: str = "default"  # SplatRenderMode
 
 
-@dataclass(frozen=True)
-class _Header:
-    count: int
-    dtype: np.dtype[Any]
-    order: str
-    start: int  # bytes before the vertices
-    rendering: dict[str, Any]
-    mode: str
-
-
 def is_splat(path: Path) -> bool:
     """Tell a splat from a point cloud by its header.  Raises DataError when it is missing or not a PLY."""
-    try:
-        with path.open("rb") as file:
-            data = file.read(HEADER_LIMIT)
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read ({error.strerror}); expected a PLY file") from error
-    return "f_dc_0" in (_parse_header(path, data).dtype.names or ())
+    return "f_dc_0" in (parse_ply_header(path, _read(path, MAX_HEADER)).dtype.names or ())
 
 
 def read_ply(path: Path) -> SplatFile:
     """Read a splat PLY.  Raises DataError when it is missing, damaged or not a splat."""
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read ({error.strerror}); expected a PLY file") from error
-    header = _parse_header(path, data[:HEADER_LIMIT])
+    data = _read(path)
+    header = parse_ply_header(path, data)
+    if header.format == "ascii":
+        raise DataError(f"{path}: is an ascii PLY; expected binary_little_endian or binary_big_endian: export it again")
     expected = header.start + header.count * header.dtype.itemsize
     if len(data) < expected:
         raise DataError(
             f"{path}: holds {len(data)} bytes, but its header promises {header.count} splats, {expected} bytes; "
             "the file is cut short, copy or export it again"
         )
-    vertices = np.frombuffer(data, header.dtype, header.count, header.start)
-    parameters = _parameters(path, vertices)
-    return SplatFile(parameters, header.rendering, "mip" if "filter_variance" in parameters else header.mode)
+    parameters = _parameters(path, np.frombuffer(data, header.dtype, header.count, header.start))
+    mode = "mip" if "filter_variance" in parameters else _comment(header, MODE) or "default"
+    return SplatFile(parameters, _rendering(header), mode)
+
+
+def _read(path: Path, size: int = -1) -> bytes:
+    """The first `size` bytes of a file, or all."""
+    try:
+        with path.open("rb") as file:
+            return file.read(size)
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror}); expected a PLY file") from error
 
 
 def write_ply(path: Path, parameters: Parameters, rendering: dict[str, Any]) -> None:
@@ -118,57 +99,29 @@ def write_ply(path: Path, parameters: Parameters, rendering: dict[str, Any]) -> 
         blocks.append(np.sqrt(parameters["filter_variance"]))
         names.append(FILTER)
     mode = "mip" if rendering.get("compensate") else "default"
-    header = ["ply", "format binary_little_endian 1.0", COMMENT + json.dumps(rendering, sort_keys=True), MODE + mode]
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"comment {RENDERING}{json.dumps(rendering, sort_keys=True)}",
+        f"comment {MODE}{mode}",
+    ]
     header += [f"element vertex {count}", *(f"property float {name}" for name in names), "end_header"]
     with atomic(path) as file:
         file.write(("\n".join(header) + "\n").encode())
         file.write(np.ascontiguousarray(np.concatenate(blocks, axis=1), "<f4").tobytes())
 
 
-def _parse_header(path: Path, data: bytes) -> _Header:
-    match = re.search(rb"end_header\r?\n", data)
-    if not data.startswith(b"ply") or match is None:
-        raise DataError(f"{path}: not a PLY file; expected 'ply' and 'end_header' in its first {HEADER_LIMIT} bytes")
-    lines = [line.strip() for line in data[: match.start()].decode("utf-8", "replace").splitlines()]
-    orders = {"format binary_little_endian 1.0": "<", "format binary_big_endian 1.0": ">"}
-    order = next((orders[line] for line in lines if line in orders), None)
-    if order is None:
-        raise DataError(f"{path}: expected a binary PLY (format binary_little_endian 1.0)")
-    first = next((line for line in lines if line.startswith("element ")), "")
-    found = re.fullmatch(r"element vertex (\d+)", first)
-    if found is None:
-        raise DataError(f"{path}: the first element is '{first}'; expected 'element vertex N'")
-    return _Header(int(found[1]), _vertex_type(path, lines, order), order, match.end(), _rendering(lines), _mode(lines))
+def _comment(header: PlyHeader, start: str) -> str:
+    """What follows `start` in the first comment that begins with it, or ""."""
+    return next((text.removeprefix(start).strip() for text in header.comments if text.startswith(start)), "")
 
 
-def _vertex_type(path: Path, lines: list[str], order: str) -> np.dtype[Any]:
-    fields = []
-    vertex = False
-    for line in lines:
-        words = line.split()
-        if words[:1] == ["element"]:
-            vertex = words[1] == "vertex"
-        elif vertex and words[:1] == ["property"]:
-            if len(words) != 3 or words[1] not in _TYPES:
-                raise DataError(f"{path}: cannot read '{line}'; a splat's properties are single numbers")
-            fields.append((words[2], order + _TYPES[words[1]]))
-    names = [name for name, _ in fields]
-    if len(set(names)) < len(names):
-        raise DataError(f"{path}: a property is declared twice")
-    return np.dtype(fields)
-
-
-def _rendering(lines: list[str]) -> dict[str, Any]:
-    text = next((line.removeprefix(COMMENT) for line in lines if line.startswith(COMMENT)), "{}")
+def _rendering(header: PlyHeader) -> dict[str, Any]:
     try:
-        values = json.loads(text)
+        values = json.loads(_comment(header, RENDERING) or "{}")
     except ValueError:
         return {}
     return values if isinstance(values, dict) else {}
-
-
-def _mode(lines: list[str]) -> str:
-    return next((line.removeprefix(MODE).strip() for line in lines if line.startswith(MODE)), "default")
 
 
 def _parameters(path: Path, vertices: NDArray[Any]) -> Parameters:
@@ -177,7 +130,7 @@ def _parameters(path: Path, vertices: NDArray[Any]) -> Parameters:
     if missing:
         raise DataError(
             f"{path}: not a splat file: it has no {', '.join(missing[:4])}{' …' if len(missing) > 4 else ''}; "
-            "a point cloud must be trained first"
+            "train a point cloud first, convert a compressed file"
         )
     rest = sum(name.startswith("f_rest_") for name in names)
     degree = next((d for d in range(MAX_DEGREE + 1) if 3 * (sh_coefficients(d) - 1) == rest), None)

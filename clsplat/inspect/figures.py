@@ -4,7 +4,7 @@ from statistics import median
 
 from clsplat.inspect.survey import CameraFacts, Facts
 
-MAX_CAMERAS = 4
+MAX_CAMERAS = 4  # cameras, by the number of their views
 
 
 def figures(facts: Facts) -> dict[str, str]:
@@ -38,8 +38,8 @@ def camera_line(camera: CameraFacts) -> str:
     """A camera on one line."""
     fx, fy = camera.focal
     focal = f"{fx:.1f}" if abs(fx - fy) < 0.05 else f"{fx:.1f}, {fy:.1f}"
-    distortion = "without limit" if camera.bend is None else f"up to {camera.bend:.1f} px"
-    lens = f", distortion {distortion}, {100 * camera.kept:.0f} % kept when undistorted" if camera.bend != 0 else ""
+    amount = "without bounds" if camera.distortion is None else f"up to {camera.distortion:.1f} px"
+    lens = f", distortion {amount}, {100 * camera.kept:.0f} % kept" if camera.distortion != 0 else ""
     return f"{camera.model} {camera.width}x{camera.height}, focal length {focal} px{lens}; {camera.views} views"
 
 

@@ -5,18 +5,18 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from clsplat.inspect.survey import DISTANT, FEW_SEEN, CameraFacts, Facts, PointFacts
+from clsplat.inspect.survey import MAX_DISTANCE, MIN_SEEN, CameraFacts, Facts, PointFacts
 
 Level = Literal["error", "warning", "note"]
 LEVELS: tuple[Level, ...] = ("error", "warning", "note")
-NAMED = 4  # names in a finding
-FEW_VIEWS = 10
-FEW_POINTS = 100
-LEFT_OUT = 0.1  # share of the photographs that a model may leave out without a warning
-IMPRECISE = 2.0  # px of mean reprojection error; COLMAP drops observations above 4
-BEHIND, IN_TWO = 0.1, 0.5  # shares of points
-KEPT = 0.6  # share of a photograph
-FOCAL = (0.2, 20.0)  # focal length by image width: 136 to 3 degrees
+MAX_NAMES = 4  # names in a finding
+MIN_VIEWS = 10  # for training
+MIN_POINTS = 100
+MAX_SHARE_LEFT_OUT = 0.1  # share of the photographs that a model may leave out without a warning
+MAX_ERROR = 2.0  # px of mean reprojection error; COLMAP drops observations above 4
+MAX_SHARE_BEHIND, MIN_SHARE_IN_TWO = 0.1, 0.5  # shares of points
+MIN_SHARE_KEPT = 0.6  # share of a photograph
+FOCAL_RANGE = (0.2, 20.0)  # focal length by image width: 136 to 3 degrees
 
 
 @dataclass(frozen=True)
@@ -25,12 +25,12 @@ class Finding:
 
     level: Level
     fault: str
-    mend: str = ""
+    remedy: str = ""
 
     @property
     def text(self) -> str:
         """One sentence."""
-        return f"{self.fault}: {self.mend}" if self.mend else self.fault
+        return f"{self.fault}: {self.remedy}" if self.remedy else self.fault
 
 
 def findings(facts: Facts) -> list[Finding]:
@@ -61,50 +61,51 @@ def _unreadable(facts: Facts) -> Iterator[Finding]:
         folder = os.path.dirname(os.path.join(facts.path, facts.unregistered[0]))
         fault = f"{facts.path} holds {_counted(facts.on_disk, 'photograph')} but no camera poses"
         yield Finding("error", fault, f"`clsplat run photos --scene {folder}` finds where they were taken")
-    yield from (Finding("error", fault) for fault in facts.faults[:NAMED])
-    if len(facts.faults) > NAMED:
-        more = f"{_counted(len(facts.faults) - NAMED, 'more part')} of the dataset cannot be read"
-        yield Finding("error", more, "mend the first ones and inspect again")
+    yield from (Finding("error", fault) for fault in facts.faults[:MAX_NAMES])
+    if len(facts.faults) > MAX_NAMES:
+        more = f"{_counted(len(facts.faults) - MAX_NAMES, 'more part')} of the dataset cannot be read"
+        yield Finding("error", more, "fix the first ones and inspect again")
 
 
 def _photographs(facts: Facts) -> Iterator[Finding]:
-    photos, colmap = facts.photos, facts.kind == "COLMAP"
+    photographs, colmap = facts.photos, facts.kind == "COLMAP"
     if facts.missing:
         fault = f"{len(facts.missing)} of {facts.registered} registered images are missing on disk"
         yield Finding(
             "error", f"{fault} ({_few(facts.missing)})", "put the files back, or remove them from the dataset"
         )
-    if photos.unreadable:
-        fault = f"{_counted(len(photos.unreadable), 'image file')} cannot be read ({_few(list(photos.unreadable))})"
+    if photographs.unreadable:
+        unreadable = _few(list(photographs.unreadable))
+        fault = f"{_counted(len(photographs.unreadable), 'image file')} cannot be read ({unreadable})"
         yield Finding("error", fault, "copy or export them again")
-    if photos.misfits:
-        sizes = [f"{name} is {size}" for name, size in photos.misfits.items()]
+    if photographs.misfits:
+        sizes = [f"{name} is {size}" for name, size in photographs.misfits.items()]
         fault = f"{_are(len(sizes), 'image file')} not of the camera's size ({_few(sizes, 2)})"
-        mend = "use the images that the cameras were made from"
-        if len(photos.on_side) == len(sizes):
-            mend = "they lie on their side as seen from the cameras: " + mend
-        yield Finding("error", fault, mend)
-    if photos.cut:
-        fault = f"the end is missing from {_counted(len(photos.cut), 'image file')} ({_few(photos.cut)})"
-        yield Finding("warning", fault, "the rest of the picture is grey; copy it again")
+        remedy = "use the images that the cameras were made from"
+        if len(photographs.on_side) == len(sizes):
+            remedy = "they lie on their side as seen from the cameras: " + remedy
+        yield Finding("error", fault, remedy)
+    if photographs.cut:
+        fault = f"the end is missing from {_counted(len(photographs.cut), 'image file')} ({_few(photographs.cut)})"
+        yield Finding("warning", fault, "the rest of the image is grey; copy it again")
     if facts.unregistered:
         share = len(facts.unregistered) / facts.on_disk
         fault = f"{len(facts.unregistered)} of {facts.on_disk} images on disk have no pose ({_few(facts.unregistered)})"
-        serious = colmap and facts.registered and share > LEFT_OUT
-        mend = "they are not trained on" + (
+        serious = colmap and facts.registered and share > MAX_SHARE_LEFT_OUT
+        remedy = "they are not trained on" + (
             "; more overlapping photographs or colmap exhaustive_matcher may place them" if colmap else ""
         )
         if facts.registered:
-            yield Finding("warning" if serious else "note", fault, mend)
-    if photos.exif_turned:
-        fault = f"{_are(len(photos.exif_turned), 'photograph')} to be turned, says the EXIF data"
+            yield Finding("warning" if serious else "note", fault, remedy)
+    if photographs.exif_turned:
+        fault = f"{_are(len(photographs.exif_turned), 'photograph')} to be turned, says the EXIF data"
         yield Finding(
             "note", fault, "the pixels are taken as they are stored, as COLMAP does, so renders may lie on their side"
         )
-    if photos.larger:
-        fault = f"{_are(len(photos.larger), 'image file')} larger than the camera"
+    if photographs.larger:
+        fault = f"{_are(len(photographs.larger), 'image file')} larger than the camera"
         yield Finding("note", fault, "they are shrunk as they are read; smaller copies would load faster")
-    for names in facts.same_but_case[:NAMED]:
+    for names in facts.same_but_case[:MAX_NAMES]:
         fault = f"{' and '.join(names)} differ only in upper and lower case"
         yield Finding("warning", fault, "they overwrite each other on Windows and macOS; rename one")
     if colmap and facts.same_base:
@@ -115,17 +116,17 @@ def _photographs(facts: Facts) -> Iterator[Finding]:
 def _cameras(facts: Facts) -> Iterator[Finding]:
     sizes = {(camera.width, camera.height) for camera in facts.cameras}
     if len(sizes) > 1:
-        mend = "that is allowed; a step takes as long as its view is large"
-        yield Finding("note", f"the photographs have {len(sizes)} sizes", mend)
+        remedy = "that is allowed; a step takes as long as its view is large"
+        yield Finding("note", f"the photographs have {len(sizes)} sizes", remedy)
     for camera in facts.cameras:
         name = f"the {_camera_name(camera)} of {_counted(camera.views, 'view')}"
-        if not FOCAL[0] < camera.focal[0] / camera.width < FOCAL[1]:
+        if not FOCAL_RANGE[0] < camera.focal[0] / camera.width < FOCAL_RANGE[1]:
             fault = f"{name} has a focal length of {camera.focal[0]:.4g} px, which is hardly possible"
             yield Finding("warning", fault, "calibrate it again, or give the poses' program the right focal length")
         if not camera.centred:
             yield Finding("warning", f"{name} has its principal point outside the image", "calibrate it again")
-        if camera.kept < KEPT:
-            fault = f"straightening {name} keeps only {100 * camera.kept:.0f} % of each photograph"
+        if camera.kept < MIN_SHARE_KEPT:
+            fault = f"undistorting {name} keeps only {100 * camera.kept:.0f} % of each photograph"
             yield Finding("warning", fault, "use a narrower lens, or crop and undistort the images yourself")
 
 
@@ -133,29 +134,29 @@ def _poses(facts: Facts) -> Iterator[Finding]:
     used, *others = facts.submodels or {"": 0}
     if others:
         parts = ", ".join(f"{name} with {facts.submodels[name]} images" for name in others)
-        large = any(facts.submodels[name] > LEFT_OUT * facts.submodels[used] for name in others)
+        large = any(facts.submodels[name] > MAX_SHARE_LEFT_OUT * facts.submodels[used] for name in others)
         fault = f"COLMAP made {len(facts.submodels)} models and only {used} ({facts.submodels[used]} images) is used"
-        mend = f"left out is {parts}; colmap model_merger may join them where they share images"
-        yield Finding("warning" if large else "note", fault, mend)
-    if facts.train is not None and facts.train < FEW_VIEWS:
+        remedy = f"left out is {parts}; colmap model_merger may join them where they share images"
+        yield Finding("warning" if large else "note", fault, remedy)
+    if facts.train is not None and facts.train < MIN_VIEWS:
         fault = f"there {_are(facts.train, 'training view', 'only ')}"
         yield Finding("warning", fault, "expect floaters and blur away from the photographs; take 30 or more")
     if facts.test == 0:
         yield Finding("note", "there are no test views", "quality will be measured on training views only")
     if facts.one_place:
         fault = "all cameras are at the same place"
-        yield Finding("warning", fault, "depth cannot be told without moving; take photographs from different places")
+        yield Finding("warning", fault, "they do not show depth; take photographs from different places")
     if facts.strayed:
         fault = f"{_are(len(facts.strayed), 'camera')} far away from all others ({_few(facts.strayed)})"
         yield Finding(
             "warning", fault, "the pose is probably wrong; remove the image from the dataset or place it again"
         )
-    for names in facts.same_pose[:NAMED] if not facts.one_place else ():
+    for names in facts.same_pose[:MAX_NAMES] if not facts.one_place else ():
         fault = f"{_few(names)} have exactly the same pose"
         yield Finding("note", fault, "copies of one photograph count double; keep one of them")
     if facts.few_seen:
         counted = [f"{name}: {facts.seen[name]}" for name in facts.few_seen]
-        fault = f"fewer than {FEW_SEEN} points are seen by {_counted(len(counted), 'view')} ({_few(counted)})"
+        fault = f"fewer than {MIN_SEEN} points are seen by {_counted(len(counted), 'view')} ({_few(counted)})"
         yield Finding("warning", fault, "their poses are unreliable; look at their renders, or remove these images")
 
 
@@ -163,30 +164,30 @@ def _points(facts: Facts) -> Iterator[Finding]:
     points = facts.points
     if points is None or points.count == 0:
         if facts.registered and not any("points3d" in fault.lower() for fault in facts.faults):
-            mend = "training finds some by a plane sweep, or where photographs have alpha takes random ones"
-            yield Finding("note", "there are no points", mend)
+            remedy = "training finds some by a plane sweep, or where photographs have alpha takes random ones"
+            yield Finding("note", "there are no points", remedy)
         return
-    if points.count < FEW_POINTS:
+    if points.count < MIN_POINTS:
         fault = f"there {_are(points.count, 'point', 'only ')}"
         yield Finding("warning", fault, "try init: {source: random} as well")
     if points.not_finite:
         fault = f"{_are(points.not_finite, 'point')} not finite"
         yield Finding("warning", fault, "they are left out; the file may be damaged, so export it again")
     if points.distant:
-        fault = f"{_are(points.distant, 'point')} more than {DISTANT:g} times the cameras' extent away"
+        fault = f"{_are(points.distant, 'point')} more than {MAX_DISTANCE:g} times the cameras' extent away"
         yield Finding("note", fault, "usually sky or wrong matches; they become very large Gaussians")
     if not facts.refusal:
         yield from _coverage(points)
-    if points.error_mean is not None and points.error_mean > IMPRECISE:
+    if points.error_mean is not None and points.error_mean > MAX_ERROR:
         fault = f"the points miss their observations by {points.error_mean:.2f} px on average"
         yield Finding("warning", fault, "renders will be blurred; run bundle adjustment (colmap bundle_adjuster)")
 
 
 def _coverage(points: PointFacts) -> Iterator[Finding]:
     axes = "the poses do not belong to these points, or their axes are flipped; export both together again"
-    if points.behind is not None and points.behind > BEHIND:
+    if points.behind is not None and points.behind > MAX_SHARE_BEHIND:
         yield Finding("warning", f"{100 * points.behind:.0f} % of the points lie behind all cameras", axes)
-    elif points.in_two is not None and points.in_two < IN_TWO:
+    elif points.in_two is not None and points.in_two < MIN_SHARE_IN_TWO:
         yield Finding(
             "warning", f"only {100 * points.in_two:.0f} % of the points lie in the image of two views or more", axes
         )
@@ -206,5 +207,5 @@ def _are(count: int, word: str, before: str = "") -> str:
     return f"{verb} {before}{_counted(count, word)}" if before else f"{_counted(count, word)} {verb}"
 
 
-def _few(names: Sequence[str], most: int = NAMED) -> str:
-    return ", ".join(names[:most]) + (", …" if len(names) > most else "")
+def _few(names: Sequence[str], limit: int = MAX_NAMES) -> str:
+    return ", ".join(names[:limit]) + (", …" if len(names) > limit else "")

@@ -5,8 +5,9 @@ from pathlib import Path
 from typing import Any
 
 from clsplat.inspect.findings import Finding, findings, trainable, verdict
-from clsplat.inspect.parts import Parts, read_parts
+from clsplat.inspect.parts import read_parts
 from clsplat.inspect.survey import Facts, survey
+from clsplat.scene.parts import Parts
 
 
 @dataclass(frozen=True)
@@ -19,7 +20,7 @@ class Inspection:
 
     @classmethod
     def of(cls, path: Path) -> "Inspection":
-        """Inspect a COLMAP, Blender or nerfstudio folder.  Raises DataError only where there is no such folder."""
+        """Inspect the dataset in a folder.  Raises DataError only where there is no such folder."""
         parts = read_parts(path)
         facts = survey(parts)
         return cls(parts, facts, findings(facts))

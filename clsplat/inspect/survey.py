@@ -10,16 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.errors import DataError
-from clsplat.inspect.headers import read_header
-from clsplat.inspect.parts import Parts
+from clsplat.scene.image_headers import read_header
 from clsplat.scene.images import fits, read_image
 from clsplat.scene.lens import BORDER, Lens
+from clsplat.scene.parts import Parts
 from clsplat.scene.points import FAR
 from clsplat.scene.scene import View, camera_extent, strayed
 
-SAMPLE = 20_000  # points that coverage is measured on
-DISTANT = 100.0  # camera extents from the middle of the cameras: nothing that a photograph resolves
-FEW_SEEN = 30  # points; COLMAP itself registers no image with fewer inliers
+SAMPLE_SIZE = 20_000  # points that coverage is measured on
+MAX_DISTANCE = 100.0  # camera extents from the middle of the cameras: nothing that a photograph resolves
+MIN_SEEN = 30  # points; COLMAP itself registers no image with fewer inliers
 
 
 @dataclass(frozen=True)
@@ -31,18 +31,18 @@ class CameraFacts:
     width: int
     height: int
     focal: tuple[float, float]  # px
-    bend: float | None  # px: the largest displacement by the lens at the border; None where it overflows
-    kept: float  # share of the photograph that is left when it is straightened
+    distortion: float | None  # px: the largest displacement by the lens at the border; None where it overflows
+    kept: float  # share of the photograph that is left when it is undistorted
     centred: bool  # whether the principal point lies in the photograph
 
 
 @dataclass(frozen=True)
 class PointFacts:
-    """The sparse points.  Shares are of a sample of SAMPLE points, evenly spaced in the file."""
+    """The sparse points.  Shares are of a sample of SAMPLE_SIZE points, evenly spaced in the file."""
 
     count: int
     not_finite: int
-    distant: int  # beyond DISTANT camera extents
+    distant: int  # beyond MAX_DISTANCE camera extents
     error_mean: float | None  # px
     error_90: float | None  # px; 90 % of the points have less
     in_two: float | None  # share that lies in the image of at least two views, hidden or not
@@ -50,7 +50,7 @@ class PointFacts:
 
 
 @dataclass(frozen=True)
-class PhotoFacts:
+class PhotographFacts:
     """The image files and masks of the views, by name."""
 
     unreadable: dict[str, str]  # the reason
@@ -77,9 +77,9 @@ class Facts:
     folders: int  # that the registered images lie in
     submodels: dict[str, int]  # images of each COLMAP model; the first is used
     cameras: list[CameraFacts]
-    photos: PhotoFacts
+    photos: PhotographFacts
     points: PointFacts | None
-    seen: dict[str, int]  # points seen by each view; empty where the dataset does not tell
+    seen: dict[str, int]  # points seen by each view; empty where the dataset does not say
     extent: float | None  # scene units
     strayed: list[str]
     one_place: bool  # all cameras have the same centre
@@ -91,8 +91,8 @@ class Facts:
 
     @property
     def few_seen(self) -> list[str]:
-        """Views that see fewer than FEW_SEEN points."""
-        return sorted((name for name, count in self.seen.items() if count < FEW_SEEN), key=lambda name: self.seen[name])
+        """Views that see fewer than MIN_SEEN points."""
+        return sorted((name for name, count in self.seen.items() if count < MIN_SEEN), key=lambda name: self.seen[name])
 
 
 def survey(parts: Parts) -> Facts:
@@ -115,13 +115,13 @@ def survey(parts: Parts) -> Facts:
         folders=len({file.parent for file in expected}),
         submodels=parts.submodels,
         cameras=_cameras(parts),
-        photos=_photos(views, set(missing)),
+        photos=_photographs(views, set(missing)),
         points=_points(parts, extent, centres) if parts.points else None,
         seen=parts.observed if any(parts.observed.values()) else {},
         extent=extent,
         strayed=[view.name for view, far in zip(views, strayed(views), strict=True) if far] if views else [],
         one_place=len(views) > 1 and bool(np.allclose(centres, centres[0], rtol=0, atol=1e-9)),
-        same_pose=_repeated(names, [(view.scale, *view.world_to_camera.ravel().round(9)) for view in views]),
+        same_pose=_repeated(names, [(view.downscale, *view.world_to_camera.ravel().round(9)) for view in views]),
         same_but_case=[group for group in _repeated(names, [n.casefold() for n in names]) if len(set(group)) > 1],
         same_base=sum(count > 1 for count in Counter(file.name for file in set(expected)).values()),
         faults=parts.faults,
@@ -129,15 +129,15 @@ def survey(parts: Parts) -> Facts:
     )
 
 
-def bend(lens: Lens) -> float | None:
-    """By how many pixels the lens moves what a pinhole shows at the border, at most; None where it overflows."""
+def distortion(lens: Lens) -> float | None:
+    """The largest displacement by the lens along the border, in pixels; None where it overflows."""
     camera, along = lens.camera, np.linspace(0, 1, BORDER)
     zeros, ones = np.zeros(BORDER), np.ones(BORDER)
     x = np.concatenate([along, along, zeros, ones]) * lens.width
     y = np.concatenate([zeros, ones, along, along]) * lens.height
     with np.errstate(all="ignore"):
-        bent_x, bent_y = lens.bend((x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy)
-        moved = float(np.hypot(bent_x - x, bent_y - y).max())
+        moved_x, moved_y = lens.distort((x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy)
+        moved = float(np.hypot(moved_x - x, moved_y - y).max())
     return moved if np.isfinite(moved) else None
 
 
@@ -165,24 +165,24 @@ def _cameras(parts: Parts) -> list[CameraFacts]:
         kept = camera.width * camera.height / (original.width * original.height)
         centred = 0 <= original.cx <= original.width and 0 <= original.cy <= original.height
         size, focal = (original.width, original.height), (original.fx, original.fy)
-        found.append(CameraFacts(len(views), model, *size, focal, bend(lens) if lens else 0.0, kept, centred))
+        found.append(CameraFacts(len(views), model, *size, focal, distortion(lens) if lens else 0.0, kept, centred))
     return sorted(found, key=lambda facts: -facts.views)
 
 
-def _photos(views: Sequence[View], missing: set[Path]) -> PhotoFacts:
-    facts = PhotoFacts({}, [], {}, [], [], [], sum(view.mask_path is not None for view in views))
+def _photographs(views: Sequence[View], missing: set[Path]) -> PhotographFacts:
+    facts = PhotographFacts({}, [], {}, [], [], [], sum(view.mask_path is not None for view in views))
     for view in views:
         files = {view.name: view.image_path, f"mask of {view.name}": view.mask_path}
         for name, file in files.items():
             if file and file not in missing:
                 try:
-                    _photo(facts, view, name, file)
+                    _photograph(facts, view, name, file)
                 except DataError as error:
                     facts.unreadable[name] = str(error)
     return facts
 
 
-def _photo(facts: PhotoFacts, view: View, name: str, file: Path) -> None:
+def _photograph(facts: PhotographFacts, view: View, name: str, file: Path) -> None:
     """Note what is wrong with a view's photograph or mask.  Raises DataError when it cannot be read."""
     header = read_header(file)
     size, camera = (header.width, header.height), view.lens or view.camera
@@ -211,12 +211,12 @@ def _points(parts: Parts, extent: float | None, centres: NDArray[np.floating]) -
         known = np.empty(0)
     good = positions[finite].astype(np.float64)
     distance = np.linalg.norm(good - np.median(centres, axis=0), axis=1) if len(centres) else np.empty(0)
-    sample = good[:: max(1, -(-len(good) // SAMPLE))]
+    sample = good[:: max(1, -(-len(good) // SAMPLE_SIZE))]
     in_two, behind = _coverage(sample, parts.views) if len(sample) and parts.views else (None, None)
     return PointFacts(
         count=len(positions),
         not_finite=int(np.count_nonzero(~finite)),
-        distant=int(np.count_nonzero(distance > DISTANT * extent)) if extent else 0,
+        distant=int(np.count_nonzero(distance > MAX_DISTANCE * extent)) if extent else 0,
         error_mean=float(known.mean()) if len(known) else None,
         error_90=float(np.quantile(known, 0.9)) if len(known) else None,
         in_two=in_two,

@@ -25,7 +25,7 @@ class Planned:
     """A step and where its result lies, or will."""
 
     step: Step
-    photos: str  # the folder that it all began with
+    origin: str  # the folder of photographs that the first step reads
     inputs: str  # hash of what it reads
     folder: Path
     why: str  # it must be done; "" when it is
@@ -37,7 +37,7 @@ class Planned:
 
 
 def plan(steps: Sequence[Step], source: Path, root: Path) -> list[Planned]:
-    """Tell which steps must be done for the photographs in `source`, and why; results lie below `root`.
+    """Return which steps must be done for the photographs in `source`, and why; results lie below `root`.
 
     Raises DataError when the photographs cannot be read.
     """
@@ -111,17 +111,17 @@ def _do(one: Planned, source: Path, root: Path) -> None:
     try:
         shutil.rmtree(temporary, ignore_errors=True)  # of a run that was killed
         temporary.mkdir(parents=True)
-        told = one.step.make(source.resolve(), temporary, root.parent)
+        summary = one.step.make(source.resolve(), temporary, root.parent)
         seconds = round(time.perf_counter() - start, 1)
         settings = one.step.model_dump(mode="json")
-        record = {"photos": one.photos, "inputs": one.inputs, "settings": settings, "seconds": seconds, **told}
+        record = {"origin": one.origin, "inputs": one.inputs, "settings": settings, "seconds": seconds, **summary}
         write_text(temporary / RECORD, json.dumps(record, indent=1) + "\n")
         os.replace(temporary, one.folder)
     except OSError as error:
         raise unwritable(one.folder, error) from error
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
-    figures = ", ".join(f"{name} {value}" for name, value in told.items() if value not in ([], ""))
+    figures = ", ".join(f"{name} {value}" for name, value in summary.items() if value not in ([], ""))
     LOG.info("%s: %s  %.0f s", one.step.stage, figures, seconds)
 
 
@@ -135,7 +135,7 @@ def _why(step: Step, inputs: str, folder: Path, source: Path) -> str:
             record = json.loads(path.read_text())
         except (OSError, ValueError) as error:
             raise OutputError(f"{path}: cannot be read back ({error}); remove its folder") from error
-        if record.get("photos") == str(source.resolve()):
+        if record.get("origin") == str(source.resolve()):
             found.append((path.stat().st_mtime, record))
     if not found:
         return "not done yet"

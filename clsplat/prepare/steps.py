@@ -8,9 +8,8 @@ from pydantic import Field
 
 from clsplat.errors import DataError
 from clsplat.scene.detect import holds_scene
-from clsplat.scene.lens import MODELS
 from clsplat.settings import Settings
-from data_tools.photos import Cameras, Mapper, Matching, find_features, map_cameras, match_features
+from data_tools.photos import CameraModel, Cameras, Mapper, Matching, find_features, map_cameras, match_features
 from data_tools.undistort import Blank, undistort_scene
 
 Count = Annotated[int, Field(gt=0)]
@@ -25,7 +24,7 @@ class Step(Settings):
 
     @abstractmethod
     def make(self, source: Path, out: Path, without: Path) -> dict[str, Any]:
-        """Fill the empty folder `out` from `source`, without looking below `without`; return figures to tell."""
+        """Fill the empty folder `out` from `source`, without looking below `without`; return figures for the log."""
 
 
 class FindFeatures(Step):
@@ -35,13 +34,10 @@ class FindFeatures(Step):
 
     long_side: Count = 1600  # px: photographs are made smaller to look for features
     features: Count = 8192  # at most, in each
-    camera_model: Literal["SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "PINHOLE", "SIMPLE_PINHOLE"] = (
-        "SIMPLE_RADIAL"
-    )
+    camera_model: CameraModel = "SIMPLE_RADIAL"
     cameras: Cameras = "auto"  # auto: one for photographs of the same size and focal length
 
     def make(self, source: Path, out: Path, without: Path) -> dict[str, Any]:
-        assert self.camera_model in MODELS
         if holds_scene(source):
             raise DataError(
                 f"{source}: has its cameras already; train it with a pipeline without `prepare`, such as splat_7k, "

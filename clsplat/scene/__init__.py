@@ -1,0 +1,15 @@
+"""Datasets on the host.  These names are what a reader of another format needs: see `Reader`."""
+
+from clsplat.scene.camera import Camera as Camera
+from clsplat.scene.detect import read_scene as read_scene
+from clsplat.scene.images import inside as inside
+from clsplat.scene.images import read_file as read_file
+from clsplat.scene.images import require_files as require_files
+from clsplat.scene.parts import Parts as Parts
+from clsplat.scene.quaternion import pose_matrix as pose_matrix
+from clsplat.scene.readers import Reader as Reader
+from clsplat.scene.scene import PointCloud as PointCloud
+from clsplat.scene.scene import Scene as Scene
+from clsplat.scene.scene import View as View
+from clsplat.scene.scene import every_nth as every_nth
+from clsplat.scene.scene import make_scene as make_scene

@@ -2,18 +2,30 @@
 
 from pathlib import Path
 
+from clsplat.scene.parts import Parts
+from clsplat.scene.readers import Reader
 from clsplat.scene.scene import Scene, make_scene
-from clsplat.scene.transforms import Transforms
+from clsplat.scene.transforms import Transforms, list_frames
+
+TRAIN, TEST = "transforms_train.json", "transforms_test.json"
 
 
-def read_blender(path: Path) -> Scene:
-    """Read a Blender scene; the test views are those of transforms_test.json, none where that is missing.
+class BlenderReader(Reader):
+    """A Blender scene; the test views are those of transforms_test.json, none where that is missing."""
 
-    Raises DataError when a file is missing, damaged or not supported.
-    """
-    transforms = Transforms(path / "transforms_train.json")
-    train, test_file = transforms.views(), path / "transforms_test.json"
-    test = Transforms(test_file).views() if test_file.is_file() else []
-    held_out = set(range(len(train), len(train) + len(test)))
-    # NeRF and every paper since show these sets on white.
-    return make_scene(path, train + test, held_out, transforms.points(), background="white")
+    name = "Blender"
+    expects = TRAIN
+
+    def matches(self, path: Path) -> bool:
+        return (path / TRAIN).is_file()
+
+    def read(self, path: Path, holdout: int) -> Scene:
+        transforms = Transforms(path / TRAIN)
+        train = transforms.views()
+        test = Transforms(path / TEST).views() if (path / TEST).is_file() else []
+        held_out = set(range(len(train), len(train) + len(test)))
+        # NeRF and every paper since show these sets on white.
+        return make_scene(path, train + test, held_out, transforms.points(), background="white")
+
+    def list_parts(self, parts: Parts) -> None:
+        list_frames(parts, TRAIN, TEST)

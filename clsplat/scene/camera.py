@@ -1,6 +1,7 @@
 """The pinhole camera that everything is rendered with."""
 
-from dataclasses import dataclass
+import math
+from dataclasses import astuple, dataclass
 
 
 @dataclass(frozen=True)
@@ -13,6 +14,15 @@ class Camera:
     fy: float
     cx: float
     cy: float
+
+    def check(self) -> "Camera":
+        """Return the camera.  Raises ValueError unless sizes and focal lengths are positive and all numbers finite."""
+        if min(self.width, self.height, self.fx, self.fy) <= 0 or not all(map(math.isfinite, astuple(self))):
+            raise ValueError(
+                f"the camera is {self.width}x{self.height} with focal lengths {self.fx}, {self.fy} and principal point "
+                f"{self.cx}, {self.cy}; expected a positive size, positive focal lengths and finite numbers"
+            )
+        return self
 
     def resized(self, width: int, height: int) -> "Camera":
         """Return the camera of the same photograph resampled to another size."""

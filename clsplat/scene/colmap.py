@@ -1,44 +1,68 @@
 """Read COLMAP folders: which model, which photographs, which cameras a pinhole rasterizer can use."""
 
 import logging
-import math
 import os
 from pathlib import Path
 
-import numpy as np
-
 from clsplat.errors import DataError
 from clsplat.scene.colmap_files import (
-    MEND,
+    REMEDY,
     CameraRecord,
     ImageRecord,
     find_file,
     read_cameras,
     read_images,
+    read_point_table,
     read_points,
 )
 from clsplat.scene.images import inside, require_files
 from clsplat.scene.lens import MODELS, Lens, shared
+from clsplat.scene.parts import Parts
 from clsplat.scene.points import FAR
-from clsplat.scene.scene import Floats, Scene, View, every_nth, make_scene
+from clsplat.scene.quaternion import pose_matrix
+from clsplat.scene.readers import Reader
+from clsplat.scene.scene import Scene, View, every_nth, make_scene
 
 logger = logging.getLogger("clsplat")
 
 
-def read_colmap(path: Path, holdout: int = 8) -> Scene:
-    """Read a COLMAP scene: models in `sparse/N`, `sparse` or `path` itself, photographs in `images`.
+class ColmapReader(Reader):
+    """A COLMAP scene: models in `sparse/N`, `sparse` or the folder itself, photographs in `images`.
 
     Of several models the one with most images is taken.  Every `holdout`-th view by name is for testing.
-    Photographs of cameras with distortion are straightened as they are read.  Masks are taken from the
-    folder `masks`: an image's name with .png behind it or in place of its suffix.  Raises DataError when a file is
-    missing, damaged or not supported.
+    Photographs of cameras with distortion are undistorted as they are read.  Masks are taken from the
+    folder `masks`: an image's name with .png behind it or in place of its suffix.
     """
-    model, images = _largest_model(path)
-    cameras = read_cameras(model)
-    folder = image_folder(path)
-    views = sorted((view_of(image, cameras, folder) for image in images), key=lambda view: view.name)
-    require_files(path, (view.image_path for view in views))
-    return make_scene(path, views, every_nth([view.name for view in views], holdout), read_points(model))
+
+    name = "COLMAP"
+    expects = "sparse/0/cameras.bin or .txt"
+
+    def matches(self, path: Path) -> bool:
+        return bool(find_models(path))
+
+    def read(self, path: Path, holdout: int) -> Scene:
+        model, images = _largest_model(path)
+        cameras = read_cameras(model)
+        folder = image_folder(path)
+        views = sorted((view_of(image, cameras, folder) for image in images), key=lambda view: view.name)
+        require_files(path, (view.image_path for view in views))
+        return make_scene(path, views, every_nth([view.name for view in views], holdout), read_points(model))
+
+    def list_parts(self, parts: Parts) -> None:
+        found = [(folder, parts.attempt(read_images, folder) or []) for folder in find_models(parts.path)]
+        found.sort(key=lambda model: -len(model[1]))  # `read` takes the first of the largest, and sorting is stable
+        parts.submodels = {str(folder.relative_to(parts.path)): len(images) for folder, images in found}
+        model, images = found[0]
+        cameras = parts.attempt(read_cameras, model)
+        parts.points = parts.attempt(read_point_table, model)
+        parts.image_folder = folder = image_folder(parts.path)
+        files = [parts.attempt(inside, folder, image.name, image.where) for image in images]
+        parts.expected = [file for file in files if file]
+        for image in images if cameras else []:
+            if view := parts.attempt(view_of, image, cameras, folder):
+                parts.views.append(view)
+                parts.models[view.name] = cameras[image.camera].model if cameras else ""
+                parts.observed[view.name] = image.observed
 
 
 def find_models(path: Path) -> list[Path]:
@@ -69,36 +93,23 @@ def view_of(image: ImageRecord, cameras: dict[int, CameraRecord], folder: Path) 
     if image.camera not in cameras:
         raise DataError(
             f"{image.where}: image '{image.name}' names camera {image.camera}; expected one of the cameras file, "
-            f"{sorted(cameras)[:8]}: {MEND}"
+            f"{sorted(cameras)[:8]}: {REMEDY}"
         )
-    if not all(abs(t) < FAR for t in image.translation) or not 0 < math.hypot(*image.quaternion) < math.inf:
+    try:
+        pose = pose_matrix(image.quaternion, image.translation)
+    except ValueError as error:
         raise DataError(
-            f"{image.where}: the pose of '{image.name}' is quaternion {image.quaternion}, translation "
-            f"{image.translation}; expected finite numbers and a rotation: remove that image or {MEND}"
-        )
-    pose = np.column_stack([_rotation(image.quaternion), image.translation])
+            f"{image.where}: the pose of '{image.name}' is {error}: remove that image or {REMEDY}"
+        ) from error
     lens = shared(_lens(image.camera, cameras[image.camera]))
-    camera, bent = (lens.pinhole, lens) if lens.distorts else (lens.camera, None)
-    return View(image.name, camera, pose, image_path, _mask(folder.with_name("masks"), image.name), lens=bent)
+    camera, distortion = (lens.pinhole, lens) if lens.distorts else (lens.camera, None)
+    return View(image.name, camera, pose, image_path, _mask(folder.with_name("masks"), image.name), lens=distortion)
 
 
 def _mask(folder: Path, name: str) -> Path | None:
     """The mask of an image: its name with .png behind it (COLMAP) or in place of its suffix."""
     files = (folder / f"{name}.png", (folder / name).with_suffix(".png"))
     return next((file for file in files if os.path.isfile(file)), None)  # never raises
-
-
-def _rotation(quaternion: tuple[float, ...]) -> Floats:
-    """Rotation matrix [3, 3] of a quaternion (w, x, y, z) of any length but zero."""
-    length = math.hypot(*quaternion)
-    w, x, y, z = (part / length for part in quaternion)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
 
 
 def _lens(number: int, camera: CameraRecord) -> Lens:
@@ -113,6 +124,6 @@ def _lens(number: int, camera: CameraRecord) -> Lens:
     ):
         raise DataError(
             f"{camera.where}: camera {number} is {camera.width}x{camera.height} with parameters {camera.params[:4]}; "
-            f"expected a positive size and focal length and finite numbers: {MEND}"
+            f"expected a positive size and focal length and finite numbers: {REMEDY}"
         )
     return Lens(camera.width, camera.height, camera.model, camera.params)

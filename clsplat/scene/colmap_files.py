@@ -10,12 +10,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from clsplat.errors import DataError
 from clsplat.scene.images import read_file
-from clsplat.scene.points import point_cloud
-from clsplat.scene.scene import Floats, PointCloud
+from clsplat.scene.points import PointTable
+from clsplat.scene.scene import PointCloud
 
 # Camera models in order of their ids, with the number of parameters (COLMAP 4, sensor/models.h).
 PARAMETERS = {
@@ -25,7 +24,7 @@ PARAMETERS = {
     **{"EUCM": 6, "EQUIRECTANGULAR": 2},
 }
 MODELS = list(PARAMETERS)
-MEND = "copy or export the model again"
+REMEDY = "copy or export the model again"
 POINT2D = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
 POINT = np.dtype([("id", "<u8"), ("position", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("track", "<u8")])
 
@@ -54,15 +53,6 @@ class ImageRecord(NamedTuple):
     observed: int = 0
 
 
-class PointTable(NamedTuple):
-    """The rows of `points3D` as they are: nothing is dropped."""
-
-    file: Path
-    positions: Floats  # [M, 3]
-    rgb: NDArray[Any]  # [M, 3], in 0..255
-    error: Floats  # [M], mean reprojection error in pixels; COLMAP writes -1 or 0 where it knows none
-
-
 def find_file(folder: Path, stem: str) -> Path | None:
     """Return `stem`.bin or else `stem`.txt in a folder, or None."""
     files = (folder / f"{stem}.bin", folder / f"{stem}.txt")
@@ -75,7 +65,7 @@ def read_cameras(folder: Path) -> dict[int, CameraRecord]:
     cameras: dict[int, CameraRecord] = {}
     for number, camera in _cameras_binary(file) if file.suffix == ".bin" else _cameras_text(file):
         if number in cameras:
-            raise DataError(f"{camera.where}: a second camera {number}; expected different ids: {MEND}")
+            raise DataError(f"{camera.where}: a second camera {number}; expected different ids: {REMEDY}")
         cameras[number] = camera
     return cameras
 
@@ -91,7 +81,7 @@ def read_points(folder: Path) -> PointCloud | None:
     table = read_point_table(folder)
     if table is None:
         return None
-    points = point_cloud(table.file, table.positions, table.rgb)
+    points = table.cloud()
     return points if len(points) else None
 
 
@@ -106,7 +96,7 @@ def read_point_table(folder: Path) -> PointTable | None:
 def _require_file(folder: Path, stem: str) -> Path:
     file = find_file(folder, stem)
     if file is None:
-        raise DataError(f"{folder}: no {stem}.bin or {stem}.txt; {MEND}")
+        raise DataError(f"{folder}: no {stem}.bin or {stem}.txt; {REMEDY}")
     return file
 
 
@@ -125,7 +115,7 @@ class _Binary:
         left = len(self.data) - self.at
         if size > left:
             raise DataError(
-                f"{self.where}: expected {size} bytes of {what}, found {left}; truncated or damaged: {MEND}"
+                f"{self.where}: expected {size} bytes of {what}, found {left}; truncated or damaged: {REMEDY}"
             )
         self.at += size
         return self.at - size
@@ -147,7 +137,7 @@ class _Binary:
 
     def finish(self) -> None:
         if self.at < len(self.data):
-            raise DataError(f"{self.where}: {len(self.data) - self.at} bytes follow the last record; damaged: {MEND}")
+            raise DataError(f"{self.where}: {len(self.data) - self.at} bytes follow the last record; damaged: {REMEDY}")
 
 
 def _cameras_binary(path: Path) -> Iterator[tuple[int, CameraRecord]]:
@@ -240,11 +230,11 @@ def _lines(path: Path) -> Iterator[tuple[str, str]]:
 def _convert(where: str, words: list[str], kinds: Sequence[Callable[[str], Any]], layout: str) -> list[Any]:
     """Turn each word into its kind.  Raises DataError naming the line."""
     if len(words) != len(kinds):
-        raise DataError(f"{where}: expected {layout}, found {len(words)} of {len(kinds)} words; {MEND}")
+        raise DataError(f"{where}: expected {layout}, found {len(words)} of {len(kinds)} words; {REMEDY}")
     try:
         return [kind(word) for kind, word in zip(kinds, words, strict=True)]
     except ValueError as error:
-        raise DataError(f"{where}: {error}; expected {layout}: remove that entry or {MEND}") from error
+        raise DataError(f"{where}: {error}; expected {layout}: remove that entry or {REMEDY}") from error
 
 
 def _byte(word: str) -> int:
@@ -263,4 +253,4 @@ def _decode(where: str, data: bytes) -> str:
     try:
         return data.decode()
     except UnicodeDecodeError as error:
-        raise DataError(f"{where}: not UTF-8 text ({error}); {MEND}") from error
+        raise DataError(f"{where}: not UTF-8 text ({error}); {REMEDY}") from error

@@ -1,44 +1,57 @@
-"""Tell which kind of dataset a folder holds, and read it."""
+"""Find the reader of a dataset among the shipped ones and those of plug-ins."""
 
 from pathlib import Path
 
 from clsplat.errors import DataError
-from clsplat.scene.blender import read_blender
-from clsplat.scene.colmap import find_models, read_colmap
-from clsplat.scene.multiscale import FILE, read_multiscale
-from clsplat.scene.nerfstudio import read_nerfstudio
-from clsplat.scene.scene import Scene
+from clsplat.scene.blender import BlenderReader
+from clsplat.scene.colmap import ColmapReader
+from clsplat.scene.images import is_image
+from clsplat.scene.multiscale import MultiscaleReader
+from clsplat.scene.nerfstudio import NerfstudioReader
+from clsplat.scene.readers import Reader, reader_classes
+from clsplat.scene.scene import HOLDOUT, Scene
 
-FILES = ("transforms_train.json", FILE, "transforms.json")  # besides COLMAP's
-PHOTOS = (".jpg", ".jpeg", ".png")
+PRECEDENCE = (ColmapReader, BlenderReader, MultiscaleReader, NerfstudioReader)
+
+
+def readers() -> list[Reader]:
+    """Return the readers in order of precedence: shipped ones, then those of plug-ins in order of definition."""
+
+    def rank(found: type[Reader]) -> int:
+        """That of the shipped reader which it is, or extends."""
+        return next((i for i, shipped in enumerate(PRECEDENCE) if issubclass(found, shipped)), len(PRECEDENCE))
+
+    return [found() for found in sorted(reader_classes(), key=rank)]
+
+
+def format_names() -> str:
+    """Return the names of all formats as in `A, B or C`."""
+    *others, last = (reader.name for reader in readers())
+    return f"{', '.join(others)} or {last}"
+
+
+def reader_of(path: Path) -> Reader | None:
+    """Return the first reader that knows the dataset in a folder."""
+    return next((reader for reader in readers() if reader.matches(path)), None)
 
 
 def holds_scene(path: Path) -> bool:
-    """Whether a folder has cameras, of any kind that read_scene knows."""
-    return bool(find_models(path)) or any((path / name).is_file() for name in FILES)
+    """Whether a folder has cameras, in any format that read_scene knows."""
+    return reader_of(path) is not None
 
 
-def read_scene(path: Path, holdout: int = 8) -> Scene:
-    """Read a COLMAP, Blender (of one scale or several) or nerfstudio folder.
+def read_scene(path: Path, holdout: int = HOLDOUT) -> Scene:
+    """Read the dataset in a folder; every `holdout`-th view is for testing where the dataset does not say which.
 
-    `holdout` is for those that do not tell their test views.
-    Raises DataError when it is none of these, or damaged.
+    Raises DataError when no reader knows it, or when it is damaged.
     """
     if not path.is_dir():
         raise DataError(f"{path}: no such folder; expected the folder of a dataset")
-    if find_models(path):
-        return read_colmap(path, holdout)
-    if (path / "transforms_train.json").is_file():
-        return read_blender(path)
-    if (path / FILE).is_file():
-        return read_multiscale(path)
-    if (path / "transforms.json").is_file():
-        return read_nerfstudio(path, holdout)
-    if any(file.suffix.lower() in PHOTOS for file in path.iterdir()):
+    if reader := reader_of(path):
+        return reader.read(path, holdout)
+    if any(is_image(file) for file in path.iterdir()):
         raise DataError(
             f"{path}: photographs without cameras; `clsplat run photos --scene {path}` finds where they were taken"
         )
-    raise DataError(
-        f"{path}: no dataset found; looked for COLMAP (sparse/0/cameras.bin or .txt), "
-        "Blender (transforms_train.json, metadata.json) and nerfstudio (transforms.json)"
-    )
+    known = ", ".join(f"{reader.name} ({reader.expects})" for reader in readers())
+    raise DataError(f"{path}: no dataset found; looked for {known}")

@@ -3,7 +3,7 @@
 import operator
 import os
 from collections.abc import Iterable
-from pathlib import Path, PureWindowsPath
+from pathlib import Path, PurePath, PureWindowsPath
 from typing import Any
 
 import cv2
@@ -14,8 +14,9 @@ from clsplat.errors import DataError
 from clsplat.files import atomic
 from clsplat.scene.scene import View
 
+IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"})  # in lower case
 BLACK = (0.0, 0.0, 0.0)
-WHITE = 0.99  # of the largest value: a mask that was stored as JPEG is never quite white
+MIN_WHITE = 0.99  # of the largest value: a mask that was stored as JPEG is never quite white
 
 
 def load_image(view: View, background: tuple[float, float, float] | None = None) -> NDArray[np.uint8]:
@@ -60,14 +61,14 @@ def load_mask(view: View) -> NDArray[np.bool_] | None:
         layers.append(np.where(view.lens.shown, 255, 0).astype(np.uint8)[:, :, None])
     size = view.camera.width, view.camera.height
     masks = [
-        cv2.resize(layer.astype(np.float32), size, interpolation=cv2.INTER_AREA) > WHITE * np.iinfo(layer.dtype).max
+        cv2.resize(layer.astype(np.float32), size, interpolation=cv2.INTER_AREA) > MIN_WHITE * np.iinfo(layer.dtype).max
         for layer in layers
     ]
     return np.logical_and.reduce(masks) if masks else None
 
 
 def _as_taken(view: View, path: Path) -> NDArray[Any]:
-    """The pixels of a file as its camera saw them: upright, straightened, before downscaling.
+    """The pixels of a file as its camera saw them: upright, undistorted, before downscaling.
 
     A file that is turned by its EXIF tag is turned where only then it is the camera's image: COLMAP ignores the tag.
     Raises DataError when it is not the camera's image in either case.
@@ -84,7 +85,12 @@ def _as_taken(view: View, path: Path) -> NDArray[Any]:
             f"{path}: the image is {width}x{height} pixels, its camera {camera[0]}x{camera[1]}; expected the same size"
             f"{'' if lens else ', or a larger image of the same shape'}: use the images the cameras were made from"
         )
-    return lens.undistort(pixels) if lens else pixels
+    return lens.undistort_image(pixels) if lens else pixels
+
+
+def is_image(path: PurePath) -> bool:
+    """Tell whether a file name has the suffix of an image."""
+    return path.suffix.lower() in IMAGE_SUFFIXES
 
 
 def write_image(path: Path, rgb: NDArray[np.uint8]) -> None:

@@ -1,4 +1,4 @@
-"""Lenses that bend light: COLMAP's camera models, and the pinhole photographs that are made from theirs.
+"""Lenses with distortion: COLMAP's camera models, and the pinhole photographs that are made from theirs.
 
 Normalised coordinates are (x/z, y/z) of a point before the camera.  A lens moves them; focal lengths and principal
 point turn them into pixels.  Formulas are those of COLMAP's sources (sensor/models.h), which follow OpenCV's.
@@ -19,11 +19,11 @@ from clsplat.scene.camera import Camera
 Floats = NDArray[np.float64]
 Distortion = Callable[[Floats, Floats, Sequence[float]], tuple[Floats, Floats]]
 BORDER = 200  # points along each edge of a photograph
-ROUNDS = 50  # of Newton's method
-EXACT = 1.0e-6  # normalised units
-ALIKE = 1.0e-3  # normalised units
-WIDEST = 3**0.5  # tan of 60 degrees: a pinhole of more is mostly stretched edges
-LARGEST = 2.0  # times the photograph's size
+MAX_ROUNDS = 50  # of Newton's method
+MAX_ERROR = 1.0e-6  # of its result, normalised units
+MAX_DIFFERENCE = 1.0e-3  # of a ray that was distorted and undistorted, normalised units
+MAX_TANGENT = 3**0.5  # tan of 60 degrees: a pinhole of more is mostly stretched edges
+MAX_GROWTH = 2.0  # of an undistorted photograph's size by the photograph's
 
 
 def _radial(u: Floats, v: Floats, k: Sequence[float]) -> tuple[Floats, Floats]:
@@ -52,8 +52,8 @@ def _full_opencv(u: Floats, v: Floats, k: Sequence[float]) -> tuple[Floats, Floa
 def _fisheye(u: Floats, v: Floats, k: Sequence[float]) -> tuple[Floats, Floats]:
     r = np.hypot(u, v)
     theta = np.arctan(r)
-    bent = theta * (1 + sum(c * theta ** (2 * i + 2) for i, c in enumerate(k)))
-    factor = np.where(r > 1e-12, bent / np.maximum(r, 1e-12), 1.0)
+    angle = theta * (1 + sum(c * theta ** (2 * i + 2) for i, c in enumerate(k)))
+    factor = np.where(r > 1e-12, angle / np.maximum(r, 1e-12), 1.0)
     return u * factor, v * factor
 
 
@@ -68,8 +68,8 @@ def _fov(u: Floats, v: Floats, k: Sequence[float]) -> tuple[Floats, Floats]:
     r, omega = np.hypot(u, v), k[0]
     if abs(omega) < 1e-9:
         return u, v
-    bent = np.arctan(2 * r * np.tan(omega / 2)) / omega
-    factor = np.where(r > 1e-12, bent / np.maximum(r, 1e-12), 2 * np.tan(omega / 2) / omega)
+    radius = np.arctan(2 * r * np.tan(omega / 2)) / omega
+    factor = np.where(r > 1e-12, radius / np.maximum(r, 1e-12), 2 * np.tan(omega / 2) / omega)
     return u * factor, v * factor
 
 
@@ -96,7 +96,7 @@ class Lens:
     height: int
     model: str
     params: tuple[float, ...]
-    whole: bool = False  # straightened photographs show all of it, blank pixels too, not the part without them
+    whole: bool = False  # the undistorted photograph shows all of it, with blank pixels, not only the part without them
 
     @property
     def _split(self) -> tuple[float, float, float, float, tuple[float, ...]]:
@@ -106,10 +106,10 @@ class Lens:
 
     @property
     def distorts(self) -> bool:
-        """Whether the lens does anything; a fisheye always does."""
+        """Whether the lens has distortion; a fisheye always has."""
         return "FISHEYE" in self.model or any(self._split[4])
 
-    def bend(self, u: Floats, v: Floats) -> tuple[Floats, Floats]:
+    def distort(self, u: Floats, v: Floats) -> tuple[Floats, Floats]:
         """Pixels of normalised coordinates."""
         fx, fy, cx, cy, rest = self._split
         x, y = MODELS[self.model][1](u, v, rest)
@@ -117,26 +117,26 @@ class Lens:
 
     def project(self, points: Floats) -> Floats:
         """Pixels [M, 2] of points [M, 3] in camera space, in front of it."""
-        return np.stack(self.bend(points[:, 0] / points[:, 2], points[:, 1] / points[:, 2]), axis=1)
+        return np.stack(self.distort(points[:, 0] / points[:, 2], points[:, 1] / points[:, 2]), axis=1)
 
-    def unbend(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
-        """Normalised coordinates of pixels, by Newton's method; NaN where there are none."""
+    def undistort(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
+        """Normalised coordinates of pixels, by Newton's method; NaN where it does not converge."""
         fx, fy, cx, cy, rest = self._split
-        distort = MODELS[self.model][1]
+        distortion = MODELS[self.model][1]
         goal_u, goal_v = (x - cx) / fx, (y - cy) / fy
         u, v = goal_u.copy(), goal_v.copy()
         step = 1e-7
         with np.errstate(all="ignore"):
-            for _ in range(ROUNDS):
-                a, b = distort(u, v, rest)
-                au, bu = distort(u + step, v, rest)
-                av, bv = distort(u, v + step, rest)
+            for _ in range(MAX_ROUNDS):
+                a, b = distortion(u, v, rest)
+                au, bu = distortion(u + step, v, rest)
+                av, bv = distortion(u, v + step, rest)
                 j00, j10, j01, j11 = (au - a) / step, (bu - b) / step, (av - a) / step, (bv - b) / step
                 det = j00 * j11 - j01 * j10
                 da, db = goal_u - a, goal_v - b
                 u, v = u + (j11 * da - j01 * db) / det, v + (j00 * db - j10 * da) / det
-            a, b = distort(u, v, rest)
-            good = (np.abs(a - goal_u) < EXACT) & (np.abs(b - goal_v) < EXACT)
+            a, b = distortion(u, v, rest)
+            good = (np.abs(a - goal_u) < MAX_ERROR) & (np.abs(b - goal_v) < MAX_ERROR)
         return np.where(good, u, np.nan), np.where(good, v, np.nan)
 
     @property
@@ -154,18 +154,18 @@ class Lens:
         """
         fx, fy, _, _, _ = self._split
         along_x, along_y = np.linspace(0, self.width, BORDER), np.linspace(0, self.height, BORDER)
-        left = self.unbend(np.zeros(BORDER), along_y)[0]
-        right = self.unbend(np.full(BORDER, float(self.width)), along_y)[0]
-        top = self.unbend(along_x, np.zeros(BORDER))[1]
-        bottom = self.unbend(along_x, np.full(BORDER, float(self.height)))[1]
+        left = self.undistort(np.zeros(BORDER), along_y)[0]
+        right = self.undistort(np.full(BORDER, float(self.width)), along_y)[0]
+        top = self.undistort(along_x, np.zeros(BORDER))[1]
+        bottom = self.undistort(along_x, np.full(BORDER, float(self.height)))[1]
         if not all(np.isfinite(side).any() for side in (left, right, top, bottom)):
             raise DataError(f"the lens {self.model} {self.params} cannot be inverted; calibrate the camera again")
         u0, u1, v0, v1 = np.nanmax(left), np.nanmin(right), np.nanmax(top), np.nanmin(bottom)
         if self.whole:
             across, down = np.concatenate([left, right]), np.concatenate([top, bottom])
-            wide, high = self.width * (LARGEST / 2) / fx, self.height * (LARGEST / 2) / fy
-            u0, u1 = max(np.nanmin(across), -WIDEST, -wide), min(np.nanmax(across), WIDEST, wide)
-            v0, v1 = max(np.nanmin(down), -WIDEST, -high), min(np.nanmax(down), WIDEST, high)
+            wide, high = self.width * (MAX_GROWTH / 2) / fx, self.height * (MAX_GROWTH / 2) / fy
+            u0, u1 = max(np.nanmin(across), -MAX_TANGENT, -wide), min(np.nanmax(across), MAX_TANGENT, wide)
+            v0, v1 = max(np.nanmin(down), -MAX_TANGENT, -high), min(np.nanmax(down), MAX_TANGENT, high)
         width, height = int((u1 - u0) * fx), int((v1 - v0) * fy)
         if min(width, height) < 1:
             raise DataError(
@@ -173,22 +173,22 @@ class Lens:
             )
         return Camera(width, height, fx, fy, float(-u0 * fx), float(-v0 * fy))
 
-    def undistort(self, pixels: NDArray[Any]) -> NDArray[Any]:
+    def undistort_image(self, pixels: NDArray[Any]) -> NDArray[Any]:
         """The photograph as `pinhole` would have taken it, [H, W, C] of the same type."""
         camera = self.pinhole
-        x, y = self.bend(*_rays(camera))
+        x, y = self.distort(*_rays(camera))
         maps = (x - 0.5).astype(np.float32), (y - 0.5).astype(np.float32)  # OpenCV's pixels have whole centres
-        straight = cv2.remap(pixels, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        return straight.reshape(camera.height, camera.width, -1)
+        undistorted = cv2.remap(pixels, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return undistorted.reshape(camera.height, camera.width, -1)
 
     @cached_property
     def shown(self) -> NDArray[np.bool_]:
         """Which pixels of `pinhole`, [H, W], the photograph shows: rays that land in it and come back as themselves."""
         u, v = _rays(self.pinhole)
-        x, y = self.bend(u, v)
-        back_u, back_v = self.unbend(x, y)
+        x, y = self.distort(u, v)
+        back_u, back_v = self.undistort(x, y)
         inside = (x >= 0) & (y >= 0) & (x <= self.width) & (y <= self.height)
-        return inside & (np.abs(back_u - u) < ALIKE) & (np.abs(back_v - v) < ALIKE)
+        return inside & (np.abs(back_u - u) < MAX_DIFFERENCE) & (np.abs(back_v - v) < MAX_DIFFERENCE)
 
 
 def _rays(camera: Camera) -> tuple[Floats, Floats]:

@@ -6,29 +6,41 @@ from typing import Any
 
 from clsplat.errors import DataError
 from clsplat.scene.images import read_file, require_files
-from clsplat.scene.points import read_points_ply
+from clsplat.scene.parts import Parts
+from clsplat.scene.points import read_ply_table, read_points_ply
+from clsplat.scene.readers import Reader
 from clsplat.scene.scene import Scene, View, make_scene
 from clsplat.scene.transforms import Frame, camera_of, image_path_of, pose_of, view_name
 
-FILE = "metadata.json"
+FILE, POINTS = "metadata.json", "points3d.ply"
 COLUMNS = ("file_path", "cam2world", "width", "height", "focal", "label")  # one value for each image
 
 
-def read_multiscale(path: Path) -> Scene:
-    """Read a multi-scale Blender scene; an image of label j shows 1/2^j of the full size.
+class MultiscaleReader(Reader):
+    """A multi-scale Blender scene; an image of label j shows 1/2^j of the full size."""
 
-    Raises DataError when a file is missing, damaged or not supported.
-    """
-    try:
-        splits = json.loads(read_file(path / FILE))
-    except (ValueError, RecursionError) as error:
-        raise DataError(f"{path / FILE}: not a JSON file ({error}); make it again") from error
-    train, test = (_views(path / FILE, splits, name) for name in ("train", "test"))
-    require_files(path, (view.image_path for view in train + test))
-    points = path / "points3d.ply"
-    held_out = set(range(len(train), len(train) + len(test)))
-    cloud = read_points_ply(points) if points.is_file() else None
-    return make_scene(path, train + test, held_out, cloud, background="white")
+    name = "multi-scale Blender"
+    expects = FILE
+
+    def matches(self, path: Path) -> bool:
+        return (path / FILE).is_file()
+
+    def read(self, path: Path, holdout: int) -> Scene:
+        try:
+            splits = json.loads(read_file(path / FILE))
+        except (ValueError, RecursionError) as error:
+            raise DataError(f"{path / FILE}: not a JSON file ({error}); make it again") from error
+        train, test = (_views(path / FILE, splits, name) for name in ("train", "test"))
+        require_files(path, (view.image_path for view in train + test))
+        points = path / POINTS
+        held_out = set(range(len(train), len(train) + len(test)))
+        cloud = read_points_ply(points) if points.is_file() else None
+        return make_scene(path, train + test, held_out, cloud, background="white")
+
+    def list_parts(self, parts: Parts) -> None:
+        super().list_parts(parts)
+        points = parts.path / POINTS
+        parts.points = parts.attempt(read_ply_table, points) if points.is_file() else None
 
 
 def _views(path: Path, splits: Any, name: str) -> list[View]:
@@ -46,6 +58,6 @@ def _views(path: Path, splits: Any, name: str) -> list[View]:
                 f"{frame.where}: label is {label!r}; expected how often the image was halved: make it again"
             )
         image = image_path_of(frame)
-        view = View(view_name(file), camera_of(frame, None), pose_of(frame), image, scale=2**level)
+        view = View(view_name(file), camera_of(frame, None), pose_of(frame), image, downscale=2**level)
         views.append(view)
     return views

@@ -4,30 +4,43 @@ import logging
 from pathlib import Path
 
 from clsplat.errors import DataError
+from clsplat.scene.parts import Parts
+from clsplat.scene.readers import Reader
 from clsplat.scene.scene import Scene, View, every_nth, make_scene
-from clsplat.scene.transforms import Transforms, view_name
+from clsplat.scene.transforms import Transforms, list_frames, view_name
 
+FILE = "transforms.json"
 logger = logging.getLogger("clsplat")
 
 
-def read_nerfstudio(path: Path, holdout: int = 8) -> Scene:
-    """Read a nerfstudio scene; views are in order of name.
+class NerfstudioReader(Reader):
+    """A nerfstudio scene; views are in order of name.
 
     The split is that of the lists `train_filenames` and `test_filenames` where the file has one of them, and images
     on neither are left out; otherwise every `holdout`-th view is for testing.
-    Raises DataError when a file is missing, damaged or not supported.
     """
-    transforms = Transforms(path / "transforms.json")
-    views = sorted(transforms.views(), key=lambda view: view.name)
-    train, test = _listed(transforms, "train_filenames", views), _listed(transforms, "test_filenames", views)
-    if train is None and test is None:
-        return make_scene(path, views, every_nth([view.name for view in views], holdout), transforms.points())
-    test = test or set()
-    kept = views if train is None else [view for view in views if view.name in train | test]
-    if len(kept) < len(views):
-        logger.info("%s: left out %d images that no split lists", transforms.path, len(views) - len(kept))
-    held_out = {i for i, view in enumerate(kept) if view.name in test}
-    return make_scene(path, kept, held_out, transforms.points())
+
+    name = "nerfstudio"
+    expects = FILE
+
+    def matches(self, path: Path) -> bool:
+        return (path / FILE).is_file()
+
+    def read(self, path: Path, holdout: int) -> Scene:
+        transforms = Transforms(path / FILE)
+        views = sorted(transforms.views(), key=lambda view: view.name)
+        train, test = _listed(transforms, "train_filenames", views), _listed(transforms, "test_filenames", views)
+        if train is None and test is None:
+            return make_scene(path, views, every_nth([view.name for view in views], holdout), transforms.points())
+        test = test or set()
+        kept = views if train is None else [view for view in views if view.name in train | test]
+        if len(kept) < len(views):
+            logger.info("%s: left out %d images that no split lists", transforms.path, len(views) - len(kept))
+        held_out = {i for i, view in enumerate(kept) if view.name in test}
+        return make_scene(path, kept, held_out, transforms.points())
+
+    def list_parts(self, parts: Parts) -> None:
+        list_frames(parts, FILE)
 
 
 def _listed(transforms: Transforms, key: str, views: list[View]) -> set[str] | None:

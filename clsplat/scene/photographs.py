@@ -14,16 +14,16 @@ from clsplat.scene.scene import View
 
 
 def load_photograph(
-    view: View, background: tuple[float, float, float], straightened: Path | None = None
+    view: View, background: tuple[float, float, float], undistorted: Path | None = None
 ) -> NDArray[np.uint8]:
     """Return RGB, [H, W, 3], or with a mask RGB and 0 or 1, [H, W, 4].
 
-    Photographs of distorting lenses are kept in the folder `straightened`, so that each is straightened once.
+    Photographs of lenses with distortion are kept in the folder `undistorted`, so that each is undistorted once.
     Raises DataError as load_image does.
     """
-    if view.lens is None or straightened is None:
+    if view.lens is None or undistorted is None:
         return _loaded(view, background)
-    file = straightened / f"{view.name}.{_key(view)}.png"
+    file = undistorted / f"{view.name}.{_key(view)}.png"
     try:
         return read_image(file).astype(np.uint8)
     except DataError:

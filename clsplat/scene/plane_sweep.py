@@ -16,12 +16,12 @@ Floats = NDArray[np.floating]
 Places = NDArray[np.integer]
 LONG_SIDE = 160  # px of the photographs that are compared
 PLANES = 64  # evenly spaced in inverse depth
-NEAREST, FARTHEST = 0.1, 20.0  # times the distance to what the cameras look at
+MIN_DEPTH, MAX_DEPTH = 0.1, 20.0  # times the distance to what the cameras look at
 NEIGHBOURS = 4  # photographs that each is compared with
 WINDOW = 5  # px
-DISTINCT = 0.6  # the best plane's difference by the mean of all planes, at most
-CONFIRMED = 2  # neighbours whose depth agrees
-AGREEMENT = 1.5  # planes
+MAX_COST_SHARE = 0.6  # of the best plane, by the mean of all planes
+MIN_VOTES = 2  # neighbours whose depth agrees with a point's
+MAX_DIFFERENCE = 1.5  # of agreeing depths, planes
 
 
 def swept_points(
@@ -31,11 +31,14 @@ def swept_points(
 
     centre: what the cameras look at, [3].  `load` returns the photograph of a view, [H, W, 3].
     """
-    small = [view.at(view.scale * max(1.0, max(view.camera.width, view.camera.height) / LONG_SIDE)) for view in views]
+    small = [
+        view.resized(view.downscale * max(1.0, max(view.camera.width, view.camera.height) / LONG_SIDE))
+        for view in views
+    ]
     images = [load(view).astype(np.float32) / 255 for view in small]
     near = [_neighbours(i, small) for i in range(len(small))]
     distance = float(np.median([np.linalg.norm(view.position - centre) for view in small]))
-    inverse = np.linspace(1 / (FARTHEST * distance), 1 / (NEAREST * distance), PLANES)
+    inverse = np.linspace(1 / (MAX_DEPTH * distance), 1 / (MIN_DEPTH * distance), PLANES)
     planes = [_best_planes(i, small, images, near[i], inverse) for i in range(len(small))]
     positions, colours = [], []
     for i, view in enumerate(small):
@@ -75,7 +78,7 @@ def _best_planes(
             differences.append(cv2.blur(np.minimum(np.abs(warped - image).sum(axis=2), 1), (WINDOW, WINDOW)))
         stacked = np.sort(np.stack(differences), axis=0) if differences else np.ones((1, *image.shape[:2]))
         costs[plane] = stacked[: -(-len(stacked) // 2)].mean(axis=0)
-    return np.where(costs.min(axis=0) < DISTINCT * costs.mean(axis=0), costs.argmin(axis=0), 0)
+    return np.where(costs.min(axis=0) < MAX_COST_SHARE * costs.mean(axis=0), costs.argmin(axis=0), 0)
 
 
 def _homography(view: View, other: View, inverse_depth: float) -> Floats:
@@ -120,6 +123,6 @@ def _confirmed(
         row = np.floor(y / depth * camera.fy + camera.cy).clip(-1, camera.height).astype(int)
         seen = ahead & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
         found = inverse[planes[j][row * seen, column * seen]]
-        votes += seen & (np.abs(found - 1 / depth) < AGREEMENT * (inverse[1] - inverse[0]))
+        votes += seen & (np.abs(found - 1 / depth) < MAX_DIFFERENCE * (inverse[1] - inverse[0]))
     middle = (planes[i] > 0) & (planes[i] < len(inverse) - 1)
-    return np.asarray((votes >= CONFIRMED).reshape(shape) & middle)
+    return np.asarray((votes >= MIN_VOTES).reshape(shape) & middle)

@@ -23,8 +23,9 @@ from clsplat.scene.lens import Lens
 Floats = NDArray[np.floating]
 Background = Literal["black", "white"]
 Alpha = Literal["transparency", "mask"]  # what the fourth channel of a photograph is
-STRAY = 10.0  # a walk of evenly spaced cameras has 2, an orbit 1, a close-up among overviews about 4
-STRAY_SHARE = 0.2
+HOLDOUT = 8  # every so many views are for testing where the dataset does not say which: the default of pipelines
+MAX_DISTANCE = 10.0  # by the median one: a walk of evenly spaced cameras has 2, an orbit 1, a close-up about 4
+MAX_STRAYED_SHARE = 0.2  # of the cameras
 
 
 @dataclass(frozen=True)
@@ -38,7 +39,7 @@ class View:
     mask_path: Path | None = None  # an image of the photograph's size, white where it counts
     alpha: Alpha = "transparency"
     lens: Lens | None = None  # of the photograph on disk, where it is not `camera`'s pinhole
-    scale: float = 1  # by what the original photograph's size was divided
+    downscale: float = 1  # divisor of the original photograph's size
 
     @property
     def position(self) -> Floats:
@@ -46,11 +47,11 @@ class View:
         rotation, translation = self.world_to_camera[:, :3], self.world_to_camera[:, 3]
         return -rotation.T @ translation
 
-    def at(self, scale: float) -> "View":
-        """Return the same photograph at another scale."""
-        if scale == self.scale:
+    def resized(self, downscale: float) -> "View":
+        """Return the same photograph with 1 / `downscale` of its original size."""
+        if downscale == self.downscale:
             return self
-        return replace(self, camera=self.camera.downscaled(scale / self.scale), scale=scale)
+        return replace(self, camera=self.camera.downscaled(downscale / self.downscale), downscale=downscale)
 
 
 @dataclass(frozen=True)
@@ -87,31 +88,32 @@ class Scene:
         return replace(self, views=tuple(replace(view, alpha=alpha) for view in self.views))
 
     @property
-    def scales(self) -> tuple[float, ...]:
-        """The scales of the views, from the finest."""
-        return tuple(sorted({view.scale for view in self.views}))
+    def downscales(self) -> tuple[float, ...]:
+        """The downscales of the views, the largest photographs first."""
+        return tuple(sorted({view.downscale for view in self.views}))
 
-    def downscaled(self, *factors: float) -> "Scene":
-        """Return the scene with every photograph at 1/factor of its original size, at each of the `factors`.
+    def downscaled(self, *downscales: float) -> "Scene":
+        """Return the scene with every photograph at 1 / downscale of its original size, for each of `downscales`.
 
-        Views that have the scale already are taken; where there is none, those of the finest scale are resampled.
-        Raises DataError for a scale finer than any there is.
+        Views of that size are taken where the dataset has them; otherwise the largest photographs are resampled.
+        Raises DataError for a size larger than the largest in the dataset.
         """
-        if factors == self.scales:
+        if downscales == self.downscales:
             return self
         views: list[View] = []
         splits: dict[str, list[int]] = {"train": [], "test": []}
-        for factor in factors:
-            finest = min(self.scales)
-            if factor < finest:
+        smallest = min(self.downscales)
+        for downscale in downscales:
+            if downscale < smallest:
                 raise DataError(
-                    f"{self.path}: the finest images have 1/{finest:g} of their full size; expected 1/{factor:g}"
+                    f"{self.path}: the largest images have 1/{smallest:g} of their full size; "
+                    f"expected 1/{downscale:g}: raise the downscale to {smallest:g}"
                 )
-            taken = factor if factor in self.scales else finest
+            source = downscale if downscale in self.downscales else smallest
             for name, indices in splits.items():
-                found = [view for view in self.split(name) if view.scale == taken]
+                found = [view for view in self.split(name) if view.downscale == source]
                 indices += range(len(views), len(views) + len(found))
-                views += [view.at(factor) for view in found]
+                views += [view.resized(downscale) for view in found]
         return replace(self, views=tuple(views), train=tuple(splits["train"]), test=tuple(splits["test"]))
 
 
@@ -120,7 +122,7 @@ def make_scene(
 ) -> Scene:
     """Check `views`, order the split and measure the extent.
 
-    Raises DataError when there is no view, when names repeat or when a pose is not finite.
+    Raises DataError when there is no view, when names repeat or when a pose or a camera is impossible.
     """
     if not views:
         raise DataError(f"{path}: the dataset holds no images; expected at least one posed image")
@@ -130,7 +132,11 @@ def make_scene(
             raise DataError(f"{path}: two images are called '{view.name}'; names must differ")
         seen.add(view.name)
         if not np.isfinite(view.world_to_camera).all():
-            raise DataError(f"{path}: the pose of '{view.name}' is not finite; remove that image or mend its pose")
+            raise DataError(f"{path}: the pose of '{view.name}' is not finite; remove that image or fix its pose")
+        try:
+            view.camera.check()
+        except ValueError as error:
+            raise DataError(f"{path}: '{view.name}': {error}; remove that image or fix its camera") from error
     train = tuple(i for i in range(len(views)) if i not in test)
     if not train:
         raise DataError(f"{path}: every image is held out for testing; raise scene.holdout or add images")
@@ -141,7 +147,7 @@ def make_scene(
 def camera_extent(views: list[View]) -> float:
     """Radius of the cameras: 1.1 x the largest distance of a centre from their mean (Kerbl et al. 2023).
 
-    Strayed cameras do not count: one wrong pose would scale every size and rate of the scene.
+    Cameras far away from all others do not count: one wrong pose would scale every size and rate of the scene.
     """
     centres = np.stack([v.position for v in views])[~strayed(views)]
     radius = 1.1 * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
@@ -149,14 +155,14 @@ def camera_extent(views: list[View]) -> float:
 
 
 def strayed(views: Sequence[View]) -> NDArray[np.bool_]:
-    """Which cameras, [N], lie more than STRAY times the median distance from the median centre.
+    """Which cameras, [N], lie more than MAX_DISTANCE times the median distance from the median centre.
 
-    None do when those are more than STRAY_SHARE of all: then the scene is like that.
+    None when more than MAX_STRAYED_SHARE of all do: such a scene has several groups of cameras.
     """
     centres = np.stack([v.position for v in views])
     distance = np.linalg.norm(centres - np.median(centres, axis=0), axis=1)
-    far = distance > STRAY * np.median(distance)
-    return far if np.median(distance) > 0 and far.mean() <= STRAY_SHARE else np.zeros(len(views), bool)
+    far = distance > MAX_DISTANCE * np.median(distance)
+    return far if np.median(distance) > 0 and far.mean() <= MAX_STRAYED_SHARE else np.zeros(len(views), bool)
 
 
 def every_nth(names: list[str], holdout: int) -> set[int]:

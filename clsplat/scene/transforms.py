@@ -2,15 +2,18 @@
 
 import json
 import math
+import os
 from pathlib import Path, PureWindowsPath
 from typing import Any
 
 import numpy as np
 
 from clsplat.errors import DataError
+from clsplat.scene.image_headers import read_header
 from clsplat.scene.images import image_size, inside, read_file, require_files
 from clsplat.scene.lens import Lens, shared
-from clsplat.scene.points import FAR, read_points_ply
+from clsplat.scene.parts import Parts
+from clsplat.scene.points import FAR, read_ply_table, read_points_ply
 from clsplat.scene.scene import Camera, Floats, PointCloud, View
 
 DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
@@ -65,14 +68,15 @@ class Transforms:
     def views(self) -> list[View]:
         """Return one view per frame, in the order of the file.
 
-        Images whose size the file does not tell are as large as the first; those of distorting lenses are straightened
-        as they are read.  Raises DataError for damaged numbers, missing files and paths that leave the folder.
+        Images whose size the file does not give are as large as the first; those of lenses with distortion are
+        undistorted as they are read.
+        Raises DataError for damaged numbers, missing files and paths that leave the folder.
         """
         images = [image_path_of(frame) for frame in self.frames]
         masks = [frame.file("mask_path") for frame in self.frames]
         require_files(self.path, [*images, *(mask for mask in masks if mask)])
-        told = all(frame.number("w") and frame.number("h") for frame in self.frames)
-        size = None if told else image_size(images[0])
+        has_sizes = all(frame.number("w") and frame.number("h") for frame in self.frames)
+        size = None if has_sizes else image_size(images[0])
         return [view_of(frame, size) for frame in self.frames]
 
     def points(self) -> PointCloud | None:
@@ -83,9 +87,27 @@ class Transforms:
 
     def points_path(self) -> Path | None:
         """Return `ply_file_path`, or else `points3d.ply` where that exists."""
-        told = Frame(self.path.parent, str(self.path), self.table).file("ply_file_path")
+        given = Frame(self.path.parent, str(self.path), self.table).file("ply_file_path")
         beside = self.path.parent / "points3d.ply"
-        return told or (beside if beside.is_file() else None)
+        return given or (beside if beside.is_file() else None)
+
+
+def list_frames(parts: Parts, *names: str) -> None:
+    """Add the frames of those of the files `names` that exist to `parts`, and the points of the first file."""
+    files = [parts.attempt(Transforms, parts.path / name) for name in names if (parts.path / name).is_file()]
+    for transforms in filter(None, files):
+        frames = [(frame, parts.attempt(image_path_of, frame)) for frame in transforms.frames]
+        paths = [path for _, path in frames if path]
+        parts.expected += paths
+        if parts.scene is None:
+            first = next((path for path in paths if os.path.isfile(path)), None)
+            header = parts.attempt(read_header, first) if first else None
+            size = (header.width, header.height) if header else None
+            views = [parts.attempt(view_of, frame, size) for frame, path in frames if path]
+            parts.views += [view for view in views if view]
+    if files and files[0]:
+        place = parts.attempt(files[0].points_path)
+        parts.points = parts.attempt(read_ply_table, place) if place else None
 
 
 def view_name(file_path: str) -> str:
@@ -94,11 +116,11 @@ def view_name(file_path: str) -> str:
 
 
 def view_of(frame: Frame, size: tuple[int, int] | None) -> View:
-    """Return the view of a frame; `size` is that of images whose frame does not tell it.  Raises DataError."""
+    """Return the view of a frame; `size` is that of images whose frame does not give it.  Raises DataError."""
     image, mask = image_path_of(frame), frame.file("mask_path")
     lens = shared(lens_of(frame, camera_of(frame, size)))
-    camera, bent = (lens.pinhole, lens) if lens.distorts else (lens.camera, None)
-    return View(view_name(frame.values["file_path"]), camera, pose_of(frame), image, mask, lens=bent)
+    camera, distortion = (lens.pinhole, lens) if lens.distorts else (lens.camera, None)
+    return View(view_name(frame.values["file_path"]), camera, pose_of(frame), image, mask, lens=distortion)
 
 
 def image_path_of(frame: Frame) -> Path:
@@ -124,7 +146,7 @@ def camera_of(frame: Frame, size: tuple[int, int] | None) -> Camera:
 
 
 def _focal(frame: Frame, length_key: str, angle_key: str, pixels: int) -> float | None:
-    """Return a focal length in pixels, told as such or as the angle (rad) that `pixels` span."""
+    """Return a focal length in pixels, given as such or as the angle (rad) that `pixels` span."""
     length, angle = frame.number(length_key), frame.number(angle_key)
     if length is not None or angle is None:
         return length
@@ -137,15 +159,15 @@ def lens_of(frame: Frame, camera: Camera) -> Lens:
     """Return the lens of a frame: OpenCV's polynomial, rational or fisheye one.  Raises DataError for others."""
     model = "OPENCV_FISHEYE" if frame.values.get("is_fisheye") else frame.values.get("camera_model", "OPENCV")
     used = LENSES.get(model)
-    told = {key: frame.number(key) or 0.0 for key in DISTORTION}
-    surplus = [key for key, value in told.items() if value and key not in (used or DISTORTION)]
+    given = {key: frame.number(key) or 0.0 for key in DISTORTION}
+    surplus = [key for key, value in given.items() if value and key not in (used or DISTORTION)]
     if used is None or surplus:
         fault = f"camera_model {model!r}" + (f" with {', '.join(surplus)}" if surplus else "")
         raise DataError(
             f"{frame.where}: {fault}; expected one of {', '.join(LENSES)} with its own parameters: "
             "undistort the images first, for example with `colmap image_undistorter`"
         )
-    params = (camera.fx, camera.fy, camera.cx, camera.cy, *(told[key] for key in used))
+    params = (camera.fx, camera.fy, camera.cx, camera.cy, *(given[key] for key in used))
     return Lens(camera.width, camera.height, "OPENCV_FISHEYE" if "FISHEYE" in model else COLMAP[len(used)], params)
 
 

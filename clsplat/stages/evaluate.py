@@ -57,7 +57,7 @@ class Evaluate(Scheduled):
         perceptual = self._perceptual()
         for scale in self.scales or [run.scale]:
             views = run.original.downscaled(scale).split(self.split)
-            photographs = run.photographs if scale in run.scene.scales else run.photographs.fresh()
+            photographs = run.photographs if scale in run.scene.downscales else run.photographs.fresh()
             results = measure(run.rasterizer, run.model, views, photographs, perceptual)
             for result in results:
                 run.records.add(run.step, "view", split=self.split, scale=scale, **result.line())

@@ -5,12 +5,11 @@ from pathlib import Path, PurePosixPath
 from typing import ClassVar, Literal
 
 from clsplat.metrics.views import render_view
-from clsplat.scene.images import write_image
+from clsplat.scene.images import is_image, write_image
 from clsplat.stages.base import Stage
 from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
-IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"}
 
 
 class Render(Stage):
@@ -36,4 +35,4 @@ class Render(Stage):
 def image_path(folder: Path, view: str, suffix: str = ".png") -> Path:
     """The file of a view's render: its name below `folder`, with another suffix."""
     name = PurePosixPath(view)
-    return folder / name.with_suffix(suffix) if name.suffix.lower() in IMAGE_SUFFIXES else folder / f"{view}{suffix}"
+    return folder / name.with_suffix(suffix) if is_image(name) else folder / f"{view}{suffix}"

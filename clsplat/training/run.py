@@ -82,7 +82,7 @@ class Run:
     @property
     def scale(self) -> float:
         """The smallest divisor of the photographs' size that is trained on."""
-        return self.scene.scales[0]
+        return self.scene.downscales[0]
 
     def memory_plan(self) -> MemoryPlan:
         """What training with the present tables takes of the device's memory."""

@@ -17,9 +17,9 @@ class ViewPool:
     """The training views, which may come at several sizes, and permutations of them."""
 
     def __init__(self, views: Sequence[View], seed: int) -> None:
-        finest = min(view.scale for view in views)
+        finest = min(view.downscale for view in views)
         self.views, self.seed = views, seed
-        self.finest = [i for i, view in enumerate(views) if view.scale == finest]  # indices into `views`
+        self.finest = [i for i, view in enumerate(views) if view.downscale == finest]  # indices into `views`
         self._epoch, self._permutation = (-1, -1), np.empty(0, np.int64)
 
     def shuffled(self, entries: Sequence[int], step: int) -> View:

@@ -66,10 +66,10 @@ class Photographs:
     """
 
     def __init__(
-        self, device: Device, background: Background, budget: int | None = None, straightened: Path | None = None
+        self, device: Device, background: Background, budget: int | None = None, undistorted: Path | None = None
     ) -> None:
         self.device = device
-        self.straightened = straightened  # folder that keeps undistorted photographs
+        self.undistorted = undistorted  # folder that keeps undistorted photographs
         self.background_name = background
         self.background = device.upload(np.array(BACKGROUNDS[background], np.float32))  # [3]
         self.budget = int(device.info.memory * BUDGET_SHARE) if budget is None else budget
@@ -80,7 +80,7 @@ class Photographs:
 
     def fresh(self) -> "Photographs":
         """Return the same with nothing held, for views that are wanted once."""
-        return Photographs(self.device, self.background_name, straightened=self.straightened)
+        return Photographs(self.device, self.background_name, undistorted=self.undistorted)
 
     def camera(self, view: View) -> DeviceCamera:
         """Return the camera of a view."""
@@ -113,7 +113,7 @@ class Photographs:
 
     def _read(self, view: View) -> NDArray[Any]:
         """Colours and, where there is one, the mask: [3 or 4, height, width] uint8."""
-        image = load_photograph(view, BACKGROUNDS[self.background_name], self.straightened)
+        image = load_photograph(view, BACKGROUNDS[self.background_name], self.undistorted)
         if image.shape[2] == 4 and not image[:, :, 3].any():
             raise DataError(
                 f"{view.mask_path or view.image_path}: the mask leaves out every pixel of '{view.name}'; expected some "

@@ -41,4 +41,4 @@ class Sampler:
     def at(self, step: int) -> Sample:
         """Return the sample of a global step, counted from 1."""
         view, divisor = self.settings.order.at(self._pool, step), at_step(self.settings.resolution, step)
-        return Sample(view.at(view.scale * divisor), self.settings.transforms, step)
+        return Sample(view.resized(view.downscale * divisor), self.settings.transforms, step)

@@ -25,7 +25,7 @@ def around(case: Case, rng: np.random.Generator, count: int) -> list[View]:
         pose[:, 3] += np.float32(rng.normal(0, 0.8, 3))
         scale = float(rng.choice([1, 2, 4]))
         camera = replace(case.view.camera.downscaled(scale), fx=float(rng.uniform(20, 60)) / scale)
-        views.append(replace(case.view, name=f"view{i}", camera=camera, world_to_camera=pose, scale=scale))
+        views.append(replace(case.view, name=f"view{i}", camera=camera, world_to_camera=pose, downscale=scale))
     return views
 
 

@@ -1,4 +1,4 @@
-"""What the first bytes of a photograph tell: its size and how it should be turned, without decoding it.
+"""Read the size of a photograph and how it should be turned from its first bytes, without decoding it.
 
 PNG (W3C, third edition), JPEG (ITU-T T.81, annex B) and Exif 2.3; other formats are decoded.
 """
@@ -10,7 +10,7 @@ from pathlib import Path
 from clsplat.errors import DataError
 from clsplat.scene.images import image_size
 
-FIRST, LAST = 1 << 18, 1 << 16  # bytes read at either end
+HEAD_SIZE, TAIL_SIZE = 1 << 18, 1 << 16  # bytes read at either end
 PNG, PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
 JPEG, JPEG_END = b"\xff\xd8\xff", b"\xff\xd9"
 FRAMES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # markers of a frame header
@@ -31,8 +31,8 @@ def read_header(path: Path) -> Header:
     """Return the header of an image file.  Raises DataError when it cannot be read or is no image."""
     try:
         with path.open("rb") as file:
-            head = file.read(FIRST)
-            file.seek(max(0, file.seek(0, 2) - LAST))
+            head = file.read(HEAD_SIZE)
+            file.seek(max(0, file.seek(0, 2) - TAIL_SIZE))
             tail = file.read()
     except (OSError, ValueError) as error:
         raise DataError(f"{path}: cannot read it ({error}); check the path and its permissions") from error
@@ -68,7 +68,7 @@ def _jpeg(path: Path, head: bytes, tail: bytes) -> Header | None:
 
 
 def _orientation(exif: bytes) -> int:
-    """The orientation in a TIFF block, 1 to 8; 1 where it tells none."""
+    """The orientation in a TIFF block, 1 to 8; 1 where there is none."""
     order = {b"II": "<", b"MM": ">"}.get(exif[:2])
     if order is None or len(exif) < 8:
         return 1

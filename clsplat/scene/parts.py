@@ -1,0 +1,43 @@
+"""What is in a dataset, piece by piece: a damaged piece becomes a fault, and the others are still there."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+
+from clsplat.errors import DataError
+from clsplat.scene.points import PointTable
+from clsplat.scene.scene import Scene, View
+
+Result = TypeVar("Result")
+
+
+@dataclass
+class Parts:
+    """A dataset in pieces.
+
+    `scene` is what training would read, None when it cannot; `refusal` is why training would not start.
+    """
+
+    path: Path
+    kind: str = "none"
+    views: list[View] = field(default_factory=list)  # whether or not their files exist
+    models: dict[str, str] = field(default_factory=dict)  # camera models by view, where the dataset names them
+    observed: dict[str, int] = field(default_factory=dict)  # points seen, by view, where the dataset has them
+    submodels: dict[str, int] = field(default_factory=dict)  # images of each COLMAP model, the one that is used first
+    points: PointTable | None = None
+    image_folder: Path | None = None  # holds all images of the dataset; None: the folders of `expected`
+    on_disk: list[Path] = field(default_factory=list)  # image files where the views' files are looked for
+    expected: list[Path] = field(default_factory=list)  # files that the dataset names
+    faults: list[str] = field(default_factory=list)
+    scene: Scene | None = None
+    refusal: str = ""
+
+    def attempt(self, read: Callable[..., Result], *arguments: Any) -> Result | None:
+        """Call a function that reads something; note its DataError and return None."""
+        try:
+            return read(*arguments)
+        except DataError as error:
+            if str(error) not in self.faults:
+                self.faults.append(str(error))
+            return None

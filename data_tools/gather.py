@@ -1,0 +1,71 @@
+"""Find the photographs below a folder, and link them into another."""
+
+import logging
+import os
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from clsplat.errors import DataError
+from clsplat.scene.images import IMAGE_SUFFIXES, read_image
+
+LOG = logging.getLogger("clsplat")
+UNREADABLE_SUFFIXES = {".heic", ".heif", ".avif", ".dng", ".cr2", ".nef", ".arw"}  # photographs, but not for OpenCV
+MIN_PHOTOGRAPHS = 3  # also of a model
+
+
+def list_photographs(folder: Path, without: Path | None = None) -> list[str]:
+    """Names of the photographs below a folder, sorted, hidden ones and those below `without` left out.
+
+    Raises DataError when there are too few of them.
+    """
+    if not folder.is_dir():
+        raise DataError(f"{folder}: no such folder; expected one with photographs")
+    names: list[str] = []
+    unreadable: list[str] = []
+    for base, folders, files in os.walk(folder):
+        folders[:] = sorted(f for f in folders if f[0] != "." and (Path(base) / f).resolve() != without)
+        for file in files:
+            suffix = Path(file).suffix.lower()
+            if file[0] != "." and suffix in IMAGE_SUFFIXES | UNREADABLE_SUFFIXES:
+                name = (Path(base) / file).relative_to(folder).as_posix()
+                (names if suffix in IMAGE_SUFFIXES else unreadable).append(name)
+    if unreadable:
+        LOG.warning(
+            "%s: %d files such as %s are left out: convert them to JPEG", folder, len(unreadable), unreadable[0]
+        )
+    if len(names) < MIN_PHOTOGRAPHS:
+        suffixes = ", ".join(sorted(IMAGE_SUFFIXES))
+        raise DataError(f"{folder}: found {len(names)} photographs; expected at least {MIN_PHOTOGRAPHS}, of {suffixes}")
+    return sorted(names)
+
+
+def gather(photographs: Path, images: Path, names: list[str]) -> list[str]:
+    """Link photographs into a folder, or copy them upright; return the names of those that can be read."""
+    kept = []
+    for name in names:
+        try:
+            stored, upright = read_image(photographs / name), read_image(photographs / name, upright=True)
+        except DataError as error:
+            LOG.warning("%s; left out", error)
+            continue
+        (images / name).parent.mkdir(parents=True, exist_ok=True)
+        if stored.shape[:2] == upright.shape[:2] and (stored[:, :, :3] == upright[:, :, :3]).all():
+            link(photographs / name, images / name)
+        else:
+            _, encoded = cv2.imencode(".jpg", np.ascontiguousarray(upright[:, :, ::-1]), [cv2.IMWRITE_JPEG_QUALITY, 98])
+            (images / name).write_bytes(encoded.tobytes())
+        kept.append(name)
+    if len(kept) < MIN_PHOTOGRAPHS:
+        raise DataError(f"{photographs}: only {len(kept)} of {len(names)} photographs can be read; export them again")
+    return kept
+
+
+def link(source: Path, target: Path) -> None:
+    """Link a file or folder, or copy it where links are not to be had."""
+    try:
+        target.symlink_to(source.resolve(), target_is_directory=source.is_dir())
+    except OSError:
+        (shutil.copytree if source.is_dir() else shutil.copyfile)(source, target)
