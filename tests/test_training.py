@@ -130,8 +130,8 @@ def test_interrupt_saves_and_resume_goes_on(finished, tiny_scene, tmp_path):
 
 
 def test_killed_three_times_and_resumed(finished, tiny_scene, tmp_path):
-    """kill -9 at random pixel_sums; the resumed run ends with the bits of the undisturbed one."""
-    out, pixel_sums = tmp_path / "killed", random.Random(1)
+    """kill -9 at random moments; the resumed run ends with the bits of the undisturbed one."""
+    out, moments = tmp_path / "killed", random.Random(1)
     command = [
         sys.executable,
         "-m",
@@ -147,11 +147,11 @@ def test_killed_three_times_and_resumed(finished, tiny_scene, tmp_path):
     killed = 0
     while killed < 3:
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        wait_for = pixel_sums.choice(["step_000010.npz", "step_000020.npz", "step_000030.npz"])
+        wait_for = moments.choice(["step_000010.npz", "step_000020.npz", "step_000030.npz"])
         deadline = time.time() + 60
         while time.time() < deadline and process.poll() is None and not (out / "checkpoints" / wait_for).exists():
             time.sleep(0.005)
-        time.sleep(pixel_sums.uniform(0, 0.05))
+        time.sleep(moments.uniform(0, 0.05))
         process.send_signal(signal.SIGKILL)
         process.wait()
         killed += 1

@@ -1,0 +1,31 @@
+"""A photograph that is blurred less and less: `views: {transforms: [{type: box_blur, reach: [[0, 4], [500, 0]]}]}`."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+from clsplat.schedule import NonNegative, at_step
+from clsplat.views.transforms import PhotographTransform, Planes
+
+
+class BoxBlur(PhotographTransform):
+    """Replace each pixel by the mean of the window around it."""
+
+    type: Literal["box_blur"] = "box_blur"
+    reach: NonNegative
+    """Pixels on each side of the window's middle, rounded; by step."""
+
+    def apply(self, planes: Planes, step: int) -> Planes:
+        camera, reach = planes.camera, round(at_step(self.reach, step))
+        if reach == 0:
+            return planes
+        blurred = planes.workspace.array("box_blur", planes.colours.shape)
+        program = planes.workspace.device.program(Path(__file__).with_suffix(".cl"))
+        program.box_blur(
+            items=(camera.stride, camera.rows, 3),
+            image=planes.colours,
+            blurred=blurred,
+            reach=reach,
+            **camera.plane_arguments(),
+        )
+        return replace(planes, colours=blurred)

@@ -1,0 +1,188 @@
+"""Variants from outside the package: loading, recording, refusing, and the same bits as inside."""
+
+import json
+import shutil
+import subprocess
+import sys
+from importlib.metadata import EntryPoint
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from clsplat import plugins
+from clsplat.density.edit import Rule
+from clsplat.errors import ConfigError
+from clsplat.pipeline import load
+from clsplat.settings import Settings, rebuild, variants
+from tests.test_training import train
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+RULE = """
+from typing import Literal
+from clsplat.density.edit import Edit, Rule
+
+class Nothing(Rule):
+    type: Literal["{name}"] = "{name}"
+
+    def mark(self, edit: Edit) -> None:
+        pass
+"""
+TRIALS = {
+    "opacity_entropy": ("optimize.losses=[l1, {type: opacity_entropy, weight: 0.02}]",),
+    "relocation": (
+        "densify.rules=[relocate]",
+        "densify.every=20",
+        "densify.start=10",
+    ),
+    "box_blur": ("optimize.views={transforms: [{type: box_blur, reach: [[0, 3], [40, 0]]}]}",),
+}
+
+
+@pytest.fixture(autouse=True)
+def _without_plugins():
+    """Forget what a test has loaded."""
+    defined = list(Settings.defined)
+    yield
+    Settings.defined[:] = defined
+    plugins._loaded.clear()
+    for name in [name for name in sys.modules if name.startswith("clsplat_plugin_")]:
+        del sys.modules[name]
+    rebuild()
+
+
+def write(folder: Path, name: str, text: str) -> Path:
+    path = folder / f"{name}.py"
+    path.write_text(text)
+    return path
+
+
+def test_a_class_in_a_file_is_a_variant(tmp_path):
+    plugins.load_file(write(tmp_path, "mine", RULE.format(name="mine")))
+    assert "mine" in variants(Rule)
+    assert load("splat", ["densify.rules=[mine]"]).resolved()["plugins"].keys() == {"mine"}
+
+
+def test_shipped_pipelines_name_no_plugin():
+    assert "plugins" not in load("splat").resolved()
+
+
+def test_the_schema_knows_plugins(tmp_path):
+    from clsplat.schema import json_schema
+
+    plugins.load_file(write(tmp_path, "mine", RULE.format(name="mine")))
+    assert "Nothing" in json_schema()["$defs"]
+
+
+def test_the_hash_covers_kernels_and_the_headers_that_they_name(tmp_path):
+    path = write(tmp_path, "mine", "KERNELS = 'other.cl'\n")
+    (tmp_path / "other.cl").write_text('#include "own.h"\n')
+    (tmp_path / "own.h").write_text("#define A 1\n")
+    (tmp_path / "stranger.cl").write_text("x")
+    before = plugins.digest_of(path)
+    (tmp_path / "stranger.cl").write_text("y")
+    assert plugins.digest_of(path) == before
+    (tmp_path / "own.h").write_text("#define A 2\n")
+    assert plugins.digest_of(path) != before
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("import os\n1 / 0\n", r"bad\.py:2: the plug-in cannot be imported: ZeroDivisionError: division by zero"),
+        ("x = (\n", r"bad\.py:1: the plug-in cannot be imported: SyntaxError: '\(' was never closed"),
+        ("import not_there_at_all\n", r"bad\.py:1: .*ModuleNotFoundError: No module named 'not_there_at_all'"),
+        (RULE.format(name="clone"), r"two variants of \w+ have the name 'clone'"),
+    ],
+)
+def test_a_plugin_that_fails_is_one_line_and_leaves_nothing(tmp_path, text, message):
+    before = list(Settings.defined)
+    with pytest.raises(ConfigError, match=message) as error:
+        plugins.load_file(write(tmp_path, "bad", text))
+    assert "\n" not in str(error.value)
+    assert Settings.defined == before
+    load("splat", ["densify.rules=[clone]"])
+
+
+def test_a_missing_file_and_a_taken_name_are_refused(tmp_path):
+    with pytest.raises(ConfigError, match="no such file"):
+        plugins.load_file(tmp_path / "nothing.py")
+    (tmp_path / "a").mkdir()
+    (tmp_path / "b").mkdir()
+    plugins.load_file(write(tmp_path / "a", "mine", ""))
+    assert plugins.load_file(tmp_path / "a" / "mine.py") in plugins.loaded(), "the same file twice is fine"
+    with pytest.raises(ConfigError, match="a plug-in named .mine. is loaded from"):
+        plugins.load_file(write(tmp_path / "b", "mine", ""))
+
+
+def test_entry_points_are_loaded_and_recorded_where_they_are_used(tmp_path, monkeypatch):
+    write(tmp_path, "installed_rule", RULE.format(name="installed"))
+    monkeypatch.syspath_prepend(str(tmp_path))
+    entry = EntryPoint("a_package", "installed_rule", plugins.GROUP)
+    monkeypatch.setattr(plugins, "entry_points", lambda group: [entry])
+    plugins.load_installed()
+    assert "plugins" not in load("splat").resolved()
+    assert load("splat", ["densify.rules=[installed]"]).resolved()["plugins"].keys() == {"a_package"}
+    sys.modules.pop("installed_rule")
+
+
+def test_a_pipeline_whose_plugin_is_missing_or_changed_is_refused(tmp_path):
+    file = write(tmp_path, "mine", RULE.format(name="mine"))
+    plugins.load_file(file)
+    saved = tmp_path / "pipeline.yaml"
+    saved.write_text(load("splat", ["densify.rules=[mine]"]).text())
+    load(str(saved))
+    plugins._loaded.clear()
+    with pytest.raises(
+        ConfigError, match=r"pipeline\.yaml: needs the plug-in 'mine', which is not loaded; use --plugin"
+    ):
+        load(str(saved))
+    Settings.defined[:] = [kind for kind in Settings.defined if not kind.__module__.startswith("clsplat_plugin_")]
+    file.write_text(file.read_text() + "\n# changed\n")
+    plugins.load_file(file)
+    with pytest.raises(ConfigError, match=r"needs the plug-in 'mine' with sha256 \w{12}, .*mine\.py has sha256 \w{12}"):
+        load(str(saved))
+
+
+@pytest.mark.parametrize("name", TRIALS)
+def test_the_bits_are_those_of_the_same_code_inside_the_package(name, tiny_scene, tmp_path):
+    """A copy of the package with the example among its modules, run in a process of its own, beside the plug-in."""
+    inside = tmp_path / "inside"
+    shutil.copytree(EXAMPLES.parent / "clsplat", inside / "clsplat", ignore=shutil.ignore_patterns("__pycache__"))
+    for folder in ("cl_kernels", "pipelines", "data_tools"):
+        shutil.copytree(EXAMPLES.parent / folder, inside / folder, ignore=shutil.ignore_patterns("__pycache__"))
+    room = {"opacity_entropy": "losses", "relocation": "stages", "box_blur": "views"}[name]
+    shutil.copy(EXAMPLES / f"{name}.py", inside / "clsplat" / room)
+    shutil.copy(EXAMPLES / f"{name}.cl", inside / "clsplat" / room)
+    code = f"import sys; sys.path.insert(0, {str(inside)!r}); from clsplat.cli import main; main()"
+    hashes = []
+    for label, command in (("in", [sys.executable, "-c", code]), ("out", [sys.executable, "-m", "clsplat"])):
+        plugin = ["--plugin", str(EXAMPLES / f"{name}.py")] if label == "out" else []
+        sets = [part for setting in TRIALS[name] for part in ("--set", setting)]
+        arguments = ["run", "smoke", "--scene", str(tiny_scene), "--out", str(tmp_path / label), *sets]
+        cwd = inside if label == "in" else EXAMPLES.parent
+        done = subprocess.run([*command, *plugin, *arguments], capture_output=True, text=True, cwd=cwd, check=False)
+        assert done.returncode == 0, done.stderr
+        hashes.append((tmp_path / label / "point_cloud.ply").read_bytes())
+    assert hashes[0] == hashes[1]
+    recorded = (tmp_path / "out" / "pipeline.yaml").read_text()
+    assert f"plugins: {{{name}: " in recorded
+    plain = train(tiny_scene, tmp_path / "plain")
+    assert (plain.out / "point_cloud.ply").read_bytes() != hashes[0], "the example changes nothing"
+
+
+def test_a_run_with_a_plugin_resumes_only_with_it(tiny_scene, tmp_path):
+    runner, out = CliRunner(), tmp_path / "run"
+    from clsplat import cli
+
+    arguments = ["run", "smoke", "--scene", str(tiny_scene), "--out", str(out)]
+    arguments += ["--set", "optimize.losses=[l1, opacity_entropy]"]
+    plugin = ["--plugin", str(EXAMPLES / "opacity_entropy.py")]
+    assert runner.invoke(cli.app, [*plugin, *arguments]).exit_code == 0
+    command = [sys.executable, "-m", "clsplat", "run", str(out / "pipeline.yaml"), "--out", str(out), "--resume"]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=EXAMPLES.parent, check=False)
+    assert done.returncode == 2
+    assert "needs the plug-in 'opacity_entropy', which is not loaded" in done.stderr
+    assert "Traceback" not in done.stderr
+    status = json.loads((out / "status.json").read_text())
+    assert status["state"] == "done", "a refused command leaves the run as it was"
