@@ -27,8 +27,8 @@ class OverrideError(ConfigError):
     """A value of `--set` that does not fit the pipeline; `reason` is what is wrong with it."""
 
     def __init__(self, override: str, reason: str) -> None:
-        super().__init__(f"--set {shortened(override, 80)}: {reason}")
-        self.reason = reason
+        self.reason = shortened(reason, 500)
+        super().__init__(f"--set {shortened(override, 80)}: {self.reason}")
 
 
 class DataError(ClsplatError):
@@ -80,8 +80,8 @@ def as_clsplat_error(error: BaseException) -> ClsplatError:
     if isinstance(error, MemoryError):
         return MemoryLimitError("out of memory; use smaller images (scene.downscale) or fewer of them")
     if isinstance(error, OSError) and error.strerror:
-        place = f"{error.filename}: " if error.filename else ""
-        return OutputError(f"{place}{error.strerror}; check the file, its folder and their space")
+        place = error.filename or "the output"
+        return OutputError(f"{place}: {error.strerror}; check the file, its folder and their space")
     what = f"{type(error).__name__}: {one_line(error)}".removesuffix(": ")
     return InternalError(f"internal error (a defect): {what}; run with --debug for the traceback, and report it")
 

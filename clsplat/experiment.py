@@ -110,8 +110,7 @@ def run_matrix(experiment: Experiment, out: Path, device: str | None, resume: bo
         _run_cells(experiment, state, device, resume)
         _compare(experiment, out, state.failures)
     except BaseException as error:
-        state.end(as_clsplat_error(error))
-        raise
+        state.end(as_clsplat_error(error))  # raises it
     state.end(_first_of(state.failures, len(experiment.cells)))
 
 

@@ -39,7 +39,12 @@ def status_text(status: dict[str, Any]) -> str:
     lines = [f"{status['run']}: {status['state']}{_progress(status)}"]
     if status.get("message"):
         lines.append(f"  {status['message']}")
-    if status["state"] == "killed" or (status["state"] in ENDED[1:] and status.get("exit_code") != 2):
+    goes_on = "resume" not in str(status.get("message"))
+    if (
+        goes_on
+        and status["state"] in ("killed", "failed", "interrupted")
+        and (Path(status["run"]) / "pipeline.yaml").is_file()
+    ):
         lines.append(f"  `clsplat resume {status['run']}` goes on with it")
     if status["last"] and status["metrics"] is None:
         lines.append("  last report: " + _figures(status["last"], ("step", "loss", "psnr", "gaussians")))

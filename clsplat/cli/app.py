@@ -109,9 +109,7 @@ def _show_version(wanted: bool) -> None:
 @app.callback()
 def common(
     context: typer.Context,
-    device: Annotated[
-        str | None, typer.Option(metavar="NAME", help="As after a command, which may have another.")
-    ] = None,
+    device: Annotated[str | None, typer.Option(metavar="NAME", help="The device of a command that names none.")] = None,
     debug: Annotated[
         bool, typer.Option("--debug", help="Show tracebacks and every log line; also after the command.")
     ] = False,
