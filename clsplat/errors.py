@@ -1,20 +1,34 @@
-"""Everything that can go wrong in a way the user can mend, each with its exit code.
+"""Everything that can go wrong, each with its exit code.
 
 A message is one line: what is wrong, where, what was expected, what to do.  The command line prints it without a
 traceback (`--debug` shows one).
 """
 
+MESSAGE_LIMIT = 1000  # characters
+
 
 class ClsplatError(Exception):
-    """Base of all errors that are the user's to mend."""
+    """Base of all errors."""
 
     exit_code = 1
+
+
+class InternalError(ClsplatError):
+    """A defect of the program."""
 
 
 class ConfigError(ClsplatError):
     """A pipeline file, a setting or a command line that does not make sense."""
 
     exit_code = 2
+
+
+class OverrideError(ConfigError):
+    """A value of `--set` that does not fit the pipeline; `reason` is what is wrong with it."""
+
+    def __init__(self, override: str, reason: str) -> None:
+        self.reason = shortened(reason, 500)
+        super().__init__(f"--set {shortened(override, 80)}: {self.reason}")
 
 
 class DataError(ClsplatError):
@@ -34,7 +48,7 @@ class KernelError(DeviceError):
 
 
 class MemoryLimitError(ClsplatError):
-    """The device cannot hold what was asked for."""
+    """The device or the host cannot hold what was asked for."""
 
     exit_code = 5
 
@@ -52,6 +66,32 @@ class OutputError(ClsplatError):
 
 
 class Interrupted(ClsplatError):
-    """The user stopped the run; what was done is saved."""
+    """The user stopped the run."""
 
     exit_code = 130
+
+
+def as_clsplat_error(error: BaseException) -> ClsplatError:
+    """Return the error that a user sees in place of any exception; a ClsplatError stays what it is."""
+    if isinstance(error, ClsplatError):
+        return error
+    if isinstance(error, KeyboardInterrupt):
+        return Interrupted("stopped at once; --resume goes on from the last checkpoint")
+    if isinstance(error, MemoryError):
+        return MemoryLimitError("out of memory; use smaller images (scene.downscale) or fewer of them")
+    if isinstance(error, OSError) and error.strerror:
+        place = error.filename or "the output"
+        return OutputError(f"{place}: {error.strerror}; check the file, its folder and their space")
+    what = f"{type(error).__name__}: {one_line(error)}".removesuffix(": ")
+    return InternalError(f"internal error (a defect): {what}; run with --debug for the traceback, and report it")
+
+
+def one_line(error: BaseException) -> str:
+    """The message of an error, in one line of limited length."""
+    return shortened(" ".join(str(error).split()), MESSAGE_LIMIT)
+
+
+def shortened(text: str, limit: int = 200) -> str:
+    """The text, cut in the middle where it is longer than `limit` characters."""
+    half = limit // 2
+    return text if len(text) <= limit else f"{text[:half]} … {text[-half:]}"

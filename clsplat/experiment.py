@@ -4,13 +4,17 @@ import json
 import logging
 import os
 import time
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from clsplat import runner, terminal
 from clsplat.compare.page import write_comparison
-from clsplat.errors import ClsplatError, ConfigError, Interrupted, MemoryLimitError
+from clsplat.errors import ClsplatError, ConfigError, DataError, Interrupted, OutputError, as_clsplat_error, one_line
 from clsplat.files import write_text
-from clsplat.matrix import Cell, Experiment
+from clsplat.matrix import Cell, Experiment, load_experiment
 from clsplat.pipeline import Pipeline, load
 from clsplat.training.checkpoint import first_difference
 from clsplat.yaml_file import read_yaml
@@ -19,20 +23,78 @@ LOG = logging.getLogger("clsplat")
 PAGE = "compare.html"
 
 
+@dataclass(frozen=True)
+class Job:
+    """A checked pipeline or matrix, and the folder that it runs in."""
+
+    work: Pipeline | Experiment
+    out: Path
+
+    @classmethod
+    def open(
+        cls,
+        pipeline: str,
+        scene: Path | None = None,
+        out: Path | None = None,
+        overrides: Sequence[str] = (),
+        resume: bool = False,
+    ) -> "Job":
+        """Check a pipeline file, or a shipped one by name; `overrides` are 'stage.key=value'.  Raises ConfigError.
+
+        out: default runs/NAME, with a number where that is another run.
+        """
+        changes = [*overrides, *([f"scene.path={_quoted(scene)}"] if scene is not None else [])]
+        if found := load_experiment(pipeline, changes):
+            return cls(found, out or runner.free_folder(Path("runs") / found.name, None, resume))
+        checked = load(pipeline, changes)
+        return cls(checked, out or runner.free_folder(Path("runs") / checked.settings.name, checked, resume))
+
+    @classmethod
+    def resume(cls, out: Path, overrides: Sequence[str] = ()) -> "Job":
+        """Take the pipeline that a run folder holds, to go on with it there.  Raises ConfigError or DataError."""
+        file = out / "pipeline.yaml"
+        if not file.is_file():
+            raise DataError(f"{out}: has no pipeline.yaml; expected the folder of a run")
+        return cls.open(str(file), None, out, overrides, resume=True)
+
+    def describe(self, device: str | None = None) -> str:
+        """What would run, as lines of text.  Raises what `run` raises before it begins."""
+        if isinstance(self.work, Experiment):
+            return describe_matrix(self.work, self.out)
+        return runner.describe(self.work, self.out, device)
+
+    def run(self, device: str | None = None, resume: bool = False) -> None:
+        """Run it; what is up to date is left alone.  Raises ClsplatError; status.json tells why."""
+        if isinstance(self.work, Experiment):
+            run_matrix(self.work, self.out, device, resume)
+        elif runner.up_to_date(self.work, self.work.preparation(self.out), self.out):
+            LOG.info("%s: up to date; change a setting, or give another --out, to run again", self.out)
+        else:
+            run_pipeline(self.work, self.out, device, resume)
+
+
+def check(pipeline: str) -> dict[str, Any]:
+    """Check a pipeline file, or a shipped one by name: its path, its name, its stages or cells.  Raises ConfigError."""
+    if found := load_experiment(pipeline):
+        return {"path": str(found.path), "name": found.name, "cells": [cell.name for cell in found.cells]}
+    checked = load(pipeline)
+    return {"path": str(checked.path), "name": checked.settings.name, "stages": checked.names}
+
+
 def run_pipeline(pipeline: Pipeline, out: Path, device: str | None, resume: bool) -> None:
-    """Run one pipeline in its folder, with a log and a progress bar."""
+    """Run one pipeline in its folder, with a log and a progress bar.  Raises ClsplatError; status.json tells why."""
     runner.make_run_folder(out, resume)
-    with terminal.logging_to(out / "log.txt"):
-        try:
-            state = runner.open_run(pipeline, out, device)
-        except ClsplatError as error:
-            runner.give_up(out, error)
-            raise
+    with (
+        runner.stopping_on_signals(_stop_at_once),
+        runner.failures_recorded(out),
+        terminal.logging_to(out / "log.txt"),
+    ):
+        run = runner.open_run(pipeline, out, device)
         with terminal.progress_bar() as show:
-            runner.execute(pipeline, state, resume, show)
+            runner.execute(pipeline, run, resume, show)
 
 
-def run(experiment: Experiment, out: Path, device: str | None, resume: bool) -> None:
+def run_matrix(experiment: Experiment, out: Path, device: str | None, resume: bool) -> None:
     """Run every cell in its folder below `out` and write compare.html; with `resume` finished cells are left alone.
 
     A cell that fails does not stop the others; at the end a ClsplatError is raised with the exit code of the first one.
@@ -42,31 +104,34 @@ def run(experiment: Experiment, out: Path, device: str | None, resume: bool) -> 
         raise ConfigError(f"{out}: holds a single run, not those of a matrix; give another --out")
     runner.make_run_folder(out, resume)
     write_text(out / "pipeline.yaml", experiment.text)
-    failures: dict[str, ClsplatError] = {}
+    state = _State(out, len(experiment.cells))
+    try:
+        _run_cells(experiment, state, device, resume)
+        _compare(experiment, out, state.failures)
+    except BaseException as error:
+        state.end(as_clsplat_error(error))  # raises it
+    state.end(_first_of(state.failures, len(experiment.cells)))
+
+
+def _run_cells(experiment: Experiment, state: "_State", device: str | None, resume: bool) -> None:
     for number, cell in enumerate(experiment.cells, 1):
-        _status(out, "running", experiment, number - 1, failures)
+        state.write("running", done=number - 1)
+        title, folder = f"cell {number} of {len(experiment.cells)}: {cell.name}", state.out / cell.name
         try:
-            if resume and _finished(cell, out / cell.name):
-                LOG.info("cell %d of %d: %s is done", number, len(experiment.cells), cell.name)
+            if resume and _finished(cell, folder):
+                LOG.info("%s is done", title)
             else:
-                LOG.info("cell %d of %d: %s", number, len(experiment.cells), cell.name)
-                run_pipeline(cell.pipeline, out / cell.name, device, resume)
+                LOG.info("%s", title)
+                run_pipeline(cell.pipeline, folder, device, resume)
         except Interrupted:
-            _status(out, "interrupted", experiment, number - 1, failures)
             raise
-        except (ClsplatError, MemoryError) as error:
-            failures[cell.name] = error if isinstance(error, ClsplatError) else MemoryLimitError("out of memory")
-            LOG.warning("cell %s failed: %s", cell.name, failures[cell.name])
-    _compare(experiment, out, failures)
-    _status(out, "failed" if failures else "done", experiment, len(experiment.cells), failures)
-    if failures:
-        name, first = next(iter(failures.items()))
-        whole = ClsplatError(f"{len(failures)} of {len(experiment.cells)} cells failed; the first, {name}: {first}")
-        whole.exit_code = first.exit_code
-        raise whole
+        except Exception as error:
+            state.failures[cell.name] = as_clsplat_error(error)
+            LOG.warning("cell %s failed: %s", cell.name, one_line(state.failures[cell.name]))
+    state.write("running", done=len(experiment.cells))
 
 
-def describe(experiment: Experiment, out: Path) -> str:
+def describe_matrix(experiment: Experiment, out: Path) -> str:
     """What would run, a line for each cell.  Raises DataError when a scene cannot be read."""
     for scene in {c.pipeline.settings.scene for c in experiment.cells if not c.pipeline.settings.prepare}:
         scene.read(scene.folder)
@@ -77,13 +142,23 @@ def describe(experiment: Experiment, out: Path) -> str:
     return f"would run {len(lines)} cells in {out}:\n" + "\n".join(lines)
 
 
+def _stop_at_once() -> None:
+    raise KeyboardInterrupt
+
+
+def _quoted(folder: Path) -> str:
+    """A folder as a value of `--set`, from wherever it is used.  Raises ConfigError when YAML cannot hold its name."""
+    path = str(folder.resolve())
+    try:
+        path.encode()
+    except UnicodeEncodeError:
+        raise ConfigError(f"--scene {path!r}: expected a path of UTF-8 text; rename the folder") from None
+    return json.dumps(path)
+
+
 def _finished(cell: Cell, folder: Path) -> bool:
     """Whether the cell was run to its end.  Raises ConfigError when that was with other settings."""
-    try:
-        state = json.loads((folder / "status.json").read_text())["state"]
-    except (OSError, ValueError, KeyError, TypeError):
-        return False
-    if state != "done":
+    if runner.read_status(folder).get("state") != "done":
         return False
     before = load(str(folder / "pipeline.yaml")).resolved()
     if difference := first_difference(before, cell.pipeline.resolved()):
@@ -99,13 +174,44 @@ def _compare(experiment: Experiment, out: Path, failures: dict[str, ClsplatError
         LOG.info("%d runs compared in %s", len(finished), out / PAGE)
 
 
-def _status(out: Path, state: str, experiment: Experiment, done: int, failures: dict[str, ClsplatError]) -> None:
-    text = {
-        "state": state,
-        "cells": len(experiment.cells),
-        "done": done,
-        "failed": {name: str(error) for name, error in failures.items()},
-        "process": os.getpid(),
-        "time": time.time(),
-    }
-    write_text(out / "status.json", json.dumps(text, indent=1) + "\n")
+def _first_of(failures: dict[str, ClsplatError], cells: int) -> ClsplatError | None:
+    """The error that stands for those of the cells, with the exit code of the first."""
+    if not failures:
+        return None
+    name, first = next(iter(failures.items()))
+    whole = ClsplatError(f"{len(failures)} of {cells} cells failed; the first, {name}: {first}")
+    whole.exit_code = first.exit_code
+    return whole
+
+
+@dataclass
+class _State:
+    """How far a matrix is, as its status.json tells."""
+
+    out: Path
+    cells: int
+    done: int = 0  # with those that failed
+    failures: dict[str, ClsplatError] = field(default_factory=dict)
+
+    def write(self, state: str, done: int, **more: Any) -> None:
+        self.done = done
+        text = {
+            "state": state,
+            "cells": self.cells,
+            "done": done,
+            "failed": {name: one_line(error) for name, error in self.failures.items()},
+            "process": os.getpid(),
+            "time": time.time(),
+            **more,
+        }
+        write_text(self.out / "status.json", json.dumps(text, indent=1) + "\n")
+
+    def end(self, failure: ClsplatError | None) -> None:
+        """Write the last status, and raise the failure."""
+        if failure is None:
+            self.write("done", self.done, exit_code=0)
+            return
+        state = "interrupted" if isinstance(failure, Interrupted) else "failed"
+        with suppress(OutputError):  # the failure itself is what the user must see
+            self.write(state, self.done, exit_code=failure.exit_code, message=one_line(failure))
+        raise failure

@@ -22,17 +22,18 @@ from typing import Annotated, Any
 
 from pydantic import Field, JsonValue, ValidationError, model_validator
 
-from clsplat.errors import ConfigError
-from clsplat.pipeline import Name, Pipeline, checked, find
+from clsplat.errors import ConfigError, OverrideError
+from clsplat.pipeline import Name, Pipeline, checked
+from clsplat.pipeline_files import find
 from clsplat.settings import Settings
-from clsplat.settings_errors import explain
+from clsplat.settings_errors import explain, place_text
 from clsplat.yaml_file import Document, Place, read_yaml
 
-LIMIT = 1000  # cells: more is a slip
+MAX_CELLS = 1000
 
 
 class Matrix(Settings):
-    """The axes; every one that is listed has a part in the cells' names."""
+    """The axes; every one that is listed is part of the cells' names."""
 
     pipelines: list[str] = Field([])  # files, or names of shipped ones
     scenes: list[str] = Field([])  # folders
@@ -51,7 +52,7 @@ class Matrix(Settings):
 
 
 class MatrixFile(Settings):
-    """What a file with `matrix:` can say; `stages` and the rest only when the matrix names no pipelines."""
+    """The keys of a file with `matrix:`; those of a pipeline stand beside them when the matrix names no pipelines."""
 
     name: Name
     matrix: Matrix
@@ -102,8 +103,8 @@ def load_experiment(name: str, overrides: Sequence[str] = ()) -> Experiment | No
     axes = _axes(file.matrix)
     _check_overrides(path, axes, overrides)
     bases = _bases(path, document, file.matrix)
-    if (count := len(bases) * math.prod(len(axis) for axis in axes)) > LIMIT:
-        raise ConfigError(f"{path}: the matrix has {count} cells; at most {LIMIT} are run, so list fewer values")
+    if (count := len(bases) * math.prod(len(axis) for axis in axes)) > MAX_CELLS:
+        raise ConfigError(f"{path}: the matrix has {count} cells; at most {MAX_CELLS} are run; list fewer values")
     for base in bases:
         _check_choices(path, document, base, axes, overrides)
     cells = [_cell(base, choices, overrides) for base in bases for choices in itertools.product(*axes)]
@@ -163,22 +164,24 @@ def _axes(matrix: Matrix) -> list[list[_Choice]]:
 def _cell(base: _Base, choices: Sequence[_Choice], overrides: Sequence[str]) -> Cell:
     parts = [base.label, *(choice.label for choice in choices)]
     name = re.sub(r"[^\w.=+-]+", "_", "-".join(part for part in parts if part))
-    pipeline = checked(base.path, base.document, [*overrides, *(choice.override for choice in choices)])
+    try:
+        pipeline = checked(base.path, base.document, [*overrides, *(choice.override for choice in choices)])
+    except OverrideError as error:
+        raise ConfigError(f"{base.path}: cell '{name}' of the matrix: {error.reason}") from error
     return Cell(name, pipeline)
 
 
 def _check_choices(
     path: Path, document: Document, base: _Base, axes: Sequence[Sequence[_Choice]], overrides: Sequence[str]
 ) -> None:
-    """Say which value of the matrix a pipeline refuses, before values meet each other."""
+    """Check each value of the matrix by itself.  Raises ConfigError with the place of the first that does not fit."""
     checked(base.path, base.document, list(overrides))
     for choice in itertools.chain(*axes):
         try:
             checked(base.path, base.document, [*overrides, choice.override])
-        except ConfigError as error:
-            place = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in choice.place)[1:]
-            reason = re.sub(r"^(\S+:\d+|--set [^:]*): ", "", str(error))
-            raise ConfigError(f"{path}:{document.line(choice.place)}: {place}: {reason}") from error
+        except OverrideError as error:
+            place, line = place_text(choice.place), document.line(choice.place)
+            raise ConfigError(f"{path}:{line}: {place}: {error.reason}") from error
 
 
 def _check_overrides(path: Path, axes: Sequence[Sequence[_Choice]], overrides: Sequence[str]) -> None:
@@ -189,13 +192,13 @@ def _check_overrides(path: Path, axes: Sequence[Sequence[_Choice]], overrides: S
 
 
 def _check_names(path: Path, cells: Sequence[Cell]) -> None:
-    names = [cell.name.casefold() for cell in cells]  # some file systems know no case
+    names = [cell.name.casefold() for cell in cells]  # some file systems ignore case
     if twice := next((cell.name for cell in cells if names.count(cell.name.casefold()) > 1), None):
         raise ConfigError(f"{path}: two cells of the matrix would be named '{twice}'; rename a pipeline or a folder")
 
 
 def _distinct(paths: Sequence[tuple[str, ...]]) -> list[str]:
-    """The shortest ends of the paths that tell them apart."""
+    """The shortest ends of the paths that differ from each other."""
     for length in range(1, max((len(parts) for parts in paths), default=0) + 1):
         names = ["-".join(parts[-length:]) for parts in paths]
         if len(set(names)) == len(names):

@@ -1,47 +1,90 @@
-"""A model file at the views of a scene: rendering and measuring without a run."""
+"""A model at the views of a scene: rendering and measuring without training."""
 
 import io
 import logging
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from clsplat.errors import DataError
+from clsplat.errors import ConfigError, DataError
 from clsplat.files import atomic
 from clsplat.filters import Dilation, Mip, ModelSettings
 from clsplat.gaussians.ply import read_ply
 from clsplat.gaussians.tables import Gaussians
-from clsplat.metrics.perceptual import Perceptual
+from clsplat.metrics.lpips import InputRange
+from clsplat.metrics.perceptual import Perceptual, metric_names
 from clsplat.metrics.views import PSNR_AND_SSIM, mean, measure, render_view
 from clsplat.opencl.device import Device, choose
+from clsplat.pipeline import SceneSettings, load
+from clsplat.prepare.cache import noted
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.scene.detect import read_scene
 from clsplat.scene.images import write_image
+from clsplat.scene.scene import Alpha
 from clsplat.stages.render import image_path
 from clsplat.views.photographs import BACKGROUNDS, Photographs
 
 LOG = logging.getLogger("clsplat")
+MODEL = "point_cloud.ply"  # of a run folder
+
+
+@dataclass(frozen=True)
+class Source:
+    """A model file, and the photographs whose cameras look at it."""
+
+    file: Path
+    folder: Path  # of the photographs
+    settings: SceneSettings  # how they are read
+    alpha: Alpha | None = None  # None: as the model file says
+
+    @classmethod
+    def of(cls, model: Path, scene: Path | None) -> "Source":
+        """Take a model file with its scene, or a run folder, which has both.
+
+        `scene` replaces the folder of the run's photographs.  Raises DataError or ConfigError when one is not known.
+        """
+        if not model.is_dir():
+            if scene is None:
+                raise ConfigError(f"{model}: a model file does not name its scene; give --scene DIR, or a run folder")
+            return cls(model, scene, SceneSettings())
+        if not (model / "pipeline.yaml").is_file():
+            raise DataError(f"{model}: has no pipeline.yaml; expected a model file or a run folder")
+        settings = load(str(model / "pipeline.yaml")).settings.scene
+        if not (model / MODEL).is_file():
+            raise DataError(f"{model}: has no {MODEL}; finish the run with `clsplat resume {model}`")
+        prepared = noted(model)
+        folder = scene or Path(prepared["folder"] if prepared else settings.folder)
+        if not folder.is_dir():
+            raise DataError(f"{model}: the folder of its photographs, {folder}, is missing; give --scene DIR")
+        return cls(model / MODEL, folder, settings, settings.alpha)
 
 
 class ModelFile:
-    """A PLY opened on a device, with the scene whose cameras look at it.
+    """A model opened on a device, with the scene whose cameras look at it.
 
     The numbers it was trained with come from the file's comment; files of other programs get those of 3DGS, or of
-    Mip-Splatting where the file says so.
+    Mip-Splatting where the file says so.  Photographs of a run folder are read as the run read them.
     """
 
-    def __init__(self, path: Path, scene: Path, device: str | None, scale: float = 1) -> None:
-        file = read_ply(path)
+    def __init__(
+        self, model: Path, scene: Path | None = None, device: str | None = None, downscale: float | None = None
+    ) -> None:
+        """downscale: divisor of the photographs' size; default: that of the run, 1 for a file."""
+        source = Source.of(model, scene)
+        file = read_ply(source.file)
         self.device = Device(choose(device))
         LOG.info("device: %s", self.device.text)
-        self.photographs = read_scene(scene).with_alpha(
-            "mask" if file.rendering.get("alpha") == "mask" else "transparency"
-        )
-        self.scene = self.photographs.downscaled(scale)
+        alpha: Alpha = source.alpha or ("mask" if file.rendering.get("alpha") == "mask" else "transparency")
+        self.photographs = read_scene(source.folder, source.settings.holdout).with_alpha(alpha)
+        self.downscale = downscale or source.settings.downscale
+        self.scene = self.photographs.downscaled(self.downscale)
         gaussians = Gaussians(self.device, file.parameters)
-        screen = Mip() if file.mode == "mip" else Dilation()
-        self.model = ModelSettings(screen_filter=screen).model(gaussians, gaussians.sh_degree)
+        screen_filter = Mip() if file.mode == "mip" else Dilation()
+        self.model = ModelSettings(screen_filter=screen_filter).model(gaussians, gaussians.sh_degree)
         for name in ("near", "screen_variance", "compensate"):
             if isinstance(file.rendering.get(name), int | float):
                 setattr(self.model, name, float(file.rendering[name]))
@@ -50,7 +93,7 @@ class ModelFile:
         self.rasterizer = Rasterizer(self.device)
 
     def render(self, split: str, out: Path, kind: str) -> int:
-        """Write an image for each view of a split; return their number."""
+        """Write an image (`kind` png) or float32 array (npy) for each view of a split; return their number."""
         photographs = Photographs(self.device, self.background)
         views = self.scene.split(split)
         if not views:
@@ -69,14 +112,47 @@ class ModelFile:
                     stream.write(buffer.getvalue())
         return len(views)
 
-    def evaluate(self, scales: list[float], perceptual: Perceptual = PSNR_AND_SSIM) -> dict[str, Any]:
-        """Metrics by split and scale, by what the photographs' sizes are divided, with the keys of metrics.json."""
+    def evaluate(
+        self, downscales: Sequence[float] | None = None, perceptual: Perceptual = PSNR_AND_SSIM
+    ) -> dict[str, Any]:
+        """Return metrics by split and divisor of the photographs' size, with the keys of metrics.json."""
         metrics: dict[str, Any] = {"test": {}, "train": {}}
-        for scale in scales:
-            scene = self.photographs.downscaled(scale)
+        for downscale in downscales or [self.downscale]:
+            scene = self.photographs.downscaled(downscale)
             photographs = Photographs(self.device, self.background)
             for split in ("test", "train"):
                 if scene.split(split):
                     results = measure(self.rasterizer, self.model, scene.split(split), photographs, perceptual)
-                    metrics[split][f"{scale:g}"] = mean(results, perceptual)
+                    metrics[split][f"{downscale:g}"] = mean(results, perceptual)
         return {**metrics, "gaussians": self.model.gaussians.count, "device": self.device.text}
+
+
+def render(
+    model: Path,
+    scene: Path | None = None,
+    out: Path = Path("renders"),
+    *,
+    split: str = "test",
+    downscale: float | None = None,
+    kind: str = "png",
+    device: str | None = None,
+) -> int:
+    """Render a model file or run folder at the views of a scene; return the number of files.  Raises ClsplatError."""
+    return ModelFile(model, scene, device, downscale).render(split, out, kind)
+
+
+def evaluate(
+    model: Path,
+    scene: Path | None = None,
+    *,
+    downscales: Sequence[float] | None = None,
+    metrics: Sequence[str] = ("psnr", "ssim"),
+    lpips: Path | None = None,
+    lpips_input: InputRange = "-1..1",
+    device: str | None = None,
+) -> dict[str, Any]:
+    """Measure a model file or run folder on a scene's views, with the keys of metrics.json.  Raises ClsplatError."""
+    if wrong := [value for value in downscales or () if not 1 <= value < math.inf]:
+        raise ConfigError(f"expected downscale factors from 1 on, got {wrong[0]:g}")
+    perceptual = Perceptual.open(metric_names(list(metrics)), lpips, lpips_input)
+    return ModelFile(model, scene, device).evaluate(downscales, perceptual)

@@ -8,10 +8,8 @@ file is written to the run folder.
 """
 
 import copy
-import difflib
 import io
 import logging
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,22 +18,25 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, ValidationError
 from ruamel.yaml import YAML
 
-from clsplat import plugins, resource_dir
-from clsplat.errors import ConfigError
+from clsplat import plugins
+from clsplat.errors import ConfigError, OverrideError, one_line
 from clsplat.filters import ModelSettings
 from clsplat.opencl.device import Schedule
+from clsplat.overrides import NoSuchKey, apply, split, suggestion
+from clsplat.pipeline_files import find
 from clsplat.prepare.cache import Planned, plan
 from clsplat.prepare.steps import Step
 from clsplat.renamed import with_new_names
 from clsplat.render.rasterizer import RECORD, UNLIMITED, Budget
 from clsplat.render.tiles import Sort
 from clsplat.scene.detect import read_scene
-from clsplat.scene.scene import Alpha, Background, Scene
+from clsplat.scene.scene import HOLDOUT, Alpha, Background, Scene
+from clsplat.settable import settable
 from clsplat.settings import OneOf, Settings, variants
-from clsplat.settings_errors import explain
+from clsplat.settings_errors import explain, first_fault, place_text
 from clsplat.stages.base import Scheduled, Stage
 from clsplat.stages.optimize import Optimize
-from clsplat.yaml_file import Document, parse_scalar, read_yaml
+from clsplat.yaml_file import Document, read_yaml
 
 LOG = logging.getLogger("clsplat")
 
@@ -55,7 +56,7 @@ class SceneSettings(Settings):
     """Colour behind the scene; auto: white for Blender scenes, else black."""
     image_budget: Annotated[int, Field(gt=0)] | None = None
     """MiB of photographs on the device; without it, a quarter of its memory."""
-    holdout: Annotated[int, Field(ge=0)] = 8
+    holdout: Annotated[int, Field(ge=0)] = HOLDOUT
     """Every n-th image, by name, is a test view; 0: none."""
 
     @property
@@ -72,8 +73,11 @@ class SceneSettings(Settings):
 
     def read(self, folder: Path) -> tuple[Scene, Background]:
         """Return the photographs of a folder, and what they are shown on.  Raises DataError."""
-        scene = read_scene(folder, self.holdout).with_alpha(self.alpha)
-        return scene, scene.background if self.background == "auto" else self.background
+        return self.applied(read_scene(folder, self.holdout))
+
+    def applied(self, scene: Scene) -> tuple[Scene, Background]:
+        """Return a scene with its photographs' alpha as these settings take it, and what they are shown on."""
+        return scene.with_alpha(self.alpha), scene.background if self.background == "auto" else self.background
 
 
 class RasterizerSettings(Settings):
@@ -137,13 +141,18 @@ class Pipeline:
     settings: PipelineFile
 
     @property
+    def names(self) -> list[str]:
+        """The names of its steps and stages, in order."""
+        return [*(step.stage for step in self.settings.prepare), *(stage.stage for stage in self.stages)]
+
+    @property
     def stages(self) -> list[Stage]:
         return list(self.settings.stages)
 
     def preparation(self, out: Path) -> list[Planned]:
         """What must be done to the photographs before a run in `out`, and why.  Raises DataError."""
         settings = self.settings
-        return plan(settings.prepare, settings.scene.folder, prepared_beside(out)) if settings.prepare else []
+        return plan(settings.prepare, settings.scene.folder, prepared_folder(out)) if settings.prepare else []
 
     def resolved(self) -> dict[str, Any]:
         """Every setting with its value, as plain data in the shape of a file."""
@@ -162,7 +171,7 @@ class Pipeline:
         return stream.getvalue()
 
 
-def prepared_beside(out: Path) -> Path:
+def prepared_folder(out: Path) -> Path:
     """Where results of `prepare:` lie: beside the run folder, for all runs there."""
     return out.absolute().parent / "prepared"
 
@@ -180,10 +189,19 @@ def checked(path: Path, document: Document, overrides: Sequence[str] = ()) -> Pi
     """Check what was read from a pipeline file; the document stays as it is.  Raises ConfigError as `load` does."""
     if not isinstance(document.data, dict):
         raise ConfigError(f"{path}:1: expected keys such as name and stages")
-    data = _tagged_file(Document(copy.deepcopy(document.data), document.lines), path)
-    for override in overrides:
-        _override(data, override)
-    data = with_new_names(data, str(path))
+    tagged = _tagged_file(document, path)
+    data = copy.deepcopy(tagged)
+    try:
+        for override in overrides:
+            apply(data, override, PipelineFile)
+        return Pipeline(path, _validated(data, path, document))
+    except ConfigError:
+        _blame(tagged, overrides, path, document)
+        raise
+
+
+def _validated(data: dict[str, Any], path: Path, document: Document) -> PipelineFile:
+    data = with_new_names(data, warn_about=str(path))
     if isinstance(recorded := data.get("plugins"), dict):
         plugins.require({str(name): str(digest) for name, digest in recorded.items()}, str(path))
     try:
@@ -191,25 +209,26 @@ def checked(path: Path, document: Document, overrides: Sequence[str] = ()) -> Pi
     except ValidationError as error:
         raise ConfigError(explain(error, PipelineFile, path, document)) from error
     _check_order(path, settings)
-    return Pipeline(path, settings.model_copy(update={"plugins": plugins.used_by(settings)}))
+    return settings.model_copy(update={"plugins": plugins.used_by(settings)})
 
 
-def find(name: str) -> Path:
-    """The file of a pipeline given by path or by the name of a shipped one."""
-    path = Path(name)
-    if path.is_file():
-        return path
-    if path.suffix in (".yaml", ".yml"):
-        raise ConfigError(f"{path}: no such pipeline file")
-    shipped = {file.stem: file for file in sorted(resource_dir("pipelines").glob("*.yaml"))}
-    if name in shipped:
-        return shipped[name]
-    if path.is_dir():
-        go_on = f"clsplat run PIPELINE --out {path} --resume"
-        raise ConfigError(f"{path}: is a folder, expected a pipeline file; to go on with a run: {go_on}")
-    near = difflib.get_close_matches(name, shipped, n=1)
-    hint = f"; did you mean '{near[0]}'?" if near else f"; there are {', '.join(shipped)}, or give a path"
-    raise ConfigError(f"no pipeline named '{name}'{hint}")
+def _blame(data: dict[str, Any], overrides: Sequence[str], path: Path, document: Document) -> None:
+    """Raise the error of the file alone, else that of the first override which does not fit."""
+    known = [key.place for key in settable(_validated(data, path, document))]
+    for override in overrides:
+        names, _ = split(override)
+        try:
+            place = apply(data, override, PipelineFile)
+        except NoSuchKey as error:
+            raise OverrideError(override, error.reason + suggestion(names, known)) from error
+        try:
+            _check_order(path, PipelineFile.model_validate(with_new_names(data)))
+        except ValidationError as error:
+            where, complaint = first_fault(error, PipelineFile)
+            around = where == place[: len(where)]
+            raise OverrideError(override, complaint if around else f"{place_text(where)}: {complaint}") from error
+        except ConfigError as error:
+            raise OverrideError(override, one_line(error).removeprefix(f"{path}: ")) from error
 
 
 def _tagged_file(document: Document, path: Path) -> dict[str, Any]:
@@ -243,48 +262,6 @@ def _untagged(stage: dict[str, Any]) -> dict[str, Any]:
     if "during" in fields:
         fields["during"] = [_untagged(inner) for inner in fields["during"]]
     return {stage["stage"]: fields}
-
-
-def _override(data: dict[str, Any], text: str) -> None:
-    """Apply 'place.key=value'; a stage is addressed by its name, inside `during` as well when that is the only one."""
-    place, equals, value = text.partition("=")
-    names = re.findall(r"[^.\[\]]+", place)
-    if not equals or len(names) < 1:
-        raise ConfigError(f"--set {text}: expected stage.key=value, for example optimize.steps=500")
-    node: Any = data
-    for position, name in enumerate(names[:-1]):
-        node = _descend(node, name, text, top=position == 0)
-    if isinstance(node, list) and names[-1].isdigit() and int(names[-1]) < len(node):
-        node[int(names[-1])] = parse_scalar(value)
-    elif isinstance(node, dict):
-        node[names[-1]] = parse_scalar(value)
-    else:
-        raise ConfigError(f"--set {text}: there is no '{names[-1]}' here")
-
-
-def _descend(node: Any, name: str, text: str, top: bool) -> Any:
-    if isinstance(node, list):
-        if name.isdigit() and int(name) < len(node):
-            return node[int(name)]
-        raise ConfigError(f"--set {text}: '{name}' is not a place in a list of {len(node)}")
-    if not isinstance(node, dict):
-        raise ConfigError(f"--set {text}: nothing lies below '{name}'")
-    stages = [stage for key in (LISTS if top else ("during",)) for stage in node.get(key, [])]
-    found = [stage for stage in stages if stage["stage"] == name]
-    if top and not found:
-        found = [inner for stage in stages for inner in stage.get("during", []) if inner["stage"] == name]
-    if len(found) > 1:
-        raise ConfigError(f"--set {text}: there are {len(found)} stages named '{name}'; set the value in the file")
-    if found:
-        return found[0]
-    if name in node:
-        return node[name]
-    if top and name not in PipelineFile.model_fields:
-        known = [*PipelineFile.model_fields, *variants(Stage), *variants(Step)]
-        near = difflib.get_close_matches(name, known, n=1)
-        raise ConfigError(f"--set {text}: no '{name}' in this pipeline{f'; did you mean {near[0]}?' if near else ''}")
-    node[name] = {}
-    return node[name]
 
 
 def _check_order(path: Path, settings: PipelineFile) -> None:

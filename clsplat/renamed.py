@@ -10,8 +10,12 @@ from typing import Any
 LOG = logging.getLogger("clsplat")
 
 
-def with_new_names(data: dict[str, Any], where: str) -> dict[str, Any]:
-    """Return the data of a pipeline file, stages as {stage: name, …}, with today's keys; `where` is for warnings."""
+def with_new_names(data: dict[str, Any], warn_about: str = "") -> dict[str, Any]:
+    """Return the data of a pipeline file, stages as {stage: name, …}, with today's keys.
+
+    `warn_about` names the file in warnings; without it there are none.
+    """
+    where = warn_about
     scene = data.get("scene")
     order = None
     if isinstance(scene, dict) and "sampling" in scene:
@@ -58,4 +62,5 @@ def _densify(stage: Any, where: str) -> Any:
 
 
 def _warn(where: str, old: str, new: str) -> None:
-    LOG.warning("%s: '%s' has a new name, '%s'; the old one goes with the next release", where, old, new)
+    if where:
+        LOG.warning("%s: '%s' has a new name, '%s'; the old one goes with the next release", where, old, new)

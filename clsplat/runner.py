@@ -5,16 +5,18 @@ import logging
 import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from types import FrameType
+from typing import Any
 
-from clsplat.errors import ClsplatError, ConfigError, Interrupted, OutputError
+from clsplat.errors import ConfigError, Interrupted, OutputError, as_clsplat_error, one_line
 from clsplat.files import unwritable, write_text
 from clsplat.opencl.device import Device, choose
-from clsplat.pipeline import Pipeline, load, prepared_beside
+from clsplat.pipeline import Pipeline, load, prepared_folder
 from clsplat.prepare.cache import NOTE, Planned, note, noted, prepare
 from clsplat.render.rasterizer import Rasterizer
+from clsplat.scene.detect import read_scene
+from clsplat.scene.scene import Scene
 from clsplat.stages.evaluate import Evaluate
 from clsplat.stages.export import Export
 from clsplat.stages.optimize import Optimize
@@ -34,16 +36,39 @@ def make_run_folder(out: Path, resume: bool) -> None:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise unwritable(out, error) from error
-    write_text(out / "status.json", json.dumps({"state": "starting"}) + "\n")
+    Records(out).status("starting", 0)
 
 
-def give_up(out: Path, error: ClsplatError) -> None:
-    """Say in the run folder's status.json why nothing was run."""
-    Records(out).status("failed", 0, exit_code=error.exit_code, message=str(error))
+@contextmanager
+def failures_recorded(out: Path, step: Callable[[], int] | None = None) -> Iterator[None]:
+    """Turn every failure of the block into a ClsplatError, and write it to status.json.
+
+    Without `step` the step is that of the status before.
+    """
+    try:
+        yield
+    except BaseException as error:
+        failure = as_clsplat_error(error)
+        state = "interrupted" if isinstance(failure, Interrupted) else "failed"
+        with suppress(OutputError):  # the failure itself is what the user must see
+            at = step() if step else int(read_status(out).get("step", 0))
+            Records(out).status(state, at, exit_code=failure.exit_code, message=one_line(failure))
+        if failure is error:
+            raise
+        raise failure from error
+
+
+def read_status(out: Path) -> dict[str, Any]:
+    """Return what status.json holds; an empty dict where it is missing or damaged."""
+    try:
+        status = json.loads((out / "status.json").read_text())
+    except (OSError, ValueError):
+        return {}
+    return status if isinstance(status, dict) else {}
 
 
 def free_folder(folder: Path, pipeline: Pipeline | None, resume: bool) -> Path:
-    """The default run folder: a number keeps a new run apart from earlier ones, but for a finished one of the same."""
+    """Return the default run folder: the next free number, unless an earlier run is resumed or is this very run."""
     number, free = 1, folder
     planned = pipeline.preparation(folder) if pipeline else []
     while (free / "pipeline.yaml").exists() and not resume and not (pipeline and up_to_date(pipeline, planned, free)):
@@ -56,33 +81,40 @@ def up_to_date(pipeline: Pipeline, planned: Sequence[Planned], out: Path) -> boo
     """Whether `out` holds a finished run of this pipeline and the same photographs; never where nothing is prepared."""
     if not planned or noted(out) != note(planned):
         return False
-    try:
-        done = json.loads((out / "status.json").read_text())["state"] == "done"
-    except (OSError, ValueError, KeyError, TypeError):
-        return False
-    return done and load(str(out / "pipeline.yaml")).resolved() == pipeline.resolved()
+    return (
+        read_status(out).get("state") == "done" and load(str(out / "pipeline.yaml")).resolved() == pipeline.resolved()
+    )
 
 
-def open_run(pipeline: Pipeline, out: Path, words: str | None) -> Run:
-    """Choose the device and read the scene.  Raises what they raise."""
+def open_run(pipeline: Pipeline, out: Path, device_name: str | None) -> Run:
+    """Choose the device, prepare and read the scene.  Raises what they raise."""
     settings = pipeline.settings
     for stage in pipeline.stages:
         stage.check()
-    device = Device(choose(words), settings.rasterizer.schedule)
+    device = Device(choose(device_name), settings.rasterizer.schedule)
     LOG.info("device: %s", device.text)
     planned = pipeline.preparation(out)
     if planned and noted(out) not in (None, note(planned)):
         raise ConfigError(f"{out}: began with other photographs, or other settings to prepare them; give another --out")
-    original, background = settings.scene.read(prepare(planned, settings.scene.folder, prepared_beside(out)))
-    scene = original.downscaled(*settings.scene.scales)
-    camera, budget = scene.views[0].camera, settings.scene.image_budget
+    folder = prepare(planned, settings.scene.folder, prepared_folder(out))
+    run = make_run(pipeline, read_scene(folder, settings.scene.holdout), device, out)
+    run.prepared = note(planned) if planned else None
+    return run
+
+
+def make_run(pipeline: Pipeline, scene: Scene, device: Device, out: Path) -> Run:
+    """Return a run of the pipeline on a scene as it was read, before its first stage."""
+    settings = pipeline.settings
+    original, background = settings.scene.applied(scene)
+    trained, budget = original.downscaled(*settings.scene.scales), settings.scene.image_budget
+    camera = trained.views[0].camera
     LOG.info(
         "scene: %s, %d training and %d test views, %d x %d px, %s background, extent %.3g",
-        *(scene.path, len(scene.train), len(scene.test), camera.width, camera.height, background, scene.extent),
+        *(scene.path, len(trained.train), len(trained.test), camera.width, camera.height, background, trained.extent),
     )
     return Run(
         device=device,
-        scene=scene,
+        scene=trained,
         original=original,
         out=out,
         name=settings.name,
@@ -91,7 +123,6 @@ def open_run(pipeline: Pipeline, out: Path, words: str | None) -> Run:
         rasterizer=Rasterizer(device, settings.rasterizer.sort, settings.rasterizer.budget()),
         photographs=Photographs(device, background, None if budget is None else budget << 20, out / "undistorted"),
         model_settings=settings.model,
-        prepared=note(planned) if planned else None,
     )
 
 
@@ -105,16 +136,12 @@ def execute(pipeline: Pipeline, run: Run, resume: bool, show: Callable[[Progress
     if run.prepared:
         write_text(run.out / NOTE, json.dumps(run.prepared) + "\n")
     run.records.start(run.step, edit_due=run.stage_step > 0)
-    try:
+    with failures_recorded(run.out, lambda: run.step):
         with _finishing_on_interrupt(run):
             _run_stages(pipeline, run)
         _write_metrics(run)
         _check_outputs(pipeline, run)
-    except ClsplatError as error:
-        state = "interrupted" if isinstance(error, Interrupted) else "failed"
-        run.records.status(state, run.step, exit_code=error.exit_code, message=str(error))
-        raise
-    run.records.status("done", run.step, exit_code=0)
+        run.records.status("done", run.step, exit_code=0)
 
 
 def _run_stages(pipeline: Pipeline, run: Run) -> None:
@@ -130,25 +157,38 @@ def _run_stages(pipeline: Pipeline, run: Run) -> None:
 
 
 @contextmanager
-def _finishing_on_interrupt(run: Run) -> Iterator[None]:
-    """Ctrl-C and SIGTERM let the step finish and the state be saved; a second one stops at once."""
+def stopping_on_signals(stop: Callable[[], None]) -> Iterator[None]:
+    """Call `stop` on Ctrl-C, SIGTERM and SIGHUP; outside the main thread nothing changes.
+
+    A signal that is ignored, as SIGHUP is under nohup, stays ignored.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
+    numbers = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    before = {number: signal.getsignal(number) for number in numbers}
+    before = {number: handler for number, handler in before.items() if handler != signal.SIG_IGN}
+    try:
+        for number in before:
+            signal.signal(number, lambda number, frame: stop())
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
-    def finish(number: int, frame: FrameType | None) -> None:
+
+@contextmanager
+def _finishing_on_interrupt(run: Run) -> Iterator[None]:
+    """A signal lets the step finish and the state be saved; a second one stops at once."""
+
+    def finish() -> None:
         if run.interrupted:
             raise KeyboardInterrupt
         LOG.info("finishing the step; press Ctrl-C again to stop at once")
         run.interrupted = True
 
-    numbers = (signal.SIGINT, signal.SIGTERM)
-    before = {number: signal.signal(number, finish) for number in numbers}
-    try:
+    with stopping_on_signals(finish):
         yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def _write_metrics(run: Run) -> None:
@@ -166,13 +206,13 @@ def _write_metrics(run: Run) -> None:
 
 
 def _check_outputs(pipeline: Pipeline, run: Run) -> None:
-    """A run that did not write what it declared has failed."""
+    """Raise OutputError where a declared file is missing."""
     promised = ["metrics.json", "pipeline.yaml"]
     promised += [stage.file for stage in pipeline.stages if isinstance(stage, Export)]
     for name in promised:
         path = run.out / name
         if not path.is_file() or path.stat().st_size == 0:
-            raise OutputError(f"{path}: was to be written but is missing or empty; see {run.out / 'log.txt'}")
+            raise OutputError(f"{path}: is missing or empty at the end of the run; see {run.out / 'log.txt'}")
 
 
 def describe(pipeline: Pipeline, out: Path, device: str | None) -> str:

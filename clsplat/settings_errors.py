@@ -1,14 +1,14 @@
 """Turning a failed validation into one sentence: file, line, place, what was expected, the nearest match."""
 
 import difflib
-import types
-import typing
 from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from clsplat.settings import Variants, variants
+from clsplat.errors import shortened
+from clsplat.fields import inside_list, models, tags
+from clsplat.settings import TAGS
 from clsplat.yaml_file import Document, Place
 
 KINDS = {
@@ -30,34 +30,53 @@ EXPECTED = {
     "dict_type": "keys and values",
     "model_type": "keys and values",
     "model_attributes_type": "keys and values",
+    "literal_error": "{expected}",
+    "greater_than": "a value greater than {gt}",
+    "greater_than_equal": "a value of at least {ge}",
+    "less_than": "a value less than {lt}",
+    "less_than_equal": "a value of at most {le}",
+    "finite_number": "a finite number",
+    "too_short": "a list of at least {min_length}",
+    "too_long": "a list of at most {max_length}",
+    "string_pattern_mismatch": "text that matches {pattern}",
 }
 
 
 def explain(error: ValidationError, root: type[BaseModel], path: Path, document: Document) -> str:
-    """Describe the first thing that is wrong; a misspelt key explains the one that is missing, so it goes first."""
+    """Describe the first fault, with its file and line."""
+    place, complaint = first_fault(error, root)
+    return f"{path}:{document.line(place)}: {place_text(place)}: {complaint}"
+
+
+def first_fault(error: ValidationError, root: type[BaseModel]) -> tuple[Place, str]:
+    """Return the first fault's place in the file and what is wrong there.
+
+    A misspelt key explains the one that is missing, so it goes first.
+    """
     first = min(error.errors(), key=lambda one: one["type"] != "extra_forbidden")
     place, model = _follow(first["loc"], root)
-    return f"{path}:{document.line(place)}: {_text(place)}: {_complaint(dict(first), place, model)}"
+    return place, _complaint(dict(first), place, model)
 
 
 def _complaint(error: dict[str, Any], place: Place, model: type[BaseModel] | None) -> str:
     kind, value = error["type"], error["input"]
     if kind == "extra_forbidden":
-        known = [name for name in (model.model_fields if model else {}) if name not in ("stage", "type")]
+        known = [name for name in (model.model_fields if model else {}) if name not in TAGS]
         return f"unknown key '{place[-1]}'{_nearest(str(place[-1]), known)}"
     if kind == "missing":
         return f"'{place[-1]}' is missing"
     if kind == "union_tag_invalid":
-        tags = [tag.strip().strip("'") for tag in error["ctx"]["expected_tags"].split(",")]
-        return f"no {_kind(place)} named '{error['ctx']['tag']}'{_nearest(error['ctx']['tag'], tags)}"
+        known = [tag.strip().strip("'") for tag in error["ctx"]["expected_tags"].split(",")]
+        tag = shortened(str(error["ctx"]["tag"]))
+        return f"no {_kind(place)} named '{tag}'{_nearest(tag, known)}"
     if kind == "union_tag_not_found":
         return f"expected a {_kind(place)} with a 'type'"
-    if kind == "literal_error":
-        return f"expected {error['ctx']['expected']}, got {value!r}"
+    got = f", got {shortened(repr(value))}"
     if kind in EXPECTED:
-        return f"expected {EXPECTED[kind]}, got {value!r}"
+        return f"expected {EXPECTED[kind].format(**error.get('ctx', {}))}{got}"
     message = error["msg"].removeprefix("Value error, ")
-    return f"{message[:1].lower()}{message[1:]}, got {value!r}" if not isinstance(value, dict | list) else message
+    message = f"{message[:1].lower()}{message[1:]}"
+    return message if isinstance(value, dict | list) else message + got
 
 
 def _nearest(word: str, known: list[str]) -> str:
@@ -67,10 +86,11 @@ def _nearest(word: str, known: list[str]) -> str:
 
 def _kind(place: Place) -> str:
     names = [p for p in place if isinstance(p, str)]
-    return next((KINDS[name] for name in reversed(names) if name in KINDS), "thing")
+    return next((KINDS[name] for name in reversed(names) if name in KINDS), "kind")
 
 
-def _text(place: Place) -> str:
+def place_text(place: Place) -> str:
+    """Return a place as text, such as stages[1].optimize.steps."""
     text = ""
     for part in place:
         text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else str(part)
@@ -86,11 +106,11 @@ def _follow(location: tuple[int | str, ...], root: type[BaseModel]) -> tuple[Pla
     annotation: Any = root
     model: type[BaseModel] | None = root
     for part in location:
-        members = _models(annotation)
-        tagged = [m for m in members if part in _tags(m)]
+        members = models(annotation)
+        tagged = [m for m in members if part in tags(m)]
         if isinstance(part, int):
             place.append(part)
-            annotation = _inside_list(annotation)
+            annotation = inside_list(annotation)
         elif tagged and not (len(members) == 1 and part in members[0].model_fields):
             annotation = model = tagged[0]
             if "stage" in model.model_fields:
@@ -101,27 +121,3 @@ def _follow(location: tuple[int | str, ...], root: type[BaseModel]) -> tuple[Pla
             field = model.model_fields.get(part) if model else None
             annotation = field.annotation if field else None
     return tuple(place), model
-
-
-def _models(annotation: Any) -> list[type[BaseModel]]:
-    """The models that an annotation allows directly."""
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return [annotation]
-    if typing.get_origin(annotation) is typing.Annotated:
-        inner, *marks = typing.get_args(annotation)
-        bases = [mark.base for mark in marks if isinstance(mark, Variants)]
-        return list(variants(bases[0]).values()) if bases else _models(inner)
-    if typing.get_origin(annotation) in (typing.Union, types.UnionType):
-        return [model for argument in typing.get_args(annotation) for model in _models(argument)]
-    return []
-
-
-def _tags(model: type[BaseModel]) -> tuple[Any, ...]:
-    field = model.model_fields.get("stage") or model.model_fields.get("type")
-    return typing.get_args(field.annotation) if field else ()
-
-
-def _inside_list(annotation: Any) -> Any:
-    if typing.get_origin(annotation) is typing.Annotated:
-        return _inside_list(typing.get_args(annotation)[0])
-    return next(iter(typing.get_args(annotation)), None)

@@ -2,54 +2,105 @@
 
 import json
 import logging
+import os
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.live import Live
 from rich.progress import BarColumn, Progress, TextColumn
 
-from clsplat.opencl.device import DeviceInfo, resolve_schedule
-from clsplat.training import run as training
+from clsplat.files import unwritable
+
+if TYPE_CHECKING:  # the command line starts without OpenCL
+    from clsplat.opencl.device import DeviceInfo
+    from clsplat.training import run as training
 
 LOG = logging.getLogger("clsplat")
-CONSOLE = Console(highlight=False, soft_wrap=True)
-ERRORS = Console(stderr=True, highlight=False, soft_wrap=True)
+
+
+class _Console(Console):
+    """A console whose reader may leave: what follows is not shown, and the work goes on."""
+
+    def on_broken_pipe(self) -> None:
+        self.quiet = True
+        discard_output()
+
+
+CONSOLE = _Console(highlight=False, soft_wrap=True)
+ERRORS = _Console(stderr=True, highlight=False, soft_wrap=True)
+
+
+def discard_output() -> None:
+    """Let nothing that is still to be written to stdout be an error."""
+    null = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(null, sys.stdout.fileno())
+    os.close(null)
 
 
 class _TerminalHandler(logging.Handler):
-    """Log lines above the progress bar: remarks to stdout, warnings to stderr."""
+    """Log lines above the progress bar: remarks to `remarks`, warnings to stderr."""
+
+    def __init__(self, remarks: Console) -> None:
+        super().__init__()
+        self.remarks = remarks
 
     def emit(self, record: logging.LogRecord) -> None:
-        console = ERRORS if record.levelno >= logging.WARNING else CONSOLE
-        prefix = "warning: " if record.levelno >= logging.WARNING else ""
-        console.print(prefix + record.getMessage(), markup=False)
+        warning = record.levelno >= logging.WARNING
+        (ERRORS if warning else self.remarks).print(
+            ("warning: " if warning else "") + record.getMessage(), markup=False
+        )
 
 
-def start_logging(debug: bool) -> None:
-    """Send the log to the screen."""
+def start_logging(debug: bool, remarks: Console = CONSOLE) -> None:
+    """Send the log to the terminal, with debug lines where that is asked for."""
     LOG.setLevel(logging.DEBUG)
     LOG.handlers.clear()
-    handler = _TerminalHandler()
+    handler = _TerminalHandler(remarks)
     handler.setLevel(logging.DEBUG if debug else logging.INFO)
     LOG.addHandler(handler)
 
 
+def keep_stdout_for_json() -> None:
+    """Send remarks of the log to stderr from here on: stdout holds JSON alone."""
+    for handler in LOG.handlers:
+        if isinstance(handler, _TerminalHandler):
+            handler.remarks = ERRORS
+
+
+def show(text: str) -> None:
+    """Print text as it is."""
+    CONSOLE.print(text, markup=False)
+
+
+def show_json(data: Any) -> None:
+    """Print data as JSON."""
+    print(json.dumps(data, indent=1), flush=True)
+
+
 @contextmanager
 def logging_to(path: Path) -> Iterator[None]:
-    """Append the log to a file, with the time of every line."""
-    handler = logging.FileHandler(path)
+    """Append the log to a file, with the time of every line, and the traceback of what ends the block."""
+    try:
+        handler = logging.FileHandler(path, encoding="utf-8", errors="backslashreplace")
+    except OSError as error:
+        raise unwritable(path, error) from error
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
     LOG.addHandler(handler)
     try:
         yield
+    except BaseException as error:
+        LOG.debug("ended by %s", type(error).__name__, exc_info=error)
+        raise
     finally:
         LOG.removeHandler(handler)
         handler.close()
 
 
-def line(progress: training.Progress) -> str:
+def line(progress: "training.Progress") -> str:
     """One step as text."""
     p = progress
     return (
@@ -58,8 +109,10 @@ def line(progress: training.Progress) -> str:
     )
 
 
-def device_text(info: DeviceInfo, fault: str | None) -> str:
-    """A device and whether it works, for people."""
+def device_text(info: "DeviceInfo", fault: str | None) -> str:
+    """A device and whether it works, as lines of text."""
+    from clsplat.opencl.device import resolve_schedule
+
     sizes = f"{info.memory / 2**30:.1f} GiB of memory, buffers up to {info.allocation / 2**30:.1f} GiB"
     limits = f"groups up to {info.group}, {info.local_memory >> 10} KiB local, {info.float_width} lanes"
     return (
@@ -71,21 +124,21 @@ def device_text(info: DeviceInfo, fault: str | None) -> str:
     )
 
 
-def summary(folder: Path) -> None:
-    """Print what a run achieved, and where it lies."""
+def show_summary(folder: Path) -> None:
+    """Print what a run achieved, and where it lies; nothing for a matrix."""
+    if not (folder / "metrics.json").exists():
+        return
     metrics = json.loads((folder / "metrics.json").read_text())
     test = next(iter(metrics["test"].values()), None)
     quality = f"test PSNR {test['psnr']:.2f} dB, SSIM {test['ssim']:.4f}; " if test else ""
-    CONSOLE.print(
-        f"{quality}{metrics['gaussians']:,} Gaussians; {metrics['train_seconds']:.0f} s of training", markup=False
-    )
+    show(f"{quality}{metrics['gaussians']:,} Gaussians; {metrics['train_seconds']:.0f} s of training")
     for title, name in (("model", "point_cloud.ply"), ("renders", "renders"), ("report", "report.html")):
         if (folder / name).exists():
-            CONSOLE.print(f"  {title:<8} {folder / name}", markup=False)
+            show(f"  {title:<8} {folder / name}")
 
 
 @contextmanager
-def progress_bar() -> Iterator[Callable[[training.Progress], None]]:
+def progress_bar() -> Iterator[Callable[["training.Progress"], None]]:
     """Yield a function that shows progress."""
     if not CONSOLE.is_terminal:
         yield lambda progress: LOG.info(line(progress))
@@ -94,11 +147,11 @@ def progress_bar() -> Iterator[Callable[[training.Progress], None]]:
     task = bar.add_task("", total=None)
     with Live(bar, console=CONSOLE, refresh_per_second=8, transient=True):
 
-        def show(progress: training.Progress) -> None:
+        def update(progress: "training.Progress") -> None:
             bar.update(task, total=progress.steps, completed=progress.step, description=line(progress))
             LOG.debug(line(progress))
 
-        yield show
+        yield update
 
 
 def _clock(seconds: float) -> str:

@@ -1,17 +1,27 @@
-"""Reading YAML as plain data, with the line of every value; nothing in a file can run code."""
+"""Reading YAML as plain data, with the line of every value; nothing in a file can run code.
+
+Allowed are text, numbers, true, false, null, lists, and maps whose keys are text.  Anchors, aliases and merge keys
+(`<<`) work; every other tag is an error.
+"""
 
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from ruamel.yaml import YAML
-from ruamel.yaml.comments import CommentedMap, CommentedSeq
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
+from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
+from ruamel.yaml.reader import ReaderError
 
-from clsplat.errors import ConfigError
+from clsplat.errors import ConfigError, shortened
 
 SIZE_LIMIT = 1 << 20  # bytes
 NODE_LIMIT = 20_000  # values after aliases are expanded: a file of aliases to aliases cannot fill the memory
+CORE = "tag:yaml.org,2002:"
+MERGE = f"{CORE}merge"
+SCALARS = tuple(CORE + name for name in ("null", "bool", "int", "float", "str"))
+PLAIN = (bool, int, float, str)  # what scalars become; ruamel's own kinds remember how they were written
+TEXT = tuple(CORE + name for name in ("timestamp", "value"))  # dates and `=` are text
 Place = tuple[str | int, ...]
 
 
@@ -29,49 +39,120 @@ class Document:
         return self.lines.get(place, 1)
 
 
+class _NotPlain(Exception):
+    """A value that no settings file can hold, and its line."""
+
+    def __init__(self, node: Node, complaint: str) -> None:
+        super().__init__(complaint)
+        self.line = node.start_mark.line + 1
+
+
 def read_yaml(path: Path) -> Document:
     """Read one document.  Raises ConfigError with file and line."""
     try:
         if path.stat().st_size > SIZE_LIMIT:
             raise ConfigError(f"{path}: larger than {SIZE_LIMIT} bytes; this is not a pipeline file")
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read ({error})") from error
+        text = path.read_bytes().decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = error.object[: error.start].count(b"\n") + 1
+        raise ConfigError(
+            f"{path}:{line}: expected UTF-8 text, found the byte {error.object[error.start]:#x}"
+        ) from error
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read ({error.strerror or error})") from error
+    return _parse(text, str(path))
+
+
+def parse_value(text: str) -> Any:
+    """Read one value as a file would: numbers, true, false, null, [lists], {maps} or text.
+
+    Raises ConfigError that says what is wrong with it.
+    """
+    return _parse(text, "").data
+
+
+def _parse(text: str, name: str) -> Document:
+    yaml = YAML(typ="safe", pure=True)
     try:
-        document = Document(None)
-        document.data = _plain(YAML(typ="rt").load(text), document, (), [NODE_LIMIT])
-        return document
+        root = yaml.compose(text)
+        return _Reader(yaml).document(root)
+    except _NotPlain as error:
+        line, complaint = error.line, str(error)
     except MarkedYAMLError as error:
         line = error.problem_mark.line + 1 if error.problem_mark else 1
-        raise ConfigError(f"{path}:{line}: {(error.problem or 'not YAML').splitlines()[0]}") from error
-    except (YAMLError, RecursionError, ValueError) as error:
-        raise ConfigError(f"{path}: not YAML ({str(error).splitlines()[0]})") from error
+        complaint = (error.problem or error.context or "this is not YAML").splitlines()[0]
+    except ReaderError as error:
+        line = text.count("\n", 0, error.position) + 1
+        complaint = f"the character U+{ord(text[error.position]):04X} is not allowed in YAML"
+    except RecursionError:
+        line, complaint = 1, "lists and maps are nested too deeply"
+    except (YAMLError, ValueError, IndexError, AttributeError, TypeError) as error:
+        line, complaint = 1, f"this is not YAML ({type(error).__name__})"
+    raise ConfigError(f"{name}:{line}: {complaint}" if name else complaint)
 
 
-def parse_scalar(text: str) -> Any:
-    """Read one value as a file would: numbers, true, false, null, [lists] or text."""
-    document = Document(None)
-    try:
-        return _plain(YAML(typ="rt").load(text), document, (), [NODE_LIMIT])
-    except YAMLError as error:
-        raise ConfigError(f"cannot read the value '{text}'") from error
+class _Reader:
+    """Plain data from the nodes of one document."""
 
+    def __init__(self, yaml: YAML) -> None:
+        self._scalars = yaml.constructor
+        self._left = NODE_LIMIT
+        self._lines: dict[Place, int] = {}
 
-def _plain(node: Any, document: Document, place: Place, left: list[int]) -> Any:
-    left[0] -= 1
-    if left[0] < 0:
-        raise ValueError("too many values")
-    if isinstance(node, CommentedMap):
-        for key in node:
-            document.lines[(*place, key)] = node.lc.key(key)[0] + 1 if key in (node.lc.data or {}) else 1
-        return {key: _plain(value, document, (*place, key), left) for key, value in node.items()}
-    if isinstance(node, CommentedSeq):
-        for i in range(len(node)):
-            document.lines[(*place, i)] = node.lc.item(i)[0] + 1
-        return [_plain(value, document, (*place, i), left) for i, value in enumerate(node)]
-    for kind in (bool, int, float, str):
-        if isinstance(node, kind):
-            return kind(node)
-    if node is None:
-        return None
-    raise ValueError(f"values of type {type(node).__name__} are not allowed")
+    def document(self, root: Node | None) -> Document:
+        return Document(None if root is None else self._plain(root, ()), self._lines)
+
+    def _plain(self, node: Node, place: Place) -> Any:
+        self._left -= 1
+        if self._left < 0:
+            raise _NotPlain(node, f"more than {NODE_LIMIT} values")
+        if isinstance(node, MappingNode) and node.tag == f"{CORE}map":
+            return self._map(node, place)
+        if isinstance(node, SequenceNode) and node.tag == f"{CORE}seq":
+            self._lines |= {(*place, i): item.start_mark.line + 1 for i, item in enumerate(node.value)}
+            return [self._plain(item, (*place, i)) for i, item in enumerate(node.value)]
+        if isinstance(node, ScalarNode) and node.tag in TEXT:
+            return str(node.value)
+        if isinstance(node, ScalarNode) and node.tag in SCALARS:
+            return self._scalar(node)
+        tag = str(node.tag).replace(CORE, "!!")
+        raise _NotPlain(node, f"the tag {tag} is not allowed; expected text, a number, a list or keys and values")
+
+    def _map(self, node: MappingNode, place: Place) -> dict[str, Any]:
+        data: dict[str, Any] = {}
+        merged: list[Node] = []
+        for key_node, value in node.value:
+            if key_node.tag == MERGE:
+                merged += value.value if isinstance(value, SequenceNode) else [value]
+                continue
+            key = self._plain(key_node, place) if isinstance(key_node, ScalarNode) else None
+            if not isinstance(key, str):
+                raise _NotPlain(
+                    key_node, "expected text as a key; put a number, a date or a word such as true in quotes"
+                )
+            if key in data:
+                raise _NotPlain(key_node, f"found duplicate key '{key}'")
+            self._lines[*place, key] = key_node.start_mark.line + 1
+            data[key] = self._plain(value, (*place, key))
+        for other in merged:
+            data = {**self._merge(other, place), **data}
+        return data
+
+    def _merge(self, node: Node, place: Place) -> dict[str, Any]:
+        """The map that `<<` names; its lines are those of the map it stands in, where that has the same keys."""
+        if not isinstance(node, MappingNode):
+            raise _NotPlain(node, "expected a map after '<<'")
+        around, self._lines = self._lines, {}
+        data: dict[str, Any] = self._plain(node, place)
+        self._lines, inside = around, self._lines
+        for inner, line in inside.items():
+            self._lines.setdefault(inner, line)
+        return data
+
+    def _scalar(self, node: ScalarNode) -> Any:
+        try:
+            value = self._scalars.construct_object(node)
+        except (ValueError, KeyError, IndexError):
+            kind = str(node.tag).removeprefix(CORE)
+            raise _NotPlain(node, f"'{shortened(node.value, 40)}' cannot be read as {kind}") from None
+        return next((plain(value) for plain in PLAIN if isinstance(value, plain)), None)

@@ -64,8 +64,10 @@ def test_a_run_that_cannot_start_says_so_in_its_status(tmp_path):
 
 
 def test_check_and_schema():
-    assert "fine" in clsplat("check", "splat").stdout
+    assert "splat.yaml: valid; init, optimize" in clsplat("check", "splat").stdout
     assert json.loads(clsplat("check", "--schema").stdout)["properties"]["stages"]
+    found = json.loads(clsplat("check", "splat", "--json").stdout)
+    assert (found["name"], found["valid"]) == ("splat", True)
 
 
 def test_devices():

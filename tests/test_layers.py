@@ -13,9 +13,9 @@ PACKAGE = Path(__file__).parents[1] / "clsplat"
 ROWS = (  # from the top down; a module imports only from lower rows, or from its own folder
     {"__main__"},
     {"cli"},
-    {"experiment", "schema"},
+    {"experiment", "schema", "run_status"},
     {"matrix"},
-    {"runner", "model_file", "bench", "compare", "inspect", "terminal"},
+    {"runner", "model_file", "recipes", "bench", "compare", "inspect", "terminal"},
     {"pipeline"},
     {"stages", "prepare"},
     {"training"},
@@ -25,8 +25,11 @@ ROWS = (  # from the top down; a module imports only from lower rows, or from it
     {"render"},
     {"gaussians", "scene"},
     {"opencl"},
-    {"settings_errors", "pages"},
-    {"errors", "files", "ply_header", "settings", "yaml_file", "schedule", "renamed", "plugins", ""},
+    {"overrides", "settable", "settings_errors", "pages"},
+    {
+        *("errors", "fields", "files", "pipeline_files", "ply_header", "plugins", "renamed", "schedule", "settings"),
+        *("yaml_file", ""),
+    },
 )
 ROW = {name: i for i, row in enumerate(ROWS) for name in row}
 MODULES = sorted(PACKAGE.rglob("*.py"))

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from clsplat import experiment, runner
-from clsplat.errors import ClsplatError, ConfigError, DataError, Interrupted, NumericError
+from clsplat.errors import ClsplatError, ConfigError, DataError, InternalError, Interrupted, NumericError
 from clsplat.matrix import Experiment, load_experiment
 from clsplat.pipeline import load
 from clsplat.schema import json_schema
@@ -124,12 +124,12 @@ def test_files_without_a_matrix_are_pipelines(write):
 REFUSED = {
     "misspelt axis": (SMALL.replace("seeds:", "seds:"), r"x.yaml:3: matrix.seds: unknown key 'seds'; did you mean"),
     "no axis": ("name: s\nmatrix: {}\n" + STAGES, r"x.yaml:2: matrix: expected one of pipelines, scenes, seeds"),
-    "empty axis": ("name: s\nmatrix: {set: {init.count: []}}\n" + STAGES, r"matrix.set.init.count: List should"),
+    "empty axis": ("name: s\nmatrix: {set: {init.count: []}}\n" + STAGES, r"init.count: expected a list of at least 1"),
     "not a list": (SMALL.replace("[4, 6]", "4"), r"x.yaml:5: matrix.set.optimize.steps: expected a list, got 4"),
     "text for a seed": (SMALL.replace("[0, 1]", "[0, one]"), r"matrix.seeds\[1\]: expected a whole number, got 'one'"),
     "misspelt setting": (
         SMALL.replace("optimize.steps", "optimize.stps"),
-        r"x.yaml:5: matrix.set.optimize.stps\[0\]: stages\[1\].optimize.stps: unknown key 'stps'; did you mean 'steps'",
+        r"x.yaml:5: matrix.set.optimize.stps\[0\]: unknown key 'stps'; did you mean 'steps'",
     ),
     "misspelt stage": (
         SMALL.replace("optimize.steps", "optimise.steps"),
@@ -190,7 +190,7 @@ def finished(tiny_scene, tmp_path_factory) -> tuple[str, Path]:
     found = load_experiment(str(folder / "x.yaml"))
     assert found is not None
     logging.getLogger("clsplat").setLevel(logging.INFO)
-    experiment.run(found, folder / "run", None, resume=False)
+    experiment.run_matrix(found, folder / "run", None, resume=False)
     return str(folder / "x.yaml"), folder / "run"
 
 
@@ -249,14 +249,27 @@ def test_a_cell_that_fails_does_not_stop_the_others(finished, tmp_path, monkeypa
 
     monkeypatch.setattr(runner, "execute", failing)
     with pytest.raises(ClsplatError, match=r"2 of 4 cells failed; the first, steps=4-.*: the loss is nan") as error:
-        experiment.run(load_experiment(finished[0]), tmp_path / "run", None, resume=False)
+        experiment.run_matrix(load_experiment(finished[0]), tmp_path / "run", None, resume=False)
     assert error.value.exit_code == NumericError.exit_code
     status = json.loads((tmp_path / "run" / "status.json").read_text())
-    assert status["state"] == "failed"
+    assert (status["state"], status["exit_code"], status["done"]) == ("failed", 6, 4)
+    assert status["message"] == str(error.value)
     assert len(status["failed"]) == 2
     page = (tmp_path / "run" / "compare.html").read_text()
     assert "sweep: 2 runs" in page
     assert "steps=4-opacity=0.1-seed=1 failed and is not shown: no photograph" in page
+
+
+def test_a_matrix_ends_in_a_status_whatever_happens(finished, tmp_path, monkeypatch):
+    def broken(*arguments):
+        raise AssertionError
+
+    monkeypatch.setattr(experiment, "write_comparison", broken)
+    shutil.copytree(finished[1], tmp_path / "run")
+    with pytest.raises(InternalError, match=r"a defect\): AssertionError; run with --debug") as error:
+        experiment.run_matrix(load_experiment(finished[0]), tmp_path / "run", None, resume=True)
+    status = json.loads((tmp_path / "run" / "status.json").read_text())
+    assert (status["state"], status["exit_code"], status["message"]) == ("failed", 1, str(error.value))
 
 
 def test_an_interrupt_stops_the_whole(finished, tmp_path, monkeypatch):
@@ -265,7 +278,7 @@ def test_an_interrupt_stops_the_whole(finished, tmp_path, monkeypatch):
 
     monkeypatch.setattr(runner, "execute", interrupted)
     with pytest.raises(Interrupted):
-        experiment.run(load_experiment(finished[0]), tmp_path / "run", None, resume=False)
+        experiment.run_matrix(load_experiment(finished[0]), tmp_path / "run", None, resume=False)
     assert json.loads((tmp_path / "run" / "status.json").read_text())["state"] == "interrupted"
     assert len(list((tmp_path / "run").glob("*/log.txt"))) == 1
     assert not (tmp_path / "run" / "compare.html").exists()
@@ -275,22 +288,22 @@ def test_cells_run_with_other_settings_are_not_taken_for_done(finished, write, t
     shutil.copytree(finished[1], tmp_path / "run")
     changed = write(Path(finished[0]).read_text().replace("count: 300", "count: 301"))
     with pytest.raises(ClsplatError, match=r"4 of 4 cells failed.*stages\[0\].init.count was 300, is 301") as error:
-        experiment.run(load_experiment(changed), tmp_path / "run", None, resume=True)
+        experiment.run_matrix(load_experiment(changed), tmp_path / "run", None, resume=True)
     assert error.value.exit_code == 2
 
 
 def test_folders_are_not_mixed(finished, tiny_scene, tmp_path):
     with pytest.raises(ConfigError, match="already holds a run"):
-        experiment.run(load_experiment(finished[0]), finished[1], None, resume=False)
+        experiment.run_matrix(load_experiment(finished[0]), finished[1], None, resume=False)
     (tmp_path / "pipeline.yaml").write_text("name: single\nstages: []\n")
     with pytest.raises(ConfigError, match="holds a single run"):
-        experiment.run(load_experiment(finished[0]), tmp_path, None, resume=True)
+        experiment.run_matrix(load_experiment(finished[0]), tmp_path, None, resume=True)
 
 
 def test_check_and_dry_run_list_the_cells(finished, tmp_path):
     done = clsplat("check", finished[0])
-    assert "x.yaml: 4 cells: steps=4" in done.stdout
-    assert "steps=6-opacity=0.1-seed=1: fine" in done.stdout
+    assert "x.yaml: valid; 4 cells: steps=4" in done.stdout
+    assert json.loads(clsplat("check", finished[0], "--json").stdout)["cells"] == names(load_experiment(finished[0]))
     done = clsplat("run", finished[0], "--out", tmp_path / "new", "--dry-run")
     assert "would run 4 cells" in done.stdout
     assert re.findall(r"^  (\S+)$", done.stdout, re.MULTILINE) == names(load_experiment(finished[0]))

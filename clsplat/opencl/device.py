@@ -7,6 +7,7 @@ to another one in silence.
 import logging
 import math
 import os
+import re
 import warnings
 import weakref
 from dataclasses import dataclass
@@ -128,7 +129,8 @@ def choose(words: str | None = None) -> DeviceInfo:
 
 
 def _named(words: str, devices: list[DeviceInfo]) -> DeviceInfo:
-    name, _, number = words.rpartition(":") if words.rpartition(":")[2].isdigit() else (words, "", "0")
+    numbered = re.fullmatch(r"(.*):([0-9]{1,4})", words, re.DOTALL)
+    name, number = numbered.groups() if numbered else (words, "0")
     matching = [info for info in devices if info.matches(name)]
     if int(number) >= len(matching):
         raise DeviceError(f"no device matches '{words}'; there are: {'; '.join(i.text for i in devices)}")

@@ -1,0 +1,85 @@
+"""A whole benchmark: its cases, the device's peaks, the times, and how they read."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from clsplat.bench.cases import Result, run_bench
+from clsplat.bench.peaks import Peaks, measure_peaks
+from clsplat.bench.scenes import SIZES, case, grown, real_case
+from clsplat.bench.table import growth_chart, growth_table, table
+from clsplat.errors import ConfigError
+from clsplat.files import write_text
+from clsplat.opencl.device import Device, Schedule, choose
+from clsplat.pipeline import load
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """Times of a training step, scene by scene."""
+
+    device: str
+    pipeline: str
+    peaks: Peaks
+    results: dict[str, Result]
+
+    def data(self) -> dict[str, Any]:
+        """Everything as plain data."""
+        scenes = {name: asdict(result) for name, result in self.results.items()}
+        return {"device": self.device, "pipeline": self.pipeline, "peaks": asdict(self.peaks), "scenes": scenes}
+
+    def text(self, earlier: dict[str, Any]) -> str:
+        """Tables, beside the `data` of an earlier measurement, or of none."""
+        peaks = f"{self.peaks.gflops:.0f} GFLOP/s, {self.peaks.gexp:.1f} Gexp/s, copy {self.peaks.gbytes:.1f} GB/s"
+        was = earlier.get("scenes", {})
+        tables = [table(name, result, was.get(name)) for name, result in self.results.items()]
+        return "\n".join([f"device: {self.device}", f"peaks: {peaks}", *tables])
+
+
+def measure(
+    scenes: Sequence[str] = ("A",),
+    *,
+    model: Path | None = None,
+    scene: Path | None = None,
+    pipeline: str = "splat",
+    repeats: int = 20,
+    schedule: Schedule = "auto",
+    device: str | None = None,
+) -> Measurement:
+    """Time a training step on fixed scenes, and of a model at the views of its scene.  Raises ClsplatError."""
+    if unknown := [name for name in scenes if name not in SIZES]:
+        raise ConfigError(f"--scenes: no scene named '{unknown[0]}'; there are {', '.join(SIZES)}")
+    if (model is None) != (scene is None):
+        raise ConfigError("bench: --model and --scene go together")
+    settings = load(pipeline).settings
+    opened = Device(choose(device), schedule)
+    peaks = measure_peaks(opened)
+    cases = {name: case(opened, *SIZES[name], settings) for name in scenes}
+    if model is not None and scene is not None:
+        cases[model.stem] = real_case(opened, model, scene, settings)
+    return Measurement(opened.text, settings.name, peaks, run_bench(cases, peaks, repeats))
+
+
+def measure_growth(chart: Path, *, pipeline: str, repeats: int, schedule: Schedule, device: str | None) -> str:
+    """Time 50 000 to a million Gaussians; write an SVG, return a table.  Raises ClsplatError."""
+    settings = load(pipeline).settings
+    opened = Device(choose(device), schedule)
+    peaks = measure_peaks(opened)
+    sizes = [run_bench({"": one}, peaks, repeats)[""] for one in grown(opened, settings)]
+    write_text(chart, growth_chart(sizes))
+    return f"device: {opened.text}\n{growth_table(sizes)}"
+
+
+def read_measurement(path: Path, pipeline: str) -> dict[str, Any]:
+    """Read the data of an earlier measurement of the same pipeline.  Raises ConfigError."""
+    name = load(pipeline).settings.name
+    try:
+        data = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{path}: expected the JSON of an earlier `clsplat bench --json` ({error})") from error
+    found = data if isinstance(data, dict) else {}
+    if found and (was := found.get("pipeline", "splat")) != name:
+        raise ConfigError(f"{path}: expected the pipeline '{name}', it has '{was}'; use --pipeline {was}")
+    return found

@@ -1,0 +1,78 @@
+"""The commands.  Each prints one line for an error, and exits with that error's code."""
+
+import difflib
+import sys
+import traceback
+from typing import Any
+
+from clsplat import terminal
+from clsplat.cli import models, runs, tools  # noqa: F401  register their commands
+from clsplat.cli.app import Passed, app
+from clsplat.errors import as_clsplat_error, one_line
+
+GLOBAL_FLAG = "--debug"  # stands before the command or after it
+
+
+def main() -> None:
+    """Run the command line; an error ends as one line, a traceback is shown with --debug only."""
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="backslashreplace")  # of file names that are not text
+    arguments = _flag_first(_one_set_each(sys.argv[1:]))
+    try:
+        code = app(arguments, prog_name="clsplat", standalone_mode=False)
+        code = code if isinstance(code, int) else 0
+        sys.stdout.flush()
+    except BaseException as error:
+        code = _report(error.__cause__ or error if isinstance(error, Passed) else error, GLOBAL_FLAG in arguments[:1])
+    sys.exit(code)
+
+
+def _report(error: BaseException, debugging: bool) -> int:
+    """Print the line for an error; return the exit code."""
+    if isinstance(error, SystemExit):
+        return error.code if isinstance(error.code, int) else 1
+    if isinstance(error, OSError) and error.filename is None:  # it is stdout that cannot be written
+        terminal.discard_output()
+    if isinstance(error, BrokenPipeError):
+        return 0
+    if debugging:
+        traceback.print_exception(error)
+    if hasattr(error, "format_message"):  # of typer
+        message, code = _usage(error), 2
+    else:
+        failure = as_clsplat_error(error)
+        message, code = one_line(failure) or type(failure).__name__, failure.exit_code
+    terminal.ERRORS.print(f"error: {message}", markup=False)
+    return code
+
+
+def _usage(error: Any) -> str:
+    """What is wrong with the command line, and where help is."""
+    context = getattr(error, "ctx", None)
+    command = context.command_path if context else "clsplat"
+    if type(error).__name__ == "NoArgsIsHelpError":
+        print(error.format_message(), end="")
+        return f"{command}: expected a command"
+    if option := getattr(error, "option_name", None) if hasattr(error, "possibilities") else None:
+        known = [name for one in context.command.get_params(context) for name in one.opts] if context else []
+        near = difflib.get_close_matches(option, [name for name in known if name.startswith("-")], n=1, cutoff=0.5)
+        hint = f"did you mean {near[0]}?" if near else f"see `{command} --help`"
+        return f"{command}: no option {option}; {hint}"
+    message = " ".join(error.format_message().split()).rstrip(".")
+    return f"{command}: {message[:1].lower()}{message[1:]}; see `{command} --help`"
+
+
+def _one_set_each(arguments: list[str]) -> list[str]:
+    """Let `--set a=1 b=2` stand for `--set a=1 --set b=2`."""
+    spread: list[str] = []
+    for argument in arguments:
+        follows = len(spread) >= 2 and spread[-2] == "--set"
+        spread += ["--set", argument] if follows and "=" in argument and argument[0] != "-" else [argument]
+    return spread
+
+
+def _flag_first(arguments: list[str]) -> list[str]:
+    """Let `--debug` after the command stand for `--debug` before it."""
+    others = [argument for argument in arguments if argument != GLOBAL_FLAG]
+    return [GLOBAL_FLAG, *others] if len(others) < len(arguments) else arguments

@@ -1,0 +1,171 @@
+"""The command line itself: options before the command, near misses, and what commands share."""
+
+import difflib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from clsplat import __version__, plugins, terminal
+from clsplat.errors import ConfigError
+from clsplat.pipeline_files import shipped
+
+SYNONYMS = {
+    **dict.fromkeys(("train", "fit", "optimize", "start"), "run"),
+    **dict.fromkeys(("eval", "measure", "metrics", "score"), "evaluate"),
+    **dict.fromkeys(("show", "info", "describe"), "inspect"),
+    **dict.fromkeys(("list", "ls", "recipes"), "pipelines"),
+    **dict.fromkeys(("validate", "lint", "verify"), "check"),
+    **dict.fromkeys(("continue", "restart"), "resume"),
+    **dict.fromkeys(("progress", "ps"), "status"),
+    **dict.fromkeys(("benchmark", "time", "profile"), "bench"),
+    "diff": "compare",
+    "help": "--help",
+    "version": "--version",
+}
+
+
+ORDER = [
+    *("run", "resume", "status", "check", "pipelines", "devices", "inspect"),
+    *("render", "evaluate", "compare", "bench", "data"),
+]
+
+
+class Passed(Exception):
+    """Carries, as its cause, an exception that typer would take for something of its own."""
+
+
+class Commands(TyperGroup):
+    """The commands; those of `data` are imported when they are asked for."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        return sorted([*super().list_commands(ctx), "data"], key=ORDER.index)
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        if cmd_name == "data" and cmd_name not in self.commands:
+            from data_tools.__main__ import app as tools
+
+            self.commands[cmd_name] = data = typer.main.get_command(tools)
+            data.name = cmd_name
+            data.short_help = "Prepare datasets: photos, video, undistort, resize, masks, fetch, …"
+        return super().get_command(ctx, cmd_name)
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        name = args[0]
+        if not name.startswith("-") and not ctx.resilient_parsing and self.get_command(ctx, name) is None:
+            near = SYNONYMS.get(name) or next(iter(difflib.get_close_matches(name, self.list_commands(ctx), n=1)), None)
+            if near is None and name in self.get_command(ctx, "data").commands:
+                near = f"data {name}"
+            hint = f"did you mean '{near}'?" if near else "`clsplat --help` lists them"
+            raise ConfigError(f"no command '{name}'; {hint}")
+        return super().resolve_command(ctx, args)
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except (EOFError, KeyboardInterrupt, OSError) as error:
+            raise Passed from error
+
+
+def examples(*lines: str) -> str:
+    """The end of a command's help: command lines that work."""
+    return "Examples:\n" + "\n".join(f"  {line}" for line in lines)
+
+
+app = typer.Typer(
+    cls=Commands,
+    help="3D Gaussian Splatting on any OpenCL device.",
+    epilog=examples(
+        "clsplat devices",
+        "clsplat run quickstart --scene my_scene",
+        "clsplat run photos --scene folder_of_photographs",
+    ),
+    invoke_without_command=True,
+    pretty_exceptions_enable=False,
+)
+
+
+def command(name: str, *lines: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Register a command with examples of its use."""
+    return app.command(name, epilog=examples(*lines))
+
+
+@dataclass(frozen=True)
+class Common:
+    """The options before the command."""
+
+    device: str | None
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        terminal.show(f"clsplat {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def common(
+    context: typer.Context,
+    device: Annotated[str | None, typer.Option(metavar="NAME", help="The device of a command that names none.")] = None,
+    debug: Annotated[
+        bool, typer.Option("--debug", help="Show tracebacks and every log line; also after the command.")
+    ] = False,
+    plugin: Annotated[
+        list[Path] | None,
+        typer.Option("--plugin", metavar="FILE", help="A Python file with variants of one's own; may be repeated."),
+    ] = None,
+    version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version and exit.")
+    ] = False,
+) -> None:
+    terminal.start_logging(debug)
+    context.obj = Common(device)
+    if context.invoked_subcommand is not None:
+        plugins.load_installed()
+    for file in plugin or []:
+        plugins.load_file(file)
+    if context.invoked_subcommand is None:
+        print(context.get_help(), end="")
+        raise ConfigError("expected a command")
+
+
+def _or_common(context: typer.Context, device: str | None) -> str | None:
+    """The device given after the command, or before it."""
+    given = context.find_root().obj
+    return device if device is not None or given is None else given.device
+
+
+def _recipe_names(incomplete: str) -> list[str]:
+    return [name for name in shipped() if name.startswith(incomplete)]
+
+
+DeviceOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="NAME",
+        callback=_or_common,
+        help="Part of a device's name as `clsplat devices` prints it; NAME:1 is the second that matches.",
+    ),
+]
+PipelineArgument = Annotated[
+    str,
+    typer.Argument(
+        metavar="PIPELINE",
+        autocompletion=_recipe_names,
+        show_default=False,
+        help="A pipeline file, or the name of a shipped one.",
+    ),
+]
+ModelArgument = Annotated[Path, typer.Argument(metavar="MODEL|RUN", help="A splat PLY with --scene, or a run folder.")]
+SceneOption = Annotated[
+    Path | None,
+    typer.Option(metavar="DIR", help="A COLMAP, Blender or nerfstudio folder; default: that of the run."),
+]
+SetOption = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE …", help="Change settings; `clsplat pipelines NAME` lists them."),
+]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]

@@ -1,0 +1,118 @@
+"""Commands about runs and pipelines."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from clsplat import terminal
+from clsplat.cli.app import DeviceOption, JsonOption, PipelineArgument, SetOption, command
+from clsplat.errors import ConfigError
+
+
+@command(
+    "run",
+    "clsplat run splat_7k --scene my_scene",
+    "clsplat run splat_7k --scene my_scene --out runs/a --set optimize.steps=3000",
+)
+def run(
+    pipeline: PipelineArgument,
+    scene: Annotated[Path | None, typer.Option(metavar="DIR", help="A COLMAP, Blender or nerfstudio folder.")] = None,
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="The run folder; default: runs/NAME.")] = None,
+    device: DeviceOption = None,
+    set_: SetOption = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on from the newest checkpoint.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Check everything and say what would run.")] = False,
+) -> None:
+    """Run a pipeline, or all cells of a matrix."""
+    from clsplat.experiment import Job
+
+    job = Job.open(pipeline, scene, out, set_ or (), resume)
+    if dry_run:
+        terminal.show(job.describe(device))
+        return
+    job.run(device, resume)
+    terminal.show_summary(job.out)
+
+
+@command("resume", "clsplat resume runs/splat_7k")
+def resume(
+    folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run folder, or that of a matrix.")],
+    device: DeviceOption = None,
+    set_: SetOption = None,
+) -> None:
+    """Go on with a run from its newest checkpoint."""
+    from clsplat.experiment import Job
+
+    job = Job.resume(folder, set_ or ())
+    job.run(device, resume=True)
+    terminal.show_summary(job.out)
+
+
+@command("status", "clsplat status runs/splat_7k", "clsplat status runs/splat_7k --json")
+def status(
+    folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run folder, or that of a matrix.")],
+    as_json: JsonOption = False,
+) -> None:
+    """Tell from its files how far a run is, and its metrics."""
+    from clsplat.run_status import run_status, status_text
+
+    found = run_status(folder)
+    if as_json:
+        terminal.show_json(found)
+    else:
+        terminal.show(status_text(found))
+
+
+@command("check", "clsplat check my_pipeline.yaml", "clsplat check --schema > pipeline.schema.json")
+def check(
+    pipeline: PipelineArgument = "",
+    schema: Annotated[
+        bool, typer.Option("--schema", help="Print the JSON schema of pipeline files, for editors.")
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Validate a pipeline without running it."""
+    from clsplat import experiment
+    from clsplat.schema import json_schema
+
+    if schema:
+        terminal.show_json(json_schema())
+        return
+    if not pipeline:
+        raise ConfigError("check: expected a pipeline, or --schema")
+    found = experiment.check(pipeline)
+    if as_json:
+        terminal.show_json({**found, "valid": True})
+    elif "cells" in found:
+        terminal.show(f"{found['path']}: valid; {len(found['cells'])} cells: {', '.join(found['cells'])}")
+    else:
+        terminal.show(f"{found['path']}: valid; {', '.join(found['stages'])}")
+
+
+@command(
+    "pipelines",
+    "clsplat pipelines",
+    "clsplat pipelines splat_7k",
+    "clsplat pipelines splat_7k --copy my_pipeline.yaml",
+)
+def pipelines(
+    name: PipelineArgument = "",
+    copy: Annotated[Path | None, typer.Option(metavar="FILE", help="Copy the pipeline to a new file.")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """List the shipped pipelines, or the keys of one as --set takes them."""
+    from clsplat import recipes
+
+    if copy is not None:
+        if not name:
+            raise ConfigError("pipelines: --copy needs the name of a pipeline")
+        target = recipes.copy(name, copy)
+        if as_json:
+            terminal.show_json({"copy": str(target)})
+        else:
+            terminal.show(f"{target}: a copy of {name}; `clsplat check {target}` validates it")
+    elif as_json:
+        terminal.show_json(recipes.manual(name) if name else recipes.summaries())
+    else:
+        terminal.show(recipes.manual_text(name) if name else recipes.summaries_text())

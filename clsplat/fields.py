@@ -1,0 +1,43 @@
+"""What the annotations of settings say: the models that a field allows, and the names that tell them apart."""
+
+import types
+import typing
+from typing import Any
+
+from pydantic import BaseModel
+
+from clsplat.settings import TAGS, Variants, variants
+
+
+def models(annotation: Any) -> list[type[BaseModel]]:
+    """Return the models that an annotation allows directly."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    if typing.get_origin(annotation) is typing.Annotated:
+        inner, *marks = typing.get_args(annotation)
+        bases = [mark.base for mark in marks if isinstance(mark, Variants)]
+        return list(variants(bases[0]).values()) if bases else models(inner)
+    if typing.get_origin(annotation) in (typing.Union, types.UnionType):
+        return [model for argument in typing.get_args(annotation) for model in models(argument)]
+    return []
+
+
+def tags(model: type[BaseModel]) -> tuple[Any, ...]:
+    """Return the names by which a pipeline file tells the model from others, if it has any."""
+    field = next((model.model_fields[name] for name in TAGS if name in model.model_fields), None)
+    return typing.get_args(field.annotation) if field else ()
+
+
+def inside_list(annotation: Any) -> Any:
+    """Return the annotation of a list's items."""
+    if typing.get_origin(annotation) is typing.Annotated:
+        return inside_list(typing.get_args(annotation)[0])
+    return next(iter(typing.get_args(annotation)), None)
+
+
+def model_of(data: Any, annotation: Any) -> type[BaseModel] | None:
+    """Return the model that plain data with its tag is checked by; None where that is not known."""
+    allowed = models(annotation)
+    if len(allowed) > 1 and isinstance(data, dict):
+        allowed = [model for model in allowed if any(data.get(name) in tags(model) for name in TAGS if name in data)]
+    return allowed[0] if len(allowed) == 1 else None

@@ -1,0 +1,137 @@
+"""`--set place=value`: changes to a pipeline file's data before it is checked.
+
+optimize.steps=500              a stage goes by its name, one inside `during` as well where no other has that name
+optimize.losses.0.weight=0.5    items of a list go by their number, from 0; losses[0] is the same
+stages.1.steps=500              stages that share a name go by their number, too
+"""
+
+import difflib
+import re
+from collections.abc import Sequence
+from typing import Any
+
+from pydantic import BaseModel
+
+from clsplat.errors import ConfigError, OverrideError
+from clsplat.fields import inside_list, model_of
+from clsplat.yaml_file import Place, parse_value
+
+MAX_SUGGESTIONS = 3
+
+
+class NoSuchKey(OverrideError):
+    """A place that the pipeline does not have."""
+
+
+def split(text: str) -> tuple[list[str], str]:
+    """Return the parts of the place, and the value.  Raises OverrideError."""
+    place, equals, value = text.partition("=")
+    names = re.findall(r"[^.\[\]]+", place)
+    if not equals or not names:
+        raise OverrideError(text, "expected stage.key=value, for example optimize.steps=500")
+    return names, value
+
+
+def apply(data: dict[str, Any], text: str, root: type[BaseModel]) -> Place:
+    """Change the data, in which each stage has its name as `stage`; return the place in the shape of the file.
+
+    Raises OverrideError.
+    """
+    names, value = split(text)
+    try:
+        parsed = parse_value(value)
+    except ConfigError as error:
+        raise OverrideError(text, f"the value cannot be read: {error}") from error
+    node = _Node(data, root, ())
+    for name in names[:-1]:
+        node = node.child(name, text)
+    last = names[-1]
+    if isinstance(node.data, list):
+        i = node.number(last, text)
+        node.data[i] = parsed
+        return (*node.place, i)
+    if not isinstance(node.data, dict):
+        raise NoSuchKey(text, f"nothing lies below '{names[-2]}'")
+    if not node.place and last not in root.model_fields:
+        raise NoSuchKey(text, f"no key '{last}' at the top of a pipeline")
+    node.data[last] = parsed
+    return (*node.place, last)
+
+
+class _Node:
+    """A dict or list of the data, what its annotation is, and its place in the file."""
+
+    def __init__(self, data: Any, annotation: Any, place: Place) -> None:
+        self.data = data
+        self.place = place
+        self.model = model_of(data, annotation)
+        self.inside = inside_list(annotation) if isinstance(data, list) else None
+
+    def child(self, name: str, text: str) -> "_Node":
+        """What lies below; a key that has a default is made from it.  Raises OverrideError."""
+        if isinstance(self.data, list):
+            return self._item(self.number(name, text))
+        if not isinstance(self.data, dict):
+            raise NoSuchKey(text, f"nothing lies below '{self.place[-1]}'")
+        if stage := self._stage(name, text):
+            return stage
+        if self.data.get(name) is None:
+            if not self.place and name not in self._fields:
+                raise NoSuchKey(text, f"no '{name}' in this pipeline")
+            default = self._fields[name].get_default(call_default_factory=True) if name in self._fields else None
+            self.data[name] = default.model_dump(mode="json") if isinstance(default, BaseModel) else {}
+        return self._key(name)
+
+    def number(self, name: str, text: str) -> int:
+        """The index that a name is.  Raises OverrideError."""
+        if re.fullmatch(r"[0-9]{1,9}", name) and int(name) < len(self.data):
+            return int(name)
+        count = len(self.data)
+        raise NoSuchKey(text, f"expected a number below {count} in a list of {count}, got '{name}'")
+
+    @property
+    def _fields(self) -> dict[str, Any]:
+        return dict(self.model.model_fields) if self.model else {}
+
+    def _key(self, name: str) -> "_Node":
+        field = self._fields.get(name)
+        return _Node(self.data[name], field.annotation if field else None, (*self.place, name))
+
+    def _item(self, i: int) -> "_Node":
+        item = self.data[i]
+        name = [item["stage"]] if isinstance(item, dict) and "stage" in item else []
+        return _Node(item, self.inside, (*self.place, i, *name))
+
+    def _stages(self) -> "list[_Node]":
+        """The stages in the lists of a map."""
+        lists = [self._key(key) for key, value in self.data.items() if isinstance(value, list)]
+        items = [node._item(i) for node in lists for i in range(len(node.data))]
+        return [item for item in items if isinstance(item.data, dict) and "stage" in item.data]
+
+    def _stage(self, name: str, text: str) -> "_Node | None":
+        """The stage of that name, here or from the top inside another.  Raises OverrideError where several have it."""
+        own = self._stages()
+        found = [node for node in own if node.data["stage"] == name]
+        if not found and not self.place:
+            found = [inner for node in own for inner in node._stages() if inner.data["stage"] == name]
+        if len(found) > 1:
+            numbers = " or ".join(_address(node.place) for node in found)
+            raise OverrideError(text, f"there are {len(found)} stages named '{name}'; write {numbers} for it")
+        return found[0] if found else None
+
+
+def _address(place: Place) -> str:
+    """A stage's place without the names of stages, which stand beside their numbers."""
+    return ".".join(str(part) for i, part in enumerate(place) if not (i and isinstance(place[i - 1], int)))
+
+
+def suggestion(names: Sequence[str], known: Sequence[str]) -> str:
+    """Return '; did you mean …?' with those of the known places that end as `names` does, or resemble it; or ''."""
+    place = ".".join(names)
+    near = [one for one in known if one.endswith(f".{place}")]
+    near = near or difflib.get_close_matches(place, known, n=1)
+    near = near or [one for one in known if one.rpartition(".")[2] == names[-1]]
+    if not near:
+        last = difflib.get_close_matches(names[-1], [one.rpartition(".")[2] for one in known], n=1)
+        near = [one for one in known if one.rpartition(".")[2] in last]
+    return f"; did you mean {' or '.join(near[:MAX_SUGGESTIONS])}?" if near else ""

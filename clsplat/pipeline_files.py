@@ -1,0 +1,36 @@
+"""The files of pipelines, found by path or by the name of a shipped one."""
+
+import difflib
+from pathlib import Path
+
+from clsplat import resource_dir
+from clsplat.errors import ConfigError
+
+
+def shipped() -> dict[str, Path]:
+    """Return the files of the shipped pipelines by name."""
+    return {file.stem: file for file in sorted(resource_dir("pipelines").glob("*.yaml"))}
+
+
+def find(name: str) -> Path:
+    """Return the file of a pipeline given by path or by the name of a shipped one.  Raises ConfigError."""
+    path = Path(name)
+    try:
+        is_file, is_folder = path.is_file(), path.is_dir()
+        is_run = is_folder and (path / "pipeline.yaml").is_file()
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{name[:200]!r}: not the name of a file ({error})") from error
+    if is_file:
+        return path
+    if path.suffix in (".yaml", ".yml"):
+        raise ConfigError(f"{path}: no such pipeline file")
+    files = shipped()
+    if name in files:
+        return files[name]
+    if is_run:
+        raise ConfigError(f"{path}: is a run folder, expected a pipeline; `clsplat resume {path}` goes on with the run")
+    if is_folder:
+        raise ConfigError(f"{path}: is a folder, expected a pipeline file")
+    near = difflib.get_close_matches(name, files, n=1)
+    hint = f"; did you mean '{near[0]}'?" if near else f"; there are {', '.join(files)}, or give a path"
+    raise ConfigError(f"no pipeline named '{name}'{hint}")

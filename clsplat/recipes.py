@@ -1,0 +1,71 @@
+"""What the shipped pipelines, and others, say of themselves; copies of them to start from."""
+
+import re
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from clsplat.errors import ConfigError
+from clsplat.files import write_text
+from clsplat.pipeline import load
+from clsplat.pipeline_files import find, shipped
+from clsplat.settable import settable
+
+MAX_KEY_WIDTH = 44  # characters; descriptions stand beside
+
+
+def summary(path: Path) -> str:
+    """Return the first sentence of a pipeline file's opening comment."""
+    lines = []
+    for line in path.read_text(encoding="utf-8").splitlines():
+        if not line.startswith("#"):
+            break
+        lines.append(line.removeprefix("#").strip())
+    return re.split(r"(?<=\.)\s+(?=[A-Z])", " ".join(lines), maxsplit=1)[0]
+
+
+def summaries() -> list[dict[str, str]]:
+    """Return name, summary and path of every shipped pipeline."""
+    return [{"name": name, "summary": summary(path), "path": str(path)} for name, path in shipped().items()]
+
+
+def summaries_text() -> str:
+    """Return a line for every shipped pipeline."""
+    found = summaries()
+    width = max(len(one["name"]) for one in found)
+    return "\n".join(f"{one['name']:<{width}}  {one['summary']}" for one in found)
+
+
+def manual(name: str) -> dict[str, Any]:
+    """Return a pipeline's name, summary, path, stages, and the keys that --set takes, with values and descriptions.
+
+    Raises ConfigError.
+    """
+    pipeline = load(name)
+    settings = pipeline.settings
+    return {
+        "name": settings.name,
+        "summary": summary(pipeline.path),
+        "path": str(pipeline.path),
+        "stages": pipeline.names,
+        "keys": [asdict(key) for key in settable(settings)],
+    }
+
+
+def manual_text(name: str) -> str:
+    """Return `manual` as lines of text: a key with its value, and what it means.  Raises ConfigError."""
+    found, keys = manual(name), settable(load(name).settings)
+    width = min(max(len(key.text) for key in keys), MAX_KEY_WIDTH)
+    lines = [f"{key.text:<{width}}  {' '.join(key.description.split())}".rstrip() for key in keys]
+    head = [f"{found['name']}: {found['summary']}", f"file: {found['path']}", f"stages: {', '.join(found['stages'])}"]
+    return "\n".join([*head, "", "Each key, as --set takes it:", *lines])
+
+
+def copy(name: str, file: Path) -> Path:
+    """Copy a pipeline to a file, or into a folder; return the copy.  Raises ConfigError where one is there already."""
+    source = find(name)
+    target = file / source.name if file.is_dir() else file
+    if target.exists():
+        raise ConfigError(f"{target}: exists already and is not overwritten; give another name")
+    write_text(target, source.read_text(encoding="utf-8"))
+    return target

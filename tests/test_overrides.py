@@ -1,0 +1,103 @@
+"""`--set`: what it reaches, and errors that blame it."""
+
+import pytest
+
+from clsplat.errors import ConfigError, OverrideError
+from clsplat.pipeline import load
+from clsplat.pipeline_files import shipped
+from clsplat.settable import settable
+
+
+@pytest.mark.parametrize("name", shipped())
+def test_every_key_that_is_listed_can_be_set_to_the_value_that_is_listed(name):
+    pipeline = load(name)
+    keys = settable(pipeline.settings)
+    assert len({key.place for key in keys}) == len(keys)
+    for key in keys:
+        assert load(name, [key.text]).resolved() == pipeline.resolved(), key
+
+
+def test_listed_keys_are_those_that_change_something():
+    before = load("micro_splatting_v2")
+    places = {key.place: key for key in settable(before.settings)}
+    assert {"seed", "scene.downscale", "init.opacity", "optimize.steps", "raise_sh.every"} <= set(places)
+    assert "densify.every" not in places, "there are three of them"
+    changed = load("micro_splatting_v2", ["optimize.during.2.every=7"])
+    assert {key.place for key in settable(changed.settings) if key.value != places[key.place].value} == {
+        "optimize.during.2.every"
+    }
+
+
+def test_a_default_that_the_file_leaves_out_can_be_changed_in_part():
+    model = load("smoke", ["model.screen_filter.variance=0.5", "scene.downscale=2"]).settings.model
+    assert (model.screen_filter.type, model.screen_filter.variance) == ("dilation", 0.5)
+
+
+REFUSED = {
+    "optimize.steps=abc": "expected a whole number, got 'abc'",
+    "optimize.steps=2024-01-01": "expected a whole number, got '2024-01-01'",
+    "optimize.stps=5": "unknown key 'stps'; did you mean 'steps'?",
+    "seed=-1": "expected a value of at least 0, got -1",
+    "scene.levels=20": "expected a value of at most 8, got 20",
+    "evaluate.scales=[1,a]": "stages[2].evaluate.scales[1]: expected a number, got 'a'",
+    "model.screen_filter.type=dilate": "no screen filter named 'dilate'; did you mean 'dilation'?",
+    "optimize.every=3": "stages[1] optimize: 'every' belongs inside optimize.during",
+    "steps=100": "no key 'steps' at the top of a pipeline; did you mean optimize.steps?",
+    "stps=100": "no key 'stps' at the top of a pipeline; did you mean optimize.steps?",
+    "max_gaussians=9": "no key 'max_gaussians' at the top of a pipeline; did you mean densify.max_gaussians?",
+    "rates.means.start=1": "no 'rates' in this pipeline; did you mean optimize.rates.means.start?",
+    "optimze.steps=5": "no 'optimze' in this pipeline; did you mean optimize.steps?",
+    "optimize.losses.9.weight=1": "expected a number below 2 in a list of 2, got '9'; did you mean",
+    "optimize.losses.²=1": "expected a number below 2 in a list of 2, got '²'",
+    "seed.x=1": "nothing lies below 'seed'",
+    "optimize.steps": "expected stage.key=value",
+    "=3": "expected stage.key=value",
+    "optimize.steps=!!float x": "the value cannot be read: 'x' cannot be read as float",
+    "optimize.steps=!!python/object/apply:os.system ['x']": "the value cannot be read: the tag !!python",
+    "optimize.steps=&a [*a]": "the value cannot be read: ",
+    "optimize.steps=[": "the value cannot be read: ",
+    "name=../up": "expected text that matches",
+    "stages=[init]": "stages[0]: expected keys and values, got 'init'",
+    "stages=3": "expected a list, got 3",
+}
+
+
+@pytest.mark.parametrize("override", REFUSED)
+def test_an_error_of_set_blames_set_alone(override):
+    with pytest.raises(OverrideError) as error:
+        load("smoke", ["optimize.log_every=5", override, "init.count=9"])
+    message = str(error.value)
+    assert message.startswith("--set ")
+    assert REFUSED[override] in message
+    assert ".yaml" not in message
+    assert "\n" not in message
+
+
+def test_long_values_are_shortened():
+    for override in ("optimize.steps=" + "9" * 5000, "stages[" + "9" * 5000 + "]=1", "name=" + "a b" * 5000):
+        with pytest.raises(OverrideError) as error:
+            load("smoke", [override])
+        assert len(str(error.value)) < 1000
+
+
+def test_stages_of_one_name_are_told_apart_by_number():
+    with pytest.raises(
+        OverrideError, match=r"3 stages named 'densify'; write stages\.1\.during\.1 or stages\.1"
+    ) as error:
+        load("micro_splatting_v2", ["densify.every=3"])
+    for place in ("stages.1.during.1", "optimize.during.1"):
+        assert place.rpartition(".")[2] in str(error.value)
+        load("micro_splatting_v2", [f"{place}.every=3"])
+
+
+def test_a_fault_of_the_file_is_the_files_whatever_is_set(tmp_path):
+    path = tmp_path / "x.yaml"
+    path.write_text("name: x\nstages:\n  - init: {cuont: 3}\n")
+    with pytest.raises(ConfigError, match=r"x.yaml:3: stages\[0\].init.cuont: unknown key 'cuont'"):
+        load(str(path), ["seed=3"])
+
+
+def test_set_can_complete_a_file(tmp_path):
+    path = tmp_path / "x.yaml"
+    path.write_text("name: x\nstages:\n  - init\n  - optimize: {losses: [{type: l1}]}\n")
+    assert load(str(path), ["optimize.steps=3"]).settings.training.steps == 3

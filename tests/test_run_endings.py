@@ -1,0 +1,161 @@
+"""However a run ends, its status.json tells how, and the command prints one line."""
+
+import json
+import logging
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from clsplat import cli, experiment, runner, terminal
+from clsplat.errors import ConfigError, DataError, InternalError, Interrupted, MemoryLimitError, OutputError
+from clsplat.experiment import Job
+from tests.test_cli import clsplat
+
+HINT = "run with --debug for the traceback, and report it"
+ENDINGS = {
+    "a defect": (
+        ZeroDivisionError("by zero"),
+        InternalError,
+        f"ZeroDivisionError: by zero; {HINT}",
+    ),
+    "a defect without words": (AssertionError(), InternalError, f"internal error (a defect): AssertionError; {HINT}"),
+    "several lines": (RuntimeError("a\n  b"), InternalError, "RuntimeError: a b; "),
+    "no memory": (MemoryError(), MemoryLimitError, "out of memory"),
+    "a second Ctrl-C": (KeyboardInterrupt(), Interrupted, "stopped at once; --resume goes on"),
+    "the end of a file": (EOFError(), InternalError, "EOFError"),
+    "a full disk": (OSError(28, "No space left on device", "/x/y"), OutputError, "/x/y: No space left on device"),
+    "bad data": (DataError("no photograph"), DataError, "no photograph"),
+}
+
+
+@pytest.fixture(autouse=True)
+def quiet_log():
+    yield
+    logging.getLogger("clsplat").handlers.clear()
+
+
+@pytest.mark.parametrize("function", ["open_run", "execute", "_run_stages"])
+@pytest.mark.parametrize("name", ENDINGS)
+def test_every_exception_of_a_run_ends_in_a_sentence_and_a_status(
+    name, function, tiny_scene, tmp_path, monkeypatch, capsys
+):
+    raised, kind, words = ENDINGS[name]
+
+    def fail(*arguments):
+        raise raised
+
+    monkeypatch.setattr(runner, function, fail)
+    out = tmp_path / "run"
+    monkeypatch.setattr(sys, "argv", ["clsplat", "run", "smoke", "--scene", str(tiny_scene), "--out", str(out)])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    assert end.value.code == kind.exit_code
+    errors = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("warning: ")]
+    assert len(errors) == 1
+    assert errors[0].startswith("error: ")
+    assert words in errors[0]
+    status = json.loads((out / "status.json").read_text())
+    assert status["state"] == ("interrupted" if kind is Interrupted else "failed")
+    assert status["exit_code"] == kind.exit_code
+    assert f"error: {status['message']}" == errors[0]
+    assert f"{type(raised).__name__}" in (out / "log.txt").read_text(), "the traceback is in the log"
+
+
+@pytest.mark.parametrize("place", [["--debug", "run"], ["run", "--debug"]], ids=["before", "after"])
+def test_debug_shows_the_traceback_before_the_line(place, tiny_scene, tmp_path, monkeypatch, capsys):
+    def fail(*arguments):
+        raise ZeroDivisionError("by zero")
+
+    monkeypatch.setattr(runner, "open_run", fail)
+    more = ["smoke", "--scene", str(tiny_scene), "--out", str(tmp_path / "run")]
+    monkeypatch.setattr(sys, "argv", ["clsplat", *place, *more])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    assert end.value.code == 1
+    lines = capsys.readouterr().err.splitlines()
+    assert "Traceback (most recent call last):" in lines
+    assert lines[-1].startswith("error: internal error (a defect): ZeroDivisionError: by zero")
+
+
+def test_what_cannot_be_logged_is_a_failure_with_a_status(tiny_scene, tmp_path):
+    (tmp_path / "run" / "log.txt").mkdir(parents=True)
+    done = clsplat("run", "smoke", "--scene", tiny_scene, "--out", tmp_path / "run", expect=7)
+    assert "log.txt: cannot be written" in done.stderr
+    assert json.loads((tmp_path / "run" / "status.json").read_text())["exit_code"] == 7
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP], ids=lambda number: number.name)
+def test_a_signal_saves_the_state_and_exits_130(number, tiny_scene, tmp_path):
+    out = tmp_path / "run"
+    command = [sys.executable, "-m", "clsplat", "run", "smoke", "--scene", str(tiny_scene), "--out", str(out)]
+    process = subprocess.Popen(
+        [*command, "--set", "optimize.steps=1000000"], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+    )
+    while not (out / "metrics.jsonl").exists() or not (out / "metrics.jsonl").read_text():
+        assert process.poll() is None
+        time.sleep(0.05)
+    process.send_signal(number)
+    assert process.wait(60) == 130
+    assert "stopped at step" in process.stderr.read()
+    status = json.loads((out / "status.json").read_text())
+    assert (status["state"], status["exit_code"]) == ("interrupted", 130)
+    assert list((out / "checkpoints").glob("*.npz"))
+
+
+def test_a_signal_that_is_ignored_stays_ignored():
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with runner.stopping_on_signals(pytest.fail):
+            os.kill(os.getpid(), signal.SIGHUP)
+            assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+def test_a_run_goes_on_when_nobody_reads_its_output(tiny_scene, tmp_path):
+    command = [sys.executable, "-m", "clsplat", "run", "smoke", "--scene", str(tiny_scene), "--out", str(tmp_path)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    process.stdout.readline()
+    process.stdout.close()
+    assert process.wait(60) == 0, process.stderr.read()
+    assert process.stderr.read() == ""
+    assert json.loads((tmp_path / "status.json").read_text())["state"] == "done"
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+@pytest.mark.parametrize("arguments", [["devices"], ["devices", "--json"], ["pipelines"]], ids=" ".join)
+def test_output_that_cannot_be_written_is_one_line(arguments):
+    with Path("/dev/full").open("w") as full:
+        command = [sys.executable, "-m", "clsplat", *arguments]
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, timeout=60)
+    assert done.returncode == 7
+    assert done.stderr.splitlines() == [
+        "error: the output: No space left on device; check the file, its folder and their space"
+    ]
+
+
+def test_a_scene_whose_name_is_no_text_is_refused(tmp_path):
+    with pytest.raises(ConfigError, match="expected a path of UTF-8 text"):
+        Job.open("smoke", tmp_path / "\udcff")
+
+
+def test_a_run_that_holds_a_run_keeps_its_status(tiny_scene, tmp_path):
+    (tmp_path / "pipeline.yaml").write_text("name: other\nstages: [init]\n")
+    (tmp_path / "status.json").write_text('{"state": "done"}')
+    clsplat("run", "smoke", "--scene", tiny_scene, "--out", tmp_path, expect=2)
+    assert (tmp_path / "status.json").read_text() == '{"state": "done"}'
+
+
+def test_the_terminal_keeps_stdout_for_json(capsys):
+    terminal.start_logging(debug=False)
+    terminal.keep_stdout_for_json()
+    experiment.LOG.info("a remark")
+    experiment.LOG.warning("a warning")
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err == "a remark\nwarning: a warning\n"

@@ -1,0 +1,115 @@
+"""Files that are YAML and no settings, or not even YAML: a sentence with file and line, and nothing is executed."""
+
+from collections.abc import Callable
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from clsplat.errors import ConfigError
+from clsplat.pipeline import load
+from clsplat.yaml_file import parse_value, read_yaml
+
+REFUSED = {  # text: (line, words)
+    "name: !!python/object/apply:os.system ['x']\nstages: []\n": (
+        1,
+        "the tag !!python/object/apply:os.system is not allowed",
+    ),
+    "name: x\nstages: !!python/tuple []\n": (2, "the tag !!python/tuple is not allowed"),
+    "name: x\nstages: !!set {a}\n": (2, "the tag !!set is not allowed"),
+    "name: x\nstages: !mine [init]\n": (2, "the tag !mine is not allowed"),
+    "--- !mine\nname: x\n": (1, "the tag !mine is not allowed"),
+    "name: x\nseed: !!float x\n": (2, "'x' cannot be read as float"),
+    "name: x\nseed: !!bool x\n": (2, "'x' cannot be read as bool"),
+    "name: x\nseed: !!binary aGk=\n": (2, "the tag !!binary is not allowed"),
+    "name: x\nseed: " + "9" * 5000: (2, "cannot be read as int"),
+    "name: x\n? [a, b]\n: 1\n": (2, "expected text as a key"),
+    "name: x\n? {a: b}\n: 1\n": (2, "expected text as a key"),
+    "name: x\n1: 2\n": (2, "expected text as a key"),
+    "name: x\ntrue: 2\n": (2, "expected text as a key"),
+    "name: x\n~: 2\n": (2, "expected text as a key"),
+    "name: x\nseed: 1\nseed: 2\n": (3, "found duplicate key 'seed'"),
+    "name: &a [*a]\n": (1, "nested too deeply"),
+    "name: &a {<<: *a}\n": (1, "nested too deeply"),
+    "name: x\n<<: 3\n": (2, "expected a map after '<<'"),
+    "name: x\nseed: *nowhere\n": (2, "undefined alias"),
+    "name: x\n--- \nname: y\n": (2, "another document"),
+    "name: x\nseed: \0\n": (2, "U+0000 is not allowed"),
+    "[" * 5000: (1, "nested too deeply"),
+    "{a: " * 5000: (1, "nested too deeply"),
+    "name: 'x\nseed: 3": (2, "unexpected end"),
+    "name: x\n\tseed: 3": (2, "cannot start any token"),
+}
+
+
+@pytest.mark.parametrize("text", REFUSED, ids=[text[:30] for text in REFUSED])
+def test_what_is_no_plain_data_is_refused_with_its_line(text, tmp_path):
+    line, words = REFUSED[text]
+    path = tmp_path / "x.yaml"
+    path.write_text(text)
+    with pytest.raises(ConfigError) as error:
+        load(str(path))
+    message = str(error.value)
+    assert words in message
+    assert message.startswith(f"{path}:{line}: ")
+    assert "\n" not in message
+    assert len(message) < len(str(path)) + 300
+
+
+def test_bytes_that_are_no_text_are_refused_with_their_line(tmp_path):
+    path = tmp_path / "x.yaml"
+    path.write_bytes(b"name: x\nscene: {path: caf\xe9}\n")
+    with pytest.raises(ConfigError, match=r"x.yaml:2: expected UTF-8 text, found the byte 0xe9"):
+        read_yaml(path)
+    path.write_bytes("\ufeffname: x\n".encode())
+    assert read_yaml(path).data == {"name": "x"}
+
+
+def test_anchors_aliases_and_merge_keys_are_plain_data(tmp_path):
+    path = tmp_path / "x.yaml"
+    path.write_text("a: &a {x: 1, y: [2]}\nb:\n  <<: *a\n  x: 3\nc: {<<: [{x: 4}, *a], z: 5}\nd: *a\n")
+    document = read_yaml(path)
+    assert document.data == {
+        "a": {"x": 1, "y": [2]},
+        "b": {"x": 3, "y": [2]},
+        "c": {"x": 4, "y": [2], "z": 5},
+        "d": {"x": 1, "y": [2]},
+    }
+    assert document.data["a"]["y"] is not document.data["d"]["y"]
+    assert document.line(("b", "x")) == 4
+
+
+def test_dates_and_standard_tags_are_what_they_say():
+    values = {"2024-01-01": "2024-01-01", "!!str 5": "5", "!!float 5": 5.0, "=": "=", "": None, "12:30": "12:30"}
+    for text, value in values.items():
+        assert parse_value(text) == value
+        assert type(parse_value(text)) is type(value)
+
+
+def complaint(read: Callable[[str], object], text: str) -> str:
+    """What is said against it, if anything; any other exception fails the test."""
+    try:
+        read(text)
+    except ConfigError as error:
+        return str(error)
+    return ""
+
+
+@given(st.text(alphabet="ab1: -[]{},#&*!|>'\"%@`?~<=.\n\t\0é\ud800", max_size=60))
+def test_any_text_is_data_or_one_sentence(text):
+    assert "\n" not in complaint(parse_value, text)
+
+
+SMOKE = load("smoke").text()
+
+
+@given(
+    st.integers(0, len(SMOKE)),
+    st.sampled_from(["!!set ", "&a ", "*a", "? ", ": ", "[", "}", "- ", "\0", "1: 2\n", "<<: "]),
+)
+def test_a_pipeline_with_something_put_in_is_valid_or_refused(tmp_path_factory, place, what):
+    path = tmp_path_factory.getbasetemp() / "fuzzed.yaml"
+    path.write_text(SMOKE[:place] + what + SMOKE[place:])
+    message = complaint(load, str(path))
+    assert not message or message.startswith(f"{path}:")
+    assert "\n" not in message
