@@ -8,8 +8,9 @@ from numpy.typing import NDArray
 
 from clsplat.errors import DataError
 from clsplat.scene.detect import read_scene
-from clsplat.scene.images import load_mask, read_image, write_image
+from clsplat.scene.images import read_image, write_image
 from clsplat.scene.scene import View
+from clsplat.scene.view import load_mask
 
 MIN_ALPHA = 0.5  # of the largest value
 

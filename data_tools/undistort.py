@@ -10,8 +10,9 @@ import numpy as np
 
 from clsplat.errors import DataError
 from clsplat.scene.detect import read_scene
-from clsplat.scene.images import load_image, load_mask, write_image
+from clsplat.scene.images import write_image
 from clsplat.scene.scene import View
+from clsplat.scene.view import load_image, load_mask
 from data_tools.colmap_writer import write_model
 
 LOG = logging.getLogger("clsplat")

@@ -13,8 +13,8 @@ from hypothesis import given, settings
 
 from clsplat.scene.colmap_files import MODELS, PARAMETERS, read_cameras, read_images, read_points
 from clsplat.scene.detect import read_scene
-from clsplat.scene.images import load_image
 from clsplat.scene.scene import Camera, Scene
+from clsplat.scene.view import load_image
 from tests.colmap_writer import (
     PINHOLE,
     DeviceModel,

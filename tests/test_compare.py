@@ -18,7 +18,8 @@ from clsplat.compare.run_folder import RunFolder
 from clsplat.errors import ClsplatError, ConfigError, DataError
 from clsplat.pipeline import load
 from clsplat.scene.detect import read_scene
-from clsplat.scene.images import load_image, write_image
+from clsplat.scene.images import write_image
+from clsplat.scene.view import load_image
 from tests.html_page import HOSTILE, Page
 from tests.test_cli import clsplat
 

@@ -11,8 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from clsplat.errors import OutputError
-from clsplat.scene.images import image_size, load_image, write_image
+from clsplat.scene.images import image_size, write_image
 from clsplat.scene.scene import Camera, View
+from clsplat.scene.view import load_image
 from tests.data_sets import data_set
 from tests.refusals import refusal
 

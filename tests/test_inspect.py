@@ -18,8 +18,8 @@ from clsplat.inspect.inspection import Inspection
 from clsplat.inspect.page import MAX_NAMES, inspection_page
 from clsplat.inspect.survey import distortion
 from clsplat.scene.detect import read_scene
-from clsplat.scene.images import load_image, load_mask
 from clsplat.scene.lens import Lens
+from clsplat.scene.view import load_image, load_mask
 from tests.colmap_writer import CameraEntry, DeviceModel, ImageEntry, PointEntry, tiny_model, write_model, write_scene
 from tests.data_sets import data_set
 from tests.html_page import HOSTILE, Page

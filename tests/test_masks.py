@@ -14,10 +14,10 @@ from clsplat.metrics.perceptual import ssim_map
 from clsplat.metrics.views import psnr
 from clsplat.render.workspace import Workspace
 from clsplat.scene.detect import read_scene
-from clsplat.scene.images import load_image, load_mask
 from clsplat.scene.lens import Lens
 from clsplat.scene.photographs import load_photograph
 from clsplat.scene.scene import Camera, View
+from clsplat.scene.view import load_image, load_mask
 from clsplat.views.photographs import cover, unpack
 from tests import reference_loss as ref_loss
 from tests.data_sets import data_set

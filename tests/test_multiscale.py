@@ -10,8 +10,8 @@ import pytest
 
 from clsplat.errors import DataError
 from clsplat.scene.detect import read_scene
-from clsplat.scene.images import load_image
 from clsplat.scene.scene import Camera, View, make_scene
+from clsplat.scene.view import load_image
 from clsplat.views.order import ViewOrder
 from data_tools.multiscale import pyramid, write_multiscale
 from tests.refusals import refusal

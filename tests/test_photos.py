@@ -9,9 +9,9 @@ import pytest
 
 from clsplat.errors import DataError
 from clsplat.scene.detect import read_scene
-from clsplat.scene.images import load_image, load_mask
 from clsplat.scene.lens import Lens
 from clsplat.scene.scene import Camera, View
+from clsplat.scene.view import load_image, load_mask
 from data_tools.colmap_writer import write_model
 from data_tools.gather import list_photographs
 from data_tools.photos import find_features, map_cameras, match_features

@@ -8,9 +8,9 @@ import pytest
 from scipy.spatial import cKDTree
 
 from clsplat.scene.detect import read_scene
-from clsplat.scene.images import load_image
 from clsplat.scene.plane_sweep import swept_points
 from clsplat.scene.scene import Camera, View
+from clsplat.scene.view import load_image
 from clsplat.stages.init import centre_of
 from tests.data_sets import data_set
 

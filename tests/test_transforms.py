@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from clsplat.scene.detect import read_scene
-from clsplat.scene.images import load_image
 from clsplat.scene.scene import Camera
+from clsplat.scene.view import load_image
 from tests.data_sets import data_set
 from tests.refusals import refusal
 

@@ -10,8 +10,8 @@ import numpy as np
 from clsplat.compare.run_folder import RunFolder
 from clsplat.metrics.images import psnr
 from clsplat.metrics.perceptual import Image
-from clsplat.scene.images import load_image
 from clsplat.scene.scene import Background, Scene, View
+from clsplat.scene.view import load_image
 from clsplat.stages.render import image_path
 from clsplat.views.photographs import BACKGROUNDS
 

@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 
 from clsplat.errors import DataError
 from clsplat.scene.image_headers import read_header
-from clsplat.scene.images import fits, read_image
+from clsplat.scene.images import read_image
 from clsplat.scene.lens import BORDER, Lens
 from clsplat.scene.parts import Parts
 from clsplat.scene.points import FAR
 from clsplat.scene.scene import View, camera_extent, strayed
+from clsplat.scene.view import fits
 
 SAMPLE_SIZE = 20_000  # points that coverage is measured on
 MAX_DISTANCE = 100.0  # camera extents from the middle of the cameras: nothing that a photograph resolves

@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from clsplat.errors import DataError
 from clsplat.files import atomic
-from clsplat.scene.images import load_image, load_mask, read_image
+from clsplat.scene.images import read_image
 from clsplat.scene.scene import View
+from clsplat.scene.view import load_image, load_mask
 
 
 def load_photograph(

@@ -18,40 +18,14 @@ from numpy.typing import NDArray
 
 from clsplat.errors import DataError
 from clsplat.scene.camera import Camera as Camera
-from clsplat.scene.lens import Lens
+from clsplat.scene.view import Alpha as Alpha
+from clsplat.scene.view import Floats as Floats
+from clsplat.scene.view import View as View
 
-Floats = NDArray[np.floating]
 Background = Literal["black", "white"]
-Alpha = Literal["transparency", "mask"]  # what the fourth channel of a photograph is
 HOLDOUT = 8  # every so many views are for testing where the dataset does not say which: the default of pipelines
 MAX_DISTANCE = 10.0  # by the median one: a walk of evenly spaced cameras has 2, an orbit 1, a close-up about 4
 MAX_STRAYED_SHARE = 0.2  # of the cameras
-
-
-@dataclass(frozen=True)
-class View:
-    """One posed photograph.  `name` is unique in its scene: the path below the image folder."""
-
-    name: str
-    camera: Camera
-    world_to_camera: Floats  # [3, 4] float64
-    image_path: Path
-    mask_path: Path | None = None  # an image of the photograph's size, white where it counts
-    alpha: Alpha = "transparency"
-    lens: Lens | None = None  # of the photograph on disk, where it is not `camera`'s pinhole
-    downscale: float = 1  # divisor of the original photograph's size
-
-    @property
-    def position(self) -> Floats:
-        """Camera centre in world coordinates, [3]."""
-        rotation, translation = self.world_to_camera[:, :3], self.world_to_camera[:, 3]
-        return -rotation.T @ translation
-
-    def resized(self, downscale: float) -> "View":
-        """Return the same photograph with 1 / `downscale` of its original size."""
-        if downscale == self.downscale:
-            return self
-        return replace(self, camera=self.camera.downscaled(downscale / self.downscale), downscale=downscale)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,139 @@
+"""A posed photograph: its camera, and its pixels as the camera saw them."""
+
+import operator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.errors import DataError
+from clsplat.scene.camera import Camera
+from clsplat.scene.images import read_image
+from clsplat.scene.lens import Lens
+
+Floats = NDArray[np.floating]
+Alpha = Literal["transparency", "mask"]  # what the fourth channel of a photograph is
+BLACK = (0.0, 0.0, 0.0)
+MIN_WHITE = 0.99  # of the largest value: a mask that was stored as JPEG is never quite white
+
+
+@dataclass(frozen=True)
+class View:
+    """One posed photograph.  `name` is unique in its scene: the path below the image folder.
+
+    A view that is made by hand, to look at a model, needs no photograph.
+    """
+
+    name: str
+    camera: Camera
+    world_to_camera: Floats  # [3, 4] float64
+    image_path: Path = Path()
+    mask_path: Path | None = None  # an image of the photograph's size, white where it counts
+    alpha: Alpha = "transparency"
+    lens: Lens | None = None  # of the photograph on disk, where it is not `camera`'s pinhole
+    downscale: float = 1  # divisor of the original photograph's size
+
+    @property
+    def position(self) -> Floats:
+        """Camera centre in world coordinates, [3]."""
+        rotation, translation = self.world_to_camera[:, :3], self.world_to_camera[:, 3]
+        return -rotation.T @ translation
+
+    def resized(self, downscale: float) -> "View":
+        """Return the same photograph with 1 / `downscale` of its original size."""
+        if downscale == self.downscale:
+            return self
+        return replace(self, camera=self.camera.downscaled(downscale / self.downscale), downscale=downscale)
+
+    def photograph(self, background: tuple[float, float, float] = BLACK) -> NDArray[np.float32]:
+        """Return the photograph at the camera's size, [height, width, 3] in [0, 1]; alpha is blended with `background`.
+
+        Raises DataError when the file cannot be read or is not the camera's image.
+        """
+        return np.asarray(load_image(self, background) / np.float32(255), np.float32)
+
+
+def load_image(view: View, background: tuple[float, float, float] | None = None) -> NDArray[np.uint8]:
+    """Return the photograph of `view` at its camera's size, RGB, [H, W, 3]; alpha is composited on `background`.
+
+    `background` is a colour in [0, 1], black by default.  Raises DataError when the file cannot be read as an 8- or
+    16-bit image, or when it is not the camera's image before downscaling.
+    """
+    pixels = _as_taken(view, view.image_path)
+    width, height = view.camera.width, view.camera.height
+    opaque, resized = pixels.shape[2] == 3, pixels.shape[:2] != (height, width)
+    if opaque and not resized and pixels.dtype == np.uint8:
+        return pixels
+    # Double where the reference uses it, to truncate as it does; single saves memory on large photographs.
+    values: NDArray[Any] = pixels.astype(np.float32 if opaque else np.float64)
+    if resized:  # not premultiplied by alpha: so does the reference (multi-scale Blender)
+        values = cv2.resize(values, (width, height), interpolation=cv2.INTER_AREA)
+    limit = int(np.iinfo(pixels.dtype).max)
+    if opaque:
+        return np.asarray(np.rint(values * (255 / limit)), np.uint8)
+    unit = values / limit
+    colour, alpha = unit[:, :, :3], unit[:, :, 3:]
+    composite = colour * alpha + np.array(background or BLACK) * (1 - alpha)
+    slack = 1e-3 if resized else 0.0  # OpenCV's area weights are single precision: no level may be lost to them
+    return np.asarray(composite * 255 + slack, np.uint8)  # truncated: so does the reference (Kerbl et al. 2023)
+
+
+def load_mask(view: View) -> NDArray[np.bool_] | None:
+    """Return which pixels of `load_image` count, [H, W], or None where all do.
+
+    They do where the whole of the pixel is white in the mask file, for alpha as mask opaque in the photograph, and for
+    a lens whose whole photograph is wanted, not blank.
+    Raises DataError as load_image does.
+    """
+    layers = []
+    if view.mask_path is not None:
+        layers.append(_as_taken(view, view.mask_path)[:, :, :1])
+    if view.alpha == "mask":
+        pixels = _as_taken(view, view.image_path)
+        layers += [pixels[:, :, 3:]] if pixels.shape[2] == 4 else []
+    if view.lens is not None and view.lens.whole:
+        layers.append(np.where(view.lens.shown, 255, 0).astype(np.uint8)[:, :, None])
+    size = view.camera.width, view.camera.height
+    masks = [
+        cv2.resize(layer.astype(np.float32), size, interpolation=cv2.INTER_AREA) > MIN_WHITE * np.iinfo(layer.dtype).max
+        for layer in layers
+    ]
+    return np.logical_and.reduce(masks) if masks else None
+
+
+def _as_taken(view: View, path: Path) -> NDArray[Any]:
+    """The pixels of a file as its camera saw them: upright, undistorted, before downscaling.
+
+    A file that is turned by its EXIF tag is turned where only then it is the camera's image: COLMAP ignores the tag.
+    Raises DataError when it is not the camera's image in either case.
+    """
+    pixels, lens = read_image(path), view.lens
+    stored = pixels.shape[1::-1]
+    camera = (lens.width, lens.height) if lens else (view.camera.width, view.camera.height)
+    fits = operator.eq if lens else _scales_to
+    if not fits(stored, camera) and fits(stored[::-1], camera):
+        pixels = read_image(path, upright=True)
+    width, height = pixels.shape[1::-1]
+    if not fits((width, height), camera):
+        raise DataError(
+            f"{path}: the image is {width}x{height} pixels, its camera {camera[0]}x{camera[1]}; expected the same size"
+            f"{'' if lens else ', or a larger image of the same shape'}: use the images the cameras were made from"
+        )
+    return lens.undistort_image(pixels) if lens else pixels
+
+
+def fits(view: View, size: tuple[int, int]) -> bool:
+    """Tell whether a file of `size` (width, height), turned upright or not, is the image of a view's camera."""
+    if view.lens:
+        return size == (view.lens.width, view.lens.height)
+    return _scales_to(size, (view.camera.width, view.camera.height))
+
+
+def _scales_to(file: tuple[int, int], camera: tuple[int, int]) -> bool:
+    """Tell whether one factor >= 1 takes the size of the file to that of the camera, as Camera.downscaled rounds."""
+    smallest = max(1.0, *(f / (c + 0.5) for f, c in zip(file, camera, strict=True)))
+    largest = min(f / (c - 0.5) if c > 1 else np.inf for f, c in zip(file, camera, strict=True))
+    return smallest <= largest
