@@ -1,5 +1,6 @@
 """The pages about keys: one for each family of what a pipeline file can name, one for all other settings."""
 
+import functools
 from typing import Any
 
 from families import Kind, families, family, tag, unnamed
@@ -14,6 +15,7 @@ BOUNDS = {"exclusiveMinimum": "> ", "minimum": "≥ ", "exclusiveMaximum": "< ",
 TABLE = "| key | takes | default | meaning and unit |\n|---|---|---|---|\n"
 
 
+@functools.cache
 def reference_pages() -> dict[str, str]:
     """Return every page that is made from settings, by its path in the site."""
     pages = {page: family_page(page) for page in dict.fromkeys(family(base).page for base in families())}

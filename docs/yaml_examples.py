@@ -1,5 +1,6 @@
 """Examples of what a pipeline file can name: from a shipped file where one has it, else with all keys."""
 
+import functools
 import io
 from collections.abc import Iterator
 from typing import Any
@@ -15,9 +16,8 @@ MAX_WIDTH = 88  # characters that a page shows without scrolling
 def example(base: Kind, kind: Kind) -> tuple[str, str]:
     """Return how a pipeline file says it, and the shipped file that does ("" where none does)."""
     found = [
-        (block(base, item), file.name)
-        for file in sorted((ROOT / "pipelines").glob("*.yaml"), key=lambda file: (len(file.name), file.name))
-        for item in items(YAML(typ="safe").load(file.read_text()))
+        (block(base, item), file)
+        for file, item in shipped_items()
         if (kind_of_item(item) == tag(kind)) and set(fields_of(item)) <= {*kind.model_fields}
     ]
     if not found:  # no shipped file uses it
@@ -26,6 +26,13 @@ def example(base: Kind, kind: Kind) -> tuple[str, str]:
         found = [(block(base, {tag(kind): values} if "stage" in kind.model_fields else values), "")]
     short = [one for one in found if one[0].count("\n") <= MAX_EXAMPLE]
     return max(short or [min(found, key=lambda one: len(one[0]))], key=lambda one: len(one[0]))
+
+
+@functools.cache
+def shipped_items() -> list[tuple[str, Node]]:
+    """Return all mappings of all shipped files, those with short names first, each with the name of its file."""
+    files = sorted((ROOT / "pipelines").glob("*.yaml"), key=lambda file: (len(file.name), file.name))
+    return [(file.name, item) for file in files for item in items(YAML(typ="safe").load(file.read_text()))]
 
 
 def items(node: Any) -> Iterator[Node]:
