@@ -41,12 +41,16 @@ def option_table(command: Any, name: str) -> str:
     """Return a table of arguments and options."""
     context = command.make_context(name, [], resilient_parsing=True)
     records = [p.get_help_record(context) for p in command.params]
-    rows = "".join(f"| `{cell(r[0])}` | {cell(r[1])} |\n" for r in records if r and r[0] != "--help")
+    escaped = "\\["  # brackets make no link
+    rows = "".join(
+        f"| `{cell(r[0])}` | {cell(r[1]).replace('[', escaped)} |\n" for r in records if r and r[0] != "--help"
+    )
     return f"| option | meaning |\n|---|---|\n{rows}\n" if rows else ""
 
 
 def cell(text: str) -> str:
-    return " ".join(text.split()).replace("|", "\\|").replace("[", "\\[")
+    """Return a text that does not break a table."""
+    return " ".join(text.split()).replace("|", "\\|")
 
 
 def summary(kind: type) -> str:
@@ -59,7 +63,7 @@ def pipelines_page() -> str:
     for file in sorted((ROOT / "pipelines").glob("*.yaml")):
         lines = file.read_text().splitlines()
         count = next(i for i, line in enumerate(lines) if not line.startswith("#"))
-        header = "\n".join(line.removeprefix("# ") for line in lines[:count])
+        header = "\n".join(line.removeprefix("# ") for line in lines[:count]).replace(".\n", ".\n\n")
         body = "\n".join(f"    {line}" for line in lines[count:])
         text += f'## {file.stem}\n\n{header}\n\n??? note "{file.name}"\n\n    ```yaml\n{body}\n    ```\n\n'
     return text

@@ -30,8 +30,8 @@ def example(base: Kind, kind: Kind) -> tuple[str, str]:
 
 @functools.cache
 def shipped_items() -> list[tuple[str, Node]]:
-    """Return all mappings of all shipped files, those with short names first, each with the name of its file."""
-    files = sorted((ROOT / "pipelines").glob("*.yaml"), key=lambda file: (len(file.name), file.name))
+    """Return all mappings of all shipped files, those of plain 3DGS first, each with the name of its file."""
+    files = sorted((ROOT / "pipelines").glob("*.yaml"), key=lambda file: (not file.name.startswith("splat"), file.name))
     return [(file.name, item) for file in files for item in items(YAML(typ="safe").load(file.read_text()))]
 
 
