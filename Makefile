@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test bench wheel clean
+.PHONY: demo test docs bench wheel clean
 
 demo: $(VENV)/installed
 	$(BIN)/python -m data_tools synthetic demo/scene
@@ -13,7 +13,12 @@ test: $(VENV)/tested-with
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(MAKE) docs
 	$(BIN)/python -m pytest
+
+docs: $(VENV)/tested-with
+	$(BIN)/python docs/collect.py
+	$(BIN)/zensical build --strict --clean
 
 bench: $(VENV)/installed
 	$(BIN)/clsplat bench
@@ -22,17 +27,17 @@ wheel: $(VENV)/tested-with
 	$(BIN)/python -m build --wheel --outdir dist .
 
 clean:
-	rm -rf $(VENV) demo build dist *.egg-info
+	rm -rf $(VENV) demo build dist .cache *.egg-info
 
 # The embedded runtime is PoCL; where it does not know the processor or finds no linker, Intel's takes its place, and
 # `clsplat devices` says why.
 $(VENV)/installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
-	for extras in '[pocl,photos]' '[pocl]' ''; do $(BIN)/python -m pip install --quiet --editable ".$$extras" && break; done
+	for extras in '[pocl]' ''; do $(BIN)/python -m pip install --quiet --editable ".$$extras" && break; done
 	$(BIN)/clsplat devices || { $(BIN)/python -m pip install --quiet '.[intel]' && $(BIN)/clsplat devices; }
 	touch $@
 
 $(VENV)/tested-with: $(VENV)/installed
-	$(BIN)/python -m pip install --quiet --editable '.[dev]'
+	$(BIN)/python -m pip install --quiet --editable '.[dev,docs]'
 	touch $@

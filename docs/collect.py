@@ -1,0 +1,26 @@
+"""Collect the pages of the site in build/docs: those that are written, in docs/, and those made from the code."""
+
+import shutil
+from pathlib import Path
+
+from families import ROOT
+from other_pages import other_pages
+from reference_pages import reference_pages
+
+SUFFIXES = {".md", ".css", ".jpg", ".svg"}
+
+
+def collect(out: Path) -> None:
+    """Fill the folder `out` anew."""
+    shutil.rmtree(out, ignore_errors=True)
+    out.mkdir(parents=True)
+    for file in (ROOT / "docs").iterdir():
+        if file.suffix in SUFFIXES:
+            shutil.copyfile(file, out / file.name)
+    for path, text in (reference_pages() | other_pages()).items():
+        (out / path).parent.mkdir(exist_ok=True)
+        (out / path).write_text(text)
+
+
+if __name__ == "__main__":
+    collect(ROOT / "build" / "docs")

@@ -1,0 +1,73 @@
+"""Examples of what a pipeline file can name: from a shipped file where one has it, else with all keys."""
+
+import functools
+import io
+from collections.abc import Iterator
+from typing import Any
+
+from families import ROOT, Kind, family, tag
+from ruamel.yaml import YAML
+
+Node = dict[str, Any]
+MAX_EXAMPLE = 10  # lines that are read at a glance
+MAX_WIDTH = 88  # characters that a page shows without scrolling
+
+
+def example(base: Kind, kind: Kind) -> tuple[str, str]:
+    """Return how a pipeline file says it, and the shipped file that does ("" where none does)."""
+    found = [
+        (block(base, item), file)
+        for file, item in shipped_items()
+        if (kind_of_item(item) == tag(kind)) and set(fields_of(item)) <= {*kind.model_fields}
+    ]
+    if not found:  # no shipped file uses it
+        values = kind.model_construct().model_dump(mode="json", exclude={"stage", "every", "start", "stop"})
+        values = {key: value for key, value in values.items() if value is not None}
+        found = [(block(base, {tag(kind): values} if "stage" in kind.model_fields else values), "")]
+    short = [one for one in found if one[0].count("\n") <= MAX_EXAMPLE]
+    return max(short or [min(found, key=lambda one: len(one[0]))], key=lambda one: len(one[0]))
+
+
+@functools.cache
+def shipped_items() -> list[tuple[str, Node]]:
+    """Return all mappings of all shipped files, those of plain 3DGS first, each with the name of its file."""
+    files = sorted((ROOT / "pipelines").glob("*.yaml"), key=lambda file: (not file.name.startswith("splat"), file.name))
+    return [(file.name, item) for file in files for item in items(YAML(typ="safe").load(file.read_text()))]
+
+
+def items(node: Any) -> Iterator[Node]:
+    """Yield all mappings of a document, and every name in a list as a stage without keys."""
+    if isinstance(node, dict):
+        yield node
+    for inner in node.values() if isinstance(node, dict) else node if isinstance(node, list) else ():
+        yield from [{inner: {}}] if isinstance(node, list) and isinstance(inner, str) else items(inner)
+
+
+def kind_of_item(item: Node) -> str:
+    """Return the name in {type: name, …} or {name: {…}}."""
+    return str(item["type"]) if "type" in item else str(next(iter(item))) if len(item) == 1 else ""
+
+
+def fields_of(item: Node) -> Node:
+    """Return the keys in {type: name, …} or {name: {…}}."""
+    inner = next(iter(item.values()))
+    return item if "type" in item else inner if isinstance(inner, dict) else {}
+
+
+def block(base: Kind, item: Node) -> str:
+    """Return an item as YAML, below the key that holds it."""
+    fields = fields_of(item)
+    key = "during" if "every" in fields else family(base).key
+    one = item if fields else kind_of_item(item)
+    data = {key: [one] if family(base).listed else one}
+    text = dumped(data, None)
+    return text if max(map(len, text.splitlines())) <= MAX_WIDTH else dumped(data, False)
+
+
+def dumped(data: Node, flow_style: bool | None) -> str:
+    """Return YAML; flow_style None: innermost collections on one line."""
+    stream, yaml = io.StringIO(), YAML(typ="safe")
+    yaml.default_flow_style, yaml.width = flow_style, 1000
+    yaml.sort_base_mapping_type_on_output = False  # type: ignore[assignment]
+    yaml.dump(data, stream)
+    return stream.getvalue()
