@@ -1,25 +1,18 @@
 """Turning a failed validation into one sentence: file, line, place, what was expected, the nearest match."""
 
 import difflib
+import re
 import types
 import typing
 from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
 
-from clsplat.settings import Variants, variants
+from clsplat.settings import Settings, Variants, variants
 from clsplat.yaml_file import Document, Place
 
-KINDS = {
-    "losses": "loss",
-    "rules": "rule",
-    "prepare": "step",
-    "stages": "stage",
-    "during": "stage",
-    "world_filter": "world filter",
-    "screen_filter": "screen filter",
-}
 EXPECTED = {
     "int_type": "a whole number",
     "int_from_float": "a whole number",
@@ -36,11 +29,11 @@ EXPECTED = {
 def explain(error: ValidationError, root: type[BaseModel], path: Path, document: Document) -> str:
     """Describe the first thing that is wrong; a misspelt key explains the one that is missing, so it goes first."""
     first = min(error.errors(), key=lambda one: one["type"] != "extra_forbidden")
-    place, model = _follow(first["loc"], root)
-    return f"{path}:{document.line(place)}: {_text(place)}: {_complaint(dict(first), place, model)}"
+    place, model, annotation = _follow(first["loc"], root)
+    return f"{path}:{document.line(place)}: {_text(place)}: {_complaint(dict(first), place, model, annotation)}"
 
 
-def _complaint(error: dict[str, Any], place: Place, model: type[BaseModel] | None) -> str:
+def _complaint(error: dict[str, Any], place: Place, model: type[BaseModel] | None, annotation: Any) -> str:
     kind, value = error["type"], error["input"]
     if kind == "extra_forbidden":
         known = [name for name in (model.model_fields if model else {}) if name not in ("stage", "type")]
@@ -49,9 +42,9 @@ def _complaint(error: dict[str, Any], place: Place, model: type[BaseModel] | Non
         return f"'{place[-1]}' is missing"
     if kind == "union_tag_invalid":
         tags = [tag.strip().strip("'") for tag in error["ctx"]["expected_tags"].split(",")]
-        return f"no {_kind(place)} named '{error['ctx']['tag']}'{_nearest(error['ctx']['tag'], tags)}"
+        return f"no {_kind(annotation)} named '{error['ctx']['tag']}'{_nearest(error['ctx']['tag'], tags)}"
     if kind == "union_tag_not_found":
-        return f"expected a {_kind(place)} with a 'type'"
+        return f"expected a 'type', the name of the {_kind(annotation)}"
     if kind == "literal_error":
         return f"expected {error['ctx']['expected']}, got {value!r}"
     if kind in EXPECTED:
@@ -65,9 +58,11 @@ def _nearest(word: str, known: list[str]) -> str:
     return f"; did you mean '{near[0]}'?" if near else f"; there are {', '.join(sorted(known))}"
 
 
-def _kind(place: Place) -> str:
-    names = [p for p in place if isinstance(p, str)]
-    return next((KINDS[name] for name in reversed(names) if name in KINDS), "thing")
+def _kind(annotation: Any) -> str:
+    """What a field chooses from, in words: 'world filter' for variants of WorldFilter, 'stage' for those of Stage."""
+    base = _bases(annotation)[0]
+    family = base.__mro__[base.__mro__.index(Settings) - 1]
+    return re.sub(r"(?<=\w)(?=[A-Z])", " ", family.__name__).lower()
 
 
 def _text(place: Place) -> str:
@@ -77,8 +72,9 @@ def _text(place: Place) -> str:
     return text
 
 
-def _follow(location: tuple[int | str, ...], root: type[BaseModel]) -> tuple[Place, type[BaseModel] | None]:
-    """Translate a location among models, which names union members, into the file's; also the model around it.
+def _follow(location: tuple[int | str, ...], root: type[BaseModel]) -> tuple[Place, type[BaseModel] | None, Any]:
+    """Translate a location among models, which names union members, into the file's; also the model around it, and the
+    annotation there.
 
     In the file a stage's name is a key of its own (stages[1].optimize.steps); a strategy's type is not.
     """
@@ -99,8 +95,13 @@ def _follow(location: tuple[int | str, ...], root: type[BaseModel]) -> tuple[Pla
             place.append(part)
             model = members[0] if len(members) == 1 else model
             field = model.model_fields.get(part) if model else None
-            annotation = field.annotation if field else None
-    return tuple(place), model
+            annotation = _annotation(field) if field else None
+    return tuple(place), model, annotation
+
+
+def _annotation(field: FieldInfo) -> Any:
+    """A field's annotation with its marks, as it was written."""
+    return typing.Annotated[field.annotation, *field.metadata] if field.metadata else field.annotation
 
 
 def _models(annotation: Any) -> list[type[BaseModel]]:
@@ -108,12 +109,18 @@ def _models(annotation: Any) -> list[type[BaseModel]]:
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
     if typing.get_origin(annotation) is typing.Annotated:
-        inner, *marks = typing.get_args(annotation)
-        bases = [mark.base for mark in marks if isinstance(mark, Variants)]
-        return list(variants(bases[0]).values()) if bases else _models(inner)
+        bases = _bases(annotation)
+        return list(variants(bases[0]).values()) if bases else _models(typing.get_args(annotation)[0])
     if typing.get_origin(annotation) in (typing.Union, types.UnionType):
         return [model for argument in typing.get_args(annotation) for model in _models(argument)]
     return []
+
+
+def _bases(annotation: Any) -> list[type[Settings]]:
+    """The base whose variants a field takes, if it does."""
+    if typing.get_origin(annotation) is not typing.Annotated:
+        return []
+    return [mark.base for mark in typing.get_args(annotation)[1:] if isinstance(mark, Variants)]
 
 
 def _tags(model: type[BaseModel]) -> tuple[Any, ...]:
