@@ -14,6 +14,7 @@ from clsplat.pipeline import load
 from clsplat.prepare import steps as prepare_steps
 from clsplat.prepare.cache import fingerprint, plan, prepare
 from clsplat.prepare.steps import Step
+from clsplat.settings import Settings
 from tests.refusals import refusal
 
 
@@ -33,6 +34,9 @@ class Copy(Step):
         if self.fail:
             raise DataError("broken")
         return {"length": len(text)}
+
+
+Settings.defined.remove(Copy)  # pipelines of other tests do not know it
 
 
 @pytest.fixture

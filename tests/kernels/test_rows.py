@@ -70,7 +70,7 @@ def test_moments_of_gaussians_without_an_optimiser_need_no_zeroing(device, rng):
 @pytest.mark.parametrize("count", [1, 15, 16, 17, 63, 64, 65, 150])
 @pytest.mark.parametrize("kept", [0, 1, 3])
 def test_each_chosen_gaussian_has_its_own_number_of_rows(device, rng, count, kept):
-    """Of `kept` old rows there are at most as many as there are rows; the first growth decides, and removal overrides."""
+    """`kept` of them are the old one, if there are as many; the first growth decides, and removal overrides."""
     edit = edit_of(gaussians_of(device, rng, count))
     expected = {"copies": np.ones(count), "kept": np.ones(count), "shrink": np.ones(count)}
     for shrink in (0.5, 0.25):
