@@ -5,8 +5,9 @@ import typing
 from typing import Any
 
 from pydantic import BaseModel
+from pydantic.fields import FieldInfo
 
-from clsplat.settings import TAGS, Variants, variants
+from clsplat.settings import TAGS, Settings, Variants, variants
 
 
 def models(annotation: Any) -> list[type[BaseModel]]:
@@ -14,12 +15,23 @@ def models(annotation: Any) -> list[type[BaseModel]]:
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
     if typing.get_origin(annotation) is typing.Annotated:
-        inner, *marks = typing.get_args(annotation)
-        bases = [mark.base for mark in marks if isinstance(mark, Variants)]
-        return list(variants(bases[0]).values()) if bases else models(inner)
+        base = bases(annotation)
+        return list(variants(base[0]).values()) if base else models(typing.get_args(annotation)[0])
     if typing.get_origin(annotation) in (typing.Union, types.UnionType):
         return [model for argument in typing.get_args(annotation) for model in models(argument)]
     return []
+
+
+def bases(annotation: Any) -> list[type[Settings]]:
+    """Return the base whose variants a field takes, if it does."""
+    if typing.get_origin(annotation) is not typing.Annotated:
+        return []
+    return [mark.base for mark in typing.get_args(annotation)[1:] if isinstance(mark, Variants)]
+
+
+def annotation_of(field: FieldInfo) -> Any:
+    """Return a field's annotation with its marks, as it was written."""
+    return typing.Annotated[field.annotation, *field.metadata] if field.metadata else field.annotation
 
 
 def tags(model: type[BaseModel]) -> tuple[Any, ...]:

@@ -13,7 +13,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from clsplat.errors import ConfigError, OverrideError
-from clsplat.fields import inside_list, model_of
+from clsplat.fields import annotation_of, inside_list, model_of
 from clsplat.yaml_file import Place, parse_value
 
 MAX_SUGGESTIONS = 3
@@ -95,7 +95,7 @@ class _Node:
 
     def _key(self, name: str) -> "_Node":
         field = self._fields.get(name)
-        return _Node(self.data[name], field.annotation if field else None, (*self.place, name))
+        return _Node(self.data[name], annotation_of(field) if field else None, (*self.place, name))
 
     def _item(self, i: int) -> "_Node":
         item = self.data[i]

@@ -30,7 +30,7 @@ def with_new_names(data: dict[str, Any], warn_about: str = "") -> dict[str, Any]
 
 def _stage(stage: Any, order: Any, where: str) -> Any:
     if not isinstance(stage, dict) or stage.get("stage") != "optimize":
-        return stage
+        return _densify(stage, where)
     stage = dict(stage)
     if order is not None and isinstance(stage.get("views", {}), dict):
         stage["views"] = {"order": order, **stage.get("views", {})}

@@ -79,17 +79,27 @@ class Decay(Settings):
         return [self.initial, self.final]
 
 
-def _explained(value: Any, validate: Callable[[Any], Any]) -> Any:
-    """Say in one sentence what is wrong with a schedule, not once for each notation."""
-    try:
-        return validate(value)
-    except ValidationError as error:
-        messages = [one["msg"].removeprefix("Value error, ") for one in error.errors() if one["type"] == "value_error"]
-        expected = "expected a number, points [[step, value], …] with growing steps, {points, between} or "
-        raise ValueError(messages[0] if messages else f"{expected}{{initial, final, over, start}}") from None
+NOTATIONS = (
+    "expected a number, points [[step, value], …] with growing steps, {points, between} or "
+    "{initial, final, over, start}"
+)
 
 
-Schedule = Annotated[float | PointList | Points | Decay, WrapValidator(_explained)]
+def explained(more: str = "") -> WrapValidator:
+    """Say in one sentence what is wrong with a schedule, or what else a field takes, not once for each notation."""
+
+    def validated(value: Any, validate: Callable[[Any], Any]) -> Any:
+        try:
+            return validate(value)
+        except ValidationError as error:
+            found = [one["msg"] for one in error.errors() if one["type"] == "value_error"]
+            messages = [message.removeprefix("Value error, ") for message in found]
+            raise ValueError(next((text for text in messages if text != NOTATIONS), NOTATIONS + more)) from None
+
+    return WrapValidator(validated)
+
+
+Schedule = Annotated[float | PointList | Points | Decay, explained()]
 
 
 def values_of(schedule: Schedule) -> list[float]:

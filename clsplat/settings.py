@@ -104,5 +104,8 @@ def import_modules(package: str, path: Iterable[str]) -> None:
 
 def rebuild() -> None:
     """Let fields of variants know those that were defined since: after a plug-in was loaded."""
+    for kind in Settings.defined:  # a schema holds those of its variants, and theirs
+        if "__pydantic_core_schema__" in vars(kind):
+            del kind.__pydantic_core_schema__
     for kind in Settings.defined:
         kind.model_rebuild(force=True)

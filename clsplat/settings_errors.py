@@ -1,25 +1,17 @@
 """Turning a failed validation into one sentence: file, line, place, what was expected, the nearest match."""
 
 import difflib
+import re
 from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
 from clsplat.errors import shortened
-from clsplat.fields import inside_list, models, tags
-from clsplat.settings import TAGS
+from clsplat.fields import annotation_of, bases, inside_list, models, tags
+from clsplat.settings import TAGS, Settings
 from clsplat.yaml_file import Document, Place
 
-KINDS = {
-    "losses": "loss",
-    "rules": "rule",
-    "prepare": "step",
-    "stages": "stage",
-    "during": "stage",
-    "world_filter": "world filter",
-    "screen_filter": "screen filter",
-}
 EXPECTED = {
     "int_type": "a whole number",
     "int_from_float": "a whole number",
@@ -54,11 +46,11 @@ def first_fault(error: ValidationError, root: type[BaseModel]) -> tuple[Place, s
     A misspelt key explains the one that is missing, so it goes first.
     """
     first = min(error.errors(), key=lambda one: one["type"] != "extra_forbidden")
-    place, model = _follow(first["loc"], root)
-    return place, _complaint(dict(first), place, model)
+    place, model, annotation = _follow(first["loc"], root)
+    return place, _complaint(dict(first), place, model, annotation)
 
 
-def _complaint(error: dict[str, Any], place: Place, model: type[BaseModel] | None) -> str:
+def _complaint(error: dict[str, Any], place: Place, model: type[BaseModel] | None, annotation: Any) -> str:
     kind, value = error["type"], error["input"]
     if kind == "extra_forbidden":
         known = [name for name in (model.model_fields if model else {}) if name not in TAGS]
@@ -68,9 +60,9 @@ def _complaint(error: dict[str, Any], place: Place, model: type[BaseModel] | Non
     if kind == "union_tag_invalid":
         known = [tag.strip().strip("'") for tag in error["ctx"]["expected_tags"].split(",")]
         tag = shortened(str(error["ctx"]["tag"]))
-        return f"no {_kind(place)} named '{tag}'{_nearest(tag, known)}"
+        return f"no {_kind(annotation)} named '{tag}'{_nearest(tag, known)}"
     if kind == "union_tag_not_found":
-        return f"expected a {_kind(place)} with a 'type'"
+        return f"expected a 'type', the name of the {_kind(annotation)}"
     got = f", got {shortened(repr(value))}"
     if kind in EXPECTED:
         return f"expected {EXPECTED[kind].format(**error.get('ctx', {}))}{got}"
@@ -84,9 +76,11 @@ def _nearest(word: str, known: list[str]) -> str:
     return f"; did you mean '{near[0]}'?" if near else f"; there are {', '.join(sorted(known))}"
 
 
-def _kind(place: Place) -> str:
-    names = [p for p in place if isinstance(p, str)]
-    return next((KINDS[name] for name in reversed(names) if name in KINDS), "kind")
+def _kind(annotation: Any) -> str:
+    """What a field chooses from, in words: 'world filter' for variants of WorldFilter, 'stage' for those of Stage."""
+    base = bases(annotation)[0]
+    family = base.__mro__[base.__mro__.index(Settings) - 1]
+    return re.sub(r"(?<=\w)(?=[A-Z])", " ", family.__name__).lower()
 
 
 def place_text(place: Place) -> str:
@@ -97,8 +91,9 @@ def place_text(place: Place) -> str:
     return text
 
 
-def _follow(location: tuple[int | str, ...], root: type[BaseModel]) -> tuple[Place, type[BaseModel] | None]:
-    """Translate a location among models, which names union members, into the file's; also the model around it.
+def _follow(location: tuple[int | str, ...], root: type[BaseModel]) -> tuple[Place, type[BaseModel] | None, Any]:
+    """Translate a location among models, which names union members, into the file's; also the model around it, and the
+    annotation there.
 
     In the file a stage's name is a key of its own (stages[1].optimize.steps); a strategy's type is not.
     """
@@ -119,5 +114,5 @@ def _follow(location: tuple[int | str, ...], root: type[BaseModel]) -> tuple[Pla
             place.append(part)
             model = members[0] if len(members) == 1 else model
             field = model.model_fields.get(part) if model else None
-            annotation = field.annotation if field else None
-    return tuple(place), model
+            annotation = annotation_of(field) if field else None
+    return tuple(place), model, annotation

@@ -105,8 +105,8 @@ def blend_backward(
         grad_v = grad_sigma * (b * step.dx + c * step.dy)
         grad.mean2d[i] = grad_u.sum(), grad_v.sum()
         grad.mean2d_abs[i] = np.abs(grad_u).sum(), np.abs(grad_v).sum()
-        pixel_sums = 0.5 * step.dx**2, step.dx * step.dy, 0.5 * step.dy**2
-        grad.conic[i] = [np.sum(grad_sigma * pixel_sum) for pixel_sum in pixel_sums]
+        products = 0.5 * step.dx**2, step.dx * step.dy, 0.5 * step.dy**2
+        grad.conic[i] = [np.sum(grad_sigma * product) for product in products]
     return grad
 
 

@@ -15,6 +15,8 @@ from clsplat.model_file import ModelFile
 from clsplat.pipeline import load
 from clsplat.stages.export import baked
 from clsplat.training.run import Progress, Run
+from clsplat.views.order import Code
+from clsplat.views.sampling import Sampler, ViewSettings
 from tests.reference_filter import filtered
 from tests.scenes import random_case, with_world_filter
 from tests.test_training import digest, train
@@ -26,7 +28,7 @@ MIP = (
     "optimize.raise_sh.every=5",
     "optimize.densify.start=5",
 )
-LEVELS = ("scene.levels=3", "scene.sampling=code", "evaluate.scales=[1, 2, 4]")
+LEVELS = ("scene.levels=3", "optimize.views.order=code", "evaluate.scales=[1, 2, 4]")
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +51,7 @@ def finished(tiny_scene: Path, pipeline: str, tmp_path_factory: pytest.TempPathF
 
 def test_the_filter_follows_and_then_stays(finished):
     """At the end it is what the last refresh, before step 47, made of the means of then."""
-    gaussians = finished.trained.gaussians
+    gaussians = finished.model.gaussians
     frozen = gaussians.get("filter_variance")
     assert (frozen > 0).all()
     finished.refresh_filter()
@@ -93,7 +95,8 @@ def test_metrics_of_every_scale(finished):
 
 def test_training_saw_every_level(finished):
     assert finished.scene.downscales == (1, 2, 4)
-    assert {finished._order.at(step).downscale for step in range(1, 51)} == {1, 2, 4}
+    sampler = Sampler(finished.scene.split("train"), ViewSettings(order=Code()), finished.seed)
+    assert {sampler.at(step).view.downscale for step in range(1, 51)} == {1, 2, 4}
 
 
 def test_zooming_in(tiny_scene, tmp_path):
@@ -112,7 +115,7 @@ def test_both_files_are_marked(finished):
     assert raw.rendering == fused.rendering
     assert (raw.rendering["screen_variance"], raw.rendering["compensate"]) == (0.1, 1)
     assert "filter_variance" not in fused.parameters
-    gaussians = finished.trained.gaussians
+    gaussians = finished.model.gaussians
     for name in PARAMETERS:
         np.testing.assert_array_equal(raw.parameters[name], gaussians.get(name))
     np.testing.assert_allclose(raw.parameters["filter_variance"], gaussians.get("filter_variance"), rtol=3e-7)
@@ -123,16 +126,16 @@ def test_files_render_as_the_run_does(finished, tiny_scene, name):
     """To rounding: floats differ by less than 2e-5, but for a pixel now and then that rounding moves across 1/255."""
     opened = ModelFile(finished.out / name, tiny_scene, None)
     for view in finished.scene.downscaled(1).split("test"):
-        camera = finished.targets.camera(view)
+        camera = finished.photographs.camera(view)
         images = [
-            finished.rasterizer.forward(model, camera, finished.targets.background_array).image.get()
-            for model in (finished.trained, on_device(finished, opened))
+            finished.rasterizer.forward(model, camera, finished.photographs.background).image.get()
+            for model in (finished.model, on_device(finished, opened))
         ]
         difference = np.abs(images[0] - images[1])
         assert np.quantile(difference, 0.999) < 2e-5
         assert difference.max() < 2 / 255
-        eight_bits = render_view(finished.rasterizer, finished.trained, camera, finished.targets.background_array)
-        other = render_view(finished.rasterizer, on_device(finished, opened), camera, finished.targets.background_array)
+        eight_bits = render_view(finished.rasterizer, finished.model, camera, finished.photographs.background)
+        other = render_view(finished.rasterizer, on_device(finished, opened), camera, finished.photographs.background)
         assert np.abs(eight_bits.astype(int) - other).max() <= 1
     measured = opened.evaluate([1, 2, 4])["test"]
     for scale, values in finished.metrics["test"].items():

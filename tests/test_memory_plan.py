@@ -10,7 +10,7 @@ from tests.test_cli import clsplat
 from tests.test_training import train
 
 SMALL = MemoryPlan(
-    gaussian=1000, pair=88, fixed=10_000_000, largest_table=180, limit=100_000_000, allocation=50_000_000
+    gaussian=1000, pair=88, fixed=10_000_000, largest_table=180, memory=100_000_000, allocation=50_000_000
 )
 
 
@@ -29,15 +29,15 @@ def test_bytes_come_from_the_tables(device, rng):
 
 
 def test_what_fits_fits_and_one_more_does_not():
-    assert SMALL.needed(SMALL.most) <= SMALL.limit < SMALL.needed(SMALL.most + 1)
-    SMALL.check(SMALL.most)
+    assert SMALL.needed(SMALL.limit) <= SMALL.memory < SMALL.needed(SMALL.limit + 1)
+    SMALL.check(SMALL.limit)
     with pytest.raises(MemoryLimitError, match=r"fit in 95 MiB.*start from fewer points"):
-        SMALL.check(SMALL.most + 1)
+        SMALL.check(SMALL.limit + 1)
 
 
 def test_a_single_buffer_may_be_what_is_too_large():
-    narrow = MemoryPlan(gaussian=10, pair=88, fixed=0, largest_table=180, limit=10**12, allocation=27_000_000)
-    assert narrow.most == 84_375  # records of 5 pairs of 64 bytes
+    narrow = MemoryPlan(gaussian=10, pair=88, fixed=0, largest_table=180, memory=10**12, allocation=27_000_000)
+    assert narrow.limit == 84_375  # records of 5 pairs of 64 bytes
 
 
 def test_training_that_cannot_fit_is_refused_before_it_starts(tiny_scene, tmp_path, monkeypatch):
@@ -47,16 +47,16 @@ def test_training_that_cannot_fit_is_refused_before_it_starts(tiny_scene, tmp_pa
 
 
 def test_growth_stops_where_memory_ends(tiny_scene, tmp_path, monkeypatch):
-    free = train(tiny_scene, tmp_path / "free").trained.gaussians.count
-    fits = MemoryPlan(gaussian=0, pair=0, fixed=0, largest_table=1, limit=9000, allocation=10**9)
+    free = train(tiny_scene, tmp_path / "free").model.gaussians.count
+    fits = MemoryPlan(gaussian=0, pair=0, fixed=0, largest_table=1, memory=9000, allocation=10**9)
     monkeypatch.setattr("clsplat.training.run.plan", lambda *_: fits)
-    assert 8000 < train(tiny_scene, tmp_path / "tight").trained.gaussians.count <= 9000 < free
+    assert 8000 < train(tiny_scene, tmp_path / "tight").model.gaussians.count <= 9000 < free
 
 
 def test_photographs_read_again_and_again_train_to_the_same_bits(tiny_scene, tmp_path, monkeypatch):
     train(tiny_scene, tmp_path / "held")
     monkeypatch.setattr("clsplat.views.photographs.BUDGET_SHARE", 1e-9)
-    assert train(tiny_scene, tmp_path / "tight").targets.budget < 100
+    assert train(tiny_scene, tmp_path / "tight").photographs.budget < 100
     held, tight = ((tmp_path / name / "point_cloud.ply").read_bytes() for name in ("held", "tight"))
     assert held == tight
 
@@ -70,6 +70,6 @@ def test_dry_run_says_what_fits(tiny_scene, tmp_path):
 def test_bands_and_short_launches_train_to_the_same_bits(tiny_scene, tmp_path):
     train(tiny_scene, tmp_path / "whole")
     cut = train(tiny_scene, tmp_path / "cut", "rasterizer.pair_budget=1", "rasterizer.launch_tiles=2")
-    assert len(cut.rasterizer._split(cut.targets.camera(cut.scene.views[0]))) > 1
+    assert len(cut.rasterizer._split(cut.photographs.camera(cut.scene.views[0]))) > 1
     whole, banded = ((tmp_path / name / "point_cloud.ply").read_bytes() for name in ("whole", "cut"))
     assert whole == banded

@@ -96,7 +96,7 @@ def test_a_ramp_of_weights_needs_no_more_memory(finished, tiny_scene, tmp_path):
     assert finished.rasterizer.workspace._arrays.keys() == run.rasterizer.workspace._arrays.keys()
 
 
-def test_census_of_known_gaussians(device, rng):
+def test_distribution_of_known_gaussians(device, rng):
     case = random_case(rng, 5)
     case.parameters["log_scales"][:] = np.log([[1, 1, 1], [1, 1, 2], [1, 1, 3], [1, 1, 4], [1, 1, 5]])
     case.parameters["logit_opacity"][:] = 0

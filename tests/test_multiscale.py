@@ -12,7 +12,8 @@ from clsplat.errors import DataError
 from clsplat.scene.detect import read_scene
 from clsplat.scene.scene import Camera, View, make_scene
 from clsplat.scene.view import load_image
-from clsplat.views.order import ViewOrder
+from clsplat.settings import variants
+from clsplat.views.order import Order, ViewPool
 from data_tools.multiscale import pyramid, write_multiscale
 from tests.refusals import refusal
 
@@ -126,10 +127,15 @@ def views_of(count: int, *scales: float) -> list[View]:
     return list(make_scene(Path("none"), views, set(), None).downscaled(*scales).views)
 
 
-def shares(views: list[View], sampling: str, steps: int) -> dict[float, float]:
-    order = ViewOrder(views, sampling, seed=0)
-    drawn = Counter(order.at(step).downscale for step in range(1, steps + 1))
-    return {scale: count / steps for scale, count in drawn.items()}
+def drawn(views: list[View], order: str, steps: int | list[int], seed: int = 0) -> list[View]:
+    """The views of some steps, or of all from 1 to `steps`."""
+    pool, chosen = ViewPool(views, seed), variants(Order)[order]()
+    return [chosen.at(pool, step) for step in (range(1, steps + 1) if isinstance(steps, int) else steps)]
+
+
+def shares(views: list[View], order: str, steps: int) -> dict[float, float]:
+    found = Counter(view.downscale for view in drawn(views, order, steps))
+    return {scale: count / steps for scale, count in found.items()}
 
 
 def test_the_shares_of_the_scales():
@@ -142,17 +148,16 @@ def test_the_shares_of_the_scales():
         assert code[scale] == pytest.approx(0.175, abs=0.015)
 
 
-@pytest.mark.parametrize("sampling", ["uniform", "paper", "code"])
-def test_the_order_depends_on_seed_and_step_alone(sampling):
+@pytest.mark.parametrize("order", ["uniform", "paper", "code"])
+def test_the_order_depends_on_seed_and_step_alone(order):
     views = views_of(7, 1, 2)
-    order, again = (ViewOrder(views, sampling, seed=3) for _ in range(2))
-    straight = [order.at(step) for step in range(1, 60)]
-    assert [again.at(step) for step in (50, 3, 21)] == [straight[step - 1] for step in (50, 3, 21)]
-    assert [ViewOrder(views, sampling, seed=4).at(step) for step in range(1, 60)] != straight
+    straight = drawn(views, order, 60, seed=3)
+    assert drawn(views, order, [50, 3, 21], seed=3) == [straight[step - 1] for step in (50, 3, 21)]
+    assert drawn(views, order, 60, seed=4) != straight
 
 
 def test_every_view_comes_once_before_any_twice():
     views = views_of(7, 1, 2)
-    drawn = [ViewOrder(views, "uniform", 0).at(step) for step in range(1, 29)]
-    for epoch in (drawn[:14], drawn[14:]):
+    found = drawn(views, "uniform", 28)
+    for epoch in (found[:14], found[14:]):
         assert len({(view.name, view.downscale) for view in epoch}) == 14

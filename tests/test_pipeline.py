@@ -93,13 +93,13 @@ TWIN = {"steps", "rates.means.over", "evaluate.every", *ENDS}
 MATCHING = {
     f"densify.rules.{rule}~2{key}"
     for rule, size in (("clone", (".size_below",)), ("split", (".size_above", ".children", ".shrink")))
-    for key in ("", ".after", ".statistic", ".as_many_as", ".gradient_above", *size)
+    for key in ("", ".start", ".statistic", ".as_many_as", ".gradient_above", *size)
 }
-SUBDIVIDE = (".after", ".at_most", ".beta", ".children", ".radius_above")
+SUBDIVIDE = (".start", ".at_most", ".beta", ".children", ".radius_above")
 THINNING = {
     *(f"densify~{n}.{key}" for n in (2, 3) for key in ("every", "max_gaussians", "start", "stop")),
-    *(f"densify~2.rules.prune_unimportant{key}" for key in ("", ".after", ".share")),
-    *(f"densify~3.rules.merge_neighbours{key}" for key in ("", ".after", ".colour_below", ".distance_below")),
+    *(f"densify~2.rules.prune_unimportant{key}" for key in ("", ".start", ".share")),
+    *(f"densify~3.rules.merge_neighbours{key}" for key in ("", ".start", ".colour_below", ".distance_below")),
 }
 DIFFERENCES = {
     ("splat", "splat_7k"): TWIN,

@@ -15,6 +15,7 @@ from clsplat.prepare import steps as prepare_steps
 from clsplat.prepare.cache import fingerprint, plan, prepare
 from clsplat.prepare.place import place_photographs
 from clsplat.prepare.steps import Step
+from clsplat.settings import Settings
 from tests.refusals import refusal
 
 
@@ -34,6 +35,9 @@ class Copy(Step):
         if self.fail:
             raise DataError("broken")
         return {"length": len(text)}
+
+
+Settings.defined.remove(Copy)  # pipelines of other tests do not know it
 
 
 @pytest.fixture

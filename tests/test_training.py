@@ -19,6 +19,7 @@ from clsplat.gaussians.ply import read_ply
 from clsplat.pipeline import load
 from clsplat.training import checkpoint
 from clsplat.training.run import Progress, Run
+from clsplat.views.sampling import Sampler
 from tests.onnx_writer import distance_network
 
 
@@ -131,7 +132,7 @@ def test_interrupt_saves_and_resume_goes_on(finished, tiny_scene, tmp_path):
 
 def test_killed_three_times_and_resumed(finished, tiny_scene, tmp_path):
     """kill -9 at random moments; the resumed run ends with the bits of the undisturbed one."""
-    out, moments = tmp_path / "killed", random.Random(1)
+    out, chance = tmp_path / "killed", random.Random(1)
     command = [
         sys.executable,
         "-m",
@@ -147,11 +148,11 @@ def test_killed_three_times_and_resumed(finished, tiny_scene, tmp_path):
     killed = 0
     while killed < 3:
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        wait_for = moments.choice(["step_000010.npz", "step_000020.npz", "step_000030.npz"])
+        wait_for = chance.choice(["step_000010.npz", "step_000020.npz", "step_000030.npz"])
         deadline = time.time() + 60
         while time.time() < deadline and process.poll() is None and not (out / "checkpoints" / wait_for).exists():
             time.sleep(0.005)
-        time.sleep(moments.uniform(0, 0.05))
+        time.sleep(chance.uniform(0, 0.05))
         process.send_signal(signal.SIGKILL)
         process.wait()
         killed += 1
@@ -173,7 +174,7 @@ def test_a_checkpoint_of_another_format_is_refused(tiny_scene, tmp_path, monkeyp
     train(tiny_scene, tmp_path)
     monkeypatch.undo()
     before = (tmp_path / "metrics.jsonl").read_bytes()
-    with pytest.raises(ConfigError, match=r"has format 1, expected 2.*use another --out"):
+    with pytest.raises(ConfigError, match=r"has format 1, expected 3.*use another --out"):
         train(tiny_scene, tmp_path, resume=True)
     assert (tmp_path / "metrics.jsonl").read_bytes() == before
 
@@ -207,9 +208,8 @@ def test_values_that_are_not_finite_stop_the_run(tiny_scene, tmp_path):
 def test_views_come_in_random_order_without_repeats(tiny_scene, tmp_path):
     checked = load("smoke", [f"scene.path='{tiny_scene}'"])
     run = runner.open_run(checked, tmp_path, None)
-    names = []
-    for run.step in range(1, 25):
-        names.append(run.train_view().name)
+    sampler = Sampler(run.scene.split("train"), checked.settings.training.views, run.seed)
+    names = [sampler.at(step).view.name for step in range(1, 25)]
     epochs = [names[i : i + 8] for i in (0, 8, 16)]
     for epoch in epochs:
         assert len(set(epoch)) == 8

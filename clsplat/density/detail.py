@@ -14,7 +14,7 @@ from clsplat.density.edit import Edit, Rule
 from clsplat.density.statistics import SEEN, StatisticName
 from clsplat.density.thresholds import PixelQuantile, Quantile, Share, Threshold
 from clsplat.gaussians.tables import INTERVAL2
-from clsplat.schedule import NonNegative, Positive
+from clsplat.schedule import NonNegative, Positive, explained
 
 BETA = 0.5  # Lee et al. 2025: a child's covariance is half its parent's
 
@@ -86,7 +86,7 @@ class SplitOversized(Subdivide):
     """
 
     type: Literal["split_oversized"] = "split_oversized"
-    rms_above: Quantile | Positive = 0.01
+    rms_above: Annotated[Quantile | Positive, explained(", or {quantile}")] = 0.01
     """Smallest rms scale, a share of the scene's extent by step, or a quantile of the Gaussians' own."""
     pixels: Annotated[float, Field(gt=0)] | None = None
     """Smallest rms scale in px of the nearest training view; takes the place of `rms_above`."""

@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from clsplat.schedule import NonNegative
+from clsplat.schedule import NonNegative, explained
 from clsplat.settings import Settings
 
 Share = Annotated[float, Field(ge=0, le=1)]
@@ -28,4 +28,4 @@ class PixelQuantile(Settings):
     """The photographs' pixels."""
 
 
-Threshold = Quantile | PixelQuantile | NonNegative
+Threshold = Annotated[Quantile | PixelQuantile | NonNegative, explained(", or {quantile, of}")]

@@ -23,7 +23,7 @@ def results(device, case, weights, budget=None, sort="radix"):
     [(Budget(UNLIMITED), 1), (Budget(600), 2), (Budget(250), 4), (Budget(1), 5), (Budget(UNLIMITED, 3), 1),
      (Budget(1, 1), 5), (Budget(250, 1000), 4)],
 )  # fmt: skip
-def test_image_and_moments_are_the_same_bits(device, rng, budget, bands, sort):
+def test_image_and_sums_over_pixels_are_the_same_bits(device, rng, budget, bands, sort):
     case = random_case(rng, 300, 60, 70)
     case.parameters["log_scales"][:20] += 1.5  # some over many rows of tiles, and too many tiles for a mask
     weights = rng.normal(size=(3, 70, 60)).astype(np.float32)

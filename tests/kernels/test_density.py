@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from clsplat.density.basic import Clone, PruneFaint, PruneLarge, Split
-from clsplat.density.edit import SceneScale, cap_opacity, densify
+from clsplat.density.edit import Edit, SceneScale, cap_opacity, densify
 from clsplat.density.statistics import SEEN, SplatStats
 from clsplat.gaussians.tables import PARAMETERS, Gaussians
 from clsplat.opencl.device import Device
@@ -18,7 +18,7 @@ RULES = [
     Clone(gradient_above=2e-4, size_below=0.01),
     Split(gradient_above=2e-4, size_above=0.01, children=2, shrink=1.6),
     PruneFaint(opacity_below=0.005),
-    PruneLarge(size_above=0.1, after=3000),
+    PruneLarge(size_above=0.1, start=3000),
 ]
 EXTENT = 5.0
 SCREEN_GRAD = "stats/screen_grad"
@@ -36,8 +36,8 @@ def edited(device: Device, rng, count: int, step: int, rules=RULES):
     adam, stats = Adam(gaussians), SplatStats(gaussians)
     assert adam.gaussians is gaussians
     for name in PARAMETERS:
-        for pixel_sum in ("moment1", "moment2"):
-            table = f"adam/{name}/{pixel_sum}"
+        for moment in ("moment1", "moment2"):
+            table = f"adam/{name}/{moment}"
             gaussians.set(table, rng.uniform(1, 2, (count, gaussians.tables[table].components)))
     seen = rng.integers(0, 4, (count, 1)).astype(np.float32)
     mean = rng.choice([5e-5, 1e-3], (count, 1))
@@ -45,7 +45,7 @@ def edited(device: Device, rng, count: int, step: int, rules=RULES):
     gaussians.set(SEEN, seen)
     before = {name: gaussians.get(name) for name in gaussians.tables}
     tiler = Rasterizer(device, "radix").tiler
-    change = densify(gaussians, stats, rules, tiler, SceneScale(EXTENT), step, seed=3)
+    change = densify(Edit(gaussians, stats, SceneScale(EXTENT), step, seed=3), rules, tiler)
     return before, gaussians, change
 
 
@@ -68,9 +68,9 @@ def test_adaptive_density_control(device, rng, count, step):
     after = {name: gaussians.get(name) for name in gaussians.tables}
     for name in ("quats", "logit_opacity", "sh_base", "sh_rest", "filter_variance"):
         np.testing.assert_array_equal(after[name], before[name][source])
-    for name in PARAMETERS:  # pixel_sums: kept rows keep theirs, fresh rows start at zero
-        for pixel_sum in (f"adam/{name}/moment1", f"adam/{name}/moment2"):
-            np.testing.assert_array_equal(after[pixel_sum], np.where(fresh[:, None], 0, before[pixel_sum][source]))
+    for name in PARAMETERS:  # moments: kept rows keep theirs, fresh rows start at zero
+        for moment in (f"adam/{name}/moment1", f"adam/{name}/moment2"):
+            np.testing.assert_array_equal(after[moment], np.where(fresh[:, None], 0, before[moment][source]))
     np.testing.assert_array_equal(after["means"][~split], before["means"][source][~split])
     np.testing.assert_array_equal(after["log_scales"][~split], before["log_scales"][source][~split])
     np.testing.assert_allclose(after["log_scales"][split], before["log_scales"][source][split] - np.log(1.6), atol=1e-5)
@@ -92,7 +92,8 @@ def test_children_follow_their_parents_distribution(device, rng):
     stats = SplatStats(gaussians)
     for name in (SCREEN_GRAD, SEEN):
         gaussians.set(name, np.ones((count, 1)))
-    densify(gaussians, stats, [Split(size_above=1e-6)], Rasterizer(device, "radix").tiler, SceneScale(1.0), 700, seed=1)
+    edit = Edit(gaussians, stats, SceneScale(1.0), step=700, seed=1)
+    densify(edit, [Split(size_above=1e-6)], Rasterizer(device, "radix").tiler)
     assert gaussians.count == 2 * count
     q = p["quats"][0].astype(np.float64)
     rotation = ref.rotation_matrix(q / np.linalg.norm(q))

@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from clsplat.density.basic import Clone, PruneFaint
 from clsplat.density.detail import SplitOversized, SplitTextured, largest
-from clsplat.density.edit import SceneScale, densify
+from clsplat.density.edit import Edit, SceneScale, densify
 from clsplat.density.statistics import SEEN, SplatStats
 from clsplat.density.thinning import MergeNeighbours, PruneUnimportant, covariance_of, mass_of, merged
 from clsplat.density.thresholds import PixelQuantile, Quantile
@@ -27,7 +27,7 @@ class Edited:
         self.gaussians = case.model(device).gaussians
         self.tiler = Rasterizer(device, "radix").tiler
         Adam(self.gaussians)
-        for table in [name for name in self.gaussians.tables if "pixel_sum" in name]:
+        for table in [name for name in self.gaussians.tables if "moment" in name]:
             self.gaussians.set(table, rng.uniform(1, 2, (count, self.gaussians.tables[table].components)))
         self.stats = SplatStats(self.gaussians, names)
         self.gaussians.set(SEEN, np.full((count, 1), 2.0, np.float32))
@@ -35,10 +35,10 @@ class Edited:
             values = np.broadcast_to(columns.get(name, 1.0 if name == "blend_weight" else 10.0), count)
             self.gaussians.set(f"stats/{name}", 2 * values.astype(np.float32)[:, None])
 
-    def apply(self, *rules, most=None, texture_quantile=lambda share: 0.1 * share):
+    def apply(self, *rules, limit=None, texture_quantile=lambda share: 0.1 * share):
         self.before = {name: self.gaussians.get(name) for name in self.gaussians.tables}
-        measures = SceneScale(EXTENT, texture_quantile)
-        return densify(self.gaussians, self.stats, rules, self.tiler, measures, 700, seed=4, most=most)
+        edit = Edit(self.gaussians, self.stats, SceneScale(EXTENT, texture_quantile), step=700, seed=4)
+        return densify(edit, rules, self.tiler, limit)
 
     def rows_of(self, source: int) -> np.ndarray:
         """Rows that carry the colours of an old row, which no edit changes."""
@@ -61,7 +61,7 @@ def test_texture_splits_and_children_are_half_as_large(device, rng):
         np.testing.assert_allclose(np.exp(2 * (children - parent)), 0.5, rtol=1e-4)  # β
         assert (case.gaussians.get("means")[rows] != case.before["means"][source]).any(axis=1).all()
         for table in case.gaussians.tables:
-            if "pixel_sum" in table or table.startswith("stats/"):
+            if "moment" in table or table.startswith("stats/"):
                 assert (case.gaussians.get(table)[rows] == 0).all(), table
 
 
@@ -142,11 +142,11 @@ def test_first_growing_rule_takes_it_and_pruning_overrides(device, rng):
 def test_growth_stops_at_the_limit_and_the_largest_gradients_grow(device, rng):
     gradient = rng.permutation(np.linspace(1e-3, 1, 50))
     case = Edited(device, rng, 50, screen_grad=gradient)
-    change = case.apply(Clone(size_below=1e9), most=58)
+    change = case.apply(Clone(size_below=1e9), limit=58)
     assert (change.after, change.causes) == (58, {"clone": 8})
     assert {n for n in range(50) if len(case.rows_of(n)) == 2} == set(np.argsort(-gradient)[:8])
     crowded = Edited(device, rng, 50, screen_grad=gradient)
-    assert crowded.apply(Clone(size_below=1e9), most=10).after == 50  # nothing is removed to reach it
+    assert crowded.apply(Clone(size_below=1e9), limit=10).after == 50  # nothing is removed to reach it
 
 
 def test_the_limit_ranks_by_gradient_whatever_else_is_measured(device, rng):
@@ -154,7 +154,7 @@ def test_the_limit_ranks_by_gradient_whatever_else_is_measured(device, rng):
     case = Edited(device, rng, 50, ("rendered_texture", "screen_grad", "screen_radius"))
     case.gaussians.set("stats/screen_grad", 2 * gradient[:, None])
     case.gaussians.set("stats/rendered_texture", 2 * (1 - gradient[:, None]))
-    case.apply(SplitTextured(texture="rendered_texture", texture_above=0.0, gradient_above=0.0, at_most=1.0), most=58)
+    case.apply(SplitTextured(texture="rendered_texture", texture_above=0.0, gradient_above=0.0, at_most=1.0), limit=58)
     assert {n for n in range(50) if len(case.rows_of(n)) == 2} == set(np.argsort(-gradient)[:8])
 
 
@@ -167,7 +167,7 @@ def test_least_important_ones_go(device, rng):
     assert {n for n in range(40) if len(case.rows_of(n)) == 0} == set(np.argsort(score)[:10])
 
 
-def test_neighbours_merge_into_their_moments(device, rng):
+def test_neighbours_merge_into_one_with_the_mean_and_covariance_of_both(device, rng):
     """Twins merge; a stranger of another colour and one far away stay."""
     case = Edited(device, rng, 4)
     means = np.array([[0, 0, 4], [0.01, 0, 4], [5, 0, 4], [5.01, 0, 4]], np.float32)
@@ -177,7 +177,7 @@ def test_neighbours_merge_into_their_moments(device, rng):
     case.gaussians.set("log_scales", np.log(np.full((4, 3), [0.05, 0.04, 0.03], np.float32)))
     case.gaussians.set("logit_opacity", np.array([[-1.0], [-1.5], [1.0], [0.0]], np.float32))
     before = {name: case.gaussians.get(name).astype(np.float64) for name in ("quats", "log_scales", "logit_opacity")}
-    pixel_sum = {name: case.gaussians.get(f"adam/{name}/moment1") for name in ("means", "quats", "log_scales")}
+    moments = {name: case.gaussians.get(f"adam/{name}/moment1") for name in ("means", "quats", "log_scales")}
     assert case.apply(MergeNeighbours()).after == 3
     tables = {**before, "means": means.astype(np.float64)}
     mass = mass_of(tables)[:2]
@@ -191,11 +191,11 @@ def test_neighbours_merge_into_their_moments(device, rng):
     np.testing.assert_allclose(covariance_of(got["quats"][:1], got["log_scales"][:1])[0], covariance, atol=1e-7)
     np.testing.assert_allclose(mass_of(got)[0], mass.sum(), rtol=1e-4)
     np.testing.assert_allclose(got["sh_base"][0], weights @ colours[:2], rtol=1e-5)
-    after = {name: case.gaussians.get(f"adam/{name}/moment1") for name in pixel_sum}
-    np.testing.assert_array_equal(after["means"][0], pixel_sum["means"][0])  # the heavier one's
+    after = {name: case.gaussians.get(f"adam/{name}/moment1") for name in moments}
+    np.testing.assert_array_equal(after["means"][0], moments["means"][0])  # the heavier one's
     for name in ("quats", "log_scales"):
         assert (after[name][0] == 0).all(), "of axes that are no more"
-        np.testing.assert_array_equal(after[name][1:], pixel_sum[name][2:])
+        np.testing.assert_array_equal(after[name][1:], moments[name][2:])
     np.testing.assert_array_equal(got["means"][1:], means[2:])
 
 
@@ -228,17 +228,17 @@ def test_a_merged_covariance_is_that_of_the_mixture(rng):
     np.testing.assert_allclose(np.linalg.norm(found["quats"], axis=1), 1, rtol=1e-9)
     assert all(np.isfinite(values).all() for values in found.values())
 
-    def pixel_sums(values, rows):
+    def mixture_of(values, rows):
         axes = Rotation.from_quat(np.roll(values["quats"][rows], -1, axis=1)).as_matrix()
         own = axes @ (np.exp(2 * values["log_scales"][rows])[:, :, None] * np.swapaxes(axes, 1, 2))
         volume = np.exp(values["log_scales"][rows].sum(axis=1))
         return values["means"][rows], own, volume / (1 + np.exp(-values["logit_opacity"][rows, 0]))
 
-    halves = [pixel_sums(tables, rows) for rows in (slice(0, count), slice(count, None))]
+    halves = [mixture_of(tables, rows) for rows in (slice(0, count), slice(count, None))]
     total = sum(mass for _, _, mass in halves)
     mean = sum(mass[:, None] * mean for mean, _, mass in halves) / total[:, None]
     second = sum(mass[:, None, None] * (own + _outer(mean)) for mean, own, mass in halves) / total[:, None, None]
-    got = pixel_sums(found, slice(None))
+    got = mixture_of(found, slice(None))
     np.testing.assert_allclose(got[0], mean, rtol=1e-9)
     np.testing.assert_allclose(got[1], second - _outer(mean), atol=1e-9 * np.abs(second).max())
 

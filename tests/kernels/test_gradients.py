@@ -145,7 +145,7 @@ def test_sorts_give_the_same_bits(device, rng):
 
 
 def pixel_sums_of(result: tuple[dict, Frame, Rasterizer]) -> np.ndarray:
-    """The sums over pixels of every Gaussian, [PIXEL_SUMS, N], each kind of pixel_sum scaled to 1."""
+    """The sums over pixels of every Gaussian, [PIXEL_SUMS, N], each kind scaled to 1."""
     gradients, _, rasterizer = result
     count = len(gradients["means"])
     pixel_sums = rasterizer.workspace.array("pixel_sums", (PIXEL_SUMS, -(-count // 64) * 64)).get()[:, :count]

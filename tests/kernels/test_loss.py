@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 
-from clsplat.losses.image import L1, L2, LOSSES, Comparison, Dssim, ssim_maps
+from clsplat.losses.base import Comparison, ImageLoss
+from clsplat.losses.image import L1, L2, Dssim, ssim_maps
 from clsplat.render.rasterizer import DeviceCamera
 from clsplat.render.workspace import Workspace
+from clsplat.settings import variants
 from clsplat.views.photographs import unpack
 from tests import reference_loss as ref_loss
 
@@ -50,9 +52,9 @@ def gradient_of(comparison: Comparison) -> np.ndarray:
 def test_value_and_gradient(device, rng, width, height, loss, oracle):
     x, y = images(rng, width, height)
     comparison = comparison_of(device, x, y)
-    term = loss(weight=0.7).add(comparison)
+    found = loss(weight=0.7).add(comparison)
     value, gradient = oracle(x.astype(np.float64), y.astype(np.float64))
-    assert term.value() == pytest.approx(0.7 * value, rel=1e-5, abs=1e-7)
+    assert found.value() == pytest.approx(0.7 * value, rel=1e-5, abs=1e-7)
     error = np.abs(gradient_of(comparison) - 0.7 * gradient)
     assert error.max() < 2e-4 * np.abs(0.7 * gradient).max()
 
@@ -70,7 +72,7 @@ def test_losses_add_up(device, rng):
 
 def test_equal_images_have_no_loss(device, rng):
     x, _ = images(rng, 40, 30)
-    for loss in LOSSES.values():
+    for loss in variants(ImageLoss).values():
         comparison = comparison_of(device, x, x)
         assert loss().add(comparison).value() == pytest.approx(0, abs=1e-6)
         assert np.abs(gradient_of(comparison)).max() < 1e-7
@@ -86,15 +88,17 @@ def test_flat_images(device):
 
 
 @pytest.mark.parametrize(("width", "height"), SIZES)
-def test_unpacked_photographs(device, rng, width, height):
-    pixels = rng.integers(0, 256, (3, height, width)).astype(np.uint8)
+def test_pixels_are_unpacked_times_a_factor(device, rng, width, height):
+    pixels = rng.integers(0, 256, (4, height, width)).astype(np.uint8)
     camera = camera_of(device, width, height)
     workspace = Workspace(device)
-    workspace.array("target", (3, camera.rows, camera.stride)).fill(9)
-    planes = unpack(workspace, camera, device.upload(pixels)).get()
-    np.testing.assert_allclose(planes[:, :height, :width], pixels / 255, rtol=1e-6)
-    assert (planes[:, height:] == 0).all()
-    assert (planes[:, :, width:] == 0).all()
+    workspace.array("photograph", (4, camera.rows, camera.stride)).fill(9)
+    for channels, factor in ((3, 1 / 255), (1, 1.0), (4, 0.5)):
+        planes = unpack(workspace, camera, device.upload(pixels[:channels]), factor, "photograph").get()
+        assert planes.shape == (channels, camera.rows, camera.stride)
+        np.testing.assert_allclose(planes[:, :height, :width], pixels[:channels] * factor, rtol=1e-6)
+        assert (planes[:, height:] == 0).all()
+        assert (planes[:, :, width:] == 0).all()
 
 
 def test_ssim_against_scikit_image(device, rng):

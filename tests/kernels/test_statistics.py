@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from clsplat.density.basic import Clone, PruneFaint, Split
-from clsplat.density.edit import SceneScale, densify
+from clsplat.density.edit import Edit, SceneScale, densify
 from clsplat.density.statistics import ABS_X, SEEN, WEIGHT, SplatStats
+from clsplat.losses.base import ViewGradients
 from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import PIXEL_SUMS, Rasterizer
-from clsplat.training.step import ViewGradients
 from tests import reference_blend as ref_blend
 from tests import reference_loss as ref_loss
 from tests.scenes import Case, random_case, relative_error, with_world_filter
@@ -128,7 +128,7 @@ def made(device: Device, screen_grad: list[float], absolute: list[float], size: 
     for name, means in (("screen_grad", screen_grad), ("screen_grad_abs", absolute), ("screen_grad_abs_sum", absolute)):
         if name in stats.names:
             gaussians.set(f"stats/{name}", 2 * np.array(means)[:, None])
-    densify(gaussians, stats, rules, Rasterizer(device, "radix").tiler, SceneScale(1.0), 600, seed=0)
+    densify(Edit(gaussians, stats, SceneScale(1.0), step=600, seed=0), rules, Rasterizer(device, "radix").tiler)
     return np.bincount(gaussians.get("sh_base")[:, 0].astype(int), minlength=count).tolist()
 
 
@@ -174,7 +174,7 @@ def test_as_many_as_never_takes_those_without_any(device):
 
 
 def test_texture_under_splats(device, rng):
-    """Σ w texture / Σ w against the oracle's blend weights; the other pixel_sums stay as they are."""
+    """Σ w texture / Σ w against the oracle's blend weights; the other sums stay as they are."""
     case = random_case(rng, 40, 48, 32)
     rasterizer, model, camera = Rasterizer(device, "radix"), case.model(device), case.device_camera(device)
     texture = np.zeros((camera.rows, camera.stride), np.float32)

@@ -6,7 +6,7 @@ from scipy import ndimage
 
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.render.workspace import Workspace
-from clsplat.views.photographs import Photograph, unpack
+from clsplat.views.photographs import Photograph
 from clsplat.views.texture import known_gradient, texture_quantile
 from tests.kernels.test_loss import camera_of
 from tests.scenes import random_case
@@ -53,14 +53,16 @@ def test_what_is_masked_has_no_texture(device, rng, width, height):
     found = []
     for filling in (rng.integers(0, 256, (3, height, width)) for _ in range(2)):
         pixels = np.where(mask, np.arange(3 * width * height).reshape(3, height, width) * 37 % 256, filling)
-        target = Photograph(camera, device.upload(np.concatenate([pixels, mask[None]]).astype(np.uint8)))
-        photograph = unpack(workspace, camera, target.pixels)
-        texture = known_gradient(workspace, camera, photograph, photograph).get()
+        photograph = Photograph(
+            camera, device.upload(pixels.astype(np.uint8)), device.upload(mask[None].astype(np.uint8))
+        )
+        planes = photograph.planes(workspace)
+        texture = known_gradient(workspace, camera, planes.colours, planes.mask).get()
         expected = np.where(known, magnitude_of(pixels / 255), -1)
         np.testing.assert_allclose(texture[:height, :width], expected, atol=1e-6)
         texture[:height, :width] = 0
         assert (texture == 0).all()
-        found.append(texture_quantile(workspace, [target], 0.5))
+        found.append(texture_quantile(workspace, [photograph], 0.5))
     assert found[0] == found[1]
     if known.any():
         assert found[0] == pytest.approx(

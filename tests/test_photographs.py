@@ -1,6 +1,7 @@
 """What lies on the device is counted, and photographs keep to their budget."""
 
 import gc
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -26,21 +27,19 @@ def test_buffers_are_counted_while_they_live(device):
 def test_photographs_keep_to_the_budget(device, tiny_scene, kept):
     views = read_scene(tiny_scene).split("train")
     size = 3 * views[0].camera.width * views[0].camera.height
-    targets, plenty = Photographs(device, "white", budget=kept * size), Photographs(device, "white")
+    tight, plenty = Photographs(device, "white", budget=kept * size), Photographs(device, "white")
     for turn in range(3):
-        targets.announce(views[turn : turn + 2])
+        tight.announce(views[turn : turn + 2])
         for view in views:
-            np.testing.assert_array_equal(targets.get(view).pixels.get(), plenty.get(view).pixels.get())
-            assert sum(target.pixels.nbytes for target in targets._targets.values()) <= max(kept, 1) * size
+            np.testing.assert_array_equal(tight.get(view).image(), plenty.get(view).image())
+            assert sum(held.nbytes for held in tight._held.values()) <= max(kept, 1) * size
 
 
 def test_a_damaged_photograph_read_ahead_is_reported_when_it_is_asked_for(device, tiny_scene, tmp_path):
-    from dataclasses import replace
-
     damaged = tmp_path / "damaged.png"
     damaged.write_bytes(b"not an image")
     view = replace(read_scene(tiny_scene).split("train")[0], image_path=damaged)
-    targets = Photographs(device, "white")
-    targets.announce([view])
+    photographs = Photographs(device, "white")
+    photographs.announce([view])
     with pytest.raises(DataError, match=r"damaged\.png"):
-        targets.get(view)
+        photographs.get(view)

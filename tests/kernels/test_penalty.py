@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from clsplat.gaussians.tables import INTERVAL2, Gradients
-from clsplat.losses.penalties import Anisotropy, CovarianceTrace, PenaltyInputs
+from clsplat.losses.base import LossValue, PenaltyInputs
+from clsplat.losses.penalties import Anisotropy, CovarianceTrace
 from clsplat.render.workspace import Workspace
 from tests import reference_shape as ref
 from tests.scenes import random_case
@@ -13,7 +14,7 @@ COUNTS = (1, 7, 8, 15, 16, 17, 64, 65, 200)
 EXTENT = 2.5
 
 
-def shapes_of(device, rng, count: int) -> tuple[PenaltyInputs, np.ndarray]:
+def inputs_of(device, rng, count: int) -> tuple[PenaltyInputs, np.ndarray]:
     """Gaussians of many sizes and forms, with gradients that are not zero to begin with."""
     case = random_case(rng, count)
     case.parameters["log_scales"][:] = rng.normal(-2, 1.5, (count, 3))
@@ -22,13 +23,13 @@ def shapes_of(device, rng, count: int) -> tuple[PenaltyInputs, np.ndarray]:
     planes = np.zeros((3, gaussians.capacity), np.float32)
     planes[:, :count] = 0.25
     gradients["log_scales"].set(planes)
-    shapes = PenaltyInputs(Workspace(device), gaussians, gradients, EXTENT, step=1)
-    return shapes, case.parameters["log_scales"].astype(np.float64)
+    inputs = PenaltyInputs(Workspace(device), gaussians, gradients, EXTENT, step=1)
+    return inputs, case.parameters["log_scales"].astype(np.float64)
 
 
-def check(shapes: PenaltyInputs, term, value: float, gradient: np.ndarray) -> None:
-    assert term.value() == pytest.approx(value, rel=1e-5, abs=1e-12)
-    planes, count = shapes.gradients["log_scales"].get(), shapes.gaussians.count
+def check(inputs: PenaltyInputs, found: LossValue, value: float, gradient: np.ndarray) -> None:
+    assert found.value() == pytest.approx(value, rel=1e-5, abs=1e-12)
+    planes, count = inputs.gradients["log_scales"].get(), inputs.gaussians.count
     added = planes[:, :count].T.astype(np.float64) - 0.25
     np.testing.assert_allclose(added, gradient, rtol=1e-4, atol=1e-6 * max(1, np.abs(gradient).max()))
     assert (planes[:, count:] == 0).all()
@@ -36,41 +37,41 @@ def check(shapes: PenaltyInputs, term, value: float, gradient: np.ndarray) -> No
 
 @pytest.mark.parametrize("count", COUNTS)
 def test_covariance_trace(device, rng, count):
-    shapes, log_scales = shapes_of(device, rng, count)
-    term = CovarianceTrace(weight=3.0, above=0.02).add(shapes)
+    inputs, log_scales = inputs_of(device, rng, count)
+    found = CovarianceTrace(weight=3.0, above=0.02).add(inputs)
     value, gradient = ref.covariance_trace(log_scales, 0.02 * EXTENT**2, EXTENT)
     assert count < 16 or 0 < np.count_nonzero(gradient) < gradient.size
-    check(shapes, term, 3 * value, 3 * gradient)
+    check(inputs, found, 3 * value, 3 * gradient)
 
 
 @pytest.mark.parametrize("count", COUNTS)
 def test_covariance_trace_in_pixels(device, rng, count):
     """τ = 3 (pixels · interval)², each Gaussian's own."""
-    shapes, log_scales = shapes_of(device, rng, count)
+    inputs, log_scales = inputs_of(device, rng, count)
     interval = rng.uniform(0.01, 0.05, count).astype(np.float32)
-    shapes.gaussians.add(INTERVAL2, 1)
-    shapes.gaussians.set(INTERVAL2, interval[:, None] ** 2)
-    term = CovarianceTrace(weight=2.0, above=9.0, pixels=4.0).add(shapes)
+    inputs.gaussians.add(INTERVAL2, 1)
+    inputs.gaussians.set(INTERVAL2, interval[:, None] ** 2)
+    found = CovarianceTrace(weight=2.0, above=9.0, pixels=4.0).add(inputs)
     each = [ref.covariance_trace(log_scales[n : n + 1], 3 * (4.0 * interval[n]) ** 2, EXTENT) for n in range(count)]
     value, gradient = (sum(v for v, _ in each) / count, np.concatenate([g for _, g in each]) / count)
     assert count < 16 or 0 < np.count_nonzero(gradient) < gradient.size
-    check(shapes, term, 2 * value, 2 * gradient)
+    check(inputs, found, 2 * value, 2 * gradient)
 
 
 def test_two_bounds_keep_their_own_values(device, rng):
-    shapes, log_scales = shapes_of(device, rng, 50)
-    terms = [CovarianceTrace(above=above).add(shapes) for above in (0.02, 1e6)]
+    inputs, log_scales = inputs_of(device, rng, 50)
+    losses = [CovarianceTrace(above=above).add(inputs) for above in (0.02, 1e6)]
     value, _ = ref.covariance_trace(log_scales, 0.02 * EXTENT**2, EXTENT)
-    assert [term.value() for term in terms] == [pytest.approx(value, rel=1e-5), 0]
+    assert [loss.value() for loss in losses] == [pytest.approx(value, rel=1e-5), 0]
 
 
 @pytest.mark.parametrize("count", COUNTS)
 def test_anisotropy(device, rng, count):
-    shapes, log_scales = shapes_of(device, rng, count)
-    term = Anisotropy(weight=0.1, above=8.0).add(shapes)
+    inputs, log_scales = inputs_of(device, rng, count)
+    found = Anisotropy(weight=0.1, above=8.0).add(inputs)
     value, gradient = ref.anisotropy(log_scales, 8.0)
     assert count < 16 or 0 < np.count_nonzero(gradient) < gradient.size
-    check(shapes, term, 0.1 * value, 0.1 * gradient)
+    check(inputs, found, 0.1 * value, 0.1 * gradient)
 
 
 @pytest.mark.parametrize("penalty", [lambda x: ref.covariance_trace(x, 0.1, EXTENT), lambda x: ref.anisotropy(x, 5.0)])
@@ -85,9 +86,9 @@ def test_oracle_against_finite_differences(rng, penalty):
 
 
 def test_not_a_number_stays_where_it_is(device, rng):
-    shapes, log_scales = shapes_of(device, rng, 40)
+    inputs, log_scales = inputs_of(device, rng, 40)
     log_scales[5] = np.nan
-    shapes.gaussians.set("log_scales", log_scales)
-    CovarianceTrace(above=0.02).add(shapes)
-    planes = shapes.gradients["log_scales"].get()[:, :40]
+    inputs.gaussians.set("log_scales", log_scales)
+    CovarianceTrace(above=0.02).add(inputs)
+    planes = inputs.gradients["log_scales"].get()[:, :40]
     assert np.isfinite(np.delete(planes, 5, axis=1)).all()

@@ -1,0 +1,73 @@
+"""blur.cl against the oracle."""
+
+import numpy as np
+import pytest
+
+from clsplat.render.workspace import Workspace
+from clsplat.views.transforms import Blur, Planes
+from tests.kernels.test_loss import camera_of
+from tests.reference_blur import blurred
+
+SIZES = ((1, 1), (2, 3), (15, 4), (16, 16), (17, 5), (33, 18), (63, 3), (64, 2), (65, 7))  # tiles and groups
+
+
+def planes_of(device, image: np.ndarray, mask: np.ndarray | None = None) -> Planes:
+    """image: [3, H, W]; mask: [H, W]."""
+    camera = camera_of(device, image.shape[2], image.shape[1])
+
+    def padded(values: np.ndarray) -> np.ndarray:
+        planes = np.zeros((len(values), camera.rows, camera.stride), np.float32)
+        planes[:, : camera.height, : camera.width] = values
+        return planes
+
+    workspace = Workspace(device)
+    workspace.array("blur", (4, camera.rows, camera.stride)).fill(7)
+    uploaded = None if mask is None else device.upload(padded(mask[None]))
+    return Planes(workspace, camera, device.upload(padded(image)), uploaded)
+
+
+def colours_of(planes: Planes) -> np.ndarray:
+    """The colours inside the image, [3, H, W]; outside it they must be zero."""
+    colours, camera = planes.colours.get(), planes.camera
+    assert (colours[:, camera.height :] == 0).all()
+    assert (colours[:, :, camera.width :] == 0).all()
+    return colours[:, : camera.height, : camera.width]
+
+
+@pytest.mark.parametrize("share", [None, 0.7, 0.05], ids=["no mask", "most count", "few count"])
+@pytest.mark.parametrize("sigma", [0.3, 1.0, 2.5, 200.0])
+@pytest.mark.parametrize(("width", "height"), SIZES)
+def test_the_blur_is_the_oracles(device, rng, width, height, sigma, share):
+    image = rng.uniform(0, 1, (3, height, width)).astype(np.float32)
+    mask = None if share is None else rng.random((height, width)) < share
+    found = colours_of(Blur(sigma=sigma).apply(planes_of(device, image, mask), step=1))
+    np.testing.assert_allclose(found, blurred(image.astype(np.float64), sigma, mask), rtol=2e-5, atol=1e-6)
+
+
+def test_a_pixel_keeps_its_value_where_nothing_near_it_counts(device, rng):
+    image = rng.uniform(0, 1, (3, 20, 40)).astype(np.float32)
+    mask = np.zeros((20, 40), bool)
+    mask[10, 5] = True
+    found = colours_of(Blur(sigma=1.0).apply(planes_of(device, image, mask), step=1))
+    near = np.zeros((20, 40), bool)
+    near[7:14, 2:9] = True
+    np.testing.assert_array_equal(found[:, ~near], image[:, ~near])
+    np.testing.assert_allclose(found[:, near], np.broadcast_to(image[:, 10, 5, None], (3, 49)), rtol=1e-6)
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_neither_the_edge_nor_a_mask_darkens_a_flat_image(device, rng, masked):
+    image = np.full((3, 18, 33), 0.75, np.float32)
+    mask = rng.random((18, 33)) < 0.5 if masked else None
+    if mask is not None:
+        image[:, ~mask] = 0
+    found = colours_of(Blur(sigma=4.0).apply(planes_of(device, image, mask), step=1))
+    np.testing.assert_allclose(found, 0.75, rtol=1e-6)
+
+
+def test_without_a_sigma_the_photograph_stays(device, rng):
+    image = rng.uniform(0, 1, (3, 5, 9)).astype(np.float32)
+    blur = Blur(sigma={"points": [[0, 0.0], [10, 2.0]], "between": "steps"})
+    np.testing.assert_array_equal(colours_of(blur.apply(planes_of(device, image), step=9)), image)
+    expected = blurred(image.astype(np.float64), 2.0)
+    np.testing.assert_allclose(colours_of(blur.apply(planes_of(device, image), step=10)), expected, rtol=2e-5)

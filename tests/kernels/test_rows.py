@@ -1,0 +1,179 @@
+"""gather.cl and density.cl: rows that the host sets or zeroes, and Gaussians that it chooses."""
+
+import numpy as np
+import pytest
+
+from clsplat.density.edit import Edit, Rule, SceneScale, densify
+from clsplat.density.statistics import SplatStats
+from clsplat.gaussians.tables import PARAMETERS, Gaussians, moment_tables
+from clsplat.render.rasterizer import Rasterizer
+from clsplat.training.adam import Adam
+from tests.scenes import random_case
+
+COUNT = 150
+ROWS = (0, 1, 15, 16, 17, 63, 64, 65, COUNT)
+
+
+def gaussians_of(device, rng, count: int = COUNT) -> Gaussians:
+    """Gaussians with moments and statistics that are not zero."""
+    gaussians = random_case(rng, count).model(device).gaussians
+    Adam(gaussians)
+    SplatStats(gaussians)
+    for name, table in gaussians.tables.items():
+        if "/" in name:
+            gaussians.set(name, rng.uniform(1, 2, (count, table.components)))
+    return gaussians
+
+
+def edit_of(gaussians: Gaussians, step: int = 600, seed: int = 3) -> Edit:
+    return Edit(gaussians, SplatStats(gaussians), SceneScale(1.0), step, seed)
+
+
+@pytest.mark.parametrize("count", ROWS)
+@pytest.mark.parametrize("name", ["means", "logit_opacity", "sh_rest"])
+def test_rows_are_set_and_the_others_stay(device, rng, count, name):
+    gaussians = gaussians_of(device, rng)
+    rows = rng.permutation(COUNT)[:count]
+    values = rng.normal(size=(count, gaussians.tables[name].components))
+    before = {table: gaussians[table].get() for table in gaussians.tables}
+    edit_of(gaussians).set_rows(name, rows, values)
+    before[name][:, rows] = values.T.astype(np.float32)
+    for table, planes in before.items():
+        np.testing.assert_array_equal(gaussians[table].get(), planes, err_msg=table)
+
+
+def test_rows_of_another_shape_are_refused(device, rng):
+    gaussians = gaussians_of(device, rng)
+    with pytest.raises(ValueError, match=r"means: expected \(2, 3\), got \(2, 4\)"):
+        gaussians.set_rows("means", np.arange(2), np.zeros((2, 4)))
+
+
+@pytest.mark.parametrize("count", ROWS)
+def test_moments_of_rows_become_zero_and_the_others_stay(device, rng, count):
+    gaussians = gaussians_of(device, rng)
+    rows = rng.permutation(COUNT)[:count]
+    before = {table: gaussians[table].get() for table in gaussians.tables}
+    edit_of(gaussians).zero_moments(rows, ("quats", "sh_rest"))
+    for table in (*moment_tables("quats"), *moment_tables("sh_rest")):
+        assert before[table][:, :COUNT].all()
+        before[table][:, rows] = 0
+    for table, planes in before.items():
+        np.testing.assert_array_equal(gaussians[table].get(), planes, err_msg=table)
+
+
+def test_moments_of_gaussians_without_an_optimiser_need_no_zeroing(device, rng):
+    gaussians = random_case(rng, 5).model(device).gaussians
+    edit_of(gaussians).zero_moments(np.arange(5))
+    assert not [name for name in gaussians.tables if name.startswith("adam/")]
+
+
+@pytest.mark.parametrize("count", [1, 15, 16, 17, 63, 64, 65, 150])
+@pytest.mark.parametrize("kept", [0, 1, 3])
+def test_each_chosen_gaussian_has_its_own_number_of_rows(device, rng, count, kept):
+    """`kept` of them are the old one, if there are as many; the first growth decides, and removal overrides."""
+    edit = edit_of(gaussians_of(device, rng, count))
+    expected = {"copies": np.ones(count), "kept": np.ones(count), "shrink": np.ones(count)}
+    for shrink in (0.5, 0.25):
+        chosen, copies = rng.random(count) < 0.7, rng.integers(0, 5, count)
+        edit.choose(chosen, copies, kept, shrink)
+        acts = chosen & ((copies == 0) | (expected["copies"] == 1))
+        expected["copies"][acts] = copies[acts]
+        expected["kept"][acts] = np.minimum(copies[acts], kept)
+        expected["shrink"][acts & (copies > 0)] = shrink
+    assert count < 60 or set(expected["copies"]) == {0, 1, 2, 3, 4}
+    for name, values in expected.items():
+        np.testing.assert_array_equal(getattr(edit, name).get(), values, err_msg=name)
+
+
+class Multiply(Rule):
+    """Give Gaussians the numbers of rows that a test has decided on."""
+
+    copies: list[int]
+    kept: int
+
+    def mark(self, edit: Edit) -> None:
+        edit.choose(np.ones(len(self.copies), bool), np.array(self.copies), self.kept)
+
+
+@pytest.mark.parametrize("kept", [1, 2])
+def test_kept_rows_keep_their_moments_and_fresh_ones_start_at_zero(device, rng, kept):
+    gaussians = gaussians_of(device, rng, 65)
+    copies = rng.integers(0, 5, 65)
+    before = {name: gaussians.get(name) for name in gaussians.tables}
+    rule = Multiply(copies=copies.tolist(), kept=kept)
+    change = densify(edit_of(gaussians), [rule], Rasterizer(device, "radix").tiler)
+    assert (change.before, change.after) == (65, copies.sum())
+    source = np.repeat(np.arange(65), copies)
+    fresh = np.concatenate([np.arange(number) for number in copies]) >= kept
+    assert 0 < fresh.sum() < len(fresh)
+    for name in PARAMETERS:
+        np.testing.assert_array_equal(gaussians.get(name), before[name][source], err_msg=name)
+        for moment in moment_tables(name):
+            np.testing.assert_array_equal(gaussians.get(moment), np.where(fresh[:, None], 0, before[moment][source]))
+
+
+class Relocate(Rule):
+    """Put faint Gaussians where strong ones are: the number of Gaussians stays (a form of MCMC's relocation)."""
+
+    def mark(self, edit: Edit) -> None:
+        logits = edit.gaussians.get("logit_opacity")[:, 0]
+        dead = np.flatnonzero(logits < np.quantile(logits, 0.3))
+        weights = np.where(logits < np.quantile(logits, 0.3), 0, 1 / (1 + np.exp(-logits.astype(np.float64))))
+        taken = edit.random().choice(len(logits), len(dead), p=weights / weights.sum())
+        copies = 1 + np.bincount(taken, minlength=len(logits))
+        copies[dead] = 0
+        sources = np.flatnonzero(copies > 1)
+        faded = logits[sources, None] - np.log(copies[sources, None])
+        edit.set_rows("logit_opacity", sources, faded)
+        edit.zero_moments(sources)
+        edit.choose(copies != 1, copies, kept=1)
+
+
+def test_a_relocation_keeps_the_number_of_gaussians(device, rng):
+    """Copies have their source's place and its new opacity; sources forget their moments, bystanders do not."""
+    gaussians = gaussians_of(device, rng)
+    before = {name: gaussians.get(name) for name in gaussians.tables}
+    change = densify(edit_of(gaussians), [Relocate()], Rasterizer(device, "radix").tiler)
+    assert change.before == change.after == gaussians.count == COUNT
+    after = {name: gaussians.get(name) for name in gaussians.tables}
+    source = np.array([int(np.flatnonzero((before["sh_rest"] == row).all(axis=1))[0]) for row in after["sh_rest"]])
+    copies = np.bincount(source, minlength=COUNT)
+    assert (copies == 0).sum() == int(0.3 * COUNT)
+    assert change.causes["rule"] == (copies != 1).sum()
+    assert copies.max() > 2
+    faded = before["logit_opacity"][:, 0] - np.log(np.maximum(copies, 1))
+    np.testing.assert_allclose(after["logit_opacity"][:, 0], faded[source], rtol=1e-6)
+    for moment in moment_tables("means"):
+        alone = (copies[source] == 1)[:, None]
+        np.testing.assert_array_equal(after[moment], np.where(alone, before[moment][source], 0))
+
+
+def test_random_numbers_of_an_edit_depend_on_seed_step_and_rule_alone(device, rng):
+    gaussians = gaussians_of(device, rng)
+
+    def drawn(step: int, seed: int, rule: int) -> list[float]:
+        edit = edit_of(gaussians, step, seed)
+        edit.rule = rule
+        return edit.random().random(4).tolist()
+
+    same = drawn(600, 3, 1)
+    gaussians.set("means", gaussians.get("means") + 1)
+    assert drawn(600, 3, 1) == same
+    others = [drawn(601, 3, 1), drawn(600, 4, 1), drawn(600, 3, 2)]
+    assert len({tuple(numbers) for numbers in (same, *others)}) == 4
+
+
+def test_a_rule_draws_the_same_whichever_rules_acted_before(device, rng):
+    """Its place in the list counts, not what came of the others."""
+    seen = []
+
+    class Watch(Rule):
+        def mark(self, edit: Edit) -> None:
+            seen.append((edit.rule, edit.random().random()))
+
+    tiler = Rasterizer(device, "radix").tiler
+    for start in (0, 1000):
+        gaussians = gaussians_of(device, rng)
+        densify(edit_of(gaussians), [Multiply(copies=[2] * COUNT, kept=1, start=start), Watch()], tiler)
+    assert seen[0] == seen[1]
+    assert seen[0][0] == 1
