@@ -14,6 +14,7 @@ from pydantic import BaseModel
 
 from clsplat.errors import ConfigError, OverrideError
 from clsplat.fields import annotation_of, inside_list, model_of
+from clsplat.settings import TAGS
 from clsplat.yaml_file import Place, parse_value
 
 MAX_SUGGESTIONS = 3
@@ -79,7 +80,7 @@ class _Node:
             if not self.place and name not in self._fields:
                 raise NoSuchKey(text, f"no '{name}' in this pipeline")
             default = self._fields[name].get_default(call_default_factory=True) if name in self._fields else None
-            self.data[name] = default.model_dump(mode="json") if isinstance(default, BaseModel) else {}
+            self.data[name] = _as_written(default) if isinstance(default, BaseModel) else {}
         return self._key(name)
 
     def number(self, name: str, text: str) -> int:
@@ -118,6 +119,12 @@ class _Node:
             numbers = " or ".join(_address(node.place) for node in found)
             raise OverrideError(text, f"there are {len(found)} stages named '{name}'; write {numbers} for it")
         return found[0] if found else None
+
+
+def _as_written(default: BaseModel) -> dict[str, Any]:
+    """A default as a file would have it: its tag, and what is not a default of its own."""
+    written = default.model_dump(mode="json", exclude_defaults=True)
+    return {**{name: getattr(default, name) for name in TAGS if hasattr(default, name)}, **written}
 
 
 def _address(place: Place) -> str:

@@ -31,6 +31,8 @@ def test_listed_keys_are_those_that_change_something():
 def test_a_default_that_the_file_leaves_out_can_be_changed_in_part():
     model = load("smoke", ["model.screen_filter.variance=0.5", "scene.downscale=2"]).settings.model
     assert (model.screen_filter.type, model.screen_filter.variance) == ("dilation", 0.5)
+    model = load("smoke", ["model.screen_filter.type=mip"]).settings.model
+    assert (model.screen_filter.variance, model.screen_filter.compensate) == (0.1, 1), "the defaults of mip"
 
 
 REFUSED = {
