@@ -1,10 +1,77 @@
-"""3D Gaussian Splatting on any OpenCL device."""
+"""3D Gaussian Splatting on any OpenCL device.
 
+    import clsplat
+    scene = clsplat.read_scene("data/fox")
+    trainer = clsplat.Trainer(scene, "splat_7k", set={"optimize.steps": 2000})
+    trainer.run()
+    picture = clsplat.Renderer(trainer.model).render(scene.split("test")[0])
+
+Names are imported when they are first used, and no device is opened before that.
+"""
+
+import importlib
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from clsplat import errors as errors
+    from clsplat import metrics as metrics
+    from clsplat.api.commands import check as check
+    from clsplat.api.commands import compare_runs as compare_runs
+    from clsplat.api.commands import devices as devices
+    from clsplat.api.commands import evaluate as evaluate
+    from clsplat.api.commands import inspect_scene as inspect_scene
+    from clsplat.api.commands import load_plugin as load_plugin
+    from clsplat.api.commands import pipelines as pipelines
+    from clsplat.api.commands import render_views as render_views
+    from clsplat.api.commands import resume as resume
+    from clsplat.api.commands import run as run
+    from clsplat.api.device import Device as Device
+    from clsplat.api.renderer import Gradients as Gradients
+    from clsplat.api.renderer import Picture as Picture
+    from clsplat.api.renderer import Renderer as Renderer
+    from clsplat.api.trainer import Report as Report
+    from clsplat.api.trainer import Trainer as Trainer
+    from clsplat.gaussians.model import Model as Model
+    from clsplat.gaussians.model import Rendering as Rendering
+    from clsplat.gaussians.model import load as load
+    from clsplat.scene.camera import Camera as Camera
+    from clsplat.scene.detect import read_scene as read_scene
+    from clsplat.scene.scene import PointCloud as PointCloud
+    from clsplat.scene.scene import Scene as Scene
+    from clsplat.scene.view import View as View
 
 __version__ = "0.1.0"
-
 _HERE = Path(__file__).resolve().parent
+_ROOMS = {  # where the names come from, which `import clsplat` does not import
+    "clsplat.api.commands": "check compare_runs devices evaluate inspect_scene load_plugin pipelines render_views"
+    " resume run",
+    "clsplat.api.device": "Device",
+    "clsplat.api.renderer": "Gradients Picture Renderer",
+    "clsplat.api.trainer": "Report Trainer",
+    "clsplat.gaussians.model": "Model Rendering load",
+    "clsplat.scene.camera": "Camera",
+    "clsplat.scene.detect": "read_scene",
+    "clsplat.scene.scene": "PointCloud Scene",
+    "clsplat.scene.view": "View",
+}
+_PLACES = {name: room for room, names in _ROOMS.items() for name in names.split()}
+_MODULES = ("errors", "metrics")
+__all__ = sorted([*_PLACES, *_MODULES])
+
+
+def __getattr__(name: str) -> Any:
+    if name in _MODULES:
+        return importlib.import_module(f"clsplat.{name}")
+    if name not in _PLACES:
+        raise AttributeError(f"module 'clsplat' has no attribute '{name}'")
+    value = getattr(importlib.import_module(_PLACES[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return [*__all__, "__version__"]
 
 
 def resource_dir(name: str) -> Path:

@@ -6,7 +6,8 @@ from typing import Any
 from families import Kind, families, family, tag, unnamed
 from yaml_examples import example
 
-from clsplat.density.statistics import STATISTICS
+from clsplat.density.statistics import Statistic
+from clsplat.settings import variants
 
 Node = dict[str, Any]
 HEADINGS = {"stages": "Stages", "losses": "Losses and penalties", "rules": "Density rules", "prepare": "Prepare steps"}
@@ -51,8 +52,8 @@ def statistics_page() -> str:
     """Return what density rules can ask for."""
     text = "# Statistics\n\nA growing rule acts where the mean of a statistic is large. Only those that a rule names "
     text += "are summed and cost time.\n\n"
-    for name, statistic in STATISTICS.items():
-        text += f"## `{name}` {{: #{name} }}\n\n{manual(type(statistic))}"
+    for name, statistic in variants(Statistic).items():
+        text += f"## `{name}` {{: #{name} }}\n\n{manual(statistic)}"
     return text
 
 
@@ -76,7 +77,7 @@ def expected(node: Node) -> str:
     if "const" in node:
         return f"`{node['const']}`"
     if "enum" in node:
-        if set(node["enum"]) <= STATISTICS.keys():
+        if set(node["enum"]) <= variants(Statistic).keys():
             return "[statistic](statistics.md)"
         return "one of " + ", ".join(f"`{value}`" for value in node["enum"])
     for union in ("anyOf", "oneOf", "allOf"):

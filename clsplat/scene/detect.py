@@ -40,11 +40,12 @@ def holds_scene(path: Path) -> bool:
     return reader_of(path) is not None
 
 
-def read_scene(path: Path, holdout: int = HOLDOUT) -> Scene:
+def read_scene(path: str | Path, holdout: int = HOLDOUT) -> Scene:
     """Read the dataset in a folder; every `holdout`-th view is for testing where the dataset does not say which.
 
     Raises DataError when no reader knows it, or when it is damaged.
     """
+    path = Path(path)
     if not path.is_dir():
         raise DataError(f"{path}: no such folder; expected the folder of a dataset")
     if reader := reader_of(path):
