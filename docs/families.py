@@ -82,7 +82,10 @@ def family(base: Kind) -> Family:
 def groups(base: Kind) -> list[Kind]:
     """Return a base and the classes without a name between it and what a pipeline file can name."""
     named = families()[base]
-    return [base, *(one for one in dict.fromkeys(below(base)) if not tag(one) and any(issubclass(k, one) for k in named))]
+    return [
+        base,
+        *(one for one in dict.fromkeys(below(base)) if not tag(one) and any(issubclass(k, one) for k in named)),
+    ]
 
 
 @functools.cache
@@ -99,7 +102,9 @@ def unnamed() -> dict[Kind, str]:
             continue
         if kind not in intermediate and not tag(kind):
             found[kind] = key
-        inner = [(one, f"{key}.{name}".strip(".")) for name, field in kind.model_fields.items() for one in models(field)]
+        inner = [
+            (one, f"{key}.{name}".strip(".")) for name, field in kind.model_fields.items() for one in models(field)
+        ]
         waiting += [(one, name) for one, name in inner if one not in met]
         met |= {one for one, _ in inner}
     return found

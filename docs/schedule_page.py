@@ -9,8 +9,8 @@ from clsplat.schedule import Decay, Points
 EXAMPLES = {  # notation: what it means, and how a file writes it
     "A constant": ("The same at every step.", "weight: 0.8"),
     "Points": (
-        "Values at global steps, with straight lines between them. Before the first point and after the last one the value "
-        "stays as it is there.",
+        "Values at global steps, with straight lines between them. Before the first point and after the last one the "
+        "value stays as it is there.",
         "weight: [[4000, 0.0], [5000, 4.0]]      # 0 until step 4000, 4 from step 5000 on",
     ),
 }
@@ -24,7 +24,9 @@ TITLES = {Points: "Points with keys", Decay: "Exponential decay"}
 def schedule_page(key_table: Callable[[Kind], str]) -> str:
     """Return the page; `key_table` makes the table of a class."""
     text = "# Numbers by step\n\nWhere a key takes a *number by step*, the number may change over training. "
-    text += "There is one notation for all of them. Steps are global: they are counted over the whole pipeline, from 1.\n\n"
+    text += (
+        "There is one notation for all of them. Steps are global: they are counted over the whole pipeline, from 1.\n\n"
+    )
     for title, (meaning, sample) in EXAMPLES.items():
         text += f"## {title}\n\n{meaning}\n\n```yaml\n{sample}\n```\n\n"
     for kind in NOTATIONS:
@@ -36,7 +38,9 @@ def schedule_page(key_table: Callable[[Kind], str]) -> str:
 
 def users() -> str:
     """Return a list of all keys that take a number by step."""
-    named = [(f"[`{tag(kind)}`]({family(base).page}.md#{tag(kind)})", kind) for base, ks in families().items() for kind in ks]
+    named = [
+        (f"[`{tag(kind)}`]({family(base).page}.md#{tag(kind)})", kind) for base, ks in families().items() for kind in ks
+    ]
     others = [(f"[`{key}`](settings.md#{kind.__name__.lower()})", kind) for kind, key in unnamed().items()]
     rows = ""
     for place, kind in [*others, *named]:

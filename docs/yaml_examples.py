@@ -32,7 +32,7 @@ def example(base: Kind, kind: Kind) -> tuple[str, str]:
 
 @functools.cache
 def shipped_items() -> list[tuple[str, Node]]:
-    """Return all mappings of all shipped files, those of plain 3DGS first, each with the name of its file, and of pages."""
+    """Return all mappings of shipped files, plain 3DGS first, each with the name of its file, and of the page."""
     files = sorted((ROOT / "pipelines").glob("*.yaml"), key=lambda file: (not file.name.startswith("splat"), file.name))
     texts = [(file.name, file.read_text()) for file in files]
     page = (ROOT / "docs" / "pipelines.md").read_text()
