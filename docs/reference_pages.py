@@ -82,9 +82,9 @@ def settings_page() -> str:
 
 def readers_page() -> str:
     """Return the dataset formats, in the order in which they are looked for."""
-    text = "# Dataset readers\n\nThe first reader that knows a folder reads it. [Datasets](../datasets.md) has the layouts.\n\n"
+    text = "# Dataset readers\n\nThe first reader that recognises a folder reads it: [datasets](../datasets.md).\n\n"
     for reader in readers():
-        text += f"## {reader.name}\n\n{manual(type(reader))}It looks for `{reader.expects}`.\n\n"
+        text += f"## {reader.name}\n\n{manual(type(reader))}It looks for {reader.expects}.\n\n"
     return text
 
 

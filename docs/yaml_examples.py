@@ -27,6 +27,7 @@ def example(base: Kind, kind: Kind) -> tuple[str, str]:
         values = {key: value for key, value in values.items() if value is not None}
         found = [(block(base, {tag(kind): values} if "stage" in kind.model_fields else values), "")]
     short = [one for one in found if one[0].count("\n") <= MAX_EXAMPLE]
+    short = [one for one in short if one[1] == short[0][1]]  # of the first file the most complete
     return max(short or [min(found, key=lambda one: len(one[0]))], key=lambda one: len(one[0]))
 
 

@@ -79,7 +79,7 @@ def test_the_reference_lists_every_reader_and_every_notation_of_a_number():
     pages = reference_pages()
     for reader in readers():
         assert f"## {reader.name}\n" in pages["reference/readers.md"]
-        assert f"`{reader.expects}`" in pages["reference/readers.md"]
+        assert f"It looks for {reader.expects}." in pages["reference/readers.md"]
     for title in ("A constant", "Points", "Points with keys", "Exponential decay"):
         assert pages["reference/schedules.md"].count(f"## {title}") >= 1
     assert "| [`optimize.rates`](settings.md#rates) | `means`" in pages["reference/schedules.md"]
