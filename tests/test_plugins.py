@@ -184,3 +184,27 @@ def test_a_run_with_a_plugin_resumes_only_with_it(tiny_scene, tmp_path):
     assert "Traceback" not in done.stderr
     status = json.loads((out / "status.json").read_text())
     assert status["state"] == "done", "a refused command leaves the run as it was"
+
+
+def test_a_comparison_says_which_plugins_are_missing(tiny_scene, tmp_path, caplog):
+    from clsplat.compare.page import write_comparison
+
+    plugins.load_file(EXAMPLES / "opacity_entropy.py")
+    out = train(tiny_scene, tmp_path / "run", "optimize.losses=[l1, opacity_entropy]").out
+    write_comparison([out], tmp_path / "with.html")
+    plugins._loaded.clear()
+    write_comparison([out], tmp_path / "without.html")
+    sentence = "needs the plug-in 'opacity_entropy', which is not loaded"
+    assert sentence in caplog.text
+    assert sentence not in (tmp_path / "with.html").read_text()
+    assert sentence.replace("'", "&#39;") in (tmp_path / "without.html").read_text()
+
+
+@pytest.mark.parametrize("command", ["render", "evaluate"])
+def test_commands_on_a_run_say_that_its_plugin_is_missing(command, tiny_scene, tmp_path):
+    plugins.load_file(EXAMPLES / "opacity_entropy.py")
+    out = train(tiny_scene, tmp_path / "run", "optimize.losses=[l1, opacity_entropy]").out
+    arguments = [sys.executable, "-m", "clsplat", command, str(out)]
+    done = subprocess.run(arguments, capture_output=True, text=True, cwd=EXAMPLES.parent, check=False)
+    assert done.returncode == 2
+    assert "needs the plug-in 'opacity_entropy', which is not loaded; use --plugin" in done.stderr

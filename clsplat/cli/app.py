@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from clsplat import __version__, plugins, terminal
+from clsplat import __version__, terminal
 from clsplat.errors import ConfigError
 from clsplat.pipeline_files import shipped
 
@@ -123,10 +123,12 @@ def common(
 ) -> None:
     terminal.start_logging(debug)
     context.obj = Common(device)
-    if context.invoked_subcommand is not None:
+    if context.invoked_subcommand is not None and not context.resilient_parsing:
+        from clsplat import plugins
+
         plugins.load_installed()
-    for file in plugin or []:
-        plugins.load_file(file)
+        for file in plugin or []:
+            plugins.load_file(file)
     if context.invoked_subcommand is None:
         print(context.get_help(), end="")
         raise ConfigError("expected a command")

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from clsplat import plugins
 from clsplat.errors import ConfigError, DataError
 from clsplat.pipeline import SceneSettings
 from clsplat.prepare.cache import noted
@@ -72,6 +73,13 @@ class RunFolder:
             raise DataError(f"{path}: has no metrics.json, so the run {_state(path)}; finish it with --resume")
         settings = read_settings(path)
         return cls(path, settings, _scene(path, settings), _metrics(path / "metrics.json"))
+
+    @property
+    def missing_plugins(self) -> list[str]:
+        """A sentence for each plug-in of the run that is not loaded, or has other content now."""
+        recorded = self.settings.get("plugins")
+        faults = plugins.differences(recorded) if isinstance(recorded, dict) else []
+        return [f"{self.path}: {fault}" for fault in faults]
 
     @property
     def photographs(self) -> Path:
