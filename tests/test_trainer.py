@@ -101,6 +101,23 @@ def test_differentiating_updates_nothing(device, rng):
     assert trainer.adam.updates["means"] == 0
 
 
+@pytest.mark.parametrize(("step", "expected"), [(1, 0.3), (9, 0.3), (10, 0.6)])
+def test_rates_and_weights_are_those_of_the_global_step(device, rng, step, expected):
+    """The first update of Adam moves by the rate, and means by the rate times the extent."""
+    weight = {"points": [[0, 1.0], [10, 0.25]], "between": "steps"}
+    trainer, photograph = trainer_of(device, rng, [L1(weight=weight)])
+    trainer.extent = 3.0
+    trainer.rates = Rates(means={"points": [[0, 0.1], [10, 0.2]], "between": "steps"}, quats=0.0)
+    before = {name: trainer.model.gaussians.get(name) for name in ("means", "quats")}
+    full = L1().add(trainer.differentiate(photograph).comparison).value()
+    view = trainer.step(photograph, step)
+    moved = np.abs(trainer.model.gaussians.get("means") - before["means"])
+    assert (moved > 0).any(axis=1).sum() > 20
+    np.testing.assert_allclose(moved[moved > 0], expected, rtol=1e-3)
+    np.testing.assert_array_equal(trainer.model.gaussians.get("quats"), before["quats"])
+    assert view.loss == pytest.approx(full * (0.25 if step >= 10 else 1.0), rel=1e-6)
+
+
 def test_stale_parameters_stay(device, rng):
     trainer, photograph = trainer_of(device, rng, [L1(), Anisotropy(above=1.0)])
     before = {name: trainer.model.gaussians.get(name) for name in ("logit_opacity", "log_scales")}
