@@ -1,8 +1,4 @@
-"""Imports go down the layers only.
-
-cli · runner, pipeline · stages · training · density, metrics · losses · views, filters · render · gaussians, scene ·
-opencl · errors, files, settings
-"""
+"""Imports go down the layers only, and inside a folder in no circle."""
 
 import ast
 from pathlib import Path
@@ -13,6 +9,7 @@ PACKAGE = Path(__file__).parents[1] / "clsplat"
 ROWS = (  # from the top down; a module imports only from lower rows, or from its own folder
     {"__main__"},
     {"cli"},
+    {"api", "torch"},
     {"experiment", "schema", "run_status"},
     {"matrix"},
     {"runner", "model_file", "recipes", "bench", "compare", "inspect", "terminal"},
@@ -57,7 +54,8 @@ def imports(path: Path) -> list[tuple[int, str]]:
 @pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(PACKAGE)))
 def test_imports_go_down(path):
     own = path.relative_to(PACKAGE).with_suffix("").parts[0]
-    own = "" if own == "__init__" else own
+    if own == "__init__":  # it offers the names of all rooms, and imports them when they are first used
+        return
     assert own in ROW, f"{path.name}: give '{own}' a row in this test and in the design"
     for line, module in imports(path):
         if not module.startswith("clsplat"):

@@ -1,4 +1,4 @@
-"""Scenes that take turns at whole training steps, so that a slow pixel_sum of the machine meets all; medians count."""
+"""Scenes that take turns at whole training steps, so that a slow moment of the machine meets all; medians count."""
 
 import statistics
 import time

@@ -115,9 +115,10 @@ class Photographs:
         """Colours and, where there is one, the mask: [3 or 4, height, width] uint8."""
         image = load_photograph(view, BACKGROUNDS[self.background_name], self.undistorted)
         if image.shape[2] == 4 and not image[:, :, 3].any():
+            size = f"{view.camera.width}x{view.camera.height}"
             raise DataError(
-                f"{view.mask_path or view.image_path}: the mask leaves out every pixel of '{view.name}'; expected some "
-                "that count: remove the photograph from the dataset, or fix its mask"
+                f"{view.mask_path or view.image_path}: at {size} the mask leaves out every pixel of '{view.name}'; "
+                "expected some that count: remove the photograph from the dataset, or fix its mask"
             )
         return np.ascontiguousarray(image.transpose(2, 0, 1))
 
