@@ -63,6 +63,29 @@ def test_a_class_in_a_file_is_a_variant(tmp_path):
     assert load("splat", ["densify.rules=[mine]"]).resolved()["plugins"].keys() == {"mine"}
 
 
+def test_a_curve_in_a_file_is_a_schedule(tmp_path):
+    text = """
+import math
+from clsplat.schedule import Curve
+
+class Wave(Curve):
+    mean: float
+    period: int
+
+    def at(self, step: int) -> float:
+        return self.mean * (1 + 0.5 * math.sin(2 * math.pi * step / self.period))
+
+    @property
+    def values(self) -> list[float]:
+        return [0.5 * self.mean]
+"""
+    plugins.load_file(write(tmp_path, "wave", text))
+    rates = load("splat", ["optimize.rates.quats={mean: 0.002, period: 100}"]).settings.training.rates
+    assert rates.at(25, 1.0)["quats"] == pytest.approx(0.003)
+    with pytest.raises(ConfigError, match="expected values at least 0"):
+        load("splat", ["optimize.rates.quats={mean: -0.002, period: 100}"])
+
+
 def test_shipped_pipelines_name_no_plugin():
     assert "plugins" not in load("splat").resolved()
 
