@@ -30,8 +30,8 @@ def test_a_sample_is_the_view_of_the_order_at_the_size_of_the_step(tiny_scene):
     for step in range(1, 40):
         view, sample = Paper().at(pool, step), sampler.at(step)
         divisor = 2 if step < 20 else 1
-        assert (sample.view.name, sample.view.scale) == (view.name, view.scale * divisor)
-        assert sample.view.camera.width == 40 / (view.scale * divisor)
+        assert (sample.view.name, sample.view.downscale) == (view.name, view.downscale * divisor)
+        assert sample.view.camera.width == 40 / (view.downscale * divisor)
         assert sample.step == step
     assert sampler.at(25).view in views, "at full size it is the scene's own"
 
@@ -87,7 +87,7 @@ def masked_everywhere(source: Path, out: Path, name: str) -> Path:
 
 def test_a_photograph_that_is_masked_everywhere_ends_the_run_with_a_sentence(tiny_scene, tmp_path):
     scene = masked_everywhere(tiny_scene, tmp_path / "scene", "r_003")
-    with pytest.raises(DataError, match=r"003\.png: the mask leaves out every pixel of '.*003'.*fix its mask") as error:
+    with pytest.raises(DataError, match=r"003\.png: at 40x40 the mask leaves out every pixel of '.*003'.*fix its mask") as error:
         train(scene, tmp_path / "run", "scene.alpha=mask")
     assert "\n" not in str(error.value)
     status = json.loads((tmp_path / "run" / "status.json").read_text())
