@@ -14,7 +14,7 @@ from pydantic import Field
 
 from clsplat.gaussians.tables import DeviceModel, Gaussians
 from clsplat.opencl.device import Array, Device
-from clsplat.render.rasterizer import camera_values
+from clsplat.render.camera import camera_values
 from clsplat.scene.scene import View
 from clsplat.settings import OneOf, Settings
 

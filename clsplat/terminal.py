@@ -16,7 +16,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 from clsplat.files import unwritable
 
 if TYPE_CHECKING:  # the command line starts without OpenCL
-    from clsplat.opencl.device import DeviceInfo
+    from clsplat.opencl.choice import DeviceInfo
     from clsplat.training import run as training
 
 LOG = logging.getLogger("clsplat")
@@ -111,7 +111,7 @@ def line(progress: "training.Progress") -> str:
 
 def device_text(info: "DeviceInfo", fault: str | None) -> str:
     """A device and whether it works, as lines of text."""
-    from clsplat.opencl.device import resolve_schedule
+    from clsplat.opencl.choice import resolve_schedule
 
     sizes = f"{info.memory / 2**30:.1f} GiB of memory, buffers up to {info.allocation / 2**30:.1f} GiB"
     limits = f"groups up to {info.group}, {info.local_memory >> 10} KiB local, {info.float_width} lanes"

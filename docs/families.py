@@ -10,9 +10,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import clsplat.schema  # noqa: F401  (it imports all that a pipeline can name)
-from clsplat.matrix import Matrix
-from clsplat.pipeline import PipelineFile
+import clsplat.pipeline.schema  # noqa: F401  (it imports all that a pipeline can name)
+from clsplat.pipeline.file import PipelineFile
+from clsplat.pipeline.matrix import Matrix
 from clsplat.settings import Settings
 
 ROOT = Path(__file__).resolve().parents[1]

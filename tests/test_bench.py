@@ -7,7 +7,7 @@ from clsplat.bench.cases import run_bench
 from clsplat.bench.peaks import Peaks
 from clsplat.bench.scenes import case
 from clsplat.gaussians.tables import INTERVAL2, PARAMETERS
-from clsplat.pipeline import load
+from clsplat.pipeline.loading import load
 
 SIZE = (64, 48, 300)  # width, height, Gaussians
 

@@ -12,11 +12,11 @@ import pytest
 
 from clsplat import __version__
 from clsplat.cli.app import ORDER, SYNONYMS
-from clsplat.pipeline import load
-from clsplat.pipeline_files import shipped
-from clsplat.recipes import copy, manual, summary
-from clsplat.run_status import run_status, status_text
-from clsplat.settable import settable
+from clsplat.pipeline.files import shipped
+from clsplat.pipeline.loading import load
+from clsplat.pipeline.recipes import copy, manual, summary
+from clsplat.pipeline.settable import settable
+from clsplat.runs.status import run_status, status_text
 from tests.test_cli import clsplat
 from tests.test_training import train
 

@@ -9,10 +9,10 @@ PACKAGE = Path(__file__).parents[1] / "clsplat"
 ROWS = (  # from the top down; a module imports only from lower rows, or from its own folder
     {"__main__"},
     {"cli"},
-    {"api", "torch"},
-    {"experiment", "schema", "run_status"},
-    {"matrix"},
-    {"runner", "model_file", "recipes", "bench", "compare", "inspect", "terminal"},
+    {"torch"},
+    {"api"},
+    {"runs", "bench"},
+    {"compare", "inspect", "terminal"},
     {"pipeline"},
     {"stages", "prepare"},
     {"training"},
@@ -21,12 +21,8 @@ ROWS = (  # from the top down; a module imports only from lower rows, or from it
     {"views", "filters"},
     {"render"},
     {"gaussians", "scene"},
-    {"opencl"},
-    {"overrides", "settable", "settings_errors", "pages"},
-    {
-        *("errors", "fields", "files", "pipeline_files", "ply_header", "plugins", "renamed", "schedule", "settings"),
-        *("yaml_file", ""),
-    },
+    {"opencl", "pages"},
+    {"errors", "files", "ply_header", "plugins", "schedule", "settings", ""},
 )
 ROW = {name: i for i, row in enumerate(ROWS) for name in row}
 MODULES = sorted(PACKAGE.rglob("*.py"))

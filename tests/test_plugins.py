@@ -11,16 +11,17 @@ import pytest
 from typer.testing import CliRunner
 
 from clsplat import plugins
-from clsplat.density.edit import Rule
+from clsplat.density.rule import Rule
 from clsplat.errors import ConfigError
-from clsplat.pipeline import load
+from clsplat.pipeline.loading import load
 from clsplat.settings import Settings, rebuild, variants
 from tests.test_training import train
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 RULE = """
 from typing import Literal
-from clsplat.density.edit import Edit, Rule
+from clsplat.density.edit import Edit
+from clsplat.density.rule import Rule
 
 class Nothing(Rule):
     type: Literal["{name}"] = "{name}"
@@ -91,7 +92,7 @@ def test_shipped_pipelines_name_no_plugin():
 
 
 def test_the_schema_knows_plugins(tmp_path):
-    from clsplat.schema import json_schema
+    from clsplat.pipeline.schema import json_schema
 
     plugins.load_file(write(tmp_path, "mine", RULE.format(name="mine")))
     assert "Nothing" in json_schema()["$defs"]

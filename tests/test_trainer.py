@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from clsplat import runner
 from clsplat.density.statistics import SplatStats
 from clsplat.filters import FilterViews, measure_intervals
 from clsplat.gaussians.tables import INTERVAL2, DeviceModel, Gaussians
@@ -14,8 +13,9 @@ from clsplat.losses.base import HostLoss, ImageLoss, Loss
 from clsplat.losses.image import L1, L2, Dssim
 from clsplat.losses.penalties import Anisotropy
 from clsplat.opencl.device import Device
-from clsplat.pipeline import load
+from clsplat.pipeline.loading import load
 from clsplat.render.rasterizer import Rasterizer
+from clsplat.runs import runner
 from clsplat.scene.detect import read_scene
 from clsplat.stages.init import from_points
 from clsplat.training.adam import Adam, Rates

@@ -26,7 +26,7 @@ def run(
 
     pipeline: a file, or the name of a shipped one; out: default runs/NAME; set: values by place, or 'place=value'.
     """
-    from clsplat.experiment import Job
+    from clsplat.runs.experiment import Job
 
     plugins.load_installed()
     job = Job.open(str(pipeline), _path(scene), _path(out), overrides(set), resume)
@@ -36,7 +36,7 @@ def run(
 
 def resume(folder: Text, *, set: Mapping[str, Any] | Sequence[str] = (), device: str | None = None) -> Path:
     """Go on with a run from its newest checkpoint, as `clsplat resume` does; return the run folder."""
-    from clsplat.experiment import Job
+    from clsplat.runs.experiment import Job
 
     plugins.load_installed()
     job = Job.resume(Path(folder), overrides(set))
@@ -46,7 +46,7 @@ def resume(folder: Text, *, set: Mapping[str, Any] | Sequence[str] = (), device:
 
 def check(pipeline: Text) -> dict[str, Any]:
     """Validate a pipeline: its path, its name, its stages or cells.  Raises ConfigError."""
-    from clsplat import experiment
+    from clsplat.runs import experiment
 
     plugins.load_installed()
     return experiment.check(str(pipeline))
@@ -54,7 +54,7 @@ def check(pipeline: Text) -> dict[str, Any]:
 
 def pipelines(name: str | None = None) -> Any:
     """List the shipped pipelines, or describe one with its keys."""
-    from clsplat import recipes
+    from clsplat.pipeline import recipes
 
     return recipes.manual(name) if name else recipes.summaries()
 
@@ -63,7 +63,7 @@ def devices() -> list[dict[str, Any]]:
     """List OpenCL devices, their limits, and under `fault` what keeps one from working."""
     from dataclasses import asdict
 
-    from clsplat.opencl.device import list_devices
+    from clsplat.opencl.choice import list_devices
 
     return [{**asdict(info), "fault": info.fault()} for info in list_devices()]
 
@@ -79,7 +79,7 @@ def render_views(
     device: str | None = None,
 ) -> int:
     """Render a model file or run folder at the views of a scene into files; return their number."""
-    from clsplat import model_file
+    from clsplat.runs import model_file
 
     plugins.load_installed()
     return model_file.render(
@@ -98,7 +98,7 @@ def evaluate(
     device: str | None = None,
 ) -> dict[str, Any]:
     """Measure a model file or run folder on a scene's views; return what metrics.json holds."""
-    from clsplat import model_file
+    from clsplat.runs import model_file
 
     plugins.load_installed()
     return model_file.evaluate(

@@ -15,8 +15,8 @@ from clsplat.gaussians.tables import PARAMETERS
 from clsplat.losses.base import HostFunction, HostLoss, ViewGradients
 from clsplat.metrics.views import mean, measure
 from clsplat.opencl.device import Device
-from clsplat.pipeline import load
-from clsplat.runner import make_run
+from clsplat.pipeline.loading import load
+from clsplat.runs.runner import make_run
 from clsplat.scene.detect import read_scene
 from clsplat.scene.scene import Scene
 from clsplat.schedule import Schedule

@@ -11,7 +11,7 @@ from typer.core import TyperGroup
 
 from clsplat import __version__, terminal
 from clsplat.errors import ConfigError
-from clsplat.pipeline_files import shipped
+from clsplat.pipeline.files import shipped
 
 SYNONYMS = {
     **dict.fromkeys(("train", "fit", "optimize", "start"), "run"),

@@ -31,7 +31,7 @@ def render(
     device: DeviceOption = None,
 ) -> None:
     """Render a model at the views of a scene, one file for each, named as the view."""
-    from clsplat import model_file
+    from clsplat.runs import model_file
 
     count = model_file.render(model, scene, out, split=split, downscale=scale, kind=format_, device=device)
     terminal.show(f"{count} images written to {out}")
@@ -65,8 +65,8 @@ def evaluate(
     device: DeviceOption = None,
 ) -> None:
     """Measure a model on a scene's test and training views."""
-    from clsplat import model_file
     from clsplat.files import write_text
+    from clsplat.runs import model_file
 
     if out is None:
         terminal.keep_stdout_for_json()

@@ -25,7 +25,7 @@ def run(
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Check everything and say what would run.")] = False,
 ) -> None:
     """Run a pipeline, or all cells of a matrix."""
-    from clsplat.experiment import Job
+    from clsplat.runs.experiment import Job
 
     job = Job.open(pipeline, scene, out, set_ or (), resume)
     if dry_run:
@@ -42,7 +42,7 @@ def resume(
     set_: SetOption = None,
 ) -> None:
     """Go on with a run from its newest checkpoint."""
-    from clsplat.experiment import Job
+    from clsplat.runs.experiment import Job
 
     job = Job.resume(folder, set_ or ())
     job.run(device, resume=True)
@@ -55,7 +55,7 @@ def status(
     as_json: JsonOption = False,
 ) -> None:
     """Tell from its files how far a run is, and its metrics."""
-    from clsplat.run_status import run_status, status_text
+    from clsplat.runs.status import run_status, status_text
 
     found = run_status(folder)
     if as_json:
@@ -73,8 +73,8 @@ def check(
     as_json: JsonOption = False,
 ) -> None:
     """Validate a pipeline without running it."""
-    from clsplat import experiment
-    from clsplat.schema import json_schema
+    from clsplat.pipeline.schema import json_schema
+    from clsplat.runs import experiment
 
     if schema:
         terminal.show_json(json_schema())
@@ -102,7 +102,7 @@ def pipelines(
     as_json: JsonOption = False,
 ) -> None:
     """List the shipped pipelines, or the keys of one as --set takes them."""
-    from clsplat import recipes
+    from clsplat.pipeline import recipes
 
     if copy is not None:
         if not name:

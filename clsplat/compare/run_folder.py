@@ -10,12 +10,12 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from clsplat import plugins
 from clsplat.errors import ConfigError, DataError
-from clsplat.pipeline import SceneSettings
+from clsplat.pipeline.explanation import explain
+from clsplat.pipeline.file import SceneSettings
+from clsplat.pipeline.yaml_file import read_yaml
 from clsplat.prepare.cache import noted
 from clsplat.scene.images import read_file
-from clsplat.settings_errors import explain
 from clsplat.training.records import Records
-from clsplat.yaml_file import read_yaml
 
 
 class Averages(BaseModel):

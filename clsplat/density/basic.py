@@ -4,7 +4,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from clsplat.density.edit import Edit, Rule
+from clsplat.density.edit import Edit
+from clsplat.density.rule import Rule
 from clsplat.density.statistics import StatisticName
 from clsplat.schedule import Positive
 

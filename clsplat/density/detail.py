@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from clsplat.density.edit import Edit, Rule
+from clsplat.density.edit import Edit
+from clsplat.density.rule import Rule
 from clsplat.density.statistics import SEEN, StatisticName
 from clsplat.density.thresholds import PixelQuantile, Quantile, Share, Threshold
 from clsplat.gaussians.tables import INTERVAL2

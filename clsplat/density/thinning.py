@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from clsplat.density.edit import Edit, Rule
+from clsplat.density.edit import Edit
+from clsplat.density.rule import Rule
 from clsplat.density.thresholds import Share
 from clsplat.gaussians.tables import SH_C0
 from clsplat.scene.quaternion import rotation_matrix, unit_quaternions

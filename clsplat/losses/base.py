@@ -11,7 +11,8 @@ from pydantic import PrivateAttr
 
 from clsplat.gaussians.tables import Gaussians, Gradients
 from clsplat.opencl.device import Array
-from clsplat.render.rasterizer import DeviceCamera, Frame
+from clsplat.render.camera import DeviceCamera
+from clsplat.render.rasterizer import Frame
 from clsplat.render.workspace import Workspace
 from clsplat.schedule import Schedule, at_step
 from clsplat.settings import Settings

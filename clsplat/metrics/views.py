@@ -12,7 +12,8 @@ from clsplat.losses.image import ssim_maps
 from clsplat.metrics.images import psnr, ssim, to_8_bits
 from clsplat.metrics.perceptual import Image, Perceptual
 from clsplat.opencl.device import Array
-from clsplat.render.rasterizer import DeviceCamera, Rasterizer
+from clsplat.render.camera import DeviceCamera
+from clsplat.render.rasterizer import Rasterizer
 from clsplat.scene.scene import View
 from clsplat.views.photographs import Photograph, Photographs, unpack
 

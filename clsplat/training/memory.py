@@ -10,7 +10,7 @@ import numpy as np
 
 from clsplat.errors import MemoryLimitError
 from clsplat.gaussians.tables import GROWTH, PARAMETERS, Gaussians
-from clsplat.opencl.device import DeviceInfo
+from clsplat.opencl.choice import DeviceInfo
 from clsplat.render.rasterizer import PIXEL_SUMS, RECORD
 
 PAIRS = 5  # (tile, Gaussian) pairs of a Gaussian, where nothing is known yet; trained scenes have 1.5 to 4

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from clsplat.errors import DataError
 from clsplat.opencl.device import Array, Device
-from clsplat.render.rasterizer import DeviceCamera, upload_camera
+from clsplat.render.camera import DeviceCamera, upload_camera
 from clsplat.render.workspace import Workspace
 from clsplat.scene.photographs import load_photograph
 from clsplat.scene.scene import Background, View

@@ -5,7 +5,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from clsplat.opencl.device import Array
-from clsplat.render.rasterizer import DeviceCamera
+from clsplat.render.camera import DeviceCamera
 from clsplat.render.workspace import Workspace
 from clsplat.views.photographs import Photograph
 

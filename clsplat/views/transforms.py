@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from clsplat.opencl.device import Array
-from clsplat.render.rasterizer import DeviceCamera
+from clsplat.render.camera import DeviceCamera
 from clsplat.render.workspace import Workspace
 from clsplat.schedule import NonNegative, at_step
 from clsplat.settings import Settings

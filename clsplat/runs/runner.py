@@ -11,8 +11,9 @@ from typing import Any
 
 from clsplat.errors import ConfigError, Interrupted, OutputError, as_clsplat_error, one_line
 from clsplat.files import unwritable, write_text
-from clsplat.opencl.device import Device, choose
-from clsplat.pipeline import Pipeline, load, prepared_folder
+from clsplat.opencl.choice import choose
+from clsplat.opencl.device import Device
+from clsplat.pipeline.loading import Pipeline, load, prepared_folder
 from clsplat.prepare.cache import NOTE, Planned, note, noted, prepare
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.scene.detect import read_scene

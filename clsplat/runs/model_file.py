@@ -18,8 +18,10 @@ from clsplat.gaussians.tables import Gaussians
 from clsplat.metrics.lpips import InputRange
 from clsplat.metrics.perceptual import Perceptual, metric_names
 from clsplat.metrics.views import PSNR_AND_SSIM, mean, measure, render_view
-from clsplat.opencl.device import Device, choose
-from clsplat.pipeline import SceneSettings, load
+from clsplat.opencl.choice import choose
+from clsplat.opencl.device import Device
+from clsplat.pipeline.file import SceneSettings
+from clsplat.pipeline.loading import load
 from clsplat.prepare.cache import noted
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.scene.detect import read_scene

@@ -10,14 +10,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from clsplat import runner, terminal
+from clsplat import terminal
 from clsplat.compare.page import write_comparison
 from clsplat.errors import ClsplatError, ConfigError, DataError, Interrupted, OutputError, as_clsplat_error, one_line
 from clsplat.files import write_text
-from clsplat.matrix import Cell, Experiment, load_experiment
-from clsplat.pipeline import Pipeline, load
+from clsplat.pipeline.loading import Pipeline, load
+from clsplat.pipeline.matrix import Cell, Experiment, load_experiment
+from clsplat.pipeline.yaml_file import read_yaml
+from clsplat.runs import runner
 from clsplat.training.checkpoint import first_difference
-from clsplat.yaml_file import read_yaml
 
 LOG = logging.getLogger("clsplat")
 PAGE = "compare.html"

@@ -7,9 +7,9 @@ from typing import Any
 
 from clsplat.errors import ConfigError
 from clsplat.files import write_text
-from clsplat.pipeline import load
-from clsplat.pipeline_files import find, shipped
-from clsplat.settable import settable
+from clsplat.pipeline.files import find, shipped
+from clsplat.pipeline.loading import load
+from clsplat.pipeline.settable import settable
 
 MAX_KEY_WIDTH = 44  # characters; descriptions stand beside
 
