@@ -1,10 +1,10 @@
-/* A Gaussian blur of an image: the mean of the pixels that count, by their weights, so that neither the image's edge nor
- * a mask darkens it.
+/* A Gaussian blur of an image: the mean of the pixels that count, by their weights, so that neither the image's edge
+ * nor a mask darkens it.
  *
  *   blurred(x) = sum_k w(k) m(x + k) v(x + k) / sum_k w(k) m(x + k),  w(k) = exp(-k^2 / (2 sigma^2)),  |k| <= reach
  *
- * along rows and then along columns, with m the mask, or 1 inside the image.  The first pass keeps numerator and
- * denominator apart.  One item = one pixel; dimensions x, y.  No local memory.  Deterministic. */
+ * along rows and then along columns, with m the mask, or 1 inside the image.  The first pass writes numerator and
+ * denominator.  One item = one pixel; dimensions x, y.  No local memory.  Deterministic. */
 #include "common.h"
 
 /* Sums along rows: three channels times the mask, and the mask itself. */
@@ -37,7 +37,7 @@ void blur_rows(
         sums[channel * plane + y * stride + x] = total[channel];
 }
 
-/* The same along columns, and the division; pixels without a neighbour that counts keep their value. */
+/* The same along columns, and the division; pixels without a neighbour that counts stay unchanged. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void blur_columns(
     __global const float *restrict sums,     // [4,H',stride]

@@ -1,4 +1,4 @@
-"""What a dataset is, on the host: cameras, views, points and which views are held out.
+"""A dataset on the host: cameras, views, points and the split into training and test views.
 
 Conventions of the whole project
     camera      OpenCV: x right, y down, z forward; `world_to_camera` is row-major [3, 4]
@@ -23,8 +23,8 @@ from clsplat.scene.view import Floats as Floats
 from clsplat.scene.view import View as View
 
 Background = Literal["black", "white"]
-HOLDOUT = 8  # every so many views are for testing where the dataset does not say which: the default of pipelines
-MAX_DISTANCE = 10.0  # by the median one: a walk of evenly spaced cameras has 2, an orbit 1, a close-up about 4
+HOLDOUT = 8  # every 8th view is for testing where the dataset has no split: the default of pipelines
+MAX_DISTANCE = 10.0  # median distances: evenly spaced cameras on a line reach 2, an orbit 1, a close-up about 4
 MAX_STRAYED_SHARE = 0.2  # of the cameras
 
 
@@ -41,7 +41,7 @@ class PointCloud:
 
 @dataclass(frozen=True)
 class Scene:
-    """A posed set of photographs, with the split that every stage uses."""
+    """Photographs with their cameras, and the split that every stage uses."""
 
     path: Path
     views: tuple[View, ...]
@@ -49,7 +49,7 @@ class Scene:
     test: tuple[int, ...]
     points: PointCloud | None
     extent: float  # radius of the training cameras, scene units
-    background: Background = "black"  # what the photographs are usually shown on
+    background: Background = "black"  # on which papers show the photographs
 
     def split(self, name: str) -> tuple[View, ...]:
         """Return the views of `train`, `test` or `all`."""
@@ -63,13 +63,13 @@ class Scene:
 
     @property
     def downscales(self) -> tuple[float, ...]:
-        """The downscales of the views, the largest photographs first."""
+        """The divisors of the photographs' sizes in the scene, ascending."""
         return tuple(sorted({view.downscale for view in self.views}))
 
     def downscaled(self, *downscales: float) -> "Scene":
         """Return the scene with every photograph at 1 / downscale of its original size, for each of `downscales`.
 
-        Views of that size are taken where the dataset has them; otherwise the largest photographs are resampled.
+        Where the dataset has views of that size, they are used; otherwise the largest photographs are resampled.
         Raises DataError for a size larger than the largest in the dataset.
         """
         if downscales == self.downscales:
@@ -94,7 +94,7 @@ class Scene:
 def make_scene(
     path: Path, views: list[View], test: set[int], points: PointCloud | None, background: Background = "black"
 ) -> Scene:
-    """Check `views`, order the split and measure the extent.
+    """Return a scene of `views`, with its split and its extent.
 
     Raises DataError when there is no view, when names repeat or when a pose or a camera is impossible.
     """
@@ -119,9 +119,9 @@ def make_scene(
 
 
 def camera_extent(views: list[View]) -> float:
-    """Radius of the cameras: 1.1 x the largest distance of a centre from their mean (Kerbl et al. 2023).
+    """Return the radius of the cameras: 1.1 x the largest distance of a centre from their mean (Kerbl et al. 2023).
 
-    Cameras far away from all others do not count: one wrong pose would scale every size and rate of the scene.
+    Cameras far away from all others do not count: one wrong pose changes every size and rate of the scene.
     """
     centres = np.stack([v.position for v in views])[~strayed(views)]
     radius = 1.1 * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
@@ -129,9 +129,9 @@ def camera_extent(views: list[View]) -> float:
 
 
 def strayed(views: Sequence[View]) -> NDArray[np.bool_]:
-    """Which cameras, [N], lie more than MAX_DISTANCE times the median distance from the median centre.
+    """Return which cameras, [N], lie more than MAX_DISTANCE times the median distance from the median centre.
 
-    None when more than MAX_STRAYED_SHARE of all do: such a scene has several groups of cameras.
+    Where that is more than MAX_STRAYED_SHARE of all, the scene has several groups of cameras, and all are False.
     """
     centres = np.stack([v.position for v in views])
     distance = np.linalg.norm(centres - np.median(centres, axis=0), axis=1)
@@ -140,7 +140,7 @@ def strayed(views: Sequence[View]) -> NDArray[np.bool_]:
 
 
 def every_nth(names: list[str], holdout: int) -> set[int]:
-    """Indices of the names that are held out: every `holdout`-th in order of name, starting with the first."""
+    """Return the indices of the names that are held out: every `holdout`-th by name, from the first on."""
     if holdout <= 0:
         return set()
     order = sorted(range(len(names)), key=lambda i: names[i])

@@ -1,4 +1,4 @@
-"""A posed photograph: its camera, and its pixels as the camera saw them."""
+"""A photograph with its camera: reading its pixels at the size of the camera."""
 
 import operator
 from dataclasses import dataclass, replace
@@ -15,25 +15,25 @@ from clsplat.scene.images import read_image
 from clsplat.scene.lens import Lens
 
 Floats = NDArray[np.floating]
-Alpha = Literal["transparency", "mask"]  # what the fourth channel of a photograph is
+Alpha = Literal["transparency", "mask"]  # the meaning of a photograph's fourth channel
 BLACK = (0.0, 0.0, 0.0)
-MIN_WHITE = 0.99  # of the largest value: a mask that was stored as JPEG is never quite white
+MIN_WHITE = 0.99  # share of the largest value: JPEG does not store white exactly
 
 
 @dataclass(frozen=True)
 class View:
-    """One posed photograph.  `name` is unique in its scene: the path below the image folder.
+    """A camera with its photograph.  `name` is unique in its scene: the path below the image folder.
 
-    A view that is made by hand, to look at a model, needs no photograph.
+    A view that only serves to render a model needs no photograph.
     """
 
     name: str
     camera: Camera
     world_to_camera: Floats  # [3, 4] float64
     image_path: Path = Path()
-    mask_path: Path | None = None  # an image of the photograph's size, white where it counts
+    mask_path: Path | None = None  # an image of the photograph's size, white in pixels that count
     alpha: Alpha = "transparency"
-    lens: Lens | None = None  # of the photograph on disk, where it is not `camera`'s pinhole
+    lens: Lens | None = None  # of the photograph on disk, where it has distortion
     downscale: float = 1  # divisor of the original photograph's size
 
     @property
@@ -67,9 +67,9 @@ def load_image(view: View, background: tuple[float, float, float] | None = None)
     opaque, resized = pixels.shape[2] == 3, pixels.shape[:2] != (height, width)
     if opaque and not resized and pixels.dtype == np.uint8:
         return pixels
-    # Double where the reference uses it, to truncate as it does; single saves memory on large photographs.
+    # Double precision where the reference has it, to truncate alike; single saves memory on large photographs.
     values: NDArray[Any] = pixels.astype(np.float32 if opaque else np.float64)
-    if resized:  # not premultiplied by alpha: so does the reference (multi-scale Blender)
+    if resized:  # not premultiplied by alpha, as in the reference (multi-scale Blender)
         values = cv2.resize(values, (width, height), interpolation=cv2.INTER_AREA)
     limit = int(np.iinfo(pixels.dtype).max)
     if opaque:
@@ -77,15 +77,15 @@ def load_image(view: View, background: tuple[float, float, float] | None = None)
     unit = values / limit
     colour, alpha = unit[:, :, :3], unit[:, :, 3:]
     composite = colour * alpha + np.array(background or BLACK) * (1 - alpha)
-    slack = 1e-3 if resized else 0.0  # OpenCV's area weights are single precision: no level may be lost to them
-    return np.asarray(composite * 255 + slack, np.uint8)  # truncated: so does the reference (Kerbl et al. 2023)
+    slack = 1e-3 if resized else 0.0  # OpenCV's area weights are single precision: rounding must not lower a level
+    return np.asarray(composite * 255 + slack, np.uint8)  # truncated, as in the reference (Kerbl et al. 2023)
 
 
 def load_mask(view: View) -> NDArray[np.bool_] | None:
-    """Return which pixels of `load_image` count, [H, W], or None where all do.
+    """Return which pixels of `load_image` count, [H, W], or None when all do.
 
-    They do where the whole of the pixel is white in the mask file, for alpha as mask opaque in the photograph, and for
-    a lens whose whole photograph is wanted, not blank.
+    A pixel counts when its whole area is white in the mask file, opaque in the photograph (with alpha as mask) and not
+    blank (with a `whole` lens).
     Raises DataError as load_image does.
     """
     layers = []
@@ -105,10 +105,10 @@ def load_mask(view: View) -> NDArray[np.bool_] | None:
 
 
 def _as_taken(view: View, path: Path) -> NDArray[Any]:
-    """The pixels of a file as its camera saw them: upright, undistorted, before downscaling.
+    """The pixels of a file at the size of its camera before downscaling: upright and undistorted.
 
-    A file that is turned by its EXIF tag is turned where only then it is the camera's image: COLMAP ignores the tag.
-    Raises DataError when it is not the camera's image in either case.
+    The EXIF rotation is applied where the file has the camera's size only with it: COLMAP ignores the tag.
+    Raises DataError when the sizes differ in both cases.
     """
     pixels, lens = read_image(path), view.lens
     stored = pixels.shape[1::-1]
@@ -126,14 +126,14 @@ def _as_taken(view: View, path: Path) -> NDArray[Any]:
 
 
 def fits(view: View, size: tuple[int, int]) -> bool:
-    """Tell whether a file of `size` (width, height), turned upright or not, is the image of a view's camera."""
+    """Return whether an image of `size` (width, height) fits the camera of a view."""
     if view.lens:
         return size == (view.lens.width, view.lens.height)
     return _scales_to(size, (view.camera.width, view.camera.height))
 
 
 def _scales_to(file: tuple[int, int], camera: tuple[int, int]) -> bool:
-    """Tell whether one factor >= 1 takes the size of the file to that of the camera, as Camera.downscaled rounds."""
+    """Return whether one divisor >= 1 takes the file's size to the camera's, rounded as in Camera.downscaled."""
     smallest = max(1.0, *(f / (c + 0.5) for f, c in zip(file, camera, strict=True)))
     largest = min(f / (c - 0.5) if c > 1 else np.inf for f, c in zip(file, camera, strict=True))
     return smallest <= largest
