@@ -34,6 +34,15 @@ def unit(module: str) -> str:
     return parts[1] if len(parts) > 1 else ""
 
 
+TEXTS = {  # what turns results into lines of text
+    "clsplat.inspect.table": {"show"},
+    "clsplat.pipeline.recipes": {"manual_text", "summaries_text"},
+    "clsplat.runs.status": {"status_text"},
+    "clsplat.pipeline.files": {"shipped"},  # for completion, which must be fast
+}
+BELOW_COMMANDS = {"api", "cli", "terminal", "errors", "files", ""}
+
+
 def imports(path: Path) -> list[tuple[int, str]]:
     found = []
     for node in ast.walk(ast.parse(path.read_text())):
@@ -91,6 +100,16 @@ def test_inside_a_folder_imports_are_acyclic():
     graph["clsplat.opencl.device"].discard("clsplat.opencl.program")
     for module in graph:
         visit(module, ())
+
+
+@pytest.mark.parametrize("path", sorted((PACKAGE / "cli").glob("*.py")), ids=lambda p: p.name)
+def test_commands_call_the_api_alone_and_print(path):
+    for node in ast.walk(ast.parse(path.read_text())):
+        if not isinstance(node, ast.ImportFrom) or not (node.module or "").startswith("clsplat"):
+            continue
+        names = {alias.name for alias in node.names}
+        rooms = {name for name in names if name in ROW} if node.module == "clsplat" else {unit(node.module)}
+        assert rooms <= BELOW_COMMANDS or names <= TEXTS.get(node.module, set()), f"{path}:{node.lineno}: {names}"
 
 
 def test_data_tools_use_the_scene_layer_only():

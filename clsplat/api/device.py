@@ -30,6 +30,6 @@ class Device(opencl.Device):
 
 
 @cache
-def default_device() -> Device:
+def default_device(schedule: Schedule = "auto") -> Device:
     """Return the device that is taken where none is given; opened on first use."""
-    return Device()
+    return Device(schedule=schedule)

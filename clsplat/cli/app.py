@@ -10,6 +10,7 @@ import typer
 from typer.core import TyperGroup
 
 from clsplat import __version__, terminal
+from clsplat.api import arguments, tools
 from clsplat.errors import ConfigError
 from clsplat.pipeline.files import shipped
 
@@ -123,12 +124,10 @@ def common(
 ) -> None:
     terminal.start_logging(debug)
     context.obj = Common(device)
-    if context.invoked_subcommand is not None and not context.resilient_parsing:
-        from clsplat import plugins
-
-        plugins.load_installed()
-        for file in plugin or []:
-            plugins.load_file(file)
+    if context.invoked_subcommand is not None:
+        arguments.load_plugins()
+    for file in plugin or []:
+        tools.load_plugin(file)
     if context.invoked_subcommand is None:
         print(context.get_help(), end="")
         raise ConfigError("expected a command")

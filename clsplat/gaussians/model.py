@@ -1,18 +1,19 @@
 """A model on the host: NumPy arrays in the units of model files, and the numbers with which they are rendered."""
 
-import html
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.gaussians.ply import read_ply, write_ply
 from clsplat.gaussians.sh import rotated_sh
-from clsplat.gaussians.tables import PARAMETERS, SH_C0, sh_coefficients
+from clsplat.gaussians.tables import PARAMETERS, SH_C0, DeviceModel, Gaussians, sh_coefficients
+from clsplat.opencl.device import Device
 
+MODEL = "point_cloud.ply"  # of a run folder
 Floats = NDArray[np.float32]
 MIP_VARIANCE = 0.1  # px², of files that say no more than `mip` (Yu et al. 2024)
 
@@ -24,8 +25,8 @@ class Rendering:
     near: float = 0.2  # scene units; nearer Gaussians are not drawn
     screen_variance: float = 0.3  # px², added to every splat
     compensate: float = 0.0  # 1: the opacity falls as that variance spreads a splat out
-    background: str | None = None  # black or white; None: what the scene says
-    alpha: str = "transparency"  # what the fourth channel of its photographs was
+    background: Literal["black", "white"] | None = None  # None: what the scene says
+    alpha: Literal["transparency", "mask"] = "transparency"  # what the fourth channel of its photographs was
     notes: Mapping[str, Any] = field(default_factory=dict)  # what else the file says
 
     @classmethod
@@ -34,9 +35,12 @@ class Rendering:
         mip = {"screen_variance": MIP_VARIANCE, "compensate": 1.0} if mode == "mip" else {}
         names = ("near", "screen_variance", "compensate")
         given = {name: float(comment[name]) for name in names if isinstance(comment.get(name), int | float)}
-        background = comment.get("background") if comment.get("background") in ("black", "white") else None
-        alpha = "mask" if comment.get("alpha") == "mask" else "transparency"
-        return cls(**{**mip, **given}, background=background, alpha=alpha, notes=dict(comment))
+        return cls(
+            **{**mip, **given},
+            background=comment["background"] if comment.get("background") in ("black", "white") else None,
+            alpha="mask" if comment.get("alpha") == "mask" else "transparency",
+            notes=dict(comment),
+        )
 
     def comment(self) -> dict[str, Any]:
         """What a model file says about rendering."""
@@ -70,6 +74,12 @@ class Model:
 
     def __len__(self) -> int:
         return len(self.means)
+
+    def upload(self, device: Device) -> DeviceModel:
+        """Copy the model to a device, for the rasterizer."""
+        numbers = self.rendering
+        gaussians = Gaussians(device, self.tables())
+        return DeviceModel(gaussians, self.sh_degree, numbers.near, numbers.screen_variance, numbers.compensate)
 
     def tables(self) -> dict[str, Floats]:
         """The arrays by name; filter_variance where there is one."""
@@ -133,6 +143,8 @@ class Model:
         return f"Model({len(self):,} Gaussians, SH degree {self.sh_degree})"
 
     def _repr_html_(self) -> str:
+        from clsplat.pages.notebook import summary
+
         low, high = (self.means.min(axis=0), self.means.max(axis=0)) if len(self) else (np.zeros(3), np.zeros(3))
         rows = {
             "Gaussians": f"{len(self):,}",
@@ -142,14 +154,13 @@ class Model:
             "median opacity": f"{float(np.median(self.opacities)):.3g}" if len(self) else "–",
             "size as PLY": f"{sum(table.nbytes for table in self.tables().values()) / 2**20:,.1f} MiB",
         }
-        cells = "".join(f"<tr><th>{html.escape(k)}</th><td>{html.escape(v)}</td></tr>" for k, v in rows.items())
-        return f"<table>{cells}</table>"
+        return summary(rows)
 
 
 def load(path: str | Path) -> Model:
     """Read a model file, or the model of a run folder.  Raises DataError when it is missing, damaged or not a splat."""
     path = Path(path)
-    file = read_ply(path / "point_cloud.ply" if path.is_dir() else path)
+    file = read_ply(path / MODEL if path.is_dir() else path)
     return Model(**file.parameters, rendering=Rendering.of(file.rendering, file.mode))
 
 

@@ -150,7 +150,7 @@ class Gradients:
     """Derivatives of the loss by each parameter, with the shapes of the parameters."""
 
     def __init__(self, gaussians: Gaussians) -> None:
-        self.capacity = gaussians.capacity
+        self.size = gaussians.capacity, gaussians.sh_degree
         self.arrays = {
             name: gaussians.device.zeros((gaussians.tables[name].components, gaussians.capacity)) for name in PARAMETERS
         }

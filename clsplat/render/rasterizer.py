@@ -174,7 +174,7 @@ class Rasterizer:
 
     def gradients(self, model: DeviceModel, frame: Frame, pixel_sums: Array) -> Gradients:
         """Derivatives of the loss by every parameter of the model that made the frame; valid until the next ones."""
-        if self._gradients is None or self._gradients.capacity != model.gaussians.capacity:
+        if self._gradients is None or self._gradients.size != (model.gaussians.capacity, model.gaussians.sh_degree):
             self._gradients = Gradients(model.gaussians)
         gradients = self._gradients
         self._project.project_backward(

@@ -44,7 +44,7 @@ class Job:
 
         out: default runs/NAME, with a number where that is another run.
         """
-        changes = [*overrides, *([f"scene.path={_quoted(scene)}"] if scene is not None else [])]
+        changes = [*overrides, *([f"scene.path={quoted(scene)}"] if scene is not None else [])]
         if found := load_experiment(pipeline, changes):
             return cls(found, out or runner.free_folder(Path("runs") / found.name, None, resume))
         checked = load(pipeline, changes)
@@ -147,7 +147,7 @@ def _stop_at_once() -> None:
     raise KeyboardInterrupt
 
 
-def _quoted(folder: Path) -> str:
+def quoted(folder: Path) -> str:
     """A folder as a value of `--set`, from wherever it is used.  Raises ConfigError when YAML cannot hold its name."""
     path = str(folder.resolve())
     try:

@@ -130,6 +130,17 @@ def make_run(pipeline: Pipeline, scene: Scene, device: Device, out: Path) -> Run
 def execute(pipeline: Pipeline, run: Run, resume: bool, show: Callable[[Progress], None]) -> None:
     """Run the stages, from the newest checkpoint when resuming, and write what the run folder promises."""
     run.show = show
+    begin(pipeline, run, resume)
+    with failures_recorded(run.out, lambda: run.step):
+        with _finishing_on_interrupt(run):
+            _run_stages(pipeline, run)
+        _write_metrics(run)
+        _check_outputs(pipeline, run)
+        run.records.status("done", run.step, exit_code=0)
+
+
+def begin(pipeline: Pipeline, run: Run, resume: bool) -> None:
+    """Take the newest checkpoint when resuming, and write what the run folder holds from the beginning on."""
     resumed = resume and checkpoint.restore(run)
     if resume:
         LOG.info("resumed at step %d" if resumed else "nothing to resume; starting from the beginning%.0s", run.step)
@@ -137,12 +148,6 @@ def execute(pipeline: Pipeline, run: Run, resume: bool, show: Callable[[Progress
     if run.prepared:
         write_text(run.out / NOTE, json.dumps(run.prepared) + "\n")
     run.records.start(run.step, edit_due=run.stage_step > 0)
-    with failures_recorded(run.out, lambda: run.step):
-        with _finishing_on_interrupt(run):
-            _run_stages(pipeline, run)
-        _write_metrics(run)
-        _check_outputs(pipeline, run)
-        run.records.status("done", run.step, exit_code=0)
 
 
 def _run_stages(pipeline: Pipeline, run: Run) -> None:

@@ -8,7 +8,8 @@ Conventions of the whole project
     colours     as the image files store them, in [0, 1]
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -21,11 +22,13 @@ from clsplat.scene.camera import Camera as Camera
 from clsplat.scene.view import Alpha as Alpha
 from clsplat.scene.view import Floats as Floats
 from clsplat.scene.view import View as View
+from clsplat.scene.view import load_image
 
 Background = Literal["black", "white"]
 HOLDOUT = 8  # every 8th view is for testing where the dataset has no split: the default of pipelines
 MAX_DISTANCE = 10.0  # median distances: evenly spaced cameras on a line reach 2, an orbit 1, a close-up about 4
 MAX_STRAYED_SHARE = 0.2  # of the cameras
+MAX_THUMBNAILS = 4
 
 
 @dataclass(frozen=True)
@@ -52,9 +55,11 @@ class Scene:
     background: Background = "black"  # on which papers show the photographs
 
     def split(self, name: str) -> tuple[View, ...]:
-        """Return the views of `train`, `test` or `all`."""
+        """Return the views of `train`, `test` or `all`.  Raises ValueError for another name."""
         if name == "all":
             return self.views
+        if name not in ("train", "test"):
+            raise ValueError(f"no split '{name}'; there are train, test and all")
         return tuple(self.views[i] for i in (self.train if name == "train" else self.test))
 
     def with_alpha(self, alpha: Alpha) -> "Scene":
@@ -89,6 +94,28 @@ class Scene:
                 indices += range(len(views), len(views) + len(found))
                 views += [view.resized(downscale) for view in found]
         return replace(self, views=tuple(views), train=tuple(splits["train"]), test=tuple(splits["test"]))
+
+    def __repr__(self) -> str:
+        return f"Scene({self.path.name}: {len(self.train)} training and {len(self.test)} test views)"
+
+    def _repr_html_(self) -> str:
+        from clsplat.pages.notebook import summary
+
+        camera, count = self.views[0].camera, len(self.points) if self.points else 0
+        rows = {
+            "scene": str(self.path),
+            "views": f"{len(self.train)} for training, {len(self.test)} for testing",
+            "photographs": f"{camera.width} x {camera.height} px, the first",
+            "points": f"{count:,}" if count else "none",
+            "extent": f"{self.extent:.3g} scene units",
+        }
+        return summary(rows, list(self._thumbnails()))
+
+    def _thumbnails(self) -> Iterator[tuple[str, NDArray[np.uint8]]]:
+        """Some photographs, evenly spaced, with their names; those that cannot be read are left out."""
+        for i in np.unique(np.linspace(0, len(self.views) - 1, MAX_THUMBNAILS).astype(int)):
+            with suppress(DataError):
+                yield self.views[i].name, load_image(self.views[i])
 
 
 def make_scene(

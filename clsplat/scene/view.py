@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from clsplat.errors import DataError
 from clsplat.scene.camera import Camera
@@ -17,6 +17,7 @@ from clsplat.scene.lens import Lens
 Floats = NDArray[np.floating]
 Alpha = Literal["transparency", "mask"]  # the meaning of a photograph's fourth channel
 BLACK = (0.0, 0.0, 0.0)
+NO_FILE = Path()  # of a view that is made by hand
 MIN_WHITE = 0.99  # share of the largest value: JPEG does not store white exactly
 
 
@@ -30,11 +31,35 @@ class View:
     name: str
     camera: Camera
     world_to_camera: Floats  # [3, 4] float64
-    image_path: Path = Path()
+    image_path: Path = NO_FILE
     mask_path: Path | None = None  # an image of the photograph's size, white in pixels that count
     alpha: Alpha = "transparency"
     lens: Lens | None = None  # of the photograph on disk, where it has distortion
     downscale: float = 1  # divisor of the original photograph's size
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "world_to_camera", np.asarray(self.world_to_camera))
+        if self.world_to_camera.shape != (3, 4):
+            raise ValueError(f"the pose of '{self.name}' has shape {self.world_to_camera.shape}; expected (3, 4)")
+
+    @classmethod
+    def looking_at(
+        cls, position: ArrayLike, target: ArrayLike, up: ArrayLike, camera: Camera, name: str = "view"
+    ) -> "View":
+        """Return a view from a position to a target, with `up` upwards in the image; each [3], in scene units.
+
+        Raises ValueError where there is no such view: the target is the position, or lies along `up`.
+        """
+        centre, point, above = (np.asarray(vector, np.float64) for vector in (position, target, up))
+        if not centre.shape == point.shape == above.shape == (3,):
+            raise ValueError(f"'{name}': expected a position, a target and `up` of 3 numbers each")
+        forward = point - centre
+        right = np.cross(forward, above)
+        axes = np.stack([right, np.cross(forward, right), forward])
+        if not np.linalg.norm(right) > 1e-9 * np.linalg.norm(forward) * np.linalg.norm(above):
+            raise ValueError(f"'{name}': expected a target away from the position, and not along `up`")
+        axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+        return cls(name, camera, np.column_stack([axes, -axes @ centre]))
 
     @property
     def position(self) -> Floats:
@@ -110,6 +135,8 @@ def _as_taken(view: View, path: Path) -> NDArray[Any]:
     The EXIF rotation is applied where the file has the camera's size only with it: COLMAP ignores the tag.
     Raises DataError when the sizes differ in both cases.
     """
+    if path == NO_FILE:
+        raise DataError(f"the view '{view.name}' has no photograph; expected one with an image_path")
     pixels, lens = read_image(path), view.lens
     stored = pixels.shape[1::-1]
     camera = (lens.width, lens.height) if lens else (view.camera.width, view.camera.height)
