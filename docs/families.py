@@ -10,13 +10,18 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from pydantic import AfterValidator
+from pydantic.fields import FieldInfo
+
 import clsplat.pipeline.schema  # noqa: F401  (it imports all that a pipeline can name)
 from clsplat.pipeline.file import PipelineFile
 from clsplat.pipeline.matrix import Matrix
+from clsplat.schedule import Decay, Points
 from clsplat.settings import Settings
 
 ROOT = Path(__file__).resolve().parents[1]
 Kind = type[Settings]
+NOTATIONS = (Points, Decay)  # of a number that changes: on a page of their own
 
 
 class Family(NamedTuple):
@@ -30,9 +35,16 @@ class Family(NamedTuple):
 
 FAMILIES = {  # by the name of the base; any other family gets a page of its own
     "Stage": Family("stages", "stage", "stages"),
+    "Scheduled": Family("stages", "stage of `during`", "during"),
     "Loss": Family("losses", "loss", "losses"),
+    "ImageLoss": Family("losses", "loss on images", "losses"),
     "Penalty": Family("losses", "penalty", "losses"),
     "Rule": Family("rules", "density rule", "rules"),
+    "Grow": Family("rules", "growing rule", "rules"),
+    "Subdivide": Family("rules", "dividing rule", "rules"),
+    "Statistic": Family("statistics", "statistic", "statistic", listed=False),
+    "Order": Family("views", "order", "order", listed=False),
+    "PhotographTransform": Family("views", "transform", "transforms"),
     "WorldFilter": Family("filters", "world filter", "world_filter", listed=False),
     "ScreenFilter": Family("filters", "screen filter", "screen_filter", listed=False),
     "Step": Family("prepare", "prepare step", "prepare"),
@@ -67,34 +79,57 @@ def family(base: Kind) -> Family:
     return FAMILIES.get(name, Family(name.lower(), name, name.lower()))
 
 
+def groups(base: Kind) -> list[Kind]:
+    """Return a base and the classes without a name between it and what a pipeline file can name."""
+    named = families()[base]
+    return [
+        base,
+        *(one for one in dict.fromkeys(below(base)) if not tag(one) and any(issubclass(k, one) for k in named)),
+    ]
+
+
 @functools.cache
 def unnamed() -> dict[Kind, str]:
     """Return the settings without a name of their own, each with the key that a reader of a file meets first."""
-    strategies = {kind for base, kinds in families().items() for kind in (base, *kinds)}
+    intermediate = {*NOTATIONS, *(group for base in families() for group in groups(base))}
     found: dict[Kind, str] = {}
     waiting: list[tuple[Kind, str]] = [(PipelineFile, ""), (Matrix, "matrix")]
     met = {PipelineFile, Matrix}
     while waiting:
         kind, key = waiting.pop(0)
-        if kind not in strategies:
+        if kind in families():  # a key takes one of the variants
+            waiting += [(one, tag(one)) for one in families()[kind]]
+            continue
+        if kind not in intermediate and not tag(kind):
             found[kind] = key
-        inner = [(one, name) for name, field in kind.model_fields.items() for one in models(field.annotation)]
-        waiting += [(one, name) for one, name in dict.fromkeys(inner) if one not in met]
+        inner = [
+            (one, f"{key}.{name}".strip(".")) for name, field in kind.model_fields.items() for one in models(field)
+        ]
+        waiting += [(one, name) for one, name in inner if one not in met]
         met |= {one for one, _ in inner}
     return found
 
 
-def models(annotation: Any) -> Iterator[Kind]:
-    """Yield the settings that an annotation mentions."""
-    if isinstance(annotation, type) and issubclass(annotation, Settings):
+def models(field: FieldInfo) -> list[Kind]:
+    """Return the settings that the annotation of a field mentions."""
+    return [part for part in parts(field) if isinstance(part, type) and issubclass(part, Settings)]
+
+
+def parts(field: FieldInfo) -> list[Any]:
+    """Return all that the annotation of a field is made of, its marks included."""
+
+    def inside(annotation: Any) -> Iterator[Any]:
         yield annotation
-    for argument in typing.get_args(annotation):
-        yield from models(argument)
+        for argument in typing.get_args(annotation):
+            yield from inside(argument)
+
+    found = [*inside(field.annotation), *field.metadata]
+    return [mark.func if isinstance(mark, AfterValidator) else mark for mark in found]
 
 
 def undescribed() -> list[str]:
     """Return the keys without a description, as Class.key."""
-    kinds = [*unnamed(), *(kind for base, kinds in families().items() for kind in (base, *kinds))]
+    kinds = [*unnamed(), *NOTATIONS, *(kind for base, kinds in families().items() for kind in (*groups(base), *kinds))]
     return [
         f"{kind.__name__}.{name}"
         for kind in kinds

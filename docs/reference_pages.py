@@ -3,14 +3,33 @@
 import functools
 from typing import Any
 
-from families import Kind, families, family, tag, unnamed
+from families import NOTATIONS, Kind, families, family, groups, parts, tag, unnamed
+from schedule_page import schedule_page
 from yaml_examples import example
 
 from clsplat.density.statistics import Statistic
+from clsplat.scene.detect import readers
+from clsplat.schedule import Bounded
 from clsplat.settings import variants
 
 Node = dict[str, Any]
-HEADINGS = {"stages": "Stages", "losses": "Losses and penalties", "rules": "Density rules", "prepare": "Prepare steps"}
+HEADINGS = {
+    "stages": "Stages",
+    "losses": "Losses and penalties",
+    "rules": "Density rules",
+    "prepare": "Prepare steps",
+    "views": "Orders and transforms",
+}
+INTRODUCTIONS = {
+    "stages": "A pipeline is a list of stages. Those that can stand in `during` are run every so many steps of training.",
+    "losses": "`optimize.losses` is a list; training minimises the weighted sum.",
+    "rules": "`densify.rules` is a list. All rules act as one rearrangement of the Gaussians.",
+    "statistics": "A growing rule acts where the mean of a statistic is large. Only the statistics that a rule names are "
+    "summed and cost time.",
+    "views": "What a training step compares with: the keys `order` and `transforms` of `optimize.views`.",
+    "filters": "The two low-pass filters of `model`: one in the scene, one on the screen.",
+    "prepare": "`prepare` is a list: what makes a scene of photographs, once, on the host.",
+}
 WORDS = {"integer": "whole number", "string": "text", "boolean": "true or false", "null": "none", "object": "keys"}
 BOUNDS = {"exclusiveMinimum": "> ", "minimum": "≥ ", "exclusiveMaximum": "< ", "maximum": "≤ "}
 TABLE = "| key | takes | default | meaning and unit |\n|---|---|---|---|\n"
@@ -20,40 +39,52 @@ TABLE = "| key | takes | default | meaning and unit |\n|---|---|---|---|\n"
 def reference_pages() -> dict[str, str]:
     """Return every page that is made from settings, by its path in the site."""
     pages = {page: family_page(page) for page in dict.fromkeys(family(base).page for base in families())}
-    pages |= {"settings": settings_page(), "statistics": statistics_page()}
+    pages |= {"settings": settings_page(), "schedules": schedule_page(key_table), "readers": readers_page()}
     return {f"reference/{name}.md": text for name, text in pages.items()}
 
 
 def family_page(page: str) -> str:
-    """Return all families of a page, each with the keys that its members share."""
-    text = f"# {HEADINGS.get(page, page.capitalize())}\n\n"
+    """Return all families of a page: the keys that members of a group share, then each member."""
+    text = f"# {HEADINGS.get(page, page.capitalize())}\n\n{INTRODUCTIONS.get(page, '')}\n\n"
     for base, kinds in families().items():
-        if family(base).page != page:
-            continue
-        text += f"## Every {family(base).title}\n\n{manual(base)}{key_table(base)}"
-        for kind in kinds:
-            sample, file = example(base, kind)
-            title = f' title="{file}"' if file else ""
-            text += f"## `{tag(kind)}` {{: #{tag(kind)} }}\n\n{manual(kind)}{key_table(kind, tuple(base.model_fields))}"
-            text += f"```yaml{title}\n{sample}```\n\n"
+        if family(base).page == page:
+            text += "".join(group_section(group) for group in groups(base))
+            text += "".join(section(base, kind) for kind in kinds)
     return text
+
+
+def group_section(group: Kind) -> str:
+    """Return what the members of a group share; they are plug-ins' bases, too."""
+    parent = group.__bases__[0]
+    keys = key_table(group, tuple(parent.model_fields) if parent in (b for f in families() for b in groups(f)) else ())
+    anchor = group.__name__.lower()
+    return f"## Every {family(group).title} {{: #{anchor} }}\n\n{manual(group)}{keys}Base class for plug-ins: `{group.__name__}`.\n\n"
+
+
+def section(base: Kind, kind: Kind) -> str:
+    """Return the manual, the keys and an example of what a pipeline file can name."""
+    sample, file = example(base, kind)
+    title = f' title="{file}"' if file else ""
+    group = next(one for one in kind.__mro__ if one in groups(base))
+    shared = f"It is a [{family(group).title}](#{group.__name__.lower()}).\n\n" if group is not base else ""
+    keys = key_table(kind, tuple(group.model_fields))
+    return f"## `{tag(kind)}` {{: #{tag(kind)} }}\n\n{manual(kind)}{shared}{keys}```yaml{title}\n{sample}```\n\n"
 
 
 def settings_page() -> str:
     """Return the settings without a name of their own."""
     text = "# Settings of a pipeline file\n\n"
     for kind, key in unnamed().items():
-        title = f"`{key}`: {kind.__name__}" if key else "The file"
+        title = f"`{key}`" if key else "The file"
         text += f"## {title} {{: #{kind.__name__.lower()} }}\n\n{manual(kind)}{key_table(kind)}"
     return text
 
 
-def statistics_page() -> str:
-    """Return what density rules can ask for."""
-    text = "# Statistics\n\nA growing rule acts where the mean of a statistic is large. Only those that a rule names "
-    text += "are summed and cost time.\n\n"
-    for name, statistic in variants(Statistic).items():
-        text += f"## `{name}` {{: #{name} }}\n\n{manual(statistic)}"
+def readers_page() -> str:
+    """Return the dataset formats, in the order in which they are looked for."""
+    text = "# Dataset readers\n\nThe first reader that knows a folder reads it. [Datasets](../datasets.md) says what is read.\n\n"
+    for reader in readers():
+        text += f"## {reader.name}\n\n{manual(type(reader))}It looks for `{reader.expects}`.\n\n"
     return text
 
 
@@ -65,9 +96,16 @@ def key_table(kind: Kind, without: tuple[str, ...] = ()) -> str:
             continue
         node = schema["properties"][name]
         default = "required" if field.is_required() else shown(node.get("default"))
-        cells = (f"`{name}`", expected(node), default, field.description or "")
+        bound = next((part for part in parts(field) if isinstance(part, Bounded)), None)
+        takes = expected(node)
+        if bound:
+            takes = takes.replace(BY_STEP, f"{BY_STEP} {'>' if bound.above else '≥'} {bound.lowest:g}")
+        cells = (f"`{name}`", takes, default, field.description or "")
         rows += "| " + " | ".join(" ".join(cell.split()).replace("|", "\\|") for cell in cells) + " |\n"
     return f"{TABLE}{rows}\n" if rows else ""
+
+
+BY_STEP = "[number by step](schedules.md)"
 
 
 def expected(node: Node) -> str:
@@ -82,7 +120,7 @@ def expected(node: Node) -> str:
         return "one of " + ", ".join(f"`{value}`" for value in node["enum"])
     for union in ("anyOf", "oneOf", "allOf"):
         if union in node:
-            return " or ".join(dict.fromkeys(expected_of(one) for one in node[union]))
+            return either(node[union])
     if node.get("type") == "array":
         return f"list of {expected(node['items'])}" if "items" in node else "list"
     if isinstance(node.get("additionalProperties"), dict):
@@ -91,8 +129,18 @@ def expected(node: Node) -> str:
     return f"{WORDS.get(node.get('type', ''), node.get('type', 'any value'))} {bounds}".strip()
 
 
+def either(nodes: list[Node]) -> str:
+    """Return what a union takes: all members of a family are one link, and so are the notations of a number."""
+    flat = [inner for node in nodes for inner in (node.get("anyOf") or [node])]
+    names = [node.get("$ref", "").rpartition("/")[2] for node in flat]
+    if {kind.__name__ for kind in NOTATIONS} <= set(names):
+        others = [expected(n) for n, name in zip(flat, names, strict=True) if n.get("type") not in ("number", "array")]
+        return " or ".join([BY_STEP, *(text for text in others if "schedules.md" not in text)])
+    return " or ".join(dict.fromkeys(expected_of(one) for one in flat))
+
+
 def expected_of(node: Node) -> str:
-    """Return what one member of a union takes: all members of a family are one link."""
+    """Return what one member of a union takes."""
     name = node.get("$ref", "").rpartition("/")[2]
     for base, kinds in families().items():
         if name in [kind.__name__ for kind in kinds]:
@@ -106,7 +154,9 @@ def link(name: str) -> str:
         for kind in kinds:
             if kind.__name__ == name:
                 return f"[`{tag(kind)}`]({family(base).page}.md#{tag(kind)})"
-    return f"[{name}](settings.md#{name.lower()})" if name in [kind.__name__ for kind in unnamed()] else "any value"
+    if name in [kind.__name__ for kind in NOTATIONS]:
+        return f"[keys](schedules.md#{name.lower()})"
+    return f"[keys](settings.md#{name.lower()})" if name in [kind.__name__ for kind in unnamed()] else "any value"
 
 
 def shown(value: Any) -> str:

@@ -1,7 +1,8 @@
-"""Examples of what a pipeline file can name: from a shipped file where one has it, else with all keys."""
+"""Examples of what a pipeline file can name: from a shipped file or a page where one has it, else with all keys."""
 
 import functools
 import io
+import re
 from collections.abc import Iterator
 from typing import Any
 
@@ -14,14 +15,15 @@ MAX_WIDTH = 88  # characters that a page shows without scrolling
 
 
 def example(base: Kind, kind: Kind) -> tuple[str, str]:
-    """Return how a pipeline file says it, and the shipped file that does ("" where none does)."""
+    """Return how a pipeline file says it, and the shipped file that does ("" where only a page or none does)."""
     found = [
         (block(base, item), file)
         for file, item in shipped_items()
         if (kind_of_item(item) == tag(kind)) and set(fields_of(item)) <= {*kind.model_fields}
     ]
-    if not found:  # no shipped file uses it
+    if not found:  # no file uses it
         values = kind.model_construct().model_dump(mode="json", exclude={"stage", "every", "start", "stop"})
+        values = {"type": values.pop("type"), **values} if "type" in values else values
         values = {key: value for key, value in values.items() if value is not None}
         found = [(block(base, {tag(kind): values} if "stage" in kind.model_fields else values), "")]
     short = [one for one in found if one[0].count("\n") <= MAX_EXAMPLE]
@@ -30,9 +32,12 @@ def example(base: Kind, kind: Kind) -> tuple[str, str]:
 
 @functools.cache
 def shipped_items() -> list[tuple[str, Node]]:
-    """Return all mappings of all shipped files, those of plain 3DGS first, each with the name of its file."""
+    """Return all mappings of all shipped files, those of plain 3DGS first, each with the name of its file, and of pages."""
     files = sorted((ROOT / "pipelines").glob("*.yaml"), key=lambda file: (not file.name.startswith("splat"), file.name))
-    return [(file.name, item) for file in files for item in items(YAML(typ="safe").load(file.read_text()))]
+    texts = [(file.name, file.read_text()) for file in files]
+    page = (ROOT / "docs" / "pipelines.md").read_text()
+    texts += [("", text) for text in re.findall(r"^```yaml\n(.*?)^```", page, re.M | re.S)]
+    return [(name, item) for name, text in texts for item in items(YAML(typ="safe").load(text))]
 
 
 def items(node: Any) -> Iterator[Node]:
@@ -58,9 +63,9 @@ def block(base: Kind, item: Node) -> str:
     """Return an item as YAML, below the key that holds it."""
     fields = fields_of(item)
     key = "during" if "every" in fields else family(base).key
-    one = item if fields else kind_of_item(item)
+    one = item if fields.keys() - {"type"} else kind_of_item(item)
     data = {key: [one] if family(base).listed else one}
-    text = dumped(data, None)
+    text = dumped(data, None if isinstance(data[key], list | dict) else False)
     return text if max(map(len, text.splitlines())) <= MAX_WIDTH else dumped(data, False)
 
 

@@ -36,10 +36,14 @@ MAX_CELLS = 1000
 class Matrix(Settings):
     """The axes; every one that is listed is part of the cells' names."""
 
-    pipelines: list[str] = Field([])  # files, or names of shipped ones
-    scenes: list[str] = Field([])  # folders
+    pipelines: list[str] = Field([])
+    """Pipeline files, or names of shipped pipelines; without them, the stages of this file."""
+    scenes: list[str] = Field([])
+    """Folders of datasets; without them, the scene of the pipeline or of --scene."""
     seeds: list[Annotated[int, Field(ge=0, lt=2**32)]] = Field([])
-    set: dict[str, Annotated[list[JsonValue], Field(min_length=1)]] = Field({})  # stage.key: its values
+    """Seeds; without them, the seed of the pipeline."""
+    set: dict[str, Annotated[list[JsonValue], Field(min_length=1)]] = Field({})
+    """Settings by place, as of --set, each with the list of its values."""
 
     @model_validator(mode="after")
     def _has_cells(self) -> "Matrix":

@@ -20,7 +20,8 @@ class Step(Settings):
 
     version: ClassVar[int] = 1  # changes with what the step does
 
-    stage: str  # the name in a pipeline file
+    stage: str
+    """Name of the step."""
 
     @abstractmethod
     def make(self, source: Path, out: Path, without: Path) -> dict[str, Any]:
@@ -32,10 +33,14 @@ class FindFeatures(Step):
 
     stage: Literal["find_features"] = "find_features"
 
-    long_side: Count = 1600  # px: photographs are made smaller to look for features
-    features: Count = 8192  # at most, in each
+    long_side: Count = 1600
+    """Longer side in px of the images in which features are found; larger photographs are made smaller."""
+    features: Count = 8192
+    """Largest number of features of a photograph."""
     camera_model: CameraModel = "SIMPLE_RADIAL"
-    cameras: Cameras = "auto"  # auto: one for photographs of the same size and focal length
+    """Camera model of COLMAP; OPENCV_FISHEYE for fisheye lenses."""
+    cameras: Cameras = "auto"
+    """Which photographs share a camera; auto: those of the same size and focal length."""
 
     def make(self, source: Path, out: Path, without: Path) -> dict[str, Any]:
         if holds_scene(source):
@@ -53,8 +58,10 @@ class MatchFeatures(Step):
 
     stage: Literal["match_features"] = "match_features"
 
-    matching: Matching = "auto"  # auto: exhaustive, vocabulary beyond 200 photographs
-    neighbours: Count = 10  # photographs that each is matched with, when not with all
+    matching: Matching = "auto"
+    """Which pairs of photographs are matched; auto: exhaustive, and vocabulary for more than 200 photographs."""
+    neighbours: Count = 10
+    """Number of photographs that each is matched with, where not with all."""
 
     def make(self, source: Path, out: Path, without: Path) -> dict[str, Any]:
         return match_features(source, out, self.matching, self.neighbours)
@@ -66,7 +73,9 @@ class MapCameras(Step):
     stage: Literal["map_cameras"] = "map_cameras"
 
     mapper: Mapper = "incremental"
-    threads: Count = 1  # more are faster, and not repeatable to the bit
+    """How cameras are found: one after the other, or all at once (global)."""
+    threads: Count = 1
+    """Number of threads; more than one are faster, and the result does not repeat to the bit."""
 
     def make(self, source: Path, out: Path, without: Path) -> dict[str, Any]:
         return map_cameras(source, out, self.mapper, self.threads)
@@ -77,8 +86,10 @@ class Undistort(Step):
 
     stage: Literal["undistort"] = "undistort"
 
-    long_side: Count | None = None  # px; none: as large as the photographs
-    blank: Blank = "crop"  # mask: keep the whole photograph, and mask what it does not show
+    long_side: Count | None = None
+    """Longer side of the new images in px; without it, that of the photographs."""
+    blank: Blank = "crop"
+    """Pixels that no photograph shows; crop: cut them off; mask: keep the whole photograph and mask them."""
 
     def make(self, source: Path, out: Path, without: Path) -> dict[str, Any]:
         return {"images": undistort_scene(source, out, self.long_side, self.blank)}

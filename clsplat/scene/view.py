@@ -73,7 +73,7 @@ class View:
             return self
         return replace(self, camera=self.camera.downscaled(downscale / self.downscale), downscale=downscale)
 
-    def photograph(self, background: tuple[float, float, float] = BLACK) -> NDArray[np.float32]:
+    def photograph(self, background: tuple[float, float, float] | Floats = BLACK) -> NDArray[np.float32]:
         """Return the photograph at the camera's size, [height, width, 3] in [0, 1]; alpha is blended with `background`.
 
         Raises DataError when the file cannot be read or is not the camera's image.
@@ -81,7 +81,7 @@ class View:
         return np.asarray(load_image(self, background) / np.float32(255), np.float32)
 
 
-def load_image(view: View, background: tuple[float, float, float] | None = None) -> NDArray[np.uint8]:
+def load_image(view: View, background: tuple[float, float, float] | Floats = BLACK) -> NDArray[np.uint8]:
     """Return the photograph of `view` at its camera's size, RGB, [H, W, 3]; alpha is composited on `background`.
 
     `background` is a colour in [0, 1], black by default.  Raises DataError when the file cannot be read as an 8- or
@@ -101,7 +101,7 @@ def load_image(view: View, background: tuple[float, float, float] | None = None)
         return np.asarray(np.rint(values * (255 / limit)), np.uint8)
     unit = values / limit
     colour, alpha = unit[:, :, :3], unit[:, :, 3:]
-    composite = colour * alpha + np.array(background or BLACK) * (1 - alpha)
+    composite = colour * alpha + np.asarray(background) * (1 - alpha)
     slack = 1e-3 if resized else 0.0  # OpenCV's area weights are single precision: rounding must not lower a level
     return np.asarray(composite * 255 + slack, np.uint8)  # truncated, as in the reference (Kerbl et al. 2023)
 

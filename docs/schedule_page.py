@@ -1,0 +1,49 @@
+"""The page about numbers that change over training: their notations, and the keys that take them."""
+
+from collections.abc import Callable
+
+from families import NOTATIONS, Kind, families, family, models, tag, unnamed
+
+from clsplat.schedule import Decay, Points
+
+EXAMPLES = {  # notation: what it means, and how a file writes it
+    "A constant": ("The same at every step.", "weight: 0.8"),
+    "Points": (
+        "Values at global steps, with straight lines between them. Before the first point and after the last one the value "
+        "stays as it is there.",
+        "weight: [[4000, 0.0], [5000, 4.0]]      # 0 until step 4000, 4 from step 5000 on",
+    ),
+}
+SAMPLES = {
+    Points: "resolution: {points: [[0, 4.0], [500, 2.0], [1000, 1.0]], between: steps}",
+    Decay: "means: {initial: 1.6e-4, final: 1.6e-6, over: 30000}",
+}
+TITLES = {Points: "Points with keys", Decay: "Exponential decay"}
+
+
+def schedule_page(key_table: Callable[[Kind], str]) -> str:
+    """Return the page; `key_table` makes the table of a class."""
+    text = "# Numbers by step\n\nWhere a key takes a *number by step*, the number may change over training. "
+    text += (
+        "There is one notation for all of them. Steps are global: they are counted over the whole pipeline, from 1.\n\n"
+    )
+    for title, (meaning, sample) in EXAMPLES.items():
+        text += f"## {title}\n\n{meaning}\n\n```yaml\n{sample}\n```\n\n"
+    for kind in NOTATIONS:
+        manual = " ".join((kind.__doc__ or "").split())
+        text += f"## {TITLES[kind]} {{: #{kind.__name__.lower()} }}\n\n{manual}\n\n{key_table(kind)}"
+        text += f"```yaml\n{SAMPLES[kind]}\n```\n\n"
+    return f"{text}## Keys that take them\n\n{users()}"
+
+
+def users() -> str:
+    """Return a list of all keys that take a number by step."""
+    named = [
+        (f"[`{tag(kind)}`]({family(base).page}.md#{tag(kind)})", kind) for base, ks in families().items() for kind in ks
+    ]
+    others = [(f"[`{key}`](settings.md#{kind.__name__.lower()})", kind) for kind, key in unnamed().items()]
+    rows = ""
+    for place, kind in [*others, *named]:
+        keys = [f"`{name}`" for name, field in kind.model_fields.items() if set(NOTATIONS) <= set(models(field))]
+        rows += f"| {place} | {', '.join(keys)} |\n" if keys else ""
+    return f"| of | keys |\n|---|---|\n{rows}\n"
