@@ -24,7 +24,7 @@ void blur_rows(
     const uint x = get_global_id(0), y = get_global_id(1), plane = rows * stride;
     if (x >= width || y >= height)
         return;
-    const uint first = x > reach ? x - reach : 0, last = x + reach < width ? x + reach : width - 1;
+    const uint first = max((int)x - (int)reach, 0), last = min(x + reach, width - 1);
     float total[4] = {0.0f, 0.0f, 0.0f, 0.0f};
     for (uint column = first; column <= last; column++) {
         const uint at = y * stride + column;
@@ -52,7 +52,7 @@ void blur_columns(
     const uint x = get_global_id(0), y = get_global_id(1), plane = rows * stride;
     if (x >= width || y >= height)
         return;
-    const uint first = y > reach ? y - reach : 0, last = y + reach < height ? y + reach : height - 1;
+    const uint first = max((int)y - (int)reach, 0), last = min(y + reach, height - 1);
     float total[4] = {0.0f, 0.0f, 0.0f, 0.0f};
     for (uint row = first; row <= last; row++)
         for (uint channel = 0; channel < 4; channel++)
