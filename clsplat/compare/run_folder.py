@@ -12,6 +12,7 @@ from clsplat import plugins
 from clsplat.errors import ConfigError, DataError
 from clsplat.pipeline.explanation import explain
 from clsplat.pipeline.file import SceneSettings
+from clsplat.pipeline.renamed import with_new_names
 from clsplat.pipeline.yaml_file import read_yaml
 from clsplat.prepare.cache import noted
 from clsplat.scene.images import read_file
@@ -118,7 +119,7 @@ def read_settings(path: Path) -> dict[str, Any]:
 
 def _scene(path: Path, settings: dict[str, Any]) -> SceneSettings:
     try:
-        return SceneSettings.model_validate(settings.get("scene", {}))
+        return SceneSettings.model_validate(with_new_names(settings).get("scene", {}))
     except ValidationError as error:
         file = path / "pipeline.yaml"
         raise ConfigError(explain(error, SceneSettings, file, read_yaml(file))) from error
