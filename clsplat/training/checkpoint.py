@@ -88,8 +88,8 @@ def _load(path: Path) -> tuple[dict[str, Any], Tables]:
         tables = {name: archive[name] for name in archive.files if name != "meta"}
     if meta["format"] != FORMAT:
         raise ConfigError(
-            f"{path} has format {meta['format']}, expected {FORMAT}: clsplat {meta['version']} made it before the format "
-            "changed; go on with the program that made it, or use another --out"
+            f"{path} has format {meta['format']}, expected {FORMAT}: clsplat {meta['version']} made it before the "
+            "format changed; go on with the program that made it, or use another --out"
         )
     missing = [name for name in PARAMETERS if _key(name) not in tables]
     if missing:
