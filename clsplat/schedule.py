@@ -39,12 +39,12 @@ PointList = Annotated[list[Point], AfterValidator(_in_order)]
 
 
 class Points(Settings):
-    """Values at steps; before the first point and after the last the value stays as there."""
+    """Values at steps; constant before the first point and after the last."""
 
     points: PointList
     """[global step, value], with growing steps."""
     between: Literal["linear", "steps"] = "linear"
-    """What lies between two points: a straight line, or the value of the point before."""
+    """Values between two points: on a straight line, or that of the point before."""
 
     def at(self, step: int) -> float:
         """Return the value at a global step."""
@@ -52,7 +52,7 @@ class Points(Settings):
 
     @property
     def values(self) -> list[float]:
-        """Every value that is named."""
+        """All values of the notation."""
         return [value for _, value in self.points]
 
 
@@ -75,7 +75,7 @@ class Decay(Settings):
 
     @property
     def values(self) -> list[float]:
-        """Every value that is named."""
+        """All values of the notation."""
         return [self.initial, self.final]
 
 
@@ -86,7 +86,7 @@ NOTATIONS = (
 
 
 def explained(more: str = "") -> WrapValidator:
-    """Say in one sentence what is wrong with a schedule, or what else a field takes, not once for each notation."""
+    """Make one sentence of the errors of all notations; `more` names other values that the field accepts."""
 
     def validated(value: Any, validate: Callable[[Any], Any]) -> Any:
         try:
@@ -103,7 +103,7 @@ Schedule = Annotated[float | PointList | Points | Decay, explained()]
 
 
 def values_of(schedule: Schedule) -> list[float]:
-    """Every value that a schedule names."""
+    """Return all values of a schedule's notation."""
     if isinstance(schedule, list):
         return [value for _, value in schedule]
     return schedule.values if isinstance(schedule, Points | Decay) else [schedule]

@@ -12,7 +12,8 @@ from clsplat.gaussians.model import Model
 from clsplat.gaussians.tables import PARAMETERS, DeviceModel, Gaussians
 from clsplat.metrics.images import to_8_bits
 from clsplat.opencl.device import Array, Device
-from clsplat.render.rasterizer import Content, DeviceCamera, Frame, Rasterizer, upload_camera
+from clsplat.render.camera import DeviceCamera, upload_camera
+from clsplat.render.rasterizer import Content, Frame, Rasterizer
 from clsplat.scene.scene import View
 
 Floats = NDArray[np.float32]

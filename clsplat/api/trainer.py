@@ -122,7 +122,7 @@ class Trainer:
     def evaluate(self, split: str = "test") -> dict[str, Any]:
         """Return the metrics of a split, with the keys of metrics.json; None for a split without views."""
         run = self._run
-        views = run.scene.downscaled(run.scale).split(split)
+        views = run.scene.downscaled(run.downscale).split(split)
         return mean(measure(run.rasterizer, run.model, views, run.photographs)) if views else {"views": 0}
 
     def checkpoint(self) -> Path:

@@ -11,7 +11,8 @@ import numpy as np
 from clsplat.bench.floors import Work, floors
 from clsplat.bench.peaks import Peaks
 from clsplat.density.basic import PruneLarge
-from clsplat.density.edit import Edit, SceneScale, densify
+from clsplat.density.control import densify
+from clsplat.density.edit import Edit, SceneScale
 from clsplat.density.statistics import SplatStats
 from clsplat.gaussians.ply import Parameters
 from clsplat.gaussians.tables import PARAMETERS, Gaussians
