@@ -63,12 +63,12 @@ class _Curves:
 
 
 class Points(Curve):
-    """Values at steps; before the first point and after the last the value stays as there."""
+    """Values at steps; constant before the first point and after the last."""
 
     points: PointList
     """[global step, value], with growing steps."""
     between: Literal["linear", "steps"] = "linear"
-    """What lies between two points: a straight line, or the value of the point before."""
+    """Values between two points: on a straight line, or that of the point before."""
 
     def at(self, step: int) -> float:
         return _between(self.points, step, linear=self.between == "linear")
@@ -106,7 +106,7 @@ NOTATIONS = (
 
 
 def explained(more: str = "") -> WrapValidator:
-    """Say in one sentence what is wrong with a schedule, or what else a field takes, not once for each notation."""
+    """Make one sentence of the errors of all notations; `more` names other values that the field accepts."""
 
     def validated(value: Any, validate: Callable[[Any], Any]) -> Any:
         try:
@@ -123,7 +123,7 @@ Schedule = Annotated[float | PointList | Annotated[Curve, _Curves()], explained(
 
 
 def values_of(schedule: Schedule) -> list[float]:
-    """Every value that a schedule names."""
+    """Return all values of a schedule's notation."""
     if isinstance(schedule, list):
         return [value for _, value in schedule]
     return schedule.values if isinstance(schedule, Curve) else [schedule]

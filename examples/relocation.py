@@ -7,8 +7,7 @@ import numpy as np
 from pydantic import Field
 from scipy.special import comb
 
-from clsplat.density.edit import Edit
-from clsplat.density.rule import Rule
+from clsplat.density.edit import Edit, Rule
 from clsplat.schedule import NonNegative, Positive, at_step
 from clsplat.stages.base import Scheduled
 from clsplat.training.run import Run

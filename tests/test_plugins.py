@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from clsplat import plugins
-from clsplat.density.rule import Rule
+from clsplat.density.edit import Rule
 from clsplat.errors import ConfigError
 from clsplat.pipeline.loading import load
 from clsplat.settings import Settings, rebuild, variants
@@ -21,7 +21,7 @@ EXAMPLES = Path(__file__).parents[1] / "examples"
 RULE = """
 from typing import Literal
 from clsplat.density.edit import Edit
-from clsplat.density.rule import Rule
+from clsplat.density.edit import Rule
 
 class Nothing(Rule):
     type: Literal["{name}"] = "{name}"

@@ -6,8 +6,7 @@ from typing import Literal
 
 import pytest
 
-from clsplat.density.edit import Edit
-from clsplat.density.rule import Rule
+from clsplat.density.edit import Edit, Rule
 from clsplat.errors import ConfigError
 from clsplat.losses.base import ImageLoss, Loss, Penalty
 from clsplat.pipeline.loading import Pipeline, load

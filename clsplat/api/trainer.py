@@ -160,7 +160,7 @@ class Trainer:
         psnr is in dB; a split without views has `views` alone.  Raises ValueError for a split that there is not.
         """
         run = self._run
-        views = run.scene.downscaled(run.scale).split(split)
+        views = run.scene.downscaled(run.downscale).split(split)
         return mean(measure(run.rasterizer, run.model, views, run.photographs.fresh())) if views else {"views": 0}
 
     def checkpoint(self) -> Path:

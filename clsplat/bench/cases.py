@@ -11,8 +11,8 @@ import numpy as np
 from clsplat.bench.floors import Work, floors
 from clsplat.bench.peaks import Peaks
 from clsplat.density.basic import PruneLarge
+from clsplat.density.control import densify
 from clsplat.density.edit import Edit, SceneScale
-from clsplat.density.rule import densify
 from clsplat.density.statistics import SplatStats
 from clsplat.gaussians.ply import Parameters
 from clsplat.gaussians.tables import PARAMETERS, Gaussians

@@ -1,11 +1,19 @@
-"""What density rules do to Gaussians: the outcome of each, and its application to all tables at once."""
+"""An edit of the Gaussians, and the base of the rules that mark it (Kerbl et al. 2023, section 5).
+
+A rule gives Gaussians an outcome: the number of rows that each becomes.  Most rules are a box in (mean of a statistic,
+size, opacity), and one kernel applies them all; others choose on the host.  Sizes are the largest standard deviation
+as a share of the scene's extent.  The first growing rule whose box holds a Gaussian decides; pruning rules override
+growth and compare the size of the children after a split.
+"""
 
 import math
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from clsplat.density.statistics import SEEN, SplatStats
 from clsplat.density.thresholds import PixelQuantile, Quantile, Threshold
@@ -13,9 +21,10 @@ from clsplat.errors import ConfigError
 from clsplat.gaussians.tables import PARAMETERS, Gaussians, moment_tables
 from clsplat.render.tiles import Tiler
 from clsplat.schedule import Schedule, at_step
+from clsplat.settings import Settings
 
-MAX_BOUND = 3.0e38  # a bound that no finite float passes
-MIN_BOUND = 1.2e-38  # the smallest normal float: a bound that only zero misses
+MAX_BOUND = 3.0e38  # a bound above all values
+MIN_BOUND = 1.2e-38  # the smallest normal float: a bound that all values but zero reach
 
 
 def _no_photographs(share: float) -> float:
@@ -24,21 +33,22 @@ def _no_photographs(share: float) -> float:
 
 @dataclass(frozen=True)
 class SceneScale:
-    """The yardsticks of rules: the scene's extent in scene units, and the texture of its photographs."""
+    """Units of rules: the scene's extent, scene units, and quantiles of the photographs' texture, per px."""
 
     extent: float
     texture_quantile: Callable[[float], float] = _no_photographs
 
 
 class Edit:
-    """The outcome of each Gaussian: its number of rows, how many of them are the old one, the shrink of fresh scales.
+    """The outcome of each Gaussian: its number of rows, how many of them are its old row, the factor of fresh scales.
 
-    Everything random in it depends on `seed`, `step` and the rule alone.
+    Random numbers depend on `seed`, `step` and the rule alone.
     """
 
-    def __init__(self, gaussians: Gaussians, stats: SplatStats, scale: SceneScale, step: int, seed: int) -> None:
+    def __init__(self, gaussians: Gaussians, stats: SplatStats, scene_scale: SceneScale, step: int, seed: int) -> None:
         device, count = gaussians.device, gaussians.count
-        self.gaussians, self.stats, self.scale, self.step, self.seed = gaussians, stats, scale, step, seed
+        self.gaussians, self.stats, self.scene_scale = gaussians, stats, scene_scale
+        self.step, self.seed = step, seed
         self.copies = device.empty(count, np.uint32)
         self.kept = device.empty(count, np.uint32)
         self.shrink = device.empty(count)
@@ -65,7 +75,7 @@ class Edit:
         size_below: float | None = None,
         opacity_below: float = math.inf,
     ) -> None:
-        """Give every Gaussian in the box its outcome; sizes are shares of the extent."""
+        """Give an outcome to every Gaussian in the box; sizes are shares of the extent."""
         gaussians = self.gaussians
         self._program.mark_rule(
             items=gaussians.count,
@@ -77,8 +87,8 @@ class Edit:
             kept=self.kept,
             shrink=self.shrink,
             gradient_above=gradient_above,
-            size_above=size_above * self.scale.extent,
-            size_below=MAX_BOUND if size_below is None else size_below * self.scale.extent,
+            size_above=size_above * self.scene_scale.extent,
+            size_below=MAX_BOUND if size_below is None else size_below * self.scene_scale.extent,
             opacity_below=min(opacity_below, MAX_BOUND),
             new_shrink=shrink,
             new_copies=copies,
@@ -88,16 +98,16 @@ class Edit:
         )
 
     def matching(self, statistic: str, other: str, gradient_above: float) -> float:
-        """The threshold that as many Gaussians reach in `statistic` as reach `gradient_above` in `other`."""
+        """Return the threshold of `statistic` that as many Gaussians reach as reach `gradient_above` in `other`."""
         if self.gaussians.count == 0:
             return MIN_BOUND
         share = float(np.mean(self.stats.mean(other) >= np.float32(gradient_above)))
         return max(float(np.quantile(self.stats.mean(statistic), 1 - share)), MIN_BOUND)
 
     def threshold(self, statistic: str, threshold: Threshold) -> float:
-        """The number that a threshold on a statistic stands for."""
+        """Return the number of a threshold on a statistic, at the step of the edit."""
         if isinstance(threshold, PixelQuantile):
-            return self.scale.texture_quantile(threshold.quantile)
+            return self.scene_scale.texture_quantile(threshold.quantile)
         if not isinstance(threshold, Quantile):
             return self.at(threshold)
         mean = self.stats.mean(statistic)[self.gaussians.get(SEEN)[:, 0] > 0]
@@ -106,7 +116,7 @@ class Edit:
     def choose(
         self, chosen: NDArray[np.bool_], copies: int | NDArray[np.integer], kept: int, shrink: float = 1.0
     ) -> None:
-        """Give the Gaussians that the host has chosen, [N], their outcome.
+        """Give an outcome to the Gaussians that are `chosen`, [N].
 
         copies: rows that each becomes, one number or [N]; kept: how many of them are the old row, with its moments and
         statistics; the others are fresh.
@@ -133,11 +143,11 @@ class Edit:
         self.gaussians.zero_rows([name for name in names if name in self.gaussians.tables], rows)
 
     def rows(self) -> NDArray[np.uint32]:
-        """How many rows each Gaussian will have, [N]."""
+        """Return the number of rows that each Gaussian becomes, [N]."""
         return self.copies.get()
 
     def limit(self, limit: int) -> None:
-        """Take growth back until at most `limit` rows remain: from the smallest values of the first column on."""
+        """Undo growth until at most `limit` rows remain; the smallest means of the first column come first."""
         rows, kept = self.rows().astype(np.int64), self.kept.get()
         growing = np.flatnonzero(rows > 1)
         score = self.stats.mean(self.stats.names[0]) if self.stats.names else np.zeros(len(rows), np.float32)
@@ -149,7 +159,7 @@ class Edit:
         self.kept.set(kept)
 
     def apply(self, tiler: Tiler) -> None:
-        """Move all tables at once and place the children of split Gaussians."""
+        """Rearrange all tables and place the children of split Gaussians."""
         gaussians, device, count = self.gaussians, self.gaussians.device, self.gaussians.count
         row_offset = tiler.scan(self.copies, count, "row_offset")
         rows = int(row_offset.get_item(count))
@@ -177,3 +187,24 @@ class Edit:
             stride=gaussians.capacity,
             count=rows,
         )
+
+
+class Rule(Settings):
+    """A condition on Gaussians, and the outcome of those that meet it."""
+
+    start: Annotated[int, Field(ge=0)] = 0
+    """Global step after which the rule acts."""
+
+    @property
+    def statistics(self) -> set[str]:
+        """Columns that the rule reads."""
+        return set()
+
+    @property
+    def tables(self) -> set[str]:
+        """Tables of the Gaussians that the rule reads beside the parameters."""
+        return set()
+
+    def mark(self, edit: Edit) -> None:
+        """Give outcomes with `edit.mark` or `edit.choose`; change rows of tables with `edit.set_rows`."""
+        raise NotImplementedError

@@ -15,7 +15,7 @@ from clsplat.errors import ConfigError
 from clsplat.filters import ModelSettings
 from clsplat.opencl.choice import Schedule
 from clsplat.prepare.steps import Step
-from clsplat.render.rasterizer import RECORD, UNLIMITED, Budget
+from clsplat.render.rasterizer import MAX_PAIRS, RECORD, Budget
 from clsplat.render.tiles import Sort
 from clsplat.scene.detect import read_scene
 from clsplat.scene.scene import HOLDOUT, Alpha, Background, Scene
@@ -79,7 +79,7 @@ class RasterizerSettings(Settings):
         """How much the rasterizer does at a time."""
         if self.pair_budget is None and self.launch_tiles == 0:
             return None
-        records = UNLIMITED if self.pair_budget is None else (self.pair_budget << 20) // (4 * RECORD)
+        records = MAX_PAIRS if self.pair_budget is None else (self.pair_budget << 20) // (4 * RECORD)
         return Budget(records, self.launch_tiles)
 
 

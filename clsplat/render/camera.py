@@ -1,4 +1,4 @@
-"""A view's camera on the device."""
+"""A view's camera on the device, and the size of its planes."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -10,9 +10,6 @@ from clsplat.opencl.device import Array, Device
 from clsplat.opencl.program import constants
 from clsplat.scene.scene import View
 
-RECORD = int(constants()["RECORD"])
-PIXEL_SUMS = int(constants()["PIXEL_SUMS"])
-UNLIMITED = 2**31  # pairs
 RAY_MARGIN = constants()["RAY_MARGIN"]
 
 # camera_t of cl_kernels/common.h
@@ -53,12 +50,12 @@ class DeviceCamera:
         return self.tiles_y * self.tile
 
     def plane_arguments(self) -> dict[str, int]:
-        """What kernels take that work on planes, by the names of their arguments."""
+        """Return the sizes for kernels on planes, by the names of their arguments."""
         return {"width": self.width, "height": self.height, "rows": self.rows, "stride": self.stride}
 
 
 def upload_camera(device: Device, view: View) -> DeviceCamera:
-    """Put a view's camera on the device."""
+    """Copy a view's camera to the device."""
     tile = int(device.tuning["TILE"])
     values = camera_values(view, tile)
     tiles_x, tiles_y = int(values["tiles_x"]), int(values["tiles_y"])
@@ -67,7 +64,7 @@ def upload_camera(device: Device, view: View) -> DeviceCamera:
 
 
 def camera_values(view: View, tile: int) -> NDArray[Any]:
-    """A view's camera_t, [].
+    """Return a view's camera_t, [].
 
     Rays are clamped 30 % of half the field of view beyond the image's edges (gsplat's off-centre form).
     """

@@ -234,8 +234,8 @@ def describe(pipeline: Pipeline, out: Path, device: str | None) -> str:
             cadences = (f"{inner.stage} every {inner.every}" for inner in stage.during)
             detail = f"{stage.steps} steps; " + ", ".join(cadences)
         elif isinstance(stage, Evaluate) and run:
-            views = run.original.downscaled(run.scale).split(stage.split)
-            scales = ", ".join(f"1/{scale:g}" for scale in stage.scales or [run.scale])
+            views = run.original.downscaled(run.downscale).split(stage.split)
+            scales = ", ".join(f"1/{scale:g}" for scale in stage.scales or [run.downscale])
             detail = f"{len(views)} {stage.split} views at {scales}"
         lines.append(f"  {stage.stage:<14} {detail}".rstrip())
     return f"would run in {out}:\n" + "\n".join(lines)

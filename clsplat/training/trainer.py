@@ -19,7 +19,7 @@ TEXTURE = int(constants("splat.h")["SUM_TEXTURE"])
 
 @dataclass
 class Trainer:
-    """All that a step needs: `step` is one call, the same for pipelines, benchmarks and notebooks."""
+    """The objects of a training step; pipelines, benchmarks and notebooks call the same `step`."""
 
     rasterizer: Rasterizer
     model: DeviceModel
@@ -72,7 +72,8 @@ class Trainer:
     def _update(self, view: ViewGradients, stale: Collection[str]) -> Array:
         """Update the parameters and add the penalties to the view's losses.
 
-        Returns the gradient of the projected means, [2, S] px⁻¹.  Gradients go through memory only where they must.
+        Returns the gradient of the projected means, [2, S] px⁻¹.  Without penalties and stale parameters, gradients are
+        not written to memory.
         """
         penalties = [loss for loss in self.losses if isinstance(loss, Penalty)]
         step = view.comparison.step

@@ -1,43 +1,13 @@
-"""Density control: rules that say which Gaussians grow or go (Kerbl et al. 2023, section 5).
-
-A rule gives Gaussians an outcome: how many rows each becomes.  Most rules are a box in (mean of a statistic, size,
-opacity), and one kernel serves them all; others choose on the host.  Sizes are the largest standard deviation as a
-share of the scene's extent.  The first growing rule whose box holds a Gaussian decides; pruning rules override growth
-and judge the size that a split leaves.
-"""
+"""Apply density rules, as one edit, and reset opacities (Kerbl et al. 2023, section 5)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated
 
 import numpy as np
-from pydantic import Field
 
-from clsplat.density.edit import Edit
+from clsplat.density.edit import Edit, Rule
 from clsplat.gaussians.tables import Gaussians
 from clsplat.render.tiles import Tiler
-from clsplat.settings import Settings
-
-
-class Rule(Settings):
-    """A condition and the outcome of the Gaussians that meet it."""
-
-    start: Annotated[int, Field(ge=0)] = 0
-    """Global step from which, exclusive, the rule acts."""
-
-    @property
-    def statistics(self) -> set[str]:
-        """Columns that the rule reads."""
-        return set()
-
-    @property
-    def tables(self) -> set[str]:
-        """Tables of the Gaussians that the rule reads beside the parameters."""
-        return set()
-
-    def mark(self, edit: Edit) -> None:
-        """Give outcomes by `edit.mark` or `edit.choose`; rows of tables may be changed by `edit.set_rows`."""
-        raise NotImplementedError
 
 
 @dataclass(frozen=True)
@@ -46,14 +16,14 @@ class Change:
 
     before: int
     after: int
-    causes: dict[str, int]  # Gaussians whose outcome a rule decided in the end, by the rule's name
+    causes: dict[str, int]  # Gaussians whose final outcome a rule decided, by the rule's name
     grown: dict[str, int]  # of these, the ones that became several
 
 
 def densify(edit: Edit, rules: Sequence[Rule], tiler: Tiler, limit: int | None = None) -> Change:
-    """Apply the rules in their order, as one rearrangement, and start the statistics anew.
+    """Apply the rules in their order, as one rearrangement of all tables, and set the statistics to zero.
 
-    Growth stops at `limit` Gaussians: those with the largest screen gradient (the first column) grow first.
+    Growth stops at `limit` Gaussians: those with the largest mean of the first column grow first.
     """
     gaussians = edit.gaussians
     before = gaussians.count
@@ -79,7 +49,7 @@ def densify(edit: Edit, rules: Sequence[Rule], tiler: Tiler, limit: int | None =
 
 
 def cap_opacity(gaussians: Gaussians, limit: float) -> None:
-    """Let no Gaussian stay more opaque than `limit` as it is drawn, world filter included (the opacity reset)."""
+    """Lower opacities to `limit`, which holds for the opacity after the world filter (the opacity reset)."""
     gaussians.device.program("density.cl").cap_opacity(
         items=gaussians.count,
         log_scales=gaussians["log_scales"],
