@@ -125,7 +125,7 @@ def test_a_pose_of_another_shape_is_refused():
 def test_a_view_made_by_hand_renders(device, rng):
     model = model_of(random_case(rng, 30))
     middle = np.median(model.means, axis=0)
-    view = clsplat.View.looking_at(middle + [0, -4, 1], middle, [0, 0, 1], CAMERA)
+    view = clsplat.View.looking_at(middle - (0, 4, -1), middle, [0, 0, 1], CAMERA)
     same = clsplat.View("front", CAMERA, view.world_to_camera)
     renderer = Renderer(model, device)
     assert renderer.render(view).alpha.max() > 0.5

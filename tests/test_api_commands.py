@@ -9,8 +9,8 @@ import pytest
 from typer.testing import CliRunner
 
 import clsplat
-from clsplat.errors import ConfigError, DataError
 from clsplat.cli import app
+from clsplat.errors import ConfigError, DataError
 from tests.test_cli import clsplat as process
 
 SET = {"optimize.steps": 40, "seed": 3}

@@ -1,7 +1,7 @@
 """Imports go down the layers only.
 
-cli · torch, api · runner, pipeline · stages · training · density, metrics · losses · views, filters · render · gaussians, scene ·
-opencl · errors, files, settings
+cli · torch, api · runner, pipeline · stages · training · density, metrics · losses · views, filters · render ·
+gaussians, scene · opencl · errors, files, settings
 """
 
 import ast
