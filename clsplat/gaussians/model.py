@@ -8,13 +8,18 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.gaussians.ply import read_ply, write_ply
+from clsplat.gaussians.ply import MAX_DEGREE, read_ply, write_ply
 from clsplat.gaussians.sh import rotated_sh
 from clsplat.gaussians.tables import PARAMETERS, SH_C0, DeviceModel, Gaussians, sh_coefficients
 from clsplat.opencl.device import Device
 
 MODEL = "point_cloud.ply"  # of a run folder
 Floats = NDArray[np.float32]
+WIDTHS = {  # of the tables
+    **{"means": (3,), "quats": (4,), "log_scales": (3,), "logit_opacity": (1,), "sh_base": (3,)},
+    "sh_rest": tuple(3 * (sh_coefficients(degree) - 1) for degree in range(MAX_DEGREE + 1)),
+    "filter_variance": (1,),
+}
 MIP_VARIANCE = 0.1  # px², of files that say no more than `mip` (Yu et al. 2024)
 
 
@@ -45,12 +50,16 @@ class Rendering:
     def comment(self) -> dict[str, Any]:
         """What a model file says about rendering."""
         numbers = {"near": self.near, "screen_variance": self.screen_variance, "compensate": self.compensate}
-        return {**self.notes, **numbers, "background": self.background or "black", "alpha": self.alpha}
+        known = {"background": self.background} if self.background else {}
+        return {**self.notes, **numbers, **known, "alpha": self.alpha}
 
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """N Gaussians before activation, float32, with the names that pipelines, kernels and checkpoints have."""
+    """N Gaussians before activation, float32, with the names that pipelines, kernels and checkpoints have.
+
+    Raises ValueError, with the name of the table, where shapes do not fit.
+    """
 
     means: Floats  # [N, 3] scene units
     quats: Floats  # [N, 4] (w, x, y, z), unnormalised
@@ -65,12 +74,12 @@ class Model:
 
     def __post_init__(self) -> None:
         count = len(self.means)
-        widths = {"means": 3, "quats": 4, "log_scales": 3, "logit_opacity": 1, "sh_base": 3}
         for name, table in self.tables().items():
-            object.__setattr__(self, name, np.ascontiguousarray(table, np.float32))
-            width = widths.get(name, 1 if name == "filter_variance" else 3 * (sh_coefficients(self.sh_degree) - 1))
-            if table.shape != (count, width):
-                raise ValueError(f"{name} has shape {table.shape}; expected {(count, width)}")
+            array = np.ascontiguousarray(table, np.float32)
+            if array.shape not in [(count, width) for width in WIDTHS[name]]:
+                widths = " or ".join(map(str, WIDTHS[name]))
+                raise ValueError(f"{name} has shape {array.shape}; expected ({count}, {widths})")
+            object.__setattr__(self, name, array)
 
     def __len__(self) -> int:
         return len(self.means)
@@ -108,7 +117,7 @@ class Model:
         return np.asarray(self.sh_base * SH_C0 + 0.5, np.float32)
 
     def __getitem__(self, chosen: Any) -> "Model":
-        """Return some of the Gaussians, by a mask, indices or a slice."""
+        """Return some of the Gaussians, by a mask [N], an array of indices, a slice, or one index."""
         tables: dict[str, Any] = {name: np.atleast_2d(table[chosen]) for name, table in self.tables().items()}
         return replace(self, **tables)
 
@@ -117,10 +126,12 @@ class Model:
     ) -> "Model":
         """Return the model after x -> scale · rotation x + translation; colours turn with it.
 
-        rotation: [3, 3]; translation: [3] scene units.  Raises ValueError for a rotation that is none.
+        rotation: [3, 3]; translation: [3] scene units.  Raises ValueError for a matrix that is not a rotation.
         """
         turn = np.eye(3) if rotation is None else np.asarray(rotation, np.float64)
-        if scale <= 0 or turn.shape != (3, 3) or not np.allclose(turn @ turn.T, np.eye(3), atol=1e-5):
+        if np.shape(translation) != (3,):
+            raise ValueError(f"the translation has shape {np.shape(translation)}; expected (3,)")
+        if not scale > 0 or turn.shape != (3, 3) or not np.allclose(turn @ turn.T, np.eye(3), atol=1e-5):
             raise ValueError("expected a positive scale and a rotation matrix [3, 3]")
         if np.linalg.det(turn) < 0:
             raise ValueError("expected a rotation; this matrix mirrors")
@@ -136,7 +147,10 @@ class Model:
         return replace(self, **{k: v.astype(np.float32) for k, v in changed.items()}, rendering=rendering)
 
     def save(self, path: str | Path) -> None:
-        """Write a PLY in the layout of 3DGS.  Raises OutputError when it cannot be written."""
+        """Write a PLY in the layout of 3DGS; a world filter is kept as it is, as a property `filter_3D`.
+
+        Raises OutputError when it cannot be written.
+        """
         write_ply(Path(path), self.tables(), self.rendering.comment())
 
     def __repr__(self) -> str:
