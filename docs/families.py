@@ -35,7 +35,7 @@ class Family(NamedTuple):
 
 FAMILIES = {  # by the name of the base; any other family gets a page of its own
     "Stage": Family("stages", "stage", "stages"),
-    "Scheduled": Family("stages", "stage of `during`", "during"),
+    "Scheduled": Family("stages", "scheduled stage", "during"),
     "Loss": Family("losses", "loss", "losses"),
     "ImageLoss": Family("losses", "loss on images", "losses"),
     "Penalty": Family("losses", "penalty", "losses"),

@@ -21,11 +21,11 @@ HEADINGS = {
     "views": "Orders and transforms",
 }
 INTRODUCTIONS = {
-    "stages": "A pipeline is a list of stages. Those that can stand in `during` are run every so many steps of training.",
+    "stages": "A pipeline is a list of stages. Those that can stand in `during` run every so many steps of training.",
     "losses": "`optimize.losses` is a list; training minimises the weighted sum.",
     "rules": "`densify.rules` is a list. All rules act as one rearrangement of the Gaussians.",
-    "statistics": "A growing rule acts where the mean of a statistic is large. Only the statistics that a rule names are "
-    "summed and cost time.",
+    "statistics": "A growing rule acts where the mean of a statistic is large. Only the statistics that a rule names "
+    "are summed and cost time.",
     "views": "What a training step compares with: the keys `order` and `transforms` of `optimize.views`.",
     "filters": "The two low-pass filters of `model`: one in the scene, one on the screen.",
     "prepare": "`prepare` is a list: what makes a scene of photographs, once, on the host.",
@@ -56,9 +56,9 @@ def family_page(page: str) -> str:
 def group_section(group: Kind) -> str:
     """Return what the members of a group share; they are plug-ins' bases, too."""
     parent = group.__bases__[0]
-    keys = key_table(group, tuple(parent.model_fields) if parent in (b for f in families() for b in groups(f)) else ())
-    anchor = group.__name__.lower()
-    return f"## Every {family(group).title} {{: #{anchor} }}\n\n{manual(group)}{keys}Base class for plug-ins: `{group.__name__}`.\n\n"
+    shared = tuple(parent.model_fields) if any(parent in groups(base) for base in families()) else ()
+    heading = f"## Every {family(group).title} {{: #{group.__name__.lower()} }}\n\n"
+    return f"{heading}{manual(group)}{key_table(group, shared)}Base class for plug-ins: `{group.__name__}`.\n\n"
 
 
 def section(base: Kind, kind: Kind) -> str:
@@ -82,9 +82,9 @@ def settings_page() -> str:
 
 def readers_page() -> str:
     """Return the dataset formats, in the order in which they are looked for."""
-    text = "# Dataset readers\n\nThe first reader that knows a folder reads it. [Datasets](../datasets.md) says what is read.\n\n"
+    text = "# Dataset readers\n\nThe first reader that recognises a folder reads it: [datasets](../datasets.md).\n\n"
     for reader in readers():
-        text += f"## {reader.name}\n\n{manual(type(reader))}It looks for `{reader.expects}`.\n\n"
+        text += f"## {reader.name}\n\n{manual(type(reader))}It looks for {reader.expects}.\n\n"
     return text
 
 

@@ -9,8 +9,8 @@ from clsplat.schedule import Decay, Points
 EXAMPLES = {  # notation: what it means, and how a file writes it
     "A constant": ("The same at every step.", "weight: 0.8"),
     "Points": (
-        "Values at global steps, with straight lines between them. Before the first point and after the last one the value "
-        "stays as it is there.",
+        "Values at global steps, with straight lines between them. Before the first point and after the last one the "
+        "value stays as it is there.",
         "weight: [[4000, 0.0], [5000, 4.0]]      # 0 until step 4000, 4 from step 5000 on",
     ),
 }

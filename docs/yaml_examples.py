@@ -27,12 +27,13 @@ def example(base: Kind, kind: Kind) -> tuple[str, str]:
         values = {key: value for key, value in values.items() if value is not None}
         found = [(block(base, {tag(kind): values} if "stage" in kind.model_fields else values), "")]
     short = [one for one in found if one[0].count("\n") <= MAX_EXAMPLE]
+    short = [one for one in short if one[1] == short[0][1]]  # of the first file the most complete
     return max(short or [min(found, key=lambda one: len(one[0]))], key=lambda one: len(one[0]))
 
 
 @functools.cache
 def shipped_items() -> list[tuple[str, Node]]:
-    """Return all mappings of all shipped files, those of plain 3DGS first, each with the name of its file, and of pages."""
+    """Return all mappings of shipped files, plain 3DGS first, each with the name of its file, and of the page."""
     files = sorted((ROOT / "pipelines").glob("*.yaml"), key=lambda file: (not file.name.startswith("splat"), file.name))
     texts = [(file.name, file.read_text()) for file in files]
     page = (ROOT / "docs" / "pipelines.md").read_text()
