@@ -1,7 +1,7 @@
 /* Adam's update of every parameter.
  *
- * adam_step takes gradients that lie in memory.  update_gaussians computes those of projection on the way, which saves
- * writing and reading 59 of them for each Gaussian; it gives the same bits as project_backward and adam_step.
+ * adam_step reads gradients from memory.  update_gaussians computes the gradients of projection itself, which saves
+ * writing and reading 59 values for each Gaussian; it gives the same bits as project_backward and adam_step.
  *
  * One item = LANES Gaussians.  No local memory.  Deterministic: each value has one writer. */
 #include "adam.h"
@@ -49,7 +49,7 @@ static inline void update_plane(__global float *values, __global float *moment1,
 
 /* The update of all tables from the sums over pixels.  Rates are divided by 1 - BETA1^t.
  *
- * One item = VECTORS vectors of Gaussians, plane by plane, so that memory is walked in runs.  Private memory:
+ * One item = VECTORS vectors of Gaussians, plane by plane, so that memory is read in runs.  Private memory:
  * VECTORS * LANES * 200 bytes. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void update_gaussians(

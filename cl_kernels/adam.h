@@ -1,5 +1,5 @@
-/* Adam (Kingma and Ba 2015) in the form that 3DGS uses: epsilon outside the root, bias correction by factors from the
- * host, moments of Gaussians without a gradient decay like all others. */
+/* Adam (Kingma and Ba 2015) in the form that 3DGS uses: epsilon outside the root; the host computes the factors of the
+ * bias correction; moments of Gaussians without a gradient decay as all others do. */
 #ifndef CLSPLAT_ADAM_H
 #define CLSPLAT_ADAM_H
 #include "lanes.h"

@@ -1,5 +1,6 @@
-/* Gradients of a Gaussian's parameters from its sums over pixels: the reverse of projection and colour,
- * recomputing what the forward pass had.  Both ways of updating parameters use it, so they give the same bits. */
+/* Gradients of a Gaussian's parameters from its sums over pixels: the reverse of projection and colour.
+ * It computes the values of the forward pass again.  Both kernels that update parameters use it, so they give the same
+ * bits. */
 #ifndef CLSPLAT_BACKWARD_H
 #define CLSPLAT_BACKWARD_H
 #include "gaussian.h"
@@ -83,7 +84,7 @@ static inline void shape_backward(const shape_t *s, __constant camera_t *camera,
 
 /* Gradients of everything but the coefficients of harmonics: those are basis[k] * colour[channel]. */
 typedef struct {
-    VI touched;      // the Gaussian was drawn; where not, all gradients are zero, whatever stands here
+    VI touched;      // the Gaussian was drawn; where not, all gradients are zero and these values invalid
     VF mean2d[2];    // px^-1
     VF means[3], quats[4], log_scales[3], logit_opacity;
     VF basis[16], colour[3];
@@ -121,7 +122,7 @@ static inline void weigh_harmonics(
     }
 }
 
-/* The rest of a gradient whose colours and weights of harmonics are known. */
+/* The other gradients, from those of the colours and from the weights of the harmonics. */
 static inline void gradient_of(
     __global const float *means,            // [3,S] scene units
     __global const float *quats,            // [4,S] unnormalised

@@ -1,9 +1,9 @@
-/* Blending for GPUs: the same maths as blend_wide.cl (splat.h) with one item per pixel going forward and one item per
- * splat going backward.  Compiled with LANES = 1. */
+/* Blending for GPUs: the formulas of splat.h, as in blend_wide.cl, with one item per pixel in the forward pass and one
+ * item per splat in the backward pass.  Compiled with LANES = 1. */
 #include "splat.h"
 
 #define PIXELS (TILE * TILE)
-#define BATCH PIXELS  // splats staged together: one for each item to fetch
+#define BATCH PIXELS  // splats in local memory: each item loads one
 
 /* One work-group = one tile, one item = one pixel.  Local memory: BATCH * 64 bytes.  Deterministic. */
 __kernel __attribute__((reqd_work_group_size(PIXELS, 1, 1)))
@@ -20,7 +20,7 @@ void blend_forward(
     const uint first_tile)                      // of this launch
 {
     __local float batch[BATCH][RECORD];
-    __local uint open;  // pixels of the tile that still want splats
+    __local uint open;  // pixels of the tile that are not finished
     const uint item = get_local_id(0), tile = first_tile + get_group_id(0);
     const uint tile_y = tile / camera->tiles_x, tile_x = tile - tile_y * camera->tiles_x;
     const uint column = tile_x * TILE + item % TILE, line = tile_y * TILE + item / TILE;
@@ -65,9 +65,9 @@ void blend_forward(
     transmittance[at] = inside ? t : 0.0f;
 }
 
-/* One item owns one splat of a batch and the tile's pixels pass it one after another: at step s item i meets pixel
- * s - i, which item i - 1 met the step before, so every pixel sees its splats front to back.  No atomics, no sums
- * across items.  Local memory: PIXELS * 20 bytes.  Deterministic. */
+/* One item owns one splat of a batch and adds the tile's pixels one after another: at step s, item i computes pixel
+ * s - i, which item i - 1 computed at the step before, so every pixel blends its splats front to back.  No atomics, no
+ * sums across items.  Local memory: PIXELS * 20 bytes.  Deterministic. */
 __kernel __attribute__((reqd_work_group_size(SPLAT_GROUP, 1, 1)))
 void blend_backward(
     __global const uint *restrict tile_offset,  // [T+1]
@@ -77,7 +77,7 @@ void blend_backward(
     __constant camera_t *restrict camera,       // [1]
     __global const float *restrict image,       // [3,tiles_y*TILE,tiles_x*TILE]
     __global const float *restrict grad_image,  // [3,tiles_y*TILE,tiles_x*TILE]
-    __global const float *restrict texture,     // [tiles_y*TILE,tiles_x*TILE] read where PIXEL_SUMS says so
+    __global const float *restrict texture,     // [tiles_y*TILE,tiles_x*TILE] read where PIXEL_SUMS > SUM_WEIGHT
     __global const uint *restrict tile_last,    // [T]
     __global float *restrict pair_sums,         // [P,RECORD] in emission order
     const uint first_tile)                      // of this launch
@@ -110,9 +110,9 @@ void blend_backward(
             for (uint k = 0; k < RECORD; k++)
                 splat[k] = splats[(size_t)pair_splat[pair] * RECORD + k];
         barrier(CLK_LOCAL_MEM_FENCE);
-        if (begin < last)  // uniform: a batch that no pixel reached only writes zeros
+        if (begin < last)  // uniform: for a batch that no pixel blends, items only write zeros
             for (uint step = 0; step < PIXELS + SPLAT_GROUP - 1; step++) {
-                const uint i = step - item;  // wraps to a huge number before the first pixel arrives
+                const uint i = step - item;  // wraps to a huge number before the item's first pixel
                 if (active && i < PIXELS) {
                     const float pixel = tile_x * TILE + i % TILE + 0.5f, row = tile_y * TILE + i / TILE + 0.5f;
                     grad_pixels_t p = pixels[i];

@@ -1,16 +1,16 @@
 /* Blending for CPUs: one item = one tile, LANES pixels of a row at a time, two rows together so that their chains of
- * transmittance overlap.  Kerbl et al. 2023, eq. 3; the maths is in splat.h. */
+ * transmittance overlap.  Kerbl et al. 2023, eq. 3; the formulas are in splat.h. */
 #include "splat.h"
 
 #define COLUMNS (TILE / LANES)  // vectors per tile row
-#define SEGMENT 128             // splats of a tile fetched together: memory is waited for once, rows read the cache
+#define SEGMENT 128             // splats of a tile loaded together: one wait for memory, then rows read the cache
 
 static inline VF pixel_centres(const uint tile_x, const uint column)
 {
     return to_VF(LANE_INDEX + (int)(tile_x * TILE + column * LANES)) + 0.5f;
 }
 
-/* 1 where the pixel lies in the image, else 0: planes are zero outside, which the losses rely on. */
+/* 1 where the pixel lies in the image, else 0: losses need planes that are zero outside. */
 static inline VF inside_image(__constant camera_t *camera, const VF pixel, const uint row)
 {
     const VF one = (VF)(1.0f), zero = (VF)(0.0f);
@@ -104,7 +104,7 @@ static inline void store_record(const pixel_sums_t m, __global float *record)
     vstore16(sums, 0, record);
 }
 
-/* Walk one splat over the rows of its tile that it reaches, whole pairs of rows. */
+/* Sum one splat over the rows of its tile that it reaches, whole pairs of rows. */
 static inline void pixel_sums_of(const float *splat, const uint tile_x, const uint tile_y,
                                  grad_pixels_t (*pixels)[COLUMNS], pixel_sums_t *sums)
 {
@@ -126,9 +126,9 @@ static inline void pixel_sums_of(const float *splat, const uint tile_x, const ui
     *sums = pixel_sums;
 }
 
-/* Splats outside, rows inside: a splat's record is summed in registers and written once, at the pair's address; pairs
- * that no pixel reached get zeros.  Private memory: SEGMENT * 68 bytes of splats and TILE * TILE * 20 of pixels.
- * Deterministic. */
+/* The outer loop runs over splats, the inner one over rows: a splat's record is summed in registers and written once,
+ * at the pair's address; the records of pairs that no pixel blends are zero.  Private memory: SEGMENT * 68 bytes of
+ * splats and TILE * TILE * 20 of pixels.  Deterministic. */
 __kernel __attribute__((reqd_work_group_size(1, 1, 1)))
 void blend_backward(
     __global const uint *restrict tile_offset,  // [T+1]
@@ -138,7 +138,7 @@ void blend_backward(
     __constant camera_t *restrict camera,       // [1]
     __global const float *restrict image,       // [3,tiles_y*TILE,tiles_x*TILE]
     __global const float *restrict grad_image,  // [3,tiles_y*TILE,tiles_x*TILE]
-    __global const float *restrict texture,     // [tiles_y*TILE,tiles_x*TILE] read where PIXEL_SUMS says so
+    __global const float *restrict texture,     // [tiles_y*TILE,tiles_x*TILE] read where PIXEL_SUMS > SUM_WEIGHT
     __global const uint *restrict tile_last,    // [T]
     __global float *restrict pair_sums,         // [P,RECORD] in emission order
     const uint first_tile)                      // of this launch

@@ -1,10 +1,10 @@
-/* A Gaussian blur of an image: the mean of the pixels that count, by their weights, so that neither the image's edge nor
- * a mask darkens it.
+/* A Gaussian blur of an image: the mean of the pixels that count, by their weights, so that neither the image's edge
+ * nor a mask darkens it.
  *
  *   blurred(x) = sum_k w(k) m(x + k) v(x + k) / sum_k w(k) m(x + k),  w(k) = exp(-k^2 / (2 sigma^2)),  |k| <= reach
  *
- * along rows and then along columns, with m the mask, or 1 inside the image.  The first pass keeps numerator and
- * denominator apart.  One item = one pixel; dimensions x, y.  No local memory.  Deterministic. */
+ * along rows and then along columns, with m the mask, or 1 inside the image.  The first pass writes numerator and
+ * denominator.  One item = one pixel; dimensions x, y.  No local memory.  Deterministic. */
 #include "common.h"
 
 /* Sums along rows: three channels times the mask, and the mask itself. */
@@ -24,7 +24,7 @@ void blur_rows(
     const uint x = get_global_id(0), y = get_global_id(1), plane = rows * stride;
     if (x >= width || y >= height)
         return;
-    const uint first = x > reach ? x - reach : 0, last = x + reach < width ? x + reach : width - 1;
+    const uint first = max((int)x - (int)reach, 0), last = min(x + reach, width - 1);
     float total[4] = {0.0f, 0.0f, 0.0f, 0.0f};
     for (uint column = first; column <= last; column++) {
         const uint at = y * stride + column;
@@ -37,7 +37,7 @@ void blur_rows(
         sums[channel * plane + y * stride + x] = total[channel];
 }
 
-/* The same along columns, and the division; pixels without a neighbour that counts keep their value. */
+/* The same along columns, and the division; pixels without a neighbour that counts stay unchanged. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void blur_columns(
     __global const float *restrict sums,     // [4,H',stride]
@@ -52,7 +52,7 @@ void blur_columns(
     const uint x = get_global_id(0), y = get_global_id(1), plane = rows * stride;
     if (x >= width || y >= height)
         return;
-    const uint first = y > reach ? y - reach : 0, last = y + reach < height ? y + reach : height - 1;
+    const uint first = max((int)y - (int)reach, 0), last = min(y + reach, height - 1);
     float total[4] = {0.0f, 0.0f, 0.0f, 0.0f};
     for (uint row = first; row <= last; row++)
         for (uint channel = 0; channel < 4; channel++)

@@ -1,4 +1,4 @@
-/* Watching over the numbers: how many values of a table are not finite.
+/* Count the values of a table that are not finite.
  *
  * One item = one Gaussian of one plane; dimension 1 is the plane.  No local memory.  The counter is an integer atomic,
  * so the count does not depend on the order of the items. */

@@ -1,4 +1,4 @@
-/* What every kernel shares: the names that the host may set with -D, the constants of the method, the camera.
+/* Definitions for all kernels: the names that the host may set with -D, the constants of the method, the camera.
  *
  * Letters in comments: N Gaussians, S stride of the planes (capacity, a multiple of 64), P (tile, Gaussian) pairs,
  * T tiles, H, W image, K spherical harmonics coefficients. */
@@ -19,7 +19,7 @@
 #define TILE 16  // pixels per tile side
 #endif
 #ifndef TEAM
-#define TEAM 1  // items that walk one run of work together, in scans, sorts and losses: 1 on CPUs
+#define TEAM 1  // items of a work-group in scans, sorts and losses: 1 on CPUs
 #endif
 #ifndef DIGIT_BITS
 #define DIGIT_BITS 11  // widest radix digit: its table is TEAM << DIGIT_BITS counters of local memory
@@ -34,10 +34,10 @@
 #define SPLAT_GROUP 32  // splats per batch of the simt backward pass
 #endif
 #ifndef PIXEL_SUMS
-#define PIXEL_SUMS 9  // sums in a gradient record (splat.h): 11 or 13 where density statistics want the last ones
+#define PIXEL_SUMS 9  // sums in a gradient record (splat.h): 11 or 13 where a density statistic needs more
 #endif
 
-/* ---- constants of the method (Kerbl et al. 2023); tests override the first three to make blending smooth ---- */
+/* ---- constants of the method (Kerbl et al. 2023); tests change the first three to make blending smooth ---- */
 #ifndef ALPHA_MIN
 #define ALPHA_MIN (1.0f / 255.0f)  // fainter contributions are skipped: they do not change an 8-bit image
 #endif

@@ -1,9 +1,9 @@
-/* Density control: what each Gaussian's screen gradient was, which rows a rule edits, and the rows that come out.
+/* Density control: sum statistics of each Gaussian, mark rows by rules, and write the new rows.
  *
- * Kerbl et al. 2023, section 5.  A rule is a box in (gradient, size, opacity) with an outcome: how many rows a Gaussian
- * becomes (`copies`), how many of them are the old one (`kept`) and by what the scales of the fresh ones are multiplied
- * (`shrink`).  Clone = (2, 1, 1), split in n = (n, 0, 1/1.6), prune = (0, 0, 1).  One item = one Gaussian or one row.
- * No local memory.  Deterministic. */
+ * Kerbl et al. 2023, section 5.  A rule is a box in (statistic, size, opacity) with an outcome of three numbers: the
+ * rows that a Gaussian becomes (`copies`), how many of them are its old row (`kept`), and the factor of the scales of
+ * its fresh rows (`shrink`).  Clone = (2, 1, 1), split in n = (n, 0, 1/1.6), prune = (0, 0, 1).  One item = one
+ * Gaussian or one row.  No local memory.  Deterministic. */
 #include "random.h"
 #include "splat.h"
 
@@ -19,7 +19,7 @@ void count_seen(
         seen[i] += 1.0f;
 }
 
-/* Add the Euclidean norm of this view's screen gradient, in the units of the reference: dL by normalised device
+/* Add the Euclidean norm of this view's screen gradient, in the units of the reference: loss by normalised device
  * coordinates.  The gradient lies in planes `first` and `first` + 1. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void accumulate_norm(
@@ -84,7 +84,7 @@ void accumulate_radius(
         total[i] += radius[i];
 }
 
-/* Every Gaussian keeps its row, until a rule says otherwise. */
+/* Start an edit: every Gaussian keeps its row. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void start_edit(
     __global uint *restrict copies,   // [N]
@@ -100,8 +100,8 @@ void start_edit(
     shrink[i] = 1.0f;
 }
 
-/* Apply one rule.  A Gaussian grows by the first growing rule that wants it; pruning overrides growth and judges the
- * size after a split, as if it looked at the children. */
+/* Apply one rule.  The first growing rule whose box holds a Gaussian decides; pruning overrides growth and compares the
+ * size of the children after a split. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void mark_rule(
     __global const float *restrict log_scales,     // [3,S] log of scene units
@@ -153,7 +153,7 @@ void mark_chosen(
     shrink[i] = copies[i] == 0 ? shrink[i] : new_shrink;
 }
 
-/* Which row each new row comes from, in the old order: a Gaussian's offspring stay beside it. */
+/* The source row of each new row, in the old order: all rows of a Gaussian are contiguous. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void list_rows(
     __global const uint *restrict copies,      // [N]
@@ -204,7 +204,7 @@ void spawn_children(
         log_scales[k * stride + i] += log(shrink[source[i]]);
 }
 
-/* No Gaussian stays more opaque than the limit once the world filter has spread it out (the opacity reset of 3DGS and
+/* Lower opacities to the limit, which holds for the opacity after the world filter (the opacity reset of 3DGS and
  * Mip-Splatting). */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void cap_opacity(
@@ -223,7 +223,7 @@ void cap_opacity(
         const float scale = exp(log_scales[k * stride + i]);
         energy2 /= 1.0f + filter_variance[i] / (scale * scale);
     }
-    const float most = limit / sqrt(energy2);  // of the opacity before the filter; may be 1 and more
-    const float logit = most < 1.0f ? log(most / (1.0f - most)) : logit_opacity[i];
+    const float unfiltered = limit / sqrt(energy2);  // limit of the opacity before the filter; may be 1 and more
+    const float logit = unfiltered < 1.0f ? log(unfiltered / (1.0f - unfiltered)) : logit_opacity[i];
     logit_opacity[i] = logit_opacity[i] < logit ? logit_opacity[i] : logit;
 }

@@ -1,9 +1,10 @@
-/* Depth instead of colour: blending then gives sums over splats of weight times depth, and of weight.
+/* Depth instead of colour: blending then sums weight times depth, and weight, over splats.
  *
  * One item = one Gaussian.  No local memory.  Deterministic. */
 #include "splat.h"
 
-/* Red becomes the depth of the mean, green 1, blue 0; blended on black they are the mean depth times alpha, and alpha. */
+/* Set red to the depth of the mean, green to 1, blue to 0; blended on black, red is the mean depth times alpha and
+ * green is alpha. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void paint_depth(
     __global const float *restrict means,      // [3,S] scene units

@@ -1,5 +1,5 @@
-/* Filling memory with one 4-byte word: drivers' own fill commands are up to 20 times slower, and some checkers do not
- * see them.
+/* Fill memory with one 4-byte word: the fill commands of drivers are up to 20 times slower, and some checkers of memory
+ * ignore them.
  *
  * One item = 16 words.  No local memory.  Deterministic. */
 #include "common.h"

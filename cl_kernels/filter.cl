@@ -1,7 +1,7 @@
-/* World filter: the variance below which no training view can tell a Gaussian's shape (Yu et al. 2024, section 5.1).
+/* World filter: a variance, in scene units^2, from the sampling of the training views (Yu et al. 2024, section 5.1).
  *
- * A camera of focal length f at depth z takes one sample every z / f scene units.  The smallest such interval over the
- * cameras that see a Gaussian bounds its frequencies; its filter has `variance` of those intervals squared.
+ * A camera of focal length f, px, at depth z, scene units, takes one sample every z / f scene units.  The smallest such
+ * interval over the cameras that see a Gaussian bounds its frequencies; its filter is `variance` times that interval^2.
  * One item = LANES Gaussians.  No local memory.  Deterministic: a maximum has no order. */
 #include "lanes.h"
 
@@ -24,7 +24,7 @@ void sampling_interval(
     if (i >= count)
         return;
     const VF px = VLOAD(means + i), py = VLOAD(means + stride + i), pz = VLOAD(means + 2 * stride + i);
-    VF least = (VF)(DEPTH_MAX);
+    VF smallest = (VF)(DEPTH_MAX);
     for (uint view = 0; view < views; view++) {
         __global const camera_t *camera = cameras + view;
         __global const float *w = camera->world_to_camera;
@@ -32,7 +32,7 @@ void sampling_interval(
         const VF y = w[4] * px + w[5] * py + w[6] * pz + w[7];
         const VF z = w[8] * px + w[9] * py + w[10] * pz + w[11];
         const float width = camera->width, height = camera->height;
-        /* written without the division by z: u + margin >= 0 is fx x + (cx + margin) z >= 0 where z > 0 */
+        /* without the division by z: u + margin >= 0 is fx x + (cx + margin) z >= 0 where z > 0 */
         const VF u = camera->fx * x, v = camera->fy * y;
         const VI sees = (z > near_plane) &
                         (u + (camera->cx + VIEW_MARGIN * width) * z >= 0.0f) &
@@ -40,18 +40,18 @@ void sampling_interval(
                         (v + (camera->cy + VIEW_MARGIN * height) * z >= 0.0f) &
                         (v + (camera->cy - (1.0f + VIEW_MARGIN) * height) * z <= 0.0f);
         const VF step = z * (1.0f / focal[view]);
-        least = sees ? smaller(least, step) : least;
+        smallest = sees ? smaller(smallest, step) : smallest;
     }
-    const VI seen = (least < DEPTH_MAX) & ((LANE_INDEX + (int)i) < (int)count);
-    float lanes[LANES], most = 0.0f;
-    VSTORE((seen ? least : (VF)(0.0f)), lanes);
+    const VI seen = (smallest < DEPTH_MAX) & ((LANE_INDEX + (int)i) < (int)count);
+    float lanes[LANES], lane_max = 0.0f;
+    VSTORE((seen ? smallest : (VF)(0.0f)), lanes);
     for (uint lane = 0; lane < LANES; lane++)
-        most = lanes[lane] > most ? lanes[lane] : most;
+        lane_max = lanes[lane] > lane_max ? lanes[lane] : lane_max;
     VSTORE(VLOAD(lanes), interval + i);
-    atomic_max(largest, as_uint(most));  // floats above zero are ordered as their bits
+    atomic_max(largest, as_uint(lane_max));  // floats above zero are ordered as their bits
 }
 
-/* Intervals become variances; a Gaussian that no camera sees takes the largest interval. */
+/* Convert intervals to variances; a Gaussian that no camera sees has the largest interval of all. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void filter_variance(
     __global const uint *restrict largest,  // [1] bits of a float

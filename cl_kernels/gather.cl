@@ -1,5 +1,5 @@
-/* Rows of tables: the sum of each Gaussian's gradient records, any per-Gaussian table in another order, and rows that the
- * host sets.  No local memory.  Deterministic: every value has one writer and sums have one order. */
+/* Rows of tables: sum each Gaussian's gradient records, put tables in another order, write rows from the host.  No
+ * local memory.  Deterministic: every value has one writer and sums have one order. */
 #include "splat.h"
 
 /* One item = LANES Gaussians; the pairs of a Gaussian are contiguous and summed in order: deterministic. */
@@ -9,7 +9,7 @@ void sum_records(
     __global const uint *restrict first_pair,  // [N]
     __global const uint *restrict tile_count,  // [N]
     __global float *restrict pixel_sums,       // [PIXEL_SUMS,S]
-    const uint accumulate,                     // 1: go on from the sums that are there
+    const uint accumulate,                     // 1: add to the sums in `pixel_sums`
     const uint stride,
     const uint count)
 {
@@ -36,7 +36,7 @@ void sum_records(
     }
 }
 
-/* Row i of `moved` is row source[i] of `table`; rows marked fresh are zeroed where `zero_fresh` says so.
+/* Row i of `moved` is row source[i] of `table`; fresh rows are zero where `zero_fresh` is 1.
  * One item = one row of one plane; dimension 1 is the plane. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void gather_rows(
@@ -55,7 +55,7 @@ void gather_rows(
     moved[plane * moved_stride + i] = zero_fresh && fresh[i] ? 0.0f : table[plane * table_stride + source[i]];
 }
 
-/* Write rows from the host; no row is named twice.  One item = one value; dimensions row, plane. */
+/* Write rows from the host; no row occurs twice.  One item = one value; dimensions row, plane. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void set_rows(
     __global const uint *restrict rows,     // [count]

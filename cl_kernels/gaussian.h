@@ -36,7 +36,7 @@ static inline void rotation_backward(const VF *q, const VF inverse_norm, const V
     grad[3] = (gz - z * along) * inverse_norm;
 }
 
-/* Everything between a Gaussian's parameters and its screen ellipse; forward and backward compute it alike. */
+/* All values between a Gaussian's parameters and its screen ellipse; the forward and the backward pass compute them. */
 typedef struct {
     VI valid;                 // in front of the near plane, with a direction and a shape
     VF x, y, z, inverse_z;    // mean in camera space, scene units
@@ -53,10 +53,10 @@ typedef struct {
     VF determinant;           // of the covariance after the screen filter
     VF ratio;                 // determinant before / after the screen filter
     VF conic_xx, conic_xy, conic_yy;  // inverse covariance after the screen filter, px^-2
-    VF energy;                // factor of the opacity: what the two filters spread out
+    VF energy;                // factor of the opacity: the energy that the two filters leave
 } shape_t;
 
-/* By address: functions that return a structure are, once inlined, more than Oclgrind 21.10 knows. */
+/* The result is written to an address: Oclgrind 21.10 does not support inlined functions that return a structure. */
 static inline void shape_of(
     __global const float *means,            // [3,S] scene units
     __global const float *quats,            // [4,S] unnormalised
@@ -72,7 +72,7 @@ static inline void shape_of(
     s.x = w[0] * px + w[1] * py + w[2] * pz + w[3];
     s.y = w[4] * px + w[5] * py + w[6] * pz + w[7];
     s.z = w[8] * px + w[9] * py + w[10] * pz + w[11];
-    s.valid = (s.z >= near_plane) & (s.z <= DEPTH_MAX);  // written so that NaN fails
+    s.valid = (s.z >= near_plane) & (s.z <= DEPTH_MAX);  // false for NaN
     s.inverse_z = 1.0f / s.z;
 
     const VF rx = s.x * s.inverse_z, ry = s.y * s.inverse_z;

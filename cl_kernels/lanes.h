@@ -1,5 +1,5 @@
-/* VF and VI: a float and an int in each of LANES lanes.  One source then serves CPUs, whose vector units want 16 or
- * 8 Gaussians or pixels per item, and GPUs, which want one.
+/* VF and VI: a float and an int in each of LANES lanes.  One source serves CPUs, where an item computes 16 or 8
+ * Gaussians or pixels, as many as the vector unit has lanes, and GPUs, where an item computes one.
  *
  * Comparisons give -1 in vectors and 1 in scalars, so masks are combined with & and | only and used as m ? a : b.
  * Loops that matter use operators only: some CPU runtimes call built-in functions out of line. */
@@ -42,7 +42,7 @@ typedef int VI;
 #define ANY(mask) any(mask)
 #endif
 
-#define ROUND_MAGIC 12582912.0f  // 1.5 * 2^23: adding it leaves the nearest integer in the low mantissa bits
+#define ROUND_MAGIC 12582912.0f  // 1.5 * 2^23: after adding it, the low mantissa bits are the nearest integer
 #define LOG2_E 1.44269504f
 #define LN_2 0.693147181f
 
@@ -87,12 +87,12 @@ static inline void transpose(VF *v)
 /* The integer in each lane, for whole numbers below 2^22 in size. */
 static inline VI to_VI(VF whole) { return as_VI(whole + ROUND_MAGIC) - 0x4b400000; }
 
-/* A NaN in the first argument stays one. */
+/* NaN in the first argument gives NaN. */
 static inline VF larger(VF a, VF b) { return b > a ? b : a; }
 static inline VF smaller(VF a, VF b) { return b < a ? b : a; }
 
 /* e^x for x in [POWER_MIN, 80]: 2^n from the exponent bits, 2^f by a minimax polynomial on [-1/2, 1/2].
- * Relative error 3e-7 near 0, 1.3e-6 at the ends.  Outside the range the lanes hold rubbish. */
+ * Relative error 3e-7 near 0, 1.3e-6 at the ends.  Outside the range the result is undefined. */
 static inline VF exp_power(VF x)
 {
     const VF t = x * LOG2_E + ROUND_MAGIC;

@@ -2,7 +2,7 @@
  *
  * SSIM: 11x11 Gaussian window, sigma 1.5, zero padding, C1 = 0.01^2, C2 = 0.03^2 (Wang et al. 2004, as 3DGS uses it).
  * Planes are [channels,H',W'] with H', W' whole tiles, zero outside the image; gradients too.  One group of TEAM items
- * = one row of one channel (SSIM: a block of its columns); it writes its sum once.  Deterministic. */
+ * = one row of one channel (SSIM: a block of its columns); each sum is written once.  Deterministic. */
 #include "lanes.h"
 
 #define SSIM_C1 1.0e-4f
@@ -40,7 +40,7 @@ void unpack_pixels(
         planes[(channel * get_global_size(1) + y) * stride + x] = 0.0f;
 }
 
-/* Pixels that the mask leaves out become zero.  One item = one pixel of one channel; dimensions pixel, channel. */
+/* Set pixels that the mask leaves out to zero.  One item = one pixel of one channel; dimensions pixel, channel. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void apply_mask(
     __global float *restrict planes,      // [3,H',stride]
@@ -97,7 +97,7 @@ void pixel_loss(
 
 /* Local means, then the SSIM map's derivatives by mean of x, variance of x and covariance:
  *   a1 = 2 mx my + C1, a2 = 2 cov + C2, b1 = mx^2 + my^2 + C1, b2 = vx + vy + C2, m = a1 a2 / (b1 b2).
- * Vertical sums go to local memory (SPAN * 20 bytes + TEAM * 4), the horizontal pass reads them. */
+ * Vertical sums go to local memory (SPAN * 20 bytes + TEAM * 4), and the horizontal pass reads them. */
 __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
 void ssim_maps(
     __global const float *restrict image,       // [3,H',stride]

@@ -1,10 +1,10 @@
-/* Which tiles each splat touches, as a list of (tile, splat) pairs.
+/* List the (tile, splat) pairs: the tiles that each splat touches.
  *
  * A pair's address is its place in emission order, so the pairs of one Gaussian are contiguous.  Deterministic: each
  * pair has one writer. */
 #include "tiles.h"
 
-/* The tiles of a rectangle too large for a mask, tested again, as when they were counted. */
+/* Emit the pairs of a rectangle too large for a mask: its tiles are tested again, as in count_tiles. */
 static inline void emit_large(__global const float *splat, uint pair, const uint i, __global uint *pair_tile,
                               __global uint *pair_splat, const uint tiles_x, const uint row_begin, const uint row_end)
 {

@@ -1,4 +1,4 @@
-/* What the device can do at best: the yardsticks of `clsplat bench`.  No kernel of the product is in here.
+/* Peak rates of the device, for `clsplat bench`.  Training and rendering use no kernel of this file.
  *
  * One item = LANES lanes.  No local memory.  Deterministic. */
 #include "lanes.h"

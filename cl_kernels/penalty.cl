@@ -1,9 +1,9 @@
-/* Penalties on the shape of Gaussians, by their scales s: value and gradient.
+/* Penalties on the scales s of Gaussians, in scene units: value and gradient.
  *
  *   covariance trace   P = max(sum_j s_j^2 - tau, 0): bounds the size, and only through it the shape
  *   anisotropy         A = max(s_max / s_min - r, 0): bounds the shape, whatever the size
  *
- * One item = LANES Gaussians; each adds to the gradient and writes its own sum.  No local memory.  Deterministic. */
+ * One item = LANES Gaussians; each adds to the gradient and writes one sum.  No local memory.  Deterministic. */
 #include "lanes.h"
 
 /* grad_log_scales += weight dP/d(log s).  The bound of a Gaussian is above + pixels^2 nearest^2. */

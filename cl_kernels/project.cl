@@ -1,8 +1,8 @@
 /* Projection of Gaussians to screen ellipses with view-dependent colour, and its gradient (backward.h).
  *
  * Kerbl et al. 2023, section 4, with the linearised perspective of Zwicker et al. 2001.  Both filters are numbers:
- * `filter_variance` is added to the squared scales, `screen_variance` to the screen covariance; the opacity loses the
- * energy that the first spreads out, and `compensate` (0 or 1) says whether it also loses that of the second
+ * `filter_variance`, scene units^2, is added to the squared scales, `screen_variance`, px^2, to the screen covariance.
+ * The opacity is multiplied by the energy factor of the first, and with `compensate` = 1 also by that of the second
  * (Mip-Splatting, Yu et al. 2024, eq. 9 and 11).
  *
  * One item = LANES Gaussians.  No local memory.  Deterministic: no item writes what another reads. */
@@ -37,7 +37,7 @@ void project_forward(
     const float near_plane,                          // scene units
     const float screen_variance,                     // px^2
     const float compensate,                          // 0 or 1
-    const uint row_begin,                            // of the band of tiles whose lists are wanted
+    const uint row_begin,                            // of the band of tiles whose pairs are listed
     const uint row_end,
     const uint degree,
     const uint stride,
@@ -52,7 +52,7 @@ void project_forward(
     const VF u = camera->fx * s.x * s.inverse_z + camera->cx;
     const VF v = camera->fy * s.y * s.inverse_z + camera->cy;
 
-    /* 3-sigma radius and the tile rectangle of the reference implementation: who counts as seen */
+    /* A Gaussian counts as seen when the rectangle of its 3-sigma radius overlaps the tile grid, as in the reference */
     const VF middle = 0.5f * (s.xx + s.yy) + screen_variance;
     const VF spread = larger(middle * middle - s.determinant, (VF)(LAMBDA_FLOOR));
     const VF r = ceil(3.0f * sqrt(middle + sqrt(spread)));

@@ -1,5 +1,5 @@
 /* Counter-based random numbers: Philox 4x32-10 (Salmon et al. 2011).  A number depends on (seed, step, Gaussian) only,
- * never on how many were drawn before: resuming and any number of cores give the same bits. */
+ * not on the numbers drawn before: a resumed run and any number of cores give the same bits. */
 #ifndef CLSPLAT_RANDOM_H
 #define CLSPLAT_RANDOM_H
 

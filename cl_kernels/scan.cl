@@ -1,7 +1,7 @@
 /* Exclusive prefix sum of unsigned integers: reduce, scan the block sums, then scan inside blocks.
  *
  * A block is one work-group; each of its TEAM items owns `run` consecutive values, long on CPUs (one item per
- * group) and short on GPUs.  Integer sums: deterministic.  No group waits for another. */
+ * group) and short on GPUs.  Integer sums: deterministic.  No group depends on another. */
 #include "common.h"
 
 /* Sum of each block.  Local memory: TEAM * 4 bytes. */
@@ -70,7 +70,7 @@ void scan_offsets(
     }
 }
 
-/* The values in another order: what the scan of a permuted table starts from.  One item = one place. */
+/* Put values in another order, before the scan of a permuted table.  One item = one place. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void permute(
     __global const uint *restrict values,  // [N]

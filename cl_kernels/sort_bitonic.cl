@@ -1,8 +1,8 @@
 /* Bitonic tile sort: the pairs of each tile front to back, ties by Gaussian.
  *
- * Pairs are first dropped into their tile in any order (the cursor is an integer atomic), then each tile is sorted by
- * (depth bits, pair).  That order is total, since pairs are unique, so the result does not depend on how the
- * tile was filled: deterministic.
+ * Pairs are first written to their tile in any order (the cursor is an integer atomic), then each tile is sorted by
+ * (depth bits, pair).  This order is total, since pairs are unique, so the result does not depend on the order of
+ * writing: deterministic.
  *
  * One work-group = one tile of any length: the ascending ("flip") form of the network, in which a partner beyond the
  * end counts as +infinity and is skipped.  Local memory: SORT_CAPACITY * 8 bytes; longer tiles are sorted in place. */
@@ -20,7 +20,7 @@ void count_pairs(
         atomic_inc(tile_pair_count + pair_tile[pair]);
 }
 
-/* Drop each pair, with its depth, into its tile.  One item = one pair. */
+/* Write each pair, with its depth, to its tile.  One item = one pair. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void fill_tiles(
     __global const uint *restrict pair_tile,   // [P]

@@ -1,8 +1,9 @@
 /* One pass of a stable radix sort of (key, value) pairs: count digits, scan the counts (scan.cl), scatter.
  *
- * A block is one work-group; each of its TEAM items owns `run` consecutive pairs, so that order inside a block is
- * order of items and stability needs no atomics.  On CPUs one item per group walks a long run with wide digits; on
- * GPUs a group walks short runs with narrow ones.  Local memory: 4 << DIGIT_BITS bytes * TEAM.  Deterministic. */
+ * A block is one work-group; each of its TEAM items owns `run` consecutive pairs, so that the order in a block is the
+ * order of items and stability needs no atomics.  On CPUs one item per group sorts a long run with wide digits; on
+ * GPUs the items of a group sort short runs with narrow digits.  Local memory: 4 << DIGIT_BITS bytes * TEAM.
+ * Deterministic. */
 #include "common.h"
 
 static inline void count_digits(__global const uint *keys, __local uint *counts, const uint first,
@@ -38,7 +39,7 @@ void radix_count(
     }
 }
 
-/* Move every pair to its place.  In the first pass the values are the places themselves: 0, 1, 2, ... */
+/* Move every pair to its place.  In the first pass the values are the indices of the keys: 0, 1, 2, ... */
 __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
 void radix_scatter(
     __global const uint *restrict keys,          // [count]

@@ -1,11 +1,11 @@
-/* One splat at LANES pixels: alpha, blending and its gradient, and which tiles a splat touches.  Both schedules use
- * these functions, so their images are equal bit for bit.
+/* One splat at LANES pixels: alpha, blending and its gradient.  Both schedules use these functions, so their images are
+ * equal bit for bit.
  *
  *   power = -1/2 (xx dx^2 + yy dy^2) - xy dx dy,  alpha = min(0.99, opacity e^power),  d = mean - pixel centre
  *
  * A splat contributes to a pixel when the pixel's row lies in its extent, power_min <= power <= 0 (power_min is where
  * alpha falls to 1/255) and blending it leaves transmittance >= 1e-4; the first splat that would leave less finishes
- * the pixel and is not blended (Kerbl et al. 2023).  A finished pixel keeps its transmittance with the sign turned. */
+ * the pixel and is not blended (Kerbl et al. 2023).  A finished pixel stores its transmittance with a negative sign. */
 #ifndef CLSPLAT_SPLAT_H
 #define CLSPLAT_SPLAT_H
 #include "lanes.h"
@@ -32,12 +32,12 @@
 #define SUM_XY 4       // p dx dy
 #define SUM_YY 5       // p dy dy
 #define SUM_RED 6      // w dL/dcolour; then green, blue
-#define SUM_ABS_X 9    // |dL/dx| of the mean, px^-1; from here on only where PIXEL_SUMS says so
+#define SUM_ABS_X 9    // |dL/dx| of the mean, px^-1; this and the next sums exist where PIXEL_SUMS is larger
 #define SUM_ABS_Y 10
 #define SUM_WEIGHT 11  // w, where the texture is known: not below 0
 #define SUM_TEXTURE 12 // w times the texture at the pixel, there
 
-/* The same sums while they grow, one set per lane. */
+/* Partial sums, one set per lane. */
 typedef struct {
     VF power, x, y, xx, xy, yy, red, green, blue, abs_x, abs_y, weight, texture;
 } pixel_sums_t;
@@ -49,7 +49,7 @@ typedef struct {
     float a, b, c;     // power = (a dx - b) dx - c
     float xy, slope;   // dpower/dy of the mean = -(xy dx + slope)
     float opacity;
-    float power_min;   // above 0 when the row is outside the splat's extent: then nothing is hit
+    float power_min;   // above 0, so that no pixel is hit, when the row is outside the splat's extent
 } row_splat_t;
 
 static inline row_splat_t splat_at_row(const float *splat, const float row)
@@ -65,9 +65,9 @@ static inline row_splat_t splat_at_row(const float *splat, const float row)
     return s;
 }
 
-/* What a splat does to LANES pixels whose transmittance before it is t. */
+/* Contribution of a splat to LANES pixels whose transmittance before it is t. */
 typedef struct {
-    VI hit;       // the splat counts here ...
+    VI hit;       // the splat reaches the pixel ...
     VI blended;   // ... and does not finish the pixel
     VF dx;        // px
     VF uncapped;  // alpha before the cap
@@ -81,7 +81,7 @@ static inline contribution_t contribution_of(const row_splat_t s, const VF pixel
     contribution_t k;
     k.dx = s.x - pixel;
     const VF power = (k.dx * s.a - s.b) * k.dx - s.c;
-    /* no pixel that is hit needs the bound; without it, far ones get subnormal numbers, which cost dearly */
+    /* the bound changes no pixel that is hit; without it, distant pixels have subnormal numbers, which are slow */
     k.uncapped = s.opacity * exp_power(larger(power, (VF)(POWER_MIN)));
     const VF alpha = smaller(k.uncapped, (VF)(ALPHA_MAX));
     k.hit = (power >= s.power_min) & (power <= 0.0f);
@@ -111,9 +111,9 @@ static inline void blend(pixels_t *p, const row_splat_t s, const VF pixel, const
 
 static inline VF magnitude(VF t) { return as_VF(as_VI(t) & 0x7fffffff); }
 
-/* The same walk for gradients: g = dL/dcolour of the pixel; rest = g . (what is still to be blended behind, background
- * included), which starts as g . final colour.  Then dL/dalpha = t (c . g) - rest_after / (1 - alpha): front to back,
- * no division to undo the transmittance. */
+/* State of LANES pixels for gradients: g = dL/dcolour of the pixel; rest = g . (colour that is blended after this
+ * splat, background included), which starts as g . final colour.  Then dL/dalpha = t (c . g) - rest_after / (1 -
+ * alpha): front to back, without dividing the transmittance. */
 typedef struct {
     VF t, rest, red, green, blue;
 #if PIXEL_SUMS > SUM_WEIGHT

@@ -1,4 +1,4 @@
-/* How fast an image's brightness changes: |Sobel| / 8 of its luminance (Rec. 601 weights), edges repeated outwards.
+/* Gradient magnitude of an image: |Sobel| / 8 of its luminance (Rec. 601 weights), per px; edges are repeated outwards.
  *
  * One item = LANES pixels of a row.  No local memory.  Deterministic. */
 #include "splat.h"
@@ -54,7 +54,7 @@ void image_gradient(
     VSTORE(inside * 0.125f * sqrt(across * across + down * down), magnitude + y * stride + x);
 }
 
-/* What is masked is not known, nor is a change beside it: such pixels get the magnitude -1.  One item = one pixel. */
+/* Set the magnitude of masked pixels and of their neighbours to -1: it is not known there.  One item = one pixel. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void hide_masked(
     __global const float *restrict mask,  // [H',stride] 0 or 1
@@ -75,8 +75,8 @@ void hide_masked(
         magnitude[y * stride + x] = -1.0f;
 }
 
-/* Add to each Gaussian that is drawn the magnitude at its projected mean, taken from the nearest pixel of the image;
- * nothing where it is not known. */
+/* Add to each visible Gaussian the magnitude at its projected mean, from the nearest pixel of the image; 0 where it is
+ * not known. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void sample_magnitude(
     __global const float *restrict magnitude,  // [H',stride] per px, below 0: not known

@@ -1,8 +1,8 @@
-/* Which tiles splats touch: LANES splats at once, or one splat in every lane.
+/* The tiles that splats touch: LANES splats at once, or one splat in every lane.
  *
- * The rectangle of tiles around a splat's extent holds `columns` x `rows` tiles; each is tested exactly.  A footprint
- * is what pairs are emitted from: the rectangle's corner and width in `tile_box`, and one bit per touched tile in
- * `tile_mask` where the rectangle has no more than 32 tiles; larger ones have width 0 there and are tested again. */
+ * The rectangle of tiles around a splat's extent holds `columns` x `rows` tiles; each is tested exactly.  Pairs are
+ * made from two numbers: `tile_box`, the rectangle's corner and width, and `tile_mask`, one bit per touched tile,
+ * where the rectangle has no more than 32 tiles; larger ones have width 0 in `tile_box` and are tested again. */
 #ifndef CLSPLAT_TILES_H
 #define CLSPLAT_TILES_H
 #include "splat.h"
@@ -14,7 +14,7 @@ typedef struct {
     VF x, y;               // mean, px
     VF xx, xy, yy;         // conic, px^-2
     VF along_x, along_y;   // where the ellipse is highest over x, and furthest right over y: -xy/yy, -xy/xx
-    VF reach;              // the least power at which alpha is 1/255, without its sign, and the slack
+    VF reach;              // -power where alpha is 1/255, plus EXTENT_SLACK / 2
     VF first_x, first_y;   // corner of the rectangle, tiles
     VF columns, rows;      // its size, tiles; none when the splat is not visible
 } footprint_t;
@@ -54,9 +54,9 @@ static inline footprint_t footprint_of(const VF *splat, const VI visible, const 
     return f;
 }
 
-/* Whether the ellipse reaches a pixel centre of the tile in `column` and `row` of the rectangle: the least -power over
- * the centres' rectangle lies at the mean or on the edges facing it, where it is a parabola (the test of StopThePop,
- * Radl et al. 2024). */
+/* Whether the ellipse reaches a pixel centre of the tile in `column` and `row` of the rectangle: the smallest -power
+ * over the centres' rectangle lies at the mean or on the edges next to it, where it is a parabola (the test of
+ * StopThePop, Radl et al. 2024). */
 static inline VI touches_tile(const footprint_t *f, const float column, const float row)
 {
     const VF x0 = (f->first_x + column) * TILE + 0.5f - f->x, x1 = x0 + (TILE - 1.0f);
@@ -84,7 +84,7 @@ static inline VI count_tiles(const footprint_t *f, VI *mask)
     return count;
 }
 
-/* Corner and width of the rectangles; width 0 where a mask cannot hold them. */
+/* Corner and width of the rectangles; width 0 where they have more tiles than a mask has bits. */
 static inline VI box_of(const footprint_t *f)
 {
     const VI width = f->columns * f->rows <= (float)BOX_TILES_MAX ? to_VI(f->columns) : (VI)(0);

@@ -18,18 +18,25 @@ if TYPE_CHECKING:
     from clsplat import metrics as metrics
     from clsplat.api.commands import check as check
     from clsplat.api.commands import compare_runs as compare_runs
-    from clsplat.api.commands import devices as devices
+    from clsplat.api.commands import copy_pipeline as copy_pipeline
+    from clsplat.api.commands import describe_run as describe_run
     from clsplat.api.commands import evaluate as evaluate
-    from clsplat.api.commands import inspect_scene as inspect_scene
-    from clsplat.api.commands import load_plugin as load_plugin
+    from clsplat.api.commands import pipeline_schema as pipeline_schema
     from clsplat.api.commands import pipelines as pipelines
     from clsplat.api.commands import render_views as render_views
     from clsplat.api.commands import resume as resume
     from clsplat.api.commands import run as run
+    from clsplat.api.commands import status as status
     from clsplat.api.device import Device as Device
     from clsplat.api.renderer import Gradients as Gradients
     from clsplat.api.renderer import Picture as Picture
     from clsplat.api.renderer import Renderer as Renderer
+    from clsplat.api.tools import devices as devices
+    from clsplat.api.tools import inspect_scene as inspect_scene
+    from clsplat.api.tools import load_plugin as load_plugin
+    from clsplat.api.tools import measure_growth as measure_growth
+    from clsplat.api.tools import measure_speed as measure_speed
+    from clsplat.api.tools import read_measurement as read_measurement
     from clsplat.api.trainer import Report as Report
     from clsplat.api.trainer import Trainer as Trainer
     from clsplat.gaussians.model import Model as Model
@@ -44,10 +51,11 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 _HERE = Path(__file__).resolve().parent
 _ROOMS = {  # where the names come from, which `import clsplat` does not import
-    "clsplat.api.commands": "check compare_runs devices evaluate inspect_scene load_plugin pipelines render_views"
-    " resume run",
+    "clsplat.api.commands": "check compare_runs copy_pipeline describe_run evaluate pipeline_schema pipelines"
+    " render_views resume run status",
     "clsplat.api.device": "Device",
     "clsplat.api.renderer": "Gradients Picture Renderer",
+    "clsplat.api.tools": "devices inspect_scene load_plugin measure_growth measure_speed read_measurement",
     "clsplat.api.trainer": "Report Trainer",
     "clsplat.gaussians.model": "Model Rendering load",
     "clsplat.scene.camera": "Camera",

@@ -1,7 +1,7 @@
-"""What a pipeline's `model:` says: the degree of the colours and the two low-pass filters, as numbers.
+"""The settings of `model:`: the degree of the colours and the two low-pass filters, as numbers.
 
-A world filter fills `filter_variance`, what is added to the squared scales of each Gaussian; a screen filter is two
-numbers of the model.  Rendering reads both always and knows neither by name.
+A world filter writes `filter_variance`, scene units², which is added to the squared scales of each Gaussian.  A screen
+filter is two numbers of the model.  Rendering reads these numbers and has no case for a filter.
 """
 
 from abc import abstractmethod
@@ -14,7 +14,7 @@ from pydantic import Field
 
 from clsplat.gaussians.tables import DeviceModel, Gaussians
 from clsplat.opencl.device import Array, Device
-from clsplat.render.rasterizer import camera_values
+from clsplat.render.camera import camera_values
 from clsplat.scene.scene import View
 from clsplat.settings import OneOf, Settings
 
@@ -29,15 +29,15 @@ class FilterViews:
 
 
 class WorldFilter(Settings):
-    """How Gaussians are blurred in the world."""
+    """A blur of Gaussians in the world."""
 
     @abstractmethod
     def refresh(self, gaussians: Gaussians, views: FilterViews, near: float) -> None:
-        """Write `filter_variance` for where the Gaussians are now; what lies nearer than `near` is not seen."""
+        """Write `filter_variance`, [S] scene units², for the present means; `near`: smallest depth, scene units."""
 
 
 class NoWorldFilter(WorldFilter):
-    """Gaussians keep their own size."""
+    """No blur in the world."""
 
     type: Literal["none"] = "none"
 
@@ -46,7 +46,7 @@ class NoWorldFilter(WorldFilter):
 
 
 class Smoothing(WorldFilter):
-    """Blur Gaussians by what the training views can resolve (the 3D smoothing filter of Mip-Splatting, Yu et al. 2024).
+    """Blur Gaussians to the training views' resolution (3D smoothing filter of Mip-Splatting, Yu et al. 2024).
 
     A view of focal length f px samples a Gaussian at depth z every z/f scene units.  `per_camera` takes the smallest
     such interval (eq. 6); `global_max` the smallest z by the largest f of all views, as the paper's code does.
@@ -54,7 +54,7 @@ class Smoothing(WorldFilter):
 
     type: Literal["smoothing"] = "smoothing"
     variance: Annotated[float, Field(ge=0)] = 0.2
-    """Added to the squared scales, in sampling intervals²."""
+    """Variance added to the squared scales, in sampling intervals²."""
     focal: Literal["per_camera", "global_max"] = "per_camera"
     """Focal length of the interval: of each view, or the largest of all."""
 
@@ -86,7 +86,7 @@ def measure_intervals(
 
 
 class ScreenFilter(Settings):
-    """How splats are blurred on the screen."""
+    """A blur of splats in the image."""
 
     variance: Annotated[float, Field(ge=0)]
     """Added to the variance of every splat, px²."""
@@ -95,7 +95,7 @@ class ScreenFilter(Settings):
 
 
 class Dilation(ScreenFilter):
-    """Add a variance to every splat, so that none is thinner than a pixel (Kerbl et al. 2023)."""
+    """Add a variance to every splat, so that each covers about a pixel or more (Kerbl et al. 2023)."""
 
     type: Literal["dilation"] = "dilation"
     variance: Annotated[float, Field(ge=0)] = 0.3
@@ -105,7 +105,7 @@ class Dilation(ScreenFilter):
 
 
 class Ewa(ScreenFilter):
-    """The same variance, but splats keep their energy (Zwicker et al. 2001; "3DGS + EWA" in Yu et al. 2024)."""
+    """Add a variance to every splat and keep its energy (Zwicker et al. 2001; "3DGS + EWA" in Yu et al. 2024)."""
 
     type: Literal["ewa"] = "ewa"
     variance: Annotated[float, Field(ge=0)] = 0.3
@@ -115,7 +115,7 @@ class Ewa(ScreenFilter):
 
 
 class Mip(ScreenFilter):
-    """Blur by about a pixel, splats keep their energy (the 2D Mip filter of Mip-Splatting, Yu et al. 2024, eq. 11)."""
+    """Blur every splat by about a pixel and keep its energy (2D Mip filter, Yu et al. 2024, eq. 11)."""
 
     type: Literal["mip"] = "mip"
     variance: Annotated[float, Field(ge=0)] = 0.1
@@ -134,7 +134,7 @@ class ModelSettings(Settings):
     world_filter: OneOf[WorldFilter] = NoWorldFilter()
     """Blur of Gaussians in the world."""
     screen_filter: OneOf[ScreenFilter] = Dilation()
-    """Blur of splats on the screen."""
+    """Blur of splats in the image."""
 
     def model(self, gaussians: Gaussians, degree: int) -> DeviceModel:
         """Return the Gaussians with the numbers of these settings; `degree` is the active one."""

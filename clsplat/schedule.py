@@ -6,11 +6,14 @@
 {initial: 1.6e-4, final: 1.6e-6, over: 30000, start: 0} exponential decay over a number of steps from a step on
 """
 
+import inspect
 import math
+from abc import abstractmethod
 from collections.abc import Callable
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, ValidationError, WrapValidator
+from pydantic import AfterValidator, Field, GetCoreSchemaHandler, ValidationError, WrapValidator
+from pydantic_core import CoreSchema, core_schema
 
 from clsplat.settings import Settings
 
@@ -38,25 +41,44 @@ def _between(points: list[Point], step: int, linear: bool) -> float:
 PointList = Annotated[list[Point], AfterValidator(_in_order)]
 
 
-class Points(Settings):
-    """Values at steps; before the first point and after the last the value stays as there."""
+class Curve(Settings):
+    """A value by step, given by keys of its own; a schedule takes any subclass."""
+
+    @abstractmethod
+    def at(self, step: int) -> float:
+        """Return the value at a global step."""
+
+    @property
+    @abstractmethod
+    def values(self) -> list[float]:
+        """The values that bounds are checked on: the smallest must be among them."""
+
+
+class _Curves:
+    """Marks a field that takes any curve, told apart by its keys."""
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        kinds = [kind for kind in Settings.defined if issubclass(kind, Curve) and not inspect.isabstract(kind)]
+        return core_schema.union_schema([handler.generate_schema(kind) for kind in kinds])
+
+
+class Points(Curve):
+    """Values at steps; constant before the first point and after the last."""
 
     points: PointList
     """[global step, value], with growing steps."""
     between: Literal["linear", "steps"] = "linear"
-    """What lies between two points: a straight line, or the value of the point before."""
+    """Values between two points: on a straight line, or that of the point before."""
 
     def at(self, step: int) -> float:
-        """Return the value at a global step."""
         return _between(self.points, step, linear=self.between == "linear")
 
     @property
     def values(self) -> list[float]:
-        """Every value that is named."""
         return [value for _, value in self.points]
 
 
-class Decay(Settings):
+class Decay(Curve):
     """A value that falls or grows exponentially (Kerbl et al. 2023)."""
 
     initial: Annotated[float, Field(gt=0)]
@@ -69,13 +91,11 @@ class Decay(Settings):
     """Global step at which the decay begins."""
 
     def at(self, step: int) -> float:
-        """Return the value at a global step."""
         share = min(max(step - self.start, 0) / self.over, 1.0)
         return math.exp((1 - share) * math.log(self.initial) + share * math.log(self.final))
 
     @property
     def values(self) -> list[float]:
-        """Every value that is named."""
         return [self.initial, self.final]
 
 
@@ -86,7 +106,7 @@ NOTATIONS = (
 
 
 def explained(more: str = "") -> WrapValidator:
-    """Say in one sentence what is wrong with a schedule, or what else a field takes, not once for each notation."""
+    """Make one sentence of the errors of all notations; `more` names other values that the field accepts."""
 
     def validated(value: Any, validate: Callable[[Any], Any]) -> Any:
         try:
@@ -99,14 +119,14 @@ def explained(more: str = "") -> WrapValidator:
     return WrapValidator(validated)
 
 
-Schedule = Annotated[float | PointList | Points | Decay, explained()]
+Schedule = Annotated[float | PointList | Annotated[Curve, _Curves()], explained()]
 
 
 def values_of(schedule: Schedule) -> list[float]:
-    """Every value that a schedule names."""
+    """Return all values of a schedule's notation."""
     if isinstance(schedule, list):
         return [value for _, value in schedule]
-    return schedule.values if isinstance(schedule, Points | Decay) else [schedule]
+    return schedule.values if isinstance(schedule, Curve) else [schedule]
 
 
 class Bounded:
@@ -132,4 +152,4 @@ def at_step(schedule: Schedule, step: int) -> float:
     """Return the value of a schedule at a global step."""
     if isinstance(schedule, list):
         return _between(schedule, step, linear=True)
-    return schedule.at(step) if isinstance(schedule, Points | Decay) else schedule
+    return schedule.at(step) if isinstance(schedule, Curve) else schedule

@@ -16,7 +16,6 @@ from rich.progress import BarColumn, Progress, TextColumn
 from clsplat.files import unwritable
 
 if TYPE_CHECKING:  # the command line starts without OpenCL
-    from clsplat.opencl.device import DeviceInfo
     from clsplat.training import run as training
 
 LOG = logging.getLogger("clsplat")
@@ -109,18 +108,17 @@ def line(progress: "training.Progress") -> str:
     )
 
 
-def device_text(info: "DeviceInfo", fault: str | None) -> str:
-    """A device and whether it works, as lines of text."""
-    from clsplat.opencl.device import resolve_schedule
-
-    sizes = f"{info.memory / 2**30:.1f} GiB of memory, buffers up to {info.allocation / 2**30:.1f} GiB"
-    limits = f"groups up to {info.group}, {info.local_memory >> 10} KiB local, {info.float_width} lanes"
+def device_text(device: dict[str, Any]) -> str:
+    """A device, as `clsplat.devices` lists it, and whether it works, as lines of text."""
+    d = device
+    sizes = f"{d['memory'] / 2**30:.1f} GiB of memory, buffers up to {d['allocation'] / 2**30:.1f} GiB"
+    limits = f"groups up to {d['group']}, {d['local_memory'] >> 10} KiB local, {d['float_width']} lanes"
     return (
-        f"{info.name} ({info.kind}, {info.units} units)\n"
-        f"  runtime   {info.platform}\n"
+        f"{d['name']} ({d['kind']}, {d['units']} units)\n"
+        f"  runtime   {d['platform']}\n"
         f"  limits    {sizes}, {limits}\n"
-        f"  schedule  {resolve_schedule(info, 'auto')}\n"
-        f"  state     {'does not work: ' + fault if fault else 'works'}"
+        f"  schedule  {d['schedule']}\n"
+        f"  state     {'does not work: ' + d['fault'] if d['fault'] else 'works'}"
     )
 
 

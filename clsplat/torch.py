@@ -22,30 +22,30 @@ class _Render(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, renderer: Renderer, view: View, background: Colour | None, *tensors: torch.Tensor) -> Any:
-        arrays = {n: t.detach().cpu().numpy() for n, t in zip(PARAMETERS, tensors, strict=True)}
-        model = replace(renderer.model, **arrays)
-        renderer.update(model)
-        ctx.picture, ctx.model, ctx.devices = renderer.render(view, background), model, [t.device for t in tensors]
+        tables: dict[str, Any] = {n: t.detach().cpu().numpy() for n, t in zip(PARAMETERS, tensors, strict=True)}
+        renderer.update(replace(renderer.model, **tables))
+        ctx.picture = renderer.render(view, background)
+        ctx.save_for_backward(*tensors)  # torch refuses backward where one was changed in place
         image, alpha = (torch.from_numpy(a.copy()) for a in (ctx.picture.image, ctx.picture.alpha))
         return image.to(tensors[0].device), alpha.to(tensors[0].device)
 
     @staticmethod
     def backward(ctx: Any, *gradients: torch.Tensor) -> Any:
         by_image, by_alpha = (gradient.detach().cpu().numpy() for gradient in gradients)
-        if ctx.picture.renderer.model is not ctx.model:
-            ctx.picture.renderer.update(ctx.model)
         found = ctx.picture.backward(image=by_image, alpha=by_alpha if by_alpha.any() else None)
         arrays = [torch.from_numpy(getattr(found, name)) for name in PARAMETERS]
-        return None, None, None, *(a.to(d) for a, d in zip(arrays, ctx.devices, strict=True))
+        return None, None, None, *(a.to(t.device) for a, t in zip(arrays, ctx.saved_tensors, strict=True))
 
 
 def render(
     renderer: Renderer, view: View, parameters: Mapping[str, torch.Tensor], background: Colour | None = None
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return image [height, width, 3] and alpha [height, width] of a view, with gradients.
+    """Return image [height, width, 3] and alpha [height, width] of a view, differentiable once.
 
-    parameters: the tables of a model by name, float32, before activation; filters and the like are those of the
-    renderer's model.  Raises KeyError for a table that is missing.
+    parameters: the tables of a model by name, float32 [N, components], before activation; filters and the like are
+    those of the renderer's model, whose tables these replace.  The number of Gaussians may change from call to call.
+    Raises KeyError for a table that is missing and ValueError for a shape that does not fit.
     """
-    image, alpha = _Render.apply(renderer, view, background, *(parameters[name] for name in PARAMETERS))
+    apply: Any = _Render.apply
+    image, alpha = apply(renderer, view, background, *(parameters[name] for name in PARAMETERS))
     return image, alpha

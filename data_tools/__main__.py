@@ -40,7 +40,7 @@ def synthetic(
 def multiscale(
     source: Annotated[Path, typer.Argument(help="Folder of a single-scale Blender dataset.")],
     out: Annotated[Path, typer.Argument(help="Folder to make.")],
-    levels: Annotated[int, typer.Option(min=1, max=8, help="Scales: full size, half, quarter, …")] = 4,
+    levels: Annotated[int, typer.Option(min=1, max=8, help="Number of sizes: full, half, quarter, …")] = 4,
 ) -> None:
     """Make the multi-scale Blender dataset of mip-NeRF from a single-scale one."""
     print(f"{write_multiscale(source, out, levels)} images written to {out}")
@@ -49,11 +49,11 @@ def multiscale(
 @app.command()
 def photos(
     source: Annotated[Path, typer.Argument(help="Folder of photographs; it is not written to.")],
-    out: Annotated[Path, typer.Argument(help="Folder for the scene; what it holds already is not made again.")],
+    out: Annotated[Path, typer.Argument(help="Folder for the scene; finished steps in it are not repeated.")],
     long_side: Annotated[int, typer.Option(min=64, help="Pixels to look for features at.")] = 1600,
-    camera_model: Annotated[CameraModel, typer.Option(help="What the lens is taken for.")] = "SIMPLE_RADIAL",
-    matching: Annotated[Matching, typer.Option(help="Which photographs are compared.")] = "auto",
-    mapper: Annotated[Mapper, typer.Option(help="How cameras are placed.")] = "incremental",
+    camera_model: Annotated[CameraModel, typer.Option(help="Camera model of COLMAP.")] = "SIMPLE_RADIAL",
+    matching: Annotated[Matching, typer.Option(help="Which pairs of photographs are matched.")] = "auto",
+    mapper: Annotated[Mapper, typer.Option(help="Method that places the cameras.")] = "incremental",
 ) -> None:
     """Find the cameras of photographs: features, matches, structure from motion; a COLMAP folder."""
     from clsplat.prepare.place import place_photographs
@@ -66,7 +66,7 @@ def photos(
 def video(
     file: Annotated[Path, typer.Argument(help="A video.")],
     out: Annotated[Path, typer.Argument(help="Folder for the frames.")],
-    frames: Annotated[int, typer.Option(min=1, help="Equal parts; the sharpest frame of each is kept.")] = 100,
+    frames: Annotated[int, typer.Option(min=1, help="Equal parts; the sharpest frame of each is written.")] = 100,
     long_side: Annotated[int | None, typer.Option(min=16, help="Pixels, at most.")] = None,
 ) -> None:
     """Take sharp, evenly spaced frames of a video."""
@@ -102,11 +102,11 @@ def resize(
 @app.command()
 def masks(
     scene: Annotated[Path, typer.Argument(help=DATASET)],
-    folder: Annotated[Path | None, typer.Option(help="Masks made elsewhere; default: from the images' alpha.")] = None,
-    out: Annotated[Path | None, typer.Option(help="Where to; default: SCENE/masks.")] = None,
-    threshold: Annotated[float, typer.Option(min=0, max=1, help="Alpha that counts.")] = 0.5,
+    folder: Annotated[Path | None, typer.Option(help="Folder of existing masks; default: the images' alpha.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for the masks; default: SCENE/masks.")] = None,
+    threshold: Annotated[float, typer.Option(min=0, max=1, help="Smallest alpha of a pixel that counts.")] = 0.5,
 ) -> None:
-    """Write masks of what counts, from alpha or from a folder."""
+    """Write masks, white in pixels that count, from alpha or from a folder."""
     from data_tools.masks import write_masks
 
     print(f"{write_masks(scene, folder, out, threshold)} masks written")
@@ -118,7 +118,7 @@ def fetch(
     out: Annotated[Path, typer.Argument(help="Folder to make.")],
     sha256: Annotated[str, typer.Option(help="The checksum of an archive given by its address.")] = "",
 ) -> None:
-    """Download a public data set; a broken download goes on where it broke."""
+    """Download a public data set; a second call continues an interrupted download."""
     from data_tools.fetch import Source, named
     from data_tools.fetch import fetch as download
 

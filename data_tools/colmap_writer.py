@@ -16,7 +16,7 @@ PINHOLE = 1  # COLMAP's number of the model
 def write_model(folder: Path, views: Sequence[View], points: PointCloud | None) -> None:
     """Write `views`, whose names are those of their images, and points; cameras that are equal are one.
 
-    What a point was seen in is not written: readers of scenes do not ask.  Raises OutputError.
+    The tracks of points are not written: no reader of scenes uses them.  Raises OutputError.
     """
     cameras: dict[Camera, int] = {}
     for view in views:

@@ -1,4 +1,4 @@
-"""Public data sets by name: downloaded, continued where a connection broke, verified, and unpacked whole."""
+"""Public data sets by name: download, continue an interrupted download, verify, unpack."""
 
 import hashlib
 import shutil
@@ -26,7 +26,7 @@ Report = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Source:
-    """An archive on the web.  Without a checksum that of the file is reported, to be compared."""
+    """An archive on the web.  Without a checksum, `fetch` reports that of the file, so that the user can compare it."""
 
     url: str
     licence: str
@@ -53,10 +53,10 @@ def named(name: str) -> Source:
 
 
 def fetch(source: Source, out: Path, report: Report = print) -> Path:
-    """Download an archive and unpack it as the folder `out`; a folder that is there already is left alone.
+    """Download an archive and unpack it as the folder `out`; an existing folder stays unchanged.
 
-    What was downloaded before a connection broke, or the process was killed, is kept beside as `….part` and continued.
-    Raises DataError when the archive cannot be had, is not what was expected or would write outside of its folder.
+    An interrupted download stays beside `out` as `….part`; the next call continues it.
+    Raises DataError when the download fails, the checksum differs or a file lies outside of the archive's folder.
     """
     if out.exists():
         report(f"{out} is there already: nothing to do")
@@ -81,11 +81,11 @@ def _download(source: Source, archive: Path, report: Report) -> None:
             _continue(source.url, part, report)
             break
         except urllib.error.HTTPError as error:
-            raise DataError(f"{source.url}: the server says {error.code} {error.reason}; check the address") from error
+            raise DataError(f"{source.url}: the server sent {error.code} {error.reason}; check the address") from error
         except (urllib.error.URLError, TimeoutError, ConnectionError, _BrokenError) as error:
             if attempt == MAX_TRIES:
                 raise DataError(
-                    f"{source.url}: the connection broke {MAX_TRIES} times ({error}); run it again to go on from "
+                    f"{source.url}: the connection broke {MAX_TRIES} times ({error}); run it again to continue from "
                     f"{part.stat().st_size if part.exists() else 0} bytes"
                 ) from error
             time.sleep(PAUSE)
@@ -100,11 +100,11 @@ def _download(source: Source, archive: Path, report: Report) -> None:
 
 
 class _BrokenError(Exception):
-    """Fewer bytes came than were promised."""
+    """The server sent fewer bytes than it announced."""
 
 
 def _continue(url: str, part: Path, report: Report) -> None:
-    """Add what is missing; a server that cannot begin in the middle begins anew."""
+    """Download the missing bytes; start again where the server does not support ranges."""
     have = part.stat().st_size if part.exists() else 0
     request = urllib.request.Request(url, headers={"Range": f"bytes={have}-"} if have else {})
     try:
@@ -127,7 +127,7 @@ def _continue(url: str, part: Path, report: Report) -> None:
                     reported = tenth
                     report(f"{have / 1e6:,.0f} of {whole / 1e6:,.0f} MB")
     if length and have < whole:
-        raise _BrokenError(f"{have} of {whole} bytes came")
+        raise _BrokenError(f"got {have} of {whole} bytes")
 
 
 def _unpack(archive: Path, out: Path, report: Report) -> None:
@@ -183,7 +183,7 @@ def _safe(archive: Path, name: str) -> PurePosixPath:
 
 
 def _copy(stream: BinaryIO, file: BinaryIO, size: int, archive: Path) -> None:
-    """Copy no more than was declared."""
+    """Copy a file.  Raises DataError when it is larger than declared."""
     left = size
     while chunk := stream.read(min(CHUNK, left + 1)):
         left -= len(chunk)

@@ -12,12 +12,12 @@ from clsplat.errors import DataError
 from clsplat.scene.images import IMAGE_SUFFIXES, read_image
 
 LOG = logging.getLogger("clsplat")
-UNREADABLE_SUFFIXES = {".heic", ".heif", ".avif", ".dng", ".cr2", ".nef", ".arw"}  # photographs, but not for OpenCV
-MIN_PHOTOGRAPHS = 3  # also of a model
+UNREADABLE_SUFFIXES = {".heic", ".heif", ".avif", ".dng", ".cr2", ".nef", ".arw"}  # photographs that OpenCV cannot read
+MIN_PHOTOGRAPHS = 3  # in a folder, and in a model
 
 
 def list_photographs(folder: Path, without: Path | None = None) -> list[str]:
-    """Names of the photographs below a folder, sorted, hidden ones and those below `without` left out.
+    """Return the names of the photographs below a folder, sorted, without hidden ones and those below `without`.
 
     Raises DataError when there are too few of them.
     """
@@ -64,7 +64,7 @@ def gather(photographs: Path, images: Path, names: list[str]) -> list[str]:
 
 
 def link(source: Path, target: Path) -> None:
-    """Link a file or folder, or copy it where links are not to be had."""
+    """Link a file or folder, or copy it where links are not supported."""
     try:
         target.symlink_to(source.resolve(), target_is_directory=source.is_dir())
     except OSError:

@@ -1,4 +1,4 @@
-"""Masks for a scene's photographs: from their alpha, or from a folder of masks made elsewhere."""
+"""Masks for a scene's photographs: from their alpha, or from a folder of existing masks."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -16,11 +16,11 @@ MIN_ALPHA = 0.5  # of the largest value
 
 
 def write_masks(scene: Path, folder: Path | None = None, out: Path | None = None, threshold: float = MIN_ALPHA) -> int:
-    """Write a mask for every photograph into `scene`/masks, or `out`: white where it counts; return their number.
+    """Write a mask for every photograph into `scene`/masks, or `out`; return the number written.
 
-    With `folder` they are those of its files (NAME.png, or STEM.png), else where the photographs' alpha is at least
-    `threshold`.  Masks that are there already are left alone.  Raises DataError when one is missing, of another size
-    than its photograph, or without alpha.
+    A mask is white in pixels that count: those of its file in `folder` (NAME.png, or STEM.png), else those whose alpha
+    is at least `threshold`, in [0, 1].  Existing masks stay unchanged.
+    Raises DataError when a mask is missing or of another size than its photograph, or a photograph has no alpha.
     """
     views = read_scene(scene, holdout=0).views
     sources = [None if folder is None else _file(folder, view.name) for view in views]
@@ -28,7 +28,7 @@ def write_masks(scene: Path, folder: Path | None = None, out: Path | None = None
     if missing:
         raise DataError(
             f"{folder}: has no masks for {len(missing)} of {len(views)} photographs: {', '.join(missing[:3])}; "
-            "expected the photograph's name with .png behind it or in place of its suffix"
+            "expected the photograph's name with .png appended, or in place of its suffix"
         )
     target, written = out or scene / "masks", 0
     for view, source in zip(views, sources, strict=True):
@@ -53,7 +53,7 @@ def _from_alpha(view: View, threshold: float) -> NDArray[np.bool_]:
 
 
 def _from_file(view: View, source: Path) -> NDArray[np.bool_]:
-    """The mask as it is, once it is known to fit its photograph."""
+    """Which pixels are white in a mask file.  Raises DataError when it does not fit its photograph."""
     load_mask(replace(view, mask_path=source))
     pixels = read_image(source)
     return np.asarray(pixels[:, :, 0] >= MIN_ALPHA * np.iinfo(pixels.dtype).max)

@@ -17,7 +17,7 @@ from clsplat.errors import DataError
 from clsplat.scene.images import read_image
 from clsplat.scene.transforms import Transforms, view_name
 
-NEAR, FAR = 2.0, 6.0  # scene units; what mip-NeRF takes for these scenes
+MIN_DEPTH, MAX_DEPTH = 2.0, 6.0  # scene units; mip-NeRF's values for these scenes
 
 
 def write_multiscale(source: Path, out: Path, levels: int = 4) -> int:
@@ -63,7 +63,7 @@ def _write_split(transforms: Transforms, name: str, out: Path, levels: int) -> d
             file = view_name(f"images_{name}/{i:03d}_d{j}.png")
             _write(out / file, image)
             camera = {"width": width >> j, "height": height >> j, "focal": view.camera.fx / 2**j}
-            sampling = {"label": j, "near": NEAR, "far": FAR, "lossmult": 4.0**j}
+            sampling = {"label": j, "near": MIN_DEPTH, "far": MAX_DEPTH, "lossmult": 4.0**j}
             inverse = _pixel_to_camera(**camera)
             pose = frame.values["transform_matrix"]
             rows.append({"file_path": file, "cam2world": pose, **camera, **sampling, "pix2cam": inverse})

@@ -4,9 +4,9 @@
     match_features   images, database   -> images/, database.db with matches
     map_cameras      images, database   -> images/, sparse/0: a COLMAP folder
 
-Each writes into an empty folder and leaves what it reads alone.  The same photographs and settings give the same files:
-images are registered in order of their names before threads look at them, every random number has a seed, and mapping
-runs in one thread by default.
+Each writes into an empty folder and changes nothing in its source.  The same photographs and settings give the same
+files: images are registered in order of their names before threads read them, every random number has a seed, and
+mapping runs in one thread by default.
 """
 
 import logging
@@ -44,7 +44,7 @@ def find_features(
 ) -> dict[str, Any]:
     """Find SIFT features (Lowe 2004) in photographs, at most `long_side` px large, for at most `features` of each.
 
-    Photographs that their EXIF tag turns are copied upright, others linked.  `cameras: auto` lets photographs of one
+    Photographs with an EXIF rotation are copied upright, others are linked.  With `cameras: auto`, photographs of one
     size and focal length share a camera.  Raises DataError when fewer than three can be read.
     """
     pycolmap = _pycolmap()
@@ -73,10 +73,10 @@ def find_features(
 
 
 def match_features(source: Path, out: Path, matching: Matching = "auto", neighbours: int = 10) -> dict[str, Any]:
-    """Match features between photographs: all pairs, each with the `neighbours` next ones by name, or alike ones.
+    """Match features between photographs: all pairs, each with the `neighbours` next ones by name, or similar ones.
 
-    `auto` matches all pairs of at most 200 photographs, and the most alike of more.  Raises DataError when nothing
-    matches.
+    `auto` matches all pairs of up to 200 photographs; of more, each with the most similar ones.  Raises DataError when
+    no pair matches.
     """
     pycolmap = _pycolmap()
     link(source / IMAGES, out / IMAGES)
@@ -108,8 +108,8 @@ def match_features(source: Path, out: Path, matching: Matching = "auto", neighbo
     verified = _matched_pairs(pycolmap, database)
     if verified == 0:
         raise DataError(
-            f"{source / IMAGES}: no two of the {count} photographs show the same thing; take them with more overlap, "
-            "of a scene that stands still"
+            f"{source / IMAGES}: no two of the {count} photographs show the same features; take photographs with more "
+            "overlap, of a scene in which nothing moves"
         )
     return {"matching": chosen, "pairs": verified}
 
@@ -118,7 +118,7 @@ def map_cameras(source: Path, out: Path, mapper: Mapper = "incremental", threads
     """Place cameras and points; keep the largest model as sparse/0 and log the others.
 
     `mapper: global` is faster for many photographs; more than one thread is faster and not repeatable to the bit.
-    Raises DataError when no model of three images comes out.
+    Raises DataError when no model has three images.
     """
     pycolmap = _pycolmap()
     link(source / IMAGES, out / IMAGES)
@@ -147,8 +147,8 @@ def map_cameras(source: Path, out: Path, mapper: Mapper = "incremental", threads
     models.sort(key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
     if not models or models[0].num_reg_images() < MIN_PHOTOGRAPHS:
         raise DataError(
-            f"{source / IMAGES}: the {len(names)} photographs could not be placed; take more of them, sharp, from "
-            "places a step apart, of a scene with texture that stands still"
+            f"{source / IMAGES}: the {len(names)} photographs could not be placed; take more sharp ones, from "
+            "places a step apart, of a textured scene in which nothing moves"
         )
     best = models[0]
     (out / "sparse" / "0").mkdir(parents=True)
@@ -176,13 +176,13 @@ def _alike_pairs(pycolmap: ModuleType, database: Path, neighbours: int) -> list[
     opened.close()
     if spaced := [image.name for image in images if len(image.name.split()) > 1]:
         raise DataError(
-            f"'{spaced[0]}': COLMAP's lists of pairs know no spaces in names; rename it, or match all pairs"
+            f"'{spaced[0]}': COLMAP's lists of pairs allow no spaces in names; rename it, or match all pairs"
         )
     return [(images[i].name, images[j].name) for i, j in alike(tables, neighbours)]
 
 
 def _matched_pairs(pycolmap: ModuleType, database: Path) -> int:
-    """Number of pairs that share features which agree on how the cameras stand."""
+    """Number of pairs whose matches pass geometric verification."""
     opened = pycolmap.Database.open(str(database))
     try:
         _, inliers = opened.read_two_view_geometry_num_inliers()

@@ -17,8 +17,8 @@ QUALITY = 98  # of JPEG
 def write_pyramid(scene: Path, levels: int = 3) -> int:
     """Write images_2, images_4, … beside `scene`/images; return the number of images written.
 
-    Means over areas; names, folders and file formats stay, sizes are rounded as cameras are when they are downscaled.
-    Images that are there already are left alone.  Raises DataError when there are none, or one cannot be read.
+    Pixels are means over areas; names, folders and file formats stay; sizes are rounded as in Camera.downscaled.
+    Existing images stay unchanged.  Raises DataError when there are none, or when one cannot be read.
     """
     folder = scene / "images"
     names = sorted(path.relative_to(folder) for path in folder.rglob("*") if is_image(path))

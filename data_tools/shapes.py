@@ -117,7 +117,7 @@ class Shape:
         """Distance along each ray to the surface ahead, [R]; inf = miss."""
         offset = origins - np.array(self.centre)[:, None]
         along, square = dot(offset, directions), dot(offset, offset) - self.reach**2
-        near = np.flatnonzero((square < along * along) & ((along < 0) | (square < 0)))  # the few rays that can hit
+        near = np.flatnonzero((square < along * along) & ((along < 0) | (square < 0)))  # rays through the ball
         distance = np.full(along.shape, np.inf)
         offset, directions = (np.broadcast_to(v, (3, len(along)))[:, near] for v in (offset, directions))
         enter, leave = self.interval(rotate(self.axes, offset), rotate(self.axes, directions))

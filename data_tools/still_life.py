@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from data_tools.shapes import Array, Box, Cylinder, Shape, Sphere, Vector, dot, spiral, unit
 
 SCENE_RADIUS = 1.25  # of the table
-SCENE_VERSION = 1  # raise it when the images change, so that an older folder is not taken for a current one
+SCENE_VERSION = 1  # increase it when the images change: folders of other versions count as incomplete
 PRIMES = (0x8DA6B343, 0xD8163841, 0xCB1AB31F)  # spatial hash
 
 

@@ -1,8 +1,8 @@
-"""The demo scene: a still life that an analytic ray caster photographs, so that every camera is known exactly.
+"""The demo scene: a still life, rendered by an analytic ray caster, so that every camera is known exactly.
 
     primary ray -> closest shape -> paint x (key light x shadow + sky x openness) -> mean of the pixel's samples
 
-The world is z up, the table top is z = 0.  Colours are linear light until `photograph` stores them.  Points and
+The z axis points up, the table top is z = 0.  Colours are linear light until `photograph` encodes them.  Points and
 directions are [3, R], as in shapes.py.
 """
 
@@ -27,11 +27,11 @@ from clsplat.scene.scene import PointCloud
 from data_tools.shapes import Array, Shape, align, disc, dot, rotate, spiral, unit
 from data_tools.still_life import SCENE, SCENE_RADIUS, SCENE_VERSION
 
-TARGET = np.array([0.0, 0.0, 0.08])
+LOOK_AT = np.array([0.0, 0.0, 0.08])  # scene units: the point in the middle of every image
 CAMERA_DISTANCE = 3.75
 CAMERA_ANGLE_X = 0.69  # field of view that just holds the table, radians
 GRID = 4  # a pixel is the mean of GRID x GRID rays
-BLOCK = 65536  # rays at a time, measured: fewer pay for calls, more for memory
+BLOCK = 65536  # rays at a time, by measurement: smaller blocks cost calls, larger ones memory
 SKIN = 1e-6  # secondary rays start this far above the surface
 POINT_COUNT = 8000
 POINT_NOISE = 0.002 * SCENE_RADIUS
@@ -86,11 +86,11 @@ def shade(points: Array, index: NDArray[np.intp], sample: int) -> Array:
 # ---- cameras
 
 
-def look_at_target(direction: Array) -> Array:
-    """Camera-to-world [4, 4] in OpenGL axes of the camera that sees TARGET from `direction` [3]."""
+def camera_pose(direction: Array) -> Array:
+    """Camera-to-world [4, 4] in OpenGL axes of the camera that sees LOOK_AT from `direction` [3]."""
     right = unit(np.cross([0.0, 0.0, 1.0], direction))
     pose = np.eye(4)
-    pose[:3] = np.stack([right, np.cross(direction, right), direction, TARGET + CAMERA_DISTANCE * direction], axis=1)
+    pose[:3] = np.stack([right, np.cross(direction, right), direction, LOOK_AT + CAMERA_DISTANCE * direction], axis=1)
     return pose
 
 
@@ -117,7 +117,7 @@ def expose(pose: Array, size: int, rows: range) -> NDArray[np.uint8]:
         distance, index = trace(origin, directions)
         hit = np.flatnonzero(np.isfinite(distance))
         light = shade(origin + distance[hit] * directions[:, hit], index[hit], sample)
-        colour[:, hit] += np.sqrt(np.minimum(light, 1))  # encode first: a reader's resizing averages stored values too
+        colour[:, hit] += np.sqrt(np.minimum(light, 1))  # encode first: readers average encoded values when they resize
         cover[hit] += 1
     rgba = np.vstack([colour / np.maximum(cover, 1), cover / GRID**2])
     return np.rint(255 * rgba).astype(np.uint8).T.reshape(len(rows), size, 4)
@@ -128,7 +128,7 @@ def expose(pose: Array, size: int, rows: range) -> NDArray[np.uint8]:
 
 @dataclass(frozen=True)
 class Options:
-    """What the data set depends on: image size in pixels, numbers of views, seed of the surface points."""
+    """Options of the data set: image size in pixels, numbers of views, seed of the surface points."""
 
     size: int = 256
     train: int = 60
@@ -138,18 +138,18 @@ class Options:
     def poses(self) -> dict[str, list[Array]]:
         """Camera-to-world matrices of each split; the test cameras stand between the training ones."""
         train, test = spiral(self.train, 10, 70), spiral(self.test, 14, 66, phase=3.0)
-        return {"train": [look_at_target(d) for d in train], "test": [look_at_target(d) for d in test]}
+        return {"train": [camera_pose(d) for d in train], "test": [camera_pose(d) for d in test]}
 
     def manifest(self) -> str:
-        """The text of OUT/synthetic.json, by which a finished data set is known again."""
+        """The text of OUT/synthetic.json, which identifies a finished data set."""
         return json.dumps({"scene": SCENE_VERSION, **asdict(self)}) + "\n"
 
 
 def write_dataset(out: Path, options: Options, workers: int | None = None) -> str:
-    """Make folder `out`, all of it or nothing, and return a line that says what was done.
+    """Make folder `out`, all of it or nothing, and return a line of text about it.
 
-    `workers` processes share the views (default: one per core; 1 = this process).  Raises DataError when `out` is
-    something else already, OutputError when it cannot be written.
+    `workers` processes share the views (default: one per core; 1 = this process).  Raises DataError when `out` exists
+    and is another data set, OutputError when it cannot be written.
     """
     if is_complete(out, options):
         return f"{out} is complete already: nothing to do"
@@ -168,7 +168,7 @@ def write_dataset(out: Path, options: Options, workers: int | None = None) -> st
 
 
 def is_complete(out: Path, options: Options) -> bool:
-    """Tell whether `out` holds every file of the data set with these options."""
+    """Return whether `out` holds every file of the data set with these options."""
     manifest = out / "synthetic.json"
     if not manifest.is_file() or manifest.read_text(errors="replace") != options.manifest():
         return False
@@ -200,7 +200,7 @@ def fill(out: Path, options: Options, workers: int) -> int:
 
 
 def photographs(poses: list[Array], size: int, workers: int) -> Iterator[NDArray[np.uint8]]:
-    """Render views in order; in processes, as NumPy calls this short leave threads waiting for the interpreter."""
+    """Render views in order, in processes: threads would wait for the interpreter between NumPy calls this short."""
     if workers == 1:
         yield from (photograph(pose, size) for pose in poses)
         return
@@ -209,7 +209,7 @@ def photographs(poses: list[Array], size: int, workers: int) -> Iterator[NDArray
 
 
 def surface_points(pose: Array, image: NDArray[np.uint8], count: int, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Draw noisy surface points that a view sees, as structure from motion would: positions and colours, [M, 3]."""
+    """Return noisy surface points of a view, as from structure from motion: positions and colours, [M, 3]."""
     rows, columns = np.nonzero(image[..., 3] == 255)
     chosen = rng.integers(len(rows), size=count) if len(rows) else np.zeros(0, int)
     x, y = np.stack([columns[chosen], rows[chosen]]) + rng.random((2, len(chosen)))

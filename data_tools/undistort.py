@@ -1,4 +1,4 @@
-"""A scene as pinhole cameras would have taken it: undistorted photographs, smaller ones if wanted, and their masks."""
+"""Convert a scene to pinhole cameras: undistorted photographs, smaller on request, and their masks."""
 
 import logging
 from collections import Counter
@@ -17,14 +17,14 @@ from data_tools.colmap_writer import write_model
 
 LOG = logging.getLogger("clsplat")
 Blank = Literal["crop", "mask"]
-PROGRESS = 20  # photographs between lines
+PROGRESS = 20  # photographs between lines of progress
 
 
 def undistort_scene(source: Path, out: Path, long_side: int | None = None, blank: Blank = "crop") -> int:
     """Write a COLMAP scene of pinhole cameras into `out`; return the number of its images.
 
     Photographs larger than `long_side` px are made smaller.  `blank: crop` keeps the largest part of a photograph
-    without blank pixels, `mask` the whole, with masks of what is blank.  Images that are there already are left alone.
+    without blank pixels; `mask` keeps all of it, with masks of blank pixels.  Existing images stay unchanged.
     Raises DataError when the scene cannot be read.
     """
     scene = read_scene(source, holdout=0)
@@ -33,14 +33,14 @@ def undistort_scene(source: Path, out: Path, long_side: int | None = None, blank
     for number, (view, name) in enumerate(zip(scene.views, names, strict=True), 1):
         if number % PROGRESS == 0:
             LOG.info("undistorted %d of %d photographs", number, len(names))
-        wanted = replace(_sized(_shown(view, blank), long_side), alpha="mask")
+        pinhole_view = replace(_sized(_shown(view, blank), long_side), alpha="mask")
         image, mask = out / "images" / name, out / "masks" / name
         if not image.is_file():
-            counts = load_mask(wanted)
+            counts = load_mask(pinhole_view)
             if counts is not None and not counts.all():
                 write_image(mask, np.repeat(np.where(counts, 255, 0).astype(np.uint8)[:, :, None], 3, axis=2))
-            write_image(image, load_image(wanted))
-        views.append(replace(wanted, name=name))
+            write_image(image, load_image(pinhole_view))
+        views.append(replace(pinhole_view, name=name))
     write_model(out / "sparse" / "0", views, scene.points)
     return len(views)
 

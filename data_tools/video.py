@@ -13,30 +13,30 @@ from clsplat.errors import DataError
 from clsplat.scene.images import write_image
 
 LOG = logging.getLogger("clsplat")
-SHARPNESS_SIDE = 480  # px: the side that sharpness is measured at; noise of the full size would count as detail
+SHARPNESS_SIDE = 480  # px: sharpness is measured at this size: at full size, noise counts as detail
 
 
 def write_frames(video: Path, out: Path, frames: int = 100, long_side: int | None = None) -> int:
     """Write the sharpest frame of each of `frames` equal parts of a video as PNG; return their number.
 
-    PNG, because features and colours should not pass through a second lossy coding.  Frames that are there already are
-    left alone.  Raises DataError when the video cannot be decoded.
+    The format is PNG because a second lossy coding changes features and colours.  Existing frames stay unchanged.
+    Raises DataError when the video cannot be decoded.
     """
     LOG.info("%s: looking for sharp frames", video)
     sharpness = [_sharpness(image) for image in _decoded(video)]
     chosen = sharpest(sharpness, frames)
     LOG.info("%d frames, of which %d are written", len(sharpness), len(chosen))
-    wanted = {place: out / f"frame_{i:05d}.png" for i, place in enumerate(chosen, 1)}
-    if all(path.is_file() for path in wanted.values()):
-        return len(wanted)
+    files = {place: out / f"frame_{i:05d}.png" for i, place in enumerate(chosen, 1)}
+    if all(path.is_file() for path in files.values()):
+        return len(files)
     for place, image in enumerate(_decoded(video)):
-        if place in wanted and not wanted[place].is_file():
-            write_image(wanted[place], np.ascontiguousarray(_limited(image, long_side)[:, :, ::-1]))
-    return len(wanted)
+        if place in files and not files[place].is_file():
+            write_image(files[place], np.ascontiguousarray(_limited(image, long_side)[:, :, ::-1]))
+    return len(files)
 
 
 def sharpest(sharpness: list[float], parts: int) -> list[int]:
-    """The index of the largest value in each of `parts` equal parts, the first of equals."""
+    """Return the index of the largest value in each of `parts` equal parts, the first of equal ones."""
     edges = np.linspace(0, len(sharpness), min(parts, len(sharpness)) + 1).astype(int)
     return [int(a + np.argmax(sharpness[a:b])) for a, b in pairwise(edges)]
 
@@ -61,7 +61,7 @@ def _decoded(video: Path) -> Iterator[NDArray[np.uint8]]:
 
 
 def _sharpness(image: NDArray[np.uint8]) -> float:
-    """Variance of the Laplacian of the reduced grey image."""
+    """Variance of the Laplacian of the reduced grey image, grey levels²."""
     grey = cv2.cvtColor(_limited(image, SHARPNESS_SIDE), cv2.COLOR_BGR2GRAY)
     return float(cv2.Laplacian(grey, cv2.CV_64F).var())
 

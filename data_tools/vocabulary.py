@@ -1,4 +1,4 @@
-"""Which photographs look alike: bags of visual words (Sivic and Zisserman 2003), learnt from these photographs."""
+"""Find similar photographs: bags of visual words (Sivic and Zisserman 2003), learnt from these photographs."""
 
 from collections.abc import Sequence
 
@@ -7,12 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 WORDS = 1024
-SAMPLES = 40  # descriptors by word that words are learnt from
+SAMPLES = 40  # descriptors for each word, from which the words are learnt
 ROUNDS = 10  # of k-means
 
 
 def alike(tables: Sequence[NDArray[np.float32]], neighbours: int) -> list[tuple[int, int]]:
-    """Pairs (i, j), i < j, of each photograph with the `neighbours` most alike ones.
+    """Return pairs (i, j), i < j, of each photograph with the `neighbours` most similar ones.
 
     tables: descriptors [M, 128] of each photograph.  A word is a cell of k-means over a sample of the descriptors;
     photographs are compared by the cosine of their TF-IDF vectors.

@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 from pydantic import AfterValidator
 from pydantic.fields import FieldInfo
 
-import clsplat.schema  # noqa: F401  (it imports all that a pipeline can name)
-from clsplat.matrix import Matrix
-from clsplat.pipeline import PipelineFile
+import clsplat.pipeline.schema  # noqa: F401  (it imports all that a pipeline can name)
+from clsplat.pipeline.file import PipelineFile
+from clsplat.pipeline.matrix import Matrix
 from clsplat.schedule import Decay, Points
 from clsplat.settings import Settings
 

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from clsplat.opencl.device import Array, Device, DeviceInfo, choose
+from clsplat.opencl.choice import DeviceInfo, choose
+from clsplat.opencl.device import Array, Device
 from data_tools.synthetic import Options, write_dataset
 
 NAMES = [name.strip() for name in os.environ.get("CLSPLAT_TEST_DEVICES", "").split(";")]

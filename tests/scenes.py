@@ -7,7 +7,7 @@ import numpy as np
 
 from clsplat.gaussians.tables import DeviceModel, Gaussians
 from clsplat.opencl.device import Device
-from clsplat.render.rasterizer import DeviceCamera, upload_camera
+from clsplat.render.camera import DeviceCamera, upload_camera
 from clsplat.scene.scene import Camera, View
 from tests import reference as ref
 

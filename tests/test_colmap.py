@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 
-from clsplat.scene.colmap_files import MODELS, PARAMETERS, read_cameras, read_images, read_points
+from clsplat.scene.colmap_files import read_cameras, read_images, read_points
+from clsplat.scene.colmap_records import MODELS, PARAMETERS
 from clsplat.scene.detect import read_scene
 from clsplat.scene.scene import Camera, Scene
 from clsplat.scene.view import load_image

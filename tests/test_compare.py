@@ -16,7 +16,7 @@ from clsplat.compare.differences import differing, flat
 from clsplat.compare.page import write_comparison
 from clsplat.compare.run_folder import RunFolder
 from clsplat.errors import ClsplatError, ConfigError, DataError
-from clsplat.pipeline import load
+from clsplat.pipeline.loading import load
 from clsplat.scene.detect import read_scene
 from clsplat.scene.images import write_image
 from clsplat.scene.view import load_image

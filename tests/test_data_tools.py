@@ -223,7 +223,7 @@ def test_a_download_that_breaks_for_good_is_kept(web, tmp_path):
     checksum = archive(folder / "d.zip")
     server.breaks = 5
     source = Source(f"{address}/d.zip", "free", checksum)
-    assert "run it again to go on from 5000 bytes" in refusal(quietly, source, tmp_path / "d")
+    assert "run it again to continue from 5000 bytes" in refusal(quietly, source, tmp_path / "d")
     assert [path.name for path in tmp_path.iterdir() if path.name != "web"] == ["d.d.zip.part"]
     quietly(source, tmp_path / "d")
     assert server.asked[-1] == "bytes=5000-"
@@ -263,7 +263,7 @@ def test_tar_links_are_left_out(web, tmp_path):
 def test_what_cannot_be_fetched(web, tmp_path):
     folder, address, _ = web
     (folder / "page.html").write_text("hello")
-    assert "the server says 404" in refusal(quietly, Source(f"{address}/none.zip", ""), tmp_path / "d")
+    assert "the server sent 404" in refusal(quietly, Source(f"{address}/none.zip", ""), tmp_path / "d")
     assert "expected a ZIP or TAR archive" in refusal(quietly, Source(f"{address}/page.html", ""), tmp_path / "d")
     with pytest.raises(ConfigError, match="no data set named 'garden'; there are mipnerf360"):
         named("garden")

@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from clsplat import runner
 from clsplat.errors import Interrupted
 from clsplat.gaussians.ply import read_ply, write_ply
 from clsplat.gaussians.tables import PARAMETERS
 from clsplat.metrics.views import render_view
-from clsplat.model_file import ModelFile
-from clsplat.pipeline import load
+from clsplat.pipeline.loading import load
+from clsplat.runs import runner
+from clsplat.runs.model_file import ModelFile
 from clsplat.stages.export import baked
 from clsplat.training.run import Progress, Run
 from clsplat.views.order import Code

@@ -52,9 +52,9 @@ def with_exif(jpeg: bytes, order: str, orientation: int) -> bytes:
 
 
 @pytest.mark.parametrize("order", ["<", ">"])
-@pytest.mark.parametrize(("told", "expected"), [(1, 1), (6, 6), (8, 8), (0, 1), (99, 1)])
-def test_orientation(tmp_path, order, told, expected):
-    (tmp_path / "a.jpg").write_bytes(with_exif(encoded(".jpg"), order, told))
+@pytest.mark.parametrize(("orientation", "expected"), [(1, 1), (6, 6), (8, 8), (0, 1), (99, 1)])
+def test_orientation(tmp_path, order, orientation, expected):
+    (tmp_path / "a.jpg").write_bytes(with_exif(encoded(".jpg"), order, orientation))
     assert read_header(tmp_path / "a.jpg") == Header(37, 23, expected)
 
 

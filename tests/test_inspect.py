@@ -141,7 +141,7 @@ def test_a_missing_image(scene):
 
 
 @pytest.mark.parametrize(
-    ("size", "word"), [((32, 20), "not of the camera's size"), ((48, 64), "they lie on their side")]
+    ("size", "word"), [((32, 20), "not of the camera's size"), ((48, 64), "width and height are swapped")]
 )
 def test_images_of_another_size(scene, size, word):
     photograph(scene / "images" / "05.png", size)
@@ -297,8 +297,8 @@ def test_points_behind_all_cameras(tmp_path):
     inspection = Inspection.of(write(tmp_path, replace(model, images=flipped)))
     assert inspection.facts.points.behind == 1.0
     assert "all 200 points lie behind all training cameras" in said(inspection, "error")
-    mended = replace(flipped[4], translation=(0.0, 0.0, 0.0))  # stands in the middle and sees some
-    inspection = Inspection.of(write(tmp_path, replace(model, images=[*flipped[:4], mended, *flipped[5:]])))
+    moved = replace(flipped[4], translation=(0.0, 0.0, 0.0))  # stands in the middle and sees some
+    inspection = Inspection.of(write(tmp_path, replace(model, images=[*flipped[:4], moved, *flipped[5:]])))
     assert 0.1 < inspection.facts.points.behind < 0.9
     assert "% of the points lie behind all cameras" in said(inspection, "warning")
 
@@ -337,7 +337,7 @@ def test_views_that_see_few_points(scene):
 def test_imprecise_poses(scene):
     rows = [struct.pack("<Q3d3BdQ", i, 0.1, 0.1, i / 200, 9, 9, 9, 2 + i / 100, 0) for i in range(200)]
     (scene / "sparse" / "0" / "points3D.bin").write_bytes(struct.pack("<Q", len(rows)) + b"".join(rows))
-    assert "the points miss their observations by 3.00 px on average" in said(Inspection.of(scene), "warning")
+    assert "the mean reprojection error of the points is 3.00 px" in said(Inspection.of(scene), "warning")
 
 
 def test_a_cut_image_and_one_on_its_side(tmp_path):
@@ -348,7 +348,7 @@ def test_a_cut_image_and_one_on_its_side(tmp_path):
     (path / "images" / "06.jpg").write_bytes(with_exif(whole, ">", 6))
     inspection = Inspection.of(path)
     assert "the end is missing from 1 image file (05.jpg)" in said(inspection, "warning")
-    assert "1 photograph is to be turned" in said(inspection, "note")
+    assert "1 photograph is rotated by the EXIF data" in said(inspection, "note")
 
 
 def test_images_on_their_side_that_the_reader_turns(tmp_path):
@@ -356,7 +356,7 @@ def test_images_on_their_side_that_the_reader_turns(tmp_path):
     path = write(tmp_path, replace(model, images=[replace(i, name=i.name[:2] + ".jpg") for i in model.images]))
     photograph(path / "images" / "06.jpg", SIZE[::-1])
     file = path / "images" / "06.jpg"
-    assert "they lie on their side" in said(Inspection.of(path), "error")
+    assert "width and height are swapped" in said(Inspection.of(path), "error")
     file.write_bytes(with_exif(file.read_bytes(), "<", 6))
     assert Inspection.of(path).findings == []
     assert load_image(read_scene(path).views[6]).shape == (48, 64, 3)

@@ -12,16 +12,13 @@ import pytest
 
 from clsplat.metrics.images import psnr
 from clsplat.metrics.perceptual import ssim_map
-from clsplat.render.workspace import Workspace
 from clsplat.scene.detect import read_scene
 from clsplat.scene.lens import Lens
 from clsplat.scene.photographs import load_photograph
 from clsplat.scene.scene import Camera, View
 from clsplat.scene.view import load_image, load_mask
-from clsplat.views.photographs import Photograph, apply_mask
 from tests import reference_loss as ref_loss
 from tests.data_sets import data_set
-from tests.kernels.test_loss import SIZES, camera_of
 from tests.refusals import refusal
 from tests.test_training import digest, train
 
@@ -89,31 +86,6 @@ def test_masks_beside_a_colmap_scene(tmp_path, name):
 
 
 # ---- they alone train, and are measured
-
-
-@pytest.mark.parametrize(("width", "height"), SIZES)
-def test_a_mask_blackens_what_it_leaves_out(device, rng, width, height):
-    camera = camera_of(device, width, height)
-    colours = rng.integers(0, 256, (3, height, width)).astype(np.uint8)
-    mask = (rng.random((1, height, width)) < 0.5).astype(np.uint8)
-    photograph = Photograph(camera, device.upload(colours), device.upload(mask))
-    assert photograph.nbytes == 4 * width * height
-    np.testing.assert_array_equal(photograph.image(), colours.transpose(1, 2, 0))
-    np.testing.assert_array_equal(photograph.counted(), mask[0] > 0)
-    workspace = Workspace(device)
-    planes = photograph.planes(workspace)
-    before, counted = planes.colours.get(), planes.mask.get()
-    np.testing.assert_array_equal(counted[:, :height, :width], mask)
-    assert (counted[:, height:] == 0).all()
-    apply_mask(workspace, camera, planes.colours, planes.mask)
-    np.testing.assert_array_equal(planes.colours.get(), before * counted)
-
-
-def test_a_photograph_without_a_mask_counts_everywhere(device, rng):
-    photograph = Photograph(camera_of(device, 5, 3), device.upload(rng.integers(0, 256, (3, 3, 5)).astype(np.uint8)))
-    assert photograph.planes(Workspace(device)).mask is None
-    assert photograph.counted() is None
-    assert photograph.nbytes == 45
 
 
 def masked_scene(source: Path, out: Path, filling: int) -> Path:

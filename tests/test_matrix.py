@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from clsplat import experiment, runner
 from clsplat.errors import ClsplatError, ConfigError, DataError, InternalError, Interrupted, NumericError
-from clsplat.matrix import Experiment, load_experiment
-from clsplat.pipeline import load
-from clsplat.schema import json_schema
+from clsplat.pipeline.loading import load
+from clsplat.pipeline.matrix import Experiment, load_experiment
+from clsplat.pipeline.schema import json_schema
+from clsplat.runs import experiment, runner
 from tests.test_cli import clsplat
 
 STAGES = """\

@@ -3,9 +3,9 @@
 import pytest
 
 from clsplat.errors import ConfigError, OverrideError
-from clsplat.pipeline import load
-from clsplat.pipeline_files import shipped
-from clsplat.settable import settable
+from clsplat.pipeline.files import shipped
+from clsplat.pipeline.loading import load
+from clsplat.pipeline.settable import settable
 
 
 @pytest.mark.parametrize("name", shipped())

@@ -84,7 +84,7 @@ def test_photographs_that_show_nothing(tmp_path):
     pytest.importorskip("pycolmap")
     for i in range(3):
         cv2.imwrite(str(tmp_path / f"{i}.png"), np.full((64, 64, 3), 80, np.uint8))
-    with pytest.raises(DataError, match="no two of the 3 photographs show the same thing"):
+    with pytest.raises(DataError, match="no two of the 3 photographs show the same features"):
         place(tmp_path, tmp_path / "out")
 
 
@@ -111,9 +111,9 @@ def test_damaged_photographs_are_left_out_and_turned_ones_turned(tmp_path, caplo
     with_orientation(photos / "turned.jpg", pixels, 6)
     (photos / "broken.jpg").write_bytes(b"\xff\xd8\xff nothing")
     (tmp_path / "out").mkdir()
-    told = find_features(photos, tmp_path / "out")
+    summary = find_features(photos, tmp_path / "out")
     images = tmp_path / "out" / "images"
-    assert told["photographs"] == 4
+    assert summary["photographs"] == 4
     assert "broken.jpg" in caplog.text
     assert sorted(path.name for path in images.iterdir()) == ["0.png", "1.png", "2.png", "turned.jpg"]
     assert (images / "0.png").is_symlink()

@@ -7,10 +7,10 @@ import pytest
 
 from clsplat import resource_dir
 from clsplat.errors import ConfigError
-from clsplat.pipeline import load
-from clsplat.schema import json_schema
+from clsplat.pipeline.loading import load
+from clsplat.pipeline.schema import json_schema
+from clsplat.pipeline.yaml_file import read_yaml
 from clsplat.stages.optimize import Optimize
-from clsplat.yaml_file import read_yaml
 
 SHIPPED = sorted(path.stem for path in resource_dir("pipelines").glob("*.yaml"))
 SMALL = """\

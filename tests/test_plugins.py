@@ -13,14 +13,15 @@ from typer.testing import CliRunner
 from clsplat import plugins
 from clsplat.density.edit import Rule
 from clsplat.errors import ConfigError
-from clsplat.pipeline import load
+from clsplat.pipeline.loading import load
 from clsplat.settings import Settings, rebuild, variants
 from tests.test_training import train
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 RULE = """
 from typing import Literal
-from clsplat.density.edit import Edit, Rule
+from clsplat.density.edit import Edit
+from clsplat.density.edit import Rule
 
 class Nothing(Rule):
     type: Literal["{name}"] = "{name}"
@@ -63,12 +64,35 @@ def test_a_class_in_a_file_is_a_variant(tmp_path):
     assert load("splat", ["densify.rules=[mine]"]).resolved()["plugins"].keys() == {"mine"}
 
 
+def test_a_curve_in_a_file_is_a_schedule(tmp_path):
+    text = """
+import math
+from clsplat.schedule import Curve
+
+class Wave(Curve):
+    mean: float
+    period: int
+
+    def at(self, step: int) -> float:
+        return self.mean * (1 + 0.5 * math.sin(2 * math.pi * step / self.period))
+
+    @property
+    def values(self) -> list[float]:
+        return [0.5 * self.mean]
+"""
+    plugins.load_file(write(tmp_path, "wave", text))
+    rates = load("splat", ["optimize.rates.quats={mean: 0.002, period: 100}"]).settings.training.rates
+    assert rates.at(25, 1.0)["quats"] == pytest.approx(0.003)
+    with pytest.raises(ConfigError, match="expected values at least 0"):
+        load("splat", ["optimize.rates.quats={mean: -0.002, period: 100}"])
+
+
 def test_shipped_pipelines_name_no_plugin():
     assert "plugins" not in load("splat").resolved()
 
 
 def test_the_schema_knows_plugins(tmp_path):
-    from clsplat.schema import json_schema
+    from clsplat.pipeline.schema import json_schema
 
     plugins.load_file(write(tmp_path, "mine", RULE.format(name="mine")))
     assert "Nothing" in json_schema()["$defs"]
@@ -184,3 +208,27 @@ def test_a_run_with_a_plugin_resumes_only_with_it(tiny_scene, tmp_path):
     assert "Traceback" not in done.stderr
     status = json.loads((out / "status.json").read_text())
     assert status["state"] == "done", "a refused command leaves the run as it was"
+
+
+def test_a_comparison_says_which_plugins_are_missing(tiny_scene, tmp_path, caplog):
+    from clsplat.compare.page import write_comparison
+
+    plugins.load_file(EXAMPLES / "opacity_entropy.py")
+    out = train(tiny_scene, tmp_path / "run", "optimize.losses=[l1, opacity_entropy]").out
+    write_comparison([out], tmp_path / "with.html")
+    plugins._loaded.clear()
+    write_comparison([out], tmp_path / "without.html")
+    sentence = "needs the plug-in 'opacity_entropy', which is not loaded"
+    assert sentence in caplog.text
+    assert sentence not in (tmp_path / "with.html").read_text()
+    assert sentence.replace("'", "&#39;") in (tmp_path / "without.html").read_text()
+
+
+@pytest.mark.parametrize("command", ["render", "evaluate"])
+def test_commands_on_a_run_say_that_its_plugin_is_missing(command, tiny_scene, tmp_path):
+    plugins.load_file(EXAMPLES / "opacity_entropy.py")
+    out = train(tiny_scene, tmp_path / "run", "optimize.losses=[l1, opacity_entropy]").out
+    arguments = [sys.executable, "-m", "clsplat", command, str(out)]
+    done = subprocess.run(arguments, capture_output=True, text=True, cwd=EXAMPLES.parent, check=False)
+    assert done.returncode == 2
+    assert "needs the plug-in 'opacity_entropy', which is not loaded; use --plugin" in done.stderr

@@ -104,11 +104,11 @@ def test_refusals(tmp_path, rng):
     write_ply(good, parameters(rng), {})
     data = good.read_bytes()
     broken = {
-        "cut short": (data[:-10], "cut short"),
+        "truncated": (data[:-10], "cut short"),
         "header only": (data[:200], "not a PLY"),
         "empty": (b"", "not a PLY"),
         "text": (b"hello", "not a PLY"),
-        "huge count": (data.replace(b"element vertex 20", b"element vertex 99999999999999"), "cut short"),
+        "huge count": (data.replace(b"element vertex 20", b"element vertex 99999999999999"), "truncated"),
         "ascii": (data.replace(b"binary_little_endian", b"ascii"), "binary"),
         "points only": (data.replace(b"property float opacity", b"property float intensity"), "not a splat"),
         "odd f_rest": (data.replace(b"property float f_rest_44", b"property float extra"), "44 f_rest"),

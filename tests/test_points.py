@@ -144,7 +144,7 @@ def test_damaged_ply(tmp_path: Path, form: str, old: bytes, new: bytes) -> None:
 def test_ply_cut_anywhere(tmp_path: Path, form: str) -> None:
     data = ply(form, PLAIN, ROWS)
     path = tmp_path / "p.ply"
-    # In text, a cut inside the last number cannot be told.
+    # In text, a cut inside the last number cannot be detected.
     for length in range(len(data) - (2 if form == "ascii" else 0)):
         path.write_bytes(data[:length])
         refusal(read_points_ply, path)
@@ -163,9 +163,9 @@ CLOUD = PointCloud(np.float32([[1, 2, 3]]), np.float32([[1, 0, 0.2]]))
 
 
 @pytest.mark.parametrize("name", ["transforms.json", "transforms_train.json"])
-@pytest.mark.parametrize(("file", "told"), [("points3d.ply", {}), ("a/p.ply", {"ply_file_path": "./a/p.ply"})])
-def test_points(tmp_path: Path, name: str, file: str, told: dict) -> None:
-    write(tmp_path, name, **LENS, **told, frames=frames("a.png", "b.png"))
+@pytest.mark.parametrize(("file", "keys"), [("points3d.ply", {}), ("a/p.ply", {"ply_file_path": "./a/p.ply"})])
+def test_points(tmp_path: Path, name: str, file: str, keys: dict) -> None:
+    write(tmp_path, name, **LENS, **keys, frames=frames("a.png", "b.png"))
     write_points_ply(tmp_path / file, CLOUD)
     points = read_scene(tmp_path).points
     assert points is not None

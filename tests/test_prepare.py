@@ -8,13 +8,14 @@ from typing import Any, ClassVar, Literal
 import pytest
 from typer.testing import CliRunner
 
-from clsplat import cli, runner
+from clsplat import cli
 from clsplat.errors import ConfigError, DataError
-from clsplat.pipeline import load
+from clsplat.pipeline.loading import load
 from clsplat.prepare import steps as prepare_steps
 from clsplat.prepare.cache import fingerprint, plan, prepare
 from clsplat.prepare.place import place_photographs
 from clsplat.prepare.steps import Step
+from clsplat.runs import runner
 from clsplat.settings import Settings
 from tests.refusals import refusal
 

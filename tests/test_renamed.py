@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from clsplat import resource_dir
-from clsplat.pipeline import load
+from clsplat.pipeline.loading import load
 
 OLD = """\
 name: recipe

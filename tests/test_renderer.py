@@ -1,5 +1,7 @@
 """Pictures and their gradients, NumPy in and out."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -109,3 +111,62 @@ def test_derivatives_of_another_shape_are_refused(device, rng):
 def test_pictures_show_themselves(device, rng):
     case = random_case(rng, 3, *SIZE)
     assert Renderer(model_of(case), device).render(case.view)._repr_png_().startswith(b"\x89PNG")
+
+
+def test_renderers_on_one_device_do_not_disturb_each_other(device, rng):
+    cases = [random_case(rng, count, *size) for count, size in ((40, SIZE), (90, (64, 48)))]
+    renderers = [Renderer(model_of(case), device) for case in cases]
+    by_image = [np.ones((case.size[1], case.size[0], 3)) for case in cases]
+    alone = []
+    for renderer, case, planes in zip(renderers, cases, by_image, strict=True):
+        picture = renderer.render(case.view)
+        alone.append((picture.image, picture.backward(image=planes)))
+    pictures = [renderer.render(case.view) for renderer, case in zip(renderers, cases, strict=True)]
+    for (image, expected), picture, planes in zip(alone, pictures, by_image, strict=True):
+        np.testing.assert_array_equal(image, picture.image)
+        gradients = picture.backward(image=planes)
+        for name in PARAMETERS:
+            np.testing.assert_array_equal(getattr(expected, name), getattr(gradients, name))
+
+
+def test_gradients_are_those_of_the_model_that_was_rendered(device, rng):
+    case = random_case(rng, 20, *SIZE)
+    model, plain = model_of(case), model_of(case)
+    plain = Model(**{**plain.tables(), "sh_rest": plain.sh_rest[:, :9]}, rendering=plain.rendering)
+    renderer, by_image = Renderer(model, device), np.ones((SIZE[1], SIZE[0], 3))
+    picture = renderer.render(case.view)
+    expected = picture.backward(image=by_image)
+    renderer.update(plain)  # of another degree
+    assert renderer.render(case.view).backward(image=by_image).sh_rest.shape == (20, 9)
+    again = picture.backward(image=by_image)
+    assert renderer.model is plain
+    for name in PARAMETERS:
+        np.testing.assert_array_equal(getattr(expected, name), getattr(again, name))
+
+
+def test_arrays_of_a_picture_are_the_callers_own(device, rng):
+    case = random_case(rng, 20, *SIZE)
+    renderer = Renderer(model_of(case), device)
+    picture = renderer.render(case.view, depth=True)
+    kept = picture.image.copy()
+    renderer.render(case.view, 1.0).image[:] = 7
+    np.testing.assert_array_equal(picture.image, kept)
+    assert repr(picture) == "Picture(33 x 21 px of 'view')"
+    assert repr(picture.backward()) == "Gradients(of 20 Gaussians)"
+
+
+def test_impossible_backgrounds_and_cameras_are_refused(device, rng):
+    case = random_case(rng, 3, *SIZE)
+    renderer = Renderer(model_of(case), device)
+    with pytest.raises(ValueError, match=r"the background has shape \(2,\); expected one number or three"):
+        renderer.render(case.view, (0, 1))
+    with pytest.raises(ValueError, match="expected a positive size, positive focal lengths"):
+        renderer.render(replace(case.view, camera=replace(case.view.camera, fx=-1.0)))
+
+
+def test_the_background_is_that_of_the_model(device, rng):
+    case = random_case(rng, 3, *SIZE)
+    model = model_of(case)
+    white = replace(model, rendering=replace(model.rendering, background="white"))
+    images = [Renderer(one, device).render(case.view, colour).image for one, colour in ((white, None), (model, 1.0))]
+    np.testing.assert_array_equal(*images)

@@ -11,9 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from clsplat import cli, experiment, runner, terminal
+from clsplat import cli, terminal
 from clsplat.errors import ConfigError, DataError, InternalError, Interrupted, MemoryLimitError, OutputError
-from clsplat.experiment import Job
+from clsplat.runs import experiment, runner
+from clsplat.runs.experiment import Job
 from tests.test_cli import clsplat
 
 HINT = "run with --debug for the traceback, and report it"

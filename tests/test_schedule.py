@@ -7,7 +7,7 @@ import pytest
 
 from clsplat.errors import ConfigError
 from clsplat.losses.image import L1
-from clsplat.pipeline import load
+from clsplat.pipeline.loading import load
 from clsplat.schedule import at_step
 
 POINTS = [[100, 0.8], [200, 0.4], [300, 4.0]]

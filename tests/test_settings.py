@@ -9,8 +9,8 @@ import pytest
 from clsplat.density.edit import Edit, Rule
 from clsplat.errors import ConfigError
 from clsplat.losses.base import ImageLoss, Loss, Penalty
-from clsplat.pipeline import Pipeline, load
-from clsplat.schema import json_schema
+from clsplat.pipeline.loading import Pipeline, load
+from clsplat.pipeline.schema import json_schema
 from clsplat.settings import OneOf, Settings, rebuild, tag_of, variants
 from clsplat.stages.base import Scheduled, Stage
 from clsplat.training.run import Run

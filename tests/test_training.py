@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from clsplat import runner
 from clsplat.errors import ConfigError, DataError, Interrupted, NumericError
 from clsplat.gaussians.ply import read_ply
-from clsplat.pipeline import load
+from clsplat.pipeline.loading import load
+from clsplat.runs import runner
 from clsplat.training import checkpoint
 from clsplat.training.run import Progress, Run
 from clsplat.views.sampling import Sampler

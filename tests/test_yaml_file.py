@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from clsplat.errors import ConfigError
-from clsplat.pipeline import load
-from clsplat.yaml_file import parse_value, read_yaml
+from clsplat.pipeline.loading import load
+from clsplat.pipeline.yaml_file import parse_value, read_yaml
 
 REFUSED = {  # text: (line, words)
     "name: !!python/object/apply:os.system ['x']\nstages: []\n": (

@@ -1,143 +1,165 @@
 """What the commands do, as functions: paths and plain values in, files and plain values out.
 
-The command line prints what these return.  Errors are those of `clsplat.errors`, with the messages of the commands.
+The command line prints what these return.  They raise the errors of `clsplat.errors`, with the messages of the
+commands: ConfigError for a pipeline or an argument, DataError for a dataset or a model, DeviceError for a device,
+OutputError for a file that cannot be written.  `device` is a part of a device's name, as `devices` lists them; without
+it CLSPLAT_DEVICE, else the first GPU that works, else the first CPU.
 """
 
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-from clsplat import plugins
+from clsplat.api.arguments import Overrides, PathLike, load_plugins, overrides, path_of
 
-Text = str | Path
+if TYPE_CHECKING:  # the command line starts without OpenCL
+    from clsplat.runs.experiment import Job
 
 
 def run(
-    pipeline: Text,
-    scene: Text | None = None,
-    out: Text | None = None,
+    pipeline: PathLike,
+    scene: PathLike | None = None,
+    out: PathLike | None = None,
     *,
-    set: Mapping[str, Any] | Sequence[str] = (),
+    set: Overrides = (),
     device: str | None = None,
     resume: bool = False,
 ) -> Path:
     """Run a pipeline or a matrix, as `clsplat run` does; return the run folder.
 
-    pipeline: a file, or the name of a shipped one; out: default runs/NAME; set: values by place, or 'place=value'.
+    pipeline: a file, or the name of a shipped one; scene: default that of the pipeline; out: default runs/NAME; set:
+    settings by place, such as {"optimize.steps": 3000}; resume: go on from the newest checkpoint in `out`.
     """
-    from clsplat.experiment import Job
-
-    plugins.load_installed()
-    job = Job.open(str(pipeline), _path(scene), _path(out), overrides(set), resume)
+    job = _job(pipeline, scene, out, set, resume)
     job.run(device, resume)
     return job.out
 
 
-def resume(folder: Text, *, set: Mapping[str, Any] | Sequence[str] = (), device: str | None = None) -> Path:
-    """Go on with a run from its newest checkpoint, as `clsplat resume` does; return the run folder."""
-    from clsplat.experiment import Job
+def describe_run(
+    pipeline: PathLike,
+    scene: PathLike | None = None,
+    out: PathLike | None = None,
+    *,
+    set: Overrides = (),
+    device: str | None = None,
+    resume: bool = False,
+) -> str:
+    """Check all that `run` would need and return what it would do, as lines of text; nothing is written."""
+    return _job(pipeline, scene, out, set, resume).describe(device)
 
-    plugins.load_installed()
+
+def resume(folder: PathLike, *, set: Overrides = (), device: str | None = None) -> Path:
+    """Go on with a run, or a matrix, from its newest checkpoint, as `clsplat resume` does; return the run folder."""
+    from clsplat.runs.experiment import Job
+
+    load_plugins()
     job = Job.resume(Path(folder), overrides(set))
     job.run(device, resume=True)
     return job.out
 
 
-def check(pipeline: Text) -> dict[str, Any]:
-    """Validate a pipeline: its path, its name, its stages or cells.  Raises ConfigError."""
-    from clsplat import experiment
+def status(folder: PathLike) -> dict[str, Any]:
+    """Return how far a run or a matrix is, from its files: `state`, `step`, `last` report, `metrics` when it is done.
 
-    plugins.load_installed()
+    A matrix has `cells`, `done` and `failed` in the place of the step.
+    """
+    from clsplat.runs.status import run_status
+
+    return run_status(Path(folder))
+
+
+def check(pipeline: PathLike) -> dict[str, Any]:
+    """Validate a pipeline or a matrix; return its `path`, its `name`, and its `stages` or `cells`."""
+    from clsplat.runs import experiment
+
+    load_plugins()
     return experiment.check(str(pipeline))
 
 
-def pipelines(name: str | None = None) -> Any:
-    """List the shipped pipelines, or describe one with its keys."""
-    from clsplat import recipes
+def pipeline_schema() -> dict[str, Any]:
+    """Return the JSON schema of pipeline files, with the variants of plug-ins."""
+    from clsplat.pipeline.schema import json_schema
 
-    return recipes.manual(name) if name else recipes.summaries()
+    load_plugins()
+    return json_schema()
 
 
-def devices() -> list[dict[str, Any]]:
-    """List OpenCL devices, their limits, and under `fault` what keeps one from working."""
-    from dataclasses import asdict
+def pipelines(name: PathLike | None = None) -> Any:
+    """Return `name`, `summary` and `path` of every shipped pipeline; of one of them its `stages` and `keys` too."""
+    from clsplat.pipeline import recipes
 
-    from clsplat.opencl.device import list_devices
+    load_plugins()
+    return recipes.summaries() if name is None else recipes.manual(str(name))
 
-    return [{**asdict(info), "fault": info.fault()} for info in list_devices()]
+
+def copy_pipeline(name: PathLike, file: PathLike) -> Path:
+    """Copy a pipeline to a file, or into a folder, to change it; return the copy.  A file is never replaced."""
+    from clsplat.pipeline import recipes
+
+    return recipes.copy(str(name), Path(file))
 
 
 def render_views(
-    model: Text,
-    scene: Text | None = None,
-    out: Text = "renders",
+    model: PathLike,
+    scene: PathLike | None = None,
+    out: PathLike = "renders",
     *,
     split: Literal["test", "train", "all"] = "test",
     downscale: float | None = None,
     kind: Literal["png", "npy"] = "png",
     device: str | None = None,
 ) -> int:
-    """Render a model file or run folder at the views of a scene into files; return their number."""
-    from clsplat import model_file
+    """Render a model at the views of a scene, one file for each view; return their number.
 
-    plugins.load_installed()
+    model: a file, with `scene`, or a run folder, whose scene is the default; downscale: divisor of the photographs'
+    size, by default that of the run, 1 for a file; kind: 8-bit images, or float32 arrays [height, width, 3].
+    """
+    from clsplat.runs import model_file
+
+    load_plugins()
     return model_file.render(
-        Path(model), _path(scene), Path(out), split=split, downscale=downscale, kind=kind, device=device
+        Path(model), path_of(scene), Path(out), split=split, downscale=downscale, kind=kind, device=device
     )
 
 
 def evaluate(
-    model: Text,
-    scene: Text | None = None,
+    model: PathLike,
+    scene: PathLike | None = None,
     *,
     downscales: Sequence[float] | None = None,
     metrics: Sequence[str] = ("psnr", "ssim"),
-    lpips: Text | None = None,
+    lpips: PathLike | None = None,
     lpips_input: Literal["-1..1", "0..1"] = "-1..1",
     device: str | None = None,
 ) -> dict[str, Any]:
-    """Measure a model file or run folder on a scene's views; return what metrics.json holds."""
-    from clsplat import model_file
+    """Measure a model at the views of a scene; return metrics by split and divisor, with the keys of metrics.json.
 
-    plugins.load_installed()
+    model, scene: as for `render_views`; downscales: divisors of the photographs' size; metrics: of psnr (dB), ssim,
+    ms_ssim and flip; lpips: an ONNX file, which reads values from -1 or from 0 on, as `lpips_input` says.
+    """
+    from clsplat.runs import model_file
+
+    load_plugins()
     return model_file.evaluate(
         Path(model),
-        _path(scene),
+        path_of(scene),
         downscales=downscales,
         metrics=metrics,
-        lpips=_path(lpips),
+        lpips=path_of(lpips),
         lpips_input=lpips_input,
         device=device,
     )
 
 
-def compare_runs(runs: Sequence[Text], out: Text = "compare.html") -> int:
-    """Write the page that shows runs side by side; return the number of runs on it."""
+def compare_runs(runs: Sequence[PathLike], out: PathLike = "compare.html") -> int:
+    """Write the page that shows runs side by side; return their number.  The folder of a matrix stands for its runs."""
     from clsplat.compare.page import write_comparison
 
     return write_comparison([Path(folder) for folder in runs], Path(out))
 
 
-def inspect_scene(scene: Text) -> Any:
-    """Look at a dataset: `trainable`, `verdict`, `findings`, `data()`."""
-    from clsplat.inspect.inspection import Inspection
+def _job(pipeline: PathLike, scene: PathLike | None, out: PathLike | None, values: Overrides, resume: bool) -> "Job":
+    from clsplat.runs.experiment import Job
 
-    plugins.load_installed()
-    return Inspection.of(Path(scene))
-
-
-def load_plugin(file: Text) -> None:
-    """Import a plug-in, as `--plugin` does.  Raises ConfigError, with file and line, when that fails."""
-    plugins.load_file(Path(file))
-
-
-def overrides(values: Mapping[str, Any] | Sequence[str]) -> list[str]:
-    """Return settings as `--set` takes them."""
-    if isinstance(values, Mapping):
-        return [f"{place}={json.dumps(value)}" for place, value in values.items()]
-    return list(values)
-
-
-def _path(value: Text | None) -> Path | None:
-    return None if value is None else Path(value)
+    load_plugins()
+    return Job.open(str(pipeline), path_of(scene), path_of(out), overrides(values), resume)

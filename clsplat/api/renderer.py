@@ -9,19 +9,20 @@ from numpy.typing import NDArray
 
 from clsplat.api.device import default_device
 from clsplat.gaussians.model import Model
-from clsplat.gaussians.tables import PARAMETERS, DeviceModel, Gaussians
+from clsplat.gaussians.tables import PARAMETERS, DeviceModel
 from clsplat.metrics.images import to_8_bits
 from clsplat.opencl.device import Array, Device
-from clsplat.render.rasterizer import Content, DeviceCamera, Frame, Rasterizer, upload_camera
+from clsplat.render.camera import DeviceCamera, upload_camera
+from clsplat.render.rasterizer import Content, Frame, Rasterizer
 from clsplat.scene.scene import View
+from clsplat.views.photographs import BACKGROUNDS
 
 Floats = NDArray[np.float32]
 Colour = float | Sequence[float]
 GEOMETRY = 6  # of the sums over pixels, the ones that do not belong to the colour (cl_kernels/splat.h)
-BACKGROUNDS = {"black": 0.0, "white": 1.0}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Gradients:
     """Derivatives by the parameters before activation, with their shapes, [N, components] float32."""
 
@@ -33,8 +34,11 @@ class Gradients:
     sh_rest: Floats
     mean2d: Floats  # [N, 2] px⁻¹, by the projected mean
 
+    def __repr__(self) -> str:
+        return f"Gradients(of {len(self.means):,} Gaussians)"
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, eq=False)
 class Picture:
     """A rendered view; the arrays are the caller's own."""
 
@@ -43,15 +47,20 @@ class Picture:
     depth: Floats | None  # [height, width] scene units, mean depth of what covers a pixel; 0 where nothing does
     view: View
     background: Floats  # [3]
+    model: Model
     renderer: "Renderer"
 
     def backward(self, image: Floats | None = None, alpha: Floats | None = None) -> Gradients:
         """Return the gradients of a loss by every parameter, from its derivatives by the picture.
 
-        image: [height, width, 3] dL/d image; alpha: [height, width] dL/d alpha.  The model must be the one that was
-        rendered.  Raises ValueError for other shapes.
+        image: [height, width, 3] dL/d image; alpha: [height, width] dL/d alpha.  It may be called again, and after the
+        renderer has taken another model.  Raises ValueError for other shapes.
         """
         return self.renderer.backward(self, image, alpha)
+
+    def __repr__(self) -> str:
+        height, width = self.alpha.shape
+        return f"Picture({width} x {height} px of '{self.view.name}')"
 
     def _repr_png_(self) -> bytes:
         _, data = cv2.imencode(".png", to_8_bits(self.image)[:, :, ::-1])
@@ -59,74 +68,83 @@ class Picture:
 
 
 class Renderer:
-    """A model on a device.  It renders one picture at a time, so threads must not share it."""
+    """A model on a device.
+
+    A renderer serves one thread, for it renders one picture at a time.  Renderers on one device do not disturb each
+    other.
+    """
 
     def __init__(self, model: Model, device: Device | None = None) -> None:
+        """Copy a model to a device, by default `default_device()`.  Raises DeviceError when there is none."""
         self.device = device or default_device()
         self.rasterizer = Rasterizer(self.device)
         self.update(model)
 
     def update(self, model: Model) -> None:
-        """Take another model, or the same with other numbers."""
-        self.model = model
-        gaussians, rendering = Gaussians(self.device, model.tables()), model.rendering
-        self._model = DeviceModel(
-            gaussians, model.sh_degree, rendering.near, rendering.screen_variance, rendering.compensate
-        )
+        """Take another model, or the same after its arrays were changed in place."""
+        self.model, self._model = model, model.upload(self.device)
 
     def render(self, view: View, background: Colour | None = None, depth: bool = False) -> Picture:
         """Render a view.
 
-        background: a colour in [0, 1], one number or three; by default that of the model, else black.
+        background: a colour in [0, 1], one number or three; by default that of the model, else black; depth: compute
+        it, which takes another pass.  Raises ValueError for a camera that cannot be and for other backgrounds.
         """
+        view.camera.check()
         camera, colour = upload_camera(self.device, view), self._colour(background)
-        frame = self._forward(camera, colour)
+        frame = self._forward(self._model, camera, colour)
         image = _inside(frame, frame.image.get())
         alpha = _inside(frame, 1 - np.abs(frame.transmittance.get())[None])[:, :, 0]
         mean = self._depth(camera) if depth else None
-        return Picture(image, alpha, mean, view, colour, self)
+        return Picture(image, alpha, mean, view, colour, self.model, self)
 
     def backward(self, picture: Picture, image: Floats | None, alpha: Floats | None) -> Gradients:
         """Return the gradients of a loss, as Picture.backward does."""
-        camera, gaussians = upload_camera(self.device, picture.view), self._model.gaussians
+        camera = upload_camera(self.device, picture.view)
+        model = self._model if picture.model is self.model else picture.model.upload(self.device)
         size = camera.height, camera.width
         sums = np.zeros((0, 0), np.float32)
         if alpha is not None:  # alpha is the second channel of a picture that shows (depth, 1, 0) on black
             planes = np.zeros((*size, 3), np.float32)
             planes[:, :, 1] = _checked("alpha", alpha, size)
-            sums = self._pixel_sums(self._forward(camera, np.zeros(3, np.float32), "depth"), planes).get()[:GEOMETRY]
-        frame = self._forward(camera, picture.background)
+            frame = self._forward(model, camera, np.zeros(3, np.float32), "depth")
+            sums = self._pixel_sums(model, frame, planes).get()[:GEOMETRY]
+        frame = self._forward(model, camera, picture.background)
         planes = np.zeros((*size, 3), np.float32) if image is None else _checked("image", image, (*size, 3))
-        pixel_sums = self._pixel_sums(frame, planes)
+        pixel_sums = self._pixel_sums(model, frame, planes)
         if alpha is not None:
             both = pixel_sums.get()
             both[:GEOMETRY] += sums
             pixel_sums.set(both)
-        gradients = self.rasterizer.gradients(self._model, frame, pixel_sums)
+        gradients = self.rasterizer.gradients(model, frame, pixel_sums)
         arrays = {**{name: gradients[name] for name in PARAMETERS}, "mean2d": gradients.mean2d}
-        count = gaussians.count
+        count = model.gaussians.count
         return Gradients(**{name: np.ascontiguousarray(a.get()[:, :count].T) for name, a in arrays.items()})
 
-    def _forward(self, camera: DeviceCamera, background: Floats, content: Content = "colour") -> Frame:
-        return self.rasterizer.forward(self._model, camera, self.device.upload(background), content)
+    def _forward(
+        self, model: DeviceModel, camera: DeviceCamera, background: Floats, content: Content = "colour"
+    ) -> Frame:
+        return self.rasterizer.forward(model, camera, self.device.upload(background), content)
 
     def _depth(self, camera: DeviceCamera) -> Floats:
-        frame = self._forward(camera, np.zeros(3, np.float32), "depth")
+        frame = self._forward(self._model, camera, np.zeros(3, np.float32), "depth")
         planes = _inside(frame, frame.image.get())
         weight = planes[:, :, 1]
         return np.divide(planes[:, :, 0], weight, out=np.zeros_like(weight), where=weight > 0)
 
-    def _pixel_sums(self, frame: Frame, derivative: Floats) -> Array:
+    def _pixel_sums(self, model: DeviceModel, frame: Frame, derivative: Floats) -> Array:
         camera = frame.camera
         planes = np.zeros((3, camera.rows, camera.stride), np.float32)
         planes[:, : camera.height, : camera.width] = derivative.transpose(2, 0, 1)
-        return self.rasterizer.pixel_sums(self._model, frame, self.device.upload(planes))
+        return self.rasterizer.pixel_sums(model, frame, self.device.upload(planes))
 
     def _colour(self, background: Colour | None) -> Floats:
         if background is None:
             background = BACKGROUNDS[self.model.rendering.background or "black"]
-        colour = np.broadcast_to(np.asarray(background, np.float32), (3,))
-        return np.ascontiguousarray(colour)
+        colour = np.asarray(background, np.float32)
+        if colour.shape not in ((), (3,)):
+            raise ValueError(f"the background has shape {colour.shape}; expected one number or three")
+        return np.ascontiguousarray(np.broadcast_to(colour, (3,)))
 
 
 def _inside(frame: Frame, planes: Floats) -> Floats:

@@ -1,30 +1,35 @@
 """A pipeline's training, step by step from Python."""
 
-import json
+import shutil
 import tempfile
+import weakref
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from clsplat import plugins
+from clsplat import __version__
+from clsplat.api.arguments import PathLike, load_plugins, overrides
 from clsplat.api.device import default_device
-from clsplat.errors import ConfigError
+from clsplat.errors import ClsplatError, ConfigError, DataError
 from clsplat.gaussians.model import Model, Rendering
 from clsplat.gaussians.tables import PARAMETERS
 from clsplat.losses.base import HostFunction, HostLoss, ViewGradients
 from clsplat.metrics.views import mean, measure
 from clsplat.opencl.device import Device
-from clsplat.pipeline import load
-from clsplat.runner import make_run
+from clsplat.pipeline.loading import Pipeline, load
+from clsplat.runs import runner
+from clsplat.runs.experiment import quoted
 from clsplat.scene.detect import read_scene
 from clsplat.scene.scene import Scene
+from clsplat.scene.view import NO_FILE
 from clsplat.schedule import Schedule
 from clsplat.stages.optimize import Optimize
 from clsplat.training import checkpoint
+from clsplat.training.run import Run
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Report:
     """One training step."""
 
@@ -42,47 +47,77 @@ class Report:
 
 
 class Trainer:
-    """Trains a scene as a pipeline says.
+    """Trains a scene as a pipeline says: a trainer and `clsplat run` give the same bits.
 
     Stages before the training are run at once; those after it, such as `evaluate` and `export`, are not run at all: use
-    `evaluate` and `model`.  A trainer and `clsplat run` give the same bits.
+    `evaluate` and `model`.  Ctrl-C lets a step finish, and training can go on; a trainer serves one thread.
     """
 
     def __init__(
         self,
-        scene: Scene | str | Path,
-        pipeline: str = "splat_7k",
+        scene: Scene | PathLike,
+        pipeline: PathLike = "splat_7k",
         *,
         set: Mapping[str, Any] | None = None,
         device: Device | None = None,
-        out: str | Path | None = None,
+        out: PathLike | None = None,
         resume: bool = False,
     ) -> None:
         """Prepare training.
 
-        pipeline: a file, or the name of a shipped one; set: values by place, as of `--set`; out: folder for records and
-        checkpoints, by default a temporary one; resume: go on from the newest checkpoint in `out`.
+        scene: what `read_scene` returns, whose split is kept, or a folder; pipeline: a file, or the name of a shipped
+        one; set: settings by place, such as {"optimize.steps": 3000}; out: the run folder, by default a temporary one
+        that goes away with the trainer; resume: go on from the newest checkpoint in `out`, also of `clsplat run`.
         Raises ConfigError, DataError and DeviceError.
         """
-        plugins.load_installed()
-        self.pipeline = load(pipeline, [f"{place}={json.dumps(value)}" for place, value in (set or {}).items()])
-        if self.pipeline.settings.prepare:
-            raise ConfigError(f"{self.pipeline.path}: prepares its scene; use clsplat.run, then train on the result")
-        self.scene = (
-            scene if isinstance(scene, Scene) else read_scene(Path(scene), self.pipeline.settings.scene.holdout)
-        )
-        self._folder = tempfile.TemporaryDirectory(prefix="clsplat-") if out is None else None
-        folder = Path(out if out is not None else self._folder.name if self._folder else "")
-        folder.mkdir(parents=True, exist_ok=True)
-        self._run = make_run(self.pipeline, self.scene, device or default_device(), folder)
-        resumed = resume and checkpoint.restore(self._run)
-        self._run.records.start(self._run.step, edit_due=bool(resumed) and self._run.stage_step > 0)
-        self._steps = self._iterate()
-        self._before_training()
+        load_plugins()
+        folder = scene.path if isinstance(scene, Scene) else Path(scene)
+        place = [f"scene.path={quoted(folder)}"] if folder.is_dir() else []
+        self.pipeline = load(str(pipeline), [*place, *overrides(set or {})])
+        _check(self.pipeline)
+        self.scene = scene if isinstance(scene, Scene) else read_scene(folder, self.pipeline.settings.scene.holdout)
+        if without := [view.name for view in self.scene.split("train") if view.image_path == NO_FILE]:
+            raise DataError(f"{self.scene.path}: the view '{without[0]}' has no photograph; training needs one of each")
+        if resume and out is None:
+            raise ConfigError("resume: expected the folder of a run as `out`")
+        if out is None:
+            out = tempfile.mkdtemp(prefix="clsplat-")
+            weakref.finalize(self, shutil.rmtree, out, ignore_errors=True)
+        self.out = Path(out)
+        runner.make_run_folder(self.out, resume)
+        schedule = self.pipeline.settings.rasterizer.schedule
+        self._run = runner.make_run(self.pipeline, self.scene, device or default_device(schedule), self.out)
+        runner.begin(self.pipeline, self._run, resume)
+        _run_until_training(self.pipeline, self._run)
+        self._steps = _training(self.pipeline, self._run)
+        self._failed = False
 
     def step(self) -> Report:
-        """Train one step.  Raises StopIteration when the pipeline's steps are done."""
-        view = next(self._steps)
+        """Train one step.  Raises StopIteration when the pipeline's steps are done.
+
+        After an error inside of a step the trainer cannot go on; the next call says so.
+        """
+        interrupts: list[bool] = []
+
+        def finish_step() -> None:
+            if interrupts:
+                raise KeyboardInterrupt
+            interrupts.append(True)
+
+        if self._failed:
+            raise ClsplatError(
+                f"{self!r} ended with an error; make another, with resume=True where `out` holds a checkpoint"
+            )
+        try:
+            with runner.stopping_on_signals(finish_step):
+                view = next(self._steps)
+        except StopIteration:
+            raise
+        except BaseException:
+            self._failed = True
+            raise
+        if interrupts:
+            raise KeyboardInterrupt
         return Report(self._run.step, self._run.model.gaussians.count, view)
 
     def steps(self, count: int | None = None) -> Iterator[Report]:
@@ -96,7 +131,7 @@ class Trainer:
             done += 1
 
     def run(self, count: int | None = None) -> Report | None:
-        """Train so many steps, or to the end of the pipeline's training; return the last one."""
+        """Train so many steps, or to the end of the pipeline's training; return the last, or None."""
         report = None
         for report in self.steps(count):  # noqa: B007
             pass
@@ -104,54 +139,69 @@ class Trainer:
 
     @property
     def model(self) -> Model:
-        """A copy of the model as it is now."""
+        """A copy of the model as it is now; a world filter is not yet part of its scales."""
         run = self._run
         tables = {name: run.model.gaussians.get(name) for name in (*PARAMETERS, "filter_variance")}
         if not tables["filter_variance"].any():
             del tables["filter_variance"]
-        return Model(**tables, rendering=Rendering.of(run.rendering(), "default"))
+        return Model(**tables, rendering=Rendering.of({"version": __version__, **run.rendering()}, "default"))
 
     def add_loss(self, function: HostFunction, weight: Schedule = 1.0) -> None:
-        """Minimise also `function(image, photograph) -> (value, derivative by the image)`, in NumPy.
+        """Minimise also `function(image, photograph) -> (value, derivative by the image)`, in NumPy, from now on.
 
-        Arrays are [height, width, 3] float32 in [0, 1].  Each step copies both images to the host and the derivative
-        back; a plug-in with a kernel does not.
+        Arrays are [height, width, 3] float32 in [0, 1]; weight: factor, by step.  Each step copies both images to the
+        host and the derivative back; a plug-in with a kernel does not.
         """
         self._run.losses.append(HostLoss(function, weight))
 
     def evaluate(self, split: str = "test") -> dict[str, Any]:
-        """Return the metrics of a split, with the keys of metrics.json; None for a split without views."""
+        """Return the metrics of a split at the size that is trained on, with the keys of metrics.json.
+
+        psnr is in dB; a split without views has `views` alone.  Raises ValueError for a split that there is not.
+        """
         run = self._run
-        views = run.scene.downscaled(run.scale).split(split)
-        return mean(measure(run.rasterizer, run.model, views, run.photographs)) if views else {"views": 0}
+        views = run.scene.downscaled(run.downscale).split(split)
+        return mean(measure(run.rasterizer, run.model, views, run.photographs.fresh())) if views else {"views": 0}
 
     def checkpoint(self) -> Path:
-        """Save all that training needs to go on to the same bits; return the file."""
+        """Save all that training needs to go on to the same bits, but for losses that were added; return the file.
+
+        It lies in `out`, where the newest two are kept.  Raises OutputError when it cannot be written.
+        """
         return checkpoint.save(self._run, keep=2)
-
-    def _before_training(self) -> None:
-        """Run the stages up to the first that trains."""
-        for cursor, stage in enumerate(self.pipeline.stages):
-            if isinstance(stage, Optimize):
-                return
-            if cursor >= self._run.cursor:
-                self._run.cursor = cursor
-                stage.run(self._run)
-        raise ConfigError(f"{self.pipeline.path}: expected a stage 'optimize'")
-
-    def _iterate(self) -> Iterator[ViewGradients]:
-        """All training stages, and those between them."""
-        stages, run = self.pipeline.stages, self._run
-        last = max(i for i, stage in enumerate(stages) if isinstance(stage, Optimize))
-        first = next(i for i, stage in enumerate(stages) if isinstance(stage, Optimize))
-        for cursor in range(max(first, run.cursor), last + 1):
-            if cursor > run.cursor:
-                run.cursor, run.stage_step = cursor, 0
-            stage = stages[cursor]
-            if isinstance(stage, Optimize):
-                yield from stage.iterate(run)
-            else:
-                stage.run(run)
 
     def __repr__(self) -> str:
         return f"Trainer({self.pipeline.settings.name} on {self.scene.path.name}, step {self._run.step})"
+
+
+def _check(pipeline: Pipeline) -> None:
+    """Raise ConfigError where a pipeline has nothing to train or more than that."""
+    if pipeline.settings.prepare:
+        raise ConfigError(f"{pipeline.path}: prepares its scene; use clsplat.run, then train on the result")
+    if not any(isinstance(stage, Optimize) for stage in pipeline.stages):
+        raise ConfigError(f"{pipeline.path}: has no stage 'optimize'; expected one to train with")
+    for stage in pipeline.stages:
+        stage.check()
+
+
+def _run_until_training(pipeline: Pipeline, run: Run) -> None:
+    """Run the stages before the first that trains, from where the run is."""
+    for cursor, stage in enumerate(pipeline.stages):
+        if isinstance(stage, Optimize):
+            return
+        if cursor >= run.cursor:
+            run.cursor = cursor
+            stage.run(run)
+
+
+def _training(pipeline: Pipeline, run: Run) -> Iterator[ViewGradients]:
+    """Run all stages that train, step by step, and those between them."""
+    trains = [i for i, stage in enumerate(pipeline.stages) if isinstance(stage, Optimize)]
+    for cursor in range(max(trains[0], run.cursor), trains[-1] + 1):
+        if cursor > run.cursor:
+            run.cursor, run.stage_step = cursor, 0
+        stage = pipeline.stages[cursor]
+        if isinstance(stage, Optimize):
+            yield from stage.iterate(run)
+        else:
+            stage.run(run)

@@ -1,4 +1,4 @@
-"""Scenes that take turns at whole training steps, so that a slow pixel_sum of the machine meets all; medians count."""
+"""Scenes that take turns at whole training steps, so that a slow moment of the machine meets all; medians count."""
 
 import statistics
 import time
@@ -11,13 +11,14 @@ import numpy as np
 from clsplat.bench.floors import Work, floors
 from clsplat.bench.peaks import Peaks
 from clsplat.density.basic import PruneLarge
-from clsplat.density.edit import Edit, SceneScale, densify
+from clsplat.density.control import densify
+from clsplat.density.edit import Edit, SceneScale
 from clsplat.density.statistics import SplatStats
 from clsplat.gaussians.ply import Parameters
 from clsplat.gaussians.tables import PARAMETERS, Gaussians
 from clsplat.opencl.device import Device
 from clsplat.opencl.program import constants
-from clsplat.pipeline import PipelineFile
+from clsplat.pipeline.file import PipelineFile
 from clsplat.render.rasterizer import RECORD, Frame, Rasterizer
 from clsplat.training.adam import Adam, Rates
 from clsplat.training.memory import plan

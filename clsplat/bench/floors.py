@@ -24,7 +24,7 @@ def floors(work: Work, peaks: Peaks) -> dict[str, float]:
 
     Blending is counted in vector instructions of 16 lanes (31 a row forward; 80 a row and 60 a pair backward), which
     issue at the rate of multiply-adds; the other stages in operations and bytes (473 operations and 236 bytes of
-    parameters a Gaussian, 59 parameters with gradient and two pixel_sums, 64 bytes a record, …).
+    parameters a Gaussian, 59 parameters with gradient and two moments, 64 bytes a record, …).
     """
     n, pairs, pixels = work.gaussians, work.pairs, work.pixels
 

@@ -12,8 +12,9 @@ from clsplat.bench.scenes import SIZES, case, grown, real_case
 from clsplat.bench.table import growth_chart, growth_table, table
 from clsplat.errors import ConfigError
 from clsplat.files import write_text
-from clsplat.opencl.device import Device, Schedule, choose
-from clsplat.pipeline import load
+from clsplat.opencl.choice import Schedule, choose
+from clsplat.opencl.device import Device
+from clsplat.pipeline.loading import load
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@ from clsplat.bench.cases import Case
 from clsplat.gaussians.ply import Parameters, is_splat, read_ply
 from clsplat.gaussians.tables import SH_C0
 from clsplat.opencl.device import Device
-from clsplat.pipeline import PipelineFile
-from clsplat.render.rasterizer import upload_camera
+from clsplat.pipeline.file import PipelineFile
+from clsplat.render.camera import upload_camera
 from clsplat.scene.points import read_points_ply
 from clsplat.scene.scene import Camera, View
 from clsplat.stages.init import from_points

@@ -9,9 +9,10 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from clsplat import __version__, plugins, terminal
+from clsplat import __version__, terminal
+from clsplat.api import arguments, tools
 from clsplat.errors import ConfigError
-from clsplat.pipeline_files import shipped
+from clsplat.pipeline.files import shipped
 
 SYNONYMS = {
     **dict.fromkeys(("train", "fit", "optimize", "start"), "run"),
@@ -124,9 +125,9 @@ def common(
     terminal.start_logging(debug)
     context.obj = Common(device)
     if context.invoked_subcommand is not None:
-        plugins.load_installed()
+        arguments.load_plugins()
     for file in plugin or []:
-        plugins.load_file(file)
+        tools.load_plugin(file)
     if context.invoked_subcommand is None:
         print(context.get_help(), end="")
         raise ConfigError("expected a command")

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 import typer
 
 from clsplat import terminal
+from clsplat.api import commands
 from clsplat.cli.app import DeviceOption, ModelArgument, SceneOption, command
 from clsplat.errors import ConfigError
 
@@ -31,9 +32,7 @@ def render(
     device: DeviceOption = None,
 ) -> None:
     """Render a model at the views of a scene, one file for each, named as the view."""
-    from clsplat import model_file
-
-    count = model_file.render(model, scene, out, split=split, downscale=scale, kind=format_, device=device)
+    count = commands.render_views(model, scene, out, split=split, downscale=scale, kind=format_, device=device)
     terminal.show(f"{count} images written to {out}")
 
 
@@ -65,7 +64,6 @@ def evaluate(
     device: DeviceOption = None,
 ) -> None:
     """Measure a model on a scene's test and training views."""
-    from clsplat import model_file
     from clsplat.files import write_text
 
     if out is None:
@@ -74,7 +72,7 @@ def evaluate(
         downscales = None if scales is None else [float(text) for text in scales.split(",")]
     except ValueError:
         raise ConfigError(f"--scales {scales}: expected numbers separated by commas, for example 1,2,4") from None
-    found = model_file.evaluate(
+    found = commands.evaluate(
         model,
         scene,
         downscales=downscales,
@@ -97,7 +95,5 @@ def compare(
     out: Annotated[Path, typer.Option(metavar="FILE", help="The page to write.")] = Path("compare.html"),
 ) -> None:
     """Show runs side by side on one page that opens offline."""
-    from clsplat.compare.page import write_comparison
-
-    count = write_comparison(runs, out)
+    count = commands.compare_runs(runs, out)
     terminal.show(f"{count} runs compared in {out}")

@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from clsplat import terminal
+from clsplat.api import commands
 from clsplat.cli.app import DeviceOption, JsonOption, PipelineArgument, SetOption, command
 from clsplat.errors import ConfigError
 
@@ -25,14 +26,12 @@ def run(
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Check everything and say what would run.")] = False,
 ) -> None:
     """Run a pipeline, or all cells of a matrix."""
-    from clsplat.experiment import Job
-
-    job = Job.open(pipeline, scene, out, set_ or (), resume)
-    if dry_run:
-        terminal.show(job.describe(device))
-        return
-    job.run(device, resume)
-    terminal.show_summary(job.out)
+    work = commands.describe_run if dry_run else commands.run
+    found = work(pipeline, scene, out, set=set_ or (), device=device, resume=resume)
+    if isinstance(found, Path):
+        terminal.show_summary(found)
+    else:
+        terminal.show(found)
 
 
 @command("resume", "clsplat resume runs/splat_7k")
@@ -42,11 +41,7 @@ def resume(
     set_: SetOption = None,
 ) -> None:
     """Go on with a run from its newest checkpoint."""
-    from clsplat.experiment import Job
-
-    job = Job.resume(folder, set_ or ())
-    job.run(device, resume=True)
-    terminal.show_summary(job.out)
+    terminal.show_summary(commands.resume(folder, set=set_ or (), device=device))
 
 
 @command("status", "clsplat status runs/splat_7k", "clsplat status runs/splat_7k --json")
@@ -55,9 +50,9 @@ def status(
     as_json: JsonOption = False,
 ) -> None:
     """Tell from its files how far a run is, and its metrics."""
-    from clsplat.run_status import run_status, status_text
+    from clsplat.runs.status import status_text
 
-    found = run_status(folder)
+    found = commands.status(folder)
     if as_json:
         terminal.show_json(found)
     else:
@@ -73,15 +68,12 @@ def check(
     as_json: JsonOption = False,
 ) -> None:
     """Validate a pipeline without running it."""
-    from clsplat import experiment
-    from clsplat.schema import json_schema
-
     if schema:
-        terminal.show_json(json_schema())
+        terminal.show_json(commands.pipeline_schema())
         return
     if not pipeline:
         raise ConfigError("check: expected a pipeline, or --schema")
-    found = experiment.check(pipeline)
+    found = commands.check(pipeline)
     if as_json:
         terminal.show_json({**found, "valid": True})
     elif "cells" in found:
@@ -102,17 +94,18 @@ def pipelines(
     as_json: JsonOption = False,
 ) -> None:
     """List the shipped pipelines, or the keys of one as --set takes them."""
-    from clsplat import recipes
-
     if copy is not None:
         if not name:
             raise ConfigError("pipelines: --copy needs the name of a pipeline")
-        target = recipes.copy(name, copy)
+        target = commands.copy_pipeline(name, copy)
         if as_json:
             terminal.show_json({"copy": str(target)})
         else:
             terminal.show(f"{target}: a copy of {name}; `clsplat check {target}` validates it")
     elif as_json:
-        terminal.show_json(recipes.manual(name) if name else recipes.summaries())
+        terminal.show_json(commands.pipelines(name or None))
     else:
-        terminal.show(recipes.manual_text(name) if name else recipes.summaries_text())
+        from clsplat.pipeline.recipes import manual_text, summaries_text
+
+        found = commands.pipelines(name or None)
+        terminal.show(manual_text(found) if name else summaries_text(found))

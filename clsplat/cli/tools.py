@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 import typer
 
 from clsplat import terminal
+from clsplat.api import tools
 from clsplat.cli.app import DeviceOption, JsonOption, command
 from clsplat.errors import DataError, DeviceError
 
@@ -13,17 +14,13 @@ from clsplat.errors import DataError, DeviceError
 @command("devices", "clsplat devices", "clsplat devices --json")
 def devices(as_json: JsonOption = False) -> None:
     """List OpenCL devices, their limits, and whether each works; exit 4 when none does."""
-    from dataclasses import asdict
-
-    from clsplat.opencl.device import list_devices
-
-    found = [(info, info.fault()) for info in list_devices()]
+    found = tools.devices()
     if as_json:
-        terminal.show_json([{**asdict(info), "fault": fault} for info, fault in found])
+        terminal.show_json(found)
     else:
-        for info, fault in found:
-            terminal.show(terminal.device_text(info, fault))
-    if all(fault for _, fault in found):
+        for device in found:
+            terminal.show(terminal.device_text(device))
+    if all(device["fault"] for device in found):
         raise DeviceError(
             "no OpenCL device works; install a runtime: pip install 'clsplat[pocl]', pip install 'clsplat[intel]', "
             "apt install pocl-opencl-icd, or your GPU's driver"
@@ -39,19 +36,15 @@ def inspect(
     ] = None,
 ) -> None:
     """Tell whether a dataset will train, and what is wrong with it; exit 3 when it cannot train."""
-    from clsplat.inspect.inspection import Inspection
-    from clsplat.inspect.page import write_page
     from clsplat.inspect.table import show
 
     if as_json:
         terminal.keep_stdout_for_json()
-    inspection = Inspection.of(scene)
+    inspection = tools.inspect_scene(scene, page)
     if as_json:
         terminal.show_json(inspection.data())
     else:
         show(inspection, terminal.CONSOLE)
-    if page is not None:
-        write_page(inspection, page)
     if not inspection.trainable:
         raise DataError(inspection.verdict)
 
@@ -81,16 +74,15 @@ def bench(
     device: DeviceOption = None,
 ) -> None:
     """Time the stages of a training step on fixed scenes, beside the device's measured peaks."""
-    from clsplat.bench.measurement import measure, measure_growth, read_measurement
-
     if as_json:
         terminal.keep_stdout_for_json()
-    earlier = read_measurement(against, pipeline) if against else {}
+    earlier = tools.read_measurement(against, pipeline) if against else {}
     if growth is not None:
-        terminal.show(measure_growth(growth, pipeline=pipeline, repeats=repeats, schedule=schedule, device=device))
+        table = tools.measure_growth(growth, pipeline=pipeline, repeats=repeats, schedule=schedule, device=device)
+        terminal.show(table)
         return
     names = [name for name in scenes.split(",") if name]
-    found = measure(
+    found = tools.measure_speed(
         names, model=model, scene=scene, pipeline=pipeline, repeats=repeats, schedule=schedule, device=device
     )
     if as_json:

@@ -51,6 +51,10 @@ class SceneSection:
 def write_comparison(paths: Sequence[Path], out: Path, title: str = "", remarks: Sequence[str] = ()) -> int:
     """Write the page on some run folders; return the number of runs on it.  Raises what Comparison.read raises."""
     comparison = Comparison.read(paths)
+    faults = [fault for run in comparison.runs for fault in run.missing_plugins]
+    for fault in faults:
+        LOG.warning("%s", fault)
+    remarks = [*remarks, *faults]
     write_text(out, comparison_page(comparison, title, remarks))
     return len(comparison.runs)
 

@@ -8,13 +8,15 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from clsplat import plugins
 from clsplat.errors import ConfigError, DataError
-from clsplat.pipeline import SceneSettings
+from clsplat.pipeline.explanation import explain
+from clsplat.pipeline.file import SceneSettings
+from clsplat.pipeline.renamed import with_new_names
+from clsplat.pipeline.yaml_file import read_yaml
 from clsplat.prepare.cache import noted
 from clsplat.scene.images import read_file
-from clsplat.settings_errors import explain
 from clsplat.training.records import Records
-from clsplat.yaml_file import read_yaml
 
 
 class Averages(BaseModel):
@@ -74,6 +76,13 @@ class RunFolder:
         return cls(path, settings, _scene(path, settings), _metrics(path / "metrics.json"))
 
     @property
+    def missing_plugins(self) -> list[str]:
+        """A sentence for each plug-in of the run that is not loaded, or has other content now."""
+        recorded = self.settings.get("plugins")
+        faults = plugins.differences(recorded) if isinstance(recorded, dict) else []
+        return [f"{self.path}: {fault}" for fault in faults]
+
+    @property
     def photographs(self) -> Path:
         """The folder with the photographs that the run trained on.  Raises ConfigError when no scene is named."""
         prepared = noted(self.path)
@@ -110,7 +119,7 @@ def read_settings(path: Path) -> dict[str, Any]:
 
 def _scene(path: Path, settings: dict[str, Any]) -> SceneSettings:
     try:
-        return SceneSettings.model_validate(settings.get("scene", {}))
+        return SceneSettings.model_validate(with_new_names(settings).get("scene", {}))
     except ValidationError as error:
         file = path / "pipeline.yaml"
         raise ConfigError(explain(error, SceneSettings, file, read_yaml(file))) from error

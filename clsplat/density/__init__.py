@@ -1,4 +1,4 @@
-"""Density control: what views say about Gaussians, and rules by which they grow or go.  Each module adds its own."""
+"""Density control: statistics of Gaussians, and rules that add and remove them.  Each module defines variants."""
 
 from clsplat.settings import import_modules
 

@@ -10,10 +10,10 @@ from clsplat.schedule import Positive
 
 
 class Grow(Rule):
-    """Base of rules that act where the mean of a statistic is large.
+    """Base of rules for Gaussians whose mean of a statistic is large.
 
-    With `as_many_as` the threshold is not `gradient_above` itself but the value that as many Gaussians reach in
-    `statistic` as reach `gradient_above` in that other one (Gaussian Opacity Fields, Yu et al. 2024).
+    With `as_many_as`, the rule chooses as many Gaussians by `statistic` as reach `gradient_above` in that other
+    statistic (Gaussian Opacity Fields, Yu et al. 2024).
     """
 
     statistic: StatisticName = "screen_grad"
@@ -21,14 +21,14 @@ class Grow(Rule):
     gradient_above: Positive = 2.0e-4
     """Lowest mean of the statistic; by step."""
     as_many_as: StatisticName | None = None
-    """Column whose count at `gradient_above` sets the threshold."""
+    """Column in which Gaussians are counted at `gradient_above`; that number sets the threshold of `statistic`."""
 
     @property
     def statistics(self) -> set[str]:
         return {self.statistic, self.as_many_as or self.statistic}
 
     def condition(self, edit: Edit) -> dict[str, Any]:
-        """The rule's part of Edit.mark."""
+        """Return the arguments of Edit.mark that hold the rule's condition."""
         above = edit.at(self.gradient_above)
         if self.as_many_as:
             above = edit.matching(self.statistic, self.as_many_as, above)
@@ -40,7 +40,7 @@ class Clone(Grow):
 
     type: Literal["clone"] = "clone"
     size_below: Positive = 0.01
-    """Largest size, a share of the scene's extent; by step."""
+    """Largest size, the largest standard deviation as a share of the scene's extent; by step."""
 
     def mark(self, edit: Edit) -> None:
         edit.mark(copies=2, kept=1, size_below=edit.at(self.size_below), **self.condition(edit))
@@ -51,9 +51,9 @@ class Split(Grow):
 
     type: Literal["split"] = "split"
     size_above: Positive = 0.01
-    """Smallest size, a share of the scene's extent; by step."""
+    """Smallest size, the largest standard deviation as a share of the scene's extent; by step."""
     children: Annotated[int, Field(ge=2, le=8)] = 2
-    """Gaussians that take the place of one."""
+    """Number of Gaussians that replace one."""
     shrink: Annotated[float, Field(ge=1)] = 1.6
     """Divisor of the children's scales."""
 
@@ -83,7 +83,7 @@ class PruneLarge(Rule):
 
     type: Literal["prune_large"] = "prune_large"
     size_above: Positive = 0.1
-    """Size above which a Gaussian is removed, a share of the scene's extent; by step."""
+    """Size above which a Gaussian is removed: largest standard deviation as a share of the extent; by step."""
 
     def mark(self, edit: Edit) -> None:
         edit.mark(copies=0, kept=0, size_above=edit.at(self.size_above))

@@ -1,7 +1,6 @@
-"""Rules that grow Gaussians where the picture has detail, or where they have become too large (Lee et al. 2025).
+"""Rules that split Gaussians where the photographs have detail, or when they are too large (Lee et al. 2025).
 
-Both choose on the host, from tables and statistics, so that guards which compare Gaussians with each other are a line
-of NumPy.
+Both rules choose on the host, from tables and statistics: comparing Gaussians with each other is a line of NumPy there.
 """
 
 from typing import Annotated, Literal
@@ -23,7 +22,7 @@ class Subdivide(Rule):
     """Base of rules that replace Gaussians by smaller ones, a limited share of them at a time."""
 
     children: Annotated[int, Field(ge=2, le=8)] = 2
-    """Gaussians that take the place of one."""
+    """Number of Gaussians that replace one."""
     beta: Annotated[float, Field(gt=0, le=1)] = BETA
     """A child's covariance divided by its parent's."""
     at_most: Share = 0.05
@@ -35,27 +34,27 @@ class Subdivide(Rule):
     def statistics(self) -> set[str]:
         return {"screen_radius"}
 
-    def subdivide(self, edit: Edit, wanted: NDArray[np.bool_], score: NDArray[np.float32]) -> None:
-        """Split the wanted Gaussians that no rule before has taken and that can be seen to be split."""
-        wanted = wanted & (edit.rows() == 1) & (edit.stats.mean("screen_radius") >= self.radius_above)
-        chosen = largest(wanted, score, int(self.at_most * len(wanted)))
+    def subdivide(self, edit: Edit, candidates: NDArray[np.bool_], score: NDArray[np.float32]) -> None:
+        """Split the candidates, [N], with the largest scores; those of earlier rules and small ones are left out."""
+        candidates = candidates & (edit.rows() == 1) & (edit.stats.mean("screen_radius") >= self.radius_above)
+        chosen = largest(candidates, score, int(self.at_most * len(candidates)))
         edit.choose(chosen, copies=self.children, kept=0, shrink=self.beta**0.5)
 
 
-def largest(wanted: NDArray[np.bool_], score: NDArray[np.float32], limit: int) -> NDArray[np.bool_]:
-    """Of the wanted ones at most `limit`, those with the largest score, ties by index."""
-    places = np.flatnonzero(wanted)
+def largest(candidates: NDArray[np.bool_], score: NDArray[np.float32], limit: int) -> NDArray[np.bool_]:
+    """Return which candidates, [N], have the largest scores: at most `limit` of them, ties by index."""
+    places = np.flatnonzero(candidates)
     order = np.argsort(-score[places], kind="stable")
-    chosen = np.zeros_like(wanted)
+    chosen = np.zeros_like(candidates)
     chosen[places[order[:limit]]] = True
     return chosen
 
 
 class SplitTextured(Subdivide):
-    """Split Gaussians where the picture is textured.
+    """Split Gaussians where the photographs are textured.
 
-    `gradient_above` 0 is the strict form: texture alone decides.  Above 0 the form is lowered: the screen gradient must
-    also reach it, a threshold below that of the other rules.
+    With `gradient_above` 0, texture alone decides.  Above 0, the mean of `screen_grad` must reach it too; choose a
+    threshold below that of the other rules.
     """
 
     type: Literal["split_textured"] = "split_textured"
@@ -74,22 +73,22 @@ class SplitTextured(Subdivide):
         texture, gradient = edit.stats.mean(self.texture), edit.stats.mean("screen_grad")
         above = edit.threshold(self.texture, self.texture_above)
         seen = edit.gaussians.get(SEEN)[:, 0] > 0
-        wanted = seen & (texture >= above) & (gradient >= edit.at(self.gradient_above))
-        self.subdivide(edit, wanted, texture)
+        candidates = seen & (texture >= above) & (gradient >= edit.at(self.gradient_above))
+        self.subdivide(edit, candidates, texture)
 
 
 class SplitOversized(Subdivide):
-    """Split Gaussians whose covariance trace passes τ = 3 s².
+    """Split Gaussians whose covariance trace is larger than τ = 3 s².
 
-    s is `rms_above` in extents, or the quantile of the Gaussians' own, or, where `pixels` is given, what spans so many
+    s is `rms_above` as a share of the extent, or a quantile of the rms scales, or, with `pixels`, the length of so many
     pixels at the nearest training view.
     """
 
     type: Literal["split_oversized"] = "split_oversized"
     rms_above: Annotated[Quantile | Positive, explained(", or {quantile}")] = 0.01
-    """Smallest rms scale, a share of the scene's extent by step, or a quantile of the Gaussians' own."""
+    """Smallest rms scale, a share of the scene's extent by step, or a quantile of all rms scales."""
     pixels: Annotated[float, Field(gt=0)] | None = None
-    """Smallest rms scale in px of the nearest training view; takes the place of `rms_above`."""
+    """Smallest rms scale in px of the nearest training view; replaces `rms_above`."""
 
     @property
     def tables(self) -> set[str]:
@@ -102,5 +101,5 @@ class SplitOversized(Subdivide):
         elif isinstance(self.rms_above, Quantile):
             bound = np.full_like(rms, np.quantile(rms, self.rms_above.quantile) if len(rms) else 0.0)
         else:
-            bound = np.full_like(rms, edit.at(self.rms_above) * edit.scale.extent)
+            bound = np.full_like(rms, edit.at(self.rms_above) * edit.scene_scale.extent)
         self.subdivide(edit, rms > bound, rms / np.maximum(bound, 1e-30))

@@ -1,13 +1,13 @@
-"""Density control: rules that say which Gaussians grow or go (Kerbl et al. 2023, section 5).
+"""An edit of the Gaussians, and the base of the rules that mark it (Kerbl et al. 2023, section 5).
 
-A rule gives Gaussians an outcome: how many rows each becomes.  Most rules are a box in (mean of a statistic, size,
-opacity), and one kernel serves them all; others choose on the host.  Sizes are the largest standard deviation as a
-share of the scene's extent.  The first growing rule whose box holds a Gaussian decides; pruning rules override growth
-and judge the size that a split leaves.
+A rule gives Gaussians an outcome: the number of rows that each becomes.  Most rules are a box in (mean of a statistic,
+size, opacity), and one kernel applies them all; others choose on the host.  Sizes are the largest standard deviation
+as a share of the scene's extent.  The first growing rule whose box holds a Gaussian decides; pruning rules override
+growth and compare the size of the children after a split.
 """
 
 import math
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -23,8 +23,8 @@ from clsplat.render.tiles import Tiler
 from clsplat.schedule import Schedule, at_step
 from clsplat.settings import Settings
 
-MAX_BOUND = 3.0e38  # a bound that no finite float passes
-MIN_BOUND = 1.2e-38  # the smallest normal float: a bound that only zero misses
+MAX_BOUND = 3.0e38  # a bound above all values
+MIN_BOUND = 1.2e-38  # the smallest normal float: a bound that all values but zero reach
 
 
 def _no_photographs(share: float) -> float:
@@ -33,21 +33,22 @@ def _no_photographs(share: float) -> float:
 
 @dataclass(frozen=True)
 class SceneScale:
-    """The yardsticks of rules: the scene's extent in scene units, and the texture of its photographs."""
+    """Units of rules: the scene's extent, scene units, and quantiles of the photographs' texture, per px."""
 
     extent: float
     texture_quantile: Callable[[float], float] = _no_photographs
 
 
 class Edit:
-    """The outcome of each Gaussian: its number of rows, how many of them are the old one, the shrink of fresh scales.
+    """The outcome of each Gaussian: its number of rows, how many of them are its old row, the factor of fresh scales.
 
-    Everything random in it depends on `seed`, `step` and the rule alone.
+    Random numbers depend on `seed`, `step` and the rule alone.
     """
 
-    def __init__(self, gaussians: Gaussians, stats: SplatStats, scale: SceneScale, step: int, seed: int) -> None:
+    def __init__(self, gaussians: Gaussians, stats: SplatStats, scene_scale: SceneScale, step: int, seed: int) -> None:
         device, count = gaussians.device, gaussians.count
-        self.gaussians, self.stats, self.scale, self.step, self.seed = gaussians, stats, scale, step, seed
+        self.gaussians, self.stats, self.scene_scale = gaussians, stats, scene_scale
+        self.step, self.seed = step, seed
         self.copies = device.empty(count, np.uint32)
         self.kept = device.empty(count, np.uint32)
         self.shrink = device.empty(count)
@@ -74,7 +75,7 @@ class Edit:
         size_below: float | None = None,
         opacity_below: float = math.inf,
     ) -> None:
-        """Give every Gaussian in the box its outcome; sizes are shares of the extent."""
+        """Give an outcome to every Gaussian in the box; sizes are shares of the extent."""
         gaussians = self.gaussians
         self._program.mark_rule(
             items=gaussians.count,
@@ -86,8 +87,8 @@ class Edit:
             kept=self.kept,
             shrink=self.shrink,
             gradient_above=gradient_above,
-            size_above=size_above * self.scale.extent,
-            size_below=MAX_BOUND if size_below is None else size_below * self.scale.extent,
+            size_above=size_above * self.scene_scale.extent,
+            size_below=MAX_BOUND if size_below is None else size_below * self.scene_scale.extent,
             opacity_below=min(opacity_below, MAX_BOUND),
             new_shrink=shrink,
             new_copies=copies,
@@ -97,16 +98,16 @@ class Edit:
         )
 
     def matching(self, statistic: str, other: str, gradient_above: float) -> float:
-        """The threshold that as many Gaussians reach in `statistic` as reach `gradient_above` in `other`."""
+        """Return the threshold of `statistic` that as many Gaussians reach as reach `gradient_above` in `other`."""
         if self.gaussians.count == 0:
             return MIN_BOUND
         share = float(np.mean(self.stats.mean(other) >= np.float32(gradient_above)))
         return max(float(np.quantile(self.stats.mean(statistic), 1 - share)), MIN_BOUND)
 
     def threshold(self, statistic: str, threshold: Threshold) -> float:
-        """The number that a threshold on a statistic stands for."""
+        """Return the number of a threshold on a statistic, at the step of the edit."""
         if isinstance(threshold, PixelQuantile):
-            return self.scale.texture_quantile(threshold.quantile)
+            return self.scene_scale.texture_quantile(threshold.quantile)
         if not isinstance(threshold, Quantile):
             return self.at(threshold)
         mean = self.stats.mean(statistic)[self.gaussians.get(SEEN)[:, 0] > 0]
@@ -115,7 +116,7 @@ class Edit:
     def choose(
         self, chosen: NDArray[np.bool_], copies: int | NDArray[np.integer], kept: int, shrink: float = 1.0
     ) -> None:
-        """Give the Gaussians that the host has chosen, [N], their outcome.
+        """Give an outcome to the Gaussians that are `chosen`, [N].
 
         copies: rows that each becomes, one number or [N]; kept: how many of them are the old row, with its moments and
         statistics; the others are fresh.
@@ -142,11 +143,11 @@ class Edit:
         self.gaussians.zero_rows([name for name in names if name in self.gaussians.tables], rows)
 
     def rows(self) -> NDArray[np.uint32]:
-        """How many rows each Gaussian will have, [N]."""
+        """Return the number of rows that each Gaussian becomes, [N]."""
         return self.copies.get()
 
     def limit(self, limit: int) -> None:
-        """Take growth back until at most `limit` rows remain: from the smallest values of the first column on."""
+        """Undo growth until at most `limit` rows remain; the smallest means of the first column come first."""
         rows, kept = self.rows().astype(np.int64), self.kept.get()
         growing = np.flatnonzero(rows > 1)
         score = self.stats.mean(self.stats.names[0]) if self.stats.names else np.zeros(len(rows), np.float32)
@@ -158,7 +159,7 @@ class Edit:
         self.kept.set(kept)
 
     def apply(self, tiler: Tiler) -> None:
-        """Move all tables at once and place the children of split Gaussians."""
+        """Rearrange all tables and place the children of split Gaussians."""
         gaussians, device, count = self.gaussians, self.gaussians.device, self.gaussians.count
         row_offset = tiler.scan(self.copies, count, "row_offset")
         rows = int(row_offset.get_item(count))
@@ -189,10 +190,10 @@ class Edit:
 
 
 class Rule(Settings):
-    """A condition and the outcome of the Gaussians that meet it."""
+    """A condition on Gaussians, and the outcome of those that meet it."""
 
     start: Annotated[int, Field(ge=0)] = 0
-    """Global step from which, exclusive, the rule acts."""
+    """Global step after which the rule acts."""
 
     @property
     def statistics(self) -> set[str]:
@@ -205,56 +206,5 @@ class Rule(Settings):
         return set()
 
     def mark(self, edit: Edit) -> None:
-        """Give outcomes by `edit.mark` or `edit.choose`; rows of tables may be changed by `edit.set_rows`."""
+        """Give outcomes with `edit.mark` or `edit.choose`; change rows of tables with `edit.set_rows`."""
         raise NotImplementedError
-
-
-@dataclass(frozen=True)
-class Change:
-    """Numbers of Gaussians before and after an edit."""
-
-    before: int
-    after: int
-    causes: dict[str, int]  # Gaussians whose outcome a rule decided in the end, by the rule's name
-    grown: dict[str, int]  # of these, the ones that became several
-
-
-def densify(edit: Edit, rules: Sequence[Rule], tiler: Tiler, limit: int | None = None) -> Change:
-    """Apply the rules in their order, as one rearrangement, and start the statistics anew.
-
-    Growth stops at `limit` Gaussians: those with the largest screen gradient (the first column) grow first.
-    """
-    gaussians = edit.gaussians
-    before = gaussians.count
-    acting = [(number, rule) for number, rule in enumerate(rules) if edit.step > rule.start]
-    decided_by = np.full(before, -1)
-    for edit.rule, rule in acting:
-        rows = edit.rows()
-        rule.mark(edit)
-        decided_by[edit.rows() != rows] = edit.rule
-    if limit is not None and int(edit.rows().sum(dtype=np.int64)) > limit:
-        edit.limit(limit)
-    rows = edit.rows()
-    decided_by[rows == 1] = -1
-    causes: dict[str, int] = {}
-    grown: dict[str, int] = {}
-    for number, rule in acting:
-        name = getattr(rule, "type", "rule")
-        causes[name] = causes.get(name, 0) + int((decided_by == number).sum())
-        grown[name] = grown.get(name, 0) + int(((decided_by == number) & (rows > 1)).sum())
-    edit.apply(tiler)
-    edit.stats.clear()
-    return Change(before, gaussians.count, causes, grown)
-
-
-def cap_opacity(gaussians: Gaussians, limit: float) -> None:
-    """Let no Gaussian stay more opaque than `limit` as it is drawn, world filter included (the opacity reset)."""
-    gaussians.device.program("density.cl").cap_opacity(
-        items=gaussians.count,
-        log_scales=gaussians["log_scales"],
-        filter_variance=gaussians["filter_variance"],
-        logit_opacity=gaussians["logit_opacity"],
-        limit=limit,
-        stride=gaussians.capacity,
-        count=gaussians.count,
-    )

@@ -1,7 +1,7 @@
-"""What the views since the last edit said about each Gaussian, in named columns that density rules choose from.
+"""Statistics of each Gaussian over the views since the last edit, in named columns that density rules read.
 
-A column is a table `stats/<name>`: the sum of one number per view, over the views that saw the Gaussian.  Its mean
-divides the sum by the number of those views, or by another column.  Only columns that a rule reads are summed.
+A column is a table `stats/<name>`: the sum of one number per view, over the views that see the Gaussian.  Its mean is
+the sum divided by the number of those views, or by another column.  Only columns that a rule reads are summed.
 """
 
 from abc import abstractmethod
@@ -27,10 +27,10 @@ TEXTURE = int(constants("splat.h")["SUM_TEXTURE"])
 
 
 class Statistic(Settings):
-    """How one view adds to a column."""
+    """A column, and how a view adds to it."""
 
-    pixel_sums: ClassVar[int] = PIXEL_SUMS  # sums over pixels that the backward pass must make
-    divisor: ClassVar[str] = "seen"  # column by which the mean divides: views that saw the Gaussian, or another sum
+    pixel_sums: ClassVar[int] = PIXEL_SUMS  # number of sums over pixels that the backward pass must compute
+    divisor: ClassVar[str] = "seen"  # column that divides the sum: views that see the Gaussian, or another column
 
     @abstractmethod
     def add(self, gaussians: Gaussians, view: ViewGradients, grad_mean2d: Array, total: Array) -> None:
@@ -38,9 +38,9 @@ class Statistic(Settings):
 
 
 class ScreenGrad(Statistic):
-    """Length of the gradient by the projected mean (Kerbl et al. 2023).
+    """Length of the gradient by the projected mean, in normalised device coordinates (Kerbl et al. 2023).
 
-    Gradients count in normalised device coordinates, as the published thresholds do.
+    Published thresholds have the same unit.
     """
 
     type: Literal["screen_grad"] = "screen_grad"
@@ -52,7 +52,7 @@ class ScreenGrad(Statistic):
 
 
 class ScreenGradAbs(Statistic):
-    """The same of sums of absolute values over pixels, which do not cancel (AbsGS, Ye et al. 2024)."""
+    """`screen_grad` from sums of absolute values over pixels, which do not cancel (AbsGS, Ye et al. 2024)."""
 
     type: Literal["screen_grad_abs"] = "screen_grad_abs"
     pixel_sums = ABS_X + 2
@@ -64,7 +64,7 @@ class ScreenGradAbs(Statistic):
 
 
 class ScreenGradAbsSum(Statistic):
-    """Those sums of absolute values in x and in y added up (Gaussian Opacity Fields, Yu et al. 2024)."""
+    """The absolute sums of `screen_grad_abs` in x and in y, added (Gaussian Opacity Fields, Yu et al. 2024)."""
 
     type: Literal["screen_grad_abs_sum"] = "screen_grad_abs_sum"
     pixel_sums = ABS_X + 2
@@ -78,7 +78,7 @@ class ScreenGradAbsSum(Statistic):
 class Texture(Statistic):
     """The photograph's gradient magnitude under the splat, per px: Σ α T |∇I| / Σ α T over pixels of all views.
 
-    What a mask hides is left out of both sums.
+    Both sums leave out masked pixels.
     """
 
     type: Literal["texture"] = "texture"
@@ -110,7 +110,7 @@ class RenderedTexture(Statistic):
 
 
 class ScreenRadius(Statistic):
-    """Three standard deviations on the screen, px."""
+    """Radius of the splat, three standard deviations, px."""
 
     type: Literal["screen_radius"] = "screen_radius"
 
@@ -121,7 +121,7 @@ class ScreenRadius(Statistic):
 
 
 class BlendWeight(Statistic):
-    """How much of the image a splat is: its α T, summed over pixels whose texture is known."""
+    """Weight of a splat in the image: α T, summed over pixels whose texture is known."""
 
     type: Literal["blend_weight"] = "blend_weight"
     pixel_sums = TEXTURE + 1
@@ -134,10 +134,10 @@ StatisticName = Annotated[str, VariantName(Statistic)]
 
 
 class SplatStats:
-    """The columns of a model, and how many views saw each Gaussian."""
+    """The columns of a model, and the number of views that see each Gaussian."""
 
     def __init__(self, gaussians: Gaussians, names: Collection[str] = ("screen_grad",)) -> None:
-        """Attach the columns `names` and those that divide them, drop any other; what is there keeps its sums."""
+        """Attach the columns `names` and their divisors, drop all others; existing columns keep their sums."""
         self.gaussians = gaussians
         known = variants(Statistic)
         needed = {*names, *(known[name].divisor for name in names)}
@@ -156,20 +156,20 @@ class SplatStats:
 
     @property
     def pixel_sums(self) -> int:
-        """How many sums over pixels the backward pass must make for these columns."""
+        """Number of sums over pixels that the backward pass must compute for these columns."""
         return max((column.pixel_sums for column in self.columns.values()), default=PIXEL_SUMS)
 
     def total(self, name: str) -> Array:
-        """A column's sums over views, [S]."""
+        """Return a column's sums over views, [S]."""
         return self.gaussians[FOLDER + name]
 
     def divisor(self, name: str) -> Array:
-        """The sums by which a column's mean divides, [S]."""
+        """Return the sums that divide a column, [S]."""
         return self.gaussians[FOLDER + self.columns[name].divisor]
 
     @property
     def seen(self) -> Array:
-        """Number of views that saw each Gaussian, [S]."""
+        """Number of views that see each Gaussian, [S]."""
         return self.gaussians[SEEN]
 
     def add(self, view: ViewGradients, grad_mean2d: Array) -> None:
@@ -182,11 +182,12 @@ class SplatStats:
             column.add(gaussians, view, grad_mean2d, self.total(name))
 
     def mean(self, name: str) -> NDArray[np.float32]:
-        """A column's mean for each Gaussian, on the host, [N]; 0 where no view gave it weight."""
+        """Return a column's mean for each Gaussian, on the host, [N]; 0 where the divisor is 0."""
         total, divisor = (self.gaussians.get(FOLDER + table)[:, 0] for table in (name, self.columns[name].divisor))
         return np.divide(total, divisor, out=np.zeros_like(total), where=divisor > 0)
 
     def clear(self) -> None:
+        """Set all columns to zero."""
         for name in self.gaussians.tables:
             if name.startswith(FOLDER):
                 self.gaussians[name].fill(0)

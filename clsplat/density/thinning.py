@@ -1,4 +1,4 @@
-"""Rules that show the same scene with fewer Gaussians (the refinement of Micro-splatting's second version, Lee et al.
+"""Rules that reduce the number of Gaussians (the refinement of Micro-splatting's second version, Lee et al.
 2025b; thresholds and formulas are ours)."""
 
 from typing import Literal
@@ -17,7 +17,7 @@ Floats = NDArray[np.float64]
 
 
 class PruneUnimportant(Rule):
-    """Remove the share of all Gaussians with the least opacity times mean scale."""
+    """Remove a share of all Gaussians: those with the smallest opacity times geometric mean scale."""
 
     type: Literal["prune_unimportant"] = "prune_unimportant"
     share: Share = 0.05
@@ -35,9 +35,9 @@ class PruneUnimportant(Rule):
 class MergeNeighbours(Rule):
     """Replace two mutual nearest neighbours, close and of like colour, by one Gaussian.
 
-    It has the mean and covariance of their mixture, the mean of their colours, and the opacity that keeps opacity times
-    volume; weights are opacity times volume.  The heavier one keeps its row, its statistics and Adam's moments, except
-    those of scales and rotation.
+    It has the mean and covariance of their mixture and the mean of their colours, weighted by opacity times volume, and
+    the opacity that keeps the sum of these weights.  The row of the heavier one stays, with its statistics and Adam's
+    moments, except those of scales and rotation.
     """
 
     type: Literal["merge_neighbours"] = "merge_neighbours"
@@ -58,7 +58,7 @@ class MergeNeighbours(Rule):
             return
         for name, values in merged(tables, first, second).items():
             edit.set_rows(name, first, values)
-        edit.zero_moments(first, ("log_scales", "quats"))  # they were of other axes
+        edit.zero_moments(first, ("log_scales", "quats"))  # which belong to other axes
         absorbed = np.zeros(gaussians.count, bool)
         absorbed[second] = True
         edit.choose(absorbed, copies=0, kept=0)
@@ -66,7 +66,7 @@ class MergeNeighbours(Rule):
     def _pairs(self, edit: Edit, tables: dict[str, Floats]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Rows of mutual nearest neighbours that may merge, the heavier one first."""
         means, mass = tables["means"], mass_of(tables)
-        if len(means) < 2 or not np.isfinite(means).all():  # the next report stops the training
+        if len(means) < 2 or not np.isfinite(means).all():  # the next report ends the training
             return np.empty(0, np.int64), np.empty(0, np.int64)
         rows = np.arange(len(means))
         distances, found = cKDTree(means).query(means, k=2)
@@ -83,13 +83,13 @@ class MergeNeighbours(Rule):
 
 
 def mass_of(tables: dict[str, Floats]) -> Floats:
-    """Opacity times volume, up to a constant, [N]."""
+    """Return opacity times volume, up to a constant, [N]."""
     mass: Floats = np.exp(tables["log_scales"].sum(axis=1)) / (1 + np.exp(-tables["logit_opacity"][:, 0]))
     return mass
 
 
 def merged(tables: dict[str, Floats], first: NDArray[np.int64], second: NDArray[np.int64]) -> dict[str, Floats]:
-    """The Gaussians with the mean and covariance of mixtures of `first` and `second`, by parameter, [pairs, ...]."""
+    """Return Gaussians with mean and covariance of mixtures of `first` and `second`, by parameter, [pairs, ...]."""
     mass = mass_of(tables)
     total = mass[first] + mass[second]
     share = (mass[second] / total)[:, None]
@@ -99,7 +99,7 @@ def merged(tables: dict[str, Floats], first: NDArray[np.int64], second: NDArray[
         offset = tables["means"][rows] - means
         own = covariance_of(tables["quats"][rows], tables["log_scales"][rows])
         covariance += weight[:, :, None] * (own + offset[:, :, None] * offset[:, None, :])
-    variances, axes = np.linalg.eigh(covariance)
+    variances, axes = np.linalg.eigh(covariance)  # scene units²
     log_scales = 0.5 * np.log(np.maximum(variances, 1e-30))
     axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]  # a rotation, not a reflection
     opacity = np.clip(total / np.exp(log_scales.sum(axis=1)), 1e-6, 0.99)
@@ -116,7 +116,7 @@ def merged(tables: dict[str, Floats], first: NDArray[np.int64], second: NDArray[
 
 
 def covariance_of(quats: Floats, log_scales: Floats) -> Floats:
-    """R diag(s²) Rᵀ, [N, 3, 3]."""
+    """Return R diag(s²) Rᵀ, [N, 3, 3] scene units²."""
     rotations = rotation_matrix(*(quats / np.linalg.norm(quats, axis=1, keepdims=True)).T)
     axes = rotations * np.exp(log_scales)[:, None, :]
     covariance: Floats = np.einsum("nij,nkj->nik", axes, axes)

@@ -1,4 +1,4 @@
-"""Thresholds of density rules: a number by step, or a quantile of what the scene itself shows."""
+"""Thresholds of density rules: a number by step, or a quantile of the scene's own values."""
 
 from typing import Annotated, Literal
 
@@ -11,19 +11,19 @@ Share = Annotated[float, Field(ge=0, le=1)]
 
 
 class Quantile(Settings):
-    """The value that a share of the Gaussians stay below."""
+    """The quantile of a statistic over the Gaussians."""
 
     quantile: Share
-    """Share of the Gaussians."""
+    """Share of the Gaussians that stay below the threshold."""
     of: Literal["gaussians"] = "gaussians"
     """The Gaussians' own values."""
 
 
 class PixelQuantile(Settings):
-    """The texture that a share of the training photographs' pixels stay below."""
+    """The quantile of the texture, per px, over the pixels of the training photographs."""
 
     quantile: Share
-    """Share of the pixels."""
+    """Share of the pixels that stay below the threshold."""
     of: Literal["pixels"]
     """The photographs' pixels."""
 

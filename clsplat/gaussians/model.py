@@ -1,19 +1,25 @@
 """A model on the host: NumPy arrays in the units of model files, and the numbers with which they are rendered."""
 
-import html
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.gaussians.ply import read_ply, write_ply
+from clsplat.gaussians.ply import MAX_DEGREE, read_ply, write_ply
 from clsplat.gaussians.sh import rotated_sh
-from clsplat.gaussians.tables import PARAMETERS, SH_C0, sh_coefficients
+from clsplat.gaussians.tables import PARAMETERS, SH_C0, DeviceModel, Gaussians, sh_coefficients
+from clsplat.opencl.device import Device
 
+MODEL = "point_cloud.ply"  # of a run folder
 Floats = NDArray[np.float32]
+WIDTHS = {  # of the tables
+    **{"means": (3,), "quats": (4,), "log_scales": (3,), "logit_opacity": (1,), "sh_base": (3,)},
+    "sh_rest": tuple(3 * (sh_coefficients(degree) - 1) for degree in range(MAX_DEGREE + 1)),
+    "filter_variance": (1,),
+}
 MIP_VARIANCE = 0.1  # px², of files that say no more than `mip` (Yu et al. 2024)
 
 
@@ -24,8 +30,8 @@ class Rendering:
     near: float = 0.2  # scene units; nearer Gaussians are not drawn
     screen_variance: float = 0.3  # px², added to every splat
     compensate: float = 0.0  # 1: the opacity falls as that variance spreads a splat out
-    background: str | None = None  # black or white; None: what the scene says
-    alpha: str = "transparency"  # what the fourth channel of its photographs was
+    background: Literal["black", "white"] | None = None  # None: what the scene says
+    alpha: Literal["transparency", "mask"] = "transparency"  # what the fourth channel of its photographs was
     notes: Mapping[str, Any] = field(default_factory=dict)  # what else the file says
 
     @classmethod
@@ -34,19 +40,26 @@ class Rendering:
         mip = {"screen_variance": MIP_VARIANCE, "compensate": 1.0} if mode == "mip" else {}
         names = ("near", "screen_variance", "compensate")
         given = {name: float(comment[name]) for name in names if isinstance(comment.get(name), int | float)}
-        background = comment.get("background") if comment.get("background") in ("black", "white") else None
-        alpha = "mask" if comment.get("alpha") == "mask" else "transparency"
-        return cls(**{**mip, **given}, background=background, alpha=alpha, notes=dict(comment))
+        return cls(
+            **{**mip, **given},
+            background=comment["background"] if comment.get("background") in ("black", "white") else None,
+            alpha="mask" if comment.get("alpha") == "mask" else "transparency",
+            notes=dict(comment),
+        )
 
     def comment(self) -> dict[str, Any]:
         """What a model file says about rendering."""
         numbers = {"near": self.near, "screen_variance": self.screen_variance, "compensate": self.compensate}
-        return {**self.notes, **numbers, "background": self.background or "black", "alpha": self.alpha}
+        known = {"background": self.background} if self.background else {}
+        return {**self.notes, **numbers, **known, "alpha": self.alpha}
 
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """N Gaussians before activation, float32, with the names that pipelines, kernels and checkpoints have."""
+    """N Gaussians before activation, float32, with the names that pipelines, kernels and checkpoints have.
+
+    Raises ValueError, with the name of the table, where shapes do not fit.
+    """
 
     means: Floats  # [N, 3] scene units
     quats: Floats  # [N, 4] (w, x, y, z), unnormalised
@@ -61,15 +74,21 @@ class Model:
 
     def __post_init__(self) -> None:
         count = len(self.means)
-        widths = {"means": 3, "quats": 4, "log_scales": 3, "logit_opacity": 1, "sh_base": 3}
         for name, table in self.tables().items():
-            object.__setattr__(self, name, np.ascontiguousarray(table, np.float32))
-            width = widths.get(name, 1 if name == "filter_variance" else 3 * (sh_coefficients(self.sh_degree) - 1))
-            if table.shape != (count, width):
-                raise ValueError(f"{name} has shape {table.shape}; expected {(count, width)}")
+            array = np.ascontiguousarray(table, np.float32)
+            if array.shape not in [(count, width) for width in WIDTHS[name]]:
+                widths = " or ".join(map(str, WIDTHS[name]))
+                raise ValueError(f"{name} has shape {array.shape}; expected ({count}, {widths})")
+            object.__setattr__(self, name, array)
 
     def __len__(self) -> int:
         return len(self.means)
+
+    def upload(self, device: Device) -> DeviceModel:
+        """Copy the model to a device, for the rasterizer."""
+        numbers = self.rendering
+        gaussians = Gaussians(device, self.tables())
+        return DeviceModel(gaussians, self.sh_degree, numbers.near, numbers.screen_variance, numbers.compensate)
 
     def tables(self) -> dict[str, Floats]:
         """The arrays by name; filter_variance where there is one."""
@@ -98,7 +117,7 @@ class Model:
         return np.asarray(self.sh_base * SH_C0 + 0.5, np.float32)
 
     def __getitem__(self, chosen: Any) -> "Model":
-        """Return some of the Gaussians, by a mask, indices or a slice."""
+        """Return some of the Gaussians, by a mask [N], an array of indices, a slice, or one index."""
         tables: dict[str, Any] = {name: np.atleast_2d(table[chosen]) for name, table in self.tables().items()}
         return replace(self, **tables)
 
@@ -107,10 +126,12 @@ class Model:
     ) -> "Model":
         """Return the model after x -> scale · rotation x + translation; colours turn with it.
 
-        rotation: [3, 3]; translation: [3] scene units.  Raises ValueError for a rotation that is none.
+        rotation: [3, 3]; translation: [3] scene units.  Raises ValueError for a matrix that is not a rotation.
         """
         turn = np.eye(3) if rotation is None else np.asarray(rotation, np.float64)
-        if scale <= 0 or turn.shape != (3, 3) or not np.allclose(turn @ turn.T, np.eye(3), atol=1e-5):
+        if np.shape(translation) != (3,):
+            raise ValueError(f"the translation has shape {np.shape(translation)}; expected (3,)")
+        if not scale > 0 or turn.shape != (3, 3) or not np.allclose(turn @ turn.T, np.eye(3), atol=1e-5):
             raise ValueError("expected a positive scale and a rotation matrix [3, 3]")
         if np.linalg.det(turn) < 0:
             raise ValueError("expected a rotation; this matrix mirrors")
@@ -126,13 +147,18 @@ class Model:
         return replace(self, **{k: v.astype(np.float32) for k, v in changed.items()}, rendering=rendering)
 
     def save(self, path: str | Path) -> None:
-        """Write a PLY in the layout of 3DGS.  Raises OutputError when it cannot be written."""
+        """Write a PLY in the layout of 3DGS; a world filter is kept as it is, as a property `filter_3D`.
+
+        Raises OutputError when it cannot be written.
+        """
         write_ply(Path(path), self.tables(), self.rendering.comment())
 
     def __repr__(self) -> str:
         return f"Model({len(self):,} Gaussians, SH degree {self.sh_degree})"
 
     def _repr_html_(self) -> str:
+        from clsplat.pages.notebook import summary
+
         low, high = (self.means.min(axis=0), self.means.max(axis=0)) if len(self) else (np.zeros(3), np.zeros(3))
         rows = {
             "Gaussians": f"{len(self):,}",
@@ -142,14 +168,13 @@ class Model:
             "median opacity": f"{float(np.median(self.opacities)):.3g}" if len(self) else "–",
             "size as PLY": f"{sum(table.nbytes for table in self.tables().values()) / 2**20:,.1f} MiB",
         }
-        cells = "".join(f"<tr><th>{html.escape(k)}</th><td>{html.escape(v)}</td></tr>" for k, v in rows.items())
-        return f"<table>{cells}</table>"
+        return summary(rows)
 
 
 def load(path: str | Path) -> Model:
     """Read a model file, or the model of a run folder.  Raises DataError when it is missing, damaged or not a splat."""
     path = Path(path)
-    file = read_ply(path / "point_cloud.ply" if path.is_dir() else path)
+    file = read_ply(path / MODEL if path.is_dir() else path)
     return Model(**file.parameters, rendering=Rendering.of(file.rendering, file.mode))
 
 

@@ -4,8 +4,8 @@
 
 f_rest is channel-major (all red, all green, all blue); opacity is a logit, scales are logarithms, rot is (w, x, y, z).
 Normals are written as zeros.  Where a world filter is not yet part of scales and opacity, `filter_3D` follows, its
-standard deviation (Mip-Splatting).  Comments carry the numbers a rasterizer needs, and the mode by which viewers know
-that opacities lose what a filter on the screen spreads out: `SplatRenderMode: mip`, else `default`.
+standard deviation (Mip-Splatting).  Comments hold the numbers that a rasterizer needs, and the mode for viewers:
+`SplatRenderMode: mip` when a screen filter reduces opacities to keep their energy, else `default`.
 """
 
 import json
@@ -37,7 +37,7 @@ Parameters = dict[str, NDArray[np.float32]]  # by the names of PARAMETERS, each 
 
 @dataclass(frozen=True)
 class SplatFile:
-    """A model file: the parameters and what its comment says about rendering them."""
+    """A model file: the parameters, and the numbers of its comment for rendering them."""
 
     parameters: Parameters  # filter_variance too, where the file has it
     rendering: dict[str, Any] = field(default_factory=dict)
@@ -45,7 +45,7 @@ class SplatFile:
 
 
 def is_splat(path: Path) -> bool:
-    """Tell a splat from a point cloud by its header.  Raises DataError when it is missing or not a PLY."""
+    """Return whether the header of a PLY file declares splats.  Raises DataError when it is missing or no PLY."""
     return "f_dc_0" in (parse_ply_header(path, _read(path, MAX_HEADER)).dtype.names or ())
 
 
@@ -58,8 +58,8 @@ def read_ply(path: Path) -> SplatFile:
     expected = header.start + header.count * header.dtype.itemsize
     if len(data) < expected:
         raise DataError(
-            f"{path}: holds {len(data)} bytes, but its header promises {header.count} splats, {expected} bytes; "
-            "the file is cut short, copy or export it again"
+            f"{path}: holds {len(data)} bytes, but its header declares {header.count} splats, {expected} bytes; "
+            "the file is truncated: copy or export it again"
         )
     parameters = _parameters(path, np.frombuffer(data, header.dtype, header.count, header.start))
     mode = "mip" if "filter_variance" in parameters else _comment(header, MODE) or "default"
@@ -78,7 +78,7 @@ def _read(path: Path, size: int = -1) -> bytes:
 def write_ply(path: Path, parameters: Parameters, rendering: dict[str, Any]) -> None:
     """Write parameters in the reference's order, and filter_variance where it is given.
 
-    `rendering` goes into a comment as JSON; where it says `compensate`, the file's mode is mip.
+    `rendering` becomes a comment in JSON; with `compensate` in it, the file's mode is mip.  Raises OutputError.
     """
     count = len(parameters["means"])
     coefficients = 1 + parameters["sh_rest"].shape[1] // 3
@@ -112,7 +112,7 @@ def write_ply(path: Path, parameters: Parameters, rendering: dict[str, Any]) -> 
 
 
 def _comment(header: PlyHeader, start: str) -> str:
-    """What follows `start` in the first comment that begins with it, or ""."""
+    """The text after `start` in the first comment that begins with it, or ""."""
     return next((text.removeprefix(start).strip() for text in header.comments if text.startswith(start)), "")
 
 
@@ -130,7 +130,7 @@ def _parameters(path: Path, vertices: NDArray[Any]) -> Parameters:
     if missing:
         raise DataError(
             f"{path}: not a splat file: it has no {', '.join(missing[:4])}{' …' if len(missing) > 4 else ''}; "
-            "train a point cloud first, convert a compressed file"
+            "train from a point cloud with `clsplat run`, or decompress the file first"
         )
     rest = sum(name.startswith("f_rest_") for name in names)
     degree = next((d for d in range(MAX_DEGREE + 1) if 3 * (sh_coefficients(d) - 1) == rest), None)

@@ -1,13 +1,13 @@
-"""Real spherical harmonics as the kernels have them (cl_kernels/harmonics.h), and their rotation."""
+"""Real spherical harmonics, as in cl_kernels/harmonics.h, and their rotation."""
 
 import numpy as np
 from numpy.typing import NDArray
 
-DIRECTIONS = 64  # more than enough to tell the functions of a band apart
+DIRECTIONS = 64  # samples of a band's functions; a band has at most 7 functions
 
 
 def basis(directions: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Values of the bands 1 to 3 at unit directions, [M, 15]."""
+    """Return the values of the bands 1 to 3 at unit directions, [M, 15]."""
     x, y, z = directions.astype(np.float64).T
     xx, yy, zz = x * x, y * y, z * z
     values = [
@@ -23,7 +23,7 @@ def basis(directions: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 def rotated_sh(sh_rest: NDArray[np.floating], rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Coefficients [N, (K-1)*3], coefficient-major, of the same colours seen in a world that is turned by [3, 3].
+    """Return the coefficients [N, (K-1)*3], coefficient-major, of the same colours after a rotation [3, 3].
 
     A rotation maps each band onto itself, so each band's matrix follows from values at a few directions.
     """

@@ -1,7 +1,7 @@
 """Gaussians on the device: a struct of arrays, and the one operation that changes their number.
 
-Every table is a set of planes [components, capacity]; hosts see [N, components].  Whatever belongs to a Gaussian is a
-table here, parameters, Adam moments and statistics alike, so that nothing can get out of step when rows move.
+Every table is a set of planes [components, capacity] on the device, and [N, components] on the host.  Parameters,
+Adam's moments and statistics are all tables, so that their rows always move together.
 
     means [3] scene units · quats [4] (w, x, y, z), unnormalised · log_scales [3] log of scene units
     logit_opacity [1] · sh_base [3] band 0 · sh_rest [(K-1)*3] the other bands, coefficient-major
@@ -18,14 +18,14 @@ from numpy.typing import NDArray
 from clsplat.opencl.device import Array, Device
 
 PARAMETERS = ("means", "quats", "log_scales", "logit_opacity", "sh_base", "sh_rest")
-INTERVAL2 = "sampling_interval2"  # scene units², at the training view that samples finest; only where it is read
+INTERVAL2 = "sampling_interval2"  # scene units², the smallest over training views; exists only where it is read
 ALIGNMENT = 64  # capacity is a multiple of this: wide kernels need no tail
 GROWTH = 1.5
 SH_C0 = 0.28209479177387814  # basis function of band 0
 
 
 def sh_coefficients(degree: int) -> int:
-    """Number of basis functions K up to `degree`."""
+    """Return the number K of basis functions up to `degree`."""
     return (degree + 1) ** 2
 
 
@@ -39,7 +39,7 @@ class Table:
 
 
 class Gaussians:
-    """N Gaussians and all that belongs to them."""
+    """N Gaussians and their tables."""
 
     def __init__(self, device: Device, parameters: Mapping[str, NDArray[np.float32]]) -> None:
         """Upload `parameters`, each [N, components] by the names of PARAMETERS; filter_variance may be given too."""
@@ -80,7 +80,7 @@ class Gaussians:
         table.array.set(planes)
 
     def set_rows(self, name: str, rows: NDArray[np.integer], values: NDArray[Any]) -> None:
-        """Write [n, components] from the host into some rows, [n], of a table; no row may be named twice."""
+        """Write [n, components] from the host into some rows, [n], of a table; no row may occur twice."""
         table = self.tables[name]
         if values.shape != (len(rows), table.components):
             raise ValueError(f"{name}: expected {(len(rows), table.components)}, got {values.shape}")
@@ -108,7 +108,7 @@ class Gaussians:
             )
 
     def not_finite(self) -> list[str]:
-        """Names of the parameters that hold NaN or infinity."""
+        """Return the names of the parameters that hold NaN or infinity."""
         program = self.device.program("check.cl")
         counters = {name: self.device.zeros(1, np.uint32) for name in PARAMETERS}
         for name, counter in counters.items():
@@ -122,7 +122,7 @@ class Gaussians:
         return [name for name, counter in counters.items() if counter.get_item(0) > 0]
 
     def rearrange(self, source: Array, fresh: Array, count: int) -> None:
-        """Row i of every table becomes row source[i]; fresh rows of moments and statistics become zero.
+        """Make row i of every table its row source[i]; set fresh rows of moments and statistics to zero.
 
         source, fresh: [count] uint32.  The only operation that changes the number of Gaussians.
         """
@@ -150,7 +150,7 @@ class Gradients:
     """Derivatives of the loss by each parameter, with the shapes of the parameters."""
 
     def __init__(self, gaussians: Gaussians) -> None:
-        self.capacity = gaussians.capacity
+        self.size = gaussians.capacity, gaussians.sh_degree
         self.arrays = {
             name: gaussians.device.zeros((gaussians.tables[name].components, gaussians.capacity)) for name in PARAMETERS
         }
@@ -160,7 +160,7 @@ class Gradients:
         return self.arrays[name]
 
     def arguments(self) -> dict[str, Any]:
-        """The arrays by the names that kernels give them."""
+        """Return the arrays by the names of the kernels' arguments."""
         return {**{f"grad_{name}": array for name, array in self.arrays.items()}, "grad_mean2d": self.mean2d}
 
 
@@ -172,11 +172,11 @@ class DeviceModel:
     degree: int  # active SH degree
     near: float = 0.2  # scene units
     screen_variance: float = 0.3  # px²
-    compensate: float = 0.0  # 1: opacity loses what the screen filter spreads out
+    compensate: float = 0.0  # 1: the opacity falls as the screen filter enlarges the splat
 
 
 def moment_tables(parameter: str) -> tuple[str, str]:
-    """Names of the tables that hold Adam's two moments of a parameter."""
+    """Return the names of the tables that hold Adam's two moments of a parameter."""
     return f"adam/{parameter}/moment1", f"adam/{parameter}/moment2"
 
 

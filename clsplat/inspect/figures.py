@@ -19,7 +19,7 @@ def figures(facts: Facts) -> dict[str, str]:
     if facts.extent is not None:
         lines["extent"] = f"{facts.extent:.4g} scene units around the cameras"
         if facts.strayed:
-            lines["extent"] += f", without {len(facts.strayed)} far away from all others"
+            lines["extent"] += f", without {len(facts.strayed)} that are far away from all others"
     if points := facts.points:
         lines["points"] = f"{points.count:,}"
         if points.error_mean is not None:
@@ -35,7 +35,7 @@ def figures(facts: Facts) -> dict[str, str]:
 
 
 def camera_line(camera: CameraFacts) -> str:
-    """A camera on one line."""
+    """Return a camera on one line."""
     fx, fy = camera.focal
     focal = f"{fx:.1f}" if abs(fx - fy) < 0.05 else f"{fx:.1f}, {fy:.1f}"
     amount = "without bounds" if camera.distortion is None else f"up to {camera.distortion:.1f} px"

@@ -1,4 +1,4 @@
-"""What the facts about a dataset mean for training, and what to do about it."""
+"""Findings: what the facts about a dataset mean for training, each with its remedy."""
 
 import os
 from collections.abc import Iterator, Sequence
@@ -21,7 +21,7 @@ FOCAL_RANGE = (0.2, 20.0)  # focal length by image width: 136 to 3 degrees
 
 @dataclass(frozen=True)
 class Finding:
-    """What is wrong, and what to do; errors keep training from starting."""
+    """A fault of a dataset and its remedy.  With an error, training does not start."""
 
     level: Level
     fault: str
@@ -29,12 +29,12 @@ class Finding:
 
     @property
     def text(self) -> str:
-        """One sentence."""
+        """Fault and remedy in one sentence."""
         return f"{self.fault}: {self.remedy}" if self.remedy else self.fault
 
 
 def findings(facts: Facts) -> list[Finding]:
-    """Return what there is to say about a dataset, the worst first."""
+    """Return the findings about a dataset, errors first, then warnings and notes."""
     found = [*_unreadable(facts), *_photographs(facts), *_cameras(facts), *_poses(facts), *_points(facts)]
     if facts.refusal and not any(finding.level == "error" for finding in found):
         found.append(Finding("error", facts.refusal))
@@ -42,12 +42,12 @@ def findings(facts: Facts) -> list[Finding]:
 
 
 def trainable(found: Sequence[Finding]) -> bool:
-    """Whether there is no error."""
+    """Return whether no finding is an error."""
     return all(finding.level != "error" for finding in found)
 
 
 def verdict(found: Sequence[Finding]) -> str:
-    """The sum of the findings in a sentence."""
+    """Return the findings in one sentence: the first error or warning, and the number of the others."""
     errors, warnings = ([f.fault for f in found if f.level == level] for level in ("error", "warning"))
     worst, start = (errors, "cannot train: ") if errors else (warnings, "trains, but ")
     if not worst:
@@ -60,7 +60,7 @@ def _unreadable(facts: Facts) -> Iterator[Finding]:
     if facts.kind == "none" and facts.on_disk:
         folder = os.path.dirname(os.path.join(facts.path, facts.unregistered[0]))
         fault = f"{facts.path} holds {_counted(facts.on_disk, 'photograph')} but no camera poses"
-        yield Finding("error", fault, f"`clsplat run photos --scene {folder}` finds where they were taken")
+        yield Finding("error", fault, f"`clsplat run photos --scene {folder}` finds the cameras")
     yield from (Finding("error", fault) for fault in facts.faults[:MAX_NAMES])
     if len(facts.faults) > MAX_NAMES:
         more = f"{_counted(len(facts.faults) - MAX_NAMES, 'more part')} of the dataset cannot be read"
@@ -72,25 +72,27 @@ def _photographs(facts: Facts) -> Iterator[Finding]:
     if facts.missing:
         fault = f"{len(facts.missing)} of {facts.registered} registered images are missing on disk"
         yield Finding(
-            "error", f"{fault} ({_few(facts.missing)})", "put the files back, or remove them from the dataset"
+            "error", f"{fault} ({_listed(facts.missing)})", "put the files back, or remove them from the dataset"
         )
     if photographs.unreadable:
-        unreadable = _few(list(photographs.unreadable))
+        unreadable = _listed(list(photographs.unreadable))
         fault = f"{_counted(len(photographs.unreadable), 'image file')} cannot be read ({unreadable})"
         yield Finding("error", fault, "copy or export them again")
     if photographs.misfits:
         sizes = [f"{name} is {size}" for name, size in photographs.misfits.items()]
-        fault = f"{_are(len(sizes), 'image file')} not of the camera's size ({_few(sizes, 2)})"
+        fault = f"{_are(len(sizes), 'image file')} not of the camera's size ({_listed(sizes, 2)})"
         remedy = "use the images that the cameras were made from"
         if len(photographs.on_side) == len(sizes):
-            remedy = "they lie on their side as seen from the cameras: " + remedy
+            remedy = "width and height are swapped: " + remedy
         yield Finding("error", fault, remedy)
     if photographs.cut:
-        fault = f"the end is missing from {_counted(len(photographs.cut), 'image file')} ({_few(photographs.cut)})"
+        fault = f"the end is missing from {_counted(len(photographs.cut), 'image file')} ({_listed(photographs.cut)})"
         yield Finding("warning", fault, "the rest of the image is grey; copy it again")
     if facts.unregistered:
         share = len(facts.unregistered) / facts.on_disk
-        fault = f"{len(facts.unregistered)} of {facts.on_disk} images on disk have no pose ({_few(facts.unregistered)})"
+        fault = (
+            f"{len(facts.unregistered)} of {facts.on_disk} images on disk have no pose ({_listed(facts.unregistered)})"
+        )
         serious = colmap and facts.registered and share > MAX_SHARE_LEFT_OUT
         remedy = "they are not trained on" + (
             "; more overlapping photographs or colmap exhaustive_matcher may place them" if colmap else ""
@@ -98,31 +100,31 @@ def _photographs(facts: Facts) -> Iterator[Finding]:
         if facts.registered:
             yield Finding("warning" if serious else "note", fault, remedy)
     if photographs.exif_turned:
-        fault = f"{_are(len(photographs.exif_turned), 'photograph')} to be turned, says the EXIF data"
+        fault = f"{_are(len(photographs.exif_turned), 'photograph')} rotated by the EXIF data"
         yield Finding(
-            "note", fault, "the pixels are taken as they are stored, as COLMAP does, so renders may lie on their side"
+            "note", fault, "clsplat reads the pixels as stored, as COLMAP does, so renders may be rotated too"
         )
     if photographs.larger:
         fault = f"{_are(len(photographs.larger), 'image file')} larger than the camera"
-        yield Finding("note", fault, "they are shrunk as they are read; smaller copies would load faster")
+        yield Finding("note", fault, "clsplat reduces them when it reads them; smaller copies load faster")
     for names in facts.same_but_case[:MAX_NAMES]:
         fault = f"{' and '.join(names)} differ only in upper and lower case"
         yield Finding("warning", fault, "they overwrite each other on Windows and macOS; rename one")
     if colmap and facts.same_base:
         fault = f"{_are(facts.same_base, 'file name')} in several folders"
-        yield Finding("note", fault, "views keep the folder in their names; tools that drop it would mix them up")
+        yield Finding("note", fault, "views keep the folder in their names; a tool that drops it confuses the files")
 
 
 def _cameras(facts: Facts) -> Iterator[Finding]:
     sizes = {(camera.width, camera.height) for camera in facts.cameras}
     if len(sizes) > 1:
-        remedy = "that is allowed; a step takes as long as its view is large"
+        remedy = "this is allowed; a larger view takes more time in a step"
         yield Finding("note", f"the photographs have {len(sizes)} sizes", remedy)
     for camera in facts.cameras:
         name = f"the {_camera_name(camera)} of {_counted(camera.views, 'view')}"
         if not FOCAL_RANGE[0] < camera.focal[0] / camera.width < FOCAL_RANGE[1]:
-            fault = f"{name} has a focal length of {camera.focal[0]:.4g} px, which is hardly possible"
-            yield Finding("warning", fault, "calibrate it again, or give the poses' program the right focal length")
+            fault = f"{name} has a focal length of {camera.focal[0]:.4g} px, which is not plausible"
+            yield Finding("warning", fault, "calibrate it again, or find the poses with the right focal length")
         if not camera.centred:
             yield Finding("warning", f"{name} has its principal point outside the image", "calibrate it again")
         if camera.kept < MIN_SHARE_KEPT:
@@ -140,23 +142,23 @@ def _poses(facts: Facts) -> Iterator[Finding]:
         yield Finding("warning" if large else "note", fault, remedy)
     if facts.train is not None and facts.train < MIN_VIEWS:
         fault = f"there {_are(facts.train, 'training view', 'only ')}"
-        yield Finding("warning", fault, "expect floaters and blur away from the photographs; take 30 or more")
+        yield Finding("warning", fault, "expect floaters and blur far from the photographs; take 30 or more")
     if facts.test == 0:
-        yield Finding("note", "there are no test views", "quality will be measured on training views only")
+        yield Finding("note", "there are no test views", "clsplat measures quality on training views only")
     if facts.one_place:
         fault = "all cameras are at the same place"
-        yield Finding("warning", fault, "they do not show depth; take photographs from different places")
+        yield Finding("warning", fault, "they show no depth; take photographs from different places")
     if facts.strayed:
-        fault = f"{_are(len(facts.strayed), 'camera')} far away from all others ({_few(facts.strayed)})"
+        fault = f"{_are(len(facts.strayed), 'camera')} far away from all others ({_listed(facts.strayed)})"
         yield Finding(
             "warning", fault, "the pose is probably wrong; remove the image from the dataset or place it again"
         )
     for names in facts.same_pose[:MAX_NAMES] if not facts.one_place else ():
-        fault = f"{_few(names)} have exactly the same pose"
-        yield Finding("note", fault, "copies of one photograph count double; keep one of them")
+        fault = f"{_listed(names)} have exactly the same pose"
+        yield Finding("note", fault, "training counts copies of a photograph twice; keep one of them")
     if facts.few_seen:
         counted = [f"{name}: {facts.seen[name]}" for name in facts.few_seen]
-        fault = f"fewer than {MIN_SEEN} points are seen by {_counted(len(counted), 'view')} ({_few(counted)})"
+        fault = f"fewer than {MIN_SEEN} points are seen by {_counted(len(counted), 'view')} ({_listed(counted)})"
         yield Finding("warning", fault, "their poses are unreliable; look at their renders, or remove these images")
 
 
@@ -164,7 +166,7 @@ def _points(facts: Facts) -> Iterator[Finding]:
     points = facts.points
     if points is None or points.count == 0:
         if facts.registered and not any("points3d" in fault.lower() for fault in facts.faults):
-            remedy = "training finds some by a plane sweep, or where photographs have alpha takes random ones"
+            remedy = "training starts from a plane sweep, or from random points where photographs have alpha"
             yield Finding("note", "there are no points", remedy)
         return
     if points.count < MIN_POINTS:
@@ -172,14 +174,14 @@ def _points(facts: Facts) -> Iterator[Finding]:
         yield Finding("warning", fault, "try init: {source: random} as well")
     if points.not_finite:
         fault = f"{_are(points.not_finite, 'point')} not finite"
-        yield Finding("warning", fault, "they are left out; the file may be damaged, so export it again")
+        yield Finding("warning", fault, "clsplat leaves them out; the file may be damaged: export it again")
     if points.distant:
         fault = f"{_are(points.distant, 'point')} more than {MAX_DISTANCE:g} times the cameras' extent away"
         yield Finding("note", fault, "usually sky or wrong matches; they become very large Gaussians")
     if not facts.refusal:
         yield from _coverage(points)
     if points.error_mean is not None and points.error_mean > MAX_ERROR:
-        fault = f"the points miss their observations by {points.error_mean:.2f} px on average"
+        fault = f"the mean reprojection error of the points is {points.error_mean:.2f} px"
         yield Finding("warning", fault, "renders will be blurred; run bundle adjustment (colmap bundle_adjuster)")
 
 
@@ -202,10 +204,10 @@ def _counted(count: int, word: str) -> str:
 
 
 def _are(count: int, word: str, before: str = "") -> str:
-    """A count with its verb: behind it, or before it where something stands between, as in `are only 3 views`."""
+    """Return a count with its verb: `3 views are`, or with words before the count `are only 3 views`."""
     verb = "is" if count == 1 else "are"
     return f"{verb} {before}{_counted(count, word)}" if before else f"{_counted(count, word)} {verb}"
 
 
-def _few(names: Sequence[str], limit: int = MAX_NAMES) -> str:
+def _listed(names: Sequence[str], limit: int = MAX_NAMES) -> str:
     return ", ".join(names[:limit]) + (", …" if len(names) > limit else "")

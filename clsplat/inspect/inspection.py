@@ -12,7 +12,7 @@ from clsplat.scene.parts import Parts
 
 @dataclass(frozen=True)
 class Inspection:
-    """What was read, what was measured, what it means."""
+    """The pieces of a dataset, the facts about them and the findings."""
 
     parts: Parts
     facts: Facts
@@ -34,7 +34,7 @@ class Inspection:
         return verdict(self.findings)
 
     def data(self) -> dict[str, Any]:
-        """All of it for JSON."""
+        """Return verdict, findings and facts as plain data for JSON."""
         return {
             "verdict": self.verdict,
             "trainable": self.trainable,

@@ -67,14 +67,14 @@ def _seen(inspection: Inspection) -> Seen | None:
 
 
 def _lists(inspection: Inspection) -> list[NameList]:
-    facts, photos = inspection.facts, inspection.facts.photos
+    facts, photographs = inspection.facts, inspection.facts.photos
     lists = {
         "registered but missing on disk": facts.missing,
         "on disk but without a pose": facts.unregistered,
-        "cannot be read": list(photos.unreadable.values()),
-        "not of the camera's size": [f"{name}: {size}" for name, size in photos.misfits.items()],
-        "end of the file is missing": photos.cut,
-        "to be turned, by the EXIF data": photos.exif_turned,
+        "cannot be read": list(photographs.unreadable.values()),
+        "not of the camera's size": [f"{name}: {size}" for name, size in photographs.misfits.items()],
+        "end of the file is missing": photographs.cut,
+        "rotated by the EXIF data": photographs.exif_turned,
         "far away from all others": facts.strayed,
         "same pose": [" = ".join(names) for names in facts.same_pose],
         "few points": facts.few_seen,

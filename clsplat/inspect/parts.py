@@ -1,4 +1,4 @@
-"""Read what can be read of a dataset: a damaged part becomes a fault, and the reading goes on."""
+"""Read a dataset in pieces: a damaged piece becomes a fault, and the other pieces are read."""
 
 import logging
 import os
@@ -50,7 +50,7 @@ def image_files(folder: Path, deep: bool) -> Iterator[Path]:
 
 @contextmanager
 def _silent() -> Iterator[None]:
-    """Hold back the messages of the readers: the findings say the same."""
+    """Suppress the messages of the readers: the findings contain them."""
     before = LOG.level
     LOG.setLevel(logging.ERROR)
     try:

@@ -1,4 +1,4 @@
-"""Cameras and points in 3D: the data of a canvas that turns under the pointer."""
+"""Cameras and points in 3D: the data of a canvas that the pointer rotates."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -7,12 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.inspect.inspection import Inspection
-from clsplat.scene.points import FAR
+from clsplat.scene.points import MAX_VALUE
 from clsplat.scene.scene import View
 
 MAX_POINTS = 5000
 RADIUS = 1000  # of the scene, in the numbers of the page
-MAX_COORDINATE = 30 * RADIUS  # points beyond are left out
+MAX_COORDINATE = 30 * RADIUS  # the page leaves out points beyond
 MAX_SLOPE = 5.0  # of a frustum's edges: half width by depth
 
 
@@ -76,7 +76,7 @@ def _points(inspection: Inspection) -> tuple[NDArray[np.float64], NDArray[np.flo
     table = inspection.parts.points
     if table is None or not len(table.positions):
         return np.empty((0, 3)), np.empty((0, 3))
-    finite = np.flatnonzero((np.abs(table.positions) < FAR).all(axis=1))
+    finite = np.flatnonzero((np.abs(table.positions) < MAX_VALUE).all(axis=1))
     chosen = finite[:: max(1, -(-len(finite) // MAX_POINTS))]
     return table.positions[chosen].astype(np.float64), table.rgb[chosen].astype(np.float64)
 

@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 from clsplat.errors import DataError
 from clsplat.scene.image_headers import read_header
 from clsplat.scene.images import read_image
-from clsplat.scene.lens import BORDER, Lens
+from clsplat.scene.lens import BORDER_POINTS, Lens
 from clsplat.scene.parts import Parts
-from clsplat.scene.points import FAR
+from clsplat.scene.points import MAX_VALUE
 from clsplat.scene.scene import View, camera_extent, strayed
 from clsplat.scene.view import fits
 
 SAMPLE_SIZE = 20_000  # points that coverage is measured on
-MAX_DISTANCE = 100.0  # camera extents from the middle of the cameras: nothing that a photograph resolves
+MAX_DISTANCE = 100.0  # camera extents from the middle of the cameras: photographs resolve nothing beyond
 MIN_SEEN = 30  # points; COLMAP itself registers no image with fewer inliers
 
 
@@ -57,15 +57,15 @@ class PhotographFacts:
     unreadable: dict[str, str]  # the reason
     cut: list[str]  # the end of the file is missing
     misfits: dict[str, str]  # the sizes of file and camera
-    on_side: list[str]  # misfits that would fit on their side
-    exif_turned: list[str]  # taken as stored although the Exif data say that they should be turned
-    larger: list[str]  # will be shrunk to their cameras' size
+    on_side: list[str]  # misfits whose width and height are swapped
+    exif_turned: list[str]  # read as stored although their Exif data have a rotation
+    larger: list[str]  # reduced to their cameras' size when they are read
     masks: int
 
 
 @dataclass(frozen=True)
 class Facts:
-    """All that was found; names are those of the views, paths relative to the dataset."""
+    """All measurements of a dataset; names are those of the views, paths are relative to the dataset."""
 
     path: str
     kind: str
@@ -80,15 +80,15 @@ class Facts:
     cameras: list[CameraFacts]
     photos: PhotographFacts
     points: PointFacts | None
-    seen: dict[str, int]  # points seen by each view; empty where the dataset does not say
+    seen: dict[str, int]  # points seen by each view; empty where the dataset has no such counts
     extent: float | None  # scene units
     strayed: list[str]
     one_place: bool  # all cameras have the same centre
     same_pose: list[list[str]]
     same_but_case: list[list[str]]
     same_base: int  # names that several folders hold
-    faults: list[str]  # why parts of it cannot be read
-    refusal: str  # why training would not start
+    faults: list[str]  # why pieces of it cannot be read
+    refusal: str  # why training does not start
 
     @property
     def few_seen(self) -> list[str]:
@@ -97,7 +97,7 @@ class Facts:
 
 
 def survey(parts: Parts) -> Facts:
-    """Measure a dataset that has been read in pieces."""
+    """Measure a dataset that was read in pieces."""
     views, expected = parts.views, parts.expected
     missing = [file for file in expected if not os.path.isfile(file)]
     known = {*expected, *(view.mask_path for view in views)}
@@ -131,9 +131,9 @@ def survey(parts: Parts) -> Facts:
 
 
 def distortion(lens: Lens) -> float | None:
-    """The largest displacement by the lens along the border, in pixels; None where it overflows."""
-    camera, along = lens.camera, np.linspace(0, 1, BORDER)
-    zeros, ones = np.zeros(BORDER), np.ones(BORDER)
+    """Return the largest displacement by the lens along the border, in pixels; None where it overflows."""
+    camera, along = lens.camera, np.linspace(0, 1, BORDER_POINTS)
+    zeros, ones = np.zeros(BORDER_POINTS), np.ones(BORDER_POINTS)
     x = np.concatenate([along, along, zeros, ones]) * lens.width
     y = np.concatenate([zeros, ones, along, along]) * lens.height
     with np.errstate(all="ignore"):
@@ -189,7 +189,7 @@ def _photograph(facts: PhotographFacts, view: View, name: str, file: Path) -> No
     size, camera = (header.width, header.height), view.lens or view.camera
     on_side = not fits(view, size) and fits(view, size[::-1])
     if on_side and (header.orientation >= 5 or read_image(file, upright=True).shape[1::-1] == size[::-1]):
-        size = size[::-1]  # turned as it is read
+        size = size[::-1]  # the reader rotates it
     elif header.orientation > 1:
         facts.exif_turned.append(name)
     if not header.complete:
@@ -205,7 +205,7 @@ def _photograph(facts: PhotographFacts, view: View, name: str, file: Path) -> No
 def _points(parts: Parts, extent: float | None, centres: NDArray[np.floating]) -> PointFacts:
     assert parts.points is not None
     positions = parts.points.positions
-    finite = (np.abs(positions) < FAR).all(axis=1)
+    finite = (np.abs(positions) < MAX_VALUE).all(axis=1)
     error = parts.points.error[finite] if len(parts.points.error) else np.empty(0)
     known = error[np.isfinite(error) & (error > 0)]
     if len(np.unique(known)) < 2:  # a placeholder

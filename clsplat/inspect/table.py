@@ -1,4 +1,4 @@
-"""An inspection on the terminal."""
+"""An inspection as a table for the terminal."""
 
 from rich.console import Console
 from rich.table import Table

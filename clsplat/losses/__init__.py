@@ -1,4 +1,4 @@
-"""What training minimises: losses that compare images, and penalties on Gaussians.  Each module adds its own."""
+"""Losses that compare images, and penalties on Gaussians.  Each module defines its own variants."""
 
 from clsplat.settings import import_modules
 

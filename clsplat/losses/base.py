@@ -1,4 +1,4 @@
-"""What losses work on and give back: each adds its share to a gradient, and tells its value on request."""
+"""The base of losses and penalties: each adds to a gradient and returns its value, which is read on request."""
 
 from abc import abstractmethod
 from collections.abc import Callable
@@ -11,7 +11,8 @@ from pydantic import PrivateAttr
 
 from clsplat.gaussians.tables import Gaussians, Gradients
 from clsplat.opencl.device import Array
-from clsplat.render.rasterizer import DeviceCamera, Frame
+from clsplat.render.camera import DeviceCamera
+from clsplat.render.rasterizer import Frame
 from clsplat.render.workspace import Workspace
 from clsplat.schedule import Schedule, at_step
 from clsplat.settings import Settings
@@ -40,7 +41,7 @@ class Comparison:
 
     @property
     def counted(self) -> int:
-        """Number of values in pixels that count; waits for the device where there is a mask."""
+        """Number of values in pixels that count; waits for the device when there is a mask."""
         return self.values if self.mask is None else 3 * int(self.mask.get().sum())
 
 
@@ -54,7 +55,7 @@ class LossValue:
 
 @dataclass(frozen=True)
 class ViewGradients:
-    """A view's frame, its losses and the sums over pixels that gradients are made of; valid until the next one."""
+    """A view's frame, its losses and the sums over pixels that give the gradients; valid until the next view."""
 
     frame: Frame
     comparison: Comparison
@@ -68,7 +69,7 @@ class ViewGradients:
 
 
 class Loss(Settings):
-    """A part of what training minimises."""
+    """A summand of the objective, which training minimises."""
 
     weight: Schedule = 1.0
     """Factor of the loss; by step."""
@@ -84,7 +85,7 @@ class ImageLoss(Loss):
 
 @dataclass(frozen=True)
 class PenaltyInputs:
-    """What a penalty works on: Gaussians and the gradients that it adds to."""
+    """The inputs of a penalty: the Gaussians, and the gradients that it adds to."""
 
     workspace: Workspace
     gaussians: Gaussians
@@ -98,11 +99,11 @@ class PenaltyInputs:
         return -(-self.gaussians.count // int(self.gaussians.device.tuning["LANES"]))
 
     def sums(self, name: str) -> Array:
-        """An array for the sum of each item, [items]; `name` tells the penalties of a step apart."""
+        """Return an array for the sum of each item, [items]; `name` must be unique among the penalties of a step."""
         return self.workspace.array(f"{name} sums", self.items)
 
     def arguments(self, parameter: str) -> dict[str, Any]:
-        """What a penalty's kernel takes, by the names of its arguments: `<parameter>`, `grad_<parameter>`, sizes."""
+        """Return the arguments of a penalty's kernel by name: `<parameter>`, `grad_<parameter>`, sizes."""
         return {
             "items": self.items,
             parameter: self.gaussians[parameter],
@@ -113,7 +114,7 @@ class PenaltyInputs:
 
 
 class Penalty(Loss):
-    """A loss that looks at Gaussians, not at an image."""
+    """A loss on the parameters of the Gaussians, not on an image."""
 
     @property
     def tables(self) -> set[str]:
@@ -122,7 +123,7 @@ class Penalty(Loss):
 
     @abstractmethod
     def add(self, inputs: PenaltyInputs) -> LossValue:
-        """Add weight · d(penalty)/d(parameter) to the gradients of the parameters that the penalty is about."""
+        """Add weight · d(penalty)/d(parameter) to the gradients of the penalty's parameters."""
 
 
 HostFunction = Callable[[NDArray[np.float32], NDArray[np.float32]], tuple[float, NDArray[np.floating]]]

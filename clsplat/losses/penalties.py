@@ -1,6 +1,6 @@
-"""Penalties on the sizes and shapes of Gaussians: each adds its share to the gradient of `log_scales`.
+"""Penalties on the sizes and shapes of Gaussians: each adds to the gradient of `log_scales`.
 
-A trace bounds the size of a Gaussian, not its anisotropy; the two are separate penalties.
+The trace of the covariance bounds the size of a Gaussian, not its anisotropy, which has a penalty of its own.
 """
 
 from typing import Annotated, Literal
@@ -14,17 +14,17 @@ from clsplat.schedule import at_step
 
 
 class CovarianceTrace(Penalty):
-    """Mean over Gaussians of max(tr Σ - τ, 0), lengths by the scene's extent (Micro-splatting, Lee et al. 2025).
+    """Mean over Gaussians of max(tr Σ - τ, 0), in extents² (Micro-splatting, Lee et al. 2025).
 
-    τ is `above`, or, where `pixels` is given, 3 s² for the s that spans so many pixels at the nearest training view,
-    as it was at the last edit.
+    τ is `above`, or, with `pixels`, 3 s², where s is the length of so many pixels at the nearest training view at the
+    last edit.
     """
 
     type: Literal["covariance_trace"] = "covariance_trace"
     above: Annotated[float, Field(ge=0)] = 3.0e-4
     """τ in extents²; the default is a standard deviation of 1 % of the extent along each axis."""
     pixels: Annotated[float, Field(gt=0)] | None = None
-    """s in px of the nearest training view; takes the place of `above`."""
+    """s in px of the nearest training view; replaces `above`."""
 
     @property
     def tables(self) -> set[str]:
@@ -50,7 +50,7 @@ class Anisotropy(Penalty):
 
     type: Literal["anisotropy"] = "anisotropy"
     above: Annotated[float, Field(ge=1)] = 10.0
-    """r, the ratio that is not penalised."""
+    """r, the largest ratio without a penalty."""
 
     def add(self, inputs: PenaltyInputs) -> LossValue:
         gaussians, sums = inputs.gaussians, inputs.sums(f"anisotropy {self.above}")

@@ -1,4 +1,4 @@
-"""What the Gaussians of a model look like all together."""
+"""The distributions of size, anisotropy and opacity over the Gaussians of a model."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ SHARES = (0.05, 0.25, 0.5, 0.75, 0.95)
 
 
 def distribution(gaussians: Gaussians) -> dict[str, list[float]]:
-    """Quantiles, at SHARES, of size (rms scale, scene units), anisotropy (longest by shortest axis) and opacity."""
+    """Return quantiles, at SHARES: size (rms scale, scene units), anisotropy (longest by shortest axis), opacity."""
     log_scales = gaussians.get("log_scales").astype(np.float64)
     columns = {
         "size": np.sqrt(np.exp(2 * log_scales).mean(axis=1)),

@@ -1,4 +1,4 @@
-"""PSNR and SSIM of two images, as papers quote them: of 8 bits a channel, SSIM with an 11 x 11 Gaussian window."""
+"""PSNR and SSIM of two images as in papers: 8 bits a channel, SSIM with an 11 x 11 Gaussian window."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""LPIPS by a network in a local ONNX file, on OpenCV's DNN module: nothing is downloaded, and there is no torch."""
+"""LPIPS with a network in a local ONNX file, on OpenCV's DNN module: without downloads and without torch."""
 
 import hashlib
 from pathlib import Path
@@ -17,16 +17,16 @@ INPUTS = ("in0", "in1")  # the arguments of lpips.LPIPS.forward
 class Lpips:
     """Learned perceptual distance (Zhang et al. 2018); 0 for equal images.
 
-    The file holds a network of two inputs `in0` and `in1`, RGB of [1, 3, height, width], and one number as output: what
-    `torch.onnx.export` makes of `lpips.LPIPS(net="vgg")`, with free height and width.  That network wants values in
-    [-1, 1]; 3DGS's and Mip-Splatting's tables were made with values in [0, 1], which gives smaller distances.
+    The file holds a network of two inputs `in0` and `in1`, RGB of [1, 3, height, width], and one number as output: the
+    result of `torch.onnx.export` for `lpips.LPIPS(net="vgg")`, with free height and width.  That network expects values
+    in [-1, 1]; the tables of 3DGS and Mip-Splatting have values in [0, 1], which give smaller distances.
     """
 
     def __init__(self, path: Path, inputs: InputRange) -> None:
         try:
             data = path.read_bytes()
         except OSError as error:
-            raise DataError(f"{path}: cannot be read ({error.strerror}); lpips wants an ONNX file") from error
+            raise DataError(f"{path}: cannot be read ({error.strerror}); expected an ONNX file of LPIPS") from error
         self.path, self.inputs = path, inputs
         self.digest = hashlib.sha256(data).hexdigest()
         try:
@@ -39,11 +39,11 @@ class Lpips:
         if (distance := self.distance(grey, grey)) != 0:
             raise ConfigError(f"{path}: the distance of equal images is {distance:g}, expected 0: this is not LPIPS")
 
-    def distance(self, image: NDArray[np.uint8], truth: NDArray[np.uint8]) -> float:
+    def distance(self, image: NDArray[np.uint8], photograph: NDArray[np.uint8]) -> float:
         """Return the distance of two images, [height, width, 3]."""
         try:
-            for name, picture in zip(INPUTS, (image, truth), strict=True):
-                self._network.setInput(self._planes(picture), name)
+            for name, pixels in zip(INPUTS, (image, photograph), strict=True):
+                self._network.setInput(self._planes(pixels), name)
             output = np.asarray(self._network.forward())
         except cv2.error as error:
             size = f"{image.shape[1]}x{image.shape[0]}"
@@ -56,7 +56,7 @@ class Lpips:
         return float(output.ravel()[0])
 
     def origin(self) -> dict[str, str]:
-        """What a reader must know to compare the figure with another."""
+        """Return input range and network: figures are comparable only where both are equal."""
         return {"lpips_input": self.inputs, "lpips_model": f"{self.path.name} sha256:{self.digest[:16]}"}
 
     def _planes(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -65,5 +65,5 @@ class Lpips:
 
 
 def _short(error: cv2.error) -> str:
-    """The last line of what OpenCV says, without its file and line."""
+    """The last line of OpenCV's message, without file and line."""
     return (error.err or str(error)).strip().splitlines()[-1][:120]

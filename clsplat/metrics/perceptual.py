@@ -1,4 +1,4 @@
-"""Metrics nearer to what people see than PSNR, of 8-bit images and on the host: MS-SSIM, FLIP and LPIPS."""
+"""Perceptual metrics of 8-bit images, on the host: MS-SSIM, FLIP and LPIPS."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -25,33 +25,33 @@ C1, C2 = 0.01**2, 0.03**2
 
 @dataclass(frozen=True)
 class Perceptual:
-    """What to measure beyond PSNR and SSIM."""
+    """The metrics beside PSNR and SSIM."""
 
     names: tuple[Metric, ...] = ()
     lpips: Lpips | None = None
 
     @classmethod
     def open(cls, names: Sequence[Metric], lpips: str | Path | None, lpips_input: InputRange) -> "Perceptual":
-        """Find what the metrics need.  Raises ConfigError for a missing package, DataError for a missing network."""
+        """Load what the metrics need.  Raises ConfigError for a missing package, DataError for a missing network."""
         chosen = tuple(name for name in METRICS[2:] if name in names)
         if "flip" in chosen:
             _flip_package()
         return cls(chosen, Lpips(Path(lpips), lpips_input) if lpips is not None else None)
 
-    def measure(self, image: Image, truth: Image) -> dict[str, float | None]:
-        """Return the figures of one view, by name.  image, truth: [height, width, 3]."""
+    def measure(self, image: Image, photograph: Image) -> dict[str, float | None]:
+        """Return the figures of one view, by name.  image, photograph: [height, width, 3]."""
         values: dict[str, float | None] = {}
         if "ms_ssim" in self.names:
-            values["ms_ssim"] = ms_ssim(image, truth)
+            values["ms_ssim"] = ms_ssim(image, photograph)
             values["ms_ssim_scales"] = ms_ssim_scales(image)
         if "flip" in self.names:
-            values["flip"] = flip(image, truth)
+            values["flip"] = flip(image, photograph)
         if self.lpips is not None:
-            values["lpips"] = self.lpips.distance(image, truth)
+            values["lpips"] = self.lpips.distance(image, photograph)
         return values
 
     def mean(self, views: Sequence[dict[str, float | None]]) -> dict[str, Any]:
-        """Return averages over views with the keys of metrics.json, and why a figure is missing."""
+        """Return averages over views with the keys of metrics.json, and the reason for each missing figure."""
         averages: dict[str, Any] = {name: _mean(views, name) for name in self.names}
         if "ms_ssim" in self.names:
             averages["ms_ssim_scales"] = min(int(view["ms_ssim_scales"] or 0) for view in views)
@@ -75,16 +75,16 @@ def _mean(views: Sequence[dict[str, float | None]], name: str) -> float | None:
 
 
 def ms_ssim_scales(image: Image) -> int:
-    """Number of scales, at most five, at which the window fits into the image."""
+    """Return the number of scales, at most five, at which the window fits into the image."""
     side = min(image.shape[:2])
     return sum(side >> scale >= 2 * RADIUS + 1 for scale in range(len(MS_SSIM_WEIGHTS)))
 
 
-def ms_ssim(image: Image, truth: Image) -> float | None:
-    """Multi-scale structural similarity (Wang, Simoncelli and Bovik 2003), in double precision.
+def ms_ssim(image: Image, photograph: Image) -> float | None:
+    """Return the multi-scale structural similarity (Wang, Simoncelli and Bovik 2003), in double precision.
 
-    For each channel, the product over scales of the mean contrast-structure term, at the coarsest scale times the
-    luminance term, to the power of the scale's weight; then the mean of the channels.  A scale is the one before,
+    For each channel, the product over scales of the mean contrast-structure factor, at the coarsest scale times the
+    luminance factor, to the power of the scale's weight; then the mean of the channels.  A scale is the one before,
     averaged over 2 x 2 pixels and halved.  Means are over the pixels whose 11 x 11 Gaussian window lies inside the
     image; a negative mean counts as 0.  An image with a side below 176 px has room for fewer scales: the weights of
     those that fit are divided by their sum.  None when not even one fits.
@@ -93,14 +93,14 @@ def ms_ssim(image: Image, truth: Image) -> float | None:
     if scales == 0:
         return None
     weights = np.array(MS_SSIM_WEIGHTS[:scales]) / sum(MS_SSIM_WEIGHTS[:scales])
-    x, y = image / 255.0, truth / 255.0
+    x, y = image / 255.0, photograph / 255.0
     product = np.ones(3)
     for scale, weight in enumerate(weights):
         if scale > 0:
             x, y = _halved(x), _halved(y)
-        luminance, structure = _ssim_terms(x, y)
-        terms = structure * luminance if scale == scales - 1 else structure
-        product *= np.maximum(terms.mean(axis=(0, 1)), 0) ** weight
+        luminance, structure = _ssim_factors(x, y)
+        similarity = structure * luminance if scale == scales - 1 else structure
+        product *= np.maximum(similarity.mean(axis=(0, 1)), 0) ** weight
     return float(product.mean())
 
 
@@ -112,14 +112,14 @@ def _halved(image: Floats) -> Floats:
     return mean
 
 
-def ssim_map(image: Image, truth: Image) -> Floats:
-    """Structural similarity of every pixel and channel, as training has it: zeros around the image."""
+def ssim_map(image: Image, photograph: Image) -> Floats:
+    """Return the structural similarity of every pixel and channel, with zeros around the image, as in training."""
     padding = ((RADIUS, RADIUS), (RADIUS, RADIUS), (0, 0))
-    luminance, structure = _ssim_terms(np.pad(image / 255.0, padding), np.pad(truth / 255.0, padding))
+    luminance, structure = _ssim_factors(np.pad(image / 255.0, padding), np.pad(photograph / 255.0, padding))
     return luminance * structure
 
 
-def _ssim_terms(x: Floats, y: Floats) -> tuple[Floats, Floats]:
+def _ssim_factors(x: Floats, y: Floats) -> tuple[Floats, Floats]:
     """Luminance and contrast-structure of every pixel with a whole window (Wang et al. 2004)."""
     mx, my = _window_mean(x), _window_mean(y)
     variances = _window_mean(x * x) - mx * mx + _window_mean(y * y) - my * my
@@ -134,9 +134,9 @@ def _window_mean(image: Floats) -> Floats:
     return np.asarray(correlate1d(rows, taps, axis=1)[:, RADIUS:-RADIUS])
 
 
-def flip(image: Image, truth: Image) -> float:
-    """Mean FLIP (Andersson et al. 2020) at 67 pixels per degree; 0 for equal images.  Raises ConfigError without it."""
-    reference, test = (np.ascontiguousarray(picture, np.float32) / np.float32(255) for picture in (truth, image))
+def flip(image: Image, photograph: Image) -> float:
+    """Return the mean FLIP (Andersson et al. 2020) at 67 px per degree.  Raises ConfigError without its package."""
+    reference, test = (np.ascontiguousarray(pixels, np.float32) / np.float32(255) for pixels in (photograph, image))
     _, mean, _ = _flip_package().evaluate(reference, test, "LDR", applyMagma=False)
     return float(mean)
 

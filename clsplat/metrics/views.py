@@ -12,7 +12,8 @@ from clsplat.losses.image import ssim_maps
 from clsplat.metrics.images import psnr, ssim, to_8_bits
 from clsplat.metrics.perceptual import Image, Perceptual
 from clsplat.opencl.device import Array
-from clsplat.render.rasterizer import DeviceCamera, Rasterizer
+from clsplat.render.camera import DeviceCamera
+from clsplat.render.rasterizer import Rasterizer
 from clsplat.scene.scene import View
 from clsplat.views.photographs import Photograph, Photographs, unpack
 
@@ -29,7 +30,7 @@ class ViewMetrics:
     perceptual: dict[str, float | None] = field(default_factory=dict)
 
     def line(self) -> dict[str, Any]:
-        """The figures as a line of metrics.jsonl has them."""
+        """Return the figures as in a line of metrics.jsonl."""
         return {"view": self.view, "psnr": self.psnr, "ssim": self.ssim, **self.perceptual}
 
 
@@ -41,7 +42,7 @@ def render_view(rasterizer: Rasterizer, model: DeviceModel, camera: DeviceCamera
 
 
 def device_ssim(rasterizer: Rasterizer, photograph: Photograph, image: Image) -> float:
-    """Structural similarity of an 8-bit image, [height, width, 3], and the photograph, computed on the device."""
+    """Return the SSIM of an 8-bit image, [height, width, 3], and the photograph, computed on the device."""
     workspace, camera = rasterizer.workspace, photograph.camera
     pixels = rasterizer.device.upload(np.ascontiguousarray(image.transpose(2, 0, 1)))
     rendered = unpack(workspace, camera, pixels, 1 / 255, "rendered")
@@ -59,7 +60,7 @@ def measure(
 ) -> list[ViewMetrics]:
     """Return the metrics of every view.
 
-    What a mask leaves out is black in both images, and PSNR and SSIM are means over the other pixels.
+    Masked pixels are black in both images; PSNR and SSIM are means over the other pixels.
     """
     results = []
     for view in views:
@@ -77,7 +78,7 @@ def measure(
 
 
 def mean(results: Sequence[ViewMetrics], perceptual: Perceptual = PSNR_AND_SSIM) -> dict[str, Any]:
-    """Averages over views, with the keys of metrics.json."""
+    """Return averages over views, with the keys of metrics.json."""
     return {
         "psnr": float(np.mean([r.psnr for r in results])),
         "ssim": float(np.mean([r.ssim for r in results])),

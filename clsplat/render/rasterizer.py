@@ -1,118 +1,44 @@
-"""From Gaussians and a camera to an image, and from the image's gradient back to the Gaussians'."""
+"""Render Gaussians to an image, and compute their gradients from the image's."""
 
 from dataclasses import dataclass, fields
 from itertools import pairwise
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from clsplat.gaussians.tables import DeviceModel, Gradients
 from clsplat.opencl.device import Array, Device
 from clsplat.opencl.program import constants
+from clsplat.render.camera import DeviceCamera
 from clsplat.render.tiles import Band, Footprints, Sort, TileLists, Tiler, TooManyPairs
 from clsplat.render.workspace import Workspace
-from clsplat.scene.scene import View
 
 RECORD = int(constants()["RECORD"])
 PIXEL_SUMS = int(constants()["PIXEL_SUMS"])
-UNLIMITED = 2**31  # pairs
-RAY_MARGIN = constants()["RAY_MARGIN"]
-
-# camera_t of cl_kernels/common.h
-CAMERA = np.dtype(
-    [
-        ("world_to_camera", np.float32, 12),
-        ("position", np.float32, 3),
-        *((name, np.float32) for name in ("fx", "fy", "cx", "cy")),
-        *((name, np.float32) for name in ("ray_x_min", "ray_x_max", "ray_y_min", "ray_y_max")),
-        *((name, np.uint32) for name in ("width", "height", "tiles_x", "tiles_y")),
-    ]
-)
-
-
-@dataclass(frozen=True)
-class DeviceCamera:
-    """A view's camera on the device, with the size of its planes: whole tiles."""
-
-    array: Array  # [1] camera_t
-    width: int
-    height: int
-    tiles_x: int
-    tiles_y: int
-    tile: int
-
-    @property
-    def tiles(self) -> int:
-        return self.tiles_x * self.tiles_y
-
-    @property
-    def stride(self) -> int:
-        """Columns of a plane."""
-        return self.tiles_x * self.tile
-
-    @property
-    def rows(self) -> int:
-        """Rows of a plane."""
-        return self.tiles_y * self.tile
-
-    def plane_arguments(self) -> dict[str, int]:
-        """What kernels take that work on planes, by the names of their arguments."""
-        return {"width": self.width, "height": self.height, "rows": self.rows, "stride": self.stride}
-
-
-def upload_camera(device: Device, view: View) -> DeviceCamera:
-    """Put a view's camera on the device."""
-    tile = int(device.tuning["TILE"])
-    values = camera_values(view, tile)
-    tiles_x, tiles_y = int(values["tiles_x"]), int(values["tiles_y"])
-    array = device.upload(values.reshape(1))
-    return DeviceCamera(array, view.camera.width, view.camera.height, tiles_x, tiles_y, tile)
-
-
-def camera_values(view: View, tile: int) -> NDArray[Any]:
-    """A view's camera_t, [].
-
-    Rays are clamped 30 % of half the field of view beyond the image's edges (gsplat's off-centre form).
-    """
-    camera = view.camera
-    tiles_x, tiles_y = -(-camera.width // tile), -(-camera.height // tile)
-    margin_x = RAY_MARGIN * camera.width / (2 * camera.fx)
-    margin_y = RAY_MARGIN * camera.height / (2 * camera.fy)
-    values = (
-        view.world_to_camera.ravel(),
-        view.position,
-        *(camera.fx, camera.fy, camera.cx, camera.cy),
-        *(-camera.cx / camera.fx - margin_x, (camera.width - camera.cx) / camera.fx + margin_x),
-        *(-camera.cy / camera.fy - margin_y, (camera.height - camera.cy) / camera.fy + margin_y),
-        *(camera.width, camera.height, tiles_x, tiles_y),
-    )
-    return np.array(values, CAMERA)
-
-
-Content = Literal["colour", "depth"]  # what splats show: colour, or (depth of the mean in scene units, 1, 0)
+MAX_PAIRS = 2**31  # more than any frame has: no limit
+Content = Literal["colour", "depth"]  # channels of the splats: colour, or (depth of the mean in scene units, 1, 0)
 
 
 @dataclass(frozen=True)
 class Frame:
-    """What a forward pass leaves behind for the losses and for the backward pass; valid until the next one."""
+    """The result of a forward pass, for losses and the backward pass; valid until the next one."""
 
     camera: DeviceCamera
     splats: Array  # [N, RECORD]
-    radius: Array  # [S] px, 0 = not seen
+    radius: Array  # [S] px, 3 standard deviations; 0: not seen
     lists: TileLists
     tile_last: Array  # [T]
     image: Array  # [3, rows, stride], zero outside the image
     transmittance: Array  # [rows, stride]
-    bands: list[Band]  # of which `lists` are those of the last
+    bands: list[Band]  # `lists` belongs to the last one
     content: Content  # what was blended
 
 
 @dataclass(frozen=True)
 class Budget:
-    """How much is done at a time; results do not depend on it."""
+    """Limits on memory and on launches; results do not depend on them."""
 
-    pairs: int  # (tile, Gaussian) pairs
+    pairs: int  # (tile, Gaussian) pairs in memory
     tiles: int = 0  # of a launch; 0: all
 
 
@@ -122,20 +48,20 @@ class Rasterizer:
     def __init__(self, device: Device, sort: Sort = "auto", budget: Budget | None = None) -> None:
         self.device = device
         self.budget = budget or Budget(device.info.allocation // (4 * RECORD))
-        self._bands: dict[int, int] = {}  # into how many bands frames of so many rows of tiles are split
+        self._bands: dict[int, int] = {}  # rows of tiles of a frame -> number of bands
         self.workspace = Workspace(device)
         self.tiler = Tiler(device, self.workspace, sort)
         self._project = device.program("project.cl")
         self._blend = device.program(f"blend_{device.schedule}.cl")
         self._lanes = int(device.tuning["LANES"])
-        self._gradients: Gradients | None = None  # made when they are first needed
+        self._gradients: Gradients | None = None  # allocated at first use
 
     def forward(
         self, model: DeviceModel, camera: DeviceCamera, background: Array, content: Content = "colour"
     ) -> Frame:
         """Render the model.  background: [3].
 
-        Where the pairs of all tiles together pass the budget, fewer rows of tiles are done at a time: the same bits.
+        Where the pairs of all tiles are more than the budget, the frame is rendered in bands of rows: the same bits.
         """
         while True:
             try:
@@ -174,7 +100,7 @@ class Rasterizer:
         return [Band(camera.tiles_x, camera.tiles_y, int(a), int(b)) for a, b in pairwise(rows)]
 
     def _launches(self, band: Band) -> list[tuple[int, int]]:
-        """First tile and number of tiles of each launch: few at a time where a display's watchdog looks on."""
+        """First tile and number of tiles of each launch: few where the watchdog of a display limits its time."""
         step = self.budget.tiles or band.tiles_inside
         end = band.first_tile + band.tiles_inside
         return [(first, min(step, end - first)) for first in range(band.first_tile, end, step)]
@@ -200,16 +126,16 @@ class Rasterizer:
             self.device.program("depth.cl").paint_depth(
                 items=count, means=gaussians["means"], camera=camera.array, splats=splats, stride=stride, count=count
             )
-        single = band.row_end - band.row_begin == 1  # it cannot be split further
-        return self.tiler.build(splats, footprints, band, count, UNLIMITED if single else self.budget.pairs)
+        single = band.row_end - band.row_begin == 1  # cannot be split further
+        return self.tiler.build(splats, footprints, band, count, MAX_PAIRS if single else self.budget.pairs)
 
     def pixel_sums(
         self, model: DeviceModel, frame: Frame, grad_image: Array, count: int = PIXEL_SUMS, texture: Array | None = None
     ) -> Array:
-        """Sums over each Gaussian's pixels that its gradients are made of, [count, S]; see cl_kernels/splat.h.
+        """Return the sums over each Gaussian's pixels that give its gradients, [count, S]; see cl_kernels/splat.h.
 
-        grad_image: [3, rows, stride], zero outside the image.  More than PIXEL_SUMS of them cost more time; the last
-        are of `texture`, [rows, stride].
+        grad_image: [3, rows, stride], zero outside the image.  A `count` above PIXEL_SUMS takes more time; the last two
+        sums need `texture`, [rows, stride] per px.
         """
         gaussians = model.gaussians
         defines = {} if count == PIXEL_SUMS else {"PIXEL_SUMS": count}
@@ -247,8 +173,8 @@ class Rasterizer:
         return pixel_sums
 
     def gradients(self, model: DeviceModel, frame: Frame, pixel_sums: Array) -> Gradients:
-        """Derivatives of the loss by every parameter of the model that made the frame; valid until the next ones."""
-        if self._gradients is None or self._gradients.capacity != model.gaussians.capacity:
+        """Return the derivatives of the loss by every parameter of the frame's model; valid until the next call."""
+        if self._gradients is None or self._gradients.size != (model.gaussians.capacity, model.gaussians.sh_degree):
             self._gradients = Gradients(model.gaussians)
         gradients = self._gradients
         self._project.project_backward(
@@ -262,7 +188,7 @@ class Rasterizer:
 
 
 def shape_arguments(model: DeviceModel, camera: DeviceCamera) -> dict[str, Any]:
-    """What every kernel takes that projects Gaussians, by the names of its arguments."""
+    """Return the arguments of every kernel that projects Gaussians, by name."""
     gaussians = model.gaussians
     names = ("means", "quats", "log_scales", "logit_opacity", "sh_rest", "filter_variance")
     return {

@@ -1,8 +1,8 @@
-"""Which splats each tile sees, front to back.
+"""The splats of each tile, front to back.
 
-Two ways with one contract.  Radix: order the Gaussians by depth once, emit their (tile, Gaussian) pairs in that order
-and sort stably by tile alone.  Bitonic: emit in order of index, drop pairs into tiles, sort each by (depth, index).
-Both give every tile the same splats in the same order, ties by index.
+Two algorithms give the same result.  Radix: order the Gaussians by depth once, emit their (tile, Gaussian) pairs in
+that order and sort stably by tile alone.  Bitonic: emit in order of index, write pairs to tiles, sort each tile by
+(depth, index).  Both give every tile the same splats in the same order, ties by index.
 """
 
 import time
@@ -42,7 +42,7 @@ class TileLists:
 
 @dataclass(frozen=True)
 class Band:
-    """Rows of tiles, from `row_begin` up to `row_end`, of a grid: all of them, or those that are done at a time."""
+    """Rows of tiles, from `row_begin` up to `row_end`, of a grid: all of them, or those that are rendered together."""
 
     tiles_x: int
     tiles_y: int
@@ -64,7 +64,7 @@ class Band:
 
 
 class TooManyPairs(Exception):
-    """More pairs in a band than were allowed: blend fewer rows of tiles at a time."""
+    """A band has more pairs than the limit: use bands with fewer rows of tiles."""
 
 
 class Tiler:
@@ -80,20 +80,20 @@ class Tiler:
         self._digit_bits = int(device.tuning["DIGIT_BITS"])
         self._zero = device.zeros(1, np.uint32)
 
-    def build(self, splats: Array, footprints: Footprints, band: Band, count: int, most: int) -> TileLists:
-        """Make the tile lists of `count` splat records in a band.  Reads the number of pairs back: the one wait.
+    def build(self, splats: Array, footprints: Footprints, band: Band, count: int, limit: int) -> TileLists:
+        """Make the tile lists of `count` splat records in a band.  Reads the number of pairs back: the only wait.
 
-        Raises TooManyPairs when there are more than `most`.
+        Raises TooManyPairs when there are more than `limit`.
         """
         if self.sort == "auto":
-            self.sort = self._faster(splats, footprints, band, count, most)
+            self.sort = self._faster(splats, footprints, band, count, limit)
         depth_key, tile_count = footprints.depth_key, footprints.tile_count
         order = self._depth_order(depth_key, count) if self.sort == "radix" else self._index_order(count)
         ordered_count = self.workspace.array("ordered_count", count, np.uint32)
         self._scan.permute(items=count, values=tile_count, order=order, permuted=ordered_count, count=count)
         pair_offset = self.scan(ordered_count, count, "pair_offset")
         pairs = int(pair_offset.get_item(count)) if count else 0
-        if pairs > most:
+        if pairs > limit:
             raise TooManyPairs
 
         pair_tile = self.workspace.array("pair_tile", pairs, np.uint32)
@@ -122,7 +122,7 @@ class Tiler:
         return TileLists(pairs, pair_splat, first_pair, tile_count, tile_offset, tile_pairs)
 
     def scan(self, values: Array, count: int, name: str) -> Array:
-        """Exclusive prefix sum, [count + 1] with the total at the end."""
+        """Return the exclusive prefix sum, [count + 1] with the total at the end."""
         offset = self.workspace.array(name, count + 1, np.uint32)
         if count == 0:
             offset.fill(0)
@@ -137,7 +137,7 @@ class Tiler:
         return offset
 
     def sort_pairs(self, keys: Array, bits: int, count: int, name: str) -> tuple[Array, Array]:
-        """Stable sort of keys below 2^bits: the sorted keys and where each came from, both [count]."""
+        """Sort keys below 2^bits stably; return the sorted keys and their old indices, both [count]."""
         passes = -(-bits // self._digit_bits)
         width = -(-bits // passes)
         run, blocks = self._runs(count, shortest=1 << 10)
@@ -164,7 +164,7 @@ class Tiler:
         return keys, values
 
     def _runs(self, count: int, shortest: int) -> tuple[int, int]:
-        """How many values an item walks, and how many groups that makes."""
+        """Return the number of values of an item, and the number of groups."""
         even = -(-count // (4 * self.device.info.units))  # four runs for each core even out their speeds
         run = 8 if self._team > 1 else max(shortest, even)
         return run, -(-count // (run * self._team))
@@ -212,14 +212,14 @@ class Tiler:
         self._bitonic.sort_tiles(groups=tiles, tile_offset=tile_offset, tile_depth=tile_depth, tile_pairs=tile_pairs)
         return tile_offset, tile_pairs
 
-    def _faster(self, splats: Array, footprints: Footprints, band: Band, count: int, most: int) -> Sort:
+    def _faster(self, splats: Array, footprints: Footprints, band: Band, count: int, limit: int) -> Sort:
         seconds: dict[Sort, float] = {}
         for sort in ("radix", "bitonic"):
             self.sort = sort
             times = []
             for _ in range(1 + TRIALS):  # the first one compiles
                 start = time.perf_counter()
-                self.build(splats, footprints, band, count, most)
+                self.build(splats, footprints, band, count, limit)
                 self.device.finish()
                 times.append(time.perf_counter() - start)
             seconds[sort] = min(times[1:])

@@ -1,4 +1,4 @@
-"""Device memory that a frame needs and the next one reuses."""
+"""Device memory that frames reuse."""
 
 import math
 
@@ -18,7 +18,7 @@ class Workspace:
         self._arrays: dict[str, Array] = {}
 
     def array(self, name: str, shape: int | tuple[int, ...], dtype: DTypeLike = np.float32) -> Array:
-        """Return an array of that shape, with whatever the buffer held before."""
+        """Return an array of that shape; its values are undefined."""
         shape = (shape,) if isinstance(shape, int) else shape
         kind = np.dtype(dtype)
         length = math.prod(shape)
@@ -30,7 +30,7 @@ class Workspace:
         return Array(self.device, held.buffer, shape, kind)
 
     def length(self, name: str) -> int:
-        """Number of values that the buffer of `name` can hold; 0 before its first use."""
+        """Return the number of values in the buffer of `name`; 0 before its first use."""
         return self._arrays[name].shape[0] if name in self._arrays else 0
 
     @property

@@ -1,4 +1,4 @@
-"""Datasets on the host.  These names are what a reader of another format needs: see `Reader`."""
+"""Datasets on the host.  A reader of another format needs these names: see `Reader`."""
 
 from clsplat.scene.camera import Camera as Camera
 from clsplat.scene.detect import read_scene as read_scene

@@ -7,25 +7,25 @@ from clsplat.scene.readers import Reader
 from clsplat.scene.scene import Scene, make_scene
 from clsplat.scene.transforms import Transforms, list_frames
 
-TRAIN, TEST = "transforms_train.json", "transforms_test.json"
+TRAIN_FILE, TEST_FILE = "transforms_train.json", "transforms_test.json"
 
 
 class BlenderReader(Reader):
     """A Blender scene; the test views are those of transforms_test.json, none where that is missing."""
 
     name = "Blender"
-    expects = TRAIN
+    expects = TRAIN_FILE
 
     def matches(self, path: Path) -> bool:
-        return (path / TRAIN).is_file()
+        return (path / TRAIN_FILE).is_file()
 
     def read(self, path: Path, holdout: int) -> Scene:
-        transforms = Transforms(path / TRAIN)
+        transforms = Transforms(path / TRAIN_FILE)
         train = transforms.views()
-        test = Transforms(path / TEST).views() if (path / TEST).is_file() else []
+        test = Transforms(path / TEST_FILE).views() if (path / TEST_FILE).is_file() else []
         held_out = set(range(len(train), len(train) + len(test)))
-        # NeRF and every paper since show these sets on white.
+        # NeRF and later papers render these scenes on white.
         return make_scene(path, train + test, held_out, transforms.points(), background="white")
 
     def list_parts(self, parts: Parts) -> None:
-        list_frames(parts, TRAIN, TEST)
+        list_frames(parts, TRAIN_FILE, TEST_FILE)

@@ -1,4 +1,4 @@
-"""The pinhole camera that everything is rendered with."""
+"""The pinhole camera of all rendering."""
 
 import math
 from dataclasses import astuple, dataclass

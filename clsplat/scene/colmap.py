@@ -1,24 +1,16 @@
-"""Read COLMAP folders: which model, which photographs, which cameras a pinhole rasterizer can use."""
+"""Read COLMAP folders: choose the model, find the photographs, make pinhole cameras."""
 
 import logging
 import os
 from pathlib import Path
 
 from clsplat.errors import DataError
-from clsplat.scene.colmap_files import (
-    REMEDY,
-    CameraRecord,
-    ImageRecord,
-    find_file,
-    read_cameras,
-    read_images,
-    read_point_table,
-    read_points,
-)
+from clsplat.scene.colmap_files import find_file, read_cameras, read_images, read_point_table, read_points
+from clsplat.scene.colmap_records import REMEDY, CameraRecord, ImageRecord
 from clsplat.scene.images import inside, require_files
 from clsplat.scene.lens import MODELS, Lens, shared
 from clsplat.scene.parts import Parts
-from clsplat.scene.points import FAR
+from clsplat.scene.points import MAX_VALUE
 from clsplat.scene.quaternion import pose_matrix
 from clsplat.scene.readers import Reader
 from clsplat.scene.scene import Scene, View, every_nth, make_scene
@@ -29,9 +21,9 @@ logger = logging.getLogger("clsplat")
 class ColmapReader(Reader):
     """A COLMAP scene: models in `sparse/N`, `sparse` or the folder itself, photographs in `images`.
 
-    Of several models the one with most images is taken.  Every `holdout`-th view by name is for testing.
-    Photographs of cameras with distortion are undistorted as they are read.  Masks are taken from the
-    folder `masks`: an image's name with .png behind it or in place of its suffix.
+    Of several models the reader takes the one with most images.  Every `holdout`-th view by name is for testing.
+    Photographs of cameras with distortion are undistorted when they are read.  Masks lie in the folder
+    `masks`: their names are those of the images with .png appended, or in place of the suffix.
     """
 
     name = "COLMAP"
@@ -107,20 +99,20 @@ def view_of(image: ImageRecord, cameras: dict[int, CameraRecord], folder: Path) 
 
 
 def _mask(folder: Path, name: str) -> Path | None:
-    """The mask of an image: its name with .png behind it (COLMAP) or in place of its suffix."""
+    """The mask of an image: its name with .png appended (COLMAP), or in place of its suffix."""
     files = (folder / f"{name}.png", (folder / name).with_suffix(".png"))
     return next((file for file in files if os.path.isfile(file)), None)  # never raises
 
 
 def _lens(number: int, camera: CameraRecord) -> Lens:
-    """Check a camera.  Raises DataError for models that are not supported, and for senseless numbers."""
+    """Check a camera.  Raises DataError for models that are not supported, and for invalid numbers."""
     if camera.model not in MODELS:
         raise DataError(
             f"{camera.where}: camera {number} is {camera.model}; expected one of {', '.join(MODELS)}: "
             "undistort the images first with `colmap image_undistorter`"
         )
     if min(camera.width, camera.height, *camera.params[: MODELS[camera.model][0]]) <= 0 or not all(
-        abs(value) < FAR for value in camera.params
+        abs(value) < MAX_VALUE for value in camera.params
     ):
         raise DataError(
             f"{camera.where}: camera {number} is {camera.width}x{camera.height} with parameters {camera.params[:4]}; "

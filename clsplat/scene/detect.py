@@ -18,7 +18,7 @@ def readers() -> list[Reader]:
     """Return the readers in order of precedence: shipped ones, then those of plug-ins in order of definition."""
 
     def rank(found: type[Reader]) -> int:
-        """That of the shipped reader which it is, or extends."""
+        """The rank of a shipped reader, or of the one that the class extends."""
         return next((i for i, shipped in enumerate(PRECEDENCE) if issubclass(found, shipped)), len(PRECEDENCE))
 
     return [found() for found in sorted(reader_classes(), key=rank)]
@@ -31,19 +31,19 @@ def format_names() -> str:
 
 
 def reader_of(path: Path) -> Reader | None:
-    """Return the first reader that knows the dataset in a folder."""
+    """Return the first reader whose format the dataset in a folder has, or None."""
     return next((reader for reader in readers() if reader.matches(path)), None)
 
 
 def holds_scene(path: Path) -> bool:
-    """Whether a folder has cameras, in any format that read_scene knows."""
+    """Return whether a folder holds a dataset in a format that read_scene can read."""
     return reader_of(path) is not None
 
 
 def read_scene(path: str | Path, holdout: int = HOLDOUT) -> Scene:
-    """Read the dataset in a folder; every `holdout`-th view is for testing where the dataset does not say which.
+    """Read the dataset in a folder; every `holdout`-th view is for testing where the dataset has no split.
 
-    Raises DataError when no reader knows it, or when it is damaged.
+    Raises DataError when its format is unknown or its files are damaged.
     """
     path = Path(path)
     if not path.is_dir():
@@ -51,8 +51,6 @@ def read_scene(path: str | Path, holdout: int = HOLDOUT) -> Scene:
     if reader := reader_of(path):
         return reader.read(path, holdout)
     if any(is_image(file) for file in path.iterdir()):
-        raise DataError(
-            f"{path}: photographs without cameras; `clsplat run photos --scene {path}` finds where they were taken"
-        )
+        raise DataError(f"{path}: photographs without cameras; `clsplat run photos --scene {path}` finds the cameras")
     known = ", ".join(f"{reader.name} ({reader.expects})" for reader in readers())
     raise DataError(f"{path}: no dataset found; looked for {known}")

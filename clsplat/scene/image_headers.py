@@ -1,4 +1,4 @@
-"""Read the size of a photograph and how it should be turned from its first bytes, without decoding it.
+"""Read the size and the orientation of a photograph from its first bytes, without decoding it.
 
 PNG (W3C, third edition), JPEG (ITU-T T.81, annex B) and Exif 2.3; other formats are decoded.
 """
@@ -19,7 +19,7 @@ ORIENTATION = 0x0112  # Exif tag
 
 @dataclass(frozen=True)
 class Header:
-    """Size in pixels as stored, the Exif orientation (1: upright), and whether the end of the file is there."""
+    """Size in pixels as stored, the Exif orientation (1: upright), and whether the file is complete."""
 
     width: int
     height: int

@@ -1,4 +1,4 @@
-"""The files of a dataset: which paths are allowed, their bytes, and images."""
+"""The files of a dataset: allowed paths, bytes and images."""
 
 import os
 from collections.abc import Iterable
@@ -16,7 +16,7 @@ IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".
 
 
 def is_image(path: PurePath) -> bool:
-    """Tell whether a file name has the suffix of an image."""
+    """Return whether a file name has the suffix of an image."""
     return path.suffix.lower() in IMAGE_SUFFIXES
 
 
@@ -44,8 +44,8 @@ def read_file(path: Path) -> bytes:
 
 
 def inside(folder: Path, name: str, where: str) -> Path:
-    """Return `folder / name`.  Raises DataError, starting with `where`, when that would lie outside the folder."""
-    path = PureWindowsPath(name)  # knows both kinds of slash, and drives
+    """Return `folder / name`.  Raises DataError, starting with `where`, when that lies outside the folder."""
+    path = PureWindowsPath(name)  # splits at both kinds of slash and at drives
     if path.anchor or ".." in path.parts or not path.parts or any(letter < " " for letter in name):
         raise DataError(f"{where}: the file name {name!r} is not a path below {folder}; rename it")
     return folder / name
@@ -53,15 +53,15 @@ def inside(folder: Path, name: str, where: str) -> Path:
 
 def require_files(path: Path, files: Iterable[Path]) -> None:
     """Raise DataError, naming the first few, when some of the `files` of the dataset at `path` do not exist."""
-    wanted = list(files)
-    missing = [str(file) for file in wanted if not os.path.isfile(file)]  # unlike Path.is_file, never raises
+    expected = list(files)
+    missing = [str(file) for file in expected if not os.path.isfile(file)]  # unlike Path.is_file, never raises
     if missing:
-        few = ", ".join(missing[:3]) + (", ..." if len(missing) > 3 else "")
-        raise DataError(f"{path}: {len(missing)} of {len(wanted)} image files are missing: {few}; put them back")
+        names = ", ".join(missing[:3]) + (", ..." if len(missing) > 3 else "")
+        raise DataError(f"{path}: {len(missing)} of {len(expected)} image files are missing: {names}; put them back")
 
 
 def read_image(path: Path, upright: bool = False) -> NDArray[Any]:
-    """Decode an image file to RGB or RGBA, [H, W, 3 or 4], uint8 or uint16; `upright` turns it by its EXIF tag."""
+    """Decode an image file to RGB or RGBA, [H, W, 3 or 4], uint8 or uint16; `upright` rotates it by its EXIF tag."""
     data = np.frombuffer(read_file(path), np.uint8)  # not cv2.imread: that needs ASCII paths on Windows
     try:
         pixels = cv2.imdecode(data, cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH if upright else cv2.IMREAD_UNCHANGED)

@@ -1,7 +1,7 @@
-"""Lenses with distortion: COLMAP's camera models, and the pinhole photographs that are made from theirs.
+"""Lenses with distortion: COLMAP's camera models, and undistorted photographs.
 
-Normalised coordinates are (x/z, y/z) of a point before the camera.  A lens moves them; focal lengths and principal
-point turn them into pixels.  Formulas are those of COLMAP's sources (sensor/models.h), which follow OpenCV's.
+Normalised coordinates are (x/z, y/z) of a point in front of the camera.  Distortion moves them; focal lengths and
+principal point convert them to pixels.  Formulas are those of COLMAP (sensor/models.h), which follow OpenCV's.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,11 +18,11 @@ from clsplat.scene.camera import Camera
 
 Floats = NDArray[np.float64]
 Distortion = Callable[[Floats, Floats, Sequence[float]], tuple[Floats, Floats]]
-BORDER = 200  # points along each edge of a photograph
+BORDER_POINTS = 200  # along each edge of a photograph
 MAX_ROUNDS = 50  # of Newton's method
 MAX_ERROR = 1.0e-6  # of its result, normalised units
 MAX_DIFFERENCE = 1.0e-3  # of a ray that was distorted and undistorted, normalised units
-MAX_TANGENT = 3**0.5  # tan of 60 degrees: a pinhole of more is mostly stretched edges
+MAX_TANGENT = 3**0.5  # tan of 60 degrees: beyond, a pinhole image is mostly stretched edges
 MAX_GROWTH = 2.0  # of an undistorted photograph's size by the photograph's
 
 
@@ -73,7 +73,7 @@ def _fov(u: Floats, v: Floats, k: Sequence[float]) -> tuple[Floats, Floats]:
     return u * factor, v * factor
 
 
-MODELS: dict[str, tuple[int, Distortion]] = {  # focal lengths, and what comes after the principal point
+MODELS: dict[str, tuple[int, Distortion]] = {  # number of focal lengths, and the distortion
     "SIMPLE_PINHOLE": (1, lambda u, v, k: (u, v)),
     "PINHOLE": (2, lambda u, v, k: (u, v)),
     "SIMPLE_RADIAL": (1, _radial),
@@ -90,13 +90,13 @@ MODELS: dict[str, tuple[int, Distortion]] = {  # focal lengths, and what comes a
 
 @dataclass(frozen=True)
 class Lens:
-    """A camera as it took the photograph: size in pixels, a model of MODELS, its parameters in COLMAP's order."""
+    """The camera of a distorted photograph: size in pixels, a model of MODELS, its parameters in COLMAP's order."""
 
     width: int
     height: int
     model: str
     params: tuple[float, ...]
-    whole: bool = False  # the undistorted photograph shows all of it, with blank pixels, not only the part without them
+    whole: bool = False  # keep the whole photograph, with blank pixels, not only the part without them
 
     @property
     def _split(self) -> tuple[float, float, float, float, tuple[float, ...]]:
@@ -106,21 +106,21 @@ class Lens:
 
     @property
     def distorts(self) -> bool:
-        """Whether the lens has distortion; a fisheye always has."""
+        """Whether the lens has distortion; a fisheye always has it."""
         return "FISHEYE" in self.model or any(self._split[4])
 
     def distort(self, u: Floats, v: Floats) -> tuple[Floats, Floats]:
-        """Pixels of normalised coordinates."""
+        """Return the pixels of normalised coordinates."""
         fx, fy, cx, cy, rest = self._split
         x, y = MODELS[self.model][1](u, v, rest)
         return fx * x + cx, fy * y + cy
 
     def project(self, points: Floats) -> Floats:
-        """Pixels [M, 2] of points [M, 3] in camera space, in front of it."""
+        """Return the pixels [M, 2] of points [M, 3] in camera space, in front of the camera."""
         return np.stack(self.distort(points[:, 0] / points[:, 2], points[:, 1] / points[:, 2]), axis=1)
 
     def undistort(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
-        """Normalised coordinates of pixels, by Newton's method; NaN where it does not converge."""
+        """Return the normalised coordinates of pixels, by Newton's method; NaN where it does not converge."""
         fx, fy, cx, cy, rest = self._split
         distortion = MODELS[self.model][1]
         goal_u, goal_v = (x - cx) / fx, (y - cy) / fy
@@ -149,15 +149,15 @@ class Lens:
     def pinhole(self) -> Camera:
         """The camera of the undistorted photograph: same focal lengths, the largest upright part without blank pixels.
 
-        Of the `whole` photograph it is the smallest part that shows it, within 60 degrees to each side and twice its
-        size.  Raises DataError when the lens leaves no such part.
+        With `whole` it is the smallest image that contains the photograph, up to 60 degrees to each side and twice its
+        size.  Raises DataError when no such image exists.
         """
         fx, fy, _, _, _ = self._split
-        along_x, along_y = np.linspace(0, self.width, BORDER), np.linspace(0, self.height, BORDER)
-        left = self.undistort(np.zeros(BORDER), along_y)[0]
-        right = self.undistort(np.full(BORDER, float(self.width)), along_y)[0]
-        top = self.undistort(along_x, np.zeros(BORDER))[1]
-        bottom = self.undistort(along_x, np.full(BORDER, float(self.height)))[1]
+        along_x, along_y = np.linspace(0, self.width, BORDER_POINTS), np.linspace(0, self.height, BORDER_POINTS)
+        left = self.undistort(np.zeros(BORDER_POINTS), along_y)[0]
+        right = self.undistort(np.full(BORDER_POINTS, float(self.width)), along_y)[0]
+        top = self.undistort(along_x, np.zeros(BORDER_POINTS))[1]
+        bottom = self.undistort(along_x, np.full(BORDER_POINTS, float(self.height)))[1]
         if not all(np.isfinite(side).any() for side in (left, right, top, bottom)):
             raise DataError(f"the lens {self.model} {self.params} cannot be inverted; calibrate the camera again")
         u0, u1, v0, v1 = np.nanmax(left), np.nanmin(right), np.nanmax(top), np.nanmin(bottom)
@@ -169,12 +169,12 @@ class Lens:
         width, height = int((u1 - u0) * fx), int((v1 - v0) * fy)
         if min(width, height) < 1:
             raise DataError(
-                f"the lens {self.model} {self.params} leaves nothing of its image; calibrate the camera again"
+                f"the lens {self.model} {self.params} leaves no pixel of its image; calibrate the camera again"
             )
         return Camera(width, height, fx, fy, float(-u0 * fx), float(-v0 * fy))
 
     def undistort_image(self, pixels: NDArray[Any]) -> NDArray[Any]:
-        """The photograph as `pinhole` would have taken it, [H, W, C] of the same type."""
+        """Return the undistorted photograph, as `pinhole` sees it, [H, W, C] of the same type."""
         camera = self.pinhole
         x, y = self.distort(*_rays(camera))
         maps = (x - 0.5).astype(np.float32), (y - 0.5).astype(np.float32)  # OpenCV's pixels have whole centres
@@ -183,7 +183,7 @@ class Lens:
 
     @cached_property
     def shown(self) -> NDArray[np.bool_]:
-        """Which pixels of `pinhole`, [H, W], the photograph shows: rays that land in it and come back as themselves."""
+        """Which pixels of `pinhole`, [H, W], the photograph shows: distorted rays lie in it and undistort back."""
         u, v = _rays(self.pinhole)
         x, y = self.distort(u, v)
         back_u, back_v = self.undistort(x, y)
@@ -202,5 +202,5 @@ def _rays(camera: Camera) -> tuple[Floats, Floats]:
 
 @lru_cache(maxsize=64)
 def shared(lens: Lens) -> Lens:
-    """Return the first lens that equals this one: it may know its pinhole already, which takes a while to find."""
+    """Return the first lens that equals this one, so that views share its `pinhole`, which is slow to compute."""
     return lens

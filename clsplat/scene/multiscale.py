@@ -1,4 +1,4 @@
-"""Read the multi-scale Blender datasets of mip-NeRF: one metadata.json, every photograph at several scales."""
+"""Read the multi-scale Blender datasets of mip-NeRF: one metadata.json, every photograph at several sizes."""
 
 import json
 from pathlib import Path
@@ -55,7 +55,7 @@ def _views(path: Path, splits: Any, name: str) -> list[View]:
         level = frame.number("label")
         if level is None or not 0 <= level <= 8 or level % 1:
             raise DataError(
-                f"{frame.where}: label is {label!r}; expected how often the image was halved: make it again"
+                f"{frame.where}: label is {label!r}; expected the number of its halvings, 0 to 8: make it again"
             )
         image = image_path_of(frame)
         view = View(view_name(file), camera_of(frame, None), pose_of(frame), image, downscale=2**level)

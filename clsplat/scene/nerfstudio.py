@@ -16,8 +16,8 @@ logger = logging.getLogger("clsplat")
 class NerfstudioReader(Reader):
     """A nerfstudio scene; views are in order of name.
 
-    The split is that of the lists `train_filenames` and `test_filenames` where the file has one of them, and images
-    on neither are left out; otherwise every `holdout`-th view is for testing.
+    The lists `train_filenames` and `test_filenames` are the split where the file has one of them; images on neither
+    list are left out.  Otherwise every `holdout`-th view is for testing.
     """
 
     name = "nerfstudio"

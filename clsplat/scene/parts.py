@@ -1,4 +1,4 @@
-"""What is in a dataset, piece by piece: a damaged piece becomes a fault, and the others are still there."""
+"""A dataset in pieces: a damaged piece becomes a fault, and the other pieces stay readable."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -16,7 +16,7 @@ Result = TypeVar("Result")
 class Parts:
     """A dataset in pieces.
 
-    `scene` is what training would read, None when it cannot; `refusal` is why training would not start.
+    `scene` is None when the dataset cannot be read as a whole; `refusal` is the reason why training does not start.
     """
 
     path: Path
@@ -34,7 +34,7 @@ class Parts:
     refusal: str = ""
 
     def attempt(self, read: Callable[..., Result], *arguments: Any) -> Result | None:
-        """Call a function that reads something; note its DataError and return None."""
+        """Return what a function reads; where it raises DataError, note the fault and return None."""
         try:
             return read(*arguments)
         except DataError as error:

@@ -1,4 +1,4 @@
-"""A photograph as training wants it: its colours, and which of its pixels count."""
+"""The photograph of a view for training: its colours and its mask."""
 
 import hashlib
 from pathlib import Path
@@ -19,7 +19,7 @@ def load_photograph(
 ) -> NDArray[np.uint8]:
     """Return RGB, [H, W, 3], or with a mask RGB and 0 or 1, [H, W, 4].
 
-    Photographs of lenses with distortion are kept in the folder `undistorted`, so that each is undistorted once.
+    The folder `undistorted` keeps undistorted photographs, so that each is undistorted once.
     Raises DataError as load_image does.
     """
     if view.lens is None or undistorted is None:
@@ -37,7 +37,7 @@ def load_photograph(
 
 
 def _key(view: View) -> str:
-    """Changes with the file, the lens and the size."""
+    """A hash of the file, the lens and the size."""
     state = view.image_path.stat() if view.image_path.exists() else None
     parts = view.lens, view.camera, view.mask_path, view.alpha, state and (state.st_mtime_ns, state.st_size)
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:12]

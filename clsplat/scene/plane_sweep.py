@@ -1,7 +1,7 @@
-"""Points for a scene that comes without: a plane sweep over its photographs (Collins 1996).
+"""Points for a scene without points: a plane sweep over its photographs (Collins 1996).
 
-For every photograph and each of a row of depths, its neighbours are projected onto the plane at that depth; where they
-agree best lies the surface.  A pixel whose depth its neighbours confirm becomes a point.
+For every photograph and each of PLANES depths, the neighbours are projected onto the plane at that depth.  The surface
+lies at the depth where they agree best.  A pixel becomes a point when its neighbours find the same depth.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,7 +20,7 @@ MIN_DEPTH, MAX_DEPTH = 0.1, 20.0  # times the distance to what the cameras look 
 NEIGHBOURS = 4  # photographs that each is compared with
 WINDOW = 5  # px
 MAX_COST_SHARE = 0.6  # of the best plane, by the mean of all planes
-MIN_VOTES = 2  # neighbours whose depth agrees with a point's
+MIN_VOTES = 2  # neighbours that find the depth of a point too
 MAX_DIFFERENCE = 1.5  # of agreeing depths, planes
 
 

@@ -16,13 +16,13 @@ from clsplat.scene.scene import Floats, PointCloud
 
 logger = logging.getLogger("clsplat")
 
-FAR = 1e15  # scene units; a float holds no square of much larger ones
+MAX_VALUE = 1e15  # of any number in a dataset: the squares of much larger ones overflow float32
 RGB = ("red", "green", "blue")
 POINT = np.dtype([(name, "<f4") for name in "xyz"] + [(name, "u1") for name in RGB])
 
 
 class PointTable(NamedTuple):
-    """The points of a dataset as they are: nothing is dropped."""
+    """All points of a dataset, invalid ones too."""
 
     file: Path
     positions: Floats  # [M, 3]
@@ -30,8 +30,8 @@ class PointTable(NamedTuple):
     error: Floats = np.empty(0)  # [M], mean reprojection error in pixels, or [0]; COLMAP writes -1 or 0 for unknown
 
     def cloud(self) -> PointCloud:
-        """Return the points that are finite; the number of the others is logged."""
-        kept = (np.abs(self.positions) < FAR).all(axis=1)
+        """Return the points that are finite; log the number of the others."""
+        kept = (np.abs(self.positions) < MAX_VALUE).all(axis=1)
         if not kept.all():
             logger.warning("%s: dropped %d points that are not finite", self.file, np.count_nonzero(~kept))
         colours = np.asarray(self.rgb[kept], np.float32) / np.float32(255)

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from clsplat.scene.points import FAR
+from clsplat.scene.points import MAX_VALUE
 
 Floats = NDArray[np.float64]
 
@@ -36,7 +36,7 @@ def pose_matrix(quaternion: Sequence[float], translation: Sequence[float]) -> Fl
     """
     length = math.hypot(*quaternion)
     sizes = len(quaternion), len(translation)
-    if sizes != (4, 3) or not 0 < length < math.inf or not all(abs(part) < FAR for part in translation):
+    if sizes != (4, 3) or not 0 < length < math.inf or not all(abs(part) < MAX_VALUE for part in translation):
         raise ValueError(
             f"quaternion {tuple(quaternion)}, translation {tuple(translation)}; expected finite numbers and a rotation"
         )

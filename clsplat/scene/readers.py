@@ -17,11 +17,11 @@ from clsplat.scene.scene import Scene
 class Reader(ABC):
     """A dataset format.
 
-    A subclass is used by all commands as soon as it is defined; a class with subclasses of its own is not used itself.
+    All commands use a subclass as soon as it is defined; they do not use a class that has subclasses of its own.
     """
 
     name: ClassVar[str]  # of the format
-    expects: ClassVar[str]  # the files that it looks for, in a few words
+    expects: ClassVar[str]  # the files that mark the format, in a few words
 
     def __init__(self) -> None:
         missing = [field for field in ("name", "expects") if not hasattr(self, field)]
@@ -31,17 +31,17 @@ class Reader(ABC):
 
     @abstractmethod
     def matches(self, path: Path) -> bool:
-        """Tell whether a folder holds a dataset of this format, without reading it."""
+        """Return whether a folder holds a dataset of this format, without reading it."""
 
     @abstractmethod
     def read(self, path: Path, holdout: int) -> Scene:
-        """Read the dataset in a folder; every `holdout`-th view is for testing where the dataset does not say which.
+        """Read the dataset in a folder; every `holdout`-th view is for testing where the dataset has no split.
 
         Raises DataError when a file is missing, damaged or not supported.
         """
 
     def list_parts(self, parts: Parts) -> None:
-        """Add what can be read of a dataset that is perhaps damaged; by default what `read` returned, if it did."""
+        """Add the readable pieces of a dataset, which may be damaged; by default those that `read` returned."""
         scene = parts.scene
         if scene is not None:
             parts.views = list(scene.views)

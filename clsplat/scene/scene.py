@@ -1,4 +1,4 @@
-"""What a dataset is, on the host: cameras, views, points and which views are held out.
+"""A dataset on the host: cameras, views, points and the split into training and test views.
 
 Conventions of the whole project
     camera      OpenCV: x right, y down, z forward; `world_to_camera` is row-major [3, 4]
@@ -8,7 +8,8 @@ Conventions of the whole project
     colours     as the image files store them, in [0, 1]
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -21,11 +22,13 @@ from clsplat.scene.camera import Camera as Camera
 from clsplat.scene.view import Alpha as Alpha
 from clsplat.scene.view import Floats as Floats
 from clsplat.scene.view import View as View
+from clsplat.scene.view import load_image
 
 Background = Literal["black", "white"]
-HOLDOUT = 8  # every so many views are for testing where the dataset does not say which: the default of pipelines
-MAX_DISTANCE = 10.0  # by the median one: a walk of evenly spaced cameras has 2, an orbit 1, a close-up about 4
+HOLDOUT = 8  # every 8th view is for testing where the dataset has no split: the default of pipelines
+MAX_DISTANCE = 10.0  # median distances: evenly spaced cameras on a line reach 2, an orbit 1, a close-up about 4
 MAX_STRAYED_SHARE = 0.2  # of the cameras
+MAX_THUMBNAILS = 4
 
 
 @dataclass(frozen=True)
@@ -41,7 +44,7 @@ class PointCloud:
 
 @dataclass(frozen=True)
 class Scene:
-    """A posed set of photographs, with the split that every stage uses."""
+    """Photographs with their cameras, and the split that every stage uses."""
 
     path: Path
     views: tuple[View, ...]
@@ -49,12 +52,14 @@ class Scene:
     test: tuple[int, ...]
     points: PointCloud | None
     extent: float  # radius of the training cameras, scene units
-    background: Background = "black"  # what the photographs are usually shown on
+    background: Background = "black"  # on which papers show the photographs
 
     def split(self, name: str) -> tuple[View, ...]:
-        """Return the views of `train`, `test` or `all`."""
+        """Return the views of `train`, `test` or `all`.  Raises ValueError for another name."""
         if name == "all":
             return self.views
+        if name not in ("train", "test"):
+            raise ValueError(f"no split '{name}'; there are train, test and all")
         return tuple(self.views[i] for i in (self.train if name == "train" else self.test))
 
     def with_alpha(self, alpha: Alpha) -> "Scene":
@@ -63,13 +68,13 @@ class Scene:
 
     @property
     def downscales(self) -> tuple[float, ...]:
-        """The downscales of the views, the largest photographs first."""
+        """The divisors of the photographs' sizes in the scene, ascending."""
         return tuple(sorted({view.downscale for view in self.views}))
 
     def downscaled(self, *downscales: float) -> "Scene":
         """Return the scene with every photograph at 1 / downscale of its original size, for each of `downscales`.
 
-        Views of that size are taken where the dataset has them; otherwise the largest photographs are resampled.
+        Where the dataset has views of that size, they are used; otherwise the largest photographs are resampled.
         Raises DataError for a size larger than the largest in the dataset.
         """
         if downscales == self.downscales:
@@ -90,11 +95,33 @@ class Scene:
                 views += [view.resized(downscale) for view in found]
         return replace(self, views=tuple(views), train=tuple(splits["train"]), test=tuple(splits["test"]))
 
+    def __repr__(self) -> str:
+        return f"Scene({self.path.name}: {len(self.train)} training and {len(self.test)} test views)"
+
+    def _repr_html_(self) -> str:
+        from clsplat.pages.notebook import summary
+
+        camera, count = self.views[0].camera, len(self.points) if self.points else 0
+        rows = {
+            "scene": str(self.path),
+            "views": f"{len(self.train)} for training, {len(self.test)} for testing",
+            "photographs": f"{camera.width} x {camera.height} px, the first",
+            "points": f"{count:,}" if count else "none",
+            "extent": f"{self.extent:.3g} scene units",
+        }
+        return summary(rows, list(self._thumbnails()))
+
+    def _thumbnails(self) -> Iterator[tuple[str, NDArray[np.uint8]]]:
+        """Some photographs, evenly spaced, with their names; those that cannot be read are left out."""
+        for i in np.unique(np.linspace(0, len(self.views) - 1, MAX_THUMBNAILS).astype(int)):
+            with suppress(DataError):
+                yield self.views[i].name, load_image(self.views[i])
+
 
 def make_scene(
     path: Path, views: list[View], test: set[int], points: PointCloud | None, background: Background = "black"
 ) -> Scene:
-    """Check `views`, order the split and measure the extent.
+    """Return a scene of `views`, with its split and its extent.
 
     Raises DataError when there is no view, when names repeat or when a pose or a camera is impossible.
     """
@@ -119,9 +146,9 @@ def make_scene(
 
 
 def camera_extent(views: list[View]) -> float:
-    """Radius of the cameras: 1.1 x the largest distance of a centre from their mean (Kerbl et al. 2023).
+    """Return the radius of the cameras: 1.1 x the largest distance of a centre from their mean (Kerbl et al. 2023).
 
-    Cameras far away from all others do not count: one wrong pose would scale every size and rate of the scene.
+    Cameras far away from all others do not count: one wrong pose changes every size and rate of the scene.
     """
     centres = np.stack([v.position for v in views])[~strayed(views)]
     radius = 1.1 * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
@@ -129,9 +156,9 @@ def camera_extent(views: list[View]) -> float:
 
 
 def strayed(views: Sequence[View]) -> NDArray[np.bool_]:
-    """Which cameras, [N], lie more than MAX_DISTANCE times the median distance from the median centre.
+    """Return which cameras, [N], lie more than MAX_DISTANCE times the median distance from the median centre.
 
-    None when more than MAX_STRAYED_SHARE of all do: such a scene has several groups of cameras.
+    Where that is more than MAX_STRAYED_SHARE of all, the scene has several groups of cameras, and all are False.
     """
     centres = np.stack([v.position for v in views])
     distance = np.linalg.norm(centres - np.median(centres, axis=0), axis=1)
@@ -140,7 +167,7 @@ def strayed(views: Sequence[View]) -> NDArray[np.bool_]:
 
 
 def every_nth(names: list[str], holdout: int) -> set[int]:
-    """Indices of the names that are held out: every `holdout`-th in order of name, starting with the first."""
+    """Return the indices of the names that are held out: every `holdout`-th by name, from the first on."""
     if holdout <= 0:
         return set()
     order = sorted(range(len(names)), key=lambda i: names[i])

@@ -13,11 +13,11 @@ from clsplat.scene.image_headers import read_header
 from clsplat.scene.images import image_size, inside, read_file, require_files
 from clsplat.scene.lens import Lens, shared
 from clsplat.scene.parts import Parts
-from clsplat.scene.points import FAR, read_ply_table, read_points_ply
+from clsplat.scene.points import MAX_VALUE, read_ply_table, read_points_ply
 from clsplat.scene.scene import Camera, Floats, PointCloud, View
 
 DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-LENSES = {  # what parameters a camera_model has, in COLMAP's order
+LENSES = {  # the parameters of each camera_model, in COLMAP's order
     **dict.fromkeys(("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"), DISTORTION[:4]),
     "FULL_OPENCV": DISTORTION,
     "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
@@ -26,7 +26,7 @@ COLMAP = {4: "OPENCV", 8: "FULL_OPENCV"}  # by the number of parameters
 
 
 class Frame:
-    """One image of the file: its own values over those that the file gives for all; `where` is for messages."""
+    """One image of the file: values of the file, replaced by those of the image; `where` is for messages."""
 
     def __init__(self, folder: Path, where: str, values: dict[str, Any]) -> None:
         self.folder, self.where, self.values = folder, where, values
@@ -36,7 +36,7 @@ class Frame:
         value = self.values.get(key)
         if value is None:
             return None
-        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < FAR:
+        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < MAX_VALUE:
             raise DataError(f"{self.where}: {key} is {value!r}; expected a finite number: export the file again")
         return float(value)
 
@@ -68,8 +68,8 @@ class Transforms:
     def views(self) -> list[View]:
         """Return one view per frame, in the order of the file.
 
-        Images whose size the file does not give are as large as the first; those of lenses with distortion are
-        undistorted as they are read.
+        An image without a size in the file has the size of the first one.  Photographs of lenses with distortion are
+        undistorted when they are read.
         Raises DataError for damaged numbers, missing files and paths that leave the folder.
         """
         images = [image_path_of(frame) for frame in self.frames]
@@ -116,7 +116,7 @@ def view_name(file_path: str) -> str:
 
 
 def view_of(frame: Frame, size: tuple[int, int] | None) -> View:
-    """Return the view of a frame; `size` is that of images whose frame does not give it.  Raises DataError."""
+    """Return the view of a frame; `size` is the image's where the frame has none.  Raises DataError."""
     image, mask = image_path_of(frame), frame.file("mask_path")
     lens = shared(lens_of(frame, camera_of(frame, size)))
     camera, distortion = (lens.pinhole, lens) if lens.distorts else (lens.camera, None)
@@ -124,7 +124,8 @@ def view_of(frame: Frame, size: tuple[int, int] | None) -> View:
 
 
 def image_path_of(frame: Frame) -> Path:
-    path = frame.file("file_path", suffix=".png")  # Blender's exporter leaves the extension out
+    """Return the path of a frame's image.  Raises DataError when the frame has none."""
+    path = frame.file("file_path", suffix=".png")  # Blender's exporter omits the suffix
     if path is None:
         raise DataError(f"{frame.where}: it has no `file_path`; expected the path of an image: export the file again")
     return path
@@ -177,7 +178,8 @@ def pose_of(frame: Frame) -> Floats:
         matrix = np.array(frame.values.get("transform_matrix"), np.float64)
     except (ValueError, TypeError, OverflowError):
         matrix = np.empty(0)
-    if matrix.shape not in ((4, 4), (3, 4)) or not (np.abs(matrix) < FAR).all() or not _is_rotation(matrix[:3, :3]):
+    finite = (np.abs(matrix) < MAX_VALUE).all()
+    if matrix.shape not in ((4, 4), (3, 4)) or not finite or not _is_rotation(matrix[:3, :3]):
         raise DataError(
             f"{frame.where}: transform_matrix is not 4x4 numbers with a rotation in its corner; "
             "remove that frame or export the file again"
@@ -189,5 +191,5 @@ def pose_of(frame: Frame) -> Floats:
 
 
 def _is_rotation(matrix: Floats) -> bool:
-    """Tell whether [3, 3] is a rotation, to the few digits some exporters write; scaled or mirrored is not."""
+    """Return whether [3, 3] is a rotation, to 1e-3: some exporters write few digits."""
     return np.allclose(matrix.T @ matrix, np.eye(3), atol=1e-3) and np.linalg.det(matrix) > 0

@@ -1,4 +1,4 @@
-"""A posed photograph: its camera, and its pixels as the camera saw them."""
+"""A photograph with its camera: reading its pixels at the size of the camera."""
 
 import operator
 from dataclasses import dataclass, replace
@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from clsplat.errors import DataError
 from clsplat.scene.camera import Camera
@@ -15,26 +15,51 @@ from clsplat.scene.images import read_image
 from clsplat.scene.lens import Lens
 
 Floats = NDArray[np.floating]
-Alpha = Literal["transparency", "mask"]  # what the fourth channel of a photograph is
+Alpha = Literal["transparency", "mask"]  # the meaning of a photograph's fourth channel
 BLACK = (0.0, 0.0, 0.0)
-MIN_WHITE = 0.99  # of the largest value: a mask that was stored as JPEG is never quite white
+NO_FILE = Path()  # of a view that is made by hand
+MIN_WHITE = 0.99  # share of the largest value: JPEG does not store white exactly
 
 
 @dataclass(frozen=True)
 class View:
-    """One posed photograph.  `name` is unique in its scene: the path below the image folder.
+    """A camera with its photograph.  `name` is unique in its scene: the path below the image folder.
 
-    A view that is made by hand, to look at a model, needs no photograph.
+    A view that only serves to render a model needs no photograph.
     """
 
     name: str
     camera: Camera
     world_to_camera: Floats  # [3, 4] float64
-    image_path: Path = Path()
-    mask_path: Path | None = None  # an image of the photograph's size, white where it counts
+    image_path: Path = NO_FILE
+    mask_path: Path | None = None  # an image of the photograph's size, white in pixels that count
     alpha: Alpha = "transparency"
-    lens: Lens | None = None  # of the photograph on disk, where it is not `camera`'s pinhole
+    lens: Lens | None = None  # of the photograph on disk, where it has distortion
     downscale: float = 1  # divisor of the original photograph's size
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "world_to_camera", np.asarray(self.world_to_camera))
+        if self.world_to_camera.shape != (3, 4):
+            raise ValueError(f"the pose of '{self.name}' has shape {self.world_to_camera.shape}; expected (3, 4)")
+
+    @classmethod
+    def looking_at(
+        cls, position: ArrayLike, target: ArrayLike, up: ArrayLike, camera: Camera, name: str = "view"
+    ) -> "View":
+        """Return a view from a position to a target, with `up` upwards in the image; each [3], in scene units.
+
+        Raises ValueError where there is no such view: the target is the position, or lies along `up`.
+        """
+        centre, point, above = (np.asarray(vector, np.float64) for vector in (position, target, up))
+        if not centre.shape == point.shape == above.shape == (3,):
+            raise ValueError(f"'{name}': expected a position, a target and `up` of 3 numbers each")
+        forward = point - centre
+        right = np.cross(forward, above)
+        axes = np.stack([right, np.cross(forward, right), forward])
+        if not np.linalg.norm(right) > 1e-9 * np.linalg.norm(forward) * np.linalg.norm(above):
+            raise ValueError(f"'{name}': expected a target away from the position, and not along `up`")
+        axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+        return cls(name, camera, np.column_stack([axes, -axes @ centre]))
 
     @property
     def position(self) -> Floats:
@@ -67,9 +92,9 @@ def load_image(view: View, background: tuple[float, float, float] | Floats = BLA
     opaque, resized = pixels.shape[2] == 3, pixels.shape[:2] != (height, width)
     if opaque and not resized and pixels.dtype == np.uint8:
         return pixels
-    # Double where the reference uses it, to truncate as it does; single saves memory on large photographs.
+    # Double precision where the reference has it, to truncate alike; single saves memory on large photographs.
     values: NDArray[Any] = pixels.astype(np.float32 if opaque else np.float64)
-    if resized:  # not premultiplied by alpha: so does the reference (multi-scale Blender)
+    if resized:  # not premultiplied by alpha, as in the reference (multi-scale Blender)
         values = cv2.resize(values, (width, height), interpolation=cv2.INTER_AREA)
     limit = int(np.iinfo(pixels.dtype).max)
     if opaque:
@@ -77,15 +102,15 @@ def load_image(view: View, background: tuple[float, float, float] | Floats = BLA
     unit = values / limit
     colour, alpha = unit[:, :, :3], unit[:, :, 3:]
     composite = colour * alpha + np.asarray(background) * (1 - alpha)
-    slack = 1e-3 if resized else 0.0  # OpenCV's area weights are single precision: no level may be lost to them
-    return np.asarray(composite * 255 + slack, np.uint8)  # truncated: so does the reference (Kerbl et al. 2023)
+    slack = 1e-3 if resized else 0.0  # OpenCV's area weights are single precision: rounding must not lower a level
+    return np.asarray(composite * 255 + slack, np.uint8)  # truncated, as in the reference (Kerbl et al. 2023)
 
 
 def load_mask(view: View) -> NDArray[np.bool_] | None:
-    """Return which pixels of `load_image` count, [H, W], or None where all do.
+    """Return which pixels of `load_image` count, [H, W], or None when all do.
 
-    They do where the whole of the pixel is white in the mask file, for alpha as mask opaque in the photograph, and for
-    a lens whose whole photograph is wanted, not blank.
+    A pixel counts when its whole area is white in the mask file, opaque in the photograph (with alpha as mask) and not
+    blank (with a `whole` lens).
     Raises DataError as load_image does.
     """
     layers = []
@@ -105,11 +130,13 @@ def load_mask(view: View) -> NDArray[np.bool_] | None:
 
 
 def _as_taken(view: View, path: Path) -> NDArray[Any]:
-    """The pixels of a file as its camera saw them: upright, undistorted, before downscaling.
+    """The pixels of a file at the size of its camera before downscaling: upright and undistorted.
 
-    A file that is turned by its EXIF tag is turned where only then it is the camera's image: COLMAP ignores the tag.
-    Raises DataError when it is not the camera's image in either case.
+    The EXIF rotation is applied where the file has the camera's size only with it: COLMAP ignores the tag.
+    Raises DataError when the sizes differ in both cases.
     """
+    if path == NO_FILE:
+        raise DataError(f"the view '{view.name}' has no photograph; expected one with an image_path")
     pixels, lens = read_image(path), view.lens
     stored = pixels.shape[1::-1]
     camera = (lens.width, lens.height) if lens else (view.camera.width, view.camera.height)
@@ -126,14 +153,14 @@ def _as_taken(view: View, path: Path) -> NDArray[Any]:
 
 
 def fits(view: View, size: tuple[int, int]) -> bool:
-    """Tell whether a file of `size` (width, height), turned upright or not, is the image of a view's camera."""
+    """Return whether an image of `size` (width, height) fits the camera of a view."""
     if view.lens:
         return size == (view.lens.width, view.lens.height)
     return _scales_to(size, (view.camera.width, view.camera.height))
 
 
 def _scales_to(file: tuple[int, int], camera: tuple[int, int]) -> bool:
-    """Tell whether one factor >= 1 takes the size of the file to that of the camera, as Camera.downscaled rounds."""
+    """Return whether one divisor >= 1 takes the file's size to the camera's, rounded as in Camera.downscaled."""
     smallest = max(1.0, *(f / (c + 0.5) for f, c in zip(file, camera, strict=True)))
     largest = min(f / (c - 0.5) if c > 1 else np.inf for f, c in zip(file, camera, strict=True))
     return smallest <= largest

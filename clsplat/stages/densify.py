@@ -5,7 +5,8 @@ from collections.abc import Collection
 from dataclasses import asdict
 from typing import ClassVar, Literal
 
-from clsplat.density.edit import Edit, Rule, SceneScale, densify
+from clsplat.density.control import densify
+from clsplat.density.edit import Edit, Rule, SceneScale
 from clsplat.errors import NumericError
 from clsplat.gaussians.tables import PARAMETERS
 from clsplat.schedule import AtLeastOne

@@ -55,7 +55,7 @@ class Evaluate(Scheduled):
             LOG.warning("no %s views: nothing to evaluate (scene.holdout chooses them)", self.split)
             return
         perceptual = self._perceptual()
-        for scale in self.scales or [run.scale]:
+        for scale in self.scales or [run.downscale]:
             views = run.original.downscaled(scale).split(self.split)
             photographs = run.photographs if scale in run.scene.downscales else run.photographs.fresh()
             results = measure(run.rasterizer, run.model, views, photographs, perceptual)

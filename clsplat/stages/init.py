@@ -86,7 +86,7 @@ class Init(Stage):
         return from_points(points, self.opacity, degree)
 
     def _swept(self, run: Run) -> PointCloud:
-        views = [view for view in run.scene.split("train") if view.downscale == run.scale]
+        views = [view for view in run.scene.split("train") if view.downscale == run.downscale]
         points = swept_points(views, centre_of(views), load_image, self.swept, run.seed)
         if len(points) < MIN_SWEPT_POINTS:
             LOG.warning("the photographs agree on %d points only; starting from random ones", len(points))

@@ -127,9 +127,15 @@ class Optimize(Stage):
         for name in sorted(self.tables - gaussians.tables.keys()):
             gaussians.add(name, 1)
             run.refresh_filter()
-        losses = [*self.losses, *run.losses]
         return Trainer(
-            run.rasterizer, run.model, run.adam, run.stats, photographs.background, losses, self.rates, run.scene.extent
+            run.rasterizer,
+            run.model,
+            run.adam,
+            run.stats,
+            photographs.background,
+            self.losses,
+            self.rates,
+            run.scene.extent,
         )
 
     def _edit(self, run: Run) -> None:
@@ -149,6 +155,7 @@ class Optimize(Stage):
         stale = {name for stage in self.during if stage.due(run.step) for name in stage.stale(run)}
         if run.stage_step == self.steps:
             stale = set()
+        trainer.losses = [*self.losses, *run.losses]
         view = trainer.step(photograph, run.step, sample.transforms, stale)
         run.device.timings.sampling = False
         return view

@@ -24,7 +24,7 @@ class Render(Stage):
     """Path inside the run folder."""
 
     def run(self, run: Run) -> None:
-        views = run.scene.downscaled(run.scale).split(self.split)
+        views = run.scene.downscaled(run.downscale).split(self.split)
         for view in views:
             camera = run.photographs.camera(view)
             image = render_view(run.rasterizer, run.model, camera, run.photographs.background)

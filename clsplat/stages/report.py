@@ -77,7 +77,7 @@ def _figures(run: Run) -> dict[str, str]:
     values = {}
     for split, scales in run.metrics.items():
         for scale, averages in scales.items():
-            suffix = "" if scale == f"{run.scale:g}" else f" at 1/{scale}"
+            suffix = "" if scale == f"{run.downscale:g}" else f" at 1/{scale}"
             values[f"{split} PSNR{suffix} ({counted(averages['views'], 'view')})"] = f"{averages['psnr']:.2f} dB"
             values[f"{split} SSIM{suffix}"] = f"{averages['ssim']:.4f}"
     values["Gaussians"] = f"{run.model.gaussians.count:,}"
@@ -91,7 +91,8 @@ def _training_charts(run: Run) -> list[Markup]:
     line = {key: [(r["step"], r[key]) for r in train] for key in ("loss", "psnr", "gaussians", "ms")}
     measured = [
         Line(
-            [(r["step"], r["psnr"]) for r in tests if r["split"] == split and r["scale"] == run.scale], f"{split} views"
+            [(r["step"], r["psnr"]) for r in tests if r["split"] == split and r["scale"] == run.downscale],
+            f"{split} views",
         )
         for split in ("test", "train")
     ]
@@ -148,7 +149,7 @@ def _shares(lines: Sequence[Line]) -> list[Line]:
 def _psnr_by_gaussians(run: Run) -> list[Line]:
     """In order of steps: where Gaussians are thinned out, the line turns back.  A single point is left out."""
     counts = {r["step"]: r["gaussians"] for r in run.records.read("train")}
-    tests = [r for r in run.records.read("evaluate") if r["split"] == "test" and r["scale"] == run.scale]
+    tests = [r for r in run.records.read("evaluate") if r["split"] == "test" and r["scale"] == run.downscale]
     points = {r["step"]: (counts[r["step"]] / 1e3, r["psnr"]) for r in tests if r["step"] in counts}
     return [Line(list(points.values()))] if len(points) > 1 else []
 
@@ -167,8 +168,8 @@ def _times(run: Run) -> Times | None:
 
 def _views(run: Run) -> dict[str, list[ViewFigure]]:
     """The worst and the best views of the last evaluation, by heading."""
-    by_name = {view.name: view for view in run.scene.downscaled(run.scale).views}
-    lines = [r for r in run.records.read("view") if r["scale"] == run.scale and r["step"] == run.step]
+    by_name = {view.name: view for view in run.scene.downscaled(run.downscale).views}
+    lines = [r for r in run.records.read("view") if r["scale"] == run.downscale and r["step"] == run.step]
     last = {r["view"]: r for r in lines if r["view"] in by_name}  # it may have been measured twice after the same step
     ranked = sorted(last.values(), key=lambda r: r["psnr"])
     worst = ranked[:MAX_VIEWS]

@@ -5,7 +5,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from clsplat.density.edit import cap_opacity
+from clsplat.density.control import cap_opacity
 from clsplat.stages.base import Scheduled
 from clsplat.training.run import Run
 

@@ -34,7 +34,7 @@ class Rates(Settings):
 
 
 class Adam:
-    """Moments live beside the parameters; each parameter counts its own updates."""
+    """Adam, with its moments in tables beside the parameters, and a number of updates for each parameter."""
 
     def __init__(self, gaussians: Gaussians) -> None:
         self.gaussians = gaussians
@@ -75,7 +75,7 @@ class Adam:
     ) -> None:
         """Update every parameter but those named in `without` from gradients in memory.
 
-        Bands above the active SH degree have neither gradient nor moments, so leaving them out changes nothing.
+        Bands above the active SH degree are left out: their gradients and moments are zero.
         """
         gaussians = self.gaussians
         for name in PARAMETERS:
@@ -99,12 +99,12 @@ class Adam:
             )
 
     def _factors(self, name: str, rates: dict[str, float]) -> tuple[float, float]:
-        """Rate and second factor of a parameter's next update, corrected for the moments' start at zero."""
+        """Rate and second factor of a parameter's next update, with the bias correction of the moments."""
         self.updates[name] += 1
         updates = self.updates[name]
         return rates[name] / (1 - self._beta1**updates), 1 / (1 - self._beta2**updates)
 
     def forget(self, name: str) -> None:
-        """Zero the moments of one parameter."""
+        """Set the moments of one parameter to zero."""
         for moment in moment_tables(name):
             self.gaussians[moment].fill(0)

@@ -1,6 +1,6 @@
-"""Saving a run so that it goes on to the same bits: parameters, moments, statistics, counters, nothing pickled.
+"""Save and restore a run, bit for bit: parameters, Adam's moments, statistics and counters, without pickle.
 
-Random numbers and the order of views depend on (seed, step) alone, so the step is their whole state.
+Random numbers and the order of views depend on (seed, step) alone, so the step is their state.
 """
 
 import json
@@ -55,7 +55,7 @@ def save(run: Run, keep: int) -> Path:
 
 
 def restore(run: Run) -> bool:
-    """Continue from the newest good checkpoint; False when there is none.
+    """Restore the newest checkpoint that is not damaged; return False when there is none.
 
     Raises ConfigError when the checkpoint was made by a pipeline with other settings.
     """
@@ -63,7 +63,7 @@ def restore(run: Run) -> bool:
         try:
             meta, tables = _load(path)
         except (OSError, ValueError, KeyError, zipfile.BadZipFile, DataError) as error:
-            LOG.warning("%s is damaged (%s); trying the one before", path, error)
+            LOG.warning("%s is damaged (%s); using the one before it", path, error)
             continue
         difference = first_difference(meta["pipeline"], run.pipeline)
         if difference:
@@ -88,8 +88,8 @@ def _load(path: Path) -> tuple[dict[str, Any], Tables]:
         tables = {name: archive[name] for name in archive.files if name != "meta"}
     if meta["format"] != FORMAT:
         raise ConfigError(
-            f"{path} has format {meta['format']}, expected {FORMAT}: made by clsplat {meta['version']}, this is "
-            f"{__version__}; go on with that version, or use another --out"
+            f"{path} has format {meta['format']}, expected {FORMAT}: clsplat {meta['version']} made it before the "
+            "format changed; go on with the program that made it, or use another --out"
         )
     missing = [name for name in PARAMETERS if _key(name) not in tables]
     if missing:
@@ -112,12 +112,12 @@ def _restore(run: Run, meta: dict[str, Any], tables: Tables) -> None:
 
 
 def _key(table: str) -> str:
-    """Tables with a folder in their name keep it; parameters get one."""
+    """The key of a table in the file: parameters are in the folder `gaussians`."""
     return table if "/" in table else f"gaussians/{table}"
 
 
 def first_difference(old: Any, new: Any, place: str = "") -> str | None:
-    """Name the first setting in which two resolved pipelines differ."""
+    """Return the first setting in which two resolved pipelines differ, or None."""
     if isinstance(old, dict) and isinstance(new, dict):
         for key in [*old, *(k for k in new if k not in old)]:
             difference = first_difference(old.get(key), new.get(key), f"{place}.{key}" if place else str(key))

@@ -1,4 +1,4 @@
-"""Where the time of a training step goes, by stage, from the device's own clock."""
+"""The time of a training step on the device, by stage."""
 
 from collections import defaultdict
 
@@ -45,7 +45,7 @@ ORDER = tuple(dict.fromkeys(STAGES.values()))
 
 
 def stage_milliseconds(timings: Timings, steps: int = 1) -> dict[str, float]:
-    """Average milliseconds of each stage over the `steps` sampled since the last call, in order of a step."""
+    """Average milliseconds of each stage over the `steps` sampled since the last call, in the order of a step."""
     totals: dict[str, float] = defaultdict(float)
     for (label, section), seconds in timings.take().items():
         totals[STAGES.get(label.partition(":")[2], section)] += 1e3 * sum(seconds) / steps

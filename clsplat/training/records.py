@@ -1,4 +1,4 @@
-"""The files by which a run can be watched and judged: metrics.jsonl, status.json, metrics.json."""
+"""The records of a run: metrics.jsonl and status.json."""
 
 import json
 import os
@@ -10,7 +10,7 @@ from clsplat.files import unwritable, write_text
 
 
 class Records:
-    """Writes a run folder's records; every line of metrics.jsonl carries the step it belongs to."""
+    """Writes a run folder's records; every line of metrics.jsonl has its step."""
 
     def __init__(self, out: Path) -> None:
         self.out = out
@@ -19,7 +19,7 @@ class Records:
     def start(self, step: int, edit_due: bool = False) -> None:
         """Keep the lines up to `step` and drop later ones, which a resumed run writes again.
 
-        Where the checkpoint is from before the edit that is due at its step, the line of that edit goes, too.
+        With `edit_due`, the checkpoint was saved before the edit of its step, and the line of that edit is dropped too.
         """
         before = [line for line in self.read() if line["step"] <= step] if step > 0 else []
         kept = [line for line in before if not (edit_due and line["kind"] == "densify" and line["step"] == step)]
@@ -47,6 +47,6 @@ class Records:
         return [line for line in lines if kind in (None, line["kind"])]
 
     def status(self, state: str, step: int, **values: Any) -> None:
-        """Say in status.json where the run stands: running, done, interrupted or failed."""
+        """Write the state of the run to status.json: starting, running, done, interrupted or failed."""
         text = {"state": state, "step": step, "process": os.getpid(), "time": time.time(), **values}
         write_text(self.out / "status.json", json.dumps(text, indent=1) + "\n")

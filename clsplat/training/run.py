@@ -1,4 +1,4 @@
-"""Everything that changes while a pipeline runs."""
+"""The state of a pipeline while it runs."""
 
 import logging
 from collections.abc import Callable
@@ -41,7 +41,7 @@ class Run:
     """The mutable state of a pipeline; stages read and change it."""
 
     device: Device
-    scene: Scene  # as trained on: at one scale or several
+    scene: Scene  # as trained on: at one size or several
     original: Scene  # as read
     out: Path
     name: str
@@ -50,7 +50,7 @@ class Run:
     rasterizer: Rasterizer
     photographs: Photographs
     model_settings: ModelSettings
-    prepared: dict[str, str] | None = None  # hash of what the photographs were prepared from, and their folder
+    prepared: dict[str, str] | None = None  # hash of the inputs of `prepare:`, and the folder of its result
     losses: list[Loss] = field(default_factory=list)  # added from Python, beside those of the pipeline
     adam: Adam | None = None
     stats: SplatStats | None = None
@@ -58,7 +58,7 @@ class Run:
     cursor: int = 0  # stage in progress
     stage_step: int = 0  # steps done in it
     train_seconds: float = 0.0
-    metrics: dict[str, dict[str, Any]] = field(default_factory=dict)  # split -> scale -> averages
+    metrics: dict[str, dict[str, Any]] = field(default_factory=dict)  # split -> downscale -> averages
     interrupted: bool = False  # finish the step, save, stop
     show: Callable[[Progress], None] = lambda progress: None
 
@@ -80,12 +80,12 @@ class Run:
         self._model = model
 
     @property
-    def scale(self) -> float:
-        """The smallest divisor of the photographs' size that is trained on."""
+    def downscale(self) -> float:
+        """The smallest divisor of the photographs' size in training."""
         return self.scene.downscales[0]
 
     def memory_plan(self) -> MemoryPlan:
-        """What training with the present tables takes of the device's memory."""
+        """Return the plan of the device's memory for training with the present tables."""
         views = self.scene.split("train")
         bytes_held = min(self.photographs.budget, sum(3 * view.camera.width * view.camera.height for view in views))
         tile = int(self.device.tuning["TILE"])
@@ -94,7 +94,7 @@ class Run:
         return plan(self.model.gaussians, bytes_held, pixels, pixel_sums)
 
     def refresh_filter(self) -> None:
-        """Let the world filter follow the Gaussians: after they are made, and after their number changes."""
+        """Update the world filter and the sampling intervals to the present Gaussians."""
         if self._filter_views is None:
             self._filter_views = FilterViews(self.device, self.scene.split("train"))
         model, views = self.model, self._filter_views
@@ -103,14 +103,14 @@ class Run:
             measure_intervals(model.gaussians, views, views.focal, model.near, 1.0, model.gaussians[INTERVAL2])
 
     def texture_quantile(self, share: float) -> float:
-        """The gradient magnitude, per px, that `share` of the training photographs' pixels stay below."""
+        """Return the gradient magnitude, per px, that `share` of the training photographs' pixels stay below."""
         if share not in self._texture_quantiles:
             photographs = (self.photographs.get(view) for view in self.scene.split("train"))
             self._texture_quantiles[share] = texture_quantile(self.rasterizer.workspace, photographs, share)
         return self._texture_quantiles[share]
 
     def rendering(self) -> dict[str, Any]:
-        """The numbers that a model file needs to be rendered as it was trained."""
+        """Return the numbers for rendering a model file as in training."""
         model = self.model
         return {
             "near": model.near,

@@ -19,7 +19,29 @@ TEXTURE = int(constants("splat.h")["SUM_TEXTURE"])
 
 @dataclass
 class Trainer:
-    """All that a step needs: `step` is one call, the same for pipelines, benchmarks and notebooks."""
+    """The objects of a training step; pipelines, benchmarks and notebooks call the same `step`.
+
+    A loop of one's own, on the training views of a scene, from a model of `clsplat.load`:
+
+        model = model.upload(device)
+        photographs = Photographs(device, scene.background)
+        trainer = Trainer(
+            Rasterizer(device),
+            model,
+            Adam(model.gaussians),
+            SplatStats(model.gaussians, []),
+            photographs.background,
+            losses=[L1(weight=0.8), Dssim(weight=0.2)],
+            rates=Rates(),
+            extent=scene.extent,
+        )
+        for step, view in enumerate(scene.split("train"), 1):
+            gradients = trainer.step(photographs.get(view), step)
+            print(gradients.loss)
+
+    Between two steps the Gaussians may be changed (`model.gaussians.set`) or moved (`clsplat.density.edit`).  In a loop
+    that applies its own update, `differentiate` is the step without Adam.
+    """
 
     rasterizer: Rasterizer
     model: DeviceModel
@@ -72,7 +94,8 @@ class Trainer:
     def _update(self, view: ViewGradients, stale: Collection[str]) -> Array:
         """Update the parameters and add the penalties to the view's losses.
 
-        Returns the gradient of the projected means, [2, S] px⁻¹.  Gradients go through memory only where they must.
+        Returns the gradient of the projected means, [2, S] px⁻¹.  Without penalties and stale parameters, gradients are
+        not written to memory.
         """
         penalties = [loss for loss in self.losses if isinstance(loss, Penalty)]
         step = view.comparison.step

@@ -1,4 +1,4 @@
-"""What a training step compares with: which view, at which size, and its photograph on the device."""
+"""The sample of a training step: a view, its size, and its photograph on the device."""
 
 from clsplat.settings import import_modules
 

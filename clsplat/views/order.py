@@ -1,4 +1,4 @@
-"""The view of each training step, a function of the seed and the step alone: a resumed run goes on with the same."""
+"""The view of each training step: it depends on the seed and the step alone, so a resumed run uses the same views."""
 
 from abc import abstractmethod
 from collections.abc import Sequence
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from clsplat.scene.scene import View
 from clsplat.settings import Settings
 
-FINEST_SHARE = 0.3  # of the steps, at which `code` takes a view of the finest size (released code of Mip-Splatting)
+FINEST_SHARE = 0.3  # of the steps, which use a random view of the finest size (released code of Mip-Splatting)
 
 
 class ViewPool:
@@ -23,7 +23,7 @@ class ViewPool:
         self._epoch, self._permutation = (-1, -1), np.empty(0, np.int64)
 
     def shuffled(self, entries: Sequence[int], step: int) -> View:
-        """Return the view of a step; all `entries`, indices into `views`, come in one random order after another."""
+        """Return the view of a step; each pass uses all `entries`, indices into `views`, in a new order."""
         epoch, place = divmod(step - 1, len(entries))
         return self.views[entries[int(self._shuffle(epoch, len(entries))[place])]]
 
@@ -47,7 +47,7 @@ class Order(Settings):
 
 
 class Uniform(Order):
-    """All views of every size, in a random order, then in another."""
+    """All views of every size, in a new random order in each pass."""
 
     type: Literal["uniform"] = "uniform"
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from clsplat.errors import DataError
 from clsplat.opencl.device import Array, Device
-from clsplat.render.rasterizer import DeviceCamera, upload_camera
+from clsplat.render.camera import DeviceCamera, upload_camera
 from clsplat.render.workspace import Workspace
 from clsplat.scene.photographs import load_photograph
 from clsplat.scene.scene import Background, View
@@ -28,18 +28,18 @@ class Photograph:
 
     camera: DeviceCamera
     colours: Array  # [3, height, width] uint8
-    mask: Array | None = None  # [1, height, width] uint8 of 0 and 1, where a mask says which pixels count
+    mask: Array | None = None  # [1, height, width] uint8, 1 in pixels that count; None: all count
 
     @property
     def nbytes(self) -> int:
         return self.colours.nbytes + (self.mask.nbytes if self.mask else 0)
 
     def image(self) -> NDArray[np.uint8]:
-        """The colours on the host, [height, width, 3]."""
+        """Return the colours on the host, [height, width, 3]."""
         return np.asarray(self.colours.get().transpose(1, 2, 0))
 
     def counted(self) -> Mask | None:
-        """Which pixels count, [height, width], or None where all do."""
+        """Return which pixels count, [height, width], or None when all do."""
         return np.asarray(self.mask.get()[0] > 0) if self.mask else None
 
     def planes(self, workspace: Workspace, transforms: Sequence[PhotographTransform] = (), step: int = 0) -> Planes:
@@ -60,9 +60,9 @@ def _key(view: View) -> Key:
 
 
 class Photographs:
-    """The photographs of a scene by view, on the device as long as `budget` bytes hold them, else read again.
+    """The photographs of a scene by view, up to `budget` bytes of them on the device; others are read again.
 
-    Views that are announced are read ahead by a thread; what a view looks like does not depend on who read it.
+    A thread reads views that are announced; the result is the same as without.
     """
 
     def __init__(
@@ -79,7 +79,7 @@ class Photographs:
         self._reader: ThreadPoolExecutor | None = None
 
     def fresh(self) -> "Photographs":
-        """Return the same with nothing held, for views that are wanted once."""
+        """Return an empty copy, for views that are used once."""
         return Photographs(self.device, self.background_name, undistorted=self.undistorted)
 
     def camera(self, view: View) -> DeviceCamera:
@@ -104,7 +104,7 @@ class Photographs:
         return photograph
 
     def announce(self, views: Iterable[View]) -> None:
-        """Read ahead what will be asked for next; nothing when it is there already."""
+        """Start to read the photographs of views that are used next, unless they are on the device."""
         for view in views:
             key = _key(view)
             if key not in self._held and key not in self._reading:
@@ -115,9 +115,10 @@ class Photographs:
         """Colours and, where there is one, the mask: [3 or 4, height, width] uint8."""
         image = load_photograph(view, BACKGROUNDS[self.background_name], self.undistorted)
         if image.shape[2] == 4 and not image[:, :, 3].any():
+            size = f"{view.camera.width}x{view.camera.height}"
             raise DataError(
-                f"{view.mask_path or view.image_path}: the mask leaves out every pixel of '{view.name}'; expected some "
-                "that count: remove the photograph from the dataset, or fix its mask"
+                f"{view.mask_path or view.image_path}: at {size} the mask leaves out every pixel of '{view.name}'; "
+                "expected some that count: remove the photograph from the dataset, or fix its mask"
             )
         return np.ascontiguousarray(image.transpose(2, 0, 1))
 
@@ -144,7 +145,7 @@ def unpack(workspace: Workspace, camera: DeviceCamera, pixels: Array, factor: fl
 
 
 def apply_mask(workspace: Workspace, camera: DeviceCamera, planes: Array, mask: Array) -> None:
-    """Set `planes` [3, rows, stride] to zero where the mask [1, rows, stride] is."""
+    """Set `planes` [3, rows, stride] to zero where the mask [1, rows, stride] is zero."""
     workspace.device.program("loss.cl").apply_mask(
         items=(camera.rows * camera.stride, 3), planes=planes, mask=mask, pixels=camera.rows * camera.stride
     )

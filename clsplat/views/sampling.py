@@ -1,4 +1,4 @@
-"""What a training step compares with: a view, at a size, with transforms of its photograph."""
+"""The sample of a training step: a view, at a size, with transforms of its photograph."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,19 +13,19 @@ from clsplat.views.transforms import PhotographTransform
 
 
 class ViewSettings(Settings):
-    """How a step is turned into a sample."""
+    """The sample of each step: a view, its size and transforms of its photograph."""
 
     order: OneOf[Order] = Uniform()
     """Which view a step trains on."""
     resolution: AtLeastOne = 1.0
-    """Divisor of the size that is trained on, at least 1; by step."""
+    """Divisor of the photographs' size beside `scene.downscale`, at least 1; by step."""
     transforms: list[OneOf[PhotographTransform]] = Field(default=[])
-    """Changes of the photograph, one after the other."""
+    """Transforms of the photograph, in order."""
 
 
 @dataclass(frozen=True)
 class Sample:
-    """What a step compares with."""
+    """The sample of one step."""
 
     view: View  # at the size of the step
     transforms: Sequence[PhotographTransform]
@@ -33,7 +33,7 @@ class Sample:
 
 
 class Sampler:
-    """Turns steps into samples: a function of the views, the seed and the step."""
+    """Samples by step: they depend on the views, the seed and the step."""
 
     def __init__(self, views: Sequence[View], settings: ViewSettings, seed: int) -> None:
         self.settings, self._pool = settings, ViewPool(views, seed)

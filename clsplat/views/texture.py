@@ -1,11 +1,11 @@
-"""How fast images change: |Sobel| / 8 of their luminance."""
+"""The texture of images: their gradient magnitude, |Sobel| / 8 of the luminance, per px."""
 
 from collections.abc import Iterable
 
 import numpy as np
 
 from clsplat.opencl.device import Array
-from clsplat.render.rasterizer import DeviceCamera
+from clsplat.render.camera import DeviceCamera
 from clsplat.render.workspace import Workspace
 from clsplat.views.photographs import Photograph
 
@@ -14,7 +14,7 @@ BINS = 3000
 
 
 def image_gradient(workspace: Workspace, camera: DeviceCamera, image: Array, name: str = "texture") -> Array:
-    """Gradient magnitudes, [rows, stride] per px, of an image [3, rows, stride] in [0, 1]."""
+    """Return the gradient magnitudes, [rows, stride] per px, of an image [3, rows, stride] in [0, 1]."""
     magnitude = workspace.array(name, (camera.rows, camera.stride))
     device = workspace.device
     device.program("texture.cl").image_gradient(
@@ -27,7 +27,7 @@ def image_gradient(workspace: Workspace, camera: DeviceCamera, image: Array, nam
 
 
 def known_gradient(workspace: Workspace, camera: DeviceCamera, image: Array, mask: Array | None) -> Array:
-    """The same, but -1 at pixels that the mask, [1, rows, stride], leaves out, and beside them."""
+    """Return gradient magnitudes, but -1 at pixels that the mask, [1, rows, stride], leaves out, and beside them."""
     magnitude = image_gradient(workspace, camera, image)
     if mask is not None:
         workspace.device.program("texture.cl").hide_masked(
@@ -42,11 +42,11 @@ def known_gradient(workspace: Workspace, camera: DeviceCamera, image: Array, mas
 
 
 def texture_quantile(workspace: Workspace, photographs: Iterable[Photograph], share: float) -> float:
-    """The magnitude, per px, that `share` of all pixels of the photographs that count stay below, to 1 / 4000."""
+    """Return the magnitude, per px, to 1 / 4000, that `share` of all pixels that count stay below."""
     counts = np.zeros(BINS, np.int64)
     for photograph in photographs:
         camera, planes = photograph.camera, photograph.planes(workspace)
         inside = known_gradient(workspace, camera, planes.colours, planes.mask).get()[: camera.height, : camera.width]
-        counts += np.histogram(inside, BINS, (0, MAX_MAGNITUDE))[0]  # leaves out what is below 0
+        counts += np.histogram(inside, BINS, (0, MAX_MAGNITUDE))[0]  # without values below 0
     below = np.searchsorted(np.cumsum(counts), share * counts.sum())
     return float(below + 1) * MAX_MAGNITUDE / BINS

@@ -1,4 +1,4 @@
-"""Transforms of the photograph that a step compares with: each is a function of the photograph and the step."""
+"""Transforms of the photograph before a step compares it: each depends on the photograph and the step."""
 
 import math
 from abc import abstractmethod
@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from clsplat.opencl.device import Array
-from clsplat.render.rasterizer import DeviceCamera
+from clsplat.render.camera import DeviceCamera
 from clsplat.render.workspace import Workspace
 from clsplat.schedule import NonNegative, at_step
 from clsplat.settings import Settings
@@ -23,11 +23,11 @@ class Planes:
     workspace: Workspace
     camera: DeviceCamera
     colours: Array  # [3, rows, stride] in [0, 1]
-    mask: Array | None  # [1, rows, stride] 0 or 1, where a mask says which pixels count
+    mask: Array | None  # [1, rows, stride], 1 in pixels that count, else 0; None: all count
 
 
 class PhotographTransform(Settings):
-    """Changes the photograph before it is compared with the rendered image; the file stays as it is."""
+    """A change of the photograph before it is compared with the rendered image; the file stays unchanged."""
 
     @abstractmethod
     def apply(self, planes: Planes, step: int) -> Planes:
@@ -35,11 +35,11 @@ class PhotographTransform(Settings):
 
 
 class Blur(PhotographTransform):
-    """Blur the photograph by a Gaussian; what a mask leaves out does not count."""
+    """Blur the photograph by a Gaussian; masked pixels do not count."""
 
     type: Literal["blur"] = "blur"
     sigma: NonNegative
-    """Standard deviation in px of the photograph as it is trained on; by step."""
+    """Standard deviation in px of the photograph at its training size; by step."""
 
     def apply(self, planes: Planes, step: int) -> Planes:
         camera, sigma = planes.camera, at_step(self.sigma, step)

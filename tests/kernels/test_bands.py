@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from clsplat.render.rasterizer import UNLIMITED, Budget, Rasterizer
+from clsplat.render.rasterizer import MAX_PAIRS, Budget, Rasterizer
 from tests.scenes import random_case
 
 
@@ -20,7 +20,7 @@ def results(device, case, weights, budget=None, sort="radix"):
 @pytest.mark.parametrize("sort", ["radix", "bitonic"])
 @pytest.mark.parametrize(
     ("budget", "bands"),
-    [(Budget(UNLIMITED), 1), (Budget(600), 2), (Budget(250), 4), (Budget(1), 5), (Budget(UNLIMITED, 3), 1),
+    [(Budget(MAX_PAIRS), 1), (Budget(600), 2), (Budget(250), 4), (Budget(1), 5), (Budget(MAX_PAIRS, 3), 1),
      (Budget(1, 1), 5), (Budget(250, 1000), 4)],
 )  # fmt: skip
 def test_image_and_sums_over_pixels_are_the_same_bits(device, rng, budget, bands, sort):

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from clsplat.density.basic import Clone, PruneFaint, PruneLarge, Split
-from clsplat.density.edit import Edit, SceneScale, cap_opacity, densify
+from clsplat.density.control import cap_opacity, densify
+from clsplat.density.edit import Edit, SceneScale
 from clsplat.density.statistics import SEEN, SplatStats
 from clsplat.gaussians.tables import PARAMETERS, Gaussians
 from clsplat.opencl.device import Device

@@ -5,8 +5,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from clsplat.density.basic import Clone, PruneFaint
+from clsplat.density.control import densify
 from clsplat.density.detail import SplitOversized, SplitTextured, largest
-from clsplat.density.edit import Edit, SceneScale, densify
+from clsplat.density.edit import Edit, SceneScale
 from clsplat.density.statistics import SEEN, SplatStats
 from clsplat.density.thinning import MergeNeighbours, PruneUnimportant, covariance_of, mass_of, merged
 from clsplat.density.thresholds import PixelQuantile, Quantile

@@ -8,7 +8,8 @@ import pytest
 from clsplat.filters import Dilation, Ewa, FilterViews, Mip, NoWorldFilter, Smoothing
 from clsplat.gaussians.tables import DeviceModel, Gaussians
 from clsplat.opencl.device import Device
-from clsplat.render.rasterizer import Rasterizer, upload_camera
+from clsplat.render.camera import upload_camera
+from clsplat.render.rasterizer import Rasterizer
 from clsplat.scene.scene import Camera, View
 from tests import reference as ref
 from tests.reference_filter import sampling_interval

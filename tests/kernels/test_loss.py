@@ -5,7 +5,7 @@ import pytest
 
 from clsplat.losses.base import Comparison, ImageLoss
 from clsplat.losses.image import L1, L2, Dssim, ssim_maps
-from clsplat.render.rasterizer import DeviceCamera
+from clsplat.render.camera import DeviceCamera
 from clsplat.render.workspace import Workspace
 from clsplat.settings import variants
 from clsplat.views.photographs import unpack

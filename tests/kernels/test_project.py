@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from clsplat.render.rasterizer import CAMERA, PIXEL_SUMS, RECORD, Rasterizer
+from clsplat.render.camera import CAMERA
+from clsplat.render.rasterizer import PIXEL_SUMS, RECORD, Rasterizer
 from tests import reference as ref
 from tests.scenes import Case, random_case, relative_error, with_world_filter
 

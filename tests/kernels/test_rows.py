@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from clsplat.density.edit import Edit, Rule, SceneScale, densify
+from clsplat.density.control import densify
+from clsplat.density.edit import Edit, Rule, SceneScale
 from clsplat.density.statistics import SplatStats
 from clsplat.gaussians.tables import PARAMETERS, Gaussians, moment_tables
 from clsplat.render.rasterizer import Rasterizer

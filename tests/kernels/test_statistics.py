@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from clsplat.density.basic import Clone, PruneFaint, Split
-from clsplat.density.edit import Edit, SceneScale, densify
+from clsplat.density.control import densify
+from clsplat.density.edit import Edit, SceneScale
 from clsplat.density.statistics import ABS_X, SEEN, WEIGHT, SplatStats
 from clsplat.losses.base import ViewGradients
 from clsplat.opencl.device import Device

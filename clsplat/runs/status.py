@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from clsplat.errors import DataError
-from clsplat.runner import read_status
+from clsplat.runs.runner import read_status
 from clsplat.training.records import Records
 
 ENDED = ("done", "failed", "interrupted")

@@ -8,9 +8,9 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 
 from clsplat.errors import shortened
-from clsplat.fields import annotation_of, bases, inside_list, models, tags
+from clsplat.pipeline.fields import annotation_of, bases, inside_list, models, tags
+from clsplat.pipeline.yaml_file import Document, Place
 from clsplat.settings import TAGS, Settings
-from clsplat.yaml_file import Document, Place
 
 EXPECTED = {
     "int_type": "a whole number",

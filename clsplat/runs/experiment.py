@@ -10,14 +10,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from clsplat import runner, terminal
+from clsplat import terminal
 from clsplat.compare.page import write_comparison
 from clsplat.errors import ClsplatError, ConfigError, DataError, Interrupted, OutputError, as_clsplat_error, one_line
 from clsplat.files import write_text
-from clsplat.matrix import Cell, Experiment, load_experiment
-from clsplat.pipeline import Pipeline, load
+from clsplat.pipeline.loading import Pipeline, load
+from clsplat.pipeline.matrix import Cell, Experiment, load_experiment
+from clsplat.pipeline.yaml_file import read_yaml
+from clsplat.runs import runner
 from clsplat.training.checkpoint import first_difference
-from clsplat.yaml_file import read_yaml
 
 LOG = logging.getLogger("clsplat")
 PAGE = "compare.html"
@@ -43,7 +44,7 @@ class Job:
 
         out: default runs/NAME, with a number where that is another run.
         """
-        changes = [*overrides, *([f"scene.path={_quoted(scene)}"] if scene is not None else [])]
+        changes = [*overrides, *([f"scene.path={quoted(scene)}"] if scene is not None else [])]
         if found := load_experiment(pipeline, changes):
             return cls(found, out or runner.free_folder(Path("runs") / found.name, None, resume))
         checked = load(pipeline, changes)
@@ -146,7 +147,7 @@ def _stop_at_once() -> None:
     raise KeyboardInterrupt
 
 
-def _quoted(folder: Path) -> str:
+def quoted(folder: Path) -> str:
     """A folder as a value of `--set`, from wherever it is used.  Raises ConfigError when YAML cannot hold its name."""
     path = str(folder.resolve())
     try:

@@ -23,11 +23,12 @@ from typing import Annotated, Any
 from pydantic import Field, JsonValue, ValidationError, model_validator
 
 from clsplat.errors import ConfigError, OverrideError
-from clsplat.pipeline import Name, Pipeline, checked
-from clsplat.pipeline_files import find
+from clsplat.pipeline.explanation import explain, place_text
+from clsplat.pipeline.file import Name
+from clsplat.pipeline.files import find
+from clsplat.pipeline.loading import Pipeline, checked
+from clsplat.pipeline.yaml_file import Document, Place, read_yaml
 from clsplat.settings import Settings
-from clsplat.settings_errors import explain, place_text
-from clsplat.yaml_file import Document, Place, read_yaml
 
 MAX_CELLS = 1000
 

@@ -8,7 +8,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from clsplat.errors import ConfigError
-from clsplat.yaml_file import parse_value
+from clsplat.pipeline.yaml_file import parse_value
 
 CADENCE = ("every", "start", "stop")  # keys of stages inside `during` only
 

@@ -13,9 +13,9 @@ from typing import Any
 from pydantic import BaseModel
 
 from clsplat.errors import ConfigError, OverrideError
-from clsplat.fields import annotation_of, inside_list, model_of
+from clsplat.pipeline.fields import annotation_of, inside_list, model_of
+from clsplat.pipeline.yaml_file import Place, parse_value
 from clsplat.settings import TAGS
-from clsplat.yaml_file import Place, parse_value
 
 MAX_SUGGESTIONS = 3
 

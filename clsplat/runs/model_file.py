@@ -12,24 +12,23 @@ import numpy as np
 
 from clsplat.errors import ConfigError, DataError
 from clsplat.files import atomic
-from clsplat.filters import Dilation, Mip, ModelSettings
-from clsplat.gaussians.ply import read_ply
-from clsplat.gaussians.tables import Gaussians
+from clsplat.gaussians.model import MODEL, load
 from clsplat.metrics.lpips import InputRange
 from clsplat.metrics.perceptual import Perceptual, metric_names
 from clsplat.metrics.views import PSNR_AND_SSIM, mean, measure, render_view
-from clsplat.opencl.device import Device, choose
-from clsplat.pipeline import SceneSettings, load
+from clsplat.opencl.choice import choose
+from clsplat.opencl.device import Device
+from clsplat.pipeline.file import SceneSettings
+from clsplat.pipeline.loading import load as load_pipeline
 from clsplat.prepare.cache import noted
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.scene.detect import read_scene
 from clsplat.scene.images import write_image
 from clsplat.scene.scene import Alpha
 from clsplat.stages.render import image_path
-from clsplat.views.photographs import BACKGROUNDS, Photographs
+from clsplat.views.photographs import Photographs
 
 LOG = logging.getLogger("clsplat")
-MODEL = "point_cloud.ply"  # of a run folder
 
 
 @dataclass(frozen=True)
@@ -53,7 +52,7 @@ class Source:
             return cls(model, scene, SceneSettings())
         if not (model / "pipeline.yaml").is_file():
             raise DataError(f"{model}: has no pipeline.yaml; expected a model file or a run folder")
-        settings = load(str(model / "pipeline.yaml")).settings.scene
+        settings = load_pipeline(str(model / "pipeline.yaml")).settings.scene
         if not (model / MODEL).is_file():
             raise DataError(f"{model}: has no {MODEL}; finish the run with `clsplat resume {model}`")
         prepared = noted(model)
@@ -75,21 +74,15 @@ class ModelFile:
     ) -> None:
         """downscale: divisor of the photographs' size; default: that of the run, 1 for a file."""
         source = Source.of(model, scene)
-        file = read_ply(source.file)
+        file = load(source.file)
         self.device = Device(choose(device))
         LOG.info("device: %s", self.device.text)
-        alpha: Alpha = source.alpha or ("mask" if file.rendering.get("alpha") == "mask" else "transparency")
+        alpha = source.alpha or file.rendering.alpha
         self.photographs = read_scene(source.folder, source.settings.holdout).with_alpha(alpha)
         self.downscale = downscale or source.settings.downscale
         self.scene = self.photographs.downscaled(self.downscale)
-        gaussians = Gaussians(self.device, file.parameters)
-        screen_filter = Mip() if file.mode == "mip" else Dilation()
-        self.model = ModelSettings(screen_filter=screen_filter).model(gaussians, gaussians.sh_degree)
-        for name in ("near", "screen_variance", "compensate"):
-            if isinstance(file.rendering.get(name), int | float):
-                setattr(self.model, name, float(file.rendering[name]))
-        background = file.rendering.get("background")
-        self.background = background if background in BACKGROUNDS else self.scene.background
+        self.model = file.upload(self.device)
+        self.background = file.rendering.background or self.scene.background
         self.rasterizer = Rasterizer(self.device)
 
     def render(self, split: str, out: Path, kind: str) -> int:

@@ -5,6 +5,7 @@ and `final`.
 """
 
 import logging
+from functools import cache
 from typing import Any
 
 LOG = logging.getLogger("clsplat")
@@ -61,6 +62,7 @@ def _densify(stage: Any, where: str) -> Any:
     return {**stage, "rules": rules}
 
 
+@cache  # once for a file, however many cells of a matrix it serves
 def _warn(where: str, old: str, new: str) -> None:
     if where:
         LOG.warning("%s: '%s' has a new name, '%s'; the old one goes with the next release", where, old, new)

@@ -2,8 +2,8 @@
 
 from typing import Any
 
-from clsplat.matrix import Matrix
-from clsplat.pipeline import PipelineFile
+from clsplat.pipeline.file import PipelineFile
+from clsplat.pipeline.matrix import Matrix
 from clsplat.prepare.steps import Step
 from clsplat.settings import Settings, variants
 from clsplat.stages.base import Scheduled, Stage

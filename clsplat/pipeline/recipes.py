@@ -7,9 +7,9 @@ from typing import Any
 
 from clsplat.errors import ConfigError
 from clsplat.files import write_text
-from clsplat.pipeline import load
-from clsplat.pipeline_files import find, shipped
-from clsplat.settable import settable
+from clsplat.pipeline.files import find, shipped
+from clsplat.pipeline.loading import load
+from clsplat.pipeline.settable import Key, settable
 
 MAX_KEY_WIDTH = 44  # characters; descriptions stand beside
 
@@ -29,9 +29,8 @@ def summaries() -> list[dict[str, str]]:
     return [{"name": name, "summary": summary(path), "path": str(path)} for name, path in shipped().items()]
 
 
-def summaries_text() -> str:
-    """Return a line for every shipped pipeline."""
-    found = summaries()
+def summaries_text(found: list[dict[str, str]]) -> str:
+    """Return a line for each of `summaries`."""
     width = max(len(one["name"]) for one in found)
     return "\n".join(f"{one['name']:<{width}}  {one['summary']}" for one in found)
 
@@ -52,9 +51,9 @@ def manual(name: str) -> dict[str, Any]:
     }
 
 
-def manual_text(name: str) -> str:
-    """Return `manual` as lines of text: a key with its value, and what it means.  Raises ConfigError."""
-    found, keys = manual(name), settable(load(name).settings)
+def manual_text(found: dict[str, Any]) -> str:
+    """Return a `manual` as lines of text: a key with its value, and what it means."""
+    keys = [Key(**key) for key in found["keys"]]
     width = min(max(len(key.text) for key in keys), MAX_KEY_WIDTH)
     lines = [f"{key.text:<{width}}  {' '.join(key.description.split())}".rstrip() for key in keys]
     head = [f"{found['name']}: {found['summary']}", f"file: {found['path']}", f"stages: {', '.join(found['stages'])}"]

@@ -11,8 +11,9 @@ from typing import Any
 
 from clsplat.errors import ConfigError, Interrupted, OutputError, as_clsplat_error, one_line
 from clsplat.files import unwritable, write_text
-from clsplat.opencl.device import Device, choose
-from clsplat.pipeline import Pipeline, load, prepared_folder
+from clsplat.opencl.choice import choose
+from clsplat.opencl.device import Device
+from clsplat.pipeline.loading import Pipeline, load, prepared_folder
 from clsplat.prepare.cache import NOTE, Planned, note, noted, prepare
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.scene.detect import read_scene
@@ -129,6 +130,17 @@ def make_run(pipeline: Pipeline, scene: Scene, device: Device, out: Path) -> Run
 def execute(pipeline: Pipeline, run: Run, resume: bool, show: Callable[[Progress], None]) -> None:
     """Run the stages, from the newest checkpoint when resuming, and write what the run folder promises."""
     run.show = show
+    begin(pipeline, run, resume)
+    with failures_recorded(run.out, lambda: run.step):
+        with _finishing_on_interrupt(run):
+            _run_stages(pipeline, run)
+        _write_metrics(run)
+        _check_outputs(pipeline, run)
+        run.records.status("done", run.step, exit_code=0)
+
+
+def begin(pipeline: Pipeline, run: Run, resume: bool) -> None:
+    """Take the newest checkpoint when resuming, and write what the run folder holds from the beginning on."""
     resumed = resume and checkpoint.restore(run)
     if resume:
         LOG.info("resumed at step %d" if resumed else "nothing to resume; starting from the beginning%.0s", run.step)
@@ -136,12 +148,6 @@ def execute(pipeline: Pipeline, run: Run, resume: bool, show: Callable[[Progress
     if run.prepared:
         write_text(run.out / NOTE, json.dumps(run.prepared) + "\n")
     run.records.start(run.step, edit_due=run.stage_step > 0)
-    with failures_recorded(run.out, lambda: run.step):
-        with _finishing_on_interrupt(run):
-            _run_stages(pipeline, run)
-        _write_metrics(run)
-        _check_outputs(pipeline, run)
-        run.records.status("done", run.step, exit_code=0)
 
 
 def _run_stages(pipeline: Pipeline, run: Run) -> None:
@@ -228,8 +234,8 @@ def describe(pipeline: Pipeline, out: Path, device: str | None) -> str:
             cadences = (f"{inner.stage} every {inner.every}" for inner in stage.during)
             detail = f"{stage.steps} steps; " + ", ".join(cadences)
         elif isinstance(stage, Evaluate) and run:
-            views = run.original.downscaled(run.scale).split(stage.split)
-            scales = ", ".join(f"1/{scale:g}" for scale in stage.scales or [run.scale])
+            views = run.original.downscaled(run.downscale).split(stage.split)
+            scales = ", ".join(f"1/{scale:g}" for scale in stage.scales or [run.downscale])
             detail = f"{len(views)} {stage.split} views at {scales}"
         lines.append(f"  {stage.stage:<14} {detail}".rstrip())
     return f"would run in {out}:\n" + "\n".join(lines)

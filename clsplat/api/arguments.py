@@ -1,0 +1,35 @@
+"""What the functions of the API take, in the forms that the rooms below take."""
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from clsplat.errors import ConfigError
+
+PathLike = str | Path
+Overrides = Mapping[str, Any] | Sequence[str]  # values by place, or 'place=value' as --set takes it
+
+
+def overrides(values: Overrides) -> list[str]:
+    """Return settings as `--set` takes them.  Raises ConfigError for a value that YAML cannot hold."""
+    if isinstance(values, str):
+        return [values]
+    if not isinstance(values, Mapping):
+        return list(values)
+    try:
+        return [f"{place}={json.dumps(value)}" for place, value in values.items()]
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"set: {error}; expected numbers, text, and lists and mappings of them") from None
+
+
+def load_plugins() -> None:
+    """Import the plug-ins of installed packages, once."""
+    from clsplat import plugins
+
+    plugins.load_installed()
+
+
+def path_of(value: PathLike | None) -> Path | None:
+    """Return a path as one."""
+    return None if value is None else Path(value)

@@ -1,0 +1,103 @@
+"""Functions about devices, datasets and speed; errors and `device` as in `clsplat.api.commands`."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from clsplat.api.arguments import PathLike, load_plugins, path_of
+
+if TYPE_CHECKING:  # the command line starts without OpenCL
+    from clsplat.bench.measurement import Measurement
+    from clsplat.inspect.inspection import Inspection
+
+ScheduleName = Literal["auto", "wide", "simt"]  # wide for CPUs, simt for GPUs
+
+
+def devices() -> list[dict[str, Any]]:
+    """Return the OpenCL devices: name, limits in bytes and items, and as `fault` what keeps one from working, or None.
+
+    Each is tried once, in a process of its own.
+    """
+    from dataclasses import asdict
+
+    from clsplat.opencl.choice import list_devices, resolve_schedule
+
+    return [
+        {**asdict(info), "schedule": resolve_schedule(info, "auto"), "fault": info.fault()} for info in list_devices()
+    ]
+
+
+def inspect_scene(scene: PathLike, page: PathLike | None = None) -> "Inspection":
+    """Look at a dataset; return its `verdict`, `findings`, whether it is `trainable`, and all as `data()`.
+
+    page: a file to write, with the cameras and points in 3D.  Raises DataError only where there is no such folder.
+    """
+    from clsplat.inspect.inspection import Inspection
+    from clsplat.inspect.page import write_page
+
+    load_plugins()
+    inspection = Inspection.of(Path(scene))
+    if page is not None:
+        write_page(inspection, Path(page))
+    return inspection
+
+
+def measure_speed(
+    scenes: Sequence[str] = ("A",),
+    *,
+    model: PathLike | None = None,
+    scene: PathLike | None = None,
+    pipeline: PathLike = "splat",
+    repeats: int = 20,
+    schedule: ScheduleName = "auto",
+    device: str | None = None,
+) -> "Measurement":
+    """Time the stages of a training step, as `clsplat bench` does; return times in ms, as `data()` and `text()`.
+
+    scenes: fixed ones, of A, B and C; model, scene: a splat or point cloud and its scene, timed too; pipeline: whose
+    losses, statistics and filter a step has; repeats: steps of each scene.
+    """
+    from clsplat.bench.measurement import measure
+
+    load_plugins()
+    return measure(
+        scenes,
+        model=path_of(model),
+        scene=path_of(scene),
+        pipeline=str(pipeline),
+        repeats=repeats,
+        schedule=schedule,
+        device=device,
+    )
+
+
+def measure_growth(
+    chart: PathLike,
+    *,
+    pipeline: PathLike = "splat",
+    repeats: int = 20,
+    schedule: ScheduleName = "auto",
+    device: str | None = None,
+) -> str:
+    """Time a step with 50 000 to a million Gaussians; write the chart, an SVG, and return a table."""
+    from clsplat.bench import measurement
+
+    load_plugins()
+    return measurement.measure_growth(
+        Path(chart), pipeline=str(pipeline), repeats=repeats, schedule=schedule, device=device
+    )
+
+
+def read_measurement(file: PathLike, pipeline: PathLike = "splat") -> dict[str, Any]:
+    """Read the `data()` of an earlier measurement from JSON, to be shown beside another of the same pipeline."""
+    from clsplat.bench import measurement
+
+    load_plugins()
+    return measurement.read_measurement(Path(file), str(pipeline))
+
+
+def load_plugin(file: PathLike) -> None:
+    """Import a plug-in, as `--plugin` does.  Raises ConfigError, with file and line, when that fails."""
+    from clsplat import plugins
+
+    plugins.load_file(Path(file))

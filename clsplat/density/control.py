@@ -1,0 +1,61 @@
+"""Apply density rules, as one edit, and reset opacities (Kerbl et al. 2023, section 5)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from clsplat.density.edit import Edit, Rule
+from clsplat.gaussians.tables import Gaussians
+from clsplat.render.tiles import Tiler
+
+
+@dataclass(frozen=True)
+class Change:
+    """Numbers of Gaussians before and after an edit."""
+
+    before: int
+    after: int
+    causes: dict[str, int]  # Gaussians whose final outcome a rule decided, by the rule's name
+    grown: dict[str, int]  # of these, the ones that became several
+
+
+def densify(edit: Edit, rules: Sequence[Rule], tiler: Tiler, limit: int | None = None) -> Change:
+    """Apply the rules in their order, as one rearrangement of all tables, and set the statistics to zero.
+
+    Growth stops at `limit` Gaussians: those with the largest mean of the first column grow first.
+    """
+    gaussians = edit.gaussians
+    before = gaussians.count
+    acting = [(number, rule) for number, rule in enumerate(rules) if edit.step > rule.start]
+    decided_by = np.full(before, -1)
+    for edit.rule, rule in acting:
+        rows = edit.rows()
+        rule.mark(edit)
+        decided_by[edit.rows() != rows] = edit.rule
+    if limit is not None and int(edit.rows().sum(dtype=np.int64)) > limit:
+        edit.limit(limit)
+    rows = edit.rows()
+    decided_by[rows == 1] = -1
+    causes: dict[str, int] = {}
+    grown: dict[str, int] = {}
+    for number, rule in acting:
+        name = getattr(rule, "type", "rule")
+        causes[name] = causes.get(name, 0) + int((decided_by == number).sum())
+        grown[name] = grown.get(name, 0) + int(((decided_by == number) & (rows > 1)).sum())
+    edit.apply(tiler)
+    edit.stats.clear()
+    return Change(before, gaussians.count, causes, grown)
+
+
+def cap_opacity(gaussians: Gaussians, limit: float) -> None:
+    """Lower opacities to `limit`, which holds for the opacity after the world filter (the opacity reset)."""
+    gaussians.device.program("density.cl").cap_opacity(
+        items=gaussians.count,
+        log_scales=gaussians["log_scales"],
+        filter_variance=gaussians["filter_variance"],
+        logit_opacity=gaussians["logit_opacity"],
+        limit=limit,
+        stride=gaussians.capacity,
+        count=gaussians.count,
+    )

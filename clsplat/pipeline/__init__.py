@@ -1,0 +1,1 @@
+"""Pipeline files: what they can say, how they are read, overridden, explained and combined."""

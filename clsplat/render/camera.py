@@ -1,0 +1,83 @@
+"""A view's camera on the device, and the size of its planes."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.opencl.device import Array, Device
+from clsplat.opencl.program import constants
+from clsplat.scene.scene import View
+
+RAY_MARGIN = constants()["RAY_MARGIN"]
+
+# camera_t of cl_kernels/common.h
+CAMERA = np.dtype(
+    [
+        ("world_to_camera", np.float32, 12),
+        ("position", np.float32, 3),
+        *((name, np.float32) for name in ("fx", "fy", "cx", "cy")),
+        *((name, np.float32) for name in ("ray_x_min", "ray_x_max", "ray_y_min", "ray_y_max")),
+        *((name, np.uint32) for name in ("width", "height", "tiles_x", "tiles_y")),
+    ]
+)
+
+
+@dataclass(frozen=True)
+class DeviceCamera:
+    """A view's camera on the device, with the size of its planes: whole tiles."""
+
+    array: Array  # [1] camera_t
+    width: int
+    height: int
+    tiles_x: int
+    tiles_y: int
+    tile: int
+
+    @property
+    def tiles(self) -> int:
+        return self.tiles_x * self.tiles_y
+
+    @property
+    def stride(self) -> int:
+        """Columns of a plane."""
+        return self.tiles_x * self.tile
+
+    @property
+    def rows(self) -> int:
+        """Rows of a plane."""
+        return self.tiles_y * self.tile
+
+    def plane_arguments(self) -> dict[str, int]:
+        """Return the sizes for kernels on planes, by the names of their arguments."""
+        return {"width": self.width, "height": self.height, "rows": self.rows, "stride": self.stride}
+
+
+def upload_camera(device: Device, view: View) -> DeviceCamera:
+    """Copy a view's camera to the device."""
+    tile = int(device.tuning["TILE"])
+    values = camera_values(view, tile)
+    tiles_x, tiles_y = int(values["tiles_x"]), int(values["tiles_y"])
+    array = device.upload(values.reshape(1))
+    return DeviceCamera(array, view.camera.width, view.camera.height, tiles_x, tiles_y, tile)
+
+
+def camera_values(view: View, tile: int) -> NDArray[Any]:
+    """Return a view's camera_t, [].
+
+    Rays are clamped 30 % of half the field of view beyond the image's edges (gsplat's off-centre form).
+    """
+    camera = view.camera
+    tiles_x, tiles_y = -(-camera.width // tile), -(-camera.height // tile)
+    margin_x = RAY_MARGIN * camera.width / (2 * camera.fx)
+    margin_y = RAY_MARGIN * camera.height / (2 * camera.fy)
+    values = (
+        view.world_to_camera.ravel(),
+        view.position,
+        *(camera.fx, camera.fy, camera.cx, camera.cy),
+        *(-camera.cx / camera.fx - margin_x, (camera.width - camera.cx) / camera.fx + margin_x),
+        *(-camera.cy / camera.fy - margin_y, (camera.height - camera.cy) / camera.fy + margin_y),
+        *(camera.width, camera.height, tiles_x, tiles_y),
+    )
+    return np.array(values, CAMERA)

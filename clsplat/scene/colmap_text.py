@@ -1,0 +1,80 @@
+"""Read the text files of a COLMAP model."""
+
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from clsplat.errors import DataError
+from clsplat.scene.colmap_records import REMEDY, CameraRecord, ImageRecord, decode, parameter_count
+from clsplat.scene.images import read_file
+from clsplat.scene.points import PointTable
+
+
+def cameras_text(path: Path) -> Iterator[tuple[int, CameraRecord]]:
+    """Yield ids and cameras.  Raises DataError, as all functions here, when the file is damaged."""
+    for where, line in _lines(path):
+        if line:
+            layout = "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]"
+            words = line.split()
+            number, model, width, height = _convert(where, words[:4], (int, str, int, int), layout)
+            params = _convert(where, words[4:], [float] * parameter_count(where, model), f"the parameters of {model}")
+            yield number, CameraRecord(where, model, width, height, tuple(params))
+
+
+def images_text(path: Path) -> Iterator[ImageRecord]:
+    """Yield the registered images, in the order of the file."""
+    layout = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
+    kinds = (int, *[float] * 7, int, str)
+    image: ImageRecord | None = None  # the line of its points may follow
+    for where, line in _lines(path):
+        if image and _is_points2d(line):
+            yield image._replace(observed=sum(not word.startswith("-") for word in line.split()[2::3]))
+            image = None
+        elif line:
+            if image:
+                yield image
+            _, *pose, camera, name = _convert(where, line.split(maxsplit=9), kinds, layout)
+            image = ImageRecord(where, name, camera, tuple(pose[:4]), tuple(pose[4:]))
+    if image:
+        yield image
+
+
+def _is_points2d(line: str) -> bool:
+    """Return whether a line holds 2D points, (X, Y, POINT3D_ID) each, or none; some writers omit such lines."""
+    words = line.split()
+    return len(words) % 3 == 0 and (not words or words[-1].lstrip("-").isdecimal())
+
+
+def points_text(path: Path) -> PointTable:
+    """Return all points with their errors."""
+    kinds = (int, float, float, float, _byte, _byte, _byte, float)
+    layout = "POINT3D_ID X Y Z R G B ERROR TRACK[]"
+    rows = [_convert(where, line.split(maxsplit=8)[:8], kinds, layout)[1:] for where, line in _lines(path) if line]
+    table = np.array(rows, np.float64).reshape(-1, 7)
+    return PointTable(path, table[:, :3], table[:, 3:6], table[:, 6])
+
+
+def _lines(path: Path) -> Iterator[tuple[str, str]]:
+    """Yield the place and the text of every line that is not a comment."""
+    text = decode(str(path), read_file(path)).lstrip("\ufeff")
+    for number, line in enumerate(map(str.strip, text.split("\n")), start=1):
+        if not line.startswith("#"):
+            yield f"{path}: line {number}", line
+
+
+def _convert(where: str, words: list[str], kinds: Sequence[Callable[[str], Any]], layout: str) -> list[Any]:
+    """Convert each word to its kind.  Raises DataError with the line."""
+    if len(words) != len(kinds):
+        raise DataError(f"{where}: expected {layout}, found {len(words)} of {len(kinds)} words; {REMEDY}")
+    try:
+        return [kind(word) for kind, word in zip(kinds, words, strict=True)]
+    except ValueError as error:
+        raise DataError(f"{where}: {error}; expected {layout}: remove that entry or {REMEDY}") from error
+
+
+def _byte(word: str) -> int:
+    if not 0 <= int(word) <= 255:
+        raise ValueError(f"colour {word} is not in 0..255")
+    return int(word)

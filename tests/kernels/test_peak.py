@@ -1,0 +1,44 @@
+"""peak.cl: the yardsticks compute what they are counted as."""
+
+import numpy as np
+import pytest
+
+from clsplat.bench.peaks import measure_peaks
+
+
+@pytest.mark.parametrize("items", [1, 15, 16, 17, 64, 65])
+def test_multiply_adds(device, items):
+    lanes, group = (int(device.tuning[name]) for name in ("LANES", "GROUP"))
+    whole = -(-items // group) * group
+    result = device.empty(whole * lanes)
+    device.program("peak.cl").peak_fma(items=items, result=result, factor=0.5, rounds=5)
+    chains = np.arange(whole)[:, None] + np.arange(8.0)
+    for _ in range(5):
+        chains = chains * 0.5 + 0.25
+    np.testing.assert_allclose(result.get(), np.repeat(chains.sum(axis=1), lanes), rtol=1e-6)
+
+
+@pytest.mark.parametrize("items", [1, 15, 16, 17, 64, 65])
+def test_exponentials(device, items):
+    lanes, group = (int(device.tuning[name]) for name in ("LANES", "GROUP"))
+    whole = -(-items // group) * group
+    result = device.empty(whole * lanes)
+    device.program("peak.cl").peak_exp(items=items, result=result, step=1e-3, rounds=4)
+    x = -0.01 * (np.arange(whole) % 8)
+    expected = sum(np.exp(x - 1e-3 * k) + np.exp(x - 0.5 - 1e-3 * k) for k in range(4))
+    np.testing.assert_allclose(result.get(), np.repeat(expected, lanes), rtol=1e-5)
+
+
+@pytest.mark.parametrize("groups", [1, 2, 5])
+def test_copies(device, rng, groups):
+    items = groups * int(device.tuning["GROUP"])
+    values = rng.normal(size=items * int(device.tuning["LANES"])).astype(np.float32)
+    copied = device.zeros(len(values))
+    device.program("peak.cl").peak_copy(items=items, values=device.upload(values), copied=copied)
+    np.testing.assert_array_equal(copied.get(), values)
+
+
+@pytest.mark.large
+def test_peaks_are_positive(device):
+    peaks = measure_peaks(device, repeats=1)
+    assert min(peaks.gflops, peaks.gexp, peaks.gbytes) > 0

@@ -1,0 +1,159 @@
+"""The package's front door: what its import loads, which names it has, and views that are made by hand."""
+
+import ast
+import importlib
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import clsplat
+from clsplat.api.arguments import overrides
+from clsplat.api.renderer import Renderer
+from clsplat.errors import ConfigError, DataError
+from clsplat.scene.scene import Scene, make_scene
+from tests.scenes import random_case
+from tests.test_model import model_of
+
+ROOT = Path(__file__).parents[1]
+CAMERA = clsplat.Camera(48, 32, 40.0, 42.0, 23.0, 17.0)
+
+
+def loaded_after(code: str) -> set[str]:
+    """The modules of a new process after some lines of Python."""
+    command = [sys.executable, "-c", f"{code}\nimport sys\nprint(*sys.modules)"]
+    return set(subprocess.run(command, capture_output=True, text=True, check=True, timeout=60).stdout.split())
+
+
+def test_the_import_loads_nothing_heavy():
+    loaded = loaded_after("import clsplat")
+    assert {name for name in loaded if name.startswith("clsplat")} == {"clsplat"}
+    assert not loaded & {"numpy", "pyopencl", "cv2", "pydantic", "scipy", "jinja2", "typer", "rich", "torch"}
+
+
+def test_models_and_scenes_open_no_device():
+    assert "clsplat.opencl.device" in loaded_after("import clsplat; clsplat.load")
+    code = "import clsplat; clsplat.load; clsplat.read_scene; clsplat.Renderer; clsplat.Trainer; clsplat.run\n"
+    code += "from clsplat.api.device import default_device; assert default_device.cache_info().currsize == 0"
+    assert "torch" not in loaded_after(code)
+
+
+def test_names_for_readers_and_for_type_checkers_agree():
+    tree = ast.parse(Path(clsplat.__file__).read_text())
+    (block,) = [node for node in tree.body if isinstance(node, ast.If)]
+    typed = {}
+    for node in block.body:
+        assert isinstance(node, ast.ImportFrom)
+        (alias,) = node.names
+        assert alias.name == alias.asname, "`import X as X` makes a name public for type checkers"
+        typed[alias.name] = node.module
+    assert typed == {**clsplat._PLACES, **dict.fromkeys(clsplat._MODULES, "clsplat")}
+    assert sorted(typed) == clsplat.__all__
+    assert {*clsplat.__all__, "__version__"} == set(dir(clsplat))
+
+
+@pytest.mark.parametrize("name", clsplat.__all__)
+def test_every_name_is_there_and_says_what_it_is(name):
+    value = getattr(clsplat, name)
+    assert value.__doc__
+    if name not in clsplat._MODULES:
+        assert value is getattr(importlib.import_module(clsplat._PLACES[name]), name)
+        places = [ROOT / "clsplat" / name, ROOT / "clsplat" / f"{name}.py"]
+        assert not any(place.exists() for place in places), "a module of that name would take its place when imported"
+
+
+def test_a_name_that_is_not_there_is_an_attribute_error():
+    with pytest.raises(AttributeError, match="module 'clsplat' has no attribute 'splat'"):
+        _ = clsplat.splat
+
+
+def test_a_wheel_has_every_room_and_its_types():
+    setup = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
+    rooms = {path.parent.relative_to(ROOT).as_posix().replace("/", ".") for path in ROOT.glob("clsplat/**/*.py")}
+    assert rooms - set(setup["packages"]) == set()
+    assert "py.typed" in setup["package-data"]["clsplat"]
+    assert (ROOT / "clsplat" / "py.typed").is_file()
+
+
+def test_settings_are_those_of_the_command_line():
+    assert overrides({"a.b": 1, "c": [True, None], "d": "x y", "e": {"f": 1e-5}}) == [
+        *("a.b=1", "c=[true, null]", 'd="x y"', 'e={"f": 1e-05}'),
+    ]
+    assert overrides(["a=1", "b=2"]) == ["a=1", "b=2"]
+    assert overrides("a=1") == ["a=1"]
+    with pytest.raises(ConfigError, match="set: Object of type ndarray is not JSON serializable; expected numbers"):
+        overrides({"a": np.zeros(3)})
+
+
+def test_a_view_that_looks_at_a_point_shows_it_in_the_middle_with_up_upwards(rng):
+    position, target, up = rng.normal(size=3), rng.normal(size=3), rng.normal(size=3)
+    view = clsplat.View.looking_at(position, target, up, CAMERA, "by hand")
+    rotation, translation = view.world_to_camera[:, :3], view.world_to_camera[:, 3]
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(rotation) == pytest.approx(1)
+    np.testing.assert_allclose(view.position, position, atol=1e-12)
+    distance = np.linalg.norm(target - position)
+    np.testing.assert_allclose(rotation @ target + translation, [0, 0, distance], atol=1e-12)
+    across, down, _ = rotation @ up
+    assert across == pytest.approx(0, abs=1e-12)
+    assert down < 0
+    assert view.name == "by hand"
+
+
+@pytest.mark.parametrize(
+    ("place", "message"),
+    [
+        (([1, 2, 3], [1, 2, 3], [0, 0, 1]), "expected a target away from the position"),
+        (([0, 0, 0], [0, 0, 5], [0, 0, 1]), "and not along `up`"),
+        (([0, 0], [0, 0, 5], [0, 1, 0]), "of 3 numbers each"),
+    ],
+)
+def test_a_view_without_a_direction_is_refused(place, message):
+    with pytest.raises(ValueError, match=f"^'view': .*{message}"):
+        clsplat.View.looking_at(*place, CAMERA)
+
+
+def test_a_pose_of_another_shape_is_refused():
+    with pytest.raises(ValueError, match=r"the pose of 'front' has shape \(4, 4\); expected \(3, 4\)"):
+        clsplat.View("front", CAMERA, np.eye(4))
+    assert clsplat.View("front", CAMERA, np.eye(4)[:3].tolist()).position.shape == (3,)
+
+
+def test_a_view_made_by_hand_renders(device, rng):
+    model = model_of(random_case(rng, 30))
+    middle = np.median(model.means, axis=0)
+    view = clsplat.View.looking_at(middle - (0, 4, -1), middle, [0, 0, 1], CAMERA)
+    same = clsplat.View("front", CAMERA, view.world_to_camera)
+    renderer = Renderer(model, device)
+    assert renderer.render(view).alpha.max() > 0.5
+    np.testing.assert_array_equal(renderer.render(view).image, renderer.render(same).image)
+    with pytest.raises(DataError, match="the view 'front' has no photograph"):
+        same.photograph()
+
+
+def hand_made_scene() -> Scene:
+    views = [clsplat.View.looking_at([np.cos(a), np.sin(a), 1], [0, 0, 0], [0, 0, 1], CAMERA, str(a)) for a in range(3)]
+    return make_scene(Path("by hand"), views, {0}, None)
+
+
+def test_a_scene_made_by_hand_is_for_rendering(device, rng):
+    scene, model = hand_made_scene(), model_of(random_case(rng, 30))
+    renderer = Renderer(model, device)
+    assert [renderer.render(view).image.shape for view in scene.split("all")] == [(32, 48, 3)] * 3
+    assert "<img" not in scene._repr_html_()
+    with pytest.raises(DataError, match="by hand: the view '1' has no photograph; training needs one of each"):
+        clsplat.Trainer(scene, "smoke", device=device)
+
+
+def test_a_split_that_there_is_not_is_refused():
+    with pytest.raises(ValueError, match="no split 'tset'; there are train, test and all"):
+        hand_made_scene().split("tset")
+
+
+def test_devices_are_context_managers():
+    with clsplat.Device() as device:
+        assert repr(device).startswith("Device('")
+    assert any(one["fault"] is None and one["schedule"] in ("wide", "simt") for one in clsplat.devices())
