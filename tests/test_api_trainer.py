@@ -219,8 +219,12 @@ def test_the_lines_of_a_loop_of_ones_own_run(tiny_scene, device, capsys):
     scene = clsplat.read_scene(tiny_scene)
     names = {"Adam": Adam, "Rates": Rates, "Rasterizer": Rasterizer, "SplatStats": SplatStats, "L1": L1, "Dssim": Dssim}
     names |= {"Photographs": Photographs, "Trainer": steps.Trainer, "device": device, "scene": scene}
-    exec(textwrap.dedent(lines), {**names, "model": clsplat.Trainer(scene, "smoke").model})
-    assert len(capsys.readouterr().out.split()) == 8
+    names["model"] = clsplat.Trainer(scene, "smoke").model
+    capsys.readouterr()
+    exec(textwrap.dedent(lines), names)
+    losses = [float(line) for line in capsys.readouterr().out.splitlines()]
+    assert len(losses) == 8
+    assert min(losses) < losses[0]
 
 
 def test_what_is_left_on_disk_is_a_run(tiny_scene, tmp_path):
