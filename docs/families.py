@@ -16,7 +16,7 @@ from pydantic.fields import FieldInfo
 import clsplat.pipeline.schema  # noqa: F401  (it imports all that a pipeline can name)
 from clsplat.pipeline.file import PipelineFile
 from clsplat.pipeline.matrix import Matrix
-from clsplat.schedule import Decay, Points
+from clsplat.schedule import Curve, Decay, Points
 from clsplat.settings import Settings
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -91,7 +91,7 @@ def groups(base: Kind) -> list[Kind]:
 @functools.cache
 def unnamed() -> dict[Kind, str]:
     """Return the settings without a name of their own, each with the key that a reader of a file meets first."""
-    intermediate = {*NOTATIONS, *(group for base in families() for group in groups(base))}
+    intermediate = {Curve, *(group for base in families() for group in groups(base))}
     found: dict[Kind, str] = {}
     waiting: list[tuple[Kind, str]] = [(PipelineFile, ""), (Matrix, "matrix")]
     met = {PipelineFile, Matrix}

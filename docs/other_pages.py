@@ -16,6 +16,7 @@ import clsplat
 from clsplat import errors
 from clsplat.cli import app
 from clsplat.scene import Reader
+from clsplat.schedule import Curve
 from clsplat.settings import Settings
 from data_tools.__main__ import app as tools
 
@@ -143,7 +144,7 @@ def module_section(module: Any) -> str:
 def plugin_classes() -> list[type]:
     """Return the base of every family with the classes of the package in the signatures of its methods."""
     found: dict[type, None] = {}
-    bases = [*(group for base in families() for group in groups(base)), Reader]
+    bases = [*(group for base in families() for group in groups(base)), Curve, Reader]
     for base in bases:
         found[base] = None
         for method in vars(base).values():

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 from families import NOTATIONS, Kind, families, family, models, tag, unnamed
 
-from clsplat.schedule import Decay, Points
+from clsplat.schedule import Curve, Decay, Points
 
 EXAMPLES = {  # notation: what it means, and how a file writes it
     "A constant": ("The same at every step.", "weight: 0.8"),
@@ -44,6 +44,6 @@ def users() -> str:
     others = [(f"[`{key}`](settings.md#{kind.__name__.lower()})", kind) for kind, key in unnamed().items()]
     rows = ""
     for place, kind in [*others, *named]:
-        keys = [f"`{name}`" for name, field in kind.model_fields.items() if set(NOTATIONS) <= set(models(field))]
+        keys = [f"`{name}`" for name, field in kind.model_fields.items() if Curve in models(field)]
         rows += f"| {place} | {', '.join(keys)} |\n" if keys else ""
     return f"| of | keys |\n|---|---|\n{rows}\n"

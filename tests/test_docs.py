@@ -1,5 +1,6 @@
 """What the documentation says holds: keys, commands, links, versions, the map of folders."""
 
+import importlib
 import re
 import subprocess
 import sys
@@ -12,9 +13,9 @@ from packaging.requirements import Requirement
 from ruamel.yaml import YAML
 
 import clsplat
-from clsplat import pipeline
 from clsplat.cli import app
 from clsplat.losses.base import Loss
+from clsplat.pipeline.loading import load
 from clsplat.scene.detect import readers
 from clsplat.training.adam import Rates
 from clsplat.views.sampling import ViewSettings
@@ -113,7 +114,17 @@ def test_the_test_of_a_kernel_that_the_pages_show_passes():
 
 @pytest.mark.parametrize("file", ["growing_resolution.yaml"])
 def test_pipelines_among_the_examples_are_valid(file):
-    pipeline.load(str(ROOT / "examples" / file))
+    load(str(ROOT / "examples" / file))
+
+
+def test_paths_and_bases_on_pages_exist():
+    for page in PAGES:
+        for path in re.findall(r"`((?:clsplat|tests|docs|examples|pipelines|cl_kernels)/[\w./]*\w/?)`", text_of(page)):
+            assert (ROOT / path).exists(), f"{page.name}: {path}"
+    bases = re.findall(r"^\| a[^|]*\| `clsplat\.([\w.]+)\.(\w+)`", text_of(ROOT / "docs" / "extending.md"), re.M)
+    assert len(bases) >= 9
+    for module, name in bases:
+        assert hasattr(importlib.import_module(f"clsplat.{module}"), name), f"clsplat.{module}.{name}"
 
 
 def test_names_of_the_package_on_pages_exist():
@@ -130,7 +141,7 @@ def test_whole_pipelines_on_pages_are_valid(tmp_path):
     for page, code in whole:
         file = tmp_path / f"{page}.yaml"
         file.write_text(code if "name:" in code else f"name: shown\n{code}")
-        pipeline.load(str(file))
+        load(str(file))
 
 
 def test_commands_on_pages_exist():
