@@ -18,8 +18,10 @@ from clsplat.gaussians.tables import Gaussians
 from clsplat.metrics.lpips import InputRange
 from clsplat.metrics.perceptual import Perceptual, metric_names
 from clsplat.metrics.views import PSNR_AND_SSIM, mean, measure, render_view
-from clsplat.opencl.device import Device, choose
-from clsplat.pipeline import SceneSettings, load
+from clsplat.opencl.device import Device
+from clsplat.opencl.discovery import choose
+from clsplat.pipeline import load
+from clsplat.pipeline_settings import SceneSettings
 from clsplat.prepare.cache import noted
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.scene.detect import read_scene

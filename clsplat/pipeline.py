@@ -1,4 +1,4 @@
-"""From a pipeline file to checked stages, and through them.
+"""Read and check pipeline files.
 
     name, seed, scene: {path, downscale, background, …}, model: {…}, rasterizer: {schedule, sort, …}
     stages: a list of   - <stage>   or   - <stage>: {field: value, …}
@@ -9,128 +9,28 @@ file is written to the run folder.
 
 import copy
 import io
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
-from pydantic import Field, ValidationError
+from pydantic import ValidationError
 from ruamel.yaml import YAML
 
 from clsplat import plugins
 from clsplat.errors import ConfigError, OverrideError, one_line
-from clsplat.filters import ModelSettings
-from clsplat.opencl.device import Schedule
 from clsplat.overrides import NoSuchKey, apply, split, suggestion
 from clsplat.pipeline_files import find
+from clsplat.pipeline_settings import PipelineFile
 from clsplat.prepare.cache import Planned, plan
-from clsplat.prepare.steps import Step
 from clsplat.renamed import with_new_names
-from clsplat.render.rasterizer import MAX_PAIRS, RECORD, Budget
-from clsplat.render.tiles import Sort
-from clsplat.scene.detect import read_scene
-from clsplat.scene.scene import HOLDOUT, Alpha, Background, Scene
 from clsplat.settable import settable
-from clsplat.settings import OneOf, Settings, variants
+from clsplat.settings import variants
 from clsplat.settings_errors import explain, first_fault, place_text
 from clsplat.stages.base import Scheduled, Stage
-from clsplat.stages.optimize import Optimize
 from clsplat.yaml_file import Document, read_yaml
 
-LOG = logging.getLogger("clsplat")
-
-
-class SceneSettings(Settings):
-    """Which photographs, and how they are read."""
-
-    path: str | None = None
-    """Folder of the dataset; usually given by --scene."""
-    downscale: Annotated[float, Field(ge=1)] = 1
-    """Divisor of the photographs' size."""
-    levels: Annotated[int, Field(ge=1, le=8)] = 1
-    """Number of sizes to train on: downscale, and twice, four times, … that."""
-    alpha: Alpha = "transparency"
-    """Fourth channel of photographs: blended with the background, or a mask of what counts."""
-    background: Literal["auto", "black", "white"] = "auto"
-    """Colour behind the scene; auto: white for Blender scenes, else black."""
-    image_budget: Annotated[int, Field(gt=0)] | None = None
-    """MiB of photographs on the device; without it, a quarter of its memory."""
-    holdout: Annotated[int, Field(ge=0)] = HOLDOUT
-    """Every n-th image, by name, is a test view; 0: none."""
-
-    @property
-    def scales(self) -> tuple[float, ...]:
-        """Divisors of the original photographs' size to train on, from the finest."""
-        return tuple(self.downscale * 2**level for level in range(self.levels))
-
-    @property
-    def folder(self) -> Path:
-        """Where the photographs lie.  Raises ConfigError when it was not given."""
-        if self.path is None:
-            raise ConfigError("no scene given; use --scene DIR, or scene: {path: DIR} in the pipeline file")
-        return Path(self.path)
-
-    def read(self, folder: Path) -> tuple[Scene, Background]:
-        """Return the photographs of a folder, and what they are shown on.  Raises DataError."""
-        return self.applied(read_scene(folder, self.holdout))
-
-    def applied(self, scene: Scene) -> tuple[Scene, Background]:
-        """Return a scene with its photographs' alpha as these settings take it, and what they are shown on."""
-        return scene.with_alpha(self.alpha), scene.background if self.background == "auto" else self.background
-
-
-class RasterizerSettings(Settings):
-    """How the device works; results do not depend on it."""
-
-    schedule: Schedule = "auto"
-    """Schedule of blending: wide for CPUs, simt for GPUs."""
-    sort: Sort = "auto"
-    """Way to order splats by tile and depth; auto: the faster one on the first frame."""
-    pair_budget: Annotated[int, Field(gt=0)] | None = None
-    """MiB of gradient records; without it, the largest buffer of the device."""
-    launch_tiles: Annotated[int, Field(ge=0)] = 0
-    """Tiles blended by one launch, for watchdogs of displays; 0: all."""
-
-    def budget(self) -> Budget | None:
-        """How much the rasterizer does at a time."""
-        if self.pair_budget is None and self.launch_tiles == 0:
-            return None
-        records = MAX_PAIRS if self.pair_budget is None else (self.pair_budget << 20) // (4 * RECORD)
-        return Budget(records, self.launch_tiles)
-
-
-LISTS = ("prepare", "stages")
-Name = Annotated[str, Field(pattern=r"^[\w.-]+$")]
-
-
-class PipelineFile(Settings):
-    """All that a pipeline file can say."""
-
-    name: Name
-    """Name of the pipeline, and of its run folder."""
-    seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
-    """Seed of all random numbers."""
-    scene: SceneSettings = SceneSettings()
-    """Which photographs."""
-    model: ModelSettings = ModelSettings()
-    """How Gaussians are rendered."""
-    rasterizer: RasterizerSettings = RasterizerSettings()
-    """How the device works."""
-    prepare: list[OneOf[Step]] = Field([])
-    """Steps from photographs to a scene, each done once."""
-    stages: Annotated[list[OneOf[Stage]], Field(min_length=1)]
-    """What is done with the scene, in order."""
-    plugins: dict[str, str] = Field(default={})
-    """Plug-ins that the run was made with: name and sha256; written by a run, and then required."""
-
-    @property
-    def training(self) -> Optimize:
-        """The first stage that trains.  Raises ConfigError when none does."""
-        for stage in self.stages:
-            if isinstance(stage, Optimize):
-                return stage
-        raise ConfigError(f"{self.name}: expected a stage 'optimize', whose steps can be timed")
+STAGE_LISTS = ("prepare", "stages")
 
 
 @dataclass(frozen=True)
@@ -150,18 +50,18 @@ class Pipeline:
         return list(self.settings.stages)
 
     def preparation(self, out: Path) -> list[Planned]:
-        """What must be done to the photographs before a run in `out`, and why.  Raises DataError."""
+        """Return the steps before a run in `out`, with the reasons to run them.  Raises DataError."""
         settings = self.settings
         return plan(settings.prepare, settings.scene.folder, prepared_folder(out)) if settings.prepare else []
 
     def resolved(self) -> dict[str, Any]:
-        """Every setting with its value, as plain data in the shape of a file."""
+        """Return every setting with its value, as plain data in the shape of a file."""
         data = self.settings.model_dump(mode="json")
-        data |= {key: [_untagged(stage) for stage in data[key]] for key in LISTS}
+        data |= {key: [_untagged(stage) for stage in data[key]] for key in STAGE_LISTS}
         return data if data["plugins"] else {key: value for key, value in data.items() if key != "plugins"}
 
     def text(self) -> str:
-        """The resolved file."""
+        """Return the text of the resolved file."""
         stream = io.StringIO()
         yaml = YAML(typ="safe")
         yaml.default_flow_style = None
@@ -172,7 +72,7 @@ class Pipeline:
 
 
 def prepared_folder(out: Path) -> Path:
-    """Where results of `prepare:` lie: beside the run folder, for all runs there."""
+    """Return the folder for results of `prepare:`: beside the run folder, for all runs there."""
     return out.absolute().parent / "prepared"
 
 
@@ -186,7 +86,7 @@ def load(name: str, overrides: list[str] | None = None) -> Pipeline:
 
 
 def checked(path: Path, document: Document, overrides: Sequence[str] = ()) -> Pipeline:
-    """Check what was read from a pipeline file; the document stays as it is.  Raises ConfigError as `load` does."""
+    """Check a document with overrides; the document stays unchanged.  Raises ConfigError as `load` does."""
     if not isinstance(document.data, dict):
         raise ConfigError(f"{path}:1: expected keys such as name and stages")
     tagged = _tagged_file(document, path)
@@ -213,7 +113,7 @@ def _validated(data: dict[str, Any], path: Path, document: Document) -> Pipeline
 
 
 def _blame(data: dict[str, Any], overrides: Sequence[str], path: Path, document: Document) -> None:
-    """Raise the error of the file alone, else that of the first override which does not fit."""
+    """Raise the error of the file without overrides, or else that of the first invalid override."""
     known = [key.place for key in settable(_validated(data, path, document))]
     for override in overrides:
         names, _ = split(override)
@@ -232,9 +132,9 @@ def _blame(data: dict[str, Any], overrides: Sequence[str], path: Path, document:
 
 
 def _tagged_file(document: Document, path: Path) -> dict[str, Any]:
-    """The file's data with each stage as {stage: name, …}, which is how the models tell them apart."""
+    """The file's data with each stage as {stage: name, …}, from which the models are chosen."""
     data = dict(document.data)
-    for key in LISTS:
+    for key in STAGE_LISTS:
         if isinstance(data.get(key), list):
             data[key] = [_tagged(item, (key, i), document, path) for i, item in enumerate(data[key])]
     return data
@@ -265,7 +165,7 @@ def _untagged(stage: dict[str, Any]) -> dict[str, Any]:
 
 
 def _check_order(path: Path, settings: PipelineFile) -> None:
-    """Every stage finds what it needs made before it."""
+    """Raise ConfigError where a stage needs a part of the run that no earlier stage makes."""
     made = {"scene"}
     for i, stage in enumerate(settings.stages):
         if isinstance(stage, Scheduled) and stage.every is not None:

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import clsplat.schema  # noqa: F401  (it imports all that a pipeline can name)
 from clsplat.matrix import Matrix
-from clsplat.pipeline import PipelineFile
+from clsplat.pipeline_settings import PipelineFile
 from clsplat.settings import Settings
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from clsplat.opencl.device import Array, Device, DeviceInfo, choose
+from clsplat.opencl.device import Array, Device
+from clsplat.opencl.discovery import DeviceInfo, choose
 from data_tools.synthetic import Options, write_dataset
 
 NAMES = [name.strip() for name in os.environ.get("CLSPLAT_TEST_DEVICES", "").split(";")]
@@ -47,7 +48,7 @@ def device(request: pytest.FixtureRequest) -> Device:
 
 def forgets_released_buffers(info: DeviceInfo) -> bool:
     """Oclgrind 21.10 takes a buffer at the address of a released one for that one, with its size and uninitialised
-    values: its check is not told of releases.
+    values: its check does not see releases.
     https://github.com/jrprice/Oclgrind/blob/v21.10/src/plugins/Uninitialized.h
     """
     return info.platform.startswith("Oclgrind")

@@ -63,7 +63,7 @@ def devices() -> list[dict[str, Any]]:
     """List OpenCL devices, their limits, and under `fault` what keeps one from working."""
     from dataclasses import asdict
 
-    from clsplat.opencl.device import list_devices
+    from clsplat.opencl.discovery import list_devices
 
     return [{**asdict(info), "fault": info.fault()} for info in list_devices()]
 

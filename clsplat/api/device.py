@@ -4,7 +4,7 @@ from functools import cache
 from types import TracebackType
 
 from clsplat.opencl import device as opencl
-from clsplat.opencl.device import Schedule
+from clsplat.opencl.discovery import Schedule, choose
 
 
 class Device(opencl.Device):
@@ -15,7 +15,7 @@ class Device(opencl.Device):
     """
 
     def __init__(self, name: str | None = None, schedule: Schedule = "auto") -> None:
-        super().__init__(opencl.choose(name), schedule)
+        super().__init__(choose(name), schedule)
 
     def __enter__(self) -> "Device":
         return self

@@ -15,7 +15,7 @@ def devices(as_json: JsonOption = False) -> None:
     """List OpenCL devices, their limits, and whether each works; exit 4 when none does."""
     from dataclasses import asdict
 
-    from clsplat.opencl.device import list_devices
+    from clsplat.opencl.discovery import list_devices
 
     found = [(info, info.fault()) for info in list_devices()]
     if as_json:

@@ -1,24 +1,20 @@
-"""One OpenCL device: how it is found and chosen, its memory and its limits.
+"""An open OpenCL device: its context, its queue, its memory and its programs.
 
-This package is the only importer of pyopencl.  The device is chosen once and passed explicitly; nothing falls back
-to another one in silence.
+This package is the only importer of pyopencl.
 """
 
-import logging
 import math
-import os
-import re
 import warnings
 import weakref
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from clsplat.errors import ConfigError, DeviceError, MemoryLimitError
+from clsplat.errors import MemoryLimitError
 from clsplat.opencl import runtimes
+from clsplat.opencl.discovery import DeviceInfo, Schedule, platforms, resolve_schedule, tuning_of
 from clsplat.opencl.timings import Timings
 
 runtimes.add_intel_runtime()
@@ -27,126 +23,15 @@ import pyopencl as cl  # noqa: E402
 if TYPE_CHECKING:
     from clsplat.opencl.program import Program
 
-DEVICE_VARIABLE = "CLSPLAT_DEVICE"
-LOG = logging.getLogger("clsplat")
-warnings.filterwarnings("ignore", category=cl.CompilerWarning)  # some runtimes always have something to say
-Schedule = Literal["auto", "wide", "simt"]
-
-
-@dataclass(frozen=True)
-class DeviceInfo:
-    """What the runtime says about a device, and how to get at it."""
-
-    name: str
-    platform: str  # name and version of the runtime
-    kind: Literal["GPU", "CPU", "other"]
-    driver: str
-    units: int  # compute units
-    memory: int  # bytes
-    allocation: int  # bytes, largest single buffer
-    local_memory: int  # bytes per work-group
-    group: int  # items, largest work-group
-    float_width: int  # lanes of the vector unit
-    place: tuple[int, int]  # platform and device number
-
-    @property
-    def text(self) -> str:
-        return f"{self.name} ({self.kind}) on {self.platform}"
-
-    def fault(self) -> str | None:
-        """Return None if the device runs a test kernel, else a sentence on what is wrong."""
-        return runtimes.fault_of(f"{self.platform}|{self.name}|{self.driver}|{cl.VERSION_TEXT}", *self.place)
-
-    def matches(self, words: str) -> bool:
-        return words.lower() in f"{self.platform} {self.name} {self.kind}".lower()
-
-
-def list_devices() -> list[DeviceInfo]:
-    """Return every device of every runtime, in the loader's order; runtimes without devices are normal."""
-    found = []
-    for p, platform in enumerate(_platforms()):
-        try:
-            devices = platform.get_devices()
-        except cl.Error:
-            continue
-        for d, device in enumerate(devices):
-            found.append(_info(platform, device, (p, d)))
-    return found
-
-
-def _platforms() -> list[Any]:
-    try:
-        return list(cl.get_platforms())
-    except cl.Error:  # the loader found no runtime at all
-        return []
-
-
-def _info(platform: Any, device: Any, place: tuple[int, int]) -> DeviceInfo:
-    kinds = cl.device_type
-    return DeviceInfo(
-        name=device.name.strip(),
-        platform=f"{platform.name.strip()}, {_short(platform.version)}",
-        kind="GPU" if device.type & kinds.GPU else "CPU" if device.type & kinds.CPU else "other",
-        driver=device.driver_version.strip(),
-        units=device.max_compute_units,
-        memory=device.global_mem_size,
-        allocation=device.max_mem_alloc_size,
-        local_memory=device.local_mem_size,
-        group=device.max_work_group_size,
-        float_width=device.native_vector_width_float,
-        place=place,
-    )
-
-
-def _short(version: str) -> str:
-    """'OpenCL 3.0 PoCL 3.1+debian  Linux, None+Asserts, ...' -> 'OpenCL 3.0 PoCL 3.1+debian'."""
-    return " ".join(version.split(",")[0].split()[:4])
-
-
-def choose(words: str | None = None) -> DeviceInfo:
-    """Pick a device; runtimes that are passed over because they do not work are named in the log.
-
-    `words` is a part of a runtime's or device's name, with `:n` for the n-th that matches; without it the variable
-    CLSPLAT_DEVICE, else the first GPU that works, else the first CPU.  Raises DeviceError naming what exists.
-    """
-    words = words or os.environ.get(DEVICE_VARIABLE)
-    devices = list_devices()
-    if not devices:
-        raise DeviceError(
-            "no OpenCL device was found; install a runtime: pip install 'clsplat[pocl]', pip install 'clsplat[intel]', "
-            "apt install pocl-opencl-icd, or your GPU's driver"
-        )
-    if words:
-        return _named(words, devices)
-    faults = []
-    for info in sorted(devices, key=lambda i: i.kind != "GPU"):
-        fault = info.fault()
-        if fault is None:
-            return info
-        faults.append(f"{info.text} does not work: {fault}")
-        LOG.warning(faults[-1])
-    raise DeviceError("; ".join(faults))
-
-
-def _named(words: str, devices: list[DeviceInfo]) -> DeviceInfo:
-    numbered = re.fullmatch(r"(.*):([0-9]{1,4})", words, re.DOTALL)
-    name, number = numbered.groups() if numbered else (words, "0")
-    matching = [info for info in devices if info.matches(name)]
-    if int(number) >= len(matching):
-        raise DeviceError(f"no device matches '{words}'; there are: {'; '.join(i.text for i in devices)}")
-    info = matching[int(number)]
-    fault = info.fault()
-    if fault is not None:
-        raise DeviceError(f"{info.text} does not work: {fault}")
-    return info
+warnings.filterwarnings("ignore", category=cl.CompilerWarning)  # some runtimes warn at every build
 
 
 class Buffer(cl.Buffer):
-    """Device memory whose end can be noticed, which pyopencl's own class does not allow."""
+    """Device memory with weak references, which pyopencl's class does not support."""
 
 
 class Array:
-    """A typed piece of device memory; it has no arithmetic."""
+    """A typed array in device memory, without arithmetic."""
 
     __slots__ = ("buffer", "device", "dtype", "shape")
 
@@ -192,13 +77,13 @@ class Device:
     def __init__(self, info: DeviceInfo, schedule: Schedule = "auto") -> None:
         platform, number = info.place
         self.info = info
-        self.context = cl.Context([_platforms()[platform].get_devices()[number]])
+        self.context = cl.Context([platforms()[platform].get_devices()[number]])
         self.queue = cl.CommandQueue(self.context, properties=cl.command_queue_properties.PROFILING_ENABLE)
         self.schedule = resolve_schedule(info, schedule)
-        self.tuning = _tuning(info, self.schedule)
+        self.tuning = tuning_of(info, self.schedule)
         self.timings = Timings()
         self.allocated = 0  # bytes of all buffers that are alive
-        self.peak = 0  # the most there ever were
+        self.peak = 0  # largest value of `allocated`
         self._programs: dict[tuple[Any, ...], Program] = {}
 
     @property
@@ -206,7 +91,7 @@ class Device:
         return f"{self.info.text}, {self.schedule} schedule"
 
     def empty(self, shape: int | tuple[int, ...], dtype: DTypeLike = np.float32) -> Array:
-        """Allocate without initialising.  Raises MemoryLimitError with the sizes involved."""
+        """Allocate an array with undefined values.  Raises MemoryLimitError with the sizes."""
         shape = (shape,) if isinstance(shape, int) else shape
         kind = np.dtype(dtype)
         size = _whole_lines(math.prod(shape) * kind.itemsize)
@@ -231,11 +116,13 @@ class Device:
         self.allocated -= size
 
     def zeros(self, shape: int | tuple[int, ...], dtype: DTypeLike = np.float32) -> Array:
+        """Allocate an array of zeros.  Raises MemoryLimitError."""
         array = self.empty(shape, dtype)
         array.fill(0)
         return array
 
     def upload(self, values: NDArray[Any]) -> Array:
+        """Copy an array from the host.  Raises MemoryLimitError."""
         array = self.empty(values.shape, values.dtype)
         array.set(values)
         return array
@@ -253,41 +140,10 @@ class Device:
         return self._programs[key]
 
     def finish(self) -> None:
-        """Wait until everything enqueued is done."""
+        """Wait for all enqueued work."""
         self.queue.finish()
 
 
 def _whole_lines(size: int) -> int:
-    """Bytes rounded up to 64, at least as many: vectors may run past the last value, and no buffer may be empty."""
+    """Bytes rounded up to 64, at least 64: vectors may read past the last value; no buffer may be empty."""
     return max(64, -(-size // 64) * 64)
-
-
-def resolve_schedule(info: DeviceInfo, schedule: Schedule) -> Literal["wide", "simt"]:
-    """`auto`: CPUs with vector units of 8 floats or more take the wide schedule, everything else simt."""
-    if schedule == "auto":
-        return "wide" if info.kind == "CPU" and info.float_width >= 8 else "simt"
-    if schedule not in ("wide", "simt"):
-        raise ConfigError(f"no schedule named '{schedule}'; there are auto, wide and simt")
-    return schedule
-
-
-def _tuning(info: DeviceInfo, schedule: Literal["wide", "simt"]) -> dict[str, int | str]:
-    """The -D values that fit kernels to a device; their meaning stands in cl_kernels/common.h."""
-    if schedule == "wide":
-        return {
-            "LANES": 16 if info.float_width >= 16 else 8,
-            "VECTORS": 4,
-            "GROUP": 16,
-            "TEAM": 1,
-            "DIGIT_BITS": 11,
-            "TILE": 16,
-        }
-    return {
-        "LANES": 1,
-        "VECTORS": 1,
-        "GROUP": 64,
-        "TEAM": 64,
-        "DIGIT_BITS": 4,
-        "TILE": 16 if info.group >= 256 else 8,
-        "SORT_CAPACITY": 2048,
-    }

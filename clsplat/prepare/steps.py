@@ -1,4 +1,4 @@
-"""The steps that a pipeline's `prepare:` can name.  Each makes a folder from a folder, on the host."""
+"""The steps of `prepare:` in pipeline files.  Each makes a folder from a folder, on the host."""
 
 from abc import abstractmethod
 from pathlib import Path
@@ -16,31 +16,36 @@ Count = Annotated[int, Field(gt=0)]
 
 
 class Step(Settings):
-    """Makes a folder from a folder.  Its result is known by its inputs, its settings and `version`."""
+    """A step from a folder to a folder.  Inputs, settings and `version` identify its result."""
 
-    version: ClassVar[int] = 1  # changes with what the step does
+    version: ClassVar[int] = 1  # increase it when the result changes
 
-    stage: str  # the name in a pipeline file
+    stage: str
+    """Name of the step."""
 
     @abstractmethod
     def make(self, source: Path, out: Path, without: Path) -> dict[str, Any]:
-        """Fill the empty folder `out` from `source`, without looking below `without`; return figures for the log."""
+        """Fill the empty folder `out` from `source`, without reading below `without`; return figures for the log."""
 
 
 class FindFeatures(Step):
-    """SIFT features of photographs."""
+    """Find SIFT features of photographs."""
 
     stage: Literal["find_features"] = "find_features"
 
-    long_side: Count = 1600  # px: photographs are made smaller to look for features
-    features: Count = 8192  # at most, in each
+    long_side: Count = 1600
+    """Largest side, px, at which features are searched."""
+    features: Count = 8192
+    """Largest number of features of a photograph."""
     camera_model: CameraModel = "SIMPLE_RADIAL"
-    cameras: Cameras = "auto"  # auto: one for photographs of the same size and focal length
+    """Camera model of COLMAP."""
+    cameras: Cameras = "auto"
+    """Photographs that share a camera; auto: those of the same size and focal length."""
 
     def make(self, source: Path, out: Path, without: Path) -> dict[str, Any]:
         if holds_scene(source):
             raise DataError(
-                f"{source}: has its cameras already; train it with a pipeline without `prepare`, such as splat_7k, "
+                f"{source}: holds cameras already; train it with a pipeline without `prepare`, such as splat_7k, "
                 "or give the folder of the photographs alone"
             )
         return find_features(
@@ -49,36 +54,42 @@ class FindFeatures(Step):
 
 
 class MatchFeatures(Step):
-    """Which features of two photographs are the same point."""
+    """Match features between pairs of photographs."""
 
     stage: Literal["match_features"] = "match_features"
 
-    matching: Matching = "auto"  # auto: exhaustive, vocabulary beyond 200 photographs
-    neighbours: Count = 10  # photographs that each is matched with, when not with all
+    matching: Matching = "auto"
+    """Pairs that are matched; auto: exhaustive up to 200 photographs, vocabulary beyond."""
+    neighbours: Count = 10
+    """Number of photographs that each is matched with, unless exhaustive."""
 
     def make(self, source: Path, out: Path, without: Path) -> dict[str, Any]:
         return match_features(source, out, self.matching, self.neighbours)
 
 
 class MapCameras(Step):
-    """Cameras and points from matches."""
+    """Find cameras and points from matches."""
 
     stage: Literal["map_cameras"] = "map_cameras"
 
     mapper: Mapper = "incremental"
-    threads: Count = 1  # more are faster, and not repeatable to the bit
+    """Method that places the cameras."""
+    threads: Count = 1
+    """Number of threads; more than one is faster and not repeatable to the bit."""
 
     def make(self, source: Path, out: Path, without: Path) -> dict[str, Any]:
         return map_cameras(source, out, self.mapper, self.threads)
 
 
 class Undistort(Step):
-    """Photographs as a pinhole camera would have taken them, at the size to train on."""
+    """Undistort photographs, as of a pinhole camera, at the training size."""
 
     stage: Literal["undistort"] = "undistort"
 
-    long_side: Count | None = None  # px; none: as large as the photographs
-    blank: Blank = "crop"  # mask: keep the whole photograph, and mask what it does not show
+    long_side: Count | None = None
+    """Largest side of the undistorted photographs, px; without it, they keep their size."""
+    blank: Blank = "crop"
+    """Blank pixels: crop removes them, mask keeps the whole photograph with a mask."""
 
     def make(self, source: Path, out: Path, without: Path) -> dict[str, Any]:
         return {"images": undistort_scene(source, out, self.long_side, self.blank)}

@@ -1,0 +1,162 @@
+"""Find the OpenCL devices of this machine and choose one.
+
+The device is chosen once and passed explicitly; no other device replaces it silently.
+"""
+
+import logging
+import os
+import re
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from clsplat.errors import ConfigError, DeviceError
+from clsplat.opencl import runtimes
+
+runtimes.add_intel_runtime()
+import pyopencl as cl  # noqa: E402
+
+DEVICE_VARIABLE = "CLSPLAT_DEVICE"
+LOG = logging.getLogger("clsplat")
+Schedule = Literal["auto", "wide", "simt"]
+
+
+@dataclass(frozen=True)
+class DeviceInfo:
+    """The properties of a device, and its place among platforms and devices."""
+
+    name: str
+    platform: str  # name and version of the runtime
+    kind: Literal["GPU", "CPU", "other"]
+    driver: str
+    units: int  # compute units
+    memory: int  # bytes
+    allocation: int  # bytes, largest single buffer
+    local_memory: int  # bytes per work-group
+    group: int  # items, largest work-group
+    float_width: int  # lanes of the vector unit
+    place: tuple[int, int]  # platform and device number
+
+    @property
+    def text(self) -> str:
+        return f"{self.name} ({self.kind}) on {self.platform}"
+
+    def fault(self) -> str | None:
+        """Return None when the device runs a test kernel, else a sentence about the fault."""
+        return runtimes.fault_of(f"{self.platform}|{self.name}|{self.driver}|{cl.VERSION_TEXT}", *self.place)
+
+    def matches(self, device_name: str) -> bool:
+        """Return whether `device_name` is a part of platform, name and kind, in any case."""
+        return device_name.lower() in f"{self.platform} {self.name} {self.kind}".lower()
+
+
+def list_devices() -> list[DeviceInfo]:
+    """Return every device of every runtime, in the loader's order; a runtime may have no device."""
+    found = []
+    for p, platform in enumerate(platforms()):
+        try:
+            devices = platform.get_devices()
+        except cl.Error:
+            continue
+        for d, device in enumerate(devices):
+            found.append(_info(platform, device, (p, d)))
+    return found
+
+
+def platforms() -> list[Any]:
+    """Return the platforms of the loader; none when it finds no runtime."""
+    try:
+        return list(cl.get_platforms())
+    except cl.Error:  # the loader found no runtime
+        return []
+
+
+def _info(platform: Any, device: Any, place: tuple[int, int]) -> DeviceInfo:
+    kinds = cl.device_type
+    return DeviceInfo(
+        name=device.name.strip(),
+        platform=f"{platform.name.strip()}, {_short(platform.version)}",
+        kind="GPU" if device.type & kinds.GPU else "CPU" if device.type & kinds.CPU else "other",
+        driver=device.driver_version.strip(),
+        units=device.max_compute_units,
+        memory=device.global_mem_size,
+        allocation=device.max_mem_alloc_size,
+        local_memory=device.local_mem_size,
+        group=device.max_work_group_size,
+        float_width=device.native_vector_width_float,
+        place=place,
+    )
+
+
+def _short(version: str) -> str:
+    """'OpenCL 3.0 PoCL 3.1+debian  Linux, None+Asserts, ...' -> 'OpenCL 3.0 PoCL 3.1+debian'."""
+    return " ".join(version.split(",")[0].split()[:4])
+
+
+def choose(device_name: str | None = None) -> DeviceInfo:
+    """Choose a device; log the devices that do not work.
+
+    `device_name` is a part of a runtime's or device's name, with `:n` for the n-th match, from 0.  Without it the
+    variable CLSPLAT_DEVICE holds the name, else the first GPU that works is chosen, else the first CPU.  Raises
+    DeviceError with the names of all devices.
+    """
+    device_name = device_name or os.environ.get(DEVICE_VARIABLE)
+    devices = list_devices()
+    if not devices:
+        raise DeviceError(
+            "no OpenCL device was found; install a runtime: pip install 'clsplat[pocl]', pip install 'clsplat[intel]', "
+            "apt install pocl-opencl-icd, or your GPU's driver"
+        )
+    if device_name:
+        return _named(device_name, devices)
+    faults = []
+    for info in sorted(devices, key=lambda i: i.kind != "GPU"):
+        fault = info.fault()
+        if fault is None:
+            return info
+        faults.append(f"{info.text} does not work: {fault}")
+        LOG.warning(faults[-1])
+    raise DeviceError("; ".join(faults))
+
+
+def _named(device_name: str, devices: list[DeviceInfo]) -> DeviceInfo:
+    numbered = re.fullmatch(r"(.*):([0-9]{1,4})", device_name, re.DOTALL)
+    name, number = numbered.groups() if numbered else (device_name, "0")
+    matching = [info for info in devices if info.matches(name)]
+    if int(number) >= len(matching):
+        raise DeviceError(f"no device matches '{device_name}'; there are: {'; '.join(i.text for i in devices)}")
+    info = matching[int(number)]
+    fault = info.fault()
+    if fault is not None:
+        raise DeviceError(f"{info.text} does not work: {fault}")
+    return info
+
+
+def resolve_schedule(info: DeviceInfo, schedule: Schedule) -> Literal["wide", "simt"]:
+    """Return the schedule of a device; `auto` is wide for CPUs with vectors of 8 floats or more, else simt."""
+    if schedule == "auto":
+        return "wide" if info.kind == "CPU" and info.float_width >= 8 else "simt"
+    if schedule not in ("wide", "simt"):
+        raise ConfigError(f"no schedule named '{schedule}'; there are auto, wide and simt")
+    return schedule
+
+
+def tuning_of(info: DeviceInfo, schedule: Literal["wide", "simt"]) -> dict[str, int | str]:
+    """Return the -D values for a device; cl_kernels/common.h explains them."""
+    if schedule == "wide":
+        return {
+            "LANES": 16 if info.float_width >= 16 else 8,
+            "VECTORS": 4,
+            "GROUP": 16,
+            "TEAM": 1,
+            "DIGIT_BITS": 11,
+            "TILE": 16,
+        }
+    return {
+        "LANES": 1,
+        "VECTORS": 1,
+        "GROUP": 64,
+        "TEAM": 64,
+        "DIGIT_BITS": 4,
+        "TILE": 16 if info.group >= 256 else 8,
+        "SORT_CAPACITY": 2048,
+    }
