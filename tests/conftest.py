@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from clsplat import plugins
-from clsplat.opencl.choice import DeviceInfo, choose
 from clsplat.opencl.device import Array, Device
+from clsplat.opencl.discovery import DeviceInfo, choose
 from clsplat.settings import Settings, rebuild
 from data_tools.synthetic import Options, write_dataset
 
@@ -59,7 +59,7 @@ def smooth(device: Device) -> Device:
 
 def forgets_released_buffers(info: DeviceInfo) -> bool:
     """Oclgrind 21.10 takes a buffer at the address of a released one for that one, with its size and uninitialised
-    values: its check is not told of releases.
+    values: its check does not see releases.
     https://github.com/jrprice/Oclgrind/blob/v21.10/src/plugins/Uninitialized.h
     """
     return info.platform.startswith("Oclgrind")

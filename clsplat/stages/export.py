@@ -12,14 +12,14 @@ from clsplat.stages.base import Scheduled
 from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
-MIN_LOGIT = -80.0  # of an opacity that the filter spreads out to nothing: as little as the kernels know
+MIN_LOGIT = -80.0  # of an opacity that the filter reduces to zero: the smallest logit of the kernels
 
 
 class Export(Scheduled):
     """Write a PLY in the reference's layout and read it back.
 
-    A world filter becomes part of its scales and opacities, so that any viewer can show it; the model as it was
-    trained, with the filter as a property `filter_3D`, goes to a second file with `_raw` in its name.
+    A world filter is applied to scales and opacities, so that any viewer can show the file.  A second file, with `_raw`
+    in its name, holds the model as trained, with the filter as a property `filter_3D`.
     """
 
     stage: Literal["export"] = "export"
@@ -42,7 +42,7 @@ class Export(Scheduled):
 
 
 def baked(parameters: Parameters) -> Parameters:
-    """The same Gaussians without `filter_variance`: scales and opacities as they are drawn (Yu et al. 2024, eq. 9)."""
+    """Return the Gaussians with the world filter applied to scales and opacities (Yu et al. 2024, eq. 9)."""
     tables = {name: parameters[name] for name in PARAMETERS}
     variance = parameters["filter_variance"].astype(np.float64)
     if variance.any():
