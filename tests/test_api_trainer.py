@@ -61,6 +61,8 @@ def test_the_bits_with_a_world_filter_are_those_of_the_raw_file(tiny_scene, tmp_
     np.testing.assert_allclose(model.filter_variance, raw.filter_variance, rtol=3e-7)  # the file has its square root
     model.save(tmp_path / "model.ply")
     assert (tmp_path / "model.ply").read_bytes() == (out / "point_cloud_raw.ply").read_bytes()
+    model.baked().save(tmp_path / "baked.ply")
+    assert (tmp_path / "baked.ply").read_bytes() == (out / "point_cloud.ply").read_bytes()
 
 
 def test_steps_are_counted_and_end(tiny_scene):
