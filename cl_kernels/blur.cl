@@ -7,18 +7,25 @@
  * denominator.  One item = one pixel; dimensions x, y.  No local memory.  Deterministic. */
 #include "common.h"
 
+/* w of the distance between two rows or columns. */
+static inline float weight_of(const uint one, const uint other, const float falloff)
+{
+    const float distance = (float)one - (float)other;
+    return exp(-falloff * distance * distance);
+}
+
 /* Sums along rows: three channels times the mask, and the mask itself. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void blur_rows(
-    __global const float *restrict image,    // [3,H',stride]
-    __global const float *restrict mask,     // [H',stride] 0 or 1; read where `masked`
-    __global const float *restrict weights,  // [reach+1] w(k)
-    __global float *restrict sums,           // [4,H',stride] channels, then the mask
+    __global const float *restrict image,  // [3,H',stride]
+    __global const float *restrict mask,   // [H',stride] 0 or 1; read where `masked`
+    __global float *restrict sums,         // [4,H',stride] channels, then the mask
     const uint masked,
-    const uint reach,                        // px
+    const float falloff,                   // 1 / (2 sigma^2), px^-2
+    const uint reach,                      // px
     const uint width,
     const uint height,
-    const uint rows,                         // H'
+    const uint rows,                       // H'
     const uint stride)
 {
     const uint x = get_global_id(0), y = get_global_id(1), plane = rows * stride;
@@ -28,7 +35,7 @@ void blur_rows(
     float total[4] = {0.0f, 0.0f, 0.0f, 0.0f};
     for (uint column = first; column <= last; column++) {
         const uint at = y * stride + column;
-        const float weight = weights[column < x ? x - column : column - x] * (masked ? mask[at] : 1.0f);
+        const float weight = weight_of(column, x, falloff) * (masked ? mask[at] : 1.0f);
         for (uint channel = 0; channel < 3; channel++)
             total[channel] += weight * image[channel * plane + at];
         total[3] += weight;
@@ -40,13 +47,13 @@ void blur_rows(
 /* The same along columns, and the division; pixels without a neighbour that counts stay unchanged. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void blur_columns(
-    __global const float *restrict sums,     // [4,H',stride]
-    __global const float *restrict weights,  // [reach+1] w(k)
-    __global float *restrict image,          // [3,H',stride]
-    const uint reach,                        // px
+    __global const float *restrict sums,  // [4,H',stride]
+    __global float *restrict image,       // [3,H',stride]
+    const float falloff,                  // 1 / (2 sigma^2), px^-2
+    const uint reach,                     // px
     const uint width,
     const uint height,
-    const uint rows,                         // H'
+    const uint rows,                      // H'
     const uint stride)
 {
     const uint x = get_global_id(0), y = get_global_id(1), plane = rows * stride;
@@ -54,9 +61,11 @@ void blur_columns(
         return;
     const uint first = max((int)y - (int)reach, 0), last = min(y + reach, height - 1);
     float total[4] = {0.0f, 0.0f, 0.0f, 0.0f};
-    for (uint row = first; row <= last; row++)
+    for (uint row = first; row <= last; row++) {
+        const float weight = weight_of(row, y, falloff);
         for (uint channel = 0; channel < 4; channel++)
-            total[channel] += weights[row < y ? y - row : row - y] * sums[channel * plane + row * stride + x];
+            total[channel] += weight * sums[channel * plane + row * stride + x];
+    }
     for (uint channel = 0; channel < 3 && total[3] > 0.0f; channel++)
         image[channel * plane + y * stride + x] = total[channel] / total[3];
 }

@@ -38,7 +38,7 @@ class PointEntry:
 
 
 @dataclass
-class DeviceModel:
+class ColmapModel:
     cameras: Sequence[CameraEntry]
     images: Sequence[ImageEntry]
     points: Sequence[PointEntry] = ()
@@ -47,7 +47,7 @@ class DeviceModel:
 PINHOLE = CameraEntry(1, "PINHOLE", 64, 48, (50.0, 51.0, 30.5, 25.25))
 
 
-def tiny_model() -> DeviceModel:
+def tiny_model() -> ColmapModel:
     """One camera, three images and three points, with and without observations."""
     images = [
         ImageEntry("b.jpg", 1, (0.5, 0.5, -0.5, 0.5), (1.0, 2.0, 3.0), points2d=2),
@@ -55,7 +55,7 @@ def tiny_model() -> DeviceModel:
         ImageEntry("c.jpg", 1, (0.0, 1.0, 0.0, 0.0), (4.0, 0.0, 0.0), points2d=1),
     ]
     points = [PointEntry((1.0, 2.0, 3.0), (255, 0, 51), track=2), PointEntry((-1.0, 0.5, 9.0)), PointEntry((7, 8, 9))]
-    return DeviceModel([PINHOLE], images, points)
+    return ColmapModel([PINHOLE], images, points)
 
 
 numbers = st.floats(-1e6, 1e6)
@@ -63,7 +63,7 @@ names = st.text("abc é日 .", min_size=1, max_size=8).map(lambda s: s.strip(" .
 
 
 @st.composite
-def models(draw: st.DrawFn) -> DeviceModel:
+def models(draw: st.DrawFn) -> ColmapModel:
     """Generate models whose cameras have no distortion."""
     focal = st.floats(1.0, 1e5)
     size = st.integers(1, 10_000)
@@ -86,10 +86,10 @@ def models(draw: st.DrawFn) -> DeviceModel:
     images = draw(st.lists(image, min_size=2, max_size=6, unique_by=lambda i: i.name))
     byte = st.integers(0, 255)
     point = st.builds(PointEntry, st.tuples(*[numbers] * 3), st.tuples(byte, byte, byte), st.integers(0, 3))
-    return DeviceModel(cameras, images, draw(st.lists(point, max_size=5)))
+    return ColmapModel(cameras, images, draw(st.lists(point, max_size=5)))
 
 
-def write_model(folder: Path, model: DeviceModel, kind: str = "bin", newline: str = "\n") -> Path:
+def write_model(folder: Path, model: ColmapModel, kind: str = "bin", newline: str = "\n") -> Path:
     """Write `cameras`, `images` and `points3D` as `kind` (bin or txt) and return the folder."""
     folder.mkdir(parents=True, exist_ok=True)
     for stem, binary, text in (
@@ -102,7 +102,7 @@ def write_model(folder: Path, model: DeviceModel, kind: str = "bin", newline: st
     return folder
 
 
-def write_scene(path: Path, model: DeviceModel, kind: str = "bin", newline: str = "\n") -> Path:
+def write_scene(path: Path, model: ColmapModel, kind: str = "bin", newline: str = "\n") -> Path:
     """Write the model to sparse/0, an empty file for each image, and return the scene's folder."""
     write_model(path / "sparse" / "0", model, kind, newline)
     for image in model.images:
@@ -112,7 +112,7 @@ def write_scene(path: Path, model: DeviceModel, kind: str = "bin", newline: str 
     return path
 
 
-def _cameras_binary(model: DeviceModel) -> bytes:
+def _cameras_binary(model: ColmapModel) -> bytes:
     rows = [
         struct.pack(f"<IiQQ{len(c.params)}d", c.number, IDS[c.model], c.width, c.height, *c.params)
         for c in model.cameras
@@ -120,7 +120,7 @@ def _cameras_binary(model: DeviceModel) -> bytes:
     return struct.pack("<Q", len(rows)) + b"".join(rows)
 
 
-def _images_binary(model: DeviceModel) -> bytes:
+def _images_binary(model: ColmapModel) -> bytes:
     rows = []
     for number, image in enumerate(model.images, start=1):
         head = struct.pack("<I7dI", number, *image.quaternion, *image.translation, image.camera)
@@ -129,7 +129,7 @@ def _images_binary(model: DeviceModel) -> bytes:
     return struct.pack("<Q", len(rows)) + b"".join(rows)
 
 
-def _points_binary(model: DeviceModel) -> bytes:
+def _points_binary(model: ColmapModel) -> bytes:
     rows = []
     for number, point in enumerate(model.points, start=1):
         head = struct.pack("<Q3d3BdQ", number, *point.position, *point.rgb, 0.5, point.track)
@@ -141,11 +141,11 @@ def _words(*values: object) -> str:
     return " ".join(str(value) for value in values)
 
 
-def _cameras_text(model: DeviceModel) -> list[str]:
+def _cameras_text(model: ColmapModel) -> list[str]:
     return [_words(c.number, c.model, c.width, c.height, *c.params) for c in model.cameras]
 
 
-def _images_text(model: DeviceModel) -> list[str]:
+def _images_text(model: ColmapModel) -> list[str]:
     lines = []
     for number, image in enumerate(model.images, start=1):
         lines.append(_words(number, *image.quaternion, *image.translation, image.camera, image.name))
@@ -153,6 +153,6 @@ def _images_text(model: DeviceModel) -> list[str]:
     return lines
 
 
-def _points_text(model: DeviceModel) -> list[str]:
+def _points_text(model: ColmapModel) -> list[str]:
     rows = enumerate(model.points, start=1)
     return [_words(i, *point.position, *point.rgb, 0.5, *[1, 0] * point.track) for i, point in rows]

@@ -18,7 +18,7 @@ from clsplat.scene.scene import Camera, Scene
 from clsplat.scene.view import load_image
 from tests.colmap_writer import (
     PINHOLE,
-    DeviceModel,
+    ColmapModel,
     ImageEntry,
     PointEntry,
     models,
@@ -141,7 +141,7 @@ def rotated(quaternion: tuple[float, ...], vector: np.ndarray) -> np.ndarray:
     return vector + 2 * np.cross(u, np.cross(u, vector) + w * vector)
 
 
-def assert_matches(scene: Scene, model: DeviceModel) -> None:
+def assert_matches(scene: Scene, model: ColmapModel) -> None:
     images = {image.name: image for image in model.images}
     cameras = {camera.number: camera for camera in model.cameras}
     assert [view.name for view in scene.views] == sorted(images)
@@ -166,7 +166,7 @@ def assert_matches(scene: Scene, model: DeviceModel) -> None:
 @pytest.mark.parametrize("kind", ["bin", "txt"])
 @given(model=models())
 @settings(max_examples=60, deadline=None)
-def test_written_model_is_read_back(tmp_path_factory: pytest.TempPathFactory, kind: str, model: DeviceModel) -> None:
+def test_written_model_is_read_back(tmp_path_factory: pytest.TempPathFactory, kind: str, model: ColmapModel) -> None:
     path = write_scene(tmp_path_factory.mktemp("scene"), model, kind)
     assert_matches(read_scene(path), model)
 
@@ -219,7 +219,7 @@ def test_binary_is_preferred_to_text(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("holdout", [0, 2, 8])
 def test_every_nth_view_by_name_is_for_testing(tmp_path: Path, holdout: int) -> None:
-    model = DeviceModel([PINHOLE], [ImageEntry(f"{i:02}.jpg") for i in reversed(range(17))])
+    model = ColmapModel([PINHOLE], [ImageEntry(f"{i:02}.jpg") for i in reversed(range(17))])
     scene = read_scene(write_scene(tmp_path, model), holdout)
     expected = {0: [], 2: list(range(0, 17, 2)), 8: [0, 8, 16]}[holdout]
     assert [view.name for view in scene.split("test")] == [f"{i:02}.jpg" for i in expected]
@@ -227,7 +227,7 @@ def test_every_nth_view_by_name_is_for_testing(tmp_path: Path, holdout: int) -> 
 
 
 def test_same_file_name_in_two_folders_makes_two_views(tmp_path: Path) -> None:
-    model = DeviceModel([PINHOLE], [ImageEntry("b/1.jpg"), ImageEntry("a/1.jpg", translation=(1, 0, 0))])
+    model = ColmapModel([PINHOLE], [ImageEntry("b/1.jpg"), ImageEntry("a/1.jpg", translation=(1, 0, 0))])
     assert [view.name for view in read_scene(write_scene(tmp_path, model)).views] == ["a/1.jpg", "b/1.jpg"]
 
 

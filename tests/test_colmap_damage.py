@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from clsplat.errors import DataError
 from clsplat.scene.colmap import ColmapReader
 from clsplat.scene.detect import read_scene
-from tests.colmap_writer import PINHOLE, CameraEntry, DeviceModel, ImageEntry, tiny_model, write_model, write_scene
+from tests.colmap_writer import PINHOLE, CameraEntry, ColmapModel, ImageEntry, tiny_model, write_model, write_scene
 from tests.refusals import refusal
 
 # ---- damage
@@ -53,7 +53,7 @@ def test_huge_count_allocates_nothing(tmp_path: Path, stem: str, offset: int, co
 
 
 def test_name_without_end(tmp_path: Path) -> None:
-    file = write_scene(tmp_path, DeviceModel([PINHOLE], [ImageEntry("abcdefgh")])) / "sparse" / "0" / "images.bin"
+    file = write_scene(tmp_path, ColmapModel([PINHOLE], [ImageEntry("abcdefgh")])) / "sparse" / "0" / "images.bin"
     file.write_bytes(file.read_bytes().replace(b"\0" * 9, b"\1" * 9))  # the end of the name and the count after it
     assert "image name" in refusal(read_scene, tmp_path)
 
@@ -113,7 +113,7 @@ def test_unknown_camera(tmp_path: Path) -> None:
 def test_lenses_that_are_not_supported_are_refused(tmp_path: Path, model: str, params: tuple[float, ...]) -> None:
     camera = CameraEntry(3, model, 64, 48, params)
     message = refusal(
-        read_scene, write_scene(tmp_path, DeviceModel([camera], [ImageEntry("a.jpg", 3), ImageEntry("b.jpg", 3)]))
+        read_scene, write_scene(tmp_path, ColmapModel([camera], [ImageEntry("a.jpg", 3), ImageEntry("b.jpg", 3)]))
     )
     assert "camera 3" in message
     assert model in message
@@ -122,7 +122,7 @@ def test_lenses_that_are_not_supported_are_refused(tmp_path: Path, model: str, p
 
 def test_distortion_that_is_not_a_number_is_refused(tmp_path: Path) -> None:
     camera = CameraEntry(3, "OPENCV", 64, 48, (50, 50, 32, 24, math.nan, 0, 0, 0))
-    message = refusal(read_scene, write_scene(tmp_path, DeviceModel([camera], [ImageEntry("a.jpg", 3)])))
+    message = refusal(read_scene, write_scene(tmp_path, ColmapModel([camera], [ImageEntry("a.jpg", 3)])))
     assert "finite numbers" in message
 
 
@@ -160,7 +160,7 @@ def test_unknown_camera_model(tmp_path: Path, number: int) -> None:
 
 
 def test_missing_images_are_counted_and_named(tmp_path: Path) -> None:
-    write_scene(tmp_path, DeviceModel([PINHOLE], [ImageEntry(f"{i}.jpg") for i in range(9)]))
+    write_scene(tmp_path, ColmapModel([PINHOLE], [ImageEntry(f"{i}.jpg") for i in range(9)]))
     for i in range(5):
         (tmp_path / "images" / f"{i}.jpg").unlink()
     message = refusal(read_scene, tmp_path)

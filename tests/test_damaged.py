@@ -21,21 +21,21 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.colmap_writer import CameraEntry, DeviceModel, ImageEntry, PointEntry, write_scene
+from tests.colmap_writer import CameraEntry, ColmapModel, ImageEntry, PointEntry, write_scene
 
 SECONDS, BYTES = 5.0, 1 << 30
 CAMERA = CameraEntry(1, "PINHOLE", 64, 48, (60.0, 60.0, 32.0, 24.0))
 NAMES = [f"{i}.png" for i in range(6)]
 
 
-def healthy(**changes: object) -> DeviceModel:
+def healthy(**changes: object) -> ColmapModel:
     """Six cameras in a row that look at points four units away."""
     images = [ImageEntry(name, translation=(0.3 * i - 0.8, 0.0, 4.0)) for i, name in enumerate(NAMES)]
     points = [PointEntry((0.2 * (i % 7) - 0.6, 0.2 * (i // 7) - 0.6, 0.05 * (i % 3))) for i in range(49)]
-    return replace(DeviceModel([CAMERA], images, points), **changes)
+    return replace(ColmapModel([CAMERA], images, points), **changes)
 
 
-def scene(path: Path, model: DeviceModel | None = None, kind: str = "bin", newline: str = "\n") -> Path:
+def scene(path: Path, model: ColmapModel | None = None, kind: str = "bin", newline: str = "\n") -> Path:
     """Write a model and a photograph for each image."""
     model = model or healthy()
     write_scene(path, model, kind, newline)
@@ -214,7 +214,7 @@ CASES: dict[str, tuple[Callable[[Path], object], int, str]] = {
 }
 
 
-def named(pattern: str) -> DeviceModel:
+def named(pattern: str) -> ColmapModel:
     model = healthy()
     return replace(model, images=[replace(image, name=pattern.format(i)) for i, image in enumerate(model.images)])
 

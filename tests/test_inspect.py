@@ -20,7 +20,7 @@ from clsplat.inspect.survey import distortion
 from clsplat.scene.detect import read_scene
 from clsplat.scene.lens import Lens
 from clsplat.scene.view import load_image, load_mask
-from tests.colmap_writer import CameraEntry, DeviceModel, ImageEntry, PointEntry, tiny_model, write_model, write_scene
+from tests.colmap_writer import CameraEntry, ColmapModel, ImageEntry, PointEntry, tiny_model, write_model, write_scene
 from tests.data_sets import data_set
 from tests.html_page import HOSTILE, Page
 from tests.test_cli import clsplat
@@ -30,7 +30,7 @@ COUNT = 24  # cameras on a circle of radius 4 that look at points in a ball of r
 SIZE = (64, 48)
 
 
-def orbit() -> DeviceModel:
+def orbit() -> ColmapModel:
     images = []
     for i, angle in enumerate(np.linspace(0, 2 * np.pi, COUNT, endpoint=False)):
         backwards = np.array([np.cos(angle), np.sin(angle), 0.0])
@@ -40,10 +40,10 @@ def orbit() -> DeviceModel:
         images.append(ImageEntry(f"{i:02}.png", 1, (w, x, y, z), (0.0, 0.0, 4.0)))
     places = np.random.default_rng(0).uniform(-0.5, 0.5, (200, 3))
     camera = CameraEntry(1, "PINHOLE", *SIZE, (60.0, 60.0, 32.0, 24.0))
-    return DeviceModel([camera], images, [PointEntry(place) for place in places.tolist()])
+    return ColmapModel([camera], images, [PointEntry(place) for place in places.tolist()])
 
 
-def write(path: Path, model: DeviceModel, kind: str = "bin", size: tuple[int, int] = SIZE) -> Path:
+def write(path: Path, model: ColmapModel, kind: str = "bin", size: tuple[int, int] = SIZE) -> Path:
     """Write a scene with a real photograph for each image."""
     write_scene(path, model, kind)
     for image in model.images:

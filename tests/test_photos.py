@@ -17,7 +17,7 @@ from data_tools.gather import list_photographs
 from data_tools.photos import find_features, map_cameras, match_features
 from data_tools.undistort import undistort_scene
 from data_tools.vocabulary import alike
-from tests.colmap_writer import CameraEntry, DeviceModel, ImageEntry, PointEntry
+from tests.colmap_writer import CameraEntry, ColmapModel, ImageEntry, PointEntry
 from tests.colmap_writer import write_model as write_test_model
 from tests.data_sets import data_set
 from tests.refusals import refusal
@@ -165,7 +165,7 @@ def test_undistorted_scene(tmp_path, lens, blank):
     photograph = np.nan_to_num(pattern(*lens.undistort(columns, rows)))
     cv2.imwrite(str(tmp_path / "images" / "a.png"), np.rint(photograph).astype(np.uint8))
     entry = CameraEntry(1, lens.model, lens.width, lens.height, lens.params)
-    write_test_model(tmp_path / "sparse" / "0", DeviceModel([entry], [ImageEntry("a.png")], [PointEntry((0, 0, 3))]))
+    write_test_model(tmp_path / "sparse" / "0", ColmapModel([entry], [ImageEntry("a.png")], [PointEntry((0, 0, 3))]))
     assert undistort_scene(tmp_path, tmp_path / "out", blank=blank) == 1
     (view,) = read_scene(tmp_path / "out", 0).views
     assert view.lens is None

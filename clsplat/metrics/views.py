@@ -1,11 +1,13 @@
 """The metrics of a model at the views of a scene, and their means."""
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
+from clsplat.errors import DataError
 from clsplat.gaussians.tables import DeviceModel
 from clsplat.losses.base import Comparison
 from clsplat.losses.image import ssim_maps
@@ -17,6 +19,7 @@ from clsplat.render.rasterizer import Rasterizer
 from clsplat.scene.scene import View
 from clsplat.views.photographs import Photograph, Photographs, unpack
 
+LOG = logging.getLogger("clsplat")
 PSNR_AND_SSIM = Perceptual()
 
 
@@ -65,6 +68,9 @@ def measure(
     results = []
     for view in views:
         photograph = photographs.get(view)
+        if photograph.empty:
+            LOG.warning("%s: not measured, since its mask leaves out every pixel", view.name)
+            continue
         rendered = render_view(rasterizer, model, photograph.camera, photographs.background)
         image, mask = photograph.image(), photograph.counted()
         if mask is None:
@@ -79,6 +85,8 @@ def measure(
 
 def mean(results: Sequence[ViewMetrics], perceptual: Perceptual = PSNR_AND_SSIM) -> dict[str, Any]:
     """Return averages over views, with the keys of metrics.json."""
+    if not results:
+        raise DataError("no view can be measured: the masks leave out every pixel; fix the masks")
     return {
         "psnr": float(np.mean([r.psnr for r in results])),
         "ssim": float(np.mean([r.ssim for r in results])),

@@ -59,6 +59,8 @@ class Evaluate(Scheduled):
             views = run.original.downscaled(downscale).split(self.split)
             photographs = run.photographs if downscale in run.scene.downscales else run.photographs.fresh()
             results = measure(run.rasterizer, run.model, views, photographs, perceptual)
+            if not results:
+                continue
             for result in results:
                 run.records.add(run.step, "view", split=self.split, scale=downscale, **result.line())
             averages = mean(results, perceptual)

@@ -9,7 +9,7 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field, field_validator
 
 from clsplat.density.statistics import SplatStats
-from clsplat.errors import Interrupted, NumericError
+from clsplat.errors import DataError, Interrupted, NumericError
 from clsplat.losses.base import ImageLoss, Loss, Penalty, ViewGradients
 from clsplat.losses.image import pixel_loss
 from clsplat.metrics.distribution import distribution
@@ -21,7 +21,8 @@ from clsplat.training.adam import Adam, Rates
 from clsplat.training.profile import stage_milliseconds
 from clsplat.training.run import Progress, Run
 from clsplat.training.trainer import Trainer
-from clsplat.views.sampling import Sampler, ViewSettings
+from clsplat.views.photographs import Photograph
+from clsplat.views.sampling import Sample, Sampler, ViewSettings
 
 LOG = logging.getLogger("clsplat")
 DISTRIBUTION_INTERVAL = 5  # reports
@@ -150,8 +151,9 @@ class Optimize(Stage):
         run.stage_step += 1
         run.device.timings.sampling = run.step % self.log_every == self.log_every // 2
         sample = sampler.at(run.step)
-        photograph = run.photographs.get(sample.view)
-        run.photographs.announce(sampler.at(run.step + ahead).view for ahead in range(1, READ_AHEAD + 1))
+        photograph = self._photograph(run, sample)
+        ahead = range(1, min(READ_AHEAD, self.steps - run.stage_step) + 1)
+        run.photographs.announce(sampler.at(run.step + number).view for number in ahead)
         stale = {name for stage in self.during if stage.due(run.step) for name in stage.stale(run)}
         if run.stage_step == self.steps:
             stale = set()
@@ -159,6 +161,22 @@ class Optimize(Stage):
         view = trainer.step(photograph, run.step, sample.transforms, stale)
         run.device.timings.sampling = False
         return view
+
+    def _photograph(self, run: Run, sample: Sample) -> Photograph:
+        """The photograph of a step; at its full size where a mask leaves nothing of the smaller one.
+
+        Raises DataError when the mask leaves out every pixel at that size too.
+        """
+        photograph = run.photographs.get(sample.view)
+        if photograph.empty and sample.view is not sample.original:
+            photograph = run.photographs.get(sample.original)
+        if photograph.empty:
+            view = sample.original
+            raise DataError(
+                f"{view.mask_path or view.image_path}: the mask leaves out every pixel of '{view.name}'; expected some "
+                "that count: remove the photograph from the dataset, or fix its mask"
+            )
+        return photograph
 
     def _values(self, run: Run, view: ViewGradients, sampler: Sampler) -> tuple[float, float]:
         """Read the step's loss and PSNR.  Raises NumericError, after saving the state, when they are not finite."""

@@ -39,6 +39,7 @@ def save(run: Run, keep: int) -> Path:
         "cursor": run.cursor,
         "stage_step": run.stage_step,
         "degree": model.degree,
+        "zero_fresh": [name for name, table in model.gaussians.tables.items() if table.zero_fresh],
         "updates": run.adam.updates if run.adam else {},
         "train_seconds": run.train_seconds,
         "metrics": run.metrics,
@@ -105,8 +106,11 @@ def _restore(run: Run, meta: dict[str, Any], tables: Tables) -> None:
         run.adam.updates = meta["updates"]
         columns = [name for name in tables if name.startswith(STATS_FOLDER) and name != SEEN]
         run.stats = SplatStats(gaussians, [name.removeprefix(STATS_FOLDER) for name in columns])
-    for name in gaussians.tables:
-        gaussians.set(name, tables[_key(name)])
+    for key, table in tables.items():  # those of rules, penalties and plug-ins too
+        name = key.removeprefix("gaussians/")
+        if name not in gaussians.tables:
+            gaussians.add(name, table.shape[1], zero_fresh=name in meta["zero_fresh"])
+        gaussians.set(name, table)
     run.step, run.cursor, run.stage_step = meta["step"], meta["cursor"], meta["stage_step"]
     run.train_seconds, run.metrics = meta["train_seconds"], meta["metrics"]
 

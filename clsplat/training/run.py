@@ -89,7 +89,7 @@ class Run:
     def memory_plan(self) -> MemoryPlan:
         """Return the plan of the device's memory for training with the present tables."""
         views = self.scene.split("train")
-        bytes_held = min(self.photographs.budget, sum(3 * view.camera.width * view.camera.height for view in views))
+        bytes_held = min(self.photographs.budget, sum(4 * view.camera.width * view.camera.height for view in views))
         tile = int(self.device.tuning["TILE"])
         pixels = max((-(-v.camera.width // tile)) * (-(-v.camera.height // tile)) * tile**2 for v in views)
         pixel_sums = PIXEL_SUMS if self.stats is None else self.stats.pixel_sums

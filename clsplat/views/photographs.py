@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.errors import DataError
 from clsplat.opencl.device import Array, Device
 from clsplat.render.camera import DeviceCamera, upload_camera
 from clsplat.render.workspace import Workspace
@@ -29,6 +28,7 @@ class Photograph:
     camera: DeviceCamera
     colours: Array  # [3, height, width] uint8
     mask: Array | None = None  # [1, height, width] uint8, 1 in pixels that count; None: all count
+    empty: bool = False  # whether the mask leaves out every pixel
 
     @property
     def nbytes(self) -> int:
@@ -73,7 +73,6 @@ class Photographs:
         self.background_name = background
         self.background = device.upload(np.array(BACKGROUNDS[background], np.float32))  # [3]
         self.budget = int(device.info.memory * BUDGET_SHARE) if budget is None else budget
-        self._cameras: dict[Key, DeviceCamera] = {}
         self._held: dict[Key, Photograph] = {}  # least recently used first
         self._reading: dict[Key, Future[NDArray[Any]]] = {}
         self._reader: ThreadPoolExecutor | None = None
@@ -84,9 +83,8 @@ class Photographs:
 
     def camera(self, view: View) -> DeviceCamera:
         """Return the camera of a view."""
-        if _key(view) not in self._cameras:
-            self._cameras[_key(view)] = upload_camera(self.device, view)
-        return self._cameras[_key(view)]
+        held = self._held.get(_key(view))
+        return held.camera if held else upload_camera(self.device, view)
 
     def get(self, view: View) -> Photograph:
         """Return the photograph of a view.  Raises DataError when its file cannot be read."""
@@ -97,9 +95,8 @@ class Photographs:
             pixels = reading.result() if reading else self._read(view)
             self._make_room(pixels.nbytes)
             colours, mask = pixels[:3], pixels[3:]
-            photograph = Photograph(
-                self.camera(view), self.device.upload(colours), self.device.upload(mask) if len(mask) else None
-            )
+            mask_on_device, empty = (self.device.upload(mask), not mask.any()) if len(mask) else (None, False)
+            photograph = Photograph(self.camera(view), self.device.upload(colours), mask_on_device, empty)
         self._held[key] = photograph
         return photograph
 
@@ -114,12 +111,6 @@ class Photographs:
     def _read(self, view: View) -> NDArray[Any]:
         """Colours and, where there is one, the mask: [3 or 4, height, width] uint8."""
         image = load_photograph(view, BACKGROUNDS[self.background_name], self.undistorted)
-        if image.shape[2] == 4 and not image[:, :, 3].any():
-            size = f"{view.camera.width}x{view.camera.height}"
-            raise DataError(
-                f"{view.mask_path or view.image_path}: at {size} the mask leaves out every pixel of '{view.name}'; "
-                "expected some that count: remove the photograph from the dataset, or fix its mask"
-            )
         return np.ascontiguousarray(image.transpose(2, 0, 1))
 
     def _make_room(self, size: int) -> None:

@@ -28,6 +28,7 @@ class Sample:
     """The sample of one step."""
 
     view: View  # at the size of the step
+    original: View  # at the size that is trained on
     transforms: Sequence[PhotographTransform]
     step: int  # global
 
@@ -41,4 +42,4 @@ class Sampler:
     def at(self, step: int) -> Sample:
         """Return the sample of a global step, counted from 1."""
         view, divisor = self.settings.order.at(self._pool, step), at_step(self.settings.resolution, step)
-        return Sample(view.resized(view.downscale * divisor), self.settings.transforms, step)
+        return Sample(view.resized(view.downscale * divisor), view, self.settings.transforms, step)

@@ -5,8 +5,6 @@ from abc import abstractmethod
 from dataclasses import dataclass
 from typing import Literal
 
-import numpy as np
-
 from clsplat.opencl.device import Array
 from clsplat.render.camera import DeviceCamera
 from clsplat.render.workspace import Workspace
@@ -46,8 +44,7 @@ class Blur(PhotographTransform):
         reach = math.ceil(REACH * sigma)
         if reach == 0:
             return planes
-        device = planes.workspace.device
-        weights = device.upload(np.exp(-0.5 * np.square(np.arange(reach + 1) / sigma)).astype(np.float32))
+        device, reach = planes.workspace.device, min(reach, max(camera.width, camera.height))
         sums = planes.workspace.array("blur", (4, camera.rows, camera.stride))
         items, size = (camera.width, camera.height), {"reach": reach, **camera.plane_arguments()}
         program, masked = device.program("blur.cl"), planes.mask is not None
@@ -55,10 +52,10 @@ class Blur(PhotographTransform):
             items=items,
             image=planes.colours,
             mask=planes.mask or sums,
-            weights=weights,
             sums=sums,
             masked=int(masked),
+            falloff=0.5 / sigma**2,
             **size,
         )
-        program.blur_columns(items=items, sums=sums, weights=weights, image=planes.colours, **size)
+        program.blur_columns(items=items, sums=sums, image=planes.colours, falloff=0.5 / sigma**2, **size)
         return planes
