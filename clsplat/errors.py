@@ -1,6 +1,6 @@
-"""Everything that can go wrong, each with its exit code.
+"""All errors, each with its exit code.
 
-A message is one line: what is wrong, where, what was expected, what to do.  The command line prints it without a
+A message is one line: the fault, its place, what was expected, the remedy.  The command line prints it without a
 traceback (`--debug` shows one).
 """
 
@@ -18,13 +18,13 @@ class InternalError(ClsplatError):
 
 
 class ConfigError(ClsplatError):
-    """A pipeline file, a setting or a command line that does not make sense."""
+    """A pipeline file, a setting or a command line is invalid."""
 
     exit_code = 2
 
 
 class OverrideError(ConfigError):
-    """A value of `--set` that does not fit the pipeline; `reason` is what is wrong with it."""
+    """A value of `--set` does not fit the pipeline; `reason` is the fault."""
 
     def __init__(self, override: str, reason: str) -> None:
         self.reason = shortened(reason, 500)
@@ -32,35 +32,35 @@ class OverrideError(ConfigError):
 
 
 class DataError(ClsplatError):
-    """A dataset, image or model file that is missing, damaged or not supported."""
+    """A dataset, image or model file is missing, damaged or not supported."""
 
     exit_code = 3
 
 
 class DeviceError(ClsplatError):
-    """No such OpenCL device, or one whose runtime does not work."""
+    """An OpenCL device does not exist, or its runtime does not work."""
 
     exit_code = 4
 
 
 class KernelError(DeviceError):
-    """A kernel that does not build, or is called with the wrong arguments."""
+    """A kernel does not build, or has wrong arguments."""
 
 
 class MemoryLimitError(ClsplatError):
-    """The device or the host cannot hold what was asked for."""
+    """The memory of the device or the host is too small."""
 
     exit_code = 5
 
 
 class NumericError(ClsplatError):
-    """Training produced values that are not finite."""
+    """Training has produced values that are not finite, or no Gaussians."""
 
     exit_code = 6
 
 
 class OutputError(ClsplatError):
-    """A file that cannot be written or read back."""
+    """A file cannot be written or read back."""
 
     exit_code = 7
 
@@ -72,11 +72,11 @@ class Interrupted(ClsplatError):
 
 
 def as_clsplat_error(error: BaseException) -> ClsplatError:
-    """Return the error that a user sees in place of any exception; a ClsplatError stays what it is."""
+    """Return the ClsplatError for any exception; a ClsplatError stays unchanged."""
     if isinstance(error, ClsplatError):
         return error
     if isinstance(error, KeyboardInterrupt):
-        return Interrupted("stopped at once; --resume goes on from the last checkpoint")
+        return Interrupted("stopped at once; --resume continues from the last checkpoint")
     if isinstance(error, MemoryError):
         return MemoryLimitError("out of memory; use smaller images (scene.downscale) or fewer of them")
     if isinstance(error, OSError) and error.strerror:
@@ -87,11 +87,11 @@ def as_clsplat_error(error: BaseException) -> ClsplatError:
 
 
 def one_line(error: BaseException) -> str:
-    """The message of an error, in one line of limited length."""
+    """Return the message of an error, in one line of limited length."""
     return shortened(" ".join(str(error).split()), MESSAGE_LIMIT)
 
 
 def shortened(text: str, limit: int = 200) -> str:
-    """The text, cut in the middle where it is longer than `limit` characters."""
+    """Return the text, cut in the middle where it is longer than `limit` characters."""
     half = limit // 2
     return text if len(text) <= limit else f"{text[:half]} … {text[-half:]}"

@@ -1,4 +1,4 @@
-"""Writing files so that a reader never sees half of one."""
+"""Write files atomically: a reader sees a complete file or none."""
 
 import os
 from collections.abc import Iterator
@@ -11,9 +11,9 @@ from clsplat.errors import OutputError
 
 @contextmanager
 def atomic(path: Path) -> Iterator[BinaryIO]:
-    """Open a temporary file beside `path`; when the block ends well it is synced and takes the name.
+    """Open a temporary file beside `path`; when the block ends without an error, sync it and rename it to `path`.
 
-    Raises OutputError naming the file when it cannot be written; whatever stood there before stays.
+    Raises OutputError with the file's name when it cannot be written; an earlier file then stays unchanged.
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
@@ -33,11 +33,11 @@ def atomic(path: Path) -> Iterator[BinaryIO]:
 
 
 def unwritable(path: Path, error: OSError) -> OutputError:
-    """The error that says so."""
+    """Return the OutputError for a file that cannot be written."""
     return OutputError(f"{path}: cannot be written ({error.strerror or error}); check the folder and its space")
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write UTF-8 text, all or nothing."""
+    """Write UTF-8 text atomically.  Raises OutputError."""
     with atomic(path) as file:
         file.write(text.encode())

@@ -1,8 +1,8 @@
 """Losses, rules, filters, stages, readers and more from outside the package.
 
 A plug-in is a Python file, given by `--plugin FILE.py`, or a module that an installed package names in the entry-point
-group `clsplat.plugins`.  Its classes are known as soon as it is imported; kernels lie beside it and may include the
-headers of `cl_kernels`.  A run records the name and the content hash of each of its plug-ins.
+group `clsplat.plugins`.  Its classes can be used after its import; kernels lie beside it and may include the headers
+of `cl_kernels`.  A run records the name and the content hash of each of its plug-ins.
 """
 
 import hashlib
@@ -32,7 +32,7 @@ class Plugin:
     name: str  # of the file without .py, or of the entry point
     path: Path
     module: str
-    digest: str  # sha256 of the module, of the kernel files that it names, and of the headers that those name
+    digest: str  # sha256 of the module, of the kernel files that it names, and of their headers
     installed: bool  # by a package, and not by --plugin
 
 
@@ -125,13 +125,13 @@ def _load_entry(entry: EntryPoint) -> Plugin:
 
 
 def _forget(module: str) -> None:
-    """Leave nothing of a module whose import failed."""
+    """Remove all of a module whose import failed."""
     sys.modules.pop(module, None)
     Settings.defined[:] = [kind for kind in Settings.defined if kind.__module__ != module]
 
 
 def _failure(path: Path, error: Exception) -> ConfigError:
-    """One line: the file, the line in it and what happened."""
+    """The error in one line: file, line and reason."""
     if isinstance(error, ClsplatError):
         return ConfigError(f"{path}: {error}")
     lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)]

@@ -1,4 +1,4 @@
-"""Read the header of a PLY file: its comments, and where its vertices are and what they consist of."""
+"""Read the header of a PLY file: comments, and place and properties of its vertices."""
 
 import re
 from dataclasses import dataclass
@@ -48,7 +48,7 @@ class _Element:
 def parse_ply_header(path: Path, data: bytes) -> PlyHeader:
     """Return the header of a PLY file from its first MAX_HEADER bytes, or more; `path` is for messages.
 
-    Other elements may stand before the vertices as long as they have no lists, and anything after them.
+    Elements before the vertices must have no lists; elements after them may.
     Raises DataError when it is not a PLY file, has no vertices, or has vertices with lists.
     """
     end = END.search(data, 0, MAX_HEADER)

@@ -1,7 +1,7 @@
 """Settings: frozen models whose fields are the keys of a pipeline file, and the variants that a key chooses from.
 
-A variant is a subclass with a name: the literal in its field `type`, or `stage` for stages.  It is known as soon as its
-class is defined, in the package or in a plug-in; nothing is listed twice.
+A variant is a subclass with a name: the literal in its field `type`, or `stage` for stages.  A pipeline file can
+name it as soon as its class is defined, in the package or in a plug-in; there is no other list of variants.
 """
 
 import importlib
@@ -20,7 +20,7 @@ Base = TypeVar("Base", bound="Settings")
 
 
 class Settings(BaseModel):
-    """Base of everything that a pipeline file can say: unknown keys and wrong types are errors."""
+    """Base of all settings in pipeline files: unknown keys and wrong types are errors."""
 
     model_config = ConfigDict(
         frozen=True, extra="forbid", strict=True, allow_inf_nan=False, use_attribute_docstrings=True
@@ -33,7 +33,7 @@ class Settings(BaseModel):
 
 
 def tag_of(kind: type[Settings]) -> tuple[str, str] | None:
-    """The field that names a variant, and its name; None for a class that is only a base of variants."""
+    """Return the field that names a variant, and its name; None for a class that is only a base of variants."""
     for tag in TAGS:
         if tag in kind.model_fields and (names := typing.get_args(kind.model_fields[tag].annotation)):
             return tag, str(names[0])
@@ -41,7 +41,7 @@ def tag_of(kind: type[Settings]) -> tuple[str, str] | None:
 
 
 def variants(base: type[Base]) -> dict[str, type[Base]]:
-    """The subclasses of `base` that have a name, by name.  Raises ConfigError when two have the same one."""
+    """Return the subclasses of `base` that have a name, by name.  Raises ConfigError when two have the same one."""
     found: dict[str, type[Base]] = {}
     for kind in Settings.defined:
         if not issubclass(kind, base) or (tag := tag_of(kind)) is None:
@@ -54,7 +54,7 @@ def variants(base: type[Base]) -> dict[str, type[Base]]:
 
 
 class Variants:
-    """Marks a field that takes one of the variants of a base: a mapping with its name, or the name alone."""
+    """Marks a field that accepts one of the variants of a base: a mapping with its name, or the name alone."""
 
     def __init__(self, base: type[Settings]) -> None:
         self.base = base
@@ -76,7 +76,7 @@ class Variants:
 
 
 class VariantName:
-    """Marks a field that takes the name of one of the variants of a base."""
+    """Marks a field that accepts the name of one of the variants of a base."""
 
     def __init__(self, base: type[Settings]) -> None:
         self.base = base
@@ -103,7 +103,7 @@ def import_modules(package: str, path: Iterable[str]) -> None:
 
 
 def rebuild() -> None:
-    """Let fields of variants know those that were defined since: after a plug-in was loaded."""
+    """Rebuild all models, so that their fields accept variants defined since, such as those of a plug-in."""
     for kind in Settings.defined:  # a schema holds those of its variants, and theirs
         if "__pydantic_core_schema__" in vars(kind):
             del kind.__pydantic_core_schema__

@@ -1,4 +1,4 @@
-"""What the terminal shows: a live line of progress, or plain lines where there is no terminal."""
+"""Output to the terminal: a live line of progress, or plain lines when the output is not a terminal."""
 
 import json
 import logging
@@ -22,7 +22,7 @@ LOG = logging.getLogger("clsplat")
 
 
 class _Console(Console):
-    """A console whose reader may leave: what follows is not shown, and the work goes on."""
+    """A console that discards its output when the reader closes the pipe; the work continues."""
 
     def on_broken_pipe(self) -> None:
         self.quiet = True
@@ -34,14 +34,14 @@ ERRORS = _Console(stderr=True, highlight=False, soft_wrap=True)
 
 
 def discard_output() -> None:
-    """Let nothing that is still to be written to stdout be an error."""
+    """Discard all further output to stdout, so that a closed pipe causes no error."""
     null = os.open(os.devnull, os.O_WRONLY)
     os.dup2(null, sys.stdout.fileno())
     os.close(null)
 
 
 class _TerminalHandler(logging.Handler):
-    """Log lines above the progress bar: remarks to `remarks`, warnings to stderr."""
+    """A handler that prints log lines above the progress bar: remarks to `remarks`, warnings to stderr."""
 
     def __init__(self, remarks: Console) -> None:
         super().__init__()
@@ -55,7 +55,7 @@ class _TerminalHandler(logging.Handler):
 
 
 def start_logging(debug: bool, remarks: Console = CONSOLE) -> None:
-    """Send the log to the terminal, with debug lines where that is asked for."""
+    """Send the log to the terminal, with debug lines when `debug` is True."""
     LOG.setLevel(logging.DEBUG)
     LOG.handlers.clear()
     handler = _TerminalHandler(remarks)
@@ -82,7 +82,7 @@ def show_json(data: Any) -> None:
 
 @contextmanager
 def logging_to(path: Path) -> Iterator[None]:
-    """Append the log to a file, with the time of every line, and the traceback of what ends the block."""
+    """Append the log to a file, with the time of every line, and the traceback of an error that ends the block."""
     try:
         handler = logging.FileHandler(path, encoding="utf-8", errors="backslashreplace")
     except OSError as error:
@@ -100,7 +100,7 @@ def logging_to(path: Path) -> Iterator[None]:
 
 
 def line(progress: "training.Progress") -> str:
-    """One step as text."""
+    """Return the progress at a step as text."""
     p = progress
     return (
         f"step {p.step}/{p.steps}  loss {p.loss:.4f}  psnr {p.psnr:.1f}  gaussians {p.gaussians:,}  "
@@ -123,7 +123,7 @@ def device_text(device: dict[str, Any]) -> str:
 
 
 def show_summary(folder: Path) -> None:
-    """Print what a run achieved, and where it lies; nothing for a matrix."""
+    """Print the metrics of a run and the paths of its files; nothing for a matrix."""
     if not (folder / "metrics.json").exists():
         return
     metrics = json.loads((folder / "metrics.json").read_text())

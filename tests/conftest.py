@@ -5,6 +5,7 @@ that clsplat would choose), each with the wide schedule at 16 and 8 lanes and wi
 """
 
 import os
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,8 +13,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from clsplat.opencl.choice import DeviceInfo, choose
+from clsplat import plugins
 from clsplat.opencl.device import Array, Device
+from clsplat.opencl.discovery import DeviceInfo, choose
+from clsplat.settings import Settings, rebuild
 from data_tools.synthetic import Options, write_dataset
 
 NAMES = [name.strip() for name in os.environ.get("CLSPLAT_TEST_DEVICES", "").split(";")]
@@ -46,9 +49,17 @@ def device(request: pytest.FixtureRequest) -> Device:
     return opened
 
 
+@pytest.fixture
+def smooth(device: Device) -> Device:
+    """The device without thresholds in blending, where derivatives have no jumps."""
+    opened = Device(device.info, device.schedule)
+    opened.tuning.update(device.tuning, ALPHA_MIN="1e-30f", TRANSMITTANCE_MIN="1e-30f")
+    return opened
+
+
 def forgets_released_buffers(info: DeviceInfo) -> bool:
     """Oclgrind 21.10 takes a buffer at the address of a released one for that one, with its size and uninitialised
-    values: its check is not told of releases.
+    values: its check does not see releases.
     https://github.com/jrprice/Oclgrind/blob/v21.10/src/plugins/Uninitialized.h
     """
     return info.platform.startswith("Oclgrind")
@@ -68,6 +79,18 @@ def held_buffers() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Device, "empty", empty)
         yield
+
+
+@pytest.fixture
+def without_plugins() -> Iterator[None]:
+    """Forget the plug-ins that a test has loaded."""
+    defined = list(Settings.defined)
+    yield
+    Settings.defined[:] = defined
+    plugins._loaded.clear()
+    for name in [name for name in sys.modules if name.startswith("clsplat_plugin_")]:
+        del sys.modules[name]
+    rebuild()
 
 
 @pytest.fixture

@@ -120,7 +120,7 @@ class Margin(NamedTuple):
 
 
 def margin(splats: Splats, width: int, height: int, thresholds: Thresholds = Thresholds()) -> Margin:
-    """Tell how far blending stays from its thresholds, so that a test can choose a scene without flips."""
+    """Return how far blending stays from its thresholds, so that a test can choose a scene without flips."""
     alpha, transmittance, cap = [np.inf], [np.inf], [np.inf]
     for step in blend_steps(splats, width, height, thresholds):
         uncapped = splats.opacity[step.index] * step.falloff

@@ -94,6 +94,6 @@ def _orthogonal(matrix: np.ndarray) -> np.ndarray:
     return u @ vt
 
 
-def relative_error(value: np.ndarray, truth: np.ndarray) -> float:
-    """Norm of the difference by norm of the truth."""
-    return float(np.linalg.norm(value - truth) / max(np.linalg.norm(truth), 1e-30))
+def relative_error(value: np.ndarray, expected: np.ndarray) -> float:
+    """Norm of the difference by the norm of `expected`."""
+    return float(np.linalg.norm(value - expected) / max(np.linalg.norm(expected), 1e-30))

@@ -6,6 +6,7 @@ import json
 import os
 import signal
 import textwrap
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -60,6 +61,8 @@ def test_the_bits_with_a_world_filter_are_those_of_the_raw_file(tiny_scene, tmp_
     np.testing.assert_allclose(model.filter_variance, raw.filter_variance, rtol=3e-7)  # the file has its square root
     model.save(tmp_path / "model.ply")
     assert (tmp_path / "model.ply").read_bytes() == (out / "point_cloud_raw.ply").read_bytes()
+    model.baked().save(tmp_path / "baked.ply")
+    assert (tmp_path / "baked.ply").read_bytes() == (out / "point_cloud.ply").read_bytes()
 
 
 def test_steps_are_counted_and_end(tiny_scene):
@@ -217,10 +220,15 @@ def test_the_lines_of_a_loop_of_ones_own_run(tiny_scene, device, capsys):
     from clsplat.views.photographs import Photographs
 
     scene = clsplat.read_scene(tiny_scene)
+    scene = replace(scene, train=scene.train[:1] * 8)  # the same view in each step
     names = {"Adam": Adam, "Rates": Rates, "Rasterizer": Rasterizer, "SplatStats": SplatStats, "L1": L1, "Dssim": Dssim}
     names |= {"Photographs": Photographs, "Trainer": steps.Trainer, "device": device, "scene": scene}
-    exec(textwrap.dedent(lines), {**names, "model": clsplat.Trainer(scene, "smoke").model})
-    assert len(capsys.readouterr().out.split()) == 8
+    names["model"] = clsplat.Trainer(scene, "smoke").model
+    capsys.readouterr()
+    exec(textwrap.dedent(lines), names)
+    losses = [float(line) for line in capsys.readouterr().out.splitlines()]
+    assert len(losses) == 8
+    assert losses[-1] < losses[0]
 
 
 def test_what_is_left_on_disk_is_a_run(tiny_scene, tmp_path):

@@ -78,7 +78,7 @@ def test_seeds_are_one_row_with_mean_and_deviation(make_run, tmp_path):
     assert '<td class="best">24.00</td>' in page, "the best is bold, one run has no deviation"
     assert "<td>22.00 <small>± 1.00</small>" in page, "at half size, where each is one higher"
     assert page.count("<polyline") == 4 + 4 + 2 + 2, "PSNR and Gaussians by run, PSNR and SSIM by size and variant"
-    assert "LPIPS" not in page, "nobody measured it"
+    assert "LPIPS" not in page, "it was not measured"
 
 
 def test_another_scene_or_size_is_another_table(make_run, tiny_scene, tmp_path):

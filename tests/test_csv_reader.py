@@ -25,7 +25,7 @@ def _plugin() -> Iterator[None]:
     spec.loader.exec_module(module)
     yield
     del spec, module
-    gc.collect()  # other tests know shipped readers only
+    gc.collect()  # other tests expect shipped readers only
 
 
 @pytest.fixture

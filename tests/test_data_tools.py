@@ -32,7 +32,7 @@ from tests.refusals import refusal
 
 @pytest.fixture
 def video(tmp_path: Path, rng: np.random.Generator) -> Path:
-    """Thirty frames whose grey tells their number; only every third is not blurred."""
+    """Thirty frames whose grey level is their number; only every third is not blurred."""
     path = tmp_path / "v.avi"
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10, (96, 64))
     noise = rng.integers(0, 60, (64, 96, 1))
@@ -136,7 +136,7 @@ def test_masks_from_a_folder(tmp_path):
 
 
 class Server(http.server.SimpleHTTPRequestHandler):
-    """Serves a folder; ranges on demand, and breaks off after some bytes as often as asked."""
+    """Serves a folder, with ranges if `ranges`, and breaks off after some bytes, `breaks` times."""
 
     ranges, breaks, after = True, 0, 1000
     asked: list[str]

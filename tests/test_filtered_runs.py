@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from clsplat.errors import Interrupted
+from clsplat.gaussians.model import Model
 from clsplat.gaussians.ply import read_ply, write_ply
 from clsplat.gaussians.tables import PARAMETERS
 from clsplat.metrics.views import render_view
 from clsplat.pipeline.loading import load
 from clsplat.runs import runner
 from clsplat.runs.model_file import ModelFile
-from clsplat.stages.export import baked
 from clsplat.training.run import Progress, Run
 from clsplat.views.order import Code
 from clsplat.views.sampling import Sampler, ViewSettings
@@ -157,7 +157,7 @@ def test_baking_is_the_filter(rng):
     parameters = {name: table.copy() for name, table in case.parameters.items()}
     parameters["filter_variance"][0] = 0
     parameters["filter_variance"][1] = 1e30  # spreads the Gaussian out to nothing
-    fused = baked(parameters)
+    fused = Model(**parameters).baked().tables()
     double = {name: table.astype(np.float64) for name, table in parameters.items()}
     scale, opacity = filtered(double["log_scales"], double["logit_opacity"][:, 0], double["filter_variance"][:, 0])
     np.testing.assert_allclose(np.exp(fused["log_scales"].astype(np.float64)), scale, rtol=2e-6)

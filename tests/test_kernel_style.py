@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from clsplat.opencl.choice import choose
 from clsplat.opencl.device import Device
+from clsplat.opencl.discovery import choose
 from clsplat.opencl.program import Program, parse_kernels
 
 ROOT = Path(__file__).parents[1]

@@ -96,7 +96,7 @@ def test_inside_a_folder_imports_are_acyclic():
             visit(target, (*trail, module))
         done.add(module)
 
-    # the device builds programs and programs take devices: the only pair that knows each other, at run time
+    # the device builds programs and programs take devices: the only pair that uses each other, at run time
     graph["clsplat.opencl.device"].discard("clsplat.opencl.program")
     for module in graph:
         visit(module, ())

@@ -115,12 +115,12 @@ def test_what_is_masked_changes_not_a_bit(tiny_scene, tmp_path):
 
 
 def test_figures_are_means_over_what_counts(rng):
-    image, truth = (rng.integers(0, 256, (30, 40, 3)).astype(np.uint8) for _ in range(2))
+    image, photograph = (rng.integers(0, 256, (30, 40, 3)).astype(np.uint8) for _ in range(2))
     mask = rng.random((30, 40)) < 0.7
-    error = ((image.astype(float) - truth)[mask] ** 2).mean() / 255**2
-    assert psnr(image, truth, mask) == pytest.approx(-10 * np.log10(error))
-    expected = ref_loss.ssim_map(image.transpose(2, 0, 1) / 255, truth.transpose(2, 0, 1) / 255)
-    np.testing.assert_allclose(ssim_map(image, truth).transpose(2, 0, 1), expected, atol=1e-12)
+    error = ((image.astype(float) - photograph)[mask] ** 2).mean() / 255**2
+    assert psnr(image, photograph, mask) == pytest.approx(-10 * np.log10(error))
+    expected = ref_loss.ssim_map(image.transpose(2, 0, 1) / 255, photograph.transpose(2, 0, 1) / 255)
+    np.testing.assert_allclose(ssim_map(image, photograph).transpose(2, 0, 1), expected, atol=1e-12)
 
 
 # ---- turned photographs

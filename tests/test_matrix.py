@@ -79,7 +79,7 @@ def test_cells_of_pipelines_and_scenes(write, tmp_path):
 
 
 def test_cells_do_not_see_each_others_values(write):
-    """Values inside nested lists and dicts of the file are shared by nobody."""
+    """Values inside nested lists and dicts of the file are not shared."""
     text = (
         "name: s\nmatrix: {set: {optimize.losses.0.weight: [0.1, 0.2], optimize.rates.quats: [0.5, 0.25]}}\n" + STAGES
     )

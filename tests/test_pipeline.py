@@ -79,7 +79,7 @@ def flat(value: object, place: str = "") -> dict[str, object]:
 
 
 def changes(base: str, recipe: str) -> set[str]:
-    """Places, shortened to what tells them apart, in which a recipe has other settings than its base."""
+    """Places, shortened, in which a recipe has other settings than its base."""
     old, new = flat(load(base).resolved()), flat(load(recipe).resolved())
     places = {place for place in old.keys() | new.keys() if old.get(place, "-") != new.get(place, "-")}
     return {place.removeprefix("stages.optimize.").removeprefix("during.") for place in places - {"name"}}

@@ -14,7 +14,7 @@ from clsplat import plugins
 from clsplat.density.edit import Rule
 from clsplat.errors import ConfigError
 from clsplat.pipeline.loading import load
-from clsplat.settings import Settings, rebuild, variants
+from clsplat.settings import Settings, variants
 from tests.test_training import train
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -40,16 +40,7 @@ TRIALS = {
 }
 
 
-@pytest.fixture(autouse=True)
-def _without_plugins():
-    """Forget what a test has loaded."""
-    defined = list(Settings.defined)
-    yield
-    Settings.defined[:] = defined
-    plugins._loaded.clear()
-    for name in [name for name in sys.modules if name.startswith("clsplat_plugin_")]:
-        del sys.modules[name]
-    rebuild()
+pytestmark = pytest.mark.usefixtures("without_plugins")
 
 
 def write(folder: Path, name: str, text: str) -> Path:

@@ -104,7 +104,7 @@ def test_refusals(tmp_path, rng):
     write_ply(good, parameters(rng), {})
     data = good.read_bytes()
     broken = {
-        "truncated": (data[:-10], "cut short"),
+        "truncated": (data[:-10], "truncated"),
         "header only": (data[:200], "not a PLY"),
         "empty": (b"", "not a PLY"),
         "text": (b"hello", "not a PLY"),

@@ -38,7 +38,7 @@ class Copy(Step):
         return {"length": len(text)}
 
 
-Settings.defined.remove(Copy)  # pipelines of other tests do not know it
+Settings.defined.remove(Copy)  # not a step in other tests
 
 
 @pytest.fixture
@@ -73,14 +73,14 @@ def test_what_depends_on_a_change_is_redone(photos, tmp_path):
 
 def test_why(photos, tmp_path):
     root, steps = tmp_path / "runs" / "prepared", [Copy(letter="a"), Copy(letter="b")]
-    assert [one.why for one in plan(steps, photos, root)] == ["not done yet"] * 2
+    assert [one.why for one in plan(steps, photos, root)] == ["no result yet"] * 2
     do(steps, photos, root)
     assert [one.why for one in plan(steps, photos, root)] == ["", ""]
     changed = plan([steps[0], Copy(letter="z")], photos, root)
     assert [one.why for one in changed] == ["", "letter is z, was b"]
     (photos / "p.txt").write_text("P")
     assert plan(steps, photos, root)[0].why == "letter is a, was b"  # the newest of that step
-    assert [one.why for one in plan(steps[1:], photos, root)] == ["what it reads has changed"]
+    assert [one.why for one in plan(steps[1:], photos, root)] == ["its input has changed"]
 
 
 def test_results_on_the_way_are_not_missed(photos, tmp_path):
@@ -148,7 +148,7 @@ def run(pipeline: Path, photos: Path, *words: str) -> str:
 
 
 def test_a_pipeline_that_was_run_is_up_to_date(pipeline, photos, tmp_path):
-    assert "find_features  not done yet" in run(pipeline, photos, "--dry-run")
+    assert "find_features  no result yet" in run(pipeline, photos, "--dry-run")
     assert not (tmp_path / "runs").exists()
     run(pipeline, photos)
     model = (tmp_path / "runs" / "smoke" / "point_cloud.ply").stat().st_mtime_ns
@@ -165,7 +165,7 @@ def test_a_changed_setting_is_another_run(pipeline, photos, tmp_path):
     assert (tmp_path / "runs" / "smoke-2" / "metrics.json").is_file()
     assert "long_side is 50, was 99" in run(pipeline, photos, "--dry-run", "--set", "find_features.long_side=50")
     (photos / "p.txt").write_text("other")
-    assert "what it reads has changed" in run(pipeline, photos, "--dry-run")
+    assert "its input has changed" in run(pipeline, photos, "--dry-run")
 
 
 def test_a_run_does_not_go_on_with_other_photographs(pipeline, photos, tmp_path):
@@ -181,7 +181,7 @@ def test_a_run_does_not_go_on_with_other_photographs(pipeline, photos, tmp_path)
 def test_a_folder_with_cameras_is_not_a_folder_of_photographs(tiny_scene, tmp_path):
     step = prepare_steps.FindFeatures()
     message = refusal(prepare, plan([step], tiny_scene, tmp_path / "r" / "p"), tiny_scene, tmp_path / "r" / "p")
-    assert "has its cameras already" in message
+    assert "holds cameras already" in message
     assert not list((tmp_path / "r" / "p").iterdir())
 
 

@@ -74,7 +74,7 @@ def test_a_reader_without_a_name_is_refused_in_a_sentence(tmp_path):
 
 @pytest.fixture
 def grid(tmp_path: Path) -> Path:
-    """A folder of four photographs that only the reader of the next tests knows."""
+    """A folder of four photographs for the reader of the next tests only."""
     for i in range(4):
         photograph(tmp_path / f"{i}.png")
     (tmp_path / "grid.txt").write_text("4")

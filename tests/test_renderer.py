@@ -17,16 +17,6 @@ def model_of(case) -> Model:
     return Model(**case.parameters, rendering=Rendering(screen_variance=case.variance, compensate=case.compensate))
 
 
-@pytest.fixture
-def smooth(device):
-    """The device without thresholds in blending, where derivatives have no jumps."""
-    from clsplat.opencl.device import Device
-
-    opened = Device(device.info, device.schedule)
-    opened.tuning.update(device.tuning, ALPHA_MIN="1e-30f", TRANSMITTANCE_MIN="1e-30f")
-    return opened
-
-
 def test_alpha_is_what_the_background_does_not_show_through(device, rng):
     case = random_case(rng, 40, *SIZE)
     renderer = Renderer(model_of(case), device)

@@ -1,4 +1,4 @@
-"""However a run ends, its status.json tells how, and the command prints one line."""
+"""However a run ends, its status.json has the reason, and the command prints one line."""
 
 import json
 import logging
@@ -118,7 +118,7 @@ def test_a_signal_that_is_ignored_stays_ignored():
         signal.signal(signal.SIGHUP, before)
 
 
-def test_a_run_goes_on_when_nobody_reads_its_output(tiny_scene, tmp_path):
+def test_a_run_continues_when_its_output_is_not_read(tiny_scene, tmp_path):
     command = [sys.executable, "-m", "clsplat", "run", "smoke", "--scene", str(tiny_scene), "--out", str(tmp_path)]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     process.stdout.readline()

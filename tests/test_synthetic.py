@@ -39,7 +39,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def frames(dataset: Path, split: str) -> list[tuple[Array, float, Array]]:
-    """Camera-to-world, focal length in pixels and RGBA image of each view, as the files tell them."""
+    """Camera-to-world, focal length in pixels and RGBA image of each view, from the files."""
     table = json.loads((dataset / f"transforms_{split}.json").read_text())
     focal = TINY.size / 2 / np.tan(table["camera_angle_x"] / 2)
     poses = [np.array(frame["transform_matrix"]) for frame in table["frames"]]

@@ -4,7 +4,7 @@ from functools import cache
 from types import TracebackType
 
 from clsplat.opencl import device as opencl
-from clsplat.opencl.choice import Schedule, choose
+from clsplat.opencl.discovery import Schedule, choose
 
 
 class Device(opencl.Device):

@@ -62,9 +62,13 @@ class Picture:
         height, width = self.alpha.shape
         return f"Picture({width} x {height} px of '{self.view.name}')"
 
-    def _repr_png_(self) -> bytes:
+    def png(self) -> bytes:
+        """Return the image as a PNG file of 8 bits a channel."""
         _, data = cv2.imencode(".png", to_8_bits(self.image)[:, :, ::-1])
         return bytes(data)
+
+    def _repr_png_(self) -> bytes:
+        return self.png()
 
 
 class Renderer:

@@ -20,7 +20,7 @@ def devices() -> list[dict[str, Any]]:
     """
     from dataclasses import asdict
 
-    from clsplat.opencl.choice import list_devices, resolve_schedule
+    from clsplat.opencl.discovery import list_devices, resolve_schedule
 
     return [
         {**asdict(info), "schedule": resolve_schedule(info, "auto"), "fault": info.fault()} for info in list_devices()

@@ -8,12 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from clsplat import __version__
 from clsplat.api.arguments import PathLike, load_plugins, overrides
 from clsplat.api.device import default_device
 from clsplat.errors import ClsplatError, ConfigError, DataError
-from clsplat.gaussians.model import Model, Rendering
-from clsplat.gaussians.tables import PARAMETERS
+from clsplat.gaussians.model import Model
 from clsplat.losses.base import HostFunction, HostLoss, ViewGradients
 from clsplat.metrics.views import mean, measure
 from clsplat.opencl.device import Device
@@ -139,12 +137,8 @@ class Trainer:
 
     @property
     def model(self) -> Model:
-        """A copy of the model as it is now; a world filter is not yet part of its scales."""
-        run = self._run
-        tables = {name: run.model.gaussians.get(name) for name in (*PARAMETERS, "filter_variance")}
-        if not tables["filter_variance"].any():
-            del tables["filter_variance"]
-        return Model(**tables, rendering=Rendering.of({"version": __version__, **run.rendering()}, "default"))
+        """A copy of the model as it is now; `model.baked()` makes a world filter part of its scales, as a run does."""
+        return self._run.host_model()
 
     def add_loss(self, function: HostFunction, weight: Schedule = 1.0) -> None:
         """Minimise also `function(image, photograph) -> (value, derivative by the image)`, in NumPy, from now on.

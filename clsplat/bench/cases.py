@@ -27,7 +27,7 @@ from clsplat.training.trainer import Trainer
 from clsplat.views.photographs import Photograph
 
 SPLAT_Y_MIN, SPLAT_Y_MAX = (int(constants("splat.h")[name]) for name in ("SPLAT_Y_MIN", "SPLAT_Y_MAX"))
-WARM_UP = 3  # steps: kernels are compiled and buffers grown
+WARM_UP_STEPS = 3  # compile kernels and grow buffers
 
 
 @dataclass
@@ -39,15 +39,15 @@ class Result:
     floors: dict[str, float]
     step: float  # on the clock
     densify: float
-    host: float  # of the step, beyond the device's own time
-    memory: int  # bytes on the device, at most
-    planned: int  # bytes, as training would plan them
+    host: float  # time of the step minus that of the device's stages
+    memory: int  # bytes on the device, the peak
+    planned: int  # bytes, from the memory plan of training
 
 
 class Case:
-    """One scene, ready for training steps with a pipeline's losses and statistics, rendered as it says.
+    """One scene for training steps with a pipeline's losses, statistics and rendering.
 
-    World filters are in the scales of an exported model; here they cost nothing.
+    An exported model has the world filter in its scales, so the filter takes no time here.
     """
 
     def __init__(
@@ -61,7 +61,7 @@ class Case:
         colour = device.zeros(3)
         colour.fill(1.0 if background == "white" else 0.0)
         model = settings.model.model(gaussians, gaussians.sh_degree)
-        still = Rates(**dict.fromkeys(PARAMETERS, 0.0))  # every step does the same work
+        zero_rates = Rates(**dict.fromkeys(PARAMETERS, 0.0))  # every step does the same work
         self.trainer = Trainer(
             Rasterizer(device, "radix"),
             model,
@@ -69,15 +69,15 @@ class Case:
             SplatStats(gaussians, optimize.statistics),
             colour,
             optimize.losses,
-            still,
+            zero_rates,
         )
         self.clock: list[float] = []
         self.stages: dict[str, list[float]] = defaultdict(list)
         self.densify: list[float] = []
         self.frame: Frame | None = None
-        for _ in range(WARM_UP):
+        for _ in range(WARM_UP_STEPS):
             self.step(record=False)
-        self.step(record=False, stale=PARAMETERS)  # as where an edit is due: its gradients stay on the device
+        self.step(record=False, stale=PARAMETERS)  # as at a step with an edit: gradients are written to memory
         self.edit()
         self.memory = device.peak - self._before
 
@@ -106,6 +106,7 @@ class Case:
         self.densify.append(1e3 * (time.perf_counter() - start))
 
     def result(self, peaks: Peaks) -> Result:
+        """Return the medians of all times, with the floors for `peaks`."""
         work = self._work()
         stages = {name: statistics.median(times) for name, times in self.stages.items()}
         clock = statistics.median(self.clock)
@@ -134,7 +135,7 @@ class Case:
 
 
 def run_bench(cases: dict[str, Case], peaks: Peaks, repeats: int) -> dict[str, Result]:
-    """Step every scene `repeats` times, in turns."""
+    """Time every scene `repeats` times, one scene after the other; return the results by name."""
     for _ in range(repeats):
         for case in cases.values():
             case.step(record=True)

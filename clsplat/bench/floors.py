@@ -1,7 +1,7 @@
-"""What a step has to do, and the least time that it can take.
+"""The work of a step, and a lower bound of its time.
 
 A stage's floor is the larger of its arithmetic by the multiply-add peak and of its bytes by the copy bandwidth; the
-counts are those of the algorithm, not of the code, so a ratio of 1 is out of reach and 2 is good.
+counts are those of the algorithm, not of the code, so a ratio of 1 cannot be reached and 2 is good.
 """
 
 from dataclasses import dataclass
@@ -11,16 +11,16 @@ from clsplat.bench.peaks import Peaks
 
 @dataclass(frozen=True)
 class Work:
-    """What one step has to do."""
+    """The work of one step."""
 
     gaussians: int
     pairs: int
-    rows: int  # (pair, pixel row) combinations: what blending walks, 16 pixels each
+    rows: int  # (pair, pixel row) combinations that blending computes, 16 pixels each
     pixels: int
 
 
 def floors(work: Work, peaks: Peaks) -> dict[str, float]:
-    """Least milliseconds of each stage.
+    """Return the lower bound of each stage, ms.
 
     Blending is counted in vector instructions of 16 lanes (31 a row forward; 80 a row and 60 a pair backward), which
     issue at the rate of multiply-adds; the other stages in operations and bytes (473 operations and 236 bytes of
@@ -31,7 +31,7 @@ def floors(work: Work, peaks: Peaks) -> dict[str, float]:
     def floor(operations: float, moved: float) -> float:
         return 1e3 * max(operations / (1e9 * peaks.gflops), moved / (1e9 * peaks.gbytes))
 
-    vector = 2 * 16  # operations that an instruction could have been
+    vector = 2 * 16  # operations of a multiply-add instruction
     return {
         "project": floor(380 * n, (236 + 64 + 8) * n),
         "pairs": floor(80 * pairs, 2 * 64 * n + 12 * pairs),

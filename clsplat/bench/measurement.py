@@ -1,4 +1,4 @@
-"""A whole benchmark: its cases, the device's peaks, the times, and how they read."""
+"""A benchmark: its cases, the device's peaks, the times, and their tables."""
 
 import json
 from collections.abc import Sequence
@@ -12,8 +12,8 @@ from clsplat.bench.scenes import SIZES, case, grown, real_case
 from clsplat.bench.table import growth_chart, growth_table, table
 from clsplat.errors import ConfigError
 from clsplat.files import write_text
-from clsplat.opencl.choice import Schedule, choose
 from clsplat.opencl.device import Device
+from clsplat.opencl.discovery import Schedule, choose
 from clsplat.pipeline.loading import load
 
 
@@ -27,12 +27,12 @@ class Measurement:
     results: dict[str, Result]
 
     def data(self) -> dict[str, Any]:
-        """Everything as plain data."""
+        """Return everything as plain data."""
         scenes = {name: asdict(result) for name, result in self.results.items()}
         return {"device": self.device, "pipeline": self.pipeline, "peaks": asdict(self.peaks), "scenes": scenes}
 
     def text(self, earlier: dict[str, Any]) -> str:
-        """Tables, beside the `data` of an earlier measurement, or of none."""
+        """Return tables of the times, beside the `data` of an earlier measurement unless that is empty."""
         peaks = f"{self.peaks.gflops:.0f} GFLOP/s, {self.peaks.gexp:.1f} Gexp/s, copy {self.peaks.gbytes:.1f} GB/s"
         was = earlier.get("scenes", {})
         tables = [table(name, result, was.get(name)) for name, result in self.results.items()]

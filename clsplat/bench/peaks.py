@@ -1,4 +1,4 @@
-"""What a device can do at best: the yardsticks that stages are held against."""
+"""Peak rates of a device, from which the floors of stages are computed."""
 
 import time
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from clsplat.opencl.device import Device
 
 @dataclass(frozen=True)
 class Peaks:
-    """Yardsticks of the device."""
+    """Peak rates of the device."""
 
     gflops: float  # multiply-adds count as two
     gexp: float  # 10⁹ exponentials per second
@@ -17,7 +17,7 @@ class Peaks:
 
 
 def measure_peaks(device: Device, repeats: int = 5) -> Peaks:
-    """Multiply-add rate, exponential rate and copy bandwidth: the best of `repeats`."""
+    """Measure the rates of multiply-adds, exponentials and copies: the best of `repeats`."""
     program, lanes = device.program("peak.cl"), int(device.tuning["LANES"])
     group = int(device.tuning["GROUP"])
     items = 64 * group * max(1, device.info.units // 8)

@@ -1,4 +1,4 @@
-"""The scenes that are timed: fixed and seeded ones, and real ones given as files."""
+"""The scenes of the benchmark: synthetic ones with a fixed seed, and real ones from files."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -25,7 +25,7 @@ GROWTH_COUNTS = (50_000, 100_000, 200_000, 400_000, 700_000, 1_000_000)
 
 
 def synthetic(width: int, height: int, count: int, size: float = SIZE) -> tuple[Parameters, View]:
-    """Flat Gaussians facing the camera, of about `size` px, log-normal sizes, random opacities."""
+    """Return flat Gaussians that face the camera, of about `size` px, with log-normal sizes and random opacities."""
     rng = np.random.default_rng(0)
     u, v = rng.uniform(-8, width + 8, count), rng.uniform(-8, height + 8, count)
     sizes = size * np.exp(rng.normal(0, 0.5, (count, 2)))
@@ -47,7 +47,7 @@ def synthetic(width: int, height: int, count: int, size: float = SIZE) -> tuple[
 
 
 def case(device: Device, width: int, height: int, count: int, settings: PipelineFile, size: float = SIZE) -> Case:
-    """Open a synthetic scene with a noise image for its photograph."""
+    """Return a synthetic scene with a noise image as its photograph."""
     parameters, view = synthetic(width, height, count, size)
     camera = upload_camera(device, view)
     shape = (3, height, width)
@@ -56,7 +56,7 @@ def case(device: Device, width: int, height: int, count: int, settings: Pipeline
 
 
 def real_case(device: Device, model: Path, scene: Path, settings: PipelineFile) -> Case:
-    """Open a splat PLY, or a point cloud as `init` would begin with it, at the first training view of a scene."""
+    """Return a splat PLY, or the Gaussians that `init` makes of a point cloud, at a scene's first training view."""
     opened, background = settings.scene.read(scene)
     photographs = Photographs(device, background)
     parameters = read_ply(model).parameters if is_splat(model) else from_points(read_points_ply(model), 0.1, 3)
@@ -64,7 +64,7 @@ def real_case(device: Device, model: Path, scene: Path, settings: PipelineFile) 
 
 
 def grown(device: Device, settings: PipelineFile) -> Iterator[Case]:
-    """Open scenes of 50 000 to a million Gaussians over one image, as much smaller as there are more of them."""
-    width, height, most = SIZES["C"]
+    """Yield scenes of 50 000 to a million Gaussians over one image; their total area is constant."""
+    width, height, largest = SIZES["C"]
     for count in GROWTH_COUNTS:
-        yield case(device, width, height, count, settings, SIZE * (most / count) ** 0.5)
+        yield case(device, width, height, count, settings, SIZE * (largest / count) ** 0.5)

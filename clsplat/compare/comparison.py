@@ -20,7 +20,7 @@ MAX_SETTINGS = 3  # differing ones in a variant's name
 
 @dataclass(frozen=True)
 class Variant:
-    """Settings under a letter and a colour, which are the same on the whole page."""
+    """Settings with a letter and a colour, which are the same on the whole page."""
 
     letter: str
     name: str
@@ -37,16 +37,16 @@ class Row:
 
     @property
     def downscale(self) -> str:
-        """The divisor of the size of the largest images trained on."""
+        """The divisor of the size of the largest photographs in training."""
         return f"{self.runs[0].scene.downscale:g}"
 
     def downscales(self, split: str) -> set[str]:
-        """The divisors of the image sizes at which every run was measured."""
+        """Return the divisors of the image sizes at which every run was measured."""
         measured: list[set[str]] = [set(getattr(run.metrics, split)) for run in self.runs]
         return set.intersection(*measured)
 
     def figures(self, split: str, downscale: str, metric: str) -> list[float]:
-        """A metric of the runs; none when a run lacks it."""
+        """Return a metric of the runs; an empty list when a run lacks it."""
         averages = [getattr(run.metrics, split).get(downscale) for run in self.runs]
         values = [found.figure(metric) if found else None for found in averages]
         present = [value for value in values if value is not None]
@@ -61,7 +61,7 @@ class Comparison:
 
     @classmethod
     def read(cls, paths: Sequence[Path]) -> "Comparison":
-        """Read run folders; that of a matrix stands for its finished cells.
+        """Read run folders; the folder of a matrix means its finished cells.
 
         Raises DataError for a folder that is missing, unfinished or damaged, ConfigError for one given twice or a
         pipeline.yaml that cannot be read.
@@ -76,7 +76,7 @@ class Comparison:
 
     @cached_property
     def variants(self) -> list[Variant]:
-        """In the order in which the runs were given."""
+        """Variants in the order of the runs."""
         distinct: list[dict[str, str]] = []
         for run in self.runs:
             if (settings := _settings(run)) not in distinct:
@@ -88,7 +88,7 @@ class Comparison:
 
     @cached_property
     def scenes(self) -> dict[str, list[Row]]:
-        """Rows by the scene's name, in the order in which the runs were given."""
+        """Rows by the scene's name, in the order of the runs."""
         grouped: dict[str, list[RunFolder]] = {}
         for run in self.runs:
             grouped.setdefault(run.scene.model_dump_json(), []).append(run)
@@ -96,7 +96,7 @@ class Comparison:
         return {name: list(self._rows(runs)) for name, runs in zip(names, grouped.values(), strict=True)}
 
     def variant(self, run: RunFolder) -> Variant:
-        """The variant of a run."""
+        """Return the variant of a run."""
         return next(variant for variant in self.variants if variant.settings == _settings(run))
 
     def _rows(self, runs: Sequence[RunFolder]) -> Iterator[Row]:
@@ -106,12 +106,12 @@ class Comparison:
 
 
 def _cells(path: Path) -> list[Path]:
-    """The finished runs below the folder of a matrix; of another folder, itself."""
+    """The finished runs below the folder of a matrix; another folder stays as it is."""
     if not (path / "pipeline.yaml").is_file() or "matrix" not in read_settings(path):
         return [path]
     cells = sorted(file.parent for file in path.glob("*/metrics.json"))
     if not cells:
-        raise DataError(f"{path}: no cell of this matrix has finished; go on with --resume")
+        raise DataError(f"{path}: no cell of this matrix has finished; continue with --resume")
     return cells
 
 
@@ -121,7 +121,7 @@ def _settings(run: RunFolder) -> dict[str, str]:
 
 
 def _name(settings: dict[str, str], distinct: Sequence[dict[str, str]]) -> str:
-    """The pipeline's name, and the settings that tell variants of the same name apart."""
+    """The pipeline's name, and the settings in which variants of the same name differ."""
     places = differing([other for other in distinct if other.get("name") == settings.get("name")])
     parts = [f"{place.rpartition('.')[2]} {settings.get(place, 'unset')}" for place in places[:MAX_SETTINGS]]
     return ", ".join([settings.get("name", "unnamed"), *parts, *(["…"] if len(places) > MAX_SETTINGS else [])])

@@ -1,4 +1,4 @@
-"""Where runs differ most: crops of the views that all runs rendered, beside the photograph."""
+"""Crops of the views that all runs rendered, where the runs differ most, beside the photograph."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -76,7 +76,7 @@ def find_crops(runs: Sequence[RunFolder], scene: Scene, background: Background) 
     Raises DataError when a render or a photograph is damaged.
     """
     rendered = [view for view in scene.views if all(_file(run, view).is_file() for run in runs)]
-    chosen: list[Crop] = []  # the best ones and one more view are in memory at a time
+    chosen: list[Crop] = []  # these and one more view are in memory at a time
     for view in rendered:
         renders = [load_image(replace(view, image_path=_file(run, view))) for run in runs]
         chosen.append(_crop(view.name, load_image(view, BACKGROUNDS[background]), renders))

@@ -8,8 +8,8 @@ from typing import Any
 def flat(settings: dict[str, Any]) -> dict[str, str]:
     """Return place -> value as text, in the order of the file.
 
-    A stage's place is its name and a strategy's its type, so that pipelines with other stages can be compared:
-    `optimize.densify.clone.gradient_above`.  The second of a name gets `#2`.
+    A stage's place is its name and a strategy's its type, so that pipelines with different stages can be compared:
+    `optimize.densify.clone.gradient_above`.  The second item of a name has `#2`.
     """
     found: dict[str, str] = {}
     for key, value in settings.items():
@@ -18,7 +18,7 @@ def flat(settings: dict[str, Any]) -> dict[str, str]:
 
 
 def differing(settings: Sequence[dict[str, str]]) -> list[str]:
-    """Places whose values are not the same in all of the flat settings, in the order of the first that has them."""
+    """Return the places whose values differ between flat settings, in order of their first occurrence."""
     places = list(dict.fromkeys(place for one in settings for place in one))
     return [place for place in places if len({one.get(place) for one in settings}) > 1]
 
@@ -42,7 +42,7 @@ def _add(found: dict[str, str], place: str, value: Any) -> None:
 
 
 def _named(item: Any) -> tuple[str, Any]:
-    """A list's item and the name it goes by."""
+    """The name of a list's item, and the item without it."""
     if isinstance(item, dict) and "type" in item:
         return str(item["type"]), {key: value for key, value in item.items() if key != "type"}
     if isinstance(item, dict) and len(item) == 1:

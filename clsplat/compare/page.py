@@ -22,7 +22,7 @@ MAX_NAMES = 4  # of pipelines, in the title
 
 @dataclass(frozen=True)
 class CropFigure:
-    """A crop with its images as addresses that hold them."""
+    """A crop with its images as data URLs."""
 
     view: str
     overview: str
@@ -34,7 +34,7 @@ class CropFigure:
 
 @dataclass(frozen=True)
 class SceneSection:
-    """What the page shows of one scene."""
+    """The section of the page about one scene."""
 
     name: str
     variants: list[Variant]
@@ -60,7 +60,7 @@ def write_comparison(paths: Sequence[Path], out: Path, title: str = "", remarks:
 
 
 def comparison_page(comparison: Comparison, title: str, remarks: Sequence[str]) -> str:
-    """Return the page; its title is by default the names of the pipelines, and `remarks` stand at its top."""
+    """Return the page; the default title is the names of the pipelines; `remarks` are at the top."""
     runs, scenes, variants = comparison.runs, comparison.scenes, comparison.variants
     names = list(dict.fromkeys(run.metrics.pipeline for run in runs))
     title = title or " · ".join([*names[:MAX_NAMES], *(["…"] if len(names) > MAX_NAMES else [])])
@@ -130,7 +130,7 @@ def _size_charts(rows: Sequence[Row], split: str) -> list[str]:
 
 
 def _crops(rows: Sequence[Row]) -> tuple[list[Crop], str]:
-    """Crops of each row's first run, or the reason why there are none, such as photographs that have moved."""
+    """Crops of each row's first run, or the reason why there are none, such as missing photographs."""
     runs = [row.runs[0] for row in rows]
     settings = runs[0].scene
     try:
@@ -144,7 +144,7 @@ def _crops(rows: Sequence[Row]) -> tuple[list[Crop], str]:
 
 
 def _figure(crop: Crop) -> CropFigure:
-    """Its squares keep every bit."""
+    """The crop for the page; PNG keeps every bit of its squares."""
     return CropFigure(
         view=crop.view,
         overview=embedded(crop.overview),

@@ -30,19 +30,19 @@ class Averages(BaseModel):
     views: int
 
     def figure(self, metric: str) -> float | None:
-        """A metric by its name; None where it was not measured."""
+        """Return a metric by name; None when it was not measured."""
         value = getattr(self, metric, None)
         return float(value) if isinstance(value, int | float) else None
 
 
-Scales = dict[Annotated[str, Field(pattern=r"^\d+(\.\d+)?$")], Averages]
+AveragesByDownscale = dict[Annotated[str, Field(pattern=r"^\d+(\.\d+)?$")], Averages]
 
 
 class RunMetrics(BaseModel):
-    """metrics.json."""
+    """The contents of metrics.json."""
 
-    test: Scales
-    train: Scales
+    test: AveragesByDownscale
+    train: AveragesByDownscale
     gaussians: int
     steps: int
     train_seconds: float
@@ -97,7 +97,7 @@ class RunFolder:
             raise DataError(f"{self.path / 'metrics.jsonl'}: damaged ({error!r}); expected lines of JSON") from error
 
     def points(self, kind: str, figure: str, **where: Any) -> list[tuple[float, float]]:
-        """(step, figure) of all records of a kind, such as `train`, in which `where` holds."""
+        """Return (step, figure) of all records of a kind, such as `train`, whose values are those of `where`."""
         lines = (line for line in self.records if line["kind"] == kind)
         chosen = (line for line in lines if all(line.get(key) == value for key, value in where.items()))
         return [(line["step"], line[figure]) for line in chosen if isinstance(line.get(figure), int | float)]
@@ -110,7 +110,7 @@ class RunFolder:
 
 
 def read_settings(path: Path) -> dict[str, Any]:
-    """Return a run folder's pipeline.yaml as plain data.  Raises ConfigError when that is not what it holds."""
+    """Return a run folder's pipeline.yaml as plain data.  Raises ConfigError when it holds anything else."""
     data = read_yaml(path / "pipeline.yaml").data
     if not isinstance(data, dict) or not isinstance(data.get("stages", []), list):
         raise ConfigError(f"{path / 'pipeline.yaml'}: damaged; expected keys such as name and stages")
@@ -132,7 +132,9 @@ def _metrics(path: Path) -> RunMetrics:
         first = error.errors()[0]
         place = ".".join(str(part) for part in first["loc"])
         message = first["msg"].removeprefix("Invalid JSON: ")
-        raise DataError(f"{path}: {place + ': ' if place else ''}{message}; the file is damaged, run again") from error
+        raise DataError(
+            f"{path}: {place + ': ' if place else ''}{message}; the file is damaged: run the pipeline again"
+        ) from error
 
 
 def _state(path: Path) -> str:

@@ -8,7 +8,7 @@ from clsplat.compare.comparison import Comparison, Row, Variant
 from clsplat.compare.differences import differing
 from clsplat.pages.page import duration
 
-METRICS = {  # name -> heading, digits, which is better
+METRICS = {  # name -> heading, digits, function that returns the better one
     "psnr": ("PSNR ↑", 2, max),
     "ssim": ("SSIM ↑", 4, max),
     "ms_ssim": ("MS-SSIM ↑", 4, max),
@@ -54,7 +54,7 @@ class Table:
 
 
 def main_table(rows: Sequence[Row]) -> Table:
-    """Return test metrics at the size trained on, and the costs."""
+    """Return test metrics at the training size, and the costs."""
     costs = [
         Column("Gaussians", _cells([[run.metrics.gaussians for run in row.runs] for row in rows], 0)),
         Column("steps", _cells([[run.metrics.steps for run in row.runs] for row in rows], 0)),
@@ -77,7 +77,7 @@ def downscales(rows: Sequence[Row], split: str) -> list[str]:
 
 
 def means_over_scenes(comparison: Comparison) -> Table | None:
-    """Return means over the scenes, of the variants that were run on all of them; None when there is no such figure."""
+    """Return means over the scenes, for variants that ran on all of them; None when there is no such figure."""
     scenes = list(comparison.scenes.values())
     everywhere = [[row for rows in scenes for row in rows if row.variant is v] for v in comparison.variants]
     complete = [rows for rows in everywhere if len(rows) == len(scenes)]
@@ -98,7 +98,7 @@ def differing_settings(variants: Sequence[Variant]) -> dict[str, list[str]]:
 
 
 def differing_conditions(rows: Sequence[Row]) -> Iterable[str]:
-    """Yield what makes figures of one column incomparable."""
+    """Yield sentences about conditions that differ, so that figures of a column are not comparable."""
     splits = [split for row in rows for run in row.runs for split in (run.metrics.test, run.metrics.train)]
     averages = [one for split in splits for one in split.values()]
     for key, name in CONDITIONS.items():
@@ -108,7 +108,7 @@ def differing_conditions(rows: Sequence[Row]) -> Iterable[str]:
 
 
 def _trained_on(rows: Sequence[Row]) -> list[Group]:
-    """The test metrics at the size trained on, where they were measured."""
+    """The test metrics at the training size, where they were measured."""
     downscale = rows[0].downscale
     return [_group(rows, "test", downscale)] if downscale in downscales(rows, "test") else []
 

@@ -20,6 +20,7 @@ WIDTHS = {  # of the tables
     "sh_rest": tuple(3 * (sh_coefficients(degree) - 1) for degree in range(MAX_DEGREE + 1)),
     "filter_variance": (1,),
 }
+MIN_LOGIT = -80.0  # of an opacity that the filter spreads out to nothing: as little as the kernels know
 MIP_VARIANCE = 0.1  # px², of files that say no more than `mip` (Yu et al. 2024)
 
 
@@ -146,8 +147,25 @@ class Model:
         rendering = replace(self.rendering, near=self.rendering.near * scale)
         return replace(self, **{k: v.astype(np.float32) for k, v in changed.items()}, rendering=rendering)
 
+    def baked(self) -> "Model":
+        """Return the model with the world filter as part of its scales and opacities (Yu et al. 2024, eq. 9).
+
+        So it looks the same in viewers that know no such filter.
+        """
+        if self.filter_variance is None:
+            return self
+        scale2 = np.exp(2 * self.log_scales.astype(np.float64))
+        filtered2 = scale2 + self.filter_variance.astype(np.float64)
+        opacity = np.sqrt(np.prod(scale2 / filtered2, axis=1, keepdims=True))
+        opacity /= 1 + np.exp(-self.logit_opacity.astype(np.float64))
+        with np.errstate(divide="ignore"):
+            logit = np.log(opacity) - np.log1p(-opacity)
+        log_scales = (0.5 * np.log(filtered2)).astype(np.float32)
+        logits = np.maximum(logit, MIN_LOGIT).astype(np.float32)
+        return replace(self, log_scales=log_scales, logit_opacity=logits, filter_variance=None)
+
     def save(self, path: str | Path) -> None:
-        """Write a PLY in the layout of 3DGS; a world filter is kept as it is, as a property `filter_3D`.
+        """Write a PLY in the layout of 3DGS; a world filter that is not `baked` is kept, as a property `filter_3D`.
 
         Raises OutputError when it cannot be written.
         """

@@ -1,17 +1,20 @@
-"""One open OpenCL device: its memory, its limits and its programs.  It is passed explicitly."""
+"""An open OpenCL device: its context, its queue, its memory and its programs.
+
+This package is the only importer of pyopencl.
+"""
 
 import math
 import warnings
 import weakref
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from clsplat.errors import MemoryLimitError
 from clsplat.opencl import runtimes
-from clsplat.opencl.choice import DeviceInfo, Schedule, platforms, resolve_schedule
+from clsplat.opencl.discovery import DeviceInfo, Schedule, platforms, resolve_schedule, tuning_of
 from clsplat.opencl.timings import Timings
 
 runtimes.add_intel_runtime()
@@ -20,15 +23,15 @@ import pyopencl as cl  # noqa: E402
 if TYPE_CHECKING:
     from clsplat.opencl.program import Program
 
-warnings.filterwarnings("ignore", category=cl.CompilerWarning)  # some runtimes always have something to say
+warnings.filterwarnings("ignore", category=cl.CompilerWarning)  # some runtimes warn at every build
 
 
 class Buffer(cl.Buffer):
-    """Device memory whose end can be noticed, which pyopencl's own class does not allow."""
+    """Device memory with weak references, which pyopencl's class does not support."""
 
 
 class Array:
-    """A typed piece of device memory; it has no arithmetic."""
+    """A typed array in device memory, without arithmetic."""
 
     __slots__ = ("buffer", "device", "dtype", "shape")
 
@@ -77,10 +80,10 @@ class Device:
         self.context = cl.Context([platforms()[platform].get_devices()[number]])
         self.queue = cl.CommandQueue(self.context, properties=cl.command_queue_properties.PROFILING_ENABLE)
         self.schedule = resolve_schedule(info, schedule)
-        self.tuning = _tuning(info, self.schedule)
+        self.tuning = tuning_of(info, self.schedule)
         self.timings = Timings()
         self.allocated = 0  # bytes of all buffers that are alive
-        self.peak = 0  # the most there ever were
+        self.peak = 0  # largest value of `allocated`
         self._programs: dict[tuple[Any, ...], Program] = {}
 
     @property
@@ -88,7 +91,7 @@ class Device:
         return f"{self.info.text}, {self.schedule} schedule"
 
     def empty(self, shape: int | tuple[int, ...], dtype: DTypeLike = np.float32) -> Array:
-        """Allocate without initialising.  Raises MemoryLimitError with the sizes involved."""
+        """Allocate an array with undefined values.  Raises MemoryLimitError with the sizes."""
         shape = (shape,) if isinstance(shape, int) else shape
         kind = np.dtype(dtype)
         size = _whole_lines(math.prod(shape) * kind.itemsize)
@@ -113,11 +116,13 @@ class Device:
         self.allocated -= size
 
     def zeros(self, shape: int | tuple[int, ...], dtype: DTypeLike = np.float32) -> Array:
+        """Allocate an array of zeros.  Raises MemoryLimitError."""
         array = self.empty(shape, dtype)
         array.fill(0)
         return array
 
     def upload(self, values: NDArray[Any]) -> Array:
+        """Copy an array from the host.  Raises MemoryLimitError."""
         array = self.empty(values.shape, values.dtype)
         array.set(values)
         return array
@@ -135,32 +140,10 @@ class Device:
         return self._programs[key]
 
     def finish(self) -> None:
-        """Wait until everything enqueued is done."""
+        """Wait for all enqueued work."""
         self.queue.finish()
 
 
 def _whole_lines(size: int) -> int:
-    """Bytes rounded up to 64, at least as many: vectors may run past the last value, and no buffer may be empty."""
+    """Bytes rounded up to 64, at least 64: vectors may read past the last value; no buffer may be empty."""
     return max(64, -(-size // 64) * 64)
-
-
-def _tuning(info: DeviceInfo, schedule: Literal["wide", "simt"]) -> dict[str, int | str]:
-    """The -D values that fit kernels to a device; their meaning stands in cl_kernels/common.h."""
-    if schedule == "wide":
-        return {
-            "LANES": 16 if info.float_width >= 16 else 8,
-            "VECTORS": 4,
-            "GROUP": 16,
-            "TEAM": 1,
-            "DIGIT_BITS": 11,
-            "TILE": 16,
-        }
-    return {
-        "LANES": 1,
-        "VECTORS": 1,
-        "GROUP": 64,
-        "TEAM": 64,
-        "DIGIT_BITS": 4,
-        "TILE": 16 if info.group >= 256 else 8,
-        "SORT_CAPACITY": 2048,
-    }

@@ -1,4 +1,4 @@
-"""Build and run one small kernel on the device given by two numbers; the exit status says whether it worked."""
+"""Build and run one small kernel on the device of two numbers; exit status 0 means that it worked."""
 
 import sys
 
@@ -29,11 +29,11 @@ def main(platform: int, device: int) -> None:
     numbers = np.arange(8, dtype=np.float32)
     flags = cl.mem_flags
     source = cl.Buffer(context, flags.READ_ONLY | flags.COPY_HOST_PTR, hostbuf=numbers)
-    target = cl.Buffer(context, flags.WRITE_ONLY, numbers.nbytes)
+    reversed_numbers = cl.Buffer(context, flags.WRITE_ONLY, numbers.nbytes)
     program = cl.Program(context, SOURCE).build(["-cl-std=CL1.2", "-Werror"])
-    cl.Kernel(program, "reverse")(queue, (8,), (8,), source, target)
+    cl.Kernel(program, "reverse")(queue, (8,), (8,), source, reversed_numbers)
     result = np.empty_like(numbers)
-    cl.enqueue_copy(queue, result, target)
+    cl.enqueue_copy(queue, result, reversed_numbers)
     if not np.array_equal(result, 2 * numbers[::-1]):
         raise SystemExit(f"error: the test kernel computed {result.tolist()}")
 

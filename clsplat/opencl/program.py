@@ -1,7 +1,6 @@
-"""Kernels by name: load a .cl file, build it, check arguments against its own text, launch.
+"""Kernels by name: load a .cl file, build it, check arguments against its text, launch.
 
-Arguments are passed by the names that stand in the kernel's signature, which the house style makes easy to read:
-missing, surplus or wrongly typed ones fail like a Python call.
+Arguments are passed by the names in the kernel's signature; missing, surplus or wrongly typed ones raise KernelError.
 """
 
 import re
@@ -39,7 +38,7 @@ _TYPES: dict[str, np.dtype[Any]] = {
 
 
 def flatten(path: Path, seen: set[Path] | None = None) -> str:
-    """Return the source with each local header inlined once; #line keeps compiler messages truthful."""
+    """Return the source with each local header inlined once; #line keeps file and line right in compiler messages."""
     seen = set() if seen is None else seen
     text = [f'#line 1 "{path.name}"']
     for number, line in enumerate(path.read_text().splitlines(), start=1):
@@ -59,7 +58,7 @@ def flatten(path: Path, seen: set[Path] | None = None) -> str:
 
 @cache
 def constants(file: str = "common.h") -> dict[str, float]:
-    """Return the numeric #defines of a header, so that Python has no second list of them."""
+    """Return the numeric #defines of a header, for use in Python."""
     text = (resource_dir("cl_kernels") / file).read_text()
     values = {}
     for name, value in _DEFINE.findall(text):
@@ -78,7 +77,7 @@ class Argument:
 
 
 def parse_kernels(source: str) -> dict[str, list[Argument]]:
-    """Return the parameters of every kernel in the source text.  Raises KernelError where the text breaks the style."""
+    """Return the parameters of every kernel in the source text.  Raises KernelError for other declarations."""
     kernels = {}
     for match in _KERNEL.finditer(_COMMENT.sub("", source)):
         kernels[match["name"]] = [_parse_argument(match["name"], a) for a in match["arguments"].split(",")]

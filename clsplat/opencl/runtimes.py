@@ -1,7 +1,7 @@
-"""Finding OpenCL runtimes, and telling the ones that work from the ones that do not.
+"""Find OpenCL runtimes, and test whether they work.
 
-This must be imported before pyopencl: the loader reads its folder of drivers once.  A runtime is tried in a process of
-its own, because some of them abort instead of reporting (PoCL before 7.2 without a linker does).
+Import this module before pyopencl: the loader reads its folder of drivers once.  Each runtime is tested in a separate
+process, because some runtimes abort the process on errors (PoCL before 7.2 without a linker).
 """
 
 import hashlib
@@ -18,17 +18,17 @@ SYSTEM_DRIVERS = Path("/etc/OpenCL/vendors")
 PROBE_SECONDS = 120  # a first build may compile for many seconds on a slow machine
 
 _OTHER_RUNTIMES = "apt install pocl-opencl-icd, or pip install 'clsplat[intel]'"
-_ADVICE = (  # what a failing test kernel says -> what to do
-    ("unknown target cpu", f"this PoCL does not know the processor: {_OTHER_RUNTIMES}"),
+_ADVICE = (  # words in the output of a failed test kernel -> remedy
+    ("unknown target cpu", f"this PoCL does not support the processor: {_OTHER_RUNTIMES}"),
     ("linker", f"PoCL needs a linker: apt install binutils libc6-dev; or use another runtime: {_OTHER_RUNTIMES}"),
     ("abort", f"PoCL may lack a linker: apt install binutils libc6-dev; or use another runtime: {_OTHER_RUNTIMES}"),
 )
 
 
 def add_intel_runtime() -> None:
-    """Let the loader see Intel's CPU runtime when pip installed it: its own driver file holds a placeholder path.
+    """Register Intel's CPU runtime when pip installed it: its own driver file holds a placeholder path.
 
-    A folder of driver files is written that names the system's drivers and Intel's; a user who chose a folder keeps it.
+    This writes a folder of driver files with the system's drivers and Intel's, unless OCL_ICD_VENDORS is set.
     """
     library = Path(sysconfig.get_path("data")) / "lib" / "libintelocl.so"
     if not library.exists() or "OCL_ICD_VENDORS" in os.environ:
@@ -45,9 +45,9 @@ def add_intel_runtime() -> None:
 
 
 def fault_of(key: str, platform: int, device: int) -> str | None:
-    """Return None if the device builds and runs a kernel, else one sentence on what is wrong and what to install.
+    """Return None when the device builds and runs a kernel, else one sentence with the fault and the remedy.
 
-    `key` identifies the runtime; only successes are remembered, so a mended machine is noticed at once.
+    `key` identifies the runtime.  Only successes are stored, so a runtime that was fixed is tested again.
     """
     record = CACHE / "probes" / hashlib.sha256(key.encode()).hexdigest()[:16]
     if record.exists():
@@ -70,7 +70,7 @@ def fault_of(key: str, platform: int, device: int) -> str | None:
 
 
 def _error_line(output: str) -> str:
-    """The line of a compiler's or Python's output that says what happened."""
+    """The line with the error in the output of a compiler or of Python."""
     lines = [line.strip() for line in output.splitlines() if line.strip()]
     errors = [line for line in lines if line.lower().startswith("error:")]
     return (errors or lines or ["the test kernel failed without a message"])[-1 if not errors else 0]

@@ -1,18 +1,18 @@
-"""Where the device's time goes."""
+"""The time of kernels on the device."""
 
 from collections import defaultdict
 from typing import Any
 
 
 class Timings:
-    """Time on the device by kernel, from profiling events, while `sampling`.
+    """Times of kernels on the device, from profiling events, while `sampling` is True.
 
     Events are dropped as soon as they are read: some drivers slow down when many are alive.
     """
 
     def __init__(self) -> None:
         self.sampling = False
-        self.section = "other"  # part of a training step to which kernels count that `profile` does not know by name
+        self.section = "other"  # part of a training step, for kernels that `profile.STAGES` does not list
         self._events: list[tuple[str, str, Any]] = []
 
     def add(self, name: str, event: Any) -> None:

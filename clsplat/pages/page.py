@@ -25,13 +25,13 @@ JPEG_QUALITY = 92
 
 
 def render(template: str, **values: Any) -> str:
-    """Fill a template of `templates/`; return the page.  What is not valid Unicode in a name becomes `?`."""
+    """Fill a template of `templates/`; return the page.  Invalid Unicode becomes `?`."""
     text = TEMPLATES.get_template(template).render(**values)
     return text.encode("utf-8", "replace").decode("utf-8")
 
 
 def charts(drawings: Iterable[str]) -> list[Markup]:
-    """Mark SVG drawings as safe and drop empty ones: nothing else enters a page unescaped."""
+    """Mark SVG drawings as safe and drop empty ones; templates escape all other values."""
     return [Markup(drawing) for drawing in drawings if drawing]
 
 
@@ -49,7 +49,7 @@ def duration(seconds: float) -> str:
 
 
 def embedded(image: NDArray[np.uint8], suffix: str = ".jpg") -> str:
-    """Return an RGB image, [height, width, 3], as an address that holds its data: .jpg, or .png to keep every bit."""
+    """Return an RGB image, [height, width, 3], as a data URL: .jpg, or .png, which keeps every bit."""
     options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY] if suffix == ".jpg" else []
     _, data = cv2.imencode(suffix, image[..., ::-1], options)
     kind = "jpeg" if suffix == ".jpg" else "png"

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 WIDTH, HEIGHT = 460, 220  # px
 LEFT, BOTTOM, TOP, RIGHT = 56, 30, 26, 12
 COLOURS = ("#2b6cb0", "#c05621", "#2f855a", "#805ad5", "#b83280", "#0f8a9d", "#8a6d1b", "#4a5568")
-FEW = 12  # a line of so few points shows each of them
-LEGEND_ROW, LEGEND_LETTERS = 14, 66  # px a row; about as many letters fit in one
+MAX_MARKED_POINTS = 12  # of a line; a longer one shows no circles
+LEGEND_ROW, LEGEND_LETTERS = 14, 66  # px of a row; letters that fit in one, about
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ def curve(
 ) -> str:
     """Draw lines over common axes; a logarithmic y axis drops values that are not positive.
 
-    `ticks` name places on the x axis, which otherwise gets numbers.  No points, no chart: "".
+    `ticks` name places on the x axis, which has numbers otherwise.  Without points the chart is "".
     """
     drawn = [_drawn(line, logarithmic) for line in lines]
     drawn = [line for line in drawn if line.points]
@@ -63,13 +63,13 @@ def curve(
         places = [place(*point) for point in line.points]
         path = " ".join(f"{x:.1f},{y:.1f}" for x, y in places)
         parts.append(f'<polyline points="{path}" fill="none" stroke="{colour}" stroke-width="1.8"/>')
-        if len(places) <= FEW:
+        if len(places) <= MAX_MARKED_POINTS:
             parts += [f'<circle cx="{x:.1f}" cy="{y:.1f}" r="2.6" fill="{colour}"/>' for x, y in places]
     return "".join([*parts, "</svg>"])
 
 
 def histogram(title: str, values: Sequence[float], bins: int = 24) -> str:
-    """Draw how many of the values lie in each of some equal intervals from zero; no values, no chart: ""."""
+    """Draw the number of values in each of `bins` equal intervals from zero; without values the chart is ""."""
     if not values:
         return ""
     high = max(values) or 1.0
@@ -96,7 +96,7 @@ def histogram(title: str, values: Sequence[float], bins: int = 24) -> str:
 
 
 def _drawn(line: Line, logarithmic: bool) -> Line:
-    """The line as the axes have it."""
+    """The line in the coordinates of the axes."""
     if not logarithmic:
         return line
     return replace(line, points=[(x, math.log10(y)) for x, y in line.points if y > 0])
@@ -107,7 +107,7 @@ def _colour(line: Line, index: int) -> str:
 
 
 def _legend(lines: Sequence[Line]) -> list[str]:
-    """Rows of names in their lines' colours; a single line needs none."""
+    """Rows of names in their lines' colours; none for a single line."""
     rows: list[str] = []
     room = 0
     for i, line in enumerate(lines if len(lines) > 1 else []):

@@ -1,4 +1,4 @@
-"""Turning a failed validation into one sentence: file, line, place, what was expected, the nearest match."""
+"""Make one sentence of a failed validation: file, line, place, what was expected, the nearest match."""
 
 import difflib
 import re
@@ -12,7 +12,7 @@ from clsplat.pipeline.fields import annotation_of, bases, inside_list, models, t
 from clsplat.pipeline.yaml_file import Document, Place
 from clsplat.settings import TAGS, Settings
 
-EXPECTED = {
+EXPECTATIONS = {
     "int_type": "a whole number",
     "int_from_float": "a whole number",
     "float_type": "a number",
@@ -41,9 +41,9 @@ def explain(error: ValidationError, root: type[BaseModel], path: Path, document:
 
 
 def first_fault(error: ValidationError, root: type[BaseModel]) -> tuple[Place, str]:
-    """Return the first fault's place in the file and what is wrong there.
+    """Return the first fault, with its place in the file.
 
-    A misspelt key explains the one that is missing, so it goes first.
+    A misspelt key comes before a missing one, because it is often the reason.
     """
     first = min(error.errors(), key=lambda one: one["type"] != "extra_forbidden")
     place, model, annotation = _follow(first["loc"], root)
@@ -64,8 +64,8 @@ def _complaint(error: dict[str, Any], place: Place, model: type[BaseModel] | Non
     if kind == "union_tag_not_found":
         return f"expected a 'type', the name of the {_kind(annotation)}"
     got = f", got {shortened(repr(value))}"
-    if kind in EXPECTED:
-        return f"expected {EXPECTED[kind].format(**error.get('ctx', {}))}{got}"
+    if kind in EXPECTATIONS:
+        return f"expected {EXPECTATIONS[kind].format(**error.get('ctx', {}))}{got}"
     message = error["msg"].removeprefix("Value error, ")
     message = f"{message[:1].lower()}{message[1:]}"
     return message if isinstance(value, dict | list) else message + got
@@ -77,7 +77,7 @@ def _nearest(word: str, known: list[str]) -> str:
 
 
 def _kind(annotation: Any) -> str:
-    """What a field chooses from, in words: 'world filter' for variants of WorldFilter, 'stage' for those of Stage."""
+    """The name of a field's base, in words: 'world filter' for variants of WorldFilter, 'stage' for those of Stage."""
     base = bases(annotation)[0]
     family = base.__mro__[base.__mro__.index(Settings) - 1]
     return re.sub(r"(?<=\w)(?=[A-Z])", " ", family.__name__).lower()

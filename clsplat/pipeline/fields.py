@@ -1,4 +1,4 @@
-"""What the annotations of settings say: the models that a field allows, and the names that tell them apart."""
+"""Read the annotations of settings: the models that a field allows, and their names."""
 
 import types
 import typing
@@ -23,7 +23,7 @@ def models(annotation: Any) -> list[type[BaseModel]]:
 
 
 def bases(annotation: Any) -> list[type[Settings]]:
-    """Return the base whose variants a field takes, if it does."""
+    """Return the base of the variants that a field accepts, in a list; without variants the list is empty."""
     if typing.get_origin(annotation) is not typing.Annotated:
         return []
     return [mark.base for mark in typing.get_args(annotation)[1:] if isinstance(mark, Variants)]
@@ -35,7 +35,7 @@ def annotation_of(field: FieldInfo) -> Any:
 
 
 def tags(model: type[BaseModel]) -> tuple[Any, ...]:
-    """Return the names by which a pipeline file tells the model from others, if it has any."""
+    """Return the names of the model in pipeline files; none when it is not a variant."""
     field = next((model.model_fields[name] for name in TAGS if name in model.model_fields), None)
     return typing.get_args(field.annotation) if field else ()
 
@@ -48,7 +48,7 @@ def inside_list(annotation: Any) -> Any:
 
 
 def model_of(data: Any, annotation: Any) -> type[BaseModel] | None:
-    """Return the model that plain data with its tag is checked by; None where that is not known."""
+    """Return the model of plain data with its tag; None when it is not known."""
     allowed = models(annotation)
     if len(allowed) > 1 and isinstance(data, dict):
         allowed = [model for model in allowed if any(data.get(name) in tags(model) for name in TAGS if name in data)]

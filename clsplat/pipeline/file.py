@@ -13,7 +13,7 @@ from pydantic import Field
 
 from clsplat.errors import ConfigError
 from clsplat.filters import ModelSettings
-from clsplat.opencl.choice import Schedule
+from clsplat.opencl.discovery import Schedule
 from clsplat.prepare.steps import Step
 from clsplat.render.rasterizer import MAX_PAIRS, RECORD, Budget
 from clsplat.render.tiles import Sort
@@ -25,16 +25,16 @@ from clsplat.stages.optimize import Optimize
 
 
 class SceneSettings(Settings):
-    """Which photographs, and how they are read."""
+    """The photographs, and how they are read."""
 
     path: str | None = None
     """Folder of the dataset; usually given by --scene."""
     downscale: Annotated[float, Field(ge=1)] = 1
     """Divisor of the photographs' size."""
     levels: Annotated[int, Field(ge=1, le=8)] = 1
-    """Number of sizes to train on: downscale, and twice, four times, … that."""
+    """Number of sizes in training: at `downscale`, and at twice, four times, … that."""
     alpha: Alpha = "transparency"
-    """Fourth channel of photographs: blended with the background, or a mask of what counts."""
+    """Fourth channel of photographs: blended with the background, or a mask of the pixels that count."""
     background: Literal["auto", "black", "white"] = "auto"
     """Colour behind the scene; auto: white for Blender scenes, else black."""
     image_budget: Annotated[int, Field(gt=0)] | None = None
@@ -43,69 +43,69 @@ class SceneSettings(Settings):
     """Every n-th image, by name, is a test view; 0: none."""
 
     @property
-    def scales(self) -> tuple[float, ...]:
-        """Divisors of the original photographs' size to train on, from the finest."""
+    def downscales(self) -> tuple[float, ...]:
+        """Divisors of the original photographs' size in training, ascending."""
         return tuple(self.downscale * 2**level for level in range(self.levels))
 
     @property
     def folder(self) -> Path:
-        """Where the photographs lie.  Raises ConfigError when it was not given."""
+        """Folder of the dataset.  Raises ConfigError when it was not given."""
         if self.path is None:
             raise ConfigError("no scene given; use --scene DIR, or scene: {path: DIR} in the pipeline file")
         return Path(self.path)
 
     def read(self, folder: Path) -> tuple[Scene, Background]:
-        """Return the photographs of a folder, and what they are shown on.  Raises DataError."""
+        """Return the scene of a folder with these settings, and its background.  Raises DataError."""
         return self.applied(read_scene(folder, self.holdout))
 
     def applied(self, scene: Scene) -> tuple[Scene, Background]:
-        """Return a scene with its photographs' alpha as these settings take it, and what they are shown on."""
+        """Return a scene with these settings for alpha, and its background."""
         return scene.with_alpha(self.alpha), scene.background if self.background == "auto" else self.background
 
 
 class RasterizerSettings(Settings):
-    """How the device works; results do not depend on it."""
+    """How the device renders; results do not depend on it."""
 
     schedule: Schedule = "auto"
     """Schedule of blending: wide for CPUs, simt for GPUs."""
     sort: Sort = "auto"
-    """Way to order splats by tile and depth; auto: the faster one on the first frame."""
+    """Algorithm that orders splats by tile and depth; auto: the faster one on the first frame."""
     pair_budget: Annotated[int, Field(gt=0)] | None = None
-    """MiB of gradient records; without it, the largest buffer of the device."""
+    """MiB of gradient records at a time; without it, the largest buffer of the device."""
     launch_tiles: Annotated[int, Field(ge=0)] = 0
-    """Tiles blended by one launch, for watchdogs of displays; 0: all."""
+    """Number of tiles of one launch, for devices whose display limits its time; 0: all."""
 
     def budget(self) -> Budget | None:
-        """How much the rasterizer does at a time."""
+        """Return the rasterizer's limits on memory and launches; None for the defaults."""
         if self.pair_budget is None and self.launch_tiles == 0:
             return None
         records = MAX_PAIRS if self.pair_budget is None else (self.pair_budget << 20) // (4 * RECORD)
         return Budget(records, self.launch_tiles)
 
 
-LISTS = ("prepare", "stages")
+STAGE_LISTS = ("prepare", "stages")
 Name = Annotated[str, Field(pattern=r"^[\w.-]+$")]
 
 
 class PipelineFile(Settings):
-    """All that a pipeline file can say."""
+    """The keys of a pipeline file."""
 
     name: Name
     """Name of the pipeline, and of its run folder."""
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
     """Seed of all random numbers."""
     scene: SceneSettings = SceneSettings()
-    """Which photographs."""
+    """The photographs."""
     model: ModelSettings = ModelSettings()
     """How Gaussians are rendered."""
     rasterizer: RasterizerSettings = RasterizerSettings()
-    """How the device works."""
+    """How the device renders."""
     prepare: list[OneOf[Step]] = Field([])
-    """Steps from photographs to a scene, each done once."""
+    """Steps from photographs to a scene; their results are kept."""
     stages: Annotated[list[OneOf[Stage]], Field(min_length=1)]
-    """What is done with the scene, in order."""
+    """Stages, in order."""
     plugins: dict[str, str] = Field(default={})
-    """Plug-ins that the run was made with: name and sha256; written by a run, and then required."""
+    """Plug-ins of the run: name and sha256.  A run writes them, and a resumed run requires them."""
 
     @property
     def training(self) -> Optimize:
@@ -113,4 +113,4 @@ class PipelineFile(Settings):
         for stage in self.stages:
             if isinstance(stage, Optimize):
                 return stage
-        raise ConfigError(f"{self.name}: expected a stage 'optimize', whose steps can be timed")
+        raise ConfigError(f"{self.name}: expected a stage 'optimize'")

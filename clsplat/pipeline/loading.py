@@ -13,7 +13,7 @@ from ruamel.yaml import YAML
 from clsplat import plugins
 from clsplat.errors import ConfigError, OverrideError, one_line
 from clsplat.pipeline.explanation import explain, first_fault, place_text
-from clsplat.pipeline.file import LISTS, PipelineFile
+from clsplat.pipeline.file import STAGE_LISTS, PipelineFile
 from clsplat.pipeline.files import find
 from clsplat.pipeline.overrides import NoSuchKey, apply, split, suggestion
 from clsplat.pipeline.renamed import with_new_names
@@ -41,18 +41,18 @@ class Pipeline:
         return list(self.settings.stages)
 
     def preparation(self, out: Path) -> list[Planned]:
-        """What must be done to the photographs before a run in `out`, and why.  Raises DataError."""
+        """Return the steps before a run in `out`, with the reasons to run them.  Raises DataError."""
         settings = self.settings
         return plan(settings.prepare, settings.scene.folder, prepared_folder(out)) if settings.prepare else []
 
     def resolved(self) -> dict[str, Any]:
-        """Every setting with its value, as plain data in the shape of a file."""
+        """Return every setting with its value, as plain data in the shape of a file."""
         data = self.settings.model_dump(mode="json")
-        data |= {key: [_untagged(stage) for stage in data[key]] for key in LISTS}
+        data |= {key: [_untagged(stage) for stage in data[key]] for key in STAGE_LISTS}
         return data if data["plugins"] else {key: value for key, value in data.items() if key != "plugins"}
 
     def text(self) -> str:
-        """The resolved file."""
+        """Return the text of the resolved file."""
         stream = io.StringIO()
         yaml = YAML(typ="safe")
         yaml.default_flow_style = None
@@ -63,7 +63,7 @@ class Pipeline:
 
 
 def prepared_folder(out: Path) -> Path:
-    """Where results of `prepare:` lie: beside the run folder, for all runs there."""
+    """Return the folder for results of `prepare:`: beside the run folder, for all runs there."""
     return out.absolute().parent / "prepared"
 
 
@@ -77,7 +77,7 @@ def load(name: str, overrides: list[str] | None = None) -> Pipeline:
 
 
 def checked(path: Path, document: Document, overrides: Sequence[str] = ()) -> Pipeline:
-    """Check what was read from a pipeline file; the document stays as it is.  Raises ConfigError as `load` does."""
+    """Check a document with overrides; the document stays unchanged.  Raises ConfigError as `load` does."""
     if not isinstance(document.data, dict):
         raise ConfigError(f"{path}:1: expected keys such as name and stages")
     tagged = _tagged_file(document, path)
@@ -104,7 +104,7 @@ def _validated(data: dict[str, Any], path: Path, document: Document) -> Pipeline
 
 
 def _blame(data: dict[str, Any], overrides: Sequence[str], path: Path, document: Document) -> None:
-    """Raise the error of the file alone, else that of the first override which does not fit."""
+    """Raise the error of the file without overrides, or else that of the first invalid override."""
     known = [key.place for key in settable(_validated(data, path, document))]
     for override in overrides:
         names, _ = split(override)
@@ -123,9 +123,9 @@ def _blame(data: dict[str, Any], overrides: Sequence[str], path: Path, document:
 
 
 def _tagged_file(document: Document, path: Path) -> dict[str, Any]:
-    """The file's data with each stage as {stage: name, …}, which is how the models tell them apart."""
+    """The file's data with each stage as {stage: name, …}, from which the models are chosen."""
     data = dict(document.data)
-    for key in LISTS:
+    for key in STAGE_LISTS:
         if isinstance(data.get(key), list):
             data[key] = [_tagged(item, (key, i), document, path) for i, item in enumerate(data[key])]
     return data
@@ -156,7 +156,7 @@ def _untagged(stage: dict[str, Any]) -> dict[str, Any]:
 
 
 def _check_order(path: Path, settings: PipelineFile) -> None:
-    """Every stage finds what it needs made before it."""
+    """Raise ConfigError where a stage needs a part of the run that no earlier stage makes."""
     made = {"scene"}
     for i, stage in enumerate(settings.stages):
         if isinstance(stage, Scheduled) and stage.every is not None:

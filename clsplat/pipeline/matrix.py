@@ -5,10 +5,10 @@
       pipelines: [splat_7k, my_variant.yaml]   # without these: the stages of this file
       scenes: [data/lego, data/garden]
       seeds: [0, 1, 2]
-      set:                                     # each key is swept over its list
+      set:                                     # each key takes every value of its list
         densify.every: [100, 200]
 
-Each cell runs in its own folder below the run folder, named after its place on every axis.
+Each cell runs in its own folder below the run folder; its name holds its value on every axis.
 """
 
 import itertools
@@ -34,7 +34,7 @@ MAX_CELLS = 1000
 
 
 class Matrix(Settings):
-    """The axes; every one that is listed is part of the cells' names."""
+    """The axes; the names of cells hold the values of all axes in the file."""
 
     pipelines: list[str] = Field([])
     """Pipeline files, or names of shipped pipelines; without them, the stages of this file."""
@@ -57,10 +57,12 @@ class Matrix(Settings):
 
 
 class MatrixFile(Settings):
-    """The keys of a file with `matrix:`; those of a pipeline stand beside them when the matrix names no pipelines."""
+    """The keys of a file with `matrix:`; without `matrix.pipelines` the file has those of a pipeline too."""
 
     name: Name
+    """Name of the matrix, and of its run folder."""
     matrix: Matrix
+    """The axes."""
 
 
 @dataclass(frozen=True)
@@ -109,7 +111,7 @@ def load_experiment(name: str, overrides: Sequence[str] = ()) -> Experiment | No
     _check_overrides(path, axes, overrides)
     bases = _bases(path, document, file.matrix)
     if (count := len(bases) * math.prod(len(axis) for axis in axes)) > MAX_CELLS:
-        raise ConfigError(f"{path}: the matrix has {count} cells; at most {MAX_CELLS} are run; list fewer values")
+        raise ConfigError(f"{path}: the matrix has {count} cells; the limit is {MAX_CELLS}: list fewer values")
     for base in bases:
         _check_choices(path, document, base, axes, overrides)
     cells = [_cell(base, choices, overrides) for base in bases for choices in itertools.product(*axes)]
@@ -119,7 +121,7 @@ def load_experiment(name: str, overrides: Sequence[str] = ()) -> Experiment | No
 
 @dataclass(frozen=True)
 class _Base:
-    """The pipeline that cells start from."""
+    """The pipeline of some cells, before their settings."""
 
     label: str  # "" when it is the file with the matrix
     path: Path

@@ -1,8 +1,8 @@
 """`--set place=value`: changes to a pipeline file's data before it is checked.
 
-optimize.steps=500              a stage goes by its name, one inside `during` as well where no other has that name
-optimize.losses.0.weight=0.5    items of a list go by their number, from 0; losses[0] is the same
-stages.1.steps=500              stages that share a name go by their number, too
+optimize.steps=500              a stage by its name, also one inside `during` if its name is unique
+optimize.losses.0.weight=0.5    an item of a list by its number, from 0; losses[0] is the same
+stages.1.steps=500              a stage by its number, where several have the same name
 """
 
 import difflib
@@ -60,7 +60,7 @@ def apply(data: dict[str, Any], text: str, root: type[BaseModel]) -> Place:
 
 
 class _Node:
-    """A dict or list of the data, what its annotation is, and its place in the file."""
+    """A dict or list of the data, with its annotation and its place in the file."""
 
     def __init__(self, data: Any, annotation: Any, place: Place) -> None:
         self.data = data
@@ -69,7 +69,7 @@ class _Node:
         self.inside = inside_list(annotation) if isinstance(data, list) else None
 
     def child(self, name: str, text: str) -> "_Node":
-        """What lies below; a key that has a default is made from it.  Raises OverrideError."""
+        """Return the node of a key; a missing key is made from its default.  Raises OverrideError."""
         if isinstance(self.data, list):
             return self._item(self.number(name, text))
         if not isinstance(self.data, dict):
@@ -84,7 +84,7 @@ class _Node:
         return self._key(name)
 
     def number(self, name: str, text: str) -> int:
-        """The index that a name is.  Raises OverrideError."""
+        """Return the index that a name holds.  Raises OverrideError."""
         if re.fullmatch(r"[0-9]{1,9}", name) and int(name) < len(self.data):
             return int(name)
         count = len(self.data)
@@ -122,18 +122,18 @@ class _Node:
 
 
 def _as_written(default: BaseModel) -> dict[str, Any]:
-    """A default as a file would have it: its tag, and what is not a default of its own."""
+    """A default as in a file: its tag, and the keys that differ from their own defaults."""
     written = default.model_dump(mode="json", exclude_defaults=True)
     return {**{name: getattr(default, name) for name in TAGS if hasattr(default, name)}, **written}
 
 
 def _address(place: Place) -> str:
-    """A stage's place without the names of stages, which stand beside their numbers."""
+    """A stage's place with numbers alone, without the names of stages."""
     return ".".join(str(part) for i, part in enumerate(place) if not (i and isinstance(place[i - 1], int)))
 
 
 def suggestion(names: Sequence[str], known: Sequence[str]) -> str:
-    """Return '; did you mean …?' with those of the known places that end as `names` does, or resemble it; or ''."""
+    """Return '; did you mean …?' with the known places that end with `names` or are similar; '' without any."""
     place = ".".join(names)
     near = [one for one in known if one.endswith(f".{place}")]
     near = near or difflib.get_close_matches(place, known, n=1)

@@ -1,4 +1,4 @@
-"""What the shipped pipelines, and others, say of themselves; copies of them to start from."""
+"""Summaries and keys of pipelines, and copies of them."""
 
 import re
 from dataclasses import asdict
@@ -61,10 +61,10 @@ def manual_text(found: dict[str, Any]) -> str:
 
 
 def copy(name: str, file: Path) -> Path:
-    """Copy a pipeline to a file, or into a folder; return the copy.  Raises ConfigError where one is there already."""
+    """Copy a pipeline to a file, or into a folder; return the copy.  Raises ConfigError when the copy exists."""
     source = find(name)
     target = file / source.name if file.is_dir() else file
     if target.exists():
-        raise ConfigError(f"{target}: exists already and is not overwritten; give another name")
+        raise ConfigError(f"{target}: exists and is not overwritten; give another name")
     write_text(target, source.read_text(encoding="utf-8"))
     return target

@@ -1,7 +1,7 @@
-"""Keys of pipeline files that had another name: old names are read for one more release, with a warning.
+"""Old names of keys in pipeline files, which are read for one more release, with a warning.
 
-`scene.sampling` is `optimize.views.order` now, a rule's `after` is `start`, a decay's `start` and `stop` are `initial`
-and `final`.
+The new names: `scene.sampling` is `optimize.views.order`, a rule's `after` is `start`, a decay's `start` and `stop` are
+`initial` and `final`.
 """
 
 import logging
@@ -65,4 +65,4 @@ def _densify(stage: Any, where: str) -> Any:
 @cache  # once for a file, however many cells of a matrix it serves
 def _warn(where: str, old: str, new: str) -> None:
     if where:
-        LOG.warning("%s: '%s' has a new name, '%s'; the old one goes with the next release", where, old, new)
+        LOG.warning("%s: '%s' has a new name, '%s'; the next release removes the old one", where, old, new)

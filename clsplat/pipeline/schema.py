@@ -21,7 +21,7 @@ def json_schema() -> dict[str, Any]:
     matrix = Matrix.model_json_schema()
     definitions |= {**matrix.pop("$defs", {}), "Matrix": matrix}
     schema["properties"]["matrix"] = {"$ref": "#/$defs/Matrix"}
-    schema["required"].remove("stages")  # a matrix can name pipelines, and then stands alone
+    schema["required"].remove("stages")  # not required beside a matrix that names pipelines
     schema["anyOf"] = [
         {"required": ["stages"]},
         {"required": ["matrix"], "properties": {"matrix": {"required": ["pipelines"]}}},

@@ -1,4 +1,4 @@
-"""The keys of a pipeline that `--set` can change, in the form it takes."""
+"""The keys of a pipeline that `--set` can change, in the notation of `--set`."""
 
 import json
 from collections.abc import Iterator
@@ -17,13 +17,13 @@ CADENCE = ("every", "start", "stop")  # keys of stages inside `during` only
 class Key:
     """One setting."""
 
-    place: str  # as --set takes it, such as optimize.losses.0.weight
+    place: str  # in the notation of --set, such as optimize.losses.0.weight
     value: Any  # plain data
     description: str
 
     @property
     def text(self) -> str:
-        """'place=value', as --set takes it."""
+        """'place=value', in the notation of --set."""
         return f"{self.place}={value_text(self.value)}"
 
 
@@ -82,7 +82,7 @@ def _stages(model: BaseModel) -> Iterator[tuple[str, Any]]:
 
 
 def value_text(value: Any) -> str:
-    """Return a value as --set takes it, with as few quotes as it needs."""
+    """Return a value in the notation of --set, with as few quotes as possible."""
     text = f"[{','.join(map(value_text, value))}]" if isinstance(value, list) else str(value)
     try:
         return text if parse_value(text) == value and not isinstance(value, bool) else json.dumps(value)

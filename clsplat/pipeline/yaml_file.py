@@ -1,4 +1,4 @@
-"""Reading YAML as plain data, with the line of every value; nothing in a file can run code.
+"""Read YAML as plain data, with the line of every value; a file cannot run code.
 
 Allowed are text, numbers, true, false, null, lists, and maps whose keys are text.  Anchors, aliases and merge keys
 (`<<`) work; every other tag is an error.
@@ -16,12 +16,12 @@ from ruamel.yaml.reader import ReaderError
 from clsplat.errors import ConfigError, shortened
 
 SIZE_LIMIT = 1 << 20  # bytes
-NODE_LIMIT = 20_000  # values after aliases are expanded: a file of aliases to aliases cannot fill the memory
+NODE_LIMIT = 20_000  # values after aliases are expanded, so that aliases to aliases cannot fill the memory
 CORE = "tag:yaml.org,2002:"
 MERGE = f"{CORE}merge"
-SCALARS = tuple(CORE + name for name in ("null", "bool", "int", "float", "str"))
-PLAIN = (bool, int, float, str)  # what scalars become; ruamel's own kinds remember how they were written
-TEXT = tuple(CORE + name for name in ("timestamp", "value"))  # dates and `=` are text
+SCALAR_TAGS = tuple(CORE + name for name in ("null", "bool", "int", "float", "str"))
+PLAIN_TYPES = (bool, int, float, str)  # of scalars; ruamel's subclasses also hold the notation
+TEXT_TAGS = tuple(CORE + name for name in ("timestamp", "value"))  # dates and `=` are text
 Place = tuple[str | int, ...]
 
 
@@ -33,7 +33,7 @@ class Document:
     lines: dict[Place, int] = field(default_factory=dict)
 
     def line(self, place: Place) -> int:
-        """The line of a value, or of the nearest thing around it."""
+        """Return the line of a value, or of the innermost list or map around it."""
         while place and place not in self.lines:
             place = place[:-1]
         return self.lines.get(place, 1)
@@ -64,9 +64,9 @@ def read_yaml(path: Path) -> Document:
 
 
 def parse_value(text: str) -> Any:
-    """Read one value as a file would: numbers, true, false, null, [lists], {maps} or text.
+    """Read one value in the notation of files: numbers, true, false, null, [lists], {maps} or text.
 
-    Raises ConfigError that says what is wrong with it.
+    Raises ConfigError.
     """
     return _parse(text, "").data
 
@@ -111,9 +111,9 @@ class _Reader:
         if isinstance(node, SequenceNode) and node.tag == f"{CORE}seq":
             self._lines |= {(*place, i): item.start_mark.line + 1 for i, item in enumerate(node.value)}
             return [self._plain(item, (*place, i)) for i, item in enumerate(node.value)]
-        if isinstance(node, ScalarNode) and node.tag in TEXT:
+        if isinstance(node, ScalarNode) and node.tag in TEXT_TAGS:
             return str(node.value)
-        if isinstance(node, ScalarNode) and node.tag in SCALARS:
+        if isinstance(node, ScalarNode) and node.tag in SCALAR_TAGS:
             return self._scalar(node)
         tag = str(node.tag).replace(CORE, "!!")
         raise _NotPlain(node, f"the tag {tag} is not allowed; expected text, a number, a list or keys and values")
@@ -155,4 +155,4 @@ class _Reader:
         except (ValueError, KeyError, IndexError):
             kind = str(node.tag).removeprefix(CORE)
             raise _NotPlain(node, f"'{shortened(node.value, 40)}' cannot be read as {kind}") from None
-        return next((plain(value) for plain in PLAIN if isinstance(value, plain)), None)
+        return next((plain(value) for plain in PLAIN_TYPES if isinstance(value, plain)), None)

@@ -1,1 +1,1 @@
-"""From a folder of photographs to a scene: steps whose results are kept."""
+"""From a folder of photographs to a scene, in steps whose results are kept."""

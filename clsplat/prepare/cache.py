@@ -1,4 +1,4 @@
-"""Doing the steps of `prepare:` once: a result lies in a folder named by the hash of all that it depends on."""
+"""Run each step of `prepare:` once: its result lies in a folder whose name is the hash of everything it depends on."""
 
 import hashlib
 import json
@@ -22,22 +22,22 @@ NOTE = "prepared.json"  # in the run folder
 
 @dataclass(frozen=True)
 class Planned:
-    """A step and where its result lies, or will."""
+    """A step and the folder of its result."""
 
     step: Step
-    origin: str  # the folder of photographs that the first step reads
-    inputs: str  # hash of what it reads
+    origin: str  # folder of the photographs, which the first step reads
+    inputs: str  # hash of its inputs
     folder: Path
-    why: str  # it must be done; "" when it is
+    why: str  # reason to run the step; "" when its result exists
 
     @property
     def key(self) -> str:
-        """Hash of all that the result depends on."""
+        """Hash of everything that the result depends on."""
         return _digest([self.step.stage, self.step.version, self.step.model_dump(mode="json"), self.inputs])
 
 
 def plan(steps: Sequence[Step], source: Path, root: Path) -> list[Planned]:
-    """Return which steps must be done for the photographs in `source`, and why; results lie below `root`.
+    """Return the steps for the photographs in `source`, with the reasons to run them; results lie below `root`.
 
     Raises DataError when the photographs cannot be read.
     """
@@ -49,22 +49,24 @@ def plan(steps: Sequence[Step], source: Path, root: Path) -> list[Planned]:
         planned.append(Planned(step, str(source.resolve()), inputs, folder, _why(step, inputs, folder, source)))
         inputs = key
     done = max((i for i, one in enumerate(planned) if not one.why), default=-1)
-    return [replace(one, why="") if i < done else one for i, one in enumerate(planned)]  # on the way to what is done
+    return [
+        replace(one, why="") if i < done else one for i, one in enumerate(planned)
+    ]  # not needed: a later result exists
 
 
 def prepare(planned: Sequence[Planned], source: Path, root: Path) -> Path:
-    """Do what must be done and return the last result.  Raises what the steps raise, and leaves nothing half-made."""
+    """Run the steps that have a reason and return the last result.  Raises the errors of the steps."""
     for one in planned:
         if one.why:
             _do(one, source, root)
         else:
-            LOG.info("%s: done before, in %s", one.step.stage, one.folder)
+            LOG.info("%s: exists in %s", one.step.stage, one.folder)
         source = one.folder
     return source
 
 
 def fingerprint(folder: Path, without: Path) -> str:
-    """A hash of the names and contents of all files below a folder, hidden ones and those below `without` left out.
+    """Return a hash of names and contents of all files below a folder, without hidden ones and those below `without`.
 
     Raises DataError when there is no such folder, or a file in it cannot be read.
     """
@@ -86,12 +88,12 @@ def fingerprint(folder: Path, without: Path) -> str:
 
 
 def note(planned: Sequence[Planned]) -> dict[str, str]:
-    """What a run folder keeps of its photographs: the hash of all that they depend on, and their folder."""
+    """Return the note for a run folder: the hash of the prepared photographs, and their folder."""
     return {"inputs": planned[-1].key, "folder": str(planned[-1].folder)}
 
 
 def noted(out: Path) -> dict[str, str] | None:
-    """The note of a run folder, where there is one."""
+    """Return the note of a run folder, or None."""
     try:
         text = json.loads((out / NOTE).read_text())
         return {"inputs": str(text["inputs"]), "folder": str(text["folder"])}
@@ -104,7 +106,7 @@ def _same(path: Path, other: Path) -> bool:
 
 
 def _do(one: Planned, source: Path, root: Path) -> None:
-    """Make a result in a hidden folder beside its place, and rename it when it is whole."""
+    """Make a result in a hidden folder beside its own, and rename it when it is complete."""
     temporary = one.folder.with_name(f".{one.folder.name}")
     LOG.info("%s: %s", one.step.stage, one.why)
     start = time.perf_counter()
@@ -126,7 +128,7 @@ def _do(one: Planned, source: Path, root: Path) -> None:
 
 
 def _why(step: Step, inputs: str, folder: Path, source: Path) -> str:
-    """Why there is no result, if there is none: what differs from the newest one of the same photographs."""
+    """The reason to run a step, "" when its result exists: the difference from the newest result."""
     if (folder / RECORD).is_file():
         return ""
     found = []
@@ -138,12 +140,12 @@ def _why(step: Step, inputs: str, folder: Path, source: Path) -> str:
         if record.get("origin") == str(source.resolve()):
             found.append((path.stat().st_mtime, record))
     if not found:
-        return "not done yet"
+        return "no result yet"
     before = max(found, key=lambda pair: pair[0])[1]
     for name, value in step.model_dump(mode="json").items():
         if before["settings"].get(name) != value:
             return f"{name} is {value}, was {before['settings'].get(name)}"
-    return "what it reads has changed" if before["inputs"] != inputs else "the step itself has changed"
+    return "its input has changed" if before["inputs"] != inputs else "the step itself has changed"
 
 
 def _digest(data: Any) -> str:

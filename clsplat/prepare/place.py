@@ -1,4 +1,4 @@
-"""A COLMAP folder from photographs, without a pipeline: what `clsplat data photos` does."""
+"""Make a COLMAP folder from photographs, without a pipeline: the command `clsplat data photos`."""
 
 import json
 import shutil
@@ -11,7 +11,7 @@ from clsplat.prepare.steps import FindFeatures, MapCameras, MatchFeatures, Step
 from data_tools.gather import link
 from data_tools.photos import IMAGES, CameraModel, Mapper, Matching
 
-STEPS = ".steps"  # in the folder of the scene: what a run that was killed goes on from
+STEPS = ".steps"  # in the folder of the scene: results from which an interrupted call continues
 
 
 def place_photographs(
@@ -24,7 +24,7 @@ def place_photographs(
 ) -> int:
     """Find the cameras of the photographs in `source`, write a COLMAP folder `out`; return the number of its images.
 
-    Raises DataError when `out` holds a model, or images of another origin, and what the steps raise.
+    Raises DataError when `out` holds a model or images of another origin, and the errors of the steps.
     """
     images, sparse = out / IMAGES, out / "sparse"
     if sparse.exists():

@@ -1,4 +1,4 @@
-"""The steps that a pipeline's `prepare:` can name.  Each makes a folder from a folder, on the host."""
+"""The steps of `prepare:` in pipeline files.  Each makes a folder from a folder, on the host."""
 
 from abc import abstractmethod
 from pathlib import Path
@@ -16,20 +16,20 @@ Count = Annotated[int, Field(gt=0)]
 
 
 class Step(Settings):
-    """Makes a folder from a folder.  Its result is known by its inputs, its settings and `version`."""
+    """A step from a folder to a folder.  Inputs, settings and `version` identify its result."""
 
-    version: ClassVar[int] = 1  # changes with what the step does
+    version: ClassVar[int] = 1  # increase it when the result changes
 
     stage: str
     """Name of the step."""
 
     @abstractmethod
     def make(self, source: Path, out: Path, without: Path) -> dict[str, Any]:
-        """Fill the empty folder `out` from `source`, without looking below `without`; return figures for the log."""
+        """Fill the empty folder `out` from `source`, without reading below `without`; return figures for the log."""
 
 
 class FindFeatures(Step):
-    """SIFT features of photographs."""
+    """Find SIFT features of photographs."""
 
     stage: Literal["find_features"] = "find_features"
 
@@ -45,7 +45,7 @@ class FindFeatures(Step):
     def make(self, source: Path, out: Path, without: Path) -> dict[str, Any]:
         if holds_scene(source):
             raise DataError(
-                f"{source}: has its cameras already; train it with a pipeline without `prepare`, such as splat_7k, "
+                f"{source}: holds cameras already; train it with a pipeline without `prepare`, such as splat_7k, "
                 "or give the folder of the photographs alone"
             )
         return find_features(
@@ -54,7 +54,7 @@ class FindFeatures(Step):
 
 
 class MatchFeatures(Step):
-    """Which features of two photographs are the same point."""
+    """Match features between pairs of photographs."""
 
     stage: Literal["match_features"] = "match_features"
 
@@ -68,7 +68,7 @@ class MatchFeatures(Step):
 
 
 class MapCameras(Step):
-    """Cameras and points from matches."""
+    """Find cameras and points from matches."""
 
     stage: Literal["map_cameras"] = "map_cameras"
 
@@ -82,7 +82,7 @@ class MapCameras(Step):
 
 
 class Undistort(Step):
-    """Photographs as a pinhole camera would have taken them, at the size to train on."""
+    """Undistort photographs, as of a pinhole camera, at the training size."""
 
     stage: Literal["undistort"] = "undistort"
 

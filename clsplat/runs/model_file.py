@@ -16,8 +16,8 @@ from clsplat.gaussians.model import MODEL, load
 from clsplat.metrics.lpips import InputRange
 from clsplat.metrics.perceptual import Perceptual, metric_names
 from clsplat.metrics.views import PSNR_AND_SSIM, mean, measure, render_view
-from clsplat.opencl.choice import choose
 from clsplat.opencl.device import Device
+from clsplat.opencl.discovery import choose
 from clsplat.pipeline.file import SceneSettings
 from clsplat.pipeline.loading import load as load_pipeline
 from clsplat.prepare.cache import noted

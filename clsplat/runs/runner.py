@@ -1,4 +1,4 @@
-"""Running a pipeline: the run folder, the device, the scene, the stages in order, and what is left behind."""
+"""Run a pipeline: the run folder, the device, the scene, the stages in order, and the output files."""
 
 import json
 import logging
@@ -11,8 +11,8 @@ from typing import Any
 
 from clsplat.errors import ConfigError, Interrupted, OutputError, as_clsplat_error, one_line
 from clsplat.files import unwritable, write_text
-from clsplat.opencl.choice import choose
 from clsplat.opencl.device import Device
+from clsplat.opencl.discovery import choose
 from clsplat.pipeline.loading import Pipeline, load, prepared_folder
 from clsplat.prepare.cache import NOTE, Planned, note, noted, prepare
 from clsplat.render.rasterizer import Rasterizer
@@ -32,7 +32,7 @@ LOG = logging.getLogger("clsplat")
 def make_run_folder(out: Path, resume: bool) -> None:
     """Make the run folder.  Raises ConfigError when it holds another run, OutputError when it cannot be written."""
     if (out / "pipeline.yaml").exists() and not resume:
-        raise ConfigError(f"{out}: already holds a run; --resume goes on with it, or give another --out")
+        raise ConfigError(f"{out}: already holds a run; --resume continues it, or give another --out")
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -51,7 +51,7 @@ def failures_recorded(out: Path, step: Callable[[], int] | None = None) -> Itera
     except BaseException as error:
         failure = as_clsplat_error(error)
         state = "interrupted" if isinstance(failure, Interrupted) else "failed"
-        with suppress(OutputError):  # the failure itself is what the user must see
+        with suppress(OutputError):  # the failure itself is more important
             at = step() if step else int(read_status(out).get("step", 0))
             Records(out).status(state, at, exit_code=failure.exit_code, message=one_line(failure))
         if failure is error:
@@ -60,7 +60,7 @@ def failures_recorded(out: Path, step: Callable[[], int] | None = None) -> Itera
 
 
 def read_status(out: Path) -> dict[str, Any]:
-    """Return what status.json holds; an empty dict where it is missing or damaged."""
+    """Return the contents of status.json; an empty dict when it is missing or damaged."""
     try:
         status = json.loads((out / "status.json").read_text())
     except (OSError, ValueError):
@@ -69,7 +69,7 @@ def read_status(out: Path) -> dict[str, Any]:
 
 
 def free_folder(folder: Path, pipeline: Pipeline | None, resume: bool) -> Path:
-    """Return the default run folder: the next free number, unless an earlier run is resumed or is this very run."""
+    """Return the default run folder: with the next free number, unless a run is resumed or up to date."""
     number, free = 1, folder
     planned = pipeline.preparation(folder) if pipeline else []
     while (free / "pipeline.yaml").exists() and not resume and not (pipeline and up_to_date(pipeline, planned, free)):
@@ -88,7 +88,7 @@ def up_to_date(pipeline: Pipeline, planned: Sequence[Planned], out: Path) -> boo
 
 
 def open_run(pipeline: Pipeline, out: Path, device_name: str | None) -> Run:
-    """Choose the device, prepare and read the scene.  Raises what they raise."""
+    """Choose the device, prepare and read the scene.  Raises the errors of these steps."""
     settings = pipeline.settings
     for stage in pipeline.stages:
         stage.check()
@@ -96,7 +96,9 @@ def open_run(pipeline: Pipeline, out: Path, device_name: str | None) -> Run:
     LOG.info("device: %s", device.text)
     planned = pipeline.preparation(out)
     if planned and noted(out) not in (None, note(planned)):
-        raise ConfigError(f"{out}: began with other photographs, or other settings to prepare them; give another --out")
+        raise ConfigError(
+            f"{out}: was started with other photographs, or other settings of `prepare`; give another --out"
+        )
     folder = prepare(planned, settings.scene.folder, prepared_folder(out))
     run = make_run(pipeline, read_scene(folder, settings.scene.holdout), device, out)
     run.prepared = note(planned) if planned else None
@@ -104,10 +106,10 @@ def open_run(pipeline: Pipeline, out: Path, device_name: str | None) -> Run:
 
 
 def make_run(pipeline: Pipeline, scene: Scene, device: Device, out: Path) -> Run:
-    """Return a run of the pipeline on a scene as it was read, before its first stage."""
+    """Return a run of the pipeline on a scene, before its first stage."""
     settings = pipeline.settings
     original, background = settings.scene.applied(scene)
-    trained, budget = original.downscaled(*settings.scene.scales), settings.scene.image_budget
+    trained, budget = original.downscaled(*settings.scene.downscales), settings.scene.image_budget
     camera = trained.views[0].camera
     LOG.info(
         "scene: %s, %d training and %d test views, %d x %d px, %s background, extent %.3g",
@@ -128,7 +130,7 @@ def make_run(pipeline: Pipeline, scene: Scene, device: Device, out: Path) -> Run
 
 
 def execute(pipeline: Pipeline, run: Run, resume: bool, show: Callable[[Progress], None]) -> None:
-    """Run the stages, from the newest checkpoint when resuming, and write what the run folder promises."""
+    """Run the stages, from the newest checkpoint with `resume`, and write the files of the run folder."""
     run.show = show
     begin(pipeline, run, resume)
     with failures_recorded(run.out, lambda: run.step):
@@ -159,7 +161,7 @@ def _run_stages(pipeline: Pipeline, run: Run) -> None:
         stage.run(run)
         if run.interrupted:
             path = checkpoint.save(run, keep=2)
-            raise Interrupted(f"stopped after {stage.stage}, saved in {path}; --resume goes on from there")
+            raise Interrupted(f"stopped after {stage.stage}, saved in {path}; --resume continues from there")
 
 
 @contextmanager
@@ -185,7 +187,7 @@ def stopping_on_signals(stop: Callable[[], None]) -> Iterator[None]:
 
 @contextmanager
 def _finishing_on_interrupt(run: Run) -> Iterator[None]:
-    """A signal lets the step finish and the state be saved; a second one stops at once."""
+    """Finish the step and save the state at the first signal; stop at once at the second."""
 
     def finish() -> None:
         if run.interrupted:
@@ -213,16 +215,16 @@ def _write_metrics(run: Run) -> None:
 
 def _check_outputs(pipeline: Pipeline, run: Run) -> None:
     """Raise OutputError where a declared file is missing."""
-    promised = ["metrics.json", "pipeline.yaml"]
-    promised += [stage.file for stage in pipeline.stages if isinstance(stage, Export)]
-    for name in promised:
+    outputs = ["metrics.json", "pipeline.yaml"]
+    outputs += [stage.file for stage in pipeline.stages if isinstance(stage, Export)]
+    for name in outputs:
         path = run.out / name
         if not path.is_file() or path.stat().st_size == 0:
             raise OutputError(f"{path}: is missing or empty at the end of the run; see {run.out / 'log.txt'}")
 
 
 def describe(pipeline: Pipeline, out: Path, device: str | None) -> str:
-    """What a run in `out` would do, a line for each stage.  Raises what open_run raises, once photographs are ready."""
+    """Return a line for each stage of a run in `out`.  Raises the errors of open_run when nothing must be prepared."""
     planned = pipeline.preparation(out)
     if planned and up_to_date(pipeline, planned, out):
         return f"{out}: up to date"
@@ -235,7 +237,7 @@ def describe(pipeline: Pipeline, out: Path, device: str | None) -> str:
             detail = f"{stage.steps} steps; " + ", ".join(cadences)
         elif isinstance(stage, Evaluate) and run:
             views = run.original.downscaled(run.downscale).split(stage.split)
-            scales = ", ".join(f"1/{scale:g}" for scale in stage.scales or [run.downscale])
-            detail = f"{len(views)} {stage.split} views at {scales}"
+            sizes = ", ".join(f"1/{downscale:g}" for downscale in stage.scales or [run.downscale])
+            detail = f"{len(views)} {stage.split} views at {sizes}"
         lines.append(f"  {stage.stage:<14} {detail}".rstrip())
     return f"would run in {out}:\n" + "\n".join(lines)

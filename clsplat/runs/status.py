@@ -1,4 +1,4 @@
-"""How far a run is, or the runs of a matrix, from the files of its folder alone."""
+"""The state of a run, or of a matrix, from the files of its folder alone."""
 
 import json
 import os
@@ -9,7 +9,7 @@ from clsplat.errors import DataError
 from clsplat.runs.runner import read_status
 from clsplat.training.records import Records
 
-ENDED = ("done", "failed", "interrupted")
+END_STATES = ("done", "failed", "interrupted")
 
 
 def run_status(out: Path) -> dict[str, Any]:
@@ -21,7 +21,7 @@ def run_status(out: Path) -> dict[str, Any]:
     status = read_status(out)
     if not isinstance(status.get("state"), str):
         raise DataError(f"{out}: has no readable status.json; expected the folder of a run")
-    if status["state"] not in ENDED and not _alive(status.get("process")):
+    if status["state"] not in END_STATES and not _alive(status.get("process")):
         status["state"] = "killed"
     try:
         metrics = json.loads((out / "metrics.json").read_text())
@@ -70,7 +70,7 @@ def _figures(values: dict[str, Any], names: tuple[str, ...]) -> str:
 
 
 def _alive(process: Any) -> bool:
-    """Whether a process runs on this machine; True where that cannot be said."""
+    """Whether a process runs on this machine; True when that is not known."""
     if not isinstance(process, int) or process <= 0:
         return True
     try:

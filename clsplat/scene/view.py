@@ -73,12 +73,14 @@ class View:
             return self
         return replace(self, camera=self.camera.downscaled(downscale / self.downscale), downscale=downscale)
 
-    def photograph(self, background: tuple[float, float, float] | Floats = BLACK) -> NDArray[np.float32]:
-        """Return the photograph at the camera's size, [height, width, 3] in [0, 1]; alpha is blended with `background`.
+    def photograph(self, background: ArrayLike = 0.0) -> NDArray[np.float32]:
+        """Return the photograph at the camera's size, [height, width, 3] in [0, 1].
 
-        Raises DataError when the file cannot be read or is not the camera's image.
+        background: behind what is transparent, one number or three in [0, 1]; that of a picture is
+        `picture.background`.  Raises DataError when the file cannot be read or is not the camera's image.
         """
-        return np.asarray(load_image(self, background) / np.float32(255), np.float32)
+        red, green, blue = np.broadcast_to(np.asarray(background, np.float64), (3,)).tolist()
+        return np.asarray(load_image(self, (red, green, blue)) / np.float32(255), np.float32)
 
 
 def load_image(view: View, background: tuple[float, float, float] | Floats = BLACK) -> NDArray[np.uint8]:

@@ -1,6 +1,6 @@
-"""The stages that a pipeline file can name.  Each module adds its own."""
+"""The stages of pipeline files.  Each module defines stages."""
 
 from clsplat.settings import import_modules, rebuild
 
 import_modules(__name__, __path__)
-rebuild()  # `optimize.during` knows every stage
+rebuild()  # `optimize.during` now accepts every stage

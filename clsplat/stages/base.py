@@ -1,4 +1,4 @@
-"""What every stage is: settings, what it needs, what it makes, and one method."""
+"""The base of all stages: settings, needed and made parts of the run, and one method."""
 
 from abc import abstractmethod
 from collections.abc import Collection
@@ -11,7 +11,7 @@ from clsplat.training.run import Run
 
 
 class Stage(Settings):
-    """One step of a pipeline.  It changes the run and returns nothing."""
+    """One stage of a pipeline.  It changes the run and returns nothing."""
 
     needs: ClassVar[frozenset[str]] = frozenset()  # parts of the run that must exist
     makes: ClassVar[frozenset[str]] = frozenset()  # parts that exist afterwards
@@ -20,11 +20,11 @@ class Stage(Settings):
     """Name of the stage."""
 
     def check(self) -> None:
-        """Raise now what would stop the stage later, such as a missing file."""
+        """Raise errors that do not depend on the run, such as a missing file, before the run starts."""
 
     @abstractmethod
     def run(self, run: Run) -> None:
-        """Do it."""
+        """Run the stage."""
 
 
 class Scheduled(Stage):
@@ -33,7 +33,7 @@ class Scheduled(Stage):
     It runs at every step that is a multiple of `every`, after `start` and before `stop`.
     """
 
-    edits: ClassVar[bool] = False  # changes the model: acts between a step and the next
+    edits: ClassVar[bool] = False  # changes the model; acts between two steps
 
     every: Annotated[int, Field(gt=0)] | None = None
     """Steps from one run of the stage to the next; inside `during` only."""
@@ -43,11 +43,11 @@ class Scheduled(Stage):
     """Global step before which the stage runs."""
 
     def due(self, step: int) -> bool:
-        """Whether the stage runs at a global step, counted from 1."""
+        """Return whether the stage runs at a global step, counted from 1."""
         if self.every is None or step % self.every != 0:
             return False
         return step > self.start and (self.stop is None or step < self.stop)
 
     def stale(self, run: Run) -> Collection[str]:
-        """Parameters whose gradients the edit makes meaningless."""
+        """Return the parameters whose gradients the edit makes invalid."""
         return ()

@@ -1,4 +1,4 @@
-"""Saving the run."""
+"""Save the run at a cadence."""
 
 from typing import Annotated, ClassVar, Literal
 
@@ -10,13 +10,13 @@ from clsplat.training.run import Run
 
 
 class Checkpoint(Scheduled):
-    """Write everything that the run needs to go on to the same bits."""
+    """Write everything that a resumed run needs to reach the same bits."""
 
     stage: Literal["checkpoint"] = "checkpoint"
     needs: ClassVar[frozenset[str]] = frozenset({"model"})
 
     keep: Annotated[int, Field(gt=0)] = 2
-    """Number of the newest checkpoints that stay."""
+    """Number of checkpoints that are kept, the newest ones."""
 
     def run(self, run: Run) -> None:
         checkpoint.save(run, self.keep)

@@ -1,4 +1,4 @@
-"""Density control on a cadence."""
+"""Density control at a cadence."""
 
 import logging
 from collections.abc import Collection
@@ -25,13 +25,13 @@ class Densify(Scheduled):
     edits: ClassVar[bool] = True
 
     rules: list[OneOf[Rule]]
-    """Which Gaussians grow or go; the first growing rule takes a Gaussian, pruning rules come before growth."""
+    """Which Gaussians grow or are removed; the first growing rule decides, pruning rules override growth."""
     max_gaussians: AtLeastOne | None = None
-    """Number at which growth stops, by step; without it, where memory ends.  Pruning goes on."""
+    """Number of Gaussians at which growth stops, by step; without it, as many as fit in memory.  Pruning continues."""
 
     @property
     def statistics(self) -> set[str]:
-        """Columns that the rules read."""
+        """Columns of statistics that the rules read."""
         return {name for rule in self.rules for name in rule.statistics}
 
     @property
@@ -52,7 +52,9 @@ class Densify(Scheduled):
         change = densify(edit, self.rules, run.rasterizer.tiler, limit)
         run.refresh_filter()
         if change.after == fits:
-            LOG.warning("step %d: growth stops at %d Gaussians, all that fit in the device's memory", run.step, fits)
+            LOG.warning(
+                "step %d: growth stops at %d Gaussians, the most that fit in the device's memory", run.step, fits
+            )
         run.records.add(run.step, "densify", **asdict(change))
         LOG.debug("step %d: %d -> %d Gaussians", run.step, change.before, change.after)
         if change.after == 0:

@@ -12,14 +12,14 @@ from clsplat.stages.base import Scheduled
 from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
-Scale = Annotated[float, Field(ge=1)]
+Downscale = Annotated[float, Field(ge=1)]
 
 
 class Evaluate(Scheduled):
     """Render the views of a split and compare them, as 8-bit images, with the photographs.
 
-    Each of `scales` divides the size of the original photographs, whatever size was trained on: a scene trained at
-    `downscale: 8` is zoomed in upon by `scales: [8, 4, 2, 1]`.
+    Each of `scales` divides the size of the original photographs, not the training size: `scales: [8, 4, 2, 1]` zooms
+    into a scene that was trained at `downscale: 8`.
     """
 
     stage: Literal["evaluate"] = "evaluate"
@@ -28,14 +28,14 @@ class Evaluate(Scheduled):
 
     split: Literal["test", "train"] = "test"
     """Views that are measured."""
-    scales: Annotated[list[Scale], Field(min_length=1)] | None = None
-    """Divisors of the photographs' size; without it, the finest that is trained on."""
+    scales: Annotated[list[Downscale], Field(min_length=1)] | None = None
+    """Divisors of the photographs' size; without it, the smallest in training."""
     metrics: list[Metric] = Field(["psnr", "ssim"])
     """Metrics beside LPIPS; psnr and ssim must be among them."""
     lpips: str | None = None
     """ONNX file of LPIPS."""
     lpips_input: InputRange = "-1..1"
-    """Values that LPIPS is given; 0..1 as in the tables of 3DGS and Mip-Splatting."""
+    """Range of the values for LPIPS; 0..1 as in the tables of 3DGS and Mip-Splatting."""
 
     @field_validator("metrics")
     @classmethod
@@ -55,16 +55,16 @@ class Evaluate(Scheduled):
             LOG.warning("no %s views: nothing to evaluate (scene.holdout chooses them)", self.split)
             return
         perceptual = self._perceptual()
-        for scale in self.scales or [run.downscale]:
-            views = run.original.downscaled(scale).split(self.split)
-            photographs = run.photographs if scale in run.scene.downscales else run.photographs.fresh()
+        for downscale in self.scales or [run.downscale]:
+            views = run.original.downscaled(downscale).split(self.split)
+            photographs = run.photographs if downscale in run.scene.downscales else run.photographs.fresh()
             results = measure(run.rasterizer, run.model, views, photographs, perceptual)
             for result in results:
-                run.records.add(run.step, "view", split=self.split, scale=scale, **result.line())
+                run.records.add(run.step, "view", split=self.split, scale=downscale, **result.line())
             averages = mean(results, perceptual)
-            run.records.add(run.step, "evaluate", split=self.split, scale=scale, **averages)
-            run.metrics.setdefault(self.split, {})[f"{scale:g}"] = averages
+            run.records.add(run.step, "evaluate", split=self.split, scale=downscale, **averages)
+            run.metrics.setdefault(self.split, {})[f"{downscale:g}"] = averages
             LOG.info(
                 "step %d  %s views at 1/%g: PSNR %.2f dB  SSIM %.4f  (%d views)",
-                *(run.step, self.split, scale, averages["psnr"], averages["ssim"], len(results)),
+                *(run.step, self.split, downscale, averages["psnr"], averages["ssim"], len(results)),
             )

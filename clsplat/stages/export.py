@@ -3,23 +3,18 @@
 import logging
 from typing import ClassVar, Literal
 
-import numpy as np
-
-from clsplat import __version__
-from clsplat.gaussians.ply import Parameters, read_ply, write_ply
-from clsplat.gaussians.tables import PARAMETERS
+from clsplat.gaussians.model import load
 from clsplat.stages.base import Scheduled
 from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
-MIN_LOGIT = -80.0  # of an opacity that the filter spreads out to nothing: as little as the kernels know
 
 
 class Export(Scheduled):
     """Write a PLY in the reference's layout and read it back.
 
-    A world filter becomes part of its scales and opacities, so that any viewer can show it; the model as it was
-    trained, with the filter as a property `filter_3D`, goes to a second file with `_raw` in its name.
+    A world filter is applied to scales and opacities, so that any viewer can show the file.  A second file, with `_raw`
+    in its name, holds the model as trained, with the filter as a property `filter_3D`.
     """
 
     stage: Literal["export"] = "export"
@@ -29,29 +24,12 @@ class Export(Scheduled):
     """Path inside the run folder."""
 
     def run(self, run: Run) -> None:
-        gaussians = run.model.gaussians
+        model = run.host_model()
         path = run.out / self.file
-        parameters = {name: gaussians.get(name) for name in (*PARAMETERS, "filter_variance")}
-        files = {path: baked(parameters)}
-        if parameters["filter_variance"].any():
-            files[path.with_name(f"{path.stem}_raw{path.suffix}")] = parameters
-        for file, tables in files.items():
-            write_ply(file, tables, {"version": __version__, **run.rendering()})
-            read_ply(file)
-            LOG.info("%d Gaussians written to %s", gaussians.count, file)
-
-
-def baked(parameters: Parameters) -> Parameters:
-    """The same Gaussians without `filter_variance`: scales and opacities as they are drawn (Yu et al. 2024, eq. 9)."""
-    tables = {name: parameters[name] for name in PARAMETERS}
-    variance = parameters["filter_variance"].astype(np.float64)
-    if variance.any():
-        scale2 = np.exp(2 * parameters["log_scales"].astype(np.float64))
-        filtered2 = scale2 + variance
-        opacity = np.sqrt(np.prod(scale2 / filtered2, axis=1, keepdims=True))
-        opacity /= 1 + np.exp(-parameters["logit_opacity"].astype(np.float64))
-        with np.errstate(divide="ignore"):
-            logit = np.log(opacity) - np.log1p(-opacity)
-        tables["log_scales"] = (0.5 * np.log(filtered2)).astype(np.float32)
-        tables["logit_opacity"] = np.maximum(logit, MIN_LOGIT).astype(np.float32)
-    return tables
+        files = {path: model.baked()}
+        if model.filter_variance is not None:
+            files[path.with_name(f"{path.stem}_raw{path.suffix}")] = model
+        for file, one in files.items():
+            one.save(file)
+            load(file)
+            LOG.info("%d Gaussians written to %s", len(one), file)

@@ -23,28 +23,28 @@ from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
 MIN_DISTANCE2 = 1.0e-7  # scene units²: coincident points still get a size
-MIN_SWEPT_POINTS = 100  # points of a sweep that are worth starting from
-RANDOM_BOX = 1.3 / 4.03  # half side of the box by camera distance: what 3DGS takes for the Blender scenes
+MIN_SWEPT_POINTS = 100  # with fewer points from a sweep, random ones are used
+RANDOM_BOX = 1.3 / 4.03  # half side of the box by camera distance: the value of 3DGS for the Blender scenes
 
 
 class Init(Stage):
     """Make Gaussians: isotropic, as large as the mean distance to the three nearest neighbours (Kerbl et al. 2023).
 
-    `source: auto` takes the scene's points where there are some; elsewhere it sweeps the photographs for surfaces, or,
-    where those are cut out (with alpha), takes random points, which fill a box around what the cameras look at.
+    `source: auto` uses the scene's points if it has points.  Without points it uses a plane sweep over the photographs,
+    or, when the photographs have alpha, random points in a box around the point that the cameras look at.
     """
 
     stage: Literal["init"] = "init"
     makes: ClassVar[frozenset[str]] = frozenset({"model"})
 
     source: Literal["auto", "points", "sweep", "random", "ply"] = "auto"
-    """Where the first Gaussians come from."""
+    """Source of the first Gaussians."""
     opacity: Annotated[float, Field(gt=0, lt=1)] = 0.1
     """Opacity of the first Gaussians."""
     count: Annotated[int, Field(gt=0)] = 100_000
     """Number of random points."""
     swept: Annotated[int, Field(gt=0)] = 20_000
-    """Largest number of points of a sweep."""
+    """Largest number of points of a plane sweep."""
     file: str | None = None
     """Model file for `source: ply`."""
 
@@ -105,7 +105,7 @@ def require_ahead(points: PointCloud, scene: Scene) -> None:
 
 
 def from_points(points: PointCloud, opacity: float, degree: int) -> Parameters:
-    """One Gaussian at each point."""
+    """Return one Gaussian for each point."""
     count = len(points)
     log_scales = 0.5 * np.log(neighbour_distance2(points.positions))
     quats = np.zeros((count, 4))
@@ -121,7 +121,7 @@ def from_points(points: PointCloud, opacity: float, degree: int) -> Parameters:
 
 
 def neighbour_distance2(positions: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Mean squared distance to the three nearest neighbours, exact, [N]."""
+    """Return the mean squared distance to the three nearest neighbours, exact, [N] scene units²."""
     neighbours = min(4, len(positions))
     if neighbours < 2:
         return np.full(len(positions), 1.0)
@@ -131,7 +131,7 @@ def neighbour_distance2(positions: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 def random_points(scene: Scene, count: int, seed: int) -> PointCloud:
-    """Grey points, uniform in a box around what the training cameras look at."""
+    """Return grey points, uniform in a box around the point that the training cameras look at."""
     views = scene.split("train")
     positions, centre = np.stack([view.position for view in views]), centre_of(views)
     half_side = RANDOM_BOX * float(np.median(np.linalg.norm(positions - centre, axis=1)))
@@ -141,20 +141,20 @@ def random_points(scene: Scene, count: int, seed: int) -> PointCloud:
 
 
 def centre_of(views: Sequence[View]) -> NDArray[np.floating]:
-    """What the cameras look at, [3]."""
+    """Return the point that the cameras look at, [3] scene units."""
     return looked_at(np.stack([v.position for v in views]), np.stack([v.world_to_camera[2, :3] for v in views]))
 
 
 def looked_at(positions: NDArray[np.floating], directions: NDArray[np.floating]) -> NDArray[np.floating]:
-    """The point nearest to all optical axes, in least squares, [3]."""
+    """Return the point nearest to all optical axes, in least squares, [3] scene units."""
     across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
     point, *_ = np.linalg.lstsq(across.sum(axis=0), np.einsum("nij,nj->i", across, positions), rcond=None)
     return np.asarray(point)
 
 
 def with_degree(parameters: Parameters, degree: int) -> Parameters:
-    """The same Gaussians with more or fewer SH bands."""
-    wanted = 3 * (sh_coefficients(degree) - 1)
-    rest = parameters["sh_rest"][:, :wanted]
-    padding = np.zeros((len(rest), wanted - rest.shape[1]), np.float32)
+    """Return the Gaussians with more or fewer SH bands."""
+    columns = 3 * (sh_coefficients(degree) - 1)
+    rest = parameters["sh_rest"][:, :columns]
+    padding = np.zeros((len(rest), columns - rest.shape[1]), np.float32)
     return {**parameters, "sh_rest": np.concatenate([rest, padding], axis=1)}

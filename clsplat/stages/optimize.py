@@ -24,16 +24,16 @@ from clsplat.training.trainer import Trainer
 from clsplat.views.sampling import Sampler, ViewSettings
 
 LOG = logging.getLogger("clsplat")
-DISTRIBUTION_EVERY = 5  # reports
+DISTRIBUTION_INTERVAL = 5  # reports
 READ_AHEAD = 4  # photographs
 
 
 class Optimize(Stage):
     """Train for a number of steps, one view each (Kerbl et al. 2023).
 
-    Stages in `during` that edit parameters act between a step and the next: stages that only look see what training has
-    settled, and nothing is edited after the last step.  As in the reference, a gradient whose parameter is about to be
-    edited is not applied.
+    Stages in `during` that edit the model act between two steps, so that other stages see the model before the edit.
+    No edit follows the last step.  As in the reference, the gradient of a parameter is not applied at the step before
+    its edit.
     """
 
     stage: Literal["optimize"] = "optimize"
@@ -45,9 +45,9 @@ class Optimize(Stage):
     rates: Rates = Rates()
     """Learning rates."""
     views: ViewSettings = ViewSettings()
-    """What each step compares with."""
+    """View, size and photograph of each step."""
     losses: list[OneOf[Loss]]
-    """What is minimised: the sum of losses and penalties."""
+    """Losses and penalties; training minimises their sum."""
     during: list[OneOf[Scheduled]] = Field([])
     """Stages that run every so many steps."""
     log_every: Annotated[int, Field(gt=0)] = 100
@@ -77,7 +77,7 @@ class Optimize(Stage):
             pass
 
     def iterate(self, run: Run) -> Iterator[ViewGradients]:
-        """Train step by step; what a step yields is valid until the next."""
+        """Train step by step; the gradients that a step yields are valid until the next."""
         trainer, sampler = self._trainer(run), Sampler(run.scene.split("train"), self.views, run.seed)
         memory, count = run.memory_plan(), run.model.gaussians.count
         LOG.info(memory.text(count))
@@ -101,12 +101,12 @@ class Optimize(Stage):
                     stage.run(run)
             if run.interrupted:
                 path = checkpoint.save(run, keep=2)
-                raise Interrupted(f"stopped at step {run.step}, saved in {path}; --resume goes on from there")
+                raise Interrupted(f"stopped at step {run.step}, saved in {path}; --resume continues from there")
             yield view
 
     @property
     def statistics(self) -> set[str]:
-        """Columns that some density rule reads."""
+        """Columns of statistics that density rules read."""
         return {name for stage in self._density for name in stage.statistics}
 
     @property
@@ -120,7 +120,7 @@ class Optimize(Stage):
         return [stage for stage in self.during if isinstance(stage, Densify)]
 
     def _trainer(self, run: Run) -> Trainer:
-        """Attach what training needs to the run's Gaussians; a resumed run has it."""
+        """Attach moments, statistics and tables to the run's Gaussians; a resumed run has them."""
         gaussians, photographs = run.model.gaussians, run.photographs
         run.adam = run.adam or Adam(gaussians)
         run.stats = SplatStats(gaussians, self.statistics)
@@ -139,13 +139,13 @@ class Optimize(Stage):
         )
 
     def _edit(self, run: Run) -> None:
-        """What was due at the step before."""
+        """Run the edits that were due at the step before."""
         for stage in self.during:
             if stage.edits and stage.due(run.step):
                 stage.run(run)
 
     def _step(self, run: Run, trainer: Trainer, sampler: Sampler) -> ViewGradients:
-        """One view; halfway between reports, where no density control is due, the kernels are timed."""
+        """Train on one view; the kernels are timed halfway between reports, away from density edits."""
         run.step += 1
         run.stage_step += 1
         run.device.timings.sampling = run.step % self.log_every == self.log_every // 2
@@ -169,8 +169,8 @@ class Optimize(Stage):
         if broken or not math.isfinite(loss):
             path = checkpoint.save(run, keep=2)
             raise NumericError(
-                f"step {run.step}, view '{sampler.at(run.step).view.name}': the loss is {loss}, not finite: "
-                f"{', '.join(broken) or 'none of the parameters'}; the state is in {path}; lower the learning rates"
+                f"step {run.step}, view '{sampler.at(run.step).view.name}': the loss is {loss}; parameters "
+                f"not finite: {', '.join(broken) or 'none'}; the state is in {path}; lower the rates"
             )
         return loss, -10 * math.log10(max(error, 1e-10))
 
@@ -178,7 +178,7 @@ class Optimize(Stage):
         count = run.model.gaussians.count
         stages = stage_milliseconds(run.device.timings)
         run.records.add(run.step, "train", loss=loss, psnr=psnr, gaussians=count, ms=1e3 * seconds, stages=stages)
-        if run.step % (DISTRIBUTION_EVERY * self.log_every) == 0 or run.step == last_step:
+        if run.step % (DISTRIBUTION_INTERVAL * self.log_every) == 0 or run.step == last_step:
             run.records.add(run.step, "distribution", gaussians=count, **distribution(run.model.gaussians))
         run.records.status("running", run.step, steps=last_step, gaussians=count)
         run.show(Progress(run.step, last_step, loss, psnr, count, 1e3 * seconds, seconds * (last_step - run.step)))

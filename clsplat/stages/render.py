@@ -1,4 +1,4 @@
-"""Images of a split."""
+"""Render a split to image files."""
 
 import logging
 from pathlib import Path, PurePosixPath
@@ -13,7 +13,7 @@ LOG = logging.getLogger("clsplat")
 
 
 class Render(Stage):
-    """Write one PNG for each view of a split, named as the view."""
+    """Write one PNG for each view of a split, with the name of the view."""
 
     stage: Literal["render"] = "render"
     needs: ClassVar[frozenset[str]] = frozenset({"model"})
@@ -33,6 +33,6 @@ class Render(Stage):
 
 
 def image_path(folder: Path, view: str, suffix: str = ".png") -> Path:
-    """The file of a view's render: its name below `folder`, with another suffix."""
+    """Return the file of a view's render: the view's name below `folder`, with another suffix."""
     name = PurePosixPath(view)
     return folder / name.with_suffix(suffix) if is_image(name) else folder / f"{view}{suffix}"

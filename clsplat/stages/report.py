@@ -58,7 +58,7 @@ class StageTime:
 
 @dataclass(frozen=True)
 class Times:
-    """Where a step's time goes on the device, averaged over the sampled steps."""
+    """The time of a step's stages on the device, averaged over the sampled steps."""
 
     samples: int
     milliseconds: float  # of all stages
@@ -70,14 +70,14 @@ class ViewFigure:
     """Images of one view with a caption."""
 
     caption: str
-    images: dict[str, str]  # label -> address that holds the image
+    images: dict[str, str]  # label -> data URL
 
 
 def _figures(run: Run) -> dict[str, str]:
     values = {}
-    for split, scales in run.metrics.items():
-        for scale, averages in scales.items():
-            suffix = "" if scale == f"{run.downscale:g}" else f" at 1/{scale}"
+    for split, by_downscale in run.metrics.items():
+        for downscale, averages in by_downscale.items():
+            suffix = "" if downscale == f"{run.downscale:g}" else f" at 1/{downscale}"
             values[f"{split} PSNR{suffix} ({counted(averages['views'], 'view')})"] = f"{averages['psnr']:.2f} dB"
             values[f"{split} SSIM{suffix}"] = f"{averages['ssim']:.4f}"
     values["Gaussians"] = f"{run.model.gaussians.count:,}"
@@ -140,14 +140,14 @@ def _totals(run: Run, what: str) -> list[Line]:
 
 
 def _shares(lines: Sequence[Line]) -> list[Line]:
-    """The lines by their sum, from where it is not zero; those that stay at zero are left out."""
+    """The lines divided by their sum, where it is not zero; lines that are always zero are left out."""
     sums = np.sum([[y for _, y in line.points] for line in lines], axis=0) if lines else []
     shares = [[(x, y / total) for (x, y), total in zip(line.points, sums, strict=True) if total > 0] for line in lines]
     return [Line(points, line.name) for points, line in zip(shares, lines, strict=True) if any(y for _, y in points)]
 
 
 def _psnr_by_gaussians(run: Run) -> list[Line]:
-    """In order of steps: where Gaussians are thinned out, the line turns back.  A single point is left out."""
+    """Points in order of steps: where Gaussians are pruned, the line turns back.  No line for a single point."""
     counts = {r["step"]: r["gaussians"] for r in run.records.read("train")}
     tests = [r for r in run.records.read("evaluate") if r["split"] == "test" and r["scale"] == run.downscale]
     points = {r["step"]: (counts[r["step"]] / 1e3, r["psnr"]) for r in tests if r["step"] in counts}
@@ -170,7 +170,7 @@ def _views(run: Run) -> dict[str, list[ViewFigure]]:
     """The worst and the best views of the last evaluation, by heading."""
     by_name = {view.name: view for view in run.scene.downscaled(run.downscale).views}
     lines = [r for r in run.records.read("view") if r["scale"] == run.downscale and r["step"] == run.step]
-    last = {r["view"]: r for r in lines if r["view"] in by_name}  # it may have been measured twice after the same step
+    last = {r["view"]: r for r in lines if r["view"] in by_name}  # a view may be measured twice after the same step
     ranked = sorted(last.values(), key=lambda r: r["psnr"])
     worst = ranked[:MAX_VIEWS]
     best = [r for r in reversed(ranked) if r not in worst][:MAX_VIEWS]

@@ -1,4 +1,4 @@
-"""The small scheduled changes of the model."""
+"""Small changes of the model at a cadence."""
 
 from collections.abc import Collection
 from typing import Annotated, ClassVar, Literal
@@ -11,7 +11,7 @@ from clsplat.training.run import Run
 
 
 class RaiseSh(Scheduled):
-    """Let the colours use one more band of spherical harmonics."""
+    """Add one band of spherical harmonics to the colours."""
 
     stage: Literal["raise_sh"] = "raise_sh"
     needs: ClassVar[frozenset[str]] = frozenset({"model"})
@@ -23,9 +23,9 @@ class RaiseSh(Scheduled):
 
 
 class ResetOpacity(Scheduled):
-    """Make every Gaussian almost transparent; those that are needed come back, floaters do not (Kerbl et al. 2023).
+    """Lower all opacities; training raises those of needed Gaussians, and pruning removes floaters (Kerbl et al. 2023).
 
-    `to` is the opacity after the world filter (Yu et al. 2024).
+    `to` holds after the world filter (Yu et al. 2024).
     """
 
     stage: Literal["reset_opacity"] = "reset_opacity"
@@ -33,7 +33,7 @@ class ResetOpacity(Scheduled):
     edits: ClassVar[bool] = True
 
     to: Annotated[float, Field(gt=0, lt=1)] = 0.01
-    """Largest opacity afterwards."""
+    """Largest opacity after the reset."""
     when_background: Literal["black", "white"] | None = None
     """Background on which the stage acts; without it, on both."""
 
@@ -52,9 +52,9 @@ class ResetOpacity(Scheduled):
 
 
 class RefreshFilter(Scheduled):
-    """Let the world filter, and the sampling intervals that sizes in pixels go by, follow the Gaussians as they move.
+    """Update the world filter and the sampling intervals, which sizes in pixels depend on, to the present means.
 
-    They also do so when Gaussians are made and after every density edit; a model that has neither has nothing to do.
+    `init` and every density edit update them too.  For a model without both, the stage has no effect.
     """
 
     stage: Literal["refresh_filter"] = "refresh_filter"

@@ -9,7 +9,7 @@ import numpy as np
 
 from clsplat.errors import MemoryLimitError
 from clsplat.gaussians.tables import GROWTH, PARAMETERS, Gaussians
-from clsplat.opencl.choice import DeviceInfo
+from clsplat.opencl.discovery import DeviceInfo
 from clsplat.render.rasterizer import PIXEL_SUMS, RECORD
 
 PAIRS_PER_GAUSSIAN = 5  # (tile, Gaussian) pairs, an estimate; trained scenes have 1.5 to 4

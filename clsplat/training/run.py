@@ -6,10 +6,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from clsplat import __version__
 from clsplat.density.statistics import SplatStats
 from clsplat.errors import ConfigError
 from clsplat.filters import FilterViews, ModelSettings, measure_intervals
-from clsplat.gaussians.tables import INTERVAL2, DeviceModel
+from clsplat.gaussians.model import Model, Rendering
+from clsplat.gaussians.tables import INTERVAL2, PARAMETERS, DeviceModel
 from clsplat.losses.base import Loss
 from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import PIXEL_SUMS, Rasterizer
@@ -108,6 +110,13 @@ class Run:
             photographs = (self.photographs.get(view) for view in self.scene.split("train"))
             self._texture_quantiles[share] = texture_quantile(self.rasterizer.workspace, photographs, share)
         return self._texture_quantiles[share]
+
+    def host_model(self) -> Model:
+        """Copy the model to the host, as it is trained: with a world filter that is not part of its scales."""
+        tables = {name: self.model.gaussians.get(name) for name in (*PARAMETERS, "filter_variance")}
+        if not tables["filter_variance"].any():
+            del tables["filter_variance"]
+        return Model(**tables, rendering=Rendering.of({"version": __version__, **self.rendering()}, "default"))
 
     def rendering(self) -> dict[str, Any]:
         """Return the numbers for rendering a model file as in training."""

@@ -67,7 +67,7 @@ def test_texture_splits_and_children_are_half_as_large(device, rng):
 
 
 def test_strict_and_lowered(device, rng):
-    """Lowered also wants some screen gradient; both leave smooth places and tiny splats alone."""
+    """The lowered form also needs some screen gradient; both forms ignore smooth places and tiny splats."""
     columns = {
         "texture": [0.3, 0.3, 0.3, 0.01],
         "screen_grad": [2e-4, 1e-5, 2e-4, 2e-4],
@@ -107,9 +107,9 @@ def test_quantiles_are_of_those_that_were_seen(device, rng):
     case.gaussians.set(SEEN, 2.0 * (texture > 0)[:, None])
     rule = SplitTextured(texture_above=Quantile(quantile=0.8), gradient_above=0.0, at_most=1.0)
     assert case.apply(rule).after == 52
-    nobody = Edited(device, rng, 50)
-    nobody.gaussians.set(SEEN, np.zeros((50, 1)))
-    assert nobody.apply(rule).after == 50
+    unseen = Edited(device, rng, 50)
+    unseen.gaussians.set(SEEN, np.zeros((50, 1)))
+    assert unseen.apply(rule).after == 50
 
 
 @pytest.mark.parametrize(("rms_above", "pixels"), [(0.01, None), (0.01, 4.0), (Quantile(quantile=0.8), None)])

@@ -72,7 +72,7 @@ def test_who_is_not_seen_takes_the_largest(device, rng):
     variance = refreshed(device, case, [case.view], Smoothing())
     assert variance[3] == variance[20] == variance.max()
     means[:] = means[3]
-    assert (refreshed(device, case, [case.view], Smoothing()) == 0).all(), "nobody is seen: nothing is known"
+    assert (refreshed(device, case, [case.view], Smoothing()) == 0).all(), "no Gaussian is seen"
 
 
 def test_nothing_to_filter(device, rng):

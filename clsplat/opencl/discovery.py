@@ -1,4 +1,7 @@
-"""Which OpenCL devices there are, and which one is chosen.  Nothing falls back to another one in silence."""
+"""Find the OpenCL devices of this machine and choose one.
+
+The device is chosen once and passed explicitly; no other device replaces it silently.
+"""
 
 import logging
 import os
@@ -19,7 +22,7 @@ Schedule = Literal["auto", "wide", "simt"]
 
 @dataclass(frozen=True)
 class DeviceInfo:
-    """What the runtime says about a device, and how to get at it."""
+    """The properties of a device, and its place among platforms and devices."""
 
     name: str
     platform: str  # name and version of the runtime
@@ -38,15 +41,16 @@ class DeviceInfo:
         return f"{self.name} ({self.kind}) on {self.platform}"
 
     def fault(self) -> str | None:
-        """Return None if the device runs a test kernel, else a sentence on what is wrong."""
+        """Return None when the device runs a test kernel, else a sentence about the fault."""
         return runtimes.fault_of(f"{self.platform}|{self.name}|{self.driver}|{cl.VERSION_TEXT}", *self.place)
 
-    def matches(self, words: str) -> bool:
-        return words.lower() in f"{self.platform} {self.name} {self.kind}".lower()
+    def matches(self, device_name: str) -> bool:
+        """Return whether `device_name` is a part of platform, name and kind, in any case."""
+        return device_name.lower() in f"{self.platform} {self.name} {self.kind}".lower()
 
 
 def list_devices() -> list[DeviceInfo]:
-    """Return every device of every runtime, in the loader's order; runtimes without devices are normal."""
+    """Return every device of every runtime, in the loader's order; a runtime may have no device."""
     found = []
     for p, platform in enumerate(platforms()):
         try:
@@ -59,10 +63,10 @@ def list_devices() -> list[DeviceInfo]:
 
 
 def platforms() -> list[Any]:
-    """Return the runtimes, in the loader's order."""
+    """Return the platforms of the loader; none when it finds no runtime."""
     try:
         return list(cl.get_platforms())
-    except cl.Error:  # the loader found no runtime at all
+    except cl.Error:  # the loader found no runtime
         return []
 
 
@@ -88,21 +92,22 @@ def _short(version: str) -> str:
     return " ".join(version.split(",")[0].split()[:4])
 
 
-def choose(words: str | None = None) -> DeviceInfo:
-    """Pick a device; runtimes that are passed over because they do not work are named in the log.
+def choose(device_name: str | None = None) -> DeviceInfo:
+    """Choose a device; log the devices that do not work.
 
-    `words` is a part of a runtime's or device's name, with `:n` for the n-th that matches; without it the variable
-    CLSPLAT_DEVICE, else the first GPU that works, else the first CPU.  Raises DeviceError naming what exists.
+    `device_name` is a part of a runtime's or device's name, with `:n` for the n-th match, from 0.  Without it the
+    variable CLSPLAT_DEVICE holds the name, else the first GPU that works is chosen, else the first CPU.  Raises
+    DeviceError with the names of all devices.
     """
-    words = words or os.environ.get(DEVICE_VARIABLE)
+    device_name = device_name or os.environ.get(DEVICE_VARIABLE)
     devices = list_devices()
     if not devices:
         raise DeviceError(
             "no OpenCL device was found; install a runtime: pip install 'clsplat[pocl]', pip install 'clsplat[intel]', "
             "apt install pocl-opencl-icd, or your GPU's driver"
         )
-    if words:
-        return _named(words, devices)
+    if device_name:
+        return _named(device_name, devices)
     faults = []
     for info in sorted(devices, key=lambda i: i.kind != "GPU"):
         fault = info.fault()
@@ -113,12 +118,12 @@ def choose(words: str | None = None) -> DeviceInfo:
     raise DeviceError("; ".join(faults))
 
 
-def _named(words: str, devices: list[DeviceInfo]) -> DeviceInfo:
-    numbered = re.fullmatch(r"(.*):([0-9]{1,4})", words, re.DOTALL)
-    name, number = numbered.groups() if numbered else (words, "0")
+def _named(device_name: str, devices: list[DeviceInfo]) -> DeviceInfo:
+    numbered = re.fullmatch(r"(.*):([0-9]{1,4})", device_name, re.DOTALL)
+    name, number = numbered.groups() if numbered else (device_name, "0")
     matching = [info for info in devices if info.matches(name)]
     if int(number) >= len(matching):
-        raise DeviceError(f"no device matches '{words}'; there are: {'; '.join(i.text for i in devices)}")
+        raise DeviceError(f"no device matches '{device_name}'; there are: {'; '.join(i.text for i in devices)}")
     info = matching[int(number)]
     fault = info.fault()
     if fault is not None:
@@ -127,9 +132,31 @@ def _named(words: str, devices: list[DeviceInfo]) -> DeviceInfo:
 
 
 def resolve_schedule(info: DeviceInfo, schedule: Schedule) -> Literal["wide", "simt"]:
-    """`auto`: CPUs with vector units of 8 floats or more take the wide schedule, everything else simt."""
+    """Return the schedule of a device; `auto` is wide for CPUs with vectors of 8 floats or more, else simt."""
     if schedule == "auto":
         return "wide" if info.kind == "CPU" and info.float_width >= 8 else "simt"
     if schedule not in ("wide", "simt"):
         raise ConfigError(f"no schedule named '{schedule}'; there are auto, wide and simt")
     return schedule
+
+
+def tuning_of(info: DeviceInfo, schedule: Literal["wide", "simt"]) -> dict[str, int | str]:
+    """Return the -D values for a device; cl_kernels/common.h explains them."""
+    if schedule == "wide":
+        return {
+            "LANES": 16 if info.float_width >= 16 else 8,
+            "VECTORS": 4,
+            "GROUP": 16,
+            "TEAM": 1,
+            "DIGIT_BITS": 11,
+            "TILE": 16,
+        }
+    return {
+        "LANES": 1,
+        "VECTORS": 1,
+        "GROUP": 64,
+        "TEAM": 64,
+        "DIGIT_BITS": 4,
+        "TILE": 16 if info.group >= 256 else 8,
+        "SORT_CAPACITY": 2048,
+    }

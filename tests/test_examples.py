@@ -1,0 +1,148 @@
+"""Every example runs, and so do the Python lines of the documentation; those of plug-ins are tested in test_plugins."""
+
+import ast
+import json
+import re
+import runpy
+import shutil
+import subprocess
+import sys
+import urllib.error
+import urllib.request
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+import clsplat
+from clsplat.pipeline.loading import load
+from tests.html_page import Page
+
+ROOT = Path(__file__).parents[1]
+EXAMPLES = ROOT / "examples"
+TESTED = {  # where
+    **dict.fromkeys(("box_blur.py", "opacity_entropy.py", "relocation.py"), "test_plugins.py"),
+    "csv_reader.py": "test_csv_reader.py",
+}
+PAGES = ("README.md", "docs/python.md")
+
+
+@pytest.fixture
+def folder(tiny_scene, tmp_path, monkeypatch) -> Path:
+    """A folder to work in."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def python_lines() -> list[tuple[str, str]]:
+    """Blocks of Python, with the page's name."""
+    found = re.compile(r"^```python\n(.*?)^```", re.M | re.S)
+    return [(page, code) for page in PAGES for code in found.findall((ROOT / page).read_text())]
+
+
+def test_every_example_has_a_test():
+    own = Path(__file__).read_text()
+    for path in EXAMPLES.iterdir():
+        if path.suffix in (".py", ".yaml", ".ipynb"):
+            text = (ROOT / "tests" / TESTED[path.name]).read_text() if path.name in TESTED else own
+            assert path.stem in text, f"{path.name} has no test"
+
+
+def test_the_gradient_of_own_loss_is_that_of_its_value(rng):
+    edges = runpy.run_path(str(EXAMPLES / "own_loss.py"))["edges"]
+    image, photograph, direction = rng.uniform(size=(3, 7, 5, 3))
+    _, derivative = edges(image, photograph)
+    up, down = (edges(image + sign * 1e-6 * direction, photograph)[0] for sign in (1, -1))
+    assert float((derivative * direction).sum()) == pytest.approx((up - down) / 2e-6, rel=1e-6)
+
+
+def test_own_loss_trains(tiny_scene, folder, monkeypatch, capsys):
+    pipeline = Path(folder / "short.yaml")
+    pipeline.write_text(load("smoke", ["optimize.steps=100"]).text())
+    monkeypatch.setattr(sys, "argv", ["own_loss.py", str(tiny_scene), str(pipeline)])
+    runpy.run_path(str(EXAMPLES / "own_loss.py"), run_name="__main__")
+    assert "step 100: loss 0." in capsys.readouterr().out
+    own = clsplat.load("own_loss.ply")
+    plain = clsplat.Trainer(tiny_scene, pipeline)
+    plain.run()
+    assert len(own) != len(plain.model) or (own.means != plain.model.means).any()
+
+
+def test_render_service_answers_with_pictures(tiny_scene, folder):
+    assert len((EXAMPLES / "render_service.py").read_text().splitlines()) <= 30
+    trainer = clsplat.Trainer(tiny_scene, "smoke", set={"optimize.steps": 5})
+    trainer.run()
+    trainer.model.save("model.ply")
+    command = [sys.executable, EXAMPLES / "render_service.py", "model.ply", tiny_scene, "0"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as service:
+        try:
+            address = service.stdout.readline().strip()
+            view = trainer.scene.split("test")[0]
+
+            def picture(query: str) -> np.ndarray:
+                with urllib.request.urlopen(f"{address}?{query}", timeout=60) as answer:
+                    assert answer.headers["Content-Type"] == "image/png"
+                    return cv2.imdecode(np.frombuffer(answer.read(), np.uint8), cv2.IMREAD_COLOR)
+
+            expected = clsplat.Renderer(trainer.model).render(view).png()
+            named = picture(f"view={view.name}")
+            np.testing.assert_array_equal(named, cv2.imdecode(np.frombuffer(expected, np.uint8), cv2.IMREAD_COLOR))
+            x, y, z = view.position
+            assert picture(f"x={x}&y={y}&z={z}").shape == (40, 40, 3)
+            for query in ("", "view=%0d%0aX:1", "x=1&y=2", "x=nan&y=0&z=0", "x=one&y=0&z=0"):
+                with pytest.raises(urllib.error.HTTPError, match="400") as error:
+                    picture(query)
+                error.value.close()
+        finally:
+            service.kill()
+
+
+def test_scene_to_picture_runs_and_shows_what_it_says(tiny_scene, folder):
+    """Cells as a notebook takes them: the value of a last line is shown."""
+    notebook = json.loads((EXAMPLES / "scene_to_picture.ipynb").read_text())
+    assert (notebook["nbformat"], notebook["nbformat_minor"]) == (4, 5)
+    assert len({cell["id"] for cell in notebook["cells"]}) == len(notebook["cells"])
+    codes = [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    assert not any(cell["outputs"] or cell["execution_count"] for cell in codes), "commit it without outputs"
+    shutil.copytree(tiny_scene, "demo_scene")
+    names, shown = {}, []
+    for number, cell in enumerate(codes):
+        tree = ast.parse("".join(cell["source"]))
+        last = tree.body.pop() if isinstance(tree.body[-1], ast.Expr) else None
+        exec(compile(tree, f"cell {number}", "exec"), names)
+        value = eval(compile(ast.Expression(last.value), f"cell {number}", "eval"), names) if last else None
+        if hasattr(value, "_repr_html_"):
+            Page(value._repr_html_())
+        elif hasattr(value, "_repr_png_"):
+            assert value._repr_png_().startswith(b"\x89PNG")
+        shown.append(type(value).__name__)
+    assert shown == ["Scene", "dict", "Model", "Picture", "Picture", "Model", "Model"]
+    assert clsplat.metrics.psnr(names["picture"].image, names["view"].photograph(1.0)) > 20
+    assert Path("scene_to_picture.ply").is_file()
+
+
+def test_there_are_python_lines_on_both_pages():
+    assert {page for page, _ in python_lines()} == set(PAGES)
+
+
+@pytest.mark.parametrize(("page", "code"), python_lines(), ids=lambda text: text.partition("\n")[0])
+def test_python_lines_of_the_documentation_run(page, code, tiny_scene, folder):
+    code, scenes = re.subn(r'"data/\w+"', repr(str(tiny_scene)), code)
+    code, steps = re.subn(r'"optimize.steps": \d+', '"optimize.steps": 20', code)
+    assert scenes == steps == 1, "what is replaced is not there"
+    exec(compile(code, page, "exec"), {})
+    assert len(list(folder.glob("*.ply"))) == 1
+
+
+def test_growing_resolution_is_a_pipeline():
+    views = load(str(EXAMPLES / "growing_resolution.yaml")).settings.stages[1].views
+    assert views.resolution is not None
+
+
+@pytest.mark.usefixtures("without_plugins")
+def test_relocation_is_a_pipeline_with_its_plugin():
+    clsplat.load_plugin(EXAMPLES / "relocation.py")
+    found = clsplat.check(EXAMPLES / "relocation.yaml")
+    assert found["stages"][:2] == ["init", "optimize"]
+    assert load(str(EXAMPLES / "relocation.yaml")).resolved()["plugins"].keys() == {"relocation"}
