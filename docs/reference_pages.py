@@ -24,8 +24,8 @@ INTRODUCTIONS = {
     "stages": "A pipeline is a list of stages. Those that can stand in `during` run every so many steps of training.",
     "losses": "`optimize.losses` is a list; training minimises the weighted sum.",
     "rules": "`densify.rules` is a list. All rules act as one rearrangement of the Gaussians.",
-    "statistics": "A growing rule acts where the mean of a statistic is large. Only the statistics that a rule names "
-    "are summed and cost time.",
+    "statistics": "A [growing rule](rules.md#grow) acts where the mean of its `statistic` is large. Only the "
+    "statistics that a rule names are summed and cost time.",
     "views": "What a training step compares with: the keys `order` and `transforms` of `optimize.views`.",
     "filters": "The two low-pass filters of `model`: one in the scene, one on the screen.",
     "prepare": "`prepare` is a list: what makes a scene of photographs, once, on the host.",

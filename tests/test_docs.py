@@ -112,11 +112,6 @@ def test_the_test_of_a_kernel_that_the_pages_show_passes():
     assert found.returncode == 0, found.stdout
 
 
-@pytest.mark.parametrize("file", ["growing_resolution.yaml"])
-def test_pipelines_among_the_examples_are_valid(file):
-    load(str(ROOT / "examples" / file))
-
-
 def test_paths_and_bases_on_pages_exist():
     for page in PAGES:
         for path in re.findall(r"`((?:clsplat|tests|docs|examples|pipelines|cl_kernels)/[\w./]*\w/?)`", text_of(page)):

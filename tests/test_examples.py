@@ -24,6 +24,7 @@ EXAMPLES = ROOT / "examples"
 TESTED = {  # where
     **dict.fromkeys(("box_blur.py", "opacity_entropy.py", "relocation.py"), "test_plugins.py"),
     "csv_reader.py": "test_csv_reader.py",
+    "test_opacity_entropy.py": "test_docs.py",
 }
 PAGES = ("README.md", "docs/python.md")
 
@@ -128,11 +129,14 @@ def test_there_are_python_lines_on_both_pages():
 
 @pytest.mark.parametrize(("page", "code"), python_lines(), ids=lambda text: text.partition("\n")[0])
 def test_python_lines_of_the_documentation_run(page, code, tiny_scene, folder):
+    if "clsplat.torch" in code:
+        pytest.importorskip("torch")
     code, scenes = re.subn(r'"data/\w+"', repr(str(tiny_scene)), code)
     code, steps = re.subn(r'"optimize.steps": \d+', '"optimize.steps": 20', code)
-    assert scenes == steps == 1, "what is replaced is not there"
+    assert scenes == 1, "what is replaced is not there"
+    assert steps == code.count("optimize.steps")
     exec(compile(code, page, "exec"), {})
-    assert len(list(folder.glob("*.ply"))) == 1
+    assert len(list(folder.glob("*.ply"))) == code.count(".save(")
 
 
 def test_growing_resolution_is_a_pipeline():
