@@ -55,7 +55,6 @@ def test_a_table_of_keys_says_what_each_takes():
     assert row.startswith("| `children` | whole number ≥ 2 and ≤ 8 | `2` |")
 
 
-@pytest.mark.xfail(strict=True, reason="some fields still have comments in the place of docstrings")
 def test_every_key_has_a_description():
     assert undescribed() == []
 
