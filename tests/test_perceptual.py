@@ -16,7 +16,7 @@ from tests.onnx_writer import distance_network
 
 
 def images(rng, height: int, width: int, noise: float = 30.0) -> tuple[np.ndarray, np.ndarray]:
-    """A smooth random pixels and a noisy copy, 8 bits."""
+    """A smooth random image and a noisy copy, 8 bits."""
     coarse = rng.uniform(0, 255, (max(2, height // 8), max(2, width // 8), 3))
     photograph = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
     image = photograph + rng.normal(0, noise, photograph.shape)
