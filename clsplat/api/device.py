@@ -1,5 +1,6 @@
 """The device of a notebook."""
 
+import threading
 from functools import cache
 from types import TracebackType
 
@@ -29,7 +30,15 @@ class Device(opencl.Device):
         return f"Device({self.text!r})"
 
 
-@cache
+_OPENING = threading.Lock()
+
+
 def default_device(schedule: Schedule = "auto") -> Device:
     """Return the device that is taken where none is given; opened on first use."""
+    with _OPENING:  # two threads get the same one
+        return _opened(schedule)
+
+
+@cache
+def _opened(schedule: Schedule) -> Device:
     return Device(schedule=schedule)

@@ -75,7 +75,7 @@ class Renderer:
     """A model on a device.
 
     A renderer serves one thread, for it renders one picture at a time.  Renderers on one device do not disturb each
-    other.
+    other, in one thread or in several.
     """
 
     def __init__(self, model: Model, device: Device | None = None) -> None:

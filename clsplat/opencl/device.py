@@ -4,6 +4,7 @@ This package is the only importer of pyopencl.
 """
 
 import math
+import threading
 import warnings
 import weakref
 from pathlib import Path
@@ -84,6 +85,7 @@ class Device:
         self.timings = Timings()
         self.allocated = 0  # bytes of all buffers that are alive
         self.peak = 0  # largest value of `allocated`
+        self.lock = threading.Lock()  # of what threads share: the programs, and the arguments of their kernels
         self._programs: dict[tuple[Any, ...], Program] = {}
 
     @property
@@ -135,9 +137,10 @@ class Device:
         from clsplat.opencl.program import Program
 
         key = (str(file), *sorted(defines.items()))
-        if key not in self._programs:
-            self._programs[key] = Program(self, file, {**self.tuning, **defines})
-        return self._programs[key]
+        with self.lock:
+            if key not in self._programs:
+                self._programs[key] = Program(self, file, {**self.tuning, **defines})
+            return self._programs[key]
 
     def finish(self) -> None:
         """Wait for all enqueued work."""
