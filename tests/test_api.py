@@ -153,6 +153,26 @@ def test_a_split_that_there_is_not_is_refused():
         hand_made_scene().split("tset")
 
 
+def test_a_device_is_given_by_name_or_open_everywhere(device, rng, tiny_scene, tmp_path):
+    case = random_case(rng, 5)
+    assert Renderer(model_of(case), device).device is device
+    name, schedule = device.info.name, {"rasterizer.schedule": device.schedule}
+    assert Renderer(model_of(case), name).device.info.name == name
+    model_of(case).save(tmp_path / "m.ply")
+    assert clsplat.render_views(tmp_path / "m.ply", tiny_scene, tmp_path / "views", device=device) == 2
+    assert clsplat.Trainer(tiny_scene, "smoke", device=name, set=schedule).evaluate("train")["views"] == 8
+    with pytest.raises(ConfigError, match="device: is a int; expected a part of a device's name, or a Device"):
+        Renderer(model_of(case), 0)
+
+
+@pytest.mark.parametrize("function", [clsplat.Trainer, clsplat.describe_run])
+def test_an_open_device_of_another_schedule_than_the_pipelines_is_refused(function, device, tiny_scene):
+    arguments = {"Trainer": (tiny_scene, "smoke"), "describe_run": ("smoke", tiny_scene)}[function.__name__]
+    other = "simt" if device.schedule == "wide" else "wide"
+    with pytest.raises(ConfigError, match=f"expected the {other} schedule, as the settings say"):
+        function(*arguments, device=device, set={"rasterizer.schedule": other})
+
+
 def test_devices_are_context_managers():
     with clsplat.Device() as device:
         assert repr(device).startswith("Device('")

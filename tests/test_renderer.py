@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from clsplat.api.renderer import Renderer
 from clsplat.api import device as devices
+from clsplat.api.renderer import Renderer
 from clsplat.gaussians.model import Model, Rendering
 from clsplat.opencl import program
 from tests.scenes import random_case, with_world_filter

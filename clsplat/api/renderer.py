@@ -11,7 +11,7 @@ from clsplat.api.device import default_device
 from clsplat.gaussians.model import Model
 from clsplat.gaussians.tables import PARAMETERS, DeviceModel
 from clsplat.metrics.images import to_8_bits
-from clsplat.opencl.device import Array, Device
+from clsplat.opencl.device import Array, Device, open_device
 from clsplat.render.camera import DeviceCamera, upload_camera
 from clsplat.render.rasterizer import Content, Frame, Rasterizer
 from clsplat.scene.scene import View
@@ -78,9 +78,12 @@ class Renderer:
     other, in one thread or in several.
     """
 
-    def __init__(self, model: Model, device: Device | None = None) -> None:
-        """Copy a model to a device, by default `default_device()`.  Raises DeviceError when there is none."""
-        self.device = device or default_device()
+    def __init__(self, model: Model, device: str | Device | None = None) -> None:
+        """Copy a model to a device, or to one by its name; by default `default_device()`.
+
+        Raises DeviceError when there is none.
+        """
+        self.device = default_device() if device is None else open_device(device)
         self.rasterizer = Rasterizer(self.device)
         self.update(model)
 

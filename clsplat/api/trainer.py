@@ -14,7 +14,7 @@ from clsplat.errors import ClsplatError, ConfigError, DataError
 from clsplat.gaussians.model import Model
 from clsplat.losses.base import HostFunction, HostLoss, ViewGradients
 from clsplat.metrics.views import mean, measure
-from clsplat.opencl.device import Device
+from clsplat.opencl.device import Device, open_device
 from clsplat.pipeline.loading import Pipeline, load
 from clsplat.runs import runner
 from clsplat.runs.experiment import quoted
@@ -57,15 +57,16 @@ class Trainer:
         pipeline: PathLike = "splat_7k",
         *,
         set: Mapping[str, Any] | None = None,
-        device: Device | None = None,
+        device: str | Device | None = None,
         out: PathLike | None = None,
         resume: bool = False,
     ) -> None:
         """Prepare training.
 
         scene: what `read_scene` returns, whose split is kept, or a folder; pipeline: a file, or the name of a shipped
-        one; set: settings by place, such as {"optimize.steps": 3000}; out: the run folder, by default a temporary one
-        that goes away with the trainer; resume: go on from the newest checkpoint in `out`, also of `clsplat run`.
+        one; set: settings by place, such as {"optimize.steps": 3000}; device: a part of its name, or one that is open,
+        with the schedule of the pipeline; out: the run folder, by default a temporary one that goes away with the
+        trainer; resume: go on from the newest checkpoint in `out`, also of `clsplat run`.
         Raises ConfigError, DataError and DeviceError.
         """
         load_plugins()
@@ -84,7 +85,8 @@ class Trainer:
         self.out = Path(out)
         runner.make_run_folder(self.out, resume)
         schedule = self.pipeline.settings.rasterizer.schedule
-        self._run = runner.make_run(self.pipeline, self.scene, device or default_device(schedule), self.out)
+        opened = default_device(schedule) if device is None else open_device(device, schedule)
+        self._run = runner.make_run(self.pipeline, self.scene, opened, self.out)
         runner.begin(self.pipeline, self._run, resume)
         _run_until_training(self.pipeline, self._run)
         self._steps = _training(self.pipeline, self._run)

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from clsplat.errors import MemoryLimitError
+from clsplat.errors import ConfigError, MemoryLimitError
 from clsplat.opencl import runtimes
-from clsplat.opencl.discovery import DeviceInfo, Schedule, platforms, resolve_schedule, tuning_of
+from clsplat.opencl.discovery import DeviceInfo, Schedule, choose, platforms, resolve_schedule, tuning_of
 from clsplat.opencl.timings import Timings
 
 runtimes.add_intel_runtime()
@@ -145,6 +145,20 @@ class Device:
     def finish(self) -> None:
         """Wait for all enqueued work."""
         self.queue.finish()
+
+
+def open_device(device: str | Device | None = None, schedule: Schedule = "auto") -> Device:
+    """Return a device that is open, or open one by a part of its name; None: as `choose` does.
+
+    Raises DeviceError when there is none, ConfigError for an open device of another schedule.
+    """
+    if device is None or isinstance(device, str):
+        return Device(choose(device), schedule)
+    if not isinstance(device, Device):
+        raise ConfigError(f"device: is a {type(device).__name__}; expected a part of a device's name, or a Device")
+    if schedule != "auto" and resolve_schedule(device.info, schedule) != device.schedule:
+        raise ConfigError(f"device: {device.text}; expected the {schedule} schedule, as the settings say: open it so")
+    return device
 
 
 def _whole_lines(size: int) -> int:

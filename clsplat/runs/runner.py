@@ -11,8 +11,7 @@ from typing import Any
 
 from clsplat.errors import ConfigError, Interrupted, OutputError, as_clsplat_error, one_line
 from clsplat.files import unwritable, write_text
-from clsplat.opencl.device import Device
-from clsplat.opencl.discovery import choose
+from clsplat.opencl.device import Device, open_device
 from clsplat.pipeline.loading import Pipeline, load, prepared_folder
 from clsplat.prepare.cache import NOTE, Planned, note, noted, prepare
 from clsplat.render.rasterizer import Rasterizer
@@ -87,20 +86,20 @@ def up_to_date(pipeline: Pipeline, planned: Sequence[Planned], out: Path) -> boo
     )
 
 
-def open_run(pipeline: Pipeline, out: Path, device_name: str | None) -> Run:
-    """Choose the device, prepare and read the scene.  Raises the errors of these steps."""
+def open_run(pipeline: Pipeline, out: Path, device: str | Device | None) -> Run:
+    """Open the device, prepare and read the scene.  Raises the errors of these steps."""
     settings = pipeline.settings
     for stage in pipeline.stages:
         stage.check()
-    device = Device(choose(device_name), settings.rasterizer.schedule)
-    LOG.info("device: %s", device.text)
+    opened = open_device(device, settings.rasterizer.schedule)
+    LOG.info("device: %s", opened.text)
     planned = pipeline.preparation(out)
     if planned and noted(out) not in (None, note(planned)):
         raise ConfigError(
             f"{out}: was started with other photographs, or other settings of `prepare`; give another --out"
         )
     folder = prepare(planned, settings.scene.folder, prepared_folder(out))
-    run = make_run(pipeline, read_scene(folder, settings.scene.holdout), device, out)
+    run = make_run(pipeline, read_scene(folder, settings.scene.holdout), opened, out)
     run.prepared = note(planned) if planned else None
     return run
 
@@ -223,7 +222,7 @@ def _check_outputs(pipeline: Pipeline, run: Run) -> None:
             raise OutputError(f"{path}: is missing or empty at the end of the run; see {run.out / 'log.txt'}")
 
 
-def describe(pipeline: Pipeline, out: Path, device: str | None) -> str:
+def describe(pipeline: Pipeline, out: Path, device: str | Device | None) -> str:
     """Return a line for each stage of a run in `out`.  Raises the errors of open_run when nothing must be prepared."""
     planned = pipeline.preparation(out)
     if planned and up_to_date(pipeline, planned, out):
