@@ -40,10 +40,10 @@ def make_run_folder(out: Path, resume: bool) -> None:
 
 
 @contextmanager
-def failures_recorded(out: Path, step: Callable[[], int] | None = None) -> Iterator[None]:
+def failures_recorded(out: Path, step: Callable[[], int] | None = None, as_raised: bool = False) -> Iterator[None]:
     """Turn every failure of the block into a ClsplatError, and write it to status.json.
 
-    Without `step` the step is that of the status before.
+    Without `step` the step is that of the status before; with `as_raised` the failure itself is raised.
     """
     try:
         yield
@@ -53,7 +53,7 @@ def failures_recorded(out: Path, step: Callable[[], int] | None = None) -> Itera
         with suppress(OutputError):  # the failure itself is more important
             at = step() if step else int(read_status(out).get("step", 0))
             Records(out).status(state, at, exit_code=failure.exit_code, message=one_line(failure))
-        if failure is error:
+        if failure is error or as_raised:
             raise
         raise failure from error
 
