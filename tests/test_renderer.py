@@ -183,6 +183,20 @@ def test_gradients_are_those_of_the_model_that_was_rendered(device, rng):
         np.testing.assert_array_equal(getattr(expected, name), getattr(again, name))
 
 
+def test_gradients_are_those_of_what_was_rendered_after_the_model_was_changed_in_place(device, rng):
+    case = random_case(rng, 20, *SIZE)
+    model, by_image = model_of(case), np.ones((SIZE[1], SIZE[0], 3))
+    renderer = Renderer(model, device)
+    picture = renderer.render(case.view)
+    expected = picture.backward(image=by_image)
+    model.means[:] += 0.3
+    renderer.update(model)
+    again = picture.backward(image=by_image)
+    for name in PARAMETERS:
+        np.testing.assert_array_equal(getattr(expected, name), getattr(again, name))
+    assert (renderer.render(case.view).backward(image=by_image).means != expected.means).any()
+
+
 def test_arrays_of_a_picture_are_the_callers_own(device, rng):
     case = random_case(rng, 20, *SIZE)
     renderer = Renderer(model_of(case), device)
