@@ -173,6 +173,15 @@ def test_an_open_device_of_another_schedule_than_the_pipelines_is_refused(functi
         function(*arguments, device=device, set={"rasterizer.schedule": other})
 
 
+@pytest.mark.parametrize("kind", [np.uint16, np.int64, np.bool_])
+@pytest.mark.parametrize("metric", [clsplat.metrics.psnr, clsplat.metrics.ssim])
+def test_images_of_other_integers_are_refused_by_metrics(metric, kind):
+    image = np.full((12, 12, 3), 1, np.uint8)
+    assert metric(image, image) == metric(np.float64(image), np.float64(image))
+    with pytest.raises(ValueError, match=f"values of type {np.dtype(kind)}; expected uint8, or floats in"):
+        metric(image.astype(kind), image)
+
+
 def test_devices_are_context_managers():
     with clsplat.Device() as device:
         assert repr(device).startswith("Device('")

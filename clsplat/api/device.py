@@ -9,7 +9,9 @@ from clsplat.opencl.discovery import Schedule, choose
 
 
 class Device(opencl.Device):
-    """An open OpenCL device; also a context manager.
+    """An open OpenCL device; a `with` block waits at its end for all its work.
+
+    Memory is released with the arrays, and the device with the last object that uses it.
 
     `name` is a part of a runtime's or device's name, as `clsplat devices` prints them; without it CLSPLAT_DEVICE, else
     the first GPU that works, else the first CPU.  Raises DeviceError when there is none.
