@@ -122,6 +122,14 @@ def test_a_pose_of_another_shape_is_refused():
     assert clsplat.View("front", CAMERA, np.eye(4)[:3].tolist()).position.shape == (3,)
 
 
+def test_views_can_be_compared_and_kept_in_sets():
+    one, other = (clsplat.View("front", CAMERA, np.eye(4)[:3]) for _ in range(2))
+    assert one == one  # noqa: PLR0124
+    assert one != other
+    assert len({one, other}) == 2
+    assert one in [other, one]
+
+
 def test_a_view_made_by_hand_renders(device, rng):
     model = model_of(random_case(rng, 30))
     middle = np.median(model.means, axis=0)
