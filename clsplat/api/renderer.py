@@ -54,7 +54,8 @@ class Picture:
         """Return the gradients of a loss by every parameter, from its derivatives by the picture.
 
         image: [height, width, 3] dL/d image; alpha: [height, width] dL/d alpha.  It may be called again, and after
-        another model, or a change of its arrays: the gradients are those of what was rendered.  Raises ValueError for other shapes.
+        another model, or a change of its arrays: the gradients are those of what was rendered.
+        Raises ValueError for other shapes.
         """
         return self.renderer.backward(self, image, alpha)
 

@@ -59,7 +59,8 @@ class Rendering:
 class Model:
     """N Gaussians before activation, float32, with the names that pipelines, kernels and checkpoints have.
 
-    The arrays are copies of those that are given.  Raises ValueError, with the name of the table, where shapes do not fit.
+    The arrays are copies of those that are given.
+    Raises ValueError, with the name of the table, where shapes do not fit.
     """
 
     means: Floats  # [N, 3] scene units

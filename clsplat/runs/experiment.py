@@ -70,7 +70,7 @@ class Job:
         if isinstance(self.work, Experiment):
             run_matrix(self.work, self.out, device, resume)
         elif runner.up_to_date(self.work, self.work.preparation(self.out), self.out):
-            LOG.info("%s: up to date; change a setting, or give another --out, to run again", self.out)
+            LOG.info("%s: up to date; change a setting, or give another folder, to run again", self.out)
         else:
             run_pipeline(self.work, self.out, device, resume)
 
@@ -103,7 +103,7 @@ def run_matrix(experiment: Experiment, out: Path, device: str | Device | None, r
     Interrupted stops the whole.
     """
     if resume and (out / "pipeline.yaml").exists() and "matrix" not in (read_yaml(out / "pipeline.yaml").data or {}):
-        raise ConfigError(f"{out}: holds a single run, not those of a matrix; give another --out")
+        raise ConfigError(f"{out}: holds a single run, not those of a matrix; give another folder")
     runner.make_run_folder(out, resume)
     write_text(out / "pipeline.yaml", experiment.text)
     state = _State(out, len(experiment.cells))
@@ -164,7 +164,7 @@ def _finished(cell: Cell, folder: Path) -> bool:
         return False
     before = load(str(folder / "pipeline.yaml")).resolved()
     if difference := first_difference(before, cell.pipeline.resolved()):
-        raise ConfigError(f"{folder}: was run with other settings: {difference}; use another --out, or those settings")
+        raise ConfigError(f"{folder}: was run with other settings: {difference}; use another folder, or those settings")
     return True
 
 

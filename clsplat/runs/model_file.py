@@ -47,7 +47,9 @@ class Source:
         """
         if not model.is_dir():
             if scene is None:
-                raise ConfigError(f"{model}: a model file does not name its scene; give --scene DIR, or a run folder")
+                raise ConfigError(
+                    f"{model}: a model file does not name its scene; give the folder of a scene, or a run folder"
+                )
             return cls(model, scene, SceneSettings())
         if not (model / "pipeline.yaml").is_file():
             raise DataError(f"{model}: has no pipeline.yaml; expected a model file or a run folder")
@@ -57,7 +59,7 @@ class Source:
         prepared = noted(model)
         folder = scene or Path(prepared["folder"] if prepared else settings.folder)
         if not folder.is_dir():
-            raise DataError(f"{model}: the folder of its photographs, {folder}, is missing; give --scene DIR")
+            raise DataError(f"{model}: the folder of its photographs, {folder}, is missing; give the folder of a scene")
         return cls(model / MODEL, folder, settings, settings.alpha)
 
 

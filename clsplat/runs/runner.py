@@ -31,7 +31,7 @@ LOG = logging.getLogger("clsplat")
 def make_run_folder(out: Path, resume: bool) -> None:
     """Make the run folder.  Raises ConfigError when it holds another run, OutputError when it cannot be written."""
     if (out / "pipeline.yaml").exists() and not resume:
-        raise ConfigError(f"{out}: already holds a run; --resume continues it, or give another --out")
+        raise ConfigError(f"{out}: already holds a run; resume it, or give another folder")
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -96,7 +96,7 @@ def open_run(pipeline: Pipeline, out: Path, device: str | Device | None) -> Run:
     planned = pipeline.preparation(out)
     if planned and noted(out) not in (None, note(planned)):
         raise ConfigError(
-            f"{out}: was started with other photographs, or other settings of `prepare`; give another --out"
+            f"{out}: was started with other photographs, or other settings of `prepare`; give another folder"
         )
     folder = prepare(planned, settings.scene.folder, prepared_folder(out))
     run = make_run(pipeline, read_scene(folder, settings.scene.holdout), opened, out)
@@ -160,7 +160,7 @@ def _run_stages(pipeline: Pipeline, run: Run) -> None:
         stage.run(run)
         if run.interrupted:
             path = checkpoint.save(run, keep=2)
-            raise Interrupted(f"stopped after {stage.stage}, saved in {path}; --resume continues from there")
+            raise Interrupted(f"stopped after {stage.stage}, saved in {path}; resume the run to go on")
 
 
 @contextmanager
