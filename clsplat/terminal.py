@@ -82,12 +82,17 @@ def show_json(data: Any) -> None:
 
 @contextmanager
 def logging_to(path: Path) -> Iterator[None]:
-    """Append the log to a file, with the time of every line, and the traceback of an error that ends the block."""
+    """Append the log to a file, with the time of every line, and the traceback of an error that ends the block.
+
+    The file has debug lines, whatever the level of the log was.
+    """
     try:
         handler = logging.FileHandler(path, encoding="utf-8", errors="backslashreplace")
     except OSError as error:
         raise unwritable(path, error) from error
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+    level = LOG.level
+    LOG.setLevel(logging.DEBUG)
     LOG.addHandler(handler)
     try:
         yield
@@ -96,6 +101,7 @@ def logging_to(path: Path) -> Iterator[None]:
         raise
     finally:
         LOG.removeHandler(handler)
+        LOG.setLevel(level)
         handler.close()
 
 

@@ -11,6 +11,7 @@ from dataclasses import replace
 from typing import Any
 
 import torch
+from torch.autograd.function import once_differentiable
 
 from clsplat.api.renderer import Colour, Renderer
 from clsplat.gaussians.tables import PARAMETERS
@@ -23,13 +24,20 @@ class _Render(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, renderer: Renderer, view: View, background: Colour | None, *tensors: torch.Tensor) -> Any:
         tables: dict[str, Any] = {n: t.detach().cpu().numpy() for n, t in zip(PARAMETERS, tensors, strict=True)}
-        renderer.update(replace(renderer.model, **tables))
+        model, count = renderer.model, len(tables["means"])
+        if model.filter_variance is not None and count != len(model):
+            raise ValueError(
+                f"the renderer's model has a world filter of {len(model)} Gaussians, the parameters have {count}; "
+                "expected as many: give the renderer `model.baked()`"
+            )
+        renderer.update(replace(model, **tables))
         ctx.picture = renderer.render(view, background)
         ctx.save_for_backward(*tensors)  # torch refuses backward where one was changed in place
         image, alpha = (torch.from_numpy(a.copy()) for a in (ctx.picture.image, ctx.picture.alpha))
         return image.to(tensors[0].device), alpha.to(tensors[0].device)
 
     @staticmethod
+    @once_differentiable  # type: ignore[untyped-decorator]
     def backward(ctx: Any, *gradients: torch.Tensor) -> Any:
         by_image, by_alpha = (gradient.detach().cpu().numpy() for gradient in gradients)
         found = ctx.picture.backward(image=by_image, alpha=by_alpha if by_alpha.any() else None)
@@ -43,8 +51,9 @@ def render(
     """Return image [height, width, 3] and alpha [height, width] of a view, differentiable once.
 
     parameters: the tables of a model by name, float32 [N, components], before activation; filters and the like are
-    those of the renderer's model, whose tables these replace.  The number of Gaussians may change from call to call.
-    Raises KeyError for a table that is missing and ValueError for a shape that does not fit.
+    those of the renderer's model, whose tables these replace.  The number of Gaussians may change from call to call,
+    but not where that model has a filter_variance.  Raises KeyError for a table that is missing and ValueError for a
+    shape that does not fit.
     """
     apply: Any = _Render.apply
     image, alpha = apply(renderer, view, background, *(parameters[name] for name in PARAMETERS))

@@ -37,7 +37,7 @@ def test_the_import_loads_nothing_heavy():
 def test_models_and_scenes_open_no_device():
     assert "clsplat.opencl.device" in loaded_after("import clsplat; clsplat.load")
     code = "import clsplat; clsplat.load; clsplat.read_scene; clsplat.Renderer; clsplat.Trainer; clsplat.run\n"
-    code += "from clsplat.api.device import default_device; assert default_device.cache_info().currsize == 0"
+    code += "from clsplat.api import device; assert device._opened.cache_info().currsize == 0"
     assert "torch" not in loaded_after(code)
 
 
@@ -122,6 +122,14 @@ def test_a_pose_of_another_shape_is_refused():
     assert clsplat.View("front", CAMERA, np.eye(4)[:3].tolist()).position.shape == (3,)
 
 
+def test_views_can_be_compared_and_kept_in_sets():
+    one, other = (clsplat.View("front", CAMERA, np.eye(4)[:3]) for _ in range(2))
+    assert one == one  # noqa: PLR0124
+    assert one != other
+    assert len({one, other}) == 2
+    assert one in [other, one]
+
+
 def test_a_view_made_by_hand_renders(device, rng):
     model = model_of(random_case(rng, 30))
     middle = np.median(model.means, axis=0)
@@ -151,6 +159,35 @@ def test_a_scene_made_by_hand_is_for_rendering(device, rng):
 def test_a_split_that_there_is_not_is_refused():
     with pytest.raises(ValueError, match="no split 'tset'; there are train, test and all"):
         hand_made_scene().split("tset")
+
+
+def test_a_device_is_given_by_name_or_open_everywhere(device, rng, tiny_scene, tmp_path):
+    case = random_case(rng, 5)
+    assert Renderer(model_of(case), device).device is device
+    name, schedule = device.info.name, {"rasterizer.schedule": device.schedule}
+    assert Renderer(model_of(case), name).device.info.name == name
+    model_of(case).save(tmp_path / "m.ply")
+    assert clsplat.render_views(tmp_path / "m.ply", tiny_scene, tmp_path / "views", device=device) == 2
+    assert clsplat.Trainer(tiny_scene, "smoke", device=name, set=schedule).evaluate("train")["views"] == 8
+    with pytest.raises(ConfigError, match="device: is a int; expected a part of a device's name, or a Device"):
+        Renderer(model_of(case), 0)
+
+
+@pytest.mark.parametrize("function", [clsplat.Trainer, clsplat.describe_run])
+def test_an_open_device_of_another_schedule_than_the_pipelines_is_refused(function, device, tiny_scene):
+    arguments = {"Trainer": (tiny_scene, "smoke"), "describe_run": ("smoke", tiny_scene)}[function.__name__]
+    other = "simt" if device.schedule == "wide" else "wide"
+    with pytest.raises(ConfigError, match=f"expected the {other} schedule, as the settings say"):
+        function(*arguments, device=device, set={"rasterizer.schedule": other})
+
+
+@pytest.mark.parametrize("kind", [np.uint16, np.int64, np.bool_])
+@pytest.mark.parametrize("metric", [clsplat.metrics.psnr, clsplat.metrics.ssim])
+def test_images_of_other_integers_are_refused_by_metrics(metric, kind):
+    image = np.full((12, 12, 3), 1, np.uint8)
+    assert metric(image, image) == metric(np.float64(image), np.float64(image))
+    with pytest.raises(ValueError, match=f"values of type {np.dtype(kind)}; expected uint8, or floats in"):
+        metric(image.astype(kind), image)
 
 
 def test_devices_are_context_managers():

@@ -9,6 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 import clsplat
+from clsplat import terminal
 from clsplat.cli import app
 from clsplat.errors import ConfigError, DataError
 from tests.test_cli import clsplat as process
@@ -51,6 +52,25 @@ def test_a_run(runs):
         assert by_command[name] == by_function[name], name
     for name in ("metrics.json", "metrics.jsonl"):
         assert without_times(by_command[name]) == without_times(by_function[name])
+
+
+def test_the_log_of_a_function_is_that_of_the_command(runs):
+    lines = [re.findall(r"^\S+ \S+ \w+ (\w+)", (folder / "log.txt").read_text(), re.MULTILINE) for folder in runs]
+    assert lines[0] == lines[1]
+    assert {"device", "scene", "step"} <= set(lines[1])
+
+
+def test_the_log_has_its_level_back_after_a_run(tmp_path):
+    log = terminal.LOG
+    before = log.level
+    try:
+        log.setLevel("ERROR")
+        with terminal.logging_to(tmp_path / "log.txt"):
+            log.debug("fine points")
+        assert log.getEffectiveLevel() == 40
+    finally:
+        log.setLevel(before)
+    assert (tmp_path / "log.txt").read_text().endswith("DEBUG fine points\n")
 
 
 def test_a_run_that_is_resumed_and_one_that_is_only_described(runs, tiny_scene, tmp_path):

@@ -164,6 +164,30 @@ def test_after_an_error_inside_of_a_step_the_trainer_says_that_it_has_ended(tiny
         trainer.run(2)
 
 
+def test_the_error_of_a_step_is_in_the_status_and_is_raised_as_it_is(tiny_scene, tmp_path):
+    def broken(image, photograph):
+        raise RuntimeError("no such teapot")
+
+    trainer = clsplat.Trainer(tiny_scene, "smoke", out=tmp_path / "run")
+    trainer.run(2)
+    trainer.add_loss(broken)
+    with pytest.raises(RuntimeError, match="no such teapot"):
+        trainer.run()
+    status = clsplat.status(tmp_path / "run")
+    assert (status["state"], status["step"]) == ("failed", 3)
+    assert "no such teapot" in status["message"]
+
+
+def test_an_error_before_the_first_step_is_in_the_status(tiny_scene, tmp_path, monkeypatch):
+    def fail(*arguments):
+        raise RuntimeError("no such teapot")
+
+    monkeypatch.setattr("clsplat.api.trainer._run_until_training", fail)
+    with pytest.raises(RuntimeError, match="no such teapot"):
+        clsplat.Trainer(tiny_scene, "smoke", out=tmp_path / "run")
+    assert clsplat.status(tmp_path / "run")["state"] == "failed"
+
+
 def test_an_interrupt_lets_the_step_finish_and_training_go_on(tiny_scene):
     trainer, whole = (clsplat.Trainer(tiny_scene, "smoke", set={"optimize.steps": 20}) for _ in range(2))
     pressed = []
@@ -232,7 +256,15 @@ def test_the_lines_of_a_loop_of_ones_own_run(tiny_scene, device, capsys):
 
 
 def test_what_is_left_on_disk_is_a_run(tiny_scene, tmp_path):
-    trainer = clsplat.Trainer(tiny_scene, "smoke", set={"optimize.steps": 10}, out=tmp_path / "run")
-    trainer.run()
-    assert clsplat.status(tmp_path / "run")["state"] == "running"
+    settings = {"optimize.steps": 10}
+    trainer = clsplat.Trainer(tiny_scene, "smoke", set=settings, out=tmp_path / "run")
+    trainer.run(9)
+    trainer.checkpoint()
+    assert clsplat.status(tmp_path / "run")["state"] in ("starting", "running")
+    trainer.step()
+    assert trainer.checkpoint().is_file()
+    assert (clsplat.status(tmp_path / "run")["state"], clsplat.status(tmp_path / "run")["step"]) == ("done", 10)
+    again = clsplat.Trainer(tiny_scene, "smoke", set=settings, out=tmp_path / "run", resume=True)
+    assert clsplat.status(tmp_path / "run")["state"] == "done"
+    assert again.run() is None
     assert Path(clsplat.check(tmp_path / "run" / "pipeline.yaml")["path"]).name == "pipeline.yaml"

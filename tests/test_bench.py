@@ -30,7 +30,7 @@ def test_a_case_does_what_its_pipeline_names_and_changes_nothing(device, pipelin
     assert (INTERVAL2 in trainer.model.gaussians.tables) == (pipeline == "micro_splatting_v2")
     before = {name: trainer.model.gaussians.get(name) for name in PARAMETERS}
     timed.step(record=True)
-    view = trainer.step(timed.photograph)
+    view = trainer.step(timed.photograph, 1)
     assert sorted(loss.name for loss in view.losses) == sorted(losses)
     assert np.isfinite(view.loss)
     assert set(trainer.stats.names) == columns

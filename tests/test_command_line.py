@@ -82,7 +82,7 @@ NEAR = {
     "resume nowhere": "nowhere: has no pipeline.yaml; expected the folder of a run",
     "status nowhere": "nowhere: has no readable status.json; expected the folder of a run",
     "pipelines --copy x": "--copy needs the name of a pipeline",
-    "evaluate x.ply": "x.ply: a model file does not name its scene; give --scene DIR, or a run folder",
+    "evaluate x.ply": "x.ply: a model file does not name its scene; give the folder of a scene, or a run folder",
     "evaluate x.ply --scene y --scales nan": "expected downscale factors from 1 on, got nan",
     "evaluate x.ply --scene y --scales inf": "expected downscale factors from 1 on, got inf",
 }
@@ -173,7 +173,7 @@ def test_a_run_folder_that_is_no_model_says_why(finished, tmp_path):
     text = (run / "pipeline.yaml").read_text()
     (run / "pipeline.yaml").write_text(text.replace(str(load(str(run / "pipeline.yaml")).settings.scene.path), "gone"))
     missing = clsplat("render", run, expect=3).stderr
-    assert "the folder of its photographs, gone, is missing; give --scene DIR" in missing
+    assert "the folder of its photographs, gone, is missing; give the folder of a scene" in missing
     (run / "point_cloud.ply").unlink()
     assert (
         f"has no point_cloud.ply; finish the run with `clsplat resume {run}`" in clsplat("render", run, expect=3).stderr

@@ -70,6 +70,14 @@ def test_rows_are_chosen_by_mask_slice_index_and_indices(rng):
     assert model[:0].sh_degree == 1
 
 
+def test_a_model_shares_no_memory_with_arrays_or_other_models(rng):
+    given = with_world_filter(random_case(rng, 9), rng).parameters
+    model = Model(**given)
+    for other in (given, model[:4].tables(), model[:].tables(), model.transformed().tables(), model.baked().tables()):
+        for name, table in other.items():
+            assert not np.shares_memory(table, getattr(model, name)), name
+
+
 @pytest.mark.parametrize("degree", WIDTHS)
 def test_a_moved_model_looks_the_same_to_a_camera_that_moves_along(device, rng, degree):
     case = with_world_filter(random_case(rng, 40, compensate=1.0), rng)

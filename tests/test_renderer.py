@@ -1,12 +1,17 @@
 """Pictures and their gradients, NumPy in and out."""
 
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from clsplat.api import device as devices
 from clsplat.api.renderer import Renderer
 from clsplat.gaussians.model import Model, Rendering
+from clsplat.opencl import program
 from tests.scenes import random_case, with_world_filter
 
 PARAMETERS = ("means", "quats", "log_scales", "logit_opacity", "sh_base", "sh_rest")
@@ -119,6 +124,50 @@ def test_renderers_on_one_device_do_not_disturb_each_other(device, rng):
             np.testing.assert_array_equal(getattr(expected, name), getattr(gradients, name))
 
 
+def test_threads_that_share_a_device_keep_the_arguments_of_their_kernels(device, monkeypatch):
+    enqueue = program.cl.enqueue_nd_range_kernel
+
+    def delayed(*arguments):
+        time.sleep(0.002)  # here another thread would set its arguments
+        return enqueue(*arguments)
+
+    def filled(value: int) -> bool:
+        arrays = [device.empty(64) for _ in range(10)]
+        start.wait()
+        for array in arrays:
+            array.fill(value)
+        return all((array.get() == value).all() for array in arrays)
+
+    device.zeros(1)  # builds the kernel
+    monkeypatch.setattr(program.cl, "enqueue_nd_range_kernel", delayed)
+    start = threading.Barrier(4)
+    with ThreadPoolExecutor(4) as pool:
+        assert all(pool.map(filled, range(1, 5)))
+
+
+def test_threads_build_a_program_once_and_open_the_default_device_once(device, monkeypatch):
+    built, opened = [], []
+
+    def slowly(seen: list):
+        def make(*arguments, **named):
+            time.sleep(0.02)
+            seen.append(object())
+            return seen[-1]
+
+        return make
+
+    monkeypatch.setattr(program, "Program", slowly(built))
+    monkeypatch.setattr(device, "_programs", {})
+    monkeypatch.setattr(devices, "Device", slowly(opened))
+    devices._opened.cache_clear()
+    with ThreadPoolExecutor(4) as pool:
+        programs = list(pool.map(lambda _: device.program("fill.cl"), range(4)))
+        found = list(pool.map(lambda _: devices.default_device(), range(4)))
+    devices._opened.cache_clear()
+    assert (len(built), len(set(programs))) == (1, 1)
+    assert (len(opened), len(set(found))) == (1, 1)
+
+
 def test_gradients_are_those_of_the_model_that_was_rendered(device, rng):
     case = random_case(rng, 20, *SIZE)
     model, plain = model_of(case), model_of(case)
@@ -132,6 +181,20 @@ def test_gradients_are_those_of_the_model_that_was_rendered(device, rng):
     assert renderer.model is plain
     for name in PARAMETERS:
         np.testing.assert_array_equal(getattr(expected, name), getattr(again, name))
+
+
+def test_gradients_are_those_of_what_was_rendered_after_the_model_was_changed_in_place(device, rng):
+    case = random_case(rng, 20, *SIZE)
+    model, by_image = model_of(case), np.ones((SIZE[1], SIZE[0], 3))
+    renderer = Renderer(model, device)
+    picture = renderer.render(case.view)
+    expected = picture.backward(image=by_image)
+    model.means[:] += 0.3
+    renderer.update(model)
+    again = picture.backward(image=by_image)
+    for name in PARAMETERS:
+        np.testing.assert_array_equal(getattr(expected, name), getattr(again, name))
+    assert (renderer.render(case.view).backward(image=by_image).means != expected.means).any()
 
 
 def test_arrays_of_a_picture_are_the_callers_own(device, rng):

@@ -5,7 +5,7 @@ import pytest
 
 from clsplat.api.renderer import Renderer
 from clsplat.gaussians.tables import PARAMETERS
-from tests.scenes import random_case
+from tests.scenes import random_case, with_world_filter
 from tests.test_model import model_of
 
 torch = pytest.importorskip("torch")
@@ -87,6 +87,23 @@ def test_a_table_that_was_changed_in_place_before_backward_is_refused(device, rn
         parameters["means"] += 1
     with pytest.raises(RuntimeError, match="modified by an inplace operation"):
         image.sum().backward()
+
+
+def test_a_second_derivative_is_refused(device, rng):
+    case = random_case(rng, 5, *SIZE)
+    parameters = parameters_of(model_of(case))
+    image, _ = clsplat.torch.render(Renderer(model_of(case), device), case.view, parameters)
+    (first,) = torch.autograd.grad(image.square().sum(), [parameters["means"]], create_graph=True)
+    with pytest.raises(RuntimeError, match="differentiate twice"):
+        first.square().sum().backward()
+
+
+def test_another_number_of_gaussians_than_the_world_filter_has_is_refused(device, rng):
+    case = with_world_filter(random_case(rng, 5, *SIZE), rng)
+    renderer = Renderer(model_of(case), device)
+    clsplat.torch.render(renderer, case.view, parameters_of(model_of(case)))
+    with pytest.raises(ValueError, match="has a world filter of 5 Gaussians, the parameters have 3; expected as many"):
+        clsplat.torch.render(renderer, case.view, parameters_of(model_of(case)[:3]))
 
 
 def test_a_missing_table_and_a_wrong_shape_are_refused(device, rng):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from clsplat.density.statistics import SplatStats
+from clsplat.errors import ConfigError
 from clsplat.filters import FilterViews, measure_intervals
 from clsplat.gaussians.tables import INTERVAL2, DeviceModel, Gaussians
 from clsplat.losses.base import HostLoss, ImageLoss, Loss
@@ -94,11 +95,18 @@ def trainer_of(device: Device, rng: np.random.Generator, losses: list[Loss]) -> 
 def test_differentiating_updates_nothing(device, rng):
     trainer, photograph = trainer_of(device, rng, [L1()])
     before = {name: trainer.model.gaussians.get(name) for name in trainer.model.gaussians.tables}
-    view = trainer.differentiate(photograph)
+    view = trainer.differentiate(photograph, 1)
     assert np.abs(view.pixel_sums.get()[:, :60]).max() > 0
     for name, table in before.items():
         np.testing.assert_array_equal(trainer.model.gaussians.get(name), table)
     assert trainer.adam.updates["means"] == 0
+
+
+@pytest.mark.parametrize("loss", [Loss(), print])
+def test_what_is_neither_a_loss_of_images_nor_a_penalty_is_refused(device, rng, loss):
+    trainer, photograph = trainer_of(device, rng, [L1(), loss])
+    with pytest.raises(ConfigError, match=r"^the loss \w+: expected a subclass of ImageLoss or of Penalty$"):
+        trainer.step(photograph, 1)
 
 
 @pytest.mark.parametrize(("step", "expected"), [(1, 0.3), (9, 0.3), (10, 0.6)])
@@ -109,7 +117,7 @@ def test_rates_and_weights_are_those_of_the_global_step(device, rng, step, expec
     trainer.extent = 3.0
     trainer.rates = Rates(means={"points": [[0, 0.1], [10, 0.2]], "between": "steps"}, quats=0.0)
     before = {name: trainer.model.gaussians.get(name) for name in ("means", "quats")}
-    full = L1().add(trainer.differentiate(photograph).comparison).value()
+    full = L1().add(trainer.differentiate(photograph, 1).comparison).value()
     view = trainer.step(photograph, step)
     moved = np.abs(trainer.model.gaussians.get("means") - before["means"])
     assert (moved > 0).any(axis=1).sum() > 20
@@ -121,7 +129,7 @@ def test_rates_and_weights_are_those_of_the_global_step(device, rng, step, expec
 def test_stale_parameters_stay(device, rng):
     trainer, photograph = trainer_of(device, rng, [L1(), Anisotropy(above=1.0)])
     before = {name: trainer.model.gaussians.get(name) for name in ("logit_opacity", "log_scales")}
-    view = trainer.step(photograph, stale=["logit_opacity"])
+    view = trainer.step(photograph, 1, stale=["logit_opacity"])
     assert [loss.name for loss in view.losses] == ["l1", "anisotropy"]
     np.testing.assert_array_equal(trainer.model.gaussians.get("logit_opacity"), before["logit_opacity"])
     assert (trainer.model.gaussians.get("log_scales") != before["log_scales"]).any()
@@ -129,7 +137,7 @@ def test_stale_parameters_stay(device, rng):
 
 def test_what_a_mask_leaves_out_has_no_gradient(device, rng):
     trainer, photograph = trainer_of(device, rng, [Dssim(), L2()])
-    comparison = trainer.differentiate(photograph).comparison
+    comparison = trainer.differentiate(photograph, 1).comparison
     for planes in (comparison.gradient, comparison.image, comparison.photograph):
         assert (planes.get()[:, :30, :13] == 0).all()
         assert (planes.get()[:, :30, 13:40] != 0).mean() > 0.3

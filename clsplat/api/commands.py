@@ -2,8 +2,8 @@
 
 The command line prints what these return.  They raise the errors of `clsplat.errors`, with the messages of the
 commands: ConfigError for a pipeline or an argument, DataError for a dataset or a model, DeviceError for a device,
-OutputError for a file that cannot be written.  `device` is a part of a device's name, as `devices` lists them; without
-it CLSPLAT_DEVICE, else the first GPU that works, else the first CPU.
+OutputError for a file that cannot be written.  `device` is a part of a device's name, as `devices` lists them, or a
+`Device`; without it CLSPLAT_DEVICE, else the first GPU that works, else the first CPU.
 """
 
 from collections.abc import Sequence
@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from clsplat.api.arguments import Overrides, PathLike, load_plugins, overrides, path_of
 
 if TYPE_CHECKING:  # the command line starts without OpenCL
+    from clsplat.opencl.device import Device
     from clsplat.runs.experiment import Job
 
 
@@ -22,7 +23,7 @@ def run(
     out: PathLike | None = None,
     *,
     set: Overrides = (),
-    device: str | None = None,
+    device: "str | Device | None" = None,
     resume: bool = False,
 ) -> Path:
     """Run a pipeline or a matrix, as `clsplat run` does; return the run folder.
@@ -41,14 +42,14 @@ def describe_run(
     out: PathLike | None = None,
     *,
     set: Overrides = (),
-    device: str | None = None,
+    device: "str | Device | None" = None,
     resume: bool = False,
 ) -> str:
     """Check all that `run` would need and return what it would do, as lines of text; nothing is written."""
     return _job(pipeline, scene, out, set, resume).describe(device)
 
 
-def resume(folder: PathLike, *, set: Overrides = (), device: str | None = None) -> Path:
+def resume(folder: PathLike, *, set: Overrides = (), device: "str | Device | None" = None) -> Path:
     """Go on with a run, or a matrix, from its newest checkpoint, as `clsplat resume` does; return the run folder."""
     from clsplat.runs.experiment import Job
 
@@ -107,7 +108,7 @@ def render_views(
     split: Literal["test", "train", "all"] = "test",
     downscale: float | None = None,
     kind: Literal["png", "npy"] = "png",
-    device: str | None = None,
+    device: "str | Device | None" = None,
 ) -> int:
     """Render a model at the views of a scene, one file for each view; return their number.
 
@@ -130,7 +131,7 @@ def evaluate(
     metrics: Sequence[str] = ("psnr", "ssim"),
     lpips: PathLike | None = None,
     lpips_input: Literal["-1..1", "0..1"] = "-1..1",
-    device: str | None = None,
+    device: "str | Device | None" = None,
 ) -> dict[str, Any]:
     """Measure a model at the views of a scene; return metrics by split and divisor, with the keys of metrics.json.
 

@@ -1,5 +1,6 @@
 """The device of a notebook."""
 
+import threading
 from functools import cache
 from types import TracebackType
 
@@ -8,7 +9,9 @@ from clsplat.opencl.discovery import Schedule, choose
 
 
 class Device(opencl.Device):
-    """An open OpenCL device; also a context manager.
+    """An open OpenCL device; a `with` block waits at its end for all its work.
+
+    Memory is released with the arrays, and the device with the last object that uses it.
 
     `name` is a part of a runtime's or device's name, as `clsplat devices` prints them; without it CLSPLAT_DEVICE, else
     the first GPU that works, else the first CPU.  Raises DeviceError when there is none.
@@ -29,7 +32,15 @@ class Device(opencl.Device):
         return f"Device({self.text!r})"
 
 
-@cache
+_OPENING = threading.Lock()
+
+
 def default_device(schedule: Schedule = "auto") -> Device:
     """Return the device that is taken where none is given; opened on first use."""
+    with _OPENING:  # two threads get the same one
+        return _opened(schedule)
+
+
+@cache
+def _opened(schedule: Schedule) -> Device:
     return Device(schedule=schedule)

@@ -11,7 +11,7 @@ from clsplat.api.device import default_device
 from clsplat.gaussians.model import Model
 from clsplat.gaussians.tables import PARAMETERS, DeviceModel
 from clsplat.metrics.images import to_8_bits
-from clsplat.opencl.device import Array, Device
+from clsplat.opencl.device import Array, Device, open_device
 from clsplat.render.camera import DeviceCamera, upload_camera
 from clsplat.render.rasterizer import Content, Frame, Rasterizer
 from clsplat.scene.scene import View
@@ -47,14 +47,15 @@ class Picture:
     depth: Floats | None  # [height, width] scene units, mean depth of what covers a pixel; 0 where nothing does
     view: View
     background: Floats  # [3]
-    model: Model
+    model: DeviceModel  # as it was rendered; the picture keeps it on the device
     renderer: "Renderer"
 
     def backward(self, image: Floats | None = None, alpha: Floats | None = None) -> Gradients:
         """Return the gradients of a loss by every parameter, from its derivatives by the picture.
 
-        image: [height, width, 3] dL/d image; alpha: [height, width] dL/d alpha.  It may be called again, and after the
-        renderer has taken another model.  Raises ValueError for other shapes.
+        image: [height, width, 3] dL/d image; alpha: [height, width] dL/d alpha.  It may be called again, and after
+        another model, or a change of its arrays: the gradients are those of what was rendered.
+        Raises ValueError for other shapes.
         """
         return self.renderer.backward(self, image, alpha)
 
@@ -75,12 +76,15 @@ class Renderer:
     """A model on a device.
 
     A renderer serves one thread, for it renders one picture at a time.  Renderers on one device do not disturb each
-    other.
+    other, in one thread or in several.
     """
 
-    def __init__(self, model: Model, device: Device | None = None) -> None:
-        """Copy a model to a device, by default `default_device()`.  Raises DeviceError when there is none."""
-        self.device = device or default_device()
+    def __init__(self, model: Model, device: str | Device | None = None) -> None:
+        """Copy a model to a device, or to one by its name; by default `default_device()`.
+
+        Raises DeviceError when there is none.
+        """
+        self.device = default_device() if device is None else open_device(device)
         self.rasterizer = Rasterizer(self.device)
         self.update(model)
 
@@ -100,12 +104,12 @@ class Renderer:
         image = _inside(frame, frame.image.get())
         alpha = _inside(frame, 1 - np.abs(frame.transmittance.get())[None])[:, :, 0]
         mean = self._depth(camera) if depth else None
-        return Picture(image, alpha, mean, view, colour, self.model, self)
+        return Picture(image, alpha, mean, view, colour, self._model, self)
 
     def backward(self, picture: Picture, image: Floats | None, alpha: Floats | None) -> Gradients:
         """Return the gradients of a loss, as Picture.backward does."""
         camera = upload_camera(self.device, picture.view)
-        model = self._model if picture.model is self.model else picture.model.upload(self.device)
+        model = picture.model
         size = camera.height, camera.width
         sums = np.zeros((0, 0), np.float32)
         if alpha is not None:  # alpha is the second channel of a picture that shows (depth, 1, 0) on black

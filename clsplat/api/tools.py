@@ -9,6 +9,7 @@ from clsplat.api.arguments import PathLike, load_plugins, path_of
 if TYPE_CHECKING:  # the command line starts without OpenCL
     from clsplat.bench.measurement import Measurement
     from clsplat.inspect.inspection import Inspection
+    from clsplat.opencl.device import Device
 
 ScheduleName = Literal["auto", "wide", "simt"]  # wide for CPUs, simt for GPUs
 
@@ -50,7 +51,7 @@ def measure_speed(
     pipeline: PathLike = "splat",
     repeats: int = 20,
     schedule: ScheduleName = "auto",
-    device: str | None = None,
+    device: "str | Device | None" = None,
 ) -> "Measurement":
     """Time the stages of a training step, as `clsplat bench` does; return times in ms, as `data()` and `text()`.
 
@@ -77,7 +78,7 @@ def measure_growth(
     pipeline: PathLike = "splat",
     repeats: int = 20,
     schedule: ScheduleName = "auto",
-    device: str | None = None,
+    device: "str | Device | None" = None,
 ) -> str:
     """Time a step with 50 000 to a million Gaussians; write the chart, an SVG, and return a table."""
     from clsplat.bench import measurement

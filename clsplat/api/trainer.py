@@ -14,7 +14,7 @@ from clsplat.errors import ClsplatError, ConfigError, DataError
 from clsplat.gaussians.model import Model
 from clsplat.losses.base import HostFunction, HostLoss, ViewGradients
 from clsplat.metrics.views import mean, measure
-from clsplat.opencl.device import Device
+from clsplat.opencl.device import Device, open_device
 from clsplat.pipeline.loading import Pipeline, load
 from clsplat.runs import runner
 from clsplat.runs.experiment import quoted
@@ -57,15 +57,16 @@ class Trainer:
         pipeline: PathLike = "splat_7k",
         *,
         set: Mapping[str, Any] | None = None,
-        device: Device | None = None,
+        device: str | Device | None = None,
         out: PathLike | None = None,
         resume: bool = False,
     ) -> None:
         """Prepare training.
 
         scene: what `read_scene` returns, whose split is kept, or a folder; pipeline: a file, or the name of a shipped
-        one; set: settings by place, such as {"optimize.steps": 3000}; out: the run folder, by default a temporary one
-        that goes away with the trainer; resume: go on from the newest checkpoint in `out`, also of `clsplat run`.
+        one; set: settings by place, such as {"optimize.steps": 3000}; device: a part of its name, or one that is open,
+        with the schedule of the pipeline; out: the run folder, by default a temporary one that goes away with the
+        trainer; resume: go on from the newest checkpoint in `out`, also of `clsplat run`.
         Raises ConfigError, DataError and DeviceError.
         """
         load_plugins()
@@ -82,18 +83,22 @@ class Trainer:
             out = tempfile.mkdtemp(prefix="clsplat-")
             weakref.finalize(self, shutil.rmtree, out, ignore_errors=True)
         self.out = Path(out)
-        runner.make_run_folder(self.out, resume)
         schedule = self.pipeline.settings.rasterizer.schedule
-        self._run = runner.make_run(self.pipeline, self.scene, device or default_device(schedule), self.out)
-        runner.begin(self.pipeline, self._run, resume)
-        _run_until_training(self.pipeline, self._run)
+        opened = default_device(schedule) if device is None else open_device(device, schedule)
+        runner.make_run_folder(self.out, resume)
+        with runner.failures_recorded(self.out, as_raised=True):
+            self._run = runner.make_run(self.pipeline, self.scene, opened, self.out)
+            runner.begin(self.pipeline, self._run, resume)
+            _run_until_training(self.pipeline, self._run)
+            self._record_end()
         self._steps = _training(self.pipeline, self._run)
         self._failed = False
 
     def step(self) -> Report:
         """Train one step.  Raises StopIteration when the pipeline's steps are done.
 
-        After an error inside of a step the trainer cannot go on; the next call says so.
+        After an error inside of a step the trainer cannot go on; the next call says so.  status.json in `out` has the
+        error, or `done` after the last step.
         """
         interrupts: list[bool] = []
 
@@ -107,13 +112,17 @@ class Trainer:
                 f"{self!r} ended with an error; make another, with resume=True where `out` holds a checkpoint"
             )
         try:
-            with runner.stopping_on_signals(finish_step):
-                view = next(self._steps)
-        except StopIteration:
-            raise
+            with (
+                runner.failures_recorded(self.out, lambda: self._run.step, as_raised=True),
+                runner.stopping_on_signals(finish_step),
+            ):
+                view = next(self._steps, None)
+                self._record_end()
         except BaseException:
             self._failed = True
             raise
+        if view is None:
+            raise StopIteration
         if interrupts:
             raise KeyboardInterrupt
         return Report(self._run.step, self._run.model.gaussians.count, view)
@@ -164,6 +173,15 @@ class Trainer:
         """
         return checkpoint.save(self._run, keep=2)
 
+    def _record_end(self) -> None:
+        """Write `done` to status.json where no step is left."""
+        last = max(_training_stages(self.pipeline))
+        stage, run = self.pipeline.stages[last], self._run
+        if isinstance(stage, Optimize) and (
+            run.cursor > last or (run.cursor == last and run.stage_step >= stage.steps)
+        ):
+            run.records.status("done", run.step, exit_code=0)
+
     def __repr__(self) -> str:
         return f"Trainer({self.pipeline.settings.name} on {self.scene.path.name}, step {self._run.step})"
 
@@ -178,6 +196,10 @@ def _check(pipeline: Pipeline) -> None:
         stage.check()
 
 
+def _training_stages(pipeline: Pipeline) -> list[int]:
+    return [i for i, stage in enumerate(pipeline.stages) if isinstance(stage, Optimize)]
+
+
 def _run_until_training(pipeline: Pipeline, run: Run) -> None:
     """Run the stages before the first that trains, from where the run is."""
     for cursor, stage in enumerate(pipeline.stages):
@@ -190,7 +212,7 @@ def _run_until_training(pipeline: Pipeline, run: Run) -> None:
 
 def _training(pipeline: Pipeline, run: Run) -> Iterator[ViewGradients]:
     """Run all stages that train, step by step, and those between them."""
-    trains = [i for i, stage in enumerate(pipeline.stages) if isinstance(stage, Optimize)]
+    trains = _training_stages(pipeline)
     for cursor in range(max(trains[0], run.cursor), trains[-1] + 1):
         if cursor > run.cursor:
             run.cursor, run.stage_step = cursor, 0

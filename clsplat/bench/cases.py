@@ -86,7 +86,7 @@ class Case:
         self.device.finish()
         self.device.timings.sampling = record
         start = time.perf_counter()
-        view = self.trainer.step(self.photograph, stale=stale)
+        view = self.trainer.step(self.photograph, 1, stale=stale)
         self.device.finish()
         seconds = time.perf_counter() - start
         self.device.timings.sampling = False

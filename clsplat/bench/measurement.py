@@ -12,8 +12,8 @@ from clsplat.bench.scenes import SIZES, case, grown, real_case
 from clsplat.bench.table import growth_chart, growth_table, table
 from clsplat.errors import ConfigError
 from clsplat.files import write_text
-from clsplat.opencl.device import Device
-from clsplat.opencl.discovery import Schedule, choose
+from clsplat.opencl.device import Device, open_device
+from clsplat.opencl.discovery import Schedule
 from clsplat.pipeline.loading import load
 
 
@@ -47,7 +47,7 @@ def measure(
     pipeline: str = "splat",
     repeats: int = 20,
     schedule: Schedule = "auto",
-    device: str | None = None,
+    device: str | Device | None = None,
 ) -> Measurement:
     """Time a training step on fixed scenes, and of a model at the views of its scene.  Raises ClsplatError."""
     if unknown := [name for name in scenes if name not in SIZES]:
@@ -55,7 +55,7 @@ def measure(
     if (model is None) != (scene is None):
         raise ConfigError("bench: --model and --scene go together")
     settings = load(pipeline).settings
-    opened = Device(choose(device), schedule)
+    opened = open_device(device, schedule)
     peaks = measure_peaks(opened)
     cases = {name: case(opened, *SIZES[name], settings) for name in scenes}
     if model is not None and scene is not None:
@@ -63,10 +63,10 @@ def measure(
     return Measurement(opened.text, settings.name, peaks, run_bench(cases, peaks, repeats))
 
 
-def measure_growth(chart: Path, *, pipeline: str, repeats: int, schedule: Schedule, device: str | None) -> str:
+def measure_growth(chart: Path, *, pipeline: str, repeats: int, schedule: Schedule, device: str | Device | None) -> str:
     """Time 50 000 to a million Gaussians; write an SVG, return a table.  Raises ClsplatError."""
     settings = load(pipeline).settings
-    opened = Device(choose(device), schedule)
+    opened = open_device(device, schedule)
     peaks = measure_peaks(opened)
     sizes = [run_bench({"": one}, peaks, repeats)[""] for one in grown(opened, settings)]
     write_text(chart, growth_chart(sizes))

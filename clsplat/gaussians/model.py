@@ -59,6 +59,7 @@ class Rendering:
 class Model:
     """N Gaussians before activation, float32, with the names that pipelines, kernels and checkpoints have.
 
+    The arrays are copies of those that are given.
     Raises ValueError, with the name of the table, where shapes do not fit.
     """
 
@@ -76,7 +77,7 @@ class Model:
     def __post_init__(self) -> None:
         count = len(self.means)
         for name, table in self.tables().items():
-            array = np.ascontiguousarray(table, np.float32)
+            array = np.array(table, np.float32, order="C")
             if array.shape not in [(count, width) for width in WIDTHS[name]]:
                 widths = " or ".join(map(str, WIDTHS[name]))
                 raise ValueError(f"{name} has shape {array.shape}; expected ({count}, {widths})")

@@ -12,9 +12,14 @@ Mask = NDArray[np.bool_]
 
 
 def to_8_bits(image: NDArray[np.generic]) -> Image:
-    """Return an image with values in [0, 1] as 8 bits: clamped, rounded to the nearest; uint8 stays as it is."""
+    """Return an image with values in [0, 1] as 8 bits: clamped, rounded to the nearest; uint8 stays as it is.
+
+    Raises ValueError for other values, such as integers of 16 bits.
+    """
     if image.dtype == np.uint8:
         return image.astype(np.uint8, copy=False)
+    if not np.issubdtype(image.dtype, np.floating):
+        raise ValueError(f"the image has values of type {image.dtype}; expected uint8, or floats in [0, 1]")
     return (np.clip(image.astype(np.float32, copy=False), 0, 1) * 255 + 0.5).astype(np.uint8)
 
 
@@ -22,6 +27,7 @@ def psnr(image: NDArray[np.generic], photograph: NDArray[np.generic], mask: Mask
     """Return the peak signal-to-noise ratio in dB over all channels of the pixels that count.
 
     image, photograph: [height, width, 3], uint8, or floats in [0, 1] that are rounded to 8 bits; mask: [height, width].
+    Raises ValueError for other values.
     """
     squared = (to_8_bits(image).astype(np.float64) - to_8_bits(photograph)) ** 2
     error = float(np.mean(squared if mask is None else squared[mask])) / 255**2

@@ -4,6 +4,7 @@ This package is the only importer of pyopencl.
 """
 
 import math
+import threading
 import warnings
 import weakref
 from pathlib import Path
@@ -12,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from clsplat.errors import MemoryLimitError
+from clsplat.errors import ConfigError, MemoryLimitError
 from clsplat.opencl import runtimes
-from clsplat.opencl.discovery import DeviceInfo, Schedule, platforms, resolve_schedule, tuning_of
+from clsplat.opencl.discovery import DeviceInfo, Schedule, choose, platforms, resolve_schedule, tuning_of
 from clsplat.opencl.timings import Timings
 
 runtimes.add_intel_runtime()
@@ -84,6 +85,7 @@ class Device:
         self.timings = Timings()
         self.allocated = 0  # bytes of all buffers that are alive
         self.peak = 0  # largest value of `allocated`
+        self.lock = threading.Lock()  # of what threads share: the programs, and the arguments of their kernels
         self._programs: dict[tuple[Any, ...], Program] = {}
 
     @property
@@ -135,13 +137,28 @@ class Device:
         from clsplat.opencl.program import Program
 
         key = (str(file), *sorted(defines.items()))
-        if key not in self._programs:
-            self._programs[key] = Program(self, file, {**self.tuning, **defines})
-        return self._programs[key]
+        with self.lock:
+            if key not in self._programs:
+                self._programs[key] = Program(self, file, {**self.tuning, **defines})
+            return self._programs[key]
 
     def finish(self) -> None:
         """Wait for all enqueued work."""
         self.queue.finish()
+
+
+def open_device(device: str | Device | None = None, schedule: Schedule = "auto") -> Device:
+    """Return a device that is open, or open one by a part of its name; None: as `choose` does.
+
+    Raises DeviceError when there is none, ConfigError for an open device of another schedule.
+    """
+    if device is None or isinstance(device, str):
+        return Device(choose(device), schedule)
+    if not isinstance(device, Device):
+        raise ConfigError(f"device: is a {type(device).__name__}; expected a part of a device's name, or a Device")
+    if schedule != "auto" and resolve_schedule(device.info, schedule) != device.schedule:
+        raise ConfigError(f"device: {device.text}; expected the {schedule} schedule, as the settings say: open it so")
+    return device
 
 
 def _whole_lines(size: int) -> int:

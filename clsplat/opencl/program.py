@@ -114,9 +114,11 @@ class Kernel:
             size = tuple(n * g for n, g in zip(size, local, strict=True))
         if 0 in size:
             return
-        self._kernel.set_args(*self._checked(values))
+        arguments = self._checked(values)
         try:
-            event = cl.enqueue_nd_range_kernel(self._device.queue, self._kernel, size, local)
+            with self._device.lock:  # the kernel object holds the arguments until it is enqueued
+                self._kernel.set_args(*arguments)
+                event = cl.enqueue_nd_range_kernel(self._device.queue, self._kernel, size, local)
         except cl.MemoryError as error:
             raise MemoryLimitError(f"{self.label}: {self._device.info.name} is out of memory ({error})") from error
         except cl.Error as error:

@@ -14,6 +14,7 @@ from clsplat import terminal
 from clsplat.compare.page import write_comparison
 from clsplat.errors import ClsplatError, ConfigError, DataError, Interrupted, OutputError, as_clsplat_error, one_line
 from clsplat.files import write_text
+from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import Pipeline, load
 from clsplat.pipeline.matrix import Cell, Experiment, load_experiment
 from clsplat.pipeline.yaml_file import read_yaml
@@ -58,18 +59,18 @@ class Job:
             raise DataError(f"{out}: has no pipeline.yaml; expected the folder of a run")
         return cls.open(str(file), None, out, overrides, resume=True)
 
-    def describe(self, device: str | None = None) -> str:
+    def describe(self, device: str | Device | None = None) -> str:
         """What would run, as lines of text.  Raises what `run` raises before it begins."""
         if isinstance(self.work, Experiment):
             return describe_matrix(self.work, self.out)
         return runner.describe(self.work, self.out, device)
 
-    def run(self, device: str | None = None, resume: bool = False) -> None:
+    def run(self, device: str | Device | None = None, resume: bool = False) -> None:
         """Run it; what is up to date is left alone.  Raises ClsplatError; status.json tells why."""
         if isinstance(self.work, Experiment):
             run_matrix(self.work, self.out, device, resume)
         elif runner.up_to_date(self.work, self.work.preparation(self.out), self.out):
-            LOG.info("%s: up to date; change a setting, or give another --out, to run again", self.out)
+            LOG.info("%s: up to date; change a setting, or give another folder, to run again", self.out)
         else:
             run_pipeline(self.work, self.out, device, resume)
 
@@ -82,7 +83,7 @@ def check(pipeline: str) -> dict[str, Any]:
     return {"path": str(checked.path), "name": checked.settings.name, "stages": checked.names}
 
 
-def run_pipeline(pipeline: Pipeline, out: Path, device: str | None, resume: bool) -> None:
+def run_pipeline(pipeline: Pipeline, out: Path, device: str | Device | None, resume: bool) -> None:
     """Run one pipeline in its folder, with a log and a progress bar.  Raises ClsplatError; status.json tells why."""
     runner.make_run_folder(out, resume)
     with (
@@ -95,14 +96,14 @@ def run_pipeline(pipeline: Pipeline, out: Path, device: str | None, resume: bool
             runner.execute(pipeline, run, resume, show)
 
 
-def run_matrix(experiment: Experiment, out: Path, device: str | None, resume: bool) -> None:
+def run_matrix(experiment: Experiment, out: Path, device: str | Device | None, resume: bool) -> None:
     """Run every cell in its folder below `out` and write compare.html; with `resume` finished cells are left alone.
 
     A cell that fails does not stop the others; at the end a ClsplatError is raised with the exit code of the first one.
     Interrupted stops the whole.
     """
     if resume and (out / "pipeline.yaml").exists() and "matrix" not in (read_yaml(out / "pipeline.yaml").data or {}):
-        raise ConfigError(f"{out}: holds a single run, not those of a matrix; give another --out")
+        raise ConfigError(f"{out}: holds a single run, not those of a matrix; give another folder")
     runner.make_run_folder(out, resume)
     write_text(out / "pipeline.yaml", experiment.text)
     state = _State(out, len(experiment.cells))
@@ -114,7 +115,7 @@ def run_matrix(experiment: Experiment, out: Path, device: str | None, resume: bo
     state.end(_first_of(state.failures, len(experiment.cells)))
 
 
-def _run_cells(experiment: Experiment, state: "_State", device: str | None, resume: bool) -> None:
+def _run_cells(experiment: Experiment, state: "_State", device: str | Device | None, resume: bool) -> None:
     for number, cell in enumerate(experiment.cells, 1):
         state.write("running", done=number - 1)
         title, folder = f"cell {number} of {len(experiment.cells)}: {cell.name}", state.out / cell.name
@@ -163,7 +164,7 @@ def _finished(cell: Cell, folder: Path) -> bool:
         return False
     before = load(str(folder / "pipeline.yaml")).resolved()
     if difference := first_difference(before, cell.pipeline.resolved()):
-        raise ConfigError(f"{folder}: was run with other settings: {difference}; use another --out, or those settings")
+        raise ConfigError(f"{folder}: was run with other settings: {difference}; use another folder, or those settings")
     return True
 
 

@@ -16,8 +16,7 @@ from clsplat.gaussians.model import MODEL, load
 from clsplat.metrics.lpips import InputRange
 from clsplat.metrics.perceptual import Perceptual, metric_names
 from clsplat.metrics.views import PSNR_AND_SSIM, mean, measure, render_view
-from clsplat.opencl.device import Device
-from clsplat.opencl.discovery import choose
+from clsplat.opencl.device import Device, open_device
 from clsplat.pipeline.file import SceneSettings
 from clsplat.pipeline.loading import load as load_pipeline
 from clsplat.prepare.cache import noted
@@ -48,7 +47,9 @@ class Source:
         """
         if not model.is_dir():
             if scene is None:
-                raise ConfigError(f"{model}: a model file does not name its scene; give --scene DIR, or a run folder")
+                raise ConfigError(
+                    f"{model}: a model file does not name its scene; give the folder of a scene, or a run folder"
+                )
             return cls(model, scene, SceneSettings())
         if not (model / "pipeline.yaml").is_file():
             raise DataError(f"{model}: has no pipeline.yaml; expected a model file or a run folder")
@@ -58,7 +59,7 @@ class Source:
         prepared = noted(model)
         folder = scene or Path(prepared["folder"] if prepared else settings.folder)
         if not folder.is_dir():
-            raise DataError(f"{model}: the folder of its photographs, {folder}, is missing; give --scene DIR")
+            raise DataError(f"{model}: the folder of its photographs, {folder}, is missing; give the folder of a scene")
         return cls(model / MODEL, folder, settings, settings.alpha)
 
 
@@ -70,12 +71,12 @@ class ModelFile:
     """
 
     def __init__(
-        self, model: Path, scene: Path | None = None, device: str | None = None, downscale: float | None = None
+        self, model: Path, scene: Path | None = None, device: str | Device | None = None, downscale: float | None = None
     ) -> None:
         """downscale: divisor of the photographs' size; default: that of the run, 1 for a file."""
         source = Source.of(model, scene)
         file = load(source.file)
-        self.device = Device(choose(device))
+        self.device = open_device(device)
         LOG.info("device: %s", self.device.text)
         alpha = source.alpha or file.rendering.alpha
         self.photographs = read_scene(source.folder, source.settings.holdout).with_alpha(alpha)
@@ -128,7 +129,7 @@ def render(
     split: str = "test",
     downscale: float | None = None,
     kind: str = "png",
-    device: str | None = None,
+    device: str | Device | None = None,
 ) -> int:
     """Render a model file or run folder at the views of a scene; return the number of files.  Raises ClsplatError."""
     return ModelFile(model, scene, device, downscale).render(split, out, kind)
@@ -142,7 +143,7 @@ def evaluate(
     metrics: Sequence[str] = ("psnr", "ssim"),
     lpips: Path | None = None,
     lpips_input: InputRange = "-1..1",
-    device: str | None = None,
+    device: str | Device | None = None,
 ) -> dict[str, Any]:
     """Measure a model file or run folder on a scene's views, with the keys of metrics.json.  Raises ClsplatError."""
     if wrong := [value for value in downscales or () if not 1 <= value < math.inf]:

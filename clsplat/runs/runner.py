@@ -11,8 +11,7 @@ from typing import Any
 
 from clsplat.errors import ConfigError, Interrupted, OutputError, as_clsplat_error, one_line
 from clsplat.files import unwritable, write_text
-from clsplat.opencl.device import Device
-from clsplat.opencl.discovery import choose
+from clsplat.opencl.device import Device, open_device
 from clsplat.pipeline.loading import Pipeline, load, prepared_folder
 from clsplat.prepare.cache import NOTE, Planned, note, noted, prepare
 from clsplat.render.rasterizer import Rasterizer
@@ -32,7 +31,7 @@ LOG = logging.getLogger("clsplat")
 def make_run_folder(out: Path, resume: bool) -> None:
     """Make the run folder.  Raises ConfigError when it holds another run, OutputError when it cannot be written."""
     if (out / "pipeline.yaml").exists() and not resume:
-        raise ConfigError(f"{out}: already holds a run; --resume continues it, or give another --out")
+        raise ConfigError(f"{out}: already holds a run; resume it, or give another folder")
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -41,10 +40,10 @@ def make_run_folder(out: Path, resume: bool) -> None:
 
 
 @contextmanager
-def failures_recorded(out: Path, step: Callable[[], int] | None = None) -> Iterator[None]:
+def failures_recorded(out: Path, step: Callable[[], int] | None = None, as_raised: bool = False) -> Iterator[None]:
     """Turn every failure of the block into a ClsplatError, and write it to status.json.
 
-    Without `step` the step is that of the status before.
+    Without `step` the step is that of the status before; with `as_raised` the failure itself is raised.
     """
     try:
         yield
@@ -54,7 +53,7 @@ def failures_recorded(out: Path, step: Callable[[], int] | None = None) -> Itera
         with suppress(OutputError):  # the failure itself is more important
             at = step() if step else int(read_status(out).get("step", 0))
             Records(out).status(state, at, exit_code=failure.exit_code, message=one_line(failure))
-        if failure is error:
+        if failure is error or as_raised:
             raise
         raise failure from error
 
@@ -87,20 +86,20 @@ def up_to_date(pipeline: Pipeline, planned: Sequence[Planned], out: Path) -> boo
     )
 
 
-def open_run(pipeline: Pipeline, out: Path, device_name: str | None) -> Run:
-    """Choose the device, prepare and read the scene.  Raises the errors of these steps."""
+def open_run(pipeline: Pipeline, out: Path, device: str | Device | None) -> Run:
+    """Open the device, prepare and read the scene.  Raises the errors of these steps."""
     settings = pipeline.settings
     for stage in pipeline.stages:
         stage.check()
-    device = Device(choose(device_name), settings.rasterizer.schedule)
-    LOG.info("device: %s", device.text)
+    opened = open_device(device, settings.rasterizer.schedule)
+    LOG.info("device: %s", opened.text)
     planned = pipeline.preparation(out)
     if planned and noted(out) not in (None, note(planned)):
         raise ConfigError(
-            f"{out}: was started with other photographs, or other settings of `prepare`; give another --out"
+            f"{out}: was started with other photographs, or other settings of `prepare`; give another folder"
         )
     folder = prepare(planned, settings.scene.folder, prepared_folder(out))
-    run = make_run(pipeline, read_scene(folder, settings.scene.holdout), device, out)
+    run = make_run(pipeline, read_scene(folder, settings.scene.holdout), opened, out)
     run.prepared = note(planned) if planned else None
     return run
 
@@ -161,7 +160,7 @@ def _run_stages(pipeline: Pipeline, run: Run) -> None:
         stage.run(run)
         if run.interrupted:
             path = checkpoint.save(run, keep=2)
-            raise Interrupted(f"stopped after {stage.stage}, saved in {path}; --resume continues from there")
+            raise Interrupted(f"stopped after {stage.stage}, saved in {path}; resume the run to go on")
 
 
 @contextmanager
@@ -223,7 +222,7 @@ def _check_outputs(pipeline: Pipeline, run: Run) -> None:
             raise OutputError(f"{path}: is missing or empty at the end of the run; see {run.out / 'log.txt'}")
 
 
-def describe(pipeline: Pipeline, out: Path, device: str | None) -> str:
+def describe(pipeline: Pipeline, out: Path, device: str | Device | None) -> str:
     """Return a line for each stage of a run in `out`.  Raises the errors of open_run when nothing must be prepared."""
     planned = pipeline.preparation(out)
     if planned and up_to_date(pipeline, planned, out):

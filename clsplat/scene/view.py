@@ -21,9 +21,11 @@ NO_FILE = Path()  # of a view that is made by hand
 MIN_WHITE = 0.99  # share of the largest value: JPEG does not store white exactly
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class View:
     """A camera with its photograph.  `name` is unique in its scene: the path below the image folder.
+
+    Two views are equal only when they are one object; compare names, downscales or poses.
 
     A view that only serves to render a model needs no photograph.
     """

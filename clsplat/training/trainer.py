@@ -4,6 +4,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 from clsplat.density.statistics import SplatStats
+from clsplat.errors import ConfigError
 from clsplat.gaussians.tables import DeviceModel
 from clsplat.losses.base import Comparison, ImageLoss, Loss, Penalty, PenaltyInputs, ViewGradients
 from clsplat.opencl.device import Array
@@ -55,7 +56,7 @@ class Trainer:
     def step(
         self,
         photograph: Photograph,
-        step: int = 1,
+        step: int,
         transforms: Sequence[PhotographTransform] = (),
         stale: Collection[str] = (),
     ) -> ViewGradients:
@@ -70,9 +71,15 @@ class Trainer:
         return view
 
     def differentiate(
-        self, photograph: Photograph, step: int = 1, transforms: Sequence[PhotographTransform] = ()
+        self, photograph: Photograph, step: int, transforms: Sequence[PhotographTransform] = ()
     ) -> ViewGradients:
-        """Return the derivative of the losses at one view, as sums over pixels; nothing is updated."""
+        """Return the derivative of the losses at one view, as sums over pixels; nothing is updated.
+
+        Raises ConfigError for a loss that is neither an ImageLoss nor a Penalty.
+        """
+        for loss in self.losses:
+            if not isinstance(loss, ImageLoss | Penalty):
+                raise ConfigError(f"the loss {type(loss).__name__}: expected a subclass of ImageLoss or of Penalty")
         workspace, camera, timings = self.rasterizer.workspace, photograph.camera, self.rasterizer.device.timings
         frame = self.rasterizer.forward(self.model, camera, self.background)
         timings.section = "loss"
