@@ -4,7 +4,10 @@ A message is one line: the fault, its place, what was expected, the remedy.  The
 traceback (`--debug` shows one).
 """
 
+import traceback
+
 MESSAGE_LIMIT = 1000  # characters
+PLUGIN_MARK = "__clsplat_plugin__"  # the name of the plug-in, a variable of its module
 
 
 class ClsplatError(Exception):
@@ -29,6 +32,10 @@ class OverrideError(ConfigError):
     def __init__(self, override: str, reason: str) -> None:
         self.reason = shortened(reason, 500)
         super().__init__(f"--set {shortened(override, 80)}: {self.reason}")
+
+
+class PluginError(ConfigError):
+    """The code of a plug-in raised an exception."""
 
 
 class DataError(ClsplatError):
@@ -83,7 +90,15 @@ def as_clsplat_error(error: BaseException) -> ClsplatError:
         place = error.filename or "the output"
         return OutputError(f"{place}: {error.strerror}; check the file, its folder and their space")
     what = f"{type(error).__name__}: {one_line(error)}".removesuffix(": ")
+    if place := _plugin_place(error):
+        return PluginError(f"{place}: {what}")
     return InternalError(f"internal error (a defect): {what}; run with --debug for the traceback, and report it")
+
+
+def _plugin_place(error: BaseException) -> str | None:
+    """The innermost file and line of a plug-in that an exception passed, or None."""
+    frames = reversed(list(traceback.walk_tb(error.__traceback__)))
+    return next((f"{f.f_code.co_filename}:{line}" for f, line in frames if PLUGIN_MARK in f.f_globals), None)
 
 
 def one_line(error: BaseException) -> str:

@@ -157,6 +157,8 @@ class Program:
 
     def __init__(self, device: "Device", file: str | Path, defines: dict[str, int | str]) -> None:
         path = resource_dir("cl_kernels") / file  # an absolute path stays as it is
+        if not path.is_file():
+            raise KernelError(f"{path}: no such kernel file")
         source = flatten(path)
         options = [*BUILD_OPTIONS, *(f"-D{name}={value}" for name, value in sorted(defines.items()))]
         try:
@@ -169,6 +171,13 @@ class Program:
             name: Kernel(device, f"{path.name}:{name}", cl.Kernel(program, name), arguments)
             for name, arguments in parse_kernels(source).items()
         }
+        names = program.get_info(cl.program_info.KERNEL_NAMES).split(";")
+        if unread := sorted({name for name in names if name} - self.kernels.keys()):
+            raise KernelError(
+                f"{path}: cannot read the head of {', '.join(unread)}; expected "
+                f"'__kernel __attribute__((reqd_work_group_size(64, 1, 1))) void {unread[0]}(' "
+                "and parameters like '__global const float *restrict means' and 'const uint count'"
+            )
 
     def __getattr__(self, name: str) -> Kernel:
         kernels: dict[str, Kernel] = self.__dict__.get("kernels", {})
