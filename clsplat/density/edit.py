@@ -59,6 +59,7 @@ class Edit:
         self.kept = device.empty(count, np.uint32)
         self.shrink = device.empty(count)
         self.rule = 0  # number of the rule that acts
+        self.max_rows: int | None = None  # rows at which growth stops; None: no limit
         self._program = device.program("density.cl")
         self._program.start_edit(items=count, copies=self.copies, kept=self.kept, shrink=self.shrink, count=count)
 
@@ -163,6 +164,11 @@ class Edit:
     def rows(self) -> NDArray[np.uint32]:
         """Return the number of rows that each Gaussian becomes, [N]."""
         return self.copies.get()
+
+    @property
+    def room(self) -> int | None:
+        """Rows that may still be added to the outcomes so far; negative: too many already; None: no limit."""
+        return None if self.max_rows is None else self.max_rows - int(self.rows().sum(dtype=np.int64))
 
     def limit(self, limit: int) -> None:
         """Undo growth until at most `limit` rows remain; the smallest means of the first column come first."""
