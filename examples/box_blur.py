@@ -1,4 +1,4 @@
-"""A photograph that is blurred less and less: `views: {transforms: [{type: box_blur, reach: [[0, 4], [500, 0]]}]}`."""
+"""Blur the photographs, and less so by step: `views: {transforms: [{type: box_blur, reach: [[0, 4], [500, 0]]}]}`."""
 
 from dataclasses import replace
 from pathlib import Path

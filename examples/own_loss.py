@@ -1,4 +1,4 @@
-"""Train with a loss in NumPy beside those of a pipeline: `python own_loss.py SCENE [PIPELINE]`."""
+"""Train with a loss in NumPy in addition to those of a pipeline: `python own_loss.py SCENE [PIPELINE]`."""
 
 import sys
 
@@ -8,15 +8,15 @@ import clsplat
 
 
 def edges(image, photograph):
-    """Mean absolute difference of the steps from pixel to pixel, and its derivative by the image.
+    """Mean absolute difference between the slopes of two images, and its derivative by the first.
 
     image, photograph: [height, width, 3] float32.
     """
     value, derivative = 0.0, np.zeros_like(image)
     for axis in (0, 1):
-        steps = np.diff(image - photograph, axis=axis)
-        value += float(np.abs(steps).mean())
-        derivative -= np.diff(np.sign(steps) / steps.size, axis=axis, prepend=0, append=0)
+        slopes = np.diff(image - photograph, axis=axis)
+        value += float(np.abs(slopes).mean())
+        derivative -= np.diff(np.sign(slopes) / slopes.size, axis=axis, prepend=0, append=0)
     return value, derivative
 
 

@@ -1,11 +1,11 @@
-/* Noise on the means of Gaussians, the more the fainter they are (3DGS-MCMC, Kheradmand et al. 2024):
+/* Noise on the means of Gaussians; a lower opacity gets more of it (3DGS-MCMC, Kheradmand et al. 2024):
  *
- *   mean += rate / (1 + exp(-100 (0.005 - opacity))) Sigma n,  Sigma = R diag(s^2) R^T,  n three normal numbers
+ *   mean += rate / (1 + exp(-100 (opacity_below - opacity))) Sigma n,  Sigma = R diag(s^2) R^T,  n 3 normal numbers
  *
  * One item = one Gaussian.  No local memory.  A number depends on (seed, step, Gaussian) alone. */
 #include "random.h"
 
-__constant float FAINT = 0.005f, SHARPNESS = 100.0f;  // the opacity of half the noise, and how fast it falls there
+__constant float SHARPNESS = 100.0f;  // per unit of opacity: how fast the noise falls at opacity_below
 
 /* Move every mean. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
@@ -15,6 +15,7 @@ void add_noise(
     __global const float *restrict log_scales,     // [3,S] log of scene units
     __global const float *restrict logit_opacity,  // [S]
     const float rate,                              // scene units^-1
+    const float opacity_below,                     // opacity of half the noise
     const uint seed,
     const uint step,
     const uint stride,
@@ -31,7 +32,7 @@ void add_noise(
         (float3)(2.0f * (x * z - w * y), 2.0f * (y * z + w * x), 1.0f - 2.0f * (x * x + y * y))};
     const float3 normal = normal3((uint4)(i, step, 1, 0), (uint2)(seed, 0));
     const float opacity = 1.0f / (1.0f + exp(-logit_opacity[i]));
-    const float gate = rate / (1.0f + exp(-SHARPNESS * (FAINT - opacity)));
+    const float gate = rate / (1.0f + exp(-SHARPNESS * (opacity_below - opacity)));
     const float3 scale = exp((float3)(log_scales[i], log_scales[stride + i], log_scales[2 * stride + i]));
     const float3 own = scale * scale * (rows[0] * normal.x + rows[1] * normal.y + rows[2] * normal.z);  // Sigma n in own axes
     for (uint k = 0; k < 3; k++)

@@ -1,7 +1,9 @@
 """Every example runs, and so do the Python lines of the documentation; those of plug-ins are tested in test_plugins."""
 
 import ast
+import inspect
 import json
+import operator
 import re
 import runpy
 import shutil
@@ -14,10 +16,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 import clsplat
+from clsplat import cli
+from clsplat.density.edit import Edit, SceneScale
+from clsplat.density.statistics import SplatStats
 from clsplat.pipeline.loading import load
 from tests.html_page import Page
+from tests.scenes import random_case
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = ROOT / "examples"
@@ -140,8 +147,46 @@ def test_python_lines_of_the_documentation_run(page, code, tiny_scene, folder):
 
 
 def test_growing_resolution_is_a_pipeline():
-    views = load(str(EXAMPLES / "growing_resolution.yaml")).settings.stages[1].views
-    assert views.resolution is not None
+    resolution = load(str(EXAMPLES / "growing_resolution.yaml")).settings.stages[1].views.resolution
+    assert resolution.points == [[0, 4.0], [500, 2.0], [1000, 1.0]]
+    assert [resolution.at(step) for step in (1, 499, 500, 999, 1000, 2000)] == [4, 4, 2, 2, 1, 1]
+
+
+def test_growing_resolution_trains_at_the_sizes_that_it_names(tiny_scene, tmp_path):
+    """Up to step 500 the size is that of `resolution: 4`, and not the full one."""
+    written = {}
+    for name, setting in {"own": "", "quarter": "4.0", "full": "1.0"}.items():
+        sets = ["optimize.steps=6", "optimize.during=[]"] + [f"optimize.views.resolution={setting}"] * bool(setting)
+        arguments = [part for text in sets for part in ("--set", text)]
+        out = tmp_path / name
+        command = ["run", str(EXAMPLES / "growing_resolution.yaml"), "--scene", str(tiny_scene), "--out", str(out)]
+        done = CliRunner().invoke(cli.app, [*command, *arguments])
+        assert done.exit_code == 0, done.output
+        written[name] = (out / "point_cloud.ply").read_bytes()
+    assert written["own"] == written["quarter"]
+    assert written["own"] != written["full"]
+
+
+@pytest.mark.parametrize(
+    ("name", "limit"), [("relocation", 60), ("opacity_entropy", 25), ("box_blur", 40), ("csv_reader", 35)]
+)
+def test_an_example_is_short(name, limit):
+    assert len((EXAMPLES / f"{name}.py").read_text().splitlines()) <= limit
+
+
+def test_the_verbs_of_an_edit_are_those_of_the_table():
+    """Each `edit.name` of the page exists, and so do the arguments that the table gives to it."""
+    gaussians = random_case(np.random.default_rng(0), 3).model(clsplat.Device()).gaussians
+    edit = Edit(gaussians, SplatStats(gaussians), SceneScale(1.0), step=1, seed=0)
+    page = (ROOT / "docs" / "extending.md").read_text()
+    found = re.findall(r"`edit\.([\w.]+)(?:\(([^)`]*)\))?", page)
+    assert {name for name, _ in found} >= {"mark", "choose", "set_rows", "room", "scene_scale.extent"}
+    for name, arguments in found:
+        verb = operator.attrgetter(name)(edit)
+        if arguments:
+            known = inspect.signature(verb).parameters
+            named = [part for part in re.findall(r"[a-z_]+", arguments) if name in ("mark", "choose", "set_rows")]
+            assert set(named) <= set(known), f"edit.{name}"
 
 
 @pytest.mark.usefixtures("without_plugins")

@@ -23,8 +23,10 @@ class Change:
 def densify(edit: Edit, rules: Sequence[Rule], tiler: Tiler, limit: int | None = None) -> Change:
     """Apply the rules in their order, as one rearrangement of all tables, and set the statistics to zero.
 
-    Growth stops at `limit` Gaussians: those with the largest mean of the first column grow first.
+    Growth stops at `limit` Gaussians: those with the largest mean of the first column grow first.  Rules read in
+    `edit.room` how many they may add.
     """
+    edit.max_rows = limit
     gaussians = edit.gaussians
     before = gaussians.count
     acting = [(number, rule) for number, rule in enumerate(rules) if edit.step > rule.start]

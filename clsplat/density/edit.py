@@ -27,6 +27,12 @@ MAX_BOUND = 3.0e38  # a bound above all values
 MIN_BOUND = 1.2e-38  # the smallest normal float: a bound that all values but zero reach
 
 
+def _require_rows(copies: int, kept: int) -> None:
+    for name, number in (("copies", copies), ("kept", kept)):
+        if number < 0:
+            raise ValueError(f"{name}: expected a number of rows, 0 or more, got {number}")
+
+
 def _no_photographs(share: float) -> float:
     raise ConfigError("a quantile of pixels needs training photographs")
 
@@ -53,6 +59,7 @@ class Edit:
         self.kept = device.empty(count, np.uint32)
         self.shrink = device.empty(count)
         self.rule = 0  # number of the rule that acts
+        self.max_rows: int | None = None  # rows at which growth stops; None: no limit
         self._program = device.program("density.cl")
         self._program.start_edit(items=count, copies=self.copies, kept=self.kept, shrink=self.shrink, count=count)
 
@@ -75,7 +82,11 @@ class Edit:
         size_below: float | None = None,
         opacity_below: float = math.inf,
     ) -> None:
-        """Give an outcome to every Gaussian in the box; sizes are shares of the extent."""
+        """Give an outcome to every Gaussian in the box; sizes are shares of the extent.
+
+        Raises ValueError for negative copies or kept.
+        """
+        _require_rows(copies, kept)
         gaussians = self.gaussians
         self._program.mark_rule(
             items=gaussians.count,
@@ -119,32 +130,45 @@ class Edit:
         """Give an outcome to the Gaussians that are `chosen`, [N].
 
         copies: rows that each becomes, one number or [N]; kept: how many of them are the old row, with its moments and
-        statistics; the others are fresh.
+        statistics; the others are fresh.  Raises ValueError for another shape or type, and for negative numbers.
         """
-        outcome = np.where(chosen, np.asarray(copies, np.int64) + 1, 0)
+        count, numbers = self.gaussians.count, np.asarray(copies)
+        if chosen.dtype != np.bool_ or chosen.shape != (count,):
+            raise ValueError(f"chosen: expected a mask, bool [{count}], got {chosen.dtype} {list(chosen.shape)}")
+        if not np.issubdtype(numbers.dtype, np.integer) or numbers.shape not in ((), (count,)):
+            raise ValueError(
+                f"copies: expected an integer or integers [{count}], got {numbers.dtype} {list(numbers.shape)}"
+            )
+        _require_rows(int(numbers.min(initial=0)), kept)
+        outcome = np.where(chosen, numbers.astype(np.int64) + 1, 0)
         self._program.mark_chosen(
-            items=self.gaussians.count,
+            items=count,
             outcome=self.gaussians.device.upload(outcome.astype(np.uint32)),
             copies=self.copies,
             kept=self.kept,
             shrink=self.shrink,
             new_shrink=shrink,
             new_kept=kept,
-            count=self.gaussians.count,
+            count=count,
         )
 
     def set_rows(self, name: str, rows: NDArray[np.integer], values: NDArray[np.floating]) -> None:
-        """Write values [n, components] into some rows, [n], of a table; fresh rows copy them."""
+        """Write values [n, components] into different rows, [n], of a table; fresh rows copy them."""
         self.gaussians.set_rows(name, rows, values)
 
     def zero_moments(self, rows: NDArray[np.integer], parameters: Collection[str] = PARAMETERS) -> None:
-        """Set Adam's moments of some rows, [n], to zero."""
+        """Set Adam's moments of different rows, [n], to zero."""
         names = [table for parameter in parameters for table in moment_tables(parameter)]
         self.gaussians.zero_rows([name for name in names if name in self.gaussians.tables], rows)
 
     def rows(self) -> NDArray[np.uint32]:
         """Return the number of rows that each Gaussian becomes, [N]."""
         return self.copies.get()
+
+    @property
+    def room(self) -> int | None:
+        """Rows that may still be added to the outcomes so far; negative: too many already; None: no limit."""
+        return None if self.max_rows is None else self.max_rows - int(self.rows().sum(dtype=np.int64))
 
     def limit(self, limit: int) -> None:
         """Undo growth until at most `limit` rows remain; the smallest means of the first column come first."""

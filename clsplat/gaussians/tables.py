@@ -80,13 +80,16 @@ class Gaussians:
         table.array.set(planes)
 
     def set_rows(self, name: str, rows: NDArray[np.integer], values: NDArray[Any]) -> None:
-        """Write [n, components] from the host into some rows, [n], of a table; no row may occur twice."""
-        table = self.tables[name]
+        """Write [n, components] from the host into some rows of a table.
+
+        rows: [n] integers, as in `checked_rows`.  Raises ValueError for other rows and for values of another shape.
+        """
+        table, rows = self.tables[name], checked_rows(rows, self.count)
         if values.shape != (len(rows), table.components):
             raise ValueError(f"{name}: expected {(len(rows), table.components)}, got {values.shape}")
         self._rows.set_rows(
             items=(len(rows), table.components),
-            rows=self.device.upload(rows.astype(np.uint32)),
+            rows=self.device.upload(rows),
             values=self.device.upload(np.ascontiguousarray(values, np.float32)),
             table=table.array,
             components=table.components,
@@ -95,8 +98,11 @@ class Gaussians:
         )
 
     def zero_rows(self, names: Collection[str], rows: NDArray[np.integer]) -> None:
-        """Set some rows, [n], of tables to zero."""
-        uploaded = self.device.upload(rows.astype(np.uint32))
+        """Set some rows of tables to zero.
+
+        rows: [n] integers, as in `checked_rows`.  Raises ValueError for other rows.
+        """
+        uploaded = self.device.upload(checked_rows(rows, self.count))
         for name in names:
             table = self.tables[name]
             self._rows.zero_rows(
@@ -173,6 +179,21 @@ class DeviceModel:
     near: float = 0.2  # scene units
     screen_variance: float = 0.3  # px²
     compensate: float = 0.0  # 1: the opacity falls as the screen filter enlarges the splat
+
+
+def checked_rows(rows: NDArray[np.integer], count: int) -> NDArray[np.uint32]:
+    """Return rows, [n], as a kernel takes them; raise ValueError unless they are different integers in [0, count)."""
+    if rows.ndim != 1 or not np.issubdtype(rows.dtype, np.integer):
+        raise ValueError(
+            f"rows: expected integers [n], got {rows.dtype} {list(rows.shape)}; np.flatnonzero gives the rows of a mask"
+        )
+    outside = rows[(rows < 0) | (rows >= count)]
+    if len(outside):
+        raise ValueError(f"rows: expected integers in [0, {count}), got {outside[0]}")
+    times = np.bincount(rows.astype(np.int64), minlength=1)
+    if times.max() > 1:
+        raise ValueError(f"rows: expected each row once, got row {times.argmax()} {times.max()} times")
+    return rows.astype(np.uint32)
 
 
 def moment_tables(parameter: str) -> tuple[str, str]:

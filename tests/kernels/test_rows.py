@@ -49,6 +49,66 @@ def test_rows_of_another_shape_are_refused(device, rng):
         gaussians.set_rows("means", np.arange(2), np.zeros((2, 4)))
 
 
+WRONG_ROWS = {
+    "a mask": (np.arange(COUNT) % 2 == 0, r"rows: expected integers \[n\], got bool \[150\]; np.flatnonzero gives"),
+    "numbers with a fraction": (np.array([1.0]), r"rows: expected integers \[n\], got float64 \[1\]"),
+    "two dimensions": (np.array([[1]]), r"rows: expected integers \[n\], got int64 \[1, 1\]"),
+    "a negative row": (np.array([3, -1]), r"rows: expected integers in \[0, 150\), got -1"),
+    "a row that is too large": (np.array([149, 150], np.uint32), r"rows: expected integers in \[0, 150\), got 150"),
+    "a row twice": (np.array([7, 2, 7]), "rows: expected each row once, got row 7 2 times"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG_ROWS)
+@pytest.mark.parametrize("verb", ["set_rows", "zero_moments", "zero_rows"])
+def test_wrong_rows_are_refused_and_change_nothing(device, rng, verb, case):
+    rows, message = WRONG_ROWS[case]
+    gaussians = gaussians_of(device, rng)
+    before = {table: gaussians[table].get() for table in gaussians.tables}
+    verbs = {
+        "set_rows": lambda: edit_of(gaussians).set_rows("means", rows, np.zeros((len(rows), 3))),
+        "zero_moments": lambda: edit_of(gaussians).zero_moments(rows),
+        "zero_rows": lambda: gaussians.zero_rows(["means"], rows),
+    }
+    with pytest.raises(ValueError, match=message):
+        verbs[verb]()
+    for table, planes in before.items():
+        np.testing.assert_array_equal(gaussians[table].get(), planes, err_msg=table)
+
+
+WRONG_CHOICES = {
+    "indices": ((np.arange(3), 0, 0), r"chosen: expected a mask, bool \[150\], got int64 \[3\]"),
+    "a short mask": ((np.ones(149, bool), 0, 0), r"chosen: expected a mask, bool \[150\], got bool \[149\]"),
+    "negative copies": ((np.ones(COUNT, bool), -1, 0), "copies: expected a number of rows, 0 or more, got -1"),
+    "one negative number": (
+        (np.ones(COUNT, bool), np.arange(COUNT) - 2, 0),
+        "copies: expected a number of rows, 0 or more, got -2",
+    ),
+    "short copies": (
+        (np.ones(COUNT, bool), np.ones(3, int), 0),
+        r"copies: expected an integer or integers \[150\], got int64 \[3\]",
+    ),
+    "copies with a fraction": ((np.ones(COUNT, bool), 1.5, 0), "copies: expected an integer or .*, got float64"),
+    "negative kept": ((np.ones(COUNT, bool), 2, -1), "kept: expected a number of rows, 0 or more, got -1"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG_CHOICES)
+def test_a_wrong_choice_is_refused(device, rng, case):
+    arguments, message = WRONG_CHOICES[case]
+    edit = edit_of(gaussians_of(device, rng))
+    with pytest.raises(ValueError, match=message):
+        edit.choose(*arguments)
+    assert (edit.rows() == 1).all()
+
+
+@pytest.mark.parametrize("numbers", [{"copies": -1, "kept": 0}, {"copies": 2, "kept": -1}])
+def test_a_mark_with_negative_numbers_is_refused(device, rng, numbers):
+    edit = edit_of(gaussians_of(device, rng))
+    with pytest.raises(ValueError, match="expected a number of rows, 0 or more, got -1"):
+        edit.mark(**numbers)
+
+
 @pytest.mark.parametrize("count", ROWS)
 def test_moments_of_rows_become_zero_and_the_others_stay(device, rng, count):
     gaussians = gaussians_of(device, rng)
