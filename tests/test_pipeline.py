@@ -181,6 +181,16 @@ REFUSED = {
     "negative": (replaced("steps: 10", "steps: -1"), "greater than 0, got -1"),
     "infinite": (replaced("weight: 0.8", "weight: .inf"), "finite"),
     "missing steps": (replaced("      steps: 10\n", ""), "'steps' is missing"),
+    "a start outside": (replaced("- evaluate", "- evaluate: {start: 3}"), r"'start' belongs inside optimize.during"),
+    "a stop outside": (replaced("- evaluate", "- evaluate: {stop: 3}"), r"'stop' belongs inside optimize.during"),
+    "another stage inside": (
+        replaced("- init", "- init: {stage: export}"),
+        r"x.yaml:3: stages\[0\].init.stage: unknown key 'stage'; remove it",
+    ),
+    "another stage inside during": (
+        replaced("{every: 5}", "{every: 5, stage: evaluate}"),
+        r"stages\[1\].optimize.during\[1\].checkpoint.stage: unknown key 'stage'",
+    ),
     "no cadence": (replaced("checkpoint: {every: 5}", "checkpoint"), "needs 'every' inside 'during'"),
     "cadence outside": (replaced("- evaluate", "- evaluate: {every: 3}"), r"'every' belongs inside optimize.during"),
     "wrong order": (

@@ -17,7 +17,7 @@ from clsplat.pipeline.file import STAGE_LISTS, PipelineFile
 from clsplat.pipeline.files import find
 from clsplat.pipeline.overrides import NoSuchKey, apply, split, suggestion
 from clsplat.pipeline.renamed import with_new_names
-from clsplat.pipeline.settable import settable
+from clsplat.pipeline.settable import CADENCE, settable
 from clsplat.pipeline.yaml_file import Document, read_yaml
 from clsplat.prepare.cache import Planned, plan
 from clsplat.settings import variants
@@ -139,6 +139,9 @@ def _tagged(item: Any, place: tuple[str | int, ...], document: Document, path: P
         raise ConfigError(f"{path}:{document.line(place)}: {where}: expected '- stage' or '- stage: {{key: value}}'")
     name, fields = next(iter(item.items()))
     fields = dict(fields or {})
+    if "stage" in fields:
+        inner = (*place, name, "stage")
+        raise ConfigError(f"{path}:{document.line(inner)}: {place_text(inner)}: unknown key 'stage'; remove it")
     if isinstance(fields.get("during"), list):
         fields["during"] = [
             _tagged(inner, (*place, name, "during", i), document, path) for i, inner in enumerate(fields["during"])
@@ -149,7 +152,7 @@ def _tagged(item: Any, place: tuple[str | int, ...], document: Document, path: P
 def _untagged(stage: dict[str, Any]) -> dict[str, Any]:
     fields = {key: value for key, value in stage.items() if key != "stage"}
     if fields.get("every") is None:  # a cadence belongs inside `during` only
-        fields = {key: value for key, value in fields.items() if key not in ("every", "start", "stop")}
+        fields = {key: value for key, value in fields.items() if key not in CADENCE}
     if "during" in fields:
         fields["during"] = [_untagged(inner) for inner in fields["during"]]
     return {stage["stage"]: fields}
@@ -159,8 +162,9 @@ def _check_order(path: Path, settings: PipelineFile) -> None:
     """Raise ConfigError where a stage needs a part of the run that no earlier stage makes."""
     made = {"scene"}
     for i, stage in enumerate(settings.stages):
-        if isinstance(stage, Scheduled) and stage.every is not None:
-            raise ConfigError(f"{path}: stages[{i}] {stage.stage}: 'every' belongs inside optimize.during")
+        for key in CADENCE if isinstance(stage, Scheduled) else ():
+            if getattr(stage, key) != type(stage).model_fields[key].default:
+                raise ConfigError(f"{path}: stages[{i}] {stage.stage}: '{key}' belongs inside optimize.during")
         for need in sorted(stage.needs - made):
             makers = ", ".join(name for name, kind in variants(Stage).items() if need in kind.makes)
             raise ConfigError(
