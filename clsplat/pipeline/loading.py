@@ -11,6 +11,8 @@ from pydantic import ValidationError
 from ruamel.yaml import YAML
 
 from clsplat import plugins
+from clsplat.density.edit import Rule
+from clsplat.density.statistics import Statistic
 from clsplat.errors import ConfigError, OverrideError, one_line
 from clsplat.pipeline.explanation import explain, first_fault, place_text
 from clsplat.pipeline.file import STAGE_LISTS, PipelineFile
@@ -20,7 +22,7 @@ from clsplat.pipeline.renamed import with_new_names
 from clsplat.pipeline.settable import CADENCE, settable
 from clsplat.pipeline.yaml_file import Document, read_yaml
 from clsplat.prepare.cache import Planned, plan
-from clsplat.settings import variants
+from clsplat.settings import Settings, variants
 from clsplat.stages.base import Scheduled, Stage
 
 
@@ -100,7 +102,23 @@ def _validated(data: dict[str, Any], path: Path, document: Document) -> Pipeline
     except ValidationError as error:
         raise ConfigError(explain(error, PipelineFile, path, document)) from error
     _check_order(path, settings)
-    return settings.model_copy(update={"plugins": plugins.used_by(settings)})
+    return settings.model_copy(update={"plugins": plugins.used_by(_kinds(settings))})
+
+
+def _kinds(value: object) -> set[type]:
+    """The classes of all settings inside settings, and of the statistics that their rules read."""
+    if isinstance(value, dict):
+        value = list(value.values())
+    if isinstance(value, list | tuple):
+        return {kind for inner in value for kind in _kinds(inner)}
+    if not isinstance(value, Settings):
+        return set()
+    kinds = {type(value), *_kinds([getattr(value, name) for name in type(value).model_fields])}
+    if isinstance(value, Rule):
+        known = variants(Statistic)
+        read = {known[name] for name in value.statistics if name in known}
+        kinds |= read | {known[kind.divisor] for kind in read if kind.divisor in known}
+    return kinds
 
 
 def _blame(data: dict[str, Any], overrides: Sequence[str], path: Path, document: Document) -> None:
