@@ -10,7 +10,7 @@ import typing
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, TypeVar
 
-from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler
+from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, GetJsonSchemaHandler
 from pydantic_core import CoreSchema, core_schema
 
 from clsplat.errors import ConfigError
@@ -53,6 +53,11 @@ def variants(base: type[Base]) -> dict[str, type[Base]]:
     return found
 
 
+def needs_settings(kind: type[Settings]) -> bool:
+    """Return whether the name of a variant alone is too little: it has keys without a default."""
+    return any(field.is_required() for name, field in kind.model_fields.items() if name not in TAGS)
+
+
 class Variants:
     """Marks a field that accepts one of the variants of a base: a mapping with its name, or the name alone."""
 
@@ -73,6 +78,11 @@ class Variants:
 
         union = core_schema.tagged_union_schema(choices, discriminator=tag)
         return core_schema.no_info_before_validator_function(with_tag, union)
+
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        alone = [name for name, kind in variants(self.base).items() if not needs_settings(kind)]
+        mapping = {"required": [self.tag], **handler(schema)}
+        return {"anyOf": [{"enum": alone}, mapping]} if alone else mapping
 
 
 class VariantName:

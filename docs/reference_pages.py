@@ -7,7 +7,6 @@ from families import NOTATIONS, Kind, families, family, groups, parts, tag, unna
 from schedule_page import schedule_page
 from yaml_examples import example
 
-from clsplat.density.statistics import Statistic
 from clsplat.scene.detect import readers
 from clsplat.schedule import Bounded
 from clsplat.settings import variants
@@ -115,8 +114,9 @@ def expected(node: Node) -> str:
     if "const" in node:
         return f"`{node['const']}`"
     if "enum" in node:
-        if set(node["enum"]) <= variants(Statistic).keys():
-            return "[statistic](statistics.md)"
+        for base in families():
+            if set(node["enum"]) <= variants(base).keys():
+                return f"[{family(base).title}]({family(base).page}.md)"
         return "one of " + ", ".join(f"`{value}`" for value in node["enum"])
     for union in ("anyOf", "oneOf", "allOf"):
         if union in node:

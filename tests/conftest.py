@@ -16,6 +16,7 @@ import pytest
 from clsplat import plugins
 from clsplat.opencl.device import Array, Device
 from clsplat.opencl.discovery import DeviceInfo, choose
+from clsplat.scene.readers import Reader
 from clsplat.settings import Settings, rebuild
 from data_tools.synthetic import Options, write_dataset
 
@@ -84,9 +85,9 @@ def held_buffers() -> Iterator[None]:
 @pytest.fixture
 def without_plugins() -> Iterator[None]:
     """Forget the plug-ins that a test has loaded."""
-    defined = list(Settings.defined)
+    defined, readers = list(Settings.defined), list(Reader.defined)
     yield
-    Settings.defined[:] = defined
+    Settings.defined[:], Reader.defined[:] = defined, readers
     plugins._loaded.clear()
     for name in [name for name in sys.modules if name.startswith("clsplat_plugin_")]:
         del sys.modules[name]

@@ -4,14 +4,18 @@ import json
 from pathlib import Path
 
 import pytest
+from jsonschema import Draft202012Validator
+from ruamel.yaml import YAML
 
 from clsplat import resource_dir
 from clsplat.errors import ConfigError
 from clsplat.pipeline.loading import load
 from clsplat.pipeline.schema import json_schema
 from clsplat.pipeline.yaml_file import read_yaml
+from clsplat.plugins import load_file
 from clsplat.stages.optimize import Optimize
 
+EXAMPLES = Path(__file__).parents[1] / "examples"
 SHIPPED = sorted(path.stem for path in resource_dir("pipelines").glob("*.yaml"))
 SMALL = """\
 name: small
@@ -181,6 +185,16 @@ REFUSED = {
     "negative": (replaced("steps: 10", "steps: -1"), "greater than 0, got -1"),
     "infinite": (replaced("weight: 0.8", "weight: .inf"), "finite"),
     "missing steps": (replaced("      steps: 10\n", ""), "'steps' is missing"),
+    "a start outside": (replaced("- evaluate", "- evaluate: {start: 3}"), r"'start' belongs inside optimize.during"),
+    "a stop outside": (replaced("- evaluate", "- evaluate: {stop: 3}"), r"'stop' belongs inside optimize.during"),
+    "another stage inside": (
+        replaced("- init", "- init: {stage: export}"),
+        r"x.yaml:3: stages\[0\].init.stage: unknown key 'stage'; remove it",
+    ),
+    "another stage inside during": (
+        replaced("{every: 5}", "{every: 5, stage: evaluate}"),
+        r"stages\[1\].optimize.during\[1\].checkpoint.stage: unknown key 'stage'",
+    ),
     "no cadence": (replaced("checkpoint: {every: 5}", "checkpoint"), "needs 'every' inside 'during'"),
     "cadence outside": (replaced("- evaluate", "- evaluate: {every: 3}"), r"'every' belongs inside optimize.during"),
     "wrong order": (
@@ -273,3 +287,59 @@ def test_schema_describes_the_file():
     }
     assert {"init", "optimize", "evaluate", "export"} <= names
     assert "steps" in schema["$defs"]["Optimize"]["properties"]
+
+
+def valid(text: str) -> bool:
+    return Draft202012Validator(json_schema()).is_valid(read_yaml_text(text))
+
+
+def read_yaml_text(text: str) -> object:
+    return YAML(typ="safe").load(text)
+
+
+FILES = [*resource_dir("pipelines").glob("*.yaml"), *EXAMPLES.glob("*.yaml")]
+
+
+@pytest.mark.usefixtures("without_plugins")
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_the_schema_accepts_what_the_loader_accepts(path):
+    if (plugin := path.with_suffix(".py")).is_file():
+        load_file(plugin)
+    assert valid(path.read_text())
+    assert valid(load(str(path)).text()), "the resolved file"
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("- init", "- init:"),
+        ("{type: clone}", "clone"),
+        ("{type: l1, weight: 0.8}", "l1"),
+        ("steps: 10", "steps: 10\n      views: {order: paper}"),
+    ],
+)
+def test_the_schema_accepts_names_alone_and_stages_without_settings(old, new, write):
+    load(write(replaced(old, new)))
+    assert valid(replaced(old, new))
+
+
+SCHEMA_REFUSES = {
+    "a loss without a type": replaced("type: l1, weight", "weight"),
+    "a transform that needs settings": replaced("steps: 10", "steps: 10\n      views: {transforms: [blur]}"),
+    "a stage that needs settings": "name: x\nstages: [init, optimize]\n",
+    "a stage without settings that it needs": "name: x\nstages: [init, optimize: ]\n",
+    "another stage inside": replaced("- init", "- init: {stage: export}"),
+    "no cadence, with a name": replaced("checkpoint: {every: 5}", "checkpoint"),
+    "no cadence": replaced("checkpoint: {every: 5}", "checkpoint: {}"),
+    "no stages": "name: x\n",
+    **{case: REFUSED[case][0] for case in ("misspelt key", "misspelt stage", "misspelt loss", "misspelt rule")},
+    **{case: REFUSED[case][0] for case in ("misspelt top key", "text for a number", "negative", "missing steps")},
+    **{case: REFUSED[case][0] for case in ("stage not for during", "two keys in a stage", "unsafe name")},
+}
+
+
+@pytest.mark.parametrize("case", SCHEMA_REFUSES)
+def test_the_schema_refuses_what_the_loader_refuses(case, write):
+    with pytest.raises(ConfigError):
+        load(write(SCHEMA_REFUSES[case]))
+    assert not valid(SCHEMA_REFUSES[case])

@@ -14,6 +14,7 @@ from clsplat import plugins
 from clsplat.density.edit import Rule
 from clsplat.errors import ConfigError
 from clsplat.pipeline.loading import load
+from clsplat.scene.detect import readers
 from clsplat.settings import Settings, variants
 from tests.test_training import train
 
@@ -139,6 +140,147 @@ def test_entry_points_are_loaded_and_recorded_where_they_are_used(tmp_path, monk
     assert "plugins" not in load("splat").resolved()
     assert load("splat", ["densify.rules=[installed]"]).resolved()["plugins"].keys() == {"a_package"}
     sys.modules.pop("installed_rule")
+
+
+STATISTIC = """
+from typing import Literal
+from clsplat.density.statistics import Statistic
+
+class Own(Statistic):
+    type: Literal["own"] = "own"
+
+    def add(self, gaussians, view, grad_mean2d, total):
+        pass
+"""
+READER = """
+from clsplat.scene import Reader
+
+class {name}(Reader):
+    name, expects = "{name}", "{name}.txt"
+
+    def matches(self, path):
+        return False
+
+    def read(self, path, holdout):
+        raise AssertionError
+"""
+
+
+@pytest.fixture
+def install(tmp_path, monkeypatch):
+    """Install packages: their files by name, and their entry points."""
+    folder = tmp_path / "installed"
+
+    def install(files: dict[str, str], **entries: str) -> None:
+        for name, text in files.items():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / name).write_text(text)
+        found = [EntryPoint(name, module, plugins.GROUP) for name, module in entries.items()]
+        monkeypatch.setattr(plugins, "entry_points", lambda group: found)
+
+    monkeypatch.syspath_prepend(str(folder))
+    yield install
+    for name in [name for name in sys.modules if name.partition(".")[0] in ("my", "my_other")]:
+        del sys.modules[name]
+
+
+def test_an_installed_plugin_is_recorded_where_a_class_that_it_imports_is_used(install):
+    install(
+        {
+            "my/__init__.py": "",
+            "my/register.py": "import my.rules, my.columns",
+            "my/rules.py": RULE.format(name="one"),
+            "my/columns.py": STATISTIC,
+            "my_other.py": RULE.format(name="two"),
+        },
+        first="my.register",
+        second="my_other",
+    )
+    plugins.load_installed()
+
+    def recorded(rule: str) -> set[str]:
+        return set(load("splat", [f"densify.rules=[{rule}]"]).settings.plugins)
+
+    assert recorded("clone") == set()
+    assert recorded("one") == {"first"}
+    assert recorded("two") == {"second"}
+    assert recorded("{type: clone, statistic: own}") == {"first"}
+
+
+def test_an_installed_reader_is_recorded_always(install):
+    install({"my.py": READER.format(name="Own")}, first="my")
+    plugins.load_installed()
+    assert set(load("splat").settings.plugins) == {"first"}
+
+
+@pytest.mark.parametrize(("text", "reason"), [("\n1 / 0", "ZeroDivisionError"), ("\nx = (", "SyntaxError")])
+def test_the_failure_of_an_installed_plugin_names_file_and_line(install, text, reason):
+    install({"my/__init__.py": "", "my/register.py": "import my.rules", "my/rules.py": text}, first="my.register")
+    with pytest.raises(ConfigError, match=rf"/my/rules\.py:2: the plug-in cannot be imported: {reason}: "):
+        plugins.load_installed()
+    assert "my.register" not in sys.modules
+
+
+def test_the_hash_of_an_installed_plugin_covers_its_package(install, tmp_path):
+    install({"my/__init__.py": "", "my/register.py": "", "my/late.py": "x = 1"}, first="my.register")
+    plugins.load_installed()
+    (before,) = plugins.loaded()
+    plugins._loaded.clear()
+    install({"my/late.py": "x = 2"}, first="my.register")
+    plugins.load_installed()
+    assert plugins.loaded()[0].digest != before.digest
+
+
+def test_the_hash_covers_modules_of_the_folder_that_are_imported(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setattr(plugins, "_loaded", {})
+    file = write(tmp_path, "mine", "from a_helper import x\n")
+    digests = set()
+    for text in ("x = 1", "x = 2000"):
+        write(tmp_path, "a_helper", text)
+        write(tmp_path, "not_imported", text)
+        plugins.load_file(file)
+        digests.add(plugins.loaded()[0].digest)
+        write(tmp_path, "not_imported", f"{text}0")
+        plugins.load_file(file)
+        write(tmp_path, "a_helper", f"{text}0")
+        with pytest.raises(ConfigError, match="have changed since it was loaded; restart Python"):
+            plugins.load_file(file)
+        plugins._loaded.clear()
+        del sys.modules["a_helper"]
+        Settings.defined[:] = [kind for kind in Settings.defined if kind.__module__ != "clsplat_plugin_mine"]
+    assert len(digests) == 2
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (READER.format(name="Own") + "1 / 0", r"bad\.py:12: .*ZeroDivisionError"),
+        (READER.format(name="Own") + "raise SystemExit(3)", r"bad\.py:12: .*SystemExit: 3"),
+        (READER.format(name="COLMAP"), r"bad\.py: two readers have the name 'COLMAP'"),
+    ],
+)
+def test_a_plugin_that_fails_leaves_no_reader_and_no_module(tmp_path, text, message):
+    before = [type(reader) for reader in readers()]
+    with pytest.raises(ConfigError, match=message):
+        plugins.load_file(write(tmp_path, "bad", text))
+    assert [type(reader) for reader in readers()] == before
+    assert "clsplat_plugin_bad" not in sys.modules
+
+
+def test_a_taken_name_is_found_in_the_first_call_of_a_process(tmp_path):
+    file = write(tmp_path, "bad", RULE.format(name="clone"))
+    code = f"""
+import clsplat
+try:
+    clsplat.load_plugin({str(file)!r})
+except clsplat.errors.ConfigError as error:
+    print(error)
+clsplat.check("splat")
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith(f"{file}: two variants of Rule have the name 'clone'")
 
 
 def test_a_pipeline_whose_plugin_is_missing_or_changed_is_refused(tmp_path):

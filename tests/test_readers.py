@@ -1,6 +1,5 @@
 """The list of dataset readers: shipped ones and those of plug-ins."""
 
-import gc
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -20,8 +19,9 @@ SHIPPED = ["COLMAP", "Blender", "multi-scale Blender", "nerfstudio"]
 
 @pytest.fixture(autouse=True)
 def _forget_readers() -> Iterator[None]:
+    defined = list(Reader.defined)
     yield
-    gc.collect()
+    Reader.defined[:] = defined
 
 
 class OneFile(Reader):
@@ -61,6 +61,19 @@ def test_a_reader_that_extends_a_shipped_one_takes_its_place():
         name = "wider"
 
     assert [reader.name for reader in readers()] == ["wider", *SHIPPED[1:]]
+
+
+def test_a_reader_that_is_defined_again_replaces_the_one_before():
+    def define() -> type[Reader]:
+        class Own(OneFile):
+            name, expects = "own", "o"
+            read = ColmapReader.read
+
+        return Own
+
+    first, second = define(), define()
+    assert first is not second
+    assert [type(reader) for reader in readers()][len(SHIPPED) :] == [second]
 
 
 def test_a_reader_without_a_name_is_refused_in_a_sentence(tmp_path):

@@ -11,16 +11,18 @@ from pydantic import ValidationError
 from ruamel.yaml import YAML
 
 from clsplat import plugins
+from clsplat.density.edit import Rule
+from clsplat.density.statistics import Statistic
 from clsplat.errors import ConfigError, OverrideError, one_line
 from clsplat.pipeline.explanation import explain, first_fault, place_text
 from clsplat.pipeline.file import STAGE_LISTS, PipelineFile
 from clsplat.pipeline.files import find
 from clsplat.pipeline.overrides import NoSuchKey, apply, split, suggestion
 from clsplat.pipeline.renamed import with_new_names
-from clsplat.pipeline.settable import settable
+from clsplat.pipeline.settable import CADENCE, settable
 from clsplat.pipeline.yaml_file import Document, read_yaml
 from clsplat.prepare.cache import Planned, plan
-from clsplat.settings import variants
+from clsplat.settings import Settings, variants
 from clsplat.stages.base import Scheduled, Stage
 
 
@@ -100,7 +102,23 @@ def _validated(data: dict[str, Any], path: Path, document: Document) -> Pipeline
     except ValidationError as error:
         raise ConfigError(explain(error, PipelineFile, path, document)) from error
     _check_order(path, settings)
-    return settings.model_copy(update={"plugins": plugins.used_by(settings)})
+    return settings.model_copy(update={"plugins": plugins.used_by(_kinds(settings))})
+
+
+def _kinds(value: object) -> set[type]:
+    """The classes of all settings inside settings, and of the statistics that their rules read."""
+    if isinstance(value, dict):
+        value = list(value.values())
+    if isinstance(value, list | tuple):
+        return {kind for inner in value for kind in _kinds(inner)}
+    if not isinstance(value, Settings):
+        return set()
+    kinds = {type(value), *_kinds([getattr(value, name) for name in type(value).model_fields])}
+    if isinstance(value, Rule):
+        known = variants(Statistic)
+        read = {known[name] for name in value.statistics if name in known}
+        kinds |= read | {known[kind.divisor] for kind in read if kind.divisor in known}
+    return kinds
 
 
 def _blame(data: dict[str, Any], overrides: Sequence[str], path: Path, document: Document) -> None:
@@ -139,6 +157,9 @@ def _tagged(item: Any, place: tuple[str | int, ...], document: Document, path: P
         raise ConfigError(f"{path}:{document.line(place)}: {where}: expected '- stage' or '- stage: {{key: value}}'")
     name, fields = next(iter(item.items()))
     fields = dict(fields or {})
+    if "stage" in fields:
+        inner = (*place, name, "stage")
+        raise ConfigError(f"{path}:{document.line(inner)}: {place_text(inner)}: unknown key 'stage'; remove it")
     if isinstance(fields.get("during"), list):
         fields["during"] = [
             _tagged(inner, (*place, name, "during", i), document, path) for i, inner in enumerate(fields["during"])
@@ -149,7 +170,7 @@ def _tagged(item: Any, place: tuple[str | int, ...], document: Document, path: P
 def _untagged(stage: dict[str, Any]) -> dict[str, Any]:
     fields = {key: value for key, value in stage.items() if key != "stage"}
     if fields.get("every") is None:  # a cadence belongs inside `during` only
-        fields = {key: value for key, value in fields.items() if key not in ("every", "start", "stop")}
+        fields = {key: value for key, value in fields.items() if key not in CADENCE}
     if "during" in fields:
         fields["during"] = [_untagged(inner) for inner in fields["during"]]
     return {stage["stage"]: fields}
@@ -159,8 +180,9 @@ def _check_order(path: Path, settings: PipelineFile) -> None:
     """Raise ConfigError where a stage needs a part of the run that no earlier stage makes."""
     made = {"scene"}
     for i, stage in enumerate(settings.stages):
-        if isinstance(stage, Scheduled) and stage.every is not None:
-            raise ConfigError(f"{path}: stages[{i}] {stage.stage}: 'every' belongs inside optimize.during")
+        for key in CADENCE if isinstance(stage, Scheduled) else ():
+            if getattr(stage, key) != type(stage).model_fields[key].default:
+                raise ConfigError(f"{path}: stages[{i}] {stage.stage}: '{key}' belongs inside optimize.during")
         for need in sorted(stage.needs - made):
             makers = ", ".join(name for name, kind in variants(Stage).items() if need in kind.makes)
             raise ConfigError(

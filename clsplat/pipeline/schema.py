@@ -1,11 +1,12 @@
 """The JSON schema of pipeline files, for editors that complete and check them."""
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from clsplat.pipeline.file import PipelineFile
 from clsplat.pipeline.matrix import Matrix
 from clsplat.prepare.steps import Step
-from clsplat.settings import Settings, variants
+from clsplat.settings import Settings, needs_settings, variants
 from clsplat.stages.base import Scheduled, Stage
 
 
@@ -13,11 +14,13 @@ def json_schema() -> dict[str, Any]:
     """Return the schema in the shape of the file: a stage is its name, or its name with settings."""
     schema = PipelineFile.model_json_schema()
     definitions = schema["$defs"]
-    stages, scheduled, steps = (_titles(base) for base in (Stage, Scheduled, Step))
-    for title in (*stages, *steps):
-        definitions[title]["properties"].pop("stage", None)
-    schema["properties"]["stages"]["items"] = _items(stages)
-    schema["properties"]["prepare"]["items"] = _items(steps)
+    for kind in (*variants(Stage).values(), *variants(Step).values()):
+        definitions[kind.__name__]["properties"].pop("stage", None)
+        definitions[kind.__name__]["required"] = [
+            key for key in definitions[kind.__name__].get("required", []) if key != "stage"
+        ]
+    schema["properties"]["stages"]["items"] = _items(variants(Stage))
+    schema["properties"]["prepare"]["items"] = _items(variants(Step))
     matrix = Matrix.model_json_schema()
     definitions |= {**matrix.pop("$defs", {}), "Matrix": matrix}
     schema["properties"]["matrix"] = {"$ref": "#/$defs/Matrix"}
@@ -26,23 +29,26 @@ def json_schema() -> dict[str, Any]:
         {"required": ["stages"]},
         {"required": ["matrix"], "properties": {"matrix": {"required": ["pipelines"]}}},
     ]
-    definitions["Optimize"]["properties"]["during"]["items"] = _items(scheduled)
+    definitions["Optimize"]["properties"]["during"]["items"] = _items(variants(Scheduled), ["every"])
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
 
 
-def _titles(base: type[Settings]) -> dict[str, str]:
-    """Names of the variants by the titles of their definitions."""
-    return {kind.__name__: name for name, kind in variants(base).items()}
-
-
-def _items(stages: dict[str, str]) -> dict[str, Any]:
+def _items(stages: Mapping[str, type[Settings]], required: Sequence[str] = ()) -> dict[str, Any]:
+    """The items of a list of stages, each with the `required` keys beside those that it requires itself."""
+    alone = sorted(name for name, kind in stages.items() if not required and not needs_settings(kind))
     with_settings = [
         {
             "type": "object",
-            "properties": {name: {"$ref": f"#/$defs/{title}"}},
+            "properties": {name: _settings(kind.__name__, required, name in alone)},
             "required": [name],
             "additionalProperties": False,
         }
-        for title, name in stages.items()
+        for name, kind in stages.items()
     ]
-    return {"oneOf": [{"enum": sorted(stages.values())}, *with_settings]}
+    return {"oneOf": [*([{"enum": alone}] if alone else []), *with_settings]}
+
+
+def _settings(title: str, required: Sequence[str], optional: bool) -> dict[str, Any]:
+    node: dict[str, Any] = {"$ref": f"#/$defs/{title}"}
+    node |= {"required": list(required)} if required else {}
+    return {"anyOf": [node, {"type": "null"}]} if optional else node

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from clsplat.errors import DataError
+from clsplat.errors import ConfigError, DataError
 from clsplat.scene.blender import BlenderReader
 from clsplat.scene.colmap import ColmapReader
 from clsplat.scene.images import is_image
@@ -15,13 +15,23 @@ PRECEDENCE = (ColmapReader, BlenderReader, MultiscaleReader, NerfstudioReader)
 
 
 def readers() -> list[Reader]:
-    """Return the readers in order of precedence: shipped ones, then those of plug-ins in order of definition."""
+    """Return the readers in order of precedence: shipped ones, then those of plug-ins in order of definition.
+
+    Raises ConfigError when two have the same name, or one has none.
+    """
 
     def rank(found: type[Reader]) -> int:
         """The rank of a shipped reader, or of the one that the class extends."""
         return next((i for i, shipped in enumerate(PRECEDENCE) if issubclass(found, shipped)), len(PRECEDENCE))
 
-    return [found() for found in sorted(reader_classes(), key=rank)]
+    found: dict[str, Reader] = {}
+    for reader in [kind() for kind in sorted(reader_classes(), key=rank)]:
+        if reader.name in found:
+            kinds = (type(found[reader.name]), type(reader))
+            places = " and ".join(f"{kind.__module__}.{kind.__name__}" for kind in kinds)
+            raise ConfigError(f"two readers have the name '{reader.name}': {places}; rename one")
+        found[reader.name] = reader
+    return list(found.values())
 
 
 def format_names() -> str:

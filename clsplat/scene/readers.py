@@ -2,9 +2,8 @@
 
 import inspect
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -17,11 +16,18 @@ from clsplat.scene.scene import Scene
 class Reader(ABC):
     """A dataset format.
 
-    All commands use a subclass as soon as it is defined; they do not use a class that has subclasses of its own.
+    All commands use a subclass as soon as it is defined; they do not use a class that has subclasses of its own.  A
+    class that is defined again, as in a notebook, replaces the one before.
     """
 
     name: ClassVar[str]  # of the format
     expects: ClassVar[str]  # the files that mark the format, in a few words
+    defined: ClassVar[list[type["Reader"]]] = []  # every subclass, in the order of definition
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        place = (cls.__module__, cls.__qualname__)
+        Reader.defined[:] = [kind for kind in Reader.defined if (kind.__module__, kind.__qualname__) != place] + [cls]
 
     def __init__(self) -> None:
         missing = [field for field in ("name", "expects") if not hasattr(self, field)]
@@ -51,10 +57,7 @@ class Reader(ABC):
             parts.points = PointTable(parts.path, scene.points.positions, rgb)
 
 
-def reader_classes(base: type[Reader] = Reader) -> Iterator[type[Reader]]:
-    """Yield the classes below `base` that have no subclasses and are not abstract, in the order of their definition."""
-    for found in base.__subclasses__():
-        if found.__subclasses__():
-            yield from reader_classes(found)
-        elif not inspect.isabstract(found):
-            yield found
+def reader_classes() -> list[type[Reader]]:
+    """Return the classes that have no subclasses and are not abstract, in the order of their definition."""
+    bases = {base for kind in Reader.defined for base in kind.__mro__[1:]}
+    return [kind for kind in Reader.defined if kind not in bases and not inspect.isabstract(kind)]
