@@ -11,15 +11,15 @@ import re
 import sys
 import traceback
 from collections.abc import Collection, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass
 from hashlib import sha256
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from types import ModuleType
 
-from clsplat.errors import ClsplatError, ConfigError
-from clsplat.settings import Settings, rebuild
+from clsplat.errors import PLUGIN_MARK, ClsplatError, ConfigError
+from clsplat.settings import Settings, fault_of, rebuild
 
 GROUP = "clsplat.plugins"
 OWN_PACKAGES = ("clsplat", "data_tools")
@@ -145,10 +145,15 @@ def _importing(module: str, path: Path | None = None) -> Iterator[list[type]]:
     lists = _lists()  # with everything of the package, so that what the block adds is the plug-in's
     before, modules = [list(known) for known in lists], set(sys.modules)
     try:
-        yield kinds
+        with redirect_stdout(sys.stderr):  # standard output is for results
+            yield kinds
         kinds += [kind for known, old in zip(lists, before, strict=True) for kind in known if kind not in old]
         rebuild()
         importlib.import_module("clsplat.scene.detect").readers()
+        for kind in kinds:
+            setattr(sys.modules[kind.__module__], PLUGIN_MARK, True)
+            if issubclass(kind, Settings) and (fault := fault_of(kind)):
+                raise ConfigError(f"class {kind.__name__}: {fault}")
     except BaseException as error:
         place = _place(module, path, error)
         new = {kind.__module__ for known, old in zip(lists, before, strict=True) for kind in known if kind not in old}

@@ -53,6 +53,23 @@ def variants(base: type[Base]) -> dict[str, type[Base]]:
     return found
 
 
+def fault_of(kind: type[Settings]) -> str | None:
+    """Return why no pipeline file can name a class that is meant as a variant, or None."""
+    if kind.__subclasses__():
+        return None
+    if missing := sorted(getattr(kind, "__abstractmethods__", ())):
+        return f"lacks {', '.join(missing)}"
+    bases = [base for base in kind.__mro__[1:] if issubclass(base, Settings) and base is not Settings]
+    tags = [tag for base in bases for other in variants(base).values() if (tag := tag_of(other))]
+    if not tags:
+        return None
+    field = kind.model_fields.get(tags[0][0])
+    names = typing.get_args(field.annotation) if field else ()
+    if len(names) == 1 and isinstance(names[0], str):
+        return None
+    return f'expected one name, as in `{tags[0][0]}: Literal["{kind.__name__.lower()}"]`'
+
+
 def needs_settings(kind: type[Settings]) -> bool:
     """Return whether the name of a variant alone is too little: it has keys without a default."""
     return any(field.is_required() for name, field in kind.model_fields.items() if name not in TAGS)

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from clsplat import plugins
 from clsplat.density.edit import Rule
-from clsplat.errors import ConfigError
+from clsplat.errors import ConfigError, as_clsplat_error
 from clsplat.pipeline.loading import load
 from clsplat.scene.detect import readers
 from clsplat.settings import Settings, variants
@@ -118,6 +118,41 @@ def test_a_plugin_that_fails_is_one_line_and_leaves_nothing(tmp_path, text, mess
     assert "\n" not in str(error.value)
     assert Settings.defined == before
     load("splat", ["densify.rules=[clone]"])
+
+
+@pytest.mark.parametrize(
+    ("body", "fault"),
+    [
+        ("after: int = 3\n    def mark(self, edit): pass", r"class Mine: expected one name, as in .type: Literal"),
+        ("type: str = 'mine'\n    def mark(self, edit): pass", "class Mine: expected one name"),
+        ("type: Literal['mine', 'other'] = 'mine'\n    def mark(self, edit): pass", "class Mine: expected one name"),
+        ("type: Literal['mine'] = 'mine'", "class Mine: lacks mark"),
+    ],
+)
+def test_a_class_that_no_pipeline_can_name_is_refused(tmp_path, body, fault):
+    head = "from typing import Literal\nfrom clsplat.density.edit import Rule\nclass Mine(Rule):\n    "
+    with pytest.raises(ConfigError, match=fault):
+        plugins.load_file(write(tmp_path, "mine", head + body + "\n"))
+    assert "mine" not in variants(Rule)
+
+
+def test_an_exception_of_a_plugin_names_its_file_and_line(tmp_path):
+    text = RULE.format(name="raising").replace("pass", "1 / 0")
+    path = write(tmp_path, "raising", text)
+    plugins.load_file(path)
+    try:
+        variants(Rule)["raising"]().mark(None)
+    except ZeroDivisionError as error:
+        found = as_clsplat_error(error)
+    line = text.splitlines().index("        1 / 0") + 1
+    assert str(found) == f"{path}:{line}: ZeroDivisionError: division by zero"
+    assert found.exit_code == 2
+
+
+def test_what_a_plugin_prints_is_no_result(tmp_path, capsys):
+    plugins.load_file(write(tmp_path, "printer", "print('hello')\n"))
+    out, err = capsys.readouterr()
+    assert (out, err) == ("", "hello\n")
 
 
 def test_a_missing_file_and_a_taken_name_are_refused(tmp_path):

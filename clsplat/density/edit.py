@@ -7,6 +7,7 @@ growth and compare the size of the children after a split.
 """
 
 import math
+from abc import abstractmethod
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import Annotated
@@ -229,6 +230,6 @@ class Rule(Settings):
         """Tables of the Gaussians that the rule reads beside the parameters."""
         return set()
 
+    @abstractmethod
     def mark(self, edit: Edit) -> None:
         """Give outcomes with `edit.mark` or `edit.choose`; change rows of tables with `edit.set_rows`."""
-        raise NotImplementedError
