@@ -124,7 +124,7 @@ def test_a_pose_of_another_shape_is_refused():
 
 def test_views_can_be_compared_and_kept_in_sets():
     one, other = (clsplat.View("front", CAMERA, np.eye(4)[:3]) for _ in range(2))
-    assert one == one  # noqa: PLR0124
+    assert one == one
     assert one != other
     assert len({one, other}) == 2
     assert one in [other, one]

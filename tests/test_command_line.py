@@ -150,7 +150,7 @@ def test_a_copy_of_a_pipeline_never_replaces_a_file(tmp_path):
     assert (tmp_path / "mine.yaml").read_text() == shipped()["smoke"].read_text()
     (tmp_path / "mine.yaml").write_text("mine")
     refused = clsplat("pipelines", "splat", "--copy", tmp_path / "mine.yaml", expect=2)
-    assert "mine.yaml: exists already and is not overwritten" in refused.stderr
+    assert "mine.yaml: exists and is not overwritten" in refused.stderr
     assert (tmp_path / "mine.yaml").read_text() == "mine"
     assert copy("smoke", tmp_path) == tmp_path / "smoke.yaml"
 
