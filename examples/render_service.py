@@ -25,8 +25,6 @@ class Service(BaseHTTPRequestHandler):
         self.wfile.write(b"HTTP/1.0 200 OK\r\nContent-Type: image/png\r\n\r\n" + renderer.render(view).png())
 
 
-server = HTTPServer(
-    ("127.0.0.1", int((*sys.argv, "8000")[3])), Service
-)  # one thread: a renderer is not safe for several
+server = HTTPServer(("127.0.0.1", int((*sys.argv, "8000")[3])), Service)
 print(f"http://127.0.0.1:{server.server_port}/", flush=True)
 server.serve_forever()
