@@ -1,4 +1,4 @@
-"""Scenes that take turns at whole training steps, so that a slow moment of the machine meets all; medians count."""
+"""Whole training steps of several scenes in turns, so that a slow moment of the machine affects all; medians count."""
 
 import statistics
 import time

@@ -108,15 +108,23 @@ def make_run(pipeline: Pipeline, scene: Scene, device: Device, out: Path) -> Run
     """Return a run of the pipeline on a scene, before its first stage."""
     settings = pipeline.settings
     original, background = settings.scene.applied(scene)
-    trained, budget = original.downscaled(*settings.scene.downscales), settings.scene.image_budget
-    camera = trained.views[0].camera
+    downscaled, budget = original.downscaled(*settings.scene.downscales), settings.scene.image_budget
+    camera = downscaled.views[0].camera
     LOG.info(
         "scene: %s, %d training and %d test views, %d x %d px, %s background, extent %.3g",
-        *(scene.path, len(trained.train), len(trained.test), camera.width, camera.height, background, trained.extent),
+        *(
+            scene.path,
+            len(downscaled.train),
+            len(downscaled.test),
+            camera.width,
+            camera.height,
+            background,
+            downscaled.extent,
+        ),
     )
     return Run(
         device=device,
-        scene=trained,
+        scene=downscaled,
         original=original,
         out=out,
         name=settings.name,
