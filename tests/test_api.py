@@ -124,7 +124,7 @@ def test_a_pose_of_another_shape_is_refused():
 
 def test_views_can_be_compared_and_kept_in_sets():
     one, other = (clsplat.View("front", CAMERA, np.eye(4)[:3]) for _ in range(2))
-    assert one == one  # noqa: PLR0124
+    assert one == one
     assert one != other
     assert len({one, other}) == 2
     assert one in [other, one]
@@ -194,3 +194,22 @@ def test_devices_are_context_managers():
     with clsplat.Device() as device:
         assert repr(device).startswith("Device('")
     assert any(one["fault"] is None and one["schedule"] in ("wide", "simt") for one in clsplat.devices())
+
+
+@pytest.mark.parametrize("metric", [clsplat.metrics.psnr, clsplat.metrics.ssim])
+def test_images_that_cannot_be_compared_are_refused_by_metrics(metric):
+    black = np.zeros((5, 6, 3))
+    for value in (np.nan, np.inf):
+        broken = black.copy()
+        broken[1, 2, 0] = value
+        with pytest.raises(ValueError, match=r"^the image has values that are not finite"):
+            metric(broken, black)
+        with pytest.raises(ValueError, match=r"^the photograph has values that are not finite"):
+            metric(black, broken)
+    with pytest.raises(ValueError, match=r"shape \(5, 6, 3\), the photograph \(6, 5, 3\); expected the same"):
+        metric(black, np.zeros((6, 5, 3)))
+    with pytest.raises(ValueError, match=r"shape \(0, 6, 3\), the photograph \(0, 6, 3\); .* at least one pixel"):
+        metric(black[:0], black[:0])
+    for mask in (np.zeros((5, 6), bool), np.ones((6, 5), bool), np.ones((5, 6))):
+        with pytest.raises(ValueError, match=r"^the mask has shape .*; expected bool of \(5, 6\)"):
+            metric(black, black, mask)
