@@ -5,6 +5,7 @@ import importlib
 import subprocess
 import sys
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -213,3 +214,43 @@ def test_images_that_cannot_be_compared_are_refused_by_metrics(metric):
     for mask in (np.zeros((5, 6), bool), np.ones((6, 5), bool), np.ones((5, 6))):
         with pytest.raises(ValueError, match=r"^the mask has shape .*; expected bool of \(5, 6\)"):
             metric(black, black, mask)
+
+
+@pytest.mark.parametrize(
+    ("pose", "message"),
+    [
+        (np.zeros((3, 4)), "has no rotation"),
+        (np.full((3, 4), np.nan), "has values that are not finite"),
+        (2 * np.eye(3, 4), "has no rotation"),
+        (np.diag([1, 1, -1]) @ np.eye(3, 4), "has no rotation .* not mirrored"),
+    ],
+)
+def test_a_pose_that_is_none_is_refused(pose, message):
+    with pytest.raises(ValueError, match=f"^the pose of 'front' {message}"):
+        clsplat.View("front", CAMERA, pose)
+
+
+def test_a_pose_with_few_digits_is_taken():
+    turned = clsplat.View.looking_at([1, 2, 3], [0, 0, 0], [0, 0, 1], CAMERA).world_to_camera
+    clsplat.View("front", CAMERA, np.round(turned, 3))
+
+
+@pytest.mark.parametrize("downscale", [0, -1, np.nan, np.inf])
+def test_a_view_of_no_size_is_refused(downscale):
+    with pytest.raises(ValueError, match=r"^the downscale of 'front' is .*; expected a divisor above 0"):
+        clsplat.View("front", CAMERA, np.eye(3, 4)).resized(downscale)
+
+
+@pytest.mark.parametrize("changes", [{"width": 50.5}, {"height": 32.0}])
+def test_a_camera_with_part_of_a_pixel_is_refused(changes, device, rng):
+    view = clsplat.View("front", replace(CAMERA, **changes), np.eye(3, 4))
+    with pytest.raises(ValueError, match=r"^the camera is .*; expected whole numbers of pixels"):
+        Renderer(model_of(random_case(rng, 5)), device).render(view)
+
+
+@pytest.mark.parametrize("background", [np.nan, 5, -1, "white", [0, 0.5, 2]])
+def test_a_background_that_is_no_colour_is_refused(background, device, rng):
+    view = clsplat.View("front", CAMERA, np.eye(3, 4))
+    for paint in (Renderer(model_of(random_case(rng, 5)), device).render, lambda view, colour: view.photograph(colour)):
+        with pytest.raises(ValueError, match=r"^the background is .*; expected one number or three in \[0, 1\]$"):
+            paint(view, background)
