@@ -85,6 +85,8 @@ def test_settings_are_those_of_the_command_line():
     ]
     assert overrides(["a=1", "b=2"]) == ["a=1", "b=2"]
     assert overrides("a=1") == ["a=1"]
+    numpy = {"a": np.int64(3), "b": [np.float32(0.5), np.bool_(True)], "c": Path("x") / "y", "d": {"e": np.float64(2)}}
+    assert overrides(numpy) == ["a=3", "b=[0.5, true]", 'c="x/y"', 'd={"e": 2.0}']
     with pytest.raises(ConfigError, match="set: Object of type ndarray is not JSON serializable; expected numbers"):
         overrides({"a": np.zeros(3)})
 
