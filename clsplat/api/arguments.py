@@ -14,7 +14,8 @@ Overrides = Mapping[str, Any] | Sequence[str]  # values by place, or 'place=valu
 def overrides(values: Overrides) -> list[str]:
     """Return settings as `--set` takes them; paths and numbers of NumPy count as text and numbers.
 
-    Raises ConfigError for a value that YAML cannot hold."""
+    Raises ConfigError for a value that YAML cannot hold.
+    """
     if isinstance(values, str):
         return [values]
     if not isinstance(values, Mapping):
