@@ -1,5 +1,6 @@
 """The base of losses and penalties: each adds to a gradient and returns its value, which is read on request."""
 
+import math
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import PrivateAttr, ValidationError
 
-from clsplat.errors import ConfigError, shortened
+from clsplat.errors import ConfigError, NumericError, shortened
 from clsplat.gaussians.tables import Gaussians, Gradients
 from clsplat.opencl.device import Array
 from clsplat.render.camera import DeviceCamera
@@ -161,6 +162,11 @@ class HostLoss(ImageLoss):
             for planes in (comparison.image, comparison.photograph)
         )
         value, derivative = self._call(image, photograph)
+        if not (math.isfinite(value) and np.isfinite(derivative).all()):
+            raise NumericError(
+                f"step {comparison.step}: the loss '{self.name}' returned values that are not finite; "
+                "expected finite numbers: look for a division, root or logarithm of 0 in it"
+            )
         planes = comparison.gradient.get() if comparison.accumulate else np.zeros(comparison.gradient.shape, np.float32)
         planes[:, :height, :width] += np.float32(weight) * derivative.transpose(2, 0, 1)
         comparison.gradient.set(planes)
