@@ -15,6 +15,8 @@ def atomic(path: Path) -> Iterator[BinaryIO]:
 
     Raises OutputError with the file's name when it cannot be written; an earlier file then stays unchanged.
     """
+    if not path.name:
+        raise OutputError(f"{path}: cannot be written (it has no name); expected the path of a file")
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

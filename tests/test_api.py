@@ -5,6 +5,7 @@ import importlib
 import subprocess
 import sys
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -84,6 +85,8 @@ def test_settings_are_those_of_the_command_line():
     ]
     assert overrides(["a=1", "b=2"]) == ["a=1", "b=2"]
     assert overrides("a=1") == ["a=1"]
+    numpy = {"a": np.int64(3), "b": [np.float32(0.5), np.bool_(True)], "c": Path("x") / "y", "d": {"e": np.float64(2)}}
+    assert overrides(numpy) == ["a=3", "b=[0.5, true]", 'c="x/y"', 'd={"e": 2.0}']
     with pytest.raises(ConfigError, match="set: Object of type ndarray is not JSON serializable; expected numbers"):
         overrides({"a": np.zeros(3)})
 
@@ -194,3 +197,62 @@ def test_devices_are_context_managers():
     with clsplat.Device() as device:
         assert repr(device).startswith("Device('")
     assert any(one["fault"] is None and one["schedule"] in ("wide", "simt") for one in clsplat.devices())
+
+
+@pytest.mark.parametrize("metric", [clsplat.metrics.psnr, clsplat.metrics.ssim])
+def test_images_that_cannot_be_compared_are_refused_by_metrics(metric):
+    black = np.zeros((5, 6, 3))
+    for value in (np.nan, np.inf):
+        broken = black.copy()
+        broken[1, 2, 0] = value
+        with pytest.raises(ValueError, match=r"^the image has values that are not finite"):
+            metric(broken, black)
+        with pytest.raises(ValueError, match=r"^the photograph has values that are not finite"):
+            metric(black, broken)
+    with pytest.raises(ValueError, match=r"shape \(5, 6, 3\), the photograph \(6, 5, 3\); expected the same"):
+        metric(black, np.zeros((6, 5, 3)))
+    with pytest.raises(ValueError, match=r"shape \(0, 6, 3\), the photograph \(0, 6, 3\); .* at least one pixel"):
+        metric(black[:0], black[:0])
+    for mask in (np.zeros((5, 6), bool), np.ones((6, 5), bool), np.ones((5, 6))):
+        with pytest.raises(ValueError, match=r"^the mask has shape .*; expected bool of \(5, 6\)"):
+            metric(black, black, mask)
+
+
+@pytest.mark.parametrize(
+    ("pose", "message"),
+    [
+        (np.zeros((3, 4)), "has no rotation"),
+        (np.full((3, 4), np.nan), "has values that are not finite"),
+        (2 * np.eye(3, 4), "has no rotation"),
+        (np.diag([1, 1, -1]) @ np.eye(3, 4), "has no rotation .* not mirrored"),
+    ],
+)
+def test_a_pose_that_is_none_is_refused(pose, message):
+    with pytest.raises(ValueError, match=f"^the pose of 'front' {message}"):
+        clsplat.View("front", CAMERA, pose)
+
+
+def test_a_pose_with_few_digits_is_taken():
+    turned = clsplat.View.looking_at([1, 2, 3], [0, 0, 0], [0, 0, 1], CAMERA).world_to_camera
+    clsplat.View("front", CAMERA, np.round(turned, 3))
+
+
+@pytest.mark.parametrize("downscale", [0, -1, np.nan, np.inf])
+def test_a_view_of_no_size_is_refused(downscale):
+    with pytest.raises(ValueError, match=r"^the downscale of 'front' is .*; expected a divisor above 0"):
+        clsplat.View("front", CAMERA, np.eye(3, 4)).resized(downscale)
+
+
+@pytest.mark.parametrize("changes", [{"width": 50.5}, {"height": 32.0}])
+def test_a_camera_with_part_of_a_pixel_is_refused(changes, device, rng):
+    view = clsplat.View("front", replace(CAMERA, **changes), np.eye(3, 4))
+    with pytest.raises(ValueError, match=r"^the camera is .*; expected whole numbers of pixels"):
+        Renderer(model_of(random_case(rng, 5)), device).render(view)
+
+
+@pytest.mark.parametrize("background", [np.nan, 5, -1, "white", [0, 0.5, 2]])
+def test_a_background_that_is_no_colour_is_refused(background, device, rng):
+    view = clsplat.View("front", CAMERA, np.eye(3, 4))
+    for paint in (Renderer(model_of(random_case(rng, 5)), device).render, lambda view, colour: view.photograph(colour)):
+        with pytest.raises(ValueError, match=r"^the background is .*; expected one number or three in \[0, 1\]$"):
+            paint(view, background)

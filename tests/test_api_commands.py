@@ -125,6 +125,25 @@ def test_pages(runs, tiny_scene, tmp_path):
         assert (tmp_path / f"{one}.html").read_bytes() == (tmp_path / f"{other}.html").read_bytes()
 
 
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"kind": "jpg"}, "^no kind 'jpg'; there are png, npy$"),
+        ({"split": "bogus"}, "^no split 'bogus'; there are train, test, all$"),
+    ],
+)
+def test_views_of_other_kinds_and_splits_are_refused(runs, tmp_path, arguments, message):
+    with pytest.raises(ConfigError, match=message):
+        clsplat.render_views(runs[0], out=tmp_path / "out", **arguments)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_comparison_of_no_runs_is_refused(tmp_path):
+    with pytest.raises(ConfigError, match=r"^no runs to compare; expected the folder of at least one$"):
+        clsplat.compare_runs([], tmp_path / "c.html")
+    assert not (tmp_path / "c.html").exists()
+
+
 def test_copies_of_pipelines(tmp_path):
     command("pipelines", "smoke", "--copy", tmp_path / "a.yaml")
     assert clsplat.copy_pipeline("smoke", tmp_path / "b.yaml") == tmp_path / "b.yaml"

@@ -14,7 +14,7 @@ import pytest
 
 import clsplat
 from clsplat.api.renderer import Renderer
-from clsplat.errors import ClsplatError, ConfigError, DataError
+from clsplat.errors import ClsplatError, ConfigError, DataError, NumericError
 from clsplat.losses.base import Comparison, HostLoss
 from clsplat.losses.image import L1, Dssim
 from clsplat.render.camera import upload_camera
@@ -162,6 +162,20 @@ def test_after_an_error_inside_of_a_step_the_trainer_says_that_it_has_ended(tiny
         trainer.run(2)
     with pytest.raises(ClsplatError, match="ended with an error; make another, with resume=True"):
         trainer.run(2)
+
+
+@pytest.mark.parametrize("broken", ["value", "derivative"])
+def test_a_loss_that_is_not_finite_stops_the_step_before_the_model_changes(tiny_scene, broken):
+    def odd(image, photograph):
+        factor = np.float32(np.nan)
+        return (factor, image) if broken == "value" else (0.0, image * factor)
+
+    trainer = clsplat.Trainer(tiny_scene, "smoke")
+    before = trainer.model
+    trainer.add_loss(odd)
+    with pytest.raises(NumericError, match=r"^step 1: the loss 'odd' returned values that are not finite; expected"):
+        trainer.run(3)
+    assert equal(trainer.model, before)
 
 
 def test_the_error_of_a_step_is_in_the_status_and_is_raised_as_it_is(tiny_scene, tmp_path):

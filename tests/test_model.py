@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from clsplat.api.renderer import Renderer
+from clsplat.errors import OutputError
 from clsplat.gaussians.model import Model, Rendering, load
 from clsplat.gaussians.sh import basis, rotated_sh
 from clsplat.scene.view import View
@@ -165,3 +166,9 @@ def test_a_scene_shows_four_photographs_and_escapes_their_names(tiny_scene):
     assert page.elements["script"] == 0
     assert page.text.count(HOSTILE) == 4, "the path, and the names of three photographs: the first has no file"
     assert repr(scene) == "Scene(tiny: 8 training and 2 test views)"
+
+
+@pytest.mark.parametrize("path", ["", ".", "/"])
+def test_a_path_without_a_name_is_refused(rng, path):
+    with pytest.raises(OutputError, match=r"cannot be written \(it has no name\); expected the path of a file$"):
+        model_of(random_case(rng, 3)).save(path)

@@ -210,6 +210,32 @@ def test_a_derivative_of_another_shape_is_refused(device, rng):
         loss.add(comparison_of(device, x, y))
 
 
+@pytest.mark.parametrize("found", [None, 0.0, (0.0,), ("much", np.zeros((4, 5, 3))), (0.0, "much"), (0.0, None, 1)])
+def test_a_loss_that_returns_no_value_and_derivative_is_refused(device, rng, found):
+    def odd(image, photograph):
+        return found
+
+    with pytest.raises(ValueError, match=r"^the loss '?(odd)?.* returned .*; expected ") as caught:
+        HostLoss(odd).add(comparison_of(device, *images(rng, 5, 4)))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("weight", "reason"),
+    [
+        ("heavy", "expected a number, points"),
+        (float("nan"), "expected a number, points"),
+        (-1.0, "expected values at least 0"),
+        ([[0, 1.0], [9, -1.0]], "expected values at least 0"),
+    ],
+)
+def test_a_weight_that_is_none_is_refused(weight, reason):
+    with pytest.raises(ConfigError, match=rf"^the weight of the loss is .*; {reason}") as caught:
+        HostLoss(mean_difference, weight)
+    assert "\n" not in str(caught.value)
+    assert HostLoss(mean_difference, np.float32(0.5)).weight == 0.5
+
+
 def test_losses_of_a_run_are_added_to_those_of_its_pipeline(tiny_scene: Path, tmp_path: Path):
     checked = load("smoke", [f"scene.path='{tiny_scene}'", "optimize.losses=[l1]"])
     run = runner.open_run(checked, tmp_path, None)

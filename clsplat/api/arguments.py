@@ -12,15 +12,29 @@ Overrides = Mapping[str, Any] | Sequence[str]  # values by place, or 'place=valu
 
 
 def overrides(values: Overrides) -> list[str]:
-    """Return settings as `--set` takes them.  Raises ConfigError for a value that YAML cannot hold."""
+    """Return settings as `--set` takes them; paths and numbers of NumPy count as text and numbers.
+
+    Raises ConfigError for a value that YAML cannot hold.
+    """
     if isinstance(values, str):
         return [values]
     if not isinstance(values, Mapping):
         return list(values)
     try:
-        return [f"{place}={json.dumps(value)}" for place, value in values.items()]
+        return [f"{place}={json.dumps(value, default=_plain)}" for place, value in values.items()]
     except (TypeError, ValueError) as error:
         raise ConfigError(f"set: {error}; expected numbers, text, and lists and mappings of them") from None
+
+
+def _plain(value: Any) -> Any:
+    """A value that JSON does not know as one that it does.  Raises TypeError."""
+    import numpy as np  # only where it is needed: the command line starts without it
+
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, np.generic):
+        return value.item()
+    raise TypeError(f"Object of type {type(value).__name__} is not JSON serializable")
 
 
 def load_plugins() -> None:

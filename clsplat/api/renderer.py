@@ -14,7 +14,7 @@ from clsplat.metrics.images import to_8_bits
 from clsplat.opencl.device import Array, Device, open_device
 from clsplat.render.camera import DeviceCamera, upload_camera
 from clsplat.render.rasterizer import Content, Frame, Rasterizer
-from clsplat.scene.scene import View
+from clsplat.scene.view import View, colour_of
 from clsplat.views.photographs import BACKGROUNDS
 
 Floats = NDArray[np.float32]
@@ -149,10 +149,7 @@ class Renderer:
     def _colour(self, background: Colour | None) -> Floats:
         if background is None:
             background = BACKGROUNDS[self.model.rendering.background or "black"]
-        colour = np.asarray(background, np.float32)
-        if colour.shape not in ((), (3,)):
-            raise ValueError(f"the background has shape {colour.shape}; expected one number or three")
-        return np.ascontiguousarray(np.broadcast_to(colour, (3,)))
+        return np.ascontiguousarray(colour_of(background), np.float32)
 
 
 def _inside(frame: Frame, planes: Floats) -> Floats:

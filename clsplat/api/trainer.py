@@ -154,6 +154,8 @@ class Trainer:
 
         Arrays are [height, width, 3] float32 in [0, 1]; weight: factor, by step.  Each step copies both images to the
         host and the derivative back; a plug-in with a kernel does not.
+        Raises ConfigError for a weight that is not from 0 on; a step raises ValueError where the function returns
+        something else, and NumericError for values that are not finite.
         """
         self._run.losses.append(HostLoss(function, weight))
 

@@ -63,9 +63,11 @@ class Comparison:
     def read(cls, paths: Sequence[Path]) -> "Comparison":
         """Read run folders; the folder of a matrix means its finished cells.
 
-        Raises DataError for a folder that is missing, unfinished or damaged, ConfigError for one given twice or a
-        pipeline.yaml that cannot be read.
+        Raises DataError for a folder that is missing, unfinished or damaged, ConfigError for none, for one given twice
+        or a pipeline.yaml that cannot be read.
         """
+        if not paths:
+            raise ConfigError("no runs to compare; expected the folder of at least one")
         runs = [RunFolder.read(folder) for path in paths for folder in _cells(path)]
         seen: set[Path] = set()
         for run in runs:

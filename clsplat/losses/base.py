@@ -1,5 +1,6 @@
 """The base of losses and penalties: each adds to a gradient and returns its value, which is read on request."""
 
+import math
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -7,14 +8,15 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import PrivateAttr
+from pydantic import PrivateAttr, ValidationError
 
+from clsplat.errors import ConfigError, NumericError, shortened
 from clsplat.gaussians.tables import Gaussians, Gradients
 from clsplat.opencl.device import Array
 from clsplat.render.camera import DeviceCamera
 from clsplat.render.rasterizer import Frame
 from clsplat.render.workspace import Workspace
-from clsplat.schedule import Schedule, at_step
+from clsplat.schedule import NonNegative, Schedule, at_step
 from clsplat.settings import Settings
 
 
@@ -135,11 +137,22 @@ class HostLoss(ImageLoss):
     Arrays are [height, width, 3] float32.  Each step copies both images to the host and the derivative back.
     """
 
+    weight: NonNegative = 1.0
     _function: HostFunction = PrivateAttr()
 
     def __init__(self, function: HostFunction, weight: Schedule = 1.0) -> None:
-        super().__init__(weight=weight)
+        """Raise ConfigError for a weight that is no schedule of numbers from 0 on."""
+        try:
+            super().__init__(weight=weight.item() if isinstance(weight, np.generic) else weight)
+        except ValidationError as error:
+            reason = error.errors()[0]["msg"].removeprefix("Value error, ")
+            raise ConfigError(f"the weight of the loss is {shortened(repr(weight))}; {reason}") from None
         self._function = function
+
+    @property
+    def name(self) -> str:
+        """The name of the function."""
+        return str(getattr(self._function, "__name__", "host"))
 
     def add(self, comparison: Comparison) -> LossValue:
         camera, weight = comparison.camera, at_step(self.weight, comparison.step)
@@ -148,14 +161,31 @@ class HostLoss(ImageLoss):
             np.ascontiguousarray(planes.get()[:3, :height, :width].transpose(1, 2, 0))
             for planes in (comparison.image, comparison.photograph)
         )
-        value, derivative = self._function(image, photograph)
-        derivative = np.asarray(derivative, np.float32)
-        if derivative.shape != image.shape:
-            raise ValueError(
-                f"the loss returned a derivative of {derivative.shape}; expected {image.shape}, as the image"
+        value, derivative = self._call(image, photograph)
+        if not (math.isfinite(value) and np.isfinite(derivative).all()):
+            raise NumericError(
+                f"step {comparison.step}: the loss '{self.name}' returned values that are not finite; "
+                "expected finite numbers: look for a division, root or logarithm of 0 in it"
             )
         planes = comparison.gradient.get() if comparison.accumulate else np.zeros(comparison.gradient.shape, np.float32)
         planes[:, :height, :width] += np.float32(weight) * derivative.transpose(2, 0, 1)
         comparison.gradient.set(planes)
         comparison.accumulate = True
-        return LossValue(getattr(self._function, "__name__", "host"), lambda: weight * float(value))
+        return LossValue(self.name, lambda: weight * value)
+
+    def _call(self, image: NDArray[np.float32], photograph: NDArray[np.float32]) -> tuple[float, NDArray[np.float32]]:
+        """Value and derivative.  Raises ValueError where the function returns no such pair."""
+        found: Any = self._function(image, photograph)
+        try:
+            value, derivative = found
+            value, derivative = float(value), np.asarray(derivative, np.float32)
+        except (TypeError, ValueError):
+            raise ValueError(
+                f"the loss '{self.name}' returned {shortened(' '.join(repr(found).split()), 80)}; "
+                "expected (value, derivative by the image)"
+            ) from None
+        if derivative.shape != image.shape:
+            raise ValueError(
+                f"the loss returned a derivative of {derivative.shape}; expected {image.shape}, as the image"
+            )
+        return value, derivative

@@ -27,14 +27,37 @@ def psnr(image: NDArray[np.generic], photograph: NDArray[np.generic], mask: Mask
     """Return the peak signal-to-noise ratio in dB over all channels of the pixels that count.
 
     image, photograph: [height, width, 3], uint8, or floats in [0, 1] that are rounded to 8 bits; mask: [height, width].
-    Raises ValueError for other values.
+    Raises ValueError for other values, for shapes that differ, and where no pixel counts.
     """
-    squared = (to_8_bits(image).astype(np.float64) - to_8_bits(photograph)) ** 2
+    image, photograph = _checked(image, photograph, mask)
+    squared = (image.astype(np.float64) - photograph) ** 2
     error = float(np.mean(squared if mask is None else squared[mask])) / 255**2
     return MAX_PSNR if error == 0 else 10 * math.log10(1 / error)
 
 
 def ssim(image: NDArray[np.generic], photograph: NDArray[np.generic], mask: Mask | None = None) -> float:
-    """Return the structural similarity (Wang et al. 2004), the mean over the pixels that count; arguments as psnr."""
-    similarity = ssim_map(to_8_bits(image), to_8_bits(photograph))
+    """Return the structural similarity (Wang et al. 2004), the mean over the pixels that count.
+
+    Arguments and errors are those of psnr.
+    """
+    similarity = ssim_map(*_checked(image, photograph, mask))
     return float((similarity if mask is None else similarity[mask]).mean())
+
+
+def _checked(image: NDArray[np.generic], photograph: NDArray[np.generic], mask: Mask | None) -> tuple[Image, Image]:
+    """Two images as 8 bits.  Raises ValueError where they cannot be compared."""
+    shape = image.shape
+    if shape != photograph.shape or len(shape) != 3 or shape[2] != 3 or image.size == 0:
+        raise ValueError(
+            f"the image has shape {shape}, the photograph {photograph.shape}; "
+            "expected the same [height, width, 3], with at least one pixel"
+        )
+    if mask is not None and (mask.dtype != np.bool_ or mask.shape != shape[:2] or not mask.any()):
+        raise ValueError(
+            f"the mask has shape {mask.shape} and type {mask.dtype}; "
+            f"expected bool of {shape[:2]}, as the image, with at least one pixel that counts"
+        )
+    for name, pixels in (("image", image), ("photograph", photograph)):
+        if np.issubdtype(pixels.dtype, np.floating) and not np.isfinite(pixels).all():
+            raise ValueError(f"the {name} has values that are not finite; expected uint8, or floats in [0, 1]")
+    return to_8_bits(image), to_8_bits(photograph)

@@ -27,6 +27,8 @@ from clsplat.scene.scene import Alpha
 from clsplat.stages.render import image_path
 from clsplat.views.photographs import Photographs
 
+SPLITS = ("train", "test", "all")
+KINDS = ("png", "npy")  # of files
 LOG = logging.getLogger("clsplat")
 
 
@@ -132,6 +134,9 @@ def render(
     device: str | Device | None = None,
 ) -> int:
     """Render a model file or run folder at the views of a scene; return the number of files.  Raises ClsplatError."""
+    for what, value, known in (("split", split, SPLITS), ("kind", kind, KINDS)):
+        if value not in known:
+            raise ConfigError(f"no {what} '{value}'; there are {', '.join(known)}")
     return ModelFile(model, scene, device, downscale).render(split, out, kind)
 
 

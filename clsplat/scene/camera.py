@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import astuple, dataclass
+from numbers import Integral
 
 
 @dataclass(frozen=True)
@@ -16,7 +17,12 @@ class Camera:
     cy: float
 
     def check(self) -> "Camera":
-        """Return the camera.  Raises ValueError unless sizes and focal lengths are positive and all numbers finite."""
+        """Return the camera.
+
+        Raises ValueError unless sizes are whole, sizes and focal lengths positive and all numbers finite.
+        """
+        if not (isinstance(self.width, Integral) and isinstance(self.height, Integral)):
+            raise ValueError(f"the camera is {self.width}x{self.height}; expected whole numbers of pixels, of type int")
         if min(self.width, self.height, self.fx, self.fy) <= 0 or not all(map(math.isfinite, astuple(self))):
             raise ValueError(
                 f"the camera is {self.width}x{self.height} with focal lengths {self.fx}, {self.fy} and principal point "

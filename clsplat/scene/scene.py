@@ -132,8 +132,6 @@ def make_scene(
         if view.name in seen:
             raise DataError(f"{path}: two images are called '{view.name}'; names must differ")
         seen.add(view.name)
-        if not np.isfinite(view.world_to_camera).all():
-            raise DataError(f"{path}: the pose of '{view.name}' is not finite; remove that image or fix its pose")
         try:
             view.camera.check()
         except ValueError as error:

@@ -1,5 +1,6 @@
 """A photograph with its camera: reading its pixels at the size of the camera."""
 
+import math
 import operator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,6 +19,7 @@ Floats = NDArray[np.floating]
 Alpha = Literal["transparency", "mask"]  # the meaning of a photograph's fourth channel
 BLACK = (0.0, 0.0, 0.0)
 NO_FILE = Path()  # of a view that is made by hand
+ROTATION_TOLERANCE = 2e-3  # of R Rᵀ: files are read to 1e-3, and an inverse has a little more
 MIN_WHITE = 0.99  # share of the largest value: JPEG does not store white exactly
 
 
@@ -27,7 +29,7 @@ class View:
 
     Two views are equal only when they are one object; compare names, downscales or poses.
 
-    A view that only serves to render a model needs no photograph.
+    A view that only serves to render a model needs no photograph.  Raises ValueError for a pose that is none.
     """
 
     name: str
@@ -40,9 +42,17 @@ class View:
     downscale: float = 1  # divisor of the original photograph's size
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "world_to_camera", np.asarray(self.world_to_camera))
+        object.__setattr__(self, "world_to_camera", np.asarray(self.world_to_camera, np.float64))
         if self.world_to_camera.shape != (3, 4):
             raise ValueError(f"the pose of '{self.name}' has shape {self.world_to_camera.shape}; expected (3, 4)")
+        rotation = self.world_to_camera[:, :3]
+        if not np.isfinite(self.world_to_camera).all():
+            raise ValueError(f"the pose of '{self.name}' has values that are not finite; expected finite numbers")
+        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=ROTATION_TOLERANCE) or np.linalg.det(rotation) < 0:
+            raise ValueError(
+                f"the pose of '{self.name}' has no rotation in its first three columns; "
+                "expected axes of length 1 at right angles, not mirrored"
+            )
 
     @classmethod
     def looking_at(
@@ -70,7 +80,12 @@ class View:
         return -rotation.T @ translation
 
     def resized(self, downscale: float) -> "View":
-        """Return the same photograph with 1 / `downscale` of its original size."""
+        """Return the same photograph with 1 / `downscale` of its original size.
+
+        Raises ValueError unless `downscale` is positive and finite.
+        """
+        if not 0 < downscale < math.inf:
+            raise ValueError(f"the downscale of '{self.name}' is {downscale:g}; expected a divisor above 0, such as 2")
         if downscale == self.downscale:
             return self
         return replace(self, camera=self.camera.downscaled(downscale / self.downscale), downscale=downscale)
@@ -79,10 +94,24 @@ class View:
         """Return the photograph at the camera's size, [height, width, 3] in [0, 1].
 
         background: behind what is transparent, one number or three in [0, 1]; that of a picture is
-        `picture.background`.  Raises DataError when the file cannot be read or is not the camera's image.
+        `picture.background`.  Raises DataError when the file cannot be read or is not the camera's image, ValueError
+        for another background.
         """
-        red, green, blue = np.broadcast_to(np.asarray(background, np.float64), (3,)).tolist()
+        red, green, blue = colour_of(background).tolist()
         return np.asarray(load_image(self, (red, green, blue)) / np.float32(255), np.float32)
+
+
+def colour_of(background: ArrayLike) -> Floats:
+    """Return a background as three numbers.  Raises ValueError unless it is one number or three in [0, 1]."""
+    try:
+        colour = np.asarray(background, np.float64)
+    except (ValueError, TypeError):
+        raise ValueError(f"the background is {background!r}; expected one number or three in [0, 1]") from None
+    if colour.shape not in ((), (3,)):
+        raise ValueError(f"the background has shape {colour.shape}; expected one number or three")
+    if not ((colour >= 0) & (colour <= 1)).all():
+        raise ValueError(f"the background is {background!r}; expected one number or three in [0, 1]")
+    return np.broadcast_to(colour, (3,))
 
 
 def load_image(view: View, background: tuple[float, float, float] | Floats = BLACK) -> NDArray[np.uint8]:
