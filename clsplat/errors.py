@@ -44,6 +44,10 @@ class DataError(ClsplatError):
     exit_code = 3
 
 
+class PoseError(DataError, ValueError):
+    """The pose of a view has another shape, is not finite or has no rotation."""
+
+
 class DeviceError(ClsplatError):
     """An OpenCL device does not exist, or its runtime does not work."""
 

@@ -142,3 +142,8 @@ def test_a_camera_that_is_impossible_is_refused_whoever_read_it(tmp_path, change
     camera = Camera(**{"width": 64, "height": 48, "fx": 60.0, "fy": 60.0, "cx": 32.0, "cy": 24.0, **changes})
     view = View("a.png", camera, np.eye(3, 4), tmp_path / "a.png")
     assert "'a.png': the camera is" in refusal(make_scene, tmp_path, [view], set(), None)
+
+
+@pytest.mark.parametrize("pose", [np.zeros((3, 4)), np.full((3, 4), np.nan), np.eye(4)])
+def test_a_pose_that_is_none_is_an_error_of_the_data_whoever_read_it(pose):
+    assert "the pose of 'a.png'" in refusal(View, "a.png", Camera(64, 48, 60.0, 60.0, 32.0, 24.0), pose)

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clsplat.errors import DataError
+from clsplat.errors import DataError, PoseError
 from clsplat.scene.camera import Camera
 from clsplat.scene.images import read_image
 from clsplat.scene.lens import Lens
@@ -29,7 +29,7 @@ class View:
 
     Two views are equal only when they are one object; compare names, downscales or poses.
 
-    A view that only serves to render a model needs no photograph.  Raises ValueError for a pose that is none.
+    A view that only serves to render a model needs no photograph.  Raises PoseError without a rotation.
     """
 
     name: str
@@ -44,12 +44,12 @@ class View:
     def __post_init__(self) -> None:
         object.__setattr__(self, "world_to_camera", np.asarray(self.world_to_camera, np.float64))
         if self.world_to_camera.shape != (3, 4):
-            raise ValueError(f"the pose of '{self.name}' has shape {self.world_to_camera.shape}; expected (3, 4)")
+            raise PoseError(f"the pose of '{self.name}' has shape {self.world_to_camera.shape}; expected (3, 4)")
         rotation = self.world_to_camera[:, :3]
         if not np.isfinite(self.world_to_camera).all():
-            raise ValueError(f"the pose of '{self.name}' has values that are not finite; expected finite numbers")
+            raise PoseError(f"the pose of '{self.name}' has values that are not finite; expected finite numbers")
         if not np.allclose(rotation @ rotation.T, np.eye(3), atol=ROTATION_TOLERANCE) or np.linalg.det(rotation) < 0:
-            raise ValueError(
+            raise PoseError(
                 f"the pose of '{self.name}' has no rotation in its first three columns; "
                 "expected axes of length 1 at right angles, not mirrored"
             )
