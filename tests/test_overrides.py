@@ -59,6 +59,8 @@ REFUSED = {
     "optimize.steps=&a [*a]": "the value cannot be read: ",
     "optimize.steps=[": "the value cannot be read: ",
     "name=../up": "expected text that matches",
+    "name=..": "expected text that matches",
+    "name=.": "expected text that matches",
     "stages=[init]": "stages[0]: expected keys and values, got 'init'",
     "stages=3": "expected a list, got 3",
 }
