@@ -66,6 +66,20 @@ REFUSED = {
 }
 
 
+INSIDE = {  # paths that leave the run folder, or name another of its files
+    "export.file": ("../../escaped.ply", "/tmp/escaped.ply", "C:/escaped.ply", "a/../../b.ply", "pipeline.yaml", "ply"),
+    "report.file": ("../report.html", "metrics.json"),
+    "render.folder": ("../renders", "/tmp/renders"),
+}
+
+
+@pytest.mark.parametrize("place", INSIDE)
+def test_outputs_stay_inside_the_run_folder(place):
+    for path in INSIDE[place]:
+        with pytest.raises(OverrideError, match=f"expected a path inside the run folder.*, got '{path}'"):
+            load("splat_7k", [f"{place}={path}"])
+
+
 @pytest.mark.parametrize("override", REFUSED)
 def test_an_error_of_set_blames_set_alone(override):
     with pytest.raises(OverrideError) as error:
