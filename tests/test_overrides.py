@@ -61,7 +61,7 @@ REFUSED = {
     "name=../up": "expected text that matches",
     "name=..": "expected text that matches",
     "name=.": "expected text that matches",
-    "stages=[init]": "stages[0]: expected keys and values, got 'init'",
+    "stages=[int]": "stages[0]: no stage named 'int'; did you mean 'init'?",
     "stages=3": "expected a list, got 3",
 }
 
@@ -119,3 +119,25 @@ def test_set_can_complete_a_file(tmp_path):
     path = tmp_path / "x.yaml"
     path.write_text("name: x\nstages:\n  - init\n  - optimize: {losses: [{type: l1}]}\n")
     assert load(str(path), ["optimize.steps=3"]).settings.training.steps == 3
+
+
+def test_bare_names_in_a_file_can_be_changed_below(tmp_path):
+    path = tmp_path / "x.yaml"
+    path.write_text(
+        "name: x\nstages:\n  - init\n  - optimize:\n      steps: 3\n      losses: [l1]\n      views: {order: code}\n"
+        "      during: [{densify: {every: 2, rules: [prune_faint]}}]\n"
+    )
+    settings = load(str(path), ["optimize.losses[0].weight=0.5", "densify.rules.0.start=7"]).settings.training
+    assert (settings.losses[0].type, settings.losses[0].weight) == ("l1", 0.5)
+    assert settings.during[0].rules[0].start == 7
+    assert load(str(path), ["optimize.views.order.type=paper"]).settings.training.views.order.type == "paper"
+
+
+def test_a_value_may_have_the_notation_of_files():
+    during = load("smoke", ["optimize.during=[{checkpoint: {every: 3}}, raise_sh]", "raise_sh.every=4"])
+    assert [(stage.stage, stage.every) for stage in during.settings.training.during] == [
+        ("checkpoint", 3),
+        ("raise_sh", 4),
+    ]
+    stages = "stages=[init, {optimize: {steps: 3, losses: [l1], during: [{checkpoint: {every: 3}}]}}]"
+    assert load("smoke", [stages, "checkpoint.every=5"]).settings.training.during[0].every == 5
