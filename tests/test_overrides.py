@@ -65,6 +65,8 @@ REFUSED = {
     "name=..": "expected text that matches",
     "name=.": "expected text that matches",
     "stages=[int]": "stages[0]: no stage named 'int'; did you mean 'init'?",
+    "plugins.a=b": "'plugins' cannot be set; a run writes it; load a plug-in with --plugin FILE",
+    "plugins={}": "'plugins' cannot be set",
     "stages=3": "expected a list, got 3",
 }
 

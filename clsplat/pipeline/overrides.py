@@ -18,6 +18,7 @@ from clsplat.pipeline.yaml_file import Place, parse_value
 from clsplat.settings import TAGS
 
 MAX_SUGGESTIONS = 3
+NOT_SETTABLE = {"plugins": "a run writes it; load a plug-in with --plugin FILE"}
 
 
 class NoSuchKey(OverrideError):
@@ -43,6 +44,8 @@ def apply(data: dict[str, Any], text: str, root: type[BaseModel]) -> Place:
         parsed = parse_value(value)
     except ConfigError as error:
         raise OverrideError(text, f"the value cannot be read: {error}") from error
+    if names[0] in NOT_SETTABLE:
+        raise OverrideError(text, f"'{names[0]}' cannot be set; {NOT_SETTABLE[names[0]]}")
     node = _Node(data, root, ())
     for name in names[:-1]:
         node = node.child(name, text)
