@@ -67,6 +67,9 @@ REFUSED = {
     "stages=[int]": "stages[0]: no stage named 'int'; did you mean 'init'?",
     "plugins.a=b": "'plugins' cannot be set; a run writes it; load a plug-in with --plugin FILE",
     "plugins={}": "'plugins' cannot be set",
+    "optimize.during=[{every: 3}, {to: 1, every: 3}]": "expected a 'stage', the name of the stage",
+    "optimize.losses=[{weight: 3}]": "expected a 'type', the name of the loss",
+    "model.world_filter={type: none, variance: 1}": "unknown key 'variance'; there are no other keys here, remove it",
     "stages=3": "expected a list, got 3",
 }
 
