@@ -194,6 +194,18 @@ def test_resume_goes_on_to_the_same_bits(finished, tmp_path):
     assert "made with other settings" in clsplat("resume", run, "--set", "seed=9", expect=2).stderr
 
 
+def test_a_plugin_may_stand_after_the_command(tmp_path):
+    plugin = Path(__file__).parents[1] / "examples" / "opacity_entropy.py"
+    assert plugin.is_file()
+    for option in (["--plugin", str(tmp_path / "x.py")], [f"--plugin={tmp_path / 'x.py'}"]):
+        before = clsplat(*option, "check", "smoke", expect=2).stderr
+        assert "x.py" in before
+        assert clsplat("check", "smoke", *option, expect=2).stderr == before
+        assert clsplat("check", *option, "smoke", "--plugin", str(plugin), expect=2).stderr == before
+    assert clsplat("check", "smoke", "--plugin", str(plugin)).returncode == 0
+    assert "--plugin" in clsplat("check", "smoke", "--plugin", expect=2).stderr
+
+
 @pytest.mark.parametrize("text", ["[1]", '{"test": 5}', '{"test": {"1": 5}}', "{"])
 def test_status_refuses_damaged_metrics(text, tmp_path):
     (tmp_path / "status.json").write_text('{"state": "done", "step": 7}')
