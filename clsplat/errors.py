@@ -89,7 +89,7 @@ def as_clsplat_error(error: BaseException) -> ClsplatError:
     if isinstance(error, KeyboardInterrupt):
         return Interrupted("stopped at once; --resume continues from the last checkpoint")
     if isinstance(error, MemoryError):
-        return MemoryLimitError("out of memory; use smaller images (scene.downscale) or fewer of them")
+        return MemoryLimitError("out of memory; use fewer Gaussians, smaller images (scene.downscale) or fewer of them")
     if isinstance(error, OSError) and error.strerror:
         place = error.filename or "the output"
         return OutputError(f"{place}: {error.strerror}; check the file, its folder and their space")

@@ -12,11 +12,13 @@ import pytest
 
 from clsplat import __version__
 from clsplat.cli.app import ORDER, SYNONYMS
+from clsplat.errors import DataError
 from clsplat.pipeline.files import shipped
 from clsplat.pipeline.loading import load
 from clsplat.pipeline.recipes import copy, manual, summary
 from clsplat.pipeline.settable import settable
 from clsplat.runs.status import run_status, status_text
+from clsplat.training.records import Records
 from tests.test_cli import clsplat
 from tests.test_training import train
 
@@ -190,6 +192,35 @@ def test_resume_goes_on_to_the_same_bits(finished, tmp_path):
     assert "resumed at step 40" in done.stdout
     assert (run / "point_cloud.ply").read_bytes() == (finished / "point_cloud.ply").read_bytes()
     assert "made with other settings" in clsplat("resume", run, "--set", "seed=9", expect=2).stderr
+
+
+def test_a_plugin_may_stand_after_the_command(tmp_path):
+    plugin = Path(__file__).parents[1] / "examples" / "opacity_entropy.py"
+    assert plugin.is_file()
+    for option in (["--plugin", str(tmp_path / "x.py")], [f"--plugin={tmp_path / 'x.py'}"]):
+        before = clsplat(*option, "check", "smoke", expect=2).stderr
+        assert "x.py" in before
+        assert clsplat("check", "smoke", *option, expect=2).stderr == before
+        assert clsplat("check", *option, "smoke", "--plugin", str(plugin), expect=2).stderr == before
+    assert clsplat("check", "smoke", "--plugin", str(plugin)).returncode == 0
+    assert "--plugin" in clsplat("check", "smoke", "--plugin", expect=2).stderr
+
+
+@pytest.mark.parametrize("text", ["[1]", '{"test": 5}', '{"test": {"1": 5}}', "{"])
+def test_status_refuses_damaged_metrics(text, tmp_path):
+    (tmp_path / "status.json").write_text('{"state": "done", "step": 7}')
+    (tmp_path / "metrics.json").write_text(text)
+    with pytest.raises(DataError, match=r"metrics.json: .*the file is damaged: run the pipeline again"):
+        run_status(tmp_path)
+
+
+@pytest.mark.parametrize("line", ["null", '{"step": null}', '{"step": 3}', '{"step": "3", "kind": "train"}'])
+def test_damaged_records_are_refused_with_their_line(line, tmp_path):
+    (tmp_path / "metrics.jsonl").write_text('{"step": 5, "kind": "train"}\n' + line + "\n")
+    (tmp_path / "status.json").write_text('{"state": "done", "step": 7}')
+    for read in (lambda: Records(tmp_path).start(6), lambda: run_status(tmp_path)):
+        with pytest.raises(DataError, match=r"metrics.jsonl:2: damaged; .*'step' and 'kind'; remove this line"):
+            read()
 
 
 def test_status_tells_from_files(finished, tmp_path):

@@ -240,7 +240,7 @@ def broken(make_run, how: str) -> Path:
     ("unfinished", 3, "has no metrics.json, so the run was interrupted; finish it with --resume"),
     ("damaged metrics", 3, "metrics.json: .*the file is damaged"),
     ("metrics of something else", 3, r"metrics.json: test.1.psnr: "),
-    ("damaged records", 3, "metrics.jsonl: damaged"),
+    ("damaged records", 3, "metrics.jsonl:1: damaged.*; remove this line"),
     ("damaged settings", 2, r"pipeline.yaml:\d"),
     ("settings of something else", 2, "expected keys such as name and stages"),
     ("no such scene setting", 2, "did you mean 'path'"),

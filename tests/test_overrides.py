@@ -43,7 +43,10 @@ REFUSED = {
     "scene.levels=20": "expected a value of at most 8, got 20",
     "evaluate.scales=[1,a]": "stages[2].evaluate.scales[1]: expected a number, got 'a'",
     "model.screen_filter.type=dilate": "no screen filter named 'dilate'; did you mean 'dilation'?",
-    "optimize.every=3": "stages[1] optimize: 'every' belongs inside optimize.during",
+    "optimize.every=3": "unknown key 'every'; did you mean 'log_every'?",
+    "export.every=3": "stages[3] export: 'every' belongs inside optimize.during",
+    "init.count.x=3": "nothing lies below 'count'",
+    "optimize.losses.0={type: 3}": "no loss named '3'",
     "steps=100": "no key 'steps' at the top of a pipeline; did you mean optimize.steps?",
     "stps=100": "no key 'stps' at the top of a pipeline; did you mean optimize.steps?",
     "max_gaussians=9": "no key 'max_gaussians' at the top of a pipeline; did you mean densify.max_gaussians?",
@@ -59,9 +62,30 @@ REFUSED = {
     "optimize.steps=&a [*a]": "the value cannot be read: ",
     "optimize.steps=[": "the value cannot be read: ",
     "name=../up": "expected text that matches",
-    "stages=[init]": "stages[0]: expected keys and values, got 'init'",
+    "name=..": "expected text that matches",
+    "name=.": "expected text that matches",
+    "stages=[int]": "stages[0]: no stage named 'int'; did you mean 'init'?",
+    "plugins.a=b": "'plugins' cannot be set; a run writes it; load a plug-in with --plugin FILE",
+    "plugins={}": "'plugins' cannot be set",
+    "optimize.during=[{every: 3}, {to: 1, every: 3}]": "expected a 'stage', the name of the stage",
+    "optimize.losses=[{weight: 3}]": "expected a 'type', the name of the loss",
+    "model.world_filter={type: none, variance: 1}": "unknown key 'variance'; there are no other keys here, remove it",
     "stages=3": "expected a list, got 3",
 }
+
+
+INSIDE = {  # paths that leave the run folder, or name another of its files
+    "export.file": ("../../escaped.ply", "/tmp/escaped.ply", "C:/escaped.ply", "a/../../b.ply", "pipeline.yaml", "ply"),
+    "report.file": ("../report.html", "metrics.json"),
+    "render.folder": ("../renders", "/tmp/renders"),
+}
+
+
+@pytest.mark.parametrize("place", INSIDE)
+def test_outputs_stay_inside_the_run_folder(place):
+    for path in INSIDE[place]:
+        with pytest.raises(OverrideError, match=f"expected a path inside the run folder.*, got '{path}'"):
+            load("splat_7k", [f"{place}={path}"])
 
 
 @pytest.mark.parametrize("override", REFUSED)
@@ -103,3 +127,25 @@ def test_set_can_complete_a_file(tmp_path):
     path = tmp_path / "x.yaml"
     path.write_text("name: x\nstages:\n  - init\n  - optimize: {losses: [{type: l1}]}\n")
     assert load(str(path), ["optimize.steps=3"]).settings.training.steps == 3
+
+
+def test_bare_names_in_a_file_can_be_changed_below(tmp_path):
+    path = tmp_path / "x.yaml"
+    path.write_text(
+        "name: x\nstages:\n  - init\n  - optimize:\n      steps: 3\n      losses: [l1]\n      views: {order: code}\n"
+        "      during: [{densify: {every: 2, rules: [prune_faint]}}]\n"
+    )
+    settings = load(str(path), ["optimize.losses[0].weight=0.5", "densify.rules.0.start=7"]).settings.training
+    assert (settings.losses[0].type, settings.losses[0].weight) == ("l1", 0.5)
+    assert settings.during[0].rules[0].start == 7
+    assert load(str(path), ["optimize.views.order.type=paper"]).settings.training.views.order.type == "paper"
+
+
+def test_a_value_may_have_the_notation_of_files():
+    during = load("smoke", ["optimize.during=[{checkpoint: {every: 3}}, raise_sh]", "raise_sh.every=4"])
+    assert [(stage.stage, stage.every) for stage in during.settings.training.during] == [
+        ("checkpoint", 3),
+        ("raise_sh", 4),
+    ]
+    stages = "stages=[init, {optimize: {steps: 3, losses: [l1], during: [{checkpoint: {every: 3}}]}}]"
+    assert load("smoke", [stages, "checkpoint.every=5"]).settings.training.during[0].every == 5

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from clsplat import resource_dir
+from clsplat.errors import ConfigError
 from clsplat.pipeline.loading import load
 
 OLD = """\
@@ -88,8 +89,23 @@ def test_an_old_key_may_be_set_on_the_command_line(write, caplog):
     set_old = load(write(NEW), ["scene.sampling=paper", "optimize.rates.quats={start: 0.1, stop: 0.01, over: 9}"])
     assert [record.levelname for record in caplog.records] == ["WARNING"] * 2
     quats = "optimize.rates.quats={initial: 0.1, final: 0.01, over: 9}"
-    new = load(write(NEW), [quats])
-    assert set_old.resolved() == new.resolved(), "the new key, where both are given"
+    new = load(write(NEW), [quats, "optimize.views.order=paper"])
+    assert set_old.resolved() == new.resolved(), "the key of --set, where both are given"
+    both = ["optimize.views.order=code", "scene.sampling=paper", "densify.rules.0.start=9", "densify.rules.0.after=8"]
+    both = [text.replace("densify", "stages.2") for text in both]
+    expected = load(write(NEW), ["optimize.views.order=paper", "stages.2.rules.0.start=8"])
+    assert load(write(NEW), both).resolved() == expected.resolved(), "the later one"
+
+
+@pytest.mark.parametrize(("new", "old", "words"), [
+    ("scene: {downscale: 2}", "scene: {sampling: paper}", "'optimize.views.order' .* 'scene.sampling'"),
+    ("{type: prune_faint,", "{type: prune_faint, after: 5,", "'prune_faint.start' .* 'prune_faint.after'"),
+    ("{initial: 1.6e-3,", "{stop: 1, initial: 1.6e-3,", "'optimize.rates.means.final' .* 'optimize.rates.means.stop'"),
+])  # fmt: skip
+def test_the_old_and_the_new_key_in_one_file_are_refused(write, new, old, words):
+    assert new in NEW
+    with pytest.raises(ConfigError, match=rf"recipe.yaml: {words}, and both are given; remove"):
+        load(write(NEW.replace(new, old)))
 
 
 def test_every_loop_takes_the_old_order_of_views(write):

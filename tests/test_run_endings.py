@@ -12,7 +12,15 @@ from pathlib import Path
 import pytest
 
 from clsplat import cli, terminal
-from clsplat.errors import ConfigError, DataError, InternalError, Interrupted, MemoryLimitError, OutputError
+from clsplat.errors import (
+    ConfigError,
+    DataError,
+    InternalError,
+    Interrupted,
+    MemoryLimitError,
+    OutputError,
+    as_clsplat_error,
+)
 from clsplat.runs import experiment, runner
 from clsplat.runs.experiment import Job
 from tests.test_cli import clsplat
@@ -160,3 +168,15 @@ def test_the_terminal_keeps_stdout_for_json(capsys):
     captured = capsys.readouterr()
     assert captured.out == ""
     assert captured.err == "a remark\nwarning: a warning\n"
+
+
+@pytest.mark.parametrize("arguments", ["status RUN --json", "status RUN", "pipelines", "--version"])
+def test_a_command_without_stdout_writes_nothing(arguments, tmp_path):
+    (tmp_path / "status.json").write_text('{"state": "done", "step": 7}')
+    command = f'"{sys.executable}" -m clsplat {arguments.replace("RUN", str(tmp_path))} >&-'
+    done = subprocess.run(command, shell=True, stderr=subprocess.PIPE, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_running_out_of_memory_names_gaussians_and_images():
+    assert "use fewer Gaussians, smaller images" in str(as_clsplat_error(MemoryError()))

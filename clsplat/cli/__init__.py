@@ -1,6 +1,7 @@
 """The commands.  Each prints one line for an error, and exits with that error's code."""
 
 import difflib
+import os
 import sys
 import traceback
 from typing import Any
@@ -10,21 +11,23 @@ from clsplat.cli import models, runs, tools  # noqa: F401  register their comman
 from clsplat.cli.app import Passed, app
 from clsplat.errors import as_clsplat_error, one_line
 
-GLOBAL_FLAG = "--debug"  # stands before the command or after it
+DEBUG, PLUGIN = "--debug", "--plugin"  # options that stand before the command or after it
 
 
 def main() -> None:
     """Run the command line; an error ends as one line, a traceback is shown with --debug only."""
+    sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115  None where it was closed before the start
+    sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="backslashreplace")  # of file names that are not text
-    arguments = _flag_first(_one_set_each(sys.argv[1:]))
+    arguments = _options_first(_one_set_each(sys.argv[1:]))
     try:
         code = app(arguments, prog_name="clsplat", standalone_mode=False)
         code = code if isinstance(code, int) else 0
         sys.stdout.flush()
     except BaseException as error:
-        code = _report(error.__cause__ or error if isinstance(error, Passed) else error, GLOBAL_FLAG in arguments[:1])
+        code = _report(error.__cause__ or error if isinstance(error, Passed) else error, DEBUG in arguments[:1])
     sys.exit(code)
 
 
@@ -72,7 +75,14 @@ def _one_set_each(arguments: list[str]) -> list[str]:
     return spread
 
 
-def _flag_first(arguments: list[str]) -> list[str]:
-    """Let `--debug` after the command stand for `--debug` before it."""
-    others = [argument for argument in arguments if argument != GLOBAL_FLAG]
-    return [GLOBAL_FLAG, *others] if len(others) < len(arguments) else arguments
+def _options_first(arguments: list[str]) -> list[str]:
+    """Let `--debug` and `--plugin FILE` after the command stand for those before it."""
+    others = [argument for argument in arguments if argument != DEBUG]
+    first = [DEBUG] if len(others) < len(arguments) else []
+    rest: list[str] = []
+    while others:
+        size = 1 if others[0].startswith(f"{PLUGIN}=") else 2 if others[0] == PLUGIN and len(others) > 1 else 0
+        first += others[:size]
+        rest += others[size : size or 1]
+        del others[: size or 1]
+    return first + rest

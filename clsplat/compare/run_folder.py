@@ -73,7 +73,7 @@ class RunFolder:
         if not (path / "metrics.json").is_file():
             raise DataError(f"{path}: has no metrics.json, so the run {_state(path)}; finish it with --resume")
         settings = read_settings(path)
-        return cls(path, settings, _scene(path, settings), _metrics(path / "metrics.json"))
+        return cls(path, settings, _scene(path, settings), read_metrics(path / "metrics.json"))
 
     @property
     def missing_plugins(self) -> list[str]:
@@ -91,10 +91,7 @@ class RunFolder:
     @cached_property
     def records(self) -> list[dict[str, Any]]:
         """The lines of metrics.jsonl; none where it is missing.  Raises DataError when it is damaged."""
-        try:
-            return Records(self.path).read()
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise DataError(f"{self.path / 'metrics.jsonl'}: damaged ({error!r}); expected lines of JSON") from error
+        return Records(self.path).read()
 
     def points(self, kind: str, figure: str, **where: Any) -> list[tuple[float, float]]:
         """Return (step, figure) of all records of a kind, such as `train`, whose values are those of `where`."""
@@ -125,7 +122,8 @@ def _scene(path: Path, settings: dict[str, Any]) -> SceneSettings:
         raise ConfigError(explain(error, SceneSettings, file, read_yaml(file))) from error
 
 
-def _metrics(path: Path) -> RunMetrics:
+def read_metrics(path: Path) -> RunMetrics:
+    """Return the contents of a metrics.json.  Raises DataError with the file and the place when it is damaged."""
     try:
         return RunMetrics.model_validate_json(read_file(path))
     except ValidationError as error:

@@ -10,7 +10,7 @@ from pydantic import BaseModel, ValidationError
 from clsplat.errors import shortened
 from clsplat.pipeline.fields import annotation_of, bases, inside_list, models, tags
 from clsplat.pipeline.yaml_file import Document, Place
-from clsplat.settings import TAGS, Settings
+from clsplat.settings import TAGS, Settings, Variants
 
 EXPECTATIONS = {
     "int_type": "a whole number",
@@ -62,7 +62,8 @@ def _complaint(error: dict[str, Any], place: Place, model: type[BaseModel] | Non
         tag = shortened(str(error["ctx"]["tag"]))
         return f"no {_kind(annotation)} named '{tag}'{_nearest(tag, known)}"
     if kind == "union_tag_not_found":
-        return f"expected a 'type', the name of the {_kind(annotation)}"
+        tag = Variants(bases(annotation)[0]).tag
+        return f"expected a '{tag}', the name of the {_kind(annotation)}"
     got = f", got {shortened(repr(value))}"
     if kind in EXPECTATIONS:
         return f"expected {EXPECTATIONS[kind].format(**error.get('ctx', {}))}{got}"
@@ -73,7 +74,9 @@ def _complaint(error: dict[str, Any], place: Place, model: type[BaseModel] | Non
 
 def _nearest(word: str, known: list[str]) -> str:
     near = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
-    return f"; did you mean '{near[0]}'?" if near else f"; there are {', '.join(sorted(known))}"
+    if near:
+        return f"; did you mean '{near[0]}'?"
+    return f"; there are {', '.join(sorted(known))}" if known else "; there are no other keys here, remove it"
 
 
 def _kind(annotation: Any) -> str:

@@ -53,3 +53,27 @@ def model_of(data: Any, annotation: Any) -> type[BaseModel] | None:
     if len(allowed) > 1 and isinstance(data, dict):
         allowed = [model for model in allowed if any(data.get(name) in tags(model) for name in TAGS if name in data)]
     return allowed[0] if len(allowed) == 1 else None
+
+
+def with_tags(data: Any, annotation: Any) -> Any:
+    """Return plain data with every bare name of a variant as {type: name}, and a stage as {stage: name, …}."""
+    if isinstance(data, list):
+        return [with_tags(item, inside_list(annotation)) for item in data]
+    for mark in _marks(annotation):
+        if isinstance(data, str):
+            data = {mark.tag: data}
+        elif mark.tag == "stage" and isinstance(data, dict) and len(data) == 1:
+            name, fields = next(iter(data.items()))
+            if name != "stage" and isinstance(fields, dict | None):
+                data = {"stage": name, **(fields or {})}
+    if isinstance(data, dict) and (model := model_of(data, annotation)):
+        known = {key: annotation_of(field) for key, field in model.model_fields.items()}
+        return {key: with_tags(value, known.get(key)) for key, value in data.items()}
+    return data
+
+
+def _marks(annotation: Any) -> list[Variants]:
+    """The marks of the variants that a field accepts, also of one that may be null."""
+    if typing.get_origin(annotation) in (typing.Union, types.UnionType):
+        return [mark for argument in typing.get_args(annotation) for mark in _marks(argument)]
+    return [Variants(base) for base in bases(annotation)]

@@ -84,7 +84,7 @@ class RasterizerSettings(Settings):
 
 
 STAGE_LISTS = ("prepare", "stages")
-Name = Annotated[str, Field(pattern=r"^[\w.-]+$")]
+Name = Annotated[str, Field(pattern=r"^[\w.-]*\w[\w.-]*$")]  # no path: not only dots
 
 
 class PipelineFile(Settings):

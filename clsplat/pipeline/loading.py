@@ -82,11 +82,12 @@ def checked(path: Path, document: Document, overrides: Sequence[str] = ()) -> Pi
     """Check a document with overrides; the document stays unchanged.  Raises ConfigError as `load` does."""
     if not isinstance(document.data, dict):
         raise ConfigError(f"{path}:1: expected keys such as name and stages")
-    tagged = _tagged_file(document, path)
+    tagged = with_new_names(_tagged_file(document, path), warn_about=str(path))
     data = copy.deepcopy(tagged)
     try:
         for override in overrides:
             apply(data, override, PipelineFile)
+            data = with_new_names(data, warn_about=f"--set {override}", old_wins=True)
         return Pipeline(path, _validated(data, path, document))
     except ConfigError:
         _blame(tagged, overrides, path, document)
@@ -94,7 +95,6 @@ def checked(path: Path, document: Document, overrides: Sequence[str] = ()) -> Pi
 
 
 def _validated(data: dict[str, Any], path: Path, document: Document) -> PipelineFile:
-    data = with_new_names(data, warn_about=str(path))
     if isinstance(recorded := data.get("plugins"), dict):
         plugins.require({str(name): str(digest) for name, digest in recorded.items()}, str(path))
     try:
@@ -130,8 +130,9 @@ def _blame(data: dict[str, Any], overrides: Sequence[str], path: Path, document:
             place = apply(data, override, PipelineFile)
         except NoSuchKey as error:
             raise OverrideError(override, error.reason + suggestion(names, known)) from error
+        data = with_new_names(data, old_wins=True)
         try:
-            _check_order(path, PipelineFile.model_validate(with_new_names(data)))
+            _check_order(path, PipelineFile.model_validate(data))
         except ValidationError as error:
             where, complaint = first_fault(error, PipelineFile)
             around = where == place[: len(where)]

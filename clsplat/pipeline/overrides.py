@@ -13,11 +13,12 @@ from typing import Any
 from pydantic import BaseModel
 
 from clsplat.errors import ConfigError, OverrideError
-from clsplat.pipeline.fields import annotation_of, inside_list, model_of
+from clsplat.pipeline.fields import annotation_of, inside_list, model_of, with_tags
 from clsplat.pipeline.yaml_file import Place, parse_value
 from clsplat.settings import TAGS
 
 MAX_SUGGESTIONS = 3
+NOT_SETTABLE = {"plugins": "a run writes it; load a plug-in with --plugin FILE"}
 
 
 class NoSuchKey(OverrideError):
@@ -43,19 +44,21 @@ def apply(data: dict[str, Any], text: str, root: type[BaseModel]) -> Place:
         parsed = parse_value(value)
     except ConfigError as error:
         raise OverrideError(text, f"the value cannot be read: {error}") from error
+    if names[0] in NOT_SETTABLE:
+        raise OverrideError(text, f"'{names[0]}' cannot be set; {NOT_SETTABLE[names[0]]}")
     node = _Node(data, root, ())
     for name in names[:-1]:
         node = node.child(name, text)
     last = names[-1]
     if isinstance(node.data, list):
         i = node.number(last, text)
-        node.data[i] = parsed
+        node.data[i] = with_tags(parsed, node.inside)
         return (*node.place, i)
     if not isinstance(node.data, dict):
         raise NoSuchKey(text, f"nothing lies below '{names[-2]}'")
     if not node.place and last not in root.model_fields:
         raise NoSuchKey(text, f"no key '{last}' at the top of a pipeline")
-    node.data[last] = parsed
+    node.data[last] = with_tags(parsed, node.annotation(last))
     return (*node.place, last)
 
 
@@ -94,9 +97,15 @@ class _Node:
     def _fields(self) -> dict[str, Any]:
         return dict(self.model.model_fields) if self.model else {}
 
-    def _key(self, name: str) -> "_Node":
+    def annotation(self, name: str) -> Any:
+        """Return the annotation of a key; None where it is not known."""
         field = self._fields.get(name)
-        return _Node(self.data[name], annotation_of(field) if field else None, (*self.place, name))
+        return annotation_of(field) if field else None
+
+    def _key(self, name: str) -> "_Node":
+        annotation = self.annotation(name)
+        self.data[name] = with_tags(self.data[name], annotation)  # nothing can be set below a bare name
+        return _Node(self.data[name], annotation, (*self.place, name))
 
     def _item(self, i: int) -> "_Node":
         item = self.data[i]

@@ -5,61 +5,83 @@ The new names: `scene.sampling` is `optimize.views.order`, a rule's `after` is `
 """
 
 import logging
+from dataclasses import dataclass
 from functools import cache
 from typing import Any
+
+from clsplat.errors import ConfigError
 
 LOG = logging.getLogger("clsplat")
 
 
-def with_new_names(data: dict[str, Any], warn_about: str = "") -> dict[str, Any]:
+def with_new_names(data: dict[str, Any], warn_about: str = "", old_wins: bool = False) -> dict[str, Any]:
     """Return the data of a pipeline file, stages as {stage: name, …}, with today's keys.
 
-    `warn_about` names the file in warnings; without it there are none.
+    `warn_about` names the file in warnings; without it there are none.  With `old_wins` an old key, which --set gave
+    after the new one, has priority; else both are an error.  Raises ConfigError.
     """
-    where = warn_about
+    names = _Names(warn_about, old_wins)
     scene = data.get("scene")
     order = None
     if isinstance(scene, dict) and "sampling" in scene:
         order = scene["sampling"]
         data = {**data, "scene": {key: value for key, value in scene.items() if key != "sampling"}}
-        _warn(where, "scene.sampling", f"optimize.views.order: {order}")
+        _warn(warn_about, "scene.sampling", f"optimize.views.order: {order}")
     if not isinstance(data.get("stages"), list):
         return data
-    stages = [_stage(stage, order, where) for stage in data["stages"]]
-    return {**data, "stages": stages}
+    return {**data, "stages": [names.stage(stage, order) for stage in data["stages"]]}
 
 
-def _stage(stage: Any, order: Any, where: str) -> Any:
-    if not isinstance(stage, dict) or stage.get("stage") != "optimize":
-        return _densify(stage, where)
-    stage = dict(stage)
-    if order is not None and isinstance(stage.get("views", {}), dict):
-        stage["views"] = {"order": order, **stage.get("views", {})}
-    if isinstance(stage.get("rates"), dict):
-        stage["rates"] = {name: _decay(rate, f"optimize.rates.{name}", where) for name, rate in stage["rates"].items()}
-    if isinstance(stage.get("during"), list):
-        stage["during"] = [_densify(inner, where) for inner in stage["during"]]
-    return stage
+@dataclass(frozen=True)
+class _Names:
+    where: str
+    old_wins: bool
 
-
-def _decay(rate: Any, place: str, where: str) -> Any:
-    if not isinstance(rate, dict) or "stop" not in rate:
-        return rate
-    new = {"start": "initial", "stop": "final"}
-    _warn(where, f"{place}: {{start, stop}}", "{initial, final}")
-    return {new.get(key, key): value for key, value in rate.items()}
-
-
-def _densify(stage: Any, where: str) -> Any:
-    if not isinstance(stage, dict) or not isinstance(stage.get("rules"), list):
+    def stage(self, stage: Any, order: Any) -> Any:
+        if not isinstance(stage, dict) or stage.get("stage") != "optimize":
+            return self._densify(stage)
+        stage = dict(stage)
+        if order is not None and isinstance(views := stage.get("views", {}), dict):
+            if "order" in views:
+                self._refuse_both("scene.sampling", "optimize.views.order")
+            stage["views"] = {**views, "order": order}
+        if isinstance(stage.get("rates"), dict):
+            stage["rates"] = {
+                name: self._decay(rate, f"optimize.rates.{name}") for name, rate in stage["rates"].items()
+            }
+        if isinstance(stage.get("during"), list):
+            stage["during"] = [self._densify(inner) for inner in stage["during"]]
         return stage
-    rules = []
-    for rule in stage["rules"]:
-        if isinstance(rule, dict) and "after" in rule:
-            _warn(where, f"{rule.get('type', 'rule')}.after", "start")
-            rule = {"start" if key == "after" else key: value for key, value in rule.items()}
-        rules.append(rule)
-    return {**stage, "rules": rules}
+
+    def _decay(self, rate: Any, place: str) -> Any:
+        if not isinstance(rate, dict) or "stop" not in rate:
+            return rate
+        _warn(self.where, f"{place}: {{start, stop}}", "{initial, final}")
+        start = {} if "initial" in rate else {"start": "initial"}  # beside `initial` it is today's `start`
+        return self._renamed(rate, {**start, "stop": "final"}, place)
+
+    def _densify(self, stage: Any) -> Any:
+        if not isinstance(stage, dict) or not isinstance(stage.get("rules"), list):
+            return stage
+        rules = []
+        for rule in stage["rules"]:
+            if isinstance(rule, dict) and "after" in rule:
+                place = str(rule.get("type", "rule"))
+                _warn(self.where, f"{place}.after", "start")
+                rule = self._renamed(rule, {"after": "start"}, place)
+            rules.append(rule)
+        return {**stage, "rules": rules}
+
+    def _renamed(self, keys: dict[str, Any], new_names: dict[str, str], place: str) -> dict[str, Any]:
+        old = {name: new for name, new in new_names.items() if name in keys}
+        for name, new in old.items():
+            if new in keys:
+                self._refuse_both(f"{place}.{name}", f"{place}.{new}")
+        return {old.get(key, key): value for key, value in keys.items() if key not in old.values()}
+
+    def _refuse_both(self, old: str, new: str) -> None:
+        if not self.old_wins:
+            raise ConfigError(f"{self.where}: '{new}' is the new name of '{old}', and both are given; remove '{old}'")
 
 
 @cache  # once for a file, however many cells of a matrix it serves

@@ -8,6 +8,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from clsplat.errors import ConfigError
+from clsplat.pipeline.overrides import NOT_SETTABLE
 from clsplat.pipeline.yaml_file import parse_value
 
 CADENCE = ("every", "start", "stop")  # keys of stages inside `during` only
@@ -38,7 +39,7 @@ def _keys(model: BaseModel, prefix: str, addresses: dict[int, str]) -> Iterator[
     fields = type(model).model_fields
     for name in sorted(fields, key=lambda name: name != "type"):
         value = getattr(model, name)
-        if name == "stage" or (outside and name in CADENCE):
+        if name in ("stage", *NOT_SETTABLE) or (outside and name in CADENCE):
             continue
         items = value if isinstance(value, list) and value and isinstance(value[0], BaseModel) else None
         if isinstance(value, BaseModel):

@@ -1,10 +1,10 @@
 """The state of a run, or of a matrix, from the files of its folder alone."""
 
-import json
 import os
 from pathlib import Path
 from typing import Any
 
+from clsplat.compare.run_folder import read_metrics
 from clsplat.errors import DataError
 from clsplat.runs.runner import read_status
 from clsplat.training.records import Records
@@ -16,21 +16,17 @@ def run_status(out: Path) -> dict[str, Any]:
     """Return state, step and metrics of a run folder; of a matrix `cells`, `done` and `failed` instead of the step.
 
     state: starting, running, done, failed, interrupted, or killed where its process on this machine has ended.
-    Raises DataError when the folder holds no run.
+    Raises DataError when the folder holds no run, or a damaged file.
     """
     status = read_status(out)
     if not isinstance(status.get("state"), str):
         raise DataError(f"{out}: has no readable status.json; expected the folder of a run")
     if status["state"] not in END_STATES and not _alive(status.get("process")):
         status["state"] = "killed"
-    try:
-        metrics = json.loads((out / "metrics.json").read_text())
-    except (OSError, ValueError):
-        metrics = None
-    try:
-        lines = Records(out).read("train")
-    except (OSError, ValueError, KeyError, TypeError):  # damaged
-        lines = []
+    metrics = None
+    if (out / "metrics.json").exists():
+        metrics = read_metrics(out / "metrics.json").model_dump(exclude_unset=True)
+    lines = Records(out).read("train")
     return {"run": str(out), **status, "last": lines[-1] if lines else None, "metrics": metrics}
 
 
@@ -56,7 +52,7 @@ def status_text(status: dict[str, Any]) -> str:
 
 def _progress(status: dict[str, Any]) -> str:
     if "cells" in status:
-        failed = status.get("failed") or {}
+        failed = status["failed"] if isinstance(status.get("failed"), dict) else {}
         return f", {status.get('done')} of {status['cells']} cells, {len(failed)} of them failed"
     steps = f" of {status['steps']}" if "steps" in status else ""
     return f" at step {status.get('step')}{steps}"

@@ -2,12 +2,25 @@
 
 from abc import abstractmethod
 from collections.abc import Collection
+from pathlib import PureWindowsPath
 from typing import Annotated, ClassVar
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from clsplat.settings import Settings
 from clsplat.training.run import Run
+
+
+def path_in_run(suffix: str = "") -> AfterValidator:
+    """Mark a field that holds a path inside the run folder, which ends in `suffix`."""
+
+    def checked(text: str) -> str:
+        path = PureWindowsPath(text)  # its separators are those of every system
+        if path.anchor or ".." in path.parts or (suffix and path.suffix.lower() != suffix):
+            raise ValueError(f"expected a path inside the run folder{f' that ends in {suffix}' if suffix else ''}")
+        return text
+
+    return AfterValidator(checked)
 
 
 class Stage(Settings):

@@ -1,10 +1,10 @@
 """The model as a file."""
 
 import logging
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 from clsplat.gaussians.model import load
-from clsplat.stages.base import Scheduled
+from clsplat.stages.base import Scheduled, path_in_run
 from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
@@ -20,7 +20,7 @@ class Export(Scheduled):
     stage: Literal["export"] = "export"
     needs: ClassVar[frozenset[str]] = frozenset({"model"})
 
-    file: str = "point_cloud.ply"
+    file: Annotated[str, path_in_run(".ply")] = "point_cloud.ply"
     """Path inside the run folder."""
 
     def run(self, run: Run) -> None:

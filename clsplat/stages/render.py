@@ -2,11 +2,11 @@
 
 import logging
 from pathlib import Path, PurePosixPath
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 from clsplat.metrics.views import render_view
 from clsplat.scene.images import is_image, write_image
-from clsplat.stages.base import Stage
+from clsplat.stages.base import Stage, path_in_run
 from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
@@ -20,7 +20,7 @@ class Render(Stage):
 
     split: Literal["test", "train", "all"] = "test"
     """Views that are rendered."""
-    folder: str = "renders"
+    folder: Annotated[str, path_in_run()] = "renders"
     """Path inside the run folder."""
 
     def run(self, run: Run) -> None:

@@ -4,7 +4,7 @@ import logging
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from markupsafe import Markup
@@ -15,7 +15,7 @@ from clsplat.metrics.perceptual import Image
 from clsplat.metrics.views import render_view
 from clsplat.pages.page import charts, counted, duration, embedded, render
 from clsplat.pages.svg import Line, curve
-from clsplat.stages.base import Stage
+from clsplat.stages.base import Stage, path_in_run
 from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
@@ -28,7 +28,7 @@ class Report(Stage):
     stage: Literal["report"] = "report"
     needs: ClassVar[frozenset[str]] = frozenset({"model", "metrics"})
 
-    file: str = "report.html"
+    file: Annotated[str, path_in_run(".html")] = "report.html"
     """Path inside the run folder."""
 
     def run(self, run: Run) -> None:

@@ -6,7 +6,9 @@ import time
 from pathlib import Path
 from typing import Any
 
+from clsplat.errors import DataError
 from clsplat.files import unwritable, write_text
+from clsplat.scene.images import read_file
 
 
 class Records:
@@ -35,15 +37,23 @@ class Records:
             raise unwritable(self.path, error) from error
 
     def read(self, kind: str | None = None) -> list[dict[str, Any]]:
-        """Return the lines, of one kind or all; a last line cut short by a crash is left out."""
+        """Return the lines, of one kind or all; a line cut short by a crash is left out.
+
+        Raises DataError with file and line when the file is damaged in another way.
+        """
         if not self.path.exists():
             return []
         lines = []
-        for text in self.path.read_text().splitlines():
+        for number, text in enumerate(read_file(self.path).decode(errors="replace").splitlines(), 1):
             try:
-                lines.append(json.loads(text))
-            except ValueError:
+                line = json.loads(text)
+            except (ValueError, RecursionError):
                 continue
+            if not isinstance(line, dict) or type(line.get("step")) is not int or not isinstance(line.get("kind"), str):
+                raise DataError(
+                    f"{self.path}:{number}: damaged; expected keys and values with 'step' and 'kind'; remove this line"
+                )
+            lines.append(line)
         return [line for line in lines if kind in (None, line["kind"])]
 
     def status(self, state: str, step: int, **values: Any) -> None:
