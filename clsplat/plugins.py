@@ -100,7 +100,7 @@ def differences(recorded: Mapping[str, str]) -> list[str]:
     faults = []
     for name, digest in recorded.items():
         if name not in _loaded:
-            faults.append(f"needs the plug-in '{name}', which is not loaded; use --plugin {name}.py before the command")
+            faults.append(f"needs the plug-in '{name}', which is not loaded; use --plugin {name}.py")
         elif _loaded[name].digest != digest:
             here = f"{_loaded[name].path} has sha256 {_loaded[name].digest[:12]}"
             faults.append(f"needs the plug-in '{name}' with sha256 {digest[:12]}, {here}; use the file as it was")
