@@ -10,7 +10,7 @@ from clsplat.density.statistics import SplatStats
 from clsplat.errors import ConfigError
 from clsplat.filters import FilterViews, measure_intervals
 from clsplat.gaussians.tables import INTERVAL2, DeviceModel, Gaussians
-from clsplat.losses.base import HostLoss, ImageLoss, Loss
+from clsplat.losses.base import HostLoss, ImageLoss, Loss, returned
 from clsplat.losses.image import L1, L2, Dssim
 from clsplat.losses.penalties import Anisotropy
 from clsplat.opencl.device import Device
@@ -244,3 +244,12 @@ def test_losses_of_a_run_are_added_to_those_of_its_pipeline(tiny_scene: Path, tm
     view = next(checked.stages[1].iterate(run))
     assert [loss.name for loss in view.losses] == ["l1", "mean_difference"]
     assert view.losses[1].value() == pytest.approx(0.5 * view.losses[0].value(), rel=1e-6)
+
+
+def test_a_loss_that_returns_nothing_is_named():
+    class Silent(ImageLoss):
+        def add(self, comparison):
+            pass
+
+    with pytest.raises(ConfigError, match="the loss Silent: expected a LossValue from 'add', got NoneType"):
+        returned(Silent(), Silent().add(None))

@@ -110,13 +110,17 @@ def _show_version(wanted: bool) -> None:
 @app.callback()
 def common(
     context: typer.Context,
-    device: Annotated[str | None, typer.Option(metavar="NAME", help="The device of a command that names none.")] = None,
+    device: Annotated[
+        str | None, typer.Option(metavar="NAME", help="The OpenCL device, where the command itself names none.")
+    ] = None,
     debug: Annotated[
         bool, typer.Option("--debug", help="Show tracebacks and every log line; also after the command.")
     ] = False,
     plugin: Annotated[
         list[Path] | None,
-        typer.Option("--plugin", metavar="FILE", help="A Python file with variants of one's own; may be repeated."),
+        typer.Option(
+            "--plugin", metavar="FILE", help="A plug-in: a Python file with methods of your own; may be repeated."
+        ),
     ] = None,
     version: Annotated[
         bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version and exit.")

@@ -49,7 +49,7 @@ def status(
     folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run folder, or that of a matrix.")],
     as_json: JsonOption = False,
 ) -> None:
-    """Tell from its files how far a run is, and its metrics."""
+    """Show the state of a run, its step and its metrics, from its files alone."""
     from clsplat.runs.status import status_text
 
     found = commands.status(folder)

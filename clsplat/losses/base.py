@@ -55,6 +55,15 @@ class LossValue:
     value: Callable[[], float]  # weight included
 
 
+def returned(loss: "Loss", value: object) -> LossValue:
+    """Return what the `add` of a loss returned.  Raises ConfigError when that is no LossValue."""
+    if not isinstance(value, LossValue):
+        raise ConfigError(
+            f"the loss {type(loss).__name__}: expected a LossValue from 'add', got {type(value).__name__}"
+        )
+    return value
+
+
 @dataclass(frozen=True)
 class ViewGradients:
     """A view's frame, its losses and the sums over pixels that give the gradients; valid until the next view."""

@@ -60,7 +60,7 @@ def _complaint(error: dict[str, Any], place: Place, model: type[BaseModel] | Non
     if kind == "union_tag_invalid":
         known = [tag.strip().strip("'") for tag in error["ctx"]["expected_tags"].split(",")]
         tag = shortened(str(error["ctx"]["tag"]))
-        return f"no {_kind(annotation)} named '{tag}'{_nearest(tag, known)}"
+        return f"no {_kind(annotation)} named '{tag}'{_nearest(tag, known)}; one of a plug-in needs --plugin FILE.py"
     if kind == "union_tag_not_found":
         tag = Variants(bases(annotation)[0]).tag
         return f"expected a '{tag}', the name of the {_kind(annotation)}"

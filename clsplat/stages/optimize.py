@@ -58,7 +58,7 @@ class Optimize(Stage):
     @classmethod
     def _of_an_image(cls, losses: list[Loss]) -> list[Loss]:
         if not any(isinstance(loss, ImageLoss) for loss in losses):
-            raise ValueError("expected at least one loss that compares images: l1, l2 or dssim")
+            raise ValueError("expected at least one loss that compares images, such as l1")
         return losses
 
     @field_validator("during")

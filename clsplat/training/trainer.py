@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from clsplat.density.statistics import SplatStats
 from clsplat.errors import ConfigError
 from clsplat.gaussians.tables import DeviceModel
-from clsplat.losses.base import Comparison, ImageLoss, Loss, Penalty, PenaltyInputs, ViewGradients
+from clsplat.losses.base import Comparison, ImageLoss, Loss, Penalty, PenaltyInputs, ViewGradients, returned
 from clsplat.opencl.device import Array
 from clsplat.opencl.program import constants
 from clsplat.render.rasterizer import Rasterizer
@@ -89,7 +89,7 @@ class Trainer:
         if planes.mask is not None:  # pixels that do not count are black in both images and have no gradient
             apply_mask(workspace, camera, frame.image, planes.mask)
             apply_mask(workspace, camera, planes.colours, planes.mask)
-        values = [loss.add(comparison) for loss in self.losses if isinstance(loss, ImageLoss)]
+        values = [returned(loss, loss.add(comparison)) for loss in self.losses if isinstance(loss, ImageLoss)]
         if planes.mask is not None:
             apply_mask(workspace, camera, gradient, planes.mask)
         count = self.stats.pixel_sums
@@ -112,6 +112,6 @@ class Trainer:
         gradients = self.rasterizer.gradients(self.model, view.frame, view.pixel_sums)
         inputs = PenaltyInputs(self.rasterizer.workspace, self.model.gaussians, gradients, self.extent, step)
         self.rasterizer.device.timings.section = "loss"
-        view.losses.extend(penalty.add(inputs) for penalty in penalties)
+        view.losses.extend(returned(penalty, penalty.add(inputs)) for penalty in penalties)
         self.adam.step(self.model, gradients, rates, stale)
         return gradients.mean2d
