@@ -14,6 +14,8 @@ from clsplat.cli import app
 from clsplat.errors import ConfigError, DataError
 from tests.test_cli import clsplat as process
 
+pytestmark = pytest.mark.slow
+
 SET = {"optimize.steps": 40, "seed": 3}
 SETS = [part for place, value in SET.items() for part in ("--set", f"{place}={value}")]
 

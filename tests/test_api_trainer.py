@@ -22,6 +22,8 @@ from clsplat.render.workspace import Workspace
 from clsplat.training import trainer as steps
 from tests.scenes import random_case
 
+pytestmark = pytest.mark.slow
+
 MIP = {
     "model.world_filter.type": "smoothing",
     "model.screen_filter": {"type": "mip"},

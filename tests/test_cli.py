@@ -13,6 +13,8 @@ import pytest
 from tests.onnx_writer import distance_network
 from tests.test_training import train
 
+pytestmark = pytest.mark.slow
+
 
 def clsplat(*arguments: str | Path, expect: int = 0) -> subprocess.CompletedProcess[str]:
     """Run the command; check its exit code and that an error is one line without a traceback."""

@@ -22,6 +22,8 @@ from clsplat.training.records import Records
 from tests.test_cli import clsplat
 from tests.test_training import train
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def finished(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:

@@ -23,6 +23,8 @@ from clsplat.scene.view import load_image
 from tests.html_page import HOSTILE, Page
 from tests.test_cli import clsplat
 
+pytestmark = pytest.mark.slow
+
 WHITE = (1.0, 1.0, 1.0)  # behind the photographs of a Blender scene
 
 

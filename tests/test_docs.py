@@ -30,6 +30,8 @@ from reference_pages import key_table, reference_pages  # noqa: E402
 from schedule_page import EXAMPLES, SAMPLES  # noqa: E402
 from yaml_examples import example, fields_of  # noqa: E402
 
+pytestmark = pytest.mark.slow
+
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 NAMED = [(base, kind) for base, kinds in families().items() for kind in kinds]
 

@@ -26,6 +26,8 @@ from clsplat.pipeline.loading import load
 from tests.html_page import Page
 from tests.scenes import random_case
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[1]
 EXAMPLES = ROOT / "examples"
 TESTED = {  # where

@@ -21,6 +21,8 @@ from tests.reference_filter import filtered
 from tests.scenes import random_case, with_world_filter
 from tests.test_training import digest, train
 
+pytestmark = pytest.mark.slow
+
 RAW = "point_cloud_raw.ply"
 MIP = (
     "model.world_filter.type=smoothing",

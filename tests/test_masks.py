@@ -22,6 +22,8 @@ from tests.data_sets import data_set
 from tests.refusals import refusal
 from tests.test_training import digest, train
 
+pytestmark = pytest.mark.slow
+
 BLACK = (0.0, 0.0, 0.0)
 
 

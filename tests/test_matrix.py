@@ -15,6 +15,8 @@ from clsplat.pipeline.schema import json_schema
 from clsplat.runs import experiment, runner
 from tests.test_cli import clsplat
 
+pytestmark = pytest.mark.slow
+
 STAGES = """\
 stages:
   - init: {count: 300}

@@ -12,6 +12,8 @@ from clsplat.pages.svg import Line, curve
 from tests.scenes import random_case
 from tests.test_training import train
 
+pytestmark = pytest.mark.slow
+
 PENALTY = "{type: covariance_trace, weight: 0.5, pixels: 1.0}"
 LOSSES = f"optimize.losses=[{{type: l1, weight: [[10, 0.8], [40, 0.4]]}}, {{type: l2, weight: 2.0}}, {PENALTY}]"
 RULES = (

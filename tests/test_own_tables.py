@@ -13,6 +13,8 @@ from clsplat.settings import rebuild
 from clsplat.training.run import Progress
 from tests.test_training import train
 
+pytestmark = pytest.mark.slow
+
 SETTINGS = ("densify.rules=[clone, split, edits_seen]", "densify.start=5", "densify.every=10")
 
 

@@ -41,7 +41,7 @@ TRIALS = {
 }
 
 
-pytestmark = pytest.mark.usefixtures("without_plugins")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("without_plugins")]
 
 
 def write(folder: Path, name: str, text: str) -> Path:

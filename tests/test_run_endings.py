@@ -25,6 +25,8 @@ from clsplat.runs import experiment, runner
 from clsplat.runs.experiment import Job
 from tests.test_cli import clsplat
 
+pytestmark = pytest.mark.slow
+
 HINT = "run with --debug for the traceback, and report it"
 ENDINGS = {
     "a defect": (

@@ -22,6 +22,8 @@ from clsplat.training.run import Progress, Run
 from clsplat.views.sampling import Sampler
 from tests.onnx_writer import distance_network
 
+pytestmark = pytest.mark.slow
+
 
 def train(scene: Path, out: Path, *overrides: str, pipeline: str = "smoke", resume: bool = False) -> Run:
     checked = load(pipeline, [f"scene.path='{scene}'", *overrides])

@@ -18,6 +18,8 @@ from clsplat.views.sampling import Sampler, ViewSettings
 from clsplat.views.transforms import Blur
 from tests.test_training import digest, train
 
+pytestmark = pytest.mark.slow
+
 RESOLUTION = "optimize.views.resolution={points: [[0, 2], [20, 1]], between: steps}"
 BLUR = "optimize.views.transforms=[{type: blur, sigma: [[0, 3.0], [30, 0.5], [45, 0.0]]}]"
 FRACTIONS = "optimize.views.resolution=[[1, 3.0], [40, 1.0]]"
