@@ -176,6 +176,12 @@ def test_an_example_is_short(name, limit):
     assert len((EXAMPLES / f"{name}.py").read_text().splitlines()) <= limit
 
 
+def test_a_blur_is_short_with_its_kernel():
+    lines = [line.strip() for suffix in ("py", "cl") for line in (EXAMPLES / f"box_blur.{suffix}").open()]
+    code = [line for line in lines if line and not line.startswith(('"""', "/*", "*"))]
+    assert len(code) <= 40
+
+
 def test_the_verbs_of_an_edit_are_those_of_the_table():
     """Each `edit.name` of the page exists, and so do the arguments that the table gives to it."""
     gaussians = random_case(np.random.default_rng(0), 3).model(clsplat.Device()).gaussians
