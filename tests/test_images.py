@@ -17,7 +17,7 @@ from clsplat.scene.view import load_image
 from tests.data_sets import data_set
 from tests.refusals import refusal
 
-WHITE = (1.0, 1.0, 1.0)
+BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 rng = np.random.default_rng(5)
 
 
@@ -69,14 +69,14 @@ def test_sixteen_bits_become_eight(tmp_path: Path) -> None:
     assert image[0, 0].tolist() == [0, 255, 77]
 
 
-@pytest.mark.parametrize("background", [None, WHITE, (0.25, 0.5, 1.0)])
+@pytest.mark.parametrize("background", [BLACK, WHITE, (0.25, 0.5, 1.0)])
 def test_alpha_is_composited_in_double_and_truncated(tmp_path: Path, background) -> None:
     colours, alphas = np.meshgrid(np.arange(256, dtype=np.uint8), np.arange(256, dtype=np.uint8))
     pixels = np.stack([colours, colours[:, ::-1], 255 - alphas, alphas], axis=2)
     image = load_image(view_of(stored(tmp_path / "a.png", pixels), 256, 256), background)
     # Transcribed from the reference (3DGS, scene/dataset_readers.py, readCamerasFromTransforms).
     norm = pixels / 255.0
-    arr = norm[:, :, :3] * norm[:, :, 3:4] + np.array(background or (0, 0, 0)) * (1 - norm[:, :, 3:4])
+    arr = norm[:, :, :3] * norm[:, :, 3:4] + np.array(background) * (1 - norm[:, :, 3:4])
     np.testing.assert_array_equal(image, (arr * 255.0).astype(np.uint8))
     assert (image[255] == pixels[255, :, :3]).all()  # where it is opaque, nothing is lost
 
