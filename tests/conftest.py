@@ -5,6 +5,7 @@ that clsplat would choose), each with the wide schedule at 16 and 8 lanes and wi
 """
 
 import os
+import signal
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -92,6 +93,12 @@ def without_plugins() -> Iterator[None]:
     for name in [name for name in sys.modules if name.startswith("clsplat_plugin_")]:
         del sys.modules[name]
     rebuild()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def python_interrupts() -> None:
+    """Interrupts arrive, also where the suite runs in the background of a shell, which ignores them."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture

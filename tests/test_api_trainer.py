@@ -6,7 +6,6 @@ import json
 import os
 import signal
 import textwrap
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -205,15 +204,6 @@ def test_an_error_before_the_first_step_is_in_the_status(tiny_scene, tmp_path, m
     assert clsplat.status(tmp_path / "run")["state"] == "failed"
 
 
-@pytest.fixture
-def python_interrupts() -> Iterator[None]:
-    """Interrupts raise KeyboardInterrupt, also where tests run in the background, which ignores them."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
-
-
-@pytest.mark.usefixtures("python_interrupts")
 def test_an_interrupt_lets_the_step_finish_and_training_go_on(tiny_scene):
     trainer, whole = (clsplat.Trainer(tiny_scene, "smoke", set={"optimize.steps": 20}) for _ in range(2))
     pressed = []
