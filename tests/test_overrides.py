@@ -75,9 +75,9 @@ REFUSED = {
 
 
 INSIDE = {  # paths that leave the run folder, or name another of its files
-    "export.file": ("../../escaped.ply", "/tmp/escaped.ply", "C:/escaped.ply", "a/../../b.ply", "pipeline.yaml", "ply"),
+    "export.file": ("../../escaped.ply", "/escaped.ply", "C:/escaped.ply", "a/../../b.ply", "pipeline.yaml", "ply"),
     "report.file": ("../report.html", "metrics.json"),
-    "render.folder": ("../renders", "/tmp/renders"),
+    "render.folder": ("../renders", "/renders"),
 }
 
 
