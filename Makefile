@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test docs bench wheel clean
+.PHONY: demo test torture docs bench wheel clean
 
 demo: $(VENV)/installed
 	$(BIN)/python -m data_tools synthetic demo/scene
@@ -15,6 +15,9 @@ test: $(VENV)/tested-with
 	$(BIN)/mypy
 	$(MAKE) docs
 	$(BIN)/python -m pytest
+
+torture: $(VENV)/tested-with
+	$(BIN)/python -m tests.torture --write
 
 docs: $(VENV)/tested-with
 	$(BIN)/python docs/collect.py

@@ -4,8 +4,26 @@
 
 #define PIXELS (TILE * TILE)
 #define BATCH PIXELS  // splats in local memory: each item loads one
+#define QUADS 3       // of four floats: what blending reads of a splat record
 
-/* One work-group = one tile, one item = one pixel.  Local memory: BATCH * 64 bytes.  Deterministic. */
+/* Load a record in aligned quads; the last field is SPLAT_POWER_MIN instead of SPLAT_X_MIN, which blending does not
+ * read. */
+static inline void load_quads(__global const float *splats, const uint splat, float4 *quads)
+{
+    __global const float4 *record = (__global const float4 *)splats + (size_t)splat * (RECORD / 4);
+    for (uint k = 0; k < QUADS; k++)
+        quads[k] = record[k];
+    quads[QUADS - 1].w = record[SPLAT_POWER_MIN / 4].y;
+}
+
+static inline void unpack_quads(const float4 *quads, float *splat)
+{
+    for (uint k = 0; k < QUADS; k++)
+        vstore4(quads[k], k, splat);
+    splat[SPLAT_POWER_MIN] = quads[QUADS - 1].w;
+}
+
+/* One work-group = one tile, one item = one pixel.  Local memory: BATCH * 48 + 4 bytes.  Deterministic. */
 __kernel __attribute__((reqd_work_group_size(PIXELS, 1, 1)))
 void blend_forward(
     __global const uint *restrict tile_offset,  // [T+1]
@@ -16,10 +34,10 @@ void blend_forward(
     __constant camera_t *restrict camera,       // [1]
     __global float *restrict image,             // [3,tiles_y*TILE,tiles_x*TILE]
     __global float *restrict transmittance,     // [tiles_y*TILE,tiles_x*TILE]
-    __global uint *restrict tile_last,          // [T] one past the last pair that any pixel blends
+    __global uint *restrict tile_last,          // [T] pairs of the tile up to the last that any pixel blends
     const uint first_tile)                      // of this launch
 {
-    __local float batch[BATCH][RECORD];
+    __local float4 batch[BATCH][QUADS];
     __local uint open;  // pixels of the tile that are not finished
     const uint item = get_local_id(0), tile = first_tile + get_group_id(0);
     const uint tile_y = tile / camera->tiles_x, tile_x = tile - tile_y * camera->tiles_x;
@@ -35,16 +53,19 @@ void blend_forward(
         if (item == 0)
             open = 0;
         if (begin + item < end) {
-            const uint splat = pair_splat[tile_pairs[begin + item]];
-            for (uint k = 0; k < RECORD; k++)
-                batch[item][k] = splats[(size_t)splat * RECORD + k];
+            float4 quads[QUADS];
+            load_quads(splats, pair_splat[tile_pairs[begin + item]], quads);
+            for (uint k = 0; k < QUADS; k++)
+                batch[item][k] = quads[k];
         }
         barrier(CLK_LOCAL_MEM_FENCE);
         const uint length = end - begin < BATCH ? end - begin : BATCH;
         for (uint j = 0; j < length && p.t > 0.0f; j++) {
+            float4 quads[QUADS];
+            for (uint k = 0; k < QUADS; k++)
+                quads[k] = batch[j][k];
             float splat[RECORD];
-            for (uint k = 0; k < RECORD; k++)
-                splat[k] = batch[j][k];
+            unpack_quads(quads, splat);
             blend(&p, splat_at_row(splat, row), pixel, splat + SPLAT_RED);
         }
         if (p.t > 0.0f)
@@ -55,7 +76,7 @@ void blend_forward(
     }
 
     if (item == 0)
-        tile_last[tile] = begin < end ? begin : end;
+        tile_last[tile] = (begin < end ? begin : end) - first;
     const bool inside = (column < camera->width) & (line < camera->height);
     const uint at = line * width + column;
     const float t = magnitude(p.t);
@@ -100,15 +121,17 @@ void blend_backward(
         pixels[i] = p;
     }
 
-    const uint end = tile_offset[tile + 1], last = tile_last[tile];
-    for (uint begin = tile_offset[tile]; begin < end; begin += SPLAT_GROUP) {
+    const uint first = tile_offset[tile], end = tile_offset[tile + 1], last = first + tile_last[tile];
+    for (uint begin = first; begin < end; begin += SPLAT_GROUP) {
         const bool owns = begin + item < end, active = begin + item < last;
         const uint pair = owns ? tile_pairs[begin + item] : 0;
         float splat[RECORD] = {0.0f};
         pixel_sums_t m = {0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f};
-        if (active)
-            for (uint k = 0; k < RECORD; k++)
-                splat[k] = splats[(size_t)pair_splat[pair] * RECORD + k];
+        if (active) {
+            float4 quads[QUADS];
+            load_quads(splats, pair_splat[pair], quads);
+            unpack_quads(quads, splat);
+        }
         barrier(CLK_LOCAL_MEM_FENCE);
         if (begin < last)  // uniform: for a batch that no pixel blends, items only write zeros
             for (uint step = 0; step < PIXELS + SPLAT_GROUP - 1; step++) {
@@ -121,8 +144,12 @@ void blend_backward(
                 }
                 barrier(CLK_LOCAL_MEM_FENCE);
             }
-        if (owns)
-            vstore16((float16)(m.power, m.x, m.y, m.xx, m.xy, m.yy, m.red, m.green, m.blue,
-                               m.abs_x, m.abs_y, m.weight, m.texture, 0.0f, 0.0f, 0.0f), pair, pair_sums);
+        if (owns) {
+            const float sums[RECORD] = {m.power, m.x, m.y, m.xx, m.xy, m.yy, m.red, m.green, m.blue,
+                                        m.abs_x, m.abs_y, m.weight, m.texture, 0.0f, 0.0f, 0.0f};
+            __global sums_part_t *record = (__global sums_part_t *)pair_sums + (size_t)pair * (RECORD / 4);
+            for (uint k = 0; k < SUMS_PARTS; k++)
+                record[k] = vload4(k, sums);
+        }
     }
 }

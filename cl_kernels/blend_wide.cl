@@ -28,7 +28,7 @@ void blend_forward(
     __constant camera_t *restrict camera,       // [1]
     __global float *restrict image,             // [3,tiles_y*TILE,tiles_x*TILE]
     __global float *restrict transmittance,     // [tiles_y*TILE,tiles_x*TILE]
-    __global uint *restrict tile_last,          // [T] one past the last pair that any pixel blends
+    __global uint *restrict tile_last,          // [T] pairs of the tile up to the last that any pixel blends
     const uint first_tile)                      // of this launch
 {
     const uint tile = first_tile + get_global_id(0);
@@ -79,7 +79,7 @@ void blend_forward(
         }
     }
 
-    tile_last[tile] = last;
+    tile_last[tile] = last - first;
     for (uint y = 0; y < TILE; y++)
         for (uint column = 0; column < COLUMNS; column++) {
             const uint row = tile_y * TILE + y;
@@ -163,8 +163,8 @@ void blend_backward(
             pixels[y][column] = p;
         }
 
-    const uint end = tile_offset[tile + 1], last = tile_last[tile];
-    for (uint begin = tile_offset[tile]; begin < last; begin += SEGMENT) {
+    const uint first = tile_offset[tile], end = tile_offset[tile + 1], last = first + tile_last[tile];
+    for (uint begin = first; begin < last; begin += SEGMENT) {
         const uint length = last - begin < SEGMENT ? last - begin : SEGMENT;
         float segment[SEGMENT][RECORD];
         uint pairs[SEGMENT];

@@ -16,22 +16,26 @@ void sum_records(
     const uint i = get_global_id(0) * LANES;
     if (i >= count)
         return;
-    float table[LANES][RECORD];
+    __global const sums_part_t *records = (__global const sums_part_t *)pair_sums;
+    const size_t parts = RECORD * sizeof(float) / sizeof(sums_part_t);
+    sums_part_t table[LANES][SUMS_PARTS];
     for (uint lane = 0; lane < LANES; lane++) {
-        vstore16((float16)(0.0f), 0, table[lane]);
-        for (uint k = 0; k < PIXEL_SUMS && accumulate; k++)
-            table[lane][k] = pixel_sums[k * stride + i + lane];
-        float16 sum = vload16(0, table[lane]);
+        float *sums = (float *)table[lane];
+        for (uint k = 0; k < SUMS_PARTS; k++)
+            table[lane][k] = (sums_part_t)(0.0f);
+        if (accumulate)
+            for (uint k = 0; k < PIXEL_SUMS; k++)
+                sums[k] = pixel_sums[k * stride + i + lane];
         const uint pairs = i + lane < count ? tile_count[i + lane] : 0;
         const uint first = pairs > 0 ? first_pair[i + lane] : 0;
         for (uint pair = first; pair < first + pairs; pair++)
-            sum += vload16(pair, pair_sums);
-        vstore16(sum, 0, table[lane]);
+            for (uint k = 0; k < SUMS_PARTS; k++)
+                table[lane][k] += records[pair * parts + k];
     }
     for (uint k = 0; k < PIXEL_SUMS; k++) {
         float lanes[LANES];
         for (uint lane = 0; lane < LANES; lane++)
-            lanes[lane] = table[lane][k];
+            lanes[lane] = ((const float *)table[lane])[k];
         VSTORE(VLOAD(lanes), pixel_sums + k * stride + i);
     }
 }

@@ -17,6 +17,26 @@ static inline void add_band(const uint first, const uint last, const VF *basis, 
             colour[channel] += basis[k] * VLOAD(sh_rest + ((k - 1) * 3 + channel) * stride + i);
 }
 
+/* Write the records of LANES splats: zero where not visible. */
+static inline void store_records(const VF *fields, const VI visible, const uint i, const uint count,
+                                 __global float *splats)
+{
+#if LANES == 1
+    __global float4 *record = (__global float4 *)splats + (size_t)i * (RECORD / 4);
+    for (uint k = 0; k < RECORD / 4; k++)
+        record[k] = visible ? vload4(k, fields) : (float4)(0.0f);
+#else
+    for (uint part = 0; part < RECORD; part += LANES) {
+        VF rows[LANES];
+        for (uint k = 0; k < LANES; k++)
+            rows[k] = visible ? fields[part + k] : (VF)(0.0f);
+        transpose(rows);
+        for (uint lane = 0; lane < LANES && i + lane < count; lane++)
+            VSTORE(rows[lane], splats + (size_t)(i + lane) * RECORD + part);
+    }
+#endif
+}
+
 /* Splat records, depth keys, 3-sigma radii and the tiles that each splat touches. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void project_forward(
@@ -95,14 +115,7 @@ void project_forward(
     VSTORE(mask, (__global int *)tile_mask + i);
     VSTORE(box_of(&footprint), (__global int *)tile_box + i);
     VSTORE((visible ? as_VI(s.z) : (VI)(-1)), (__global int *)depth_key + i);
-    for (uint part = 0; part < RECORD; part += LANES) {
-        VF rows[LANES];
-        for (uint k = 0; k < LANES; k++)
-            rows[k] = visible ? fields[part + k] : zero;
-        transpose(rows);
-        for (uint lane = 0; lane < LANES && i + lane < count; lane++)
-            VSTORE(rows[lane], splats + (size_t)(i + lane) * RECORD + part);
-    }
+    store_records(fields, visible, i, count, splats);
 }
 
 static inline void store_planes(__global float *planes, const VF *values, const VI touched,

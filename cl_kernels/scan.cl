@@ -1,4 +1,4 @@
-/* Exclusive prefix sum of unsigned integers: reduce, scan the block sums, then scan inside blocks.
+/* Exclusive prefix sum of unsigned integers: sum each block, then scan inside blocks, each behind the sums before it.
  *
  * A block is one work-group; each of its TEAM items owns `run` consecutive values, long on CPUs (one item per
  * group) and short on GPUs.  Integer sums: deterministic.  No group depends on another. */
@@ -28,40 +28,31 @@ void scan_blocks(
     }
 }
 
-/* Exclusive scan of the block sums, in place.  One item. */
-__kernel __attribute__((reqd_work_group_size(1, 1, 1)))
-void scan_sums(
-    __global uint *restrict block_sum,  // [blocks]
-    const uint blocks)
-{
-    uint sum = 0;
-    for (uint i = 0; i < blocks; i++) {
-        const uint value = block_sum[i];
-        block_sum[i] = sum;
-        sum += value;
-    }
-}
-
-/* offset[i] = sum of the values before i; offset[count] = their total.  Local memory: TEAM * 4 bytes. */
+/* offset[i] = sum of the values before i; offset[count] = their total.  Each group adds the sums of all blocks before
+ * its own: the host keeps them few.  Local memory: TEAM * 8 bytes. */
 __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
 void scan_offsets(
     __global const uint *restrict values,     // [count]
-    __global const uint *restrict block_sum,  // [blocks] after scan_sums
+    __global const uint *restrict block_sum,  // [blocks] sums of the blocks; not read where there is one
     __global uint *restrict offset,           // [count+1]
     const uint run,
     const uint count)
 {
-    __local uint sums[TEAM];
+    __local uint sums[TEAM], sums_before[TEAM];  // of the item's values, and of its share of the blocks before
     const uint item = get_local_id(0);
     const uint first = (get_group_id(0) * TEAM + item) * run;
     uint sum = 0;
     for (uint i = first; i < first + run && i < count; i++)
         sum += values[i];
+    uint before = 0;
+    for (uint block = item; block < get_group_id(0); block += TEAM)
+        before += block_sum[block];
     sums[item] = sum;
+    sums_before[item] = before;
     barrier(CLK_LOCAL_MEM_FENCE);
-    sum = block_sum[get_group_id(0)];
-    for (uint i = 0; i < item; i++)
-        sum += sums[i];
+    sum = 0;
+    for (uint i = 0; i < TEAM; i++)
+        sum += sums_before[i] + (i < item ? sums[i] : 0);
     for (uint i = first; i < first + run && i < count; i++) {
         offset[i] = sum;
         sum += values[i];

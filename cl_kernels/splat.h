@@ -37,6 +37,16 @@
 #define SUM_WEIGHT 11  // w, where the texture is known: not below 0
 #define SUM_TEXTURE 12 // w times the texture at the pixel, there
 
+/* A gradient record is written and read in aligned parts: quads where an item computes one Gaussian, and only those
+ * with sums; else whole. */
+#if LANES == 1
+typedef float4 sums_part_t;
+#define SUMS_PARTS ((PIXEL_SUMS + 3) / 4)
+#else
+typedef float16 sums_part_t;
+#define SUMS_PARTS 1
+#endif
+
 /* Partial sums, one set per lane. */
 typedef struct {
     VF power, x, y, xx, xy, yy, red, green, blue, abs_x, abs_y, weight, texture;

@@ -27,11 +27,13 @@ if TYPE_CHECKING:
     from clsplat.api.commands import resume as resume
     from clsplat.api.commands import run as run
     from clsplat.api.commands import status as status
+    from clsplat.api.commands import status_schema as status_schema
     from clsplat.api.device import Device as Device
     from clsplat.api.renderer import Gradients as Gradients
     from clsplat.api.renderer import Picture as Picture
     from clsplat.api.renderer import Renderer as Renderer
     from clsplat.api.tools import devices as devices
+    from clsplat.api.tools import doctor as doctor
     from clsplat.api.tools import inspect_scene as inspect_scene
     from clsplat.api.tools import load_plugin as load_plugin
     from clsplat.api.tools import measure_growth as measure_growth
@@ -52,10 +54,10 @@ __version__ = "0.1.0"
 _HERE = Path(__file__).resolve().parent
 _ROOMS = {  # where the names come from, which `import clsplat` does not import
     "clsplat.api.commands": "check compare_runs copy_pipeline describe_run evaluate pipeline_schema pipelines"
-    " render_views resume run status",
+    " render_views resume run status status_schema",
     "clsplat.api.device": "Device",
     "clsplat.api.renderer": "Gradients Picture Renderer",
-    "clsplat.api.tools": "devices inspect_scene load_plugin measure_growth measure_speed read_measurement",
+    "clsplat.api.tools": "devices doctor inspect_scene load_plugin measure_growth measure_speed read_measurement",
     "clsplat.api.trainer": "Report Trainer",
     "clsplat.gaussians.model": "Model Rendering load",
     "clsplat.scene.camera": "Camera",

@@ -4,9 +4,12 @@ A message is one line: the fault, its place, what was expected, the remedy.  The
 traceback (`--debug` shows one).
 """
 
+import reprlib
 import traceback
+from itertools import islice
 
 MESSAGE_LIMIT = 1000  # characters
+QUOTE_LIMIT = 80  # characters of a value in a message
 PLUGIN_MARK = "__clsplat_plugin__"  # the name of the plug-in, a variable of its module
 
 
@@ -17,7 +20,7 @@ class ClsplatError(Exception):
 
 
 class InternalError(ClsplatError):
-    """A defect of the program."""
+    """A defect of clsplat, to be reported; `--debug` shows its traceback."""
 
 
 class ConfigError(ClsplatError):
@@ -30,8 +33,8 @@ class OverrideError(ConfigError):
     """A value of `--set` does not fit the pipeline; `reason` is the fault."""
 
     def __init__(self, override: str, reason: str) -> None:
-        self.reason = shortened(reason, 500)
-        super().__init__(f"--set {shortened(override, 80)}: {self.reason}")
+        self.reason = shortened(" ".join(reason.split()), 500)
+        super().__init__(f"--set {shortened(' '.join(override.split()))}: {self.reason}")
 
 
 class PluginError(ConfigError):
@@ -71,13 +74,13 @@ class NumericError(ClsplatError):
 
 
 class OutputError(ClsplatError):
-    """A file cannot be written or read back."""
+    """A file cannot be written or read back, or a folder is in use."""
 
     exit_code = 7
 
 
 class Interrupted(ClsplatError):
-    """The user stopped the run."""
+    """Ctrl-C, SIGTERM or SIGHUP stopped the command; the state of a run is saved."""
 
     exit_code = 130
 
@@ -106,11 +109,41 @@ def _plugin_place(error: BaseException) -> str | None:
 
 
 def one_line(error: BaseException) -> str:
-    """Return the message of an error, in one line of limited length."""
-    return shortened(" ".join(str(error).split()), MESSAGE_LIMIT)
+    """Return the message of an error, in one line of limited length, without characters that a terminal obeys."""
+    text = shortened(" ".join(str(error).split()), MESSAGE_LIMIT)
+    return shortened("".join(c if c.isprintable() else ascii(c)[1:-1] for c in text), MESSAGE_LIMIT)
 
 
-def shortened(text: str, limit: int = 200) -> str:
+def shortened(text: str, limit: int = QUOTE_LIMIT) -> str:
     """Return the text, cut in the middle where it is longer than `limit` characters."""
-    half = limit // 2
-    return text if len(text) <= limit else f"{text[:half]} … {text[-half:]}"
+    kept = limit - 3
+    return text if len(text) <= limit else f"{text[: kept - kept // 2]} … {text[-(kept // 2) :]}"
+
+
+def quoted(value: object) -> str:
+    """Return a value of the input as a message shows it, in one line of QUOTE_LIMIT characters."""
+    return shortened(" ".join(_QUOTES.repr(value).split()))
+
+
+class _Quotes(reprlib.Repr):
+    """The notation of Python, which takes no longer for a large value."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.fillvalue = "…"
+        self.maxlist = self.maxtuple = self.maxdict = 8
+        self.maxlevel = 4
+        self.maxstring = self.maxother = self.maxlong = 2 * QUOTE_LIMIT
+
+    def repr_int(self, x: int, level: int) -> str:
+        return f"a number of {x.bit_length()} bits" if x.bit_length() > 256 else repr(x)
+
+    def repr_dict(self, x: dict[object, object], level: int) -> str:
+        """The first keys, in their own order."""
+        if level <= 0:
+            return f"{{{self.fillvalue}}}"
+        shown = [f"{self.repr1(key, level - 1)}: {self.repr1(x[key], level - 1)}" for key in islice(x, self.maxdict)]
+        return f"{{{', '.join([*shown, *([self.fillvalue] if len(x) > self.maxdict else [])])}}}"
+
+
+_QUOTES = _Quotes()

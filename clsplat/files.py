@@ -1,30 +1,46 @@
-"""Write files atomically: a reader sees a complete file or none."""
+"""Write files atomically: a reader sees a complete file or none, also after a power cut."""
 
+import errno
+import itertools
+import logging
 import os
+import re
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
 from clsplat.errors import OutputError
+from clsplat.processes import is_alive
+
+LOG = logging.getLogger("clsplat")
+PARTIAL = re.compile(r"\..+\.(\d+)-\d+\.partial")  # what a process that was killed leaves: .NAME.PROCESS-NUMBER.partial
+NO_SYNC = {errno.EINVAL, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EBADF, errno.EACCES, errno.EPERM}
+SYSTEM = os.name
+_number = itertools.count()
+_open: set[str] = set()  # names of the temporary files that this process writes
 
 
 @contextmanager
 def atomic(path: Path) -> Iterator[BinaryIO]:
     """Open a temporary file beside `path`; when the block ends without an error, sync it and rename it to `path`.
 
+    Then the folder is synced, so that the new name outlasts a power cut.
     Raises OutputError with the file's name when it cannot be written; an earlier file then stays unchanged.
     """
     if not path.name:
         raise OutputError(f"{path}: cannot be written (it has no name); expected the path of a file")
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    temporary = path.with_name(f".{path.name}.{os.getpid()}-{next(_number)}.partial")
+    _open.add(temporary.name)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with temporary.open("wb") as file:
             yield file
             file.flush()
             os.fsync(file.fileno())
-        os.replace(temporary, path)
+        _replace(temporary, path)
+        sync_folder(path.parent)
     except OSError as error:
         raise OutputError(
             f"{path}: cannot be written ({error.strerror or error}); check the folder and its space"
@@ -32,6 +48,51 @@ def atomic(path: Path) -> Iterator[BinaryIO]:
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
+        _open.discard(temporary.name)
+
+
+def _replace(temporary: Path, path: Path) -> None:
+    """Rename a file; where Windows refuses because somebody reads the other one just now, try again for a second."""
+    for attempt in range(20):
+        try:
+            return os.replace(temporary, path)
+        except PermissionError:
+            if SYSTEM != "nt" or attempt == 19:
+                raise
+            time.sleep(0.05)
+
+
+def sync_folder(folder: Path) -> None:
+    """Wait until the names in a folder are on the disk; without effect where a system cannot.  Raises OSError."""
+    if not hasattr(os, "O_DIRECTORY"):  # Windows writes names with the file
+        return
+    try:
+        number = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            os.fsync(number)
+        finally:
+            os.close(number)
+    except OSError as error:
+        if error.errno not in NO_SYNC:
+            raise
+
+
+def sweep(folder: Path, border: str) -> None:
+    """Remove the temporary files of killed processes below a folder, but not below folders that hold a `border`."""
+    for base, folders, files in os.walk(folder):
+        folders[:] = [name for name in folders if not os.path.exists(os.path.join(base, name, border))]
+        for name in filter(_is_left, files):
+            with suppress(OSError):
+                os.unlink(os.path.join(base, name))
+                LOG.debug("removed %s, which a killed run has left", os.path.join(base, name))
+
+
+def _is_left(name: str) -> bool:
+    """Whether a file is a temporary one that no process of this machine writes any more."""
+    if not (found := PARTIAL.fullmatch(name)) or name in _open:
+        return False
+    process = int(found[1])
+    return process == os.getpid() or not is_alive(process)  # an earlier container had the same number
 
 
 def unwritable(path: Path, error: OSError) -> OutputError:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from clsplat.errors import DataError
+from clsplat.errors import DataError, quoted, shortened
 
 ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}  # of bytes, as NumPy writes them
 MAX_HEADER = 1 << 16  # bytes; real headers have about 1.5 KB
@@ -76,7 +76,7 @@ def parse_ply_header(path: Path, data: bytes) -> PlyHeader:
                 pass
             case _:
                 raise DataError(
-                    f"{path}: line {number}: cannot read '{line.strip()[:80]}'; expected a PLY header whose vertices "
+                    f"{path}: line {number}: cannot read {quoted(line.strip())}; expected a PLY header whose vertices "
                     "have single numbers as properties: export it again"
                 )
     if not form:
@@ -87,10 +87,14 @@ def parse_ply_header(path: Path, data: bytes) -> PlyHeader:
 def _vertices(path: Path, form: str, comments: tuple[str, ...], elements: list[_Element], start: int) -> PlyHeader:
     names = [element.name for element in elements]
     if "vertex" not in names:
-        raise DataError(f"{path}: has no vertices, only {', '.join(names) or 'a header'}; expected 'element vertex N'")
+        raise DataError(
+            f"{path}: has no vertices, only {shortened(', '.join(names)) or 'a header'}; expected 'element vertex N'"
+        )
     *before, vertex = elements[: names.index("vertex") + 1]
     if lists := [element.name for element in before if element.has_list]:
-        raise DataError(f"{path}: '{lists[0]}', with a list, stands before the vertices; export it with vertices first")
+        raise DataError(
+            f"{path}: {quoted(lists[0])}, with a list, stands before the vertices; export it with vertices first"
+        )
     properties = [name for name, _ in vertex.properties]
     if not properties or len(set(properties)) < len(properties):
         fault = "a property of the vertices is declared twice" if properties else "its vertices have no properties"

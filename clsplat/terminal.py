@@ -2,10 +2,9 @@
 
 import json
 import logging
-import os
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +12,8 @@ from rich.console import Console
 from rich.live import Live
 from rich.progress import BarColumn, Progress, TextColumn
 
+from clsplat import __version__, streams
+from clsplat.errors import OutputError
 from clsplat.files import unwritable
 
 if TYPE_CHECKING:  # the command line starts without OpenCL
@@ -21,23 +22,8 @@ if TYPE_CHECKING:  # the command line starts without OpenCL
 LOG = logging.getLogger("clsplat")
 
 
-class _Console(Console):
-    """A console that discards its output when the reader closes the pipe; the work continues."""
-
-    def on_broken_pipe(self) -> None:
-        self.quiet = True
-        discard_output()
-
-
-CONSOLE = _Console(highlight=False, soft_wrap=True)
-ERRORS = _Console(stderr=True, highlight=False, soft_wrap=True)
-
-
-def discard_output() -> None:
-    """Discard all further output to stdout, so that a closed pipe causes no error."""
-    null = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(null, sys.stdout.fileno())
-    os.close(null)
+CONSOLE = Console(file=streams.STDOUT, highlight=False, soft_wrap=True)  # type: ignore[arg-type]
+ERRORS = Console(file=streams.STDERR, highlight=False, soft_wrap=True)  # type: ignore[arg-type]
 
 
 class _TerminalHandler(logging.Handler):
@@ -70,27 +56,60 @@ def keep_stdout_for_json() -> None:
             handler.remarks = ERRORS
 
 
-def show(text: str) -> None:
-    """Print text as it is."""
+def remark(text: str) -> None:
+    """Print what was done; where that cannot be written nothing is lost."""
     CONSOLE.print(text, markup=False)
 
 
+def show(text: str) -> None:
+    """Print what the command is for, as it is.  Raises OutputError where it cannot be written."""
+    CONSOLE.print(text, markup=False)
+    streams.check_output()
+
+
 def show_json(data: Any) -> None:
-    """Print data as JSON."""
-    print(json.dumps(data, indent=1), flush=True)
+    """Print data as JSON.  Raises OutputError as `show` does."""
+    streams.STDOUT.write(json.dumps(data, indent=1) + "\n")
+    streams.check_output()
+
+
+class _LogFile(logging.FileHandler):
+    """A file of the log.  Where a line cannot be written, a warning says so once, and the work goes on."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, encoding="utf-8", errors="backslashreplace")
+        self.failed = False
+
+    def handleError(self, record: logging.LogRecord) -> None:
+        if not self.failed:
+            self.failed = True
+            error = sys.exc_info()[1]
+            reason = getattr(error, "strerror", None) or error
+            LOG.warning("%s: cannot be written (%s); the work goes on without these lines", self.baseFilename, reason)
+
+    def close(self) -> None:
+        with suppress(OSError):  # lines that are held back; the warning was given
+            super().close()
 
 
 @contextmanager
 def logging_to(path: Path) -> Iterator[None]:
     """Append the log to a file, with the time of every line, and the traceback of an error that ends the block.
 
-    The file has debug lines, whatever the level of the log was.
+    The file has debug lines, whatever the level of the log was.  Raises OutputError where it cannot be written at the
+    beginning; later nothing ends for the log.
     """
+    if path.exists() and not path.is_file():
+        raise OutputError(f"{path}: cannot be written (it is not a file); remove it, or give another folder")
+    form = logging.Formatter("%(asctime)s %(levelname)s %(message)s")
+    first = logging.LogRecord(LOG.name, logging.DEBUG, __file__, 0, "clsplat %s", (__version__,), None)
     try:
-        handler = logging.FileHandler(path, encoding="utf-8", errors="backslashreplace")
+        with path.open("a", encoding="utf-8") as file:
+            file.write(form.format(first) + "\n")
+        handler = _LogFile(path)
     except OSError as error:
         raise unwritable(path, error) from error
-    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+    handler.setFormatter(form)
     level = LOG.level
     LOG.setLevel(logging.DEBUG)
     LOG.addHandler(handler)
@@ -100,6 +119,9 @@ def logging_to(path: Path) -> Iterator[None]:
         LOG.debug("ended by %s", type(error).__name__, exc_info=error)
         raise
     finally:
+        for stream in (streams.STDOUT, streams.STDERR):
+            if stream.fault is not None:
+                LOG.debug("%s could not be written: %s", stream.name, stream.fault)
         LOG.removeHandler(handler)
         LOG.setLevel(level)
         handler.close()
@@ -132,13 +154,13 @@ def show_summary(folder: Path) -> None:
     """Print the metrics of a run and the paths of its files; nothing for a matrix."""
     if not (folder / "metrics.json").exists():
         return
-    metrics = json.loads((folder / "metrics.json").read_text())
+    metrics = json.loads((folder / "metrics.json").read_text("utf-8"))
     test = next(iter(metrics["test"].values()), None)
     quality = f"test PSNR {test['psnr']:.2f} dB, SSIM {test['ssim']:.4f}; " if test else ""
-    show(f"{quality}{metrics['gaussians']:,} Gaussians; {metrics['train_seconds']:.0f} s of training")
+    remark(f"{quality}{metrics['gaussians']:,} Gaussians; {metrics['train_seconds']:.0f} s of training")
     for title, name in (("model", "point_cloud.ply"), ("renders", "renders"), ("report", "report.html")):
         if (folder / name).exists():
-            show(f"  {title:<8} {folder / name}")
+            remark(f"  {title:<8} {folder / name}")
 
 
 @contextmanager

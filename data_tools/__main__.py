@@ -1,13 +1,10 @@
 """Dataset preparation: `clsplat data COMMAND …`, or `python -m data_tools COMMAND …`."""
 
-import logging
-import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from clsplat.errors import ClsplatError
 from clsplat.scene.detect import format_names
 from data_tools.multiscale import write_multiscale
 from data_tools.photos import CameraModel, Mapper, Matching
@@ -126,13 +123,10 @@ def fetch(
 
 
 def main() -> None:
-    """Run the command line; an error that the user can fix is one line and its exit code."""
-    logging.basicConfig(level=logging.INFO, format="%(message)s")
-    try:
-        app()
-    except ClsplatError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(error.exit_code)
+    """Run the command line as `clsplat data` does."""
+    from clsplat.cli import main as clsplat
+
+    clsplat("data")
 
 
 if __name__ == "__main__":

@@ -9,6 +9,8 @@ import cv2
 import numpy as np
 
 from clsplat.errors import DataError
+from clsplat.files import atomic
+from clsplat.progress import Count
 from clsplat.scene.images import IMAGE_SUFFIXES, read_image
 
 LOG = logging.getLogger("clsplat")
@@ -21,6 +23,25 @@ def list_photographs(folder: Path, without: Path | None = None) -> list[str]:
 
     Raises DataError when there are too few of them.
     """
+    names, unreadable = _found(folder, without)
+    if unreadable:
+        LOG.warning(
+            "%s: %d files such as %s are left out: convert them to JPEG", folder, len(unreadable), unreadable[0]
+        )
+    require_photographs(folder, without)
+    return names
+
+
+def require_photographs(folder: Path, without: Path | None = None) -> None:
+    """Raise DataError when there are too few photographs below a folder."""
+    names, _ = _found(folder, without)
+    if len(names) < MIN_PHOTOGRAPHS:
+        suffixes = ", ".join(sorted(IMAGE_SUFFIXES))
+        raise DataError(f"{folder}: found {len(names)} photographs; expected at least {MIN_PHOTOGRAPHS}, of {suffixes}")
+
+
+def _found(folder: Path, without: Path | None) -> tuple[list[str], list[str]]:
+    """The names of photographs, sorted, and of those that cannot be read."""
     if not folder.is_dir():
         raise DataError(f"{folder}: no such folder; expected one with photographs")
     names: list[str] = []
@@ -32,20 +53,20 @@ def list_photographs(folder: Path, without: Path | None = None) -> list[str]:
             if file[0] != "." and suffix in IMAGE_SUFFIXES | UNREADABLE_SUFFIXES:
                 name = (Path(base) / file).relative_to(folder).as_posix()
                 (names if suffix in IMAGE_SUFFIXES else unreadable).append(name)
-    if unreadable:
-        LOG.warning(
-            "%s: %d files such as %s are left out: convert them to JPEG", folder, len(unreadable), unreadable[0]
-        )
-    if len(names) < MIN_PHOTOGRAPHS:
-        suffixes = ", ".join(sorted(IMAGE_SUFFIXES))
-        raise DataError(f"{folder}: found {len(names)} photographs; expected at least {MIN_PHOTOGRAPHS}, of {suffixes}")
-    return sorted(names)
+    return sorted(names), unreadable
 
 
 def gather(photographs: Path, images: Path, names: list[str]) -> list[str]:
-    """Link photographs into a folder, or copy them upright; return the names of those that can be read."""
-    kept = []
-    for name in names:
+    """Link photographs into a folder, or copy them upright; return the names of those that can be read.
+
+    What an interrupted call has put there stays.
+    """
+    kept, count = [], Count("photographs read", len(names))
+    for number, name in enumerate(names, 1):
+        count.reach(number)
+        if _is_there(photographs / name, images / name):
+            kept.append(name)
+            continue
         try:
             stored, upright = read_image(photographs / name), read_image(photographs / name, upright=True)
         except DataError as error:
@@ -56,7 +77,8 @@ def gather(photographs: Path, images: Path, names: list[str]) -> list[str]:
             link(photographs / name, images / name)
         else:
             _, encoded = cv2.imencode(".jpg", np.ascontiguousarray(upright[:, :, ::-1]), [cv2.IMWRITE_JPEG_QUALITY, 98])
-            (images / name).write_bytes(encoded.tobytes())
+            with atomic(images / name) as file:
+                file.write(encoded.tobytes())
         kept.append(name)
     if len(kept) < MIN_PHOTOGRAPHS:
         raise DataError(f"{photographs}: only {len(kept)} of {len(names)} photographs can be read; export them again")
@@ -64,8 +86,22 @@ def gather(photographs: Path, images: Path, names: list[str]) -> list[str]:
 
 
 def link(source: Path, target: Path) -> None:
-    """Link a file or folder, or copy it where links are not supported."""
+    """Link a file or folder, or copy it where links are not supported; what is there already stays."""
+    if _is_there(source, target):
+        return
     try:
+        target.unlink(missing_ok=True)
         target.symlink_to(source.resolve(), target_is_directory=source.is_dir())
     except OSError:
-        (shutil.copytree if source.is_dir() else shutil.copyfile)(source, target)
+        half = target.with_name(f".{target.name}")
+        if source.is_dir():
+            shutil.rmtree(half, ignore_errors=True)
+            shutil.copytree(source, half)
+        else:
+            shutil.copyfile(source, half)
+        half.replace(target)
+
+
+def _is_there(source: Path, target: Path) -> bool:
+    """Whether a target is a copy, which is complete, or a link to this source."""
+    return target.exists() and (not target.is_symlink() or target.resolve() == source.resolve())

@@ -7,10 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.errors import DataError
+from clsplat.progress import Count
 from clsplat.scene.detect import read_scene
 from clsplat.scene.images import read_image, write_image
 from clsplat.scene.scene import View
 from clsplat.scene.view import load_mask
+from data_tools.made import Made, hash_of
 
 MIN_ALPHA = 0.5  # of the largest value
 
@@ -19,7 +21,8 @@ def write_masks(scene: Path, folder: Path | None = None, out: Path | None = None
     """Write a mask for every photograph into `scene`/masks, or `out`; return the number written.
 
     A mask is white in pixels that count: those of its file in `folder` (NAME.png, or STEM.png), else those whose alpha
-    is at least `threshold`, in [0, 1].  Existing masks stay unchanged.
+    is at least `threshold`, in [0, 1].  Masks that exist stay unchanged, unless an earlier call has made
+    them of others.
     Raises DataError when a mask is missing or of another size than its photograph, or a photograph has no alpha.
     """
     views = read_scene(scene, holdout=0).views
@@ -30,13 +33,15 @@ def write_masks(scene: Path, folder: Path | None = None, out: Path | None = None
             f"{folder}: has no masks for {len(missing)} of {len(views)} photographs: {', '.join(missing[:3])}; "
             "expected the photograph's name with .png appended, or in place of its suffix"
         )
-    target, written = out or scene / "masks", 0
-    for view, source in zip(views, sources, strict=True):
+    target, written, count = out or scene / "masks", 0, Count("masks written", len(views))
+    made = Made(target)
+    for number, (view, source) in enumerate(zip(views, sources, strict=True), 1):
         path = target / Path(view.name).with_suffix(".png")
-        if not path.is_file():
+        if made.is_due(path, hash_of(view.image_path, threshold) if source is None else hash_of(source)):
             white = _from_alpha(view, threshold) if source is None else _from_file(view, source)
             write_image(path, np.repeat(np.where(white, 255, 0).astype(np.uint8)[:, :, None], 3, axis=2))
             written += 1
+        count.reach(number)
     return written
 
 

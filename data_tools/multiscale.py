@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.errors import DataError
+from clsplat.files import atomic, write_text
 from clsplat.scene.images import read_image
 from clsplat.scene.transforms import Transforms, view_name
 
@@ -29,7 +30,7 @@ def write_multiscale(source: Path, out: Path, levels: int = 4) -> int:
     if "train" not in splits:
         raise DataError(f"{source}: has no transforms_train.json; expected the folder of a Blender dataset")
     metadata = {name: _write_split(Transforms(path), name, out, levels) for name, path in splits.items()}
-    (out / "metadata.json").write_text(json.dumps(metadata) + "\n")
+    write_text(out / "metadata.json", json.dumps(metadata) + "\n")
     points = source / "points3d.ply"
     if points.is_file():
         shutil.copyfile(points, out / points.name)
@@ -50,7 +51,6 @@ def pyramid(pixels: NDArray[np.uint8], levels: int) -> list[NDArray[np.uint8]]:
 def _write_split(transforms: Transforms, name: str, out: Path, levels: int) -> dict[str, Any]:
     """Write one split's images and return its columns, one value for each image."""
     rows = []
-    (out / f"images_{name}").mkdir(parents=True, exist_ok=True)
     for i, (frame, view) in enumerate(zip(transforms.frames, transforms.views(), strict=True)):
         pixels = read_image(view.image_path)
         height, width = pixels.shape[:2]
@@ -65,7 +65,7 @@ def _write_split(transforms: Transforms, name: str, out: Path, levels: int) -> d
             camera = {"width": width >> j, "height": height >> j, "focal": view.camera.fx / 2**j}
             sampling = {"label": j, "near": MIN_DEPTH, "far": MAX_DEPTH, "lossmult": 4.0**j}
             inverse = _pixel_to_camera(**camera)
-            pose = frame.values["transform_matrix"]
+            pose = frame.value("transform_matrix")
             rows.append({"file_path": file, "cam2world": pose, **camera, **sampling, "pix2cam": inverse})
     return {key: [row[key] for row in rows] for key in rows[0]}
 
@@ -78,4 +78,5 @@ def _pixel_to_camera(width: int, height: int, focal: float) -> list[list[float]]
 def _write(path: Path, pixels: NDArray[np.uint8]) -> None:
     order = [2, 1, 0, 3][: pixels.shape[2]]
     _, encoded = cv2.imencode(".png", np.ascontiguousarray(pixels[:, :, order]))
-    path.write_bytes(encoded.tobytes())
+    with atomic(path) as file:
+        file.write(encoded.tobytes())

@@ -4,9 +4,10 @@
     match_features   images, database   -> images/, database.db with matches
     map_cameras      images, database   -> images/, sparse/0: a COLMAP folder
 
-Each writes into an empty folder and changes nothing in its source.  The same photographs and settings give the same
-files: images are registered in order of their names before threads read them, every random number has a seed, and
-mapping runs in one thread by default.
+Each changes nothing in its source.  The first two go on where an interrupted call with the same photographs and
+settings stopped; mapping starts again.  The same photographs and settings give the same cameras and points: images are
+registered in order of their names before threads read them, every random number has a seed, and mapping runs in one
+thread by default.
 """
 
 import logging
@@ -20,6 +21,8 @@ from typing import Any, Literal
 import numpy as np
 
 from clsplat.errors import ConfigError, DataError
+from clsplat.files import write_text
+from clsplat.progress import Count
 from data_tools.gather import MIN_PHOTOGRAPHS, gather, link, list_photographs
 from data_tools.vocabulary import alike
 
@@ -29,7 +32,7 @@ Mapper = Literal["incremental", "global"]
 Cameras = Literal["auto", "one", "per_folder", "per_image"]
 CameraModel = Literal["SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "PINHOLE", "SIMPLE_PINHOLE"]
 MAX_EXHAUSTIVE = 200  # photographs whose pairs are all matched: the time grows with the square of their number
-CHUNK = 10  # photographs between lines of progress
+CHUNK = 10  # photographs between two counts
 DATABASE, IMAGES = "database.db", "images"
 
 
@@ -47,7 +50,7 @@ def find_features(
     Photographs with an EXIF rotation are copied upright, others are linked.  With `cameras: auto`, photographs of one
     size and focal length share a camera.  Raises DataError when fewer than three can be read.
     """
-    pycolmap = _pycolmap()
+    pycolmap = require_pycolmap()
     names = gather(photographs, out / IMAGES, list_photographs(photographs, without))
     database, mode = str(out / DATABASE), {"auto": "AUTO", "one": "SINGLE"}.get(cameras, cameras.upper())
     reader, extraction = pycolmap.ImageReaderOptions(), pycolmap.FeatureExtractionOptions()
@@ -56,19 +59,24 @@ def find_features(
     extraction.sift.max_num_features = features
     with _explained(photographs, "find features"):
         pycolmap.Database.open(database).close()
-        pycolmap.import_images(
-            database, str(out / IMAGES), getattr(pycolmap.CameraMode, mode), image_names=names, options=reader
-        )
-        for start in range(0, len(names), CHUNK):
+        if _image_names(pycolmap, out / DATABASE) != sorted(names):  # a new database, or one cut short
+            _remove(out / DATABASE)
+            pycolmap.Database.open(database).close()
+            pycolmap.import_images(
+                database, str(out / IMAGES), getattr(pycolmap.CameraMode, mode), image_names=names, options=reader
+            )
+        missing, count = _without_features(pycolmap, out / DATABASE), Count("photographs with features", len(names))
+        for start in range(0, len(missing), CHUNK):
+            count.reach(len(names) - len(missing) + start)
             pycolmap.extract_features(
                 database,
                 str(out / IMAGES),
-                names[start : start + CHUNK],
+                missing[start : start + CHUNK],
                 extraction_options=extraction,
                 reader_options=reader,
                 device=pycolmap.Device.cpu,
             )
-            LOG.info("features of %d of %d photographs", min(start + CHUNK, len(names)), len(names))
+        count.reach(len(names))
     return {"photographs": len(names)}
 
 
@@ -78,10 +86,13 @@ def match_features(source: Path, out: Path, matching: Matching = "auto", neighbo
     `auto` matches all pairs of up to 200 photographs; of more, each with the most similar ones.  Raises DataError when
     no pair matches.
     """
-    pycolmap = _pycolmap()
+    pycolmap = require_pycolmap()
     link(source / IMAGES, out / IMAGES)
-    shutil.copyfile(source / DATABASE, out / DATABASE)
     database = out / DATABASE
+    if not database.exists():  # pairs that it holds are not matched again
+        half = out / f".{DATABASE}"
+        shutil.copyfile(source / DATABASE, half)
+        half.replace(database)
     count = len(_image_names(pycolmap, database))
     chosen = ("exhaustive" if count <= MAX_EXHAUSTIVE else "vocabulary") if matching == "auto" else matching
     options, verification = pycolmap.FeatureMatchingOptions(), pycolmap.TwoViewGeometryOptions()
@@ -99,7 +110,7 @@ def match_features(source: Path, out: Path, matching: Matching = "auto", neighbo
             pycolmap.match_sequential(str(database), pairing_options=pairing, **common)
         elif chosen == "vocabulary":
             pairs = out / "pairs.txt"
-            pairs.write_text("".join(f"{a} {b}\n" for a, b in _alike_pairs(pycolmap, database, 2 * neighbours)))
+            write_text(pairs, "".join(f"{a} {b}\n" for a, b in _alike_pairs(pycolmap, database, 2 * neighbours)))
             imported = pycolmap.ImportedPairingOptions()
             imported.match_list_path = pairs
             pycolmap.match_image_pairs(str(database), pairing_options=imported, **common)
@@ -120,7 +131,7 @@ def map_cameras(source: Path, out: Path, mapper: Mapper = "incremental", threads
     `mapper: global` is faster for many photographs; more than one thread is faster and not repeatable to the bit.
     Raises DataError when no model has three images.
     """
-    pycolmap = _pycolmap()
+    pycolmap = require_pycolmap()
     link(source / IMAGES, out / IMAGES)
     work = out / ".models"
     work.mkdir()
@@ -134,14 +145,12 @@ def map_cameras(source: Path, out: Path, mapper: Mapper = "incremental", threads
     with _explained(source / IMAGES, "place the cameras"):
         function = pycolmap.global_mapping if is_global else pycolmap.incremental_mapping
         paths = str(source / DATABASE), str(out / IMAGES), str(work)
-        placed = [2]
+        count = Count("photographs placed", len(names))
 
-        def count() -> None:
-            placed[0] += 1
-            if placed[0] % CHUNK == 0:
-                LOG.info("%d of %d photographs placed", placed[0], len(names))
+        def placed() -> None:
+            count.reach(min(max(2, count.done) + 1, len(names)))
 
-        watched = {} if is_global else {"next_image_callback": count}
+        watched = {} if is_global else {"next_image_callback": placed}
         models = list(function(*paths, options=options, **watched).values())
     shutil.rmtree(work)
     models.sort(key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
@@ -199,7 +208,26 @@ def _image_names(pycolmap: ModuleType, database: Path) -> list[str]:
         opened.close()
 
 
-def _pycolmap() -> ModuleType:
+def _without_features(pycolmap: ModuleType, database: Path) -> list[str]:
+    """The names of images whose features are not in the database, or not all, sorted."""
+    opened = pycolmap.Database.open(str(database))
+    try:
+        return sorted(
+            image.name
+            for image in opened.read_all_images()
+            if not (opened.exists_keypoints(image.image_id) and opened.exists_descriptors(image.image_id))
+        )
+    finally:
+        opened.close()
+
+
+def _remove(database: Path) -> None:
+    for file in database.parent.glob(f"{database.name}*"):  # with its journal
+        file.unlink()
+
+
+def require_pycolmap() -> ModuleType:
+    """Return pycolmap.  Raises ConfigError where it is not installed."""
     try:
         import pycolmap
     except ImportError as error:

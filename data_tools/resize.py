@@ -9,7 +9,9 @@ from numpy.typing import NDArray
 
 from clsplat.errors import DataError
 from clsplat.files import atomic
+from clsplat.progress import Count
 from clsplat.scene.images import is_image, read_image
+from data_tools.made import Made, hash_of
 
 QUALITY = 98  # of JPEG
 
@@ -18,20 +20,24 @@ def write_pyramid(scene: Path, levels: int = 3) -> int:
     """Write images_2, images_4, … beside `scene`/images; return the number of images written.
 
     Pixels are means over areas; names, folders and file formats stay; sizes are rounded as in Camera.downscaled.
-    Existing images stay unchanged.  Raises DataError when there are none, or when one cannot be read.
+    Images that exist stay unchanged, unless an earlier call has made them of others.
+    Raises DataError when there are none, or when one cannot be read.
     """
     folder = scene / "images"
     names = sorted(path.relative_to(folder) for path in folder.rglob("*") if is_image(path))
     if not names:
         raise DataError(f"{folder}: holds no images; expected the folder above `images`")
-    written = 0
-    for name in names:
-        missing = [2**k for k in range(1, levels + 1) if not (scene / f"images_{2**k}" / name).is_file()]
-        pixels = read_image(folder / name) if missing else None
-        for factor in missing:
+    made = {2**k: Made(scene / f"images_{2**k}") for k in range(1, levels + 1)}
+    written, count = 0, Count("photographs resized", len(names))
+    for number, name in enumerate(names, 1):
+        content = hash_of(folder / name)
+        due = [factor for factor, record in made.items() if record.is_due(record.folder / name, content)]
+        pixels = read_image(folder / name) if due else None
+        for factor in due:
             assert pixels is not None
             _write(scene / f"images_{factor}" / name, pixels, factor)
             written += 1
+        count.reach(number)
     return written
 
 

@@ -170,7 +170,7 @@ def write_dataset(out: Path, options: Options, workers: int | None = None) -> st
 def is_complete(out: Path, options: Options) -> bool:
     """Return whether `out` holds every file of the data set with these options."""
     manifest = out / "synthetic.json"
-    if not manifest.is_file() or manifest.read_text(errors="replace") != options.manifest():
+    if not manifest.is_file() or manifest.read_text("utf-8", errors="replace") != options.manifest():
         return False
     files = [f"{split}/r_{i:03}.png" for split, poses in options.poses().items() for i in range(len(poses))]
     files += ["transforms_train.json", "transforms_test.json", "points3d.ply"]
@@ -192,10 +192,10 @@ def fill(out: Path, options: Options, workers: int) -> int:
         if split == "train":
             points.append(surface_points(pose, image, -(-POINT_COUNT // options.train), rng))
     for split, poses in splits.items():
-        (out / f"transforms_{split}.json").write_text(json.dumps(transforms(split, poses), indent=1) + "\n")
+        (out / f"transforms_{split}.json").write_text(json.dumps(transforms(split, poses), indent=1) + "\n", "utf-8")
     positions, colours = (np.concatenate(parts).astype(np.float32) for parts in zip(*points, strict=True))
     write_points_ply(out / "points3d.ply", PointCloud(positions, colours))
-    (out / "synthetic.json").write_text(options.manifest())
+    (out / "synthetic.json").write_text(options.manifest(), "utf-8")
     return len(positions)
 
 

@@ -1,6 +1,5 @@
 """Convert a scene to pinhole cameras: undistorted photographs, smaller on request, and their masks."""
 
-import logging
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -9,40 +8,48 @@ from typing import Literal
 import numpy as np
 
 from clsplat.errors import DataError
+from clsplat.progress import Count
 from clsplat.scene.detect import read_scene
 from clsplat.scene.images import write_image
 from clsplat.scene.scene import View
 from clsplat.scene.view import load_image, load_mask
 from data_tools.colmap_writer import write_model
+from data_tools.made import Made, hash_of
 
-LOG = logging.getLogger("clsplat")
 Blank = Literal["crop", "mask"]
-PROGRESS = 20  # photographs between lines of progress
 
 
 def undistort_scene(source: Path, out: Path, long_side: int | None = None, blank: Blank = "crop") -> int:
     """Write a COLMAP scene of pinhole cameras into `out`; return the number of its images.
 
     Photographs larger than `long_side` px are made smaller.  `blank: crop` keeps the largest part of a photograph
-    without blank pixels; `mask` keeps all of it, with masks of blank pixels.  Existing images stay unchanged.
-    Raises DataError when the scene cannot be read.
+    without blank pixels; `mask` keeps all of it, with masks of blank pixels.  Images that an earlier call has made of
+    the same photographs with the same settings stay unchanged.
+    Raises DataError when the scene cannot be read, or when an image in `out` has another origin.
     """
     scene = read_scene(source, holdout=0)
-    names = _png_names([view.name for view in scene.views])
-    views = []
+    names, made = _png_names([view.name for view in scene.views]), Made(out)
+    for name in names:
+        made.require_own(out / "images" / name)
+    views, count = [], Count("photographs undistorted", len(names))
     for number, (view, name) in enumerate(zip(scene.views, names, strict=True), 1):
-        if number % PROGRESS == 0:
-            LOG.info("undistorted %d of %d photographs", number, len(names))
         pinhole_view = replace(_sized(_shown(view, blank), long_side), alpha="mask")
         image, mask = out / "images" / name, out / "masks" / name
-        if not image.is_file():
+        if made.is_due(image, _source(pinhole_view), mask):
             counts = load_mask(pinhole_view)
             if counts is not None and not counts.all():
                 write_image(mask, np.repeat(np.where(counts, 255, 0).astype(np.uint8)[:, :, None], 3, axis=2))
             write_image(image, load_image(pinhole_view))
         views.append(replace(pinhole_view, name=name))
+        count.reach(number)
     write_model(out / "sparse" / "0", views, scene.points)
     return len(views)
+
+
+def _source(view: View) -> str:
+    """A hash of all that decides over the pixels of an undistorted image and its mask."""
+    files = [view.image_path, *([view.mask_path] if view.mask_path else [])]
+    return hash_of(*files, view.lens, view.camera)
 
 
 def _shown(view: View, blank: Blank) -> View:

@@ -1,38 +1,88 @@
 """Sharp, evenly spaced frames of a video."""
 
+import hashlib
+import json
 import logging
 from collections.abc import Iterator
+from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.errors import DataError
-from clsplat.scene.images import write_image
+from clsplat.files import write_text
+from clsplat.progress import Count
+from clsplat.scene.images import is_image, write_image
 
 LOG = logging.getLogger("clsplat")
+RECORD = ".frames.json"  # beside the frames: what they were made from
 SHARPNESS_SIDE = 480  # px: sharpness is measured at this size: at full size, noise counts as detail
 
 
 def write_frames(video: Path, out: Path, frames: int = 100, long_side: int | None = None) -> int:
     """Write the sharpest frame of each of `frames` equal parts of a video as PNG; return their number.
 
-    The format is PNG because a second lossy coding changes features and colours.  Existing frames stay unchanged.
-    Raises DataError when the video cannot be decoded.
+    The format is PNG because a second lossy coding changes features and colours.  An interrupted call goes on: frames
+    of the same video and settings stay unchanged.
+    Raises DataError when the video cannot be decoded, and when `out` holds other images, which would mix with frames.
     """
-    LOG.info("%s: looking for sharp frames", video)
-    sharpness = [_sharpness(image) for image in _decoded(video)]
-    chosen = sharpest(sharpness, frames)
-    LOG.info("%d frames, of which %d are written", len(sharpness), len(chosen))
-    files = {place: out / f"frame_{i:05d}.png" for i, place in enumerate(chosen, 1)}
-    if all(path.is_file() for path in files.values()):
-        return len(files)
-    for place, image in enumerate(_decoded(video)):
-        if place in files and not files[place].is_file():
+    settings: dict[str, Any] = {"video": _content(video), "frames": frames, "long_side": long_side}
+    chosen = _begun(out, settings)
+    if chosen is None:
+        LOG.info("%s: looking for sharp frames", video)
+        sharpness = [_sharpness(image) for image in _decoded(video)]
+        chosen = sharpest(sharpness, frames)
+        LOG.info("%d frames, of which %d are written", len(sharpness), len(chosen))
+        write_text(out / RECORD, json.dumps({**settings, "chosen": chosen}) + "\n")
+    files = {place: _file(out, i) for i, place in enumerate(chosen, 1)}
+    count = Count("frames written", len(files))
+    missing = {place for place, path in files.items() if not path.is_file()}
+    for place, image in enumerate(_decoded(video) if missing else ()):
+        if place in missing:
             write_image(files[place], np.ascontiguousarray(_limited(image, long_side)[:, :, ::-1]))
+            count.reach(count.done + 1)
     return len(files)
+
+
+def _begun(out: Path, settings: dict[str, Any]) -> list[int] | None:
+    """The frames that a call with the same settings has chosen, or None.  Raises DataError for a folder of others."""
+    record: dict[str, Any] = {}
+    with suppress(OSError, ValueError, TypeError):
+        record = dict(json.loads((out / RECORD).read_text("utf-8")))
+    chosen: list[int] | None = record.pop("chosen", None)
+    if record and record != settings:
+        changed = [name for name, value in settings.items() if record.get(name) != value]
+        raise DataError(
+            f"{out}: holds frames that were taken with another {' and another '.join(changed)}; give another folder, "
+            "or remove it"
+        )
+    own = {_file(out, i) for i in range(1, len(chosen or ()) + 1)}
+    others = sorted(path for path in out.rglob("*") if is_image(path) and path.name[0] != "." and path not in own)
+    if others:
+        raise DataError(
+            f"{out}: holds {len(others)} images already, such as {others[0].name}, with which the frames would mix; "
+            "give another folder"
+        )
+    return chosen
+
+
+def _file(out: Path, number: int) -> Path:
+    return out / f"frame_{number:05d}.png"
+
+
+def _content(video: Path) -> str:
+    """SHA-256 of a file.  Raises DataError when it cannot be read."""
+    if not video.is_file():
+        raise DataError(f"{video}: no such file; expected a video")
+    try:
+        with video.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise DataError(f"{video}: cannot be read ({error.strerror}); check its permissions") from error
 
 
 def sharpest(sharpness: list[float], parts: int) -> list[int]:
@@ -43,8 +93,6 @@ def sharpest(sharpness: list[float], parts: int) -> list[int]:
 
 def _decoded(video: Path) -> Iterator[NDArray[np.uint8]]:
     """The frames, [H, W, 3] BGR.  Raises DataError when there is none."""
-    if not video.is_file():
-        raise DataError(f"{video}: no such file; expected a video")
     reader = cv2.VideoCapture(str(video))
     try:
         found = False

@@ -19,7 +19,7 @@ def collect(out: Path) -> None:
             shutil.copyfile(file, out / file.name)
     for path, text in (reference_pages() | other_pages()).items():
         (out / path).parent.mkdir(exist_ok=True)
-        (out / path).write_text(text)
+        (out / path).write_text(text, "utf-8")
 
 
 if __name__ == "__main__":

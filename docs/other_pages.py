@@ -20,7 +20,7 @@ from clsplat.schedule import Curve
 from clsplat.settings import Settings
 from data_tools.__main__ import app as tools
 
-OTHER_CODES = {0: "Done.", 1: "A defect of clsplat: please report it."}
+OTHER_CODES = {0: "Done.", 1: "Internal error, a defect of clsplat: `--debug` shows it; please report it."}
 
 
 def command_page() -> str:
@@ -79,7 +79,7 @@ def pipelines_page() -> str:
     """Return the shipped pipelines: what their headers say, and the files."""
     text = "# Shipped pipelines\n\n`clsplat run NAME --scene DIR` runs one. Copy a file to make your own variant.\n\n"
     for file in sorted((ROOT / "pipelines").glob("*.yaml")):
-        lines = file.read_text().splitlines()
+        lines = file.read_text("utf-8").splitlines()
         count = next(i for i, line in enumerate(lines) if not line.startswith("#"))
         header = "\n".join(line.removeprefix("# ") for line in lines[:count]).replace(".\n", ".\n\n")
         body = "\n".join(f"    {line}" for line in lines[count:])
@@ -167,7 +167,7 @@ def options(level: int, heading: str = "") -> str:
 
 def repository_page(file: str) -> str:
     """Return a file of the repository, with links that hold in the site."""
-    return (ROOT / file).read_text().replace("](docs/", "](")
+    return (ROOT / file).read_text("utf-8").replace("](docs/", "](")
 
 
 @functools.cache

@@ -35,8 +35,8 @@ def example(base: Kind, kind: Kind) -> tuple[str, str]:
 def shipped_items() -> list[tuple[str, Node]]:
     """Return all mappings of shipped files, plain 3DGS first, each with the name of its file, and of the page."""
     files = sorted((ROOT / "pipelines").glob("*.yaml"), key=lambda file: (not file.name.startswith("splat"), file.name))
-    texts = [(file.name, file.read_text()) for file in files]
-    page = (ROOT / "docs" / "pipelines.md").read_text()
+    texts = [(file.name, file.read_text("utf-8")) for file in files]
+    page = (ROOT / "docs" / "pipelines.md").read_text("utf-8")
     texts += [("", text) for text in re.findall(r"^```yaml\n(.*?)^```", page, re.M | re.S)]
     return [(name, item) for name, text in texts for item in items(YAML(typ="safe").load(text))]
 

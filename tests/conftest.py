@@ -11,22 +11,30 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import hypothesis
 import numpy as np
 import pytest
 
 from clsplat import plugins
 from clsplat.opencl.device import Array, Device
 from clsplat.opencl.discovery import DeviceInfo, choose
+from clsplat.opencl.program import Program
 from clsplat.scene.readers import Reader
 from clsplat.settings import Settings, rebuild
 from data_tools.synthetic import Options, write_dataset
 
+hypothesis.settings.register_profile("suite", deadline=None)  # a busy machine is no fault
+hypothesis.settings.load_profile("suite")
 NAMES = [name.strip() for name in os.environ.get("CLSPLAT_TEST_DEVICES", "").split(";")]
 TUNINGS = {"wide16": ("wide", 16), "wide8": ("wide", 8), "simt": ("simt", 1)}
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--one-each", action="store_true", help="of a test's parameters take those in the middle alone")
+
+
+def pytest_configure() -> None:
+    Program.options += ("-Werror",)
 
 
 @pytest.hookimpl(trylast=True)  # after -m and -k

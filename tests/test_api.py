@@ -14,9 +14,9 @@ import pytest
 import clsplat
 from clsplat.api.arguments import overrides
 from clsplat.api.renderer import Renderer
+from clsplat.conformance.scenes import random_case
 from clsplat.errors import ConfigError, DataError
 from clsplat.scene.scene import Scene, make_scene
-from tests.scenes import random_case
 from tests.test_model import model_of
 
 ROOT = Path(__file__).parents[1]

@@ -110,6 +110,7 @@ def test_json(runs, tiny_scene):
         f"status {runs[0]} --json": lambda: clsplat.status(runs[0]),
         "check smoke --json": lambda: {**clsplat.check("smoke"), "valid": True},
         "check --schema": clsplat.pipeline_schema,
+        "status --schema": clsplat.status_schema,
         "pipelines --json": clsplat.pipelines,
         "pipelines splat --json": lambda: clsplat.pipelines("splat"),
         "devices --json": clsplat.devices,

@@ -14,13 +14,16 @@ import pytest
 
 import clsplat
 from clsplat.api.renderer import Renderer
+from clsplat.conformance.scenes import random_case
+from clsplat.density.statistics import SplatStats
 from clsplat.errors import ClsplatError, ConfigError, DataError, NumericError
 from clsplat.losses.base import Comparison, HostLoss
 from clsplat.losses.image import L1, Dssim
 from clsplat.render.camera import upload_camera
 from clsplat.render.workspace import Workspace
+from clsplat.stages.schedule import RaiseSh
 from clsplat.training import trainer as steps
-from tests.scenes import random_case
+from clsplat.views.photographs import Photographs
 
 pytestmark = pytest.mark.slow
 
@@ -87,17 +90,18 @@ def test_a_trainer_goes_on_from_its_checkpoint_or_that_of_the_command(tiny_scene
     part = clsplat.Trainer(tiny_scene, "smoke", out=tmp_path / "a")
     part.run(20)  # a density edit is due
     assert part.checkpoint() == tmp_path / "a" / "checkpoints" / "step_000020.npz"
+    part.close()
     again = clsplat.Trainer(tiny_scene, "smoke", out=tmp_path / "a", resume=True)
     assert repr(again).endswith("step 20)")
     again.run()
     assert equal(again.model, whole.model)
     for file in (tmp_path / "a" / "checkpoints").iterdir():
-        if file.name > "step_000030.npz":
+        if file.name > "step_000040.npz":
             file.unlink()
     clsplat.resume(tmp_path / "a")
     assert equal(clsplat.load(tmp_path / "a"), whole.model)
     for file in (tmp_path / "a" / "checkpoints").iterdir():
-        if file.name > "step_000030.npz":
+        if file.name > "step_000040.npz":
             file.unlink()
     after_command = clsplat.Trainer(tiny_scene, "smoke", out=tmp_path / "a", resume=True)
     after_command.run()
@@ -190,8 +194,25 @@ def test_the_error_of_a_step_is_in_the_status_and_is_raised_as_it_is(tiny_scene,
     with pytest.raises(RuntimeError, match="no such teapot"):
         trainer.run()
     status = clsplat.status(tmp_path / "run")
-    assert (status["state"], status["step"]) == ("failed", 3)
+    assert (status["state"], status["step"], status["checkpoint"]) == ("failed", 2, "step_000002.npz")
     assert "no such teapot" in status["message"]
+
+
+def test_an_edit_that_fails_between_two_trainings_leaves_nothing_to_save(tiny_scene, tmp_path, monkeypatch):
+    two = tmp_path / "two.yaml"
+    part = "  - optimize: {steps: 2, losses: [l1]}\n"
+    two.write_text(f"name: two\nstages:\n  - init\n{part}  - raise_sh\n{part}")
+
+    def fail(stage, run):
+        raise RuntimeError("no such teapot")
+
+    monkeypatch.setattr(RaiseSh, "run", fail)
+    trainer = clsplat.Trainer(tiny_scene, two, out=tmp_path / "run")
+    with pytest.raises(RuntimeError, match="no such teapot"):
+        trainer.run()
+    with pytest.raises(ClsplatError, match="step 2 is half done"):
+        trainer.checkpoint()
+    assert not (tmp_path / "run" / "checkpoints").exists()
 
 
 def test_an_error_before_the_first_step_is_in_the_status(tiny_scene, tmp_path, monkeypatch):
@@ -220,6 +241,33 @@ def test_an_interrupt_lets_the_step_finish_and_training_go_on(tiny_scene):
     assert repr(trainer).endswith("step 1)")
     assert trainer.run().step == whole.run().step == 20
     assert equal(trainer.model, whole.model)
+
+
+def test_a_second_interrupt_leaves_the_step_before_or_nothing_to_save(tiny_scene, tmp_path, monkeypatch):
+    few = {"optimize.steps": 4}
+    for place, step in ((Photographs, 2), (SplatStats, 3)):
+        out = tmp_path / place.__name__
+        trainer = clsplat.Trainer(tiny_scene, "smoke", set=few, out=out)
+        trainer.run(2)
+        with monkeypatch.context() as patch:
+            patch.setattr(place, "get" if place is Photographs else "add", _interrupt)
+            with pytest.raises(KeyboardInterrupt):
+                trainer.step()
+        if place is SplatStats:  # in the middle of the update
+            with pytest.raises(ClsplatError, match="step 3 is half done, so it is not saved"):
+                trainer.checkpoint()
+            assert not (out / "checkpoints").exists()
+            continue
+        assert trainer.checkpoint().name == f"step_00000{step}.npz"
+        again = clsplat.Trainer(tiny_scene, "smoke", set=few, out=out, resume=True)
+        again.run()
+        whole = clsplat.Trainer(tiny_scene, "smoke", set=few)
+        whole.run()
+        assert equal(again.model, whole.model)
+
+
+def _interrupt(*arguments):
+    raise KeyboardInterrupt
 
 
 @pytest.mark.parametrize(
@@ -254,10 +302,8 @@ def test_folders_that_are_missing_or_taken_are_refused(tiny_scene, tmp_path):
 
 def test_the_lines_of_a_loop_of_ones_own_run(tiny_scene, device, capsys):
     lines = inspect.getdoc(steps.Trainer).split("clsplat.load`:\n\n")[1].split("\n\nBetween")[0]
-    from clsplat.density.statistics import SplatStats
     from clsplat.render.rasterizer import Rasterizer
     from clsplat.training.adam import Adam, Rates
-    from clsplat.views.photographs import Photographs
 
     scene = clsplat.read_scene(tiny_scene)
     scene = replace(scene, train=scene.train[:1] * 8)  # the same view in each step

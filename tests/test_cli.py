@@ -59,6 +59,7 @@ def test_set_takes_several_values(tiny_scene, tmp_path):
 
 def test_a_run_that_cannot_start_says_so_in_its_status(tmp_path):
     (tmp_path / "scene").mkdir()
+    (tmp_path / "run").mkdir()
     clsplat("run", "smoke", "--scene", tmp_path / "scene", "--out", tmp_path / "run", expect=3)
     status = json.loads((tmp_path / "run" / "status.json").read_text())
     assert (status["state"], status["exit_code"]) == ("failed", 3)

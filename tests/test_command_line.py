@@ -87,8 +87,8 @@ NEAR = {
     "status nowhere": "nowhere: has no readable status.json; expected the folder of a run",
     "pipelines --copy x": "--copy needs the name of a pipeline",
     "evaluate x.ply": "x.ply: a model file does not name its scene; give the folder of a scene, or a run folder",
-    "evaluate x.ply --scene y --scales nan": "expected downscale factors from 1 on, got nan",
-    "evaluate x.ply --scene y --scales inf": "expected downscale factors from 1 on, got inf",
+    "evaluate x.ply --scene y --downscales nan": "expected downscale factors from 1 on, got nan",
+    "evaluate x.ply --scene y --downscales inf": "expected downscale factors from 1 on, got inf",
 }
 
 
@@ -166,7 +166,7 @@ def test_a_run_folder_is_a_model_with_its_scene(finished, tiny_scene, tmp_path):
     clsplat("render", finished, "--out", tmp_path / "renders")
     own = {path.name: path.read_bytes() for path in (finished / "renders").rglob("*.png")}
     assert {path.name: path.read_bytes() for path in (tmp_path / "renders").rglob("*.png")} == own
-    again = json.loads(clsplat("evaluate", finished, "--scene", tiny_scene, "--scales", "1").stdout)
+    again = json.loads(clsplat("evaluate", finished, "--scene", tiny_scene, "--downscales", "1").stdout)
     assert list(again["test"]) == ["1"]
 
 
@@ -220,7 +220,9 @@ def test_status_refuses_damaged_metrics(text, tmp_path):
 def test_damaged_records_are_refused_with_their_line(line, tmp_path):
     (tmp_path / "metrics.jsonl").write_text('{"step": 5, "kind": "train"}\n' + line + "\n")
     (tmp_path / "status.json").write_text('{"state": "done", "step": 7}')
-    for read in (lambda: Records(tmp_path).start(6), lambda: run_status(tmp_path)):
+    records = Records(tmp_path)
+    records.lines = 6
+    for read in (records.start, lambda: run_status(tmp_path)):
         with pytest.raises(DataError, match=r"metrics.jsonl:2: damaged; .*'step' and 'kind'; remove this line"):
             read()
 

@@ -273,7 +273,7 @@ def test_without_the_photographs_the_rest_is_shown(make_run, tmp_path):
 def test_a_damaged_render_is_refused(make_run, tmp_path):
     folder = make_run("run")
     (folder / "renders/test/r_001.png").write_bytes((folder / "renders/test/r_001.png").read_bytes()[:40])
-    with pytest.raises(DataError, match=r"r_001.png: not an image, or a damaged one"):
+    with pytest.raises(DataError, match=r"r_001.png: the end of the file is missing"):
         write_comparison([folder], tmp_path / "page.html")
     cv2.imwrite(str(folder / "renders/test/r_001.png"), np.zeros((41, 50, 3), np.uint8))
     with pytest.raises(DataError, match=r"r_001.png: the image is 50x41 pixels, its camera 40x40"):

@@ -21,6 +21,8 @@ from clsplat import cli
 from clsplat.errors import ConfigError
 from clsplat.scene.images import read_image
 from data_tools import fetch as fetching
+from data_tools import resize as resize_tool
+from data_tools import video as video_tool
 from data_tools.fetch import Source, fetch, named
 from data_tools.masks import write_masks
 from data_tools.resize import write_pyramid
@@ -45,7 +47,7 @@ def video(tmp_path: Path, rng: np.random.Generator) -> Path:
 
 def test_the_sharp_frames_of_a_video(video, tmp_path):
     assert write_frames(video, tmp_path / "frames", frames=10) == 10
-    files = sorted((tmp_path / "frames").iterdir())
+    files = sorted((tmp_path / "frames").glob("*.png"))
     assert [file.name for file in files] == [f"frame_{i:05d}.png" for i in range(1, 11)]
     levels = [(read_image(file).mean() - 29.5) / 6 for file in files]
     np.testing.assert_allclose(levels, np.arange(1, 30, 3), atol=0.6)
@@ -53,13 +55,65 @@ def test_the_sharp_frames_of_a_video(video, tmp_path):
 
 def test_frames_are_not_taken_twice(video, tmp_path):
     write_frames(video, tmp_path / "frames", frames=4, long_side=48)
-    files = sorted((tmp_path / "frames").iterdir())
+    files = sorted((tmp_path / "frames").glob("*.png"))
     assert read_image(files[0]).shape == (32, 48, 3)
     kept = files[0].stat().st_mtime_ns
     files[1].unlink()
     assert write_frames(video, tmp_path / "frames", frames=4, long_side=48) == 4
     assert files[0].stat().st_mtime_ns == kept
     assert files[1].is_file()
+
+
+@pytest.mark.parametrize(
+    "more", [{"frames": 5}, {"long_side": 32}, {"video": "w.avi"}], ids=lambda more: next(iter(more))
+)
+def test_frames_of_another_video_or_other_settings_do_not_mix(video, tmp_path, more):
+    write_frames(video, tmp_path / "frames", frames=4)
+    before = {path.name: path.read_bytes() for path in (tmp_path / "frames").iterdir()}
+    (tmp_path / "w.avi").write_bytes(video.read_bytes() + b"more")
+    asked = {"video": video, "frames": 4, "long_side": None, **more}
+    message = refusal(write_frames, tmp_path / asked["video"], tmp_path / "frames", asked["frames"], asked["long_side"])
+    assert f"holds frames that were taken with another {next(iter(more))}; give another folder" in message
+    assert {path.name: path.read_bytes() for path in (tmp_path / "frames").iterdir()} == before
+
+
+def test_frames_do_not_mix_with_images_of_the_user(video, tmp_path):
+    (tmp_path / "frames" / "below").mkdir(parents=True)
+    (tmp_path / "frames" / "notes.txt").write_text("not an image")
+    image = tmp_path / "frames" / "below" / "frame_00001.png"
+    cv2.imwrite(str(image), np.zeros((4, 4, 3), np.uint8))
+    kept = image.read_bytes()
+    message = refusal(write_frames, video, tmp_path / "frames", 4)
+    assert "holds 1 images already, such as frame_00001.png, with which the frames would mix" in message
+    assert sorted(path.name for path in (tmp_path / "frames").iterdir()) == ["below", "notes.txt"]
+    assert image.read_bytes() == kept
+
+
+def test_frames_go_on_where_a_call_was_killed(video, tmp_path, monkeypatch):
+    write_frames(video, tmp_path / "whole", frames=6)
+    written: list[str] = []
+    write, looked = video_tool.write_image, video_tool._sharpness
+
+    def killed(path: Path, pixels: np.ndarray) -> None:
+        if len(written) == 2:
+            raise KeyboardInterrupt
+        written.append(path.name)
+        write(path, pixels)
+
+    monkeypatch.setattr(video_tool, "write_image", killed)
+    with pytest.raises(KeyboardInterrupt):
+        write_frames(video, tmp_path / "frames", frames=6)
+    monkeypatch.setattr(
+        video_tool, "write_image", lambda path, pixels: (written.append(path.name), write(path, pixels))
+    )
+    monkeypatch.setattr(video_tool, "_sharpness", lambda image: pytest.fail("was measured before") or looked(image))
+    assert write_frames(video, tmp_path / "frames", frames=6) == 6
+    assert written == [f"frame_{i:05d}.png" for i in range(1, 7)]
+    assert contents(tmp_path / "frames") == contents(tmp_path / "whole")
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def test_not_a_video(tmp_path):
@@ -93,6 +147,36 @@ def test_pyramids(tmp_path, rng):
     assert "holds no images" in refusal(write_pyramid, tmp_path / "images")
 
 
+def test_pyramids_go_on_and_keep_what_others_made(tmp_path, rng, monkeypatch):
+    folder, whole = tmp_path / "scene", tmp_path / "whole"
+    (folder / "images").mkdir(parents=True)
+    for i in range(4):
+        cv2.imwrite(str(folder / "images" / f"{i}.png"), rng.integers(0, 256, (16, 16, 3)).astype(np.uint8))
+    (folder / "images_2").mkdir()
+    (folder / "images_2" / "3.png").write_bytes(b"shipped")
+    shutil.copytree(folder, whole)
+    write_pyramid(whole, levels=2)
+    read: list[str] = []
+
+    def killed(path: Path) -> np.ndarray:
+        if len(read) == 2:
+            raise KeyboardInterrupt
+        read.append(path.name)
+        return read_image(path)
+
+    monkeypatch.setattr(resize_tool, "read_image", killed)
+    with pytest.raises(KeyboardInterrupt):
+        write_pyramid(folder, levels=2)
+    monkeypatch.setattr(resize_tool, "read_image", lambda path: (read.append(path.name), read_image(path))[1])
+    assert write_pyramid(folder, levels=2) == 3
+    assert read == ["0.png", "1.png", "2.png", "3.png"]
+    assert contents(folder) == contents(whole)
+    assert (folder / "images_2" / "3.png").read_bytes() == b"shipped"
+    cv2.imwrite(str(folder / "images" / "1.png"), np.full((16, 16, 3), 77, np.uint8))
+    assert write_pyramid(folder, levels=2) == 2
+    assert (read_image(folder / "images_4" / "1.png") == 77).all()
+
+
 # ---- masks
 
 
@@ -117,6 +201,17 @@ def test_masks_from_alpha(tmp_path):
     assert write_masks(scene, out=tmp_path / "others", threshold=0.3) == 2
     assert read_image(tmp_path / "others" / "train" / "0.png").min() == 255
     assert "has no alpha" in refusal(write_masks, blender_scene(tmp_path / "opaque", 3))
+
+
+def test_masks_follow_their_source_but_not_over_those_of_others(tmp_path):
+    scene = blender_scene(tmp_path / "scene", 4)
+    (scene / "masks" / "train").mkdir(parents=True)
+    cv2.imwrite(str(scene / "masks" / "train" / "1.png"), np.zeros((6, 8), np.uint8))
+    assert write_masks(scene) == 1
+    assert write_masks(scene) == 0
+    assert write_masks(scene, threshold=0.3) == 1
+    assert read_image(scene / "masks" / "train" / "0.png").min() == 255
+    assert read_image(scene / "masks" / "train" / "1.png").max() == 0
 
 
 def test_masks_from_a_folder(tmp_path):

@@ -8,6 +8,8 @@ import pytest
 from scipy.special import comb
 
 import clsplat
+from clsplat.conformance import reference as ref
+from clsplat.conformance.scenes import random_case
 from clsplat.density.control import densify
 from clsplat.density.edit import Edit, Rule, SceneScale
 from clsplat.density.statistics import SplatStats
@@ -18,9 +20,7 @@ from clsplat.settings import variants
 from clsplat.stages.base import Stage
 from clsplat.training.adam import Adam
 from clsplat.views.transforms import PhotographTransform
-from tests import reference as ref
 from tests.kernels.test_blur import colours_of, planes_of
-from tests.scenes import random_case
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 SIZES = (1, 15, 16, 17, 63, 64, 65, 150)  # around the sizes of vectors and groups

@@ -20,11 +20,11 @@ from typer.testing import CliRunner
 
 import clsplat
 from clsplat import cli
+from clsplat.conformance.scenes import random_case
 from clsplat.density.edit import Edit, SceneScale
 from clsplat.density.statistics import SplatStats
 from clsplat.pipeline.loading import load
 from tests.html_page import Page
-from tests.scenes import random_case
 
 pytestmark = pytest.mark.slow
 

@@ -6,19 +6,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from clsplat.conformance.reference import filtered
+from clsplat.conformance.scenes import random_case, with_world_filter
 from clsplat.errors import Interrupted
 from clsplat.gaussians.model import Model
 from clsplat.gaussians.ply import read_ply, write_ply
 from clsplat.gaussians.tables import PARAMETERS
 from clsplat.metrics.views import render_view
 from clsplat.pipeline.loading import load
-from clsplat.runs import runner
+from clsplat.runs import folders, opening, runner
 from clsplat.runs.model_file import ModelFile
 from clsplat.training.run import Progress, Run
 from clsplat.views.order import Code
 from clsplat.views.sampling import Sampler, ViewSettings
-from tests.reference_filter import filtered
-from tests.scenes import random_case, with_world_filter
 from tests.test_training import digest, train
 
 pytestmark = pytest.mark.slow
@@ -30,7 +30,7 @@ MIP = (
     "optimize.raise_sh.every=5",
     "optimize.densify.start=5",
 )
-LEVELS = ("scene.levels=3", "optimize.views.order=code", "evaluate.scales=[1, 2, 4]")
+LEVELS = ("scene.levels=3", "optimize.views.order=code", "evaluate.downscales=[1, 2, 4]")
 
 
 @pytest.fixture(scope="module")
@@ -66,10 +66,10 @@ def test_the_filter_follows_and_then_stays(finished):
 def test_the_same_bits_and_the_same_after_an_interruption(finished, tiny_scene, pipeline, tmp_path):
     """Stopped just after a density edit and just after a refresh."""
     checked = load(pipeline, [f"scene.path='{tiny_scene}'", *MIP, *LEVELS])
-    runner.make_run_folder(tmp_path, resume=False)
+    folders.make_run_folder(tmp_path, resume=False)
     stops = [21, 33]
     while stops:
-        run = runner.open_run(checked, tmp_path, None)
+        run = opening.open_run(checked, tmp_path, None)
         stop_at = stops.pop(0)
 
         def stop(progress: Progress, run: Run = run, stop_at: int = stop_at) -> None:
@@ -86,13 +86,15 @@ def test_metrics_of_every_scale(finished):
     metrics = json.loads((finished.out / "metrics.json").read_text())
     assert list(metrics["test"]) == ["1", "2", "4"]
     lines = [json.loads(line) for line in (finished.out / "metrics.jsonl").read_text().splitlines()]
-    for scale in ("1", "2", "4"):
+    for downscale in ("1", "2", "4"):
         last = [
-            line for line in lines if line["kind"] == "view" and line["step"] == 50 and line["scale"] == float(scale)
+            line
+            for line in lines
+            if line["kind"] == "view" and line["step"] == 50 and line["downscale"] == float(downscale)
         ]
         views = {line["view"]: line["psnr"] for line in last}
-        assert len(views) == metrics["test"][scale]["views"] == 2
-        assert np.mean(list(views.values())) == pytest.approx(metrics["test"][scale]["psnr"])
+        assert len(views) == metrics["test"][downscale]["views"] == 2
+        assert np.mean(list(views.values())) == pytest.approx(metrics["test"][downscale]["psnr"])
 
 
 def test_training_saw_every_level(finished):
@@ -103,7 +105,7 @@ def test_training_saw_every_level(finished):
 
 def test_zooming_in(tiny_scene, tmp_path):
     """Trained at 1/4, tested up to the full size; factors are those of the photographs."""
-    run = train(tiny_scene, tmp_path, "scene.downscale=4", "evaluate.scales=[4, 2, 1]", "optimize.steps=5")
+    run = train(tiny_scene, tmp_path, "scene.downscale=4", "evaluate.downscales=[4, 2, 1]", "optimize.steps=5")
     assert run.scene.views[0].camera.width == 10
     assert list(run.metrics["test"]) == ["4", "2", "1"]
     default = train(tiny_scene, tmp_path / "default", "scene.downscale=4", "optimize.steps=5")

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from clsplat.errors import DataError
-from clsplat.scene.image_headers import Header, read_header
-from clsplat.scene.images import image_size
+from clsplat.scene.image_headers import Header
+from clsplat.scene.images import image_size, read_header
 from tests.data_sets import data_set
 
 

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from clsplat.errors import OutputError
-from clsplat.scene.images import image_size, write_image
+from clsplat.scene.images import image_size, require_files, write_image
 from clsplat.scene.scene import Camera, View
 from clsplat.scene.view import load_image
 from tests.data_sets import data_set
@@ -199,3 +199,10 @@ def test_write_below_a_file(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(OutputError):
         write_image(tmp_path / "file" / "a.png", random(2, 2, 3))
+
+
+def test_missing_files_are_named_at_a_readable_length(tmp_path):
+    names = [tmp_path / f"{'a' * 5000}{number}.png" for number in range(5)]
+    message = refusal(require_files, tmp_path, names)
+    assert "5 of 5 image files are missing" in message
+    assert len(message) < 1000

@@ -160,7 +160,19 @@ def test_larger_images_of_the_same_shape_are_allowed(tmp_path):
 
 def test_an_unreadable_image(scene):
     (scene / "images" / "05.png").write_bytes(b"\x89PNG\r\n\x1a\nnot really")
-    assert "1 image file cannot be read (05.png)" in said(Inspection.of(scene), "error")
+    assert "1 image file cannot be decoded (05.png)" in said(Inspection.of(scene), "error")
+
+
+def test_a_test_view_whose_pixels_are_damaged(scene):
+    file = scene / "images" / "08.png"
+    content = bytearray(file.read_bytes())
+    content[len(content) // 2] ^= 255  # headers and end stay as they are
+    file.write_bytes(content)
+    inspection = Inspection.of(scene)
+    assert "08.png" in {view.name for view in read_scene(scene).split("test")}
+    assert inspection.verdict == "cannot train: 1 image file cannot be decoded (08.png)"
+    done = clsplat("inspect", scene, expect=3)
+    assert "1 image file cannot be decoded (08.png): copy or export them again" in done.stdout
 
 
 def test_a_pose_that_is_not_finite_in_a_text_model(tmp_path):
@@ -227,7 +239,7 @@ def test_trainable_is_what_the_readers_can_read(tmp_path_factory, kind: str, dat
         for view in read_scene(path).views:
             load_image(view)
     except DataError:
-        assert not inspection.trainable or file.suffix == ".jpg"  # whose pixels are not decoded
+        assert not inspection.trainable
     else:
         assert inspection.trainable, inspection.verdict
 
@@ -347,7 +359,7 @@ def test_a_cut_image_and_one_on_its_side(tmp_path):
     (path / "images" / "05.jpg").write_bytes(whole[: len(whole) // 2])
     (path / "images" / "06.jpg").write_bytes(with_exif(whole, ">", 6))
     inspection = Inspection.of(path)
-    assert "the end is missing from 1 image file (05.jpg)" in said(inspection, "warning")
+    assert "the end is missing from 1 image file (05.jpg): copy" in said(inspection, "error")
     assert "1 photograph is rotated by the EXIF data" in said(inspection, "note")
 
 
@@ -371,7 +383,7 @@ def test_masks(scene):
     with pytest.raises(DataError):
         load_mask(read_scene(scene).views[1])
     (scene / "masks" / "01.png").write_bytes(b"no image")
-    assert "1 image file cannot be read (mask of 01.png)" in said(Inspection.of(scene), "error")
+    assert "1 image file cannot be decoded (mask of 01.png)" in said(Inspection.of(scene), "error")
 
 
 def test_few_views(tmp_path):

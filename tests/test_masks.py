@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
+from clsplat.conformance import reference as ref
 from clsplat.metrics.images import psnr
 from clsplat.metrics.perceptual import ssim_map
 from clsplat.scene.detect import read_scene
@@ -17,7 +18,6 @@ from clsplat.scene.lens import Lens
 from clsplat.scene.photographs import load_photograph
 from clsplat.scene.scene import Camera, View
 from clsplat.scene.view import load_image, load_mask
-from tests import reference_loss as ref_loss
 from tests.data_sets import data_set
 from tests.refusals import refusal
 from tests.test_training import digest, train
@@ -121,7 +121,7 @@ def test_figures_are_means_over_what_counts(rng):
     mask = rng.random((30, 40)) < 0.7
     error = ((image.astype(float) - photograph)[mask] ** 2).mean() / 255**2
     assert psnr(image, photograph, mask) == pytest.approx(-10 * np.log10(error))
-    expected = ref_loss.ssim_map(image.transpose(2, 0, 1) / 255, photograph.transpose(2, 0, 1) / 255)
+    expected = ref.ssim_map(image.transpose(2, 0, 1) / 255, photograph.transpose(2, 0, 1) / 255)
     np.testing.assert_allclose(ssim_map(image, photograph).transpose(2, 0, 1), expected, atol=1e-12)
 
 

@@ -105,11 +105,11 @@ def test_short_keys_are_told_apart(write):
 
 
 def test_values_that_are_lists_or_text(write):
-    text = "name: s\nmatrix: {set: {evaluate.scales: [[1], [1, 2]], init.source: [auto, random]}}\n" + STAGES
+    text = "name: s\nmatrix: {set: {evaluate.downscales: [[1], [1, 2]], init.source: [auto, random]}}\n" + STAGES
     found = load_experiment(write(text))
-    assert names(found)[:2] == ["scales=1-source=auto", "scales=1-source=random"]
-    assert names(found)[3] == "scales=1+2-source=random"
-    assert found.cells[3].pipeline.settings.stages[2].scales == [1, 2]
+    assert names(found)[:2] == ["downscales=1-source=auto", "downscales=1-source=random"]
+    assert names(found)[3] == "downscales=1+2-source=random"
+    assert found.cells[3].pipeline.settings.stages[2].downscales == [1, 2]
 
 
 def test_options_reach_every_cell(write):
@@ -275,14 +275,18 @@ def test_a_matrix_ends_in_a_status_whatever_happens(finished, tmp_path, monkeypa
 
 
 def test_an_interrupt_stops_the_whole(finished, tmp_path, monkeypatch):
+    cells = []
+
     def interrupted(pipeline, run, resume, show):
+        cells.append(run.out)
         raise Interrupted("stopped at step 2")
 
     monkeypatch.setattr(runner, "execute", interrupted)
     with pytest.raises(Interrupted):
         experiment.run_matrix(load_experiment(finished[0]), tmp_path / "run", None, resume=False)
     assert json.loads((tmp_path / "run" / "status.json").read_text())["state"] == "interrupted"
-    assert len(list((tmp_path / "run").glob("*/log.txt"))) == 1
+    assert len(cells) == 1
+    assert not cells[0].exists(), "it had not begun"
     assert not (tmp_path / "run" / "compare.html").exists()
 
 
@@ -310,5 +314,6 @@ def test_check_and_dry_run_list_the_cells(finished, tmp_path):
     assert "would run 4 cells" in done.stdout
     assert re.findall(r"^  (\S+)$", done.stdout, re.MULTILINE) == names(load_experiment(finished[0]))
     assert not (tmp_path / "new").exists()
-    done = clsplat("run", finished[0], "--out", finished[1], "--dry-run")
+    assert "already holds a run" in clsplat("run", finished[0], "--out", finished[1], "--dry-run", expect=2).stderr
+    done = clsplat("run", finished[0], "--out", finished[1], "--resume", "--dry-run")
     assert done.stdout.count("  done") == 4

@@ -2,10 +2,11 @@
 
 import pytest
 
+from clsplat.conformance.scenes import random_case
 from clsplat.errors import MemoryLimitError
 from clsplat.gaussians.tables import Gradients
-from clsplat.training.memory import FRAME_GAUSSIAN, MemoryPlan, plan
-from tests.scenes import random_case
+from clsplat.training import memory
+from clsplat.training.memory import FRAME_GAUSSIAN, MemoryPlan
 from tests.test_cli import clsplat
 from tests.test_training import train
 
@@ -15,6 +16,9 @@ SMALL = MemoryPlan(
 
 
 def test_bytes_come_from_the_tables(device, rng):
+    def plan(gaussians, *numbers, **more):
+        return memory.plan(device.info, gaussians.components, *numbers, **more)
+
     gaussians = random_case(rng, 100).model(device).gaussians
     parameters = 4 * (3 + 4 + 3 + 1 + 3 + 45 + 1)  # with the filter's variance
     gradients = Gradients(gaussians)
@@ -44,6 +48,35 @@ def test_training_that_cannot_fit_is_refused_before_it_starts(tiny_scene, tmp_pa
     monkeypatch.setattr("clsplat.training.run.plan", lambda *_: SMALL)
     with pytest.raises(MemoryLimitError):
         train(tiny_scene, tmp_path / "run", "init.source=random", "init.count=80000")
+
+
+@pytest.mark.parametrize("count", [5 * 10**7, 10**18])
+def test_random_points_beyond_the_memory_are_not_made(count, tiny_scene, tmp_path, monkeypatch):
+    def made(*_):
+        raise AssertionError("random points are made")
+
+    monkeypatch.setattr("clsplat.stages.init.random_points", made)
+    with pytest.raises(MemoryLimitError, match=f"for {count:,} Gaussians .* start from fewer points"):
+        train(tiny_scene, tmp_path / "run", "init.source=random", f"init.count={count}")
+
+
+def test_points_beyond_the_memory_have_no_neighbours_looked_for(tiny_scene, tmp_path, monkeypatch):
+    def looked_for(*_):
+        raise AssertionError("neighbours are looked for")
+
+    monkeypatch.setattr("clsplat.stages.init.neighbour_distance2", looked_for)
+    tight = MemoryPlan(gaussian=1000, pair=0, fixed=0, largest_table=1, memory=9000, allocation=10**9)
+    monkeypatch.setattr("clsplat.training.run.plan", lambda *_: tight)
+    with pytest.raises(MemoryLimitError):
+        train(tiny_scene, tmp_path / "run")
+
+
+def test_the_first_plan_has_the_tables_that_training_adds(tiny_scene, tmp_path):
+    run = train(tiny_scene, tmp_path / "run", "optimize.steps=1")
+    present = run.model.gaussians.components
+    first = memory.first_tables(run.model_settings.sh_degree)
+    assert first == {name: present[name] for name in first}
+    assert run.memory_plan(first).limit >= run.memory_plan().limit
 
 
 def test_growth_stops_where_memory_ends(tiny_scene, tmp_path, monkeypatch):

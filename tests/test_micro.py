@@ -6,10 +6,10 @@ import re
 import numpy as np
 import pytest
 
+from clsplat.conformance.scenes import random_case
 from clsplat.gaussians.ply import read_ply
 from clsplat.metrics.distribution import SHARES, distribution
 from clsplat.pages.svg import Line, curve
-from tests.scenes import random_case
 from tests.test_training import train
 
 pytestmark = pytest.mark.slow

@@ -7,13 +7,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from clsplat.api.renderer import Renderer
+from clsplat.conformance.reference import sh_basis
+from clsplat.conformance.scenes import Case, random_case, with_world_filter
 from clsplat.errors import OutputError
 from clsplat.gaussians.model import Model, Rendering, load
 from clsplat.gaussians.sh import basis, rotated_sh
 from clsplat.scene.view import View
 from tests.html_page import HOSTILE, Page
-from tests.reference import sh_basis
-from tests.scenes import Case, random_case, with_world_filter
 
 WIDTHS = {0: 0, 1: 9, 2: 24, 3: 45}  # of sh_rest, by degree
 

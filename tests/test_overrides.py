@@ -41,7 +41,7 @@ REFUSED = {
     "optimize.stps=5": "unknown key 'stps'; did you mean 'steps'?",
     "seed=-1": "expected a value of at least 0, got -1",
     "scene.levels=20": "expected a value of at most 8, got 20",
-    "evaluate.scales=[1,a]": "stages[2].evaluate.scales[1]: expected a number, got 'a'",
+    "evaluate.downscales=[1,a]": "stages[2].evaluate.downscales[1]: expected a number, got 'a'",
     "model.screen_filter.type=dilate": "no screen filter named 'dilate'; did you mean 'dilation'?",
     "optimize.every=3": "unknown key 'every'; did you mean 'log_every'?",
     "export.every=3": "stages[3] export: 'every' belongs inside optimize.during",
@@ -97,6 +97,11 @@ def test_an_error_of_set_blames_set_alone(override):
     assert REFUSED[override] in message
     assert ".yaml" not in message
     assert "\n" not in message
+
+
+def test_a_place_has_no_thousand_parts():
+    with pytest.raises(OverrideError, match=r"expected stage\.key=value"):
+        load("smoke", ["optimize." + "x." * 1000 + "y=1"])
 
 
 def test_long_values_are_shortened():

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from clsplat.conformance import reference as ref
 from clsplat.errors import ConfigError, DataError
 from clsplat.metrics.lpips import Lpips
 from clsplat.metrics.perceptual import Perceptual, flip, metric_names, ms_ssim, ms_ssim_scales
 from clsplat.stages.evaluate import Evaluate
-from tests import reference_loss as ref_loss
 from tests.onnx_writer import distance_network
 
 
@@ -32,7 +32,7 @@ def test_ms_ssim_is_the_oracles(rng, height, width, scales):
     image, photograph = images(rng, height, width)
     assert ms_ssim_scales(image) == scales
     x, y = (pixels.astype(np.float64).transpose(2, 0, 1) / 255 for pixels in (image, photograph))
-    assert ms_ssim(image, photograph) == pytest.approx(ref_loss.ms_ssim(x, y, scales), rel=1e-12)
+    assert ms_ssim(image, photograph) == pytest.approx(ref.ms_ssim(x, y, scales), rel=1e-12)
     assert 0 < ms_ssim(image, photograph) < 1
 
 

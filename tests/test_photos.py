@@ -1,6 +1,8 @@
 """Structure from motion on real photographs, against the poses they came with; and photographs that need care."""
 
 import shutil
+import sqlite3
+from contextlib import closing
 from pathlib import Path
 
 import cv2
@@ -12,6 +14,8 @@ from clsplat.scene.detect import read_scene
 from clsplat.scene.lens import Lens
 from clsplat.scene.scene import Camera, View
 from clsplat.scene.view import load_image, load_mask
+from data_tools import photos as photos_tool
+from data_tools import undistort as undistort_tool
 from data_tools.colmap_writer import write_model
 from data_tools.gather import list_photographs
 from data_tools.photos import find_features, map_cameras, match_features
@@ -21,6 +25,7 @@ from tests.colmap_writer import CameraEntry, ColmapModel, ImageEntry, PointEntry
 from tests.colmap_writer import write_model as write_test_model
 from tests.data_sets import data_set
 from tests.refusals import refusal
+from tests.test_data_tools import contents
 from tests.test_masks import with_orientation
 
 
@@ -86,6 +91,152 @@ def test_photographs_that_show_nothing(tmp_path):
         cv2.imwrite(str(tmp_path / f"{i}.png"), np.full((64, 64, 3), 80, np.uint8))
     with pytest.raises(DataError, match="no two of the 3 photographs show the same features"):
         place(tmp_path, tmp_path / "out")
+
+
+# ---- interrupted and gone on with
+
+
+def rows(database: Path) -> dict[str, list[tuple]]:
+    """All tables of a database.  The layout of its file depends on when it was written; its rows do not."""
+    with closing(sqlite3.connect(database)) as opened:
+        names = [name for (name,) in opened.execute("select name from sqlite_master where type = 'table'")]
+        return {name: sorted(opened.execute(f"select * from {name}").fetchall(), key=repr) for name in names}
+
+
+@pytest.fixture(scope="module")
+def few(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Five of the photographs, one of them turned by EXIF."""
+    folder = tmp_path_factory.mktemp("few")
+    for file in sorted(photos.iterdir())[:5]:
+        shutil.copy(file, folder)
+    file = sorted(folder.iterdir())[2]
+    with_orientation(file, cv2.imread(str(file)), 6)
+    return folder
+
+
+def test_features_are_found_once_for_each_photograph(few, tmp_path, monkeypatch):
+    pycolmap = pytest.importorskip("pycolmap")
+    monkeypatch.setattr(photos_tool, "CHUNK", 2)
+    for name in ("whole", "half"):
+        (tmp_path / name).mkdir()
+    find_features(few, tmp_path / "whole", long_side=320, features=500)
+    asked: list[str] = []
+    extract = pycolmap.extract_features
+
+    def killed(database: str, images: str, names: list[str], **options: object) -> None:
+        if asked:
+            raise KeyboardInterrupt
+        asked.extend(names)
+        extract(database, images, names, **options)
+
+    monkeypatch.setattr(pycolmap, "extract_features", killed)
+    with pytest.raises(KeyboardInterrupt):
+        find_features(few, tmp_path / "half", long_side=320, features=500)
+
+    def counted(database: str, images: str, names: list[str], **options: object) -> None:
+        asked.extend(names)
+        extract(database, images, names, **options)
+
+    monkeypatch.setattr(pycolmap, "extract_features", counted)
+    find_features(few, tmp_path / "half", long_side=320, features=500)
+    assert asked == sorted(path.name for path in few.iterdir())
+    assert rows(tmp_path / "half" / "database.db") == rows(tmp_path / "whole" / "database.db")
+    for file in sorted((tmp_path / "whole" / "images").iterdir()):
+        assert (tmp_path / "half" / "images" / file.name).read_bytes() == file.read_bytes()
+
+
+def test_a_database_without_all_photographs_starts_again(few, tmp_path):
+    pycolmap = pytest.importorskip("pycolmap")
+    for name in ("whole", "half"):
+        (tmp_path / name).mkdir()
+    find_features(few, tmp_path / "whole", long_side=320, features=500)
+    first = sorted(path.name for path in few.iterdir())[:2]
+    (tmp_path / "half" / "images").mkdir()
+    for name in first:
+        shutil.copy(few / name, tmp_path / "half" / "images")
+    database = str(tmp_path / "half" / "database.db")
+    pycolmap.Database.open(database).close()
+    pycolmap.import_images(database, str(few), image_names=first)
+    find_features(few, tmp_path / "half", long_side=320, features=500)
+    assert rows(tmp_path / "half" / "database.db") == rows(tmp_path / "whole" / "database.db")
+
+
+def test_pairs_are_matched_once(photos, placed, tmp_path):
+    pycolmap = pytest.importorskip("pycolmap")
+    source, whole = placed.parent / "features", placed.parent / "matches"
+    half = tmp_path / "half"
+    half.mkdir()
+    shutil.copy(source / "database.db", half)
+    names = sorted(path.name for path in photos.iterdir())
+    pairs = tmp_path / "pairs.txt"
+    pairs.write_text("".join(f"{names[0]} {other}\n" for other in names[1:]))
+    options, verification = pycolmap.FeatureMatchingOptions(), pycolmap.TwoViewGeometryOptions()
+    options.use_gpu, verification.ransac.random_seed = False, 0
+    pairing = pycolmap.ImportedPairingOptions()
+    pairing.match_list_path = pairs
+    pycolmap.match_image_pairs(
+        str(half / "database.db"),
+        pairing_options=pairing,
+        matching_options=options,
+        verification_options=verification,
+        device=pycolmap.Device.cpu,
+    )
+    with closing(sqlite3.connect(half / "database.db")) as opened:
+        opened.execute("create table counted (pair)")
+        opened.execute("create trigger counts after insert on matches begin insert into counted values (1); end")
+        opened.commit()
+    match_features(source, half)
+    found = rows(half / "database.db")
+    assert len(found.pop("counted")) == 14 * 13 // 2 - 13
+    assert found == rows(whole / "database.db")
+    (tmp_path / "cameras").mkdir()
+    map_cameras(half, tmp_path / "cameras")
+    for name in ("cameras.bin", "images.bin", "points3D.bin"):
+        assert (tmp_path / "cameras" / "sparse" / "0" / name).read_bytes() == (
+            placed / "sparse" / "0" / name
+        ).read_bytes()
+
+
+@pytest.mark.parametrize("blank", ["crop", "mask"])
+def test_undistortion_goes_on(tmp_path, monkeypatch, blank):
+    source, written = shutil.copytree(data_set("fox_opencv"), tmp_path / "source"), []
+    write = undistort_tool.write_image
+
+    def counted(path: Path, pixels: np.ndarray) -> None:
+        if path.parent.name == "images":
+            if len(written) == 7:
+                raise KeyboardInterrupt
+            written.append(path.name)
+        write(path, pixels)
+
+    undistort_scene(source, tmp_path / "whole", 120, blank)
+    monkeypatch.setattr(undistort_tool, "write_image", counted)
+    with pytest.raises(KeyboardInterrupt):
+        undistort_scene(source, tmp_path / "half", 120, blank)
+    first = list(written)
+    written.clear()
+    monkeypatch.setattr(undistort_tool, "write_image", lambda path, image: (written.append(path), write(path, image)))
+    undistort_scene(source, tmp_path / "half", 120, blank)
+    again = [path.name for path in written if path.parent.name == "images"]
+    assert sorted(first + again) == sorted(path.name for path in (tmp_path / "half" / "images").iterdir())
+    assert contents(tmp_path / "half") == contents(tmp_path / "whole")
+    changed = sorted((source / "images").iterdir())[0]
+    shutil.copy(sorted((source / "images").iterdir())[1], changed)
+    written.clear()
+    undistort_scene(source, tmp_path / "half", 120, blank)
+    assert {path.stem for path in written} == {changed.stem}
+    written.clear()
+    undistort_scene(source, tmp_path / "half", 90, blank)
+    assert len([path for path in written if path.parent.name == "images"]) == 50
+
+
+def test_undistorted_images_do_not_mix_with_others(tmp_path):
+    source = data_set("fox_opencv")
+    name = f"{sorted((source / 'images').iterdir())[3].stem}.png"
+    (tmp_path / "images").mkdir()
+    cv2.imwrite(str(tmp_path / "images" / name), np.zeros((4, 4, 3), np.uint8))
+    assert "exists, and was not made from this scene" in refusal(undistort_scene, source, tmp_path)
+    assert [path.name for path in tmp_path.rglob("*")] == ["images", name]
 
 
 # ---- which photographs

@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 
+from clsplat.conformance.scenes import random_case
 from clsplat.errors import DataError, OutputError
+from clsplat.gaussians.model import Rendering, load
 from clsplat.gaussians.ply import read_ply, write_ply
 from clsplat.gaussians.tables import PARAMETERS
 from tests.data_sets import data_set
-from tests.scenes import random_case
 
 
 def parameters(rng, count=20, degree=3):
@@ -103,6 +104,10 @@ def test_refusals(tmp_path, rng):
     good = tmp_path / "good.ply"
     write_ply(good, parameters(rng), {})
     data = good.read_bytes()
+
+    def commented(text):
+        return data.replace(b"comment clsplat {}", b"comment clsplat " + text)
+
     broken = {
         "truncated": (data[:-10], "truncated"),
         "header only": (data[:200], "not a PLY"),
@@ -115,6 +120,15 @@ def test_refusals(tmp_path, rng):
         "no vertices": (data.replace(b"element vertex", b"element point"), "no vertices"),
         "lists": (data.replace(b"property float nx", b"property list uchar int nx"), "cannot read"),
         "twice": (data.replace(b"property float nx", b"property float ny"), "twice"),
+        "f_rest from 1 on": (data.replace(b"f_rest_0\n", b"f_rest_45\n"), "45 f_rest.*numbered from 0"),
+        "count of many digits": (data.replace(b"vertex 20", b"vertex " + b"9" * 5000), "line 5: cannot read"),
+        "no count": (data.replace(b"element vertex 20", b"element vertex"), "line 5: cannot read"),
+        "nothing after element": (data.replace(b"element vertex 20", b"element"), "line 5: cannot read"),
+        "near of 400 digits": (commented(b'{"near": ' + b"9" * 400 + b"}"), "near = a number of 1329 bits; expected"),
+        "near below 0": (commented(b'{"near": -1}'), "near = -1; expected"),
+        "near that is no number": (commented(b'{"near": NaN}'), "near = nan; expected"),
+        "near that is text": (commented(b'{"near": "x"}'), "near = 'x'; expected"),
+        "variance that is endless": (commented(b'{"screen_variance": 1e999}'), "screen_variance = inf; expected"),
     }
     nan = bytearray(data)
     nan[data.index(b"end_header\n") + 11 : data.index(b"end_header\n") + 15] = np.float32(np.nan).tobytes()
@@ -128,6 +142,35 @@ def test_refusals(tmp_path, rng):
         assert "\n" not in str(error.value)
     with pytest.raises(DataError, match="cannot be read"):
         read_ply(tmp_path / "missing.ply")
+
+
+@pytest.mark.parametrize("text", [b"[" * 50_000, b'{"background": ["x"]}', b'{"near": null}', b"[1]", b"was here"])
+def test_a_comment_that_says_nothing_about_rendering_is_passed_over(text, tmp_path, rng):
+    path = tmp_path / "model.ply"
+    write_ply(path, parameters(rng), {})
+    path.write_bytes(path.read_bytes().replace(b"comment clsplat {}", b"comment clsplat " + text))
+    assert load(path).rendering.near == Rendering().near
+    assert load(path).rendering.background is None
+
+
+def test_a_filter_whose_square_is_beyond_floats_is_refused_without_a_warning(tmp_path, rng, recwarn):
+    write_ply(tmp_path / "a.ply", parameters(rng) | {"filter_variance": np.ones((20, 1), np.float32)}, {})
+    data = (tmp_path / "a.ply").read_bytes()
+    (tmp_path / "a.ply").write_bytes(data[:-4] + np.float32(1e30).tobytes())
+    with pytest.raises(DataError, match="filter_variance hold values that are not finite"):
+        read_ply(tmp_path / "a.ply")
+    assert not recwarn.list
+
+
+def test_doubles_beyond_floats_are_refused_without_a_warning(tmp_path, recwarn):
+    names = [*"xyz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", *(f"scale_{i}" for i in range(3))]
+    names += [f"rot_{i}" for i in range(4)]
+    header = ["ply", "format binary_little_endian 1.0", "element vertex 1", *(f"property double {n}" for n in names)]
+    path = tmp_path / "model.ply"
+    path.write_bytes("\n".join([*header, "end_header", ""]).encode() + np.full(len(names), 1e300).tobytes())
+    with pytest.raises(DataError, match="not finite"):
+        read_ply(path)
+    assert not recwarn.list
 
 
 def test_writing_is_all_or_nothing(tmp_path, rng):

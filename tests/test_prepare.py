@@ -9,13 +9,13 @@ import pytest
 from typer.testing import CliRunner
 
 from clsplat import cli
-from clsplat.errors import ConfigError, DataError
+from clsplat.errors import ConfigError, DataError, OutputError
 from clsplat.pipeline.loading import load
 from clsplat.prepare import steps as prepare_steps
 from clsplat.prepare.cache import fingerprint, plan, prepare
 from clsplat.prepare.place import place_photographs
 from clsplat.prepare.steps import Step
-from clsplat.runs import runner
+from clsplat.runs import folders, lock, opening, runner
 from clsplat.settings import Settings
 from tests.refusals import refusal
 
@@ -109,6 +109,62 @@ def test_what_a_killed_run_left_is_removed(photos, tmp_path):
     assert not (folder / "half.txt").exists()
 
 
+class Slow(Copy):
+    """Writes a file for each of five photographs, and goes on with those that are there."""
+
+    resumes: ClassVar[bool] = True
+    stage: Literal["slow"] = "slow"
+    stop_at: ClassVar[int] = 5
+    error: ClassVar[BaseException] = KeyboardInterrupt()
+
+    def make(self, source: Path, out: Path, without: Path) -> dict[str, Any]:
+        for i in range(5):
+            if i == self.stop_at:
+                raise self.error
+            if not (out / f"{i}.txt").exists():
+                self.calls.append(str(i))
+                (out / f"{i}.txt").write_text(self.letter)
+        return {}
+
+
+Settings.defined.remove(Slow)
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(28, "No space left on device"), RuntimeError("defect")])
+def test_a_step_that_resumes_keeps_what_an_interrupted_call_made(photos, tmp_path, monkeypatch, error):
+    root, steps = tmp_path / "runs" / "prepared", [Slow()]
+    monkeypatch.setattr(Slow, "stop_at", 3)
+    monkeypatch.setattr(Slow, "error", error)
+    with pytest.raises((type(error), OutputError)):
+        prepare(plan(steps, photos, root), photos, root)
+    (half,) = root.iterdir()
+    assert half.name[0] == "."
+    (half / ".3.txt.99999999-0.partial").write_text("what a killed process was writing")
+    monkeypatch.setattr(Slow, "stop_at", 5)
+    folder = prepare(plan(steps, photos, root), photos, root)
+    assert Slow.calls == ["0", "1", "2", "3", "4"]
+    assert sorted(path.name for path in folder.iterdir()) == [*(f"{i}.txt" for i in range(5)), "record.json"]
+    assert [path.name for path in root.iterdir()] == [folder.name]
+
+
+def test_what_was_made_of_other_photographs_is_not_gone_on_with(photos, tmp_path, monkeypatch):
+    root = tmp_path / "runs" / "prepared"
+    for letter, text in (("a", "p"), ("b", "p"), ("a", "q")):
+        (photos / "p.txt").write_text(text)
+        monkeypatch.setattr(Slow, "stop_at", 2)
+        with pytest.raises(KeyboardInterrupt):
+            prepare(plan([Slow(letter=letter)], photos, root), photos, root)
+    assert Slow.calls == ["0", "1"] * 3
+
+
+def test_a_step_that_refuses_its_photographs_leaves_nothing(photos, tmp_path, monkeypatch):
+    root = tmp_path / "runs" / "prepared"
+    monkeypatch.setattr(Slow, "stop_at", 2)
+    monkeypatch.setattr(Slow, "error", DataError("broken"))
+    assert refusal(prepare, plan([Slow()], photos, root), photos, root) == "broken"
+    assert list(root.iterdir()) == []
+
+
 def test_runs_inside_the_folder_of_photographs_do_not_count(photos, tmp_path):
     root, steps = photos / "runs" / "prepared", [Copy(letter="a")]
     before = fingerprint(photos, photos / "runs")
@@ -132,6 +188,7 @@ def pipeline(photos: Path, tiny_scene: Path, tmp_path: Path, monkeypatch: pytest
     file = tmp_path / "p.yaml"
     file.write_text(text.replace("stages:", "prepare:\n  - find_features: {long_side: 99}\nstages:", 1))
     monkeypatch.setattr(prepare_steps.FindFeatures, "make", make)
+    monkeypatch.setattr(prepare_steps.FindFeatures, "check", lambda step, source, without: None)
     monkeypatch.chdir(tmp_path)
     return file
 
@@ -171,11 +228,32 @@ def test_a_changed_setting_is_another_run(pipeline, photos, tmp_path):
 def test_a_run_does_not_go_on_with_other_photographs(pipeline, photos, tmp_path):
     checked = load(str(pipeline), [f"scene.path='{photos}'", "optimize.steps=3"])
     out = tmp_path / "runs" / "a"
-    runner.make_run_folder(out, False)
-    runner.execute(checked, runner.open_run(checked, out, None), False, lambda progress: None)
+    folders.make_run_folder(out, False)
+    runner.execute(checked, opening.open_run(checked, out, None), False, lambda progress: None)
     (photos / "p.txt").write_text("other")
     with pytest.raises(ConfigError, match="other photographs"):
-        runner.open_run(checked, out, None)
+        opening.open_run(checked, out, None)
+
+
+def test_one_process_prepares_at_a_time(pipeline, photos, tmp_path):
+    checked = load(str(pipeline), [f"scene.path='{photos}'", "optimize.steps=3"])
+    (tmp_path / "runs" / "prepared").mkdir(parents=True)
+    with (
+        lock.held(tmp_path / "runs" / "prepared"),
+        pytest.raises(OutputError, match="prepared: is in use by this process"),
+    ):
+        opening.open_run(checked, tmp_path / "runs" / "a", None)
+    opening.open_run(checked, tmp_path / "runs" / "a", None)
+    with lock.held(tmp_path / "runs" / "prepared"):  # where nothing must be prepared, nobody waits
+        opening.open_run(checked, tmp_path / "runs" / "b", None)
+
+
+def test_a_restarted_run_may_have_other_photographs(pipeline, photos, tmp_path):
+    words = ["run", str(pipeline), "--scene", str(photos), "--set", "optimize.steps=3", "--out", "runs/a"]
+    assert clsplat(*words)[0] == 0
+    (photos / "p.txt").write_text("other")
+    assert "find_features  its input has changed" in clsplat(*words, "--restart", "--dry-run")[1]
+    assert clsplat(*words, "--restart")[0] == 0
 
 
 def test_a_folder_with_cameras_is_not_a_folder_of_photographs(tiny_scene, tmp_path):

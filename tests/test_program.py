@@ -3,6 +3,7 @@
 import pytest
 
 from clsplat.errors import KernelError
+from clsplat.opencl.program import Program
 
 
 def test_a_missing_kernel_file_is_named(device, tmp_path):
@@ -15,3 +16,15 @@ def test_a_kernel_without_a_group_size_is_refused_with_the_form_expected(device,
     file.write_text("kernel void fade(global float *x) { x[0] = 1; }\n")
     with pytest.raises(KernelError, match=r"own\.cl: cannot read the head of fade; expected .*reqd_work_group_size"):
         device.program(file)
+
+
+def test_a_warning_stops_tests_and_no_user(device, tmp_path, monkeypatch):
+    file = tmp_path / "own.cl"
+    file.write_text(
+        "#warning this driver says something\n"
+        "__kernel __attribute__((reqd_work_group_size(1, 1, 1)))\nvoid own(__global float *restrict x) { x[0] = 1; }\n"
+    )
+    with pytest.raises(KernelError, match="this driver says something"):
+        device.program(file)
+    monkeypatch.setattr(Program, "options", Program.options[:-1])
+    assert device.program(file).kernels

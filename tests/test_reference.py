@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 from skimage.metrics import structural_similarity
 
-from tests import reference as ref
-from tests import reference_blend as blending
-from tests import reference_loss as loss
+from clsplat.conformance import reference as ref
 
 WIDTH, HEIGHT = 40, 30
 BACKGROUND = np.array([0.2, 0.5, 0.9])
@@ -115,12 +113,12 @@ def check_chain(rng, gaussians: ref.Gaussians, camera: ref.Camera, degree: int, 
 
     def value() -> float:
         return np.sum(
-            weights * blending.render(gaussians, camera, BACKGROUND, degree, thresholds=ref.SMOOTH, **screen).image
+            weights * ref.render(gaussians, camera, BACKGROUND, degree, thresholds=ref.SMOOTH, **screen).image
         )
 
     splats = ref.project(gaussians, camera, degree, thresholds=ref.SMOOTH, **screen)
     assert splats.visible.all()
-    analytic, _ = blending.render_backward(
+    analytic, _ = ref.render_backward(
         gaussians, camera, BACKGROUND, degree, splats, weights, thresholds=ref.SMOOTH, **screen
     )
     check_gradients(analytic, gaussians, value)
@@ -165,9 +163,9 @@ def test_chain_clamped_ray(rng, side):
     gaussians.log_scales[0] = np.log([1.2, 1.5, 0.9])
     gaussians.logit_opacity[0] = 2
     assert np.any(ref.clamped_ray(camera, point) != point[:2])
-    frame = blending.render(gaussians, camera, BACKGROUND, 1)
+    frame = ref.render(gaussians, camera, BACKGROUND, 1)
     without = replace(gaussians, logit_opacity=gaussians.logit_opacity - [100, 0, 0, 0])
-    assert np.max(np.abs(frame.image - blending.render(without, camera, BACKGROUND, 1).image)) > 0.05
+    assert np.max(np.abs(frame.image - ref.render(without, camera, BACKGROUND, 1).image)) > 0.05
     check_chain(rng, gaussians, camera, 1)
 
 
@@ -189,8 +187,8 @@ def test_chain_with_capped_alpha(rng):
     gaussians.logit_opacity[2] = 6
     gaussians.log_scales[2] = np.log([0.8, 0.9, 0.7])  # wide: several pixels above the cap
     splats = ref.project(gaussians, camera, 1)
-    assert any(np.any(step.alpha == 0.99) for step in blending.blend_steps(splats, WIDTH, HEIGHT, ref.SMOOTH))
-    assert blending.margin(splats, WIDTH, HEIGHT, ref.SMOOTH).cap > 10 * STEP, "a pixel would cross the cap"
+    assert any(np.any(step.alpha == 0.99) for step in ref.blend_steps(splats, WIDTH, HEIGHT, ref.SMOOTH))
+    assert ref.margin(splats, WIDTH, HEIGHT, ref.SMOOTH).cap > 10 * STEP, "a pixel would cross the cap"
     check_chain(rng, gaussians, camera, 1)
 
 
@@ -203,7 +201,7 @@ def test_blend_gradients(rng):
     splats = ref.project(random_gaussians(rng, camera, 0), camera, 0)
     thresholds = ref.Thresholds(transmittance_min=0.2)  # high, so that some pixels stop
     safe, stopped, faint = np.ones((HEIGHT, WIDTH), bool), np.zeros((HEIGHT, WIDTH), bool), 0
-    for step in blending.blend_steps(splats, WIDTH, HEIGHT, thresholds):
+    for step in ref.blend_steps(splats, WIDTH, HEIGHT, thresholds):
         near_alpha_min = np.abs(step.alpha / thresholds.alpha_min - 1) < 0.3
         near_stop = np.abs(step.before * (1 - step.alpha) / thresholds.transmittance_min - 1) < 0.3
         safe &= ~(step.tried & (near_alpha_min | near_stop))
@@ -214,9 +212,9 @@ def test_blend_gradients(rng):
     weights = rng.normal(0, 1, (3, HEIGHT, WIDTH)) * safe
 
     def value() -> float:
-        return np.sum(weights * blending.blend(splats, WIDTH, HEIGHT, BACKGROUND, thresholds)[0])
+        return np.sum(weights * ref.blend(splats, WIDTH, HEIGHT, BACKGROUND, thresholds)[0])
 
-    grad = blending.blend_backward(splats, WIDTH, HEIGHT, BACKGROUND, weights, thresholds)._asdict()
+    grad = ref.blend_backward(splats, WIDTH, HEIGHT, BACKGROUND, weights, thresholds)._asdict()
     del grad["mean2d_abs"]
     check_gradients(grad, splats, value)
 
@@ -231,8 +229,8 @@ def test_absolute_mean2d_gradient(rng):
     for row, column in np.ndindex(height, width):
         single = np.zeros_like(weights)
         single[:, row, column] = weights[:, row, column]
-        total += np.abs(blending.blend_backward(splats, width, height, BACKGROUND, single).mean2d)
-    grad = blending.blend_backward(splats, width, height, BACKGROUND, weights)
+        total += np.abs(ref.blend_backward(splats, width, height, BACKGROUND, single).mean2d)
+    grad = ref.blend_backward(splats, width, height, BACKGROUND, weights)
     np.testing.assert_allclose(grad.mean2d_abs, total, rtol=1e-12)
     assert np.all(grad.mean2d_abs > 1.01 * np.abs(grad.mean2d))
 
@@ -294,13 +292,13 @@ def test_single_isotropic_gaussian():
     colour = np.array([0.9, 0.3, 0.1])
     camera = simple_camera(focal=focal)
     gaussians = isotropic([0, 0, depth], scale, opacity, colour)
-    frame = blending.render(gaussians, camera, BACKGROUND, 0, thresholds=ref.SMOOTH)
+    frame = ref.render(gaussians, camera, BACKGROUND, 0, thresholds=ref.SMOOTH)
     x, y = np.meshgrid(np.arange(WIDTH) + 0.5 - WIDTH / 2, np.arange(HEIGHT) + 0.5 - HEIGHT / 2)
     alpha = opacity * np.exp(-0.5 * (x**2 + y**2) / ((focal * scale / depth) ** 2 + 0.3))
     expected = colour[:, None, None] * alpha + BACKGROUND[:, None, None] * (1 - alpha)
     np.testing.assert_allclose(frame.image, expected, rtol=1e-13)
     np.testing.assert_allclose(frame.transmittance, 1 - alpha, rtol=1e-13)
-    assert np.all(frame.count == 1)
+    assert np.all(frame.blended == 1)
 
 
 def test_pixel_centres_and_axes():
@@ -308,7 +306,7 @@ def test_pixel_centres_and_axes():
     splats = ref.project(isotropic([0.3, -0.6, 3], 0.1, 0.5, [1, 1, 1]), simple_camera(), 0)
     np.testing.assert_allclose(splats.mean2d, [[24, 7]], rtol=1e-14)
     np.testing.assert_allclose(splats.depth, [3])
-    image, _, _ = blending.blend(splats, WIDTH, HEIGHT, np.zeros(3))
+    image, _, _ = ref.blend(splats, WIDTH, HEIGHT, np.zeros(3))
     middle = image[0, 6:8, 23:25]  # the mean is the corner shared by these four pixels
     assert middle.min() > 0.99 * image.max()
 
@@ -391,7 +389,7 @@ def test_filters_in_closed_form():
 def test_two_splats_by_hand():
     """Front 0.5 red, behind it 0.4 green, background blue: 0.5 + 0.2 + 0.3."""
     splats = flat_splats(depth=[2, 1], opacity=[0.4, 0.5], colour=[[0, 1, 0], [1, 0, 0]])
-    image, transmittance, count = blending.blend(splats, 1, 1, np.array([0, 0, 1]))
+    image, transmittance, count = ref.blend(splats, 1, 1, np.array([0, 0, 1]))
     np.testing.assert_allclose(image[:, 0, 0], [0.5, 0.2, 0.3])
     np.testing.assert_allclose(transmittance, 0.3)
     assert count[0, 0] == 2
@@ -399,7 +397,7 @@ def test_two_splats_by_hand():
 
 def test_equal_depths_keep_the_order_of_indices():
     splats = flat_splats(depth=[1, 1, 1], opacity=[0.5, 0.5, 0.5], colour=np.eye(3))
-    image, _, _ = blending.blend(splats, 1, 1, np.zeros(3))
+    image, _, _ = ref.blend(splats, 1, 1, np.zeros(3))
     np.testing.assert_allclose(image[:, 0, 0], [0.5, 0.25, 0.125])
 
 
@@ -408,16 +406,16 @@ def test_order_of_gaussians_does_not_matter(rng):
     gaussians = random_gaussians(rng, camera, 1)
     shuffle = np.array([3, 0, 4, 1, 2])
     shuffled = ref.Gaussians(**{name: values[shuffle] for name, values in vars(gaussians).items()})
-    image = blending.render(gaussians, camera, BACKGROUND, 1).image
-    np.testing.assert_array_equal(blending.render(shuffled, camera, BACKGROUND, 1).image, image)
+    image = ref.render(gaussians, camera, BACKGROUND, 1).image
+    np.testing.assert_array_equal(ref.render(shuffled, camera, BACKGROUND, 1).image, image)
 
 
 def test_alpha_is_capped():
     splats = flat_splats(depth=[1], opacity=[0.999], colour=[[1, 1, 1]])
-    image, transmittance, _ = blending.blend(splats, 1, 1, np.zeros(3))
+    image, transmittance, _ = ref.blend(splats, 1, 1, np.zeros(3))
     np.testing.assert_allclose(image, 0.99)
     np.testing.assert_allclose(transmittance, 0.01)
-    grad = blending.blend_backward(splats, 1, 1, np.zeros(3), np.ones((3, 1, 1)))
+    grad = ref.blend_backward(splats, 1, 1, np.zeros(3), np.ones((3, 1, 1)))
     assert grad.opacity[0] == 0
     np.testing.assert_allclose(grad.colour, 0.99)
 
@@ -426,7 +424,7 @@ def test_faint_alpha_is_skipped():
     """alpha < 1/255 is skipped, alpha = 1/255 is not."""
     limit = 1 / 255
     splats = flat_splats(depth=[1, 2], opacity=[np.nextafter(limit, 0), limit], colour=[[1, 0, 0], [0, 1, 0]])
-    image, _, count = blending.blend(splats, 1, 1, np.zeros(3))
+    image, _, count = ref.blend(splats, 1, 1, np.zeros(3))
     np.testing.assert_allclose(image[:, 0, 0], [0, limit, 0])
     assert count[0, 0] == 1
 
@@ -435,19 +433,19 @@ def test_negative_sigma_is_skipped():
     """No projection makes such a conic, but rounding does."""
     splats = flat_splats(depth=[1], opacity=[0.5], colour=[[1, 1, 1]])
     splats.conic[0] = [-1e-3, 0, -1e-3]
-    assert blending.blend(splats, 1, 1, np.zeros(3))[2][0, 0] == 0
+    assert ref.blend(splats, 1, 1, np.zeros(3))[2][0, 0] == 0
     splats.conic[0] = [1e-3, 0, 1e-3]
-    assert blending.blend(splats, 1, 1, np.zeros(3))[2][0, 0] == 1
+    assert ref.blend(splats, 1, 1, np.zeros(3))[2][0, 0] == 1
 
 
 def test_stopping_splat_is_excluded():
     """0.1 · 0.02 · 0.02 < 1e-4: the third splat stops the pixel unseen, and the faint fourth is not reached."""
     splats = flat_splats(depth=[1, 2, 3, 4], opacity=[0.9, 0.98, 0.98, 0.1], colour=[*np.eye(3).tolist(), [9, 9, 9]])
-    image, transmittance, count = blending.blend(splats, 1, 1, np.ones(3))
+    image, transmittance, count = ref.blend(splats, 1, 1, np.ones(3))
     np.testing.assert_allclose(image[:, 0, 0], [0.9 + 0.002, 0.098 + 0.002, 0.002])
     np.testing.assert_allclose(transmittance, 0.002)
     assert count[0, 0] == 2
-    grad = blending.blend_backward(splats, 1, 1, np.ones(3), np.ones((3, 1, 1)))
+    grad = ref.blend_backward(splats, 1, 1, np.ones(3), np.ones((3, 1, 1)))
     assert np.all(grad.opacity[2:] == 0)
     assert np.all(grad.colour[2:] == 0)
 
@@ -455,7 +453,7 @@ def test_stopping_splat_is_excluded():
 def test_transmittance_of_the_threshold_itself_does_not_stop():
     thresholds = ref.Thresholds(transmittance_min=0.25)
     splats = flat_splats(depth=[1, 2, 3], opacity=[0.5, 0.5, 0.01], colour=np.eye(3))
-    _, transmittance, count = blending.blend(splats, 1, 1, np.zeros(3), thresholds)
+    _, transmittance, count = ref.blend(splats, 1, 1, np.zeros(3), thresholds)
     assert count[0, 0] == 2
     assert transmittance[0, 0] == 0.25
 
@@ -464,12 +462,12 @@ def test_margin():
     """The second splat is too faint, the third stops the pixel, so that the fourth does not count."""
     splats = flat_splats(depth=[1, 1.25, 2, 3], opacity=[0.5, 0.02, 0.9, 0.0301], colour=np.ones((4, 3)))
     thresholds = ref.Thresholds(alpha_min=0.03, alpha_max=0.99, transmittance_min=0.08)
-    margin = blending.margin(splats, 1, 1, thresholds)
+    margin = ref.margin(splats, 1, 1, thresholds)
     np.testing.assert_allclose(margin.alpha, 1 - 0.02 / 0.03)
     np.testing.assert_allclose(margin.transmittance, 1 - 0.5 * 0.1 / 0.08)
     np.testing.assert_allclose(margin.cap, 1 - 0.9 / 0.99)
     np.testing.assert_allclose(margin.depth, 0.25 / 1.25)
-    assert blending.margin(splats, 1, 1, ref.SMOOTH)[:2] == (np.inf, np.inf)
+    assert ref.margin(splats, 1, 1, ref.SMOOTH)[:2] == (np.inf, np.inf)
 
 
 # ---- Culling and radius -------------------------------------------------------------------------------------------
@@ -547,7 +545,7 @@ def test_radius_is_zero_outside_the_tiles(column, radius):
 # ---- Losses, Adam, density control --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("function", [loss.l1, loss.l2, loss.dssim])
+@pytest.mark.parametrize("function", [ref.l1, ref.l2, ref.dssim])
 def test_loss_gradients(rng, function):
     x, y = rng.uniform(0, 1, (2, 3, 14, 9))
     _, grad = function(x, y)
@@ -559,16 +557,16 @@ def test_loss_gradients(rng, function):
 def test_loss_values():
     x, y = np.zeros((3, 2, 2)), np.zeros((3, 2, 2))
     x[1, 0, 1] = 0.6
-    np.testing.assert_allclose(loss.l1(x, y)[0], 0.6 / 12)
-    np.testing.assert_allclose(loss.l2(x, y)[0], 0.36 / 12)
-    np.testing.assert_allclose(loss.psnr(x, y), 10 * np.log10(12 / 0.36))
-    np.testing.assert_allclose(loss.psnr(np.full((3, 2, 2), 0.1), y), 20)
+    np.testing.assert_allclose(ref.l1(x, y)[0], 0.6 / 12)
+    np.testing.assert_allclose(ref.l2(x, y)[0], 0.36 / 12)
+    np.testing.assert_allclose(ref.psnr(x, y), 10 * np.log10(12 / 0.36))
+    np.testing.assert_allclose(ref.psnr(np.full((3, 2, 2), 0.1), y), 20)
 
 
 def test_ssim_taps():
     """Against the published numbers."""
     published = [0.00102838, 0.00759876, 0.03600077, 0.10936069, 0.21300554, 0.26601172]
-    np.testing.assert_allclose(loss.ssim_taps(), published + published[4::-1], atol=5e-9)
+    np.testing.assert_allclose(ref.ssim_taps(), published + published[4::-1], atol=5e-9)
 
 
 def test_ssim_against_scikit_image(rng):
@@ -577,19 +575,19 @@ def test_ssim_against_scikit_image(rng):
     options = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 1, "full": True}
     _, expected = structural_similarity(x, y, channel_axis=0, **options)
     interior = (slice(None), slice(5, -5), slice(5, -5))
-    ours = loss.ssim_map(x, y)
+    ours = ref.ssim_map(x, y)
     np.testing.assert_allclose(ours[interior], expected[interior], rtol=1e-12, atol=1e-13)
     assert np.max(np.abs(ours - expected)) > 1e-3
-    np.testing.assert_allclose(loss.dssim(x, y)[0], 1 - ours.mean(), rtol=1e-14)
+    np.testing.assert_allclose(ref.dssim(x, y)[0], 1 - ours.mean(), rtol=1e-14)
 
 
 def test_ssim_border_is_zero_padded():
     """Two constant images in the corner: all five means are fractions q of the constants' own."""
     x, y = np.full((1, 12, 12), 0.8), np.full((1, 12, 12), 0.4)
-    q = loss.ssim_taps()[5:].sum() ** 2  # the window's part inside the image
+    q = ref.ssim_taps()[5:].sum() ** 2  # the window's part inside the image
     luminance = (2 * q * q * 0.32 + 1e-4) / (q * q * 0.8 + 1e-4)
     structure = (2 * (q - q * q) * 0.32 + 9e-4) / ((q - q * q) * 0.8 + 9e-4)
-    np.testing.assert_allclose(loss.ssim_map(x, y)[0, 0, 0], luminance * structure, rtol=1e-12)
+    np.testing.assert_allclose(ref.ssim_map(x, y)[0, 0, 0], luminance * structure, rtol=1e-12)
 
 
 def test_adam_is_the_sum_it_stands_for(rng):
@@ -599,7 +597,7 @@ def test_adam_is_the_sum_it_stands_for(rng):
     parameter, moment1, moment2 = np.ones(4), np.zeros(4), np.zeros(4)
     expected = np.ones(4)
     for t in range(1, steps + 1):
-        parameter, moment1, moment2 = loss.adam_step(parameter, gradients[t - 1], moment1, moment2, t, rate)
+        parameter, moment1, moment2 = ref.adam_step(parameter, gradients[t - 1], moment1, moment2, t, rate)
         age = np.arange(t - 1, -1, -1)[:, None]
         mean = 0.1 * np.sum(0.9**age * gradients[:t], axis=0) / (1 - 0.9**t)
         square = 0.001 * np.sum(0.999**age * gradients[:t] ** 2, axis=0) / (1 - 0.999**t)
@@ -609,36 +607,36 @@ def test_adam_is_the_sum_it_stands_for(rng):
 
 def test_adam_epsilon_is_outside_the_root():
     """The first step is rate · g / (|g| + ε): half the rate at g = ε, the whole of it at g = 1."""
-    parameter, _, _ = loss.adam_step(np.zeros(2), np.array([1e-15, -1.0]), np.zeros(2), np.zeros(2), 1, 0.01)
+    parameter, _, _ = ref.adam_step(np.zeros(2), np.array([1e-15, -1.0]), np.zeros(2), np.zeros(2), 1, 0.01)
     np.testing.assert_allclose(parameter, [-0.005, 0.01], rtol=1e-9)
 
 
 def test_screen_gradient_and_its_mean():
     grad = np.array([[0.3, 0.0], [0.3, -0.4]])
-    np.testing.assert_allclose(loss.screen_gradient(grad, 20, 20), [3, 5])
-    np.testing.assert_allclose(loss.screen_gradient(grad, 40, 10), [6, np.hypot(6, 2)])
-    np.testing.assert_allclose(loss.mean_gradient(np.array([6.0, 3.0, 0.0]), np.array([4, 1, 0])), [1.5, 3, 0])
+    np.testing.assert_allclose(ref.screen_gradient(grad, 20, 20), [3, 5])
+    np.testing.assert_allclose(ref.screen_gradient(grad, 40, 10), [6, np.hypot(6, 2)])
+    np.testing.assert_allclose(ref.mean_gradient(np.array([6.0, 3.0, 0.0]), np.array([4, 1, 0])), [1.5, 3, 0])
 
 
 def test_density_actions():
     """Extent 10: dense is 0.1, too large is 1."""
     cases = [  # gradient, largest scale, opacity, prune_large, action
-        (1.9e-4, 0.05, 0.5, False, loss.KEEP),
-        (2e-4, 0.05, 0.5, False, loss.CLONE),
-        (2e-4, 0.1, 0.5, False, loss.CLONE),
-        (2e-4, 0.11, 0.5, False, loss.SPLIT),
-        (1.9e-4, 0.11, 0.5, False, loss.KEEP),
-        (3e-4, 0.05, 0.0049, False, loss.PRUNE),  # the copy is pruned with it
-        (3e-4, 0.5, 0.0049, False, loss.PRUNE),
-        (0, 0.5, 0.005, False, loss.KEEP),
-        (0, 1.1, 0.5, False, loss.KEEP),
-        (0, 1.0, 0.5, True, loss.KEEP),
-        (0, 1.1, 0.5, True, loss.PRUNE),
-        (3e-4, 1.5, 0.5, True, loss.SPLIT),  # its children, 0.94, are small enough
-        (3e-4, 1.7, 0.5, True, loss.PRUNE),
+        (1.9e-4, 0.05, 0.5, False, ref.KEEP),
+        (2e-4, 0.05, 0.5, False, ref.CLONE),
+        (2e-4, 0.1, 0.5, False, ref.CLONE),
+        (2e-4, 0.11, 0.5, False, ref.SPLIT),
+        (1.9e-4, 0.11, 0.5, False, ref.KEEP),
+        (3e-4, 0.05, 0.0049, False, ref.PRUNE),  # the copy is pruned with it
+        (3e-4, 0.5, 0.0049, False, ref.PRUNE),
+        (0, 0.5, 0.005, False, ref.KEEP),
+        (0, 1.1, 0.5, False, ref.KEEP),
+        (0, 1.0, 0.5, True, ref.KEEP),
+        (0, 1.1, 0.5, True, ref.PRUNE),
+        (3e-4, 1.5, 0.5, True, ref.SPLIT),  # its children, 0.94, are small enough
+        (3e-4, 1.7, 0.5, True, ref.PRUNE),
     ]
     for gradient, scale, opacity, prune_large, expected in cases:
-        actions = loss.adc_actions(np.array([gradient]), np.array([scale]), np.array([opacity]), 10.0, prune_large)
+        actions = ref.adc_actions(np.array([gradient]), np.array([scale]), np.array([opacity]), 10.0, prune_large)
         assert actions.tolist() == [expected], (gradient, scale, opacity, prune_large)
 
 
@@ -647,15 +645,15 @@ def test_density_actions_of_absgs():
     gradient = np.array([3e-4, 1e-4, 3e-4, 1e-4])
     absolute = np.array([3e-4, 5e-4, 3e-4, 5e-4])
     scale = np.array([0.009, 0.009, 0.011, 0.011])
-    actions = loss.adc_actions(gradient, scale, np.full(4, 0.5), 10.0, False, loss.ABSGS, absolute)
-    assert actions.tolist() == [loss.CLONE, loss.KEEP, loss.KEEP, loss.SPLIT]
+    actions = ref.adc_actions(gradient, scale, np.full(4, 0.5), 10.0, False, ref.ABSGS, absolute)
+    assert actions.tolist() == [ref.CLONE, ref.KEEP, ref.KEEP, ref.SPLIT]
 
 
 def test_split_children():
     """A quarter turn about z takes the offset (0.5 · 2, 0, 0) to (0, 1, 0)."""
     mean, quat = np.array([1.0, 2.0, 3.0]), np.array([2.0, 0.0, 0.0, 2.0])
     noise = np.array([[2.0, 0.0, 0.0], [0.0, -1.0, 1.0]])
-    means, log_scales = loss.split_children(mean, quat, np.log([0.5, 0.25, 4.0]), noise)
+    means, log_scales = ref.split_children(mean, quat, np.log([0.5, 0.25, 4.0]), noise)
     np.testing.assert_allclose(means, [[1, 3, 3], [1.25, 2, 7]], atol=1e-15)
     np.testing.assert_allclose(np.exp(log_scales), [[0.5 / 1.6, 0.25 / 1.6, 2.5]] * 2)
 
@@ -665,5 +663,5 @@ def test_opacity_reset():
         return 1 / (1 + np.exp(-logit))
 
     logit = np.array([2.0, -7.0])
-    np.testing.assert_allclose(opacity(loss.reset_logit(logit)), [0.01, opacity(-7.0)])
-    np.testing.assert_allclose(opacity(loss.reset_logit(logit, 0.5)), [0.02, opacity(-7.0)])
+    np.testing.assert_allclose(opacity(ref.reset_logit(logit)), [0.01, opacity(-7.0)])
+    np.testing.assert_allclose(opacity(ref.reset_logit(logit, 0.5)), [0.02, opacity(-7.0)])

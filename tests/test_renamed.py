@@ -9,6 +9,7 @@ import pytest
 from clsplat import resource_dir
 from clsplat.errors import ConfigError
 from clsplat.pipeline.loading import load
+from clsplat.training.records import Records
 
 OLD = """\
 name: recipe
@@ -31,6 +32,7 @@ stages:
               - {type: prune_large, after: 3000}
   - densify:
       rules: [{type: prune_faint, after: 7}]
+  - evaluate: {scales: [1, 2]}
 """
 NEW = """\
 name: recipe
@@ -54,12 +56,14 @@ stages:
               - {type: prune_large, start: 3000}
   - densify:
       rules: [{type: prune_faint, start: 7}]
+  - evaluate: {downscales: [1, 2]}
 """
 WARNINGS = [
     ("scene.sampling", "optimize.views.order: code"),
     ("optimize.rates.means: {start, stop}", "{initial, final}"),
     ("prune_large.after", "start"),
     ("prune_faint.after", "start"),
+    ("evaluate.scales", "downscales"),
 ]
 
 
@@ -86,10 +90,11 @@ def test_old_keys_mean_what_the_new_ones_do_and_warn_once_each(write, caplog):
 
 
 def test_an_old_key_may_be_set_on_the_command_line(write, caplog):
-    set_old = load(write(NEW), ["scene.sampling=paper", "optimize.rates.quats={start: 0.1, stop: 0.01, over: 9}"])
-    assert [record.levelname for record in caplog.records] == ["WARNING"] * 2
+    quats = "optimize.rates.quats={start: 0.1, stop: 0.01, over: 9}"
+    set_old = load(write(NEW), ["scene.sampling=paper", quats, "evaluate.scales=[4]"])
+    assert [record.levelname for record in caplog.records] == ["WARNING"] * 3
     quats = "optimize.rates.quats={initial: 0.1, final: 0.01, over: 9}"
-    new = load(write(NEW), [quats, "optimize.views.order=paper"])
+    new = load(write(NEW), [quats, "optimize.views.order=paper", "evaluate.downscales=[4]"])
     assert set_old.resolved() == new.resolved(), "the key of --set, where both are given"
     both = ["optimize.views.order=code", "scene.sampling=paper", "densify.rules.0.start=9", "densify.rules.0.after=8"]
     both = [text.replace("densify", "stages.2") for text in both]
@@ -119,3 +124,12 @@ def test_shipped_pipelines_have_no_old_names(caplog):
     for path in sorted(resource_dir("pipelines").glob("*.yaml")):
         load(path.stem)
     assert not [record.message for record in caplog.records if "new name" in record.message]
+
+
+def test_records_of_older_runs_have_the_new_name_of_the_divisor(tmp_path):
+    (tmp_path / "metrics.jsonl").write_text(
+        '{"step": 5, "kind": "evaluate", "split": "test", "scale": 2.0, "psnr": 30}\n'
+    )
+    assert Records(tmp_path).read("evaluate") == [
+        {"step": 5, "kind": "evaluate", "split": "test", "downscale": 2.0, "psnr": 30}
+    ]

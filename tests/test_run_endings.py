@@ -21,8 +21,9 @@ from clsplat.errors import (
     OutputError,
     as_clsplat_error,
 )
-from clsplat.runs import experiment, runner
+from clsplat.runs import experiment, opening
 from clsplat.runs.experiment import Job
+from clsplat.signals import stopping_on_signals
 from tests.test_cli import clsplat
 
 pytestmark = pytest.mark.slow
@@ -50,7 +51,7 @@ def quiet_log():
     logging.getLogger("clsplat").handlers.clear()
 
 
-@pytest.mark.parametrize("function", ["open_run", "execute", "_run_stages"])
+@pytest.mark.parametrize("function", ["opening.open_run", "runner.execute", "runner._run_stages"])
 @pytest.mark.parametrize("name", ENDINGS)
 def test_every_exception_of_a_run_ends_in_a_sentence_and_a_status(
     name, function, tiny_scene, tmp_path, monkeypatch, capsys
@@ -60,8 +61,9 @@ def test_every_exception_of_a_run_ends_in_a_sentence_and_a_status(
     def fail(*arguments):
         raise raised
 
-    monkeypatch.setattr(runner, function, fail)
+    monkeypatch.setattr(f"clsplat.runs.{function}", fail)
     out = tmp_path / "run"
+    out.mkdir()  # a folder that a run makes itself does not outlive its refusal
     monkeypatch.setattr(sys, "argv", ["clsplat", "run", "smoke", "--scene", str(tiny_scene), "--out", str(out)])
     with pytest.raises(SystemExit) as end:
         cli.main()
@@ -82,7 +84,7 @@ def test_debug_shows_the_traceback_before_the_line(place, tiny_scene, tmp_path, 
     def fail(*arguments):
         raise ZeroDivisionError("by zero")
 
-    monkeypatch.setattr(runner, "open_run", fail)
+    monkeypatch.setattr(opening, "open_run", fail)
     more = ["smoke", "--scene", str(tiny_scene), "--out", str(tmp_path / "run")]
     monkeypatch.setattr(sys, "argv", ["clsplat", *place, *more])
     with pytest.raises(SystemExit) as end:
@@ -100,7 +102,10 @@ def test_what_cannot_be_logged_is_a_failure_with_a_status(tiny_scene, tmp_path):
     assert json.loads((tmp_path / "run" / "status.json").read_text())["exit_code"] == 7
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP], ids=lambda number: number.name)
+SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+
+
+@pytest.mark.parametrize("number", SIGNALS, ids=lambda number: number.name)
 def test_a_signal_saves_the_state_and_exits_130(number, tiny_scene, tmp_path):
     out = tmp_path / "run"
     command = [sys.executable, "-m", "clsplat", "run", "smoke", "--scene", str(tiny_scene), "--out", str(out)]
@@ -121,7 +126,7 @@ def test_a_signal_saves_the_state_and_exits_130(number, tiny_scene, tmp_path):
 def test_a_signal_that_is_ignored_stays_ignored():
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
-        with runner.stopping_on_signals(pytest.fail):
+        with stopping_on_signals(pytest.fail):
             os.kill(os.getpid(), signal.SIGHUP)
             assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
     finally:
@@ -139,14 +144,16 @@ def test_a_run_continues_when_its_output_is_not_read(tiny_scene, tmp_path):
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
-@pytest.mark.parametrize("arguments", [["devices"], ["devices", "--json"], ["pipelines"]], ids=" ".join)
+@pytest.mark.parametrize(
+    "arguments", [["devices"], ["check", "smoke", "--json"], ["pipelines"], ["--help"], ["--version"]], ids=" ".join
+)
 def test_output_that_cannot_be_written_is_one_line(arguments):
     with Path("/dev/full").open("w") as full:
         command = [sys.executable, "-m", "clsplat", *arguments]
         done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, timeout=60)
     assert done.returncode == 7
     assert done.stderr.splitlines() == [
-        "error: the output: No space left on device; check the file, its folder and their space"
+        "error: stdout: cannot be written (No space left on device); let it lead elsewhere, or free its space"
     ]
 
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from clsplat.api.renderer import Renderer
+from clsplat.conformance.scenes import random_case, with_world_filter
 from clsplat.gaussians.tables import PARAMETERS
-from tests.scenes import random_case, with_world_filter
 from tests.test_model import model_of
 
 torch = pytest.importorskip("torch")

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from clsplat.conformance.scenes import random_case
 from clsplat.density.statistics import SplatStats
 from clsplat.errors import ConfigError
 from clsplat.filters import FilterViews, measure_intervals
@@ -16,7 +17,7 @@ from clsplat.losses.penalties import Anisotropy
 from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import load
 from clsplat.render.rasterizer import Rasterizer
-from clsplat.runs import runner
+from clsplat.runs import opening
 from clsplat.scene.detect import read_scene
 from clsplat.stages.init import from_points
 from clsplat.training.adam import Adam, Rates
@@ -24,7 +25,6 @@ from clsplat.training.trainer import Trainer
 from clsplat.views.photographs import Photograph, Photographs
 from clsplat.views.sampling import Sampler
 from tests.kernels.test_loss import comparison_of, gradient_of, images
-from tests.scenes import random_case
 
 STEPS = 8  # of smoke, before its first edit
 PENALTIES = (
@@ -38,7 +38,7 @@ BLUR = "optimize.views.transforms=[{type: blur, sigma: 1.5}]"
 def test_steps_of_a_trainer_are_those_of_a_pipeline(tiny_scene, tmp_path, overrides):
     """The same tables and losses, bit for bit, without a run."""
     checked = load("smoke", [f"scene.path='{tiny_scene}'", *overrides])
-    run = runner.open_run(checked, tmp_path, None)
+    run = opening.open_run(checked, tmp_path, None)
     init, optimize = checked.stages[:2]
     init.run(run)
     losses = [view.loss for view in islice(optimize.iterate(run), STEPS)]
@@ -238,7 +238,7 @@ def test_a_weight_that_is_none_is_refused(weight, reason):
 
 def test_losses_of_a_run_are_added_to_those_of_its_pipeline(tiny_scene: Path, tmp_path: Path):
     checked = load("smoke", [f"scene.path='{tiny_scene}'", "optimize.losses=[l1]"])
-    run = runner.open_run(checked, tmp_path, None)
+    run = opening.open_run(checked, tmp_path, None)
     run.losses.append(HostLoss(mean_difference, 0.5))
     checked.stages[0].run(run)
     view = next(checked.stages[1].iterate(run))

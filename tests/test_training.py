@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 
 from clsplat.errors import ConfigError, DataError, Interrupted, NumericError
-from clsplat.gaussians.ply import read_ply
+from clsplat.gaussians.ply import read_ply, write_ply
 from clsplat.pipeline.loading import load
-from clsplat.runs import runner
-from clsplat.training import checkpoint
+from clsplat.runs import folders, opening, runner
+from clsplat.training import changes, checkpoint
 from clsplat.training.run import Progress, Run
 from clsplat.views.sampling import Sampler
 from tests.onnx_writer import distance_network
@@ -27,8 +27,8 @@ pytestmark = pytest.mark.slow
 
 def train(scene: Path, out: Path, *overrides: str, pipeline: str = "smoke", resume: bool = False) -> Run:
     checked = load(pipeline, [f"scene.path='{scene}'", *overrides])
-    runner.make_run_folder(out, resume)
-    run = runner.open_run(checked, out, None)
+    folders.make_run_folder(out, resume)
+    run = opening.open_run(checked, out, None)
     runner.execute(checked, run, resume, lambda progress: None)
     return run
 
@@ -116,8 +116,8 @@ def test_the_sort_does_not_matter(finished, tiny_scene, tmp_path, sort):
 def test_interrupt_saves_and_resume_goes_on(finished, tiny_scene, tmp_path):
     out = tmp_path / "stopped"
     checked = load("smoke", [f"scene.path='{tiny_scene}'"])
-    runner.make_run_folder(out, resume=False)
-    run = runner.open_run(checked, out, None)
+    folders.make_run_folder(out, resume=False)
+    run = opening.open_run(checked, out, None)
 
     def stop(progress: Progress) -> None:
         run.interrupted = progress.step == 20
@@ -176,15 +176,15 @@ def test_a_checkpoint_of_another_format_is_refused(tiny_scene, tmp_path, monkeyp
     train(tiny_scene, tmp_path)
     monkeypatch.undo()
     before = (tmp_path / "metrics.jsonl").read_bytes()
-    with pytest.raises(ConfigError, match=r"has format 1, expected 3.*use another --out"):
+    with pytest.raises(ConfigError, match=r"has format 1, expected 4.*use another --out"):
         train(tiny_scene, tmp_path, resume=True)
     assert (tmp_path / "metrics.jsonl").read_bytes() == before
 
 
 def test_other_settings_are_refused_on_resume(tiny_scene, tmp_path):
     train(tiny_scene, tmp_path)
-    with pytest.raises(ConfigError, match=r"stages\[1\].optimize.rates.quats was 0.005, is 0.1"):
-        train(tiny_scene, tmp_path, "optimize.rates.quats=0.1", resume=True)
+    with pytest.raises(ConfigError, match=r"stages\[0\].init.count was 2000, is 1000"):
+        train(tiny_scene, tmp_path, "init.count=1000", resume=True)
     with pytest.raises(ConfigError, match="already holds a run"):
         train(tiny_scene, tmp_path)
 
@@ -207,9 +207,17 @@ def test_values_that_are_not_finite_stop_the_run(tiny_scene, tmp_path):
     assert json.loads((tmp_path / "status.json").read_text())["exit_code"] == 6
 
 
+def test_a_model_without_gaussians_is_nothing_to_start_from(tiny_scene, tmp_path):
+    path = tmp_path / "empty.ply"
+    widths = {"means": 3, "quats": 4, "log_scales": 3, "logit_opacity": 1, "sh_base": 3, "sh_rest": 45}
+    write_ply(path, {name: np.zeros((0, width), np.float32) for name, width in widths.items()}, {})
+    with pytest.raises(DataError, match=r"empty\.ply: holds no Gaussians"):
+        train(tiny_scene, tmp_path / "run", "init.source=ply", f"init.file='{path}'")
+
+
 def test_views_come_in_random_order_without_repeats(tiny_scene, tmp_path):
     checked = load("smoke", [f"scene.path='{tiny_scene}'"])
-    run = runner.open_run(checked, tmp_path, None)
+    run = opening.open_run(checked, tmp_path, None)
     sampler = Sampler(run.scene.split("train"), checked.settings.training.views, run.seed)
     names = [sampler.at(step).view.name for step in range(1, 25)]
     epochs = [names[i : i + 8] for i in (0, 8, 16)]
@@ -220,6 +228,6 @@ def test_views_come_in_random_order_without_repeats(tiny_scene, tmp_path):
 
 def test_first_difference():
     old = {"a": 1, "b": {"c": [1, {"d": 2}]}}
-    assert checkpoint.first_difference(old, old) is None
-    assert checkpoint.first_difference(old, {"a": 1, "b": {"c": [1, {"d": 3}]}}) == "b.c[1].d was 2, is 3"
-    assert checkpoint.first_difference(old, {"a": 1}) is not None
+    assert changes.first_difference(old, old) is None
+    assert str(changes.first_difference(old, {"a": 1, "b": {"c": [1, {"d": 3}]}})) == "b.c[1].d was 2, is 3"
+    assert changes.first_difference(old, {"a": 1}) is not None

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from clsplat.scene.detect import read_scene
+from clsplat.scene.nerfstudio import NerfstudioReader
+from clsplat.scene.parts import Parts
 from clsplat.scene.scene import Camera
 from clsplat.scene.view import load_image
 from tests.data_sets import data_set
@@ -167,6 +169,17 @@ def test_intrinsics(tmp_path: Path, values: dict, expected: Camera, per_frame: b
         ({"file_path": "../a.png"}, "'../a.png' is not a path below"),
         ({"file_path": "/a.png"}, "not a path below"),
         ({"file_path": "x\\..\\..\\a.png"}, "not a path below"),
+        ({"camera_model": ["X"]}, "camera_model ['X']; expected one of"),
+        ({"camera_model": {"X": 1}}, "camera_model {'X': 1}; expected one of"),
+        ({"camera_model": 3}, "camera_model 3; expected one of"),
+        ({"camera_model": "X" * 6000}, "camera_model 'XXX"),
+        ({"fl_x": "5" * 6000}, "fl_x is '555"),
+        ({"fl_x": [[5] * 1000] * 10}, "fl_x is [[5, 5, "),
+        ({"file_path": {"x" * 6000: 1}}, "file_path is {'xxx"),
+        ({"file_path": "../" + "x" * 6000}, "the file name '../xxx"),
+        ({"fl_x": 5e-324, "k1": 0.1}, "the camera is 64x48 with focal lengths 5e-324"),
+        ({"w": 2**20 + 1}, "the camera is 1048577x48"),
+        ({"w": 10**14, "h": 10**14, "k1": 0.1}, "the camera is 100000000000000x100000000000000"),
         ({"mask_path": "../a.png"}, "not a path below"),
         ({"mask_path": "masks/a.png"}, "1 of 3 image files are missing"),
     ],
@@ -179,6 +192,7 @@ def test_damaged_frame_is_named(tmp_path: Path, change: dict, message: str) -> N
     text = refusal(read_scene, tmp_path)
     assert message in text
     assert "frames[1]" in text or "missing" in text
+    assert len(text) < len(str(tmp_path)) * 2 + 400
 
 
 @pytest.mark.parametrize(
@@ -187,6 +201,31 @@ def test_damaged_frame_is_named(tmp_path: Path, change: dict, message: str) -> N
 def test_file_that_is_no_transforms(tmp_path: Path, text: str) -> None:
     (tmp_path / "transforms.json").write_bytes(text.encode("latin-1"))
     assert "transforms.json: " in refusal(read_scene, tmp_path)
+
+
+def test_a_null_is_no_camera_model(tmp_path: Path) -> None:
+    write(tmp_path, **LENS, frames=frames("a.png", "b.png", camera_model=None))
+    assert len(read_scene(tmp_path).views) == 2
+
+
+def test_more_frames_than_a_scene_has_are_refused_before_they_are_read(tmp_path: Path, monkeypatch) -> None:
+    write(tmp_path, **LENS, frames=frames("a.png", "b.png", "c.png"))
+    monkeypatch.setattr("clsplat.scene.transforms.MAX_FRAMES", 2)
+    assert "has 3 frames; expected at most 2: divide the scene" in refusal(read_scene, tmp_path)
+
+
+def test_what_frames_share_is_not_copied_for_each(tmp_path: Path) -> None:
+    shared = {f"key {i}": i for i in range(2000)}
+    table = LENS | shared | {"frames": frames(*(f"{i}.png" for i in range(2000)))}
+    (tmp_path / "transforms.json").write_text(json.dumps(table))
+    assert "2000 of 2000 image files are missing" in refusal(read_scene, tmp_path)
+
+
+def test_a_thousand_damaged_frames_are_a_thousand_faults(tmp_path: Path) -> None:
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": [{}] * 1000}))
+    parts = Parts(tmp_path)
+    NerfstudioReader().list_parts(parts)
+    assert len(parts.faults) == len(set(parts.faults)) == 1000
 
 
 def test_no_frames(tmp_path: Path) -> None:

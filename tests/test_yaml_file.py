@@ -5,6 +5,7 @@ from collections.abc import Callable
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from ruamel.yaml.composer import Composer
 
 from clsplat.errors import ConfigError
 from clsplat.pipeline.loading import load
@@ -23,6 +24,11 @@ REFUSED = {  # text: (line, words)
     "name: x\nseed: !!bool x\n": (2, "'x' cannot be read as bool"),
     "name: x\nseed: !!binary aGk=\n": (2, "the tag !!binary is not allowed"),
     "name: x\nseed: " + "9" * 5000: (2, "cannot be read as int"),
+    "name: x\nseed: 0x" + "f" * 5000: (2, "is too large; expected a whole number of at most 64 bits"),
+    "name: x\nseed: 9223372036854775808": (2, "is too large"),
+    "name: x\nseed: !" + "t" * 5000 + " 3": (2, "is not allowed"),
+    "name: x\n" + "k" * 900 + ": 1\n" + "k" * 900 + ": 2": (3, "found duplicate key"),
+    "name: x\nseed: *" + "a" * 5000: (2, "undefined alias"),
     "name: x\n? [a, b]\n: 1\n": (2, "expected text as a key"),
     "name: x\n? {a: b}\n: 1\n": (2, "expected text as a key"),
     "name: x\n1: 2\n": (2, "expected text as a key"),
@@ -35,6 +41,8 @@ REFUSED = {  # text: (line, words)
     "name: x\nseed: *nowhere\n": (2, "undefined alias"),
     "name: x\n--- \nname: y\n": (2, "another document"),
     "name: x\nseed: \0\n": (2, "U+0000 is not allowed"),
+    "name: x\nseed: " + "[" * 60 + "]" * 60: (2, "nested too deeply"),
+    "name: x\nstages: [" + "1," * 20_001 + "]": (2, "more than 20000 values"),
     "[" * 5000: (1, "nested too deeply"),
     "{a: " * 5000: (1, "nested too deeply"),
     "name: 'x\nseed: 3": (2, "unexpected end"),
@@ -77,6 +85,28 @@ def test_anchors_aliases_and_merge_keys_are_plain_data(tmp_path):
     }
     assert document.data["a"]["y"] is not document.data["d"]["y"]
     assert document.line(("b", "x")) == 4
+
+
+def test_an_anchor_that_is_used_twice_is_no_warning(recwarn):
+    assert parse_value("[&a 1, &a 2, *a]") == [1, 2, 2]
+    assert not recwarn.list
+
+
+def test_what_is_nested_is_given_up_before_the_rest_is_read(monkeypatch):
+    """The time of the parser grows with the square of the depth."""
+    composed = []
+    monkeypatch.setattr(Composer, "compose_node", counted(Composer.compose_node, composed))
+    with pytest.raises(ConfigError, match="nested too deeply"):
+        parse_value("- " * 9000)
+    assert len(composed) < 60
+
+
+def counted(function: Callable[..., object], calls: list[int]) -> Callable[..., object]:
+    def call(*arguments: object) -> object:
+        calls.append(1)
+        return function(*arguments)
+
+    return call
 
 
 def test_dates_and_standard_tags_are_what_they_say():

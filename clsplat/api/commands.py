@@ -25,14 +25,16 @@ def run(
     set: Overrides = (),
     device: "str | Device | None" = None,
     resume: bool = False,
+    restart: bool = False,
 ) -> Path:
     """Run a pipeline or a matrix, as `clsplat run` does; return the run folder.
 
     pipeline: a file, or the name of a shipped one; scene: default that of the pipeline; out: default runs/NAME; set:
-    settings by place, such as {"optimize.steps": 3000}; resume: go on from the newest checkpoint in `out`.
+    settings by place, such as {"optimize.steps": 3000}; resume: go on from the newest checkpoint in `out`; restart:
+    begin again where `out` holds a run, and remove its checkpoints and metrics.
     """
-    job = _job(pipeline, scene, out, set, resume)
-    job.run(device, resume)
+    job = _job(pipeline, scene, out, set, resume or restart)
+    job.run(device, resume, restart)
     return job.out
 
 
@@ -44,9 +46,10 @@ def describe_run(
     set: Overrides = (),
     device: "str | Device | None" = None,
     resume: bool = False,
+    restart: bool = False,
 ) -> str:
     """Check all that `run` would need and return what it would do, as lines of text; nothing is written."""
-    return _job(pipeline, scene, out, set, resume).describe(device)
+    return _job(pipeline, scene, out, set, resume or restart).describe(device, resume, restart)
 
 
 def resume(folder: PathLike, *, set: Overrides = (), device: "str | Device | None" = None) -> Path:
@@ -60,21 +63,32 @@ def resume(folder: PathLike, *, set: Overrides = (), device: "str | Device | Non
 
 
 def status(folder: PathLike) -> dict[str, Any]:
-    """Return how far a run or a matrix is, from its files: `state`, `step`, `last` report, `metrics` when it is done.
+    """Return how far a run or a matrix is, from its files: what status.json holds, `last` report, `metrics` at the end.
 
-    A matrix has `cells`, `done` and `failed` in the place of the step.
+    A matrix has `cells`, `done` and `failed` in the place of the step.  `silent` is the time in s since the last
+    heartbeat of a run that has not ended; the state is `killed` where its process is gone.
     """
     from clsplat.runs.status import run_status
 
     return run_status(Path(folder))
 
 
+def status_schema() -> dict[str, Any]:
+    """Return the JSON schema of status.json, for programs that watch runs."""
+    from clsplat.training.status import status_schema
+
+    return status_schema()
+
+
 def check(pipeline: PathLike) -> dict[str, Any]:
-    """Validate a pipeline or a matrix; return its `path`, its `name`, and its `stages` or `cells`."""
-    from clsplat.runs import experiment
+    """Validate a pipeline or a matrix; return its `path`, its `name`, and its `stages` or `cells`.
+
+    Of a run folder return `whole`, its `state`, and `objects`: every file, whether it is `whole`, and a `detail`.
+    """
+    from clsplat.runs import verify
 
     load_plugins()
-    return experiment.check(str(pipeline))
+    return verify.check(str(pipeline))
 
 
 def pipeline_schema() -> dict[str, Any]:

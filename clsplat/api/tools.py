@@ -8,6 +8,7 @@ from clsplat.api.arguments import PathLike, load_plugins, path_of
 
 if TYPE_CHECKING:  # the command line starts without OpenCL
     from clsplat.bench.measurement import Measurement
+    from clsplat.conformance.report import Report
     from clsplat.inspect.inspection import Inspection
     from clsplat.opencl.device import Device
 
@@ -26,6 +27,21 @@ def devices() -> list[dict[str, Any]]:
     return [
         {**asdict(info), "schedule": resolve_schedule(info, "auto"), "fault": info.fault()} for info in list_devices()
     ]
+
+
+def doctor(device: "str | Device | None" = None, page: PathLike | None = None) -> "Report":
+    """Compare every kernel with the reference on a device; return a `verdict`, whether it is `usable`, and `data()`.
+
+    It takes about a minute on a CPU.  page: a file to write, to be attached to a report.
+    """
+    from clsplat.conformance.doctor import examine
+    from clsplat.conformance.page import write_page
+
+    load_plugins()
+    report = examine(device)
+    if page is not None:
+        write_page(report, Path(page))
+    return report
 
 
 def inspect_scene(scene: PathLike, page: PathLike | None = None) -> "Inspection":

@@ -4,9 +4,10 @@ import shutil
 import tempfile
 import weakref
 from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from clsplat.api.arguments import PathLike, load_plugins, overrides
 from clsplat.api.device import default_device
@@ -16,14 +17,16 @@ from clsplat.losses.base import HostFunction, HostLoss, ViewGradients
 from clsplat.metrics.views import mean, measure
 from clsplat.opencl.device import Device, open_device
 from clsplat.pipeline.loading import Pipeline, load
-from clsplat.runs import runner
+from clsplat.runs import folders, lock, opening, runner
 from clsplat.runs.experiment import quoted
 from clsplat.scene.detect import read_scene
 from clsplat.scene.scene import Scene
 from clsplat.scene.view import NO_FILE
 from clsplat.schedule import Schedule
+from clsplat.signals import stopping_on_signals
 from clsplat.stages.optimize import Optimize
 from clsplat.training import checkpoint
+from clsplat.training.rescue import saved_on_failure
 from clsplat.training.run import Run
 
 
@@ -66,7 +69,8 @@ class Trainer:
         scene: what `read_scene` returns, whose split is kept, or a folder; pipeline: a file, or the name of a shipped
         one; set: settings by place, such as {"optimize.steps": 3000}; device: a part of its name, or one that is open,
         with the schedule of the pipeline; out: the run folder, by default a temporary one that goes away with the
-        trainer; resume: go on from the newest checkpoint in `out`, also of `clsplat run`.
+        trainer; resume: go on from the newest checkpoint in `out`, also of `clsplat run`.  A trainer holds its folder
+        until its training has ended, `close()`, or it is let go.
         Raises ConfigError, DataError and DeviceError.
         """
         load_plugins()
@@ -85,14 +89,28 @@ class Trainer:
         self.out = Path(out)
         schedule = self.pipeline.settings.rasterizer.schedule
         opened = default_device(schedule) if device is None else open_device(device, schedule)
-        runner.make_run_folder(self.out, resume)
-        with runner.failures_recorded(self.out, as_raised=True):
-            self._run = runner.make_run(self.pipeline, self.scene, opened, self.out)
-            runner.begin(self.pipeline, self._run, resume)
-            _run_until_training(self.pipeline, self._run)
-            self._record_end()
+        with ExitStack() as holding:
+            status = holding.enter_context(folders.opened(self.out, resume))
+            with folders.failures_recorded(status, as_raised=True):
+                self._run = opening.make_run(self.pipeline, self.scene, opened, self.out, status)
+                runner.begin(self.pipeline, self._run, resume)
+                with saved_on_failure(self._run):
+                    _run_until_training(self.pipeline, self._run)
+            self._holding = holding.pop_all()
+        weakref.finalize(self, self._holding.close)
         self._steps = _training(self.pipeline, self._run)
-        self._failed = False
+        self._state: Literal["open", "done", "failed", "closed"] = "open"
+        self._record_end()
+
+    def close(self) -> None:
+        """Leave the run folder to others.  Training does not go on after it; what is left in `out` can be resumed.
+
+        After its last step, and after an error, a trainer is closed by itself.
+        """
+        if self._state == "open":
+            self._state = "closed"
+        self._steps = iter(())
+        self._holding.close()
 
     def step(self) -> Report:
         """Train one step.  Raises StopIteration when the pipeline's steps are done.
@@ -107,19 +125,22 @@ class Trainer:
                 raise KeyboardInterrupt
             interrupts.append(True)
 
-        if self._failed:
-            raise ClsplatError(
-                f"{self!r} ended with an error; make another, with resume=True where `out` holds a checkpoint"
-            )
+        if self._state == "done":
+            raise StopIteration
+        if self._state != "open":
+            why = "ended with an error" if self._state == "failed" else "is closed"
+            raise ClsplatError(f"{self!r} {why}; make another, with resume=True where `out` holds a checkpoint")
         try:
             with (
-                runner.failures_recorded(self.out, lambda: self._run.step, as_raised=True),
-                runner.stopping_on_signals(finish_step),
+                folders.failures_recorded(self._run.status, as_raised=True),
+                stopping_on_signals(finish_step),
+                saved_on_failure(self._run),
             ):
                 view = next(self._steps, None)
                 self._record_end()
         except BaseException:
-            self._failed = True
+            self._state = "failed"
+            self.close()
             raise
         if view is None:
             raise StopIteration
@@ -173,7 +194,8 @@ class Trainer:
 
         It lies in `out`, where the newest two are kept.  Raises OutputError when it cannot be written.
         """
-        return checkpoint.save(self._run, keep=2)
+        with nullcontext() if self._state == "open" else lock.held(self.out):
+            return checkpoint.save(self._run, keep=2)
 
     def _record_end(self) -> None:
         """Write `done` to status.json where no step is left."""
@@ -182,7 +204,9 @@ class Trainer:
         if isinstance(stage, Optimize) and (
             run.cursor > last or (run.cursor == last and run.stage_step >= stage.steps)
         ):
-            run.records.status("done", run.step, exit_code=0)
+            run.status.end("done", exit_code=0)
+            self._state = "done"
+            self.close()
 
     def __repr__(self) -> str:
         return f"Trainer({self.pipeline.settings.name} on {self.scene.path.name}, step {self._run.step})"
@@ -209,7 +233,7 @@ def _run_until_training(pipeline: Pipeline, run: Run) -> None:
             return
         if cursor >= run.cursor:
             run.cursor = cursor
-            stage.run(run)
+            stage.act(run)
 
 
 def _training(pipeline: Pipeline, run: Run) -> Iterator[ViewGradients]:
@@ -217,9 +241,10 @@ def _training(pipeline: Pipeline, run: Run) -> Iterator[ViewGradients]:
     trains = _training_stages(pipeline)
     for cursor in range(max(trains[0], run.cursor), trains[-1] + 1):
         if cursor > run.cursor:
-            run.cursor, run.stage_step = cursor, 0
+            run.next_stage(cursor)
         stage = pipeline.stages[cursor]
         if isinstance(stage, Optimize):
+            run.status.note(stage=stage.stage, progress=None)
             yield from stage.iterate(run)
         else:
-            stage.run(run)
+            stage.act(run)

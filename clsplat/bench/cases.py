@@ -118,7 +118,8 @@ class Case:
         camera = self.photograph.camera
         gaussians = self.trainer.model.gaussians
         pixels, pixel_sums = camera.stride * camera.rows, self.trainer.stats.pixel_sums
-        return plan(gaussians, self.photograph.nbytes, pixels, pixel_sums).needed(gaussians.count)
+        info, components = gaussians.device.info, gaussians.components
+        return plan(info, components, self.photograph.nbytes, pixels, pixel_sums).needed(gaussians.count)
 
     def _work(self) -> Work:
         assert self.frame is not None

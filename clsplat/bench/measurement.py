@@ -1,6 +1,5 @@
 """A benchmark: its cases, the device's peaks, the times, and their tables."""
 
-import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -10,11 +9,12 @@ from clsplat.bench.cases import Result, run_bench
 from clsplat.bench.peaks import Peaks, measure_peaks
 from clsplat.bench.scenes import SIZES, case, grown, real_case
 from clsplat.bench.table import growth_chart, growth_table, table
-from clsplat.errors import ConfigError
+from clsplat.errors import ConfigError, quoted
 from clsplat.files import write_text
 from clsplat.opencl.device import Device, open_device
 from clsplat.opencl.discovery import Schedule
 from clsplat.pipeline.loading import load
+from clsplat.reading import read_json
 
 
 @dataclass(frozen=True)
@@ -76,11 +76,8 @@ def measure_growth(chart: Path, *, pipeline: str, repeats: int, schedule: Schedu
 def read_measurement(path: Path, pipeline: str) -> dict[str, Any]:
     """Read the data of an earlier measurement of the same pipeline.  Raises ConfigError."""
     name = load(pipeline).settings.name
-    try:
-        data = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise ConfigError(f"{path}: expected the JSON of an earlier `clsplat bench --json` ({error})") from error
+    data = read_json(path, "the JSON of an earlier `clsplat bench --json`", ConfigError)
     found = data if isinstance(data, dict) else {}
     if found and (was := found.get("pipeline", "splat")) != name:
-        raise ConfigError(f"{path}: expected the pipeline '{name}', it has '{was}'; use --pipeline {was}")
+        raise ConfigError(f"{path}: expected the pipeline '{name}', it has {quoted(was)}")
     return found

@@ -1,44 +1,45 @@
 """The commands.  Each prints one line for an error, and exits with that error's code."""
 
 import difflib
-import os
 import sys
 import traceback
 from typing import Any
 
-from clsplat import terminal
+import typer
+
+from clsplat import streams, terminal
 from clsplat.cli import models, runs, tools  # noqa: F401  register their commands
 from clsplat.cli.app import Passed, app
-from clsplat.errors import as_clsplat_error, one_line
+from clsplat.errors import Interrupted, as_clsplat_error, one_line
+from clsplat.signals import stop_at_once, stopping_on_signals
 
 DEBUG, PLUGIN = "--debug", "--plugin"  # options that stand before the command or after it
 
 
-def main() -> None:
-    """Run the command line; an error ends as one line, a traceback is shown with --debug only."""
-    sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115  None where it was closed before the start
-    sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115
-    for stream in (sys.stdout, sys.stderr):
-        if hasattr(stream, "reconfigure"):
-            stream.reconfigure(errors="backslashreplace")  # of file names that are not text
-    arguments = _options_first(_one_set_each(sys.argv[1:]))
+def main(*before: str) -> None:
+    """Run the command line; an error ends as one line, a traceback is shown with --debug only.
+
+    before: arguments that stand before those of the process.
+    """
+    streams.install()
+    arguments = _options_first(_one_set_each([*before, *sys.argv[1:]]))
     try:
-        code = app(arguments, prog_name="clsplat", standalone_mode=False)
-        code = code if isinstance(code, int) else 0
-        sys.stdout.flush()
+        with stopping_on_signals(stop_at_once):
+            shown = app(arguments, prog_name="clsplat", standalone_mode=False)
+            if shown is not None:  # the code of --help and --version; commands return nothing
+                streams.check_output()
+            code = 0
     except BaseException as error:
-        code = _report(error.__cause__ or error if isinstance(error, Passed) else error, DEBUG in arguments[:1])
+        code = _report(error, DEBUG in arguments[:1])
     sys.exit(code)
 
 
 def _report(error: BaseException, debugging: bool) -> int:
     """Print the line for an error; return the exit code."""
-    if isinstance(error, SystemExit):
-        return error.code if isinstance(error.code, int) else 1
-    if isinstance(error, OSError) and error.filename is None:  # it is stdout that cannot be written
-        terminal.discard_output()
-    if isinstance(error, BrokenPipeError):
-        return 0
+    if isinstance(error, Passed | typer.Abort):
+        error = error.__cause__ or error
+    if isinstance(error, KeyboardInterrupt):  # not of a run, whose message tells how to go on
+        error = Interrupted("stopped")
     if debugging:
         traceback.print_exception(error)
     if hasattr(error, "format_message"):  # of typer

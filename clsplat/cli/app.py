@@ -23,6 +23,7 @@ SYNONYMS = {
     **dict.fromkeys(("continue", "restart"), "resume"),
     **dict.fromkeys(("progress", "ps"), "status"),
     **dict.fromkeys(("benchmark", "time", "profile"), "bench"),
+    **dict.fromkeys(("prove", "diagnose", "selftest"), "doctor"),
     "diff": "compare",
     "help": "--help",
     "version": "--version",
@@ -30,7 +31,7 @@ SYNONYMS = {
 
 
 ORDER = [
-    *("run", "resume", "status", "check", "pipelines", "devices", "inspect"),
+    *("run", "resume", "status", "check", "pipelines", "devices", "doctor", "inspect"),
     *("render", "evaluate", "compare", "bench", "data"),
 ]
 
@@ -143,7 +144,7 @@ def _or_common(context: typer.Context, device: str | None) -> str | None:
     return device if device is not None or given is None else given.device
 
 
-def _recipe_names(incomplete: str) -> list[str]:
+def recipe_names(incomplete: str) -> list[str]:
     return [name for name in shipped() if name.startswith(incomplete)]
 
 
@@ -159,7 +160,7 @@ PipelineArgument = Annotated[
     str,
     typer.Argument(
         metavar="PIPELINE",
-        autocompletion=_recipe_names,
+        autocompletion=recipe_names,
         show_default=False,
         help="A pipeline file, or the name of a shipped one.",
     ),

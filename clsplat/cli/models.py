@@ -1,6 +1,7 @@
 """Commands about trained models."""
 
 import json
+import math
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -9,7 +10,7 @@ import typer
 from clsplat import terminal
 from clsplat.api import commands
 from clsplat.cli.app import DeviceOption, ModelArgument, SceneOption, command
-from clsplat.errors import ConfigError
+from clsplat.errors import ConfigError, quoted
 
 
 @command(
@@ -32,21 +33,25 @@ def render(
     device: DeviceOption = None,
 ) -> None:
     """Render a model at the views of a scene, one file for each, named as the view."""
+    if scale is not None and not math.isfinite(scale):
+        raise ConfigError(f"--scale {scale}: expected a finite number of at least 1")
     count = commands.render_views(model, scene, out, split=split, downscale=scale, kind=format_, device=device)
-    terminal.show(f"{count} images written to {out}")
+    terminal.remark(f"{count} images written to {out}")
 
 
 @command(
     "evaluate",
     "clsplat evaluate runs/splat_7k",
-    "clsplat evaluate point_cloud.ply --scene my_scene --scales 1,2,4,8",
+    "clsplat evaluate point_cloud.ply --scene my_scene --downscales 1,2,4,8",
 )
 def evaluate(
     model: ModelArgument,
     scene: SceneOption = None,
-    scales: Annotated[
+    downscales: Annotated[
         str | None,
         typer.Option(
+            "--downscales",
+            "--scales",
             metavar="N,…",
             help="Divide image sizes by these; default: as the run did, 1 for a file.",
         ),
@@ -69,13 +74,14 @@ def evaluate(
     if out is None:
         terminal.keep_stdout_for_json()
     try:
-        downscales = None if scales is None else [float(text) for text in scales.split(",")]
+        divisors = None if downscales is None else [float(text) for text in downscales.split(",")]
     except ValueError:
-        raise ConfigError(f"--scales {scales}: expected numbers separated by commas, for example 1,2,4") from None
+        expected = "expected numbers, separated by commas, such as 1,2,4"
+        raise ConfigError(f"--downscales {quoted(downscales)}: {expected}") from None
     found = commands.evaluate(
         model,
         scene,
-        downscales=downscales,
+        downscales=divisors,
         metrics=metrics.split(","),
         lpips=lpips,
         lpips_input=lpips_input,
@@ -96,4 +102,4 @@ def compare(
 ) -> None:
     """Show runs side by side on one page that opens offline."""
     count = commands.compare_runs(runs, out)
-    terminal.show(f"{count} runs compared in {out}")
+    terminal.remark(f"{count} runs compared in {out}")

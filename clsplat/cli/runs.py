@@ -1,14 +1,14 @@
 """Commands about runs and pipelines."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from clsplat import terminal
 from clsplat.api import commands
-from clsplat.cli.app import DeviceOption, JsonOption, PipelineArgument, SetOption, command
-from clsplat.errors import ConfigError
+from clsplat.cli.app import DeviceOption, JsonOption, PipelineArgument, SetOption, command, recipe_names
+from clsplat.errors import ConfigError, OutputError
 
 
 @command(
@@ -23,11 +23,14 @@ def run(
     device: DeviceOption = None,
     set_: SetOption = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the newest checkpoint.")] = False,
+    restart: Annotated[
+        bool, typer.Option("--restart", help="Begin again in a folder that holds a run, without its checkpoints.")
+    ] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Check everything and say what would run.")] = False,
 ) -> None:
     """Run a pipeline, or all cells of a matrix."""
     work = commands.describe_run if dry_run else commands.run
-    found = work(pipeline, scene, out, set=set_ or (), device=device, resume=resume)
+    found = work(pipeline, scene, out, set=set_ or (), device=device, resume=resume, restart=restart)
     if isinstance(found, Path):
         terminal.show_summary(found)
     else:
@@ -44,14 +47,27 @@ def resume(
     terminal.show_summary(commands.resume(folder, set=set_ or (), device=device))
 
 
-@command("status", "clsplat status runs/splat_7k", "clsplat status runs/splat_7k --json")
+@command(
+    "status",
+    "clsplat status runs/splat_7k",
+    "clsplat status runs/splat_7k --json",
+    "clsplat status --schema > status.schema.json",
+)
 def status(
-    folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run folder, or that of a matrix.")],
+    folder: Annotated[
+        Path | None, typer.Argument(metavar="RUN", help="A run folder, or that of a matrix.", show_default=False)
+    ] = None,
+    schema: Annotated[bool, typer.Option("--schema", help="Print the JSON schema of status.json.")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Show the state of a run, its step and its metrics, from its files alone."""
     from clsplat.runs.status import status_text
 
+    if schema:
+        terminal.show_json(commands.status_schema())
+        return
+    if folder is None:
+        raise ConfigError("status: expected a run folder, or --schema")
     found = commands.status(folder)
     if as_json:
         terminal.show_json(found)
@@ -59,27 +75,53 @@ def status(
         terminal.show(status_text(found))
 
 
-@command("check", "clsplat check my_pipeline.yaml", "clsplat check --schema > pipeline.schema.json")
+@command(
+    "check",
+    "clsplat check my_pipeline.yaml",
+    "clsplat check runs/splat_7k",
+    "clsplat check --schema > pipeline.schema.json",
+)
 def check(
-    pipeline: PipelineArgument = "",
+    pipeline: Annotated[
+        str,
+        typer.Argument(
+            metavar="PIPELINE|RUN", autocompletion=recipe_names, show_default=False, help="As for run; or a run folder."
+        ),
+    ] = "",
     schema: Annotated[
         bool, typer.Option("--schema", help="Print the JSON schema of pipeline files, for editors.")
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Validate a pipeline without running it."""
+    """Validate a pipeline without running it, or verify every file of a run folder."""
     if schema:
         terminal.show_json(commands.pipeline_schema())
         return
     if not pipeline:
-        raise ConfigError("check: expected a pipeline, or --schema")
+        raise ConfigError("check: expected a pipeline, a run folder, or --schema")
     found = commands.check(pipeline)
-    if as_json:
+    if "objects" in found:
+        _show_verified(found, as_json)
+    elif as_json:
         terminal.show_json({**found, "valid": True})
     elif "cells" in found:
         terminal.show(f"{found['path']}: valid; {len(found['cells'])} cells: {', '.join(found['cells'])}")
     else:
         terminal.show(f"{found['path']}: valid; {', '.join(found['stages'])}")
+
+
+def _show_verified(found: dict[str, Any], as_json: bool) -> None:
+    """Show what was found of a run folder.  Raises OutputError where a file is damaged."""
+    from clsplat.runs.verify import lines, verdict
+
+    if as_json:
+        terminal.show_json(found)
+    else:
+        terminal.show(lines(found))
+    if not found["whole"]:
+        raise OutputError(verdict(found))
+    if not as_json:
+        terminal.show(verdict(found))
 
 
 @command(
@@ -101,7 +143,7 @@ def pipelines(
         if as_json:
             terminal.show_json({"copy": str(target)})
         else:
-            terminal.show(f"{target}: a copy of {name}; `clsplat check {target}` validates it")
+            terminal.remark(f"{target}: a copy of {name}; `clsplat check {target}` validates it")
     elif as_json:
         terminal.show_json(commands.pipelines(name or None))
     else:

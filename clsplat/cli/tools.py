@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from clsplat import terminal
+from clsplat import streams, terminal
 from clsplat.api import tools
 from clsplat.cli.app import DeviceOption, JsonOption, command
 from clsplat.errors import DataError, DeviceError
@@ -27,6 +27,26 @@ def devices(as_json: JsonOption = False) -> None:
         )
 
 
+@command("doctor", "clsplat doctor", "clsplat doctor --device radeonsi --html device.html")
+def doctor(
+    device: DeviceOption = None,
+    as_json: JsonOption = False,
+    page: Annotated[
+        Path | None, typer.Option("--html", metavar="FILE", help="Write a page, to be attached to a report.")
+    ] = None,
+) -> None:
+    """Prove that a device computes what the reference says; exit 4 when it does not."""
+    if as_json:
+        terminal.keep_stdout_for_json()
+    report = tools.doctor(device, page)
+    if as_json:
+        terminal.show_json(report.data())
+    else:
+        terminal.show(report.text())
+    if not report.usable:
+        raise DeviceError(f"{report.info.text}: {report.verdict.text}")
+
+
 @command("inspect", "clsplat inspect my_scene", "clsplat inspect my_scene --html scene.html")
 def inspect(
     scene: Annotated[Path, typer.Argument(metavar="SCENE", help="A COLMAP, Blender or nerfstudio folder.")],
@@ -45,6 +65,7 @@ def inspect(
         terminal.show_json(inspection.data())
     else:
         show(inspection, terminal.CONSOLE)
+        streams.check_output()
     if not inspection.trainable:
         raise DataError(inspection.verdict)
 

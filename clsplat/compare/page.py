@@ -106,7 +106,7 @@ def _curves(rows: Sequence[Row]) -> list[Markup]:
 
     downscale = rows[0].runs[0].scene.downscale
     drawings = [
-        curve("test PSNR over steps, dB", lines("evaluate", "psnr", split="test", scale=downscale)),
+        curve("test PSNR over steps, dB", lines("evaluate", "psnr", split="test", downscale=downscale)),
         curve("PSNR of single training views over steps, dB", lines("train", "psnr")),
         curve("Gaussians over steps", lines("train", "gaussians")),
     ]

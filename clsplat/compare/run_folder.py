@@ -1,6 +1,5 @@
 """A finished run, read from its folder: settings, metrics, records, renders."""
 
-import json
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -9,13 +8,13 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from clsplat import plugins
-from clsplat.errors import ConfigError, DataError
+from clsplat.errors import ConfigError, DataError, shortened
 from clsplat.pipeline.explanation import explain
 from clsplat.pipeline.file import SceneSettings
 from clsplat.pipeline.renamed import with_new_names
 from clsplat.pipeline.yaml_file import read_yaml
 from clsplat.prepare.cache import noted
-from clsplat.scene.images import read_file
+from clsplat.reading import read_file, read_json
 from clsplat.training.records import Records
 
 
@@ -128,8 +127,8 @@ def read_metrics(path: Path) -> RunMetrics:
         return RunMetrics.model_validate_json(read_file(path))
     except ValidationError as error:
         first = error.errors()[0]
-        place = ".".join(str(part) for part in first["loc"])
-        message = first["msg"].removeprefix("Invalid JSON: ")
+        place = shortened(".".join(str(part) for part in first["loc"]))
+        message = shortened(first["msg"].removeprefix("Invalid JSON: "), 200)
         raise DataError(
             f"{path}: {place + ': ' if place else ''}{message}; the file is damaged: run the pipeline again"
         ) from error
@@ -137,7 +136,7 @@ def read_metrics(path: Path) -> RunMetrics:
 
 def _state(path: Path) -> str:
     try:
-        state = json.loads((path / "status.json").read_text()).get("state")
-    except (OSError, ValueError, AttributeError):
+        state = read_json(path / "status.json").get("state")
+    except (DataError, AttributeError):
         state = None
     return {"failed": "failed", "interrupted": "was interrupted"}.get(str(state), "is not finished")

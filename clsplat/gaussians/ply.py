@@ -9,6 +9,7 @@ standard deviation (Mip-Splatting).  Comments hold the numbers that a rasterizer
 """
 
 import json
+import os
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,13 +17,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.errors import DataError
+from clsplat.errors import DataError, quoted
 from clsplat.files import atomic
 from clsplat.gaussians.tables import PARAMETERS, sh_coefficients
 from clsplat.ply_header import MAX_HEADER, PlyHeader, parse_ply_header
+from clsplat.reading import opened
 
 RENDERING, MODE = "clsplat ", "SplatRenderMode: "  # comments
 FILTER = "filter_3D"
+NUMBERS = ("near", "screen_variance", "compensate")  # of the comment
+MAX_NUMBER = 1e15  # as of any number in a dataset
 MAX_DEGREE = 3
 _COLUMNS = {
     "means": ("x", "y", "z"),
@@ -46,33 +50,27 @@ class SplatFile:
 
 def is_splat(path: Path) -> bool:
     """Return whether the header of a PLY file declares splats.  Raises DataError when it is missing or no PLY."""
-    return "f_dc_0" in (parse_ply_header(path, _read(path, MAX_HEADER)).dtype.names or ())
+    with opened(path, "a PLY file") as file:
+        return "f_dc_0" in (parse_ply_header(path, file.read(MAX_HEADER)).dtype.names or ())
 
 
 def read_ply(path: Path) -> SplatFile:
     """Read a splat PLY.  Raises DataError when it is missing, damaged or not a splat."""
-    data = _read(path)
-    header = parse_ply_header(path, data)
-    if header.format == "ascii":
-        raise DataError(f"{path}: is an ascii PLY; expected binary_little_endian or binary_big_endian: export it again")
-    expected = header.start + header.count * header.dtype.itemsize
-    if len(data) < expected:
-        raise DataError(
-            f"{path}: holds {len(data)} bytes, but its header declares {header.count} splats, {expected} bytes; "
-            "the file is truncated: copy or export it again"
-        )
-    parameters = _parameters(path, np.frombuffer(data, header.dtype, header.count, header.start))
+    with opened(path, "a PLY file") as file:
+        header = parse_ply_header(path, file.read(MAX_HEADER))
+        if header.format == "ascii":
+            raise DataError(f"{path}: is an ascii PLY; expected binary_little_endian or big_endian: export it again")
+        rendering, size = _rendering(path, header), header.count * header.dtype.itemsize
+        held, expected = file.seek(0, os.SEEK_END), header.start + size
+        if held < expected:
+            raise DataError(
+                f"{path}: holds {held} bytes, but its header declares {header.count} splats, {expected} bytes; "
+                "the file is truncated: copy or export it again"
+            )
+        file.seek(header.start)
+        parameters = _parameters(path, np.frombuffer(file.read(size), header.dtype))
     mode = "mip" if "filter_variance" in parameters else _comment(header, MODE) or "default"
-    return SplatFile(parameters, _rendering(header), mode)
-
-
-def _read(path: Path, size: int = -1) -> bytes:
-    """The first `size` bytes of a file, or all."""
-    try:
-        with path.open("rb") as file:
-            return file.read(size)
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read ({error.strerror}); expected a PLY file") from error
+    return SplatFile(parameters, rendering, mode)
 
 
 def write_ply(path: Path, parameters: Parameters, rendering: dict[str, Any]) -> None:
@@ -116,12 +114,22 @@ def _comment(header: PlyHeader, start: str) -> str:
     return next((text.removeprefix(start).strip() for text in header.comments if text.startswith(start)), "")
 
 
-def _rendering(header: PlyHeader) -> dict[str, Any]:
+def _rendering(path: Path, header: PlyHeader) -> dict[str, Any]:
+    """The numbers of the comment; none where a comment says something else.  Raises DataError for an invalid one."""
     try:
         values = json.loads(_comment(header, RENDERING) or "{}")
-    except ValueError:
+    except (ValueError, RecursionError):
         return {}
-    return values if isinstance(values, dict) else {}
+    if not isinstance(values, dict):
+        return {}
+    for name in NUMBERS:
+        value = values.get(name)
+        if value is not None and (not isinstance(value, int | float) or not 0 <= value < MAX_NUMBER):
+            raise DataError(
+                f"{path}: its comment says {name} = {quoted(value)}; expected a number from 0 to {MAX_NUMBER:g}: "
+                "export it again, or correct that line"
+            )
+    return values
 
 
 def _parameters(path: Path, vertices: NDArray[Any]) -> Parameters:
@@ -134,15 +142,17 @@ def _parameters(path: Path, vertices: NDArray[Any]) -> Parameters:
         )
     rest = sum(name.startswith("f_rest_") for name in names)
     degree = next((d for d in range(MAX_DEGREE + 1) if 3 * (sh_coefficients(d) - 1) == rest), None)
-    if degree is None:
-        raise DataError(f"{path}: has {rest} f_rest properties; expected 0, 9, 24 or 45")
+    columns = tuple(f"f_rest_{i}" for i in range(rest))
+    if degree is None or not set(columns) <= set(names):
+        raise DataError(f"{path}: has {rest} f_rest properties; expected 0, 9, 24 or 45, numbered from 0 on")
     parameters = {name: _columns(vertices, columns) for name, columns in _COLUMNS.items()}
-    by_channel = _columns(vertices, tuple(f"f_rest_{i}" for i in range(rest)))
+    by_channel = _columns(vertices, columns)
     per_channel = sh_coefficients(degree) - 1
     parameters["sh_rest"] = _swapped(by_channel, 3, per_channel)
     parameters = {name: parameters[name] for name in PARAMETERS}
     if FILTER in names:
-        parameters["filter_variance"] = np.square(_columns(vertices, (FILTER,)))
+        with np.errstate(over="ignore"):  # infinity is refused
+            parameters["filter_variance"] = np.square(_columns(vertices, (FILTER,)))
     bad = [name for name, table in parameters.items() if not np.isfinite(table).all()]
     if bad:
         raise DataError(f"{path}: {', '.join(bad)} hold values that are not finite; export the file again")
@@ -159,4 +169,5 @@ def _swapped(table: NDArray[np.float32], outer: int, inner: int) -> NDArray[np.f
 def _columns(vertices: NDArray[Any], columns: tuple[str, ...]) -> NDArray[np.float32]:
     if not columns:
         return np.zeros((len(vertices), 0), np.float32)
-    return np.stack([vertices[c].astype(np.float32) for c in columns], axis=1)
+    with np.errstate(over="ignore"):  # of doubles: infinity is refused
+        return np.stack([vertices[c].astype(np.float32) for c in columns], axis=1)

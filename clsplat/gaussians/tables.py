@@ -61,6 +61,11 @@ class Gaussians:
     def __getitem__(self, name: str) -> Array:
         return self.tables[name].array
 
+    @property
+    def components(self) -> dict[str, int]:
+        """The number of components of each table, by name."""
+        return {name: table.components for name, table in self.tables.items()}
+
     def add(self, name: str, components: int, zero_fresh: bool = False) -> None:
         """Attach a table of zeros."""
         self.tables[name] = Table(self.device.zeros((components, self.capacity)), components, zero_fresh)
@@ -114,17 +119,18 @@ class Gaussians:
             )
 
     def not_finite(self) -> list[str]:
-        """Return the names of the parameters that hold NaN or infinity."""
+        """Return the names of the parameters that hold NaN or infinity, or whose moments do."""
         program = self.device.program("check.cl")
         counters = {name: self.device.zeros(1, np.uint32) for name in PARAMETERS}
         for name, counter in counters.items():
-            program.count_not_finite(
-                items=(self.count, self.tables[name].components),
-                values=self[name],
-                counter=counter,
-                stride=self.capacity,
-                count=self.count,
-            )
+            for table in self.tables.keys() & {name, *moment_tables(name)}:
+                program.count_not_finite(
+                    items=(self.count, self.tables[table].components),
+                    values=self[table],
+                    counter=counter,
+                    stride=self.capacity,
+                    count=self.count,
+                )
         return [name for name, counter in counters.items() if counter.get_item(0) > 0]
 
     def rearrange(self, source: Array, fresh: Array, count: int) -> None:

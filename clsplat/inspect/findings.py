@@ -76,8 +76,11 @@ def _photographs(facts: Facts) -> Iterator[Finding]:
         )
     if photographs.unreadable:
         unreadable = _listed(list(photographs.unreadable))
-        fault = f"{_counted(len(photographs.unreadable), 'image file')} cannot be read ({unreadable})"
+        fault = f"{_counted(len(photographs.unreadable), 'image file')} cannot be decoded ({unreadable})"
         yield Finding("error", fault, "copy or export them again")
+    if photographs.cut:
+        fault = f"the end is missing from {_counted(len(photographs.cut), 'image file')} ({_listed(photographs.cut)})"
+        yield Finding("error", fault, "copy them again")
     if photographs.misfits:
         sizes = [f"{name} is {size}" for name, size in photographs.misfits.items()]
         fault = f"{_are(len(sizes), 'image file')} not of the camera's size ({_listed(sizes, 2)})"
@@ -85,9 +88,6 @@ def _photographs(facts: Facts) -> Iterator[Finding]:
         if len(photographs.on_side) == len(sizes):
             remedy = "width and height are swapped: " + remedy
         yield Finding("error", fault, remedy)
-    if photographs.cut:
-        fault = f"the end is missing from {_counted(len(photographs.cut), 'image file')} ({_listed(photographs.cut)})"
-        yield Finding("warning", fault, "the rest of the image is grey; copy it again")
     if facts.unregistered:
         share = len(facts.unregistered) / facts.on_disk
         fault = (

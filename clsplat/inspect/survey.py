@@ -9,9 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.errors import DataError
-from clsplat.scene.image_headers import read_header
-from clsplat.scene.images import read_image
+from clsplat.scene.decoding import ImageFile, decode_all
 from clsplat.scene.lens import BORDER_POINTS, Lens
 from clsplat.scene.parts import Parts
 from clsplat.scene.points import MAX_VALUE
@@ -54,8 +52,8 @@ class PointFacts:
 class PhotographFacts:
     """The image files and masks of the views, by name."""
 
-    unreadable: dict[str, str]  # the reason
-    cut: list[str]  # the end of the file is missing
+    unreadable: dict[str, str]  # the reason why they cannot be decoded
+    cut: list[str]  # the end of the file is missing; they cannot be decoded either
     misfits: dict[str, str]  # the sizes of file and camera
     on_side: list[str]  # misfits whose width and height are swapped
     exif_turned: list[str]  # read as stored although their Exif data have a rotation
@@ -172,34 +170,32 @@ def _cameras(parts: Parts) -> list[CameraFacts]:
 
 def _photographs(views: Sequence[View], missing: set[Path]) -> PhotographFacts:
     facts = PhotographFacts({}, [], {}, [], [], [], sum(view.mask_path is not None for view in views))
+    decoded = decode_all(view for view in views if view.image_path not in missing)
     for view in views:
         files = {view.name: view.image_path, f"mask of {view.name}": view.mask_path}
         for name, file in files.items():
-            if file and file not in missing:
-                try:
-                    _photograph(facts, view, name, file)
-                except DataError as error:
-                    facts.unreadable[name] = str(error)
+            if file in decoded:
+                _photograph(facts, view, name, decoded[file])
     return facts
 
 
-def _photograph(facts: PhotographFacts, view: View, name: str, file: Path) -> None:
-    """Note what is wrong with a view's photograph or mask.  Raises DataError when it cannot be read."""
-    header = read_header(file)
-    size, camera = (header.width, header.height), view.lens or view.camera
-    on_side = not fits(view, size) and fits(view, size[::-1])
-    if on_side and (header.orientation >= 5 or read_image(file, upright=True).shape[1::-1] == size[::-1]):
-        size = size[::-1]  # the reader rotates it
-    elif header.orientation > 1:
-        facts.exif_turned.append(name)
-    if not header.complete:
+def _photograph(facts: PhotographFacts, view: View, name: str, file: ImageFile) -> None:
+    """Note what there is to say about a view's photograph or mask."""
+    camera = view.lens or view.camera
+    if file.cut:
         facts.cut.append(name)
-    if not fits(view, size):
-        facts.misfits[name] = f"{size[0]}x{size[1]}, its camera {camera.width}x{camera.height}"
-        if on_side:
+    elif file.size is None:
+        facts.unreadable[name] = file.fault
+    elif file.fault and not fits(view, file.size):
+        facts.misfits[name] = f"{file.size[0]}x{file.size[1]}, its camera {camera.width}x{camera.height}"
+        if fits(view, file.size[::-1]):
             facts.on_side.append(name)
-    elif size != (camera.width, camera.height):
-        facts.larger.append(name)
+    else:
+        turned = not fits(view, file.size)  # the reader rotates it
+        if file.orientation > 1 and not turned:
+            facts.exif_turned.append(name)
+        if (file.size[::-1] if turned else file.size) != (camera.width, camera.height):
+            facts.larger.append(name)
 
 
 def _points(parts: Parts, extent: float | None, centres: NDArray[np.floating]) -> PointFacts:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import PrivateAttr, ValidationError
 
-from clsplat.errors import ConfigError, NumericError, shortened
+from clsplat.errors import ConfigError, NumericError, quoted
 from clsplat.gaussians.tables import Gaussians, Gradients
 from clsplat.opencl.device import Array
 from clsplat.render.camera import DeviceCamera
@@ -155,7 +155,7 @@ class HostLoss(ImageLoss):
             super().__init__(weight=weight.item() if isinstance(weight, np.generic) else weight)
         except ValidationError as error:
             reason = error.errors()[0]["msg"].removeprefix("Value error, ")
-            raise ConfigError(f"the weight of the loss is {shortened(repr(weight))}; {reason}") from None
+            raise ConfigError(f"the weight of the loss is {quoted(weight)}; {reason}") from None
         self._function = function
 
     @property
@@ -190,8 +190,7 @@ class HostLoss(ImageLoss):
             value, derivative = float(value), np.asarray(derivative, np.float32)
         except (TypeError, ValueError):
             raise ValueError(
-                f"the loss '{self.name}' returned {shortened(' '.join(repr(found).split()), 80)}; "
-                "expected (value, derivative by the image)"
+                f"the loss '{self.name}' returned {quoted(found)}; expected (value, derivative by the image)"
             ) from None
         if derivative.shape != image.shape:
             raise ValueError(

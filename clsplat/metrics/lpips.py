@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.errors import ConfigError, DataError
+from clsplat.reading import read_file
 
 InputRange = Literal["-1..1", "0..1"]
 INPUTS = ("in0", "in1")  # the arguments of lpips.LPIPS.forward
@@ -23,10 +24,7 @@ class Lpips:
     """
 
     def __init__(self, path: Path, inputs: InputRange) -> None:
-        try:
-            data = path.read_bytes()
-        except OSError as error:
-            raise DataError(f"{path}: cannot be read ({error.strerror}); expected an ONNX file of LPIPS") from error
+        data = read_file(path, "an ONNX file of LPIPS")
         self.path, self.inputs = path, inputs
         self.digest = hashlib.sha256(data).hexdigest()
         try:

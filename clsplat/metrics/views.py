@@ -1,7 +1,7 @@
 """The metrics of a model at the views of a scene, and their means."""
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -57,7 +57,7 @@ def device_ssim(rasterizer: Rasterizer, photograph: Photograph, image: Image) ->
 def measure(
     rasterizer: Rasterizer,
     model: DeviceModel,
-    views: Sequence[View],
+    views: Iterable[View],
     photographs: Photographs,
     perceptual: Perceptual = PSNR_AND_SSIM,
 ) -> list[ViewMetrics]:

@@ -3,6 +3,7 @@
 This package is the only importer of pyopencl.
 """
 
+import logging
 import math
 import threading
 import warnings
@@ -13,18 +14,21 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from clsplat.errors import ConfigError, MemoryLimitError
+from clsplat.errors import ConfigError, KernelError, MemoryLimitError
 from clsplat.opencl import runtimes
 from clsplat.opencl.discovery import DeviceInfo, Schedule, choose, platforms, resolve_schedule, tuning_of
 from clsplat.opencl.timings import Timings
 
-runtimes.add_intel_runtime()
+runtimes.prepare()
 import pyopencl as cl  # noqa: E402
 
 if TYPE_CHECKING:
     from clsplat.opencl.program import Program
 
 warnings.filterwarnings("ignore", category=cl.CompilerWarning)  # some runtimes warn at every build
+
+
+LOG = logging.getLogger("clsplat")
 
 
 class Buffer(cl.Buffer):
@@ -73,13 +77,15 @@ class Array:
 
 
 class Device:
-    """An open device: one context, one in-order queue, programs built once."""
+    """An open device: one context, one order of commands, programs built once."""
 
     def __init__(self, info: DeviceInfo, schedule: Schedule = "auto") -> None:
         platform, number = info.place
         self.info = info
         self.context = cl.Context([platforms()[platform].get_devices()[number]])
-        self.queue = cl.CommandQueue(self.context, properties=cl.command_queue_properties.PROFILING_ENABLE)
+        timed = cl.command_queue_properties.PROFILING_ENABLE
+        self._queues = {False: cl.CommandQueue(self.context), True: cl.CommandQueue(self.context, properties=timed)}
+        self._sampling = False  # whether the timed queue is in use: it costs the host
         self.schedule = resolve_schedule(info, schedule)
         self.tuning = tuning_of(info, self.schedule)
         self.timings = Timings()
@@ -87,10 +93,37 @@ class Device:
         self.peak = 0  # largest value of `allocated`
         self.lock = threading.Lock()  # of what threads share: the programs, and the arguments of their kernels
         self._programs: dict[tuple[Any, ...], Program] = {}
+        if self.schedule == "simt":
+            self._fit_groups()
+
+    def _fit_groups(self) -> None:
+        """Take tiles of 8 x 8 px where the compiler allows blending no group of 16 x 16 items; in the backward pass as
+        many splats as the device runs items together, which leaves none of them idle."""
+        try:
+            blend = self.program("blend_simt.cl")
+        except KernelError as error:
+            if self.tuning["TILE"] == 8:
+                raise
+            LOG.info(f"tiles of 8 x 8 px instead of 16 x 16: {error}")
+            self.tuning["TILE"] = 8
+            blend = self.program("blend_simt.cl")
+        if blend.blend_backward.together >= 64:
+            self.tuning["SPLAT_GROUP"] = 64
 
     @property
     def text(self) -> str:
         return f"{self.info.text}, {self.schedule} schedule"
+
+    @property
+    def queue(self) -> Any:
+        """The queue of commands, the timed one while `timings` samples; at a change the device waits, not the host."""
+        sampling = self.timings.sampling
+        if sampling != self._sampling:
+            before = cl.enqueue_marker(self._queues[self._sampling])
+            self._queues[self._sampling].flush()
+            cl.enqueue_barrier(self._queues[sampling], wait_for=[before])
+            self._sampling = sampling
+        return self._queues[sampling]
 
     def empty(self, shape: int | tuple[int, ...], dtype: DTypeLike = np.float32) -> Array:
         """Allocate an array with undefined values.  Raises MemoryLimitError with the sizes."""
@@ -136,7 +169,7 @@ class Device:
         """
         from clsplat.opencl.program import Program
 
-        key = (str(file), *sorted(defines.items()))
+        key = (str(file), *defines.items(), *self.tuning.items())
         with self.lock:
             if key not in self._programs:
                 self._programs[key] = Program(self, file, {**self.tuning, **defines})

@@ -9,10 +9,10 @@ import re
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from clsplat.errors import ConfigError, DeviceError
+from clsplat.errors import ConfigError, DeviceError, quoted
 from clsplat.opencl import runtimes
 
-runtimes.add_intel_runtime()
+runtimes.prepare()
 import pyopencl as cl  # noqa: E402
 
 DEVICE_VARIABLE = "CLSPLAT_DEVICE"
@@ -35,13 +35,18 @@ class DeviceInfo:
     group: int  # items, largest work-group
     float_width: int  # lanes of the vector unit
     place: tuple[int, int]  # platform and device number
+    clock: int = 0  # MHz, at most
+    unified: bool = False  # its memory is the host's: an integrated GPU
 
     @property
     def text(self) -> str:
         return f"{self.name} ({self.kind}) on {self.platform}"
 
     def fault(self) -> str | None:
-        """Return None when the device runs a test kernel, else a sentence about the fault."""
+        """Return None when the device runs a test kernel of the size needed, else a sentence about the fault."""
+        needed = int(tuning_of(self, resolve_schedule(self, "auto"))["GROUP"])
+        if self.group < needed:
+            return f"its work-groups have at most {self.group} items; expected {needed} or more"
         return runtimes.fault_of(f"{self.platform}|{self.name}|{self.driver}|{cl.VERSION_TEXT}", *self.place)
 
     def matches(self, device_name: str) -> bool:
@@ -84,6 +89,8 @@ def _info(platform: Any, device: Any, place: tuple[int, int]) -> DeviceInfo:
         group=device.max_work_group_size,
         float_width=device.native_vector_width_float,
         place=place,
+        clock=device.max_clock_frequency,
+        unified=bool(device.host_unified_memory),
     )
 
 
@@ -96,7 +103,7 @@ def choose(device_name: str | None = None) -> DeviceInfo:
     """Choose a device; log the devices that do not work.
 
     `device_name` is a part of a runtime's or device's name, with `:n` for the n-th match, from 0.  Without it the
-    variable CLSPLAT_DEVICE holds the name, else the first GPU that works is chosen, else the first CPU.  Raises
+    variable CLSPLAT_DEVICE holds the name, else the strongest GPU that works is chosen, else the first CPU.  Raises
     DeviceError with the names of all devices.
     """
     device_name = device_name or os.environ.get(DEVICE_VARIABLE)
@@ -109,13 +116,25 @@ def choose(device_name: str | None = None) -> DeviceInfo:
     if device_name:
         return _named(device_name, devices)
     faults = []
-    for info in sorted(devices, key=lambda i: i.kind != "GPU"):
+    for info in sorted(devices, key=_rank):
         fault = info.fault()
         if fault is None:
+            others = [other.text for other in devices if other.kind == info.kind == "GPU" and other is not info]
+            if others:
+                LOG.info(f"chose {info.text}; other GPUs: {'; '.join(others)}; --device NAME chooses one")
             return info
         faults.append(f"{info.text} does not work: {fault}")
         LOG.warning(faults[-1])
     raise DeviceError("; ".join(faults))
+
+
+def _rank(info: DeviceInfo) -> tuple[bool, bool, int]:
+    """GPUs first, those with memory of their own before integrated ones, then by units times clock; CPUs as found.
+
+    Units alone compare badly: some vendors count whole processors, others their parts.
+    """
+    gpu = info.kind == "GPU"
+    return not gpu, gpu and info.unified, -info.units * info.clock if gpu else 0
 
 
 def _named(device_name: str, devices: list[DeviceInfo]) -> DeviceInfo:
@@ -123,7 +142,7 @@ def _named(device_name: str, devices: list[DeviceInfo]) -> DeviceInfo:
     name, number = numbered.groups() if numbered else (device_name, "0")
     matching = [info for info in devices if info.matches(name)]
     if int(number) >= len(matching):
-        raise DeviceError(f"no device matches '{device_name}'; there are: {'; '.join(i.text for i in devices)}")
+        raise DeviceError(f"no device matches {quoted(device_name)}; there are: {'; '.join(i.text for i in devices)}")
     info = matching[int(number)]
     fault = info.fault()
     if fault is not None:

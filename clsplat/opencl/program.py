@@ -3,11 +3,12 @@
 Arguments are passed by the names in the kernel's signature; missing, surplus or wrongly typed ones raise KernelError.
 """
 
+import math
 import re
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any, ClassVar, NoReturn
 
 import numpy as np
 import pyopencl as cl
@@ -15,11 +16,12 @@ import pyopencl as cl
 from clsplat import resource_dir
 from clsplat.errors import DeviceError, KernelError, MemoryLimitError
 from clsplat.opencl.device import Array
+from clsplat.opencl.discovery import DeviceInfo
 
 if TYPE_CHECKING:
     from clsplat.opencl.device import Device
 
-BUILD_OPTIONS = ("-cl-std=CL1.2", "-Werror")
+BUILD_OPTIONS = ("-cl-std=CL1.2",)
 
 _INCLUDE = re.compile(r'^#include "(\w+\.h)"')
 _COMMENT = re.compile(r"/\*.*?\*/|//[^\n]*", re.DOTALL)
@@ -41,7 +43,7 @@ def flatten(path: Path, seen: set[Path] | None = None) -> str:
     """Return the source with each local header inlined once; #line keeps file and line right in compiler messages."""
     seen = set() if seen is None else seen
     text = [f'#line 1 "{path.name}"']
-    for number, line in enumerate(path.read_text().splitlines(), start=1):
+    for number, line in enumerate(path.read_text("utf-8").splitlines(), start=1):
         match = _INCLUDE.match(line)
         if match is None:
             text.append(line)
@@ -59,7 +61,7 @@ def flatten(path: Path, seen: set[Path] | None = None) -> str:
 @cache
 def constants(file: str = "common.h") -> dict[str, float]:
     """Return the numeric #defines of a header, for use in Python."""
-    text = (resource_dir("cl_kernels") / file).read_text()
+    text = (resource_dir("cl_kernels") / file).read_text("utf-8")
     values = {}
     for name, value in _DEFINE.findall(text):
         numerator, _, denominator = value.strip("()").partition(" / ")
@@ -93,6 +95,24 @@ def _parse_argument(kernel: str, text: str) -> Argument:
     raise KernelError(f"{kernel}: cannot read the parameter '{text.strip()}'")
 
 
+def group_limit(kernel: Any, device: Any) -> int:
+    """Return the items of the largest work-group that the compiler allows a kernel."""
+    return int(kernel.get_work_group_info(cl.kernel_work_group_info.WORK_GROUP_SIZE, device))
+
+
+def understates_groups(info: DeviceInfo, most: int, together: int) -> bool:
+    """Return whether a limit is that of rusticl, which gives the items that run together for the largest group of any
+    kernel and runs larger ones: Mesa 22.3.6 says 32 of a kernel that requires 256.
+    https://gitlab.freedesktop.org/mesa/mesa/-/blob/mesa-22.3.6/src/gallium/frontends/rusticl/api/kernel.rs
+    """
+    return info.platform.startswith("rusticl") and most == together
+
+
+def group_multiple(kernel: Any, device: Any) -> int:
+    """Return the number of items that a device runs together, of whose multiples groups should be."""
+    return int(kernel.get_work_group_info(cl.kernel_work_group_info.PREFERRED_WORK_GROUP_SIZE_MULTIPLE, device))
+
+
 class Kernel:
     """A kernel that is called with named arguments."""
 
@@ -100,8 +120,15 @@ class Kernel:
         self.label, self.arguments = label, arguments
         self._device, self._kernel = device, kernel
         self._kernel.set_scalar_arg_dtypes([None if a.pointer else a.dtype for a in arguments])
-        size = kernel.get_work_group_info(cl.kernel_work_group_info.COMPILE_WORK_GROUP_SIZE, device.context.devices[0])
-        self.group = tuple(int(n) for n in size)
+        info, opened = cl.kernel_work_group_info, device.context.devices[0]
+        self.group = tuple(int(n) for n in kernel.get_work_group_info(info.COMPILE_WORK_GROUP_SIZE, opened))
+        items, most = math.prod(self.group), group_limit(kernel, opened)
+        self.together = group_multiple(kernel, opened)
+        if items > most and not understates_groups(device.info, most, self.together):
+            raise KernelError(
+                f"{label} has work-groups of {items} items, and {device.info.text} allows it {most}; "
+                "use another device, rasterizer.schedule or rasterizer.sort"
+            )
 
     def __call__(self, *, items: int | tuple[int, ...] = 0, groups: int | tuple[int, ...] = 0, **values: Any) -> None:
         """Launch over `items`, rounded up to whole groups, or `groups` of the kernel's own size; none: no launch."""
@@ -155,12 +182,14 @@ class Kernel:
 class Program:
     """One .cl file, built; its kernels are attributes."""
 
+    options: ClassVar[tuple[str, ...]] = BUILD_OPTIONS  # tests add -Werror; drivers of users may warn
+
     def __init__(self, device: "Device", file: str | Path, defines: dict[str, int | str]) -> None:
         path = resource_dir("cl_kernels") / file  # an absolute path stays as it is
         if not path.is_file():
             raise KernelError(f"{path}: no such kernel file")
         source = flatten(path)
-        options = [*BUILD_OPTIONS, *(f"-D{name}={value}" for name, value in sorted(defines.items()))]
+        options = [*self.options, *(f"-D{name}={value}" for name, value in sorted(defines.items()))]
         try:
             program = cl.Program(device.context, source).build(options)
         except cl.Error as error:

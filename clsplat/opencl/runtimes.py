@@ -11,35 +11,48 @@ import sys
 import sysconfig
 from pathlib import Path
 
-import platformdirs
+from clsplat.caches import cache_folder
 
-CACHE = Path(platformdirs.user_cache_dir("clsplat"))
 SYSTEM_DRIVERS = Path("/etc/OpenCL/vendors")
 PROBE_SECONDS = 120  # a first build may compile for many seconds on a slow machine
 
 _OTHER_RUNTIMES = "apt install pocl-opencl-icd, or pip install 'clsplat[intel]'"
 _ADVICE = (  # words in the output of a failed test kernel -> remedy
     ("unknown target cpu", f"this PoCL does not support the processor: {_OTHER_RUNTIMES}"),
+    (
+        "failed to map segment",
+        "PoCL's cache lies where nothing may be executed: mount it with `exec`, or set POCL_CACHE_DIR",
+    ),
     ("linker", f"PoCL needs a linker: apt install binutils libc6-dev; or use another runtime: {_OTHER_RUNTIMES}"),
     ("abort", f"PoCL may lack a linker: apt install binutils libc6-dev; or use another runtime: {_OTHER_RUNTIMES}"),
 )
 
 
-def add_intel_runtime() -> None:
+def prepare() -> None:
+    """Do what must precede the loader: let its runtimes write their caches, and add Intel's.  Raises OutputError."""
+    cache_folder()
+    _add_intel_runtime()
+
+
+def _add_intel_runtime() -> None:
     """Register Intel's CPU runtime when pip installed it: its own driver file holds a placeholder path.
 
-    This writes a folder of driver files with the system's drivers and Intel's, unless OCL_ICD_VENDORS is set.
+    This writes a folder of driver files with the system's drivers and Intel's, unless OCL_ICD_VENDORS is set.  The
+    loader of Windows takes the library itself, beside the registry's, unless OCL_ICD_FILENAMES is set.
     """
-    library = Path(sysconfig.get_path("data")) / "lib" / "libintelocl.so"
+    data = Path(sysconfig.get_path("data"))
+    if (dll := data / "Library" / "bin" / "intelocl64.dll").exists():  # Windows
+        os.environ.setdefault("OCL_ICD_FILENAMES", str(dll))
+    library = data / "lib" / "libintelocl.so"
     if not library.exists() or "OCL_ICD_VENDORS" in os.environ:
         return
-    folder = CACHE / "drivers" / hashlib.sha256(str(library).encode()).hexdigest()[:12]
+    folder = cache_folder() / "drivers" / hashlib.sha256(str(library).encode()).hexdigest()[:12]
     folder.mkdir(parents=True, exist_ok=True)
     for old in folder.glob("*.icd"):
         if old.name != "intel-pip.icd" and not (SYSTEM_DRIVERS / old.name).exists():
             old.unlink(missing_ok=True)
     for driver in SYSTEM_DRIVERS.glob("*.icd"):
-        _write(folder / driver.name, driver.read_text())
+        _write(folder / driver.name, driver.read_text("utf-8", errors="replace"))
     _write(folder / "intel-pip.icd", f"{library}\n")
     os.environ["OCL_ICD_VENDORS"] = str(folder)
 
@@ -49,12 +62,14 @@ def fault_of(key: str, platform: int, device: int) -> str | None:
 
     `key` identifies the runtime.  Only successes are stored, so a runtime that was fixed is tested again.
     """
-    record = CACHE / "probes" / hashlib.sha256(key.encode()).hexdigest()[:16]
+    record = cache_folder() / "probes" / hashlib.sha256(key.encode()).hexdigest()[:16]
     if record.exists():
         return None
-    command = [sys.executable, "-m", "clsplat.opencl.probe", str(platform), str(device)]
+    command = [sys.executable, "-P", "-m", "clsplat.opencl.probe", str(platform), str(device)]
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=PROBE_SECONDS, check=False)
+        done = subprocess.run(
+            command, capture_output=True, encoding="utf-8", errors="replace", timeout=PROBE_SECONDS, check=False
+        )
     except subprocess.TimeoutExpired:
         return f"a test kernel did not finish in {PROBE_SECONDS} s"
     if done.returncode == 0:
@@ -62,7 +77,7 @@ def fault_of(key: str, platform: int, device: int) -> str | None:
         _write(record, key)
         return None
     output = f"{done.stdout}\n{done.stderr}"
-    reason = "the runtime aborts the process" if done.returncode < 0 else _error_line(output)
+    reason = "the runtime aborts the process" if done.returncode not in range(256) else _error_line(output)
     for word, advice in _ADVICE:
         if word in f"{output} {reason}".lower():
             return f"{reason}; {advice}"
@@ -77,8 +92,8 @@ def _error_line(output: str) -> str:
 
 
 def _write(path: Path, text: str) -> None:
-    if path.exists() and path.read_text() == text:
+    if path.exists() and path.read_text("utf-8", errors="replace") == text:
         return
     temporary = path.with_name(f"{path.name}.{os.getpid()}")
-    temporary.write_text(text)
+    temporary.write_text(text, "utf-8")
     os.replace(temporary, path)

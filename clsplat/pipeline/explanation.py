@@ -7,7 +7,7 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from clsplat.errors import shortened
+from clsplat.errors import quoted, shortened
 from clsplat.pipeline.fields import annotation_of, bases, inside_list, models, tags
 from clsplat.pipeline.yaml_file import Document, Place
 from clsplat.settings import TAGS, Settings, Variants
@@ -54,7 +54,7 @@ def _complaint(error: dict[str, Any], place: Place, model: type[BaseModel] | Non
     kind, value = error["type"], error["input"]
     if kind == "extra_forbidden":
         known = [name for name in (model.model_fields if model else {}) if name not in TAGS]
-        return f"unknown key '{place[-1]}'{_nearest(str(place[-1]), known)}"
+        return f"unknown key {quoted(place[-1])}{_nearest(str(place[-1]), known)}"
     if kind == "missing":
         return f"'{place[-1]}' is missing"
     if kind == "union_tag_invalid":
@@ -64,7 +64,7 @@ def _complaint(error: dict[str, Any], place: Place, model: type[BaseModel] | Non
     if kind == "union_tag_not_found":
         tag = Variants(bases(annotation)[0]).tag
         return f"expected a '{tag}', the name of the {_kind(annotation)}"
-    got = f", got {shortened(repr(value))}"
+    got = f", got {quoted(value)}"
     if kind in EXPECTATIONS:
         return f"expected {EXPECTATIONS[kind].format(**error.get('ctx', {}))}{got}"
     message = error["msg"].removeprefix("Value error, ")
@@ -90,7 +90,8 @@ def place_text(place: Place) -> str:
     """Return a place as text, such as stages[1].optimize.steps."""
     text = ""
     for part in place:
-        text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else str(part)
+        name = shortened(str(part))
+        text += f"[{part}]" if isinstance(part, int) else f".{name}" if text else name
     return text
 
 

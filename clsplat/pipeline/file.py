@@ -9,10 +9,11 @@ A file is complete and strict: unknown keys are errors, and every value has its 
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from clsplat.errors import ConfigError
 from clsplat.filters import ModelSettings
+from clsplat.names import ReadPath, fault_of_name
 from clsplat.opencl.discovery import Schedule
 from clsplat.prepare.steps import Step
 from clsplat.render.rasterizer import MAX_PAIRS, RECORD, Budget
@@ -27,7 +28,7 @@ from clsplat.stages.optimize import Optimize
 class SceneSettings(Settings):
     """The photographs, and how they are read."""
 
-    path: str | None = None
+    path: ReadPath | None = None
     """Folder of the dataset; usually given by --scene."""
     downscale: Annotated[float, Field(ge=1)] = 1
     """Divisor of the photographs' size."""
@@ -84,7 +85,15 @@ class RasterizerSettings(Settings):
 
 
 STAGE_LISTS = ("prepare", "stages")
-Name = Annotated[str, Field(pattern=r"^[\w.-]*\w[\w.-]*$")]  # no path: not only dots
+
+
+def _folder_name(name: str) -> str:
+    if fault := fault_of_name(name):
+        raise ValueError(f"expected the name of a folder: {fault}")
+    return name
+
+
+Name = Annotated[str, Field(pattern=r"^[\w.-]*\w[\w.-]*$"), AfterValidator(_folder_name)]  # not only dots
 
 
 class PipelineFile(Settings):

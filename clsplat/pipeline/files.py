@@ -4,7 +4,7 @@ import difflib
 from pathlib import Path
 
 from clsplat import resource_dir
-from clsplat.errors import ConfigError
+from clsplat.errors import ConfigError, quoted
 
 
 def shipped() -> dict[str, Path]:
@@ -16,10 +16,12 @@ def find(name: str) -> Path:
     """Return the file of a pipeline given by path or by the name of a shipped one.  Raises ConfigError."""
     path = Path(name)
     try:
-        is_file, is_folder = path.is_file(), path.is_dir()
+        is_folder = path.is_dir()
+        is_file = path.exists() and not is_folder  # or a pipe, of which the reader will say so
         is_run = is_folder and (path / "pipeline.yaml").is_file()
     except (OSError, ValueError) as error:
-        raise ConfigError(f"{name[:200]!r}: not the name of a file ({error})") from error
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise ConfigError(f"{quoted(name)}: not the name of a file ({reason})") from error
     if is_file:
         return path
     if path.suffix in (".yaml", ".yml"):
@@ -33,4 +35,4 @@ def find(name: str) -> Path:
         raise ConfigError(f"{path}: is a folder, expected a pipeline file")
     near = difflib.get_close_matches(name, files, n=1)
     hint = f"; did you mean '{near[0]}'?" if near else f"; there are {', '.join(files)}, or give a path"
-    raise ConfigError(f"no pipeline named '{name}'{hint}")
+    raise ConfigError(f"no pipeline named {quoted(name)}{hint}")

@@ -23,7 +23,7 @@ from clsplat.pipeline.settable import CADENCE, settable
 from clsplat.pipeline.yaml_file import Document, read_yaml
 from clsplat.prepare.cache import Planned, plan
 from clsplat.settings import Settings, variants
-from clsplat.stages.base import Scheduled, Stage
+from clsplat.stages.base import Scheduled, Stage, written_twice
 
 
 @dataclass(frozen=True)
@@ -190,3 +190,5 @@ def _check_order(path: Path, settings: PipelineFile) -> None:
                 f"{path}: stages[{i}] {stage.stage} needs '{need}', which no earlier stage makes ({makers} makes it)"
             )
         made |= stage.makes
+    if place := written_twice(settings.stages):
+        raise ConfigError(f"{path}: two stages write '{place}'; give one of them another name")

@@ -22,7 +22,8 @@ from typing import Annotated, Any
 
 from pydantic import Field, JsonValue, ValidationError, model_validator
 
-from clsplat.errors import ConfigError, OverrideError
+from clsplat.errors import ConfigError, OverrideError, quoted, shortened
+from clsplat.names import ReadPath, fault_of_output
 from clsplat.pipeline.explanation import explain, place_text
 from clsplat.pipeline.file import Name
 from clsplat.pipeline.files import find
@@ -36,9 +37,9 @@ MAX_CELLS = 1000
 class Matrix(Settings):
     """The axes; the names of cells hold the values of all axes in the file."""
 
-    pipelines: list[str] = Field([])
+    pipelines: list[ReadPath] = Field([])
     """Pipeline files, or names of shipped pipelines; without them, the stages of this file."""
-    scenes: list[str] = Field([])
+    scenes: list[ReadPath] = Field([])
     """Folders of datasets; without them, the scene of the pipeline or of --scene."""
     seeds: list[Annotated[int, Field(ge=0, lt=2**32)]] = Field([])
     """Seeds; without them, the seed of the pipeline."""
@@ -52,7 +53,7 @@ class Matrix(Settings):
             raise ValueError("expected one of pipelines, scenes, seeds and set")
         for axis in axes:
             if len({json.dumps(value) for value in axis}) < len(axis):
-                raise ValueError(f"the same value twice in {axis}")
+                raise ValueError(f"the same value twice in {quoted(axis)}")
         return self
 
 
@@ -174,7 +175,7 @@ def _cell(base: _Base, choices: Sequence[_Choice], overrides: Sequence[str]) -> 
     try:
         pipeline = checked(base.path, base.document, [*overrides, *(choice.override for choice in choices)])
     except OverrideError as error:
-        raise ConfigError(f"{base.path}: cell '{name}' of the matrix: {error.reason}") from error
+        raise ConfigError(f"{base.path}: cell '{shortened(name)}' of the matrix: {error.reason}") from error
     return Cell(name, pipeline)
 
 
@@ -199,6 +200,9 @@ def _check_overrides(path: Path, axes: Sequence[Sequence[_Choice]], overrides: S
 
 
 def _check_names(path: Path, cells: Sequence[Cell]) -> None:
+    for cell in cells:
+        if fault := fault_of_output(cell.name):
+            raise ConfigError(f"{path}: a cell of the matrix would be named '{shortened(cell.name)}': {fault}")
     names = [cell.name.casefold() for cell in cells]  # some file systems ignore case
     if twice := next((cell.name for cell in cells if names.count(cell.name.casefold()) > 1), None):
         raise ConfigError(f"{path}: two cells of the matrix would be named '{twice}'; rename a pipeline or a folder")

@@ -12,12 +12,13 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from clsplat.errors import ConfigError, OverrideError
+from clsplat.errors import ConfigError, OverrideError, quoted, shortened
 from clsplat.pipeline.fields import annotation_of, inside_list, model_of, with_tags
 from clsplat.pipeline.yaml_file import Place, parse_value
 from clsplat.settings import TAGS
 
 MAX_SUGGESTIONS = 3
+MAX_PARTS = 32  # of a place; real ones have up to ten
 NOT_SETTABLE = {"plugins": "a run writes it; load a plug-in with --plugin FILE"}
 
 
@@ -29,7 +30,7 @@ def split(text: str) -> tuple[list[str], str]:
     """Return the parts of the place, and the value.  Raises OverrideError."""
     place, equals, value = text.partition("=")
     names = re.findall(r"[^.\[\]]+", place)
-    if not equals or not names:
+    if not equals or not 0 < len(names) <= MAX_PARTS:
         raise OverrideError(text, "expected stage.key=value, for example optimize.steps=500")
     return names, value
 
@@ -55,9 +56,9 @@ def apply(data: dict[str, Any], text: str, root: type[BaseModel]) -> Place:
         node.data[i] = with_tags(parsed, node.inside)
         return (*node.place, i)
     if not isinstance(node.data, dict):
-        raise NoSuchKey(text, f"nothing lies below '{names[-2]}'")
+        raise NoSuchKey(text, f"nothing lies below {quoted(names[-2])}")
     if not node.place and last not in root.model_fields:
-        raise NoSuchKey(text, f"no key '{last}' at the top of a pipeline")
+        raise NoSuchKey(text, f"no key {quoted(last)} at the top of a pipeline")
     node.data[last] = with_tags(parsed, node.annotation(last))
     return (*node.place, last)
 
@@ -76,12 +77,12 @@ class _Node:
         if isinstance(self.data, list):
             return self._item(self.number(name, text))
         if not isinstance(self.data, dict):
-            raise NoSuchKey(text, f"nothing lies below '{self.place[-1]}'")
+            raise NoSuchKey(text, f"nothing lies below {quoted(self.place[-1])}")
         if stage := self._stage(name, text):
             return stage
         if self.data.get(name) is None:
             if not self.place and name not in self._fields:
-                raise NoSuchKey(text, f"no '{name}' in this pipeline")
+                raise NoSuchKey(text, f"no {quoted(name)} in this pipeline")
             default = self._fields[name].get_default(call_default_factory=True) if name in self._fields else None
             self.data[name] = _as_written(default) if isinstance(default, BaseModel) else {}
         return self._key(name)
@@ -91,7 +92,7 @@ class _Node:
         if re.fullmatch(r"[0-9]{1,9}", name) and int(name) < len(self.data):
             return int(name)
         count = len(self.data)
-        raise NoSuchKey(text, f"expected a number below {count} in a list of {count}, got '{name}'")
+        raise NoSuchKey(text, f"expected a number below {count} in a list of {count}, got {quoted(name)}")
 
     @property
     def _fields(self) -> dict[str, Any]:
@@ -125,8 +126,8 @@ class _Node:
         if not found and not self.place:
             found = [inner for node in own for inner in node._stages() if inner.data["stage"] == name]
         if len(found) > 1:
-            numbers = " or ".join(_address(node.place) for node in found)
-            raise OverrideError(text, f"there are {len(found)} stages named '{name}'; write {numbers} for it")
+            numbers = shortened(" or ".join(_address(node.place) for node in found), 200)
+            raise OverrideError(text, f"there are {len(found)} stages named {quoted(name)}; write {numbers} for it")
         return found[0] if found else None
 
 

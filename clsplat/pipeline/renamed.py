@@ -1,7 +1,7 @@
 """Old names of keys in pipeline files, which are read for one more release, with a warning.
 
 The new names: `scene.sampling` is `optimize.views.order`, a rule's `after` is `start`, a decay's `start` and `stop` are
-`initial` and `final`.
+`initial` and `final`, `scales` of `evaluate` is `downscales`.
 """
 
 import logging
@@ -39,7 +39,7 @@ class _Names:
 
     def stage(self, stage: Any, order: Any) -> Any:
         if not isinstance(stage, dict) or stage.get("stage") != "optimize":
-            return self._densify(stage)
+            return self._measured(self._densify(stage))
         stage = dict(stage)
         if order is not None and isinstance(views := stage.get("views", {}), dict):
             if "order" in views:
@@ -50,7 +50,7 @@ class _Names:
                 name: self._decay(rate, f"optimize.rates.{name}") for name, rate in stage["rates"].items()
             }
         if isinstance(stage.get("during"), list):
-            stage["during"] = [self._densify(inner) for inner in stage["during"]]
+            stage["during"] = [self._measured(self._densify(inner)) for inner in stage["during"]]
         return stage
 
     def _decay(self, rate: Any, place: str) -> Any:
@@ -59,6 +59,12 @@ class _Names:
         _warn(self.where, f"{place}: {{start, stop}}", "{initial, final}")
         start = {} if "initial" in rate else {"start": "initial"}  # beside `initial` it is today's `start`
         return self._renamed(rate, {**start, "stop": "final"}, place)
+
+    def _measured(self, stage: Any) -> Any:
+        if not isinstance(stage, dict) or stage.get("stage") != "evaluate" or "scales" not in stage:
+            return stage
+        _warn(self.where, "evaluate.scales", "downscales")
+        return self._renamed(stage, {"scales": "downscales"}, "evaluate")
 
     def _densify(self, stage: Any) -> Any:
         if not isinstance(stage, dict) or not isinstance(stage.get("rules"), list):

@@ -9,14 +9,18 @@ from pathlib import Path
 from typing import Any
 
 from ruamel.yaml import YAML
+from ruamel.yaml.composer import Composer
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 from ruamel.yaml.reader import ReaderError
 
-from clsplat.errors import ConfigError, shortened
+from clsplat.errors import ConfigError, quoted, shortened
+from clsplat.reading import read_file
 
 SIZE_LIMIT = 1 << 20  # bytes
 NODE_LIMIT = 20_000  # values after aliases are expanded, so that aliases to aliases cannot fill the memory
+DEPTH_LIMIT = 50  # lists and maps in each other
+INTEGER_LIMIT = 1 << 63
 CORE = "tag:yaml.org,2002:"
 MERGE = f"{CORE}merge"
 SCALAR_TAGS = tuple(CORE + name for name in ("null", "bool", "int", "float", "str"))
@@ -42,24 +46,39 @@ class Document:
 class _NotPlain(Exception):
     """A value that no settings file can hold, and its line."""
 
-    def __init__(self, node: Node, complaint: str) -> None:
+    def __init__(self, node: Any, complaint: str) -> None:
         super().__init__(complaint)
         self.line = node.start_mark.line + 1
+
+
+class _Bounded(Composer):
+    """Stops at the limits before the rest of a text is read, whose time grows with the square of the depth."""
+
+    def __init__(self, loader: Any = None) -> None:
+        super().__init__(loader=loader)
+        self.warn_double_anchors = False
+        self._around = self._count = 0
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        self._around += 1
+        self._count += 1
+        if self._around > DEPTH_LIMIT or self._count > NODE_LIMIT:
+            depth, count = "lists and maps are nested too deeply", f"more than {NODE_LIMIT} values"
+            raise _NotPlain(self.parser.peek_event(), depth if self._around > DEPTH_LIMIT else count)
+        node = super().compose_node(parent, index)
+        self._around -= 1
+        return node
 
 
 def read_yaml(path: Path) -> Document:
     """Read one document.  Raises ConfigError with file and line."""
     try:
-        if path.stat().st_size > SIZE_LIMIT:
-            raise ConfigError(f"{path}: larger than {SIZE_LIMIT} bytes; this is not a pipeline file")
-        text = path.read_bytes().decode("utf-8-sig")
+        text = read_file(path, "a pipeline file", ConfigError, SIZE_LIMIT).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = error.object[: error.start].count(b"\n") + 1
         raise ConfigError(
             f"{path}:{line}: expected UTF-8 text, found the byte {error.object[error.start]:#x}"
         ) from error
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read ({error.strerror or error})") from error
     return _parse(text, str(path))
 
 
@@ -73,6 +92,7 @@ def parse_value(text: str) -> Any:
 
 def _parse(text: str, name: str) -> Document:
     yaml = YAML(typ="safe", pure=True)
+    yaml.Composer = _Bounded
     try:
         root = yaml.compose(text)
         return _Reader(yaml).document(root)
@@ -80,7 +100,7 @@ def _parse(text: str, name: str) -> Document:
         line, complaint = error.line, str(error)
     except MarkedYAMLError as error:
         line = error.problem_mark.line + 1 if error.problem_mark else 1
-        complaint = (error.problem or error.context or "this is not YAML").splitlines()[0]
+        complaint = shortened((error.problem or error.context or "this is not YAML").splitlines()[0], 200)
     except ReaderError as error:
         line = text.count("\n", 0, error.position) + 1
         complaint = f"the character U+{ord(text[error.position]):04X} is not allowed in YAML"
@@ -115,7 +135,7 @@ class _Reader:
             return str(node.value)
         if isinstance(node, ScalarNode) and node.tag in SCALAR_TAGS:
             return self._scalar(node)
-        tag = str(node.tag).replace(CORE, "!!")
+        tag = shortened(str(node.tag).replace(CORE, "!!"))
         raise _NotPlain(node, f"the tag {tag} is not allowed; expected text, a number, a list or keys and values")
 
     def _map(self, node: MappingNode, place: Place) -> dict[str, Any]:
@@ -131,7 +151,7 @@ class _Reader:
                     key_node, "expected text as a key; put a number, a date or a word such as true in quotes"
                 )
             if key in data:
-                raise _NotPlain(key_node, f"found duplicate key '{key}'")
+                raise _NotPlain(key_node, f"found duplicate key {quoted(key)}")
             self._lines[*place, key] = key_node.start_mark.line + 1
             data[key] = self._plain(value, (*place, key))
         for other in merged:
@@ -154,5 +174,7 @@ class _Reader:
             value = self._scalars.construct_object(node)
         except (ValueError, KeyError, IndexError):
             kind = str(node.tag).removeprefix(CORE)
-            raise _NotPlain(node, f"'{shortened(node.value, 40)}' cannot be read as {kind}") from None
+            raise _NotPlain(node, f"{quoted(node.value)} cannot be read as {kind}") from None
+        if isinstance(value, int) and abs(value) >= INTEGER_LIMIT:
+            raise _NotPlain(node, f"{quoted(node.value)} is too large; expected a whole number of at most 64 bits")
         return next((plain(value) for plain in PLAIN_TYPES if isinstance(value, plain)), None)

@@ -6,14 +6,17 @@ import logging
 import os
 import shutil
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from clsplat.errors import DataError, OutputError
-from clsplat.files import unwritable, write_text
+from clsplat.files import sweep, unwritable, write_text
 from clsplat.prepare.steps import Step
+from clsplat.progress import Count
+from clsplat.reading import read_json
 
 LOG = logging.getLogger("clsplat")
 RECORD = "record.json"
@@ -54,11 +57,22 @@ def plan(steps: Sequence[Step], source: Path, root: Path) -> list[Planned]:
     ]  # not needed: a later result exists
 
 
-def prepare(planned: Sequence[Planned], source: Path, root: Path) -> Path:
-    """Run the steps that have a reason and return the last result.  Raises the errors of the steps."""
-    for one in planned:
-        if one.why:
-            _do(one, source, root)
+def prepare(
+    planned: Sequence[Planned],
+    source: Path,
+    root: Path,
+    begun: Callable[[str], AbstractContextManager[Any]] = nullcontext,
+) -> Path:
+    """Run the steps that have a reason, each inside of `begun(name)`, and return the last result.
+
+    Raises the errors of the steps.
+    """
+    count = Count("steps of the preparation", len(planned))
+    for number, one in enumerate(planned):
+        count.reach(number)
+        if one.why and not (one.folder / RECORD).is_file():  # made by another process since
+            with begun(one.step.stage):
+                _do(one, source, root)
         else:
             LOG.info("%s: exists in %s", one.step.stage, one.folder)
         source = one.folder
@@ -95,9 +109,9 @@ def note(planned: Sequence[Planned]) -> dict[str, str]:
 def noted(out: Path) -> dict[str, str] | None:
     """Return the note of a run folder, or None."""
     try:
-        text = json.loads((out / NOTE).read_text())
+        text = read_json(out / NOTE)
         return {"inputs": str(text["inputs"]), "folder": str(text["folder"])}
-    except (OSError, ValueError, KeyError, TypeError):
+    except (DataError, KeyError, TypeError):
         return None
 
 
@@ -106,23 +120,31 @@ def _same(path: Path, other: Path) -> bool:
 
 
 def _do(one: Planned, source: Path, root: Path) -> None:
-    """Make a result in a hidden folder beside its own, and rename it when it is complete."""
+    """Make a result in a hidden folder beside its own, and rename it when it is complete.
+
+    A step that resumes finds there what an interrupted call has made of the same inputs with the same settings.
+    """
     temporary = one.folder.with_name(f".{one.folder.name}")
     LOG.info("%s: %s", one.step.stage, one.why)
     start = time.perf_counter()
     try:
-        shutil.rmtree(temporary, ignore_errors=True)  # of a run that was killed
-        temporary.mkdir(parents=True)
+        if one.step.resumes:
+            sweep(temporary, border=RECORD)
+        else:
+            shutil.rmtree(temporary, ignore_errors=True)
+        temporary.mkdir(parents=True, exist_ok=True)
         summary = one.step.make(source.resolve(), temporary, root.parent)
         seconds = round(time.perf_counter() - start, 1)
         settings = one.step.model_dump(mode="json")
         record = {"origin": one.origin, "inputs": one.inputs, "settings": settings, "seconds": seconds, **summary}
         write_text(temporary / RECORD, json.dumps(record, indent=1) + "\n")
         os.replace(temporary, one.folder)
-    except OSError as error:
-        raise unwritable(one.folder, error) from error
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+    except BaseException as error:
+        if isinstance(error, DataError) or not one.step.resumes:  # the same data would be refused again
+            shutil.rmtree(temporary, ignore_errors=True)
+        if isinstance(error, OSError):
+            raise unwritable(one.folder, error) from error
+        raise
     figures = ", ".join(f"{name} {value}" for name, value in summary.items() if value not in ([], ""))
     LOG.info("%s: %s  %.0f s", one.step.stage, figures, seconds)
 
@@ -133,10 +155,7 @@ def _why(step: Step, inputs: str, folder: Path, source: Path) -> str:
         return ""
     found = []
     for path in folder.parent.glob(f"{step.stage}-*/{RECORD}"):
-        try:
-            record = json.loads(path.read_text())
-        except (OSError, ValueError) as error:
-            raise OutputError(f"{path}: cannot be read back ({error}); remove its folder") from error
+        record = read_json(path, "the record of a result, or no such folder", OutputError)
         if record.get("origin") == str(source.resolve()):
             found.append((path.stat().st_mtime, record))
     if not found:

@@ -46,4 +46,4 @@ def place_photographs(
         half.rename(sparse)
     except OSError as error:
         raise unwritable(out, error) from error
-    return int(json.loads((result / RECORD).read_text())["registered"])
+    return int(json.loads((result / RECORD).read_text("utf-8"))["registered"])

@@ -9,7 +9,17 @@ from pydantic import Field
 from clsplat.errors import DataError
 from clsplat.scene.detect import holds_scene
 from clsplat.settings import Settings
-from data_tools.photos import CameraModel, Cameras, Mapper, Matching, find_features, map_cameras, match_features
+from data_tools.gather import require_photographs
+from data_tools.photos import (
+    CameraModel,
+    Cameras,
+    Mapper,
+    Matching,
+    find_features,
+    map_cameras,
+    match_features,
+    require_pycolmap,
+)
 from data_tools.undistort import Blank, undistort_scene
 
 Count = Annotated[int, Field(gt=0)]
@@ -19,17 +29,29 @@ class Step(Settings):
     """A step from a folder to a folder.  Inputs, settings and `version` identify its result."""
 
     version: ClassVar[int] = 1  # increase it when the result changes
+    resumes: ClassVar[bool] = False  # whether `make` goes on with what an interrupted call left in `out`
 
     stage: str
     """Name of the step."""
 
+    def check(self, source: Path, without: Path) -> None:
+        """Raise what `make` would raise, where that can be known at once: of the first step, before anything is made.
+
+        Nothing is written.
+        """
+
     @abstractmethod
     def make(self, source: Path, out: Path, without: Path) -> dict[str, Any]:
-        """Fill the empty folder `out` from `source`, without reading below `without`; return figures for the log."""
+        """Fill the folder `out` from `source`, without reading below `without`; return figures for the log.
+
+        `out` is empty, or of a step that `resumes` holds what an interrupted call of the same inputs and settings made.
+        """
 
 
 class FindFeatures(Step):
     """Find SIFT features of photographs."""
+
+    resumes: ClassVar[bool] = True
 
     stage: Literal["find_features"] = "find_features"
 
@@ -42,12 +64,17 @@ class FindFeatures(Step):
     cameras: Cameras = "auto"
     """Which photographs share a camera; auto: those of the same size and focal length."""
 
-    def make(self, source: Path, out: Path, without: Path) -> dict[str, Any]:
+    def check(self, source: Path, without: Path) -> None:
         if holds_scene(source):
             raise DataError(
                 f"{source}: holds cameras already; train it with a pipeline without `prepare`, such as splat_7k, "
                 "or give the folder of the photographs alone"
             )
+        require_photographs(source, without.resolve())
+        require_pycolmap()
+
+    def make(self, source: Path, out: Path, without: Path) -> dict[str, Any]:
+        self.check(source, without)
         return find_features(
             source, out, self.long_side, self.features, self.camera_model, self.cameras, without.resolve()
         )
@@ -55,6 +82,8 @@ class FindFeatures(Step):
 
 class MatchFeatures(Step):
     """Match features between pairs of photographs."""
+
+    resumes: ClassVar[bool] = True
 
     stage: Literal["match_features"] = "match_features"
 
@@ -83,6 +112,8 @@ class MapCameras(Step):
 
 class Undistort(Step):
     """Undistort photographs, as of a pinhole camera, at the training size."""
+
+    resumes: ClassVar[bool] = True
 
     stage: Literal["undistort"] = "undistort"
 

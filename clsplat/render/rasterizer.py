@@ -6,6 +6,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from clsplat.errors import MemoryLimitError
 from clsplat.gaussians.tables import DeviceModel, Gradients
 from clsplat.opencl.device import Array, Device
 from clsplat.opencl.program import constants
@@ -27,7 +28,7 @@ class Frame:
     splats: Array  # [N, RECORD]
     radius: Array  # [S] px, 3 standard deviations; 0: not seen
     lists: TileLists
-    tile_last: Array  # [T]
+    tile_last: Array  # [T] pairs of each tile up to the last that any pixel blends
     image: Array  # [3, rows, stride], zero outside the image
     transmittance: Array  # [rows, stride]
     bands: list[Band]  # `lists` belongs to the last one
@@ -47,7 +48,8 @@ class Rasterizer:
 
     def __init__(self, device: Device, sort: Sort = "auto", budget: Budget | None = None) -> None:
         self.device = device
-        self.budget = budget or Budget(device.info.allocation // (4 * RECORD))
+        self.budget = budget or Budget(MAX_PAIRS)
+        self._limit = min(self.budget.pairs, device.info.allocation // (4 * RECORD))  # records are in one buffer
         self._bands: dict[int, int] = {}  # rows of tiles of a frame -> number of bands
         self.workspace = Workspace(device)
         self.tiler = Tiler(device, self.workspace, sort)
@@ -61,13 +63,21 @@ class Rasterizer:
     ) -> Frame:
         """Render the model.  background: [3].
 
-        Where the pairs of all tiles are more than the budget, the frame is rendered in bands of rows: the same bits.
+        Where the pairs of all tiles are more than the budget or the device's memory, the frame is rendered in bands of
+        rows: the same bits.  Raises MemoryLimitError where one row at a time does not fit.
         """
         while True:
             try:
                 return self._forward(model, camera, background, content)
-            except TooManyPairs:
-                self._bands[camera.tiles_y] = 2 * self._bands.get(camera.tiles_y, 1)
+            except (TooManyPairs, MemoryLimitError):
+                if not self._narrow(camera):
+                    raise
+
+    def _narrow(self, camera: DeviceCamera) -> bool:
+        """Halve the bands of a frame; return whether they had more than one row."""
+        bands = self._bands.get(camera.tiles_y, 1)
+        self._bands[camera.tiles_y] = 2 * bands
+        return bands < camera.tiles_y
 
     def _forward(self, model: DeviceModel, camera: DeviceCamera, background: Array, content: Content) -> Frame:
         array = self.workspace.array
@@ -127,7 +137,7 @@ class Rasterizer:
                 items=count, means=gaussians["means"], camera=camera.array, splats=splats, stride=stride, count=count
             )
         single = band.row_end - band.row_begin == 1  # cannot be split further
-        return self.tiler.build(splats, footprints, band, count, MAX_PAIRS if single else self.budget.pairs)
+        return self.tiler.build(splats, footprints, band, count, MAX_PAIRS if single else self._limit)
 
     def pixel_sums(
         self, model: DeviceModel, frame: Frame, grad_image: Array, count: int = PIXEL_SUMS, texture: Array | None = None
@@ -135,14 +145,26 @@ class Rasterizer:
         """Return the sums over each Gaussian's pixels that give its gradients, [count, S]; see cl_kernels/splat.h.
 
         grad_image: [3, rows, stride], zero outside the image.  A `count` above PIXEL_SUMS takes more time; the last two
-        sums need `texture`, [rows, stride] per px.
+        sums need `texture`, [rows, stride] per px.  Memory as in `forward`.
         """
+        bands = frame.bands
+        while True:
+            try:
+                return self._pixel_sums(model, frame, bands, grad_image, count, texture)
+            except MemoryLimitError:
+                if not self._narrow(frame.camera):
+                    raise
+                bands = self._split(frame.camera)
+
+    def _pixel_sums(
+        self, model: DeviceModel, frame: Frame, bands: list[Band], grad_image: Array, count: int, texture: Array | None
+    ) -> Array:
         gaussians = model.gaussians
         defines = {} if count == PIXEL_SUMS else {"PIXEL_SUMS": count}
         pixel_sums = self.workspace.array("pixel_sums", (count, gaussians.capacity))
-        for number, band in enumerate(frame.bands):
+        for number, band in enumerate(bands):
             lists = frame.lists
-            if len(frame.bands) > 1:
+            if len(bands) > 1:
                 lists = self._project_band(model, frame.camera, band, frame.splats, frame.radius, frame.content)
             pair_sums = self.workspace.array("pair_sums", (lists.pairs, RECORD))
             for first_tile, groups in self._launches(band):

@@ -16,6 +16,8 @@ from clsplat.render.workspace import Workspace
 
 Sort = Literal["auto", "radix", "bitonic"]
 TRIALS = 3  # of each sort when `auto` measures
+ONE_GROUP = 32  # values of an item, at most, where one group scans them all
+BLOCKS_MAX = 1024  # of a scan: each adds the sums of all before it
 
 
 @dataclass(frozen=True)
@@ -67,16 +69,21 @@ class TooManyPairs(Exception):
     """A band has more pairs than the limit: use bands with fewer rows of tiles."""
 
 
+def known_sort(device: Device, sort: Sort) -> Sort:
+    """Return radix for `auto` on a device without teams, since bitonic needs barriers; else `sort` itself."""
+    return "radix" if sort == "auto" and int(device.tuning["TEAM"]) == 1 else sort
+
+
 class Tiler:
-    """Builds tile lists; `sort` is radix, bitonic or auto, which measures both on the first frame."""
+    """Builds tile lists; `sort` is radix, bitonic or auto: radix on CPUs, on GPUs the faster on the first frame."""
 
     def __init__(self, device: Device, workspace: Workspace, sort: Sort = "auto") -> None:
-        self.device, self.workspace, self.sort = device, workspace, sort
+        self.device, self.workspace = device, workspace
+        self._team = int(device.tuning["TEAM"])
+        self.sort: Sort = known_sort(device, sort)
         self._pairs = device.program("pairs.cl")
         self._scan = device.program("scan.cl")
         self._radix = device.program("sort_radix.cl")
-        self._bitonic = device.program("sort_bitonic.cl")
-        self._team = int(device.tuning["TEAM"])
         self._digit_bits = int(device.tuning["DIGIT_BITS"])
         self._zero = device.zeros(1, np.uint32)
 
@@ -127,12 +134,15 @@ class Tiler:
         if count == 0:
             offset.fill(0)
             return offset
-        run, blocks = self._runs(count, shortest=1 << 14)
+        run, _ = self._runs(count, shortest=1 << 14)
+        if count <= ONE_GROUP * self._team:  # on a GPU one launch of long runs is shorter than two
+            run = max(run, -(-count // self._team))
+        run = max(run, -(-count // (BLOCKS_MAX * self._team)))
+        blocks = -(-count // (run * self._team))
         block_sum = self._zero
         if blocks > 1:
             block_sum = self.workspace.array("block_sum", blocks, np.uint32)
             self._scan.scan_blocks(groups=blocks, values=values, block_sum=block_sum, run=run, count=count)
-            self._scan.scan_sums(groups=1, block_sum=block_sum, blocks=blocks)
         self._scan.scan_offsets(groups=blocks, values=values, block_sum=block_sum, offset=offset, run=run, count=count)
         return offset
 
@@ -193,12 +203,13 @@ class Tiler:
     ) -> tuple[Array, Array]:
         filled = self.workspace.array("tile_fill", tiles, np.uint32)
         filled.fill(0)
-        self._bitonic.count_pairs(items=pairs, pair_tile=pair_tile, tile_pair_count=filled, count=pairs)
+        bitonic = self.device.program("sort_bitonic.cl")
+        bitonic.count_pairs(items=pairs, pair_tile=pair_tile, tile_pair_count=filled, count=pairs)
         tile_offset = self.scan(filled, tiles, "tile_offset")
         filled.fill(0)
         tile_depth = self.workspace.array("tile_depth", pairs, np.uint32)
         tile_pairs = self.workspace.array("tile_pairs", pairs, np.uint32)
-        self._bitonic.fill_tiles(
+        bitonic.fill_tiles(
             items=pairs,
             pair_tile=pair_tile,
             pair_splat=pair_splat,
@@ -209,17 +220,17 @@ class Tiler:
             tile_pairs=tile_pairs,
             count=pairs,
         )
-        self._bitonic.sort_tiles(groups=tiles, tile_offset=tile_offset, tile_depth=tile_depth, tile_pairs=tile_pairs)
+        bitonic.sort_tiles(groups=tiles, tile_offset=tile_offset, tile_depth=tile_depth, tile_pairs=tile_pairs)
         return tile_offset, tile_pairs
 
     def _faster(self, splats: Array, footprints: Footprints, band: Band, count: int, limit: int) -> Sort:
         seconds: dict[Sort, float] = {}
         for sort in ("radix", "bitonic"):
-            self.sort = sort
+            tiler = Tiler(self.device, self.workspace, sort)
             times = []
             for _ in range(1 + TRIALS):  # the first one compiles
                 start = time.perf_counter()
-                self.build(splats, footprints, band, count, limit)
+                tiler.build(splats, footprints, band, count, limit)
                 self.device.finish()
                 times.append(time.perf_counter() - start)
             seconds[sort] = min(times[1:])

@@ -1,10 +1,12 @@
 """Device memory that frames reuse."""
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import DTypeLike
 
+from clsplat.errors import MemoryLimitError
 from clsplat.opencl.device import Array, Device
 
 GROWTH = 1.25
@@ -18,16 +20,27 @@ class Workspace:
         self._arrays: dict[str, Array] = {}
 
     def array(self, name: str, shape: int | tuple[int, ...], dtype: DTypeLike = np.float32) -> Array:
-        """Return an array of that shape; its values are undefined."""
+        """Return an array of that shape; its values are undefined.
+
+        Raises MemoryLimitError when it does not fit, also without room to grow.
+        """
         shape = (shape,) if isinstance(shape, int) else shape
         kind = np.dtype(dtype)
         length = math.prod(shape)
         held = self._arrays.get(name)
         if held is None or held.nbytes < length * kind.itemsize:
-            grown = length if held is None else int(length * GROWTH)
-            held = self.device.zeros(grown, kind)
-            self._arrays[name] = held
+            grows, held = held is not None, None
+            self._arrays.pop(name, None)  # released before its successor is allocated
+            held = self._arrays[name] = self._roomy(length, kind) if grows else self.device.zeros(length, kind)
         return Array(self.device, held.buffer, shape, kind)
+
+    def _roomy(self, length: int, kind: np.dtype[Any]) -> Array:
+        """Allocate with room to grow, as far as the device has it."""
+        largest = self.device.info.allocation // kind.itemsize
+        try:
+            return self.device.zeros(max(length, min(int(length * GROWTH), largest)), kind)
+        except MemoryLimitError:
+            return self.device.zeros(length, kind)
 
     def length(self, name: str) -> int:
         """Return the number of values in the buffer of `name`; 0 before its first use."""

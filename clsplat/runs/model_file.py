@@ -24,7 +24,7 @@ from clsplat.render.rasterizer import Rasterizer
 from clsplat.scene.detect import read_scene
 from clsplat.scene.images import write_image
 from clsplat.scene.scene import Alpha
-from clsplat.stages.render import image_path
+from clsplat.stages.render import image_paths
 from clsplat.views.photographs import Photographs
 
 SPLITS = ("train", "test", "all")
@@ -94,9 +94,9 @@ class ModelFile:
         views = self.scene.split(split)
         if not views:
             raise DataError(f"{self.scene.path}: has no {split} views")
-        for view in views:
+        paths = image_paths(out, [view.name for view in views], f".{kind}")
+        for path, view in zip(paths, views, strict=True):
             camera = photographs.camera(view)
-            path = image_path(out, view.name, f".{kind}")
             if kind == "png":
                 write_image(path, render_view(self.rasterizer, self.model, camera, photographs.background))
             else:

@@ -1,28 +1,34 @@
 """The state of a run, or of a matrix, from the files of its folder alone."""
 
-import os
+import platform
+import time
 from pathlib import Path
 from typing import Any
 
 from clsplat.compare.run_folder import read_metrics
 from clsplat.errors import DataError
-from clsplat.runs.runner import read_status
+from clsplat.processes import is_alive
 from clsplat.training.records import Records
+from clsplat.training.status import END_STATES, pid_namespace, read_status
 
-END_STATES = ("done", "failed", "interrupted")
+SILENT = 60  # seconds without a heartbeat that are worth a line
 
 
 def run_status(out: Path) -> dict[str, Any]:
-    """Return state, step and metrics of a run folder; of a matrix `cells`, `done` and `failed` instead of the step.
+    """Return what status.json says, the last report and the metrics of a run folder; of a matrix no step.
 
-    state: starting, running, done, failed, interrupted, or killed where its process on this machine has ended.
+    state: as there, or killed where its process on this machine has ended; silent: seconds since the heartbeat of a run
+    that has not ended, on whatever machine it runs.
     Raises DataError when the folder holds no run, or a damaged file.
     """
     status = read_status(out)
     if not isinstance(status.get("state"), str):
         raise DataError(f"{out}: has no readable status.json; expected the folder of a run")
-    if status["state"] not in END_STATES and not _alive(status.get("process")):
-        status["state"] = "killed"
+    if status["state"] not in END_STATES:
+        if _gone(status):
+            status["state"] = "killed"
+        elif isinstance(status.get("time"), int | float):
+            status["silent"] = max(0, round(time.time() - status["time"]))
     metrics = None
     if (out / "metrics.json").exists():
         metrics = read_metrics(out / "metrics.json").model_dump(exclude_unset=True)
@@ -33,6 +39,8 @@ def run_status(out: Path) -> dict[str, Any]:
 def status_text(status: dict[str, Any]) -> str:
     """Return what run_status found as lines of text."""
     lines = [f"{status['run']}: {status['state']}{_progress(status)}"]
+    if status.get("silent", 0) >= SILENT:
+        lines.append(f"  no sign of life for {status['silent']} s{_place(status)}")
     if status.get("message"):
         lines.append(f"  {status['message']}")
     goes_on = "resume" not in str(status.get("message"))
@@ -51,11 +59,20 @@ def status_text(status: dict[str, Any]) -> str:
 
 
 def _progress(status: dict[str, Any]) -> str:
+    """Where the run is, and how far its stage."""
     if "cells" in status:
         failed = status["failed"] if isinstance(status.get("failed"), dict) else {}
         return f", {status.get('done')} of {status['cells']} cells, {len(failed)} of them failed"
     steps = f" of {status['steps']}" if "steps" in status else ""
-    return f" at step {status.get('step')}{steps}"
+    amount, count = status.get("progress"), ""
+    if isinstance(amount, dict) and amount.get("unit") != "steps":
+        count = f", {amount.get('done')} of {amount.get('total')} {amount.get('unit')}"
+    left = status.get("seconds_left")
+    if status["state"] in END_STATES:
+        return f" at step {status.get('step')}{steps if status['state'] != 'done' else ''}"
+    stage = f", {status['stage']}{count}" if status.get("stage") else ""
+    time_left = f", {left:.0f} s left" if isinstance(left, int | float) and status["state"] == "running" else ""
+    return f" at step {status.get('step')}{steps}{stage}{time_left}"
 
 
 def _figures(values: dict[str, Any], names: tuple[str, ...]) -> str:
@@ -65,14 +82,19 @@ def _figures(values: dict[str, Any], names: tuple[str, ...]) -> str:
     )
 
 
-def _alive(process: Any) -> bool:
-    """Whether a process runs on this machine; True when that is not known."""
-    if not isinstance(process, int) or process <= 0:
-        return True
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except OSError:
-        return True
-    return True
+def _here(status: dict[str, Any]) -> bool:
+    """Whether the run's process number counts on this machine; older files do not say."""
+    return status.get("host", platform.node()) == platform.node() and status.get("pid_namespace") in (
+        None,
+        pid_namespace(),
+    )
+
+
+def _place(status: dict[str, Any]) -> str:
+    return f"; process {status.get('process')}" if _here(status) else f"; it runs on {status.get('host')}"
+
+
+def _gone(status: dict[str, Any]) -> bool:
+    """Whether the process has ended, as far as that can be known from here."""
+    process = status.get("process")
+    return isinstance(process, int) and process > 0 and _here(status) and not is_alive(process)

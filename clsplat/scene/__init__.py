@@ -1,9 +1,9 @@
 """Datasets on the host.  A reader of another format needs these names: see `Reader`."""
 
+from clsplat.reading import read_file as read_file
 from clsplat.scene.camera import Camera as Camera
 from clsplat.scene.detect import read_scene as read_scene
 from clsplat.scene.images import inside as inside
-from clsplat.scene.images import read_file as read_file
 from clsplat.scene.images import require_files as require_files
 from clsplat.scene.parts import Parts as Parts
 from clsplat.scene.quaternion import pose_matrix as pose_matrix

@@ -4,6 +4,9 @@ import math
 from dataclasses import astuple, dataclass
 from numbers import Integral
 
+MAX_SIDE = 1 << 20  # px: OpenCV decodes no larger image
+MIN_FOCAL = 1e-3  # px, in a dataset: with less an image shows half of all directions
+
 
 @dataclass(frozen=True)
 class Camera:
@@ -19,10 +22,13 @@ class Camera:
     def check(self) -> "Camera":
         """Return the camera.
 
-        Raises ValueError unless sizes are whole, sizes and focal lengths positive and all numbers finite.
+        Raises ValueError unless sizes are whole and at most MAX_SIDE, sizes and focal lengths positive, and all numbers
+        finite.
         """
         if not (isinstance(self.width, Integral) and isinstance(self.height, Integral)):
             raise ValueError(f"the camera is {self.width}x{self.height}; expected whole numbers of pixels, of type int")
+        if max(self.width, self.height) > MAX_SIDE:
+            raise ValueError(f"the camera is {self.width}x{self.height} pixels; expected at most {MAX_SIDE} to a side")
         if min(self.width, self.height, self.fx, self.fy) <= 0 or not all(map(math.isfinite, astuple(self))):
             raise ValueError(
                 f"the camera is {self.width}x{self.height} with focal lengths {self.fx}, {self.fy} and principal point "

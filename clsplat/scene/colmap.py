@@ -4,7 +4,8 @@ import logging
 import os
 from pathlib import Path
 
-from clsplat.errors import DataError
+from clsplat.errors import DataError, quoted
+from clsplat.scene.camera import MAX_SIDE, MIN_FOCAL
 from clsplat.scene.colmap_files import find_file, read_cameras, read_images, read_point_table, read_points
 from clsplat.scene.colmap_records import REMEDY, CameraRecord, ImageRecord
 from clsplat.scene.images import inside, require_files
@@ -84,14 +85,14 @@ def view_of(image: ImageRecord, cameras: dict[int, CameraRecord], folder: Path) 
     image_path = inside(folder, image.name, image.where)
     if image.camera not in cameras:
         raise DataError(
-            f"{image.where}: image '{image.name}' names camera {image.camera}; expected one of the cameras file, "
+            f"{image.where}: image {quoted(image.name)} names camera {image.camera}; expected one of the cameras file, "
             f"{sorted(cameras)[:8]}: {REMEDY}"
         )
     try:
         pose = pose_matrix(image.quaternion, image.translation)
     except ValueError as error:
         raise DataError(
-            f"{image.where}: the pose of '{image.name}' is {error}: remove that image or {REMEDY}"
+            f"{image.where}: the pose of {quoted(image.name)} is {error}: remove that image or {REMEDY}"
         ) from error
     lens = shared(_lens(image.camera, cameras[image.camera]))
     camera, distortion = (lens.pinhole, lens) if lens.distorts else (lens.camera, None)
@@ -111,11 +112,12 @@ def _lens(number: int, camera: CameraRecord) -> Lens:
             f"{camera.where}: camera {number} is {camera.model}; expected one of {', '.join(MODELS)}: "
             "undistort the images first with `colmap image_undistorter`"
         )
-    if min(camera.width, camera.height, *camera.params[: MODELS[camera.model][0]]) <= 0 or not all(
-        abs(value) < MAX_VALUE for value in camera.params
-    ):
+    sizes = camera.width, camera.height
+    valid = min(sizes) > 0 and max(sizes) <= MAX_SIDE and min(camera.params[: MODELS[camera.model][0]]) >= MIN_FOCAL
+    if not valid or not all(abs(value) < MAX_VALUE for value in camera.params):
         raise DataError(
-            f"{camera.where}: camera {number} is {camera.width}x{camera.height} with parameters {camera.params[:4]}; "
-            f"expected a positive size and focal length and finite numbers: {REMEDY}"
+            f"{camera.where}: camera {number} is {camera.width}x{camera.height} with parameters "
+            f"{quoted(camera.params)}; expected a positive size of at most {MAX_SIDE}, focal lengths from "
+            f"{MIN_FOCAL:g} on and finite numbers: {REMEDY}"
         )
     return Lens(camera.width, camera.height, camera.model, camera.params)

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from clsplat.errors import DataError
+from clsplat.reading import read_file
 from clsplat.scene.colmap_records import MODELS, REMEDY, CameraRecord, ImageRecord, decode, parameter_count
-from clsplat.scene.images import read_file
 from clsplat.scene.points import PointTable
 
 POINT2D = np.dtype([("xy", "<f8", 2), ("point", "<i8")])

@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from clsplat.errors import DataError
+from clsplat.errors import DataError, quoted
 
 # Camera models in order of their ids, with the number of parameters (COLMAP 4, sensor/models.h).
 PARAMETERS = {
@@ -42,7 +42,7 @@ class ImageRecord(NamedTuple):
 def parameter_count(where: str, model: str) -> int:
     """Return the number of parameters of a camera model.  Raises DataError, starting with `where`, for others."""
     if model not in PARAMETERS:
-        raise DataError(f"{where}: unknown camera model '{model}'; expected one of {', '.join(PARAMETERS)}")
+        raise DataError(f"{where}: unknown camera model {quoted(model)}; expected one of {', '.join(PARAMETERS)}")
     return PARAMETERS[model]
 
 

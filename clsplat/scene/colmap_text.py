@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from clsplat.errors import DataError
+from clsplat.errors import DataError, shortened
+from clsplat.reading import read_file
 from clsplat.scene.colmap_records import REMEDY, CameraRecord, ImageRecord, decode, parameter_count
-from clsplat.scene.images import read_file
 from clsplat.scene.points import PointTable
 
 
@@ -71,7 +71,9 @@ def _convert(where: str, words: list[str], kinds: Sequence[Callable[[str], Any]]
     try:
         return [kind(word) for kind, word in zip(kinds, words, strict=True)]
     except ValueError as error:
-        raise DataError(f"{where}: {error}; expected {layout}: remove that entry or {REMEDY}") from error
+        raise DataError(
+            f"{where}: {shortened(str(error))}; expected {layout}: remove that entry or {REMEDY}"
+        ) from error
 
 
 def _byte(word: str) -> int:

@@ -1,16 +1,13 @@
-"""Read the size and the orientation of a photograph from its first bytes, without decoding it.
+"""The size, the orientation and the end of a photograph, from its bytes, without decoding it.
 
-PNG (W3C, third edition), JPEG (ITU-T T.81, annex B) and Exif 2.3; other formats are decoded.
+PNG (W3C, third edition), JPEG (ITU-T T.81, annex B) and Exif 2.3.
 """
 
 import struct
+from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
-from clsplat.errors import DataError
-from clsplat.scene.images import image_size
-
-HEAD_SIZE, TAIL_SIZE = 1 << 18, 1 << 16  # bytes read at either end
+HEAD_SIZE, TAIL_SIZE = 1 << 18, 1 << 16  # bytes that are looked at, at either end
 PNG, PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
 JPEG, JPEG_END = b"\xff\xd8\xff", b"\xff\xd9"
 FRAMES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # markers of a frame header
@@ -27,27 +24,27 @@ class Header:
     complete: bool = True
 
 
-def read_header(path: Path) -> Header:
-    """Return the header of an image file.  Raises DataError when it cannot be read or is no image."""
-    try:
-        with path.open("rb") as file:
-            head = file.read(HEAD_SIZE)
-            file.seek(max(0, file.seek(0, 2) - TAIL_SIZE))
-            tail = file.read()
-    except (OSError, ValueError) as error:
-        raise DataError(f"{path}: cannot read it ({error}); check the path and its permissions") from error
+def parse_header(head: bytes, tail: bytes, whole: Callable[[], bytes]) -> Header | None:
+    """Return the header of a PNG or JPEG file from its first and last bytes; None for anything else.
+
+    `whole` returns all bytes: it is called where neither end holds what is looked for.
+    """
     found = None
     if head.startswith(PNG) and head[12:16] == b"IHDR" and len(head) >= 24:
         width, height = struct.unpack_from(">II", head, 16)
-        found = Header(width, height, complete=PNG_END in tail or PNG_END in path.read_bytes())
+        found = Header(width, height, complete=PNG_END in tail or PNG_END in whole())
     elif head.startswith(JPEG):
-        found = _jpeg(path, head, tail)
-    if found is None or not found.width or not found.height:
-        return Header(*image_size(path))
-    return found
+        found = _jpeg(head, tail, whole)
+    return found if found and found.width and found.height else None
 
 
-def _jpeg(path: Path, head: bytes, tail: bytes) -> Header | None:
+def is_cut(data: bytes) -> bool:
+    """Return whether the end of a PNG or JPEG file is missing; False for other formats."""
+    header = parse_header(data, data[-TAIL_SIZE:], lambda: data)
+    return header is not None and not header.complete
+
+
+def _jpeg(head: bytes, tail: bytes, whole: Callable[[], bytes]) -> Header | None:
     """Walk the segments up to the frame header; None when the walk fails."""
     at, orientation = 2, 1
     while at + 9 <= len(head) and head[at] == 0xFF:
@@ -59,7 +56,7 @@ def _jpeg(path: Path, head: bytes, tail: bytes) -> Header | None:
         if marker in FRAMES:
             height, width = struct.unpack_from(">HH", head, at + 5)
             # An end marker cannot be part of the pixels; that of a thumbnail lies before them.
-            complete = JPEG_END in tail or JPEG_END in path.read_bytes()[at:]
+            complete = JPEG_END in tail or whole().find(JPEG_END, at) >= 0
             return Header(width, height, orientation, complete)
         if marker == 0xE1 and head[at + 4 : at + 10] == b"Exif\0\0":
             orientation = _orientation(head[at + 10 : at + 2 + length])

@@ -9,9 +9,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.errors import DataError
+from clsplat.errors import DataError, quoted, shortened
 from clsplat.files import atomic
+from clsplat.reading import opened, read_file
+from clsplat.scene.image_headers import HEAD_SIZE, TAIL_SIZE, Header, is_cut, parse_header
+from clsplat.scene.png import pixels_only
 
+cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # its lines name no file; errors here do
+MAX_BYTES = (1 << 31) - 1  # of an image file: OpenCV decodes no longer ones
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"})  # in lower case
 
 
@@ -35,19 +40,11 @@ def image_size(path: Path) -> tuple[int, int]:
     return width, height
 
 
-def read_file(path: Path) -> bytes:
-    """Return the bytes of a file.  Raises DataError when it cannot be read."""
-    try:
-        return path.read_bytes()
-    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
-        raise DataError(f"{path}: cannot read it ({error}); check the path and its permissions") from error
-
-
 def inside(folder: Path, name: str, where: str) -> Path:
     """Return `folder / name`.  Raises DataError, starting with `where`, when that lies outside the folder."""
     path = PureWindowsPath(name)  # splits at both kinds of slash and at drives
     if path.anchor or ".." in path.parts or not path.parts or any(letter < " " for letter in name):
-        raise DataError(f"{where}: the file name {name!r} is not a path below {folder}; rename it")
+        raise DataError(f"{where}: the file name {quoted(name)} is not a path below {folder}; rename it")
     return folder / name
 
 
@@ -56,19 +53,38 @@ def require_files(path: Path, files: Iterable[Path]) -> None:
     expected = list(files)
     missing = [str(file) for file in expected if not os.path.isfile(file)]  # unlike Path.is_file, never raises
     if missing:
-        names = ", ".join(missing[:3]) + (", ..." if len(missing) > 3 else "")
+        names = ", ".join(map(shortened, missing[:3])) + (", ..." if len(missing) > 3 else "")
         raise DataError(f"{path}: {len(missing)} of {len(expected)} image files are missing: {names}; put them back")
+
+
+def read_header(path: Path) -> Header:
+    """Return the header of an image file; formats but PNG and JPEG are decoded.  Raises DataError."""
+    with opened(path, "an image", limit=MAX_BYTES) as file:
+        head = file.read(HEAD_SIZE)
+        file.seek(max(0, file.seek(0, 2) - TAIL_SIZE))
+        tail = file.read(TAIL_SIZE)
+    return parse_header(head, tail, lambda: read_file(path, "an image", limit=MAX_BYTES)) or Header(*image_size(path))
 
 
 def read_image(path: Path, upright: bool = False) -> NDArray[Any]:
     """Decode an image file to RGB or RGBA, [H, W, 3 or 4], uint8 or uint16; `upright` rotates it by its EXIF tag."""
-    data = np.frombuffer(read_file(path), np.uint8)  # not cv2.imread: that needs ASCII paths on Windows
-    try:
-        pixels = cv2.imdecode(data, cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH if upright else cv2.IMREAD_UNCHANGED)
+    return decode_image(read_file(path, "an image", limit=MAX_BYTES), path, upright)
+
+
+def decode_image(data: bytes, path: Path, upright: bool = False) -> NDArray[Any]:
+    """Decode the bytes of the image file `path`, as read_image does.  Raises DataError when they are damaged."""
+    if is_cut(data):  # some versions of OpenCV fill the rest with grey
+        raise DataError(f"{path}: the end of the file is missing; copy it again")
+    flags = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH if upright else cv2.IMREAD_UNCHANGED
+    pixels, fault = None, ""
+    try:  # not cv2.imread: that needs ASCII paths on Windows
+        pixels = cv2.imdecode(np.frombuffer(pixels_only(data), np.uint8), flags)
+    except ValueError as error:
+        fault = f" ({error})"
     except cv2.error:
-        pixels = None
+        pass
     if pixels is None:
-        raise DataError(f"{path}: not an image, or a damaged one; copy or export it again")
+        raise DataError(f"{path}: not an image, or a damaged one{fault}; copy or export it again")
     if pixels.dtype not in (np.uint8, np.uint16):
         raise DataError(f"{path}: {pixels.dtype} pixels; expected 8 or 16 bits per channel: convert it to PNG")
     if pixels.ndim == 2:

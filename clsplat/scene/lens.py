@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.errors import DataError
+from clsplat.errors import DataError, quoted
 from clsplat.scene.camera import Camera
 
 Floats = NDArray[np.float64]
@@ -159,7 +159,9 @@ class Lens:
         top = self.undistort(along_x, np.zeros(BORDER_POINTS))[1]
         bottom = self.undistort(along_x, np.full(BORDER_POINTS, float(self.height)))[1]
         if not all(np.isfinite(side).any() for side in (left, right, top, bottom)):
-            raise DataError(f"the lens {self.model} {self.params} cannot be inverted; calibrate the camera again")
+            raise DataError(
+                f"the lens {self.model} {quoted(self.params)} cannot be inverted; calibrate the camera again"
+            )
         u0, u1, v0, v1 = np.nanmax(left), np.nanmin(right), np.nanmax(top), np.nanmin(bottom)
         if self.whole:
             across, down = np.concatenate([left, right]), np.concatenate([top, bottom])
@@ -169,7 +171,7 @@ class Lens:
         width, height = int((u1 - u0) * fx), int((v1 - v0) * fy)
         if min(width, height) < 1:
             raise DataError(
-                f"the lens {self.model} {self.params} leaves no pixel of its image; calibrate the camera again"
+                f"the lens {self.model} {quoted(self.params)} leaves no pixel of its image; calibrate the camera again"
             )
         return Camera(width, height, fx, fy, float(-u0 * fx), float(-v0 * fy))
 

@@ -1,16 +1,16 @@
 """Read the multi-scale Blender datasets of mip-NeRF: one metadata.json, every photograph at several sizes."""
 
-import json
 from pathlib import Path
 from typing import Any
 
-from clsplat.errors import DataError
-from clsplat.scene.images import read_file, require_files
+from clsplat.errors import DataError, quoted
+from clsplat.reading import read_json
+from clsplat.scene.images import require_files
 from clsplat.scene.parts import Parts
 from clsplat.scene.points import read_ply_table, read_points_ply
 from clsplat.scene.readers import Reader
 from clsplat.scene.scene import Scene, View, make_scene
-from clsplat.scene.transforms import Frame, camera_of, image_path_of, pose_of, view_name
+from clsplat.scene.transforms import MAX_BYTES, MAX_FRAMES, Frame, camera_of, image_path_of, pose_of, view_name
 
 FILE, POINTS = "metadata.json", "points3d.ply"
 COLUMNS = ("file_path", "cam2world", "width", "height", "focal", "label")  # one value for each image
@@ -26,10 +26,7 @@ class MultiscaleReader(Reader):
         return (path / FILE).is_file()
 
     def read(self, path: Path, holdout: int) -> Scene:
-        try:
-            splits = json.loads(read_file(path / FILE))
-        except (ValueError, RecursionError) as error:
-            raise DataError(f"{path / FILE}: not a JSON file ({error}); make it again") from error
+        splits = read_json(path / FILE, limit=MAX_BYTES)
         train, test = (_views(path / FILE, splits, name) for name in ("train", "test"))
         require_files(path, (view.image_path for view in train + test))
         points = path / POINTS
@@ -48,6 +45,8 @@ def _views(path: Path, splits: Any, name: str) -> list[View]:
     columns: list[Any] = [table.get(column) for column in COLUMNS] if isinstance(table, dict) else [None]
     if not all(isinstance(column, list) for column in columns) or len(set(map(len, columns))) > 1:
         raise DataError(f"{path}: '{name}' lacks lists of one length called {', '.join(COLUMNS)}; make it again")
+    if len(columns[0]) > MAX_FRAMES:
+        raise DataError(f"{path}: '{name}' has {len(columns[0])} images; expected at most {MAX_FRAMES}")
     views = []
     for i, (file, pose, width, height, focal, label) in enumerate(zip(*columns, strict=True)):
         values = {"file_path": file, "transform_matrix": pose, "w": width, "h": height, "fl_x": focal, "label": label}
@@ -55,7 +54,7 @@ def _views(path: Path, splits: Any, name: str) -> list[View]:
         level = frame.number("label")
         if level is None or not 0 <= level <= 8 or level % 1:
             raise DataError(
-                f"{frame.where}: label is {label!r}; expected the number of its halvings, 0 to 8: make it again"
+                f"{frame.where}: label is {quoted(label)}; expected the number of its halvings, 0 to 8: make it again"
             )
         image = image_path_of(frame)
         view = View(view_name(file), camera_of(frame, None), pose_of(frame), image, downscale=2**level)

@@ -3,7 +3,7 @@
 import logging
 from pathlib import Path
 
-from clsplat.errors import DataError
+from clsplat.errors import DataError, quoted
 from clsplat.scene.parts import Parts
 from clsplat.scene.readers import Reader
 from clsplat.scene.scene import Scene, View, every_nth, make_scene
@@ -53,5 +53,7 @@ def _listed(transforms: Transforms, key: str, views: list[View]) -> set[str] | N
     names = {view_name(entry) for entry in entries}
     unknown = sorted(names - {view.name for view in views})
     if unknown:
-        raise DataError(f"{transforms.path}: {key} lists '{unknown[0]}', which no frame has; remove it from the list")
+        raise DataError(
+            f"{transforms.path}: {key} lists {quoted(unknown[0])}, which no frame has; remove it from the list"
+        )
     return names

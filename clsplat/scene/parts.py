@@ -32,12 +32,14 @@ class Parts:
     faults: list[str] = field(default_factory=list)
     scene: Scene | None = None
     refusal: str = ""
+    _said: set[str] = field(default_factory=set)  # of `faults`
 
     def attempt(self, read: Callable[..., Result], *arguments: Any) -> Result | None:
         """Return what a function reads; where it raises DataError, note the fault and return None."""
         try:
             return read(*arguments)
         except DataError as error:
-            if str(error) not in self.faults:
+            if str(error) not in self._said:
+                self._said.add(str(error))
                 self.faults.append(str(error))
             return None

@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.errors import DataError
+from clsplat.errors import DataError, quoted, shortened
 from clsplat.files import atomic
 from clsplat.ply_header import PlyHeader, parse_ply_header
-from clsplat.scene.images import read_file
+from clsplat.reading import read_file
 from clsplat.scene.scene import Floats, PointCloud
 
 logger = logging.getLogger("clsplat")
@@ -54,7 +54,7 @@ def read_ply_table(path: Path) -> PointTable:
         raise DataError(f"{path}: is big-endian; expected ascii or binary_little_endian: export it again")
     names = header.dtype.names or ()
     if not set(POINT.names or ()) <= set(names) or any(header.dtype[name] != np.uint8 for name in RGB):
-        raise DataError(f"{path}: expected x y z and uchar red green blue of each vertex, found {names}")
+        raise DataError(f"{path}: expected x y z and uchar red green blue of each vertex, found {quoted(names)}")
     table = _read_ascii(path, data, header) if header.format == "ascii" else _read_binary(path, data, header)
     positions, rgb = (np.stack([table[name] for name in names], axis=1) for names in ("xyz", RGB))
     return PointTable(path, positions, rgb)
@@ -90,8 +90,9 @@ def _read_binary(path: Path, data: bytes, header: PlyHeader) -> NDArray[Any]:
 def _read_ascii(path: Path, data: bytes, header: PlyHeader) -> NDArray[Any]:
     """Return the vertices, one per line, as a structured array, [count]."""
     body = io.BytesIO(data[header.start :])
-    for _ in range(min(header.lines_before, len(data))):
-        body.readline()
+    for _ in range(header.lines_before):
+        if not body.readline():
+            break
     # A number takes a digit and a blank, but the last blank may be missing.
     _require(path, header.count, 2 * len(header.dtype.names or ()), len(data) - header.start - body.tell() + 1)
     if header.count == 0:
@@ -99,7 +100,9 @@ def _read_ascii(path: Path, data: bytes, header: PlyHeader) -> NDArray[Any]:
     try:
         table = np.loadtxt(body, header.dtype, comments=None, max_rows=header.count, ndmin=1)
     except (ValueError, OverflowError) as error:
-        raise DataError(f"{path}: {error} after the header; expected one number for each property") from error
+        raise DataError(
+            f"{path}: {shortened(str(error), 200)} after the header; expected one number for each property"
+        ) from error
     if len(table) < header.count:
         raise DataError(
             f"{path}: expected {header.count} lines with points, found {len(table)}; the file is truncated: "

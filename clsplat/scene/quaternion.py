@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from clsplat.errors import quoted
 from clsplat.scene.points import MAX_VALUE
 
 Floats = NDArray[np.float64]
@@ -38,6 +39,7 @@ def pose_matrix(quaternion: Sequence[float], translation: Sequence[float]) -> Fl
     sizes = len(quaternion), len(translation)
     if sizes != (4, 3) or not 0 < length < math.inf or not all(abs(part) < MAX_VALUE for part in translation):
         raise ValueError(
-            f"quaternion {tuple(quaternion)}, translation {tuple(translation)}; expected finite numbers and a rotation"
+            f"quaternion {quoted(tuple(quaternion))}, translation {quoted(tuple(translation))}; "
+            "expected finite numbers and a rotation"
         )
     return np.column_stack([rotation_matrix(*(part / length for part in quaternion)), translation])

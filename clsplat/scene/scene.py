@@ -17,7 +17,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.errors import DataError
+from clsplat.errors import DataError, quoted
 from clsplat.scene.camera import Camera as Camera
 from clsplat.scene.view import Alpha as Alpha
 from clsplat.scene.view import Floats as Floats
@@ -130,16 +130,17 @@ def make_scene(
     seen: set[str] = set()
     for view in views:
         if view.name in seen:
-            raise DataError(f"{path}: two images are called '{view.name}'; names must differ")
+            raise DataError(f"{path}: two images are called {quoted(view.name)}; names must differ")
         seen.add(view.name)
         try:
             view.camera.check()
         except ValueError as error:
-            raise DataError(f"{path}: '{view.name}': {error}; remove that image or fix its camera") from error
+            raise DataError(f"{path}: {quoted(view.name)}: {error}; remove that image or fix its camera") from error
     train = tuple(i for i in range(len(views)) if i not in test)
     if not train:
         raise DataError(f"{path}: every image is held out for testing; raise scene.holdout or add images")
     extent = camera_extent([views[i] for i in train])
+    points = points if points and len(points) else None
     return Scene(path, tuple(views), train, tuple(sorted(test)), points, extent, background)
 
 

@@ -1,6 +1,5 @@
 """Read a `transforms*.json`: the frames and points that Blender (NeRF) and nerfstudio datasets share."""
 
-import json
 import math
 import os
 from pathlib import Path, PureWindowsPath
@@ -8,9 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from clsplat.errors import DataError
-from clsplat.scene.image_headers import read_header
-from clsplat.scene.images import image_size, inside, read_file, require_files
+from clsplat.errors import DataError, quoted
+from clsplat.reading import read_json
+from clsplat.scene.camera import MAX_SIDE, MIN_FOCAL
+from clsplat.scene.images import image_size, inside, read_header, require_files
 from clsplat.scene.lens import Lens, shared
 from clsplat.scene.parts import Parts
 from clsplat.scene.points import MAX_VALUE, read_ply_table, read_points_ply
@@ -23,30 +23,37 @@ LENSES = {  # the parameters of each camera_model, in COLMAP's order
     "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
 }
 COLMAP = {4: "OPENCV", 8: "FULL_OPENCV"}  # by the number of parameters
+MAX_FRAMES = 100_000  # ten times the largest captures that are trained as one scene; they take some 15 s
+MAX_BYTES = 1 << 27  # exporters write at most 1.3 KB for a frame
 
 
 class Frame:
-    """One image of the file: values of the file, replaced by those of the image; `where` is for messages."""
+    """One image of the file, with values of its own, or else those of the whole file; `where` is for messages."""
 
-    def __init__(self, folder: Path, where: str, values: dict[str, Any]) -> None:
-        self.folder, self.where, self.values = folder, where, values
+    def __init__(self, folder: Path, where: str, own: dict[str, Any], common: dict[str, Any] | None = None) -> None:
+        self.folder, self.where = folder, where
+        self._own, self._common = own, common or {}
+
+    def value(self, key: str) -> Any:
+        """Return a value as the file holds it, or None."""
+        return self._own[key] if key in self._own else self._common.get(key)
 
     def number(self, key: str) -> float | None:
         """Return a finite number, or None where there is none.  Raises DataError for anything else."""
-        value = self.values.get(key)
+        value = self.value(key)
         if value is None:
             return None
         if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < MAX_VALUE:
-            raise DataError(f"{self.where}: {key} is {value!r}; expected a finite number: export the file again")
+            raise DataError(f"{self.where}: {key} is {quoted(value)}; expected a finite number: export the file again")
         return float(value)
 
     def file(self, key: str, suffix: str = "") -> Path | None:
         """Return a path below the folder of the JSON file, with `suffix` where it has none, or None."""
-        value = self.values.get(key)
+        value = self.value(key)
         if value is None:
             return None
         if not isinstance(value, str):
-            raise DataError(f"{self.where}: {key} is {value!r}; expected a path below {self.folder}")
+            raise DataError(f"{self.where}: {key} is {quoted(value)}; expected a path below {self.folder}")
         path = inside(self.folder, view_name(value), self.where)
         return path if path.suffix else path.with_name(path.name + suffix)
 
@@ -56,14 +63,13 @@ class Transforms:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        try:
-            self.table = json.loads(read_file(path))
-        except (ValueError, RecursionError) as error:
-            raise DataError(f"{path}: not a JSON file ({error}); export it again") from error
+        self.table = read_json(path, "cameras in JSON", limit=MAX_BYTES)
         frames = self.table.get("frames") if isinstance(self.table, dict) else None
         if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
             raise DataError(f"{path}: expected a table with a list of tables called `frames`; export it again")
-        self.frames = [Frame(path.parent, f"{path}: frames[{i}]", self.table | own) for i, own in enumerate(frames)]
+        if len(frames) > MAX_FRAMES:
+            raise DataError(f"{path}: has {len(frames)} frames; expected at most {MAX_FRAMES}: divide the scene")
+        self.frames = [Frame(path.parent, f"{path}: frames[{i}]", own, self.table) for i, own in enumerate(frames)]
 
     def views(self) -> list[View]:
         """Return one view per frame, in the order of the file.
@@ -120,7 +126,7 @@ def view_of(frame: Frame, size: tuple[int, int] | None) -> View:
     image, mask = image_path_of(frame), frame.file("mask_path")
     lens = shared(lens_of(frame, camera_of(frame, size)))
     camera, distortion = (lens.pinhole, lens) if lens.distorts else (lens.camera, None)
-    return View(view_name(frame.values["file_path"]), camera, pose_of(frame), image, mask, lens=distortion)
+    return View(view_name(frame.value("file_path")), camera, pose_of(frame), image, mask, lens=distortion)
 
 
 def image_path_of(frame: Frame) -> Path:
@@ -137,10 +143,10 @@ def camera_of(frame: Frame, size: tuple[int, int] | None) -> Camera:
     width, height = int(frame.number("w") or default_width), int(frame.number("h") or default_height)
     fx, fy = _focal(frame, "fl_x", "camera_angle_x", width), _focal(frame, "fl_y", "camera_angle_y", height)
     fx, fy = fy if fx is None else fx, fx if fy is None else fy
-    if fx is None or fy is None or min(width, height, fx, fy) <= 0:
+    if fx is None or fy is None or min(width, height) <= 0 or max(width, height) > MAX_SIDE or min(fx, fy) < MIN_FOCAL:
         raise DataError(
             f"{frame.where}: the camera is {width}x{height} with focal lengths {fx}, {fy}; expected positive numbers "
-            "from w, h and fl_x, fl_y or camera_angle_x: export the file again"
+            f"from w, h (at most {MAX_SIDE}) and fl_x, fl_y or camera_angle_x: export the file again"
         )
     cx, cy = frame.number("cx"), frame.number("cy")
     return Camera(width, height, fx, fy, width / 2 if cx is None else cx, height / 2 if cy is None else cy)
@@ -158,12 +164,13 @@ def _focal(frame: Frame, length_key: str, angle_key: str, pixels: int) -> float 
 
 def lens_of(frame: Frame, camera: Camera) -> Lens:
     """Return the lens of a frame: OpenCV's polynomial, rational or fisheye one.  Raises DataError for others."""
-    model = "OPENCV_FISHEYE" if frame.values.get("is_fisheye") else frame.values.get("camera_model", "OPENCV")
-    used = LENSES.get(model)
+    named = frame.value("camera_model")
+    model = "OPENCV_FISHEYE" if frame.value("is_fisheye") else "OPENCV" if named is None else named
+    used = LENSES.get(model) if isinstance(model, str) else None
     given = {key: frame.number(key) or 0.0 for key in DISTORTION}
     surplus = [key for key, value in given.items() if value and key not in (used or DISTORTION)]
     if used is None or surplus:
-        fault = f"camera_model {model!r}" + (f" with {', '.join(surplus)}" if surplus else "")
+        fault = f"camera_model {quoted(model)}" + (f" with {', '.join(surplus)}" if surplus else "")
         raise DataError(
             f"{frame.where}: {fault}; expected one of {', '.join(LENSES)} with its own parameters: "
             "undistort the images first, for example with `colmap image_undistorter`"
@@ -175,7 +182,7 @@ def lens_of(frame: Frame, camera: Camera) -> Lens:
 def pose_of(frame: Frame) -> Floats:
     """Return [3, 4], OpenCV axes, from a camera-to-world matrix with OpenGL axes (y up, z backwards)."""
     try:
-        matrix = np.array(frame.values.get("transform_matrix"), np.float64)
+        matrix = np.array(frame.value("transform_matrix"), np.float64)
     except (ValueError, TypeError, OverflowError):
         matrix = np.empty(0)
     finite = (np.abs(matrix) < MAX_VALUE).all()

@@ -1,7 +1,7 @@
 """A photograph with its camera: reading its pixels at the size of the camera."""
 
 import math
-import operator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -10,12 +10,13 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clsplat.errors import DataError, PoseError
+from clsplat.errors import DataError, PoseError, quoted
 from clsplat.scene.camera import Camera
 from clsplat.scene.images import read_image
 from clsplat.scene.lens import Lens
 
 Floats = NDArray[np.floating]
+Size = tuple[int, int]  # width, height, px
 Alpha = Literal["transparency", "mask"]  # the meaning of a photograph's fourth channel
 BLACK = (0.0, 0.0, 0.0)
 NO_FILE = Path()  # of a view that is made by hand
@@ -44,13 +45,13 @@ class View:
     def __post_init__(self) -> None:
         object.__setattr__(self, "world_to_camera", np.asarray(self.world_to_camera, np.float64))
         if self.world_to_camera.shape != (3, 4):
-            raise PoseError(f"the pose of '{self.name}' has shape {self.world_to_camera.shape}; expected (3, 4)")
+            raise PoseError(f"the pose of {quoted(self.name)} has shape {self.world_to_camera.shape}; expected (3, 4)")
         rotation = self.world_to_camera[:, :3]
         if not np.isfinite(self.world_to_camera).all():
-            raise PoseError(f"the pose of '{self.name}' has values that are not finite; expected finite numbers")
+            raise PoseError(f"the pose of {quoted(self.name)} has values that are not finite; expected finite numbers")
         if not np.allclose(rotation @ rotation.T, np.eye(3), atol=ROTATION_TOLERANCE) or np.linalg.det(rotation) < 0:
             raise PoseError(
-                f"the pose of '{self.name}' has no rotation in its first three columns; "
+                f"the pose of {quoted(self.name)} has no rotation in its first three columns; "
                 "expected axes of length 1 at right angles, not mirrored"
             )
 
@@ -64,12 +65,12 @@ class View:
         """
         centre, point, above = (np.asarray(vector, np.float64) for vector in (position, target, up))
         if not centre.shape == point.shape == above.shape == (3,):
-            raise ValueError(f"'{name}': expected a position, a target and `up` of 3 numbers each")
+            raise ValueError(f"{quoted(name)}: expected a position, a target and `up` of 3 numbers each")
         forward = point - centre
         right = np.cross(forward, above)
         axes = np.stack([right, np.cross(forward, right), forward])
         if not np.linalg.norm(right) > 1e-9 * np.linalg.norm(forward) * np.linalg.norm(above):
-            raise ValueError(f"'{name}': expected a target away from the position, and not along `up`")
+            raise ValueError(f"{quoted(name)}: expected a target away from the position, and not along `up`")
         axes /= np.linalg.norm(axes, axis=1, keepdims=True)
         return cls(name, camera, np.column_stack([axes, -axes @ centre]))
 
@@ -85,7 +86,9 @@ class View:
         Raises ValueError unless `downscale` is positive and finite.
         """
         if not 0 < downscale < math.inf:
-            raise ValueError(f"the downscale of '{self.name}' is {downscale:g}; expected a divisor above 0, such as 2")
+            raise ValueError(
+                f"the downscale of {quoted(self.name)} is {downscale:g}; expected a divisor above 0, such as 2"
+            )
         if downscale == self.downscale:
             return self
         return replace(self, camera=self.camera.downscaled(downscale / self.downscale), downscale=downscale)
@@ -106,11 +109,11 @@ def colour_of(background: ArrayLike) -> Floats:
     try:
         colour = np.asarray(background, np.float64)
     except (ValueError, TypeError):
-        raise ValueError(f"the background is {background!r}; expected one number or three in [0, 1]") from None
+        raise ValueError(f"the background is {quoted(background)}; expected one number or three in [0, 1]") from None
     if colour.shape not in ((), (3,)):
         raise ValueError(f"the background has shape {colour.shape}; expected one number or three")
     if not ((colour >= 0) & (colour <= 1)).all():
-        raise ValueError(f"the background is {background!r}; expected one number or three in [0, 1]")
+        raise ValueError(f"the background is {quoted(background)}; expected one number or three in [0, 1]")
     return np.broadcast_to(colour, (3,))
 
 
@@ -165,34 +168,50 @@ def load_mask(view: View) -> NDArray[np.bool_] | None:
 def _as_taken(view: View, path: Path) -> NDArray[Any]:
     """The pixels of a file at the size of its camera before downscaling: upright and undistorted.
 
-    The EXIF rotation is applied where the file has the camera's size only with it: COLMAP ignores the tag.
-    Raises DataError when the sizes differ in both cases.
+    Raises DataError as is_turned does.
     """
     if path == NO_FILE:
-        raise DataError(f"the view '{view.name}' has no photograph; expected one with an image_path")
-    pixels, lens = read_image(path), view.lens
-    stored = pixels.shape[1::-1]
-    camera = (lens.width, lens.height) if lens else (view.camera.width, view.camera.height)
-    fits = operator.eq if lens else _scales_to
-    if not fits(stored, camera) and fits(stored[::-1], camera):
-        pixels = read_image(path, upright=True)
-    width, height = pixels.shape[1::-1]
-    if not fits((width, height), camera):
-        raise DataError(
-            f"{path}: the image is {width}x{height} pixels, its camera {camera[0]}x{camera[1]}; expected the same size"
-            f"{'' if lens else ', or a larger image of the same shape'}: use the images the cameras were made from"
-        )
-    return lens.undistort_image(pixels) if lens else pixels
+        raise DataError(f"the view {quoted(view.name)} has no photograph; expected one with an image_path")
+    decoded: dict[bool, NDArray[Any]] = {}
+
+    def size(upright: bool) -> Size:
+        decoded[upright] = read_image(path, upright)
+        height, width = decoded[upright].shape[:2]
+        return width, height
+
+    pixels = decoded[is_turned(view, path, size)]
+    return view.lens.undistort_image(pixels) if view.lens else pixels
 
 
-def fits(view: View, size: tuple[int, int]) -> bool:
+def is_turned(view: View, path: Path, size: Callable[[bool], Size]) -> bool:
+    """Return whether a view's photograph or mask has its camera's size only when the EXIF rotation is applied.
+
+    COLMAP ignores that tag.  `size` returns (width, height) of the file as stored, or with True upright.
+    Raises DataError when neither is the camera's.
+    """
+    found = size(False)
+    if fits(view, found):
+        return False
+    if fits(view, found[::-1]):
+        found = size(True)
+        if fits(view, found):
+            return True
+    camera = view.lens or view.camera
+    raise DataError(
+        f"{path}: the image is {found[0]}x{found[1]} pixels, its camera {camera.width}x{camera.height}; expected the "
+        f"same size{'' if view.lens else ', or a larger image of the same shape'}: use the images the cameras were "
+        "made from"
+    )
+
+
+def fits(view: View, size: Size) -> bool:
     """Return whether an image of `size` (width, height) fits the camera of a view."""
     if view.lens:
         return size == (view.lens.width, view.lens.height)
     return _scales_to(size, (view.camera.width, view.camera.height))
 
 
-def _scales_to(file: tuple[int, int], camera: tuple[int, int]) -> bool:
+def _scales_to(file: Size, camera: Size) -> bool:
     """Return whether one divisor >= 1 takes the file's size to the camera's, rounded as in Camera.downscaled."""
     smallest = max(1.0, *(f / (c + 0.5) for f, c in zip(file, camera, strict=True)))
     largest = min(f / (c - 0.5) if c > 1 else np.inf for f, c in zip(file, camera, strict=True))

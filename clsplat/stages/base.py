@@ -1,26 +1,44 @@
 """The base of all stages: settings, needed and made parts of the run, and one method."""
 
 from abc import abstractmethod
-from collections.abc import Collection
-from pathlib import PureWindowsPath
-from typing import Annotated, ClassVar
+from collections.abc import Collection, Iterable, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Annotated, Any, ClassVar, get_args
 
 from pydantic import AfterValidator, Field
 
+from clsplat.names import fault_of_output
 from clsplat.settings import Settings
 from clsplat.training.run import Run
 
 
-def path_in_run(suffix: str = "") -> AfterValidator:
-    """Mark a field that holds a path inside the run folder, which ends in `suffix`."""
+@dataclass(frozen=True)
+class PathInRun(AfterValidator):
+    """Marks a field that holds a path inside the run folder: a file where there is a suffix, else a folder."""
+
+    suffix: str = ""
+
+
+def path_in_run(suffix: str = "") -> PathInRun:
+    """Mark a field that holds a file in the run folder whose name ends in `suffix`, or a folder in it."""
 
     def checked(text: str) -> str:
-        path = PureWindowsPath(text)  # its separators are those of every system
-        if path.anchor or ".." in path.parts or (suffix and path.suffix.lower() != suffix):
-            raise ValueError(f"expected a path inside the run folder{f' that ends in {suffix}' if suffix else ''}")
+        fault = fault_of_output(text)
+        if fault is None and suffix and PurePosixPath(text).suffix.lower() != suffix:
+            fault = f"it does not end in {suffix}"
+        if fault:
+            raise ValueError(f"expected a path inside the run folder: {fault}")
         return text
 
-    return AfterValidator(checked)
+    return PathInRun(checked, suffix)
+
+
+def _marks(kind: Any, metadata: Iterable[Any]) -> list[PathInRun]:
+    """The marks among metadata, and among those of the types that a type is made of."""
+    own = [mark for mark in metadata if isinstance(mark, PathInRun)]
+    return own + [mark for one in get_args(kind) for mark in _marks(one, getattr(one, "__metadata__", ()))]
 
 
 class Stage(Settings):
@@ -28,6 +46,7 @@ class Stage(Settings):
 
     needs: ClassVar[frozenset[str]] = frozenset()  # parts of the run that must exist
     makes: ClassVar[frozenset[str]] = frozenset()  # parts that exist afterwards
+    edits: ClassVar[bool] = False  # changes the model; inside `during` it acts between two steps
 
     stage: str
     """Name of the stage."""
@@ -39,14 +58,31 @@ class Stage(Settings):
     def run(self, run: Run) -> None:
         """Run the stage."""
 
+    def outputs(self, out: Path) -> list[Path]:
+        """Return the files and folders of the run folder `out` that the stage writes: those that its fields name."""
+        values = (getattr(self, name) for name in self.named_outputs())
+        return [out / value for value in values if value is not None]
+
+    @classmethod
+    def named_outputs(cls) -> dict[str, str]:
+        """Return the fields that hold a path inside the run folder, each with the suffix of the file."""
+        marks = {name: _marks(field.annotation, field.metadata) for name, field in cls.model_fields.items()}
+        return {name: found[0].suffix for name, found in marks.items() if found}
+
+    def verify(self, run: Run) -> None:
+        """Read back what the stage has written.  Raises DataError where it is missing or damaged."""
+
+    def act(self, run: Run) -> None:
+        """Run the stage, under its name in status.json; what fails inside of an edit leaves a run that is not whole."""
+        with run.status.stage(self.stage), run.changing() if self.edits else nullcontext():
+            self.run(run)
+
 
 class Scheduled(Stage):
     """A stage that may stand inside `optimize.during`, where it runs at a cadence.
 
     It runs at every step that is a multiple of `every`, after `start` and before `stop`.
     """
-
-    edits: ClassVar[bool] = False  # changes the model; acts between two steps
 
     every: Annotated[int, Field(gt=0)] | None = None
     """Steps from one run of the stage to the next; inside `during` only."""
@@ -64,3 +100,26 @@ class Scheduled(Stage):
     def stale(self, run: Run) -> Collection[str]:
         """Return the parameters whose gradients the edit makes invalid."""
         return ()
+
+
+def written_twice(stages: Sequence[Stage]) -> str | None:
+    """Return a path that two stages would write, a file or what one stage takes for a folder; None if there is none.
+
+    Stages may share a folder, and those of a cadence may share a file with a later stage.  Names that differ in case
+    alone are one file on some systems.
+    """
+    written: list[tuple[tuple[str, ...], bool]] = []  # the parts of a path, and whether it is a file
+    for stage in stages:
+        if not (named := stage.named_outputs()):  # what other stages write for it
+            continue
+        suffixes = set(named.values()) - {""}
+        own = [
+            (tuple(part.casefold() for part in path.parts), path.suffix.lower() in suffixes)
+            for path in stage.outputs(Path())
+        ]
+        for parts, is_file in own:
+            for other, other_is_file in written:
+                if (is_file and other[: len(parts)] == parts) or (other_is_file and parts[: len(other)] == other):
+                    return "/".join(parts)
+        written += own
+    return None

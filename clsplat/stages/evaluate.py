@@ -8,6 +8,7 @@ from pydantic import Field, field_validator
 from clsplat.metrics.lpips import InputRange
 from clsplat.metrics.perceptual import Metric, Perceptual
 from clsplat.metrics.views import mean, measure
+from clsplat.names import ReadPath
 from clsplat.stages.base import Scheduled
 from clsplat.training.run import Run
 
@@ -18,8 +19,8 @@ Downscale = Annotated[float, Field(ge=1)]
 class Evaluate(Scheduled):
     """Render the views of a split and compare them, as 8-bit images, with the photographs.
 
-    Each of `scales` divides the size of the original photographs, not the training size: `scales: [8, 4, 2, 1]` zooms
-    into a scene that was trained at `downscale: 8`.
+    Each of `downscales` divides the size of the original photographs, not the training size: `downscales: [8, 4, 2, 1]`
+    zooms into a scene that was trained at `downscale: 8`.
     """
 
     stage: Literal["evaluate"] = "evaluate"
@@ -28,11 +29,11 @@ class Evaluate(Scheduled):
 
     split: Literal["test", "train"] = "test"
     """Views that are measured."""
-    scales: Annotated[list[Downscale], Field(min_length=1)] | None = None
+    downscales: Annotated[list[Downscale], Field(min_length=1)] | None = None
     """Divisors of the photographs' size; without it, the smallest in training."""
     metrics: list[Metric] = Field(["psnr", "ssim"])
     """Metrics beside LPIPS; psnr and ssim must be among them."""
-    lpips: str | None = None
+    lpips: ReadPath | None = None
     """ONNX file of LPIPS."""
     lpips_input: InputRange = "-1..1"
     """Range of the values for LPIPS; 0..1 as in the tables of 3DGS and Mip-Splatting."""
@@ -55,16 +56,17 @@ class Evaluate(Scheduled):
             LOG.warning("no %s views: nothing to evaluate (scene.holdout chooses them)", self.split)
             return
         perceptual = self._perceptual()
-        for downscale in self.scales or [run.downscale]:
+        for downscale in self.downscales or [run.downscale]:
             views = run.original.downscaled(downscale).split(self.split)
             photographs = run.photographs if downscale in run.scene.downscales else run.photographs.fresh()
-            results = measure(run.rasterizer, run.model, views, photographs, perceptual)
+            counted = run.status.counted(run.until_interrupted(views), "views", len(views))
+            results = measure(run.rasterizer, run.model, counted, photographs, perceptual)
             if not results:
                 continue
             for result in results:
-                run.records.add(run.step, "view", split=self.split, scale=downscale, **result.line())
+                run.records.add(run.step, "view", split=self.split, downscale=downscale, **result.line())
             averages = mean(results, perceptual)
-            run.records.add(run.step, "evaluate", split=self.split, scale=downscale, **averages)
+            run.records.add(run.step, "evaluate", split=self.split, downscale=downscale, **averages)
             run.metrics.setdefault(self.split, {})[f"{downscale:g}"] = averages
             LOG.info(
                 "step %d  %s views at 1/%g: PSNR %.2f dB  SSIM %.4f  (%d views)",

@@ -1,8 +1,10 @@
 """The model as a file."""
 
 import logging
+from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
+from clsplat.errors import DataError
 from clsplat.gaussians.model import load
 from clsplat.stages.base import Scheduled, path_in_run
 from clsplat.training.run import Run
@@ -23,13 +25,22 @@ class Export(Scheduled):
     file: Annotated[str, path_in_run(".ply")] = "point_cloud.ply"
     """Path inside the run folder."""
 
+    def outputs(self, out: Path) -> list[Path]:
+        path = out / self.file
+        return [path, path.with_name(f"{path.stem}_raw{path.suffix}")]
+
     def run(self, run: Run) -> None:
         model = run.host_model()
-        path = run.out / self.file
+        path, raw = self.outputs(run.out)
         files = {path: model.baked()}
         if model.filter_variance is not None:
-            files[path.with_name(f"{path.stem}_raw{path.suffix}")] = model
+            files[raw] = model
         for file, one in files.items():
             one.save(file)
             load(file)
             LOG.info("%d Gaussians written to %s", len(one), file)
+
+    def verify(self, run: Run) -> None:
+        path = run.out / self.file  # it was read back when it was written
+        if not path.is_file() or path.stat().st_size == 0:
+            raise DataError(f"{path}: is missing or empty")

@@ -14,11 +14,13 @@ from scipy.spatial import cKDTree
 from clsplat.errors import DataError
 from clsplat.gaussians.ply import Parameters, read_ply
 from clsplat.gaussians.tables import SH_C0, Gaussians, sh_coefficients
+from clsplat.names import ReadPath
 from clsplat.scene.images import read_image
 from clsplat.scene.plane_sweep import swept_points
 from clsplat.scene.scene import PointCloud, Scene, View
 from clsplat.scene.view import load_image
 from clsplat.stages.base import Stage
+from clsplat.training.memory import first_tables
 from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
@@ -36,6 +38,7 @@ class Init(Stage):
 
     stage: Literal["init"] = "init"
     makes: ClassVar[frozenset[str]] = frozenset({"model"})
+    edits: ClassVar[bool] = True
 
     source: Literal["auto", "points", "sweep", "random", "ply"] = "auto"
     """Source of the first Gaussians."""
@@ -45,7 +48,7 @@ class Init(Stage):
     """Number of random points."""
     swept: Annotated[int, Field(gt=0)] = 20_000
     """Largest number of points of a plane sweep."""
-    file: str | None = None
+    file: ReadPath | None = None
     """Model file for `source: ply`."""
 
     def run(self, run: Run) -> None:
@@ -73,24 +76,37 @@ class Init(Stage):
         if self.source == "ply":
             if self.file is None:
                 raise DataError("init: source 'ply' needs 'file'")
-            return with_degree(read_ply(Path(self.file)).parameters, degree)
+            return with_degree(self._read(Path(self.file)), degree)
         points, source = run.scene.points, self._source(run.scene)
         if source == "random":
-            points = random_points(run.scene, self.count, run.seed)
+            points = self._random(run)
         elif source == "sweep":
             points = self._swept(run)
         elif points is None:
             raise DataError(f"{run.scene.path}: has no points to start from; use init: {{source: sweep}}")
         else:
             require_ahead(points, run.scene)
+        run.memory_plan(first_tables(degree)).check(len(points))
         return from_points(points, self.opacity, degree)
+
+    @staticmethod
+    def _read(path: Path) -> Parameters:
+        parameters = read_ply(path).parameters
+        if not len(parameters["means"]):
+            raise DataError(f"{path}: holds no Gaussians; expected one at least to start from")
+        return parameters
+
+    def _random(self, run: Run) -> PointCloud:
+        """Random points, where so many Gaussians fit.  Raises MemoryLimitError before any is made."""
+        run.memory_plan(first_tables(run.model_settings.sh_degree)).check(self.count)
+        return random_points(run.scene, self.count, run.seed)
 
     def _swept(self, run: Run) -> PointCloud:
         views = [view for view in run.scene.split("train") if view.downscale == run.downscale]
         points = swept_points(views, centre_of(views), load_image, self.swept, run.seed)
         if len(points) < MIN_SWEPT_POINTS:
             LOG.warning("the photographs agree on %d points only; starting from random ones", len(points))
-            return random_points(run.scene, self.count, run.seed)
+            return self._random(run)
         return points
 
 

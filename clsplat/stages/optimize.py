@@ -4,6 +4,8 @@ import logging
 import math
 import time
 from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, field_validator
@@ -19,7 +21,7 @@ from clsplat.stages.densify import Densify
 from clsplat.training import checkpoint
 from clsplat.training.adam import Adam, Rates
 from clsplat.training.profile import stage_milliseconds
-from clsplat.training.run import Progress, Run
+from clsplat.training.run import Progress, Run, Stopped
 from clsplat.training.trainer import Trainer
 from clsplat.views.photographs import Photograph
 from clsplat.views.sampling import Sample, Sampler, ViewSettings
@@ -73,6 +75,9 @@ class Optimize(Stage):
         for stage in self.during:
             stage.check()
 
+    def outputs(self, out: Path) -> list[Path]:
+        return [path for stage in self.during for path in stage.outputs(out)]
+
     def run(self, run: Run) -> None:
         for _ in self.iterate(run):
             pass
@@ -85,11 +90,12 @@ class Optimize(Stage):
         memory.check(count)
         last_step = run.step - run.stage_step + self.steps
         seconds: list[float] = []  # of the steps since the last report
+        self._act(run)
         while run.stage_step < self.steps:
             start = time.perf_counter()
-            if run.stage_step > 0:
-                self._edit(run)
+            self._edit(run)
             view = self._step(run, trainer, sampler)
+            run.status.count("steps", run.stage_step, self.steps, step=run.step, steps=last_step)
             report = run.step % self.log_every == 0 or run.stage_step == self.steps or run.interrupted
             loss, psnr = self._values(run, view, sampler) if report else (0.0, 0.0)
             seconds.append(time.perf_counter() - start)
@@ -97,11 +103,10 @@ class Optimize(Stage):
             if report:
                 self._report(run, last_step, loss, psnr, sum(seconds) / len(seconds))
                 seconds.clear()
-            for stage in self.during:
-                if not stage.edits and stage.due(run.step):
-                    stage.run(run)
+            with suppress(Stopped):
+                self._act(run)
             if run.interrupted:
-                path = checkpoint.save(run, keep=2)
+                path = checkpoint.save(run)
                 raise Interrupted(f"stopped at step {run.step}, saved in {path}; --resume continues from there")
             yield view
 
@@ -139,16 +144,50 @@ class Optimize(Stage):
             run.scene.extent,
         )
 
+    def _act(self, run: Run) -> None:
+        """Run the stages that are due and do not edit; those that fail run again when the run goes on."""
+        for place, stage in enumerate(self.during):
+            if run.stage_step == 0 or place < run.acted or stage.edits or not stage.due(run.step):
+                continue
+            run.acted = place + 1  # a checkpoint is of the state after it
+            try:
+                stage.act(run)
+            except BaseException:
+                run.acted = place
+                raise
+
     def _edit(self, run: Run) -> None:
         """Run the edits that were due at the step before."""
-        for stage in self.during:
-            if stage.edits and stage.due(run.step):
-                stage.run(run)
+        if run.stage_step == 0 or run.edited:
+            return
+        with run.changing():
+            for stage in self.during:
+                if stage.edits and stage.due(run.step):
+                    stage.act(run)
+            run.edited = True
 
     def _step(self, run: Run, trainer: Trainer, sampler: Sampler) -> ViewGradients:
-        """Train on one view; the kernels are timed halfway between reports, away from density edits."""
+        """Do one step; a failure before its update leaves the run at the step before."""
         run.step += 1
         run.stage_step += 1
+        try:
+            view, stale = self._differentiate(run, trainer, sampler)
+        except BaseException:  # a second Ctrl-C too
+            run.step -= 1
+            run.stage_step -= 1
+            raise
+        with run.changing():
+            trainer.update(view, stale)
+            run.acted, run.edited = 0, False
+        run.device.timings.sampling = False
+        run.status.note(step=run.step)
+        return view
+
+    def _differentiate(self, run: Run, trainer: Trainer, sampler: Sampler) -> tuple[ViewGradients, set[str]]:
+        """The gradients of one view, and the parameters that they do not update.
+
+        The kernels are timed halfway between reports, away from density edits.
+        """
         run.device.timings.sampling = run.step % self.log_every == self.log_every // 2
         sample = sampler.at(run.step)
         photograph = self._photograph(run, sample)
@@ -158,9 +197,7 @@ class Optimize(Stage):
         if run.stage_step == self.steps:
             stale = set()
         trainer.losses = [*self.losses, *run.losses]
-        view = trainer.step(photograph, run.step, sample.transforms, stale)
-        run.device.timings.sampling = False
-        return view
+        return trainer.differentiate(photograph, run.step, sample.transforms), stale
 
     def _photograph(self, run: Run, sample: Sample) -> Photograph:
         """The photograph of a step; at its full size where a mask leaves nothing of the smaller one.
@@ -179,17 +216,15 @@ class Optimize(Stage):
         return photograph
 
     def _values(self, run: Run, view: ViewGradients, sampler: Sampler) -> tuple[float, float]:
-        """Read the step's loss and PSNR.  Raises NumericError, after saving the state, when they are not finite."""
+        """Read the step's loss and PSNR.  Raises NumericError, with the state set aside, when not finite."""
         loss = view.loss
         squared = float(pixel_loss(view.comparison, l1=0.0, l2=0.0).get()[..., 1].sum(dtype="float64"))
         error = squared / view.comparison.counted
         broken = run.model.gaussians.not_finite()
         if broken or not math.isfinite(loss):
-            path = checkpoint.save(run, keep=2)
-            raise NumericError(
-                f"step {run.step}, view '{sampler.at(run.step).view.name}': the loss is {loss}; parameters "
-                f"not finite: {', '.join(broken) or 'none'}; the state is in {path}; lower the rates"
-            )
+            view_name = sampler.at(run.step).view.name
+            told = checkpoint.set_aside(run, broken)
+            raise NumericError(f"step {run.step}, view '{view_name}': the loss is {loss}; {told}")
         return loss, -10 * math.log10(max(error, 1e-10))
 
     def _report(self, run: Run, last_step: int, loss: float, psnr: float, seconds: float) -> None:
@@ -198,5 +233,6 @@ class Optimize(Stage):
         run.records.add(run.step, "train", loss=loss, psnr=psnr, gaussians=count, ms=1e3 * seconds, stages=stages)
         if run.step % (DISTRIBUTION_INTERVAL * self.log_every) == 0 or run.step == last_step:
             run.records.add(run.step, "distribution", gaussians=count, **distribution(run.model.gaussians))
-        run.records.status("running", run.step, steps=last_step, gaussians=count)
-        run.show(Progress(run.step, last_step, loss, psnr, count, 1e3 * seconds, seconds * (last_step - run.step)))
+        left = seconds * (last_step - run.step)
+        run.status.note(gaussians=count, seconds_left=round(left, 1))
+        run.show(Progress(run.step, last_step, loss, psnr, count, 1e3 * seconds, left))

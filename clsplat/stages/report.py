@@ -9,12 +9,14 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from markupsafe import Markup
 
+from clsplat.errors import DataError
 from clsplat.files import write_text
 from clsplat.metrics.distribution import SHARES
 from clsplat.metrics.perceptual import Image
 from clsplat.metrics.views import render_view
 from clsplat.pages.page import charts, counted, duration, embedded, render
 from clsplat.pages.svg import Line, curve
+from clsplat.reading import read_file
 from clsplat.stages.base import Stage, path_in_run
 from clsplat.training.run import Run
 
@@ -45,6 +47,10 @@ class Report(Stage):
         )
         write_text(run.out / self.file, page)
         LOG.info("report written to %s", run.out / self.file)
+
+    def verify(self, run: Run) -> None:
+        if not read_file(run.out / self.file).rstrip().endswith(b"</html>"):
+            raise DataError(f"{run.out / self.file}: ends before its end")
 
 
 @dataclass(frozen=True)
@@ -91,7 +97,7 @@ def _training_charts(run: Run) -> list[Markup]:
     line = {key: [(r["step"], r[key]) for r in train] for key in ("loss", "psnr", "gaussians", "ms")}
     measured = [
         Line(
-            [(r["step"], r["psnr"]) for r in tests if r["split"] == split and r["scale"] == run.downscale],
+            [(r["step"], r["psnr"]) for r in tests if r["split"] == split and r["downscale"] == run.downscale],
             f"{split} views",
         )
         for split in ("test", "train")
@@ -149,7 +155,7 @@ def _shares(lines: Sequence[Line]) -> list[Line]:
 def _psnr_by_gaussians(run: Run) -> list[Line]:
     """Points in order of steps: where Gaussians are pruned, the line turns back.  No line for a single point."""
     counts = {r["step"]: r["gaussians"] for r in run.records.read("train")}
-    tests = [r for r in run.records.read("evaluate") if r["split"] == "test" and r["scale"] == run.downscale]
+    tests = [r for r in run.records.read("evaluate") if r["split"] == "test" and r["downscale"] == run.downscale]
     points = {r["step"]: (counts[r["step"]] / 1e3, r["psnr"]) for r in tests if r["step"] in counts}
     return [Line(list(points.values()))] if len(points) > 1 else []
 
@@ -169,7 +175,7 @@ def _times(run: Run) -> Times | None:
 def _views(run: Run) -> dict[str, list[ViewFigure]]:
     """The worst and the best views of the last evaluation, by heading."""
     by_name = {view.name: view for view in run.scene.downscaled(run.downscale).views}
-    lines = [r for r in run.records.read("view") if r["scale"] == run.downscale and r["step"] == run.step]
+    lines = [r for r in run.records.read("view") if r["downscale"] == run.downscale and r["step"] == run.step]
     last = {r["view"]: r for r in lines if r["view"] in by_name}  # a view may be measured twice after the same step
     ranked = sorted(last.values(), key=lambda r: r["psnr"])
     worst = ranked[:MAX_VIEWS]
@@ -181,7 +187,11 @@ def _views(run: Run) -> dict[str, list[ViewFigure]]:
         image = render_view(run.rasterizer, run.model, photograph.camera, run.photographs.background)
         return _figure(record, image, photograph.image())
 
-    return {title: [figure(record) for record in records] for title, records in chosen.items() if records}
+    return {
+        title: [figure(record) for record in run.until_interrupted(records)]
+        for title, records in chosen.items()
+        if records
+    }
 
 
 def _figure(record: dict[str, Any], image: Image, photograph: Image) -> ViewFigure:

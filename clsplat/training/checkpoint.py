@@ -1,134 +1,250 @@
 """Save and restore a run, bit for bit: parameters, Adam's moments, statistics and counters, without pickle.
 
-Random numbers and the order of views depend on (seed, step) alone, so the step is their state.
+Random numbers and the order of views depend on (seed, step) alone, so the step is their state.  A state that is not
+finite is no checkpoint: it lies beside them as failed_N.npz, and a run goes on from the last good one.
 """
 
-import json
 import logging
 import re
-import zipfile
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from clsplat import __version__
 from clsplat.density.statistics import FOLDER as STATS_FOLDER
 from clsplat.density.statistics import SEEN, SplatStats
-from clsplat.errors import ConfigError, DataError
+from clsplat.errors import ClsplatError, ConfigError, DataError, NumericError, OutputError
 from clsplat.files import atomic
-from clsplat.gaussians.tables import PARAMETERS, Gaussians
+from clsplat.gaussians.model import WIDTHS
+from clsplat.gaussians.tables import PARAMETERS, Gaussians, moment_tables
+from clsplat.training import archive
 from clsplat.training.adam import Adam
+from clsplat.training.advice import lower_rate
+from clsplat.training.archive import Arrays
+from clsplat.training.changes import differences
 from clsplat.training.run import Run
 
-FORMAT = 3
+FORMAT = 4
 FOLDER = "checkpoints"
 LOG = logging.getLogger("clsplat")
-Tables = dict[str, NDArray[np.float32]]
+Count = Annotated[int, Field(ge=0)]
 
 
-def save(run: Run, keep: int) -> Path:
-    """Write checkpoints/step_N.npz, whole or not at all, and remove all but the `keep` newest."""
-    model = run.model
-    tables = {_key(name): model.gaussians.get(name) for name in model.gaussians.tables}
-    meta = {
-        "format": FORMAT,
-        "version": __version__,
-        "step": run.step,
-        "cursor": run.cursor,
-        "stage_step": run.stage_step,
-        "degree": model.degree,
-        "zero_fresh": [name for name, table in model.gaussians.tables.items() if table.zero_fresh],
-        "updates": run.adam.updates if run.adam else {},
-        "train_seconds": run.train_seconds,
-        "metrics": run.metrics,
-        "device": run.device.text,
-        "pipeline": run.pipeline,
-    }
-    folder = run.out / FOLDER
-    path = folder / f"step_{run.step:06d}.npz"
-    with atomic(path) as file:
-        np.savez(file, allow_pickle=False, meta=np.array(json.dumps(meta)), **tables)
-    for old in _saved(folder)[:-keep]:
-        old.unlink(missing_ok=True)
+class State(BaseModel):
+    """What a checkpoint holds beside its tables."""
+
+    model_config = ConfigDict(strict=True, extra="forbid")
+
+    format: int
+    version: str
+    step: Count
+    cursor: Count
+    stage_step: Count
+    acted: Count
+    edited: bool
+    degree: Annotated[int, Field(ge=0, le=3)]
+    zero_fresh: list[str]
+    updates: dict[str, Count]
+    train_seconds: float
+    metrics: dict[str, dict[str, Any]]
+    records: Count  # lines of metrics.jsonl
+    changes: list[str]
+    device: str
+    inputs: str  # identity of the scene
+    pipeline: dict[str, Any]
+
+
+def save(run: Run, keep: int | None = None) -> Path:
+    """Write checkpoints/step_N.npz, whole or not at all; with `keep` remove all but so many of the newest.
+
+    Raises NumericError, after writing failed_N.npz, where the model is not finite; then nothing is removed.  Raises
+    ClsplatError where a step or an edit is half done.
+    """
+    if not run.whole:
+        raise ClsplatError(f"{run.out}: step {run.step} is half done, so it is not saved; resume the run to go on")
+    if broken := run.model.gaussians.not_finite():
+        raise NumericError(f"step {run.step}: {set_aside(run, broken)}")
+    path = _write(run, "step")
+    run.status.note(checkpoint=path.name)
+    run.status.refresh()
+    if keep is not None:
+        for other in saved(run.out)[:-keep]:
+            other.unlink(missing_ok=True)
     return path
 
 
-def restore(run: Run) -> bool:
-    """Restore the newest checkpoint that is not damaged; return False when there is none.
+def set_aside(run: Run, broken: list[str]) -> str:
+    """Write a state that is not finite as failed_N.npz, the only one of its kind; return what to tell and to do."""
+    try:
+        path = _write(run, "failed")
+        for other in path.parent.glob("failed_*.npz"):
+            if other != path:
+                other.unlink(missing_ok=True)
+        state = f"the state is in {path}"
+    except OutputError as error:
+        state = f"the state is lost: {error}"
+    good = saved(run.out)
+    return (
+        f"parameters not finite: {', '.join(broken) or 'none'}; {state}; "
+        f"`clsplat resume {run.out} --set {lower_rate(run, broken)}` lowers a rate and "
+        f"{f'goes on from {good[-1].name}' if good else 'starts again'}"
+    )
 
-    Raises ConfigError when the checkpoint was made by a pipeline with other settings.
+
+def saved(out: Path) -> list[Path]:
+    """Return the checkpoints of a run folder from old to new."""
+    steps = {
+        int(found[1]): path
+        for path in (out / FOLDER).glob("step_*.npz")
+        if (found := re.fullmatch(r"step_(\d+)\.npz", path.name))
+    }
+    return [steps[step] for step in sorted(steps)]
+
+
+def load(path: Path) -> tuple[State, Arrays]:
+    """Read a checkpoint.  Raises DataError, with the reason alone, when damaged; ConfigError for another format."""
+    notes, tables = archive.read(path)
+    if type(notes.get("format")) is int and notes["format"] != FORMAT:
+        raise ConfigError(
+            f"{path} has format {notes['format']}, expected {FORMAT}: clsplat {notes.get('version')} made it before "
+            "the format changed; go on with the program that made it, or use another --out"
+        )
+    try:
+        state = State.model_validate(notes)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise DataError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from error
+    if state.cursor > len(state.pipeline.get("stages", ())):  # equal to it: all stages have ended
+        raise DataError(f"it has no stage {state.cursor}")
+    _check(state, {name.removeprefix("gaussians/"): table for name, table in tables.items()})
+    return state, tables
+
+
+def restore(run: Run) -> Path | None:
+    """Take the newest checkpoint that is whole; return its file, or None where the run has saved none so far.
+
+    Raises ConfigError when it was made with settings that a run cannot go on with, or has another format; OutputError
+    when no checkpoint is whole, or all are gone.
     """
-    for path in reversed(_saved(run.out / FOLDER)):
+    paths = saved(run.out)
+    again = f"`clsplat run {run.out / 'pipeline.yaml'} --out {run.out} --restart` starts from the beginning"
+    for path in reversed(paths):
         try:
-            meta, tables = _load(path)
-        except (OSError, ValueError, KeyError, zipfile.BadZipFile, DataError) as error:
+            state, tables = load(path)
+        except DataError as error:
+            if path == paths[0]:
+                raise OutputError(f"{path} is damaged ({error}), and no checkpoint is whole; {again}") from error
             LOG.warning("%s is damaged (%s); using the one before it", path, error)
             continue
-        difference = first_difference(meta["pipeline"], run.pipeline)
-        if difference:
-            raise ConfigError(
-                f"{path} was made with other settings: {difference}; use another --out, or those settings"
-            )
-        if meta["device"] != run.device.text:
-            LOG.warning("the run was started on %s: the bits may differ from here on", meta["device"])
-        _restore(run, meta, tables)
-        return True
-    return False
+        _take_changes(run, path, state)
+        if state.device != run.device.text:
+            LOG.warning("the run was started on %s: the bits may differ from here on", state.device)
+        _restore(run, state, tables)
+        return path
+    if last := run.status.now.checkpoint:
+        raise OutputError(f"{run.out / FOLDER}: is empty, but {last} was saved there; put it back, or {again}")
+    return None
 
 
-def _saved(folder: Path) -> list[Path]:
-    """Checkpoints from old to new."""
-    return sorted(path for path in folder.glob("step_*.npz") if re.fullmatch(r"step_\d+\.npz", path.name))
+def drop_later(out: Path, taken: Path | None) -> None:
+    """Rename the damaged checkpoints after the one that was taken: they take no place among those that are kept."""
+    files = saved(out)
+    for damaged in files[files.index(taken) + 1 :] if taken else ():
+        with suppress(OSError):
+            damaged.rename(damaged.with_name(damaged.name.replace("step", "damaged")))
 
 
-def _load(path: Path) -> tuple[dict[str, Any], Tables]:
-    with np.load(path, allow_pickle=False) as archive:
-        meta = json.loads(str(archive["meta"]))
-        tables = {name: archive[name] for name in archive.files if name != "meta"}
-    if meta["format"] != FORMAT:
-        raise ConfigError(
-            f"{path} has format {meta['format']}, expected {FORMAT}: clsplat {meta['version']} made it before the "
-            "format changed; go on with the program that made it, or use another --out"
-        )
-    missing = [name for name in PARAMETERS if _key(name) not in tables]
-    if missing:
+def _write(run: Run, kind: str) -> Path:
+    model = run.model
+    state = State(
+        format=FORMAT,
+        version=__version__,
+        step=run.step,
+        cursor=run.cursor,
+        stage_step=run.stage_step,
+        acted=run.acted,
+        edited=run.edited,
+        degree=model.degree,
+        zero_fresh=[name for name, table in model.gaussians.tables.items() if table.zero_fresh],
+        updates=run.adam.updates if run.adam else {},
+        train_seconds=run.train_seconds,
+        metrics=run.metrics,
+        records=run.records.lines,
+        changes=run.changes,
+        device=run.device.text,
+        inputs=run.inputs,
+        pipeline=run.pipeline,
+    )
+    path = run.out / FOLDER / f"{kind}_{run.step:06d}.npz"
+    with atomic(path) as file:
+        tables = ((_key(name), model.gaussians.get(name)) for name in model.gaussians.tables)
+        archive.write(file, state.model_dump(), tables)
+    return path
+
+
+def _check(state: State, tables: Arrays) -> None:
+    """Raise DataError for tables that are not those of a run."""
+    if missing := [name for name in PARAMETERS if name not in tables]:
         raise DataError(f"lacks {', '.join(missing)}")
-    return meta, tables
+    count = len(tables["means"])
+    for name, table in tables.items():
+        if table.dtype != np.float32 or table.ndim != 2 or len(table) != count:
+            raise DataError(f"{name} is not [{count}, components] of float32")
+    if count == 0:
+        raise DataError("it holds no Gaussians")
+    for name in PARAMETERS:
+        if tables[name].shape[1] not in WIDTHS[name]:
+            raise DataError(f"{name} has {tables[name].shape[1]} components")
+        moments = [moment for moment in moment_tables(name) if moment in tables]
+        if broken := [key for key in (name, *moments) if not np.isfinite(tables[key]).all()]:
+            raise DataError(f"{broken[0]} holds values that are not finite")
+        if [tables[moment].shape for moment in moments] != [tables[name].shape] * (2 if state.updates else 0):
+            raise DataError(f"the moments of {name} are not like it")
+    if state.updates and state.updates.keys() != set(PARAMETERS):
+        raise DataError("it counts updates of other parameters")
 
 
-def _restore(run: Run, meta: dict[str, Any], tables: Tables) -> None:
+def _take_changes(run: Run, path: Path, state: State) -> None:
+    """Note the settings that have changed.  Raises ConfigError for one that a run cannot go on with."""
+    changed, remedy = [], "use another --out, those settings, or --restart"
+    before = state.pipeline
+    if run.inputs and state.inputs == run.inputs:  # the same scene, wherever it lies now
+        before = {**before, "scene": {**before["scene"], "path": run.pipeline["scene"]["path"]}}
+    for difference in differences(before, run.pipeline):
+        if difference.of_outputs:
+            continue
+        if difference.stage is None:
+            raise ConfigError(f"{path} was made with other settings: {difference}; {remedy}")
+        if difference.stage < state.cursor:
+            raise ConfigError(f"{path} was saved after that stage, at step {state.step}: {difference}; {remedy}")
+        changed.append(f"step {state.step}: {difference}")
+    run.changes = [*state.changes, *changed]
+    for text in changed:
+        LOG.warning("%s; from here on the bits are not those of a run without a change", text)
+
+
+def _restore(run: Run, state: State, tables: Arrays) -> None:
     gaussians = Gaussians(run.device, {name.removeprefix("gaussians/"): table for name, table in tables.items()})
-    run.model = run.model_settings.model(gaussians, meta["degree"])
-    if meta["updates"]:
+    run.model = run.model_settings.model(gaussians, state.degree)
+    if state.updates:
         run.adam = Adam(gaussians)
-        run.adam.updates = meta["updates"]
+        run.adam.updates = state.updates
         columns = [name for name in tables if name.startswith(STATS_FOLDER) and name != SEEN]
         run.stats = SplatStats(gaussians, [name.removeprefix(STATS_FOLDER) for name in columns])
     for key, table in tables.items():  # those of rules, penalties and plug-ins too
         name = key.removeprefix("gaussians/")
         if name not in gaussians.tables:
-            gaussians.add(name, table.shape[1], zero_fresh=name in meta["zero_fresh"])
+            gaussians.add(name, table.shape[1], zero_fresh=name in state.zero_fresh)
         gaussians.set(name, table)
-    run.step, run.cursor, run.stage_step = meta["step"], meta["cursor"], meta["stage_step"]
-    run.train_seconds, run.metrics = meta["train_seconds"], meta["metrics"]
+    run.step, run.cursor, run.stage_step = state.step, state.cursor, state.stage_step
+    run.acted, run.edited, run.whole = state.acted, state.edited, True
+    run.train_seconds, run.metrics = state.train_seconds, state.metrics
+    run.records.lines, run.inputs_before = state.records, state.inputs
 
 
 def _key(table: str) -> str:
     """The key of a table in the file: parameters are in the folder `gaussians`."""
     return table if "/" in table else f"gaussians/{table}"
-
-
-def first_difference(old: Any, new: Any, place: str = "") -> str | None:
-    """Return the first setting in which two resolved pipelines differ, or None."""
-    if isinstance(old, dict) and isinstance(new, dict):
-        for key in [*old, *(k for k in new if k not in old)]:
-            difference = first_difference(old.get(key), new.get(key), f"{place}.{key}" if place else str(key))
-            if difference:
-                return difference
-        return None
-    if isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
-        pairs = enumerate(zip(old, new, strict=True))
-        return next((d for i, (a, b) in pairs if (d := first_difference(a, b, f"{place}[{i}]"))), None)
-    return None if old == new else f"{place} was {old!r}, is {new!r}"

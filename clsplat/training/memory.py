@@ -3,12 +3,11 @@
 Bytes are those of the tables for each Gaussian, and those of a frame for each Gaussian, each pair and each pixel.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
-import numpy as np
-
 from clsplat.errors import MemoryLimitError
-from clsplat.gaussians.tables import GROWTH, PARAMETERS, Gaussians
+from clsplat.gaussians.tables import GROWTH, PARAMETERS, moment_tables, sh_coefficients
 from clsplat.opencl.discovery import DeviceInfo
 from clsplat.render.rasterizer import PIXEL_SUMS, RECORD
 
@@ -62,15 +61,23 @@ class MemoryPlan:
             )
 
 
-def plan(gaussians: Gaussians, photographs: int, pixels: int, pixel_sums: int = PIXEL_SUMS) -> MemoryPlan:
-    """Return the plan for Gaussians with their present tables.
+def first_tables(degree: int) -> dict[str, int]:
+    """Return the components of the tables that training has at least, by name: parameters and their moments."""
+    widths = (3, 4, 3, 1, 3, 3 * (sh_coefficients(degree) - 1))
+    parameters = dict(zip(PARAMETERS, widths, strict=True))
+    return parameters | {table: width for name, width in parameters.items() for table in moment_tables(name)}
+
+
+def plan(
+    info: DeviceInfo, components: Mapping[str, int], photographs: int, pixels: int, pixel_sums: int = PIXEL_SUMS
+) -> MemoryPlan:
+    """Return the plan for Gaussians with tables of these components, by name.
 
     photographs: their bytes on the device; pixels: of the largest view, whole tiles; pixel_sums: sums over pixels that
     the backward pass computes for each Gaussian.
     """
-    info: DeviceInfo = gaussians.device.info
-    sizes = [4 * table.components for table in gaussians.tables.values()]
-    gradients = sum(4 * gaussians.tables[name].components for name in PARAMETERS) + 8  # for penalties and edits
-    gaussian = int(np.sum(sizes)) + FRAME_GAUSSIAN + 4 * pixel_sums + gradients
+    sizes = [4 * width for width in components.values()]
+    gradients = sum(4 * components[name] for name in PARAMETERS) + 8  # for penalties and edits
+    gaussian = sum(sizes) + FRAME_GAUSSIAN + 4 * pixel_sums + gradients
     fixed = photographs + FRAME_PIXEL * pixels
     return MemoryPlan(gaussian, FRAME_PAIR, fixed, max(sizes), info.memory, info.allocation)

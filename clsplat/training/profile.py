@@ -10,7 +10,6 @@ STAGES = {
     "emit_pairs": "pairs",
     "find_tile_offsets": "pairs",
     "scan_blocks": "sort",
-    "scan_sums": "sort",
     "scan_offsets": "sort",
     "radix_count": "sort",
     "radix_scatter": "sort",

@@ -1,28 +1,36 @@
 """The state of a pipeline while it runs."""
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from clsplat import __version__
 from clsplat.density.statistics import SplatStats
-from clsplat.errors import ConfigError
+from clsplat.errors import ConfigError, Interrupted
 from clsplat.filters import FilterViews, ModelSettings, measure_intervals
 from clsplat.gaussians.model import Model, Rendering
 from clsplat.gaussians.tables import INTERVAL2, PARAMETERS, DeviceModel
 from clsplat.losses.base import Loss
 from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import PIXEL_SUMS, Rasterizer
+from clsplat.scene.identity import Identity
 from clsplat.scene.scene import Scene
 from clsplat.training.adam import Adam
 from clsplat.training.memory import MemoryPlan, plan
 from clsplat.training.records import Records
+from clsplat.training.status import StatusFile
 from clsplat.views.photographs import Photographs
 from clsplat.views.texture import texture_quantile
 
 LOG = logging.getLogger("clsplat")
+Item = TypeVar("Item")
+
+
+class Stopped(Interrupted):
+    """A stage has ended before its end, since the run is to stop; it is repeated when the run goes on."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +60,7 @@ class Run:
     rasterizer: Rasterizer
     photographs: Photographs
     model_settings: ModelSettings
+    identity: Identity | None = None  # of the original scene and its photographs
     prepared: dict[str, str] | None = None  # hash of the inputs of `prepare:`, and the folder of its result
     losses: list[Loss] = field(default_factory=list)  # added from Python, beside those of the pipeline
     adam: Adam | None = None
@@ -59,6 +68,11 @@ class Run:
     step: int = 0  # updates done, or in progress
     cursor: int = 0  # stage in progress
     stage_step: int = 0  # steps done in it
+    acted: int = 0  # stages of its `during` that have acted since that step
+    edited: bool = False  # whether those that edit the model have too
+    whole: bool = True  # False after a failure in the middle of a change of the tables
+    changes: list[str] = field(default_factory=list)  # of settings, with which the run went on
+    inputs_before: str = ""  # `inputs` of the checkpoint that the run goes on from
     train_seconds: float = 0.0
     metrics: dict[str, dict[str, Any]] = field(default_factory=dict)  # split -> downscale -> averages
     interrupted: bool = False  # finish the step, save, stop
@@ -66,6 +80,7 @@ class Run:
 
     def __post_init__(self) -> None:
         self.records = Records(self.out)
+        self.status = StatusFile(self.out)
         self._model: DeviceModel | None = None
         self._filter_views: FilterViews | None = None
         self._texture_quantiles: dict[float, float] = {}
@@ -81,19 +96,48 @@ class Run:
     def model(self, model: DeviceModel) -> None:
         self._model = model
 
+    def next_stage(self, cursor: int) -> None:
+        """Come to the beginning of a stage."""
+        self.cursor, self.stage_step, self.acted, self.edited = cursor, 0, 0, False
+
+    @contextmanager
+    def changing(self) -> Iterator[None]:
+        """Change the tables in the block: where it fails they are neither those before nor those after it."""
+        before, self.whole = self.whole, False
+        yield
+        self.whole = before
+
+    @property
+    def inputs(self) -> str:
+        """A hash of the photographs, cameras and points; "" where they were not looked at."""
+        return self.identity.digest if self.identity else ""
+
+    @property
+    def has_model(self) -> bool:
+        """Whether there is a model, which a checkpoint can hold."""
+        return self._model is not None
+
+    def until_interrupted(self, items: Iterable[Item]) -> Iterator[Item]:
+        """Yield the items of a long stage; raise Stopped between two of them when the run is to stop."""
+        for item in items:
+            if self.interrupted:
+                raise Stopped("stopped")
+            yield item
+
     @property
     def downscale(self) -> float:
         """The smallest divisor of the photographs' size in training."""
         return self.scene.downscales[0]
 
-    def memory_plan(self) -> MemoryPlan:
-        """Return the plan of the device's memory for training with the present tables."""
+    def memory_plan(self, components: Mapping[str, int] | None = None) -> MemoryPlan:
+        """Return the plan of the device's memory for training with the present tables, or those of `components`."""
+        components = components or self.model.gaussians.components
         views = self.scene.split("train")
         bytes_held = min(self.photographs.budget, sum(4 * view.camera.width * view.camera.height for view in views))
         tile = int(self.device.tuning["TILE"])
         pixels = max((-(-v.camera.width // tile)) * (-(-v.camera.height // tile)) * tile**2 for v in views)
         pixel_sums = PIXEL_SUMS if self.stats is None else self.stats.pixel_sums
-        return plan(self.model.gaussians, bytes_held, pixels, pixel_sums)
+        return plan(self.device.info, components, bytes_held, pixels, pixel_sums)
 
     def refresh_filter(self) -> None:
         """Update the world filter and the sampling intervals to the present Gaussians."""

@@ -65,9 +65,7 @@ class Trainer:
         Returns the view's losses and gradients, which are valid until the next step.
         """
         view = self.differentiate(photograph, step, transforms)
-        grad_mean2d = self._update(view, stale)
-        self.rasterizer.device.timings.section = "statistics"
-        self.stats.add(view, grad_mean2d)
+        self.update(view, stale)
         return view
 
     def differentiate(
@@ -97,6 +95,12 @@ class Trainer:
         texture = known_gradient(workspace, camera, planes.colours, planes.mask) if count > TEXTURE else None
         pixel_sums = self.rasterizer.pixel_sums(self.model, frame, gradient, count, texture)
         return ViewGradients(frame, comparison, values, pixel_sums)
+
+    def update(self, view: ViewGradients, stale: Collection[str] = ()) -> None:
+        """Apply what `differentiate` returned: change parameters, moments and statistics."""
+        grad_mean2d = self._update(view, stale)
+        self.rasterizer.device.timings.section = "statistics"
+        self.stats.add(view, grad_mean2d)
 
     def _update(self, view: ViewGradients, stale: Collection[str]) -> Array:
         """Update the parameters and add the penalties to the view's losses.

@@ -3,44 +3,17 @@
 import numpy as np
 import pytest
 
-from clsplat.gaussians.tables import PARAMETERS, Gradients
+from clsplat.conformance.checks.update import step_figures
+from clsplat.conformance.scenes import random_case, with_world_filter
+from clsplat.gaussians.tables import Gradients
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.training.adam import Adam, Rates
-from tests import reference_loss as ref_loss
-from tests.scenes import random_case, with_world_filter
+from tests.kernels.figures import hold
 
 
 @pytest.mark.parametrize("count", [1, 15, 16, 17, 64, 65])
 def test_steps(device, rng, count):
-    case = random_case(rng, count)
-    model = case.model(device)
-    gaussians = model.gaussians
-    adam, rates = Adam(gaussians), Rates().at(3, extent=2.0)
-    values = {name: case.parameters[name].astype(np.float64) for name in PARAMETERS}
-    moments = {name: (np.zeros_like(v), np.zeros_like(v)) for name, v in values.items()}
-    for step in range(1, 4):
-        gradients = Gradients(gaussians)
-        for name in PARAMETERS:
-            gradient = (rng.normal(size=values[name].shape) * rng.choice([1e-7, 1e-3, 1], values[name].shape)).astype(
-                np.float32
-            )
-            gradient[::3] = 0
-            planes = np.zeros(gradients[name].shape, np.float32)
-            planes[:, :count] = gradient.T
-            gradients[name].set(planes)
-            values[name], *moments[name] = ref_loss.adam_step(
-                values[name], gradient.astype(np.float64), *moments[name], step, rates[name]
-            )
-        adam.step(model, gradients, rates)
-    for name in PARAMETERS:
-        moved = np.abs(values[name] - case.parameters[name]).max()
-        np.testing.assert_allclose(gaussians.get(name), values[name], rtol=3e-7, atol=2e-5 * moved)
-        np.testing.assert_allclose(
-            gaussians.get(f"adam/{name}/moment1"),
-            moments[name][0],
-            rtol=1e-5,
-            atol=1e-6 * np.abs(moments[name][0]).max(),
-        )
+    hold(step_figures(device, rng, count))
 
 
 @pytest.mark.parametrize("count", [1, 17, 64, 150])

@@ -1,14 +1,20 @@
 """Bands of tiles and short launches: the same bits as all at once."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from clsplat.conformance.scenes import random_case
+from clsplat.errors import MemoryLimitError
+from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import MAX_PAIRS, Budget, Rasterizer
-from tests.scenes import random_case
+from clsplat.render.workspace import Workspace
 
 
-def results(device, case, weights, budget=None, sort="radix"):
-    rasterizer, model, camera = Rasterizer(device, sort, budget), case.model(device), case.device_camera(device)
+def results(device, case, weights, budget=None, sort="radix", rasterizer=None):
+    rasterizer = rasterizer or Rasterizer(device, sort, budget)
+    model, camera = case.model(device), case.device_camera(device)
     frame = rasterizer.forward(model, camera, device.upload(np.array([0.2, 0.5, 0.9], np.float32)))
     planes = np.zeros((3, camera.rows, camera.stride), np.float32)
     planes[:, : camera.height, : camera.width] = weights
@@ -41,3 +47,63 @@ def test_nothing_in_a_band(device, rng):
     case = random_case(rng, 0, 40, 64)
     image, _, _ = results(device, case, 0.0, Budget(1, 2))
     np.testing.assert_allclose(image[:, :64, :40], np.broadcast_to([[[0.2]], [[0.5]], [[0.9]]], (3, 64, 40)), rtol=1e-6)
+
+
+def limited(device, allocation):
+    """The device with smaller buffers, in bytes."""
+    other = Device(replace(device.info, allocation=allocation), device.schedule)
+    other.tuning.update(device.tuning)
+    return other
+
+
+def test_room_to_grow_ends_at_the_largest_buffer(device):
+    workspace = Workspace(limited(device, 4096))
+    workspace.array("table", 900)
+    assert workspace.array("table", 1000).shape == (1000,)
+    assert workspace.length("table") == 1024
+    with pytest.raises(MemoryLimitError, match="one buffer of"):
+        workspace.array("table", 1025)
+
+
+def test_records_may_fill_the_largest_buffer(device, rng):
+    case = random_case(rng, 300, 60, 70)
+    case.parameters["log_scales"] += 1.0  # more bytes of records than of any table
+    weights = rng.normal(size=(3, 70, 60)).astype(np.float32)
+    image, pixel_sums, frame = results(device, case, weights)
+    small = limited(device, 64 * frame.lists.pairs)
+    rasterizer = Rasterizer(small, "radix")
+    first = replace(case, parameters={name: table[:270] for name, table in case.parameters.items()})
+    results(small, first, weights, rasterizer=rasterizer)
+    limited_image, limited_sums, whole = results(small, case, weights, rasterizer=rasterizer)
+    assert len(whole.bands) == 1
+    np.testing.assert_array_equal(limited_image, image)
+    np.testing.assert_array_equal(limited_sums, pixel_sums)
+
+
+@pytest.mark.parametrize("refused", ["pair_sums", "pair_tile", "tile_pairs", "tile_values0"])
+def test_a_refusal_of_memory_leads_to_bands_and_the_same_bits(device, rng, monkeypatch, refused):
+    case = random_case(rng, 300, 60, 70)
+    case.parameters["log_scales"][:20] += 1.5
+    weights = rng.normal(size=(3, 70, 60)).astype(np.float32)
+    image, pixel_sums, frame = results(device, case, weights)
+    most, array = frame.lists.pairs // 2, Workspace.array
+
+    def refusing(workspace, name, shape, *dtype):
+        if name == refused and (shape if isinstance(shape, int) else shape[0]) > most:
+            raise MemoryLimitError("no memory is left")
+        return array(workspace, name, shape, *dtype)
+
+    monkeypatch.setattr(Workspace, "array", refusing)
+    sort = "bitonic" if refused == "tile_pairs" else "radix"
+    rasterizer = Rasterizer(device, sort)
+    for _ in range(2):  # the second frame begins with bands
+        refused_image, refused_sums, _ = results(device, case, weights, rasterizer=rasterizer)
+        np.testing.assert_array_equal(refused_image, image)
+        np.testing.assert_array_equal(refused_sums, pixel_sums)
+    assert max(rasterizer._bands.values()) > 1
+
+
+def test_memory_that_one_row_of_tiles_exceeds_is_refused(device, rng):
+    small = limited(device, 300 * 64)
+    with pytest.raises(MemoryLimitError):
+        results(small, random_case(rng, 301, 60, 70), 0.0)

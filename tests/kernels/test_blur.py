@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from clsplat.conformance.checks.images import camera_of
+from clsplat.conformance.reference import blurred
 from clsplat.render.workspace import Workspace
 from clsplat.views.transforms import Blur, Planes
-from tests.kernels.test_loss import camera_of
-from tests.reference_blur import blurred
 
 SIZES = ((1, 1), (2, 3), (15, 4), (16, 16), (17, 5), (33, 18), (63, 3), (64, 2), (65, 7))  # tiles and groups
 

@@ -3,17 +3,16 @@
 import numpy as np
 import pytest
 
+from clsplat.conformance import reference as ref
+from clsplat.conformance.scenes import random_case, with_world_filter
 from clsplat.density.basic import Clone, PruneFaint, PruneLarge, Split
 from clsplat.density.control import cap_opacity, densify
 from clsplat.density.edit import Edit, SceneScale
 from clsplat.density.statistics import SEEN, SplatStats
-from clsplat.gaussians.tables import PARAMETERS, Gaussians
+from clsplat.gaussians.tables import PARAMETERS, Gaussians, moment_tables
 from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.training.adam import Adam
-from tests import reference as ref
-from tests import reference_loss as ref_loss
-from tests.scenes import random_case, with_world_filter
 
 RULES = [
     Clone(gradient_above=2e-4, size_below=0.01),
@@ -56,13 +55,13 @@ def test_adaptive_density_control(device, rng, count, step):
     before, gaussians, change = edited(device, rng, count, step)
     size = np.exp(before["log_scales"]).max(axis=1)
     opacity = 1 / (1 + np.exp(-before["logit_opacity"][:, 0]))
-    gradient = ref_loss.mean_gradient(before[SCREEN_GRAD][:, 0], before[SEEN][:, 0])
-    action = ref_loss.adc_actions(gradient, size, opacity, EXTENT, prune_large=step > 3000)
-    rows = {ref_loss.KEEP: 1, ref_loss.CLONE: 2, ref_loss.SPLIT: 2, ref_loss.PRUNE: 0}
+    gradient = ref.mean_gradient(before[SCREEN_GRAD][:, 0], before[SEEN][:, 0])
+    action = ref.adc_actions(gradient, size, opacity, EXTENT, prune_large=step > 3000)
+    rows = {ref.KEEP: 1, ref.CLONE: 2, ref.SPLIT: 2, ref.PRUNE: 0}
     source = np.repeat(np.arange(count), [rows[a] for a in action])
     place = np.concatenate([np.arange(rows[a]) for a in action]) if len(source) else np.zeros(0, int)
-    split = action[source] == ref_loss.SPLIT
-    fresh = split | ((action[source] == ref_loss.CLONE) & (place == 1))
+    split = action[source] == ref.SPLIT
+    fresh = split | ((action[source] == ref.CLONE) & (place == 1))
     assert (change.before, change.after) == (count, len(source))
     assert gaussians.count == len(source)
 
@@ -160,7 +159,7 @@ def test_opacity_is_capped_after_the_world_filter(device, rng):
     ratio = np.prod(np.sqrt(scale2 / (scale2 + oracle.filter_variance[:, None])), axis=1)
     expected = np.minimum(oracle.logit_opacity, 99)
     capped = ratio / (1 + np.exp(-expected)) > 0.3
-    expected[capped] = ref_loss.reset_logit(expected[capped], ratio[capped], 0.3)
+    expected[capped] = ref.reset_logit(expected[capped], ratio[capped], 0.3)
     assert 20 < capped.sum() < 280
     np.testing.assert_allclose(after, expected, rtol=2e-5, atol=2e-5)
     assert (ratio / (1 + np.exp(-after)) <= 0.3 * (1 + 1e-5)).all()
@@ -172,4 +171,10 @@ def test_values_that_are_not_finite_are_found(device, rng, value):
     assert case.model(device).gaussians.not_finite() == []
     case.parameters["quats"][64, 2] = value
     case.parameters["sh_rest"][0, 44] = value
-    assert case.model(device).gaussians.not_finite() == ["quats", "sh_rest"]
+    gaussians = case.model(device).gaussians
+    assert gaussians.not_finite() == ["quats", "sh_rest"]
+    for table in moment_tables("means"):
+        gaussians.add(table, 3)
+    assert gaussians.not_finite() == ["quats", "sh_rest"]
+    gaussians[moment_tables("means")[1]].fill(value)
+    assert gaussians.not_finite() == ["means", "quats", "sh_rest"]

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from clsplat.conformance import reference as ref
+from clsplat.conformance.scenes import random_case
 from clsplat.render.rasterizer import Rasterizer
-from tests import reference_blend as ref_blend
-from tests.scenes import random_case
 
 
 @pytest.mark.parametrize("count", [0, 1, 15, 16, 17, 65, 150])
@@ -16,7 +16,7 @@ def test_depth_and_alpha_are_sums_of_blend_weights(device, rng, count):
     image = frame.image.get()[:, : camera.height, : camera.width].astype(np.float64)
     pose = case.camera().world_to_camera
     depth = case.parameters["means"].astype(np.float64) @ pose[2, :3] + pose[2, 3]
-    weights = ref_blend.blend_weights(case.project(), 48, 32) if count else np.zeros((0, 32, 48))
+    weights = ref.blend_weights(case.project(), 48, 32) if count else np.zeros((0, 32, 48))
     np.testing.assert_allclose(
         image[0], np.tensordot(depth, weights, 1), atol=2e-4 * max(1, np.abs(depth).max(initial=0))
     )

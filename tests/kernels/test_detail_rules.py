@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from clsplat.conformance.scenes import random_case
 from clsplat.density.basic import Clone, PruneFaint
 from clsplat.density.control import densify
 from clsplat.density.detail import SplitOversized, SplitTextured, largest
@@ -14,7 +15,6 @@ from clsplat.density.thresholds import PixelQuantile, Quantile
 from clsplat.gaussians.tables import INTERVAL2
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.training.adam import Adam
-from tests.scenes import random_case
 
 COLUMNS = ["screen_grad", "texture", "screen_radius"]
 EXTENT = 2.0

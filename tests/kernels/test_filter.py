@@ -5,15 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from clsplat.conformance import reference as ref
+from clsplat.conformance.reference import sampling_interval
+from clsplat.conformance.scenes import Case, random_case
 from clsplat.filters import Dilation, Ewa, FilterViews, Mip, NoWorldFilter, Smoothing
 from clsplat.gaussians.tables import DeviceModel, Gaussians
 from clsplat.opencl.device import Device
 from clsplat.render.camera import upload_camera
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.scene.scene import Camera, View
-from tests import reference as ref
-from tests.reference_filter import sampling_interval
-from tests.scenes import Case, random_case
 
 COUNTS = (1, 15, 16, 17, 63, 64, 65, 200)
 

@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from clsplat.conformance import reference as ref
+from clsplat.conformance.comparison import GRADIENT, relative_error
+from clsplat.conformance.scenes import SHARP, Case, random_case, safe_case, with_world_filter
 from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import PIXEL_SUMS, Frame, Rasterizer
-from tests import reference as ref
-from tests import reference_blend as ref_blend
-from tests.scenes import SHARP, Case, random_case, relative_error, with_world_filter
 
 BACKGROUND = np.array([0.2, 0.5, 0.9], np.float32)
 
@@ -31,7 +31,7 @@ def gradients_of(
 
 def expected_gradients(case: Case, weights: np.ndarray, thresholds: ref.Thresholds = SHARP) -> dict:
     splats = case.project(thresholds)
-    by_parameter, by_splat = ref_blend.render_backward(
+    by_parameter, by_splat = ref.render_backward(
         case.gaussians(),
         case.camera(),
         BACKGROUND,
@@ -52,16 +52,6 @@ def expected_gradients(case: Case, weights: np.ndarray, thresholds: ref.Threshol
     }
 
 
-def safe_case(rng: np.random.Generator, count: int, width: int, height: int, **changes) -> Case:
-    """A scene in which no pixel is near a threshold, so that float32 and float64 blend the same splats."""
-    for _ in range(60):
-        case = random_case(rng, count, width, height, **changes)
-        gaps = ref_blend.margin(case.project(), width, height)
-        if min(gaps) > 2e-6:
-            return case
-    raise AssertionError("no scene with margins was found")
-
-
 def compare(values: dict, expected: dict, tolerance: float) -> None:
     for name, truth in expected.items():
         assert relative_error(values[name], truth) < tolerance, name
@@ -74,7 +64,7 @@ def test_gradients(device, rng, count, width, height):
     case = safe_case(rng, count, width, height)
     weights = rng.normal(size=(3, height, width)).astype(np.float32)
     values, *_ = gradients_of(device, case, weights)
-    compare(values, expected_gradients(case, weights), 2e-4)
+    compare(values, expected_gradients(case, weights), GRADIENT)
 
 
 @pytest.mark.parametrize(("variance", "compensate"), [(0.3, 1.0), (0.1, 1.0)])
@@ -85,7 +75,7 @@ def test_gradients_with_filters(device, rng, variance, compensate):
     smooth = Device(device.info, device.schedule)
     smooth.tuning.update(device.tuning, ALPHA_MIN="1e-30f", TRANSMITTANCE_MIN="1e-30f")
     values, *_ = gradients_of(smooth, case, weights)
-    compare(values, expected_gradients(case, weights, ref.SMOOTH), 2e-4)
+    compare(values, expected_gradients(case, weights, ref.SMOOTH), GRADIENT)
 
 
 def test_finished_pixels_pass_no_gradient_behind(device, rng):

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
+from clsplat.conformance.checks.images import camera_of
 from clsplat.render.workspace import Workspace
 from clsplat.views.photographs import Photograph, apply_mask
-from tests.kernels.test_loss import SIZES, camera_of
+from tests.kernels.test_loss import SIZES
 
 
 @pytest.mark.parametrize(("width", "height"), SIZES)

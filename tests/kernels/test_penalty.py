@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
+from clsplat.conformance import reference as ref
+from clsplat.conformance.scenes import random_case
 from clsplat.gaussians.tables import INTERVAL2, Gradients
 from clsplat.losses.base import LossValue, PenaltyInputs
 from clsplat.losses.penalties import Anisotropy, CovarianceTrace
 from clsplat.render.workspace import Workspace
-from tests import reference_shape as ref
-from tests.scenes import random_case
 
 COUNTS = (1, 7, 8, 15, 16, 17, 64, 65, 200)
 EXTENT = 2.5

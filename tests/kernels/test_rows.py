@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
+from clsplat.conformance.scenes import random_case
 from clsplat.density.control import densify
 from clsplat.density.edit import Edit, Rule, SceneScale
 from clsplat.density.statistics import SplatStats
 from clsplat.gaussians.tables import PARAMETERS, Gaussians, moment_tables
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.training.adam import Adam
-from tests.scenes import random_case
 
 COUNT = 150
 ROWS = (0, 1, 15, 16, 17, 63, 64, 65, COUNT)

@@ -6,6 +6,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from clsplat.conformance import reference as ref
+from clsplat.conformance.comparison import relative_error
+from clsplat.conformance.scenes import Case, random_case, with_world_filter
 from clsplat.density.basic import Clone, PruneFaint, Split
 from clsplat.density.control import densify
 from clsplat.density.edit import Edit, SceneScale
@@ -13,9 +16,6 @@ from clsplat.density.statistics import ABS_X, SEEN, WEIGHT, SplatStats
 from clsplat.losses.base import ViewGradients
 from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import PIXEL_SUMS, Rasterizer
-from tests import reference_blend as ref_blend
-from tests import reference_loss as ref_loss
-from tests.scenes import Case, random_case, relative_error, with_world_filter
 
 BACKGROUND = np.array([0.3, 0.6, 0.1], np.float32)
 ALL = ABS_X + 2
@@ -33,7 +33,7 @@ def pixel_sums_of(device: Device, case: Case, weights: np.ndarray, count: int) -
 def expected_abs(case: Case, weights: np.ndarray) -> np.ndarray:
     """Sums over pixels of |dL/du| and |dL/dv|, [N, 2]."""
     splats = case.project()
-    return ref_blend.blend_backward(splats, *case.size, BACKGROUND.astype(np.float64), weights).mean2d_abs
+    return ref.blend_backward(splats, *case.size, BACKGROUND.astype(np.float64), weights).mean2d_abs
 
 
 @pytest.mark.parametrize(
@@ -93,8 +93,8 @@ def test_columns(device, rng, names):
     assert 0 < seen.sum() < 65
     half = np.array([width / 2, height / 2])
     expected = {
-        "screen_grad": ref_loss.screen_gradient(planes[:2, :65].T.astype(np.float64), width, height),
-        "screen_grad_abs": ref_loss.screen_gradient(planes[ABS_X:, :65].T.astype(np.float64), width, height),
+        "screen_grad": ref.screen_gradient(planes[:2, :65].T.astype(np.float64), width, height),
+        "screen_grad_abs": ref.screen_gradient(planes[ABS_X:, :65].T.astype(np.float64), width, height),
         "screen_grad_abs_sum": planes[ABS_X:, :65].T.astype(np.float64) @ half,
     }
     for name in names:
@@ -149,10 +149,8 @@ def test_absgs_splits_where_gradients_cancel(device):
     ]
     grad, absolute, size, rows = (list(column) for column in zip(*cases, strict=True))
     assert made(device, grad, absolute, size, rules) == rows
-    oracle = ref_loss.adc_actions(
-        np.array(grad), np.array(size), np.full(5, 0.5), 1.0, False, ref_loss.ABSGS, np.array(absolute)
-    )
-    assert [1 + (action in (ref_loss.CLONE, ref_loss.SPLIT)) for action in oracle] == rows
+    oracle = ref.adc_actions(np.array(grad), np.array(size), np.full(5, 0.5), 1.0, False, ref.ABSGS, np.array(absolute))
+    assert [1 + (action in (ref.CLONE, ref.SPLIT)) for action in oracle] == rows
 
 
 def test_as_many_as_takes_the_matching_quantile(device):
@@ -187,7 +185,7 @@ def test_texture_under_splats(device, rng):
     few = rasterizer.pixel_sums(model, frame, planes).get()[:, :40]
     pixel_sums = rasterizer.pixel_sums(model, frame, planes, WEIGHT + 2, device.upload(texture))
     assert relative_error(pixel_sums.get()[:PIXEL_SUMS, :40], few) < 1e-6
-    blended = ref_blend.blend_weights(case.project(), 48, 32)
+    blended = ref.blend_weights(case.project(), 48, 32)
     blended *= texture[:32, :48] >= 0
     weight, textured = blended.sum(axis=(1, 2)), (blended * texture[:32, :48]).sum(axis=(1, 2))
     assert relative_error(pixel_sums.get()[WEIGHT, :40], weight) < 1e-3  # pixels at thresholds

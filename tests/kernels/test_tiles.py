@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from clsplat.conformance.scenes import random_case
 from clsplat.render.rasterizer import Rasterizer
-from tests.scenes import random_case
 
 
 def lists_of(device, case, sort):
@@ -69,3 +69,54 @@ def test_auto_measures_and_agrees(device, rng):
     _, radix = lists_of(device, case, "radix")
     for a, b in zip(chosen, radix, strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("surplus", [-7, -1, 0, 1, 7, 10_000])
+def test_large_splats_list_as_many_tiles_as_were_counted(device, rng, surplus):
+    """Whatever another compiler counted, emission stays inside its places and leaves none open."""
+    case = random_case(rng, 12, 150, 130)
+    case.parameters["log_scales"][:8] += 2.5
+    rasterizer = Rasterizer(device, "radix")
+    frame = rasterizer.forward(case.model(device), case.device_camera(device), device.zeros(3))
+    camera, array = frame.camera, rasterizer.workspace._arrays
+    box, mask, count = (array[name].get()[:12] for name in ("tile_box", "tile_mask", "tile_count"))
+    touched = [set(_emitted(device, frame, box, mask, count)[n]) for n in range(12)]
+    large = (count > 0) & (box >> 24 == 0)
+    assert large.any()
+    plenty = np.where(large, camera.tiles + 1, count).astype(np.uint32)
+    rectangle = [set(tiles) - {0} for tiles in _emitted(device, frame, box, mask, plenty)]
+    counted = np.where(large, np.maximum(1, count.astype(int) + surplus), count).astype(np.uint32)
+    for n, tiles in enumerate(_emitted(device, frame, box, mask, counted)):
+        assert len(tiles) == counted[n]
+        assert max(tiles, default=0) < camera.tiles
+        if counted[n] <= count[n]:
+            assert set(tiles) <= touched[n]
+        else:
+            assert set(tiles) >= touched[n]
+        assert len(set(tiles)) >= min(len(tiles), len(rectangle[n]))
+
+
+def _emitted(device, frame, box, mask, count):
+    """Tiles of each Gaussian that emit_pairs lists for these counts; nothing else may be written."""
+    offset = np.concatenate([[0], np.cumsum(count)]).astype(np.uint32)
+    guarded, untouched = int(offset[-1]) + 64, np.uint32(0xDEADBEEF)
+    pair_tile, pair_splat = (device.upload(np.full(guarded, untouched)) for _ in range(2))
+    device.program("pairs.cl").emit_pairs(
+        items=len(count),
+        splats=frame.splats,
+        tile_box=device.upload(box),
+        tile_mask=device.upload(mask),
+        order=device.upload(np.arange(len(count), dtype=np.uint32)),
+        pair_offset=device.upload(offset),
+        pair_tile=pair_tile,
+        pair_splat=pair_splat,
+        first_pair=device.zeros(len(count), np.uint32),
+        tiles_x=frame.camera.tiles_x,
+        row_begin=0,
+        row_end=frame.camera.tiles_y,
+        count=len(count),
+    )
+    tiles, splats = pair_tile.get(), pair_splat.get()
+    assert (tiles[offset[-1] :] == untouched).all()
+    np.testing.assert_array_equal(splats[: offset[-1]], np.repeat(np.arange(len(count)), count))
+    return [tiles[offset[n] : offset[n + 1]].tolist() for n in range(len(count))]

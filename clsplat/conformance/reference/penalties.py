@@ -1,9 +1,14 @@
-"""The oracle, last part: penalties on the shapes of Gaussians in float64 NumPy, with their gradients by log_scales."""
+"""Penalties on the shapes of Gaussians, with their gradients by log_scales."""
+
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 
-def covariance_trace(log_scales: np.ndarray, above: np.ndarray | float, extent: float) -> tuple[float, np.ndarray]:
+def covariance_trace(
+    log_scales: NDArray[Any], above: NDArray[Any] | float, extent: float
+) -> tuple[float, NDArray[Any]]:
     """Mean of max(sum of squared scales - above, 0) by extent².  log_scales: [N, 3]; above: scene units²."""
     scale2 = np.exp(2 * log_scales)
     excess = scale2.sum(axis=1) - above
@@ -11,7 +16,7 @@ def covariance_trace(log_scales: np.ndarray, above: np.ndarray | float, extent: 
     return np.maximum(excess, 0).mean() / extent**2, 2 * scale2 * penalised / len(scale2) / extent**2
 
 
-def anisotropy(log_scales: np.ndarray, above: float) -> tuple[float, np.ndarray]:
+def anisotropy(log_scales: NDArray[Any], above: float) -> tuple[float, NDArray[Any]]:
     """Mean of max(longest / shortest axis - above, 0)."""
     rows = np.arange(len(log_scales))
     longest, shortest = log_scales.argmax(axis=1), log_scales.argmin(axis=1)

@@ -1,15 +1,18 @@
-"""Small random scenes, for the kernels and for the oracle alike."""
+"""Small random scenes, for the kernels and for the reference alike."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from clsplat.conformance import reference as ref
 from clsplat.gaussians.tables import DeviceModel, Gaussians
 from clsplat.opencl.device import Device
 from clsplat.render.camera import DeviceCamera, upload_camera
 from clsplat.scene.scene import Camera, View
-from tests import reference as ref
 
 SHARP = ref.Thresholds()
 EYE = np.array([[0.98, 0.05, -0.19, 0.1], [-0.03, 0.995, 0.1, -0.05], [0.19, -0.09, 0.977, 0.3]])
@@ -19,7 +22,7 @@ EYE = np.array([[0.98, 0.05, -0.19, 0.1], [-0.03, 0.995, 0.1, -0.05], [0.19, -0.
 class Case:
     """N Gaussians in front of one camera; parameters in float32, so that both sides see the same numbers."""
 
-    parameters: dict[str, np.ndarray]  # [N, components] float32
+    parameters: dict[str, NDArray[Any]]  # [N, components] float32
     view: View
     degree: int = 3
     near: float = 0.2
@@ -47,13 +50,14 @@ class Case:
             p["log_scales"],
             p["logit_opacity"][:, 0],
             sh,
-            None if filters is None else filters[:, 0],
+            np.zeros(0) if filters is None else filters[:, 0],
         )
 
     def camera(self) -> ref.Camera:
         c = self.view.camera
-        pose = np.float64(np.float32(self.view.world_to_camera))
-        return ref.Camera(pose, *(float(np.float32(v)) for v in (c.fx, c.fy, c.cx, c.cy)), c.width, c.height)
+        pose = self.view.world_to_camera.astype(np.float32).astype(np.float64)
+        fx, fy, cx, cy = (float(np.float32(value)) for value in (c.fx, c.fy, c.cx, c.cy))
+        return ref.Camera(pose, fx, fy, cx, cy, c.width, c.height)
 
     def numbers(self) -> dict[str, float]:
         return {"near": self.near, "variance": self.variance, "compensate": self.compensate}
@@ -62,7 +66,7 @@ class Case:
         return ref.project(self.gaussians(), self.camera(), self.degree, **self.numbers(), thresholds=thresholds)
 
 
-def random_case(rng: np.random.Generator, count: int, width: int = 40, height: int = 30, **changes: object) -> Case:
+def random_case(rng: np.random.Generator, count: int, width: int = 40, height: int = 30, **changes: Any) -> Case:
     """Gaussians spread over the view and somewhat beyond it, a few pixels large."""
     focal = 0.9 * width
     depth = rng.uniform(1.5, 6, count)
@@ -89,11 +93,25 @@ def with_world_filter(case: Case, rng: np.random.Generator) -> Case:
     return replace(case, parameters={**case.parameters, "filter_variance": variance.astype(np.float32)})
 
 
-def _orthogonal(matrix: np.ndarray) -> np.ndarray:
+def _orthogonal(matrix: NDArray[Any]) -> NDArray[Any]:
     u, _, vt = np.linalg.svd(matrix)
     return u @ vt
 
 
-def relative_error(value: np.ndarray, expected: np.ndarray) -> float:
-    """Norm of the difference by the norm of `expected`."""
-    return float(np.linalg.norm(value - expected) / max(np.linalg.norm(expected), 1e-30))
+def safe_case(
+    rng: np.random.Generator,
+    count: int,
+    width: int,
+    height: int,
+    margin: float = 2e-6,
+    change: Callable[[dict[str, NDArray[Any]]], None] = lambda parameters: None,
+    **changes: Any,
+) -> Case:
+    """A scene in which no pixel is nearer to a threshold than `margin`, so that float32 and float64 blend the same."""
+    for _ in range(200):
+        case = random_case(rng, count, width, height, **changes)
+        change(case.parameters)
+        gaps = ref.margin(case.project(), width, height)
+        if min(gaps.alpha, gaps.transmittance, gaps.cap) > margin and gaps.depth > min(margin, 2e-6):
+            return case
+    raise AssertionError("no scene with margins was found")

@@ -1,13 +1,16 @@
-"""The oracle of the world filter: how finely cameras sample each Gaussian, in float64 NumPy (Yu et al. 2024, 5.1)."""
+"""The world filter: how finely cameras sample each Gaussian (Yu et al. 2024, 5.1)."""
+
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from tests.reference import Camera
+from clsplat.conformance.reference.kinds import Camera
 
 
 def sampling_interval(
-    means: np.ndarray, cameras: list[Camera], focal: list[float], near: float = 0.2, margin: float = 0.15
-) -> np.ndarray:
+    means: NDArray[Any], cameras: list[Camera], focal: list[float], near: float = 0.2, margin: float = 0.15
+) -> NDArray[Any]:
     """Smallest depth / focal length over the cameras that see each mean; the largest of them where none does: [N]."""
     intervals = np.full(len(means), np.inf)
     for n, mean in enumerate(means):
@@ -26,7 +29,9 @@ def sampling_interval(
     return intervals
 
 
-def filtered(log_scales: np.ndarray, logit: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def filtered(
+    log_scales: NDArray[Any], logit: NDArray[Any], variance: NDArray[Any]
+) -> tuple[NDArray[Any], NDArray[Any]]:
     """Standard deviations and opacities as they are drawn: [N,3], [N] -> [N,3], [N]."""
     scale = np.exp(log_scales)
     drawn = np.sqrt(scale**2 + variance[:, None])

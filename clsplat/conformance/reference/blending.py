@@ -1,31 +1,34 @@
-"""The oracle: blending in float64 NumPy, one splat at a time over all pixels, and its gradient; there are no tiles.
+"""Blending, one splat at a time over all pixels, and its gradient; there are no tiles.
 
 Kerbl et al. 2023, eq. 3.  `grad_x` is dL/dx; H, W image.
 """
 
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from tests.reference import Camera, Gaussians, SplatGradients, Splats, Thresholds, project, project_backward
+from clsplat.conformance.reference.kinds import Camera, Gaussians, SplatGradients, Splats, Thresholds
+from clsplat.conformance.reference.projection import project
+from clsplat.conformance.reference.projection_backward import project_backward
 
 
 class BlendStep(NamedTuple):
     """One splat over all pixels; every array is [H,W]."""
 
-    index: int
-    dx: np.ndarray
-    dy: np.ndarray
-    falloff: np.ndarray  # e^-σ
-    alpha: np.ndarray
-    before: np.ndarray  # transmittance in front of the splat
-    tried: np.ndarray  # the pixel had not stopped yet
-    candidate: np.ndarray  # tried and not too faint
-    blended: np.ndarray  # candidate and does not make the pixel stop
+    splat: int
+    dx: NDArray[Any]
+    dy: NDArray[Any]
+    falloff: NDArray[Any]  # e^-σ
+    alpha: NDArray[Any]
+    before: NDArray[Any]  # transmittance in front of the splat
+    tried: NDArray[Any]  # the pixel had not stopped yet
+    candidate: NDArray[Any]  # tried and not too faint
+    blended: NDArray[Any]  # candidate and does not make the pixel stop
 
 
-def depth_order(splats: Splats) -> np.ndarray:
+def depth_order(splats: Splats) -> NDArray[Any]:
     """Visible splats front to back, ties by index."""
     order = np.argsort(splats.depth, kind="stable")
     return order[splats.visible[order]]
@@ -52,25 +55,25 @@ def blend_steps(splats: Splats, width: int, height: int, thresholds: Thresholds)
 
 
 def blend(
-    splats: Splats, width: int, height: int, background: np.ndarray, thresholds: Thresholds = Thresholds()
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    splats: Splats, width: int, height: int, background: NDArray[Any], thresholds: Thresholds = Thresholds()
+) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
     """Image [3,H,W], final transmittance [H,W], number of blended splats [H,W]."""
     image = np.zeros((3, height, width))
     transmittance = np.ones((height, width))
     count = np.zeros((height, width), int)
     for step in blend_steps(splats, width, height, thresholds):
         weight = np.where(step.blended, step.alpha * step.before, 0)
-        image += splats.colour[step.index][:, None, None] * weight
+        image += splats.colour[step.splat][:, None, None] * weight
         transmittance = np.where(step.blended, step.before * (1 - step.alpha), transmittance)
         count += step.blended
     return image + np.asarray(background)[:, None, None] * transmittance, transmittance, count
 
 
-def blend_weights(splats: Splats, width: int, height: int, thresholds: Thresholds = Thresholds()) -> np.ndarray:
+def blend_weights(splats: Splats, width: int, height: int, thresholds: Thresholds = Thresholds()) -> NDArray[Any]:
     """What each splat contributes to each pixel, α T, [N,H,W]."""
     weights = np.zeros((len(splats.opacity), height, width))
     for step in blend_steps(splats, width, height, thresholds):
-        weights[step.index] = np.where(step.blended, step.alpha * step.before, 0)
+        weights[step.splat] = np.where(step.blended, step.alpha * step.before, 0)
     return weights
 
 
@@ -78,8 +81,8 @@ def blend_backward(
     splats: Splats,
     width: int,
     height: int,
-    background: np.ndarray,
-    grad_image: np.ndarray,
+    background: NDArray[Any],
+    grad_image: NDArray[Any],
     thresholds: Thresholds = Thresholds(),
 ) -> SplatGradients:
     """Gradients of the splats, in the prefix form.  Where alpha is capped its derivative is zero."""
@@ -89,7 +92,7 @@ def blend_backward(
     through_background = np.einsum("c,chw->hw", background, grad_image)
     behind = image - np.asarray(background)[:, None, None] * final  # S_N - S_i, once splat i has been taken off
     for step in blend_steps(splats, width, height, thresholds):
-        i, alpha, before = step.index, step.alpha, step.before
+        i, alpha, before = step.splat, step.alpha, step.before
         colour = splats.colour[i][:, None, None]
         behind = behind - colour * np.where(step.blended, alpha * before, 0)
         grad.colour[i] = np.sum(grad_image * np.where(step.blended, alpha * before, 0), axis=(1, 2))
@@ -123,7 +126,7 @@ def margin(splats: Splats, width: int, height: int, thresholds: Thresholds = Thr
     """Return how far blending stays from its thresholds, so that a test can choose a scene without flips."""
     alpha, transmittance, cap = [np.inf], [np.inf], [np.inf]
     for step in blend_steps(splats, width, height, thresholds):
-        uncapped = splats.opacity[step.index] * step.falloff
+        uncapped = splats.opacity[step.splat] * step.falloff
         cap.append(_relative_gap(uncapped[step.candidate], thresholds.alpha_max))
         alpha.append(_relative_gap(step.alpha[step.tried], thresholds.alpha_min))
         after = step.before * (1 - step.alpha)
@@ -133,7 +136,7 @@ def margin(splats: Splats, width: int, height: int, thresholds: Thresholds = Thr
     return Margin(min(alpha), min(transmittance), min(cap), float(gap))
 
 
-def _relative_gap(values: np.ndarray, threshold: float) -> float:
+def _relative_gap(values: NDArray[Any], threshold: float) -> float:
     return float(np.min(np.abs(values / threshold - 1), initial=np.inf)) if threshold > 0 else np.inf
 
 
@@ -143,16 +146,16 @@ def _relative_gap(values: np.ndarray, threshold: float) -> float:
 class Frame(NamedTuple):
     """What `render` returns."""
 
-    image: np.ndarray  # [3,H,W]
-    transmittance: np.ndarray  # [H,W]
-    count: np.ndarray  # [H,W] blended splats
+    image: NDArray[Any]  # [3,H,W]
+    transmittance: NDArray[Any]  # [H,W]
+    blended: NDArray[Any]  # [H,W] splats
     splats: Splats
 
 
 def render(
     gaussians: Gaussians,
     camera: Camera,
-    background: np.ndarray,
+    background: NDArray[Any],
     degree: int,
     near: float = 0.2,
     variance: float = 0.3,
@@ -167,14 +170,14 @@ def render(
 def render_backward(
     gaussians: Gaussians,
     camera: Camera,
-    background: np.ndarray,
+    background: NDArray[Any],
     degree: int,
     splats: Splats,
-    grad_image: np.ndarray,
+    grad_image: NDArray[Any],
     variance: float = 0.3,
     compensate: float = 0.0,
     thresholds: Thresholds = Thresholds(),
-) -> tuple[dict[str, np.ndarray], SplatGradients]:
+) -> tuple[dict[str, NDArray[Any]], SplatGradients]:
     """Gradients of the parameters, and those of the splats on the way (for density control)."""
     grad = blend_backward(splats, camera.width, camera.height, background, grad_image, thresholds)
     upstream = grad.mean2d, grad.conic, grad.opacity, grad.colour

@@ -1,11 +1,13 @@
-"""The oracle: a Gaussian blur of the pixels that count, in float64 NumPy, one place of the window at a time."""
+"""A Gaussian blur of the pixels that count, one place of the window at a time."""
 
 import math
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 
-def blurred(image: np.ndarray, sigma: float, mask: np.ndarray | None = None) -> np.ndarray:
+def blurred(image: NDArray[Any], sigma: float, mask: NDArray[Any] | None = None) -> NDArray[Any]:
     """Mean by weight of the pixels that count within 3 sigma along each axis; where none does, the pixel itself.
 
     image: [3, H, W]; mask: [H, W] bool; sigma: px.

@@ -1,0 +1,161 @@
+"""The two schedules of blending: images, and the sums over pixels from which gradients come."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.conformance import reference as ref
+from clsplat.conformance.check import Checks, Note
+from clsplat.conformance.comparison import GRADIENT, SUM, Figure, by_norm, equal, image_figures
+from clsplat.conformance.scenes import Case, random_case, safe_case
+from clsplat.density.statistics import ABS_X, WEIGHT
+from clsplat.opencl.device import Device
+from clsplat.render.rasterizer import PIXEL_SUMS, RECORD, Budget, Frame, Rasterizer
+from clsplat.render.tiles import Sort
+
+CHECKS = Checks()
+BACKGROUND = np.array([0.2, 0.5, 0.9], np.float32)
+MARGIN = 1e-5  # of alpha and transmittance: float32 is off by about 3e-6 there
+ALL_SUMS = WEIGHT + 2
+Sums = tuple[NDArray[Any], Frame, Rasterizer]
+
+
+def render(device: Device, case: Case, sort: Sort = "radix") -> Frame:
+    return Rasterizer(device, sort).forward(case.model(device), case.device_camera(device), device.upload(BACKGROUND))
+
+
+def blend_figures(device: Device, case: Case, what: str, sort: Sort = "radix") -> Iterator[Figure]:
+    """Compare image and transmittance of a scene with the reference; outside the image they are zero."""
+    frame, (width, height) = render(device, case, sort), case.size
+    image, transmittance = frame.image.get(), frame.transmittance.get()
+    outside = np.concatenate([image, transmittance[None]])
+    outside[:, :height, :width] = 0
+    yield equal("blend_forward", f"pixels outside the image, {what}", outside, 0.0)
+    expected, left, _ = ref.blend(case.project(), width, height, BACKGROUND.astype(np.float64))
+    yield from image_figures("blend_forward", f"image, {what}", image[:, :height, :width], expected)
+    found = transmittance[None, :height, :width]
+    yield from image_figures("blend_forward", f"transmittance, {what}", found, left[None])
+
+
+def pixel_sums_of(
+    device: Device,
+    case: Case,
+    weights: NDArray[Any],
+    count: int = PIXEL_SUMS,
+    sort: Sort = "radix",
+    budget: Budget | None = None,
+    texture: NDArray[Any] | None = None,
+) -> NDArray[Any]:
+    """Sums over each Gaussian's pixels under the loss Σ weights · image, [N, count]."""
+    rasterizer, model, camera = Rasterizer(device, sort, budget), case.model(device), case.device_camera(device)
+    frame = rasterizer.forward(model, camera, device.upload(BACKGROUND))
+    planes = np.zeros((4, camera.rows, camera.stride), np.float32)
+    planes[:3, : camera.height, : camera.width] = weights
+    if texture is not None:
+        planes[3, : camera.height, : camera.width] = texture
+    uploaded = None if texture is None else device.upload(planes[3])
+    pixel_sums = rasterizer.pixel_sums(model, frame, device.upload(planes[:3]), count, uploaded)
+    return pixel_sums.get()[:, : model.gaussians.count].T.astype(np.float64)
+
+
+def sum_figures(case: Case, m: NDArray[Any], weights: NDArray[Any], what: str) -> Iterator[Figure]:
+    """Compare sums over pixels, [N, PIXEL_SUMS or more], as the gradients of splats."""
+    kernel, splats = "blend_backward", case.project()
+    truth = ref.blend_backward(splats, *case.size, BACKGROUND.astype(np.float64), weights)
+    a, b, c = splats.conic.T
+    mean2d = -np.stack([a * m[:, 1] + b * m[:, 2], b * m[:, 1] + c * m[:, 2]], axis=1)
+    yield by_norm(kernel, f"gradients of splat means, {what}", mean2d, truth.mean2d, GRADIENT)
+    conic = np.stack([-0.5 * m[:, 3], -m[:, 4], -0.5 * m[:, 5]], axis=1)
+    yield by_norm(kernel, f"gradients of conics, {what}", conic, truth.conic, GRADIENT)
+    yield by_norm(kernel, f"gradients of opacities, {what}", m[:, 0], truth.opacity * splats.opacity, GRADIENT)
+    yield by_norm(kernel, f"gradients of colours, {what}", m[:, 6:9], truth.colour, GRADIENT)
+    if m.shape[1] > PIXEL_SUMS:
+        found = m[:, ABS_X : ABS_X + 2]
+        yield by_norm(kernel, f"absolute gradients, {what}", found, truth.mean2d_abs, GRADIENT)
+
+
+def _opaque(parameters: dict[str, NDArray[Any]]) -> None:
+    parameters["log_scales"] += 0.6
+    parameters["logit_opacity"] += 2
+
+
+def _of_all_sizes(parameters: dict[str, NDArray[Any]]) -> None:
+    parameters["log_scales"][:10] += 4
+    parameters["log_scales"][10:20] -= 6
+
+
+@CHECKS.add("blend_forward")
+def images(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    for count, width, height in ((0, 20, 20), (1, 16, 16), (17, 15, 17), (60, 33, 31), (120, 40, 30), (40, 5, 3)):
+        case = safe_case(rng, count, width, height, MARGIN)
+        yield from blend_figures(device, case, f"{count} Gaussians, {width} x {height} px")
+    yield from blend_figures(device, safe_case(rng, 300, 14, 14, 2e-6, _opaque), "long tiles, finished pixels")
+    yield from blend_figures(device, safe_case(rng, 30, 40, 40, MARGIN, _of_all_sizes), "huge and tiny splats")
+
+
+@CHECKS.add("blend_backward", "sum_records")
+def gradients_of_blending(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    for count, width, height in ((1, 16, 16), (17, 33, 15), (40, 40, 30), (65, 24, 24)):
+        case = safe_case(rng, count, width, height, MARGIN)
+        weights = rng.normal(size=(3, height, width)).astype(np.float32)
+        what = f"{count} Gaussians, {width} x {height} px"
+        yield from sum_figures(case, pixel_sums_of(device, case, weights), weights, what)
+    case = safe_case(rng, 300, 14, 14, 2e-6, _opaque)
+    weights = rng.normal(size=(3, 14, 14)).astype(np.float32)
+    yield from sum_figures(case, pixel_sums_of(device, case, weights), weights, "long tiles, finished pixels")
+
+
+@CHECKS.add("blend_backward", "sum_records")
+def statistics_of_blending(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    width, height = 48, 32  # whole tiles: the plane of texture is known beyond the image's edge
+    case = safe_case(rng, 40, width, height, MARGIN)
+    weights = rng.normal(size=(3, height, width)).astype(np.float32)
+    texture = np.where(rng.random((height, width)) < 0.9, rng.uniform(0, 0.5, (height, width)), -1).astype(np.float32)
+    yield from sum_figures(case, pixel_sums_of(device, case, weights, ABS_X + 2), weights, "with absolute gradients")
+    m = pixel_sums_of(device, case, weights, ALL_SUMS, texture=texture)
+    yield from sum_figures(case, m, weights, "with weights and texture")
+    blended = ref.blend_weights(case.project(), width, height) * (texture >= 0)
+    yield by_norm("blend_backward", "sums of weights", m[:, WEIGHT], blended.sum(axis=(1, 2)), GRADIENT)
+    expected = (blended * texture).sum(axis=(1, 2))
+    yield by_norm("blend_backward", "sums of texture", m[:, WEIGHT + 1], expected, GRADIENT)
+
+
+@CHECKS.add("sum_records")
+def sums_of_records(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    lanes = int(device.tuning["LANES"])
+    for count in (1, 15, 17, 65):
+        pairs, stride = rng.integers(0, 6, count), -(-count // 64) * 64
+        records = rng.uniform(0.5, 1, (max(1, pairs.sum()), RECORD)).astype(np.float32)
+        first = np.cumsum(pairs) - pairs
+        sums = rng.uniform(0.5, 1, (PIXEL_SUMS, stride)).astype(np.float32)
+        expected = np.stack([records[f : f + n].sum(axis=0) for f, n in zip(first, pairs, strict=True)], axis=1)
+        for accumulate in (0, 1):
+            pixel_sums = device.upload(sums)
+            device.program("gather.cl").sum_records(
+                items=-(-count // lanes),
+                pair_sums=device.upload(records),
+                first_pair=device.upload(first.astype(np.uint32)),
+                tile_count=device.upload(pairs.astype(np.uint32)),
+                pixel_sums=pixel_sums,
+                accumulate=accumulate,
+                stride=stride,
+                count=count,
+            )
+            truth = expected[:PIXEL_SUMS] + accumulate * sums[:, :count].astype(np.float64)
+            yield by_norm("sum_records", f"sums of {count} Gaussians", pixel_sums.get()[:, :count], truth, SUM)
+
+
+@CHECKS.add("blend_forward", "blend_backward")
+def the_same_bits_with_either_sort_and_in_bands(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    case = random_case(rng, 150, 50, 70)
+    case.parameters["log_scales"][:10] += 1.5  # some over many rows of tiles, and too many tiles for a mask
+    weights = rng.normal(size=(3, 70, 50)).astype(np.float32)
+    image, sums = render(device, case).image.get(), pixel_sums_of(device, case, weights)
+    yield equal("sort_tiles", "pixels, against the radix sort", render(device, case, "bitonic").image.get(), image)
+    again = pixel_sums_of(device, case, weights, sort="bitonic")
+    yield equal("sort_tiles", "sums over pixels, against the radix sort", again, sums)
+    banded = pixel_sums_of(device, case, weights, budget=Budget(250, 3))
+    yield equal("blend_backward", "sums over pixels, against bands of tiles", banded, sums)
+    yield equal("blend_backward", "sums over pixels, a second time", pixel_sums_of(device, case, weights), sums)

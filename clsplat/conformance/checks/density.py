@@ -1,0 +1,148 @@
+"""density.cl: statistics of views, rules, and the rows that an edit makes."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.conformance import reference as ref
+from clsplat.conformance.check import Checks, Note
+from clsplat.conformance.checks.images import comparison_of, magnitude_of
+from clsplat.conformance.comparison import SUM, Figure, by_element, by_norm, equal
+from clsplat.conformance.scenes import random_case, with_world_filter
+from clsplat.density.basic import Clone, PruneFaint, PruneLarge, Split
+from clsplat.density.control import cap_opacity, densify
+from clsplat.density.edit import Edit, SceneScale
+from clsplat.density.statistics import ABS_X, SEEN, WEIGHT, SplatStats
+from clsplat.gaussians.tables import Gaussians
+from clsplat.losses.base import ViewGradients
+from clsplat.opencl.device import Device
+from clsplat.render.rasterizer import Rasterizer
+from clsplat.training.adam import Adam
+
+CHECKS = Checks()
+COUNTS = (1, 15, 17, 65, 200)
+RULES = (Clone(size_below=0.01), Split(size_above=0.01), PruneFaint(opacity_below=0.005), PruneLarge(size_above=0.1))
+EXTENT = 5.0
+SEED, STEP = 3, 3100
+COLUMNS = ("screen_grad", "screen_grad_abs_sum", "rendered_texture", "screen_radius", "blend_weight")
+
+
+@CHECKS.add(
+    *("count_seen", "accumulate_norm", "accumulate_sum", "accumulate_pixel_sum", "accumulate_radius"),
+    "sample_magnitude",
+)
+def statistics(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    for count in COUNTS:
+        case = random_case(rng, count)
+        case.parameters["means"][1::4] -= 20 * case.view.world_to_camera[2, :3]  # behind the camera
+        model, (width, height) = case.model(device), case.size
+        frame = Rasterizer(device, "radix").forward(model, case.device_camera(device), device.zeros(3))
+        gaussians, stats = model.gaussians, SplatStats(model.gaussians, COLUMNS)
+        planes = rng.normal(size=(stats.pixel_sums, gaussians.capacity)).astype(np.float32)
+        planes[ABS_X:] = np.abs(planes[ABS_X:])
+        image = frame.image.get()[:, :height, :width]
+        comparison = comparison_of(device, image, image)
+        view = ViewGradients(frame, comparison, [], device.upload(planes))
+        for _ in range(2):
+            stats.add(view, device.upload(planes[:2]))
+        radius, half = frame.radius.get()[:count], np.array([width / 2, height / 2])
+        seen, sums = radius > 0, planes[:, :count].T.astype(np.float64)
+        x, y = frame.splats.get()[:count, :2].T
+        column, row = np.clip(x, 0, width - 1).astype(int), np.clip(y, 0, height - 1).astype(int)
+        expected = {
+            ("screen_grad", "accumulate_norm"): ref.screen_gradient(sums[:, :2], width, height),
+            ("screen_grad_abs_sum", "accumulate_sum"): sums[:, ABS_X : ABS_X + 2] @ half,
+            ("rendered_texture", "sample_magnitude"): magnitude_of(image)[row, column],
+            ("screen_radius", "accumulate_radius"): radius,
+            ("blend_weight", "accumulate_pixel_sum"): sums[:, WEIGHT],
+        }
+        yield equal("count_seen", f"views of {count} Gaussians", gaussians.get(SEEN)[:, 0], 2.0 * seen)
+        for (name, kernel), values in expected.items():
+            found = gaussians.get(f"stats/{name}")[:, 0]
+            yield by_element(kernel, f"{name} of {count} Gaussians", found, 2 * values * seen, SUM, floor=0.1)
+
+
+def _edited(device: Device, rng: np.random.Generator, count: int) -> tuple[dict[str, NDArray[Any]], Gaussians]:
+    """Random Gaussians on both sides of every threshold, before and after an edit."""
+    case = random_case(rng, count)
+    p = case.parameters
+    sizes = EXTENT * rng.choice([0.003, 0.03, 0.12, 0.4], (count, 1))
+    p["log_scales"][:] = np.log(sizes) + rng.normal(0, 0.2, (count, 3))
+    p["logit_opacity"][:] = rng.choice([-7.0, -4.0, 2.0], (count, 1))
+    gaussians = case.model(device).gaussians
+    Adam(gaussians)
+    stats = SplatStats(gaussians)
+    for name, table in gaussians.tables.items():
+        if name.startswith("adam/"):
+            gaussians.set(name, rng.uniform(1, 2, (count, table.components)))
+    seen = rng.integers(0, 4, (count, 1)).astype(np.float32)
+    gaussians.set("stats/screen_grad", seen * rng.choice([5e-5, 1e-3], (count, 1)))
+    gaussians.set(SEEN, seen)
+    before = {name: gaussians.get(name) for name in gaussians.tables}
+    edit = Edit(gaussians, stats, SceneScale(EXTENT), STEP, SEED)
+    densify(edit, RULES, Rasterizer(device, "radix").tiler)
+    return before, gaussians
+
+
+@CHECKS.add("start_edit", "mark_rule", "list_rows", "spawn_children", "gather_rows")
+def edits(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    for count in COUNTS:
+        before, gaussians = _edited(device, rng, count)
+        size, opacity = np.exp(before["log_scales"]).max(axis=1), 1 / (1 + np.exp(-before["logit_opacity"][:, 0]))
+        gradient = ref.mean_gradient(before["stats/screen_grad"][:, 0], before[SEEN][:, 0])
+        action = ref.adc_actions(gradient, size, opacity, EXTENT, prune_large=True)
+        rows = np.select([action == ref.PRUNE, action == ref.KEEP], [0, 1], 2)
+        source = np.repeat(np.arange(count), rows)
+        what = f"an edit of {count} Gaussians"
+        yield Figure("mark_rule", f"rows after {what}", abs(gaussians.count - len(source)), 0, counts=True)
+        if gaussians.count != len(source):
+            continue
+        after = {name: gaussians.get(name) for name in gaussians.tables}
+        yield equal("list_rows", f"places after {what}", after["sh_rest"], before["sh_rest"][source])
+        split = action[source] == ref.SPLIT
+        second = np.concatenate([np.arange(n) for n in rows] or [np.zeros(0)]) == 1
+        fresh = split | ((action[source] == ref.CLONE) & second)
+        moment = "adam/means/moment1"
+        expected = np.where(fresh[:, None], 0, before[moment][source])
+        yield equal("list_rows", f"moments after {what}", after[moment], expected)
+        means, scales = before["means"].astype(np.float64)[source], before["log_scales"].astype(np.float64)[source]
+        for i in np.flatnonzero(split):
+            noise = ref.normal3((int(i), STEP, 0, 0), (SEED, 0))
+            rotation = ref.rotation_matrix(before["quats"][source[i]].astype(np.float64))
+            means[i] += rotation @ (np.exp(scales[i]) * noise)
+        scales[split] -= np.log(1.6)
+        yield by_norm("spawn_children", f"means after {what}", after["means"], means, SUM)
+        yield by_element("spawn_children", f"scales after {what}", after["log_scales"], scales, SUM, floor=1)
+
+
+@CHECKS.add("mark_chosen")
+def choices(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    for count in COUNTS:
+        gaussians = random_case(rng, count).model(device).gaussians
+        edit = Edit(gaussians, SplatStats(gaussians), SceneScale(1.0), STEP, SEED)
+        copies, kept, shrink = np.ones(count), np.ones(count), np.ones(count)
+        for factor in (0.5, 0.25):
+            chosen, numbers = rng.random(count) < 0.7, rng.integers(0, 5, count)
+            edit.choose(chosen, numbers, 3, factor)
+            acts = chosen & ((numbers == 0) | (copies == 1))
+            copies[acts], kept[acts] = numbers[acts], np.minimum(numbers, 3)[acts]
+            shrink[acts & (copies > 0)] = factor
+        for name, expected in (("copies", copies), ("kept", kept), ("shrink", shrink)):
+            yield equal("mark_chosen", f"{name} of {count} Gaussians", getattr(edit, name).get(), expected)
+
+
+@CHECKS.add("cap_opacity")
+def opacity_reset(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    for count in COUNTS:
+        for case in (random_case(rng, count), with_world_filter(random_case(rng, count), rng)):
+            gaussians, oracle = case.model(device).gaussians, case.gaussians()
+            cap_opacity(gaussians, 0.3)
+            scale2 = np.exp(2 * oracle.log_scales)
+            ratio = np.prod(np.sqrt(scale2 / (scale2 + oracle.filter_variance[:, None])), axis=1)
+            expected = oracle.logit_opacity.copy()
+            capped = ratio / (1 + np.exp(-expected)) > 0.3
+            expected[capped] = ref.reset_logit(expected[capped], ratio[capped], 0.3)
+            found = gaussians.get("logit_opacity")[:, 0]
+            yield by_element("cap_opacity", f"opacities of {count} Gaussians", found, expected, 2e-5, floor=1)

@@ -1,0 +1,44 @@
+"""The two-second form: the kernels of every training step, each once, on one small scene."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from clsplat.conformance.check import Checks, Note
+from clsplat.conformance.checks import blending, images, projection, tiles, update
+from clsplat.conformance.comparison import Figure
+from clsplat.conformance.scenes import random_case, safe_case
+from clsplat.opencl.device import Device
+
+CHECKS = Checks()
+BITONIC = Checks()  # only where a run may sort so
+
+
+@CHECKS.add("project_forward", "project_backward", "emit_pairs", "blend_forward", "blend_backward", "sum_records")
+def rendering(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    case, what = safe_case(rng, 60, 40, 30, blending.MARGIN), "a scene of 60 Gaussians"
+    yield from projection.record_figures(device, case, what)
+    yield from tiles.list_figures(device, case, "radix", what)
+    yield from blending.blend_figures(device, case, what)
+    weights = rng.normal(size=(3, 30, 40)).astype(np.float32)
+    yield from blending.sum_figures(case, blending.pixel_sums_of(device, case, weights), weights, what)
+    yield from projection.gradient_figures(device, case, rng, what)
+
+
+@CHECKS.add("scan_offsets", "radix_count", "radix_scatter")
+def sorting(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    yield tiles.scan_figure(device, rng.integers(0, 100, 1025).astype(np.uint32))
+    yield from tiles.radix_figures(device, rng.integers(0, 2**20, 1025).astype(np.uint32), 20)
+
+
+@BITONIC.add("count_pairs", "fill_tiles", "sort_tiles")
+def sorting_in_tiles(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    yield from tiles.bitonic_figures(device, rng, (0, 1, 65, 300), 50)
+
+
+@CHECKS.add("pixel_loss", "ssim_maps", "ssim_gradient", "update_gaussians")
+def learning(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    x, y = images.pictures(rng, 33, 17)
+    for loss, oracle, kernel in images.LOSSES:
+        yield from images.loss_figures(device, loss(weight=0.7), 0.7, oracle, kernel, x, y)
+    yield from update.fused_figures(device, rng, random_case(rng, 40), "40 Gaussians")

@@ -1,0 +1,152 @@
+"""Losses, masks, blur and texture: kernels on planes of pixels."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from clsplat.conformance import reference as ref
+from clsplat.conformance.check import Checks, Note
+from clsplat.conformance.comparison import LOSS_GRADIENT, SUM, Figure, by_element, equal
+from clsplat.losses.base import Comparison, ImageLoss
+from clsplat.losses.image import L1, L2, Dssim
+from clsplat.opencl.device import Array, Device
+from clsplat.render.camera import DeviceCamera
+from clsplat.render.workspace import Workspace
+from clsplat.views.photographs import apply_mask, unpack
+from clsplat.views.texture import known_gradient
+from clsplat.views.transforms import Blur, Planes
+
+CHECKS = Checks()
+SIZES = ((1, 1), (11, 11), (17, 33), (257, 9))  # around the window, tiles and the columns of a group
+LOSSES = ((L1, ref.l1, "pixel_loss"), (L2, ref.l2, "pixel_loss"), (Dssim, ref.dssim, "ssim_gradient"))
+
+
+def camera_of(device: Device, width: int, height: int) -> DeviceCamera:
+    tile = int(device.tuning["TILE"])
+    return DeviceCamera(device.zeros(1), width, height, -(-width // tile), -(-height // tile), tile)
+
+
+def planes_of(device: Device, camera: DeviceCamera, image: NDArray[Any]) -> Array:
+    """An image [C, height, width] as planes of whole tiles, zero outside."""
+    planes = np.zeros((len(image), camera.rows, camera.stride), np.float32)
+    planes[:, : camera.height, : camera.width] = image
+    return device.upload(planes)
+
+
+def outside(camera: DeviceCamera, planes: NDArray[Any]) -> NDArray[Any]:
+    """The planes with the image itself set to zero."""
+    rest = planes.copy()
+    rest[..., : camera.height, : camera.width] = 0
+    return rest
+
+
+def comparison_of(device: Device, x: NDArray[Any], y: NDArray[Any]) -> Comparison:
+    """x, y: [3, H, W]."""
+    camera = camera_of(device, x.shape[2], x.shape[1])
+    gradient = device.empty((3, camera.rows, camera.stride))
+    gradient.fill(7)
+    return Comparison(Workspace(device), camera, planes_of(device, camera, x), planes_of(device, camera, y), gradient)
+
+
+def pictures(rng: np.random.Generator, width: int, height: int) -> tuple[NDArray[Any], NDArray[Any]]:
+    """A photograph and a noisy rendering of it, [3, H, W]: rendering first."""
+    y = rng.uniform(0, 1, (3, height, width)).astype(np.float32)
+    return (y + rng.normal(0, 0.2, y.shape)).astype(np.float32), y
+
+
+def loss_figures(
+    device: Device, loss: ImageLoss, weight: float, oracle: Any, kernel: str, x: NDArray[Any], y: NDArray[Any]
+) -> Iterator[Figure]:
+    """Compare value and gradient of a loss of weight `weight`."""
+    comparison, what = comparison_of(device, x, y), f"{type(loss).__name__}, {x.shape[2]} x {x.shape[1]} px"
+    found = loss.add(comparison)
+    value, gradient = oracle(x.astype(np.float64), y.astype(np.float64))
+    value_of = {"ssim_gradient": "ssim_maps"}.get(kernel, kernel)
+    values = np.array([found.value()]), np.array([weight * value])
+    yield by_element(value_of, f"value of {what}", *values, SUM, floor=1e-2)
+    planes, camera = comparison.gradient.get(), comparison.camera
+    error = np.abs(planes[:, : camera.height, : camera.width] - weight * gradient).max()
+    largest = max(float(np.abs(weight * gradient).max()), 1e-30)
+    yield Figure(kernel, f"gradient of {what}", float(error) / largest, LOSS_GRADIENT)
+    yield equal(kernel, f"gradient outside the image, {what}", outside(camera, planes), 0.0)
+
+
+@CHECKS.add("pixel_loss", "ssim_maps", "ssim_gradient")
+def losses(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    for width, height in SIZES:
+        x, y = pictures(rng, width, height)
+        for loss, oracle, kernel in LOSSES:
+            yield from loss_figures(device, loss(weight=0.7), 0.7, oracle, kernel, x, y)
+
+
+@CHECKS.add("pixel_loss", "ssim_gradient")
+def losses_that_add_up(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    x, y = pictures(rng, 50, 20)
+    comparison = comparison_of(device, x, y)
+    expected = np.zeros(x.shape)
+    for weight, (loss, oracle, _) in zip((0.8, 3.0, 0.2), LOSSES, strict=True):
+        loss(weight=weight).add(comparison)
+        expected += weight * oracle(x.astype(np.float64), y.astype(np.float64))[1]
+    error = np.abs(comparison.gradient.get()[:, :20, :50] - expected).max() / np.abs(expected).max()
+    yield Figure("ssim_gradient", "sum of the gradients of three losses", float(error), LOSS_GRADIENT)
+
+
+@CHECKS.add("unpack_pixels", "apply_mask")
+def photographs(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    for width, height in SIZES:
+        pixels = rng.integers(0, 256, (3, height, width)).astype(np.uint8)
+        mask = (rng.random((1, height, width)) < 0.5).astype(np.uint8)
+        camera, workspace, what = camera_of(device, width, height), Workspace(device), f"{width} x {height} px"
+        workspace.array("photograph", (3, camera.rows, camera.stride)).fill(9)
+        colours = unpack(workspace, camera, device.upload(pixels), 1 / 255, "photograph")
+        counted = unpack(workspace, camera, device.upload(mask), 1.0, "mask")
+        found = colours.get()
+        yield by_element("unpack_pixels", f"colours, {what}", found[:, :height, :width], pixels / 255, 1e-6)
+        yield equal("unpack_pixels", f"pixels outside the image, {what}", outside(camera, found), 0.0)
+        yield equal("unpack_pixels", f"mask, {what}", counted.get()[:, :height, :width], mask)
+        apply_mask(workspace, camera, colours, counted)
+        yield equal("apply_mask", f"masked colours, {what}", colours.get(), found * counted.get())
+
+
+@CHECKS.add("blur_rows", "blur_columns")
+def blur(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    for width, height in ((1, 1), (15, 4), (33, 18), (65, 7)):
+        for sigma, share in ((1.0, None), (2.5, 0.7), (0.5, 0.05)):
+            image = rng.uniform(0, 1, (3, height, width)).astype(np.float32)
+            mask = None if share is None else rng.random((height, width)) < share
+            camera, workspace = camera_of(device, width, height), Workspace(device)
+            counted = None if mask is None else planes_of(device, camera, mask[None])
+            planes = Planes(workspace, camera, planes_of(device, camera, image), counted)
+            found = Blur(sigma=sigma).apply(planes, step=1).colours.get()
+            expected = ref.blurred(image.astype(np.float64), sigma, mask)
+            what = f"sigma {sigma:g}, {width} x {height} px"
+            yield by_element("blur_columns", what, found[:, :height, :width], expected, 2e-5, floor=0.05)
+            yield equal("blur_columns", f"pixels outside the image, {what}", outside(camera, found), 0.0)
+
+
+def magnitude_of(image: NDArray[Any]) -> NDArray[Any]:
+    """|Sobel| / 8 of the luminance of [3, H, W], float64."""
+    luminance = np.tensordot([0.299, 0.587, 0.114], image.astype(np.float64), axes=1)
+    across, down = (ndimage.sobel(luminance, axis=axis, mode="nearest") for axis in (1, 0))
+    return np.hypot(across, down) / 8
+
+
+@CHECKS.add("image_gradient", "hide_masked")
+def texture(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    for width, height in ((1, 1), (7, 5), (17, 17), (40, 30), (65, 3)):
+        image = rng.uniform(0, 1, (3, height, width)).astype(np.float32)
+        mask = rng.random((height, width)) < 0.9
+        camera, workspace, what = camera_of(device, width, height), Workspace(device), f"{width} x {height} px"
+        workspace.array("texture", (camera.rows, camera.stride)).fill(9)
+        expected = magnitude_of(image)
+        for counted in (None, mask):
+            uploaded = None if counted is None else planes_of(device, camera, counted[None])
+            found = known_gradient(workspace, camera, planes_of(device, camera, image), uploaded).get()
+            if counted is not None:
+                expected = np.where(ndimage.minimum_filter(counted, 3, mode="nearest"), expected, -1)
+            kernel = "image_gradient" if counted is None else "hide_masked"
+            yield by_element(kernel, f"texture, {what}", found[:height, :width], expected, 1e-6, floor=1)
+            yield equal(kernel, f"texture outside the image, {what}", outside(camera, found), 0.0)

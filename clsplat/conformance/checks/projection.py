@@ -1,0 +1,205 @@
+"""project.cl and what reads splats: records, gradients, depth, the world filter."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.conformance import reference as ref
+from clsplat.conformance.check import Checks, Note
+from clsplat.conformance.comparison import CONIC, DEPTH, PROJECTION, SUM, Figure, by_element, by_norm, equal, wrong
+from clsplat.conformance.scenes import Case, random_case, with_world_filter
+from clsplat.filters import FilterViews, Smoothing
+from clsplat.opencl.device import Device
+from clsplat.render.rasterizer import PIXEL_SUMS, Rasterizer
+
+CHECKS = Checks()
+CULLED = 0xFFFFFFFF  # depth key
+COUNTS = (1, 15, 17, 65)
+FILTERS = ((0.3, 1.0), (0.1, 1.0), (0.0, 0.0))  # variance, compensate
+
+
+def splats_of(device: Device, case: Case) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """Records [N, RECORD], depth keys [N] and radii [N] of the kernel."""
+    rasterizer = Rasterizer(device, "radix")
+    frame = rasterizer.forward(case.model(device), case.device_camera(device), device.zeros(3))
+    keys = rasterizer.workspace.array("depth_key", len(case.parameters["means"]), np.uint32).get()
+    return frame.splats.get(), keys, frame.radius.get()[: len(keys)]
+
+
+def record_figures(device: Device, case: Case, what: str) -> Iterator[Figure]:
+    """Compare the records of a scene with the reference."""
+    kernel = "project_forward"
+    records, keys, radius = splats_of(device, case)
+    truth, (width, height) = case.project(), case.size
+    # the kernel also drops what no pixel of the image can see: those must be outside or too faint
+    drawn = records[:, 5] > 0
+    x, y = truth.mean2d.T
+    unseen = (x < 0) | (y < 0) | (x > width) | (y > height) | (truth.opacity < 1.001 / 255)
+    yield wrong(
+        kernel, f"which splats are drawn, {what}", (drawn & ~truth.visible) | (truth.visible & ~drawn & ~unseen)
+    )
+    drawn &= truth.visible
+    record = records[drawn]
+    yield by_element(kernel, f"means, {what}", record[:, :2], truth.mean2d[drawn], PROJECTION, floor=50)
+    size = np.maximum(np.linalg.norm(truth.conic[drawn], axis=1), 1e-30)
+    error = np.linalg.norm(record[:, 2:5] - truth.conic[drawn], axis=1) / size
+    yield Figure(kernel, f"conics, {what}", float(error.max(initial=0)), CONIC)
+    yield by_element(kernel, f"opacities, {what}", record[:, 5], truth.opacity[drawn], PROJECTION)
+    yield by_element(kernel, f"colours, {what}", record[:, 6:9], truth.colour[drawn], PROJECTION, floor=1)
+    yield by_element(kernel, f"depths, {what}", keys[drawn].view(np.float32), truth.depth[drawn], DEPTH)
+    power_min = -np.log(255 * truth.opacity[drawn])
+    yield by_element(kernel, f"reaches, {what}", record[:, 13], power_min, PROJECTION, floor=1)
+    hidden = records[:, 5] <= 0
+    yield wrong(kernel, f"culled splats, {what}", (keys[hidden] != CULLED) | (records[hidden] != 0).any(axis=1))
+    # ceil() may jump by a pixel where the radius is almost whole
+    yield wrong(kernel, f"radii, {what}", ~(np.abs(radius - truth.radius) <= 1))
+    yield wrong(kernel, f"exact radii, {what}", radius != truth.radius, allowed=0.02 * len(radius))
+    yield wrong(kernel, f"extents, {what}", _wrong_extents(record, truth, drawn))
+
+
+def _wrong_extents(record: NDArray[Any], truth: ref.Splats, drawn: NDArray[Any]) -> NDArray[Any]:
+    """Extents that do not hold the pixels where alpha falls to 1/255, or much more than those."""
+    reach2 = 2 * np.log(255 * truth.opacity[drawn])
+    a, b, c = truth.conic[drawn].T
+    half_x, half_y = np.sqrt(reach2 * c / (a * c - b * b)), np.sqrt(reach2 * a / (a * c - b * b))
+    right = np.ones(len(record), bool)
+    for low, high, centre, half in ((11, 12, 0, half_x), (9, 10, 1, half_y)):
+        mean = truth.mean2d[drawn, centre]
+        right &= (record[:, high] >= mean + half - 1e-3) & (record[:, low] <= mean - half + 1e-3)
+        right &= record[:, high] - record[:, low] <= 2.4 * half + 1
+    return ~right
+
+
+def gradient_figures(device: Device, case: Case, rng: np.random.Generator, what: str) -> Iterator[Figure]:
+    """Give the kernel and the reference the same sums over a Gaussian's pixels; compare the parameters' gradients."""
+    model, camera = case.model(device), case.device_camera(device)
+    rasterizer = Rasterizer(device, "radix")
+    frame = rasterizer.forward(model, camera, device.zeros(3))
+    gaussians, truth = model.gaussians, case.project()
+    drawn = frame.splats.get()[:, 5] > 0
+    pixel_sums = np.zeros((PIXEL_SUMS, gaussians.capacity), np.float32)
+    pixel_sums[:, : gaussians.count] = rng.normal(size=(PIXEL_SUMS, gaussians.count)) * drawn
+    gradients = rasterizer.gradients(model, frame, device.upload(pixel_sums))
+    expected = expected_gradients(case, truth, pixel_sums[:, : gaussians.count].astype(np.float64).T)
+    for name, array in gradients.arrays.items():
+        value = array.get()[:, : gaussians.count].T
+        yield by_norm("project_backward", f"gradients of {name}, {what}", value, expected[name], CONIC)
+    value = gradients.mean2d.get()[:, : gaussians.count].T
+    yield by_norm("project_backward", f"gradients of the projected means, {what}", value, expected["mean2d"], CONIC)
+
+
+def expected_gradients(case: Case, truth: ref.Splats, m: NDArray[Any]) -> dict[str, NDArray[Any]]:
+    """Gradients of all parameters, and of the projected means, from the sums over pixels, [N, PIXEL_SUMS]."""
+    a, b, c = truth.conic.T
+    grad_mean2d = -np.stack([a * m[:, 1] + b * m[:, 2], b * m[:, 1] + c * m[:, 2]], axis=1)
+    grad_conic = np.stack([-0.5 * m[:, 3], -m[:, 4], -0.5 * m[:, 5]], axis=1)
+    grad_opacity = np.where(truth.visible, m[:, 0] / np.where(truth.visible, truth.opacity, 1), 0)
+    upstream = grad_mean2d, grad_conic, grad_opacity, m[:, 6:9]
+    reference, camera = case.gaussians(), case.camera()
+    expected = ref.project_backward(reference, camera, case.degree, case.variance, case.compensate, truth, *upstream)
+    sh = expected.pop("sh")
+    return {
+        **expected,
+        "logit_opacity": expected["logit_opacity"][:, None],
+        "sh_base": sh[:, 0],
+        "sh_rest": sh[:, 1:].reshape(len(sh), -1),
+        "mean2d": grad_mean2d,
+    }
+
+
+def not_drawable(rng: np.random.Generator) -> Case:
+    """40 Gaussians; the first nine are behind the camera, huge, faint or not numbers."""
+    case = random_case(rng, 40)
+    p, pose = case.parameters, case.view.world_to_camera
+    p["means"][0] = (np.array([0, 0, -3]) - pose[:, 3]) @ pose[:, :3]
+    p["means"][1, 1] = np.nan
+    p["means"][2] = 1e30
+    p["quats"][3] = 0
+    p["quats"][4, 2] = np.nan
+    p["log_scales"][5] = np.nan
+    p["log_scales"][6] = 200  # clamped, covers everything
+    p["logit_opacity"][7] = -9
+    p["logit_opacity"][8] = np.nan
+    return case
+
+
+def beyond_the_clamp(rng: np.random.Generator) -> Case:
+    """Wide Gaussians whose rays lie beyond the limits of the linear projection."""
+    case = random_case(rng, 30)
+    depth, far = rng.uniform(1, 2, 30), rng.choice([-1, 1], 30) * rng.uniform(0.9, 1.3, 30)
+    in_camera = np.stack([far * depth, 0.2 * depth, depth], axis=1)
+    rotation, translation = case.view.world_to_camera[:, :3], case.view.world_to_camera[:, 3]
+    case.parameters["means"][:] = (in_camera - translation) @ rotation
+    case.parameters["log_scales"][:] = np.log(0.6) + rng.normal(0, 0.2, (30, 3))
+    return case
+
+
+@CHECKS.add("project_forward")
+def projection(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    for count in COUNTS:
+        yield from record_figures(device, random_case(rng, count), f"{count} Gaussians")
+    for degree in range(3):
+        yield from record_figures(device, random_case(rng, 20, degree=degree), f"harmonics of degree {degree}")
+    for variance, compensate in FILTERS:
+        case = with_world_filter(random_case(rng, 30, variance=variance, compensate=compensate), rng)
+        yield from record_figures(device, case, f"filters of {variance:g} px², compensate {compensate:g}")
+
+
+@CHECKS.add("project_forward")
+def projection_of_what_cannot_be_drawn(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    records, keys, radius = splats_of(device, not_drawable(rng))
+    culled = [0, 1, 2, 3, 4, 5, 7, 8]
+    yield equal("project_forward", "records of Gaussians behind, faint or not finite", records[culled], 0.0)
+    yield equal("project_forward", "depths of Gaussians behind, faint or not finite", keys[culled], CULLED)
+    yield equal("project_forward", "radii of Gaussians behind or not finite", radius[:6], 0.0)
+    yield wrong("project_forward", "records that are not numbers", np.isnan(records))
+
+
+@CHECKS.add("project_backward")
+def gradients_of_the_projection(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    for count in COUNTS:
+        yield from gradient_figures(device, random_case(rng, count), rng, f"{count} Gaussians")
+    for degree in range(3):
+        case = random_case(rng, 20, degree=degree)
+        yield from gradient_figures(device, case, rng, f"harmonics of degree {degree}")
+    for variance, compensate in FILTERS:
+        case = with_world_filter(random_case(rng, 30, variance=variance, compensate=compensate), rng)
+        yield from gradient_figures(device, case, rng, f"filters of {variance:g} px², compensate {compensate:g}")
+    yield from gradient_figures(device, beyond_the_clamp(rng), rng, "rays beyond the image")
+
+
+@CHECKS.add("sampling_interval", "filter_variance")
+def world_filter(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    for count in COUNTS:
+        case = random_case(rng, count)
+        case.parameters["means"][::3] *= 4  # out of sight of some, or of all
+        views = []
+        for i in range(5):
+            pose = case.view.world_to_camera.astype(np.float32).astype(np.float64)
+            pose[:, 3] += np.float32(rng.normal(0, 0.8, 3))
+            camera = replace(case.view.camera, fx=float(rng.uniform(20, 60)))
+            views.append(replace(case.view, name=f"view{i}", camera=camera, world_to_camera=pose))
+        gaussians = case.model(device).gaussians
+        Smoothing(variance=0.2).refresh(gaussians, FilterViews(device, views), near=0.2)
+        cameras = [replace(case, view=view).camera() for view in views]
+        means = case.parameters["means"].astype(np.float64)
+        interval = ref.sampling_interval(means, cameras, [view.camera.fx for view in views])
+        found = gaussians.get("filter_variance")[:, 0]
+        yield by_element("filter_variance", f"variances, {count} Gaussians", found, 0.2 * interval**2, SUM)
+
+
+@CHECKS.add("paint_depth")
+def depth(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    for count in COUNTS:
+        case = random_case(rng, count)
+        frame = Rasterizer(device, "radix").forward(
+            case.model(device), case.device_camera(device), device.zeros(3), "depth"
+        )
+        pose = case.camera().world_to_camera
+        z = case.parameters["means"].astype(np.float64) @ pose[2, :3] + pose[2, 3]
+        painted = frame.splats.get()[:, 6:9]
+        expected = np.stack([z, np.ones(count), np.zeros(count)], axis=1)
+        yield by_element("paint_depth", f"depths, {count} Gaussians", painted, expected, DEPTH, floor=1)

@@ -1,0 +1,142 @@
+"""Scans, sorts and tile lists, which are exact."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.conformance.check import Checks, Note
+from clsplat.conformance.comparison import Figure, equal, wrong
+from clsplat.conformance.scenes import Case, random_case
+from clsplat.opencl.device import Device
+from clsplat.render.rasterizer import Frame, Rasterizer
+from clsplat.render.tiles import Sort, Tiler
+from clsplat.render.workspace import Workspace
+
+CHECKS = Checks()
+LENGTHS = (0, 1, 2, 3, 63, 64, 65, 1023, 1024, 1025, 0, 2047, 2048, 2049, 300, 0)  # around what local memory holds
+# around the teams' runs (8 * 64) and the shortest run of one item
+COUNTS = (1, 63, 64, 65, 511, 513, 1025, 16385, 40001)
+
+
+def tiler_of(device: Device, sort: Sort = "radix") -> Tiler:
+    return Tiler(device, Workspace(device), sort)
+
+
+def scan_figure(device: Device, values: NDArray[Any]) -> Figure:
+    """Compare an exclusive prefix sum."""
+    offsets = tiler_of(device).scan(device.upload(values), len(values), "test").get()
+    expected = np.concatenate([[0], np.cumsum(values, dtype=np.uint32)])
+    return equal("scan_offsets", f"sums of {len(values)} values", offsets, expected)
+
+
+def radix_figures(device: Device, keys: NDArray[Any], bits: int) -> Iterator[Figure]:
+    """Compare a stable sort of keys below 2^bits."""
+    sorted_keys, places = tiler_of(device).sort_pairs(device.upload(keys), bits, len(keys), "test")
+    expected = np.argsort(keys, kind="stable")
+    yield equal("radix_scatter", f"places of {len(keys)} keys of {bits} bits", places.get(), expected)
+    yield equal("radix_scatter", f"order of {len(keys)} keys of {bits} bits", sorted_keys.get(), keys[expected])
+
+
+def bitonic_figures(
+    device: Device, rng: np.random.Generator, lengths: tuple[int, ...], deepest: int
+) -> Iterator[Figure]:
+    """Sort tiles of these lengths by depth keys below `deepest`, ties by pair."""
+    tiles, pairs = len(lengths), sum(lengths)
+    pair_tile = rng.permutation(np.repeat(np.arange(tiles), lengths)).astype(np.uint32)
+    depth_key = rng.integers(0, deepest, pairs).astype(np.uint32)
+    pair_splat = np.arange(pairs, dtype=np.uint32)
+    upload = device.upload
+    offsets, ordered = tiler_of(device, "bitonic")._sort_in_tiles(
+        upload(pair_tile), upload(pair_splat), upload(depth_key), pairs, tiles
+    )
+    found = offsets.get()
+    yield equal("count_pairs", "offsets of tiles", found, np.concatenate([[0], np.cumsum(lengths)]))
+    expected = np.lexsort((pair_splat, depth_key, pair_tile))
+    yield equal("sort_tiles", f"order of {pairs} pairs in {tiles} tiles", ordered.get(), expected)
+
+
+@CHECKS.add("scan_blocks", "scan_offsets")
+def scans(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    for count in COUNTS:
+        yield scan_figure(device, rng.integers(0, 100, count).astype(np.uint32))
+
+
+@CHECKS.add("radix_count", "radix_scatter")
+def radix_sort(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    for count in COUNTS:
+        for bits in (9, 32):
+            keys = rng.integers(0, 2**bits, count, dtype=np.uint64).astype(np.uint32)
+            yield from radix_figures(device, keys, bits)
+    for orderly in (np.full(3000, 7), np.arange(3000)[::-1]):
+        yield from radix_figures(device, orderly.astype(np.uint32), 12)
+
+
+@CHECKS.add("count_pairs", "fill_tiles", "sort_tiles")
+def bitonic_sort(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    for deepest in (50, 2**31):
+        yield from bitonic_figures(device, rng, LENGTHS, deepest)
+
+
+@CHECKS.add("emit_pairs", "find_tile_offsets", "permute")
+def tile_lists(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    for count, width, height in ((1, 16, 16), (60, 17, 15), (150, 100, 70), (64, 5, 3)):
+        case = random_case(rng, count, width, height)
+        case.parameters["log_scales"][: count // 10] += 1.5
+        case.parameters["means"][: count // 3] = case.parameters["means"][count // 3 : 2 * (count // 3)]  # equal depths
+        for sort in ("radix", "bitonic"):
+            yield from list_figures(device, case, sort, f"{count} Gaussians, {width} x {height} px, {sort}")
+
+
+def list_figures(device: Device, case: Case, sort: Sort, what: str) -> Iterator[Figure]:
+    """Every tile lists the splats that reach it, front to back, once, and hardly any other."""
+    rasterizer = Rasterizer(device, sort)
+    frame = rasterizer.forward(case.model(device), case.device_camera(device), device.zeros(3))
+    lists, tiles, count = frame.lists, frame.camera.tiles, len(case.parameters["means"])
+    keys = rasterizer.workspace.array("depth_key", count, np.uint32).get()
+    splats, offsets = lists.pair_splat.get()[: lists.pairs], lists.tile_offset.get()[: tiles + 1]
+    ordered = splats[np.minimum(lists.tile_pairs.get()[: lists.pairs], max(lists.pairs, 1) - 1)]
+    kernel = "find_tile_offsets" if sort == "radix" else "count_pairs"
+    yield wrong(kernel, f"offsets of tiles, {what}", np.diff(offsets.astype(np.int64), append=lists.pairs) < 0)
+    tile = np.repeat(np.arange(tiles), np.maximum(np.diff(offsets.astype(np.int64)), 0))[: lists.pairs]
+    if len(tile) < lists.pairs:
+        yield wrong(kernel, f"pairs outside all tiles, {what}", np.ones(lists.pairs - len(tile)))
+        return
+    sorted_places = np.lexsort((ordered, keys[ordered], tile))
+    kernel = "radix_scatter" if sort == "radix" else "sort_tiles"
+    yield equal(kernel, f"order in tiles, {what}", sorted_places, np.arange(lists.pairs))
+    listed = np.zeros((tiles, count), int)
+    np.add.at(listed, (tile, ordered), 1)
+    yield wrong("emit_pairs", f"pairs listed twice, {what}", listed > 1)
+    strongest, bounded = _strongest(frame, case)
+    yield wrong("emit_pairs", f"pairs that are missing, {what}", (strongest >= 1.0001 / 255) & (listed == 0))
+    yield wrong("emit_pairs", f"pairs too many, {what}", bounded & (strongest <= 0.95 / 255) & (listed > 0))
+    pairs = np.bincount(splats, minlength=count)
+    kept = lists.tile_count.get()[:count]
+    yield equal("emit_pairs", f"number of pairs of each Gaussian, {what}", pairs, kept)
+    first = lists.first_pair.get()[:count][kept > 0]
+    yield equal("emit_pairs", f"first pairs, {what}", splats[first], np.flatnonzero(kept))
+
+
+def _strongest(frame: Frame, case: Case) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Largest alpha of each record in each tile, [T, N], and whether it bounds the list there.
+
+    Tiles that leave the image, and splats thinner than a few pixels, may be listed without a pixel that is reached.
+    """
+    records, camera = frame.splats.get().astype(np.float64), frame.camera
+    (width, height), tile = case.size, camera.tile
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    strongest = np.zeros((camera.tiles, len(records)))
+    inside = np.zeros(camera.tiles, bool)
+    for n, record in enumerate(records):
+        dx, dy = record[0] - x, record[1] - y
+        power = -0.5 * (record[2] * dx**2 + record[4] * dy**2) - record[3] * dx * dy
+        alpha = record[5] * np.exp(np.minimum(power, 0))
+        for t in range(camera.tiles):
+            row, column = divmod(t, camera.tiles_x)
+            part = alpha[row * tile : (row + 1) * tile, column * tile : (column + 1) * tile]
+            strongest[t, n] = part.max()
+            inside[t] = part.shape == (tile, tile)
+    thin = np.minimum(records[:, 12] - records[:, 11], records[:, 10] - records[:, 9]) < 4
+    return strongest, inside[:, None] & ~thin

@@ -1,0 +1,171 @@
+"""Adam, penalties on shapes, and the rows of tables."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.conformance import reference as ref
+from clsplat.conformance.check import Checks, Note
+from clsplat.conformance.checks.blending import BACKGROUND
+from clsplat.conformance.checks.projection import expected_gradients
+from clsplat.conformance.comparison import CONIC, SUM, Figure, by_element, by_norm, equal
+from clsplat.conformance.scenes import Case, random_case, with_world_filter
+from clsplat.gaussians.tables import INTERVAL2, PARAMETERS, Gaussians, Gradients, moment_tables
+from clsplat.losses.base import Penalty, PenaltyInputs
+from clsplat.losses.penalties import Anisotropy, CovarianceTrace
+from clsplat.opencl.device import Device
+from clsplat.render.rasterizer import Rasterizer
+from clsplat.render.workspace import Workspace
+from clsplat.training.adam import Adam, Rates
+
+CHECKS = Checks()
+COUNTS = (1, 15, 17, 65)
+EXTENT = 2.5
+
+
+def step_figures(device: Device, rng: np.random.Generator, count: int) -> Iterator[Figure]:
+    """Three updates from gradients of very different sizes."""
+    case = random_case(rng, count)
+    model = case.model(device)
+    adam, rates = Adam(model.gaussians), Rates().at(3, extent=2.0)
+    values = {name: case.parameters[name].astype(np.float64) for name in PARAMETERS}
+    moments = {name: [np.zeros_like(v), np.zeros_like(v)] for name, v in values.items()}
+    for step in range(1, 4):
+        gradients = Gradients(model.gaussians)
+        for name in PARAMETERS:
+            shape = values[name].shape
+            gradient = (rng.normal(size=shape) * rng.choice([1e-7, 1e-3, 1], shape)).astype(np.float32)
+            gradient[::3] = 0
+            planes = np.zeros(gradients[name].shape, np.float32)
+            planes[:, :count] = gradient.T
+            gradients[name].set(planes)
+            values[name], *moments[name] = ref.adam_step(
+                values[name], gradient.astype(np.float64), moments[name][0], moments[name][1], step, rates[name]
+            )
+        adam.step(model, gradients, rates)
+    for name in PARAMETERS:
+        moved, what = float(np.abs(values[name] - case.parameters[name]).max()), f"{name}, {count} Gaussians"
+        found = model.gaussians.get(name)
+        # the value itself is rounded to float32, its change to 2e-5 of the largest
+        yield by_element("adam_step", what, found, values[name], 3e-7, floor=2e-5 * moved / 3e-7)
+        # 1 - 0.999f is off by 1.3e-5 in float32
+        for moment, expected, bound in zip(moment_tables(name), moments[name], (SUM, 3 * SUM), strict=True):
+            largest = float(np.abs(expected).max())
+            found = model.gaussians.get(moment)
+            yield by_element("adam_step", f"moments of {what}", found, expected, bound, floor=0.1 * largest)
+
+
+def fused_figures(device: Device, rng: np.random.Generator, case: Case, what: str) -> Iterator[Figure]:
+    """One update on the way: moments against the reference's gradients, values against the device's own moments."""
+    kernel, count = "update_gaussians", len(case.parameters["means"])
+    rasterizer, model, camera = Rasterizer(device, "radix"), case.model(device), case.device_camera(device)
+    gaussians, adam, rates = model.gaussians, Adam(model.gaussians), Rates().at(3, extent=2.0)
+    frame = rasterizer.forward(model, camera, device.upload(BACKGROUND))
+    weights = np.zeros((3, camera.rows, camera.stride), np.float32)
+    weights[:, : camera.height, : camera.width] = rng.normal(size=(3, camera.height, camera.width))
+    pixel_sums = rasterizer.pixel_sums(model, frame, device.upload(weights))
+    grad_mean2d = adam.update(model, frame, pixel_sums, rates).get()[:, :count].T
+    expected = expected_gradients(case, case.project(), pixel_sums.get()[:, :count].T.astype(np.float64))
+    yield by_norm(kernel, f"gradients of the projected means, {what}", grad_mean2d, expected["mean2d"], CONIC)
+    for name in PARAMETERS:
+        moment1, moment2 = (gaussians.get(table).astype(np.float64) for table in moment_tables(name))
+        yield by_norm(kernel, f"first moment of {name}, {what}", moment1, 0.1 * expected[name], CONIC)
+        yield by_norm(kernel, f"second moment of {name}, {what}", moment2, 1e-3 * expected[name] ** 2, 2 * CONIC)
+        step = rates[name] * (moment1 / 0.1) / (np.sqrt(moment2 / 1e-3) + 1e-15)
+        before = case.parameters[name].astype(np.float64)
+        floor = 2e-5 * max(float(np.abs(step).max()), 1e-30) / 3e-7
+        yield by_element(kernel, f"{name}, {what}", gaussians.get(name), before - step, 3e-7, floor)
+
+
+def _behind_each_fifth(case: Case) -> Case:
+    case.parameters["means"][1::5] -= 20 * case.view.world_to_camera[2, :3]
+    return case
+
+
+@CHECKS.add("adam_step")
+def adam(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    for count in COUNTS:
+        yield from step_figures(device, rng, count)
+
+
+@CHECKS.add("update_gaussians")
+def update_from_sums_over_pixels(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    for count, degree in ((1, 3), (17, 0), (40, 2), (150, 3)):
+        case = with_world_filter(random_case(rng, count, degree=degree, compensate=1.0), rng)
+        what = f"{count} Gaussians, degree {degree}"
+        yield from fused_figures(device, rng, _behind_each_fifth(case), what)
+
+
+def penalty_figures(
+    device: Device, rng: np.random.Generator, count: int, penalty: Penalty, oracle: Any, interval: NDArray[Any] | None
+) -> Iterator[Figure]:
+    """Compare value and gradient of a penalty of weight 3, for Gaussians of many sizes and forms."""
+    case = random_case(rng, count)
+    case.parameters["log_scales"][:] = rng.normal(-2, 1.5, (count, 3))
+    gaussians = case.model(device).gaussians
+    if interval is not None:
+        gaussians.add(INTERVAL2, 1)
+        gaussians.set(INTERVAL2, interval[:, None] ** 2)
+    gradients = Gradients(gaussians)
+    gradients["log_scales"].fill(0.25)
+    inputs = PenaltyInputs(Workspace(device), gaussians, gradients, EXTENT, step=1)
+    found = penalty.add(inputs).value()
+    value, gradient = oracle(case.parameters["log_scales"].astype(np.float64))
+    kernel, what = str(getattr(penalty, "type", "penalty")), f"{count} Gaussians"
+    yield by_element(kernel, f"value, {what}", np.array([found]), np.array([3 * value]), SUM, floor=1e-7)
+    added = gradients["log_scales"].get()[:, :count].T.astype(np.float64) - 0.25
+    floor = 1e-2 * max(1.0, float(np.abs(3 * gradient).max()))
+    yield by_element(kernel, f"gradient, {what}", added, 3 * gradient, 1e-4, floor)
+
+
+@CHECKS.add("covariance_trace", "anisotropy")
+def penalties(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    for count in COUNTS:
+        interval = rng.uniform(0.01, 0.05, count).astype(np.float32)
+        trace = CovarianceTrace(weight=3.0, above=0.02)
+        yield from penalty_figures(
+            device, rng, count, trace, lambda s: ref.covariance_trace(s, 0.02 * EXTENT**2, EXTENT), None
+        )
+        in_pixels = CovarianceTrace(weight=3.0, above=9.0, pixels=4.0)
+        bound = 3 * (4.0 * interval) ** 2
+        yield from penalty_figures(
+            device, rng, count, in_pixels, lambda s, bound=bound: ref.covariance_trace(s, bound, EXTENT), interval
+        )
+        shape = Anisotropy(weight=3.0, above=8.0)
+        yield from penalty_figures(device, rng, count, shape, lambda s: ref.anisotropy(s, 8.0), None)
+
+
+def _tables(gaussians: Gaussians) -> dict[str, NDArray[Any]]:
+    return {name: gaussians[name].get() for name in gaussians.tables}
+
+
+@CHECKS.add("set_rows", "zero_rows", "gather_rows", "count_not_finite", "fill_words")
+def rows_of_tables(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    for count in (0, 1, 15, 17, 1025):
+        array = device.upload(np.full(count, 3, np.float32))
+        array.fill(-1.5)
+        yield equal("fill_words", f"{count} values", array.get(), -1.5)
+    gaussians = random_case(rng, 65).model(device).gaussians
+    before, rows, values = _tables(gaussians), rng.permutation(65)[:17], rng.normal(size=(17, 45))
+    gaussians.set_rows("sh_rest", rows, values)
+    before["sh_rest"][:, rows] = values.T.astype(np.float32)
+    gaussians.zero_rows(["quats"], rows)
+    before["quats"][:, rows] = 0
+    for name, kernel in (("sh_rest", "set_rows"), ("quats", "zero_rows"), ("means", "set_rows")):
+        yield equal(kernel, f"17 rows of {name}", gaussians[name].get(), before[name])
+    source, fresh = rng.integers(0, 65, 150).astype(np.uint32), rng.integers(0, 2, 150).astype(np.uint32)
+    gaussians.add("fresh", 2, zero_fresh=True)
+    gaussians.set("fresh", rng.normal(size=(65, 2)))
+    old = {name: gaussians.get(name) for name in gaussians.tables}
+    gaussians.rearrange(device.upload(source), device.upload(fresh), 150)
+    for name, table in old.items():
+        expected = table[source] * (1 if name != "fresh" else 1 - fresh[:, None])
+        yield equal("gather_rows", f"150 rows of {name}", gaussians.get(name), expected)
+    for value in (np.nan, np.inf, -np.inf):
+        case = random_case(rng, 65)
+        case.parameters["quats"][64, 2] = case.parameters["sh_rest"][0, 44] = value
+        found = case.model(device).gaussians.not_finite()
+        mistaken = {"quats", "sh_rest"} ^ set(found)
+        yield Figure("count_not_finite", f"tables with {value}", len(mistaken), 0, counts=True)

@@ -1,0 +1,156 @@
+"""A training, the memory, and the speed of a device."""
+
+import time
+from collections.abc import Iterator
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.bench.cases import run_bench
+from clsplat.bench.peaks import Peaks, measure_peaks
+from clsplat.bench.scenes import case as bench_case
+from clsplat.conformance.check import Checks, Note
+from clsplat.conformance.comparison import Figure, by_element, equal
+from clsplat.conformance.host import available_memory
+from clsplat.conformance.scenes import Case, random_case
+from clsplat.density.basic import Clone, PruneFaint, Split
+from clsplat.density.control import densify
+from clsplat.density.edit import Edit, SceneScale
+from clsplat.density.statistics import SplatStats
+from clsplat.errors import MemoryLimitError
+from clsplat.losses.image import L1, Dssim
+from clsplat.opencl.device import Array, Device
+from clsplat.pipeline.loading import load
+from clsplat.render.rasterizer import Rasterizer
+from clsplat.training.adam import Adam, Rates
+from clsplat.training.trainer import Trainer
+from clsplat.views.photographs import Photograph
+
+CHECKS = Checks()
+SPEED = Checks()  # needed once for a device, not for each schedule
+STEPS = 60
+PATIENCE = 40.0  # s of training after which a slow device does as many steps as it has done
+MEMORY_SHARE = 0.25  # of what device and host have free, which they may share: nothing must be swapped out
+FIRST_BUFFER = 128 << 20  # bytes
+TOUCH_SECONDS = 4.0  # of writing a buffer, after which no larger one is tried
+BENCH = (256, 256, 20_000)  # width, height, Gaussians
+
+
+def _photographs(device: Device, case: Case) -> Photograph:
+    """The scene as the device itself shows it, 8 bits."""
+    camera = case.device_camera(device)
+    frame = Rasterizer(device, "radix").forward(case.model(device), camera, device.zeros(3))
+    image = frame.image.get()[:, : camera.height, : camera.width]
+    return Photograph(camera, device.upload(np.clip(255 * image + 0.5, 0, 255).astype(np.uint8)))
+
+
+def train(
+    device: Device, case: Case, start: dict[str, NDArray[Any]], steps: int
+) -> tuple[list[float], dict[str, NDArray[Any]]]:
+    """Train `start` on the picture of a scene, with one density edit; return the losses and all tables."""
+    photograph = _photographs(device, case)
+    model = Case(start, case.view).model(device)
+    gaussians, rasterizer = model.gaussians, Rasterizer(device, "radix")
+    adam, stats = Adam(gaussians), SplatStats(gaussians)
+    losses = [L1(weight=0.8), Dssim(weight=0.2)]
+    trainer = Trainer(rasterizer, model, adam, stats, device.zeros(3), losses, Rates(sh_base=0.03))
+    values: list[float] = []
+    began = time.monotonic()
+    for step in range(1, steps + 1):
+        values.append(trainer.step(photograph, step).loss)
+        if step == STEPS // 2:
+            edit = Edit(gaussians, stats, SceneScale(4.0), step, seed=0)
+            densify(edit, [Clone(gradient_above=1e-3), Split(gradient_above=1e-3), PruneFaint()], rasterizer.tiler)
+        if time.monotonic() - began > PATIENCE and len(values) < steps:
+            break
+    return values, {name: gaussians.get(name) for name in gaussians.tables}
+
+
+@CHECKS.add()
+def training(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    case = random_case(rng, 120, 48, 40)
+    start = {name: table.copy() for name, table in case.parameters.items()}
+    start["means"] += rng.normal(0, 0.05, start["means"].shape).astype(np.float32)
+    start["sh_base"] *= 0  # grey
+    values, tables = train(device, case, start, STEPS)
+    again, same = train(device, case, start, len(values))
+    count, what = len(tables["means"]), f"{len(values)} steps"
+    yield Note("training", {"steps": len(values), "losses": [values[0], values[-1]], "gaussians": count})
+    yield equal("training", f"losses of {what}, a second time", np.array(again), np.array(values[: len(again)]))
+    for name, table in tables.items():
+        if table.shape != same[name].shape:
+            difference, where = abs(len(same[name]) - count), f"rows of {name} after {what}, a second time"
+            yield Figure("training", where, difference, 0, counts=True)
+        else:
+            bits = same[name].view(np.uint32), table.view(np.uint32)
+            yield equal("training", f"{name} after {what}, a second time", *bits)
+    finite = sum(int(np.count_nonzero(~np.isfinite(table))) for table in tables.values())
+    yield Figure("training", f"values that are not finite after {what}", finite, 0, counts=True)
+    if len(values) == STEPS:
+        yield Figure("training", f"the loss after {what}, as a share of the first one", values[-1] / values[0], 0.7)
+
+
+@SPEED.add()
+def memory(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    """Allocate buffers of growing size, write all of each, and read its ends: up to what one buffer may have."""
+    promised, free = device.info.allocation, available_memory()
+    room = int(MEMORY_SHARE * min(device.info.memory, device.info.memory if free is None else free))
+    limit = min(promised, room) // 64 * 64  # allocations are rounded up to 64
+    held, size = 0, min(FIRST_BUFFER, limit)
+    stopped = "more was not tried, for want of free memory"
+    while size > held:
+        started = time.perf_counter()
+        try:
+            yield from _buffer_figures(device, size)
+        except MemoryLimitError as error:
+            stopped = str(error)
+            yield Figure("fill_words", f"a buffer of {size / 2**20:,.0f} MiB, which is refused", 1, 0, counts=True)
+            break
+        held, size = size, min(2 * size, limit)
+        if 2 * (time.perf_counter() - started) > TOUCH_SECONDS and size > held:
+            stopped = "more was not tried, for it takes too long"
+            break
+    if held == promised // 64 * 64:
+        stopped = "that is all"
+    yield Note("memory", {"promised": promised, "held": held, "free": free, "stopped": stopped})
+
+
+def _buffer_figures(device: Device, size: int) -> Iterator[Figure]:
+    whole = device.empty(size // 4)
+    whole.fill(1.5)
+    Array(device, whole.buffer, (16,), np.dtype(np.float32)).fill(2.5)  # must not be seen at the other end
+    places = [*range(0, size // 4, max(1, size // 4 // 64)), size // 4 - 1]
+    found = np.array([whole.get_item(i) for i in places])
+    expected = np.where(np.arange(len(found)) == 0, 2.5, 1.5)
+    yield equal("fill_words", f"samples of a buffer of {size / 2**20:,.0f} MiB", found, expected)
+
+
+@SPEED.add("peak_fma", "peak_exp", "peak_copy")
+def yardsticks(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    lanes, group = (int(device.tuning[name]) for name in ("LANES", "GROUP"))
+    program, whole = device.program("peak.cl"), 2 * group
+    result = device.empty(whole * lanes)
+    program.peak_fma(items=whole, result=result, factor=0.5, rounds=5)
+    chains = np.arange(whole)[:, None] + np.arange(8.0)
+    for _ in range(5):
+        chains = chains * 0.5 + 0.25
+    expected = np.repeat(chains.sum(axis=1), lanes)
+    yield by_element("peak_fma", "chains of multiply-adds", result.get(), expected, 1e-6)
+    program.peak_exp(items=whole, result=result, step=1e-3, rounds=4)
+    x = -0.01 * (np.arange(whole) % 8)
+    sums = sum(np.exp(x - 1e-3 * k) + np.exp(x - 0.5 - 1e-3 * k) for k in range(4))
+    yield by_element("peak_exp", "sums of exponentials", result.get(), np.repeat(sums, lanes), 1e-5)
+    values = rng.normal(size=whole * lanes).astype(np.float32)
+    copied = device.zeros(len(values))
+    program.peak_copy(items=whole, values=device.upload(values), copied=copied)
+    yield equal("peak_copy", "copied values", copied.get(), values)
+
+
+@SPEED.add()
+def speed(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    peaks = measure_peaks(device, repeats=2)
+    one = bench_case(device, *BENCH, load("splat").settings)
+    result = run_bench({"": one}, Peaks(**asdict(peaks)), repeats=5)[""]
+    yield Note("speed", {"scene": BENCH, "peaks": asdict(peaks), **asdict(result)})

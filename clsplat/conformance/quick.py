@@ -1,0 +1,84 @@
+"""The two-second form: the kernels of a training step on one small scene, once for a device, driver and kernels."""
+
+import hashlib
+import logging
+from collections.abc import Sequence
+from contextlib import suppress
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import Literal
+
+from clsplat import resource_dir
+from clsplat.caches import cache_folder
+from clsplat.conformance.checks import BITONIC, ESSENTIAL
+from clsplat.conformance.supervision import supervised
+from clsplat.errors import DeviceError, MemoryLimitError, OutputError
+from clsplat.files import write_text
+from clsplat.opencl.device import Device, open_device
+from clsplat.opencl.discovery import DeviceInfo, Schedule, tuning_of
+from clsplat.opencl.program import BUILD_OPTIONS
+from clsplat.render.tiles import Sort, known_sort
+
+LOG = logging.getLogger("clsplat")
+QUICK_SECONDS = 120  # without a word from a check, in front of a run
+Resolved = Literal["wide", "simt"]
+SORTS = ("radix", "bitonic")  # each with a record of its own
+
+
+def open_correct(device: str | Device | None, schedule: Schedule, sort: Sort = "auto") -> Device:
+    """Open a device as `open_device` does, say which it is, and ensure that it computes correctly."""
+    opened = open_device(device, schedule)
+    LOG.info("device: %s", opened.text)
+    ensure_correct(opened, sort)
+    return opened
+
+
+def ensure_correct(device: Device, sort: Sort = "auto") -> None:
+    """Compare the essential kernels with the reference when this device, driver and kernels meet for the first time.
+
+    It happens in a process of its own, so that nothing of the device changes; the bitonic sort is checked where the run
+    may choose it.  Raises DeviceError when the device computes wrongly, MemoryLimitError.
+    """
+    info, schedule = device.info, device.schedule
+    bitonic = known_sort(device, sort) != "radix"
+    sorts = SORTS if bitonic else SORTS[:1]
+    if all(_record(info, schedule, one).exists() for one in sorts):
+        return
+    LOG.info("checking %s, once for each driver; this takes some seconds, more where it builds slowly", info.name)
+    for result in supervised(info, schedule, [*ESSENTIAL, *(BITONIC if bitonic else [])], QUICK_SECONDS):
+        if result.out_of_memory:
+            raise MemoryLimitError(f"{device.text}: {result.failures[0]}; end other programs that use its memory")
+        if not result.holds:
+            how = "cannot be trusted" if result.fault else "computes wrongly"
+            raise DeviceError(f"{device.text} {how}: {result.failures[0]}; `clsplat doctor` tells more")
+    remember(info, schedule, sorts)
+
+
+def remember(info: DeviceInfo, schedule: Resolved, sorts: Sequence[str] = SORTS) -> None:
+    """Note that a device computes what the reference says; where the cache cannot be written, it is checked again."""
+    with suppress(OutputError):
+        for sort in sorts:
+            write_text(_record(info, schedule, sort), f"{info.text}, {schedule}, {sort}\n")
+
+
+def forget(info: DeviceInfo, schedule: Resolved) -> None:
+    """Remove the notes of a device that was found wrong: the next run checks it again."""
+    for sort in SORTS:
+        with suppress(OSError):
+            _record(info, schedule, sort).unlink(missing_ok=True)
+
+
+def _record(info: DeviceInfo, schedule: Resolved, sort: str) -> Path:
+    """A file for all that decides what the device computes: its driver, and what is compiled for it."""
+    device = (info.platform, info.name, info.driver, version("pyopencl"))
+    build = (schedule, sort, BUILD_OPTIONS, sorted(tuning_of(info, schedule).items()), _hash_of_kernels())
+    return cache_folder() / "conformance" / hashlib.sha256(repr((device, build)).encode()).hexdigest()[:16]
+
+
+@cache
+def _hash_of_kernels() -> str:
+    together = hashlib.sha256()
+    for path in sorted(resource_dir("cl_kernels").iterdir()):
+        together.update(path.name.encode() + path.read_bytes())
+    return together.hexdigest()

@@ -1,0 +1,124 @@
+"""The reference: 3D Gaussian splatting and its gradients in float64 NumPy, written to be read, not to be fast.
+
+Kerbl et al. 2023 (3DGS), with the filters of Yu et al. 2024 (Mip-Splatting).
+
+Conventions: OpenCV camera (x right, y down, z forward); the centre of pixel (0, 0) is (0.5, 0.5); quaternions are
+(w, x, y, z); `grad_x` is dL/dx.  Letters: N Gaussians, K harmonics, C = 3 channels, H, W image.
+"""
+
+from clsplat.conformance.reference.adam import (
+    adam_step,
+)
+from clsplat.conformance.reference.blending import (
+    blend,
+    blend_backward,
+    blend_steps,
+    blend_weights,
+    margin,
+    render,
+    render_backward,
+)
+from clsplat.conformance.reference.blur import (
+    blurred,
+)
+from clsplat.conformance.reference.density import (
+    ABSGS,
+    CLONE,
+    KEEP,
+    PRUNE,
+    SPLIT,
+    adc_actions,
+    mean_gradient,
+    reset_logit,
+    screen_gradient,
+    split_children,
+)
+from clsplat.conformance.reference.harmonics import (
+    sh_basis,
+    sh_basis_gradient,
+)
+from clsplat.conformance.reference.kinds import (
+    SMOOTH,
+    Camera,
+    Gaussians,
+    Splats,
+    Thresholds,
+)
+from clsplat.conformance.reference.losses import (
+    dssim,
+    l1,
+    l2,
+    ms_ssim,
+    psnr,
+    ssim_map,
+    ssim_taps,
+)
+from clsplat.conformance.reference.penalties import (
+    anisotropy,
+    covariance_trace,
+)
+from clsplat.conformance.reference.projection import (
+    clamped_ray,
+    footprint,
+    project,
+    ray_limits,
+    rotation_matrix,
+)
+from clsplat.conformance.reference.projection_backward import (
+    project_backward,
+    ratio_gradient,
+)
+from clsplat.conformance.reference.random import normal3, philox
+from clsplat.conformance.reference.world_filter import (
+    filtered,
+    sampling_interval,
+)
+
+__all__ = [
+    "ABSGS",
+    "CLONE",
+    "KEEP",
+    "PRUNE",
+    "SMOOTH",
+    "SPLIT",
+    "Camera",
+    "Gaussians",
+    "Splats",
+    "Thresholds",
+    "adam_step",
+    "adc_actions",
+    "anisotropy",
+    "blend",
+    "blend_backward",
+    "blend_steps",
+    "blend_weights",
+    "blurred",
+    "clamped_ray",
+    "covariance_trace",
+    "dssim",
+    "filtered",
+    "footprint",
+    "l1",
+    "l2",
+    "margin",
+    "mean_gradient",
+    "ms_ssim",
+    "normal3",
+    "philox",
+    "project",
+    "project_backward",
+    "psnr",
+    "ratio_gradient",
+    "ray_limits",
+    "render",
+    "render_backward",
+    "reset_logit",
+    "rotation_matrix",
+    "sampling_interval",
+    "screen_gradient",
+    "sh_basis",
+    "sh_basis_gradient",
+    "split_children",
+    "ssim_map",
+    "ssim_taps",
+]

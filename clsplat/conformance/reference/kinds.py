@@ -1,0 +1,88 @@
+"""What the reference is told, and what it returns."""
+
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+PARAMETERS = ("means", "quats", "log_scales", "logit_opacity", "sh")
+RADIUS_TILE = 16  # px; the tile of the vanilla visibility test, whatever tile the kernels use
+
+
+@dataclass(frozen=True)
+class Thresholds:
+    """The three constants of 2.3.  With `SMOOTH` nothing is skipped, so that the image is differentiable."""
+
+    alpha_min: float = 1 / 255
+    alpha_max: float = 0.99
+    transmittance_min: float = 1e-4
+
+
+SMOOTH = Thresholds(alpha_min=0.0, transmittance_min=0.0)
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Pinhole camera; `fx, fy, cx, cy` in px."""
+
+    world_to_camera: NDArray[Any]  # [3,4]
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+
+    @property
+    def rotation(self) -> NDArray[Any]:
+        return self.world_to_camera[:, :3]
+
+    @property
+    def translation(self) -> NDArray[Any]:
+        return self.world_to_camera[:, 3]
+
+    @property
+    def position(self) -> NDArray[Any]:
+        return -self.rotation.T @ self.translation
+
+
+@dataclass
+class Gaussians:
+    """Raw parameters, as optimised."""
+
+    means: NDArray[Any]  # [N,3]
+    quats: NDArray[Any]  # [N,4] w, x, y, z; not normalised
+    log_scales: NDArray[Any]  # [N,3]
+    logit_opacity: NDArray[Any]  # [N]
+    sh: NDArray[Any]  # [N,K,3]
+    filter_variance: NDArray[Any] = field(default_factory=lambda: np.zeros(0))  # [N] scene units²; zeros when not given
+
+    def __post_init__(self) -> None:
+        if len(self.filter_variance) == 0:
+            self.filter_variance = np.zeros(len(self.means))
+        for name in (*PARAMETERS, "filter_variance"):
+            setattr(self, name, np.array(getattr(self, name), np.float64))
+
+
+@dataclass
+class Splats:
+    """Projected Gaussians.  Rows that are not visible are zero, except for their radius."""
+
+    mean2d: NDArray[Any]  # [N,2] px
+    conic: NDArray[Any]  # [N,3] A, B, C = xx, xy, yy of the inverse covariance
+    opacity: NDArray[Any]  # [N] after both filters
+    colour: NDArray[Any]  # [N,3]
+    depth: NDArray[Any]  # [N] z
+    radius: NDArray[Any]  # [N] px, whole; 0 = not visible to density control; independent of opacity
+    visible: NDArray[Any]  # [N] bool: blended
+
+
+class SplatGradients(NamedTuple):
+    """What `blend_backward` returns."""
+
+    mean2d: NDArray[Any]  # [N,2]
+    conic: NDArray[Any]  # [N,3] with respect to the scalars A, B, C
+    opacity: NDArray[Any]  # [N]
+    colour: NDArray[Any]  # [N,3]
+    mean2d_abs: NDArray[Any]  # [N,2] sum over pixels of |dL/du|, |dL/dv|

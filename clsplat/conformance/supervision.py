@@ -1,0 +1,124 @@
+"""Run checks in processes of their own, and go on after one that dies or hangs."""
+
+import json
+import queue
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import IO, Any
+
+from clsplat.conformance.check import Check, Note
+from clsplat.conformance.comparison import Figure
+from clsplat.errors import shortened
+from clsplat.opencl.discovery import DeviceInfo
+
+WORKER = ("-P", "-m", "clsplat.conformance.worker")  # -P: nothing of the working folder is imported
+CHECK_SECONDS = 900  # without a word from a check; an interpreter of kernels needs minutes
+
+
+@dataclass
+class Result:
+    """What one check found on a device."""
+
+    name: str
+    kernels: tuple[str, ...]
+    seconds: float = 0.0
+    figures: list[Figure] = field(default_factory=list)
+    notes: list[Note] = field(default_factory=list)
+    fault: str | None = None  # why it could not be completed
+    log: str = ""  # of a build that failed
+    out_of_memory: bool = False  # the fault is no more than that
+
+    @property
+    def holds(self) -> bool:
+        return self.fault is None and all(figure.holds for figure in self.figures)
+
+    @property
+    def failures(self) -> list[str]:
+        """A sentence for everything that is wrong."""
+        stopped = [f"{self.name}: {shortened(self.fault, 240)}"] if self.fault else []
+        return stopped + [figure.text for figure in self.figures if not figure.holds]
+
+
+def supervised(
+    info: DeviceInfo, schedule: str, checks: Sequence[Check], seconds: float = CHECK_SECONDS
+) -> Iterator[Result]:
+    """Run checks on a device with a schedule; yield each result when it is complete.
+
+    A check that says nothing for `seconds` is stopped.
+    """
+    left = list(checks)
+    while left:
+        done = 0
+        for result in _one_process(info, schedule, left, seconds):
+            done += 1
+            yield result
+        left = left[done:]
+
+
+def _one_process(info: DeviceInfo, schedule: str, checks: Sequence[Check], seconds: float) -> Iterator[Result]:
+    """Results of the first checks, up to and including one that ends the process: at least one."""
+    command = [sys.executable, *WORKER, *map(str, info.place), schedule]
+    names = [check.name for check in checks]
+    with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as errors:
+        process = subprocess.Popen(
+            [*command, *names], stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=errors, encoding="utf-8"
+        )
+        assert process.stdout is not None
+        lines: queue.Queue[str | None] = queue.Queue()
+        threading.Thread(target=_pump, args=(process.stdout, lines), daemon=True).start()
+        try:
+            for check in checks:
+                result = Result(check.name, check.kernels)
+                ended = _fill(result, lines, seconds)
+                if ended is not None:
+                    process.kill()
+                    code = process.wait()
+                    result.fault = ended or _death(code, errors)
+                yield result
+                if ended is not None:
+                    return
+        finally:
+            process.kill()
+            process.wait()
+
+
+def _fill(result: Result, lines: "queue.Queue[str | None]", seconds: float) -> str | None:
+    """Take the lines of one check; None: it is complete, "": the process ended, else why it is stopped."""
+    while True:
+        try:
+            text = lines.get(timeout=seconds)
+        except queue.Empty:
+            return f"gives no answer for {seconds} s"
+        if text is None:
+            return ""
+        line: dict[str, Any] = json.loads(text)
+        if "figure" in line:
+            result.figures.append(Figure(**line["figure"]))
+        elif "note" in line:
+            result.notes.append(Note(**line["note"]))
+        elif "fault" in line:
+            result.fault, result.log, result.out_of_memory = line["fault"], line["log"], line["out_of_memory"]
+        elif "end" in line:
+            result.seconds = line["seconds"]
+            return None
+
+
+def _pump(stdout: IO[str], lines: "queue.Queue[str | None]") -> None:
+    for line in stdout:
+        lines.put(line)
+    lines.put(None)
+
+
+def _death(code: int, errors: IO[str]) -> str:
+    """Why a process ended: its signal or exit code, and the last line that it wrote."""
+    errors.seek(0)
+    written = [line.strip() for line in errors.read().splitlines() if line.strip()]
+    last = f" ({shortened(written[-1], 300)})" if written else ""
+    if code < 0:
+        return f"the runtime ends the process with {signal.Signals(-code).name}{last}"
+    return f"the process ends with code {code}{last}"

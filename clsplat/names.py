@@ -1,0 +1,51 @@
+"""Names of files: those that every system can hold, and those of a run folder that no pipeline may choose."""
+
+import re
+from pathlib import PureWindowsPath
+from typing import Annotated
+
+from pydantic import AfterValidator
+
+RESERVED = {  # what a run or a matrix writes itself
+    *("pipeline.yaml", "metrics.json", "metrics.jsonl", "status.json", "log.txt", "prepared.json", "inputs.json"),
+    *("checksums.json", "run.lock", "checkpoints", "undistorted", "prepared", "compare.html"),
+    *("cameras.json", "view_colours.json"),
+}
+LONGEST = 200  # bytes; systems allow 255, and temporary names are longer
+_DEVICES = re.compile(r"(con|prn|aux|nul|conin\$|conout\$|(com|lpt)[0-9¹²³])(\..*)?", re.IGNORECASE)  # of Windows
+
+
+def fault_of_name(name: str) -> str | None:
+    """Return why not every system can hold a file of this name, or None."""
+    try:
+        size = len(name.encode())
+    except UnicodeEncodeError:
+        return f"{name!r} is not text"
+    if size > LONGEST:
+        return f"a name has {size} bytes; the limit is {LONGEST}"
+    if any(letter < " " or letter in '<>:"|?*\x7f' for letter in name):
+        return f"{name!r} holds a character that not every system allows"
+    if _DEVICES.fullmatch(name.rstrip(" .")) or re.search(r"~\d", name) or name != name.rstrip(" ."):
+        return f"'{name}' means something else on Windows"
+    return None
+
+
+def _readable(text: str) -> str:
+    if "\0" in text or any("\ud800" <= letter <= "\udfff" for letter in text):
+        raise ValueError("expected a path: no name of a file holds such a character")
+    return text
+
+
+ReadPath = Annotated[str, AfterValidator(_readable)]  # a file or folder that is read
+
+
+def fault_of_output(text: str) -> str | None:
+    """Return why a pipeline may not choose a path in the run folder, or None.  Both kinds of slash separate."""
+    parts = PureWindowsPath(text).parts
+    if not parts or PureWindowsPath(text).anchor or ".." in parts:
+        return "it is not inside"
+    if parts[0].casefold() in RESERVED:
+        return f"'{parts[0]}' is written by the run itself"
+    if any(part.startswith(".") for part in parts):
+        return "names with a dot in front are for temporary files"
+    return next(filter(None, map(fault_of_name, parts)), None)

@@ -1,0 +1,41 @@
+"""How far a piece of work on the host is: a line of the log now and then, and whoever else listens."""
+
+import logging
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+
+LOG = logging.getLogger("clsplat")
+INTERVAL = 5.0  # seconds between lines of the log
+
+Listener = Callable[[str, int, int], None]  # what is counted, how many are done, how many there are
+_listener: ContextVar[Listener | None] = ContextVar("listener", default=None)
+
+
+@contextmanager
+def heard_by(listener: Listener) -> Iterator[None]:
+    """Call `listener` for each step of the work in this block; it is called from the thread of the block."""
+    token = _listener.set(listener)
+    try:
+        yield
+    finally:
+        _listener.reset(token)
+
+
+class Count:
+    """Counts the pieces of some work: `what` is what is done, such as 'photographs decoded'."""
+
+    def __init__(self, what: str, total: int) -> None:
+        self.what, self.total, self.done = what, total, 0
+        self._logged = time.monotonic()
+        self.reach(0)
+
+    def reach(self, done: int) -> None:
+        """Note how many pieces are done."""
+        self.done = done
+        if listener := _listener.get():
+            listener(self.what, done, self.total)
+        if done and time.monotonic() - self._logged >= INTERVAL:
+            self._logged = time.monotonic()
+            LOG.info("%s: %d of %d", self.what, done, self.total)

@@ -1,0 +1,50 @@
+"""What a run would do, before it does it."""
+
+from pathlib import Path
+
+from clsplat.opencl.device import Device
+from clsplat.pipeline.loading import Pipeline
+from clsplat.runs.folders import check_run_folder, up_to_date
+from clsplat.runs.opening import check_start, open_run
+from clsplat.runs.outputs import check_places
+from clsplat.runs.runner import restore
+from clsplat.stages.base import Stage
+from clsplat.stages.evaluate import Evaluate
+from clsplat.stages.optimize import Optimize
+from clsplat.training.run import Run
+
+
+def describe(
+    pipeline: Pipeline, out: Path, device: str | Device | None, resume: bool = False, restart: bool = False
+) -> str:
+    """Return a line for each stage of a run in `out`, which is left as it is.
+
+    Raises what the run would raise before its first stage; of its photographs only where nothing must be prepared.
+    """
+    planned = pipeline.preparation(out)
+    if not restart and planned and up_to_date(pipeline, planned, out):
+        return f"{out}: up to date"
+    check_run_folder(out, resume or restart)
+    check_places(pipeline, out)
+    lines = [f"  {one.step.stage:<14} {one.why or 'done'}" for one in planned]
+    run, start = None, "would run"
+    if any(one.why for one in planned):
+        check_start(pipeline, out, device, restart)
+    else:
+        run = open_run(pipeline, out, device, restart)
+        if resume:
+            resumed = restore(run)
+            start = f"would go on from step {run.step}" if resumed else "nothing to resume; would run"
+    lines += [f"  {stage.stage:<14} {_detail(stage, run)}".rstrip() for stage in pipeline.stages]
+    return f"{start} in {out}:\n" + "\n".join(lines)
+
+
+def _detail(stage: Stage, run: Run | None) -> str:
+    if isinstance(stage, Optimize):
+        cadences = (f"{inner.stage} every {inner.every}" for inner in stage.during)
+        return f"{stage.steps} steps; " + ", ".join(cadences)
+    if isinstance(stage, Evaluate) and run:
+        views = run.original.downscaled(run.downscale).split(stage.split)
+        sizes = ", ".join(f"1/{downscale:g}" for downscale in stage.downscales or [run.downscale])
+        return f"{len(views)} {stage.split} views at {sizes}"
+    return ""

@@ -1,0 +1,136 @@
+"""The run folder: made, held, its failures recorded, its state read."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager, suppress
+from pathlib import Path
+from typing import Any, Literal
+
+from clsplat.errors import ConfigError, InternalError, Interrupted, OutputError, as_clsplat_error, one_line
+from clsplat.files import sweep, unwritable
+from clsplat.pipeline.loading import Pipeline, load
+from clsplat.prepare.cache import NOTE, Planned, note, noted
+from clsplat.runs import lock
+from clsplat.runs.outputs import CHECKSUMS
+from clsplat.training import checkpoint
+from clsplat.training.status import StatusFile, read_status
+
+PIPELINE = "pipeline.yaml"
+BEFORE_A_RUN = {"status.json", "log.txt", lock.FILE}  # files of a run that has not begun
+
+
+@contextmanager
+def opened(out: Path, resume: bool, **values: Any) -> Iterator[StatusFile]:
+    """Make the run folder, with `values` in its status, and hold it in the block.
+
+    A run that ends before it has begun leaves no new folder.
+    Raises ConfigError when it holds another run, OutputError when it is in use or cannot be written.
+    """
+    made = [folder for folder in (out, *out.parents) if not folder.exists()]
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise unwritable(out, error) from error
+    try:
+        with lock.held(out):
+            status = make_run_folder(out, resume, **values)
+            try:
+                with closing(status):  # the next holder writes its own
+                    yield status
+            except BaseException as error:
+                if made and not isinstance(as_clsplat_error(error), InternalError):  # its log has the traceback
+                    _remove_unused(out)
+                raise
+    except BaseException:
+        with suppress(OSError):  # where a folder holds anything, it stays
+            for folder in made:
+                folder.rmdir()
+        raise
+
+
+def _remove_unused(out: Path) -> None:
+    with suppress(OSError):
+        files = list(out.iterdir())
+        if {file.name for file in files} <= BEFORE_A_RUN:
+            for file in files:
+                if file.name != lock.FILE:
+                    file.unlink()
+
+
+def clear(status: StatusFile) -> None:
+    """Remove what a run would go on from.  Raises OutputError."""
+    status.note(checkpoint=None)
+    status.write()
+    out = status.out
+    checkpoints = out / checkpoint.FOLDER
+    files = [*checkpoint.saved(out), *checkpoints.glob("failed_*.npz"), *checkpoints.glob("damaged_*.npz")]
+    files += [out / name for name in (CHECKSUMS, "metrics.json", "metrics.jsonl", "inputs.json", NOTE)]
+    for file in files:
+        try:
+            file.unlink(missing_ok=True)
+        except OSError as error:
+            raise unwritable(file, error) from error
+
+
+def make_run_folder(out: Path, resume: bool, **values: Any) -> StatusFile:
+    """Make the run folder, swept of what killed runs have left, and its status.json with `values`.
+
+    Raises ConfigError when it holds another run, OutputError when it cannot be written.
+    """
+    check_run_folder(out, resume)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise unwritable(out, error) from error
+    sweep(out, border=PIPELINE)
+    status = StatusFile(out, **(values or {"step": 0}))
+    status.begin()
+    return status
+
+
+def check_run_folder(out: Path, resume: bool) -> None:
+    """Raise ConfigError when the folder holds another run."""
+    if not resume and ((out / PIPELINE).exists() or checkpoint.saved(out)):
+        raise ConfigError(f"{out}: already holds a run; give another folder, --resume or --restart")
+
+
+@contextmanager
+def failures_recorded(status: StatusFile, as_raised: bool = False) -> Iterator[None]:
+    """Turn every failure of the block into a ClsplatError, and write it to status.json.
+
+    With `as_raised` the failure itself is raised.
+    """
+    try:
+        yield
+    except BaseException as error:
+        failure = as_clsplat_error(error)
+        with suppress(OutputError):  # the failure itself is more important
+            state: Literal["interrupted", "failed"] = "interrupted" if isinstance(failure, Interrupted) else "failed"
+            status.end(state, failure.exit_code, one_line(failure))
+        if failure is error or as_raised:
+            raise
+        raise failure from error
+
+
+def free_folder(folder: Path, pipeline: Pipeline | None, resume: bool) -> Path:
+    """Return the default run folder: with the next free number, unless a run is resumed or up to date."""
+    number, free = 1, folder
+    planned = pipeline.preparation(folder) if pipeline else []
+
+    def taken() -> bool:
+        if (free / lock.FILE).exists():  # by a run that has not begun yet
+            return True
+        return (free / PIPELINE).exists() and not (pipeline and up_to_date(pipeline, planned, free))
+
+    while not resume and taken():
+        number += 1
+        free = folder.with_name(f"{folder.name}-{number}")
+    return free
+
+
+def up_to_date(pipeline: Pipeline, planned: Sequence[Planned], out: Path) -> bool:
+    """Whether `out` holds a finished run of this pipeline and the same photographs; never where nothing is prepared."""
+    if not planned or noted(out) != note(planned):
+        return False
+    return (
+        read_status(out).get("state") == "done" and load(str(out / "pipeline.yaml")).resolved() == pipeline.resolved()
+    )

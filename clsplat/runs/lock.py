@@ -1,0 +1,155 @@
+"""One process at a time in a run folder.
+
+The system releases the lock when its holder ends, however it ends, so that it is never left behind.  The file
+`run.lock` tells who holds it.  Where a file system knows no locks, that file stands for the lock: one whose process has
+ended on this host is taken over.
+"""
+
+import errno
+import io
+import json
+import logging
+import os
+import socket
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from clsplat.errors import OutputError
+from clsplat.files import unwritable
+from clsplat.processes import is_alive
+
+LOG = logging.getLogger("clsplat")
+FILE = "run.lock"
+HELD = {errno.EACCES, errno.EAGAIN, errno.EDEADLK}  # what the systems answer for a lock that another holds
+NO_LOCKS = {errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL}
+BEHIND_THE_TEXT = 1 << 20  # Windows locks bytes for readers too
+_held: set[Path] = set()  # by this process
+
+
+@contextmanager
+def held(folder: Path) -> Iterator[None]:
+    """Hold the lock of a folder in the block.
+
+    Raises OutputError, with process and host where another holds it.
+    """
+    path = (folder / FILE).resolve()
+    if path in _held:
+        raise OutputError(f"{folder}: is in use by this process; end that run or trainer first, or give another folder")
+    try:
+        file = _locked(path, folder)
+    except OSError as error:
+        raise unwritable(path, error) from error
+    _held.add(path)
+    try:
+        yield
+    finally:
+        _held.discard(path)
+        with suppress(OSError):  # Windows removes no open file
+            path.unlink()
+        file.close()
+        with suppress(OSError):
+            if os.name == "nt":
+                path.unlink()
+
+
+def _locked(path: Path, folder: Path) -> io.FileIO:
+    """Open the file and lock it; write into it who holds it.  Raises OutputError and OSError."""
+    while True:
+        file = path.open("a+b", buffering=0)
+        try:
+            _lock(file, folder)
+            if _is_at(file, path):
+                file.seek(0)
+                file.truncate()
+                file.write(json.dumps(_owner()).encode())
+                return file
+        except BaseException:
+            file.close()
+            raise
+        file.close()  # its holder has ended, and removed it
+
+
+def _lock(file: io.FileIO, folder: Path) -> None:
+    try:
+        if not _system_lock(file):
+            raise OutputError(_in_use(folder, _read(file)))
+    except OSError as error:
+        if error.errno not in NO_LOCKS:
+            raise
+        owner = _read(file)
+        if owner and not _has_ended(owner):
+            raise OutputError(
+                f"{_in_use(folder, owner)}; this file system knows no locks: if that process has ended, "
+                f"remove {folder / FILE}"
+            ) from error
+        if owner:
+            LOG.info("%s: taken over from process %s, which has ended", folder, owner.get("process"))
+        LOG.warning("%s: its file system knows no locks: never run two at once there from different hosts", folder)
+
+
+def _system_lock(file: io.FileIO) -> bool:
+    """Lock an open file; return False where another holds the lock.  Raises OSError where there are no locks."""
+    try:
+        if os.name == "nt":
+            import msvcrt
+
+            file.seek(BEHIND_THE_TEXT)
+            msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined]
+        else:
+            import fcntl
+
+            fcntl.flock(file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except ImportError as error:
+        raise OSError(errno.ENOSYS, "no locks") from error
+    except OSError as error:
+        if error.errno not in HELD:
+            raise
+        return False
+    return True
+
+
+def _is_at(file: io.FileIO, path: Path) -> bool:
+    """Whether an open file is still the one at a path."""
+    try:
+        return os.path.samestat(os.fstat(file.fileno()), path.stat())
+    except FileNotFoundError:
+        return False
+
+
+def _owner() -> dict[str, Any]:
+    command = " ".join([Path(sys.argv[0]).name, *sys.argv[1:]])
+    return {"process": os.getpid(), "host": socket.gethostname(), "time": time.time(), "command": command}
+
+
+def _read(file: io.FileIO) -> dict[str, Any]:
+    """Who the file names; nobody where it is empty or damaged."""
+    try:
+        file.seek(0)
+        owner = json.loads(file.read(BEHIND_THE_TEXT))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return owner if isinstance(owner, dict) else {}
+
+
+def _has_ended(owner: dict[str, Any]) -> bool:
+    if owner.get("host") != socket.gethostname():
+        return False
+    process = owner.get("process")
+    return isinstance(process, int) and (process == os.getpid() or not is_alive(process))  # this one does not hold it
+
+
+def _in_use(folder: Path, owner: dict[str, Any]) -> str:
+    if not owner:
+        return f"{folder}: is in use by another process"
+    try:
+        since = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(float(owner.get("time", 0))))
+    except (TypeError, ValueError, OverflowError, OSError):
+        since = "an unknown time"
+    return (
+        f"{folder}: is in use by process {owner.get('process')} on {owner.get('host')} since {since} "
+        f"({str(owner.get('command'))[:80]}); wait for it, or give another folder"
+    )

@@ -1,0 +1,110 @@
+"""A file of named arrays and notes that notices damage: an .npz in which every object has a SHA-256.
+
+    NAME.npy          an array of float32; its SHA-256, of all bytes of the member, stands in the notes
+    meta.npy          the notes: JSON, with the key `sha256` by name of array
+    meta_sha256.npy   the SHA-256 of meta.npy
+
+NumPy reads the arrays.  A changed byte is either noticed or lies where it means nothing, such as in a time of day.
+"""
+
+import errno
+import hashlib
+import io
+import json
+import zipfile
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.errors import DataError, OutputError, one_line, shortened
+
+META, META_DIGEST, DIGESTS = "meta", "meta_sha256", "sha256"
+DAMAGE = {None, errno.EINVAL, errno.EISDIR}  # a place before the file's beginning, or a folder of its name
+Notes = dict[str, Any]
+Arrays = dict[str, NDArray[np.float32]]
+
+
+def write(file: BinaryIO, notes: Notes, arrays: Iterable[tuple[str, NDArray[np.float32]]]) -> None:
+    """Write arrays and notes, which are JSON; one array is held in memory at a time."""
+    with zipfile.ZipFile(file, "w") as archive:
+        digests = {name: _add(archive, name, array) for name, array in arrays}
+        digest = _add(archive, META, np.array(json.dumps({**notes, DIGESTS: digests})))
+        _add(archive, META_DIGEST, np.array(digest))
+
+
+def read(path: Path) -> tuple[Notes, Arrays]:
+    """Return notes and arrays, all as they were written.  Raises DataError, with the reason alone, when damaged.
+
+    An archive without any checksum, of an earlier program, is returned with its notes alone.
+    Raises OutputError and MemoryError where the system cannot read it, which says nothing about the file.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            _require_sizes(archive, path.stat().st_size)
+            notes = _notes(archive)
+            if DIGESTS not in notes:
+                return notes, {}
+            digests = notes.pop(DIGESTS)
+            expected = sorted(f"{name}.npy" for name in (*digests, META, META_DIGEST))
+            if sorted(archive.namelist()) != expected:
+                raise DataError("its list of contents has changed")
+            return notes, {name: _array(_member(archive, name, digest)) for name, digest in digests.items()}
+    except MemoryError:
+        raise
+    except Exception as error:  # zipfile and NumPy raise a dozen kinds for damaged bytes, EOFError and TokenError too
+        if isinstance(error, OSError) and error.errno not in DAMAGE:
+            raise OutputError(f"{path}: cannot be read ({error.strerror}); check disk and permissions") from error
+        raise DataError(shortened(one_line(error) or type(error).__name__)) from error
+
+
+def _add(archive: zipfile.ZipFile, name: str, array: NDArray[Any]) -> str:
+    """Write an array as NumPy does; return the SHA-256 of its bytes."""
+    header, values = io.BytesIO(), np.asarray(array, order="C")
+    np.lib.format.write_array_header_1_0(header, np.lib.format.header_data_from_array_1_0(values))
+    digest = hashlib.sha256()
+    with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as member:
+        for part in (memoryview(header.getvalue()), values.reshape(-1).view(np.uint8).data):
+            digest.update(part)
+            member.write(part)
+    return digest.hexdigest()
+
+
+def _require_sizes(archive: zipfile.ZipFile, size: int) -> None:
+    """Raise DataError where the members declare more bytes than the file has, or are not plain bytes."""
+    members = archive.infolist()
+    if any(member.compress_type != zipfile.ZIP_STORED or member.flag_bits & 1 for member in members):
+        raise DataError("its contents are not stored as they were written")
+    if sum(max(member.file_size, member.compress_size) for member in members) > size:
+        raise DataError(f"it declares more bytes than its {size}")
+
+
+def _notes(archive: zipfile.ZipFile) -> Notes:
+    """The notes, checked where they have a checksum; without one they may be of an earlier format."""
+    data = archive.read(f"{META}.npy")
+    digest = f"{META_DIGEST}.npy" in archive.namelist()
+    if digest and hashlib.sha256(data).hexdigest() != str(_array(archive.read(f"{META_DIGEST}.npy"))):
+        raise DataError("its notes differ from their checksum")
+    notes = json.loads(str(_array(data)))
+    if not isinstance(notes, dict) or (DIGESTS in notes) != digest:
+        raise DataError("its checksums are missing")
+    return notes
+
+
+def _member(archive: zipfile.ZipFile, name: str, digest: str) -> bytes:
+    data = archive.read(f"{name}.npy")
+    if hashlib.sha256(data).hexdigest() != digest:
+        raise DataError(f"{name} differs from its checksum")
+    return data
+
+
+def _array(data: bytes) -> NDArray[Any]:
+    """Parse a member, without memory of its own: a header may declare any shape."""
+    stream = io.BytesIO(data)
+    np.lib.format.read_magic(stream)
+    shape, fortran, dtype = np.lib.format.read_array_header_1_0(stream, max_header_size=1000)
+    if fortran or dtype.hasobject:
+        raise DataError("an array has another layout than that of a checkpoint")
+    return np.frombuffer(data, dtype, offset=stream.tell()).reshape(shape)

@@ -1,0 +1,36 @@
+"""Save the state of a run that fails."""
+
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from clsplat.errors import Interrupted, NumericError, one_line
+from clsplat.training import checkpoint
+from clsplat.training.run import Run
+
+LOG = logging.getLogger("clsplat")
+
+
+@contextmanager
+def saved_on_failure(run: Run) -> Iterator[None]:
+    """Where the block fails, save the state of the last whole step, and tell where it is; the failure is raised."""
+    try:
+        yield
+    except (Interrupted, NumericError):  # saved already, or not to be gone on from
+        raise
+    except Exception:
+        if run.step > 0:
+            LOG.warning(_rescue(run))
+        raise
+
+
+def _rescue(run: Run) -> str:
+    """Save the state where it is whole; return a sentence about it."""
+    try:
+        if run.whole and not run.model.gaussians.not_finite() and run.model.gaussians.count:
+            return f"the state of step {run.step} is saved in {checkpoint.save(run)}; `clsplat resume` goes on from it"
+        why = "the step that failed was not whole" if not run.whole else "the model is not finite"
+    except Exception as error:  # the failure itself is what the user must see
+        why = f"the state could not be saved ({one_line(error)})"
+    files = checkpoint.saved(run.out)
+    return f"{why}; {f'the last good state is {files[-1]}' if files else 'no state was saved before'}"

@@ -1,0 +1,229 @@
+"""status.json: what a run is doing, for whoever watches it from outside."""
+
+import json
+import logging
+import os
+import platform
+import threading
+import time
+import weakref
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+from pydantic import BaseModel, ConfigDict
+
+from clsplat import __version__
+from clsplat.errors import DataError, OutputError
+from clsplat.files import write_text
+from clsplat.reading import read_json
+
+LOG = logging.getLogger("clsplat")
+FILE = "status.json"
+BEAT = 5.0  # seconds between two writes of a run that goes on
+END_STATES = ("done", "failed", "interrupted")
+Item = TypeVar("Item")
+
+
+class Amount(BaseModel):
+    """How much of a stage is done."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    done: int
+    """Number of units that are done."""
+    total: int
+    """Number of units in all."""
+    unit: str
+    """What is counted: steps, views, photographs, cells."""
+
+
+class Status(BaseModel):
+    """The contents of status.json.  What does not apply, or is not known yet, is left out.  Times are in seconds since
+    1970, UTC.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+
+    format: Literal[1] = 1
+    """Version of this schema: a key that is new does not change it, one that goes or has another meaning does."""
+    state: Literal["starting", "preparing", "running", "done", "failed", "interrupted"] = "starting"
+    """starting: opens the device; preparing: makes and reads the scene; running: the stages; the others are the end."""
+    stage: str | None = None
+    """Stage or step of `prepare` in progress, or the last that was; of a matrix, the cell."""
+    progress: Amount | None = None
+    """How much of that stage is done, where it can be counted."""
+    step: int | None = None
+    """Training steps done, of all stages; not of a matrix."""
+    steps: int | None = None
+    """Step at which the training in progress ends."""
+    gaussians: int | None = None
+    """Number of Gaussians at the last report."""
+    seconds_left: float | None = None
+    """Time that the training in progress still needs, estimated at the last report."""
+    checkpoint: str | None = None
+    """Newest checkpoint that was saved, a file in the folder `checkpoints`."""
+    cells: int | None = None
+    """Number of cells; of a matrix alone."""
+    done: int | None = None
+    """Number of cells that have ended; of a matrix alone."""
+    failed: dict[str, str] | None = None
+    """Names of the cells that failed, and why; of a matrix alone."""
+    exit_code: int | None = None
+    """Exit code of the run, when it has ended."""
+    message: str | None = None
+    """The one line that says why a run failed or was interrupted."""
+    device: str | None = None
+    """OpenCL device and runtime."""
+    version: str = __version__
+    """Version of clsplat."""
+    host: str
+    """Name of the machine, or of the container."""
+    process: int
+    """Number of the process on that machine."""
+    pid_namespace: str | None = None
+    """Linux: where that number counts; containers on one machine have their own."""
+    started: float
+    """When this process began with the run."""
+    changed: float
+    """When state, stage, progress or step last changed."""
+    time: float
+    """Heartbeat: when this file was written; at least every 10 s while the process lives."""
+
+
+class StatusFile:
+    """The status.json of one run: held in memory, written at its beginning and end and every few seconds between.
+
+    A thread does the writing in between, so that training never waits for a disk; where it fails, the run goes on.
+    """
+
+    def __init__(self, out: Path, **values: Any) -> None:
+        self.out = out
+        now = time.time()
+        checkpoint = read_status(out).get("checkpoint")
+        self.now = Status(
+            host=platform.node(),
+            process=os.getpid(),
+            pid_namespace=pid_namespace(),
+            started=now,
+            changed=now,
+            time=now,
+            checkpoint=checkpoint if isinstance(checkpoint, str) else None,
+            **values,
+        )
+        self._changing, self._writing = threading.Lock(), threading.Lock()
+        self._ended = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._depth = 0  # of stages in progress
+        self._warned = False
+
+    def begin(self) -> None:
+        """Write the first status and go on writing.  Raises OutputError."""
+        self.write()
+        self._beat()
+
+    def note(self, **values: Any) -> None:
+        """Change fields; the next heartbeat writes them."""
+        with self._changing:
+            self.now = self.now.model_copy(update={"changed": time.time(), **values})
+
+    def enter(self, state: Literal["preparing", "running"], **values: Any) -> None:
+        """Change the state, and write it at once."""
+        self.note(state=state, stage=None, progress=None, **values)
+        self.refresh()
+        self._beat()
+
+    def end(self, state: Literal["done", "failed", "interrupted"], exit_code: int, message: str | None = None) -> None:
+        """Write the last status.  Raises OutputError."""
+        self.close()
+        self.note(state=state, exit_code=exit_code, message=message, seconds_left=None)
+        self.write()
+
+    def close(self) -> None:
+        """Write no more by itself."""
+        self._ended.set()
+        with self._writing:  # what is being written is no longer on its way
+            pass
+
+    def count(self, unit: str, done: int, total: int, **values: Any) -> None:
+        """Note how much of the stage is done, and other fields."""
+        self.note(progress=Amount(done=done, total=total, unit=unit), **values)
+
+    def counted(self, items: Iterable[Item], unit: str, total: int) -> Iterator[Item]:
+        """Yield the items and count them; what was yielded is done when the next is asked for."""
+        for number, item in enumerate(items):
+            self.count(unit, number, total)
+            yield item
+        self.count(unit, total, total)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Name the stage in progress; one inside of another gives way to it again, unless it fails."""
+        around = {"stage": self.now.stage, "progress": self.now.progress}
+        self._depth += 1
+        self.note(stage=name, progress=None)
+        yield
+        self._depth -= 1
+        if self._depth:
+            self.note(**around)
+
+    def refresh(self) -> None:
+        """Write the status, before the end; where that fails the run goes on, with a warning the first time."""
+        try:
+            with self._writing:
+                if not self._ended.is_set() and self.out.is_dir():  # one that was removed stays so
+                    self._write()
+        except OutputError as error:
+            if not self._warned:
+                LOG.warning("%s; the run goes on", error)
+            self._warned = True
+
+    def write(self) -> None:
+        """Write the status now.  Raises OutputError."""
+        with self._writing:  # whoever writes last writes the newest
+            self._write()
+
+    def _write(self) -> None:
+        now = self.now.model_copy(update={"time": time.time()})
+        write_text(self.out / FILE, json.dumps(now.model_dump(exclude_none=True), indent=1) + "\n")
+
+    def _beat(self) -> None:
+        if self._thread is None and not self._ended.is_set():
+            self._thread = threading.Thread(
+                target=_refresh_until, args=(self._ended, weakref.ref(self)), name="status", daemon=True
+            )
+            self._thread.start()
+
+
+def _refresh_until(ended: threading.Event, reference: "weakref.ref[StatusFile]") -> None:
+    """Refresh a status until its run has ended, or nobody holds it any more."""
+    while not ended.wait(BEAT):
+        status = reference()
+        if status is None:
+            return
+        status.refresh()
+        del status
+
+
+def read_status(out: Path) -> dict[str, Any]:
+    """Return the contents of status.json; an empty dict when it is missing or damaged."""
+    try:
+        status = read_json(out / FILE)
+    except DataError:
+        return {}
+    return status if isinstance(status, dict) else {}
+
+
+def pid_namespace() -> str | None:
+    """Return where process numbers count, such as 'pid:[4026531836]'; None where the system does not say."""
+    try:
+        return os.readlink("/proc/self/ns/pid")
+    except (OSError, AttributeError):
+        return None
+
+
+def status_schema() -> dict[str, Any]:
+    """Return the JSON schema of status.json."""
+    schema = Status.model_json_schema()
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}

@@ -1,0 +1,125 @@
+"""Damaged datasets: COLMAP, binary and text, and transforms.json; each is read, and inspected in pieces."""
+
+import json
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from clsplat.inspect.inspection import Inspection
+from clsplat.scene.detect import read_scene
+from tests.colmap_writer import CameraEntry, ColmapModel, tiny_model, write_scene
+from tests.fuzz.mutation import damaged, fuzzed
+from tests.fuzz.outcome import outcome
+
+POSE = [[1, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 5], [0, 0, 0, 1]]
+KEYS = ["w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "camera_angle_x", "camera_model", "is_fisheye"]
+WORDS = [f'"{key}": ' for key in [*KEYS, "file_path", "mask_path", "ply_file_path", "frames", "test_filenames"]]
+WORDS += [
+    '"OPENCV_FISHEYE"',
+    '"a.png"',
+    "[[1, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 5]]",
+    '{"file_path": "a.png"}, ',
+    "[],",
+]
+MODELS = ["SIMPLE_RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV", "PINHOLE", "7", "a.jpg", "# "]
+
+
+def read_and_inspect(path: Path) -> None:
+    """A scene that is read has finite cameras; whatever it is, it can be inspected, and the result written."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        scene = outcome(read_scene, path)
+        inspection = outcome(Inspection.of, path)
+    assert inspection is not None
+    json.dumps(inspection.data())
+    assert len(inspection.verdict) < 2000
+    if scene is not None:
+        assert all(np.isfinite(view.world_to_camera).all() for view in scene.views)
+        assert all(view.image_path.is_relative_to(path) for view in scene.views)
+        assert np.isfinite(scene.extent)
+
+
+def photo(path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(cv2.imencode(path.suffix, np.full((48, 64, 3), 90, np.uint8))[1].tobytes())
+
+
+def colmap(folder: Path, kind: str) -> tuple[Path, dict[str, list[bytes]]]:
+    """A scene, and its files by name as seeds: with and without distortion."""
+    cameras = [
+        CameraEntry(1, "SIMPLE_RADIAL", 64, 48, (50.0, 30.5, 25.25, 0.01)),
+        CameraEntry(1, "OPENCV_FISHEYE", 64, 48, (50.0, 51.0, 30.5, 25.25, 0.01, 0, 0, 0)),
+        CameraEntry(1, "FOV", 64, 48, (50.0, 51.0, 30.5, 25.25, 0.1)),
+    ]
+    models: list[ColmapModel] = [*(replace(tiny_model(), cameras=[camera]) for camera in cameras), tiny_model()]
+    seeds: dict[str, list[bytes]] = {"cameras": [], "images": [], "points3D": []}
+    for model in models:
+        path = write_scene(folder / kind, model, kind)
+        for stem, files in seeds.items():
+            files.append((path / "sparse" / "0" / f"{stem}.{kind}").read_bytes())
+    for image in models[-1].images:
+        photo(path / "images" / image.name)
+    return path, seeds
+
+
+@pytest.mark.parametrize("kind", ["bin", "txt"])
+@pytest.mark.parametrize("stem", ["cameras", "images", "points3D"])
+def test_a_damaged_colmap_model_is_read_or_refused(stem, kind, folder):
+    path, seeds = colmap(folder, kind)
+
+    @fuzzed(data=damaged(seeds[stem], MODELS))
+    def reads(data):
+        (path / "sparse" / "0" / f"{stem}.{kind}").write_bytes(data)
+        read_and_inspect(path)
+
+    reads()
+    for name, files in seeds.items():
+        (path / "sparse" / "0" / f"{name}.{kind}").write_bytes(files[-1])
+
+
+def tables() -> list[bytes]:
+    """Nerfstudio's and Blender's notations, with lenses, masks, points and splits."""
+    frames = [{"file_path": f"{name}.png", "transform_matrix": POSE} for name in "ab"]
+    lens = {"fl_x": 50, "fl_y": 51.5, "cx": 30.5, "cy": 25, "w": 64, "h": 48}
+    own = [{**frame, **lens, "k1": 0.01, "camera_model": "OPENCV"} for frame in frames]
+    masked = [{**frame, "mask_path": "a.png"} for frame in frames]
+    found = [
+        {**lens, "frames": frames, "test_filenames": ["a.png"], "train_filenames": ["b.png"]},
+        {"frames": own, "ply_file_path": "points.ply"},
+        {"camera_angle_x": 0.7, "frames": [{**frame, "file_path": f"./{frame['file_path'][0]}"} for frame in frames]},
+        {**lens, "camera_model": "OPENCV_FISHEYE", "k1": 0.01, "k2": 0.001, "frames": masked},
+    ]
+    return [json.dumps(table, indent=i % 2 or None).encode() for i, table in enumerate(found)]
+
+
+@pytest.mark.parametrize("name", ["transforms.json", "transforms_train.json"])
+def test_a_damaged_transforms_file_is_read_or_refused(name, folder):
+    path = folder / name.partition(".")[0]
+    for photograph in "ab":
+        photo(path / f"{photograph}.png")
+
+    @fuzzed(data=damaged(tables(), WORDS))
+    def reads(data):
+        (path / name).write_bytes(data)
+        read_and_inspect(path)
+
+    reads()
+
+
+def test_a_damaged_table_of_sizes_is_read_or_refused(folder):
+    path = folder / "multiscale"
+    for photograph in "ab":
+        photo(path / f"{photograph}.png")
+    column = {"file_path": ["a.png"], "cam2world": [POSE], "width": [64], "height": [48], "focal": [50.0], "label": [0]}
+    table = {"train": column, "test": column | {"file_path": ["b.png"], "label": [1]}}
+
+    @fuzzed(data=damaged([json.dumps(table).encode()], WORDS))
+    def reads(data):
+        (path / "metadata.json").write_bytes(data)
+        read_and_inspect(path)
+
+    reads()

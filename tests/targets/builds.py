@@ -1,0 +1,82 @@
+"""Every build of a kernel file that clsplat asks a device for: both schedules, with the options of the code."""
+
+import re
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import product
+from pathlib import Path
+from typing import Literal
+
+from clsplat import resource_dir
+from clsplat.density.statistics import Statistic
+from clsplat.opencl.discovery import DeviceInfo, tuning_of
+from clsplat.opencl.program import BUILD_OPTIONS, flatten, parse_kernels
+from clsplat.render.rasterizer import PIXEL_SUMS
+from clsplat.settings import variants
+
+Schedule = Literal["simt", "wide"]
+KERNELS = resource_dir("cl_kernels")
+GPU = DeviceInfo(
+    name="", platform="", kind="GPU", driver="", units=16, memory=2**33, allocation=2**31, local_memory=2**15,
+    group=256, float_width=1, place=(0, 0),
+)  # fmt: skip
+DEVICES = {"simt": [GPU, replace(GPU, group=64)], "wide": [GPU]}  # wide where somebody asks a GPU for it
+FITTED: tuple[dict[str, int | str], ...] = ({}, {"SPLAT_GROUP": 64})  # once it is open, by its waves
+SCHEDULES: tuple[Schedule, ...] = ("simt", "wide")
+SUMS = sorted({kind.pixel_sums for kind in variants(Statistic).values()} - {PIXEL_SUMS})
+PASSED = {  # what call sites of Device.program add to the tuning; a test holds it against them
+    "blend_simt.cl": [{"PIXEL_SUMS": count} for count in SUMS],
+    "blend_wide.cl": [{"PIXEL_SUMS": count} for count in SUMS],
+    "gather.cl": [{"PIXEL_SUMS": count} for count in SUMS],
+}
+
+
+@dataclass(frozen=True)
+class Build:
+    """One .cl file with the values that clsplat passes by -D."""
+
+    path: Path
+    schedule: Schedule
+    defines: tuple[tuple[str, int | str], ...]  # by name
+    variant: str = ""  # what differs from the first build of the file and schedule: 'TILE 8'
+
+    @property
+    def options(self) -> list[str]:
+        return [*BUILD_OPTIONS, *(f"-D{name}={value}" for name, value in self.defines)]
+
+    @property
+    def text(self) -> str:
+        return f"{self.path.name} ({', '.join(filter(None, [self.schedule, self.variant]))})"
+
+    @cached_property
+    def source(self) -> str:
+        return flatten(self.path)
+
+    @cached_property
+    def kernels(self) -> list[str]:
+        return list(parse_kernels(self.source))
+
+
+def builds(schedules: Iterable[Schedule] = SCHEDULES, files: Iterable[str] = ("*.cl",)) -> Iterator[Build]:
+    """Yield each different build once; values that a file does not read make no difference."""
+    for path in sorted({path for pattern in files for path in KERNELS.glob(pattern)}):
+        for schedule in schedules:
+            if path.stem.startswith("blend_") and not path.stem.endswith(schedule):
+                continue
+            yield from _of_file(path, schedule)
+
+
+def _of_file(path: Path, schedule: Schedule) -> Iterator[Build]:
+    words = set(re.findall(r"\w+", flatten(path, {KERNELS / "common.h"})))
+    first: dict[str, int | str] = {}
+    seen: set[tuple[tuple[str, int | str], ...]] = set()
+    for info, fitted in product(DEVICES[schedule], FITTED if "SPLAT_GROUP" in words else FITTED[:1]):
+        for passed in [{}, *PASSED.get(path.name, [])]:
+            defines = {**tuning_of(info, schedule), **fitted, **passed}
+            read = {name: value for name, value in sorted(defines.items()) if name in words}
+            first = first or read
+            if tuple(read.items()) not in seen:
+                seen.add(tuple(read.items()))
+                variant = ", ".join(f"{name} {value}" for name, value in read.items() if first.get(name) != value)
+                yield Build(path, schedule, tuple(sorted(defines.items())), variant)

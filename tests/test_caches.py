@@ -1,0 +1,134 @@
+"""The folder of caches, and where it goes when the user's cannot be written."""
+
+import logging
+import os
+import shutil
+import stat
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import platformdirs
+import pytest
+
+from clsplat.caches import cache_folder
+from clsplat.errors import OutputError
+
+linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the folders of Linux")
+
+
+@pytest.fixture
+def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A home and a temporary folder of the test's own, and no variables that name caches."""
+    for name in ("home", "tmp"):
+        (tmp_path / name).mkdir()
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    for name in ("XDG_CACHE_HOME", "POCL_CACHE_DIR"):
+        monkeypatch.setenv(name, "")  # so that what the test sets is taken back
+        monkeypatch.delenv(name)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "tmp"))
+    cache_folder.cache_clear()
+    yield tmp_path
+    cache_folder.cache_clear()
+
+
+@pytest.fixture
+def own(machine: Path) -> Path:
+    """The user's folder below the temporary one."""
+    return machine / "tmp" / f"clsplat-{os.getuid()}"
+
+
+@linux
+def test_the_users_folder_is_used_where_it_can_be_written(machine, caplog):
+    assert cache_folder() == machine / "home" / ".cache" / "clsplat"
+    assert cache_folder().is_dir()
+    assert "XDG_CACHE_HOME" not in os.environ
+    assert not caplog.records
+
+
+def put_file(machine: Path, place: str) -> None:
+    shutil.rmtree(machine / place, ignore_errors=True)
+    (machine / place).parent.mkdir(parents=True, exist_ok=True)
+    (machine / place).write_text("a file cannot hold a folder")
+
+
+@linux
+@pytest.mark.parametrize("place", ["home", "home/.cache", "home/.cache/pocl", "home/.cache/pytools"])
+def test_caches_move_where_the_home_or_a_librarys_cache_cannot_be_written(machine, own, place, caplog):
+    put_file(machine, place)
+    assert cache_folder() == own / "clsplat"
+    assert os.environ["XDG_CACHE_HOME"] == str(own)
+    assert platformdirs.user_cache_dir("pyopencl", "pyopencl") == str(own / "pyopencl")
+    assert stat.S_IMODE(own.stat().st_mode) == 0o700
+    cache_folder()
+    (record,) = caplog.records  # once
+    assert record.levelno == logging.WARNING
+    assert str(machine / place) in record.getMessage()
+    assert f"caches are in {own} instead" in record.getMessage()
+
+
+@linux
+def test_caches_move_where_the_user_has_no_home(machine, own, monkeypatch, caplog):
+    monkeypatch.delenv("HOME")
+    monkeypatch.setattr("pwd.getpwuid", lambda user: {}[user])
+    assert cache_folder() == own / "clsplat"
+    assert "there is no home folder" in caplog.text
+
+
+@linux
+def test_caches_move_where_the_named_folder_of_pocl_cannot_be_written(machine, own, monkeypatch):
+    put_file(machine, "kernels")
+    monkeypatch.setenv("POCL_CACHE_DIR", str(machine / "kernels"))
+    cache_folder()
+    assert os.environ["POCL_CACHE_DIR"] == str(own / "pocl")
+
+
+@linux
+def test_a_named_folder_of_pocl_stays_where_it_can_be_written(machine, monkeypatch):
+    monkeypatch.setenv("POCL_CACHE_DIR", str(machine / "kernels"))
+    cache_folder()
+    assert os.environ["POCL_CACHE_DIR"] == str(machine / "kernels")
+
+
+@linux
+@pytest.mark.parametrize("trap", ["open to all", "a link", "a file", "dangling"])
+def test_a_temporary_folder_that_others_can_write_is_not_used(machine, own, trap):
+    put_file(machine, "home")
+    if trap == "open to all":
+        own.mkdir()
+        own.chmod(0o777)
+    elif trap == "a file":
+        own.write_text("")
+    else:
+        target = machine / "elsewhere"
+        if trap == "a link":
+            target.mkdir(mode=0o700)
+        own.symlink_to(target)
+    folder = cache_folder()
+    assert own not in folder.parents
+    assert folder.parents[1] == machine / "tmp"
+    assert stat.S_IMODE(folder.parent.stat().st_mode) == 0o700
+
+
+@linux
+def test_without_any_folder_that_can_be_written_the_error_says_what_to_set(machine, monkeypatch):
+    put_file(machine, "home")
+    put_file(machine, "tmp")
+    with pytest.raises(OutputError, match=r"no folder for caches .*; let XDG_CACHE_HOME or TMPDIR name"):
+        cache_folder()
+
+
+@linux
+@pytest.mark.slow
+def test_a_device_works_without_a_home(tmp_path):
+    """As in a container: a user without a name, a home that is not there, nothing that can be written but /tmp."""
+    (tmp_path / "file").write_text("")
+    variables = {"HOME": str(tmp_path / "file"), "TMPDIR": str(tmp_path)}
+    command = [sys.executable, "-m", "clsplat", "devices"]
+    done = subprocess.run(command, env={**os.environ, **variables}, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert "state     works" in done.stdout
+    assert done.stderr.count("\n") == 1
+    assert "caches are in" in done.stderr

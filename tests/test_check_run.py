@@ -1,0 +1,139 @@
+"""`clsplat check RUN`: whatever changes in a run folder is noticed, from its files alone."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+import clsplat
+from clsplat.errors import DataError
+from clsplat.opencl import device
+from clsplat.runs import verify
+from tests.test_cli import clsplat as command
+
+pytestmark = pytest.mark.slow
+
+SET = {"optimize.steps": 20, "init.count": 60}
+TINY = """
+name: two
+matrix: {{set: {{seed: [1, 2]}}}}
+scene: {{path: '{scene}'}}
+stages:
+  - init: {{count: 50}}
+  - optimize: {{steps: 4, losses: [l1], during: [{{checkpoint: {{every: 2}}}}]}}
+  - evaluate
+  - export
+"""
+
+
+@pytest.fixture(scope="module")
+def finished(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return clsplat.run("smoke", tiny_scene, tmp_path_factory.mktemp("runs") / "run", set=SET)
+
+
+@pytest.fixture
+def copy(finished: Path, tmp_path: Path) -> Path:
+    shutil.copytree(finished, tmp_path / "run")
+    return tmp_path / "run"
+
+
+def damaged(out: Path) -> dict[str, str]:
+    """The files that are not whole, and why."""
+    found = clsplat.check(out)
+    assert found["whole"] == all(one["whole"] for one in found["objects"])
+    return {one["file"]: one["detail"] for one in found["objects"] if not one["whole"]}
+
+
+def test_a_whole_run_has_a_line_for_each_file_and_needs_no_device(finished, monkeypatch):
+    monkeypatch.setattr(device, "Device", lambda *arguments: pytest.fail("opens a device"))
+    assert damaged(finished) == {}
+    done = command("check", finished)
+    lines = done.stdout.splitlines()
+    assert lines[-1] == f"{finished}: done; all {len(lines) - 1} files are whole"
+    text = "\n".join(lines)
+    names = ["pipeline.yaml", "status.json, done", "checkpoints/step_000020.npz, step 20, ", "metrics.jsonl, "]
+    names += ["metrics.json, ", "point_cloud.ply, ", "renders/test/", "report.html", "checksums.json, of 7 files"]
+    assert [name for name in names if name not in text] == []
+    data = json.loads(command("check", finished, "--json").stdout)
+    assert data == clsplat.check(finished)
+    assert (data["state"], data["whole"]) == ("done", True)
+
+
+def test_checksums_are_those_of_sha256sum(finished):
+    sums = json.loads((finished / "checksums.json").read_text())
+    import hashlib
+
+    for name, value in sums.items():
+        assert hashlib.sha256((finished / name).read_bytes()).hexdigest() == value
+    assert {"pipeline.yaml", "metrics.json", "metrics.jsonl", "point_cloud.ply", "report.html"} < set(sums)
+
+
+def test_a_changed_byte_in_any_file_is_noticed(finished, copy):
+    files = [one["file"] for one in clsplat.check(finished)["objects"] if one["file"] != "status.json"]
+    assert len(files) > 9
+    for name in files:
+        data = (copy / name).read_bytes()
+        place = len(data) // 2
+        (copy / name).write_bytes(data[:place] + bytes([data[place] ^ 1]) + data[place + 1 :])
+        found = damaged(copy)
+        assert name in found or name == "checksums.json", name
+        assert found, name
+        (copy / name).write_bytes(data)
+    assert damaged(copy) == {}
+
+
+@pytest.mark.parametrize("content", [None, b"", b"[", b"\xff\x00", b"[]", b"1"])
+def test_a_file_that_is_gone_or_no_such_file_is_noticed(content, finished, copy):
+    for one in clsplat.check(finished)["objects"]:
+        path = copy / one["file"]
+        data = path.read_bytes()
+        path.unlink() if content is None else path.write_bytes(content)
+        found = damaged(copy)
+        if not (content is None and ("checkpoints" in one["file"] or one["file"] == "checksums.json")):
+            assert found, one["file"]
+        path.write_bytes(data)
+
+
+def test_damage_ends_with_exit_code_7_and_one_line(copy):
+    (copy / "point_cloud.ply").write_bytes((copy / "point_cloud.ply").read_bytes()[:-4])
+    (copy / "checkpoints" / "step_000020.npz").write_bytes(b"")
+    done = command("check", copy, expect=7)
+    assert "DAMAGED  point_cloud.ply, differs from its checksum" in done.stdout
+    assert "files are damaged or missing: checkpoints/step_000020.npz, point_cloud.ply; " in done.stderr
+    data = json.loads(command("check", copy, "--json", expect=7).stdout)
+    assert data["whole"] is False
+
+
+def test_a_run_that_was_killed_is_whole_without_its_outputs(copy):
+    for name in ("checksums.json", "metrics.json", "point_cloud.ply", "report.html"):
+        (copy / name).unlink()
+    status = json.loads((copy / "status.json").read_text())
+    (copy / "status.json").write_text(json.dumps({**status, "state": "running"}))
+    assert damaged(copy) == {}
+    (copy / "status.json").write_text(json.dumps({**status, "state": "done"}))
+    assert damaged(copy) == {"metrics.json": "is missing", "point_cloud.ply": "is missing"}
+
+
+def test_the_sums_are_those_of_the_run_that_ended_last(copy):
+    (copy / "point_cloud.ply").write_bytes(b"")
+    assert damaged(copy)
+    (copy / "checkpoints" / "step_000020.npz").unlink()
+    clsplat.resume(copy)
+    assert damaged(copy) == {}
+
+
+def test_a_matrix_is_checked_with_its_cells(tiny_scene, tmp_path):
+    (tmp_path / "two.yaml").write_text(TINY.format(scene=tiny_scene))
+    out = clsplat.run(tmp_path / "two.yaml", out=tmp_path / "run")
+    assert damaged(out) == {}
+    cell = next(path for path in sorted(out.iterdir()) if path.is_dir())
+    (cell / "point_cloud.ply").write_bytes(b"ply")
+    assert damaged(out) == {f"{cell.name}/point_cloud.ply": "differs from its checksum"}
+    assert "cells" in clsplat.check(tmp_path / "two.yaml")
+
+
+def test_a_folder_without_a_run_is_refused(tmp_path):
+    with pytest.raises(DataError, match=r"holds neither pipeline.yaml nor status.json"):
+        verify.verify(tmp_path)
+    assert "expected the folder of a run" in command("check", tmp_path, expect=3).stderr

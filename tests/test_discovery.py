@@ -1,0 +1,143 @@
+"""Which device is chosen, what keeps one from working, and what a compiler's limits lead to."""
+
+import logging
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from clsplat.conformance.scenes import random_case
+from clsplat.errors import DeviceError, KernelError
+from clsplat.opencl import discovery, program, runtimes
+from clsplat.opencl.device import Device
+from clsplat.opencl.discovery import DeviceInfo, choose
+from clsplat.render.rasterizer import Rasterizer
+
+CPU = DeviceInfo("Two Cores", "Runtime A", "CPU", "1", 2, 2**32, 2**31, 2**15, 4096, 16, (0, 0), 3000, True)
+INTEGRATED = replace(CPU, name="Small", kind="GPU", units=96, clock=1300, group=256, float_width=1, place=(1, 0))
+LARGE = replace(INTEGRATED, name="Large", units=28, clock=1800, unified=False, place=(2, 0))
+LARGER = replace(LARGE, name="Larger", units=80, clock=1700, place=(2, 1))
+
+
+@pytest.fixture
+def found(monkeypatch):
+    """Lets the test say which devices there are; all work."""
+    monkeypatch.delenv("CLSPLAT_DEVICE", raising=False)
+    monkeypatch.setattr(runtimes, "fault_of", lambda *_: None)
+    return lambda *devices: monkeypatch.setattr(discovery, "list_devices", lambda: list(devices))
+
+
+@pytest.mark.parametrize(
+    ("devices", "first"),
+    [
+        ([CPU], CPU),
+        ([CPU, INTEGRATED], INTEGRATED),
+        ([CPU, INTEGRATED, LARGE], LARGE),
+        ([INTEGRATED, LARGE, LARGER, CPU], LARGER),
+        ([INTEGRATED, replace(INTEGRATED, clock=1400), LARGE], LARGE),
+        ([CPU, replace(CPU, units=64)], CPU),
+    ],
+)
+def test_the_strongest_gpu_is_chosen_and_of_cpus_the_first(found, devices, first):
+    found(*devices)
+    assert choose() is first
+
+
+def test_the_other_gpus_are_named_in_one_line(found, caplog):
+    found(CPU, INTEGRATED, LARGE, LARGER)
+    with caplog.at_level(logging.INFO, "clsplat"):
+        choose()
+    assert [record.message for record in caplog.records] == [
+        "chose Larger (GPU) on Runtime A; other GPUs: Small (GPU) on Runtime A; Large (GPU) on Runtime A; "
+        "--device NAME chooses one"
+    ]
+    caplog.clear()
+    found(CPU, LARGE)
+    choose()
+    assert not caplog.records
+
+
+@pytest.mark.parametrize(("info", "least"), [(CPU, 16), (LARGE, 64)])
+def test_a_device_with_small_groups_does_not_work(found, info, least):
+    assert replace(info, group=least).fault() is None
+    small = replace(info, group=least - 1)
+    assert small.fault() == f"its work-groups have at most {least - 1} items; expected {least} or more"
+    found(small)
+    with pytest.raises(DeviceError, match="work-groups have at most"):
+        choose()
+
+
+@pytest.fixture
+def info() -> DeviceInfo:
+    return choose()
+
+
+def capped(monkeypatch: pytest.MonkeyPatch, items: int, *kernels: str) -> None:
+    """Cap the work-groups of these kernels, of all without names, as a compiler may do."""
+    limit = program.group_limit
+    monkeypatch.setattr(
+        program,
+        "group_limit",
+        lambda kernel, device: items if not kernels or kernel.function_name in kernels else limit(kernel, device),
+    )
+
+
+def image_of(device: Device, rng: np.random.Generator) -> np.ndarray:
+    case = random_case(rng, 60, 50, 37)
+    frame = Rasterizer(device).forward(case.model(device), case.device_camera(device), device.zeros(3))
+    return frame.image.get()[:, :37, :50]
+
+
+def test_a_compiler_that_caps_blending_gets_smaller_tiles_and_the_same_image(info, rng, monkeypatch, caplog):
+    image = image_of(Device(info, "simt"), np.random.default_rng(1))
+    capped(monkeypatch, 255, "blend_forward")
+    with caplog.at_level(logging.INFO, "clsplat"):
+        device = Device(info, "simt")
+    assert device.tuning["TILE"] == 8
+    assert len(caplog.records) == 1
+    assert (
+        "tiles of 8 x 8 px instead of 16 x 16: blend_simt.cl:blend_forward has work-groups of 256 items" in caplog.text
+    )
+    np.testing.assert_array_equal(image_of(device, np.random.default_rng(1)), image)
+
+
+@pytest.mark.parametrize(("together", "splats"), [(8, 32), (32, 32), (64, 64), (128, 64)])
+def test_the_backward_pass_takes_as_many_splats_as_run_together_and_gives_the_same_bits(
+    info, monkeypatch, together, splats
+):
+    def sums(device: Device) -> np.ndarray:
+        rng = np.random.default_rng(2)
+        case, rasterizer = random_case(rng, 150, 40, 30), Rasterizer(device, "radix")
+        model, camera = case.model(device), case.device_camera(device)
+        frame = rasterizer.forward(model, camera, device.zeros(3))
+        gradient = np.zeros((3, camera.rows, camera.stride), np.float32)
+        gradient[:, :30, :40] = rng.normal(size=(3, 30, 40))
+        return rasterizer.pixel_sums(model, frame, device.upload(gradient)).get()[:, :150]
+
+    monkeypatch.setattr(program, "group_multiple", lambda *_: 32)
+    expected = sums(Device(info, "simt"))
+    monkeypatch.setattr(program, "group_multiple", lambda *_: together)
+    device = Device(info, "simt")
+    assert device.program("blend_simt.cl").blend_backward.group[0] == splats
+    np.testing.assert_array_equal(sums(device), expected)
+
+
+def test_a_kernel_whose_group_is_too_large_is_refused_in_a_sentence(info, monkeypatch):
+    capped(monkeypatch, 63, "scan_blocks")
+    with pytest.raises(KernelError, match=r"scan.cl:scan_blocks has work-groups of 64 items, and .* allows it 63; use"):
+        Device(info, "simt").program("scan.cl")
+
+
+def test_a_limit_that_rusticl_understates_refuses_no_kernel(info, monkeypatch):
+    capped(monkeypatch, 32)
+    monkeypatch.setattr(program, "group_multiple", lambda *_: 32)
+    assert Device(replace(info, platform="rusticl, OpenCL 3.0"), "simt").tuning["TILE"] == 16
+    capped(monkeypatch, 48)
+    with pytest.raises(KernelError, match="allows it 48"):
+        Device(replace(info, platform="rusticl, OpenCL 3.0"), "simt")
+
+
+def test_wide_needs_no_kernel_with_barriers(info, rng, monkeypatch):
+    image = image_of(Device(info, "wide"), np.random.default_rng(1))
+    capped(monkeypatch, 1, "sort_tiles", "blend_forward", "blend_backward", "scan_offsets", "radix_count")
+    np.testing.assert_array_equal(image_of(Device(info, "wide"), np.random.default_rng(1)), image)

@@ -1,0 +1,341 @@
+"""`clsplat doctor` and the check that a run does once: verdicts, reports, and runtimes that die."""
+
+import io
+import json
+import sys
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+
+from clsplat import cli
+from clsplat.conformance import doctor, quick, reference, supervision
+from clsplat.conformance import worker as worker_process
+from clsplat.conformance.check import Check
+from clsplat.conformance.checks import BY_NAME, ESSENTIAL, KERNELS, SPEED, whole
+from clsplat.conformance.comparison import Figure
+from clsplat.conformance.doctor import examine
+from clsplat.conformance.page import report_page
+from clsplat.conformance.report import Report
+from clsplat.conformance.supervision import Result, supervised
+from clsplat.conformance.verdict import judge
+from clsplat.errors import DeviceError, MemoryLimitError
+from clsplat.opencl import runtimes
+from clsplat.opencl.device import Device
+from clsplat.opencl.discovery import choose, resolve_schedule, tuning_of
+from tests.conftest import NAMES
+from tests.html_page import Page
+
+WRONG = Figure("blend_backward", "gradients of conics, 17 Gaussians", 3e-2, 2e-4)
+RIGHT = Figure("blend_backward", "gradients of colours", 1e-6, 2e-4)
+SCRIPT = """
+import json, os, sys
+print("noise of a runtime", file=sys.stderr)
+for name in sys.argv[4:]:
+    print(json.dumps({"begin": name}), flush=True)
+    if name == "dies":
+        os.abort()
+    if name == "leaves":
+        sys.exit(3)
+    print(json.dumps({"figure": {"kernel": "blend_backward", "what": "x", "value": %s, "bound": 0.1, "counts": False}}))
+    print(json.dumps({"end": name, "seconds": 0.1}), flush=True)
+"""
+
+
+@pytest.fixture(scope="module")
+def info():
+    return choose(NAMES[0] or None)
+
+
+def worker(monkeypatch, value: str = "1e-6") -> None:
+    """Put a script in the place of the process that opens the device."""
+    monkeypatch.setattr(supervision, "WORKER", ("-c", SCRIPT % value))
+
+
+def checks(*names: str) -> list[Check]:
+    return [Check(name, ("blend_backward",), None) for name in names]
+
+
+def result(*figures: Figure, fault: str | None = None) -> list[Result]:
+    return [Result("a check", ("blend_backward",), 1.0, list(figures), fault=fault)]
+
+
+VERDICTS = {
+    "all is right": ({"wide": result(RIGHT), "simt": result(RIGHT)}, True, "use it"),
+    "the default is wrong": (
+        {"wide": result(WRONG), "simt": result(RIGHT)},
+        True,
+        "use it with --set rasterizer.schedule=simt: with the wide schedule, blend_backward differs by 0.03 in "
+        "gradients of conics, 17 Gaussians, bound 0.0002",
+    ),
+    "the other one is wrong": (
+        {"wide": result(RIGHT), "simt": result(WRONG)},
+        True,
+        "use it, as it is; but with the simt schedule, blend_backward differs by 0.03",
+    ),
+    "both are wrong": (
+        {"wide": result(WRONG), "simt": result(fault="the runtime ends the process with SIGABRT")},
+        False,
+        "do not use it: blend_backward differs by 0.03 in gradients of conics, 17 Gaussians, bound 0.0002; "
+        "1 more is wrong",
+    ),
+    "a sort is wrong": (
+        dict.fromkeys(("wide", "simt"), result(Figure("sort_tiles", "order of 300 pairs", 2, 0, counts=True))),
+        True,
+        "use it with --set rasterizer.sort=radix: sort_tiles gives 2 wrong values in order of 300 pairs",
+    ),
+    "not a number": (
+        {"wide": result(Figure("exp", "x", float("nan"), 1.0))},
+        False,
+        "do not use it: exp differs by nan in x",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", VERDICTS)
+def test_the_verdict_says_what_to_do(case):
+    schedules, usable, text = VERDICTS[case]
+    verdict = judge("wide", schedules, [])
+    assert verdict.usable == usable
+    assert verdict.text.startswith(text)
+    assert bool(verdict.advice) == (case != "all is right")
+
+
+def test_wrong_memory_does_not_hide_behind_right_kernels():
+    verdict = judge("wide", {"wide": result(RIGHT)}, result(Figure("fill_words", "samples", 3, 0, counts=True)))
+    assert verdict.text == "use it, as it is; but fill_words gives 3 wrong values in samples"
+
+
+def test_checks_go_on_after_a_runtime_that_ends_the_process(monkeypatch, info):
+    worker(monkeypatch)
+    results = list(supervised(info, "simt", checks("first", "dies", "second", "leaves", "third")))
+    assert [one.name for one in results] == ["first", "dies", "second", "leaves", "third"]
+    assert [one.holds for one in results] == [True, False, True, False, True]
+    assert results[1].fault == "the runtime ends the process with SIGABRT (noise of a runtime)"
+    assert results[3].fault == "the process ends with code 3 (noise of a runtime)"
+
+
+def test_a_runtime_that_hangs_is_stopped(monkeypatch, info):
+    monkeypatch.setattr(supervision, "WORKER", ("-c", "import time; time.sleep(600)"))
+    (one,) = supervised(info, "simt", checks("hangs"), 1)
+    assert one.fault == "gives no answer for 1 s"
+
+
+def test_a_file_of_the_working_folder_is_not_imported(monkeypatch, info, tmp_path, empty_cache):
+    for name in ("json.py", "hashlib.py"):
+        (tmp_path / name).write_text("raise RuntimeError('of the user')")
+    monkeypatch.setattr(runtimes, "cache_folder", lambda: tmp_path)
+    monkeypatch.chdir(tmp_path)
+    (one,) = supervised(info, resolve_schedule(info, "auto"), [BY_NAME["scans"]])
+    assert one.holds, one.fault
+    assert runtimes.fault_of("key", *info.place) is None
+
+
+@pytest.mark.parametrize(
+    ("kind", "width", "value", "schedules"),
+    [
+        ("CPU", 16, "1e-6", ["simt", "wide"]),
+        ("CPU", 1, "1e-6", ["simt"]),
+        ("CPU", 1, "0.3", ["simt", "wide"]),
+        ("GPU", 1, "0.3", ["simt"]),
+    ],
+)
+def test_wide_is_tried_where_somebody_would_use_it(monkeypatch, info, empty_cache, kind, width, value, schedules):
+    worker(monkeypatch, value)
+    device = Device(info)
+    device.info = replace(info, kind=kind, float_width=width)
+    assert list(examine(device).schedules) == schedules
+
+
+def report_of(info, **schedules: list[Result]) -> Report:
+    return Report(info, "wide", schedules, seconds=2.0)
+
+
+def test_a_report_is_json_whatever_the_values_are(info):
+    report = report_of(info, wide=result(WRONG, Figure("exp", "x", float("nan"), 1.0)))
+    data = json.loads(json.dumps(report.data(), allow_nan=False))
+    assert data["schema"] == 1
+    assert data["verdict"]["usable"] is False
+    found = data["schedules"]["wide"][0]["figures"]
+    assert [one["value"] for one in found] == [0.03, None]
+    assert not any(one["holds"] for one in found)
+    assert data["device"]["name"] == info.name
+    assert "blend_backward differs by 0.03" in report.text()
+
+
+def test_the_page_shows_every_figure_and_the_head_of_a_build_log(info):
+    broken = Result("projection", ("project_forward",), fault="project.cl does not build", log="error: <unknown>")
+    page = report_page(report_of(info, wide=[*result(WRONG, RIGHT), broken], simt=result(RIGHT)))
+    assert Page(page).text
+    for text in (info.platform, "gradients of conics, 17 Gaussians", "gradients of colours", "error: &lt;unknown&gt;"):
+        assert text in page
+
+
+@pytest.fixture
+def empty_cache(monkeypatch, tmp_path):
+    monkeypatch.setattr(quick, "cache_folder", lambda: tmp_path)
+    return tmp_path
+
+
+OTHER_BUILDS = {
+    "_hash_of_kernels": lambda: "other sources",
+    "BUILD_OPTIONS": ("-cl-std=CL1.2", "-cl-mad-enable"),
+    "tuning_of": lambda info, schedule: {**tuning_of(info, schedule), "DIGIT_BITS": 6},
+}
+
+
+def like(device, **changes):
+    return SimpleNamespace(
+        **{"info": device.info, "schedule": device.schedule, "tuning": device.tuning, "text": "x", **changes}
+    )
+
+
+@pytest.mark.parametrize(
+    ("team", "sort", "bitonic"),
+    [(1, "auto", False), (1, "radix", False), (1, "bitonic", True), (64, "auto", True), (64, "radix", False)],
+)
+def test_bitonic_is_checked_where_the_run_can_choose_it(monkeypatch, info, empty_cache, team, sort, bitonic):
+    found = []
+    monkeypatch.setattr(quick, "supervised", lambda info, schedule, checks, seconds: found.extend(checks) or [])
+    device = like(Device(info), tuning={"TEAM": team})
+    quick.ensure_correct(device, sort)
+    assert any("sort_tiles" in check.kernels for check in found) == bitonic
+    found.clear()
+    quick.ensure_correct(device, sort)
+    assert not found
+    quick.ensure_correct(device, "bitonic")
+    assert bool(found) != bitonic
+
+
+def test_no_check_of_every_run_needs_bitonic():
+    assert not {"count_pairs", "fill_tiles", "sort_tiles"} & {name for check in ESSENTIAL for name in check.kernels}
+
+
+def test_doctor_forgets_a_device_that_it_finds_wrong(monkeypatch, info, empty_cache):
+    worker(monkeypatch)
+    device = Device(info)
+    quick.ensure_correct(device)
+    worker(monkeypatch, "0.3")
+    examine(device)
+    with pytest.raises(DeviceError, match="computes wrongly"):
+        quick.ensure_correct(device)
+
+
+def test_want_of_memory_is_no_fault_of_the_device(monkeypatch, info, empty_cache):
+    def check(device, rng):
+        raise MemoryLimitError("no buffer")
+        yield
+
+    out = io.StringIO()
+    worker_process._run(out, Check("rendering", (), check), None)
+    worker_process._print(out, end="rendering", seconds=0.1)
+    monkeypatch.setattr(supervision, "WORKER", ("-c", f"print({out.getvalue()!r}, end='')"))
+    with pytest.raises(MemoryLimitError, match=r"no buffer.*other programs"):
+        quick.ensure_correct(Device(info))
+
+
+def test_the_log_says_that_a_check_begins(monkeypatch, info, empty_cache, caplog):
+    worker(monkeypatch)
+    with caplog.at_level("INFO", "clsplat"):
+        quick.ensure_correct(Device(info))
+    assert f"checking {info.name}, once for each driver" in caplog.text
+
+
+@pytest.mark.parametrize(("largest", "wrong"), [(2**30 + 4, 0), (2**28, 1), (0, 1)])
+def test_a_buffer_that_the_device_promises_and_refuses_is_wrong(monkeypatch, largest, wrong):
+    def buffer(device, size):
+        if -(-size // 64) * 64 > largest:
+            raise MemoryLimitError("no buffer")
+        yield RIGHT
+
+    monkeypatch.setattr(whole, "_buffer_figures", buffer)
+    monkeypatch.setattr(whole, "available_memory", lambda: 2**34)
+    device = SimpleNamespace(info=SimpleNamespace(memory=2**33, allocation=2**30 + 4))
+    found = [one.text for one in whole.memory(device, None) if isinstance(one, Figure) and not one.holds]
+    assert len(found) == wrong
+
+
+def test_a_device_that_computes_wrongly_is_refused(monkeypatch, info, empty_cache):
+    worker(monkeypatch, "0.3")
+    device = Device(info)
+    for _ in range(2):  # it is not remembered
+        with pytest.raises(DeviceError, match=r"computes wrongly: blend_backward differs by 0.3 .*clsplat doctor"):
+            quick.ensure_correct(device)
+
+
+def test_a_device_that_computes_rightly_is_checked_once(monkeypatch, info, empty_cache):
+    worker(monkeypatch)
+    device = Device(info)
+    before = device.allocated, device.peak, dict(device.tuning)
+    quick.ensure_correct(device)
+    monkeypatch.setattr(supervision, "WORKER", ("-c", "raise SystemExit(1)"))
+    quick.ensure_correct(device)
+    assert (device.allocated, device.peak, device.tuning) == before
+    for change in ({"driver": "another"}, {"platform": "another"}, {"name": "another"}):
+        with pytest.raises(DeviceError, match="cannot be trusted"):
+            quick.ensure_correct(like(device, info=replace(info, **change)))
+    other = Device(info, "simt" if device.schedule == "wide" else "wide")
+    with pytest.raises(DeviceError, match="cannot be trusted"):
+        quick.ensure_correct(other)
+    for name, changed in OTHER_BUILDS.items():
+        with monkeypatch.context() as patched:
+            patched.setattr(quick, name, changed)
+            with pytest.raises(DeviceError, match="cannot be trusted"):
+                quick.ensure_correct(device)
+
+
+def test_where_the_cache_cannot_be_written_a_device_is_checked_each_time(monkeypatch, info, tmp_path):
+    blocked = tmp_path / "a file"
+    blocked.write_text("")
+    monkeypatch.setattr(quick, "cache_folder", lambda: blocked)
+    started = []
+    monkeypatch.setattr(quick, "supervised", lambda *arguments: started.append(arguments) or [])
+    for _ in range(2):
+        quick.ensure_correct(Device(info))
+    assert len(started) == 2
+
+
+def test_the_two_second_form_holds(info, empty_cache):
+    quick.ensure_correct(Device(info))
+    assert len(list((empty_cache / "conformance").iterdir())) == 1
+
+
+@pytest.mark.parametrize(("value", "code"), [("1e-6", 0), ("0.3", 4)])
+def test_the_command_ends_with_4_where_a_device_computes_wrongly(monkeypatch, capsys, info, empty_cache, value, code):
+    worker(monkeypatch, value)
+    monkeypatch.setattr(sys, "argv", ["clsplat", "doctor", "--json", "--device", f"{info.platform} {info.name}"])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    out, err = capsys.readouterr()
+    assert (ended.value.code or 0) == code
+    data = json.loads(out)
+    assert data["verdict"]["usable"] == (code == 0)
+    assert len(data["schedules"]["simt"]) == len(KERNELS)
+    assert len(data["once"]) == len(SPEED)
+    if code:
+        assert "do not use it: blend_backward differs by 0.3" in err
+
+
+@pytest.mark.slow
+def test_a_device_that_is_right_is_not_refused(info, empty_cache, monkeypatch):
+    monkeypatch.setattr(doctor, "SPEED", SPEED[:1])
+    report = examine(Device(info))
+    assert report.verdict.text == "use it", report.text()
+    assert set(report.schedules) == {"wide", "simt"} if report.default == "wide" else {"simt"}
+    assert report.note("training")["steps"] == 60
+
+
+PHILOX = (  # of the paper's own test vectors: counter, key, words
+    ((0, 0, 0, 0), (0, 0), (0x6627E8D5, 0xE169C58D, 0xBC57AC4C, 0x9B00DBD8)),
+    ((0xFFFFFFFF,) * 4, (0xFFFFFFFF,) * 2, (0x408F276D, 0x41C83B0E, 0xA20BC7C6, 0x6D5451FD)),
+    (
+        (0x243F6A88, 0x85A308D3, 0x13198A2E, 0x03707344),
+        (0xA4093822, 0x299F31D0),
+        (0xD16CFE09, 0x94FDCCEB, 0x5001E420, 0x24126EA1),
+    ),
+)
+
+
+@pytest.mark.parametrize(("counter", "key", "words"), PHILOX)
+def test_the_random_numbers_of_the_reference_are_philox(counter, key, words):
+    assert reference.philox(counter, key) == words

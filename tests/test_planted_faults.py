@@ -1,0 +1,118 @@
+"""One wrong constant or sign in any kernel is caught by the checks of `clsplat doctor`."""
+
+import re
+
+import pytest
+
+from clsplat import resource_dir
+from clsplat.conformance.check import Note
+from clsplat.conformance.checks import ESSENTIAL, KERNELS, SPEED
+from clsplat.opencl import program
+from clsplat.opencl.device import Device
+from clsplat.opencl.discovery import choose
+from clsplat.opencl.program import parse_kernels
+from tests.conftest import NAMES
+
+pytestmark = pytest.mark.slow  # most programs are built anew
+
+FAULTS = {  # kernel -> file, text, wrong text
+    "adam_step": ("adam.h", "EPSILON 1.0e-15f", "EPSILON 1.0e-5f"),
+    "update_gaussians": ("adam.cl", "basis[0] * g[v].colour", "basis[1] * g[v].colour"),
+    "blend_forward wide": ("blend_wide.cl", "(p.blue + t * background[2])", "(p.blue + t * background[1])"),
+    "blend_backward wide": ("blend_wide.cl", "p.blue * VLOAD(image + 2 * plane", "p.blue * VLOAD(image + plane"),
+    "blend_forward simt": ("blend_simt.cl", "? p.red + t * background[0]", "? p.red - t * background[0]"),
+    "blend_backward simt": ("blend_simt.cl", "{m.power, m.x, m.y", "{m.power, -m.x, m.y"),
+    "blur_rows": ("blur.cl", "column <= last", "column < last"),
+    "blur_columns": ("blur.cl", "row <= last", "row < last"),
+    "count_not_finite": ("check.cl", "<= FLT_MAX", "<= INFINITY"),
+    "count_seen": ("density.cl", "seen[i] += 1.0f", "seen[i] += 1.001f"),
+    "accumulate_norm": ("density.cl", "sqrt(x * x + y * y)", "sqrt(x * x - y * y * 0.5f)"),
+    "accumulate_sum": ("density.cl", "half_height * fabs(planes[(first + 1)", "half_width * fabs(planes[(first + 1)"),
+    "accumulate_pixel_sum": ("density.cl", "pixel_sums[pixel_sum * stride", "pixel_sums[(pixel_sum - 1) * stride"),
+    "accumulate_radius": ("density.cl", "total[i] += radius[i]", "total[i] = radius[i]"),
+    "start_edit": ("density.cl", "kept[i] = 1;", "kept[i] = 0;"),
+    "mark_rule": ("density.cl", "gradient >= gradient_above", "gradient <= gradient_above"),
+    "mark_chosen": ("density.cl", "copies[i] = outcome[i] - 1", "copies[i] = outcome[i]"),
+    "list_rows": ("density.cl", "copy >= kept[i] ? 1", "copy > kept[i] ? 1"),
+    "spawn_children": ("density.cl", "2.0f * (y * z - w * x) * ez", "2.0f * (y * z + w * x) * ez"),
+    "cap_opacity": ("density.cl", "limit / sqrt(energy2)", "limit / energy2"),
+    "paint_depth": ("depth.cl", "row[2] * means[2 * stride + i]", "row[2] * means[stride + i]"),
+    "fill_words": ("fill.cl", "(uint16)(word)", "(uint16)(word & 0xfffffffeu | 2u)"),
+    "sampling_interval": ("filter.cl", "z * (1.0f / focal[view])", "z * (1.0f / focal[0])"),
+    "filter_variance": ("filter.cl", "variance * taken * taken", "variance * taken"),
+    "sum_records": ("gather.cl", "pair < first + pairs", "pair + 1 < first + pairs"),
+    "gather_rows": ("gather.cl", "zero_fresh && fresh[i]", "zero_fresh || fresh[i]"),
+    "set_rows": ("gather.cl", "values[i * components + plane]", "values[i * components]"),
+    "zero_rows": ("gather.cl", "rows[i]] = 0.0f", "rows[i]] = 1.0f"),
+    "unpack_pixels": ("loss.cl", "y < height ? pixels", "y + 1 < height ? pixels"),
+    "apply_mask": ("loss.cl", "mask[pixel] == 0.0f", "mask[pixel] != 0.0f"),
+    "pixel_loss": ("loss.cl", "(2.0f * l2)", "(1.99f * l2)"),
+    "ssim_maps": ("loss.cl", "SSIM_C2 9.0e-4f", "SSIM_C2 9.1e-4f"),
+    "ssim_gradient": ("loss.cl", "* covariance);", "* -covariance);"),
+    "emit_pairs": ("pairs.cl", "tile += tiles_x;", "tile += tiles_x - 1;"),
+    "find_tile_offsets": ("pairs.cl", "sorted_tile[pair - 1] + 1", "sorted_tile[pair - 1] + 2"),
+    "peak_fma": ("peak.cl", "c = c * m + step", "c = c * m - step"),
+    "peak_exp": ("peak.cl", "y = x - 0.5f", "y = x - 0.51f"),
+    "peak_copy": ("peak.cl", "VSTORE(VLOAD(values + i)", "VSTORE(1.0001f * VLOAD(values + i)"),
+    "covariance_trace": ("penalty.cl", "2.0f * weight", "weight"),
+    "anisotropy": ("penalty.cl", "(up - down)", "(up + down)"),
+    "project_forward": ("gaussian.h", "2.0f * (x * y - w * z)", "2.0f * (x * y + w * z)"),
+    "project_backward": ("backward.h", "energy2 = larger(1.0f + compensate", "energy2 = larger(1.0f - compensate"),
+    "scan_blocks": ("scan.cl", "total += sums[i]", "total = sums[i] + 1"),
+    "scan_offsets": ("scan.cl", "offset[count] = sum", "offset[count] = sum - 1"),
+    "permute": ("scan.cl", "values[order[place]]", "values[order[place]] + 1"),
+    "count_pairs": ("sort_bitonic.cl", "if (pair < count)\n", "if (pair + 1 < count)\n"),
+    "fill_tiles": ("sort_bitonic.cl", "= depth_key[pair_splat[pair]]", "= pair_splat[pair]"),
+    "sort_tiles": ("sort_bitonic.cl", "key > other ||", "key < other ||"),
+    "radix_count": ("sort_radix.cl", "blocks + block] = sum;", "blocks + block] = sum / 2;"),
+    "radix_scatter": ("sort_radix.cl", "first_pass ? i : values[i]", "i"),
+    "image_gradient": ("texture.cl", "0.587f * VLOAD", "0.578f * VLOAD"),
+    "hide_masked": ("texture.cl", "row <= y + 1", "row <= y"),
+    "sample_magnitude": ("texture.cl", "magnitude[row * stride + column]", "magnitude[row * stride]"),
+}  # fmt: skip
+
+
+CHECKS = [*KERNELS, *SPEED]
+
+
+def kernel_names() -> set[str]:
+    """Names of all kernels, with their schedule where each has its own."""
+    found = set()
+    for path in resource_dir("cl_kernels").glob("*.cl"):
+        own = re.search("_(wide|simt)$", path.stem)
+        found |= {f"{name} {own[1]}" if own else name for name in parse_kernels(path.read_text())}
+    return found
+
+
+def test_every_kernel_has_a_check_and_a_planted_fault():
+    checked = {kernel for check in CHECKS for kernel in check.kernels}
+    assert checked == {name.partition(" ")[0] for name in kernel_names()}
+    assert FAULTS.keys() == kernel_names()
+    assert {kernel for check in ESSENTIAL for kernel in check.kernels} < checked
+
+
+def first_failure(device: Device, kernel: str) -> str | None:
+    """The first figure beyond its bound in the checks of a kernel."""
+    for check in CHECKS:
+        for found in check.figures(device) if kernel in check.kernels else ():
+            if not isinstance(found, Note) and not found.holds:
+                return found.text
+    return None
+
+
+@pytest.mark.parametrize("planted", FAULTS)
+def test_a_planted_fault_is_caught(monkeypatch, planted):
+    """The sources on disk stay as they are: the text is changed on its way to the compiler."""
+    file, text, wrong = FAULTS[planted]
+    assert (resource_dir("cl_kernels") / file).read_text().count(text) == 1, "the place of the fault is not unique"
+    flatten = program.flatten
+
+    def with_the_fault(path, seen=None):
+        flat = flatten(path, seen)
+        return flat.replace(text, wrong) if path.name == file else flat
+
+    monkeypatch.setattr(program, "flatten", with_the_fault)
+    kernel, _, schedule = planted.partition(" ")
+    device = Device(choose(NAMES[0] or None), schedule or "auto")
+    failure = first_failure(device, kernel)
+    assert failure, f"a fault in {kernel} goes unnoticed"

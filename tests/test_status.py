@@ -1,0 +1,292 @@
+"""status.json: every one fits its schema, it has a heartbeat, and it never disturbs a run."""
+
+import gc
+import json
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+import jsonschema
+import pytest
+
+import clsplat
+from clsplat import processes
+from clsplat.errors import ClsplatError, OutputError
+from clsplat.files import write_text
+from clsplat.runs import status as reading
+from clsplat.runs.experiment import Job
+from clsplat.training import status as writing
+from clsplat.training.status import Amount, StatusFile
+from tests.test_training import digest, train
+
+pytestmark = pytest.mark.slow
+
+SCHEMA = clsplat.status_schema()
+MATRIX = "name: two\nmatrix:\n  pipelines: [smoke]\n  seeds: [1, 2]\n"
+
+
+@pytest.fixture
+def written(monkeypatch):
+    """Every status that is written, in order: each one that there is, and fast heartbeats."""
+    texts: list[dict] = []
+    note = StatusFile.note
+
+    def note_and_write(status: StatusFile, **values) -> None:
+        note(status, **values)
+        status.refresh()
+
+    def write(path: Path, text: str) -> None:
+        texts.append(json.loads(text))
+        write_text(path, text)
+
+    monkeypatch.setattr(writing, "write_text", write)
+    monkeypatch.setattr(writing, "BEAT", 0.002)
+    monkeypatch.setattr(StatusFile, "note", note_and_write)
+    return texts
+
+
+def until(holds) -> None:
+    """Wait for something that another thread does."""
+    for _ in range(2000):
+        if holds():
+            return
+        time.sleep(0.01)
+    pytest.fail("it did not happen")
+
+
+def in_order(items: list) -> list:
+    return [item for i, item in enumerate(items) if i == 0 or item != items[i - 1]]
+
+
+def test_every_status_of_a_run_fits_the_schema(written, tiny_scene, tmp_path):
+    clsplat.run("smoke", tiny_scene, tmp_path / "run")
+    for status in written:
+        jsonschema.validate(status, SCHEMA)
+    assert in_order([status["state"] for status in written]) == ["starting", "preparing", "running", "done"]
+    stages = in_order([status.get("stage") for status in written])
+    assert stages[0] is None
+    assert {"init", "optimize", "densify", "checkpoint", "evaluate", "export", "render", "report"} <= set(stages)
+    training = [s["progress"] for s in written if s.get("stage") == "optimize" and s.get("progress")]
+    assert [amount["done"] for amount in training] == sorted(amount["done"] for amount in training)
+    assert {(amount["total"], amount["unit"]) for amount in training} == {(50, "steps")}
+    last = written[-1]
+    assert (last["exit_code"], last["step"], last["steps"], last["stage"]) == (0, 50, 50, "report")
+    assert last["device"]
+    assert last["version"] == clsplat.__version__
+    assert "seconds_left" not in last
+
+
+@pytest.mark.parametrize(
+    ("failure", "state", "code"), [(OutputError("no space"), "failed", 7), (KeyboardInterrupt(), "interrupted", 130)]
+)
+def test_a_run_that_ends_early_names_the_stage_and_fits_the_schema(
+    failure, state, code, written, tiny_scene, tmp_path, monkeypatch
+):
+    def fail(*arguments):
+        raise failure
+
+    monkeypatch.setattr("clsplat.stages.evaluate.measure", fail)
+    with pytest.raises(ClsplatError):
+        clsplat.run("smoke", tiny_scene, tmp_path / "run")
+    for status in written:
+        jsonschema.validate(status, SCHEMA)
+    last = written[-1]
+    assert (last["state"], last["exit_code"], last["stage"]) == (state, code, "evaluate")
+    assert last["message"]
+    assert last["step"] > 0
+
+
+def test_every_status_of_a_matrix_fits_the_schema(written, tiny_scene, tmp_path):
+    file = tmp_path / "two.yaml"
+    file.write_text(MATRIX)
+    Job.open(str(file), tiny_scene, tmp_path / "out").run()
+    for status in written:
+        jsonschema.validate(status, SCHEMA)
+    whole = [status for status in written if "cells" in status]
+    assert in_order([status["state"] for status in whole]) == ["starting", "running", "done"]
+    assert in_order([status["done"] for status in whole]) == [0, 1, 2]
+    assert len({status.get("stage") for status in whole} - {None}) == 2, "the names of the cells"
+    assert whole[-1]["progress"] == {"done": 2, "total": 2, "unit": "cells"}
+
+
+def test_steps_of_the_preparation_are_stages(written, tmp_path):
+    from clsplat.prepare.cache import Planned, prepare
+    from clsplat.prepare.steps import Step
+
+    class Wait(Step):
+        def make(self, source: Path, out: Path, without: Path) -> dict:
+            seen = len(written)
+            until(lambda: len(written) > seen + 1)
+            return {}
+
+    status = StatusFile(tmp_path)
+    status.begin()
+    status.enter("preparing")
+    planned = [Planned(Wait(stage="wait"), "", "", tmp_path / "prepared" / "wait", "no result yet")]
+    prepare(planned, tmp_path, tmp_path / "prepared", status.stage)
+    status.end("done", 0)
+    assert ("preparing", "wait") in {(one["state"], one.get("stage")) for one in written}
+
+
+def test_the_heart_beats_while_nothing_else_happens(written, tmp_path):
+    status = StatusFile(tmp_path)
+    status.begin()
+    until(lambda: len(written) > 3)
+    times = [one["time"] for one in written]
+    assert times == sorted(set(times))
+    assert len({one["changed"] for one in written}) == 1
+    status.end("done", 0)
+
+
+def test_nothing_is_written_after_the_end(tmp_path, monkeypatch):
+    """A heartbeat that is being written when a run ends does not stay."""
+    monkeypatch.setattr(writing, "BEAT", 0.001)
+    waiting, go_on = threading.Event(), threading.Event()
+    main = threading.current_thread()
+
+    def write(path: Path, text: str) -> None:
+        if threading.current_thread() is not main:
+            waiting.set()
+            go_on.wait(20)
+        write_text(path, text)
+
+    monkeypatch.setattr(writing, "write_text", write)
+    status = StatusFile(tmp_path)
+    status.begin()
+    assert waiting.wait(20)
+    threading.Timer(0.05, go_on.set).start()
+    status.end("failed", 3, "no")
+    until(lambda: not status._thread.is_alive())
+    assert json.loads((tmp_path / "status.json").read_text())["state"] == "failed"
+
+
+def test_a_full_disk_does_not_stop_a_run(tiny_scene, tmp_path, monkeypatch, caplog):
+    def write(path: Path, text: str) -> None:
+        if json.loads(text)["state"] in ("preparing", "running"):
+            raise OutputError(f"{path}: cannot be written (No space left on device)")
+        write_text(path, text)
+
+    monkeypatch.setattr(writing, "write_text", write)
+    monkeypatch.setattr(writing, "BEAT", 0.002)
+    clsplat.run("smoke", tiny_scene, tmp_path / "run")
+    assert json.loads((tmp_path / "run" / "status.json").read_text())["state"] == "done"
+    assert [m for m in caplog.messages if "status.json" in m] == [
+        f"{tmp_path / 'run' / 'status.json'}: cannot be written (No space left on device); the run goes on"
+    ]
+
+
+def test_a_heartbeat_changes_no_bit(tiny_scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(writing, "BEAT", 1000.0)
+    train(tiny_scene, tmp_path / "slow")
+    monkeypatch.setattr(writing, "BEAT", 0.0005)
+    train(tiny_scene, tmp_path / "fast")
+    assert digest(tmp_path / "slow") == digest(tmp_path / "fast")
+
+
+def test_a_folder_that_was_removed_stays_removed(written, tmp_path):
+    status = StatusFile(tmp_path / "run")
+    status.begin()
+    (tmp_path / "gone").mkdir()
+    (tmp_path / "run").rename(tmp_path / "gone" / "run")
+    seen = len(written)
+    status.refresh()
+    assert len(written) <= seen + 1  # one may have been on its way
+    assert not (tmp_path / "run").exists()
+    status._ended.set()
+
+
+def test_a_run_that_nobody_holds_has_no_heartbeat(written, tmp_path):
+    status = StatusFile(tmp_path)
+    status.begin()
+    thread = status._thread
+    del status
+    gc.collect()
+    until(lambda: not thread.is_alive())
+
+
+def put(folder: Path, **values) -> dict:
+    """Write a status of a run whose process has ended, and return what is found."""
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    now = StatusFile(folder, step=7, steps=9).now.model_copy(
+        update={"state": "running", "process": gone.pid, "time": time.time() - 200, **values}
+    )
+    (folder / "status.json").write_text(json.dumps(now.model_dump(exclude_none=True)))
+    return reading.run_status(folder)
+
+
+def test_a_process_that_is_gone_was_killed(tmp_path):
+    found = put(tmp_path)
+    assert found["state"] == "killed"
+    assert "silent" not in found
+
+
+@pytest.mark.parametrize("elsewhere", [{"host": "another"}, {"pid_namespace": "pid:[1]"}])
+def test_a_run_elsewhere_is_judged_by_its_heartbeat_alone(elsewhere, tmp_path):
+    found = put(tmp_path, **elsewhere)
+    assert found["state"] == "running"
+    assert 199 < found["silent"] < 300
+    place = f"it runs on {elsewhere.get('host', StatusFile(tmp_path).now.host)}"
+    assert f"\n  no sign of life for {found['silent']} s; {place}" in reading.status_text(found)
+    assert "no sign" not in reading.status_text(put(tmp_path, time=time.time() - 2, **elsewhere))
+
+
+def test_a_process_that_is_stopped_shows_no_sign_of_life(tmp_path):
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as process:
+        found = put(tmp_path, process=process.pid)
+        process.communicate(b"\n")
+    assert f"no sign of life for {found['silent']} s; process {process.pid}" in reading.status_text(found)
+
+
+def test_the_lines_name_the_stage_and_what_is_left(tmp_path):
+    amount = Amount(done=3, total=20, unit="views")
+    found = put(tmp_path, host="a", time=time.time(), stage="evaluate", progress=amount, seconds_left=71.6)
+    assert reading.status_text(found).splitlines()[0] == (
+        f"{tmp_path}: running at step 7 of 9, evaluate, 3 of 20 views, 72 s left"
+    )
+
+
+def test_a_clock_that_is_late_gives_no_negative_time(tmp_path):
+    assert put(tmp_path, host="a", time=time.time() + 100)["silent"] == 0
+
+
+class Function:
+    """A function of a Windows library, which takes the type of its result."""
+
+    def __init__(self, call) -> None:
+        self.call = call
+
+    def __call__(self, *arguments):
+        return self.call(*arguments)
+
+
+@pytest.mark.parametrize(
+    ("code", "error", "alive"), [(259, 0, True), (1, 0, False), (None, 87, False), (None, 5, True)]
+)
+def test_a_process_of_windows_is_probed_without_ending_it(code, error, alive, monkeypatch):
+    """As Windows answers: the exit code of a process, or the error where there is none or it is another user's."""
+    handles: list[int] = []
+
+    def opened(rights, inherited, process):
+        if code is not None:
+            handles.append(process)
+        return process if code is not None else None
+
+    def asked(handle, place):
+        place._obj.value = code
+        return 1
+
+    kernel = SimpleNamespace(
+        OpenProcess=Function(opened),
+        GetExitCodeProcess=Function(asked),
+        CloseHandle=Function(lambda handle: handles.remove(handle.value)),
+    )
+    monkeypatch.setattr(sys, "platform", "win32")
+    monkeypatch.setattr(processes.ctypes, "WinDLL", lambda name, use_last_error: kernel, raising=False)
+    monkeypatch.setattr(processes.ctypes, "get_last_error", lambda: error, raising=False)
+    monkeypatch.setattr(processes.os, "kill", lambda *arguments: pytest.fail("it would end the process"))
+    assert processes.is_alive(1234) is alive
+    assert handles == [], "the handle is closed"

@@ -1,0 +1,93 @@
+"""The long form of the tests of what must not be lost: `make torture`, an hour and more on two cores.
+
+    python -m tests.torture [--kills 1000] [--inputs 100000] [--write]
+
+With `--write` the table goes to docs/reliability.md.  Exit code 1 where a line of it does not hold.
+"""
+
+import argparse
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from clsplat import __version__
+from data_tools.synthetic import Options, write_dataset
+from tests.torture.kills import kills
+
+ROOT = Path(__file__).parents[2]
+PAGE = ROOT / "docs" / "reliability.md"
+BEGIN, END = "<!-- torture: begin -->", "<!-- torture: end -->"
+
+
+@dataclass(frozen=True)
+class Row:
+    """A line of the table."""
+
+    what: str
+    cases: int
+    result: str
+    holds: bool
+    seconds: float
+
+    @property
+    def text(self) -> str:
+        return f"| {self.what} | {self.cases:,} | {self.result} | {self.seconds / 60:.0f} min |"
+
+
+def killed(count: int, folder: Path) -> Row:
+    """`kill -9` at random moments of runs on a tiny scene."""
+    start, scene = time.perf_counter(), folder / "scene"
+    write_dataset(scene, Options(size=40, train=8, test=2, seed=0), workers=1)
+    for tally in kills(scene, folder / "runs", count):
+        print(f"\r{dict(tally)}", end="", flush=True)
+    print()
+    result = (
+        f"{tally['equal']} of {tally['finished']} runs ended with the undisturbed bits; "
+        f"{tally['in a write']} kills met a write"
+    )
+    holds = tally["equal"] == tally["finished"] > 0
+    return Row(
+        "`kill -9` at a random moment, then resumed", tally["killed"], result, holds, time.perf_counter() - start
+    )
+
+
+def tested(what: str, count: int, *arguments: str) -> Row:
+    """Tests with many more examples than in the suite: CLSPLAT_FUZZ of each."""
+    start = time.perf_counter()
+    environment = {**os.environ, "CLSPLAT_FUZZ": str(count)}
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *arguments]
+    end = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
+    last = (end.stdout.strip().splitlines() or [end.stderr.strip()])[-1]
+    if end.returncode:
+        print(end.stdout[-4000:])
+    return Row(what, count, last, end.returncode == 0, time.perf_counter() - start)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="python -m tests.torture", description=__doc__.splitlines()[0])
+    parser.add_argument("--kills", type=int, default=1000, help="number of kills")
+    parser.add_argument("--inputs", type=int, default=100_000, help="number of damaged inputs of each reader")
+    parser.add_argument("--write", action="store_true", help="write the table to docs/reliability.md")
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        rows = [killed(options.kills, Path(folder))]
+    rows.append(tested("damaged inputs, for each reader", options.inputs, "tests/fuzz"))
+    every = ("tests/test_checkpoints.py", "-k", "whichever_write")
+    rows.append(tested("a write that fails, every one of a run", 1, *every))
+    table = "\n".join(["| what | cases | seen | time |", "|---|---|---|---|", *(row.text for row in rows)])
+    print(table)
+    if options.write:
+        head, _, rest = PAGE.read_text().partition(BEGIN)
+        tail = rest.partition(END)[2]
+        place = f"clsplat {__version__}, Python {platform.python_version()}, {platform.system()} {platform.machine()}"
+        PAGE.write_text(f"{head}{BEGIN}\n{place}:\n\n{table}\n{END}{tail}")
+    return 0 if all(row.holds for row in rows) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
