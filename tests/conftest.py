@@ -7,7 +7,7 @@ that clsplat would choose), each with the wide schedule at 16 and 8 lanes and wi
 import os
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +45,14 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             parameters = item.callspec.params if hasattr(item, "callspec") else {}
             cases.setdefault((item.nodeid.partition("[")[0], parameters.get("device")), []).append(item)
         items[:] = [same[len(same) // 2] for same in cases.values()]
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport() -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Make what a test has printed UTF-8: processes that share the tests send it to each other."""
+    report = yield
+    report.sections = [(name, text.encode("utf-8", "replace").decode()) for name, text in report.sections]
+    return report
 
 
 @pytest.fixture(
