@@ -4,10 +4,27 @@
  * pair has one writer. */
 #include "tiles.h"
 
+/* Fill the places up to `end`, behind the pairs of a splat from `first` to `pair`, with tiles of the band that those do
+ * not name, so that no tile lists the splat twice.  Blending finds no pixel of it there. */
+static inline void fill_up(const uint first, const uint pair, const uint end, const uint i,
+                           __global uint *pair_tile, __global uint *pair_splat, const uint tiles_x,
+                           const uint row_begin, const uint row_end)
+{
+    const uint last = row_end * tiles_x - 1;
+    uint listed = first, place = pair;
+    for (uint tile = row_begin * tiles_x; place < end; tile++)
+        if (listed < pair && pair_tile[listed] == tile) {
+            listed++;
+        } else {
+            pair_tile[place] = tile < last ? tile : last;  // a count beyond the band stays inside it
+            pair_splat[place] = i;
+            place++;
+        }
+}
+
 /* Emit the pairs up to `end` of a rectangle too large for a mask: its tiles are tested again, as in count_tiles.  That
- * is another program, whose compiler may round differently at a tile's edge: a tile that is not touched is listed where
- * too few would follow otherwise.  Blending finds no pixel there. */
-static inline void emit_large(__global const float *splat, uint pair, const uint end, const uint i,
+ * is another program, whose compiler may round differently at a tile's edge and count a tile more or less. */
+static inline void emit_large(__global const float *splat, const uint first, const uint end, const uint i,
                               __global uint *pair_tile, __global uint *pair_splat, const uint tiles_x,
                               const uint row_begin, const uint row_end)
 {
@@ -20,18 +37,15 @@ static inline void emit_large(__global const float *splat, uint pair, const uint
     VSTORE(f.first_y, first_y);
     VSTORE(f.columns, columns);
     VSTORE(f.rows, rows);
-    uint left = (uint)rows[0] * (uint)columns[0];  // tiles of the rectangle from here on
+    uint pair = first;
     for (uint row = 0; row < (uint)rows[0]; row++)
-        for (uint column = 0; column < (uint)columns[0] && pair < end; column++, left--)
-            if (left <= end - pair || ANY(touches_tile(&f, (float)column, (float)row))) {
+        for (uint column = 0; column < (uint)columns[0] && pair < end; column++)
+            if (ANY(touches_tile(&f, (float)column, (float)row))) {
                 pair_tile[pair] = ((uint)first_y[0] + row) * tiles_x + (uint)first_x[0] + column;
                 pair_splat[pair] = i;
                 pair++;
             }
-    for (; pair < end; pair++) {  // a rectangle with fewer tiles than were counted: any tile of the band
-        pair_tile[pair] = row_begin * tiles_x;
-        pair_splat[pair] = i;
-    }
+    fill_up(first, pair, end, i, pair_tile, pair_splat, tiles_x, row_begin, row_end);
 }
 
 /* One item = one place of `order`.  No local memory. */

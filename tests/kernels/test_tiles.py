@@ -83,8 +83,6 @@ def test_large_splats_list_as_many_tiles_as_were_counted(device, rng, surplus):
     touched = [set(_emitted(device, frame, box, mask, count)[n]) for n in range(12)]
     large = (count > 0) & (box >> 24 == 0)
     assert large.any()
-    plenty = np.where(large, camera.tiles + 1, count).astype(np.uint32)
-    rectangle = [set(tiles) - {0} for tiles in _emitted(device, frame, box, mask, plenty)]
     counted = np.where(large, np.maximum(1, count.astype(int) + surplus), count).astype(np.uint32)
     for n, tiles in enumerate(_emitted(device, frame, box, mask, counted)):
         assert len(tiles) == counted[n]
@@ -93,7 +91,46 @@ def test_large_splats_list_as_many_tiles_as_were_counted(device, rng, surplus):
             assert set(tiles) <= touched[n]
         else:
             assert set(tiles) >= touched[n]
-        assert len(set(tiles)) >= min(len(tiles), len(rectangle[n]))
+        assert len(set(tiles)) == min(len(tiles), camera.tiles)
+
+
+@pytest.mark.parametrize("sort", ["radix", "bitonic"])
+@pytest.mark.parametrize("surplus", [-1, 1])
+def test_a_large_splat_that_was_counted_wrongly_is_blended_once(device, rng, monkeypatch, sort, surplus):
+    """It fills its rectangle at the left edge: the surplus place names a tile outside, where it adds nothing."""
+    case = random_case(rng, 12, 400, 300)
+    pose = case.view.world_to_camera
+    case.parameters["means"][0] = ([-0.8, 0, 1.5] - pose[:, 3]) @ pose[:, :3]
+    case.parameters["quats"][0], case.parameters["logit_opacity"][0] = [1, 0, 0, 0], 3
+    case.parameters["log_scales"][0] = [-2, 2, -4]
+    model, camera = case.model(device), case.device_camera(device)
+    rasterizer = Rasterizer(device, sort)
+    build = rasterizer.tiler.build
+    gradient = device.upload(rng.normal(0, 1, (3, camera.rows, camera.stride)).astype(np.float32))
+    expected = rasterizer.forward(model, camera, device.zeros(3))
+    image, pairs = expected.image.get(), expected.lists.pairs
+    sums = rasterizer.pixel_sums(model, expected, gradient).get()[:, :12]
+
+    def miscounted(splats, footprints, *others):
+        count = footprints.tile_count.get()
+        assert count[0] > 32
+        count[0] = int(count[0]) + surplus
+        footprints.tile_count.set(count)
+        return build(splats, footprints, *others)
+
+    monkeypatch.setattr(rasterizer.tiler, "build", miscounted)
+    frame = rasterizer.forward(model, camera, device.zeros(3))
+    lists = frame.lists
+    assert lists.pairs == pairs + surplus
+    tile = np.repeat(np.arange(frame.camera.tiles), np.diff(lists.tile_offset.get()))
+    names = np.stack([tile, lists.pair_splat.get()[lists.tile_pairs.get()]])
+    assert len(np.unique(names, axis=1)[0]) == lists.pairs
+    if surplus > 0:
+        np.testing.assert_array_equal(frame.image.get(), image)
+        np.testing.assert_array_equal(rasterizer.pixel_sums(model, frame, gradient).get()[:, :12], sums)
+    else:
+        changed = (frame.image.get() != image).any(axis=0).reshape(camera.tiles_y, camera.tile, camera.tiles_x, -1)
+        assert changed.any(axis=(1, 3)).sum() <= 1  # the tile that is missing
 
 
 def _emitted(device, frame, box, mask, count):
