@@ -81,7 +81,7 @@ def test_large_splats_list_as_many_tiles_as_were_counted(device, rng, surplus):
     camera, array = frame.camera, rasterizer.workspace._arrays
     box, mask, count = (array[name].get()[:12] for name in ("tile_box", "tile_mask", "tile_count"))
     touched = [set(_emitted(device, frame, box, mask, count)[n]) for n in range(12)]
-    large = (count > 0) & (box >> 24 == 0)
+    large = (count > 0) & (box >> 24 == 33)
     assert large.any()
     counted = np.where(large, np.maximum(1, count.astype(int) + surplus), count).astype(np.uint32)
     for n, tiles in enumerate(_emitted(device, frame, box, mask, counted)):
@@ -105,20 +105,22 @@ def test_a_large_splat_that_was_counted_wrongly_is_blended_once(device, rng, mon
     case.parameters["log_scales"][0] = [-2, 2, -4]
     model, camera = case.model(device), case.device_camera(device)
     rasterizer = Rasterizer(device, sort)
-    build = rasterizer.tiler.build
     gradient = device.upload(rng.normal(0, 1, (3, camera.rows, camera.stride)).astype(np.float32))
     expected = rasterizer.forward(model, camera, device.zeros(3))
     image, pairs = expected.image.get(), expected.lists.pairs
     sums = rasterizer.pixel_sums(model, expected, gradient).get()[:, :12]
 
-    def miscounted(splats, footprints, *others):
-        count = footprints.tile_count.get()
+    kernels = rasterizer.tiler._large.kernels
+    correct = kernels["count_large"]
+
+    def miscount(**values):
+        correct(**values)
+        count = values["tile_count"].get()
         assert count[0] > 32
         count[0] = int(count[0]) + surplus
-        footprints.tile_count.set(count)
-        return build(splats, footprints, *others)
+        values["tile_count"].set(count)
 
-    monkeypatch.setattr(rasterizer.tiler, "build", miscounted)
+    monkeypatch.setitem(kernels, "count_large", miscount)
     frame = rasterizer.forward(model, camera, device.zeros(3))
     lists = frame.lists
     assert lists.pairs == pairs + surplus
@@ -138,20 +140,26 @@ def _emitted(device, frame, box, mask, count):
     offset = np.concatenate([[0], np.cumsum(count)]).astype(np.uint32)
     guarded, untouched = int(offset[-1]) + 64, np.uint32(0xDEADBEEF)
     pair_tile, pair_splat = (device.upload(np.full(guarded, untouched)) for _ in range(2))
+    first_pair = device.zeros(len(count), np.uint32)
+    written = {"first_pair": first_pair, "pair_tile": pair_tile, "pair_splat": pair_splat}
+    size = {"tile_box": device.upload(box), "tiles_x": frame.camera.tiles_x, "count": len(count)}
     device.program("pairs.cl").emit_pairs(
         items=len(count),
-        splats=frame.splats,
-        tile_box=device.upload(box),
         tile_mask=device.upload(mask),
         order=device.upload(np.arange(len(count), dtype=np.uint32)),
         pair_offset=device.upload(offset),
-        pair_tile=pair_tile,
-        pair_splat=pair_splat,
-        first_pair=device.zeros(len(count), np.uint32),
-        tiles_x=frame.camera.tiles_x,
+        **written,
+        **size,
+    )
+    device.program("large.cl").emit_large(
+        groups=1,
+        splats=frame.splats,
+        tile_count=device.upload(count),
         row_begin=0,
         row_end=frame.camera.tiles_y,
-        count=len(count),
+        run=len(count),
+        **written,
+        **size,
     )
     tiles, splats = pair_tile.get(), pair_splat.get()
     assert (tiles[offset[-1] :] == untouched).all()
