@@ -73,8 +73,11 @@ class Stage(Settings):
         """Read back what the stage has written.  Raises DataError where it is missing or damaged."""
 
     def act(self, run: Run) -> None:
-        """Run the stage, under its name in status.json; what fails inside of an edit leaves a run that is not whole."""
-        with run.status.stage(self.stage), run.changing() if self.edits else nullcontext():
+        """Run the stage, under its name in status.json; what fails inside of an edit leaves a run that is not whole.
+
+        A stage that fails is repeated from its beginning when the run goes on, so that its records do not stay.
+        """
+        with run.status.stage(self.stage), run.changing() if self.edits else nullcontext(), run.records.of_a_stage():
             self.run(run)
 
 

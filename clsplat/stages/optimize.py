@@ -82,6 +82,10 @@ class Optimize(Stage):
         for _ in self.iterate(run):
             pass
 
+    def act(self, run: Run) -> None:
+        with run.status.stage(self.stage):  # it goes on in its middle, so that its records stay
+            self.run(run)
+
     def iterate(self, run: Run) -> Iterator[ViewGradients]:
         """Train step by step; the gradients that a step yields are valid until the next."""
         trainer, sampler = self._trainer(run), Sampler(run.scene.split("train"), self.views, run.seed)
@@ -233,6 +237,7 @@ class Optimize(Stage):
         run.records.add(run.step, "train", loss=loss, psnr=psnr, gaussians=count, ms=1e3 * seconds, stages=stages)
         if run.step % (DISTRIBUTION_INTERVAL * self.log_every) == 0 or run.step == last_step:
             run.records.add(run.step, "distribution", gaussians=count, **distribution(run.model.gaussians))
+        run.records.write()
         left = seconds * (last_step - run.step)
         run.status.note(gaussians=count, seconds_left=round(left, 1))
         run.show(Progress(run.step, last_step, loss, psnr, count, 1e3 * seconds, left))

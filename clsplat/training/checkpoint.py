@@ -158,7 +158,7 @@ def drop_later(out: Path, taken: Path | None) -> None:
 
 
 def _write(run: Run, kind: str) -> Path:
-    model = run.model
+    run.records.write()  # the state counts them
     state = State(
         format=FORMAT,
         version=__version__,
@@ -167,8 +167,8 @@ def _write(run: Run, kind: str) -> Path:
         stage_step=run.stage_step,
         acted=run.acted,
         edited=run.edited,
-        degree=model.degree,
-        zero_fresh=[name for name, table in model.gaussians.tables.items() if table.zero_fresh],
+        degree=run.model.degree,
+        zero_fresh=[name for name, table in run.model.gaussians.tables.items() if table.zero_fresh],
         updates=run.adam.updates if run.adam else {},
         train_seconds=run.train_seconds,
         metrics=run.metrics,
@@ -180,7 +180,7 @@ def _write(run: Run, kind: str) -> Path:
     )
     path = run.out / FOLDER / f"{kind}_{run.step:06d}.npz"
     with atomic(path) as file:
-        tables = ((_key(name), model.gaussians.get(name)) for name in model.gaussians.tables)
+        tables = ((_key(name), run.model.gaussians.get(name)) for name in run.model.gaussians.tables)
         archive.write(file, state.model_dump(), tables)
     return path
 
