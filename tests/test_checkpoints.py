@@ -10,7 +10,6 @@ import re
 import shutil
 import zipfile
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -461,57 +460,9 @@ def test_a_state_that_cannot_be_saved_does_not_hide_the_failure(tiny_scene, tmp_
     assert "could not be saved (the disk is full); the last good state is " in caplog.text
 
 
-# The n-th write fails
-
-
-class Faults:
-    """Lets one call of a function that writes fail."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, at: int, number: int) -> None:
-        self.count, self.at, self.number = 0, at, number
-        for place in ("fsync", "replace"):
-            monkeypatch.setattr(os, place, self._failing(getattr(os, place)))
-
-    def _failing(self, function: Callable) -> Callable:
-        def call(*arguments, **values):
-            self.count += 1
-            if self.count == self.at:
-                raise OSError(self.number, os.strerror(self.number))
-            return function(*arguments, **values)
-
-        return call
-
-
-SPARED = 1 if "CLSPLAT_FUZZ" in os.environ else 4  # `make torture` tries every write
-TINY = ("optimize.steps=4", "init.count=20", "checkpoint.every=2", "optimize.log_every=2", "optimize.evaluate.every=3")
-
-
-@pytest.mark.parametrize("first", [1, 2, 3])
-def test_whichever_write_fails_nothing_is_lost(first, tiny_scene, tmp_path_factory, monkeypatch):
-    base = tmp_path_factory.mktemp("writes")
-    with monkeypatch.context() as patch:
-        faults = Faults(patch, 0, 0)
-        train(tiny_scene, base / "whole", *TINY)
-        total = faults.count
-    assert total > 30
-    whole = model(base / "whole")
-    for at in range(first, total + 1, 3 * SPARED):
-        out = base / str(at)
-        with monkeypatch.context() as patch:
-            Faults(patch, at, (errno.ENOSPC, errno.EIO)[at % 2])
-            with suppress(OutputError):  # some failures are not the run's
-                train(tiny_scene, out, *TINY)
-        for file in (out / "checkpoints").glob("*.npz") if out.exists() else ():
-            checkpoint.load(file)
-        assert not list(out.rglob("*.partial")), at
-        train(tiny_scene, out, *TINY, resume=True)
-        assert model(out) == whole, at
-        assert json.loads((out / "status.json").read_text())["state"] == "done"
-
-
 def test_restoring_reads_no_other_run(tiny_scene, tmp_path):
     """A folder with checkpoints and no pipeline.yaml is a run too."""
-    train(tiny_scene, tmp_path, *TINY)
+    train(tiny_scene, tmp_path, *FEW)
     (tmp_path / "pipeline.yaml").unlink()
     with pytest.raises(ConfigError, match="already holds a run; give another folder, --resume or --restart"):
         folders.make_run_folder(tmp_path, resume=False)
