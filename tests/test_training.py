@@ -17,7 +17,7 @@ from clsplat.errors import ConfigError, DataError, Interrupted, NumericError
 from clsplat.gaussians.ply import read_ply, write_ply
 from clsplat.pipeline.loading import load
 from clsplat.runs import folders, opening, runner
-from clsplat.training import changes, checkpoint
+from clsplat.training import checkpoint
 from clsplat.training.run import Progress, Run
 from clsplat.views.sampling import Sampler
 from tests.onnx_writer import distance_network
@@ -224,10 +224,3 @@ def test_views_come_in_random_order_without_repeats(tiny_scene, tmp_path):
     for epoch in epochs:
         assert len(set(epoch)) == 8
     assert epochs[0] != epochs[1] != epochs[2]
-
-
-def test_first_difference():
-    old = {"a": 1, "b": {"c": [1, {"d": 2}]}}
-    assert changes.first_difference(old, old) is None
-    assert str(changes.first_difference(old, {"a": 1, "b": {"c": [1, {"d": 3}]}})) == "b.c[1].d was 2, is 3"
-    assert changes.first_difference(old, {"a": 1}) is not None

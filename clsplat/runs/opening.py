@@ -112,6 +112,7 @@ def make_run(pipeline: Pipeline, scene: Scene, device: Device, out: Path, status
         out=out,
         name=settings.name,
         seed=settings.seed,
+        settings=settings,
         pipeline=pipeline.resolved(),
         rasterizer=Rasterizer(device, settings.rasterizer.sort, settings.rasterizer.budget()),
         photographs=Photographs(device, background, None if budget is None else budget << 20, out / "undistorted"),

@@ -13,6 +13,8 @@ from clsplat.names import fault_of_output
 from clsplat.settings import Settings
 from clsplat.training.run import Run
 
+CADENCE = frozenset({"every", "start", "stop"})
+
 
 @dataclass(frozen=True)
 class PathInRun(AfterValidator):
@@ -86,6 +88,8 @@ class Scheduled(Stage):
 
     It runs at every step that is a multiple of `every`, after `start` and before `stop`.
     """
+
+    training_keys: ClassVar[frozenset[str]] = CADENCE
 
     every: Annotated[int, Field(gt=0)] | None = None
     """Steps from one run of the stage to the next; inside `during` only."""

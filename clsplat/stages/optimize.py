@@ -42,6 +42,8 @@ class Optimize(Stage):
     stage: Literal["optimize"] = "optimize"
     needs: ClassVar[frozenset[str]] = frozenset({"model"})
     makes: ClassVar[frozenset[str]] = frozenset({"adam", "stats"})
+    output_keys: ClassVar[frozenset[str]] = frozenset({"log_every"})
+    training_keys: ClassVar[frozenset[str]] = frozenset({"steps", "rates"})
 
     steps: Annotated[int, Field(gt=0)]
     """Number of training steps."""

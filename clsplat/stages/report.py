@@ -29,6 +29,7 @@ class Report(Stage):
 
     stage: Literal["report"] = "report"
     needs: ClassVar[frozenset[str]] = frozenset({"model", "metrics"})
+    output_keys: ClassVar[frozenset[str]] = frozenset({"file"})
 
     file: Annotated[str, path_in_run(".html")] = "report.html"
     """Path inside the run folder."""

@@ -213,12 +213,12 @@ def _take_changes(run: Run, path: Path, state: State) -> None:
     before = state.pipeline
     if run.inputs and state.inputs == run.inputs:  # the same scene, wherever it lies now
         before = {**before, "scene": {**before["scene"], "path": run.pipeline["scene"]["path"]}}
-    for difference in differences(before, run.pipeline):
-        if difference.of_outputs:
+    for difference in differences(before, run.pipeline, run.settings):
+        if difference.kind == "output":
             continue
-        if difference.stage is None:
+        if difference.kind is None:
             raise ConfigError(f"{path} was made with other settings: {difference}; {remedy}")
-        if difference.stage < state.cursor:
+        if difference.stage is not None and difference.stage < state.cursor:
             raise ConfigError(f"{path} was saved after that stage, at step {state.step}: {difference}; {remedy}")
         changed.append(f"step {state.step}: {difference}")
     run.changes = [*state.changes, *changed]

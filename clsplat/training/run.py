@@ -18,6 +18,7 @@ from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import PIXEL_SUMS, Rasterizer
 from clsplat.scene.identity import Identity
 from clsplat.scene.scene import Scene
+from clsplat.settings import Settings
 from clsplat.training.adam import Adam
 from clsplat.training.memory import MemoryPlan, plan
 from clsplat.training.records import Records
@@ -56,7 +57,8 @@ class Run:
     out: Path
     name: str
     seed: int
-    pipeline: dict[str, Any]  # resolved settings, as written to pipeline.yaml
+    settings: Settings  # of the pipeline
+    pipeline: dict[str, Any]  # the same, resolved, as written to pipeline.yaml
     rasterizer: Rasterizer
     photographs: Photographs
     model_settings: ModelSettings
