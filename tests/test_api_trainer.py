@@ -91,7 +91,7 @@ def test_a_trainer_goes_on_from_its_checkpoint_or_that_of_the_command(tiny_scene
     part.run(20)  # a density edit is due
     assert part.checkpoint() == tmp_path / "a" / "checkpoints" / "step_000020.npz"
     part.close()
-    again = clsplat.Trainer(tiny_scene, "smoke", out=tmp_path / "a", resume=True)
+    again = clsplat.Trainer(tiny_scene, "smoke", out=tmp_path / "a", start="resume")
     assert repr(again).endswith("step 20)")
     again.run()
     assert equal(again.model, whole.model)
@@ -103,7 +103,7 @@ def test_a_trainer_goes_on_from_its_checkpoint_or_that_of_the_command(tiny_scene
     for file in (tmp_path / "a" / "checkpoints").iterdir():
         if file.name > "step_000040.npz":
             file.unlink()
-    after_command = clsplat.Trainer(tiny_scene, "smoke", out=tmp_path / "a", resume=True)
+    after_command = clsplat.Trainer(tiny_scene, "smoke", out=tmp_path / "a", start="resume")
     after_command.run()
     assert equal(after_command.model, whole.model)
 
@@ -166,7 +166,7 @@ def test_after_an_error_inside_of_a_step_the_trainer_says_that_it_has_ended(tiny
     trainer.add_loss(lambda image, photograph: (0.0, np.zeros(3)))
     with pytest.raises(ValueError, match=r"the loss returned a derivative of \(3,\); expected \(40, 40, 3\)"):
         trainer.run(2)
-    with pytest.raises(ClsplatError, match="ended with an error; make another, with resume=True"):
+    with pytest.raises(ClsplatError, match="ended with an error; make another, with start='resume'"):
         trainer.run(2)
 
 
@@ -219,7 +219,7 @@ def test_an_error_before_the_first_step_is_in_the_status(tiny_scene, tmp_path, m
     def fail(*arguments):
         raise RuntimeError("no such teapot")
 
-    monkeypatch.setattr("clsplat.api.trainer._run_until_training", fail)
+    monkeypatch.setattr("clsplat.api.trainer.run_until_training", fail)
     with pytest.raises(RuntimeError, match="no such teapot"):
         clsplat.Trainer(tiny_scene, "smoke", out=tmp_path / "run")
     assert clsplat.status(tmp_path / "run")["state"] == "failed"
@@ -259,7 +259,7 @@ def test_a_second_interrupt_leaves_the_step_before_or_nothing_to_save(tiny_scene
             assert not (out / "checkpoints").exists()
             continue
         assert trainer.checkpoint().name == f"step_00000{step}.npz"
-        again = clsplat.Trainer(tiny_scene, "smoke", set=few, out=out, resume=True)
+        again = clsplat.Trainer(tiny_scene, "smoke", set=few, out=out, start="resume")
         again.run()
         whole = clsplat.Trainer(tiny_scene, "smoke", set=few)
         whole.run()
@@ -277,13 +277,13 @@ def _interrupt(*arguments):
         (("photos",), ConfigError, "prepares its scene; use clsplat.run"),
         (("smoke", {"optimize.step": 3}), ConfigError, "did you mean"),
         (("smoke", {"optimize.steps": np.zeros(2)}), ConfigError, "set: Object of type ndarray"),
-        (("smoke", {}, None, True), ConfigError, "resume: expected the folder of a run as `out`"),
+        (("smoke", {}, None, "resume"), ConfigError, "resume: expected the folder of a run as `out`"),
     ],
 )
 def test_what_cannot_be_trained_is_a_sentence(tiny_scene, arguments, error, message):
-    pipeline, settings, out, resume = (*arguments, *({}, None, False)[len(arguments) - 1 :])
+    pipeline, settings, out, start = (*arguments, *({}, None, "new")[len(arguments) - 1 :])
     with pytest.raises(error) as raised:
-        clsplat.Trainer(tiny_scene, pipeline, set=settings, out=out, resume=resume)
+        clsplat.Trainer(tiny_scene, pipeline, set=settings, out=out, start=start)
     assert message in str(raised.value)
     assert "\n" not in str(raised.value)
 
@@ -326,7 +326,7 @@ def test_what_is_left_on_disk_is_a_run(tiny_scene, tmp_path):
     trainer.step()
     assert trainer.checkpoint().is_file()
     assert (clsplat.status(tmp_path / "run")["state"], clsplat.status(tmp_path / "run")["step"]) == ("done", 10)
-    again = clsplat.Trainer(tiny_scene, "smoke", set=settings, out=tmp_path / "run", resume=True)
+    again = clsplat.Trainer(tiny_scene, "smoke", set=settings, out=tmp_path / "run", start="resume")
     assert clsplat.status(tmp_path / "run")["state"] == "done"
     assert again.run() is None
     assert Path(clsplat.check(tmp_path / "run" / "pipeline.yaml")["path"]).name == "pipeline.yaml"

@@ -465,5 +465,5 @@ def test_restoring_reads_no_other_run(tiny_scene, tmp_path):
     train(tiny_scene, tmp_path, *FEW)
     (tmp_path / "pipeline.yaml").unlink()
     with pytest.raises(ConfigError, match="already holds a run; give another folder, --resume or --restart"):
-        folders.make_run_folder(tmp_path, resume=False)
+        folders.make_run_folder(tmp_path, "new")
     assert runner.CHECKSUMS in {path.name for path in tmp_path.iterdir()}

@@ -188,16 +188,16 @@ def test_trainers_hold_their_folder_until_they_end(tiny_scene, tmp_path):
     first.step()
     first.checkpoint()
     with pytest.raises(OutputError, match="is in use by this process; end that run or trainer first"):
-        clsplat.Trainer(tiny_scene, "smoke", set=few, out=tmp_path / "run", resume=True)
+        clsplat.Trainer(tiny_scene, "smoke", set=few, out=tmp_path / "run", start="resume")
     first.close()
     with pytest.raises(clsplat.errors.ClsplatError, match="is closed; make another"):
         first.step()
-    second = clsplat.Trainer(tiny_scene, "smoke", set=few, out=tmp_path / "run", resume=True)
+    second = clsplat.Trainer(tiny_scene, "smoke", set=few, out=tmp_path / "run", start="resume")
     assert second.run().step == 3
     assert second.checkpoint().exists()
-    third = clsplat.Trainer(tiny_scene, "smoke", set=few, out=tmp_path / "run", resume=True)
+    third = clsplat.Trainer(tiny_scene, "smoke", set=few, out=tmp_path / "run", start="resume")
     assert third.run() is None
-    fourth = clsplat.Trainer(tiny_scene, "smoke", set={"optimize.steps": 4}, out=tmp_path / "run", resume=True)
+    fourth = clsplat.Trainer(tiny_scene, "smoke", set={"optimize.steps": 4}, out=tmp_path / "run", start="resume")
     with pytest.raises(OutputError, match="is in use by this process"):
         clsplat.resume(tmp_path / "run")
     del fourth
@@ -205,16 +205,16 @@ def test_trainers_hold_their_folder_until_they_end(tiny_scene, tmp_path):
 
 
 def test_a_run_that_is_just_starting_in_the_default_folder_is_not_joined(tmp_path):
-    assert folders.free_folder(tmp_path / "splat", None, resume=False) == tmp_path / "splat"
+    assert folders.free_folder(tmp_path / "splat", None, "new") == tmp_path / "splat"
     (tmp_path / "splat").mkdir()
     with lock.held(tmp_path / "splat"):
-        assert folders.free_folder(tmp_path / "splat", None, resume=False) == tmp_path / "splat-2"
-    assert folders.free_folder(tmp_path / "splat", None, resume=False) == tmp_path / "splat"
+        assert folders.free_folder(tmp_path / "splat", None, "new") == tmp_path / "splat-2"
+    assert folders.free_folder(tmp_path / "splat", None, "new") == tmp_path / "splat"
 
 
 def test_a_folder_that_was_left_is_written_to_no_more(tmp_path, monkeypatch):
     monkeypatch.setattr(writing, "BEAT", 0.002)
-    with folders.opened(tmp_path / "run", resume=False) as status:
+    with folders.opened(tmp_path / "run", "new") as status:
         pass
     (tmp_path / "run" / "status.json").write_text("of the next")
     status._thread.join(5)
@@ -251,7 +251,7 @@ def test_what_a_process_still_writes_is_not_swept(tmp_path):
         path.write_text("x")
     with atomic(tmp_path / "c") as file:
         file.write(b"x")
-        folders.make_run_folder(tmp_path, resume=False).close()
+        folders.make_run_folder(tmp_path, "new").close()
     assert (tmp_path / "c").read_bytes() == b"x"
     assert other.exists()
     assert not old.exists(), "left by an earlier process of this number, as in a container"

@@ -201,9 +201,9 @@ def test_files_that_a_new_run_did_not_make_are_not_replaced(tiny_scene, tmp_path
         opened(tiny_scene, tmp_path)
     with pytest.raises(ConfigError, match=r"holiday: exists, and is not of this run"):
         opened(tiny_scene, tmp_path, "render.folder=holiday", "report.file=other.html")
-    for ways in ({}, {"resume": True}, {"restart": True}):
+    for start in ("new", "resume", "restart"):
         with pytest.raises(ConfigError, match="is not of this run"):
-            Job.open("smoke", tiny_scene, tmp_path).run(**ways)
+            Job.open("smoke", tiny_scene, tmp_path, start=start).run()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["holiday", "report.html"]
     (tmp_path / "pipeline.yaml").touch()
     opened(tiny_scene, tmp_path)
@@ -276,9 +276,9 @@ DAMAGE = {
 def finished(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, Run]:
     out = tmp_path_factory.mktemp("outputs") / "run"
     checked = load("smoke", [f"scene.path='{tiny_scene}'", "optimize.steps=3", "optimize.during=[]"])
-    folders.make_run_folder(out, False)
+    folders.make_run_folder(out, "new")
     run = opening.open_run(checked, out, None)
-    runner.execute(checked, run, False, lambda progress: None)
+    runner.execute(checked, run, "new", lambda progress: None)
     return checked, run
 
 

@@ -228,8 +228,8 @@ def test_a_changed_setting_is_another_run(pipeline, photos, tmp_path):
 def test_a_run_does_not_go_on_with_other_photographs(pipeline, photos, tmp_path):
     checked = load(str(pipeline), [f"scene.path='{photos}'", "optimize.steps=3"])
     out = tmp_path / "runs" / "a"
-    folders.make_run_folder(out, False)
-    runner.execute(checked, opening.open_run(checked, out, None), False, lambda progress: None)
+    folders.make_run_folder(out, "new")
+    runner.execute(checked, opening.open_run(checked, out, None), "new", lambda progress: None)
     (photos / "p.txt").write_text("other")
     with pytest.raises(ConfigError, match="other photographs"):
         opening.open_run(checked, out, None)

@@ -38,7 +38,7 @@ def test_an_evaluate_that_was_half_done_leaves_no_line_twice(
     way, rendered, finished, tiny_scene, tmp_path, monkeypatch
 ):
     checked = load("smoke", [f"scene.path='{tiny_scene}'", *FEW])
-    folders.make_run_folder(tmp_path / "run", resume=False)
+    folders.make_run_folder(tmp_path / "run", "new")
     run = opening.open_run(checked, tmp_path / "run", None)
     render, count = views.render_view, []
 
@@ -53,7 +53,7 @@ def test_an_evaluate_that_was_half_done_leaves_no_line_twice(
     with monkeypatch.context() as patch:
         patch.setattr(views, "render_view", counted)
         with pytest.raises(Interrupted if way == "stopped" else DataError):
-            runner.execute(checked, run, False, lambda progress: None)
+            runner.execute(checked, run, "new", lambda progress: None)
     saved = sorted(path.name for path in (tmp_path / "run" / "checkpoints").iterdir())
     assert saved[-1] == ("step_000004.npz" if rendered == 3 else "step_000006.npz")
     train(tiny_scene, tmp_path / "run", *FEW, resume=True)

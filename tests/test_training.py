@@ -27,9 +27,10 @@ pytestmark = pytest.mark.slow
 
 def train(scene: Path, out: Path, *overrides: str, pipeline: str = "smoke", resume: bool = False) -> Run:
     checked = load(pipeline, [f"scene.path='{scene}'", *overrides])
-    folders.make_run_folder(out, resume)
+    start: folders.Start = "resume" if resume else "new"
+    folders.make_run_folder(out, start)
     run = opening.open_run(checked, out, None)
-    runner.execute(checked, run, resume, lambda progress: None)
+    runner.execute(checked, run, start, lambda progress: None)
     return run
 
 
@@ -116,14 +117,14 @@ def test_the_sort_does_not_matter(finished, tiny_scene, tmp_path, sort):
 def test_interrupt_saves_and_resume_goes_on(finished, tiny_scene, tmp_path):
     out = tmp_path / "stopped"
     checked = load("smoke", [f"scene.path='{tiny_scene}'"])
-    folders.make_run_folder(out, resume=False)
+    folders.make_run_folder(out, "new")
     run = opening.open_run(checked, out, None)
 
     def stop(progress: Progress) -> None:
         run.interrupted = progress.step == 20
 
     with pytest.raises(Interrupted, match="stopped at step 20"):
-        runner.execute(checked, run, False, stop)
+        runner.execute(checked, run, "new", stop)
     assert json.loads((out / "status.json").read_text())["state"] == "interrupted"
     train(tiny_scene, out, resume=True)
     assert digest(out) == digest(finished)

@@ -19,6 +19,8 @@ from clsplat.opencl.device import Device, open_device
 from clsplat.pipeline.loading import Pipeline, load
 from clsplat.runs import folders, lock, opening, runner
 from clsplat.runs.experiment import quoted
+from clsplat.runs.folders import Start
+from clsplat.runs.stepwise import is_trained, run_until_training, train
 from clsplat.scene.detect import read_scene
 from clsplat.scene.scene import Scene
 from clsplat.scene.view import NO_FILE
@@ -27,7 +29,6 @@ from clsplat.signals import stopping_on_signals
 from clsplat.stages.optimize import Optimize
 from clsplat.training import checkpoint
 from clsplat.training.rescue import saved_on_failure
-from clsplat.training.run import Run
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,15 +63,15 @@ class Trainer:
         set: Mapping[str, Any] | None = None,
         device: str | Device | None = None,
         out: PathLike | None = None,
-        resume: bool = False,
+        start: Start = "new",
     ) -> None:
         """Prepare training.
 
         scene: what `read_scene` returns, whose split is kept, or a folder; pipeline: a file, or the name of a shipped
         one; set: settings by place, such as {"optimize.steps": 3000}; device: a part of its name, or one that is open,
         with the schedule of the pipeline; out: the run folder, by default a temporary one that goes away with the
-        trainer; resume: go on from the newest checkpoint in `out`, also of `clsplat run`.  A trainer holds its folder
-        until its training has ended, `close()`, or it is let go.
+        trainer; start: as for `clsplat.run`.  A trainer holds its folder until its training has ended, `close()`, or it
+        is let go.
         Raises ConfigError, DataError and DeviceError.
         """
         load_plugins()
@@ -81,8 +82,8 @@ class Trainer:
         self.scene = scene if isinstance(scene, Scene) else read_scene(folder, self.pipeline.settings.scene.holdout)
         if without := [view.name for view in self.scene.split("train") if view.image_path == NO_FILE]:
             raise DataError(f"{self.scene.path}: the view '{without[0]}' has no photograph; training needs one of each")
-        if resume and out is None:
-            raise ConfigError("resume: expected the folder of a run as `out`")
+        if start != "new" and out is None:
+            raise ConfigError(f"{start}: expected the folder of a run as `out`")
         if out is None:
             out = tempfile.mkdtemp(prefix="clsplat-")
             weakref.finalize(self, shutil.rmtree, out, ignore_errors=True)
@@ -90,15 +91,15 @@ class Trainer:
         schedule = self.pipeline.settings.rasterizer.schedule
         opened = default_device(schedule) if device is None else open_device(device, schedule)
         with ExitStack() as holding:
-            status = holding.enter_context(folders.opened(self.out, resume))
+            status = holding.enter_context(folders.opened(self.out, start))
             with folders.failures_recorded(status, as_raised=True):
                 self._run = opening.make_run(self.pipeline, self.scene, opened, self.out, status)
-                runner.begin(self.pipeline, self._run, resume)
+                runner.begin(self.pipeline, self._run, start)
                 with saved_on_failure(self._run):
-                    _run_until_training(self.pipeline, self._run)
+                    run_until_training(self.pipeline, self._run)
             self._holding = holding.pop_all()
         weakref.finalize(self, self._holding.close)
-        self._steps = _training(self.pipeline, self._run)
+        self._steps = train(self.pipeline, self._run)
         self._state: Literal["open", "done", "failed", "closed"] = "open"
         self._record_end()
 
@@ -129,7 +130,7 @@ class Trainer:
             raise StopIteration
         if self._state != "open":
             why = "ended with an error" if self._state == "failed" else "is closed"
-            raise ClsplatError(f"{self!r} {why}; make another, with resume=True where `out` holds a checkpoint")
+            raise ClsplatError(f"{self!r} {why}; make another, with start='resume' where `out` holds a checkpoint")
         try:
             with (
                 folders.failures_recorded(self._run.status, as_raised=True),
@@ -199,12 +200,8 @@ class Trainer:
 
     def _record_end(self) -> None:
         """Write `done` to status.json where no step is left."""
-        last = max(_training_stages(self.pipeline))
-        stage, run = self.pipeline.stages[last], self._run
-        if isinstance(stage, Optimize) and (
-            run.cursor > last or (run.cursor == last and run.stage_step >= stage.steps)
-        ):
-            run.status.end("done", exit_code=0)
+        if is_trained(self.pipeline, self._run):
+            self._run.status.end("done", exit_code=0)
             self._state = "done"
             self.close()
 
@@ -220,31 +217,3 @@ def _check(pipeline: Pipeline) -> None:
         raise ConfigError(f"{pipeline.path}: has no stage 'optimize'; expected one to train with")
     for stage in pipeline.stages:
         stage.check()
-
-
-def _training_stages(pipeline: Pipeline) -> list[int]:
-    return [i for i, stage in enumerate(pipeline.stages) if isinstance(stage, Optimize)]
-
-
-def _run_until_training(pipeline: Pipeline, run: Run) -> None:
-    """Run the stages before the first that trains, from where the run is."""
-    for cursor, stage in enumerate(pipeline.stages):
-        if isinstance(stage, Optimize):
-            return
-        if cursor >= run.cursor:
-            run.cursor = cursor
-            stage.act(run)
-
-
-def _training(pipeline: Pipeline, run: Run) -> Iterator[ViewGradients]:
-    """Run all stages that train, step by step, and those between them."""
-    trains = _training_stages(pipeline)
-    for cursor in range(max(trains[0], run.cursor), trains[-1] + 1):
-        if cursor > run.cursor:
-            run.next_stage(cursor)
-        stage = pipeline.stages[cursor]
-        if isinstance(stage, Optimize):
-            run.status.note(stage=stage.stage, progress=None)
-            yield from stage.iterate(run)
-        else:
-            stage.act(run)

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from clsplat.errors import ConfigError, InternalError, Interrupted, OutputError, as_clsplat_error, one_line
 from clsplat.files import sweep, unwritable
@@ -15,11 +15,12 @@ from clsplat.training import checkpoint
 from clsplat.training.status import StatusFile, read_status
 
 PIPELINE = "pipeline.yaml"
+Start = Literal["new", "resume", "restart"]
 BEFORE_A_RUN = {"status.json", "log.txt", lock.FILE}  # files of a run that has not begun
 
 
 @contextmanager
-def opened(out: Path, resume: bool, **values: Any) -> Iterator[StatusFile]:
+def opened(out: Path, start: Start, **values: Any) -> Iterator[StatusFile]:
     """Make the run folder, with `values` in its status, and hold it in the block.
 
     A run that ends before it has begun leaves no new folder.
@@ -32,7 +33,7 @@ def opened(out: Path, resume: bool, **values: Any) -> Iterator[StatusFile]:
         raise unwritable(out, error) from error
     try:
         with lock.held(out):
-            status = make_run_folder(out, resume, **values)
+            status = make_run_folder(out, start, **values)
             try:
                 with closing(status):  # the next holder writes its own
                     yield status
@@ -71,12 +72,12 @@ def clear(status: StatusFile) -> None:
             raise unwritable(file, error) from error
 
 
-def make_run_folder(out: Path, resume: bool, **values: Any) -> StatusFile:
+def make_run_folder(out: Path, start: Start, **values: Any) -> StatusFile:
     """Make the run folder, swept of what killed runs have left, and its status.json with `values`.
 
     Raises ConfigError when it holds another run, OutputError when it cannot be written.
     """
-    check_run_folder(out, resume)
+    check_run_folder(out, start)
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -87,9 +88,11 @@ def make_run_folder(out: Path, resume: bool, **values: Any) -> StatusFile:
     return status
 
 
-def check_run_folder(out: Path, resume: bool) -> None:
-    """Raise ConfigError when the folder holds another run."""
-    if not resume and ((out / PIPELINE).exists() or checkpoint.saved(out)):
+def check_run_folder(out: Path, start: Start) -> None:
+    """Raise ConfigError when a new run finds another one in its folder."""
+    if start not in get_args(Start):
+        raise ConfigError(f"no start '{start}'; there are {', '.join(get_args(Start))}")
+    if start == "new" and ((out / PIPELINE).exists() or checkpoint.saved(out)):
         raise ConfigError(f"{out}: already holds a run; give another folder, --resume or --restart")
 
 
@@ -111,8 +114,8 @@ def failures_recorded(status: StatusFile, as_raised: bool = False) -> Iterator[N
         raise failure from error
 
 
-def free_folder(folder: Path, pipeline: Pipeline | None, resume: bool) -> Path:
-    """Return the default run folder: with the next free number, unless a run is resumed or up to date."""
+def free_folder(folder: Path, pipeline: Pipeline | None, start: Start) -> Path:
+    """Return the default run folder: a new run beside one that is not up to date gets the next free number."""
     number, free = 1, folder
     planned = pipeline.preparation(folder) if pipeline else []
 
@@ -121,7 +124,7 @@ def free_folder(folder: Path, pipeline: Pipeline | None, resume: bool) -> Path:
             return True
         return (free / PIPELINE).exists() and not (pipeline and up_to_date(pipeline, planned, free))
 
-    while not resume and taken():
+    while start == "new" and taken():
         number += 1
         free = folder.with_name(f"{folder.name}-{number}")
     return free
