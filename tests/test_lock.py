@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import platform
 import signal
 import subprocess
 import sys
@@ -130,7 +131,7 @@ def without_locks(monkeypatch):
 
 
 def owned_by(folder: Path, **values) -> None:
-    owner = {"process": os.getpid(), "host": lock.socket.gethostname(), "time": time.time(), "command": "clsplat run"}
+    owner = {"process": os.getpid(), "host": platform.node(), "time": time.time(), "command": "clsplat run"}
     (folder / lock.FILE).write_text(json.dumps({**owner, **values}))
 
 
@@ -148,7 +149,16 @@ def test_a_file_system_without_locks_is_warned_of_and_a_dead_owner_replaced(tmp_
     assert "its file system knows no locks" in caplog.text
 
 
-@pytest.mark.parametrize("values", [{"process": 1}, {"host": "another"}, {"host": "another", "time": "x"}])
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"process": 1},
+        {"host": "another"},
+        {"host": "another", "time": "x"},
+        {"process": NONE, "pid_namespace": "pid:[1]"},
+    ],
+    ids=["alive", "on another host", "since when is not known", "in a container"],
+)
 def test_a_file_system_without_locks_keeps_the_owner_that_may_live(values, tmp_path, without_locks):
     owned_by(tmp_path, **values)
     with pytest.raises(OutputError, match=r"if that process has ended, remove .*run.lock"), lock.held(tmp_path):

@@ -10,17 +10,17 @@ import io
 import json
 import logging
 import os
-import socket
 import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from clsplat.errors import OutputError
 from clsplat.files import unwritable
-from clsplat.processes import is_alive
+from clsplat.processes import Owner
 
 LOG = logging.getLogger("clsplat")
 FILE = "run.lock"
@@ -65,7 +65,7 @@ def _locked(path: Path, folder: Path) -> io.FileIO:
             if _is_at(file, path):
                 file.seek(0)
                 file.truncate()
-                file.write(json.dumps(_owner()).encode())
+                file.write(_own_text().encode())
                 return file
         except BaseException:
             file.close()
@@ -81,7 +81,7 @@ def _lock(file: io.FileIO, folder: Path) -> None:
         if error.errno not in NO_LOCKS:
             raise
         owner = _read(file)
-        if owner and not _has_ended(owner):
+        if owner and not _has_ended(Owner.named_by(owner)):
             raise OutputError(
                 f"{_in_use(folder, owner)}; this file system knows no locks: if that process has ended, "
                 f"remove {folder / FILE}"
@@ -120,9 +120,10 @@ def _is_at(file: io.FileIO, path: Path) -> bool:
         return False
 
 
-def _owner() -> dict[str, Any]:
+def _own_text() -> str:
+    """What the file says of this process."""
     command = " ".join([Path(sys.argv[0]).name, *sys.argv[1:]])
-    return {"process": os.getpid(), "host": socket.gethostname(), "time": time.time(), "command": command}
+    return json.dumps({**asdict(Owner.this()), "time": time.time(), "command": command})
 
 
 def _read(file: io.FileIO) -> dict[str, Any]:
@@ -135,11 +136,8 @@ def _read(file: io.FileIO) -> dict[str, Any]:
     return owner if isinstance(owner, dict) else {}
 
 
-def _has_ended(owner: dict[str, Any]) -> bool:
-    if owner.get("host") != socket.gethostname():
-        return False
-    process = owner.get("process")
-    return isinstance(process, int) and (process == os.getpid() or not is_alive(process))  # this one does not hold it
+def _has_ended(owner: Owner | None) -> bool:
+    return owner is not None and (owner == Owner.this() or owner.has_ended)  # this process does not hold it
 
 
 def _in_use(folder: Path, owner: dict[str, Any]) -> str:

@@ -2,13 +2,12 @@
 
 import json
 import logging
-import os
-import platform
 import threading
 import time
 import weakref
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -17,6 +16,7 @@ from pydantic import BaseModel, ConfigDict
 from clsplat import __version__
 from clsplat.errors import DataError, OutputError
 from clsplat.files import write_text
+from clsplat.processes import Owner
 from clsplat.reading import read_json
 
 LOG = logging.getLogger("clsplat")
@@ -103,9 +103,7 @@ class StatusFile:
         now = time.time()
         checkpoint = read_status(out).get("checkpoint")
         self.now = Status(
-            host=platform.node(),
-            process=os.getpid(),
-            pid_namespace=pid_namespace(),
+            **asdict(Owner.this()),
             started=now,
             changed=now,
             time=now,
@@ -213,14 +211,6 @@ def read_status(out: Path) -> dict[str, Any]:
     except DataError:
         return {}
     return status if isinstance(status, dict) else {}
-
-
-def pid_namespace() -> str | None:
-    """Return where process numbers count, such as 'pid:[4026531836]'; None where the system does not say."""
-    try:
-        return os.readlink("/proc/self/ns/pid")
-    except (OSError, AttributeError):
-        return None
 
 
 def status_schema() -> dict[str, Any]:
