@@ -89,8 +89,18 @@ def test_one_process_holds_a_folder_once_by_whatever_name(tmp_path):
         pass
 
 
-def test_of_many_that_want_a_folder_at_once_one_has_it(tmp_path):
-    code = (
+NO_LOCKS = """
+import errno, fcntl, logging
+def no_locks(*arguments):
+    raise OSError(errno.ENOLCK, "no locks")
+fcntl.flock = no_locks
+logging.disable()
+"""
+
+
+@pytest.mark.parametrize("before", ["", NO_LOCKS], ids=["with locks", "without"])
+def test_of_many_that_want_a_folder_at_once_one_has_it(before, tmp_path):
+    code = before + (
         "import sys, time; from pathlib import Path; from clsplat.runs import lock\n"
         "from clsplat.errors import OutputError\n"
         "folder, n = Path(sys.argv[1]), 0\n"
@@ -122,12 +132,12 @@ def test_a_file_that_its_holder_has_just_removed_is_not_the_lock(tmp_path, monke
         assert json.loads((tmp_path / lock.FILE).read_text())["process"] == os.getpid()
 
 
-@pytest.fixture
-def without_locks(monkeypatch):
-    def no_locks(file):
-        raise OSError(errno.ENOLCK, "No locks available")
+@pytest.fixture(params=[errno.ENOLCK, errno.ENOTSUP], ids=errno.errorcode.get)
+def without_locks(request, monkeypatch):
+    def no_locks(file, kind):
+        raise OSError(request.param, os.strerror(request.param))
 
-    monkeypatch.setattr(lock, "_system_lock", no_locks)
+    monkeypatch.setattr("fcntl.flock", no_locks)
 
 
 def owned_by(folder: Path, **values) -> None:
@@ -149,15 +159,41 @@ def test_a_file_system_without_locks_is_warned_of_and_a_dead_owner_replaced(tmp_
     assert "its file system knows no locks" in caplog.text
 
 
+def test_a_lock_that_is_just_being_made_is_somebodys(tmp_path, without_locks):
+    """Between making the file and writing into it; or a process was killed there."""
+    (tmp_path / lock.FILE).touch()
+    with pytest.raises(OutputError, match=r"another process; .* has ended, remove .*run.lock"), lock.held(tmp_path):
+        pass
+    assert (tmp_path / lock.FILE).exists()
+
+
+def test_a_lock_that_was_made_since_is_not_removed_with_a_dead_one(tmp_path, without_locks, monkeypatch):
+    """Two processes find the same dead owner; the slower one finds the file of the other in its place."""
+    owned_by(tmp_path, process=NONE)
+    has_ended = lock._has_ended
+
+    def slow(owner):
+        ended = has_ended(owner)
+        if ended:
+            (tmp_path / lock.FILE).unlink()
+            owned_by(tmp_path, process=os.getppid())
+        return ended
+
+    monkeypatch.setattr(lock, "_has_ended", slow)
+    with pytest.raises(OutputError, match=f"in use by process {os.getppid()} on"), lock.held(tmp_path):
+        pass
+    assert json.loads((tmp_path / lock.FILE).read_text())["process"] == os.getppid()
+    assert [path.name for path in tmp_path.iterdir()] == [lock.FILE]
+
+
 @pytest.mark.parametrize(
     "values",
     [
-        {"process": 1},
-        {"host": "another"},
-        {"host": "another", "time": "x"},
-        {"process": NONE, "pid_namespace": "pid:[1]"},
+        pytest.param({"process": 1}, id="alive"),
+        pytest.param({"host": "another"}, id="on another host"),
+        pytest.param({"host": "another", "time": "x"}, id="since when is not known"),
+        pytest.param({"process": NONE, "pid_namespace": "pid:[1]"}, id="in a container"),
     ],
-    ids=["alive", "on another host", "since when is not known", "in a container"],
 )
 def test_a_file_system_without_locks_keeps_the_owner_that_may_live(values, tmp_path, without_locks):
     owned_by(tmp_path, **values)

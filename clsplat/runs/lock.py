@@ -1,8 +1,8 @@
 """One process at a time in a run folder.
 
 The system releases the lock when its holder ends, however it ends, so that it is never left behind.  The file
-`run.lock` tells who holds it.  Where a file system knows no locks, that file stands for the lock: one whose process has
-ended on this host is taken over.
+`run.lock` tells who holds it.  Where a file system knows no locks, whoever makes that file holds the folder; one whose
+process has ended on this host is taken over.
 """
 
 import errno
@@ -59,10 +59,11 @@ def held(folder: Path) -> Iterator[None]:
 def _locked(path: Path, folder: Path) -> io.FileIO:
     """Open the file and lock it; write into it who holds it.  Raises OutputError and OSError."""
     while True:
-        file = path.open("a+b", buffering=0)
+        file, is_new = _opened(path)
+        if file is None:
+            continue
         try:
-            _lock(file, folder)
-            if _is_at(file, path):
+            if _is_ours(file, is_new, path, folder):
                 file.seek(0)
                 file.truncate()
                 file.write(_own_text().encode())
@@ -70,25 +71,50 @@ def _locked(path: Path, folder: Path) -> io.FileIO:
         except BaseException:
             file.close()
             raise
-        file.close()  # its holder has ended, and removed it
+        file.close()
 
 
-def _lock(file: io.FileIO, folder: Path) -> None:
+def _opened(path: Path) -> tuple[io.FileIO | None, bool]:
+    """Open the file, and tell whether this process made it; None where its holder removes it just now."""
+    with suppress(FileExistsError):
+        return path.open("x+b", buffering=0), True
+    with suppress(FileNotFoundError):
+        return path.open("r+b", buffering=0), False
+    return None, False
+
+
+def _is_ours(file: io.FileIO, is_new: bool, path: Path, folder: Path) -> bool:
+    """Lock the file; False where it is no longer the one at its path.  Where there are no locks, its maker holds it."""
     try:
         if not _system_lock(file):
             raise OutputError(_in_use(folder, _read(file)))
+        return _is_at(file, path)
     except OSError as error:
         if error.errno not in NO_LOCKS:
             raise
+    if not is_new:
         owner = _read(file)
-        if owner and not _has_ended(Owner.named_by(owner)):
+        if not _has_ended(Owner.named_by(owner)):
             raise OutputError(
                 f"{_in_use(folder, owner)}; this file system knows no locks: if that process has ended, "
                 f"remove {folder / FILE}"
-            ) from error
-        if owner:
-            LOG.info("%s: taken over from process %s, which has ended", folder, owner.get("process"))
-        LOG.warning("%s: its file system knows no locks: never run two at once there from different hosts", folder)
+            )
+        LOG.info("%s: taken over from process %s, which has ended", folder, owner.get("process"))
+        _remove(file, path)
+        return False
+    LOG.warning("%s: its file system knows no locks; %s alone keeps other processes away", folder, FILE)
+    return True
+
+
+def _remove(file: io.FileIO, path: Path) -> None:
+    """Remove an open file from its path, but not another that was made there since."""
+    aside = path.with_name(f".{path.name}.{os.getpid()}-0.partial")  # swept where this process is killed
+    with suppress(FileNotFoundError):
+        os.replace(path, aside)
+        if _is_at(file, aside):
+            aside.unlink()
+        else:
+            os.replace(aside, path)
 
 
 def _system_lock(file: io.FileIO) -> bool:
