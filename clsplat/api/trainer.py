@@ -4,20 +4,20 @@ import shutil
 import tempfile
 import weakref
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, nullcontext
+from contextlib import ExitStack, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 from clsplat.api.arguments import PathLike, load_plugins, overrides
 from clsplat.api.device import default_device
-from clsplat.errors import ClsplatError, ConfigError, DataError
+from clsplat.errors import ClsplatError, ConfigError, DataError, Interrupted, OutputError
 from clsplat.gaussians.model import Model
 from clsplat.losses.base import HostFunction, HostLoss, ViewGradients
 from clsplat.metrics.views import mean, measure
 from clsplat.opencl.device import Device, open_device
 from clsplat.pipeline.loading import Pipeline, load
-from clsplat.runs import folders, lock, opening, runner
+from clsplat.runs import folders, lock, opening, outputs, runner
 from clsplat.runs.experiment import quoted
 from clsplat.runs.folders import Start
 from clsplat.runs.stepwise import is_trained, run_until_training, train
@@ -29,6 +29,7 @@ from clsplat.signals import stopping_on_signals
 from clsplat.stages.optimize import Optimize
 from clsplat.training import checkpoint
 from clsplat.training.rescue import saved_on_failure
+from clsplat.training.status import END_STATES, StatusFile
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,6 +91,7 @@ class Trainer:
         self.out = Path(out)
         schedule = self.pipeline.settings.rasterizer.schedule
         opened = default_device(schedule) if device is None else open_device(device, schedule)
+        outputs.check_places(self.pipeline, self.out)
         with ExitStack() as holding:
             status = holding.enter_context(folders.opened(self.out, start))
             with folders.failures_recorded(status, as_raised=True):
@@ -97,6 +99,7 @@ class Trainer:
                 runner.begin(self.pipeline, self._run, start)
                 with saved_on_failure(self._run):
                     run_until_training(self.pipeline, self._run)
+            holding.callback(_left, status)
             self._holding = holding.pop_all()
         weakref.finalize(self, self._holding.close)
         self._steps = train(self.pipeline, self._run)
@@ -106,7 +109,8 @@ class Trainer:
     def close(self) -> None:
         """Leave the run folder to others.  Training does not go on after it; what is left in `out` can be resumed.
 
-        After its last step, and after an error, a trainer is closed by itself.
+        Before its last step status.json says `interrupted` then.  After it, and after an error, a trainer is closed by
+        itself.
         """
         if self._state == "open":
             self._state = "closed"
@@ -207,6 +211,13 @@ class Trainer:
 
     def __repr__(self) -> str:
         return f"Trainer({self.pipeline.settings.name} on {self.scene.path.name}, step {self._run.step})"
+
+
+def _left(status: StatusFile) -> None:
+    """Write that a trainer was closed, or let go, before its end; a folder that was removed stays so."""
+    if status.now.state not in END_STATES and status.out.is_dir():
+        with suppress(OutputError):
+            status.end("interrupted", Interrupted.exit_code, "the trainer was closed before its last step")
 
 
 def _check(pipeline: Pipeline) -> None:
