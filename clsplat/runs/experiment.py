@@ -9,7 +9,7 @@ from pathlib import Path
 from clsplat import terminal
 from clsplat.compare.page import write_comparison
 from clsplat.errors import ClsplatError, ConfigError, DataError, Interrupted, as_clsplat_error, one_line
-from clsplat.files import write_text
+from clsplat.files import is_there, write_text
 from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import Pipeline, load
 from clsplat.pipeline.matrix import Cell, Experiment, load_experiment
@@ -46,6 +46,8 @@ class Job:
         out: default runs/NAME, with a number where that is another run; start: "resume" goes on from the newest
         checkpoint, "restart" begins again in a folder that holds a run.
         """
+        if out is not None:
+            is_there(out)
         changes = [*overrides, *([f"scene.path={quoted(scene)}"] if scene is not None else [])]
         if found := load_experiment(pipeline, changes):
             return cls(found, out or folders.free_folder(Path("runs") / found.name, None, start), start)

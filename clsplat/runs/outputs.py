@@ -6,7 +6,7 @@ from pathlib import Path
 
 from clsplat.compare.run_folder import read_metrics
 from clsplat.errors import ConfigError, DataError, OutputError
-from clsplat.files import write_text
+from clsplat.files import is_there, write_text
 from clsplat.pipeline.loading import Pipeline, load
 from clsplat.training import checkpoint
 from clsplat.training.run import Run
@@ -48,7 +48,11 @@ def checksum(path: Path) -> str:
 
 
 def check_places(pipeline: Pipeline, out: Path) -> None:
-    """Raise ConfigError where a run in `out` would write elsewhere, or over files that no run there has made."""
+    """Raise ConfigError where a run in `out` would write elsewhere, or over files that no run there has made.
+
+    Raises OutputError where there can be no such folder.
+    """
+    is_there(out)
     folder, scene = out.resolve(), pipeline.settings.scene
     if folder == folder.parent:
         raise ConfigError(f"{out}: is the root of a file system; give another folder for the run")
