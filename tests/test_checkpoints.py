@@ -18,8 +18,9 @@ import pytest
 
 from clsplat.density.statistics import SplatStats
 from clsplat.errors import ConfigError, DataError, DeviceError, NumericError, OutputError, as_clsplat_error
+from clsplat.names import CHECKSUMS
 from clsplat.opencl.program import Kernel
-from clsplat.runs import folders, runner
+from clsplat.runs import folders
 from clsplat.stages.evaluate import Evaluate
 from clsplat.stages.report import Report
 from clsplat.training import archive, checkpoint
@@ -465,5 +466,5 @@ def test_restoring_reads_no_other_run(tiny_scene, tmp_path):
     train(tiny_scene, tmp_path, *FEW)
     (tmp_path / "pipeline.yaml").unlink()
     with pytest.raises(ConfigError, match="already holds a run; give another folder, --resume or --restart"):
-        folders.make_run_folder(tmp_path, "new")
-    assert runner.CHECKSUMS in {path.name for path in tmp_path.iterdir()}
+        folders.check_run_folder(tmp_path, "new")
+    assert CHECKSUMS in {path.name for path in tmp_path.iterdir()}

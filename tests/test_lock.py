@@ -17,6 +17,7 @@ import clsplat
 from clsplat import files
 from clsplat.errors import ConfigError, OutputError
 from clsplat.files import atomic
+from clsplat.names import LOCK
 from clsplat.runs import experiment, folders, lock
 from clsplat.training import status as writing
 from tests.test_cli import clsplat as command
@@ -54,10 +55,10 @@ def test_a_lock_ends_with_its_process_however_it_ends(tmp_path):
         process = holder(tmp_path)
         process.send_signal(number)
         process.wait()
-        assert (tmp_path / lock.FILE).exists()
+        assert (tmp_path / LOCK).exists()
         with lock.held(tmp_path):
-            assert json.loads((tmp_path / lock.FILE).read_text())["process"] == os.getpid()
-        assert not (tmp_path / lock.FILE).exists()
+            assert json.loads((tmp_path / LOCK).read_text())["process"] == os.getpid()
+        assert not (tmp_path / LOCK).exists()
 
 
 def test_children_do_not_hold_the_lock_of_a_killed_parent(tmp_path):
@@ -124,12 +125,12 @@ def test_a_file_that_its_holder_has_just_removed_is_not_the_lock(tmp_path, monke
     def late(file):
         calls.append(file)
         if len(calls) == 1:
-            (tmp_path / lock.FILE).unlink()
+            (tmp_path / LOCK).unlink()
         return system_lock(file)
 
     monkeypatch.setattr(lock, "_system_lock", late)
     with lock.held(tmp_path):
-        assert json.loads((tmp_path / lock.FILE).read_text())["process"] == os.getpid()
+        assert json.loads((tmp_path / LOCK).read_text())["process"] == os.getpid()
 
 
 @pytest.fixture(params=[errno.ENOLCK, errno.ENOTSUP], ids=errno.errorcode.get)
@@ -142,7 +143,7 @@ def without_locks(request, monkeypatch):
 
 def owned_by(folder: Path, **values) -> None:
     owner = {"process": os.getpid(), "host": platform.node(), "time": time.time(), "command": "clsplat run"}
-    (folder / lock.FILE).write_text(json.dumps({**owner, **values}))
+    (folder / LOCK).write_text(json.dumps({**owner, **values}))
 
 
 def test_a_file_system_without_locks_is_warned_of_and_a_dead_owner_replaced(tmp_path, without_locks, caplog):
@@ -155,16 +156,16 @@ def test_a_file_system_without_locks_is_warned_of_and_a_dead_owner_replaced(tmp_
             assert f"taken over from process {values.get('process', os.getpid())}, which has ended" in caplog.text
             with pytest.raises(OutputError, match="is in use by this process"), lock.held(tmp_path):
                 pass
-        assert not (tmp_path / lock.FILE).exists()
+        assert not (tmp_path / LOCK).exists()
     assert "its file system knows no locks" in caplog.text
 
 
 def test_a_lock_that_is_just_being_made_is_somebodys(tmp_path, without_locks):
     """Between making the file and writing into it; or a process was killed there."""
-    (tmp_path / lock.FILE).touch()
+    (tmp_path / LOCK).touch()
     with pytest.raises(OutputError, match=r"another process; .* has ended, remove .*run.lock"), lock.held(tmp_path):
         pass
-    assert (tmp_path / lock.FILE).exists()
+    assert (tmp_path / LOCK).exists()
 
 
 def test_a_lock_that_was_made_since_is_not_removed_with_a_dead_one(tmp_path, without_locks, monkeypatch):
@@ -175,15 +176,15 @@ def test_a_lock_that_was_made_since_is_not_removed_with_a_dead_one(tmp_path, wit
     def slow(owner):
         ended = has_ended(owner)
         if ended:
-            (tmp_path / lock.FILE).unlink()
+            (tmp_path / LOCK).unlink()
             owned_by(tmp_path, process=os.getppid())
         return ended
 
     monkeypatch.setattr(lock, "_has_ended", slow)
     with pytest.raises(OutputError, match=f"in use by process {os.getppid()} on"), lock.held(tmp_path):
         pass
-    assert json.loads((tmp_path / lock.FILE).read_text())["process"] == os.getppid()
-    assert [path.name for path in tmp_path.iterdir()] == [lock.FILE]
+    assert json.loads((tmp_path / LOCK).read_text())["process"] == os.getppid()
+    assert [path.name for path in tmp_path.iterdir()] == [LOCK]
 
 
 @pytest.mark.parametrize(
@@ -199,7 +200,7 @@ def test_a_file_system_without_locks_keeps_the_owner_that_may_live(values, tmp_p
     owned_by(tmp_path, **values)
     with pytest.raises(OutputError, match=r"if that process has ended, remove .*run.lock"), lock.held(tmp_path):
         pass
-    assert (tmp_path / lock.FILE).exists()
+    assert (tmp_path / LOCK).exists()
 
 
 def test_two_runs_in_one_folder(tiny_scene, tmp_path):
@@ -223,7 +224,7 @@ def test_two_runs_in_one_folder(tiny_scene, tmp_path):
     finally:
         process.send_signal(signal.SIGTERM)
         assert process.wait(60) == 130
-    assert not (out / lock.FILE).exists()
+    assert not (out / LOCK).exists()
     steps = [json.loads(line)["step"] for line in (out / "metrics.jsonl").read_text().splitlines()]
     assert steps == sorted(steps)
 
@@ -247,7 +248,7 @@ def test_trainers_hold_their_folder_until_they_end(tiny_scene, tmp_path):
     with pytest.raises(OutputError, match="is in use by this process"):
         clsplat.resume(tmp_path / "run")
     del fourth
-    assert not (tmp_path / "run" / lock.FILE).exists()
+    assert not (tmp_path / "run" / LOCK).exists()
 
 
 def test_a_run_that_is_just_starting_in_the_default_folder_is_not_joined(tmp_path):
@@ -297,7 +298,8 @@ def test_what_a_process_still_writes_is_not_swept(tmp_path):
         path.write_text("x")
     with atomic(tmp_path / "c") as file:
         file.write(b"x")
-        folders.make_run_folder(tmp_path, "new").close()
+        with folders.opened(tmp_path, "new", step=0):
+            pass
     assert (tmp_path / "c").read_bytes() == b"x"
     assert other.exists()
     assert not old.exists(), "left by an earlier process of this number, as in a container"
@@ -391,7 +393,7 @@ def test_a_refused_run_leaves_no_folder(tiny_scene, tmp_path):
         status = json.loads((out / "status.json").read_text())
         assert (status["state"], status["exit_code"]) == ("failed", done.returncode)
         assert f"error: {status['message']}" in again.stderr
-        assert not (out / lock.FILE).exists()
+        assert not (out / LOCK).exists()
 
 
 def test_a_folder_with_files_of_others_stays(tiny_scene, tmp_path, monkeypatch):

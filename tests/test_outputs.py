@@ -1,5 +1,6 @@
 """A pipeline, also one from the network, writes inside its run folder alone, and what it writes is read back."""
 
+import ast
 import json
 import sys
 import typing
@@ -13,14 +14,12 @@ from clsplat.errors import ConfigError, OutputError
 from clsplat.pipeline.file import PipelineFile
 from clsplat.pipeline.loading import load
 from clsplat.pipeline.matrix import Matrix, MatrixFile, load_experiment
-from clsplat.prepare.cache import NOTE
-from clsplat.runs import folders, lock, opening, outputs, runner
-from clsplat.runs.experiment import PAGE, Job
+from clsplat.runs import opening, outputs, runner
+from clsplat.runs.experiment import Job
 from clsplat.scene.images import write_image
 from clsplat.settings import TAGS, Settings, VariantName
 from clsplat.stages.base import Stage, path_in_run
 from clsplat.stages.render import image_paths
-from clsplat.training import checkpoint
 from clsplat.training.run import Run
 
 READ = {  # text that is read, or compared, and never the name of something that is written
@@ -248,8 +247,18 @@ def test_what_a_run_writes_itself_is_on_the_table_of_reserved_names(finished):
     chosen = {path for stage in pipeline.stages for path in stage.outputs(run.out)}
     made = {path.name for path in run.out.iterdir()} - {path.relative_to(run.out).parts[0] for path in chosen}
     assert {"status.json", "metrics.jsonl", "checksums.json"} <= made
-    fixed = {lock.FILE, NOTE, PAGE, checkpoint.FOLDER, "log.txt", "undistorted"}
-    assert made | fixed <= names.RESERVED
+    assert made <= names.RESERVED
+
+
+def test_names_of_files_of_a_run_stand_in_one_table_and_are_reserved():
+    table = {value for name, value in vars(names).items() if name.isupper() and isinstance(value, str)}
+    assert {"pipeline.yaml", "run.lock", "compare.html", "undistorted"} < table <= names.RESERVED
+    package = Path(names.__file__).parent
+    for file in package.rglob("*.py"):
+        if file.parent.name in ("api", "cli") or file.name == "names.py":  # of a page that is no run's
+            continue
+        texts = {node.value for node in ast.walk(ast.parse(file.read_text())) if isinstance(node, ast.Constant)}
+        assert not texts & table, file
 
 
 def test_views_that_differ_in_their_suffix_have_a_render_each():
@@ -276,7 +285,6 @@ DAMAGE = {
 def finished(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, Run]:
     out = tmp_path_factory.mktemp("outputs") / "run"
     checked = load("smoke", [f"scene.path='{tiny_scene}'", "optimize.steps=3", "optimize.during=[]"])
-    folders.make_run_folder(out, "new")
     run = opening.open_run(checked, out, None)
     runner.execute(checked, run, "new", lambda progress: None)
     return checked, run

@@ -8,7 +8,7 @@ import pytest
 from clsplat.errors import DataError, Interrupted
 from clsplat.metrics import views
 from clsplat.pipeline.loading import load
-from clsplat.runs import folders, opening, runner
+from clsplat.runs import opening, runner
 from tests.test_training import train
 
 pytestmark = pytest.mark.slow
@@ -38,7 +38,6 @@ def test_an_evaluate_that_was_half_done_leaves_no_line_twice(
     way, rendered, finished, tiny_scene, tmp_path, monkeypatch
 ):
     checked = load("smoke", [f"scene.path='{tiny_scene}'", *FEW])
-    folders.make_run_folder(tmp_path / "run", "new")
     run = opening.open_run(checked, tmp_path / "run", None)
     render, count = views.render_view, []
 

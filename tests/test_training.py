@@ -28,9 +28,9 @@ pytestmark = pytest.mark.slow
 def train(scene: Path, out: Path, *overrides: str, pipeline: str = "smoke", resume: bool = False) -> Run:
     checked = load(pipeline, [f"scene.path='{scene}'", *overrides])
     start: folders.Start = "resume" if resume else "new"
-    folders.make_run_folder(out, start)
-    run = opening.open_run(checked, out, None)
-    runner.execute(checked, run, start, lambda progress: None)
+    with folders.opened(out, start, step=0) as status:
+        run = opening.open_run(checked, out, None, start, status)
+        runner.execute(checked, run, start, lambda progress: None)
     return run
 
 
@@ -117,7 +117,6 @@ def test_the_sort_does_not_matter(finished, tiny_scene, tmp_path, sort):
 def test_interrupt_saves_and_resume_goes_on(finished, tiny_scene, tmp_path):
     out = tmp_path / "stopped"
     checked = load("smoke", [f"scene.path='{tiny_scene}'"])
-    folders.make_run_folder(out, "new")
     run = opening.open_run(checked, out, None)
 
     def stop(progress: Progress) -> None:

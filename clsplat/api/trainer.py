@@ -93,7 +93,7 @@ class Trainer:
         opened = default_device(schedule) if device is None else open_device(device, schedule)
         outputs.check_places(self.pipeline, self.out)
         with ExitStack() as holding:
-            status = holding.enter_context(folders.opened(self.out, start))
+            status = holding.enter_context(folders.opened(self.out, start, step=0))
             with folders.failures_recorded(status, as_raised=True):
                 self._run = opening.make_run(self.pipeline, self.scene, opened, self.out, status)
                 runner.begin(self.pipeline, self._run, start)

@@ -10,6 +10,7 @@ from clsplat import terminal
 from clsplat.compare.page import write_comparison
 from clsplat.errors import ClsplatError, ConfigError, DataError, Interrupted, as_clsplat_error, one_line
 from clsplat.files import is_there, write_text
+from clsplat.names import COMPARISON, LOG_FILE, PIPELINE
 from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import Pipeline, load
 from clsplat.pipeline.matrix import Cell, Experiment, load_experiment
@@ -21,7 +22,6 @@ from clsplat.training.changes import first_difference
 from clsplat.training.status import StatusFile, read_status
 
 LOG = logging.getLogger("clsplat")
-PAGE = "compare.html"
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Job:
     @classmethod
     def resume(cls, out: Path, overrides: Sequence[str] = ()) -> "Job":
         """Take the pipeline that a run folder holds, to go on with it there.  Raises ConfigError or DataError."""
-        file = out / "pipeline.yaml"
+        file = out / PIPELINE
         if not file.is_file():
             raise DataError(f"{out}: has no pipeline.yaml; expected the folder of a run")
         return cls.open(str(file), None, out, overrides, "resume")
@@ -65,7 +65,8 @@ class Job:
     def describe(self, device: str | Device | None = None) -> str:
         """What would run, as lines of text.  Raises what `run` raises before it begins."""
         if isinstance(self.work, Experiment):
-            check_matrix_folder(self.out, self.start)
+            folders.check_run_folder(self.out, self.start)
+            check_matrix_folder(self.out)
             return describe_matrix(self.work, self.out)
         return description.describe(self.work, self.out, device, self.start)
 
@@ -81,13 +82,12 @@ class Job:
 
 def run_pipeline(pipeline: Pipeline, out: Path, device: str | Device | None, start: Start) -> None:
     """Run one pipeline in its folder, with a log and a progress bar.  Raises ClsplatError; status.json tells why."""
-    folders.check_run_folder(out, start)
     outputs.check_places(pipeline, out)
     with (
-        folders.opened(out, start) as status,
+        folders.opened(out, start, step=0) as status,
         stopping_on_signals(stop_at_once),
         folders.failures_recorded(status),
-        terminal.logging_to(out / "log.txt"),
+        terminal.logging_to(out / LOG_FILE),
     ):
         run = opening.open_run(pipeline, out, device, start, status)
         with terminal.progress_bar() as show:
@@ -100,13 +100,13 @@ def run_matrix(experiment: Experiment, out: Path, device: str | Device | None, s
     A cell that fails does not stop the others; at the end a ClsplatError is raised with the exit code of the first one.
     Interrupted stops the whole.
     """
-    check_matrix_folder(out, start)
+    check_matrix_folder(out)
     count = len(experiment.cells)
     with (
         folders.opened(out, start, cells=count, done=0, failed={}) as status,
         folders.failures_recorded(status),
     ):
-        write_text(out / folders.PIPELINE, experiment.text)
+        write_text(out / PIPELINE, experiment.text)
         failures = _run_cells(experiment, status, device, start)
         _compare(experiment, out, failures)
         if failures:
@@ -139,10 +139,9 @@ def _run_cells(
     return failures
 
 
-def check_matrix_folder(out: Path, start: Start) -> None:
-    """Raise ConfigError when the folder holds another run, or not those of a matrix."""
-    folders.check_run_folder(out, start)
-    if (out / "pipeline.yaml").exists() and "matrix" not in (read_yaml(out / "pipeline.yaml").data or {}):
+def check_matrix_folder(out: Path) -> None:
+    """Raise ConfigError when the folder holds a single run."""
+    if (out / PIPELINE).exists() and "matrix" not in (read_yaml(out / PIPELINE).data or {}):
         raise ConfigError(f"{out}: holds a single run, not those of a matrix; give another folder")
 
 
@@ -171,7 +170,7 @@ def _finished(cell: Cell, folder: Path) -> bool:
     """Whether the cell was run to its end.  Raises ConfigError when that was with other settings."""
     if read_status(folder).get("state") != "done":
         return False
-    before = load(str(folder / "pipeline.yaml")).resolved()
+    before = load(str(folder / PIPELINE)).resolved()
     if difference := first_difference(before, cell.pipeline.resolved()):
         raise ConfigError(f"{folder}: was run with other settings: {difference}; use another folder, or those settings")
     return True
@@ -181,8 +180,8 @@ def _compare(experiment: Experiment, out: Path, failures: dict[str, ClsplatError
     finished = [out / cell.name for cell in experiment.cells if cell.name not in failures]
     remarks = [f"{name} failed and is not shown: {error}" for name, error in failures.items()]
     if finished:
-        write_comparison(finished, out / PAGE, experiment.name, remarks)
-        LOG.info("%d runs compared in %s", len(finished), out / PAGE)
+        write_comparison(finished, out / COMPARISON, experiment.name, remarks)
+        LOG.info("%d runs compared in %s", len(finished), out / COMPARISON)
 
 
 def _first_of(failures: dict[str, ClsplatError], cells: int) -> ClsplatError:

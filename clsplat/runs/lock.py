@@ -20,10 +20,10 @@ from typing import Any
 
 from clsplat.errors import OutputError
 from clsplat.files import unwritable
+from clsplat.names import LOCK
 from clsplat.processes import Owner
 
 LOG = logging.getLogger("clsplat")
-FILE = "run.lock"
 HELD = {errno.EACCES, errno.EAGAIN, errno.EDEADLK}  # what the systems answer for a lock that another holds
 NO_LOCKS = {errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL}
 BEHIND_THE_TEXT = 1 << 20  # Windows locks bytes for readers too
@@ -36,7 +36,7 @@ def held(folder: Path) -> Iterator[None]:
 
     Raises OutputError, with process and host where another holds it.
     """
-    path = (folder / FILE).resolve()
+    path = (folder / LOCK).resolve()
     if path in _held:
         raise OutputError(f"{folder}: is in use by this process; end that run or trainer first, or give another folder")
     try:
@@ -97,12 +97,12 @@ def _is_ours(file: io.FileIO, is_new: bool, path: Path, folder: Path) -> bool:
         if not _has_ended(Owner.named_by(owner)):
             raise OutputError(
                 f"{_in_use(folder, owner)}; this file system knows no locks: if that process has ended, "
-                f"remove {folder / FILE}"
+                f"remove {folder / LOCK}"
             )
         LOG.info("%s: taken over from process %s, which has ended", folder, owner.get("process"))
         _remove(file, path)
         return False
-    LOG.warning("%s: its file system knows no locks; %s alone keeps other processes away", folder, FILE)
+    LOG.warning("%s: its file system knows no locks; %s alone keeps other processes away", folder, LOCK)
     return True
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from clsplat.conformance.quick import open_correct
 from clsplat.errors import ConfigError
 from clsplat.files import unwritable
+from clsplat.names import UNDISTORTED
 from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import Pipeline, prepared_folder
 from clsplat.prepare.cache import Planned, note, noted, prepare
@@ -81,7 +82,7 @@ def check_start(
     return opened, planned
 
 
-def make_run(pipeline: Pipeline, scene: Scene, device: Device, out: Path, status: StatusFile | None = None) -> Run:
+def make_run(pipeline: Pipeline, scene: Scene, device: Device, out: Path, status: StatusFile) -> Run:
     """Return a run of the pipeline on a scene, before its first stage; every photograph was decoded.
 
     Raises DataError, naming the files, when some of the training or test photographs and masks cannot be used.
@@ -106,7 +107,7 @@ def make_run(pipeline: Pipeline, scene: Scene, device: Device, out: Path, status
         view for one in (original, downscaled) for split in ("train", "test") for view in one.split(split)
     )
     require_whole(scene.path, files)
-    run = Run(
+    return Run(
         device=device,
         scene=downscaled,
         original=original,
@@ -116,9 +117,8 @@ def make_run(pipeline: Pipeline, scene: Scene, device: Device, out: Path, status
         settings=settings,
         pipeline=pipeline.resolved(),
         rasterizer=Rasterizer(device, settings.rasterizer.sort, settings.rasterizer.budget()),
-        photographs=Photographs(device, background, None if budget is None else budget << 20, out / "undistorted"),
+        photographs=Photographs(device, background, None if budget is None else budget << 20, out / UNDISTORTED),
+        status=status,
         model_settings=settings.model,
         identity=Identity.of(original, files),
     )
-    run.status = status or run.status
-    return run

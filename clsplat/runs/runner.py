@@ -8,11 +8,11 @@ from pathlib import Path
 
 from clsplat.errors import Interrupted
 from clsplat.files import write_text
+from clsplat.names import CHECKSUMS, NOTE, PIPELINE
 from clsplat.pipeline.loading import Pipeline
-from clsplat.prepare.cache import NOTE
 from clsplat.runs.folders import Start, clear, failures_recorded
 from clsplat.runs.inputs import require_same_inputs, write_inputs
-from clsplat.runs.outputs import CHECKSUMS, check_outputs, write_checksums, write_metrics
+from clsplat.runs.outputs import check_outputs, write_checksums, write_metrics
 from clsplat.runs.signals import finishing_on_interrupt
 from clsplat.training import checkpoint
 from clsplat.training.rescue import saved_on_failure
@@ -43,7 +43,7 @@ def begin(pipeline: Pipeline, run: Run, start: Start) -> None:
         LOG.info("resumed at step %d" if taken else "nothing to resume; starting from the beginning%.0s", run.step)
         checkpoint.drop_later(run.out, taken)
     (run.out / CHECKSUMS).unlink(missing_ok=True)
-    write_text(run.out / "pipeline.yaml", f"# resolved from {pipeline.path.name}\n{pipeline.text()}")
+    write_text(run.out / PIPELINE, f"# resolved from {pipeline.path.name}\n{pipeline.text()}")
     write_inputs(run)
     if run.prepared:
         write_text(run.out / NOTE, json.dumps(run.prepared) + "\n")

@@ -6,6 +6,7 @@ from typing import Any
 
 from clsplat.compare.run_folder import read_metrics
 from clsplat.errors import DataError
+from clsplat.names import METRICS, PIPELINE
 from clsplat.processes import Owner
 from clsplat.training.records import Records
 from clsplat.training.status import END_STATES, read_status
@@ -30,8 +31,8 @@ def run_status(out: Path) -> dict[str, Any]:
         elif isinstance(status.get("time"), int | float):
             status["silent"] = max(0, round(time.time() - status["time"]))
     metrics = None
-    if (out / "metrics.json").exists():
-        metrics = read_metrics(out / "metrics.json").model_dump(exclude_unset=True)
+    if (out / METRICS).exists():
+        metrics = read_metrics(out / METRICS).model_dump(exclude_unset=True)
     lines = Records(out).read("train")
     return {"run": str(out), **status, "last": lines[-1] if lines else None, "metrics": metrics}
 
@@ -47,7 +48,7 @@ def status_text(status: dict[str, Any]) -> str:
     if (
         goes_on
         and status["state"] in ("killed", "failed", "interrupted")
-        and (Path(status["run"]) / "pipeline.yaml").is_file()
+        and (Path(status["run"]) / PIPELINE).is_file()
     ):
         lines.append(f"  `clsplat resume {status['run']}` goes on with it")
     if status["last"] and status["metrics"] is None:

@@ -9,6 +9,7 @@ from typing import Any
 
 from clsplat.errors import DataError
 from clsplat.files import unwritable, write_text
+from clsplat.names import RECORDS
 from clsplat.reading import read_file
 
 
@@ -20,7 +21,7 @@ class Records:
 
     def __init__(self, out: Path) -> None:
         self.out = out
-        self.path = out / "metrics.jsonl"
+        self.path = out / RECORDS
         self.lines = 0  # of metrics.jsonl that belong to the state of the run, with those that wait
         self._waiting: list[str] = []
 

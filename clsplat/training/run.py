@@ -61,6 +61,7 @@ class Run:
     pipeline: dict[str, Any]  # the same, resolved, as written to pipeline.yaml
     rasterizer: Rasterizer
     photographs: Photographs
+    status: StatusFile
     model_settings: ModelSettings
     identity: Identity | None = None  # of the original scene and its photographs
     prepared: dict[str, str] | None = None  # hash of the inputs of `prepare:`, and the folder of its result
@@ -82,7 +83,6 @@ class Run:
 
     def __post_init__(self) -> None:
         self.records = Records(self.out)
-        self.status = StatusFile(self.out)
         self._model: DeviceModel | None = None
         self._filter_views: FilterViews | None = None
         self._texture_quantiles: dict[float, float] = {}
