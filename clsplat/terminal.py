@@ -15,6 +15,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 from clsplat import __version__, streams
 from clsplat.errors import OutputError
 from clsplat.files import unwritable
+from clsplat.names import METRICS
 
 if TYPE_CHECKING:  # the command line starts without OpenCL
     from clsplat.training import run as training
@@ -152,9 +153,9 @@ def device_text(device: dict[str, Any]) -> str:
 
 def show_summary(folder: Path) -> None:
     """Print the metrics of a run and the paths of its files; nothing for a matrix."""
-    if not (folder / "metrics.json").exists():
+    if not (folder / METRICS).exists():
         return
-    metrics = json.loads((folder / "metrics.json").read_text("utf-8"))
+    metrics = json.loads((folder / METRICS).read_text("utf-8"))
     test = next(iter(metrics["test"].values()), None)
     quality = f"test PSNR {test['psnr']:.2f} dB, SSIM {test['ssim']:.4f}; " if test else ""
     remark(f"{quality}{metrics['gaussians']:,} Gaussians; {metrics['train_seconds']:.0f} s of training")

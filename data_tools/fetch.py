@@ -14,7 +14,7 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import BinaryIO
 
 from clsplat.errors import ConfigError, DataError, OutputError
-from clsplat.files import unwritable
+from clsplat.files import is_there, unwritable
 
 CHUNK = 1 << 20  # bytes
 MAX_TRIES = 5  # of one download
@@ -58,7 +58,7 @@ def fetch(source: Source, out: Path, report: Report = print) -> Path:
     An interrupted download stays beside `out` as `….part`; the next call continues it.
     Raises DataError when the download fails, the checksum differs or a file lies outside of the archive's folder.
     """
-    if out.exists():
+    if is_there(out):
         report(f"{out} is there already: nothing to do")
         return out
     archive = out.with_name(f"{out.name}.{PurePosixPath(source.url.split('?')[0]).name}")

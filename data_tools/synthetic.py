@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from rich.progress import track
 
 from clsplat.errors import DataError, OutputError
+from clsplat.files import is_there
 from clsplat.scene.points import write_points_ply
 from clsplat.scene.scene import PointCloud
 from data_tools.shapes import Array, Shape, align, disc, dot, rotate, spiral, unit
@@ -151,9 +152,9 @@ def write_dataset(out: Path, options: Options, workers: int | None = None) -> st
     `workers` processes share the views (default: one per core; 1 = this process).  Raises DataError when `out` exists
     and is another data set, OutputError when it cannot be written.
     """
-    if is_complete(out, options):
-        return f"{out} is complete already: nothing to do"
-    if out.exists() or out.is_symlink():
+    if is_there(out):
+        if is_complete(out, options):
+            return f"{out} is complete already: nothing to do"
         raise DataError(f"{out} exists and is not this data set; remove it or choose another folder")
     partial_out = out.parent / f".{out.name}.{os.getpid()}.partial"
     try:

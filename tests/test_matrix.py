@@ -192,7 +192,7 @@ def finished(tiny_scene, tmp_path_factory) -> tuple[str, Path]:
     found = load_experiment(str(folder / "x.yaml"))
     assert found is not None
     logging.getLogger("clsplat").setLevel(logging.INFO)
-    experiment.run_matrix(found, folder / "run", None, resume=False)
+    experiment.run_matrix(found, folder / "run", None, "new")
     return str(folder / "x.yaml"), folder / "run"
 
 
@@ -244,14 +244,14 @@ def test_resume_runs_what_is_missing_only(finished, tmp_path):
 def test_a_cell_that_fails_does_not_stop_the_others(finished, tmp_path, monkeypatch):
     execute = runner.execute
 
-    def failing(pipeline, run, resume, show):
+    def failing(pipeline, run, start, show):
         if pipeline.settings.stages[1].steps == 4:
             raise NumericError("the loss is nan") if run.seed == 0 else DataError("no photograph")
-        execute(pipeline, run, resume, show)
+        execute(pipeline, run, start, show)
 
     monkeypatch.setattr(runner, "execute", failing)
     with pytest.raises(ClsplatError, match=r"2 of 4 cells failed; the first, steps=4-.*: the loss is nan") as error:
-        experiment.run_matrix(load_experiment(finished[0]), tmp_path / "run", None, resume=False)
+        experiment.run_matrix(load_experiment(finished[0]), tmp_path / "run", None, "new")
     assert error.value.exit_code == NumericError.exit_code
     status = json.loads((tmp_path / "run" / "status.json").read_text())
     assert (status["state"], status["exit_code"], status["done"]) == ("failed", 6, 4)
@@ -269,7 +269,7 @@ def test_a_matrix_ends_in_a_status_whatever_happens(finished, tmp_path, monkeypa
     monkeypatch.setattr(experiment, "write_comparison", broken)
     shutil.copytree(finished[1], tmp_path / "run")
     with pytest.raises(InternalError, match=r"a defect\): AssertionError; run with --debug") as error:
-        experiment.run_matrix(load_experiment(finished[0]), tmp_path / "run", None, resume=True)
+        experiment.run_matrix(load_experiment(finished[0]), tmp_path / "run", None, "resume")
     status = json.loads((tmp_path / "run" / "status.json").read_text())
     assert (status["state"], status["exit_code"], status["message"]) == ("failed", 1, str(error.value))
 
@@ -277,13 +277,13 @@ def test_a_matrix_ends_in_a_status_whatever_happens(finished, tmp_path, monkeypa
 def test_an_interrupt_stops_the_whole(finished, tmp_path, monkeypatch):
     cells = []
 
-    def interrupted(pipeline, run, resume, show):
+    def interrupted(pipeline, run, start, show):
         cells.append(run.out)
         raise Interrupted("stopped at step 2")
 
     monkeypatch.setattr(runner, "execute", interrupted)
     with pytest.raises(Interrupted):
-        experiment.run_matrix(load_experiment(finished[0]), tmp_path / "run", None, resume=False)
+        experiment.run_matrix(load_experiment(finished[0]), tmp_path / "run", None, "new")
     assert json.loads((tmp_path / "run" / "status.json").read_text())["state"] == "interrupted"
     assert len(cells) == 1
     assert not cells[0].exists(), "it had not begun"
@@ -294,16 +294,16 @@ def test_cells_run_with_other_settings_are_not_taken_for_done(finished, write, t
     shutil.copytree(finished[1], tmp_path / "run")
     changed = write(Path(finished[0]).read_text().replace("count: 300", "count: 301"))
     with pytest.raises(ClsplatError, match=r"4 of 4 cells failed.*stages\[0\].init.count was 300, is 301") as error:
-        experiment.run_matrix(load_experiment(changed), tmp_path / "run", None, resume=True)
+        experiment.run_matrix(load_experiment(changed), tmp_path / "run", None, "resume")
     assert error.value.exit_code == 2
 
 
 def test_folders_are_not_mixed(finished, tiny_scene, tmp_path):
     with pytest.raises(ConfigError, match="already holds a run"):
-        experiment.run_matrix(load_experiment(finished[0]), finished[1], None, resume=False)
+        experiment.run_matrix(load_experiment(finished[0]), finished[1], None, "new")
     (tmp_path / "pipeline.yaml").write_text("name: single\nstages: []\n")
     with pytest.raises(ConfigError, match="holds a single run"):
-        experiment.run_matrix(load_experiment(finished[0]), tmp_path, None, resume=True)
+        experiment.run_matrix(load_experiment(finished[0]), tmp_path, None, "resume")
 
 
 def test_check_and_dry_run_list_the_cells(finished, tmp_path):

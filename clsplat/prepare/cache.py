@@ -14,13 +14,13 @@ from typing import Any
 
 from clsplat.errors import DataError, OutputError
 from clsplat.files import sweep, unwritable, write_text
+from clsplat.names import NOTE
 from clsplat.prepare.steps import Step
 from clsplat.progress import Count
 from clsplat.reading import read_json
 
 LOG = logging.getLogger("clsplat")
 RECORD = "record.json"
-NOTE = "prepared.json"  # in the run folder
 
 
 @dataclass(frozen=True)

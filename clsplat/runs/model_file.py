@@ -16,6 +16,7 @@ from clsplat.gaussians.model import MODEL, load
 from clsplat.metrics.lpips import InputRange
 from clsplat.metrics.perceptual import Perceptual, metric_names
 from clsplat.metrics.views import PSNR_AND_SSIM, mean, measure, render_view
+from clsplat.names import PIPELINE
 from clsplat.opencl.device import Device, open_device
 from clsplat.pipeline.file import SceneSettings
 from clsplat.pipeline.loading import load as load_pipeline
@@ -53,9 +54,9 @@ class Source:
                     f"{model}: a model file does not name its scene; give the folder of a scene, or a run folder"
                 )
             return cls(model, scene, SceneSettings())
-        if not (model / "pipeline.yaml").is_file():
+        if not (model / PIPELINE).is_file():
             raise DataError(f"{model}: has no pipeline.yaml; expected a model file or a run folder")
-        settings = load_pipeline(str(model / "pipeline.yaml")).settings.scene
+        settings = load_pipeline(str(model / PIPELINE)).settings.scene
         if not (model / MODEL).is_file():
             raise DataError(f"{model}: has no {MODEL}; finish the run with `clsplat resume {model}`")
         prepared = noted(model)

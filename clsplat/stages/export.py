@@ -6,7 +6,7 @@ from typing import Annotated, ClassVar, Literal
 
 from clsplat.errors import DataError
 from clsplat.gaussians.model import load
-from clsplat.stages.base import Scheduled, path_in_run
+from clsplat.stages.base import CADENCE, Scheduled, path_in_run
 from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
@@ -21,6 +21,7 @@ class Export(Scheduled):
 
     stage: Literal["export"] = "export"
     needs: ClassVar[frozenset[str]] = frozenset({"model"})
+    output_keys: ClassVar[frozenset[str]] = CADENCE | {"file"}
 
     file: Annotated[str, path_in_run(".ply")] = "point_cloud.ply"
     """Path inside the run folder."""
