@@ -1,13 +1,15 @@
 """Read files: regular ones alone, because a pipe or a device may have no end, and no more bytes than are expected."""
 
 import errno
+import hashlib
 import json
 import os
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
+from io import BufferedReader
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 from clsplat.errors import ClsplatError, DataError
 
@@ -23,7 +25,7 @@ KINDS = {
 @contextmanager
 def opened(
     path: Path, expected: str = "a file", kind: type[ClsplatError] = DataError, limit: int | None = None
-) -> Iterator[BinaryIO]:
+) -> Iterator[BufferedReader]:
     """Open a regular file of at most `limit` bytes for reading.
 
     Raises an error of this `kind` when that fails, or when the block cannot read.
@@ -43,6 +45,12 @@ def read_file(
         return file.read()
 
 
+def sha256(path: Path, kind: type[ClsplatError] = DataError) -> str:
+    """Return the SHA-256 of a regular file, as `sha256sum` prints it.  Raises DataError, or another `kind`."""
+    with opened(path, kind=kind) as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
 def read_json(
     path: Path, expected: str = "a JSON file", kind: type[ClsplatError] = DataError, limit: int | None = None
 ) -> Any:
@@ -55,7 +63,7 @@ def read_json(
         raise kind(f"{path}: not a JSON file ({reason}); expected {expected}: make it again") from error
 
 
-def _regular(path: Path, limit: int | None) -> BinaryIO:
+def _regular(path: Path, limit: int | None) -> BufferedReader:
     """Open a regular file.  Raises OSError."""
     try:
         state = os.stat(path)
