@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any, Literal
 
 from clsplat.api.arguments import PathLike, load_plugins, overrides
-from clsplat.api.device import default_device
+from clsplat.api.device import proved
 from clsplat.errors import ClsplatError, ConfigError, DataError
 from clsplat.gaussians.model import Model
 from clsplat.losses.base import HostFunction, HostLoss, ViewGradients
 from clsplat.metrics.views import mean, measure
-from clsplat.opencl.device import Device, open_device
+from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import Pipeline, load
 from clsplat.runs import folders, lock, opening, runner
 from clsplat.runs.experiment import quoted
@@ -87,8 +87,8 @@ class Trainer:
             out = tempfile.mkdtemp(prefix="clsplat-")
             weakref.finalize(self, shutil.rmtree, out, ignore_errors=True)
         self.out = Path(out)
-        schedule = self.pipeline.settings.rasterizer.schedule
-        opened = default_device(schedule) if device is None else open_device(device, schedule)
+        rasterizer = self.pipeline.settings.rasterizer
+        opened = proved(device, rasterizer.schedule, rasterizer.sort)
         with ExitStack() as holding:
             status = holding.enter_context(folders.opened(self.out, resume))
             with folders.failures_recorded(status, as_raised=True):

@@ -1,7 +1,6 @@
 """A model at the views of a scene: rendering and measuring without training."""
 
 import io
-import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,13 +9,14 @@ from typing import Any
 
 import numpy as np
 
+from clsplat.conformance.quick import open_correct
 from clsplat.errors import ConfigError, DataError
 from clsplat.files import atomic
 from clsplat.gaussians.model import MODEL, load
 from clsplat.metrics.lpips import InputRange
 from clsplat.metrics.perceptual import Perceptual, metric_names
 from clsplat.metrics.views import PSNR_AND_SSIM, mean, measure, render_view
-from clsplat.opencl.device import Device, open_device
+from clsplat.opencl.device import Device
 from clsplat.pipeline.file import SceneSettings
 from clsplat.pipeline.loading import load as load_pipeline
 from clsplat.prepare.cache import noted
@@ -29,7 +29,6 @@ from clsplat.views.photographs import Photographs
 
 SPLITS = ("train", "test", "all")
 KINDS = ("png", "npy")  # of files
-LOG = logging.getLogger("clsplat")
 
 
 @dataclass(frozen=True)
@@ -78,8 +77,7 @@ class ModelFile:
         """downscale: divisor of the photographs' size; default: that of the run, 1 for a file."""
         source = Source.of(model, scene)
         file = load(source.file)
-        self.device = open_device(device)
-        LOG.info("device: %s", self.device.text)
+        self.device = open_correct(device)
         alpha = source.alpha or file.rendering.alpha
         self.photographs = read_scene(source.folder, source.settings.holdout).with_alpha(alpha)
         self.downscale = downscale or source.settings.downscale
