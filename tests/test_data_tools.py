@@ -119,7 +119,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 def test_not_a_video(tmp_path):
     (tmp_path / "v.mp4").write_text("nothing")
     assert "not a video that OpenCV decodes" in refusal(write_frames, tmp_path / "v.mp4", tmp_path / "out")
-    assert "no such file" in refusal(write_frames, tmp_path / "w.mp4", tmp_path / "out")
+    assert "No such file" in refusal(write_frames, tmp_path / "w.mp4", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 

@@ -38,7 +38,7 @@ def write_checksums(pipeline: Pipeline, run: Run) -> None:
     for place in (path for stage in pipeline.stages for path in stage.outputs(run.out)):
         found += sorted(place.rglob("*")) if place.is_dir() else [place]
     sums = {
-        path.relative_to(run.out).as_posix(): sha256(path, OutputError)
+        path.relative_to(run.out).as_posix(): sha256(path, kind=OutputError)
         for path in dict.fromkeys(found)
         if path.is_file()
     }
