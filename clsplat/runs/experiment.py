@@ -61,8 +61,7 @@ class Job:
         """What would run, as lines of text.  Raises what `run` raises before it begins."""
         _require_one(resume, restart)
         if isinstance(self.work, Experiment):
-            check_matrix_folder(self.out, resume or restart)
-            return describe_matrix(self.work, self.out)
+            return describe_matrix(self.work, self.out, device, resume, restart)
         return description.describe(self.work, self.out, device, resume, restart)
 
     def run(self, device: str | Device | None = None, resume: bool = False, restart: bool = False) -> None:
@@ -121,7 +120,7 @@ def run_matrix(
         failures = _run_cells(experiment, status, device, resume, restart)
         _compare(experiment, out, failures)
         if failures:
-            raise _first_of(failures, count)
+            raise _first_of(failures, count, "failed")
         status.end("done", exit_code=0)
 
 
@@ -157,14 +156,28 @@ def check_matrix_folder(out: Path, resume: bool) -> None:
         raise ConfigError(f"{out}: holds a single run, not those of a matrix; give another folder")
 
 
-def describe_matrix(experiment: Experiment, out: Path) -> str:
-    """What would run, a line for each cell.  Raises DataError when a scene cannot be read."""
-    for scene in {c.pipeline.settings.scene for c in experiment.cells if not c.pipeline.settings.prepare}:
-        scene.read(scene.folder)
-    lines = []
+def describe_matrix(
+    experiment: Experiment, out: Path, device: str | Device | None, resume: bool, restart: bool = False
+) -> str:
+    """What would run, a line for each cell.
+
+    Raises a ClsplatError with the exit code of the first cell that the run would refuse.
+    """
+    check_matrix_folder(out, resume or restart)
+    lines, refusals = [], dict[str, ClsplatError]()
     for cell in experiment.cells:
-        state = "done" if _finished(cell, out / cell.name) else "unfinished" if (out / cell.name).exists() else ""
+        folder = out / cell.name
+        state = "unfinished" if folder.exists() else ""
+        try:
+            if resume and _finished(cell, folder):
+                state = "done"
+            else:
+                description.describe(cell.pipeline, folder, device, resume, restart)
+        except ClsplatError as error:
+            refusals[cell.name] = error
         lines.append(f"  {cell.name}  {state}".rstrip())
+    if refusals:
+        raise _first_of(refusals, len(lines), "would fail")
     return f"would run {len(lines)} cells in {out}:\n" + "\n".join(lines)
 
 
@@ -196,9 +209,9 @@ def _compare(experiment: Experiment, out: Path, failures: dict[str, ClsplatError
         LOG.info("%d runs compared in %s", len(finished), out / PAGE)
 
 
-def _first_of(failures: dict[str, ClsplatError], cells: int) -> ClsplatError:
+def _first_of(failures: dict[str, ClsplatError], cells: int, what: str) -> ClsplatError:
     """The error that stands for those of the cells, with the exit code of the first."""
     name, first = next(iter(failures.items()))
-    whole = ClsplatError(f"{len(failures)} of {cells} cells failed; the first, {name}: {first}")
+    whole = ClsplatError(f"{len(failures)} of {cells} cells {what}; the first, {name}: {first}")
     whole.exit_code = first.exit_code
     return whole
