@@ -12,6 +12,8 @@ thread by default.
 
 import logging
 import shutil
+import signal
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -232,7 +234,9 @@ def require_pycolmap() -> ModuleType:
         import pycolmap
     except ImportError as error:
         raise ConfigError("placing photographs needs pycolmap: pip install 'clsplat[photos]'") from error
-    pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR.value)
+    if threading.current_thread() is threading.main_thread():  # its import lets SIGTERM end the process with a dump
+        signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM) or signal.SIG_DFL)
+    pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL.value)  # what ends a step is raised too
     return pycolmap
 
 

@@ -2,6 +2,8 @@
 
 import os
 import signal
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -104,3 +106,24 @@ def test_the_first_signal_stops_at_once_where_there_is_no_model_yet(pipeline, ti
         Job.open(pipeline, tiny_scene, tmp_path).run()
     assert read_status(tmp_path)["state"] == "interrupted"
     assert not (tmp_path / "checkpoints").exists()
+
+
+AFTER_PYCOLMAP = """
+import os, signal
+from data_tools.photos import require_pycolmap
+
+def handler(number, frame):
+    raise SystemExit("handled")
+
+signal.signal(signal.SIGTERM, handler)
+require_pycolmap()
+os.kill(os.getpid(), signal.SIGTERM)
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="SIGTERM ends a process at once there")
+def test_pycolmap_does_not_take_sigterm():
+    """Its import has the process end with a dump, and nothing said in status.json."""
+    pytest.importorskip("pycolmap")
+    done = subprocess.run([sys.executable, "-c", AFTER_PYCOLMAP], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (1, "handled\n")
