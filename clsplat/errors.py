@@ -68,7 +68,7 @@ class MemoryLimitError(ClsplatError):
 
 
 class NumericError(ClsplatError):
-    """Training has produced values that are not finite, or no Gaussians."""
+    """Values of training or of a picture are not finite, or no Gaussians are left."""
 
     exit_code = 6
 

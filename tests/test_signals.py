@@ -65,9 +65,9 @@ def signalled(function: Callable[..., Any], call: int, times: int = 1) -> Callab
 
 
 PLACES = {  # what is called for the n-th time when the signal comes -> the message
-    "an evaluation in training": (views, "render_view", 1, "stopped at step 4, saved in "),
+    "an evaluation in training": (views, "render_floats", 1, "stopped at step 4, saved in "),
     "a stage that edits": (densify, "densify", 1, "stopped in densify, saved in "),
-    "an evaluation": (views, "render_view", 4, "stopped in evaluate, saved in "),
+    "an evaluation": (views, "render_floats", 4, "stopped in evaluate, saved in "),
     "renders": (render, "render_view", 1, "stopped in render, saved in "),
     "the report": (report, "render_view", 1, "stopped in report, saved in "),
 }

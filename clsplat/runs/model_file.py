@@ -13,9 +13,10 @@ from clsplat.conformance.quick import open_correct
 from clsplat.errors import ConfigError, DataError
 from clsplat.files import atomic
 from clsplat.gaussians.model import MODEL, load
+from clsplat.metrics.images import to_8_bits
 from clsplat.metrics.lpips import InputRange
 from clsplat.metrics.perceptual import Perceptual, metric_names
-from clsplat.metrics.views import PSNR_AND_SSIM, mean, measure, render_view
+from clsplat.metrics.views import PSNR_AND_SSIM, mean, measure, render_floats, require_finite
 from clsplat.opencl.device import Device
 from clsplat.pipeline.file import SceneSettings
 from clsplat.pipeline.loading import load as load_pipeline
@@ -94,14 +95,13 @@ class ModelFile:
             raise DataError(f"{self.scene.path}: has no {split} views")
         paths = image_paths(out, [view.name for view in views], f".{kind}")
         for path, view in zip(paths, views, strict=True):
-            camera = photographs.camera(view)
+            image = render_floats(self.rasterizer, self.model, photographs.camera(view), photographs.background)
+            require_finite(image, view)
             if kind == "png":
-                write_image(path, render_view(self.rasterizer, self.model, camera, photographs.background))
+                write_image(path, to_8_bits(image))
             else:
-                frame = self.rasterizer.forward(self.model, camera, photographs.background)
-                planes = frame.image.get()[:, : camera.height, : camera.width]
                 buffer = io.BytesIO()
-                np.save(buffer, np.ascontiguousarray(planes.transpose(1, 2, 0)), allow_pickle=False)
+                np.save(buffer, image, allow_pickle=False)
                 with atomic(path) as stream:
                     stream.write(buffer.getvalue())
         return len(views)
@@ -116,7 +116,8 @@ class ModelFile:
             photographs = Photographs(self.device, self.background)
             for split in ("test", "train"):
                 if scene.split(split):
-                    results = measure(self.rasterizer, self.model, scene.split(split), photographs, perceptual)
+                    views = scene.split(split)
+                    results = measure(self.rasterizer, self.model, views, photographs, perceptual, finite=True)
                     metrics[split][f"{downscale:g}"] = mean(results, perceptual)
         return {**metrics, "gaussians": self.model.gaussians.count, "device": self.device.text}
 
