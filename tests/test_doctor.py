@@ -14,7 +14,7 @@ from clsplat.conformance.checks import BY_NAME, KERNELS, SPEED, whole
 from clsplat.conformance.comparison import Figure
 from clsplat.conformance.doctor import examine
 from clsplat.conformance.page import report_page
-from clsplat.conformance.report import Report
+from clsplat.conformance.report import DeviceReport
 from clsplat.conformance.supervision import Result, supervised
 from clsplat.conformance.verdict import judge
 from clsplat.errors import MemoryLimitError
@@ -123,8 +123,8 @@ def test_wide_is_tried_where_somebody_would_use_it(monkeypatch, info, empty_cach
     assert list(examine(device).schedules) == schedules
 
 
-def report_of(info, **schedules: list[Result]) -> Report:
-    return Report(info, "wide", schedules, seconds=2.0)
+def report_of(info, **schedules: list[Result]) -> DeviceReport:
+    return DeviceReport(info, "wide", schedules, seconds=2.0)
 
 
 def test_a_report_is_json_whatever_the_values_are(info):

@@ -18,7 +18,7 @@ from clsplat.metrics.views import mean, measure
 from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import Pipeline, load
 from clsplat.runs import folders, lock, opening, runner
-from clsplat.runs.experiment import quoted
+from clsplat.runs.experiment import as_setting
 from clsplat.scene.detect import read_scene
 from clsplat.scene.scene import Scene
 from clsplat.scene.view import NO_FILE
@@ -75,7 +75,7 @@ class Trainer:
         """
         load_plugins()
         folder = scene.path if isinstance(scene, Scene) else Path(scene)
-        place = [f"scene.path={quoted(folder)}"] if folder.is_dir() else []
+        place = [f"scene.path={as_setting(folder)}"] if folder.is_dir() else []
         self.pipeline = load(str(pipeline), [*place, *overrides(set or {})])
         _check(self.pipeline)
         self.scene = scene if isinstance(scene, Scene) else read_scene(folder, self.pipeline.settings.scene.holdout)

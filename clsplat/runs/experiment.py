@@ -43,7 +43,7 @@ class Job:
 
         out: default runs/NAME, with a number where that is another run.
         """
-        changes = [*overrides, *([f"scene.path={quoted(scene)}"] if scene is not None else [])]
+        changes = [*overrides, *([f"scene.path={as_setting(scene)}"] if scene is not None else [])]
         if found := load_experiment(pipeline, changes):
             return cls(found, out or folders.free_folder(Path("runs") / found.name, None, resume))
         checked = load(pipeline, changes)
@@ -181,7 +181,7 @@ def describe_matrix(
     return f"would run {len(lines)} cells in {out}:\n" + "\n".join(lines)
 
 
-def quoted(folder: Path) -> str:
+def as_setting(folder: Path) -> str:
     """A folder as a value of `--set`, from wherever it is used.  Raises ConfigError when YAML cannot hold its name."""
     path = str(folder.resolve())
     try:
