@@ -108,9 +108,9 @@ def test_the_first_signal_stops_at_once_where_there_is_no_model_yet(pipeline, ti
     assert not (tmp_path / "checkpoints").exists()
 
 
-AFTER_PYCOLMAP = """
+AFTER = """
 import os, signal
-from data_tools.photos import require_pycolmap
+from data_tools.pycolmap_import import require_pycolmap
 
 def handler(number, frame):
     raise SystemExit("handled")
@@ -119,11 +119,27 @@ signal.signal(signal.SIGTERM, handler)
 require_pycolmap()
 os.kill(os.getpid(), signal.SIGTERM)
 """
+WITHIN = """
+import signal, sys
+from data_tools.pycolmap_import import require_pycolmap
+
+class Finder:
+    def find_spec(name, path, target=None):
+        if name == "pycolmap":
+            signal.raise_signal(signal.SIGINT)
+
+sys.meta_path.insert(0, Finder)
+try:
+    require_pycolmap()
+except KeyboardInterrupt:
+    raise SystemExit("handled" if "pycolmap._core" in sys.modules else "in the middle")
+"""
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="SIGTERM ends a process at once there")
-def test_pycolmap_does_not_take_sigterm():
-    """Its import has the process end with a dump, and nothing said in status.json."""
+@pytest.mark.parametrize("script", [AFTER, WITHIN], ids=["after its import", "within its import"])
+def test_pycolmap_does_not_take_signals(script):
+    """Its import has SIGTERM end the process with a dump, and turns a KeyboardInterrupt into a defect."""
     pytest.importorskip("pycolmap")
-    done = subprocess.run([sys.executable, "-c", AFTER_PYCOLMAP], capture_output=True, text=True, check=False)
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (1, "handled\n")

@@ -18,8 +18,8 @@ from data_tools.photos import (
     find_features,
     map_cameras,
     match_features,
-    require_pycolmap,
 )
+from data_tools.pycolmap_import import require_pycolmap
 from data_tools.undistort import Blank, undistort_scene
 
 Positive = Annotated[int, Field(gt=0)]
