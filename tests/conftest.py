@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from clsplat import plugins
+from clsplat.conformance import quick
 from clsplat.opencl.device import Array, Device
 from clsplat.opencl.discovery import DeviceInfo, choose
 from clsplat.opencl.program import Program
@@ -65,6 +66,19 @@ def device(request: pytest.FixtureRequest) -> Device:
     opened = Device(choose(name or None), schedule)
     opened.tuning["LANES"] = lanes
     return opened
+
+
+@pytest.fixture(scope="session")
+def info() -> DeviceInfo:
+    """The first device that is tested."""
+    return choose(NAMES[0] or None)
+
+
+@pytest.fixture
+def empty_cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """A folder where no device is known to compute rightly."""
+    monkeypatch.setattr(quick, "cache_folder", lambda: tmp_path)
+    return tmp_path
 
 
 @pytest.fixture

@@ -10,15 +10,15 @@ from pathlib import Path
 from typing import Any, Literal
 
 from clsplat.api.arguments import PathLike, load_plugins, overrides
-from clsplat.api.device import default_device
+from clsplat.api.device import proved
 from clsplat.errors import ClsplatError, ConfigError, DataError, Interrupted, OutputError
 from clsplat.gaussians.model import Model
 from clsplat.losses.base import HostFunction, HostLoss, ViewGradients
 from clsplat.metrics.views import mean, measure
-from clsplat.opencl.device import Device, open_device
+from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import Pipeline, load
 from clsplat.runs import folders, lock, opening, outputs, runner
-from clsplat.runs.experiment import quoted
+from clsplat.runs.experiment import as_setting
 from clsplat.runs.folders import Start
 from clsplat.runs.stepwise import is_trained, run_until_training, train
 from clsplat.scene.detect import read_scene
@@ -77,7 +77,7 @@ class Trainer:
         """
         load_plugins()
         folder = scene.path if isinstance(scene, Scene) else Path(scene)
-        place = [f"scene.path={quoted(folder)}"] if folder.is_dir() else []
+        place = [f"scene.path={as_setting(folder)}"] if folder.is_dir() else []
         self.pipeline = load(str(pipeline), [*place, *overrides(set or {})])
         _check(self.pipeline)
         self.scene = scene if isinstance(scene, Scene) else read_scene(folder, self.pipeline.settings.scene.holdout)
@@ -89,9 +89,9 @@ class Trainer:
             out = tempfile.mkdtemp(prefix="clsplat-")
             weakref.finalize(self, shutil.rmtree, out, ignore_errors=True)
         self.out = Path(out)
-        schedule = self.pipeline.settings.rasterizer.schedule
-        opened = default_device(schedule) if device is None else open_device(device, schedule)
         outputs.check_places(self.pipeline, self.out)
+        rasterizer = self.pipeline.settings.rasterizer
+        opened = proved(device, rasterizer.schedule, rasterizer.sort)
         with ExitStack() as holding:
             status = holding.enter_context(folders.opened(self.out, start, step=0))
             with folders.failures_recorded(status, as_raised=True):

@@ -48,7 +48,7 @@ class Job:
         """
         if out is not None:
             is_there(out)
-        changes = [*overrides, *([f"scene.path={quoted(scene)}"] if scene is not None else [])]
+        changes = [*overrides, *([f"scene.path={as_setting(scene)}"] if scene is not None else [])]
         if found := load_experiment(pipeline, changes):
             return cls(found, out or folders.free_folder(Path("runs") / found.name, None, start), start)
         checked = load(pipeline, changes)
@@ -65,9 +65,7 @@ class Job:
     def describe(self, device: str | Device | None = None) -> str:
         """What would run, as lines of text.  Raises what `run` raises before it begins."""
         if isinstance(self.work, Experiment):
-            folders.check_run_folder(self.out, self.start)
-            check_matrix_folder(self.out)
-            return describe_matrix(self.work, self.out)
+            return describe_matrix(self.work, self.out, device, self.start)
         return description.describe(self.work, self.out, device, self.start)
 
     def run(self, device: str | Device | None = None) -> None:
@@ -110,7 +108,7 @@ def run_matrix(experiment: Experiment, out: Path, device: str | Device | None, s
         failures = _run_cells(experiment, status, device, start)
         _compare(experiment, out, failures)
         if failures:
-            raise _first_of(failures, count)
+            raise _first_of(failures, count, "failed")
         status.end("done", exit_code=0)
 
 
@@ -145,18 +143,31 @@ def check_matrix_folder(out: Path) -> None:
         raise ConfigError(f"{out}: holds a single run, not those of a matrix; give another folder")
 
 
-def describe_matrix(experiment: Experiment, out: Path) -> str:
-    """What would run, a line for each cell.  Raises DataError when a scene cannot be read."""
-    for scene in {c.pipeline.settings.scene for c in experiment.cells if not c.pipeline.settings.prepare}:
-        scene.read(scene.folder)
-    lines = []
+def describe_matrix(experiment: Experiment, out: Path, device: str | Device | None, start: Start) -> str:
+    """What would run, a line for each cell.
+
+    Raises a ClsplatError with the exit code of the first cell that the run would refuse.
+    """
+    folders.check_run_folder(out, start)
+    check_matrix_folder(out)
+    lines, refusals = [], dict[str, ClsplatError]()
     for cell in experiment.cells:
-        state = "done" if _finished(cell, out / cell.name) else "unfinished" if (out / cell.name).exists() else ""
+        folder = out / cell.name
+        state = "unfinished" if folder.exists() else ""
+        try:
+            if start == "resume" and _finished(cell, folder):
+                state = "done"
+            else:
+                description.describe(cell.pipeline, folder, device, start)
+        except ClsplatError as error:
+            refusals[cell.name] = error
         lines.append(f"  {cell.name}  {state}".rstrip())
+    if refusals:
+        raise _first_of(refusals, len(lines), "would fail")
     return f"would run {len(lines)} cells in {out}:\n" + "\n".join(lines)
 
 
-def quoted(folder: Path) -> str:
+def as_setting(folder: Path) -> str:
     """A folder as a value of `--set`, from wherever it is used.  Raises ConfigError when YAML cannot hold its name."""
     path = str(folder.resolve())
     try:
@@ -184,9 +195,9 @@ def _compare(experiment: Experiment, out: Path, failures: dict[str, ClsplatError
         LOG.info("%d runs compared in %s", len(finished), out / COMPARISON)
 
 
-def _first_of(failures: dict[str, ClsplatError], cells: int) -> ClsplatError:
+def _first_of(failures: dict[str, ClsplatError], cells: int, what: str) -> ClsplatError:
     """The error that stands for those of the cells, with the exit code of the first."""
     name, first = next(iter(failures.items()))
-    whole = ClsplatError(f"{len(failures)} of {cells} cells failed; the first, {name}: {first}")
+    whole = ClsplatError(f"{len(failures)} of {cells} cells {what}; the first, {name}: {first}")
     whole.exit_code = first.exit_code
     return whole

@@ -4,9 +4,10 @@ import json
 import logging
 from pathlib import Path
 
-from clsplat.errors import ConfigError, shortened
+from clsplat.errors import ConfigError, DataError, shortened
 from clsplat.files import write_text
 from clsplat.names import INPUTS
+from clsplat.reading import read_json
 from clsplat.scene.identity import Identity
 from clsplat.training.run import Run
 
@@ -36,6 +37,6 @@ def require_same_inputs(run: Run) -> None:
 
 def _read(path: Path) -> Identity | None:
     try:
-        return Identity.from_data(json.loads(path.read_text("utf-8")))
-    except (OSError, ValueError, RecursionError):
+        return Identity.from_data(read_json(path))
+    except (DataError, ValueError):
         return None

@@ -1,7 +1,7 @@
 """The files that a run has at its end."""
 
-import hashlib
 import json
+from collections.abc import Iterator
 from pathlib import Path
 
 from clsplat.compare.run_folder import read_metrics
@@ -9,6 +9,9 @@ from clsplat.errors import ConfigError, DataError, OutputError
 from clsplat.files import is_there, write_text
 from clsplat.names import CHECKSUMS, LOG_FILE, METRICS, PIPELINE, RECORDS
 from clsplat.pipeline.loading import Pipeline, load
+from clsplat.reading import sha256
+from clsplat.stages.base import Stage
+from clsplat.stages.optimize import Optimize
 from clsplat.training import checkpoint
 from clsplat.training.run import Run
 
@@ -33,17 +36,12 @@ def write_checksums(pipeline: Pipeline, run: Run) -> None:
     found = [run.out / name for name in (PIPELINE, METRICS, RECORDS)]
     for place in (path for stage in pipeline.stages for path in stage.outputs(run.out)):
         found += sorted(place.rglob("*")) if place.is_dir() else [place]
-    sums = {path.relative_to(run.out).as_posix(): checksum(path) for path in dict.fromkeys(found) if path.is_file()}
+    sums = {
+        path.relative_to(run.out).as_posix(): sha256(path, kind=OutputError)
+        for path in dict.fromkeys(found)
+        if path.is_file()
+    }
     write_text(run.out / CHECKSUMS, json.dumps(sums, indent=1) + "\n")
-
-
-def checksum(path: Path) -> str:
-    """Return the SHA-256 of a file, as `sha256sum` prints it.  Raises OutputError."""
-    try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be read back ({error.strerror})") from error
 
 
 def check_places(pipeline: Pipeline, out: Path) -> None:
@@ -73,7 +71,17 @@ def check_outputs(pipeline: Pipeline, run: Run) -> None:
     try:
         read_metrics(run.out / METRICS)
         load(str(run.out / PIPELINE))
-        for stage in pipeline.stages:
+        for stage in _acting(pipeline):
             stage.verify(run)
     except (ConfigError, DataError) as error:
         raise OutputError(f"{error}, at the end of the run; see {run.out / LOG_FILE}") from error
+
+
+def _acting(pipeline: Pipeline) -> Iterator[Stage]:
+    """The stages of a whole run, each training with those of its `during` that have run."""
+    step = 0
+    for stage in pipeline.stages:
+        yield stage
+        if isinstance(stage, Optimize):
+            yield from stage.acting(step)
+            step += stage.steps

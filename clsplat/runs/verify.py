@@ -13,8 +13,7 @@ from clsplat.names import CHECKPOINTS, CHECKSUMS, METRICS, PIPELINE, RECORDS, ST
 from clsplat.pipeline.files import shipped
 from clsplat.pipeline.loading import load as load_pipeline
 from clsplat.pipeline.matrix import load_experiment
-from clsplat.reading import read_json
-from clsplat.runs.outputs import checksum
+from clsplat.reading import read_json, sha256
 from clsplat.scene.images import read_image
 from clsplat.stages.export import Export
 from clsplat.training import archive, checkpoint
@@ -169,7 +168,7 @@ def _present(out: Path) -> list[str]:
 
 def _output(expected: str | None, path: Path) -> str:
     """Look at one output; return what it is.  Raises the errors of its reader, DataError where its bytes changed."""
-    if expected is not None and checksum(path) != expected:
+    if expected is not None and sha256(path) != expected:
         raise DataError("differs from its checksum")
     if path.name == METRICS:
         return f"{read_metrics(path).gaussians:,} Gaussians"

@@ -80,6 +80,11 @@ class Optimize(Stage):
     def outputs(self, out: Path) -> list[Path]:
         return [path for stage in self.during for path in stage.outputs(out)]
 
+    def acting(self, step: int) -> list[Scheduled]:
+        """Return the stages of `during` that run when the training begins after a global step."""
+        steps = range(step + 1, step + self.steps + 1)
+        return [stage for stage in self.during if any(map(stage.due, steps))]
+
     def run(self, run: Run) -> None:
         for _ in self.iterate(run):
             pass

@@ -17,7 +17,7 @@ from clsplat.metrics.views import render_view
 from clsplat.names import PIPELINE
 from clsplat.pages.page import charts, counted, duration, embedded, render
 from clsplat.pages.svg import Line, curve
-from clsplat.reading import read_file
+from clsplat.reading import read_file, read_text
 from clsplat.stages.base import Stage, path_in_run
 from clsplat.training.run import Run
 
@@ -205,4 +205,4 @@ def _figure(record: dict[str, Any], image: Image, photograph: Image) -> ViewFigu
 
 def _settings(run: Run) -> str:
     path = run.out / PIPELINE
-    return path.read_text(encoding="utf-8") if path.exists() else ""
+    return read_text(path) if path.exists() else ""
