@@ -84,7 +84,7 @@ def test_a_long_stage_ends_early_with_its_state_saved_and_is_repeated(
             Job.open(pipeline, tiny_scene, tmp_path).run()
     assert read_status(tmp_path)["state"] == "interrupted"
     assert list((tmp_path / "checkpoints").glob("*.npz"))
-    Job.resume(tmp_path).run(resume=True)
+    Job.resume(tmp_path).run()
     assert read_status(tmp_path)["state"] == "done"
     assert digest(tmp_path) == digest(undisturbed)
     for file in (undisturbed / "renders").rglob("*.png"):
