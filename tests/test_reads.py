@@ -30,6 +30,7 @@ ALLOWED = {  # module and function -> why it reads by itself
     "clsplat/files.py:sync_folder": "opens a folder",
     "clsplat/training/archive.py:read": "takes a file that `regular` has opened",
     "clsplat/training/archive.py:write": "writes",
+    "clsplat/runs/lock.py:_opened": "opens for writing too",
     "clsplat/conformance/quick.py:_hash_of_kernels": "reads files of the package",
     "clsplat/opencl/program.py": "reads kernels, of the package and of plug-ins: code that is trusted",
     "clsplat/opencl/runtimes.py": "reads files of the system's loader, before clsplat can be imported",
