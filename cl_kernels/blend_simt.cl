@@ -89,7 +89,7 @@ void blend_forward(
 
 /* One item owns one splat of a batch and adds the tile's pixels one after another: at step s, item i computes pixel
  * s - i, which item i - 1 computed at the step before, so every pixel blends its splats front to back.  No atomics, no
- * sums across items.  Local memory: PIXELS * 20 bytes.  Deterministic. */
+ * sums across items.  Local memory: PIXELS * 20 bytes, 24 with a texture.  Deterministic. */
 __kernel __attribute__((reqd_work_group_size(SPLAT_GROUP, 1, 1)))
 void blend_backward(
     __global const uint *restrict tile_offset,  // [T+1]

@@ -74,6 +74,10 @@ class NumericError(ClsplatError):
     exit_code = 6
 
 
+class NotFiniteError(NumericError):
+    """The state of a training is not finite; it was set aside, as failed_N.npz."""
+
+
 class OutputError(ClsplatError):
     """A file cannot be written or read back, or a folder is in use."""
 

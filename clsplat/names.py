@@ -2,9 +2,6 @@
 
 import re
 from pathlib import PureWindowsPath
-from typing import Annotated
-
-from pydantic import AfterValidator
 
 # What a run or a matrix writes itself, in its folder.
 PIPELINE = "pipeline.yaml"
@@ -45,19 +42,16 @@ def fault_of_name(name: str) -> str | None:
     return None
 
 
-def _readable(text: str) -> str:
-    if "\0" in text or any("\ud800" <= letter <= "\udfff" for letter in text):
-        raise ValueError("expected a path: no name of a file holds such a character")
-    return text
-
-
-ReadPath = Annotated[str, AfterValidator(_readable)]  # a file or folder that is read
+def is_inside(text: str) -> bool:
+    """Whether a relative path stays in its folder.  Both kinds of slash separate."""
+    path = PureWindowsPath(text)
+    return bool(path.parts) and not path.anchor and ".." not in path.parts
 
 
 def fault_of_output(text: str) -> str | None:
-    """Return why a pipeline may not choose a path in the run folder, or None.  Both kinds of slash separate."""
+    """Return why a pipeline may not choose a path in the run folder, or None."""
     parts = PureWindowsPath(text).parts
-    if not parts or PureWindowsPath(text).anchor or ".." in parts:
+    if not is_inside(text):
         return "it is not inside"
     if parts[0].casefold() in RESERVED:
         return f"'{parts[0]}' is written by the run itself"

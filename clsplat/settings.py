@@ -10,7 +10,7 @@ import typing
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, GetJsonSchemaHandler
+from pydantic import AfterValidator, BaseModel, ConfigDict, GetCoreSchemaHandler, GetJsonSchemaHandler
 from pydantic_core import CoreSchema, core_schema
 
 from clsplat.errors import ConfigError
@@ -110,6 +110,15 @@ class Variants:
         alone = [name for name, kind in variants(self.base).items() if not needs_settings(kind)]
         mapping = {"required": [self.tag], **handler(schema)}
         return {"anyOf": [{"enum": alone}, mapping]} if alone else mapping
+
+
+def _readable(text: str) -> str:
+    if "\0" in text or any("\ud800" <= letter <= "\udfff" for letter in text):
+        raise ValueError("expected a path: no name of a file holds such a character")
+    return text
+
+
+ReadPath = Annotated[str, AfterValidator(_readable)]  # a file or folder that is read
 
 
 class VariantName:

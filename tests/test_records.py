@@ -39,7 +39,7 @@ def test_an_evaluate_that_was_half_done_leaves_no_line_twice(
 ):
     checked = load("smoke", [f"scene.path='{tiny_scene}'", *FEW])
     run = opening.open_run(checked, tmp_path / "run", None)
-    render, count = views.render_view, []
+    render, count = views.render_floats, []
 
     def counted(*arguments):
         count.append(1)
@@ -50,7 +50,7 @@ def test_an_evaluate_that_was_half_done_leaves_no_line_twice(
         return render(*arguments)
 
     with monkeypatch.context() as patch:
-        patch.setattr(views, "render_view", counted)
+        patch.setattr(views, "render_floats", counted)
         with pytest.raises(Interrupted if way == "stopped" else DataError):
             runner.execute(checked, run, "new", lambda progress: None)
     saved = sorted(path.name for path in (tmp_path / "run" / "checkpoints").iterdir())

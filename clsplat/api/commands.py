@@ -3,7 +3,7 @@
 The command line prints what these return.  They raise the errors of `clsplat.errors`, with the messages of the
 commands: ConfigError for a pipeline or an argument, DataError for a dataset or a model, DeviceError for a device,
 OutputError for a file that cannot be written.  `device` is a part of a device's name, as `devices` lists them, or a
-`Device`; without it CLSPLAT_DEVICE, else the first GPU that works, else the first CPU.
+`Device`; without it CLSPLAT_DEVICE, else the strongest GPU that works, else the first CPU.
 """
 
 from collections.abc import Sequence

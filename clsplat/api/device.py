@@ -16,7 +16,7 @@ class Device(opencl.Device):
     Memory is released with the arrays, and the device with the last object that uses it.
 
     `name` is a part of a runtime's or device's name, as `clsplat devices` prints them; without it CLSPLAT_DEVICE, else
-    the first GPU that works, else the first CPU.  Raises DeviceError when there is none.
+    the strongest GPU that works, else the first CPU.  Raises DeviceError when there is none.
     """
 
     def __init__(self, name: str | None = None, schedule: Schedule = "auto") -> None:

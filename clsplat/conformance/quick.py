@@ -21,7 +21,7 @@ from clsplat.opencl.program import BUILD_OPTIONS
 from clsplat.render.tiles import Sort, known_sort
 
 LOG = logging.getLogger("clsplat")
-QUICK_SECONDS = 120  # without a word from a check, in front of a run
+QUICK_SECONDS = 300  # without a word from a check, in front of a run
 Resolved = Literal["wide", "simt"]
 SORTS = ("radix", "bitonic")  # each with a record of its own
 

@@ -96,7 +96,10 @@ def _fill(result: Result, lines: "queue.Queue[str | None]", seconds: float) -> s
             return f"gives no answer for {seconds} s"
         if text is None:
             return ""
-        line: dict[str, Any] = json.loads(text)
+        try:
+            line: dict[str, Any] = json.loads(text)
+        except ValueError:
+            return f"ends in the middle of a line: {shortened(text, 100)}"
         if "figure" in line:
             result.figures.append(Figure(**line["figure"]))
         elif "note" in line:
@@ -120,5 +123,6 @@ def _death(code: int, errors: IO[str]) -> str:
     written = [line.strip() for line in errors.read().splitlines() if line.strip()]
     last = f" ({shortened(written[-1], 300)})" if written else ""
     if code < 0:
-        return f"the runtime ends the process with {signal.Signals(-code).name}{last}"
+        names = {one.value: one.name for one in signal.Signals}
+        return f"the runtime ends the process with {names.get(-code, f'signal {-code}')}{last}"
     return f"the process ends with code {code}{last}"

@@ -1,6 +1,6 @@
 """Run checks on the device of two numbers, in a process of its own, and print what they find: one line of JSON each.
 
-A runtime may abort the process; whoever reads the lines knows which check had begun.
+A runtime may abort the process: the check of the next line is then the one that it ended.
 """
 
 import json
@@ -25,7 +25,6 @@ def main(platform: int, number: int, schedule: Schedule, names: list[str]) -> No
     info = next(info for info in list_devices() if info.place == (platform, number))
     device = Device(info, schedule)
     for name in names:
-        _print(out, begin=name)
         started = time.perf_counter()
         _run(out, BY_NAME[name], device)
         _print(out, end=name, seconds=round(time.perf_counter() - started, 3))

@@ -140,7 +140,9 @@ class Gaussians:
         """
         capacity = self.capacity
         if count > capacity:
-            capacity = _aligned(max(count, int(self.capacity * GROWTH)))
+            widest = max(table.components for table in self.tables.values()) * np.dtype(np.float32).itemsize
+            roomy = min(int(self.capacity * GROWTH), self.device.info.allocation // widest - ALIGNMENT)
+            capacity = _aligned(max(count, roomy))
         for table in self.tables.values():
             moved = self.device.zeros((table.components, capacity))
             self._rows.gather_rows(

@@ -16,6 +16,7 @@ runtimes.prepare()
 import pyopencl as cl  # noqa: E402
 
 DEVICE_VARIABLE = "CLSPLAT_DEVICE"
+LOCAL_MEMORY = 32 << 10  # bytes that kernels may take for a work-group; OpenCL 1.2, full profile
 LOG = logging.getLogger("clsplat")
 Schedule = Literal["auto", "wide", "simt"]
 
@@ -47,6 +48,8 @@ class DeviceInfo:
         needed = int(tuning_of(self, resolve_schedule(self, "auto"))["GROUP"])
         if self.group < needed:
             return f"its work-groups have at most {self.group} items; expected {needed} or more"
+        if self.local_memory < LOCAL_MEMORY:
+            return f"its work-groups have {self.local_memory} bytes of local memory; expected {LOCAL_MEMORY} or more"
         return runtimes.fault_of(f"{self.platform}|{self.name}|{self.driver}|{cl.VERSION_TEXT}", *self.place)
 
     def matches(self, device_name: str) -> bool:

@@ -13,14 +13,14 @@ from pydantic import AfterValidator, Field
 
 from clsplat.errors import ConfigError
 from clsplat.filters import ModelSettings
-from clsplat.names import ReadPath, fault_of_name
+from clsplat.names import fault_of_name
 from clsplat.opencl.discovery import Schedule
 from clsplat.prepare.steps import Step
 from clsplat.render.rasterizer import MAX_PAIRS, RECORD, Budget
 from clsplat.render.tiles import Sort
 from clsplat.scene.detect import read_scene
 from clsplat.scene.scene import HOLDOUT, Alpha, Background, Scene
-from clsplat.settings import OneOf, Settings
+from clsplat.settings import OneOf, ReadPath, Settings
 from clsplat.stages.base import Stage
 from clsplat.stages.optimize import Optimize
 

@@ -23,13 +23,13 @@ from typing import Annotated, Any
 from pydantic import Field, JsonValue, ValidationError, model_validator
 
 from clsplat.errors import ConfigError, OverrideError, quoted, shortened
-from clsplat.names import ReadPath, fault_of_output
+from clsplat.names import fault_of_output
 from clsplat.pipeline.explanation import explain, place_text
 from clsplat.pipeline.file import Name
 from clsplat.pipeline.files import find
 from clsplat.pipeline.loading import Pipeline, checked
 from clsplat.pipeline.yaml_file import Document, Place, read_pipeline, read_yaml
-from clsplat.settings import Settings
+from clsplat.settings import ReadPath, Settings
 
 MAX_CELLS = 1000
 

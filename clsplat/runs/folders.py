@@ -33,6 +33,7 @@ def opened(out: Path, start: Start, **values: Any) -> Iterator[StatusFile]:
         raise unwritable(out, error) from error
     try:
         with lock.held(out):
+            check_run_folder(out, start)  # again: another run may have ended since
             sweep(out, border=PIPELINE)
             status = StatusFile(out, **values)
             status.begin()

@@ -36,9 +36,11 @@ def held(folder: Path) -> Iterator[None]:
 
     Raises OutputError, with process and host where another holds it.
     """
-    path = (folder / LOCK).resolve()
+    path = folder.resolve() / LOCK
     if path in _held:
         raise OutputError(f"{folder}: is in use by this process; end that run or trainer first, or give another folder")
+    if path.is_symlink():
+        raise OutputError(f"{folder / LOCK}: is a link, which is not followed; remove it")
     try:
         file = _locked(path, folder)
     except OSError as error:
@@ -49,7 +51,8 @@ def held(folder: Path) -> Iterator[None]:
     finally:
         _held.discard(path)
         with suppress(OSError):  # Windows removes no open file
-            path.unlink()
+            if _is_at(file, path):
+                path.unlink()
         file.close()
         with suppress(OSError):
             if os.name == "nt":
@@ -114,7 +117,9 @@ def _remove(file: io.FileIO, path: Path) -> None:
         if _is_at(file, aside):
             aside.unlink()
         else:
-            os.replace(aside, path)
+            with suppress(FileExistsError):  # where a third process has made one since
+                os.link(aside, path)
+            aside.unlink()
 
 
 def _system_lock(file: io.FileIO) -> bool:

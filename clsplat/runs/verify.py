@@ -7,13 +7,14 @@ from typing import Any
 
 from clsplat import plugins
 from clsplat.compare.run_folder import read_metrics, read_settings
-from clsplat.errors import ConfigError, DataError, one_line
+from clsplat.errors import ConfigError, DataError, one_line, shortened
 from clsplat.gaussians.model import load as load_model
-from clsplat.names import CHECKPOINTS, CHECKSUMS, METRICS, PIPELINE, RECORDS, STATUS
+from clsplat.names import CHECKPOINTS, CHECKSUMS, INPUTS, METRICS, PIPELINE, RECORDS, STATUS, is_inside
 from clsplat.pipeline.files import shipped
 from clsplat.pipeline.loading import load as load_pipeline
 from clsplat.pipeline.matrix import load_experiment
 from clsplat.reading import read_json, sha256
+from clsplat.scene.identity import Identity
 from clsplat.scene.images import read_image
 from clsplat.stages.export import Export
 from clsplat.training import archive, checkpoint
@@ -94,7 +95,7 @@ def _objects(out: Path) -> Iterator[dict[str, Any]]:
     yield one(out / PIPELINE, pipeline)
     yield one(out / STATUS, _status)
     if "matrix" in settings:
-        for cell in sorted(folder for folder in out.iterdir() if folder.is_dir() and is_run(folder)):
+        for cell in sorted(one for one in out.iterdir() if one.is_dir() and not one.is_symlink() and is_run(one)):
             yield from ({**found, "file": f"{cell.name}/{found['file']}"} for found in _objects(cell))
         return
     yield from (one(path, _checkpoint) for path in checkpoint.saved(out))
@@ -102,6 +103,8 @@ def _objects(out: Path) -> Iterator[dict[str, Any]]:
     sums = _sums(out)
     if (out / CHECKSUMS).exists():
         yield one(out / CHECKSUMS, _listed)
+    if (out / INPUTS).exists():
+        yield one(out / INPUTS, _inputs)
     done = read_status(out).get("state") == "done"
     for name in dict.fromkeys([*sums, *_declared(out, settings, done), *_present(out)]):
         yield one(out / name, partial(_output, sums.get(name)))
@@ -132,10 +135,17 @@ def _failed(path: Path) -> str:
     return f"the state of a failure at step {archive.read(path)[0].get('step')}"
 
 
+def _inputs(path: Path) -> str:
+    Identity.from_data(read_json(path))
+    return ""
+
+
 def _listed(path: Path) -> str:
     sums = read_json(path)
     if not isinstance(sums, dict) or not all(isinstance(value, str) for value in sums.values()):
         raise DataError("expected the SHA-256 of each file")
+    if outside := [name for name in sums if not is_inside(name)]:
+        raise DataError(f"'{shortened(outside[0])}' is no file of the run")
     return f"of {len(sums)} files"
 
 
@@ -145,7 +155,7 @@ def _sums(out: Path) -> dict[str, str]:
         sums = read_json(out / CHECKSUMS)
     except DataError:
         return {}
-    return {str(name): str(value) for name, value in sums.items()} if isinstance(sums, dict) else {}
+    return {name: str(value) for name, value in sums.items() if is_inside(name)} if isinstance(sums, dict) else {}
 
 
 def _declared(out: Path, settings: dict[str, Any], done: bool) -> list[str]:

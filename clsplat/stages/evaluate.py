@@ -8,7 +8,7 @@ from pydantic import Field, field_validator
 from clsplat.metrics.lpips import InputRange
 from clsplat.metrics.perceptual import Metric, Perceptual
 from clsplat.metrics.views import mean, measure
-from clsplat.names import ReadPath
+from clsplat.settings import ReadPath
 from clsplat.stages.base import CADENCE, Scheduled
 from clsplat.training.run import Run
 

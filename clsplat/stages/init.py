@@ -14,11 +14,11 @@ from scipy.spatial import cKDTree
 from clsplat.errors import DataError
 from clsplat.gaussians.ply import Parameters, read_ply
 from clsplat.gaussians.tables import SH_C0, Gaussians, sh_coefficients
-from clsplat.names import ReadPath
 from clsplat.scene.images import read_image
 from clsplat.scene.plane_sweep import swept_points
 from clsplat.scene.scene import PointCloud, Scene, View
 from clsplat.scene.view import load_image
+from clsplat.settings import ReadPath
 from clsplat.stages.base import Stage
 from clsplat.training.memory import first_tables
 from clsplat.training.run import Run

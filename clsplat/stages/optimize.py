@@ -11,7 +11,7 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field, field_validator
 
 from clsplat.density.statistics import SplatStats
-from clsplat.errors import DataError, Interrupted, NumericError
+from clsplat.errors import DataError, Interrupted, NotFiniteError
 from clsplat.losses.base import ImageLoss, Loss, Penalty, ViewGradients
 from clsplat.losses.image import pixel_loss
 from clsplat.metrics.distribution import distribution
@@ -186,6 +186,7 @@ class Optimize(Stage):
         except BaseException:  # a second Ctrl-C too
             run.step -= 1
             run.stage_step -= 1
+            run.device.timings.sampling = False
             raise
         with run.changing():
             trainer.update(view, stale)
@@ -227,7 +228,7 @@ class Optimize(Stage):
         return photograph
 
     def _values(self, run: Run, view: ViewGradients, sampler: Sampler) -> tuple[float, float]:
-        """Read the step's loss and PSNR.  Raises NumericError, with the state set aside, when not finite."""
+        """Read the step's loss and PSNR.  Raises NotFiniteError, with the state set aside, when not finite."""
         loss = view.loss
         squared = float(pixel_loss(view.comparison, l1=0.0, l2=0.0).get()[..., 1].sum(dtype="float64"))
         error = squared / view.comparison.counted
@@ -235,7 +236,7 @@ class Optimize(Stage):
         if broken or not math.isfinite(loss):
             view_name = sampler.at(run.step).view.name
             told = checkpoint.set_aside(run, broken)
-            raise NumericError(f"step {run.step}, view '{view_name}': the loss is {loss}; {told}")
+            raise NotFiniteError(f"step {run.step}, view '{view_name}': the loss is {loss}; {told}")
         return loss, -10 * math.log10(max(error, 1e-10))
 
     def _report(self, run: Run, last_step: int, loss: float, psnr: float, seconds: float) -> None:

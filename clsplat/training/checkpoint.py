@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from clsplat import __version__
 from clsplat.density.statistics import FOLDER as STATS_FOLDER
 from clsplat.density.statistics import SEEN, SplatStats
-from clsplat.errors import ClsplatError, ConfigError, DataError, NumericError, OutputError
+from clsplat.errors import ClsplatError, ConfigError, DataError, NotFiniteError, OutputError
 from clsplat.files import atomic
 from clsplat.gaussians.model import WIDTHS
 from clsplat.gaussians.tables import PARAMETERS, Gaussians, moment_tables
@@ -60,13 +60,13 @@ class State(BaseModel):
 def save(run: Run, keep: int | None = None) -> Path:
     """Write checkpoints/step_N.npz, whole or not at all; with `keep` remove all but so many of the newest.
 
-    Raises NumericError, after writing failed_N.npz, where the model is not finite; then nothing is removed.  Raises
+    Raises NotFiniteError, after writing failed_N.npz, where the model is not finite; then nothing is removed.  Raises
     ClsplatError where a step or an edit is half done.
     """
     if not run.whole:
         raise ClsplatError(f"{run.out}: step {run.step} is half done, so it is not saved; resume the run to go on")
     if broken := run.model.gaussians.not_finite():
-        raise NumericError(f"step {run.step}: {set_aside(run, broken)}")
+        raise NotFiniteError(f"step {run.step}: {set_aside(run, broken)}")
     path = _write(run, "step")
     run.status.note(checkpoint=path.name)
     run.status.refresh()

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from clsplat.errors import MemoryLimitError
-from clsplat.gaussians.tables import GROWTH, PARAMETERS, moment_tables, sh_coefficients
+from clsplat.gaussians.tables import ALIGNMENT, GROWTH, PARAMETERS, moment_tables, sh_coefficients
 from clsplat.opencl.discovery import DeviceInfo
 from clsplat.render.rasterizer import PIXEL_SUMS, RECORD
 
@@ -40,8 +40,9 @@ class MemoryPlan:
         by_total = (self.memory - self.fixed) / (
             GROWTH * self.gaussian + self.largest_table + PAIRS_PER_GAUSSIAN * self.pair
         )
-        by_buffer = self.allocation / max(GROWTH * self.largest_table, PAIRS_PER_GAUSSIAN * 4 * RECORD)
-        return max(0, int(min(by_total, by_buffer)))
+        by_table = self.allocation // self.largest_table // ALIGNMENT * ALIGNMENT
+        by_pairs = self.allocation / (PAIRS_PER_GAUSSIAN * 4 * RECORD)
+        return max(0, int(min(by_total, by_table, by_pairs)))
 
     def text(self, gaussians: int) -> str:
         """Return one line: the memory needed now, and the number of Gaussians that fit."""

@@ -73,11 +73,14 @@ class Records:
         if not self.path.exists():
             return []
         lines = []
-        for number, text in enumerate(read_file(self.path).decode(errors="replace").splitlines(), 1):
+        texts = read_file(self.path).decode(errors="replace").split("\n")
+        for number, text in enumerate(texts, 1):
             try:
                 line = json.loads(text)
             except (ValueError, RecursionError):
-                continue
+                if number == len(texts):  # nothing, or what a crash has left
+                    break
+                line = None
             if not isinstance(line, dict) or type(line.get("step")) is not int or not isinstance(line.get("kind"), str):
                 raise DataError(
                     f"{self.path}:{number}: damaged; expected keys and values with 'step' and 'kind'; remove this line"

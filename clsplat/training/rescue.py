@@ -4,7 +4,7 @@ import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from clsplat.errors import Interrupted, NumericError, one_line
+from clsplat.errors import Interrupted, NotFiniteError, one_line
 from clsplat.training import checkpoint
 from clsplat.training.run import Run
 
@@ -16,7 +16,7 @@ def saved_on_failure(run: Run) -> Iterator[None]:
     """Where the block fails, save the state of the last whole step, and tell where it is; the failure is raised."""
     try:
         yield
-    except (Interrupted, NumericError):  # saved already, or not to be gone on from
+    except (Interrupted, NotFiniteError):  # saved already, or set aside
         raise
     except Exception:
         if run.step > 0:

@@ -2,6 +2,7 @@
 
 import json
 import logging
+import os
 import threading
 import time
 import weakref
@@ -36,7 +37,7 @@ class Amount(BaseModel):
     total: int
     """Number of units in all."""
     unit: str
-    """What is counted: steps, views, photographs, cells."""
+    """What is counted, in words: steps, views, cells, photographs decoded, …"""
 
 
 class Status(BaseModel):
@@ -170,9 +171,9 @@ class StatusFile:
         """Write the status, before the end; where that fails the run goes on, with a warning the first time."""
         try:
             with self._writing:
-                if not self._ended.is_set() and self.out.is_dir():  # one that was removed stays so
+                if not self._ended.is_set() and os.path.isdir(self.out):  # one that was removed stays so
                     self._write()
-        except OutputError as error:
+        except (OutputError, OSError) as error:
             if not self._warned:
                 LOG.warning("%s; the run goes on", error)
             self._warned = True

@@ -19,6 +19,7 @@ import clsplat
 from clsplat.files import PARTIAL
 from clsplat.training.records import Records
 
+ATTEMPTS = 200  # of one run: each has time for a step at least, most for many
 TIMES = ("ms", "stages")  # of a record
 SETTINGS = {
     "smoke": {"checkpoint.every": 1, "optimize.steps": 30},
@@ -38,6 +39,7 @@ def kills(scene: Path, folder: Path, count: int, seed: int = 0) -> Iterator[Coun
     Its entries: killed, in a write (a temporary file was left), finished (runs that came to their end), and equal
     (those with the bits and the records of the undisturbed run).
     """
+    folder.mkdir(parents=True, exist_ok=True)
     chance, tally = random.Random(seed), Counter[str]()
     expected, seconds = {}, {}
     for recipe in SETTINGS:
@@ -47,7 +49,7 @@ def kills(scene: Path, folder: Path, count: int, seed: int = 0) -> Iterator[Coun
     while tally["killed"] < count:
         recipe = list(SETTINGS)[tally["finished"] % len(SETTINGS)]
         out = folder / f"{recipe}-{tally['finished']}"
-        while True:
+        for _ in range(ATTEMPTS):
             attempt = Attempt(scene, out, recipe)
             if attempt.killed_after(chance.uniform(0.05, 1.0) * seconds[recipe]):
                 tally["killed"] += 1
@@ -55,6 +57,8 @@ def kills(scene: Path, folder: Path, count: int, seed: int = 0) -> Iterator[Coun
                 yield tally
             else:
                 break
+        else:
+            raise RuntimeError(f"{out}: {ATTEMPTS} attempts, and the run has not come to its end")
         tally["finished"] += 1
         tally["equal"] += attempt.code == 0 and identity(out) == expected[recipe]
         yield tally

@@ -32,9 +32,10 @@ def large_splats(device: Device, rng: np.random.Generator) -> Iterator[Figure | 
     yield from tiles.list_figures(device, case, "radix", "a scene of large Gaussians")
 
 
-@CHECKS.add("scan_offsets", "radix_count", "radix_scatter")
+@CHECKS.add("scan_blocks", "scan_offsets", "radix_count", "radix_scatter")
 def sorting(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
-    yield tiles.scan_figure(device, rng.integers(0, 100, 1025).astype(np.uint32))
+    for count in (1025, 40_001):  # one block, and several
+        yield tiles.scan_figure(device, rng.integers(0, 100, count).astype(np.uint32))
     yield from tiles.radix_figures(device, rng.integers(0, 2**20, 1025).astype(np.uint32), 20)
 
 
