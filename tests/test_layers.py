@@ -23,6 +23,7 @@ ROWS = (  # from the top down; a module imports only from lower rows, or from it
     {"views", "filters"},
     {"render"},
     {"gaussians", "scene"},
+    {"formats"},
     {"opencl", "pages"},
     {"caches", "errors", "files", "names", "ply_header", "plugins", "processes", "progress", "reading", "schedule"}
     | {"settings", "signals", "streams", ""},

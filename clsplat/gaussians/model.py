@@ -8,9 +8,10 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.gaussians.ply import MAX_DEGREE, read_ply, write_ply
+from clsplat.formats.splats import MAX_DEGREE, PARAMETERS, SH_C0, Reading, SplatFile, Writing, sh_coefficients
+from clsplat.formats.table import for_writing, read, write
 from clsplat.gaussians.sh import rotated_sh
-from clsplat.gaussians.tables import PARAMETERS, SH_C0, DeviceModel, Gaussians, sh_coefficients
+from clsplat.gaussians.tables import DeviceModel, Gaussians
 from clsplat.opencl.device import Device
 
 MODEL = "point_cloud.ply"  # of a run folder
@@ -165,12 +166,15 @@ class Model:
         logits = np.maximum(logit, MIN_LOGIT).astype(np.float32)
         return replace(self, log_scales=log_scales, logit_opacity=logits, filter_variance=None)
 
-    def save(self, path: str | Path) -> None:
-        """Write a PLY in the layout of 3DGS; a world filter that is not `baked` is kept, as a property `filter_3D`.
+    def save(self, path: str | Path, options: Writing | None = None) -> None:
+        """Write a file in the format that its name stands for: .ply, .spz, .sog, .glb and others (docs/formats.md).
 
-        Raises OutputError when it cannot be written.
+        A world filter that is not `baked` is kept in a PLY, as a property `filter_3D`, and baked for other formats.
+        Raises ConfigError for another name, and OutputError when the file cannot be written.
         """
-        write_ply(Path(path), self.tables(), self.rendering.comment())
+        model = self if for_writing(Path(path)).keeps_filter else self.baked()
+        mode = "mip" if self.rendering.compensate else "default"
+        write(Path(path), SplatFile(model.tables(), self.rendering.comment(), mode), options)
 
     def __repr__(self) -> str:
         return f"Model({len(self):,} Gaussians, SH degree {self.sh_degree})"
@@ -190,10 +194,13 @@ class Model:
         return summary(rows)
 
 
-def load(path: str | Path) -> Model:
-    """Read a model file, or the model of a run folder.  Raises DataError when it is missing, damaged or not a splat."""
+def load(path: str | Path, options: Reading | None = None) -> Model:
+    """Read a model file of any format (docs/formats.md), or the model of a run folder.
+
+    Raises DataError when it is missing, damaged or not a splat.
+    """
     path = Path(path)
-    file = read_ply(path / MODEL if path.is_dir() else path)
+    file = read(path / MODEL if path.is_dir() and (path / MODEL).exists() else path, options)
     return Model(**file.parameters, rendering=Rendering.of(file.rendering, file.mode))
 
 

@@ -12,7 +12,8 @@ from pydantic import Field
 from scipy.spatial import cKDTree
 
 from clsplat.errors import DataError
-from clsplat.gaussians.ply import Parameters, read_ply
+from clsplat.formats.splats import Parameters, with_degree
+from clsplat.formats.table import read
 from clsplat.gaussians.tables import SH_C0, Gaussians, sh_coefficients
 from clsplat.names import ReadPath
 from clsplat.scene.images import read_image
@@ -91,7 +92,7 @@ class Init(Stage):
 
     @staticmethod
     def _read(path: Path) -> Parameters:
-        parameters = read_ply(path).parameters
+        parameters = read(path).parameters
         if not len(parameters["means"]):
             raise DataError(f"{path}: holds no Gaussians; expected one at least to start from")
         return parameters
@@ -166,11 +167,3 @@ def looked_at(positions: NDArray[np.floating], directions: NDArray[np.floating])
     across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
     point, *_ = np.linalg.lstsq(across.sum(axis=0), np.einsum("nij,nj->i", across, positions), rcond=None)
     return np.asarray(point)
-
-
-def with_degree(parameters: Parameters, degree: int) -> Parameters:
-    """Return the Gaussians with more or fewer SH bands."""
-    columns = 3 * (sh_coefficients(degree) - 1)
-    rest = parameters["sh_rest"][:, :columns]
-    padding = np.zeros((len(rest), columns - rest.shape[1]), np.float32)
-    return {**parameters, "sh_rest": np.concatenate([rest, padding], axis=1)}

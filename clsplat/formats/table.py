@@ -1,0 +1,159 @@
+"""The table of formats.  A file is told apart by its content; its name decides what is written."""
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from clsplat.errors import ConfigError, DataError, OutputError, quoted, shortened
+from clsplat.formats.compressed_ply import is_compressed, read_compressed_ply, write_compressed_ply
+from clsplat.formats.ply import read_ply, write_ply
+from clsplat.formats.splats import Reading, SplatFile, Writing, not_finite
+from clsplat.ply_header import MAX_HEADER, PlyHeader, parse_ply_header
+from clsplat.reading import opened
+
+LOG = logging.getLogger("clsplat")
+
+
+@dataclass(frozen=True)
+class Start:
+    """How a file begins."""
+
+    path: Path
+    data: bytes  # at most MAX_HEADER
+
+    def ply(self) -> PlyHeader | None:
+        """The header, where it is a PLY file that can be read."""
+        if not self.data.startswith(b"ply"):
+            return None
+        try:
+            return parse_ply_header(self.path, self.data)
+        except DataError:  # its reader says what is wrong
+            return None
+
+
+@dataclass(frozen=True)
+class Codec:
+    """One format."""
+
+    name: str
+    endings: tuple[str, ...]  # of names of files; the first is the usual one
+    reads: str  # in words; "" where there is no reader
+    writes: str  # in words; "" where there is no writer
+    loses: str  # in words: what writing changes
+    is_one: Callable[[Start], bool] = lambda start: False
+    read: Callable[[Path, Reading], SplatFile] | None = None
+    write: Callable[[Path, SplatFile, Writing], None] | None = None
+    keeps_filter: bool = False  # filter_3D
+    keeps_mode: bool = True  # the mark of a mip model
+    keeps_numbers: bool = False  # of the rasterizer
+    keeps_nan: bool = False
+
+
+def _is_ply(start: Start) -> bool:
+    return "f_dc_0" in (((header := start.ply()) and header.dtype.names) or ())
+
+
+CODECS = (
+    Codec(
+        "ply",
+        (".ply",),
+        "any order and number types, little or big endian, discs of 2DGS, other elements around the vertices",
+        "the order of 3DGS",
+        "nothing",
+        _is_ply,
+        lambda path, options: read_ply(path),
+        lambda path, splats, options: write_ply(path, splats.parameters, splats.rendering),
+        keeps_filter=True,
+        keeps_numbers=True,
+        keeps_nan=True,
+    ),
+    Codec(
+        "compressed PLY",
+        (".compressed.ply",),
+        "with and without ranges of colours",
+        "chunks of 256 along a Morton curve",
+        "position and scale to 1/2047 of a chunk's range, quaternions to 10 bits, colours and opacity to 8, "
+        "harmonics to 1/32, order",
+        lambda start: (header := start.ply()) is not None and is_compressed(header),
+        lambda path, options: read_compressed_ply(path),
+        write_compressed_ply,
+        keeps_numbers=True,
+    ),
+)
+
+
+def endings(reads: bool = False) -> list[str]:
+    """Return the endings of names that are written, or of those that are read."""
+    return [end for codec in CODECS if (codec.read if reads else codec.write) for end in codec.endings]
+
+
+def detect(path: Path) -> Codec | None:
+    """Return the format of a file by its content, or None.  Raises DataError when it cannot be read."""
+    with opened(path, "a model file") as file:
+        start = Start(path, file.read(MAX_HEADER))
+    return next((codec for codec in CODECS if codec.is_one(start)), None)
+
+
+def named(path: Path) -> Codec | None:
+    """Return the format that a name stands for, or None; the longest ending counts."""
+    name = path.name.lower()
+    found = [(len(end), codec) for codec in CODECS for end in codec.endings if name.endswith(end)]
+    return max(found, key=lambda one: one[0])[1] if found else None
+
+
+def read(path: Path, options: Reading | None = None) -> SplatFile:
+    """Read a model file of any format.  Raises DataError when it is missing, damaged or of no known format."""
+    options = options or Reading()
+    codec = detect(path) or named(path)  # the reader of a format that the name stands for says what is wrong
+    if codec is None:
+        known = ", ".join(endings(reads=True))
+        raise DataError(f"{path}: no model file of a known format; expected one of {known}: export it again")
+    if codec.read is None:
+        raise DataError(f"{path}: {codec.name} is written, not read; convert the model that it was made from")
+    return _settled(path, codec.read(path, options), options)
+
+
+def for_writing(path: Path) -> Codec:
+    """Return the format that a name stands for.
+
+    Raises ConfigError where none is written, OutputError for an empty name.
+    """
+    if not path.name:
+        raise OutputError(f"{path}: cannot be written (it has no name); expected the path of a file")
+    codec = named(path)
+    if codec is None or codec.write is None:
+        what = f"{codec.name} is read, not written" if codec else f"no format has the name {quoted(path.name)}"
+        raise ConfigError(f"{shortened(str(path))}: {what}; expected a name that ends in {', '.join(endings())}")
+    return codec
+
+
+def write(path: Path, splats: SplatFile, options: Writing | None = None) -> None:
+    """Write a model file in the format that its name stands for; log in a line what the format does not hold.
+
+    A world filter must be part of the scales and opacities already, but for a PLY.  Raises ConfigError and OutputError.
+    """
+    codec = for_writing(path)
+    assert codec.write is not None
+    if not codec.keeps_filter and "filter_variance" in splats.parameters:
+        raise ValueError(f"{path}: {codec.name} holds no world filter; call baked() first")
+    if not codec.keeps_nan and (bad := int(not_finite(splats.parameters).sum())):
+        raise DataError(f"{path}: {bad} Gaussians hold values that are not finite, which {codec.name} cannot hold")
+    if not codec.keeps_mode and splats.mode == "mip":
+        LOG.warning("%s: %s has no mark for a mip model; viewers show it as plain 3DGS", path, codec.name)
+    codec.write(path, splats, options or Writing())
+
+
+def _settled(path: Path, splats: SplatFile, options: Reading) -> SplatFile:
+    """Refuse, drop or keep Gaussians that are not finite."""
+    bad = not_finite(splats.parameters)
+    if options.not_finite == "keep" or not bad.any():
+        return splats
+    if options.not_finite == "drop":
+        LOG.warning("%s: dropped %d Gaussians with values that are not finite", path, int(bad.sum()))
+        return splats.rows(~bad)
+    names = [name for name, table in splats.parameters.items() if not_finite({"means": table}).any()]
+    raise DataError(
+        f"{path}: {', '.join(names)} hold values that are not finite; export the file again, or drop those Gaussians "
+        "with `clsplat convert`"
+    )
