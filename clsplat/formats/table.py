@@ -1,14 +1,18 @@
 """The table of formats.  A file is told apart by its content; its name decides what is written."""
 
 import logging
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from clsplat.errors import ConfigError, DataError, OutputError, quoted, shortened
 from clsplat.formats.compressed_ply import is_compressed, read_compressed_ply, write_compressed_ply
+from clsplat.formats.ksplat import looks_like_ksplat, read_ksplat
 from clsplat.formats.ply import read_ply, write_ply
+from clsplat.formats.splat import looks_like_splat, read_splat, write_splat
 from clsplat.formats.splats import Reading, SplatFile, Writing, not_finite
+from clsplat.formats.spz import read_spz, write_spz
 from clsplat.ply_header import MAX_HEADER, PlyHeader, parse_ply_header
 from clsplat.reading import opened
 
@@ -21,6 +25,7 @@ class Start:
 
     path: Path
     data: bytes  # at most MAX_HEADER
+    size: int  # bytes of the file
 
     def ply(self) -> PlyHeader | None:
         """The header, where it is a PLY file that can be read."""
@@ -80,6 +85,37 @@ CODECS = (
         write_compressed_ply,
         keeps_numbers=True,
     ),
+    Codec(
+        "SPZ",
+        (".spz",),
+        "versions 1 to 4",
+        "version 3, or 4 with the extra `spz`, along a Morton curve",
+        "position to 2^-12, log scale to 1/16, quaternions to 9 bits, colours, opacity and harmonics to 8, harmonics "
+        "beyond 1, order",
+        lambda start: start.data.startswith((b"NGSP", b"\x1f\x8b")),
+        read_spz,
+        write_spz,
+    ),
+    Codec(
+        "ksplat",
+        (".ksplat",),
+        "versions 0.1 and later, levels 0 to 2, SH degree 0 to 2",
+        "",
+        "",
+        lambda start: looks_like_ksplat(start.data, start.size),
+        lambda path, options: read_ksplat(path),
+    ),
+    Codec(
+        "splat",
+        (".splat",),
+        "all",
+        "the largest and most opaque first",
+        "harmonics, colours outside [0, 1], order; colours and opacity are in 8 bits, quaternions in 8",
+        lambda start: looks_like_splat(start.data, start.size),
+        lambda path, options: read_splat(path),
+        write_splat,
+        keeps_mode=False,
+    ),
 )
 
 
@@ -91,7 +127,7 @@ def endings(reads: bool = False) -> list[str]:
 def detect(path: Path) -> Codec | None:
     """Return the format of a file by its content, or None.  Raises DataError when it cannot be read."""
     with opened(path, "a model file") as file:
-        start = Start(path, file.read(MAX_HEADER))
+        start = Start(path, file.read(MAX_HEADER), file.seek(0, os.SEEK_END))
     return next((codec for codec in CODECS if codec.is_one(start)), None)
 
 

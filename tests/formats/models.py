@@ -25,7 +25,7 @@ def splats(rng: np.random.Generator, count: int = 600, degree: int = 3, mode: st
         "quats": rng.normal(0, 1, (count, 4)),
         "log_scales": rng.uniform(-8, 1, (count, 3)),
         "logit_opacity": rng.normal(0, 3, (count, 1)),
-        "sh_base": rng.normal(0, 0.8, (count, 3)),
+        "sh_base": rng.normal(0, 0.8, (count, 3)).clip(-3, 3),
         "sh_rest": rng.normal(0, 0.1, (count, 3 * ((degree + 1) ** 2 - 1))),
     }
     numbers = {"near": 0.05, "screen_variance": 0.1, "compensate": 1.0} if mode == "mip" else {}

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from clsplat.errors import DataError
 from clsplat.formats.compressed_ply import CHUNK
@@ -64,8 +65,6 @@ def test_the_published_bytes_of_a_compressed_ply(rng):
 @pytest.mark.parametrize(("name", "rows"), [("train1000", 1000), ("playbot31k", 31_000)])
 def test_a_compressed_ply_of_another_program_is_the_source(name, rows):
     """Its splats are sorted: each is matched with the nearest of the source."""
-    from scipy.spatial import cKDTree
-
     source, found = read(interop(f"{name}.ply")), read(interop(f"{name}.compressed.ply"))
     assert len(found) == rows
     distance, nearest = cKDTree(source.parameters["means"]).query(found.parameters["means"])
