@@ -144,3 +144,9 @@ def require_held(path: Path, held: int, expected: int, what: str) -> None:
             f"{path}: holds {held} bytes, but its header declares {what}, {expected} bytes; "
             "the file is truncated: copy or export it again"
         )
+
+
+def require_some(path: Path, splats: SplatFile) -> None:
+    """Raise DataError for a model without Gaussians, which most formats do not know."""
+    if not len(splats):
+        raise DataError(f"{path}: the model holds no Gaussians; a PLY alone can hold none")

@@ -21,7 +21,7 @@ from clsplat.errors import DataError
 from clsplat.files import atomic
 from clsplat.formats import zstd
 from clsplat.formats.packing import morton_order
-from clsplat.formats.splats import MAX_DEGREE, MAX_FILE, Reading, SplatFile, Writing, flipped
+from clsplat.formats.splats import MAX_DEGREE, MAX_FILE, Reading, SplatFile, Writing, flipped, require_some
 from clsplat.formats.spz_planes import EXTENSIONS, HEADER, MAGIC, MIP, Header, fraction_of, packed, unpacked
 from clsplat.reading import read_file
 
@@ -48,6 +48,7 @@ def read_spz(path: Path, options: Reading) -> SplatFile:
 
 def write_spz(path: Path, splats: SplatFile, options: Writing) -> None:
     """Write splats along a Morton curve.  Raises OutputError; DataError where positions are too large."""
+    require_some(path, splats)
     p = splats.rows(morton_order(splats.parameters["means"])).parameters
     most = FINE_FRACTION if options.quality == "high" else MAX_FRACTION
     fraction = fraction_of(path, p["means"], most)

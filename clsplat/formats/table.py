@@ -10,6 +10,8 @@ from clsplat.errors import ConfigError, DataError, OutputError, quoted, shortene
 from clsplat.formats.compressed_ply import is_compressed, read_compressed_ply, write_compressed_ply
 from clsplat.formats.ksplat import looks_like_ksplat, read_ksplat
 from clsplat.formats.ply import read_ply, write_ply
+from clsplat.formats.sog import META, looks_like_sog, read_sog
+from clsplat.formats.sog_writing import write_sog
 from clsplat.formats.splat import looks_like_splat, read_splat, write_splat
 from clsplat.formats.splats import Reading, SplatFile, Writing, not_finite
 from clsplat.formats.spz import read_spz, write_spz
@@ -97,6 +99,18 @@ CODECS = (
         write_spz,
     ),
     Codec(
+        "SOG",
+        (".sog", META),
+        "versions 1 and 2, bundled or as a folder with meta.json",
+        "version 2, bundled, or as the files beside a meta.json, along a Morton curve",
+        "position to 16 bits of a logarithm, quaternions to 8, scales and colours to 256 values, opacity to 8 bits, "
+        "harmonics to a palette, order",
+        lambda start: looks_like_sog(start.data),
+        lambda path, options: read_sog(path),
+        write_sog,
+        keeps_numbers=True,
+    ),
+    Codec(
         "ksplat",
         (".ksplat",),
         "versions 0.1 and later, levels 0 to 2, SH degree 0 to 2",
@@ -134,13 +148,16 @@ def detect(path: Path) -> Codec | None:
 def named(path: Path) -> Codec | None:
     """Return the format that a name stands for, or None; the longest ending counts."""
     name = path.name.lower()
-    found = [(len(end), codec) for codec in CODECS for end in codec.endings if name.endswith(end)]
+    fits = [(end, codec) for codec in CODECS for end in codec.endings if name == end or name.endswith(end)]
+    found = [(len(end), codec) for end, codec in fits if end.startswith(".") or name == end]
     return max(found, key=lambda one: one[0])[1] if found else None
 
 
 def read(path: Path, options: Reading | None = None) -> SplatFile:
     """Read a model file of any format.  Raises DataError when it is missing, damaged or of no known format."""
     options = options or Reading()
+    if path.is_dir() and (path / META).is_file():
+        path /= META
     codec = detect(path) or named(path)  # the reader of a format that the name stands for says what is wrong
     if codec is None:
         known = ", ".join(endings(reads=True))
