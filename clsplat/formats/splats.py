@@ -34,6 +34,7 @@ class SplatFile:
     parameters: Parameters  # filter_variance too, where the file has it
     rendering: dict[str, Any] = field(default_factory=dict)
     mode: str = "default"  # `mip` where a screen filter reduces opacities to keep their energy
+    placement: NDArray[np.float64] | None = None  # [4, 4], by which the Gaussians are still to be moved
 
     def __len__(self) -> int:
         return len(self.parameters["means"])

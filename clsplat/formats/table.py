@@ -8,6 +8,7 @@ from pathlib import Path
 
 from clsplat.errors import ConfigError, DataError, OutputError, quoted, shortened
 from clsplat.formats.compressed_ply import is_compressed, read_compressed_ply, write_compressed_ply
+from clsplat.formats.glb import read_glb, write_glb
 from clsplat.formats.ksplat import looks_like_ksplat, read_ksplat
 from clsplat.formats.ply import read_ply, write_ply
 from clsplat.formats.sog import META, looks_like_sog, read_sog
@@ -15,6 +16,7 @@ from clsplat.formats.sog_writing import write_sog
 from clsplat.formats.splat import looks_like_splat, read_splat, write_splat
 from clsplat.formats.splats import Reading, SplatFile, Writing, not_finite
 from clsplat.formats.spz import read_spz, write_spz
+from clsplat.formats.usda import write_usda
 from clsplat.ply_header import MAX_HEADER, PlyHeader, parse_ply_header
 from clsplat.reading import opened
 
@@ -109,6 +111,28 @@ CODECS = (
         lambda path, options: read_sog(path),
         write_sog,
         keeps_numbers=True,
+    ),
+    Codec(
+        "GLB",
+        (".glb",),
+        "KHR_gaussian_splatting, numbers of every kind, nodes that are moved, turned or scaled",
+        "KHR_gaussian_splatting, 32-bit floats, and colours for other viewers",
+        "digits of large logits: opacities and scales are stored, not their logits and logarithms",
+        lambda start: start.data.startswith(b"glTF"),
+        lambda path, options: read_glb(path),
+        write_glb,
+        keeps_numbers=True,
+    ),
+    Codec(
+        "OpenUSD",
+        (".usda",),
+        "",
+        "ParticleField3DGaussianSplat, as text",
+        "digits of large logits",
+        lambda start: start.data.startswith(b"#usda"),
+        None,
+        write_usda,
+        keeps_mode=False,
     ),
     Codec(
         "ksplat",

@@ -8,6 +8,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.errors import DataError
 from clsplat.formats.splats import MAX_DEGREE, PARAMETERS, SH_C0, Reading, SplatFile, Writing, sh_coefficients
 from clsplat.formats.table import for_writing, read, write
 from clsplat.gaussians.sh import rotated_sh
@@ -201,7 +202,14 @@ def load(path: str | Path, options: Reading | None = None) -> Model:
     """
     path = Path(path)
     file = read(path / MODEL if path.is_dir() and (path / MODEL).exists() else path, options)
-    return Model(**file.parameters, rendering=Rendering.of(file.rendering, file.mode))
+    model = Model(**file.parameters, rendering=Rendering.of(file.rendering, file.mode))
+    if file.placement is None:
+        return model
+    scale = float(np.cbrt(np.linalg.det(file.placement[:3, :3])))
+    try:
+        return model.transformed(scale, file.placement[:3, :3] / (scale or 1), file.placement[:3, 3])
+    except ValueError as error:
+        raise DataError(f"{path}: a node stretches or mirrors its Gaussians; export it again") from error
 
 
 def _quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:

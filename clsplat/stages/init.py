@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from clsplat.errors import DataError
 from clsplat.formats.splats import Parameters, with_degree
-from clsplat.formats.table import read
+from clsplat.gaussians.model import load
 from clsplat.gaussians.tables import SH_C0, Gaussians, sh_coefficients
 from clsplat.names import ReadPath
 from clsplat.scene.images import read_image
@@ -92,7 +92,7 @@ class Init(Stage):
 
     @staticmethod
     def _read(path: Path) -> Parameters:
-        parameters = read(path).parameters
+        parameters = load(path).tables()
         if not len(parameters["means"]):
             raise DataError(f"{path}: holds no Gaussians; expected one at least to start from")
         return parameters
