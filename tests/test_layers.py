@@ -39,6 +39,7 @@ def unit(module: str) -> str:
 
 
 TEXTS = {  # what turns results into lines of text
+    "clsplat.gaussians.checkup": {"lines", "verdict"},
     "clsplat.inspect.table": {"show"},
     "clsplat.pipeline.recipes": {"manual_text", "summaries_text"},
     "clsplat.runs.status": {"status_text"},

@@ -42,7 +42,7 @@ def read_spz(path: Path, options: Reading) -> SplatFile:
         LOG.warning("%s: dropped the bands of SH degree 4", path)
     if options.axes == "spz":
         parameters = flipped(parameters)
-        LOG.info("%s: axes as the format says (up, back); if the model stands on its head, use --axes ply", path)
+        LOG.info("%s: axes as the format says (up, back); if it stands on its head, `clsplat convert --axes ply`", path)
     return SplatFile(parameters, {}, "mip" if header.flags & MIP else "default")
 
 

@@ -162,6 +162,11 @@ def endings(reads: bool = False) -> list[str]:
     return [end for codec in CODECS if (codec.read if reads else codec.write) for end in codec.endings]
 
 
+def located(path: Path) -> Path:
+    """Return the file of a model: of a folder with a meta.json that one."""
+    return path / META if path.is_dir() and (path / META).is_file() else path
+
+
 def detect(path: Path) -> Codec | None:
     """Return the format of a file by its content, or None.  Raises DataError when it cannot be read."""
     with opened(path, "a model file") as file:
@@ -180,8 +185,7 @@ def named(path: Path) -> Codec | None:
 def read(path: Path, options: Reading | None = None) -> SplatFile:
     """Read a model file of any format.  Raises DataError when it is missing, damaged or of no known format."""
     options = options or Reading()
-    if path.is_dir() and (path / META).is_file():
-        path /= META
+    path = located(path)
     codec = detect(path) or named(path)  # the reader of a format that the name stands for says what is wrong
     if codec is None:
         known = ", ".join(endings(reads=True))
@@ -215,7 +219,10 @@ def write(path: Path, splats: SplatFile, options: Writing | None = None) -> None
     if not codec.keeps_filter and "filter_variance" in splats.parameters:
         raise ValueError(f"{path}: {codec.name} holds no world filter; call baked() first")
     if not codec.keeps_nan and (bad := int(not_finite(splats.parameters).sum())):
-        raise DataError(f"{path}: {bad} Gaussians hold values that are not finite, which {codec.name} cannot hold")
+        raise DataError(
+            f"{path}: {bad} Gaussians hold values that are not finite, which {codec.name} cannot hold; drop them, "
+            "or write a PLY"
+        )
     if not codec.keeps_mode and splats.mode == "mip":
         LOG.warning("%s: %s has no mark for a mip model; viewers show it as plain 3DGS", path, codec.name)
     codec.write(path, splats, options or Writing())

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from clsplat.errors import DataError
 from clsplat.formats.splats import MAX_DEGREE, PARAMETERS, SH_C0, Reading, SplatFile, Writing, sh_coefficients
-from clsplat.formats.table import for_writing, read, write
+from clsplat.formats.table import for_writing, located, read, write
 from clsplat.gaussians.sh import rotated_sh
 from clsplat.gaussians.tables import DeviceModel, Gaussians
 from clsplat.opencl.device import Device
@@ -201,7 +201,7 @@ def load(path: str | Path, options: Reading | None = None) -> Model:
     Raises DataError when it is missing, damaged or not a splat.
     """
     path = Path(path)
-    file = read(path / MODEL if path.is_dir() and (path / MODEL).exists() else path, options)
+    file = read(path / MODEL if path.is_dir() and located(path) == path else path, options)
     model = Model(**file.parameters, rendering=Rendering.of(file.rendering, file.mode))
     if file.placement is None:
         return model

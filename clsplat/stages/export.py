@@ -5,29 +5,31 @@ from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
 from clsplat.errors import DataError
+from clsplat.formats.table import endings, for_writing
 from clsplat.gaussians.model import load
 from clsplat.stages.base import Scheduled, path_in_run
 from clsplat.training.run import Run
 
+WRITTEN = tuple(ending for ending in endings() if ending.startswith("."))  # a folder of SOG is no file
 LOG = logging.getLogger("clsplat")
 
 
 class Export(Scheduled):
-    """Write a PLY in the reference's layout and read it back.
+    """Write the model in the format that the name of the file stands for, by default a PLY, and read it back.
 
-    A world filter is applied to scales and opacities, so that any viewer can show the file.  A second file, with `_raw`
-    in its name, holds the model as trained, with the filter as a property `filter_3D`.
+    A world filter is applied to scales and opacities, so that any viewer can show the file.  A second file, a PLY with
+    `_raw` in its name, holds the model as trained, with the filter as a property `filter_3D`.
     """
 
     stage: Literal["export"] = "export"
     needs: ClassVar[frozenset[str]] = frozenset({"model"})
 
-    file: Annotated[str, path_in_run(".ply")] = "point_cloud.ply"
-    """Path inside the run folder."""
+    file: Annotated[str, path_in_run(*WRITTEN)] = "point_cloud.ply"
+    """Path inside the run folder; its ending is the format: .ply, .compressed.ply, .spz, .sog, .glb, .splat, .usda."""
 
     def outputs(self, out: Path) -> list[Path]:
         path = out / self.file
-        return [path, path.with_name(f"{path.stem}_raw{path.suffix}")]
+        return [path, path.with_name(f"{path.stem}_raw.ply")]
 
     def run(self, run: Run) -> None:
         model = run.host_model()
@@ -37,7 +39,8 @@ class Export(Scheduled):
             files[raw] = model
         for file, one in files.items():
             one.save(file)
-            load(file)
+            if for_writing(file).read:
+                load(file)
             LOG.info("%d Gaussians written to %s", len(one), file)
 
     def verify(self, run: Run) -> None:

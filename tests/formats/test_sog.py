@@ -73,7 +73,7 @@ def test_a_folder_holds_what_the_bundle_holds(tmp_path, rng):
 
 
 def test_a_larger_palette_is_nearer(tmp_path, rng):
-    source = splats(rng, 2100)
+    source = splats(rng, 2050, 1)
     errors = []
     for quality in ("small", "balanced"):
         found = there_and_back(tmp_path / "a.sog", source, Writing(quality=quality)).parameters["sh_rest"]
