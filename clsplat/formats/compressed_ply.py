@@ -103,7 +103,7 @@ def _checked(path: Path, header: PlyHeader, tables: dict[str, NDArray[Any]]) -> 
     """Chunks and vertices.  Raises DataError where they do not fit each other."""
     if not {"chunk", "vertex"} <= tables.keys() or not set(_ENDS[:12]) <= set(tables["chunk"].dtype.names or ()):
         raise DataError(f"{path}: a compressed PLY without 'element chunk', the ranges of its splats; export it again")
-    if any(header.dtype[name].kind != "u" or header.dtype[name].itemsize != 4 for name in PACKED):
+    if not is_compressed(header) or any(header.dtype[name].str[1:] != "u4" for name in PACKED):
         raise DataError(f"{path}: expected 'property uint' for {', '.join(PACKED)}; export it again")
     chunks, vertices = tables["chunk"], tables["vertex"]
     if len(chunks) * CHUNK < len(vertices):

@@ -110,7 +110,7 @@ def _check(path: Path, section: Section, number: int) -> None:
             f"{path}: section {number} has {section.count} of {section.rows} splats with SH degree {section.degree}; "
             f"expected no more splats than places, and degree 0 to {MAX_DEGREE}: the file is damaged, copy it again"
         )
-    if section.buckets and (section.bucket_bytes < 12 or section.full + section.partial > section.buckets):
+    if (section.buckets and section.bucket_bytes < 12) or section.full + section.partial > section.buckets:
         raise DataError(f"{path}: the buckets of section {number} do not fit their numbers; copy the file again")
 
 
@@ -121,7 +121,7 @@ def _tables(
     partial, buckets, _ = section.sizes(level)
     rows = np.frombuffer(data, section.row(level), section.count, start + partial + buckets)
     position = rows["position"].astype(np.float64)
-    if level:
+    if level and section.count:
         position = (position - section.range) * (section.block / 2 / section.range)
         position += _centres(path, data, start, section)
     sh = rows["sh"].astype(np.float64)

@@ -6,6 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from clsplat.errors import ConfigError, DataError, OutputError, quoted, shortened
 from clsplat.formats.compressed_ply import is_compressed, read_compressed_ply, write_compressed_ply
 from clsplat.formats.glb import read_glb, write_glb
@@ -192,7 +194,8 @@ def read(path: Path, options: Reading | None = None) -> SplatFile:
         raise DataError(f"{path}: no model file of a known format; expected one of {known}: export it again")
     if codec.read is None:
         raise DataError(f"{path}: {codec.name} is written, not read; convert the model that it was made from")
-    return _settled(path, codec.read(path, options), options)
+    with np.errstate(all="ignore"):  # what is not finite is refused, dropped or kept
+        return _settled(path, codec.read(path, options), options)
 
 
 def for_writing(path: Path) -> Codec:
