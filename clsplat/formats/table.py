@@ -67,7 +67,7 @@ def _is_ply(start: Start) -> bool:
 
 CODECS = (
     Codec(
-        "ply",
+        "PLY",
         (".ply",),
         "any order and number types, little or big endian, discs of 2DGS, other elements around the vertices",
         "the order of 3DGS",

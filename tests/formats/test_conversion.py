@@ -1,6 +1,7 @@
 """`clsplat convert` and `clsplat check MODEL`."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from scipy.spatial.transform import Rotation
 import clsplat
 from clsplat.errors import ConfigError, DataError
 from clsplat.formats.ply import write_ply
-from clsplat.formats.table import detect, read, write
+from clsplat.formats.table import CODECS, detect, read, write
 from clsplat.gaussians.checkup import lines, verdict
 from clsplat.gaussians.conversion import transform_of
 from clsplat.gaussians.model import load
@@ -215,3 +216,11 @@ def test_a_folder_of_images_is_a_model(source, tmp_path):
     assert clsplat.check(tmp_path / "f")["format"] == "SOG"
     assert len(read(tmp_path / "f")) == 100
     assert len(load(tmp_path / "f")) == 100
+
+
+def test_the_page_about_formats_has_the_table_of_formats():
+    page = (Path(__file__).parents[2] / "docs" / "formats.md").read_text(encoding="utf-8")
+    for codec in CODECS:
+        names = ", ".join(f"`{ending}`" for ending in codec.endings)
+        row = f"| {codec.name} | {names} | {codec.reads or '–'} | {codec.writes or '–'} | {codec.loses or '–'} |"
+        assert row in page, row

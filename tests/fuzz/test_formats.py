@@ -69,7 +69,7 @@ def reads_or_refuses(path: Path) -> None:
 
 
 def test_every_reader_of_the_table_is_here():
-    own = {"ply"}  # in test_ply.py
+    own = {"PLY"}  # in test_ply.py
     assert {codec.name for codec in CODECS if codec.read} == own | NAMES.keys() | {"ksplat"}
 
 
