@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.errors import DataError
-from clsplat.files import atomic
+from clsplat.formats.output import written
 from clsplat.formats.packing import from_smallest_three, morton_order, smallest_three
 from clsplat.formats.ply import comment_of, comments, mode_of
 from clsplat.formats.splats import (
@@ -75,7 +75,7 @@ def read_compressed_ply(path: Path) -> SplatFile:
     return SplatFile(parameters, comment_of(path, header), mode_of(header))
 
 
-def write_compressed_ply(path: Path, splats: SplatFile, options: Writing) -> None:
+def write_compressed_ply(path: Path, splats: SplatFile, options: Writing) -> str:
     """Write splats along a Morton curve.  Raises OutputError."""
     p = splats.rows(morton_order(splats.parameters["means"])).parameters
     count = len(p["means"])
@@ -93,10 +93,11 @@ def write_compressed_ply(path: Path, splats: SplatFile, options: Writing) -> Non
     header += [f"property uint {name}" for name in PACKED]
     if sh.shape[1]:
         header += [f"element sh {count}", *(f"property uchar f_rest_{i}" for i in range(sh.shape[1]))]
-    with atomic(path) as file:
+    with written(path) as file:
         file.write(("\n".join([*header, "end_header"]) + "\n").encode())
         for table, kind in ((chunks, "<f4"), (vertices, "<u4"), (sh, "u1")):
             file.write(np.ascontiguousarray(table, kind).tobytes())
+    return file.sha256
 
 
 def _checked(path: Path, header: PlyHeader, tables: dict[str, NDArray[Any]]) -> tuple[NDArray[Any], NDArray[Any]]:

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.errors import DataError, quoted
-from clsplat.files import atomic
 from clsplat.formats.gltf import EXTENSION, PREFIX, Gltf
+from clsplat.formats.output import written
 from clsplat.formats.ply import checked_numbers
 from clsplat.formats.splats import (
     MAX_DEGREE,
@@ -63,7 +63,7 @@ def read_glb(path: Path) -> SplatFile:
     return SplatFile(parameters, rendering, "mip" if rendering.get("compensate") else "default", found.placement)
 
 
-def write_glb(path: Path, splats: SplatFile, options: Writing) -> None:
+def write_glb(path: Path, splats: SplatFile, options: Writing) -> str:
     """Write Gaussians as one primitive.  Raises OutputError."""
     require_some(path, splats)
     p = flipped(splats.parameters)
@@ -103,11 +103,12 @@ def write_glb(path: Path, splats: SplatFile, options: Writing) -> None:
     }
     text = json.dumps(tree, separators=(",", ":"), sort_keys=True).encode()
     text += b" " * (-len(text) % 4)
-    with atomic(path) as file:
+    with written(path) as file:
         file.write(struct.pack("<4s2I", MAGIC, 2, 12 + 8 + len(text) + 8 + start))
         file.write(struct.pack("<2I", len(text), JSON) + text + struct.pack("<2I", start, BINARY))
         for block in blocks:
             file.write(block)
+    return file.sha256
 
 
 def _attributes(p: Parameters) -> dict[str, NDArray[Any]]:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.errors import DataError, quoted
-from clsplat.files import atomic
+from clsplat.formats.output import written
 from clsplat.formats.splats import (
     FLAT_LOG_SCALE,
     MAX_DEGREE,
@@ -62,8 +62,8 @@ def read_ply(path: Path) -> SplatFile:
     return SplatFile(parameters, rendering, "mip" if "filter_variance" in parameters else mode_of(header))
 
 
-def write_ply(path: Path, parameters: Parameters, rendering: dict[str, Any]) -> None:
-    """Write parameters in the reference's order, and filter_variance where it is given.
+def write_ply(path: Path, parameters: Parameters, rendering: dict[str, Any]) -> str:
+    """Write parameters in the reference's order, and filter_variance where it is given; return the SHA-256 of the file.
 
     `rendering` becomes a comment in JSON; with `compensate` in it, the file's mode is mip.  Raises OutputError.
     """
@@ -87,9 +87,11 @@ def write_ply(path: Path, parameters: Parameters, rendering: dict[str, Any]) -> 
         names.append(FILTER)
     header = ["ply", "format binary_little_endian 1.0", *comments(rendering)]
     header += [f"element vertex {count}", *(f"property float {name}" for name in names), "end_header"]
-    with atomic(path) as file:
+    body = np.ascontiguousarray(np.concatenate(blocks, axis=1), "<f4")
+    with written(path) as file:
         file.write(("\n".join(header) + "\n").encode())
-        file.write(np.ascontiguousarray(np.concatenate(blocks, axis=1), "<f4").tobytes())
+        file.write(body.tobytes())
+    return file.sha256
 
 
 def comments(rendering: dict[str, Any]) -> list[str]:

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.files import atomic
 from clsplat.formats import webp
+from clsplat.formats.output import written
 from clsplat.formats.packing import morton_order, smallest_three
 from clsplat.formats.palette import codebook, nearest, palette
 from clsplat.formats.sog import META, PER_ROW, ROTATED
@@ -21,7 +21,7 @@ SMALLEST = 1024  # entries for so many splats, and twice as many for twice as ma
 EPOCH = (1980, 1, 1, 0, 0, 0)  # of files in the ZIP: the same model gives the same bytes
 
 
-def write_sog(path: Path, splats: SplatFile, options: Writing) -> None:
+def write_sog(path: Path, splats: SplatFile, options: Writing) -> str:
     """Write a `.sog`, or where the name is meta.json the files of a folder, it last.  Raises OutputError, DataError."""
     require_some(path, splats)
     p = splats.rows(morton_order(splats.parameters["means"])).parameters
@@ -51,12 +51,13 @@ def write_sog(path: Path, splats: SplatFile, options: Writing) -> None:
         meta["shN"] = _harmonics(p["sh_rest"], PALETTES[options.quality], image)
     images[META] = json.dumps(meta, separators=(",", ":"), sort_keys=True).encode()
     if path.name == META:
-        for name, data in images.items():
-            with atomic(path.with_name(name)) as file:
-                file.write(data)
+        files = {path.with_name(name): data for name, data in images.items()}  # meta.json is the last
     else:
-        with atomic(path) as file:
-            file.write(_zipped(images))
+        files = {path: _zipped(images)}
+    for place, data in files.items():
+        with written(place) as file:
+            file.write(data)
+    return file.sha256
 
 
 def _means(p: Parameters, image: Any) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from clsplat.errors import DataError
-from clsplat.files import atomic
+from clsplat.formats.output import written
 from clsplat.formats.splats import MAX_FILE, SH_C0, Parameters, SplatFile, Writing, logits, logs, opacities, unit
 from clsplat.reading import read_file
 
@@ -52,7 +52,7 @@ def read_splat(path: Path) -> SplatFile:
     return SplatFile(parameters)
 
 
-def write_splat(path: Path, splats: SplatFile, options: Writing) -> None:
+def write_splat(path: Path, splats: SplatFile, options: Writing) -> str:
     """Write a `.splat` file.  Raises OutputError."""
     p = splats.parameters
     alpha = opacities(p["logit_opacity"])
@@ -66,5 +66,6 @@ def write_splat(path: Path, splats: SplatFile, options: Writing) -> None:
     colour = np.concatenate([p["sh_base"].astype(np.float64) * SH_C0 + 0.5, alpha], axis=1)
     rows["colour"] = np.clip(np.rint(255 * colour), 0, 255)
     rows["rotation"] = np.clip(np.rint(128 * unit(p["quats"]) + 128), 0, 255)
-    with atomic(path) as file:
+    with written(path) as file:
         file.write(rows[order].tobytes())
+    return file.sha256

@@ -18,8 +18,8 @@ import zlib
 from pathlib import Path
 
 from clsplat.errors import DataError
-from clsplat.files import atomic
 from clsplat.formats import zstd
+from clsplat.formats.output import written
 from clsplat.formats.packing import morton_order
 from clsplat.formats.splats import MAX_DEGREE, MAX_FILE, Reading, SplatFile, Writing, flipped, require_some
 from clsplat.formats.spz_planes import EXTENSIONS, HEADER, MAGIC, MIP, Header, fraction_of, packed, unpacked
@@ -46,7 +46,7 @@ def read_spz(path: Path, options: Reading) -> SplatFile:
     return SplatFile(parameters, {}, "mip" if header.flags & MIP else "default")
 
 
-def write_spz(path: Path, splats: SplatFile, options: Writing) -> None:
+def write_spz(path: Path, splats: SplatFile, options: Writing) -> str:
     """Write splats along a Morton curve.  Raises OutputError; DataError where positions are too large."""
     require_some(path, splats)
     p = splats.rows(morton_order(splats.parameters["means"])).parameters
@@ -62,8 +62,9 @@ def write_spz(path: Path, splats: SplatFile, options: Writing) -> None:
         frames = [zstd.compress(plane) for plane in streams]
         table = b"".join(struct.pack("<2Q", len(f), len(s)) for f, s in zip(frames, streams, strict=True))
         content = start + struct.pack("<BI12x", len(streams), HEADER4) + table + b"".join(frames)
-    with atomic(path) as file:
+    with written(path) as file:
         file.write(content)
+    return file.sha256
 
 
 def _unpacked(path: Path, data: bytes) -> tuple[Header, list[bytes]]:

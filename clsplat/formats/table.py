@@ -54,7 +54,7 @@ class Codec:
     loses: str  # in words: what writing changes
     is_one: Callable[[Start], bool] = lambda start: False
     read: Callable[[Path, Reading], SplatFile] | None = None
-    write: Callable[[Path, SplatFile, Writing], None] | None = None
+    write: Callable[[Path, SplatFile, Writing], str] | None = None  # returns the SHA-256 of the file
     keeps_filter: bool = False  # filter_3D
     keeps_mode: bool = True  # the mark of a mip model
     keeps_numbers: bool = False  # of the rasterizer
@@ -212,8 +212,10 @@ def for_writing(path: Path) -> Codec:
     return codec
 
 
-def write(path: Path, splats: SplatFile, options: Writing | None = None) -> None:
+def write(path: Path, splats: SplatFile, options: Writing | None = None) -> str:
     """Write a model file in the format that its name stands for; log in a line what the format does not hold.
+
+    Returns the SHA-256 of what was written, of a folder of SOG that of its meta.json.
 
     A world filter must be part of the scales and opacities already, but for a PLY.  Raises ConfigError and OutputError.
     """
@@ -228,7 +230,7 @@ def write(path: Path, splats: SplatFile, options: Writing | None = None) -> None
         )
     if not codec.keeps_mode and splats.mode == "mip":
         LOG.warning("%s: %s has no mark for a mip model; viewers show it as plain 3DGS", path, codec.name)
-    codec.write(path, splats, options or Writing())
+    return codec.write(path, splats, options or Writing())
 
 
 def _settled(path: Path, splats: SplatFile, options: Reading) -> SplatFile:

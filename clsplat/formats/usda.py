@@ -5,12 +5,11 @@ Gaussian stand together, band 0 first.
 """
 
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.files import atomic
+from clsplat.formats.output import Output, written
 from clsplat.formats.splats import SplatFile, Writing, flipped, opacities, require_some, unit
 
 BLOCK = 4096  # rows of text at a time
@@ -29,7 +28,7 @@ def ParticleField3DGaussianSplat "Gaussians"
 """
 
 
-def write_usda(path: Path, splats: SplatFile, options: Writing) -> None:
+def write_usda(path: Path, splats: SplatFile, options: Writing) -> str:
     """Write a `.usda` file.  Raises OutputError."""
     require_some(path, splats)
     p = flipped(splats.parameters)
@@ -45,15 +44,16 @@ def write_usda(path: Path, splats: SplatFile, options: Writing) -> None:
         "float[] opacities": opacities(p["logit_opacity"]),
         "float3[] radiance:sphericalHarmonicsCoefficients": harmonics,
     }
-    with atomic(path) as file:
+    with written(path) as file:
         file.write(START.encode())
         file.write(f"    uniform int radiance:sphericalHarmonicsDegree = {splats.sh_degree}\n".encode())
         for name, table in tables.items():
             _array(file, name, table)
         file.write(b"}\n")
+    return file.sha256
 
 
-def _array(file: BinaryIO, name: str, table: NDArray[np.floating]) -> None:
+def _array(file: Output, name: str, table: NDArray[np.floating]) -> None:
     """One attribute, with as many digits as float32 has."""
     width = table.shape[1]
     row = ", ".join(["%.8g"] * width) if width == 1 else f"({', '.join(['%.8g'] * width)})"

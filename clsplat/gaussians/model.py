@@ -167,15 +167,16 @@ class Model:
         logits = np.maximum(logit, MIN_LOGIT).astype(np.float32)
         return replace(self, log_scales=log_scales, logit_opacity=logits, filter_variance=None)
 
-    def save(self, path: str | Path, options: Writing | None = None) -> None:
+    def save(self, path: str | Path, options: Writing | None = None) -> str:
         """Write a file in the format that its name stands for: .ply, .spz, .sog, .glb and others (docs/formats.md).
 
         A world filter that is not `baked` is kept in a PLY, as a property `filter_3D`, and baked for other formats.
+        Returns the SHA-256 of what was written; of a folder of SOG that of its meta.json.
         Raises ConfigError for another name, and OutputError when the file cannot be written.
         """
         model = self if for_writing(Path(path)).keeps_filter else self.baked()
         mode = "mip" if self.rendering.compensate else "default"
-        write(Path(path), SplatFile(model.tables(), self.rendering.comment(), mode), options)
+        return write(Path(path), SplatFile(model.tables(), self.rendering.comment(), mode), options)
 
     def __repr__(self) -> str:
         return f"Model({len(self):,} Gaussians, SH degree {self.sh_degree})"

@@ -4,10 +4,11 @@ import logging
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
-from clsplat.errors import DataError
+from clsplat.errors import DataError, OutputError
 from clsplat.formats.table import endings, for_writing
 from clsplat.gaussians.model import load
-from clsplat.stages.base import Scheduled, path_in_run
+from clsplat.reading import sha256
+from clsplat.stages.base import CADENCE, Scheduled, path_in_run
 from clsplat.training.run import Run
 
 WRITTEN = tuple(ending for ending in endings() if ending.startswith("."))  # a folder of SOG is no file
@@ -23,6 +24,7 @@ class Export(Scheduled):
 
     stage: Literal["export"] = "export"
     needs: ClassVar[frozenset[str]] = frozenset({"model"})
+    output_keys: ClassVar[frozenset[str]] = CADENCE | {"file"}
 
     file: Annotated[str, path_in_run(*WRITTEN)] = "point_cloud.ply"
     """Path inside the run folder; its ending is the format: .ply, .compressed.ply, .spz, .sog, .glb, .splat, .usda."""
@@ -38,12 +40,20 @@ class Export(Scheduled):
         if model.filter_variance is not None:
             files[raw] = model
         for file, one in files.items():
-            one.save(file)
-            if for_writing(file).read:
-                load(file)
+            run.written[file] = one.save(file)
+            try:
+                if for_writing(file).read:
+                    load(file)
+            except DataError as error:
+                raise OutputError(f"{error}; it was written just now: check the disk and its space") from error
             LOG.info("%d Gaussians written to %s", len(one), file)
 
     def verify(self, run: Run) -> None:
-        path = run.out / self.file  # it was read back when it was written
-        if not path.is_file() or path.stat().st_size == 0:
-            raise DataError(f"{path}: is missing or empty")
+        path, raw = self.outputs(run.out)
+        for file in (path, raw) if raw in run.written or raw.exists() else (path,):
+            found = sha256(file)
+            if file in run.written:
+                if found != run.written[file]:
+                    raise DataError(f"{file}: differs from what was written")
+            elif for_writing(file).read:  # written before the run was resumed
+                load(file)

@@ -12,6 +12,7 @@ from clsplat.formats.glb import write_glb
 from clsplat.formats.splats import Writing, opacities, unit
 from clsplat.formats.table import detect, read, write
 from clsplat.gaussians.model import Model, load
+from clsplat.reading import sha256
 from tests.formats.models import angles, assert_close, interop, splats, there_and_back
 
 KHR = "KHR_gaussian_splatting"
@@ -215,8 +216,8 @@ def test_openusd_holds_every_number(tmp_path, rng):
 @pytest.mark.parametrize("name", ["a.glb", "a.usda", "a.spz", "a.sog", "a.splat", "a.ply", "a.compressed.ply"])
 def test_the_same_model_gives_the_same_bytes(name, tmp_path, rng):
     source = splats(rng, 300, 3, "mip")
-    for folder in ("a", "b"):
-        write(tmp_path / folder / name, source)
+    sums = [write(tmp_path / folder / name, source) for folder in ("a", "b")]
+    assert sums == [sha256(tmp_path / folder / name) for folder in ("a", "b")]
     assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
 
 
