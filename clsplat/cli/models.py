@@ -96,7 +96,7 @@ def evaluate(
 @command(
     "convert",
     "clsplat convert point_cloud.ply scene.spz",
-    "clsplat convert a.ply b.sog both.glb --drop-below 0.02 --transform 'scale=2 rotate=90,0,0'",
+    "clsplat convert a.ply b.sog both.glb --transform 'rotate=90,0,0'",
 )
 def convert(
     files: Annotated[

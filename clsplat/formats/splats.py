@@ -19,6 +19,8 @@ from clsplat.errors import DataError
 PARAMETERS = ("means", "quats", "log_scales", "logit_opacity", "sh_base", "sh_rest")
 SH_C0 = 0.28209479177387814  # basis function of band 0
 MAX_DEGREE = 3
+NEAR, VARIANCE = 0.2, 0.3  # scene units and px²: nearest distance and screen filter of 3DGS
+MIP_VARIANCE = 0.1  # px², of files that say no more than `mip` (Yu et al. 2024)
 MAX_FILE = 1 << 33  # bytes
 MIN_ALPHA = 1e-6  # opacities of 0 and 1 have no logit
 FLAT_LOG_SCALE = -13.815511  # log 1e-6: of the third axis of a disc

@@ -2,13 +2,12 @@
 
 import logging
 import os
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from clsplat.errors import ConfigError, DataError, OutputError, quoted, shortened
+from clsplat.formats.codec import Codec, Start
 from clsplat.formats.compressed_ply import is_compressed, read_compressed_ply, write_compressed_ply
 from clsplat.formats.glb import read_glb, write_glb
 from clsplat.formats.ksplat import looks_like_ksplat, read_ksplat
@@ -16,49 +15,13 @@ from clsplat.formats.ply import read_ply, write_ply
 from clsplat.formats.sog import META, looks_like_sog, read_sog
 from clsplat.formats.sog_writing import write_sog
 from clsplat.formats.splat import looks_like_splat, read_splat, write_splat
-from clsplat.formats.splats import Reading, SplatFile, Writing, not_finite
+from clsplat.formats.splats import MIP_VARIANCE, NEAR, VARIANCE, Reading, SplatFile, Writing, not_finite
 from clsplat.formats.spz import read_spz, write_spz
 from clsplat.formats.usda import write_usda
-from clsplat.ply_header import MAX_HEADER, PlyHeader, parse_ply_header
+from clsplat.ply_header import MAX_HEADER
 from clsplat.reading import opened
 
 LOG = logging.getLogger("clsplat")
-
-
-@dataclass(frozen=True)
-class Start:
-    """How a file begins."""
-
-    path: Path
-    data: bytes  # at most MAX_HEADER
-    size: int  # bytes of the file
-
-    def ply(self) -> PlyHeader | None:
-        """The header, where it is a PLY file that can be read."""
-        if not self.data.startswith(b"ply"):
-            return None
-        try:
-            return parse_ply_header(self.path, self.data)
-        except DataError:  # its reader says what is wrong
-            return None
-
-
-@dataclass(frozen=True)
-class Codec:
-    """One format."""
-
-    name: str
-    endings: tuple[str, ...]  # of names of files; the first is the usual one
-    reads: str  # in words; "" where there is no reader
-    writes: str  # in words; "" where there is no writer
-    loses: str  # in words: what writing changes
-    is_one: Callable[[Start], bool] = lambda start: False
-    read: Callable[[Path, Reading], SplatFile] | None = None
-    write: Callable[[Path, SplatFile, Writing], str] | None = None  # returns the SHA-256 of the file
-    keeps_filter: bool = False  # filter_3D
-    keeps_mode: bool = True  # the mark of a mip model
-    keeps_numbers: bool = False  # of the rasterizer
-    keeps_nan: bool = False
 
 
 def _is_ply(start: Start) -> bool:
@@ -230,7 +193,16 @@ def write(path: Path, splats: SplatFile, options: Writing | None = None) -> str:
         )
     if not codec.keeps_mode and splats.mode == "mip":
         LOG.warning("%s: %s has no mark for a mip model; viewers show it as plain 3DGS", path, codec.name)
+    if not codec.keeps_numbers and (lost := _unusual(splats)):
+        LOG.warning("%s: %s does not keep %s; PLY, SOG and GLB do", path, codec.name, lost)
     return codec.write(path, splats, options or Writing())
+
+
+def _unusual(splats: SplatFile) -> str:
+    """The numbers of the renderer that a reader would not take for a file without them, in words."""
+    usual = {"near": NEAR, "screen_variance": MIP_VARIANCE if splats.mode == "mip" else VARIANCE, "background": None}
+    given = {name: splats.rendering.get(name, value) for name, value in usual.items()}
+    return ", ".join(f"{name} = {value}" for name, value in given.items() if value != usual[name])
 
 
 def _settled(path: Path, splats: SplatFile, options: Reading) -> SplatFile:

@@ -9,7 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.errors import DataError
-from clsplat.formats.splats import MAX_DEGREE, PARAMETERS, SH_C0, Reading, SplatFile, Writing, sh_coefficients
+from clsplat.formats.splats import (
+    MAX_DEGREE,
+    MIP_VARIANCE,
+    NEAR,
+    PARAMETERS,
+    SH_C0,
+    VARIANCE,
+    Reading,
+    SplatFile,
+    Writing,
+    sh_coefficients,
+)
 from clsplat.formats.table import for_writing, located, read, write
 from clsplat.gaussians.sh import rotated_sh
 from clsplat.gaussians.tables import DeviceModel, Gaussians
@@ -23,15 +34,14 @@ WIDTHS = {  # of the tables
     "filter_variance": (1,),
 }
 MIN_LOGIT = -80.0  # of an opacity that the filter spreads out to nothing: as little as the kernels know
-MIP_VARIANCE = 0.1  # px², of files that say no more than `mip` (Yu et al. 2024)
 
 
 @dataclass(frozen=True)
 class Rendering:
     """The numbers with which a model is rendered."""
 
-    near: float = 0.2  # scene units; nearer Gaussians are not drawn
-    screen_variance: float = 0.3  # px², added to every splat
+    near: float = NEAR  # scene units; nearer Gaussians are not drawn
+    screen_variance: float = VARIANCE  # px², added to every splat
     compensate: float = 0.0  # 1: the opacity falls as that variance spreads a splat out
     background: Literal["black", "white"] | None = None  # None: what the scene says
     alpha: Literal["transparency", "mask"] = "transparency"  # what the fourth channel of its photographs was

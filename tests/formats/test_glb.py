@@ -237,3 +237,16 @@ def test_a_world_filter_is_baked_but_for_a_ply(tmp_path, rng):
 def test_a_mark_that_is_lost_is_said(name, said, tmp_path, rng, caplog):
     write(tmp_path / name, splats(rng, 5, 0, "mip"))
     assert ("has no mark for a mip model" in caplog.text) is said
+
+
+def test_numbers_of_the_renderer_that_are_lost_are_said(tmp_path, rng, caplog):
+    source = splats(rng, 5, 0, "mip")
+    for name in ("a.ply", "a.compressed.ply", "a.sog", "a.glb"):
+        assert there_and_back(tmp_path / name, source).rendering == source.rendering
+    assert "does not keep" not in caplog.text
+    write(tmp_path / "a.spz", source)
+    assert "SPZ does not keep near = 0.05; PLY, SOG and GLB do" in caplog.text
+    caplog.clear()
+    source.rendering["near"] = 0.2
+    write(tmp_path / "a.spz", source)
+    assert "does not keep" not in caplog.text
