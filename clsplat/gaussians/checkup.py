@@ -20,7 +20,9 @@ NEARLY_ALL = 0.99
 def is_model(path: Path) -> bool:
     """Return whether a path is a model, by its content or its name; pipeline files are none."""
     place = located(path)
-    return place.is_file() and place.suffix not in (".yaml", ".yml") and bool(detect(place) or named(place))
+    if place.suffix in (".yaml", ".yml"):
+        return False
+    return bool(named(place) or (place.is_file() and detect(place)))
 
 
 def examine(path: Path) -> dict[str, Any]:

@@ -152,6 +152,12 @@ def test_check_tells_what_a_model_is(source, tmp_path):
     json.dumps(found, allow_nan=False)
 
 
+def test_a_model_that_is_missing_cannot_be_read_and_a_pipeline_is_none(tmp_path):
+    with pytest.raises(DataError, match=r"a\.spz: cannot be read \(No such file or directory\)"):
+        clsplat.check(tmp_path / "a.spz")
+    assert "stages" in clsplat.check("smoke")
+
+
 def test_check_counts_what_shows_nothing(tmp_path, rng):
     odd = splats(rng, 40)
     p = odd.parameters
