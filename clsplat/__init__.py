@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from clsplat import metrics as metrics
     from clsplat.api.commands import check as check
     from clsplat.api.commands import compare_runs as compare_runs
+    from clsplat.api.commands import convert as convert
     from clsplat.api.commands import copy_pipeline as copy_pipeline
     from clsplat.api.commands import describe_run as describe_run
     from clsplat.api.commands import evaluate as evaluate
@@ -41,6 +42,8 @@ if TYPE_CHECKING:
     from clsplat.api.tools import read_measurement as read_measurement
     from clsplat.api.trainer import Report as Report
     from clsplat.api.trainer import Trainer as Trainer
+    from clsplat.formats.splats import Reading as Reading
+    from clsplat.formats.splats import Writing as Writing
     from clsplat.gaussians.model import Model as Model
     from clsplat.gaussians.model import Rendering as Rendering
     from clsplat.gaussians.model import load as load
@@ -53,12 +56,13 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 _HERE = Path(__file__).resolve().parent
 _ROOMS = {  # where the names come from, which `import clsplat` does not import
-    "clsplat.api.commands": "check compare_runs copy_pipeline describe_run evaluate pipeline_schema pipelines"
+    "clsplat.api.commands": "check compare_runs convert copy_pipeline describe_run evaluate pipeline_schema pipelines"
     " render_views resume run status status_schema",
     "clsplat.api.device": "Device",
     "clsplat.api.renderer": "Gradients Picture Renderer",
     "clsplat.api.tools": "devices doctor inspect_scene load_plugin measure_growth measure_speed read_measurement",
     "clsplat.api.trainer": "Report Trainer",
+    "clsplat.formats.splats": "Reading Writing",
     "clsplat.gaussians.model": "Model Rendering load",
     "clsplat.scene.camera": "Camera",
     "clsplat.scene.detect": "read_scene",

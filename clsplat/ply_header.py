@@ -1,7 +1,7 @@
 """Read the header of a PLY file: comments, and place and properties of its vertices."""
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,15 @@ TYPES = {
 
 
 @dataclass(frozen=True)
+class Section:
+    """One element of a binary PLY file."""
+
+    count: int
+    dtype: np.dtype[Any]  # of one row, in the byte order of the file
+    start: int  # bytes before its rows
+
+
+@dataclass(frozen=True)
 class PlyHeader:
     """The vertices of a PLY file."""
 
@@ -35,6 +44,7 @@ class PlyHeader:
     dtype: np.dtype[Any]  # of one vertex, in the byte order of the file
     start: int  # bytes before the vertices; of an ascii file those of the header
     lines_before: int  # of an ascii file: lines between header and vertices
+    sections: dict[str, Section] = field(default_factory=dict)  # of a binary file: all elements before one with a list
 
 
 @dataclass
@@ -102,5 +112,21 @@ def _vertices(path: Path, form: str, comments: tuple[str, ...], elements: list[_
     dtype = np.dtype([(name, ORDERS[form] + kind) for name, kind in vertex.properties])
     if form == "ascii":
         return PlyHeader(form, comments, vertex.count, dtype, start, sum(element.count for element in before))
-    sizes = [element.count * sum(np.dtype(kind).itemsize for _, kind in element.properties) for element in before]
-    return PlyHeader(form, comments, vertex.count, dtype, start + sum(sizes), 0)
+    sections = _sections(elements, ORDERS[form], start)
+    return PlyHeader(form, comments, vertex.count, dtype, sections["vertex"].start, 0, sections)
+
+
+def _sections(elements: list[_Element], order: str, start: int) -> dict[str, Section]:
+    """Where the elements of a binary file lie, up to one whose size nobody knows; of two with one name the first."""
+    sections: dict[str, Section] = {}
+    for element in elements:
+        if element.has_list:
+            break
+        names = [f"{i} {name}" for i, (name, _) in enumerate(element.properties)]
+        if len({name for name, _ in element.properties}) == len(element.properties):
+            names = [name for name, _ in element.properties]
+        kinds = [order + kind for _, kind in element.properties]
+        dtype = np.dtype(list(zip(names, kinds, strict=True)))
+        sections.setdefault(element.name, Section(element.count, dtype, start))
+        start += element.count * dtype.itemsize
+    return sections

@@ -9,8 +9,9 @@ import pytest
 from clsplat.conformance.reference import filtered
 from clsplat.conformance.scenes import random_case, with_world_filter
 from clsplat.errors import Interrupted
+from clsplat.formats.ply import write_ply
+from clsplat.formats.table import read as read_ply
 from clsplat.gaussians.model import Model
-from clsplat.gaussians.ply import read_ply, write_ply
 from clsplat.gaussians.tables import PARAMETERS
 from clsplat.metrics.views import render_view
 from clsplat.pipeline.loading import load

@@ -23,6 +23,7 @@ ROWS = (  # from the top down; a module imports only from lower rows, or from it
     {"views", "filters"},
     {"render"},
     {"gaussians", "scene"},
+    {"formats"},
     {"opencl", "pages"},
     {"caches", "errors", "files", "names", "ply_header", "plugins", "processes", "progress", "reading", "schedule"}
     | {"settings", "signals", "streams", ""},
@@ -38,6 +39,7 @@ def unit(module: str) -> str:
 
 
 TEXTS = {  # what turns results into lines of text
+    "clsplat.gaussians.checkup": {"lines", "verdict"},
     "clsplat.inspect.table": {"show"},
     "clsplat.pipeline.recipes": {"manual_text", "summaries_text"},
     "clsplat.runs.status": {"status_text"},

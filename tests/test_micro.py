@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from clsplat.conformance.scenes import random_case
-from clsplat.gaussians.ply import read_ply
+from clsplat.formats.table import read as read_ply
 from clsplat.metrics.distribution import SHARES, distribution
 from clsplat.pages.svg import Line, curve
 from tests.test_training import train

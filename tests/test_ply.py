@@ -5,8 +5,9 @@ import pytest
 
 from clsplat.conformance.scenes import random_case
 from clsplat.errors import DataError, OutputError
+from clsplat.formats.ply import write_ply
+from clsplat.formats.table import read as read_ply
 from clsplat.gaussians.model import Rendering, load
-from clsplat.gaussians.ply import read_ply, write_ply
 from clsplat.gaussians.tables import PARAMETERS
 from tests.data_sets import data_set
 

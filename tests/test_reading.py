@@ -9,7 +9,8 @@ import pytest
 
 from clsplat.bench.measurement import read_measurement
 from clsplat.errors import ConfigError, DataError
-from clsplat.gaussians.ply import is_splat, read_ply
+from clsplat.formats.table import detect
+from clsplat.formats.table import read as read_ply
 from clsplat.metrics.lpips import Lpips
 from clsplat.pipeline.loading import load
 from clsplat.reading import read_file, read_json
@@ -42,7 +43,7 @@ NOT_FILES: dict[str, Callable[[Path], object]] = {
 }
 READERS: dict[str, Callable[[Path], object]] = {
     "model": read_ply,
-    "kind of model": is_splat,
+    "kind of model": detect,
     "points": read_points_ply,
     "image": read_image,
     "image header": read_header,

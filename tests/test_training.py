@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from clsplat.errors import ConfigError, DataError, Interrupted, NumericError
-from clsplat.gaussians.ply import read_ply, write_ply
+from clsplat.formats.ply import write_ply
+from clsplat.formats.table import read as read_ply
 from clsplat.pipeline.loading import load
 from clsplat.runs import folders, opening, runner
 from clsplat.training import checkpoint

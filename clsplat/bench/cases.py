@@ -14,7 +14,7 @@ from clsplat.density.basic import PruneLarge
 from clsplat.density.control import densify
 from clsplat.density.edit import Edit, SceneScale
 from clsplat.density.statistics import SplatStats
-from clsplat.gaussians.ply import Parameters
+from clsplat.formats.splats import Parameters
 from clsplat.gaussians.tables import PARAMETERS, Gaussians
 from clsplat.opencl.device import Device
 from clsplat.opencl.program import constants

@@ -8,7 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.bench.cases import Case
-from clsplat.gaussians.ply import Parameters, is_splat, read_ply
+from clsplat.formats.splats import Parameters
+from clsplat.formats.table import detect
+from clsplat.gaussians.model import load
 from clsplat.gaussians.tables import SH_C0
 from clsplat.opencl.device import Device
 from clsplat.pipeline.file import PipelineFile
@@ -59,7 +61,7 @@ def real_case(device: Device, model: Path, scene: Path, settings: PipelineFile) 
     """Return a splat PLY, or the Gaussians that `init` makes of a point cloud, at a scene's first training view."""
     opened, background = settings.scene.read(scene)
     photographs = Photographs(device, background)
-    parameters = read_ply(model).parameters if is_splat(model) else from_points(read_points_ply(model), 0.1, 3)
+    parameters = load(model).tables() if detect(model) else from_points(read_points_ply(model), 0.1, 3)
     return Case(device, parameters, photographs.get(opened.split("train")[0]), background, settings)
 
 

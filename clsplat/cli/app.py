@@ -24,6 +24,7 @@ SYNONYMS = {
     **dict.fromkeys(("progress", "ps"), "status"),
     **dict.fromkeys(("benchmark", "time", "profile"), "bench"),
     **dict.fromkeys(("prove", "diagnose", "selftest"), "doctor"),
+    **dict.fromkeys(("export", "transform", "merge"), "convert"),
     "diff": "compare",
     "help": "--help",
     "version": "--version",
@@ -32,7 +33,7 @@ SYNONYMS = {
 
 ORDER = [
     *("run", "resume", "status", "check", "pipelines", "devices", "doctor", "inspect"),
-    *("render", "evaluate", "compare", "bench", "data"),
+    *("render", "evaluate", "convert", "compare", "bench", "data"),
 ]
 
 
@@ -165,7 +166,7 @@ PipelineArgument = Annotated[
         help="A pipeline file, or the name of a shipped one.",
     ),
 ]
-ModelArgument = Annotated[Path, typer.Argument(metavar="MODEL|RUN", help="A splat PLY with --scene, or a run folder.")]
+ModelArgument = Annotated[Path, typer.Argument(metavar="MODEL|RUN", help="A model file with --scene, or a run folder.")]
 SceneOption = Annotated[
     Path | None,
     typer.Option(metavar="DIR", help="A COLMAP, Blender or nerfstudio folder; default: that of the run."),

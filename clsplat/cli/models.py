@@ -93,6 +93,59 @@ def evaluate(
         write_text(out, json.dumps(found, indent=1) + "\n")
 
 
+@command(
+    "convert",
+    "clsplat convert point_cloud.ply scene.spz",
+    "clsplat convert a.ply b.sog both.glb --transform 'rotate=90,0,0'",
+)
+def convert(
+    files: Annotated[
+        list[Path],
+        typer.Argument(metavar="IN… OUT", help="Models to read, all merged, and the file to write; its name says how."),
+    ],
+    sh_degree: Annotated[int | None, typer.Option(metavar="N", help="Keep harmonics to this degree.")] = None,
+    sh_bits: Annotated[
+        str | None, typer.Option(metavar="A/B", help="SPZ: bits of band 1 and of the others; default: 8/8.")
+    ] = None,
+    axes: Annotated[
+        Literal["spz", "ply"],
+        typer.Option(help="Of SPZ files that are read, else of the one that is written: up and back, or as in a PLY."),
+    ] = "spz",
+    spz_version: Annotated[int, typer.Option(metavar="3|4", help="SPZ: 4 needs the extra spz.")] = 3,
+    quality: Annotated[
+        Literal["small", "balanced", "high"], typer.Option(help="Of SPZ (bits) and SOG (palette).")
+    ] = "balanced",
+    keep_nan: Annotated[bool, typer.Option("--keep-nan", help="Keep Gaussians that are not finite, in a PLY.")] = False,
+    crop: Annotated[
+        str | None, typer.Option(metavar="X0,Y0,Z0,X1,Y1,Z1", help="Keep what lies in this box after --transform.")
+    ] = None,
+    transform: Annotated[
+        str | None,
+        typer.Option(metavar="TEXT", help="scale=S rotate=X,Y,Z translate=X,Y,Z, or a matrix; colours turn too."),
+    ] = None,
+    drop_below: Annotated[
+        float, typer.Option(metavar="OPACITY", min=0, max=1, help="Drop Gaussians that are fainter.")
+    ] = 0.0,
+) -> None:
+    """Write models in another format: PLY, SPZ, SOG, glTF and others."""
+    done = commands.convert(
+        files[:-1],
+        files[-1],
+        sh_degree=sh_degree,
+        sh_bits=sh_bits,
+        axes=axes,
+        spz_version=spz_version,
+        quality=quality,
+        keep_nan=keep_nan,
+        crop=crop,
+        transform=transform,
+        drop_below=drop_below,
+    )
+    share = 100 * done["bytes"] / max(done["bytes_read"], 1)
+    size = f"{done['bytes'] / 1e6:.3g} MB, {share:.3g} % of what was read"
+    terminal.remark(f"{done['file']}: {done['format']}, {done['gaussians']:,} Gaussians, {size}")
+
+
 @command("compare", "clsplat compare runs/splat runs/mip_splatting --out compare.html")
 def compare(
     runs: Annotated[

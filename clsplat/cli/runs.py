@@ -8,7 +8,7 @@ import typer
 from clsplat import terminal
 from clsplat.api import commands
 from clsplat.cli.app import DeviceOption, JsonOption, PipelineArgument, SetOption, command, recipe_names
-from clsplat.errors import ConfigError, OutputError
+from clsplat.errors import ConfigError, DataError, OutputError
 
 
 @command(
@@ -82,13 +82,17 @@ def status(
     "check",
     "clsplat check my_pipeline.yaml",
     "clsplat check runs/splat_7k",
+    "clsplat check model.spz --json",
     "clsplat check --schema > pipeline.schema.json",
 )
 def check(
     pipeline: Annotated[
         str,
         typer.Argument(
-            metavar="PIPELINE|RUN", autocompletion=recipe_names, show_default=False, help="As for run; or a run folder."
+            metavar="PIPELINE|RUN|MODEL",
+            autocompletion=recipe_names,
+            show_default=False,
+            help="As for run; or a run folder, or a model file.",
         ),
     ] = "",
     schema: Annotated[
@@ -96,15 +100,17 @@ def check(
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Validate a pipeline without running it, or verify every file of a run folder."""
+    """Validate a pipeline without running it, verify every file of a run folder, or look at a model file."""
     if schema:
         terminal.show_json(commands.pipeline_schema())
         return
     if not pipeline:
-        raise ConfigError("check: expected a pipeline, a run folder, or --schema")
+        raise ConfigError("check: expected a pipeline, a run folder, a model, or --schema")
     found = commands.check(pipeline)
     if "objects" in found:
         _show_verified(found, as_json)
+    elif "model" in found:
+        _show_examined(found, as_json)
     elif as_json:
         terminal.show_json({**found, "valid": True})
     elif "cells" in found:
@@ -123,6 +129,20 @@ def _show_verified(found: dict[str, Any], as_json: bool) -> None:
         terminal.show(lines(found))
     if not found["whole"]:
         raise OutputError(verdict(found))
+    if not as_json:
+        terminal.show(verdict(found))
+
+
+def _show_examined(found: dict[str, Any], as_json: bool) -> None:
+    """Show what a model file holds.  Raises DataError where something is wrong with it."""
+    from clsplat.gaussians.checkup import lines, verdict
+
+    if as_json:
+        terminal.show_json(found)
+    else:
+        terminal.show(lines(found))
+    if not found["valid"]:
+        raise DataError(verdict(found))
     if not as_json:
         terminal.show(verdict(found))
 

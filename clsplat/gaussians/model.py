@@ -8,9 +8,22 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.gaussians.ply import MAX_DEGREE, read_ply, write_ply
+from clsplat.errors import DataError
+from clsplat.formats.splats import (
+    MAX_DEGREE,
+    MIP_VARIANCE,
+    NEAR,
+    PARAMETERS,
+    SH_C0,
+    VARIANCE,
+    Reading,
+    SplatFile,
+    Writing,
+    sh_coefficients,
+)
+from clsplat.formats.table import for_writing, located, read, write
 from clsplat.gaussians.sh import rotated_sh
-from clsplat.gaussians.tables import PARAMETERS, SH_C0, DeviceModel, Gaussians, sh_coefficients
+from clsplat.gaussians.tables import DeviceModel, Gaussians
 from clsplat.opencl.device import Device
 
 MODEL = "point_cloud.ply"  # of a run folder
@@ -21,15 +34,14 @@ WIDTHS = {  # of the tables
     "filter_variance": (1,),
 }
 MIN_LOGIT = -80.0  # of an opacity that the filter spreads out to nothing: as little as the kernels know
-MIP_VARIANCE = 0.1  # px², of files that say no more than `mip` (Yu et al. 2024)
 
 
 @dataclass(frozen=True)
 class Rendering:
     """The numbers with which a model is rendered."""
 
-    near: float = 0.2  # scene units; nearer Gaussians are not drawn
-    screen_variance: float = 0.3  # px², added to every splat
+    near: float = NEAR  # scene units; nearer Gaussians are not drawn
+    screen_variance: float = VARIANCE  # px², added to every splat
     compensate: float = 0.0  # 1: the opacity falls as that variance spreads a splat out
     background: Literal["black", "white"] | None = None  # None: what the scene says
     alpha: Literal["transparency", "mask"] = "transparency"  # what the fourth channel of its photographs was
@@ -165,12 +177,16 @@ class Model:
         logits = np.maximum(logit, MIN_LOGIT).astype(np.float32)
         return replace(self, log_scales=log_scales, logit_opacity=logits, filter_variance=None)
 
-    def save(self, path: str | Path) -> str:
-        """Write a PLY in the layout of 3DGS; a world filter that is not `baked` is kept, as a property `filter_3D`.
+    def save(self, path: str | Path, options: Writing | None = None) -> str:
+        """Write a file in the format that its name stands for: .ply, .spz, .sog, .glb and others (docs/formats.md).
 
-        Returns the SHA-256 of what was written.  Raises OutputError when it cannot be written.
+        A world filter that is not `baked` is kept in a PLY, as a property `filter_3D`, and baked for other formats.
+        Returns the SHA-256 of what was written; of a folder of SOG that of its meta.json.
+        Raises ConfigError for another name, and OutputError when the file cannot be written.
         """
-        return write_ply(Path(path), self.tables(), self.rendering.comment())
+        model = self if for_writing(Path(path)).keeps_filter else self.baked()
+        mode = "mip" if self.rendering.compensate else "default"
+        return write(Path(path), SplatFile(model.tables(), self.rendering.comment(), mode), options)
 
     def __repr__(self) -> str:
         return f"Model({len(self):,} Gaussians, SH degree {self.sh_degree})"
@@ -190,11 +206,21 @@ class Model:
         return summary(rows)
 
 
-def load(path: str | Path) -> Model:
-    """Read a model file, or the model of a run folder.  Raises DataError when it is missing, damaged or not a splat."""
+def load(path: str | Path, options: Reading | None = None) -> Model:
+    """Read a model file of any format (docs/formats.md), or the model of a run folder.
+
+    Raises DataError when it is missing, damaged or not a splat.
+    """
     path = Path(path)
-    file = read_ply(path / MODEL if path.is_dir() else path)
-    return Model(**file.parameters, rendering=Rendering.of(file.rendering, file.mode))
+    file = read(path / MODEL if path.is_dir() and located(path) == path else path, options)
+    model = Model(**file.parameters, rendering=Rendering.of(file.rendering, file.mode))
+    if file.placement is None:
+        return model
+    scale = float(np.cbrt(np.linalg.det(file.placement[:3, :3])))
+    try:
+        return model.transformed(scale, file.placement[:3, :3] / (scale or 1), file.placement[:3, 3])
+    except ValueError as error:
+        raise DataError(f"{path}: a node stretches or mirrors its Gaussians; export it again") from error
 
 
 def _quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -15,18 +15,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.formats.splats import PARAMETERS as PARAMETERS
+from clsplat.formats.splats import SH_C0 as SH_C0
+from clsplat.formats.splats import sh_coefficients as sh_coefficients
 from clsplat.opencl.device import Array, Device
 
-PARAMETERS = ("means", "quats", "log_scales", "logit_opacity", "sh_base", "sh_rest")
 INTERVAL2 = "sampling_interval2"  # scene units², the smallest over training views; exists only where it is read
 ALIGNMENT = 64  # capacity is a multiple of this: wide kernels need no tail
 GROWTH = 1.5
-SH_C0 = 0.28209479177387814  # basis function of band 0
-
-
-def sh_coefficients(degree: int) -> int:
-    """Return the number K of basis functions up to `degree`."""
-    return (degree + 1) ** 2
 
 
 @dataclass

@@ -12,6 +12,7 @@ import numpy as np
 from clsplat.conformance.quick import open_correct
 from clsplat.errors import ConfigError, DataError
 from clsplat.files import atomic
+from clsplat.formats.table import located
 from clsplat.gaussians.model import MODEL, load
 from clsplat.metrics.images import to_8_bits
 from clsplat.metrics.lpips import InputRange
@@ -48,7 +49,7 @@ class Source:
 
         `scene` replaces the folder of the run's photographs.  Raises DataError or ConfigError when one is not known.
         """
-        if not model.is_dir():
+        if not model.is_dir() or (located(model).is_file() and not (model / "pipeline.yaml").is_file()):
             if scene is None:
                 raise ConfigError(
                     f"{model}: a model file does not name its scene; give the folder of a scene, or a run folder"

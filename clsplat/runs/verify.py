@@ -8,6 +8,8 @@ from typing import Any
 from clsplat import plugins
 from clsplat.compare.run_folder import read_metrics, read_settings
 from clsplat.errors import ConfigError, DataError, one_line, shortened
+from clsplat.formats.table import endings
+from clsplat.gaussians.checkup import examine, is_model
 from clsplat.gaussians.model import load as load_model
 from clsplat.names import CHECKPOINTS, CHECKSUMS, INPUTS, METRICS, PIPELINE, RECORDS, STATUS, is_inside
 from clsplat.pipeline.files import shipped
@@ -30,10 +32,13 @@ def is_run(folder: Path) -> bool:
 
 
 def check(pipeline: str) -> dict[str, Any]:
-    """Check a pipeline file, or a shipped one by name: its path, its name, its stages or cells; or a run folder.
+    """Check a pipeline file, or a shipped one by name: its path, its name, its stages or cells.
 
+    Of a run folder and of a model file return what `verify` and `examine` say.
     Raises ConfigError; DataError for a folder without a run.
     """
+    if not is_run(Path(pipeline)) and pipeline not in shipped() and is_model(Path(pipeline)):
+        return examine(Path(pipeline))
     if Path(pipeline).is_dir() and (is_run(Path(pipeline)) or pipeline not in shipped()):
         return verify(Path(pipeline))
     if found := load_experiment(pipeline):
@@ -184,7 +189,7 @@ def _output(expected: str | None, path: Path) -> str:
         return f"{read_metrics(path).gaussians:,} Gaussians"
     if path.name == RECORDS:
         return f"{len(Records(path.parent).read())} lines"
-    if path.suffix == ".ply":
+    if path.name.lower().endswith(tuple(endings(reads=True))):
         return f"{len(load_model(path)):,} Gaussians"
     if path.suffix == ".png":
         height, width = read_image(path).shape[:2]

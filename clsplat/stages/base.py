@@ -20,21 +20,21 @@ CADENCE = frozenset({"every", "start", "stop"})
 class PathInRun(AfterValidator):
     """Marks a field that holds a path inside the run folder: a file where there is a suffix, else a folder."""
 
-    suffix: str = ""
+    suffixes: tuple[str, ...] = ()
 
 
-def path_in_run(suffix: str = "") -> PathInRun:
-    """Mark a field that holds a file in the run folder whose name ends in `suffix`, or a folder in it."""
+def path_in_run(*suffixes: str) -> PathInRun:
+    """Mark a field that holds a file in the run folder whose name ends in one of `suffixes`, or a folder in it."""
 
     def checked(text: str) -> str:
         fault = fault_of_output(text)
-        if fault is None and suffix and PurePosixPath(text).suffix.lower() != suffix:
-            fault = f"it does not end in {suffix}"
+        if fault is None and suffixes and not PurePosixPath(text).name.lower().endswith(suffixes):
+            fault = f"it does not end in {', '.join(suffixes)}"
         if fault:
             raise ValueError(f"expected a path inside the run folder: {fault}")
         return text
 
-    return PathInRun(checked, suffix)
+    return PathInRun(checked, suffixes)
 
 
 def _marks(kind: Any, metadata: Iterable[Any]) -> list[PathInRun]:
@@ -66,10 +66,10 @@ class Stage(Settings):
         return [out / value for value in values if value is not None]
 
     @classmethod
-    def named_outputs(cls) -> dict[str, str]:
-        """Return the fields that hold a path inside the run folder, each with the suffix of the file."""
+    def named_outputs(cls) -> dict[str, tuple[str, ...]]:
+        """Return the fields that hold a path inside the run folder, each with the suffixes that a file may have."""
         marks = {name: _marks(field.annotation, field.metadata) for name, field in cls.model_fields.items()}
-        return {name: found[0].suffix for name, found in marks.items() if found}
+        return {name: found[0].suffixes for name, found in marks.items() if found}
 
     def verify(self, run: Run) -> None:
         """Read back what the stage has written.  Raises DataError where it is missing or damaged."""
@@ -119,9 +119,9 @@ def written_twice(stages: Sequence[Stage]) -> str | None:
     for stage in stages:
         if not (named := stage.named_outputs()):  # what other stages write for it
             continue
-        suffixes = set(named.values()) - {""}
+        suffixes = tuple(suffix for of_field in named.values() for suffix in of_field)
         own = [
-            (tuple(part.casefold() for part in path.parts), path.suffix.lower() in suffixes)
+            (tuple(part.casefold() for part in path.parts), path.name.lower().endswith(suffixes))
             for path in stage.outputs(Path())
         ]
         for parts, is_file in own:

@@ -5,31 +5,33 @@ from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
 from clsplat.errors import DataError, OutputError
+from clsplat.formats.table import endings, for_writing
 from clsplat.gaussians.model import load
 from clsplat.reading import sha256
 from clsplat.stages.base import CADENCE, Scheduled, path_in_run
 from clsplat.training.run import Run
 
+WRITTEN = tuple(ending for ending in endings() if ending.startswith("."))  # a folder of SOG is no file
 LOG = logging.getLogger("clsplat")
 
 
 class Export(Scheduled):
-    """Write a PLY in the reference's layout and read it back.
+    """Write the model in the format that the name of the file stands for, by default a PLY, and read it back.
 
-    A world filter is applied to scales and opacities, so that any viewer can show the file.  A second file, with `_raw`
-    in its name, holds the model as trained, with the filter as a property `filter_3D`.
+    A world filter is applied to scales and opacities, so that any viewer can show the file.  A second file, a PLY with
+    `_raw` in its name, holds the model as trained, with the filter as a property `filter_3D`.
     """
 
     stage: Literal["export"] = "export"
     needs: ClassVar[frozenset[str]] = frozenset({"model"})
     output_keys: ClassVar[frozenset[str]] = CADENCE | {"file"}
 
-    file: Annotated[str, path_in_run(".ply")] = "point_cloud.ply"
-    """Path inside the run folder."""
+    file: Annotated[str, path_in_run(*WRITTEN)] = "point_cloud.ply"
+    """Path inside the run folder; its ending is the format: .ply, .compressed.ply, .spz, .sog, .glb, .splat, .usda."""
 
     def outputs(self, out: Path) -> list[Path]:
         path = out / self.file
-        return [path, path.with_name(f"{path.stem}_raw{path.suffix}")]
+        return [path, path.with_name(f"{path.stem}_raw.ply")]
 
     def run(self, run: Run) -> None:
         model = run.host_model()
@@ -40,7 +42,8 @@ class Export(Scheduled):
         for file, one in files.items():
             run.written[file] = one.save(file)
             try:
-                load(file)
+                if for_writing(file).read:
+                    load(file)
             except DataError as error:
                 raise OutputError(f"{error}; it was written just now: check the disk and its space") from error
             LOG.info("%d Gaussians written to %s", len(one), file)
@@ -48,7 +51,9 @@ class Export(Scheduled):
     def verify(self, run: Run) -> None:
         path, raw = self.outputs(run.out)
         for file in (path, raw) if raw in run.written or raw.exists() else (path,):
-            if file not in run.written:  # before the run was resumed
+            found = sha256(file)
+            if file in run.written:
+                if found != run.written[file]:
+                    raise DataError(f"{file}: differs from what was written")
+            elif for_writing(file).read:  # written before the run was resumed
                 load(file)
-            elif sha256(file) != run.written[file]:
-                raise DataError(f"{file}: differs from what was written")

@@ -12,7 +12,8 @@ from pydantic import Field
 from scipy.spatial import cKDTree
 
 from clsplat.errors import DataError
-from clsplat.gaussians.ply import Parameters, read_ply
+from clsplat.formats.splats import Parameters, with_degree
+from clsplat.gaussians.model import load
 from clsplat.gaussians.tables import SH_C0, Gaussians, sh_coefficients
 from clsplat.scene.images import read_image
 from clsplat.scene.plane_sweep import swept_points
@@ -26,6 +27,7 @@ from clsplat.training.run import Run
 LOG = logging.getLogger("clsplat")
 MIN_DISTANCE2 = 1.0e-7  # scene units²: coincident points still get a size
 MIN_SWEPT_POINTS = 100  # with fewer points from a sweep, random ones are used
+MODEL_SOURCES = ("model", "ply")
 RANDOM_BOX = 1.3 / 4.03  # half side of the box by camera distance: the value of 3DGS for the Blender scenes
 
 
@@ -40,8 +42,8 @@ class Init(Stage):
     makes: ClassVar[frozenset[str]] = frozenset({"model"})
     edits: ClassVar[bool] = True
 
-    source: Literal["auto", "points", "sweep", "random", "ply"] = "auto"
-    """Source of the first Gaussians."""
+    source: Literal["auto", "points", "sweep", "random", "model", "ply"] = "auto"
+    """Source of the first Gaussians; `ply` is an older name of `model`."""
     opacity: Annotated[float, Field(gt=0, lt=1)] = 0.1
     """Opacity of the first Gaussians."""
     count: Annotated[int, Field(gt=0)] = 100_000
@@ -49,12 +51,12 @@ class Init(Stage):
     swept: Annotated[int, Field(gt=0)] = 20_000
     """Largest number of points of a plane sweep."""
     file: ReadPath | None = None
-    """Model file for `source: ply`."""
+    """Model file of any format, or a run folder, for `source: model`."""
 
     def run(self, run: Run) -> None:
         degree = run.model_settings.sh_degree
         gaussians = Gaussians(run.device, self._parameters(run, degree))
-        run.model = run.model_settings.model(gaussians, degree if self.source == "ply" else 0)
+        run.model = run.model_settings.model(gaussians, degree if self.source in MODEL_SOURCES else 0)
         run.refresh_filter()
         LOG.info("%d Gaussians from %s", run.model.gaussians.count, self._origin(run.scene))
 
@@ -62,7 +64,7 @@ class Init(Stage):
         names = {"points": "the scene's points", "random": "random points", "sweep": "a sweep over the photographs"}
         source = self._source(scene)
         return names.get(source, source) + (
-            "" if scene.points is not None or source == "ply" else ": the scene has none"
+            "" if scene.points is not None or source in MODEL_SOURCES else ": the scene has none"
         )
 
     def _source(self, scene: Scene) -> str:
@@ -73,9 +75,9 @@ class Init(Stage):
         return "random" if read_image(scene.views[0].image_path).shape[2] == 4 else "sweep"
 
     def _parameters(self, run: Run, degree: int) -> Parameters:
-        if self.source == "ply":
+        if self.source in MODEL_SOURCES:
             if self.file is None:
-                raise DataError("init: source 'ply' needs 'file'")
+                raise DataError(f"init: source '{self.source}' needs 'file'")
             return with_degree(self._read(Path(self.file)), degree)
         points, source = run.scene.points, self._source(run.scene)
         if source == "random":
@@ -91,7 +93,7 @@ class Init(Stage):
 
     @staticmethod
     def _read(path: Path) -> Parameters:
-        parameters = read_ply(path).parameters
+        parameters = load(path).tables()
         if not len(parameters["means"]):
             raise DataError(f"{path}: holds no Gaussians; expected one at least to start from")
         return parameters
@@ -166,11 +168,3 @@ def looked_at(positions: NDArray[np.floating], directions: NDArray[np.floating])
     across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
     point, *_ = np.linalg.lstsq(across.sum(axis=0), np.einsum("nij,nj->i", across, positions), rcond=None)
     return np.asarray(point)
-
-
-def with_degree(parameters: Parameters, degree: int) -> Parameters:
-    """Return the Gaussians with more or fewer SH bands."""
-    columns = 3 * (sh_coefficients(degree) - 1)
-    rest = parameters["sh_rest"][:, :columns]
-    padding = np.zeros((len(rest), columns - rest.shape[1]), np.float32)
-    return {**parameters, "sh_rest": np.concatenate([rest, padding], axis=1)}

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
+from clsplat.formats.ply import write_ply
+from clsplat.formats.table import detect
 from clsplat.gaussians.model import load
-from clsplat.gaussians.ply import is_splat, write_ply
 from clsplat.gaussians.tables import PARAMETERS
 from clsplat.scene.points import read_points_ply, write_points_ply
 from clsplat.scene.scene import PointCloud
@@ -59,7 +60,7 @@ def test_a_damaged_model_is_read_or_refused(folder):
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             model = outcome(load, folder / "model.ply")
-            outcome(is_splat, folder / "model.ply")
+            outcome(detect, folder / "model.ply")
         if model is not None:
             assert all(np.isfinite(table).all() for table in model.tables().values())
             assert np.isfinite(

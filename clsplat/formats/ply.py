@@ -8,10 +8,9 @@ standard deviation (Mip-Splatting).  Comments hold the numbers that a rasterizer
 `SplatRenderMode: mip` when a screen filter reduces opacities to keep their energy, else `default`.
 """
 
-import hashlib
 import json
 import os
-from dataclasses import dataclass, field
+import re
 from pathlib import Path
 from typing import Any
 
@@ -19,16 +18,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.errors import DataError, quoted
-from clsplat.files import atomic
-from clsplat.gaussians.tables import PARAMETERS, sh_coefficients
+from clsplat.formats.output import written
+from clsplat.formats.splats import (
+    FLAT_LOG_SCALE,
+    MAX_DEGREE,
+    PARAMETERS,
+    Parameters,
+    SplatFile,
+    require_held,
+    sh_coefficients,
+    swapped,
+)
 from clsplat.ply_header import MAX_HEADER, PlyHeader, parse_ply_header
 from clsplat.reading import opened
 
 RENDERING, MODE = "clsplat ", "SplatRenderMode: "  # comments
+MIP = re.compile(r"SplatRenderMode\s*:\s*mip|postshot\.anti_aliasing\s*=\s*1", re.IGNORECASE)  # of all programs
 FILTER = "filter_3D"
 NUMBERS = ("near", "screen_variance", "compensate")  # of the comment
 MAX_NUMBER = 1e15  # as of any number in a dataset
-MAX_DEGREE = 3
 _COLUMNS = {
     "means": ("x", "y", "z"),
     "sh_base": ("f_dc_0", "f_dc_1", "f_dc_2"),
@@ -37,41 +45,21 @@ _COLUMNS = {
     "quats": ("rot_0", "rot_1", "rot_2", "rot_3"),
 }
 
-Parameters = dict[str, NDArray[np.float32]]  # by the names of PARAMETERS, each [N, components]
-
-
-@dataclass(frozen=True)
-class SplatFile:
-    """A model file: the parameters, and the numbers of its comment for rendering them."""
-
-    parameters: Parameters  # filter_variance too, where the file has it
-    rendering: dict[str, Any] = field(default_factory=dict)
-    mode: str = "default"  # SplatRenderMode
-
-
-def is_splat(path: Path) -> bool:
-    """Return whether the header of a PLY file declares splats.  Raises DataError when it is missing or no PLY."""
-    with opened(path, "a PLY file") as file:
-        return "f_dc_0" in (parse_ply_header(path, file.read(MAX_HEADER)).dtype.names or ())
-
 
 def read_ply(path: Path) -> SplatFile:
-    """Read a splat PLY.  Raises DataError when it is missing, damaged or not a splat."""
+    """Read a splat PLY; of a disc, which has no scale_2, the third axis is FLAT_LOG_SCALE.
+
+    Raises DataError when it is missing, damaged or not a splat.
+    """
     with opened(path, "a PLY file") as file:
         header = parse_ply_header(path, file.read(MAX_HEADER))
         if header.format == "ascii":
             raise DataError(f"{path}: is an ascii PLY; expected binary_little_endian or big_endian: export it again")
-        rendering, size = _rendering(path, header), header.count * header.dtype.itemsize
-        held, expected = file.seek(0, os.SEEK_END), header.start + size
-        if held < expected:
-            raise DataError(
-                f"{path}: holds {held} bytes, but its header declares {header.count} splats, {expected} bytes; "
-                "the file is truncated: copy or export it again"
-            )
+        rendering, size = comment_of(path, header), header.count * header.dtype.itemsize
+        require_held(path, file.seek(0, os.SEEK_END), header.start + size, f"{header.count} splats")
         file.seek(header.start)
         parameters = _parameters(path, np.frombuffer(file.read(size), header.dtype))
-    mode = "mip" if "filter_variance" in parameters else _comment(header, MODE) or "default"
-    return SplatFile(parameters, rendering, mode)
+    return SplatFile(parameters, rendering, "mip" if "filter_variance" in parameters else mode_of(header))
 
 
 def write_ply(path: Path, parameters: Parameters, rendering: dict[str, Any]) -> str:
@@ -81,7 +69,7 @@ def write_ply(path: Path, parameters: Parameters, rendering: dict[str, Any]) -> 
     """
     count = len(parameters["means"])
     coefficients = 1 + parameters["sh_rest"].shape[1] // 3
-    rest = _swapped(parameters["sh_rest"], coefficients - 1, 3)
+    rest = swapped(parameters["sh_rest"], coefficients - 1, 3)
     blocks = [
         parameters["means"],
         np.zeros((count, 3), np.float32),
@@ -97,36 +85,38 @@ def write_ply(path: Path, parameters: Parameters, rendering: dict[str, Any]) -> 
     if "filter_variance" in parameters:
         blocks.append(np.sqrt(parameters["filter_variance"]))
         names.append(FILTER)
-    mode = "mip" if rendering.get("compensate") else "default"
-    header = [
-        "ply",
-        "format binary_little_endian 1.0",
-        f"comment {RENDERING}{json.dumps(rendering, sort_keys=True)}",
-        f"comment {MODE}{mode}",
-    ]
+    header = ["ply", "format binary_little_endian 1.0", *comments(rendering)]
     header += [f"element vertex {count}", *(f"property float {name}" for name in names), "end_header"]
     body = np.ascontiguousarray(np.concatenate(blocks, axis=1), "<f4")
-    written = hashlib.sha256()
-    with atomic(path) as file:
-        for part in (("\n".join(header) + "\n").encode(), body.tobytes()):
-            file.write(part)
-            written.update(part)
-    return written.hexdigest()
+    with written(path) as file:
+        file.write(("\n".join(header) + "\n").encode())
+        file.write(body.tobytes())
+    return file.sha256
 
 
-def _comment(header: PlyHeader, start: str) -> str:
-    """The text after `start` in the first comment that begins with it, or ""."""
-    return next((text.removeprefix(start).strip() for text in header.comments if text.startswith(start)), "")
+def comments(rendering: dict[str, Any]) -> list[str]:
+    """Return the lines of a header that say how a model is rendered."""
+    mode = "mip" if rendering.get("compensate") else "default"
+    return [f"comment {RENDERING}{json.dumps(rendering, sort_keys=True)}", f"comment {MODE}{mode}"]
 
 
-def _rendering(path: Path, header: PlyHeader) -> dict[str, Any]:
-    """The numbers of the comment; none where a comment says something else.  Raises DataError for an invalid one."""
+def mode_of(header: PlyHeader) -> str:
+    """Return `mip` where a comment of any program says so, else `default`."""
+    return "mip" if any(MIP.match(text) for text in header.comments) else "default"
+
+
+def comment_of(path: Path, header: PlyHeader) -> dict[str, Any]:
+    """Return the numbers of our comment; none where there is another.  Raises DataError for an invalid one."""
+    text = next((text.removeprefix(RENDERING) for text in header.comments if text.startswith(RENDERING)), "")
     try:
-        values = json.loads(_comment(header, RENDERING) or "{}")
+        values = json.loads(text or "{}")
     except (ValueError, RecursionError):
         return {}
-    if not isinstance(values, dict):
-        return {}
+    return checked_numbers(path, values) if isinstance(values, dict) else {}
+
+
+def checked_numbers(path: Path, values: dict[str, Any]) -> dict[str, Any]:
+    """Return what a file says about rendering.  Raises DataError for an invalid number."""
     for name in NUMBERS:
         value = values.get(name)
         if value is not None and (not isinstance(value, int | float) or not 0 <= value < MAX_NUMBER):
@@ -139,36 +129,31 @@ def _rendering(path: Path, header: PlyHeader) -> dict[str, Any]:
 
 def _parameters(path: Path, vertices: NDArray[Any]) -> Parameters:
     names = vertices.dtype.names or ()
-    missing = [column for columns in _COLUMNS.values() for column in columns if column not in names]
+    columns_of = dict(_COLUMNS)
+    if "scale_1" in names and "scale_2" not in names:  # 2DGS
+        columns_of["log_scales"] = ("scale_0", "scale_1")
+    missing = [column for columns in columns_of.values() for column in columns if column not in names]
     if missing:
         raise DataError(
             f"{path}: not a splat file: it has no {', '.join(missing[:4])}{' …' if len(missing) > 4 else ''}; "
-            "train from a point cloud with `clsplat run`, or decompress the file first"
+            "train from a point cloud with `clsplat run`"
         )
     rest = sum(name.startswith("f_rest_") for name in names)
     degree = next((d for d in range(MAX_DEGREE + 1) if 3 * (sh_coefficients(d) - 1) == rest), None)
     columns = tuple(f"f_rest_{i}" for i in range(rest))
     if degree is None or not set(columns) <= set(names):
         raise DataError(f"{path}: has {rest} f_rest properties; expected 0, 9, 24 or 45, numbered from 0 on")
-    parameters = {name: _columns(vertices, columns) for name, columns in _COLUMNS.items()}
+    parameters = {name: _columns(vertices, columns) for name, columns in columns_of.items()}
     by_channel = _columns(vertices, columns)
     per_channel = sh_coefficients(degree) - 1
-    parameters["sh_rest"] = _swapped(by_channel, 3, per_channel)
+    parameters["sh_rest"] = swapped(by_channel, 3, per_channel)
+    if parameters["log_scales"].shape[1] == 2:
+        parameters["log_scales"] = np.pad(parameters["log_scales"], ((0, 0), (0, 1)), constant_values=FLAT_LOG_SCALE)
     parameters = {name: parameters[name] for name in PARAMETERS}
     if FILTER in names:
         with np.errstate(over="ignore"):  # infinity is refused
             parameters["filter_variance"] = np.square(_columns(vertices, (FILTER,)))
-    bad = [name for name, table in parameters.items() if not np.isfinite(table).all()]
-    if bad:
-        raise DataError(f"{path}: {', '.join(bad)} hold values that are not finite; export the file again")
     return parameters
-
-
-def _swapped(table: NDArray[np.float32], outer: int, inner: int) -> NDArray[np.float32]:
-    """Columns in outer-major order -> inner-major, [N, outer * inner]."""
-    count = len(table)
-    swapped = table.reshape(count, outer, inner).transpose(0, 2, 1)
-    return np.ascontiguousarray(swapped.reshape(count, outer * inner))
 
 
 def _columns(vertices: NDArray[Any], columns: tuple[str, ...]) -> NDArray[np.float32]:

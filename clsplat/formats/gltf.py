@@ -1,0 +1,110 @@
+"""The parts of glTF that hold Gaussians: primitives, where their node stands, and accessors."""
+
+import logging
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.errors import DataError, quoted
+
+LOG = logging.getLogger("clsplat")
+EXTENSION = "KHR_gaussian_splatting"
+PREFIX = f"{EXTENSION}:"
+COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
+WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+MAX_DEPTH = 64  # of nodes
+FLIP = np.diag([1.0, -1, -1, 1])  # between the axes of glTF and those of a PLY
+
+
+class Gltf:
+    """A file's primitives of Gaussians, all in the same place.
+
+    Raises DataError where there are none, or more than one place; the errors of Python for a tree that is damaged.
+    """
+
+    def __init__(self, path: Path, tree: dict[str, Any], binary: bytes) -> None:
+        self.path, self.tree, self.binary = path, tree, binary
+        self.primitives: list[dict[str, Any]] = []
+        self.placement: NDArray[np.float64] | None = None  # [4, 4] in the axes of a PLY
+        placements = []
+        for mesh, matrix in self._meshes():
+            for primitive in tree["meshes"][mesh]["primitives"]:
+                extension = primitive.get("extensions", {}).get(EXTENSION)
+                if extension is not None:
+                    self._check(extension)
+                    self.primitives.append(primitive)
+                    placements.append(matrix)
+        if not self.primitives:
+            raise DataError(f"{path}: holds no Gaussians ({EXTENSION}); expected a primitive that has some")
+        if any(not np.allclose(one, placements[0]) for one in placements):
+            raise DataError(f"{path}: its Gaussians stand in several places; export them apart, then merge them")
+        if not np.allclose(placements[0], np.eye(4)):
+            self.placement = FLIP @ placements[0] @ FLIP
+
+    def accessor(self, number: Any, width: int) -> NDArray[np.float32]:
+        """Return the rows of an accessor, [count, width]; normalised whole numbers as those in [-1, 1]."""
+        one = self.tree["accessors"][_index(number)]
+        kind, count, start = COMPONENTS[one["componentType"]], _index(one["count"]), _index(one.get("byteOffset", 0))
+        view = self.tree["bufferViews"][_index(one["bufferView"])]
+        if WIDTHS.get(one["type"]) != width or "sparse" in one or "uri" in self.tree["buffers"][_index(view["buffer"])]:
+            raise DataError(
+                f"{self.path}: accessor {number} is a {quoted(one['type'])}, or lies elsewhere; expected {width} "
+                "numbers a row in the file itself: export it again"
+            )
+        size = width * np.dtype(kind).itemsize
+        stride = _index(view.get("byteStride", size)) or size
+        start += _index(view.get("byteOffset", 0))
+        if stride < size or start + stride * max(count - 1, 0) + size * min(count, 1) > len(self.binary):
+            raise DataError(f"{self.path}: accessor {number} has {count} rows, more than the file; copy it again")
+        rows = np.ndarray((count, width), kind, self.binary, start, (stride, np.dtype(kind).itemsize))
+        if not one.get("normalized") or kind == "<f4":
+            return rows.astype(np.float32)
+        return np.maximum(rows / np.float32(np.iinfo(kind).max), -1).astype(np.float32)
+
+    def _check(self, extension: dict[str, Any]) -> None:
+        kernel, space = extension.get("kernel", "ellipse"), extension.get("colorSpace", "srgb_rec709_display")
+        if kernel != "ellipse":
+            raise DataError(f"{self.path}: its kernel is {quoted(kernel)}; expected 'ellipse': export it again")
+        if space != "srgb_rec709_display":
+            LOG.warning("%s: its colours are %s; they are taken as they are", self.path, quoted(space))
+
+    def _meshes(self) -> list[tuple[int, NDArray[np.float64]]]:
+        """The meshes of the scene, each with the matrix of its node."""
+        nodes = self.tree["nodes"]
+        found: list[tuple[int, NDArray[np.float64]]] = []
+        roots = self.tree["scenes"][_index(self.tree.get("scene", 0))]["nodes"] if "scenes" in self.tree else []
+        waiting = [(_index(root), np.eye(4), 0) for root in roots or range(len(nodes))]
+        while waiting:
+            number, above, depth = waiting.pop()
+            if depth > MAX_DEPTH or len(found) > len(nodes):
+                raise DataError(f"{self.path}: its nodes are no tree; export it again")
+            matrix = above @ _matrix(nodes[number])
+            if "mesh" in nodes[number]:
+                found.append((_index(nodes[number]["mesh"]), matrix))
+            waiting += [(_index(child), matrix, depth + 1) for child in nodes[number].get("children", [])]
+        return found
+
+
+def _index(value: Any) -> int:
+    """A whole number from 0 on.  Raises ValueError."""
+    if not isinstance(value, int) or not 0 <= value < 1 << 40:
+        raise ValueError(f"expected a whole number, got {quoted(value)}")
+    return value
+
+
+def _matrix(node: dict[str, Any]) -> NDArray[np.float64]:
+    """Where a node stands in the one above, [4, 4]."""
+    if "matrix" in node:
+        return np.array(node["matrix"], np.float64).reshape(4, 4).T
+    x, y, z, w = np.array(node.get("rotation", [0, 0, 0, 1]), np.float64)
+    matrix = np.eye(4)
+    matrix[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    matrix[:3, :3] *= np.array(node.get("scale", [1, 1, 1]), np.float64)
+    matrix[:3, 3] = np.array(node.get("translation", [0, 0, 0]), np.float64)
+    return matrix

@@ -1,0 +1,132 @@
+"""Codebooks of numbers and palettes of vectors: the same bits on every machine, with any number of threads.
+
+Sums that depend on an order run in one; products of matrices, whose order is the library's, are of whole numbers that
+float32 holds exactly, so that no order changes them.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+ENTRIES = 256  # of a codebook
+CODEBOOK_ROUNDS, LLOYD_STEPS, PALETTE_ROUNDS = 4, 8, 10
+BLOCK = 1024  # rows of points whose distances are in memory
+SAMPLE = 8  # points that train one entry of a palette
+LEVELS = 511  # whole numbers on each side of 0: sums of 45 products are below 2^24
+TAIL = 1e-4  # share of values that may lie beyond LEVELS
+
+
+def codebook(values: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return ENTRIES numbers, ascending, that stand for `values` with little squared error.
+
+    Lloyd's iteration (1982) in rounds; between them two cells become one where that costs less than what the division
+    of another gains.  Values that are at most ENTRIES different numbers are kept; the last is then repeated.
+    """
+    ordered = np.sort(values.astype(np.float64), axis=None)
+    different = np.unique(ordered)
+    if len(different) <= ENTRIES:
+        return np.concatenate([different, np.full(ENTRIES - len(different), different[-1])])
+    cells = _Cells(ordered)
+    cuts = _first_cuts(ordered)
+    for _ in range(CODEBOOK_ROUNDS):
+        for _ in range(LLOYD_STEPS):
+            means = cells.means(cuts)
+            cuts[1:-1] = np.searchsorted(ordered, (means[1:] + means[:-1]) / 2)
+        cuts = cells.exchanged(cuts)
+    return np.sort(cells.means(cuts))
+
+
+class _Cells:
+    """Sorted values in consecutive cells, which are divided by the places `cuts`, [ENTRIES + 1]."""
+
+    def __init__(self, ordered: NDArray[np.float64]) -> None:
+        self.ordered, self.centre = ordered, ordered.mean()
+        around = ordered - self.centre
+        self.sums = np.concatenate([[0.0], np.cumsum(around)])
+        self.squares = np.concatenate([[0.0], np.cumsum(np.square(around))])
+
+    def means(self, cuts: NDArray[np.int64]) -> NDArray[np.float64]:
+        """The mean of each cell; of an empty one the value before it."""
+        first, last = cuts[:-1], cuts[1:]
+        mean: NDArray[np.float64] = (self.sums[last] - self.sums[first]) / np.maximum(last - first, 1) + self.centre
+        return np.where(last > first, mean, self.ordered[np.maximum(first, 1) - 1])
+
+    def errors(self, first: NDArray[np.int64], last: NDArray[np.int64]) -> NDArray[np.float64]:
+        """The squared errors of cells."""
+        total = self.sums[last] - self.sums[first]
+        return np.asarray(self.squares[last] - self.squares[first] - np.square(total) / np.maximum(last - first, 1))
+
+    def exchanged(self, cuts: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Cuts after each pair of cells that is worth less apart than another cell is divided has been joined."""
+        for _ in range(ENTRIES):
+            own = self.errors(cuts[:-1], cuts[1:])
+            joined = self.errors(cuts[:-2], cuts[2:]) - own[:-1] - own[1:]
+            middle = np.searchsorted(self.ordered, self.means(cuts))
+            gain = own - self.errors(cuts[:-1], middle) - self.errors(middle, cuts[1:])
+            worst = int(gain.argmax())
+            joined[max(worst - 1, 0) : worst + 1] = np.inf  # of cells beside it
+            cheap = int(joined.argmin())
+            if gain[worst] <= joined[cheap] * (1 + 1e-9):
+                break
+            cuts = np.sort(np.append(np.delete(cuts, cheap + 1), middle[worst]))
+        return cuts
+
+
+def _first_cuts(ordered: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Cells as dense as the cube root of the values' density (Panter and Dite 1951)."""
+    edges = np.linspace(ordered[0], ordered[-1], 4 * ENTRIES + 1)
+    places = np.searchsorted(ordered, edges)
+    weight = np.concatenate([[0.0], np.cumsum(np.cbrt(np.diff(places)))])
+    cuts = np.searchsorted(ordered, np.interp(np.linspace(0, weight[-1], ENTRIES + 1), weight, edges))
+    cuts[0], cuts[-1] = 0, len(ordered)
+    return cuts.astype(np.int64)
+
+
+def nearest(values: NDArray[np.floating], entries: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """Return the index of the nearest entry for each value."""
+    return np.searchsorted((entries[1:] + entries[:-1]) / 2, values).astype(np.uint8)
+
+
+def palette(points: NDArray[np.float32], entries: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Return vectors [entries, c] that stand for points [N, c], and for each point the index of its vector.
+
+    Lloyd's iteration on a share of the points, from evenly spaced ones; a vector without points gets one that is far
+    from its own.  At most 45 components.
+    """
+    whole = _whole_numbers(points)
+    chosen = np.linspace(0, len(points) - 1, min(len(points), SAMPLE * entries)).astype(np.int64)
+    sample, sample_whole = points[chosen].astype(np.float64), whole[chosen]
+    starts = np.linspace(0, len(sample) - 1, entries).astype(np.int64)
+    vectors, vectors_whole = sample[starts], sample_whole[starts]
+    for _ in range(PALETTE_ROUNDS):
+        labels, distance = _assign(sample_whole, vectors_whole)
+        held = np.bincount(labels, minlength=entries)
+        for column in range(points.shape[1]):
+            total = np.bincount(labels, sample[:, column], minlength=entries)
+            vectors[:, column] = total / np.maximum(held, 1)
+        empty = np.flatnonzero(held == 0)
+        vectors[empty] = sample[np.argsort(-distance, kind="stable")[: len(empty)]]
+        vectors_whole = _whole_numbers(vectors.astype(np.float32), points)
+    return vectors, _assign(whole, vectors_whole)[0]
+
+
+def _whole_numbers(values: NDArray[np.float32], of: NDArray[np.float32] | None = None) -> NDArray[np.float32]:
+    """Values as whole numbers from -LEVELS to LEVELS, in the scale of the points `of`."""
+    size = np.abs(values if of is None else of).ravel()
+    place = min(int((1 - TAIL) * size.size), size.size - 1)
+    largest = np.partition(size, place)[place] or np.float32(1)
+    return np.rint(np.clip(values / largest, -1, 1) * np.float32(LEVELS))
+
+
+def _assign(points: NDArray[np.float32], vectors: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """The nearest vector of each point, the first of those that are equally near, and half the squared distance."""
+    half = np.square(vectors).sum(axis=1) / 2
+    labels, distance = np.empty(len(points), np.int64), np.empty(len(points), np.float32)
+    space = np.empty((BLOCK, len(vectors)), np.float32)
+    for start in range(0, len(points), BLOCK):
+        block = points[start : start + BLOCK]
+        apart = np.matmul(block, vectors.T, out=space[: len(block)])
+        np.subtract(half, apart, out=apart)
+        best = apart.argmin(axis=1)
+        labels[start : start + BLOCK] = best
+        distance[start : start + BLOCK] = apart[np.arange(len(block)), best] + np.square(block).sum(axis=1) / 2
+    return labels, distance

@@ -1,0 +1,103 @@
+"""Write SOG, version 2 (layout: sog.py): the same model gives the same bytes."""
+
+import io
+import json
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.formats import webp
+from clsplat.formats.output import written
+from clsplat.formats.packing import morton_order, smallest_three
+from clsplat.formats.palette import codebook, nearest, palette
+from clsplat.formats.sog import META, PER_ROW, ROTATED
+from clsplat.formats.splats import Parameters, SplatFile, Writing, opacities, require_some, unit
+
+PALETTES = {"small": 1024, "balanced": 4096, "high": 16384}  # entries at most
+SMALLEST = 1024  # entries for so many splats, and twice as many for twice as many
+EPOCH = (1980, 1, 1, 0, 0, 0)  # of files in the ZIP: the same model gives the same bytes
+
+
+def write_sog(path: Path, splats: SplatFile, options: Writing) -> str:
+    """Write a `.sog`, or where the name is meta.json the files of a folder, it last.  Raises OutputError, DataError."""
+    require_some(path, splats)
+    p = splats.rows(morton_order(splats.parameters["means"])).parameters
+    width = -(-int(np.ceil(np.sqrt(len(splats)))) // 4) * 4
+    images: dict[str, bytes] = {}
+    meta: dict[str, Any] = {"version": 2, "count": len(splats), "asset": {"generator": "clsplat"}}
+    if splats.mode == "mip":
+        meta |= {"model": "antialiased", "antialias": True}
+    if splats.rendering:
+        meta["extras"] = {"clsplat": splats.rendering}
+
+    def image(name: str, *planes: NDArray[Any], across: int = width) -> str:
+        pixels = np.full((len(planes[0]), 4), 255, np.uint8)
+        pixels[:, : len(planes)] = np.stack(planes, axis=1)
+        images[f"{name}.webp"] = webp.encode(path, pixels, across)
+        return f"{name}.webp"
+
+    meta["means"] = _means(p, image)
+    largest, others = smallest_three(unit(p["quats"]))
+    levels = np.clip(np.rint(255 * (others * 0.5**0.5 + 0.5)), 0, 255)
+    meta["quats"] = {"files": [image("quats", *levels.T, ROTATED + largest)]}
+    for name, table, more in (("scales", "log_scales", []), ("sh0", "sh_base", [_alpha(p)])):
+        entries = codebook(p[table])
+        planes = nearest(p[table], entries).T
+        meta[name] = {"codebook": _short(entries), "files": [image(name, *planes, *more)]}
+    if p["sh_rest"].shape[1]:
+        meta["shN"] = _harmonics(p["sh_rest"], PALETTES[options.quality], image)
+    images[META] = json.dumps(meta, separators=(",", ":"), sort_keys=True).encode()
+    if path.name == META:
+        files = {path.with_name(name): data for name, data in images.items()}  # meta.json is the last
+    else:
+        files = {path: _zipped(images)}
+    for place, data in files.items():
+        with written(place) as file:
+            file.write(data)
+    return file.sha256
+
+
+def _means(p: Parameters, image: Any) -> dict[str, Any]:
+    wide = p["means"].astype(np.float64)
+    t = np.sign(wide) * np.log1p(np.abs(wide))
+    lows, highs = t.min(axis=0), t.max(axis=0)
+    span = np.where(highs > lows, highs - lows, 1)
+    levels = np.rint(65535 * (t - lows) / span).astype(np.uint16)
+    files = [image("means_l", *(levels & 255).T), image("means_u", *(levels >> 8).T)]
+    return {"mins": lows.tolist(), "maxs": highs.tolist(), "files": files}
+
+
+def _alpha(p: Parameters) -> NDArray[np.float64]:
+    """Opacities in 255 steps, 1 at least: lossless WebP forgets the colour under 0."""
+    return np.maximum(np.rint(255 * opacities(p["logit_opacity"][:, 0])), 1)
+
+
+def _harmonics(rest: NDArray[np.float32], most: int, image: Any) -> dict[str, Any]:
+    entries = min(most, max(1, int(SMALLEST * 2.0 ** np.floor(np.log2(len(rest) / SMALLEST)))))
+    vectors, labels = palette(rest, entries)
+    size = rest.shape[1] // 3
+    numbers = codebook(vectors)
+    centroids = nearest(vectors, numbers).reshape(entries * size, 3)
+    degree = round((size + 1) ** 0.5) - 1
+    files = [image("shN_centroids", *centroids.T, across=PER_ROW * size)]
+    files.append(image("shN_labels", labels & 255, labels >> 8, np.zeros_like(labels)))
+    return {"count": entries, "bands": degree, "codebook": _short(numbers), "files": files}
+
+
+def _short(numbers: NDArray[np.float64]) -> list[float]:
+    """Numbers as float32 has them, in few digits."""
+    return [float(f"{number:.8g}") for number in numbers]
+
+
+def _zipped(images: dict[str, bytes]) -> bytes:
+    """A ZIP without times, systems and compression of its own."""
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w") as archive:
+        for name, data in images.items():
+            member = zipfile.ZipInfo(name, EPOCH)
+            member.create_system, member.external_attr = 3, 0o644 << 16
+            archive.writestr(member, data)
+    return packed.getvalue()

@@ -1,0 +1,155 @@
+"""What a model file holds, and what the formats share: names and widths of tables, activations, axes.
+
+    means [3] scene units · quats [4] (w, x, y, z), unnormalised · log_scales [3] log of scene units
+    logit_opacity [1] · sh_base [3] band 0 · sh_rest [(K-1)*3] the other bands, coefficient-major
+    filter_variance [1] scene units², the world filter; only in our own PLY
+
+Axes are those of the PLY of 3DGS: x right, y down, z ahead.
+"""
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.errors import DataError
+
+PARAMETERS = ("means", "quats", "log_scales", "logit_opacity", "sh_base", "sh_rest")
+SH_C0 = 0.28209479177387814  # basis function of band 0
+MAX_DEGREE = 3
+NEAR, VARIANCE = 0.2, 0.3  # scene units and px²: nearest distance and screen filter of 3DGS
+MIP_VARIANCE = 0.1  # px², of files that say no more than `mip` (Yu et al. 2024)
+MAX_FILE = 1 << 33  # bytes
+MIN_ALPHA = 1e-6  # opacities of 0 and 1 have no logit
+FLAT_LOG_SCALE = -13.815511  # log 1e-6: of the third axis of a disc
+FLIP_SH = (-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1)  # y and z change sign: bands 1 to 3
+Parameters = dict[str, NDArray[np.float32]]  # by the names of PARAMETERS, each [N, components]
+Floats = NDArray[np.floating]
+
+
+@dataclass(frozen=True)
+class SplatFile:
+    """A model file: the parameters, and the numbers of its comment for rendering them."""
+
+    parameters: Parameters  # filter_variance too, where the file has it
+    rendering: dict[str, Any] = field(default_factory=dict)
+    mode: str = "default"  # `mip` where a screen filter reduces opacities to keep their energy
+    placement: NDArray[np.float64] | None = None  # [4, 4], by which the Gaussians are still to be moved
+
+    def __len__(self) -> int:
+        return len(self.parameters["means"])
+
+    @property
+    def sh_degree(self) -> int:
+        """Highest degree of the spherical harmonics."""
+        return degree_of(self.parameters["sh_rest"].shape[1])
+
+    def rows(self, chosen: Any) -> "SplatFile":
+        """Return some of the Gaussians, in the order that is given."""
+        return replace(self, parameters={name: table[chosen] for name, table in self.parameters.items()})
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What a file does not say about itself."""
+
+    axes: Literal["spz", "ply"] = "spz"  # of an SPZ file: as its specification says, or those of a PLY, unturned
+    not_finite: Literal["refuse", "drop", "keep"] = "refuse"  # Gaussians with NaN or infinity
+
+
+@dataclass(frozen=True)
+class Writing:
+    """How a model is written, where a format leaves a choice."""
+
+    sh_bits: tuple[int, int] | None = None  # SPZ: bits of band 1 and of the others, from 1 to 8; None: as `quality`
+    axes: Literal["spz", "ply"] = "spz"  # SPZ: as its specification says, or those of the PLY, for readers that differ
+    spz_version: Literal[3, 4] = 3
+    quality: Literal["small", "balanced", "high"] = "balanced"  # SPZ and SOG
+
+
+def sh_coefficients(degree: int) -> int:
+    """Return the number K of basis functions up to `degree`."""
+    return (degree + 1) ** 2
+
+
+def degree_of(columns: int) -> int:
+    """Return the SH degree of a table sh_rest with so many columns."""
+    degree: int = round((1 + columns / 3) ** 0.5) - 1
+    return degree
+
+
+def with_degree(parameters: Parameters, degree: int) -> Parameters:
+    """Return the Gaussians with more or fewer SH bands."""
+    columns = 3 * (sh_coefficients(degree) - 1)
+    rest = parameters["sh_rest"][:, :columns]
+    padding = np.zeros((len(rest), columns - rest.shape[1]), np.float32)
+    return {**parameters, "sh_rest": np.concatenate([rest, padding], axis=1)}
+
+
+def logits(alpha: Floats) -> NDArray[np.float32]:
+    """Return the logits of opacities in [0, 1]; 0 and 1 become MIN_ALPHA and 1 - MIN_ALPHA."""
+    inside = np.clip(alpha.astype(np.float64), MIN_ALPHA, 1 - MIN_ALPHA)
+    return np.asarray(np.log(inside / (1 - inside)), np.float32)
+
+
+def opacities(logit: Floats) -> NDArray[np.float64]:
+    """Return opacities in [0, 1] of logits."""
+    return np.asarray(0.5 + 0.5 * np.tanh(0.5 * logit.astype(np.float64)))
+
+
+def logs(scales: Floats) -> NDArray[np.float32]:
+    """Return the logarithms of scales; those of 0 become FLAT_LOG_SCALE."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        found = np.log(scales.astype(np.float64))
+    return np.where(scales == 0, FLAT_LOG_SCALE, found).astype(np.float32)
+
+
+def unit(quats: Floats) -> NDArray[np.float64]:
+    """Return unit quaternions [N, 4]; those of length 0 become (1, 0, 0, 0)."""
+    wide = quats.astype(np.float64)
+    length = np.linalg.norm(wide, axis=1, keepdims=True)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(length > 0, wide / length, [1.0, 0, 0, 0])
+
+
+def flipped(parameters: Parameters) -> Parameters:
+    """Return the Gaussians in axes whose y and z point the other way: up and back for down and ahead, or back again."""
+    signs = np.repeat(np.array(FLIP_SH, np.float32), 3)[: parameters["sh_rest"].shape[1]]
+    return {
+        **parameters,
+        "means": parameters["means"] * np.array([1, -1, -1], np.float32),
+        "quats": parameters["quats"] * np.array([1, 1, -1, -1], np.float32),
+        "sh_rest": parameters["sh_rest"] * signs,
+    }
+
+
+def swapped(table: NDArray[np.float32], outer: int, inner: int) -> NDArray[np.float32]:
+    """Return columns in outer-major order as inner-major ones, [N, outer * inner]."""
+    count = len(table)
+    moved = table.reshape(count, outer, inner).transpose(0, 2, 1)
+    return np.ascontiguousarray(moved.reshape(count, outer * inner))
+
+
+def not_finite(parameters: Parameters) -> NDArray[np.bool_]:
+    """Return which Gaussians hold NaN or infinity, [N]."""
+    found = np.zeros(len(parameters["means"]), np.bool_)
+    for table in parameters.values():
+        found |= ~np.isfinite(table).all(axis=1)
+    return found
+
+
+def require_held(path: Path, held: int, expected: int, what: str) -> None:
+    """Raise DataError where a file holds fewer bytes than its header declares."""
+    if held < expected:
+        raise DataError(
+            f"{path}: holds {held} bytes, but its header declares {what}, {expected} bytes; "
+            "the file is truncated: copy or export it again"
+        )
+
+
+def require_some(path: Path, splats: SplatFile) -> None:
+    """Raise DataError for a model without Gaussians, which most formats do not know."""
+    if not len(splats):
+        raise DataError(f"{path}: the model holds no Gaussians; a PLY alone can hold none")

@@ -1,0 +1,143 @@
+"""SPZ of Niantic, versions 1 to 4: planes of bytes in gzip (1 to 3) or Zstandard (4).
+
+    header     u32 magic, version, splats · u8 SH degree, fractional bits, flags, 0; of version 4 in place of the 0: u8
+               streams, u32 offset of their table (u64 packed, u64 unpacked size each), 12 bytes of 0
+    positions  int24 of x 2^bits (version 1: float16) · alphas  255 opacity · colours  255 (0.15 f_dc + 1/2)
+    scales     16 (log s + 10) · rotations  index of the largest of x y z w << 30, the others as sign and 9 bits of
+               511 |c| sqrt 2 (versions 1, 2: x y z as 127.5 c + 127.5, where w >= 0)
+    harmonics  128 f + 128, coefficient-major, to 1/2^(bits - 1)
+
+Axes are x right, y up, z back.  Some programs leave those of the PLY, and nothing in the file tells: see `axes`.
+"""
+
+import gzip
+import itertools
+import logging
+import struct
+import zlib
+from pathlib import Path
+
+from clsplat.errors import DataError
+from clsplat.formats import zstd
+from clsplat.formats.output import written
+from clsplat.formats.packing import morton_order
+from clsplat.formats.splats import MAX_DEGREE, MAX_FILE, Reading, SplatFile, Writing, flipped, require_some
+from clsplat.formats.spz_planes import EXTENSIONS, HEADER, MAGIC, MIP, Header, fraction_of, packed, unpacked
+from clsplat.reading import read_file
+
+LOG = logging.getLogger("clsplat")
+HEADER4 = 32  # bytes, of version 4
+GZIP_RATIO, ZSTD_RATIO = 1032, 1 << 17  # most bytes that one byte of a stream can stand for
+ADOBE_AXES = 0xADBE0003  # an extension that changes the axes
+MAX_FRACTION, FINE_FRACTION = 12, 20  # bits; the second for quality high
+EXPECTED = "an SPZ file"
+
+
+def read_spz(path: Path, options: Reading) -> SplatFile:
+    """Read an SPZ file.  Raises DataError when it is missing or damaged, or where its axes are not known."""
+    data = read_file(path, EXPECTED, limit=MAX_FILE)
+    header, planes = _unpacked_4(path, data) if data[:4] == MAGIC else _unpacked(path, data)
+    parameters = unpacked(header, planes)
+    if header.degree > MAX_DEGREE:
+        LOG.warning("%s: dropped the bands of SH degree 4", path)
+    if options.axes == "spz":
+        parameters = flipped(parameters)
+        LOG.info("%s: axes as the format says (up, back); if it stands on its head, `clsplat convert --axes ply`", path)
+    return SplatFile(parameters, {}, "mip" if header.flags & MIP else "default")
+
+
+def write_spz(path: Path, splats: SplatFile, options: Writing) -> str:
+    """Write splats along a Morton curve.  Raises OutputError; DataError where positions are too large."""
+    require_some(path, splats)
+    p = splats.rows(morton_order(splats.parameters["means"])).parameters
+    most = FINE_FRACTION if options.quality == "high" else MAX_FRACTION
+    fraction = fraction_of(path, p["means"], most)
+    planes = packed(path, flipped(p) if options.axes == "spz" else p, fraction, options)
+    numbers = (options.spz_version, len(splats), splats.sh_degree, fraction, MIP if splats.mode == "mip" else 0)
+    start = MAGIC + struct.pack("<2I3B", *numbers)
+    if options.spz_version == 3:
+        content = gzip.compress(start + b"\0" + b"".join(planes), 9, mtime=0)
+    else:
+        streams = [plane for plane in planes if plane]
+        frames = [zstd.compress(plane) for plane in streams]
+        table = b"".join(struct.pack("<2Q", len(f), len(s)) for f, s in zip(frames, streams, strict=True))
+        content = start + struct.pack("<BI12x", len(streams), HEADER4) + table + b"".join(frames)
+    with written(path) as file:
+        file.write(content)
+    return file.sha256
+
+
+def _unpacked(path: Path, data: bytes) -> tuple[Header, list[bytes]]:
+    """Header and planes of versions 1 to 3."""
+    try:
+        header = Header.of(path, zlib.decompressobj(31).decompress(data, HEADER))
+        expected = HEADER + sum(header.sizes)
+        _check_size(path, header, len(data) * GZIP_RATIO)
+        stream = zlib.decompressobj(31)
+        body = stream.decompress(data, expected + 1)
+    except zlib.error as error:
+        raise DataError(f"{path}: {error}; expected {EXPECTED} in gzip: copy or export it again") from error
+    if header.version > 3:
+        raise DataError(f"{path}: SPZ of version 4 in gzip; expected Zstandard: export it again")
+    if len(body) < expected:
+        raise DataError(f"{path}: ends early: {header.count} splats take {expected} bytes; copy or export it again")
+    if header.flags & EXTENSIONS:
+        rest = stream.decompress(stream.unconsumed_tail, MAX_DEGREE * 1024)
+        _check_extensions(path, body[expected:] + rest)
+    elif len(body) > expected:
+        raise DataError(f"{path}: goes on after {header.count} splats; copy or export it again")
+    return header, _cut(body[HEADER:expected], header.sizes)
+
+
+def _unpacked_4(path: Path, data: bytes) -> tuple[Header, list[bytes]]:
+    """Header and planes of version 4."""
+    header = Header.of(path, data)
+    if header.version != 4 or len(data) < HEADER4:
+        raise DataError(f"{path}: SPZ of version {header.version} without gzip; expected version 4: export it again")
+    streams, table = struct.unpack_from("<BI", data, HEADER - 1)
+    present = [size for size in header.sizes if size]
+    if streams != len(present) or not HEADER4 <= table <= len(data) - 16 * streams:
+        raise DataError(
+            f"{path}: has {streams} streams, their table at byte {table}; expected {len(present)}, inside of its "
+            f"{len(data)} bytes: copy or export it again"
+        )
+    _check_size(path, header, len(data) * ZSTD_RATIO)
+    if header.flags & EXTENSIONS:
+        _check_extensions(path, data[HEADER4:table])
+    start, planes = table + 16 * streams, []
+    for number, size in enumerate(present):
+        held, declared = struct.unpack_from("<2Q", data, table + 16 * number)
+        if declared != size or held > len(data) - start:
+            raise DataError(
+                f"{path}: stream {number} declares {held} bytes for {declared}; expected {size} for {header.count} "
+                "splats, inside of the file: copy or export it again"
+            )
+        planes.append(zstd.decompress(path, data[start : start + held], size))
+        start += held
+    if start != len(data):
+        raise DataError(f"{path}: goes on after its last stream, at byte {start}; copy or export it again")
+    return header, planes + [b""] * (len(header.sizes) - len(planes))
+
+
+def _check_size(path: Path, header: Header, most: int) -> None:
+    """Raise DataError where a file cannot hold so many splats, before any is made."""
+    if sum(header.sizes) > most:
+        raise DataError(
+            f"{path}: declares {header.count} splats, {sum(header.sizes)} bytes, more than it can hold; "
+            "the file is truncated or damaged: copy or export it again"
+        )
+
+
+def _check_extensions(path: Path, data: bytes) -> None:
+    """Raise DataError for a record that changes the axes; others are skipped, as the library does."""
+    start = 0
+    while start + 8 <= len(data):
+        kind, length = struct.unpack_from("<2I", data, start)
+        if kind == ADOBE_AXES:
+            raise DataError(f"{path}: has axes of its own, in the record {kind:#x}; expected none: export it without")
+        start += 8 + length
+
+
+def _cut(data: bytes, sizes: list[int]) -> list[bytes]:
+    """Divide bytes into parts of these sizes."""
+    return [data[end - size : end] for size, end in zip(sizes, itertools.accumulate(sizes), strict=True)]

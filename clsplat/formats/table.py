@@ -1,0 +1,220 @@
+"""The table of formats.  A file is told apart by its content; its name decides what is written."""
+
+import logging
+import os
+from pathlib import Path
+
+import numpy as np
+
+from clsplat.errors import ConfigError, DataError, OutputError, quoted, shortened
+from clsplat.formats.codec import Codec, Start
+from clsplat.formats.compressed_ply import is_compressed, read_compressed_ply, write_compressed_ply
+from clsplat.formats.glb import read_glb, write_glb
+from clsplat.formats.ksplat import looks_like_ksplat, read_ksplat
+from clsplat.formats.ply import read_ply, write_ply
+from clsplat.formats.sog import META, looks_like_sog, read_sog
+from clsplat.formats.sog_writing import write_sog
+from clsplat.formats.splat import looks_like_splat, read_splat, write_splat
+from clsplat.formats.splats import MIP_VARIANCE, NEAR, VARIANCE, Reading, SplatFile, Writing, not_finite
+from clsplat.formats.spz import read_spz, write_spz
+from clsplat.formats.usda import write_usda
+from clsplat.ply_header import MAX_HEADER
+from clsplat.reading import opened
+
+LOG = logging.getLogger("clsplat")
+
+
+def _is_ply(start: Start) -> bool:
+    return "f_dc_0" in (((header := start.ply()) and header.dtype.names) or ())
+
+
+CODECS = (
+    Codec(
+        "PLY",
+        (".ply",),
+        "any order and number types, little or big endian, discs of 2DGS, other elements around the vertices",
+        "the order of 3DGS",
+        "nothing",
+        _is_ply,
+        lambda path, options: read_ply(path),
+        lambda path, splats, options: write_ply(path, splats.parameters, splats.rendering),
+        keeps_filter=True,
+        keeps_numbers=True,
+        keeps_nan=True,
+    ),
+    Codec(
+        "compressed PLY",
+        (".compressed.ply",),
+        "with and without ranges of colours",
+        "chunks of 256 along a Morton curve",
+        "position and scale to 1/2047 of a chunk's range, quaternions to 10 bits, colours and opacity to 8, "
+        "harmonics to 1/32, order",
+        lambda start: (header := start.ply()) is not None and is_compressed(header),
+        lambda path, options: read_compressed_ply(path),
+        write_compressed_ply,
+        keeps_numbers=True,
+    ),
+    Codec(
+        "SPZ",
+        (".spz",),
+        "versions 1 to 4",
+        "version 3, or 4 with the extra `spz`, along a Morton curve",
+        "position to 2^-12, log scale to 1/16, quaternions to 9 bits, colours, opacity and harmonics to 8, harmonics "
+        "beyond 1, order",
+        lambda start: start.data.startswith((b"NGSP", b"\x1f\x8b")),
+        read_spz,
+        write_spz,
+    ),
+    Codec(
+        "SOG",
+        (".sog", META),
+        "versions 1 and 2, bundled or as a folder with meta.json",
+        "version 2, bundled, or as the files beside a meta.json, along a Morton curve",
+        "position to 16 bits of a logarithm, quaternions to 8, scales and colours to 256 values, opacity to 8 bits, "
+        "harmonics to a palette, order",
+        lambda start: looks_like_sog(start.data),
+        lambda path, options: read_sog(path),
+        write_sog,
+        keeps_numbers=True,
+    ),
+    Codec(
+        "GLB",
+        (".glb",),
+        "KHR_gaussian_splatting, numbers of every kind, nodes that are moved, turned or scaled",
+        "KHR_gaussian_splatting, 32-bit floats, and colours for other viewers",
+        "digits of large logits: opacities and scales are stored, not their logits and logarithms",
+        lambda start: start.data.startswith(b"glTF"),
+        lambda path, options: read_glb(path),
+        write_glb,
+        keeps_numbers=True,
+    ),
+    Codec(
+        "OpenUSD",
+        (".usda",),
+        "",
+        "ParticleField3DGaussianSplat, as text",
+        "digits of large logits",
+        lambda start: start.data.startswith(b"#usda"),
+        None,
+        write_usda,
+        keeps_mode=False,
+    ),
+    Codec(
+        "ksplat",
+        (".ksplat",),
+        "versions 0.1 and later, levels 0 to 2, SH degree 0 to 2",
+        "",
+        "",
+        lambda start: looks_like_ksplat(start.data, start.size),
+        lambda path, options: read_ksplat(path),
+    ),
+    Codec(
+        "splat",
+        (".splat",),
+        "all",
+        "the largest and most opaque first",
+        "harmonics, colours outside [0, 1], order; colours and opacity are in 8 bits, quaternions in 8",
+        lambda start: looks_like_splat(start.data, start.size),
+        lambda path, options: read_splat(path),
+        write_splat,
+        keeps_mode=False,
+    ),
+)
+
+
+def endings(reads: bool = False) -> list[str]:
+    """Return the endings of names that are written, or of those that are read."""
+    return [end for codec in CODECS if (codec.read if reads else codec.write) for end in codec.endings]
+
+
+def located(path: Path) -> Path:
+    """Return the file of a model: of a folder with a meta.json that one."""
+    return path / META if path.is_dir() and (path / META).is_file() else path
+
+
+def detect(path: Path) -> Codec | None:
+    """Return the format of a file by its content, or None.  Raises DataError when it cannot be read."""
+    with opened(path, "a model file") as file:
+        start = Start(path, file.read(MAX_HEADER), file.seek(0, os.SEEK_END))
+    return next((codec for codec in CODECS if codec.is_one(start)), None)
+
+
+def named(path: Path) -> Codec | None:
+    """Return the format that a name stands for, or None; the longest ending counts."""
+    name = path.name.lower()
+    fits = [(end, codec) for codec in CODECS for end in codec.endings if name == end or name.endswith(end)]
+    found = [(len(end), codec) for end, codec in fits if end.startswith(".") or name == end]
+    return max(found, key=lambda one: one[0])[1] if found else None
+
+
+def read(path: Path, options: Reading | None = None) -> SplatFile:
+    """Read a model file of any format.  Raises DataError when it is missing, damaged or of no known format."""
+    options = options or Reading()
+    path = located(path)
+    codec = detect(path) or named(path)  # the reader of a format that the name stands for says what is wrong
+    if codec is None:
+        known = ", ".join(endings(reads=True))
+        raise DataError(f"{path}: no model file of a known format; expected one of {known}: export it again")
+    if codec.read is None:
+        raise DataError(f"{path}: {codec.name} is written, not read; convert the model that it was made from")
+    with np.errstate(all="ignore"):  # what is not finite is refused, dropped or kept
+        return _settled(path, codec.read(path, options), options)
+
+
+def for_writing(path: Path) -> Codec:
+    """Return the format that a name stands for.
+
+    Raises ConfigError where none is written, OutputError for an empty name.
+    """
+    if not path.name:
+        raise OutputError(f"{path}: cannot be written (it has no name); expected the path of a file")
+    codec = named(path)
+    if codec is None or codec.write is None:
+        what = f"{codec.name} is read, not written" if codec else f"no format has the name {quoted(path.name)}"
+        raise ConfigError(f"{shortened(str(path))}: {what}; expected a name that ends in {', '.join(endings())}")
+    return codec
+
+
+def write(path: Path, splats: SplatFile, options: Writing | None = None) -> str:
+    """Write a model file in the format that its name stands for; log in a line what the format does not hold.
+
+    Returns the SHA-256 of what was written, of a folder of SOG that of its meta.json.
+
+    A world filter must be part of the scales and opacities already, but for a PLY.  Raises ConfigError and OutputError.
+    """
+    codec = for_writing(path)
+    assert codec.write is not None
+    if not codec.keeps_filter and "filter_variance" in splats.parameters:
+        raise ValueError(f"{path}: {codec.name} holds no world filter; call baked() first")
+    if not codec.keeps_nan and (bad := int(not_finite(splats.parameters).sum())):
+        raise DataError(
+            f"{path}: {bad} Gaussians hold values that are not finite, which {codec.name} cannot hold; drop them, "
+            "or write a PLY"
+        )
+    if not codec.keeps_mode and splats.mode == "mip":
+        LOG.warning("%s: %s has no mark for a mip model; viewers show it as plain 3DGS", path, codec.name)
+    if not codec.keeps_numbers and (lost := _unusual(splats)):
+        LOG.warning("%s: %s does not keep %s; PLY, SOG and GLB do", path, codec.name, lost)
+    return codec.write(path, splats, options or Writing())
+
+
+def _unusual(splats: SplatFile) -> str:
+    """The numbers of the renderer that a reader would not take for a file without them, in words."""
+    usual = {"near": NEAR, "screen_variance": MIP_VARIANCE if splats.mode == "mip" else VARIANCE, "background": None}
+    given = {name: splats.rendering.get(name, value) for name, value in usual.items()}
+    return ", ".join(f"{name} = {value}" for name, value in given.items() if value != usual[name])
+
+
+def _settled(path: Path, splats: SplatFile, options: Reading) -> SplatFile:
+    """Refuse, drop or keep Gaussians that are not finite."""
+    bad = not_finite(splats.parameters)
+    if options.not_finite == "keep" or not bad.any():
+        return splats
+    if options.not_finite == "drop":
+        LOG.warning("%s: dropped %d Gaussians with values that are not finite", path, int(bad.sum()))
+        return splats.rows(~bad)
+    names = [name for name, table in splats.parameters.items() if not_finite({"means": table}).any()]
+    raise DataError(
+        f"{path}: {', '.join(names)} hold values that are not finite; export the file again, or drop those Gaussians "
+        "with `clsplat convert`"
+    )

@@ -1,0 +1,197 @@
+"""Model files into one of another format: merged, moved, cropped, and with fewer Gaussians or harmonics."""
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.errors import ConfigError, DataError, quoted
+from clsplat.formats.splats import MAX_DEGREE, Reading, Writing, with_degree
+from clsplat.formats.table import detect, for_writing
+from clsplat.gaussians.model import Model, load
+
+LOG = logging.getLogger("clsplat")
+WORDS = ("scale", "rotate", "translate")
+
+
+@dataclass(frozen=True)
+class Changes:
+    """What is done to a model, in this order."""
+
+    drop_below: float = 0.0  # opacity: fainter Gaussians go
+    transform: NDArray[np.float64] | None = None  # [4, 4], one scale, a rotation and a translation
+    crop: tuple[float, ...] | None = None  # x0, y0, z0, x1, y1, z1, scene units: means outside go
+    sh_degree: int | None = None  # at most
+
+    def of(self, model: Model) -> Model:
+        """Return the changed model.  Raises DataError where nothing is left."""
+        kept = model[model.opacities >= self.drop_below] if self.drop_below else model
+        if self.transform is not None:
+            scale = float(np.cbrt(np.linalg.det(self.transform[:3, :3])))
+            kept = kept.transformed(scale, self.transform[:3, :3] / scale, self.transform[:3, 3])
+        if self.crop is not None:
+            low, high = np.array(self.crop, np.float64).reshape(2, 3)
+            kept = kept[((kept.means >= low) & (kept.means <= high)).all(axis=1)]
+        if self.sh_degree is not None and self.sh_degree < kept.sh_degree:
+            kept = replace(kept, **with_degree(kept.tables(), self.sh_degree))  # type: ignore[arg-type]
+        if not len(kept) and len(model):
+            raise DataError(f"none of {len(model)} Gaussians is left; expected some inside of the crop and as opaque")
+        return kept
+
+
+@dataclass(frozen=True)
+class Options:
+    """How files are read and written."""
+
+    sh_bits: str | None = None  # A/B
+    axes: Literal["spz", "ply"] = "spz"  # of SPZ files that are read, or where none is of the one that is written
+    spz_version: int = 3
+    quality: Literal["small", "balanced", "high"] = "balanced"
+    keep_nan: bool = False
+
+    def of(self, sources: Sequence[Path], out: Path) -> tuple[Reading, Writing]:
+        """Return them for these files.  Raises ConfigError where one has no meaning there."""
+        to_spz, from_spz = for_writing(out).name == "SPZ", _reads_spz(sources)
+        if self.spz_version not in (3, 4):
+            raise ConfigError(f"--spz-version {self.spz_version}: expected 3 or 4")
+        if not to_spz and (self.sh_bits is not None or self.spz_version != 3):
+            raise ConfigError(f"{out}: --sh-bits and --spz-version are of SPZ; expected a name that ends in .spz")
+        if self.axes != "spz" and not to_spz and not from_spz:
+            raise ConfigError("--axes is of SPZ; expected an SPZ file to read or to write")
+        bits = None if self.sh_bits is None else sh_bits_of(self.sh_bits)
+        version: Literal[3, 4] = 4 if self.spz_version == 4 else 3
+        written = Writing(bits, "spz" if from_spz else self.axes, version, self.quality)
+        return Reading(self.axes, "keep" if self.keep_nan else "drop"), written
+
+
+def convert(
+    sources: Sequence[Path], out: Path, changes: Changes | None = None, options: Options | None = None
+) -> dict[str, Any]:
+    """Read model files or run folders, and write one file of all their Gaussians, in the format of its name.
+
+    Returns `file`, `format`, `gaussians`, `bytes` and the `bytes_read`.  Raises ConfigError, DataError, OutputError.
+    """
+    if not sources:
+        raise ConfigError("convert: expected a model file to read, and one to write")
+    codec = for_writing(out)
+    reading, writing = (options or Options()).of(sources, out)
+    models = [load(source, reading) for source in sources]
+    model = (changes or Changes()).of(merged(models, [str(source) for source in sources]))
+    model.save(out, writing)
+    size = sum(_bytes(source) for source in sources)
+    return {"file": str(out), "format": codec.name, "gaussians": len(model), "bytes": _bytes(out), "bytes_read": size}
+
+
+def merged(models: Sequence[Model], names: Sequence[str]) -> Model:
+    """Return one model of all Gaussians, with the numbers of the first for rendering and the largest SH degree.
+
+    Where one has a world filter and another has none, it is baked.  Raises DataError where some are mip models and
+    others are not, for one filter serves all.
+    """
+    first = models[0]
+    if len(models) == 1:
+        return first
+    for model, name in zip(models, names, strict=True):
+        if bool(model.rendering.compensate) != bool(first.rendering.compensate):
+            kinds = [("a mip model" if m.rendering.compensate else "none") for m in (first, model)]
+            raise DataError(f"{name}: is {kinds[1]}, {names[0]} is {kinds[0]}; expected the same: one filter draws all")
+        if model.rendering.screen_variance != first.rendering.screen_variance:
+            LOG.warning("%s: its screen_variance is another; that of %s is kept", name, names[0])
+    if any(model.filter_variance is None for model in models):
+        models = [model.baked() for model in models]
+    degree = max(model.sh_degree for model in models)
+    tables = [with_degree(model.tables(), degree) for model in models]
+    return Model(**{n: np.concatenate([t[n] for t in tables]) for n in tables[0]}, rendering=first.rendering)
+
+
+def transform_of(text: str) -> NDArray[np.float64]:
+    """Return the matrix [4, 4] of words such as `scale=2 rotate=90,0,0 translate=0,1,0`, done from left to right.
+
+    Rotations are in degrees about x, then y, then z.  12 or 16 numbers, with commas, are a matrix row by row.
+    Raises ConfigError.
+    """
+    expected = (
+        f"--transform {quoted(text)}: expected scale=S, rotate=X,Y,Z (degrees) and translate=X,Y,Z with blanks "
+        "between, or the 12 or 16 numbers of a matrix, row by row"
+    )
+    try:
+        if "=" not in text:
+            numbers = [float(part) for part in text.replace(",", " ").split()]
+            bottom = [] if len(numbers) == 16 else [0, 0, 0, 1]
+            matrix = np.array([*numbers, *bottom]).reshape(4, 4)
+        else:
+            matrix = np.eye(4)
+            for part in text.split():
+                word, _, values = part.partition("=")
+                matrix = _step(word, [float(value) for value in values.split(",")]) @ matrix
+    except ValueError as error:
+        raise ConfigError(expected) from error
+    turned = matrix[:3, :3]
+    scale2 = turned @ turned.T
+    if (
+        not np.isfinite(matrix).all()
+        or not np.allclose(matrix[3], [0, 0, 0, 1])
+        or np.linalg.det(turned) <= 0
+        or not np.allclose(scale2, scale2[0, 0] * np.eye(3), atol=1e-5 * scale2[0, 0])
+    ):
+        raise ConfigError(f"--transform {quoted(text)}: stretches or mirrors; expected one scale and a rotation")
+    return matrix
+
+
+def _step(word: str, values: list[float]) -> NDArray[np.float64]:
+    """The matrix of one word.  Raises ValueError."""
+    from scipy.spatial.transform import Rotation
+
+    if word not in WORDS or len(values) != (1 if word == "scale" else 3):
+        raise ValueError(word)
+    matrix = np.eye(4)
+    if word == "scale":
+        matrix[:3, :3] *= values[0]
+    elif word == "rotate":
+        matrix[:3, :3] = Rotation.from_euler("xyz", values, degrees=True).as_matrix()
+    else:
+        matrix[:3, 3] = values
+    return matrix
+
+
+def crop_of(text: str) -> tuple[float, ...]:
+    """Return the box of `x0,y0,z0,x1,y1,z1`.  Raises ConfigError."""
+    try:
+        box = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        box = ()
+    if len(box) != 6 or not all(low <= high for low, high in zip(box[:3], box[3:], strict=True)):
+        raise ConfigError(f"--crop {quoted(text)}: expected x0,y0,z0,x1,y1,z1, the least first, in scene units")
+    return box
+
+
+def sh_bits_of(text: str) -> tuple[int, int]:
+    """Return the bits of `A/B`: of band 1 and of the others.  Raises ConfigError."""
+    first, _, others = text.partition("/")
+    if not (first.isdecimal() and others.isdecimal() and 1 <= int(first) <= 8 and 1 <= int(others) <= 8):
+        raise ConfigError(f"--sh-bits {quoted(text)}: expected two numbers from 1 to 8, such as 8/6")
+    return int(first), int(others)
+
+
+def checked_degree(degree: int | None) -> int | None:
+    """Return an SH degree.  Raises ConfigError for one that there is not."""
+    if degree is not None and not 0 <= degree <= MAX_DEGREE:
+        raise ConfigError(f"--sh-degree {degree}: expected 0 to {MAX_DEGREE}")
+    return degree
+
+
+def _reads_spz(sources: Sequence[Path]) -> bool:
+    """Whether one of the files is an SPZ file."""
+    found = [detect(source) for source in sources if source.is_file()]
+    return any(codec is not None and codec.name == "SPZ" for codec in found)
+
+
+def _bytes(path: Path) -> int:
+    """The size of a file, or of the files of a folder or beside a meta.json."""
+    if path.is_dir():
+        return sum(one.stat().st_size for one in path.iterdir() if one.is_file())
+    return _bytes(path.parent) if path.name == "meta.json" else path.stat().st_size

@@ -1,0 +1,232 @@
+"""`clsplat convert` and `clsplat check MODEL`."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import clsplat
+from clsplat.errors import ConfigError, DataError
+from clsplat.formats.ply import write_ply
+from clsplat.formats.table import CODECS, detect, read, write
+from clsplat.gaussians.checkup import lines, verdict
+from clsplat.gaussians.conversion import transform_of
+from clsplat.gaussians.model import load
+from clsplat.gaussians.sh import basis
+from tests.formats.models import splats
+
+
+@pytest.fixture
+def source(tmp_path, rng):
+    write(tmp_path / "a.ply", splats(rng, 100))
+    return tmp_path / "a.ply"
+
+
+@pytest.mark.parametrize("name", ["b.compressed.ply", "b.spz", "b.sog", "b.glb", "b.splat", "b.usda", "f/meta.json"])
+def test_a_model_is_written_as_its_name_says(name, source, tmp_path):
+    done = clsplat.convert(source, tmp_path / name)
+    assert done["gaussians"] == 100
+    assert done["bytes"] > 0
+    assert done["bytes_read"] == source.stat().st_size
+    if name != "b.usda":
+        assert len(clsplat.load(tmp_path / name)) == 100
+        assert detect(tmp_path / name).name == done["format"]
+
+
+def test_models_are_merged_with_the_most_harmonics_of_them(source, tmp_path, rng):
+    write(tmp_path / "b.glb", splats(rng, 30, 1))
+    done = clsplat.convert([source, tmp_path / "b.glb"], tmp_path / "c.ply")
+    found = load(tmp_path / "c.ply")
+    assert (done["gaussians"], found.sh_degree) == (130, 3)
+    assert not found.sh_rest[100:, 9:].any()
+    np.testing.assert_array_equal(found.means[:100], load(source).means)
+
+
+def test_a_mip_model_is_not_merged_with_another(source, tmp_path, rng):
+    write(tmp_path / "b.ply", splats(rng, 30, 1, "mip"))
+    with pytest.raises(DataError, match=r"b\.ply: is a mip model, .*a\.ply is none; expected the same"):
+        clsplat.convert([source, tmp_path / "b.ply"], tmp_path / "c.ply")
+
+
+def test_a_transform_turns_harmonics_as_directions_say(source, tmp_path, rng):
+    """The colour towards a turned direction is that of the source towards the direction."""
+    text = "rotate=20,-50,130 scale=3 translate=1,2,3"
+    clsplat.convert(source, tmp_path / "b.ply", transform=text)
+    before, after = load(source), load(tmp_path / "b.ply")
+    turn = Rotation.from_euler("xyz", [20, -50, 130], degrees=True).as_matrix()
+    directions = rng.normal(size=(10, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    old = np.einsum("dk,nkc->ndc", basis(directions), before.sh_rest.reshape(100, 15, 3))
+    new = np.einsum("dk,nkc->ndc", basis(directions @ turn.T), after.sh_rest.reshape(100, 15, 3))
+    np.testing.assert_allclose(new, old, atol=1e-5)
+    np.testing.assert_allclose(after.means, 3 * before.means @ turn.T + [1, 2, 3], rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(after.log_scales, before.log_scales + np.log(3), atol=1e-5)
+
+
+def test_a_transform_is_words_from_left_to_right_or_a_matrix():
+    words = transform_of("translate=1,0,0 rotate=0,0,90 scale=2")
+    np.testing.assert_allclose(words @ [0, 0, 0, 1], [0, 2, 0, 1], atol=1e-12)
+    rows = ",".join(str(value) for value in words.ravel())
+    np.testing.assert_allclose(transform_of(rows), words)
+    np.testing.assert_allclose(transform_of("1,0,0,5,0,1,0,6,0,0,1,7")[:3, 3], [5, 6, 7])
+
+
+WRONG = {
+    "transform": (
+        ["scale=0", "scale=-1", "rotate=1", "turn=1,2,3", "1,2,3", "scale=nan", "2,0,0,0,0,1,0,0,0,0,1,0"],
+        "",
+    ),
+    "crop": (["1,2,3", "0,0,0,-1,1,1", "a", "0,0,0,1,1,nan"], "expected x0,y0,z0"),
+    "sh_bits": (["8", "9/8", "0/1", "a/b", "8/"], "from 1 to 8"),
+}
+
+
+@pytest.mark.parametrize(("option", "text"), [(option, text) for option, (texts, _) in WRONG.items() for text in texts])
+def test_a_wrong_option_is_refused_before_anything_is_written(option, text, source, tmp_path):
+    with pytest.raises(ConfigError, match=WRONG[option][1] or "--transform .*expected"):
+        clsplat.convert(source, tmp_path / "b.spz", **{option: text})
+    assert not (tmp_path / "b.spz").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "words"),
+    [
+        ("b.ply", {"sh_bits": "8/8"}, "are of SPZ"),
+        ("b.ply", {"spz_version": 4}, "are of SPZ"),
+        ("b.spz", {"spz_version": 2}, "expected 3 or 4"),
+        ("b.ply", {"axes": "ply"}, "--axes is of SPZ"),
+        ("b.xyz", {}, r"no format has the name 'b.xyz'; expected a name that ends in \.ply, "),
+        ("b.ply", {"sh_degree": 4}, "expected 0 to 3"),
+    ],
+)
+def test_an_option_without_meaning_is_refused(name, options, words, source, tmp_path):
+    with pytest.raises(ConfigError, match=words):
+        clsplat.convert(source, tmp_path / name, **options)
+
+
+def test_a_crop_and_an_opacity_leave_what_they_say(source, tmp_path):
+    model = load(source)
+    box = (-1.0, -1.0, -1.0, 1.0, 2.0, 3.0)
+    clsplat.convert(source, tmp_path / "b.ply", crop=box, drop_below=0.3, sh_degree=1)
+    found = load(tmp_path / "b.ply")
+    inside = ((model.means >= box[:3]) & (model.means <= box[3:])).all(axis=1) & (model.opacities >= 0.3)
+    np.testing.assert_array_equal(found.means, model.means[inside])
+    np.testing.assert_array_equal(found.sh_rest, model.sh_rest[inside, :9])
+    assert 0 < len(found) < 100
+    with pytest.raises(DataError, match="none of 100 Gaussians is left"):
+        clsplat.convert(source, tmp_path / "c.ply", crop="50,50,50,51,51,51")
+
+
+def test_axes_are_of_the_file_that_is_read_or_else_written(source, tmp_path):
+    means = np.sort(load(source).means[:, 1])
+    clsplat.convert(source, tmp_path / "ply_axes.spz", axes="ply")
+    np.testing.assert_allclose(np.sort(-load(tmp_path / "ply_axes.spz").means[:, 1]), means, atol=1e-3)
+    clsplat.convert(tmp_path / "ply_axes.spz", tmp_path / "right.spz", axes="ply")
+    np.testing.assert_allclose(np.sort(load(tmp_path / "right.spz").means[:, 1]), means, atol=1e-3)
+
+
+def test_gaussians_that_are_not_finite_are_dropped_or_kept(tmp_path, rng, caplog):
+    bad = splats(rng, 20)
+    bad.parameters["means"][3, 1], bad.parameters["sh_rest"][7, 0] = np.nan, np.inf
+    write_ply(tmp_path / "a.ply", bad.parameters, {})
+    with pytest.raises(DataError, match=r"means, sh_rest hold values that are not finite; .* `clsplat convert`"):
+        load(tmp_path / "a.ply")
+    assert clsplat.convert(tmp_path / "a.ply", tmp_path / "b.spz")["gaussians"] == 18
+    assert "dropped 2 Gaussians" in caplog.text
+    assert clsplat.convert(tmp_path / "a.ply", tmp_path / "b.ply", keep_nan=True)["gaussians"] == 20
+    with pytest.raises(DataError, match="2 Gaussians hold values that are not finite, which GLB cannot hold"):
+        clsplat.convert(tmp_path / "a.ply", tmp_path / "b.glb", keep_nan=True)
+
+
+def test_check_tells_what_a_model_is(source, tmp_path):
+    clsplat.convert(source, tmp_path / "b.spz")
+    found = clsplat.check(tmp_path / "b.spz")
+    assert (found["format"], found["gaussians"], found["sh_degree"], found["mode"]) == ("SPZ", 100, 3, "default")
+    model = load(tmp_path / "b.spz")
+    np.testing.assert_allclose(found["bounds"], [model.means.min(axis=0), model.means.max(axis=0)])
+    assert found["valid"]
+    assert verdict(found) == f"{tmp_path / 'b.spz'}: valid"
+    assert "SPZ, 100 Gaussians, SH degree 3" in lines(found)
+    json.dumps(found, allow_nan=False)
+
+
+def test_a_model_that_is_missing_cannot_be_read_and_a_pipeline_is_none(tmp_path):
+    with pytest.raises(DataError, match=r"a\.spz: cannot be read \(No such file or directory\)"):
+        clsplat.check(tmp_path / "a.spz")
+    assert "stages" in clsplat.check("smoke")
+
+
+def test_check_counts_what_shows_nothing(tmp_path, rng):
+    odd = splats(rng, 40)
+    p = odd.parameters
+    p["logit_opacity"][:] = np.linspace(-3, 3, 40)[:, None]
+    p["means"][0] = np.nan
+    p["log_scales"][1, 2] = -20
+    p["logit_opacity"][2:5] = -30
+    p["quats"][5] = 0
+    write_ply(tmp_path / "a.ply", p, {})
+    found = clsplat.check(tmp_path / "a.ply")
+    assert found["degenerate"] == {"not_finite": 1, "no_rotation": 1, "flat": 1, "invisible": 3}
+    assert not found["valid"]
+    assert "1 of 40 Gaussians hold values that are not finite; 1 quaternions have no length" in verdict(found)
+    json.dumps(found, allow_nan=False)
+
+
+@pytest.mark.parametrize(
+    ("table", "values", "words"),
+    [
+        ("log_scales", (0.5, 3.0), "not logarithms"),
+        ("logit_opacity", (0.01, 0.99), "not logits"),
+        ("sh_base", (0.1, 0.9), "not coefficients"),
+    ],
+)
+def test_check_sees_activations_that_were_applied_already(table, values, words, tmp_path, rng):
+    model = splats(rng, 60)
+    assert not [text for text in checked(tmp_path, model)["findings"] if words in text]
+    model.parameters[table][:] = rng.uniform(*values, model.parameters[table].shape)
+    assert [text for text in checked(tmp_path, model)["findings"] if words in text]
+
+
+def checked(tmp_path, model):
+    write_ply(tmp_path / "a.ply", model.parameters, {})
+    return clsplat.check(tmp_path / "a.ply")
+
+
+PIPELINE = """name: formats
+scene: {path: SCENE}
+stages:
+  - init: INIT
+  - optimize: {steps: 1, losses: [l1]}
+  - export: {file: FILE}
+"""
+
+
+@pytest.mark.parametrize("name", ["a.spz", "a.sog"])
+def test_a_run_starts_from_any_format_and_exports_any(name, tiny_scene, tmp_path, rng):
+    out = tmp_path / "run"
+    write(tmp_path / name, splats(rng, 40, 1))
+    text = PIPELINE.replace("SCENE", str(tiny_scene)).replace("FILE", name)
+    (tmp_path / "p.yaml").write_text(text.replace("INIT", f"{{source: model, file: '{tmp_path / name}'}}"))
+    clsplat.run(tmp_path / "p.yaml", out=out)
+    found = load(out / name)
+    assert len(found) == 40
+    assert detect(out / name).name == detect(tmp_path / name).name
+    assert clsplat.check(out)["whole"]
+    assert clsplat.render_views(out / name, tiny_scene, tmp_path / "views") == 2
+
+
+def test_a_folder_of_images_is_a_model(source, tmp_path):
+    clsplat.convert(source, tmp_path / "f" / "meta.json", sh_degree=0)
+    assert clsplat.check(tmp_path / "f")["format"] == "SOG"
+    assert len(read(tmp_path / "f")) == 100
+    assert len(load(tmp_path / "f")) == 100
+
+
+def test_the_page_about_formats_has_the_table_of_formats():
+    page = (Path(__file__).parents[2] / "docs" / "formats.md").read_text(encoding="utf-8")
+    for codec in CODECS:
+        names = ", ".join(f"`{ending}`" for ending in codec.endings)
+        row = f"| {codec.name} | {names} | {codec.reads or '–'} | {codec.writes or '–'} | {codec.loses or '–'} |"
+        assert row in page, row

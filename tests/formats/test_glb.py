@@ -1,0 +1,252 @@
+"""glTF and OpenUSD: validity, axes, nodes, and what a file may not declare."""
+
+import json
+import struct
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from clsplat.errors import DataError
+from clsplat.formats.glb import write_glb
+from clsplat.formats.splats import Writing, opacities, unit
+from clsplat.formats.table import detect, read, write
+from clsplat.gaussians.model import Model, load
+from clsplat.reading import sha256
+from tests.formats.models import angles, assert_close, interop, splats, there_and_back
+
+KHR = "KHR_gaussian_splatting"
+SIZES = {5121: 1, 5126: 4}
+
+
+def parts(data):
+    """The JSON and the binary chunk of a .glb file, whose lengths are checked."""
+    magic, version, length = struct.unpack_from("<4s2I", data)
+    assert (magic, version, length) == (b"glTF", 2, len(data))
+    size, kind = struct.unpack_from("<2I", data, 12)
+    assert kind == 0x4E4F534A
+    assert size % 4 == 0
+    rest, kind = struct.unpack_from("<2I", data, 20 + size)
+    assert kind == 0x004E4942
+    assert 28 + size + rest == len(data)
+    return json.loads(data[20 : 20 + size]), data[28 + size :]
+
+
+def glued(tree, binary):
+    text = json.dumps(tree).encode()
+    text += b" " * (-len(text) % 4)
+    head = struct.pack("<4s2I", b"glTF", 2, 28 + len(text) + len(binary))
+    return head + struct.pack("<2I", len(text), 0x4E4F534A) + text + struct.pack("<2I", len(binary), 0x4E4942) + binary
+
+
+def attribute(tree, binary, name):
+    accessor = tree["accessors"][tree["meshes"][0]["primitives"][0]["attributes"][name]]
+    view = tree["bufferViews"][accessor["bufferView"]]
+    kind = {5121: "u1", 5126: "<f4"}[accessor["componentType"]]
+    rows = np.frombuffer(binary, kind, view["byteLength"] // SIZES[accessor["componentType"]], view["byteOffset"])
+    return rows.reshape(accessor["count"], -1)
+
+
+@pytest.mark.parametrize("degree", range(4))
+@pytest.mark.parametrize("count", [1, 200])
+def test_a_glb_comes_back_within_its_digits(tmp_path, rng, count, degree):
+    source = splats(rng, count, degree, "mip")
+    found = there_and_back(tmp_path / "a.glb", source)
+    assert detect(tmp_path / "a.glb").name == "GLB"
+    assert (found.mode, found.rendering) == ("mip", source.rendering)
+    assert_close(found, source, 1e-3, means=0, log_scales=1e-6, opacity=1e-6, sh_base=0, sh_rest=0)
+
+
+def test_a_glb_is_what_the_specification_says(tmp_path, rng):
+    source = splats(rng, 100, 2)
+    write(tmp_path / "a.glb", source)
+    tree, binary = parts((tmp_path / "a.glb").read_bytes())
+    assert tree["extensionsUsed"] == [KHR]
+    (primitive,) = tree["meshes"][0]["primitives"]
+    assert primitive["mode"] == 0
+    assert primitive["extensions"][KHR] == {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+    coefficients = [f"{KHR}:SH_DEGREE_{d}_COEF_{m}" for d in range(3) for m in range(2 * d + 1)]
+    own = [f"{KHR}:{name}" for name in ("ROTATION", "SCALE", "OPACITY")]
+    assert set(primitive["attributes"]) == {"POSITION", "COLOR_0", *own, *coefficients}
+    position = tree["accessors"][primitive["attributes"]["POSITION"]]
+    values = attribute(tree, binary, "POSITION")
+    np.testing.assert_array_equal(np.float32(position["min"]), values.min(axis=0))
+    np.testing.assert_array_equal(np.float32(position["max"]), values.max(axis=0))
+    np.testing.assert_array_equal(values, source.parameters["means"] * np.float32([1, -1, -1]))
+    rotation = attribute(tree, binary, f"{KHR}:ROTATION")
+    np.testing.assert_allclose(np.linalg.norm(rotation, axis=1), 1, atol=1e-6)
+    w, x, y, z = unit(source.parameters["quats"]).T
+    np.testing.assert_allclose(rotation, np.stack([x, -y, -z, w], axis=1), atol=1e-6)
+    np.testing.assert_allclose(
+        attribute(tree, binary, f"{KHR}:SCALE"), np.exp(source.parameters["log_scales"]), rtol=1e-6
+    )
+    colour = np.clip(0.28209479 * source.parameters["sh_base"] + 0.5, 0, 1)
+    linear = np.where(colour <= 0.04045, colour / 12.92, ((colour + 0.055) / 1.055) ** 2.4)
+    shown = attribute(tree, binary, "COLOR_0")
+    np.testing.assert_allclose(shown[:, :3] / 255, linear, atol=0.0021)
+    np.testing.assert_allclose(shown[:, 3:] / 255, opacities(source.parameters["logit_opacity"]), atol=0.0021)
+    assert all(view["byteOffset"] % 4 == 0 for view in tree["bufferViews"])
+
+
+def test_a_glb_of_another_program_is_the_source():
+    """splat-transform turns a model by half about z, where the axes of glTF ask for half about x."""
+    source, found = load(interop("train1000.ply")), load(interop("train1000.glb"))
+    half = source.transformed(rotation=np.diag([-1.0, 1, -1]))
+    np.testing.assert_allclose(found.means, half.means, atol=1e-5)
+    np.testing.assert_allclose(found.sh_rest, half.sh_rest, atol=1e-5)
+    np.testing.assert_allclose(found.log_scales, half.log_scales, atol=1e-5)
+    np.testing.assert_allclose(covariances(found), covariances(half), atol=1e-5)
+
+
+def covariances(model):
+    """Of each Gaussian, [N, 3, 3]: several quaternions, by half turns about its own axes, give the same."""
+    axes = Rotation.from_quat(np.roll(unit(model.quats), -1, axis=1)).as_matrix() * model.scales[:, None, :]
+    return axes @ axes.transpose(0, 2, 1)
+
+
+def moved(tmp_path, rng, **node):
+    write(tmp_path / "a.glb", splats(rng, 20))
+    tree, binary = parts((tmp_path / "a.glb").read_bytes())
+    tree["nodes"] = [{"children": [1], "translation": [0, 1, 0]}, {"mesh": 0, **node}]
+    (tmp_path / "b.glb").write_bytes(glued(tree, binary))
+    return tmp_path / "a.glb", tmp_path / "b.glb"
+
+
+def test_a_node_that_is_moved_turned_and_scaled_moves_its_gaussians(tmp_path, rng):
+    """A quarter about glTF's y, up, is a quarter about ours the other way."""
+    rotation = [0, 0.5**0.5, 0, 0.5**0.5]
+    plain, other = moved(tmp_path, rng, rotation=rotation, scale=[2, 2, 2], translation=[1, 0, 0])
+    expected = load(plain).transformed(2.0, np.array([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]]), (1, -1, 0))
+    found = load(other)
+    for name, table in expected.tables().items():
+        if name != "quats":
+            np.testing.assert_allclose(getattr(found, name), table, atol=2e-6, err_msg=name)
+    np.testing.assert_allclose(np.abs((unit(found.quats) * unit(expected.quats)).sum(axis=1)), 1, atol=1e-6)
+
+
+@pytest.mark.parametrize("scale", [[1, 2, 1], [-1, 1, 1], [0, 0, 0]])
+def test_a_node_that_stretches_or_mirrors_is_refused(scale, tmp_path, rng):
+    _, other = moved(tmp_path, rng, scale=scale)
+    with pytest.raises(DataError, match="stretches or mirrors"):
+        load(other)
+
+
+def test_whole_numbers_and_strides_are_read(tmp_path, rng):
+    write(tmp_path / "a.glb", splats(rng, 5, 0))
+    tree, binary = parts((tmp_path / "a.glb").read_bytes())
+    rows = np.zeros((5, 8), "<i2")
+    rows[:, :4] = [0, 32767, 0, -32768]
+    tree["bufferViews"].append({"buffer": 0, "byteOffset": len(binary), "byteLength": 80, "byteStride": 16})
+    number = tree["meshes"][0]["primitives"][0]["attributes"][f"{KHR}:ROTATION"]
+    tree["accessors"][number] |= {"componentType": 5122, "normalized": True, "bufferView": len(tree["bufferViews"]) - 1}
+    (tmp_path / "b.glb").write_bytes(glued(tree, binary + rows.tobytes()))
+    np.testing.assert_array_equal(read(tmp_path / "b.glb").parameters["quats"], [[-1, 0, -1, 0]] * 5)
+
+
+def change(place, value):
+    def changed(tree):
+        *steps, last = place
+        for step in steps:
+            tree = tree[step]
+        tree[last] = value
+
+    return changed
+
+
+REFUSED = {
+    "count": (change(["accessors", 0, "count"], 10**9), "more than the file"),
+    "counts": (change(["accessors", 0, "count"], 3), "different counts"),
+    "stride": (change(["bufferViews", 0, "byteStride"], 4), "more than the file"),
+    "view": (change(["accessors", 0, "bufferView"], 99), "its JSON is damaged"),
+    "negative": (change(["bufferViews", 0, "byteOffset"], -4), "its JSON is damaged"),
+    "text": (change(["nodes", 0], "x"), "its JSON is damaged"),
+    "circle": (change(["nodes", 0], {"children": [0]}), "no tree"),
+    "no splats": (change(["meshes", 0, "primitives", 0, "extensions"], {}), "holds no Gaussians"),
+    "kernel": (change(["meshes", 0, "primitives", 0, "extensions", KHR, "kernel"], "box"), "kernel is 'box'"),
+    "elsewhere": (change(["buffers", 0, "uri"], "a.bin"), "in the file itself"),
+}
+
+
+@pytest.mark.parametrize("fault", REFUSED)
+def test_a_damaged_glb_is_refused(fault, tmp_path, rng):
+    changed, words = REFUSED[fault]
+    write_glb(tmp_path / "a.glb", splats(rng, 4, 0), Writing())
+    tree, binary = parts((tmp_path / "a.glb").read_bytes())
+    changed(tree)
+    (tmp_path / "a.glb").write_bytes(glued(tree, binary))
+    with pytest.raises(DataError, match=words):
+        read(tmp_path / "a.glb")
+
+
+def test_a_cut_glb_is_refused(tmp_path, rng):
+    write(tmp_path / "a.glb", splats(rng, 4, 0))
+    data = (tmp_path / "a.glb").read_bytes()
+    for size in (4, 19, 40, len(data) - 1):
+        (tmp_path / "a.glb").write_bytes(data[:size])
+        with pytest.raises(DataError, match="copy or export it again"):
+            read(tmp_path / "a.glb")
+
+
+def test_openusd_holds_every_number(tmp_path, rng):
+    """Read back by splitting: a viewer of OpenUSD sees these values."""
+    source = splats(rng, 7, 1)
+    write(tmp_path / "a.usda", source)
+    lines = (tmp_path / "a.usda").read_text().splitlines()
+    assert lines[0] == "#usda 1.0"
+    assert 'def ParticleField3DGaussianSplat "Gaussians"' in lines
+    assert "    uniform int radiance:sphericalHarmonicsDegree = 1" in lines
+    tables = {}
+    for line in lines:
+        if " = [" in line:
+            name, _, text = line.strip().partition(" = ")
+            tables[name.split()[1]] = np.float32(eval(text))
+    p = source.parameters
+    np.testing.assert_array_equal(tables["positions"], p["means"] * np.float32([1, -1, -1]))
+    np.testing.assert_allclose(tables["scales"], np.exp(p["log_scales"]), rtol=1e-6)
+    np.testing.assert_allclose(tables["opacities"], opacities(p["logit_opacity"])[:, 0], rtol=1e-6)
+    np.testing.assert_allclose(tables["orientations"], unit(p["quats"]) * [1, 1, -1, -1], atol=1e-6)
+    harmonics = tables["radiance:sphericalHarmonicsCoefficients"].reshape(7, 4, 3)
+    np.testing.assert_array_equal(harmonics[:, 0], p["sh_base"])
+    np.testing.assert_array_equal(harmonics[:, 1:], p["sh_rest"].reshape(7, 3, 3) * np.float32([[-1], [-1], [1]]))
+    assert (tables["extent"][0] < tables["positions"].min(axis=0)).all()
+    with pytest.raises(DataError, match="OpenUSD is written, not read"):
+        read(tmp_path / "a.usda")
+
+
+@pytest.mark.parametrize("name", ["a.glb", "a.usda", "a.spz", "a.sog", "a.splat", "a.ply", "a.compressed.ply"])
+def test_the_same_model_gives_the_same_bytes(name, tmp_path, rng):
+    source = splats(rng, 300, 3, "mip")
+    sums = [write(tmp_path / folder / name, source) for folder in ("a", "b")]
+    assert sums == [sha256(tmp_path / folder / name) for folder in ("a", "b")]
+    assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
+
+
+def test_a_world_filter_is_baked_but_for_a_ply(tmp_path, rng):
+    source = splats(rng, 50, 0).parameters
+    model = Model(**source, filter_variance=np.full((50, 1), 0.01, np.float32))
+    for name in ("a.ply", "a.glb"):
+        model.save(tmp_path / name)
+    assert load(tmp_path / "a.ply").filter_variance is not None
+    found, baked = load(tmp_path / "a.glb"), model.baked()
+    np.testing.assert_allclose(found.log_scales, baked.log_scales, atol=1e-6)
+    np.testing.assert_allclose(found.opacities, baked.opacities, atol=1e-6)
+    assert angles(read(tmp_path / "a.glb"), read(tmp_path / "a.ply")).max() < 1e-3
+
+
+@pytest.mark.parametrize(("name", "said"), [("a.splat", True), ("a.usda", True), ("a.spz", False), ("a.sog", False)])
+def test_a_mark_that_is_lost_is_said(name, said, tmp_path, rng, caplog):
+    write(tmp_path / name, splats(rng, 5, 0, "mip"))
+    assert ("has no mark for a mip model" in caplog.text) is said
+
+
+def test_numbers_of_the_renderer_that_are_lost_are_said(tmp_path, rng, caplog):
+    source = splats(rng, 5, 0, "mip")
+    for name in ("a.ply", "a.compressed.ply", "a.sog", "a.glb"):
+        assert there_and_back(tmp_path / name, source).rendering == source.rendering
+    assert "does not keep" not in caplog.text
+    write(tmp_path / "a.spz", source)
+    assert "SPZ does not keep near = 0.05; PLY, SOG and GLB do" in caplog.text
+    caplog.clear()
+    source.rendering["near"] = 0.2
+    write(tmp_path / "a.spz", source)
+    assert "does not keep" not in caplog.text

@@ -1,0 +1,119 @@
+"""PLY files of many programs: marks, discs, packed splats."""
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from clsplat.errors import DataError
+from clsplat.formats.compressed_ply import CHUNK
+from clsplat.formats.packing import morton_order
+from clsplat.formats.ply import write_ply
+from clsplat.formats.splats import FLAT_LOG_SCALE
+from clsplat.formats.table import detect, read, write
+from tests.formats.models import assert_close, interop, splats, there_and_back
+
+MARKS = {
+    "comment SplatRenderMode: mip": "mip",
+    "comment splatrendermode:MIP": "mip",
+    "comment postshot.anti_aliasing=1": "mip",
+    "comment postshot.anti_aliasing=0": "default",
+    "comment SplatRenderMode: default": "default",
+    "comment made of mip maps": "default",
+}
+
+
+def packed(rng, tmp_path, count=600, degree=1):
+    """A compressed PLY as header and body."""
+    write(tmp_path / "a.compressed.ply", splats(rng, count, degree))
+    header, body = (tmp_path / "a.compressed.ply").read_bytes().split(b"end_header\n", 1)
+    return header, body
+
+
+@pytest.mark.parametrize("mark", MARKS)
+def test_the_mark_of_a_mip_model_is_read_in_every_spelling(mark, tmp_path, rng):
+    path = tmp_path / "a.ply"
+    write_ply(path, splats(rng, 3).parameters, {})
+    path.write_bytes(path.read_bytes().replace(b"comment SplatRenderMode: default", mark.encode()))
+    assert read(path).mode == MARKS[mark]
+
+
+def test_a_disc_has_a_third_axis_of_almost_nothing(tmp_path, rng):
+    path, source = tmp_path / "a.ply", splats(rng, 5).parameters
+    write_ply(path, source, {})
+    header, body = path.read_bytes().split(b"end_header\n", 1)
+    rows = np.delete(np.frombuffer(body, "<f4").reshape(5, -1), 57, axis=1)
+    path.write_bytes(header.replace(b"property float scale_2\n", b"") + b"end_header\n" + rows.tobytes())
+    found = read(path).parameters
+    np.testing.assert_array_equal(found["log_scales"][:, :2], source["log_scales"][:, :2])
+    np.testing.assert_array_equal(found["log_scales"][:, 2], np.float32(FLAT_LOG_SCALE))
+    np.testing.assert_array_equal(found["quats"], source["quats"])
+
+
+def test_the_published_bytes_of_a_compressed_ply(rng):
+    """Values worked out by hand from the first splat of a file that splat-transform wrote."""
+    path = interop("train1000.compressed.ply")
+    assert detect(path).name == "compressed PLY"
+    found = {name: table[0] for name, table in read(path).parameters.items()}
+    np.testing.assert_allclose(found["means"], (-2.633789, -0.987691, -1.480688), atol=2e-6)
+    np.testing.assert_allclose(found["log_scales"], (-5.685699, -4.33116, -4.80418), atol=1e-5)
+    np.testing.assert_allclose(found["quats"], (0.867207, -0.281322, 0.22326, 0.344913), atol=1e-6)
+    np.testing.assert_allclose(found["logit_opacity"], 0.149296, atol=1e-5)
+    np.testing.assert_allclose(found["sh_base"], (-0.85329, -0.360405, -0.564274), atol=1e-5)
+    np.testing.assert_allclose(found["sh_rest"][::3][:4], (0.015625, 0.015625, -0.078125, -0.046875), atol=1e-7)
+
+
+@pytest.mark.parametrize(("name", "rows"), [("train1000", 1000), ("playbot31k", 31_000)])
+def test_a_compressed_ply_of_another_program_is_the_source(name, rows):
+    """Its splats are sorted: each is matched with the nearest of the source."""
+    source, found = read(interop(f"{name}.ply")), read(interop(f"{name}.compressed.ply"))
+    assert len(found) == rows
+    distance, nearest = cKDTree(source.parameters["means"]).query(found.parameters["means"])
+    assert np.median(distance) < 5e-3
+    kept = source.rows(nearest)
+    difference = np.abs(found.parameters["sh_base"] - kept.parameters["sh_base"])
+    assert np.median(difference) < 0.01
+
+
+@pytest.mark.parametrize("degree", range(4))
+@pytest.mark.parametrize("count", [1, CHUNK, 600])
+def test_a_compressed_ply_comes_back_within_its_steps(tmp_path, rng, count, degree):
+    source = splats(rng, count, degree, "mip")
+    found = there_and_back(tmp_path / "a.compressed.ply", source)
+    expected = source.rows(morton_order(source.parameters["means"]))
+    assert (found.mode, found.rendering) == ("mip", source.rendering)
+    bounds = {"means": 0.008, "log_scales": 0.01, "opacity": 0.51 / 255, "sh_base": 0.05, "sh_rest": 1 / 64}
+    assert_close(found, expected, 0.25, **bounds)
+
+
+def test_a_compressed_ply_without_ranges_of_colours(tmp_path, rng):
+    header, body = packed(rng, tmp_path, 3, 0)
+    for end in ("min", "max"):
+        for colour in "rgb":
+            header = header.replace(f"property float {end}_{colour}\n".encode(), b"")
+    (tmp_path / "b.ply").write_bytes(header + b"end_header\n" + body[:48] + body[72:])
+    colours = read(tmp_path / "b.ply").parameters["sh_base"] * 0.28209479177387814 + 0.5
+    levels = np.frombuffer(body[72:], "<u4").reshape(3, 4)[:, 3] >> np.uint32(24)
+    np.testing.assert_allclose(colours[:, 0], levels / 255, atol=1e-6)
+
+
+def test_no_splats_are_a_model_too(tmp_path, rng):
+    for name in ("a.ply", "a.compressed.ply"):
+        assert len(there_and_back(tmp_path / name, splats(rng, 0))) == 0
+
+
+BROKEN = {
+    "no chunks": (lambda h, b: (h.replace(b"element chunk 3", b"element chunks 3"), b), "without 'element chunk'"),
+    "too few chunks": (lambda h, b: (h.replace(b"element chunk 3", b"element chunk 2"), b), "2 chunks for 600 splats"),
+    "floats": (lambda h, b: (h.replace(b"uint packed_scale", b"float packed_scale"), b), "'property uint'"),
+    "short harmonics": (lambda h, b: (h, b[:-1]), "truncated"),
+    "harmonics of others": (lambda h, b: (h.replace(b"element sh 600", b"element sh 599"), b), "599 rows"),
+    "harmonics from 1 on": (lambda h, b: (h.replace(b"f_rest_0\n", b"f_rest_9\n"), b), "numbered from 0 on"),
+}
+
+
+@pytest.mark.parametrize("fault", BROKEN)
+def test_a_damaged_compressed_ply_is_refused(fault, tmp_path, rng):
+    change, words = BROKEN[fault]
+    (tmp_path / "b.ply").write_bytes(b"end_header\n".join(change(*packed(rng, tmp_path))))
+    with pytest.raises(DataError, match=words):
+        read(tmp_path / "b.ply")

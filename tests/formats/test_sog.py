@@ -1,0 +1,207 @@
+"""SOG: published bytes, both containers, both versions, and what a file may not declare."""
+
+import io
+import json
+import shutil
+import zipfile
+
+import cv2
+import numpy as np
+import pytest
+
+from clsplat.errors import DataError
+from clsplat.formats.packing import morton_order
+from clsplat.formats.palette import ENTRIES, codebook, nearest, palette
+from clsplat.formats.splats import Writing
+from clsplat.formats.table import detect, read, write
+from tests.data_sets import data_set
+from tests.formats.models import assert_close, interop, splats, there_and_back
+
+
+def test_the_published_bytes_of_a_sog():
+    path = interop("train1000.sog")
+    assert detect(path).name == "SOG"
+    found = {name: table[0] for name, table in read(path).parameters.items()}
+    np.testing.assert_allclose(found["means"], (-2.631508, -0.98734, -1.482454), atol=2e-6)
+    np.testing.assert_allclose(found["log_scales"], (-5.693027, -4.337001, -4.804688), atol=1e-5)
+    np.testing.assert_allclose(found["quats"], (0.868391, -0.285616, 0.219064, 0.341075), atol=1e-6)
+    np.testing.assert_allclose(found["logit_opacity"], 0.133531, atol=1e-5)
+    np.testing.assert_allclose(found["sh_rest"][::3][:4], (0.014241, 0.016862, -0.073519, -0.052921), atol=1e-6)
+
+
+def test_a_sog_of_another_program_is_the_source():
+    source, found = read(interop("playbot31k.ply")), read(interop("playbot31k.sog"))
+    kept = np.sort(source.parameters["means"], axis=0), np.sort(found.parameters["means"], axis=0)
+    np.testing.assert_allclose(kept[0], kept[1], atol=1e-4)
+
+
+def test_version_1_is_read():
+    found = read(data_set("splats") / "playcanvas-logo_sog").parameters
+    assert len(found["means"]) == 307_128
+    np.testing.assert_allclose(found["log_scales"].max(axis=0), (-1.0510782, -1.2544534, -0.9433849), atol=1e-5)
+    np.testing.assert_allclose(found["logit_opacity"].max(), 5.537334, atol=1e-5)
+
+
+@pytest.mark.parametrize(("count", "degree"), [(1, 3), (63, 0), (300, 1), (1100, 2), (1100, 3)])
+def test_a_sog_comes_back_within_its_steps(tmp_path, rng, count, degree):
+    source = splats(rng, count, degree, "mip")
+    found = there_and_back(tmp_path / "a.sog", source)
+    expected = source.rows(morton_order(source.parameters["means"]))
+    assert (found.mode, found.rendering) == ("mip", source.rendering)
+    assert_close(found, expected, 0.8, means=0.002, log_scales=0.05, opacity=0.0101, sh_base=0.05, sh_rest=0.5)
+
+
+def test_a_palette_of_as_many_entries_as_differ_is_exact(tmp_path, rng):
+    """Eight different colours in a thousand Gaussians."""
+    source = splats(rng, 1024)
+    source.parameters["sh_rest"][:] = source.parameters["sh_rest"][rng.integers(0, 8, 1024)].round(1)
+    found = there_and_back(tmp_path / "a.sog", source).parameters["sh_rest"]
+    expected = source.rows(morton_order(source.parameters["means"])).parameters["sh_rest"]
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
+def test_a_folder_holds_what_the_bundle_holds(tmp_path, rng):
+    source = splats(rng, 200, 1)
+    bundled = there_and_back(tmp_path / "a.sog", source)
+    write(tmp_path / "folder" / "meta.json", source)
+    with zipfile.ZipFile(tmp_path / "a.sog") as archive:
+        for name in archive.namelist():
+            assert archive.read(name) == (tmp_path / "folder" / name).read_bytes()
+    for place in (tmp_path / "folder", tmp_path / "folder" / "meta.json"):
+        for name, table in read(place).parameters.items():
+            np.testing.assert_array_equal(table, bundled.parameters[name])
+
+
+def test_a_larger_palette_is_nearer(tmp_path, rng):
+    source = splats(rng, 2050, 1)
+    errors = []
+    for quality in ("small", "balanced"):
+        found = there_and_back(tmp_path / "a.sog", source, Writing(quality=quality)).parameters["sh_rest"]
+        expected = source.rows(morton_order(source.parameters["means"])).parameters["sh_rest"]
+        errors.append(float(np.square(found - expected).mean()))
+    assert errors[1] < errors[0] < 0.1**2
+
+
+def test_a_codebook_is_better_than_equal_steps(rng):
+    values = rng.normal(size=20_000) ** 3
+    entries = codebook(values)
+    assert len(entries) == ENTRIES
+    assert (np.diff(entries) >= 0).all()
+    error = np.square(entries[nearest(values, entries)] - values).mean()
+    equal = np.linspace(values.min(), values.max(), ENTRIES)
+    assert error < 0.2 * np.square(equal[nearest(values, equal)] - values).mean()
+    few = np.float32([3, 1, 2, 2])
+    np.testing.assert_array_equal(codebook(few)[nearest(few, codebook(few))], few)
+
+
+def test_every_point_has_the_nearest_vector_in_whole_numbers(rng):
+    points = rng.integers(-511, 512, (400, 45)).astype(np.float32)
+    points[0, 0] = 511
+    vectors, labels = palette(points, 32)
+    distance = np.square(points[:, None].astype(np.int64) - np.rint(vectors).astype(np.int64)).sum(axis=2)
+    assert (distance[np.arange(400), labels] <= distance.min(axis=1) * 1.02).all()
+    assert len(np.unique(labels)) > 28
+
+
+def test_a_palette_does_not_depend_on_the_number_of_threads(rng):
+    """Sums of whole numbers below 2^24: any order of a product gives the same."""
+    from clsplat.formats import palette as module
+
+    points = rng.normal(size=(3000, 45)).astype(np.float32)
+    before = palette(points, 64)
+    block = module.BLOCK
+    try:
+        module.BLOCK = 7  # other shapes take other paths through the library
+        after = palette(points, 64)
+    finally:
+        module.BLOCK = block
+    np.testing.assert_array_equal(before[0], after[0])
+    np.testing.assert_array_equal(before[1], after[1])
+
+
+def test_a_transparent_splat_keeps_its_colour(tmp_path, rng):
+    source = splats(rng, 100, 0)
+    source.parameters["logit_opacity"][:] = -20
+    found = there_and_back(tmp_path / "a.sog", source)
+    expected = source.rows(morton_order(source.parameters["means"]))
+    assert_close(found, expected, 0.8, sh_base=0.1, opacity=1.01 / 255)
+
+
+def folder_of(tmp_path, rng, **changes):
+    write(tmp_path / "s" / "meta.json", splats(rng, 100, 1))
+    meta = json.loads((tmp_path / "s" / "meta.json").read_text())
+    for place, value in changes.items():
+        *parts, last = place.split("__")
+        part = meta
+        for name in parts:
+            part = part[name]
+        part[last] = value
+    (tmp_path / "s" / "meta.json").write_text(json.dumps(meta))
+    return tmp_path / "s"
+
+
+REFUSED = {
+    "count": ({"count": 10**8}, "declares 100000000 splats"),
+    "no count": ({"count": None}, "count is None; expected a whole number"),
+    "version": ({"version": 3}, "version 3; expected 1 or 2"),
+    "path": ({"means__files": ["../means_l.webp", "x"]}, "the name of a file beside it"),
+    "absolute": ({"means__files": ["/etc/passwd", "x"]}, "the name of a file beside it"),
+    "names": ({"means__files": 3}, "expected the names of one or two files"),
+    "one file": ({"means__files": ["means_l.webp"]}, "names 1 files"),
+    "missing": ({"quats__files": ["other.webp"]}, "cannot be read"),
+    "codebook": ({"scales__codebook": [1.0] * 255}, "expected 256 numbers"),
+    "text": ({"sh0__codebook": ["x"] * 256}, "expected 256 numbers"),
+    "huge": ({"means__mins": [1e300, 0, 0]}, "expected 3 numbers"),
+    "bands": ({"shN__bands": 4}, "from 1 to 3"),
+    "not JSON": ({"means": 3}, "has no 'means'"),
+}
+
+
+@pytest.mark.parametrize("fault", REFUSED)
+def test_a_damaged_meta_is_refused(fault, tmp_path, rng):
+    changes, words = REFUSED[fault]
+    with pytest.raises(DataError, match=words):
+        read(folder_of(tmp_path, rng, **changes))
+
+
+def test_an_image_of_another_size_is_refused_before_it_is_decoded(tmp_path, rng):
+    folder = folder_of(tmp_path, rng)
+    large, small = (
+        cv2.imencode(".webp", np.zeros((side, side, 4), np.uint8), [cv2.IMWRITE_WEBP_QUALITY, quality])[1].tobytes()
+        for side, quality in ((4000, 101), (12, 101))
+    )
+    for data, words in (
+        (large, "4000 x 4000 px; expected 100 at least"),
+        (large[:100], "4000 x 4000 px"),
+        (b"RIFF", "no lossless WebP"),
+        ((folder / "quats.webp").read_bytes()[:60], "cannot be decoded"),
+        (small[:12] + b"VP8 " + small[16:], "no lossless WebP"),
+    ):
+        (folder / "quats.webp").write_bytes(data)
+        with pytest.raises(DataError, match=words):
+            read(folder)
+
+
+def test_a_damaged_bundle_is_refused(tmp_path, rng):
+    path = tmp_path / "a.sog"
+    write(path, splats(rng, 100, 1))
+    data = path.read_bytes()
+    bomb = io.BytesIO()
+    with zipfile.ZipFile(bomb, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("meta.json", b" " * (1 << 25))
+    for content, words in (
+        (data[:-30], "a damaged ZIP"),
+        (data.replace(b"webpPK", b"wepbPK"), "has no '.*webp'"),
+        (bomb.getvalue(), "more than 16777216 bytes"),
+    ):
+        path.write_bytes(content)
+        with pytest.raises(DataError, match=words):
+            read(path)
+
+
+def test_files_of_a_bundle_may_lie_in_a_folder_of_it(tmp_path, rng):
+    write(tmp_path / "s" / "meta.json", splats(rng, 50, 0))
+    shutil.make_archive(str(tmp_path / "a"), "zip", tmp_path, "s")
+    shutil.move(tmp_path / "a.zip", tmp_path / "a.sog")
+    for name, table in read(tmp_path / "a.sog").parameters.items():
+        np.testing.assert_array_equal(table, read(tmp_path / "s").parameters[name])

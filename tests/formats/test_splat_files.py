@@ -1,0 +1,129 @@
+"""`.splat` and `.ksplat`: records without a mark."""
+
+import struct
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from clsplat.errors import ConfigError, DataError
+from clsplat.formats.ksplat import HEADER, SECTION
+from clsplat.formats.splats import opacities
+from clsplat.formats.table import detect, read, write
+from tests.formats.models import angles, assert_close, interop, splats, there_and_back
+
+PUBLISHED = bytes.fromhex("c2851ec15dd5db3eba33d54072ce773ee8e8ca3d8e23743e7a8d597cff80757d")
+LEVELS = {"L0": (1e-6, 1e-6, 1e-6), "L1": (2e-4, 0.002, 0.001), "L2": (2e-4, 0.002, 0.013)}
+
+
+def by_size(source):
+    """The rows of a model in the order of a `.splat` file."""
+    p = source.parameters
+    size = p["log_scales"].astype(np.float64).sum(axis=1) + np.log(opacities(p["logit_opacity"])[:, 0])
+    return source.rows(np.argsort(-size, kind="stable"))
+
+
+def test_the_published_bytes_of_a_splat(tmp_path):
+    (tmp_path / "a").write_bytes(PUBLISHED)
+    assert detect(tmp_path / "a").name == "splat", "by content, for the name says nothing"
+    found = {name: table[0] for name, table in read(tmp_path / "a").parameters.items()}
+    np.testing.assert_allclose(found["means"], (-9.907656, 0.429362, 6.662564), atol=1e-6)
+    np.testing.assert_allclose(found["log_scales"], (-1.418824, -2.311857, -1.433735), atol=1e-6)
+    np.testing.assert_allclose(found["logit_opacity"], np.log(0x7C / (255 - 0x7C)), atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["train1000", "playbot31k"])
+def test_a_splat_of_another_program_is_the_source(name):
+    source, found = read(interop(f"{name}.ply")), read(interop(f"{name}.splat"))
+    expected = by_size(source)
+    same = np.flatnonzero((found.parameters["means"] == expected.parameters["means"]).all(axis=1))
+    assert len(same) > 0.9 * len(found), "ties are in another order"
+    assert angles(found.rows(same), expected.rows(same)).max() < 1.8, "its writer truncates to 1/128"
+    found, expected = found.rows(same), expected.rows(same)
+    np.testing.assert_allclose(found.parameters["log_scales"], expected.parameters["log_scales"], atol=1e-5)
+
+
+def test_a_splat_comes_back_within_its_steps(tmp_path, rng):
+    source = splats(rng, 300)
+    source.parameters["sh_base"][:] = np.clip(source.parameters["sh_base"], -1.7, 1.7)
+    found = there_and_back(tmp_path / "a.splat", source)
+    expected = by_size(source)
+    expected.parameters["sh_rest"] = np.zeros((300, 0), np.float32)
+    bounds = {"means": 0, "log_scales": 1e-6, "opacity": 0.501 / 255, "sh_base": 0.501 / 255 / 0.2820947, "sh_rest": 0}
+    assert_close(found, expected, 0.8, **bounds)
+
+
+def test_numbers_as_text_are_no_splat(tmp_path):
+    (tmp_path / "a.txt").write_bytes(b"0.001 0.0020.001 0.0020.001 0.02" * 5)
+    assert detect(tmp_path / "a.txt") is None
+    with pytest.raises(DataError, match=r"no model file of a known format; expected one of \.ply, "):
+        read(tmp_path / "a.txt")
+
+
+@pytest.mark.parametrize(("data", "words"), [(PUBLISHED[:-1], "31 bytes, no multiple of 32"), (b"\xff" * 64, "finite")])
+def test_a_damaged_splat_is_refused(data, words, tmp_path):
+    (tmp_path / "a.splat").write_bytes(data)
+    with pytest.raises(DataError, match=words):
+        read(tmp_path / "a.splat")
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_a_ksplat_of_another_program_is_the_source(level):
+    """Its writer keeps degree 2 and the order of the source."""
+    source, found = read(interop("train1000.ply")), read(interop(f"train1000.{level}.ksplat"))
+    assert detect(interop(f"train1000.{level}.ksplat")).name == "ksplat"
+    degree = found.sh_degree
+    position, scale, sh = LEVELS[level]
+    assert len(found) == len(source)
+    expected = source.rows(cKDTree(source.parameters["means"]).query(found.parameters["means"])[1])
+    expected.parameters["sh_rest"] = expected.parameters["sh_rest"][:, : 3 * ((degree + 1) ** 2 - 1)]
+    bounds = {"means": position, "log_scales": scale, "sh_rest": sh, "opacity": 1.01 / 255}
+    assert_close(found, expected, 0.2, **bounds)
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_a_larger_ksplat_has_buckets(level):
+    found = read(interop(f"playbot31k.{level}.ksplat"))
+    source = read(interop("playbot31k.ply"))
+    assert len(found) == len(source)
+    for axis in range(3):
+        a, b = np.sort(found.parameters["means"][:, axis]), np.sort(source.parameters["means"][:, axis])
+        np.testing.assert_allclose(a, b, atol=1e-3)
+
+
+def ksplat(count=3, rows=3, degree=1, level=1, buckets=1, full=0, partial=1, held=3, sections=1):
+    header, section = bytearray(HEADER), bytearray(SECTION)
+    struct.pack_into("<BB2x4IH", header, 0, 0, 1, 1, sections, rows, count, level)
+    struct.pack_into("<4IfHxx4IH", section, 0, count, rows, 256, buckets, 5.0, 12, 32767, 0, full, partial, degree)
+    row = (24, 42, 72)[degree] if degree < 3 else 72
+    return bytes(header + section) + struct.pack("<I3f", held, 1, 2, 3) + bytes(row * rows)
+
+
+def test_positions_of_a_ksplat_are_relative_to_their_bucket(tmp_path):
+    (tmp_path / "a.ksplat").write_bytes(ksplat())
+    found = read(tmp_path / "a.ksplat").parameters
+    np.testing.assert_allclose(found["means"], [[-1.5, -0.5, 0.5]] * 3)
+    assert found["sh_rest"].shape == (3, 9)
+
+
+DAMAGED = {
+    "more splats than places": ({"count": 4}, "4 of 3 splats"),
+    "degree": ({"degree": 3}, "SH degree 3"),
+    "places": ({"rows": 3, "buckets": 10**6}, "truncated"),
+    "empty buckets": ({"held": 2}, "hold fewer splats"),
+    "full buckets": ({"full": 1}, "do not fit"),
+    "no sections": ({"sections": 0}, "not a .ksplat"),
+}
+
+
+@pytest.mark.parametrize("fault", DAMAGED)
+def test_a_damaged_ksplat_is_refused(fault, tmp_path):
+    change, words = DAMAGED[fault]
+    (tmp_path / "a.ksplat").write_bytes(ksplat(**change))
+    with pytest.raises(DataError, match=words):
+        read(tmp_path / "a.ksplat")
+
+
+def test_a_ksplat_is_not_written(tmp_path, rng):
+    with pytest.raises(ConfigError, match=r"ksplat is read, not written; expected a name that ends in \.ply, "):
+        write(tmp_path / "a.ksplat", splats(rng, 3))

@@ -1,0 +1,200 @@
+"""SPZ: published bytes, every version, both axes, and what a file may not declare."""
+
+import gzip
+import struct
+import sys
+import zlib
+
+import numpy as np
+import pytest
+
+from clsplat.errors import ConfigError, DataError
+from clsplat.formats.packing import morton_order
+from clsplat.formats.splats import Reading, Writing
+from clsplat.formats.table import detect, read, write
+from tests.formats.models import angles, assert_close, interop, splats, there_and_back
+
+UNTURNED = Reading(axes="ply")
+STEPS = {"means": 2**-13, "log_scales": 1 / 32, "opacity": 0.501 / 255, "sh_base": 0.501 / 255 / 0.15}
+
+
+def version_4(path, source, **more):
+    pytest.importorskip("zstandard")
+    write(path, source, Writing(spz_version=4, **more))
+    return path.read_bytes()
+
+
+@pytest.mark.parametrize("version", [3, 4])
+def test_the_published_bytes_of_an_spz(version):
+    """Positions as the file has them, up and back; then as a PLY has them, whose order it keeps."""
+    path = interop(f"train1000.v{version}.spz")
+    assert detect(path).name == "SPZ"
+    found = {name: table[0] for name, table in read(path, UNTURNED).parameters.items()}
+    np.testing.assert_allclose(found["means"], (2.095947, 0.599854, -1.219238), atol=1e-6)
+    np.testing.assert_allclose(found["log_scales"], (-5.6875, -5.0625, -5.125), atol=0)
+    np.testing.assert_allclose(found["quats"], (0.993998, 0.009686, -0.03321, 0.103783), atol=1e-6)
+    assert not found["sh_rest"].any()
+    turned = {name: table[0] for name, table in read(path).parameters.items()}
+    np.testing.assert_allclose(turned["means"], (2.095947, -0.599854, 1.219238), atol=1e-6)
+    np.testing.assert_allclose(turned["quats"], (0.993998, 0.009686, 0.03321, -0.103783), atol=1e-6)
+
+
+@pytest.mark.parametrize("version", [3, 4])
+def test_an_spz_of_another_program_is_the_source(version):
+    source, found = read(interop("playbot31k.ply")), read(interop(f"playbot31k.v{version}.spz"))
+    kept = np.sort(source.parameters["means"], axis=0), np.sort(found.parameters["means"], axis=0)
+    np.testing.assert_allclose(kept[0], kept[1], atol=2e-4)
+    assert angles(read(interop("train1000.ply")), read(interop(f"train1000.v{version}.spz"))).max() < 0.2
+
+
+@pytest.mark.parametrize("axes", ["spz", "ply"])
+@pytest.mark.parametrize("version", [3, 4])
+@pytest.mark.parametrize("degree", range(4))
+def test_an_spz_comes_back_within_its_steps(tmp_path, rng, degree, version, axes):
+    if version == 4:
+        pytest.importorskip("zstandard")
+    source = splats(rng, 200, degree, "mip")
+    found = there_and_back(tmp_path / "a.spz", source, Writing(spz_version=version, axes=axes), Reading(axes=axes))
+    expected = source.rows(morton_order(source.parameters["means"]))
+    assert found.mode == "mip"
+    assert_close(found, expected, 0.25, sh_rest=1 / 256, **STEPS)
+
+
+def test_both_versions_hold_the_same_bytes(tmp_path, rng):
+    source = splats(rng, 100)
+    version_4(tmp_path / "b.spz", source)
+    a, b = there_and_back(tmp_path / "a.spz", source), read(tmp_path / "b.spz")
+    for name, table in a.parameters.items():
+        np.testing.assert_array_equal(table, b.parameters[name])
+
+
+@pytest.mark.parametrize(("bits", "band1", "others"), [((5, 4), 1 / 32, 1 / 16), ((8, 6), 1 / 256, 1 / 64)])
+def test_bits_of_harmonics_are_a_choice(tmp_path, rng, bits, band1, others):
+    source = splats(rng, 100)
+    found = there_and_back(tmp_path / "a.spz", source, Writing(sh_bits=bits)).parameters["sh_rest"]
+    difference = np.abs(found - source.rows(morton_order(source.parameters["means"])).parameters["sh_rest"])
+    assert band1 / 2 < difference[:, :9].max() <= band1
+    assert others / 2 < difference[:, 9:].max() <= others
+
+
+def test_positions_get_the_bits_that_they_need(tmp_path, rng, caplog):
+    for largest, fraction in ((1.0, 12), (1000.0, 12), (5000.0, 9), (4e6, 0)):
+        source = splats(rng, 50)
+        source.parameters["means"][0] = largest
+        found = there_and_back(tmp_path / "a.spz", source).parameters["means"]
+        expected = source.rows(morton_order(source.parameters["means"])).parameters["means"]
+        assert np.abs(found - expected).max() <= 2.0 ** -(fraction + 1)
+    source.parameters["means"][0] = 1e8
+    with pytest.raises(DataError, match="crop it"):
+        write(tmp_path / "a.spz", source)
+    source = splats(rng, 50)
+    fine = there_and_back(tmp_path / "a.spz", source, Writing(quality="high")).parameters["means"]
+    assert np.abs(fine - source.rows(morton_order(source.parameters["means"])).parameters["means"]).max() < 2e-6
+
+
+def test_harmonics_beyond_one_are_cut_and_said(tmp_path, rng, caplog):
+    source = splats(rng, 10)
+    source.parameters["sh_rest"][3, 5] = 2.9
+    found = there_and_back(tmp_path / "a.spz", source)
+    assert "those of 1 Gaussians were cut" in caplog.text
+    assert 127 / 128 <= np.abs(found.parameters["sh_rest"]).max() <= 1
+
+
+def legacy(version, count=2, flags=0, rest=b""):
+    """A file of version 1 or 2, degree 0: all at (1, -2, 0.5), opacity 1, quaternion (1, 0, 0, 0)."""
+    positions = (
+        np.float16([1, -2, 0.5]).tobytes()
+        if version == 1
+        else b"".join(struct.pack("<i", int(v * 4096))[:3] for v in (1, -2, 0.5))
+    )
+    one = [positions, b"\xff", b"\x80" * 3, b"\x50" * 3, b"\x80\x7f\x80" if version < 3 else b""]
+    header = struct.pack("<4s2I4B", b"NGSP", version, count, 0, 12, flags, 0)
+    return header + b"".join(plane * count for plane in one) + rest
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_older_versions_are_read(version, tmp_path):
+    (tmp_path / "a.spz").write_bytes(gzip.compress(legacy(version)))
+    found = read(tmp_path / "a.spz").parameters
+    np.testing.assert_allclose(found["means"], [[1, 2, -0.5]] * 2)
+    np.testing.assert_allclose(np.abs(found["quats"]), [[1, 0, 0, 0]] * 2, atol=0.005)
+    np.testing.assert_array_equal(found["log_scales"], np.full((2, 3), -5))
+
+
+def test_an_extension_that_turns_the_axes_is_refused_and_others_are_skipped(tmp_path):
+    path = tmp_path / "a.spz"
+    other = struct.pack("<2I4s", 7, 4, b"abcd")
+    path.write_bytes(gzip.compress(legacy(2, flags=2, rest=other)))
+    assert len(read(path)) == 2
+    path.write_bytes(gzip.compress(legacy(2, flags=2, rest=other + struct.pack("<2II", 0xADBE0003, 4, 1))))
+    with pytest.raises(DataError, match="axes of its own, in the record 0xadbe0003"):
+        read(path)
+
+
+def test_degree_four_is_cut_to_three(tmp_path, caplog):
+    body = legacy(2)[16:] + b"\x90" * (2 * 72)
+    (tmp_path / "a.spz").write_bytes(gzip.compress(struct.pack("<4s2I4B", b"NGSP", 2, 2, 4, 12, 0, 0) + body))
+    assert np.abs(read(tmp_path / "a.spz").parameters["sh_rest"]).tolist() == [[0.125] * 45] * 2
+    assert "degree 4" in caplog.text
+
+
+REFUSED = {
+    "other version": (gzip.compress(legacy(5)), "version 5"),
+    "count": (gzip.compress(legacy(2, 2)[:8] + struct.pack("<I", 2**31) + legacy(2)[12:]), "more than it can hold"),
+    "short": (gzip.compress(legacy(2)[:-1]), "ends early"),
+    "long": (gzip.compress(legacy(2) + b"a"), "goes on after 2 splats"),
+    "gzip": (gzip.compress(legacy(2))[:20], "not an SPZ|ends early"),
+    "checksum of bytes": (b"\x1f\x8b\x08\0\0\0\0\0\0\xff\xff\xff\xff", "in gzip"),
+    "version 3 without gzip": (legacy(3), "without gzip"),
+    "header": (b"NGSP\4\0\0\0", "its header of 16 bytes"),
+}
+
+
+@pytest.mark.parametrize("fault", REFUSED)
+def test_a_damaged_spz_is_refused(fault, tmp_path):
+    data, words = REFUSED[fault]
+    (tmp_path / "a.spz").write_bytes(data)
+    with pytest.raises(DataError, match=words):
+        read(tmp_path / "a.spz")
+
+
+def test_streams_of_other_sizes_are_refused(tmp_path, rng):
+    path = tmp_path / "a.spz"
+    data = version_4(path, splats(rng, 40))
+    table = struct.unpack_from("<12Q", data, 32)
+    cases = {
+        "goes on after its last stream": data + b"x",
+        "has 5 streams": data[:15] + b"\5" + data[16:],
+        "table at byte 4294967295": data[:16] + b"\xff" * 4 + data[20:],
+        "expected 360 for 40 splats": data[:40] + struct.pack("<Q", table[1] + 1) + data[48:],
+        f"declares {2**40} bytes": data[:32] + struct.pack("<Q", 2**40) + data[40:],
+        "a stream is damaged": data[:128] + bytes(8) + data[136:],
+    }
+    for words, content in cases.items():
+        path.write_bytes(content)
+        with pytest.raises(DataError, match=words):
+            read(path)
+
+
+def test_a_bomb_is_refused_before_it_grows(tmp_path):
+    """A stream that would become 1 GiB, in a file that declares two splats."""
+    zstandard = pytest.importorskip("zstandard")
+    frame = zstandard.ZstdCompressor(1).compress(bytes(1 << 26)) * 16
+    sizes = [18, 2, 6, 6, 8]
+    table = struct.pack("<2Q", len(frame), 18) + b"".join(struct.pack("<2Q", 0, size) for size in sizes[1:])
+    header = struct.pack("<4s2I4BI12x", b"NGSP", 4, 2, 0, 12, 0, 5, 32)
+    assert len(header) == 32
+    (tmp_path / "a.spz").write_bytes(header + table + frame)
+    with pytest.raises(DataError, match="expected 18"):
+        read(tmp_path / "a.spz")
+    (tmp_path / "a.spz").write_bytes(zlib.compress(legacy(2) + bytes(1 << 26), wbits=31))
+    with pytest.raises(DataError, match="goes on after 2 splats"):
+        read(tmp_path / "a.spz")
+
+
+def test_version_4_without_zstandard_says_what_to_install(tmp_path, rng, monkeypatch):
+    monkeypatch.setitem(sys.modules, "zstandard", None)
+    monkeypatch.setitem(sys.modules, "compression", None)
+    with pytest.raises(ConfigError, match=r"pip install 'clsplat\[spz\]', or use version 3"):
+        write(tmp_path / "a.spz", splats(rng, 3), Writing(spz_version=4))
+    assert not (tmp_path / "a.spz").exists()

@@ -1,0 +1,113 @@
+"""Damaged model files of every format: read or refused, soon and in little memory."""
+
+import io
+import warnings
+import zipfile
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from clsplat.errors import ConfigError
+from clsplat.formats.splats import Reading, Writing
+from clsplat.formats.table import CODECS, detect, read, write
+from clsplat.gaussians.checkup import examine
+from tests.formats.models import splats
+from tests.formats.test_splat_files import ksplat
+from tests.fuzz.mutation import damaged, fuzzed
+from tests.fuzz.outcome import outcome
+
+RNG = np.random.default_rng(0)
+WORDS = {
+    "compressed PLY": ["element chunk 1\n", "element sh 5\n", "property uchar f_rest_0\n", "uint packed_scale\n"],
+    "SPZ": ["NGSP", "\x1f\x8b"],
+    "SOG": ["meta.json", "means_l.webp", "../x", '"files":["a"]', '"count":', "RIFF", "VP8L", "WEBP", '"codebook":[]'],
+    "GLB": [
+        "glTF",
+        "JSON",
+        '"byteStride":',
+        '"sparse":{}',
+        '"count":',
+        '"matrix":[]',
+        '"children":[0]',
+        "5121",
+        '"uri":""',
+    ],
+}
+NAMES = {"compressed PLY": "a.compressed.ply", "SPZ": "a.spz", "SOG": "a.sog", "GLB": "a.glb", "splat": "a.splat"}
+
+
+def seeds(name: str, folder: Path) -> list[bytes]:
+    """Small files of a format."""
+    if name == "ksplat":
+        return [ksplat(degree=degree, level=level) for degree in range(3) for level in range(1, 3)]
+    found = []
+    for count, degree, mode in ((3, 0, "mip"), (40, 1, "default"), (5, 3, "mip")):
+        for version in (3, 4) if name == "SPZ" else (3,):
+            try:
+                write(folder / NAMES[name], splats(RNG, count, degree, mode), Writing(spz_version=version))
+            except ConfigError:  # no Zstandard here
+                continue
+            found.append((folder / NAMES[name]).read_bytes())
+    return found
+
+
+def reads_or_refuses(path: Path) -> None:
+    """Also what a reader tells of numbers that are not finite."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model = outcome(read, path)
+        outcome(detect, path)
+        outcome(examine, path)
+        kept = outcome(read, path, Reading(axes="ply", not_finite="keep"))
+    if model is not None:
+        assert kept is not None
+        assert all(np.isfinite(table).all() for table in model.parameters.values())
+        widths = {len(table) for table in model.parameters.values()}
+        assert len(widths) == 1
+
+
+def test_every_reader_of_the_table_is_here():
+    own = {"PLY"}  # in test_ply.py
+    assert {codec.name for codec in CODECS if codec.read} == own | NAMES.keys() | {"ksplat"}
+
+
+@pytest.mark.parametrize("name", [*NAMES, "ksplat"])
+def test_a_damaged_model_is_read_or_refused(name, folder: Path):
+    path = folder / NAMES.get(name, "a.ksplat")
+
+    @fuzzed(30, data=damaged(seeds(name, folder), WORDS.get(name, ())))
+    def reads(data):
+        path.write_bytes(data)
+        reads_or_refuses(path)
+
+    reads()
+
+
+def test_what_a_damaged_spz_holds_is_read_or_refused(folder: Path):
+    """The damage lies inside of the compression."""
+    plain = [zlib.decompress(data, 31) for data in seeds("SPZ", folder) if data[:2] == b"\x1f\x8b"]
+
+    @fuzzed(30, data=damaged(plain, WORDS["SPZ"]))
+    def reads(data):
+        (folder / "b.spz").write_bytes(zlib.compress(data, 1, wbits=31))
+        reads_or_refuses(folder / "b.spz")
+
+    reads()
+
+
+def test_a_damaged_part_of_a_sog_is_read_or_refused(folder: Path):
+    """The ZIP is whole; its meta.json or an image is not."""
+    with zipfile.ZipFile(io.BytesIO(seeds("SOG", folder)[1])) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+
+    @fuzzed(40, data=damaged([members["meta.json"], *members.values()], WORDS["SOG"]))
+    def reads(data):
+        like = next((name for name, held in members.items() if held[:4] == data[:4]), "meta.json")
+        with zipfile.ZipFile(folder / "b.sog", "w") as archive:
+            for name, held in members.items():
+                archive.writestr(name, data if name == like else held)
+        reads_or_refuses(folder / "b.sog")
+
+    reads()
