@@ -158,7 +158,12 @@ def show_summary(folder: Path) -> None:
     test = next(iter(metrics["test"].values()), None)
     quality = f"test PSNR {test['psnr']:.2f} dB, SSIM {test['ssim']:.4f}; " if test else ""
     remark(f"{quality}{metrics['gaussians']:,} Gaussians; {metrics['train_seconds']:.0f} s of training")
-    for title, name in (("model", "point_cloud.ply"), ("renders", "renders"), ("report", "report.html")):
+    for title, name in (
+        ("model", "point_cloud.ply"),
+        ("renders", "renders"),
+        ("viewer", "viewer.html"),
+        ("report", "report.html"),
+    ):
         if (folder / name).exists():
             remark(f"  {title:<8} {folder / name}")
 
