@@ -45,7 +45,8 @@ function between(a, b, t) { // on the way from one camera to another
   const angle = Math.acos(Math.min(1, cosine)), sine = Math.sin(angle);
   const [f, g] = sine < 1e-6 ? [1 - t, t] : [Math.sin((1 - t) * angle) / sine, Math.sin(t * angle) / sine];
   const turned = p.map((v, i) => f * v + g * q[i]);
-  return {rotation: rotationOf(scaled(turned, 1 / size(turned))), eye: mix(a.eye, b.eye, t), lens: mix(a.lens, b.lens, t)};
+  const rotation = rotationOf(scaled(turned, 1 / size(turned)));
+  return {rotation, eye: mix(a.eye, b.eye, t), lens: mix(a.lens, b.lens, t)};
 }
 
 // A camera turned by an angle about an axis of the world through a point.
@@ -90,7 +91,8 @@ const written = camera => [camera.eye, quaternion(camera.rotation), camera.lens]
 // The camera of an address' part behind #; null where it is none.
 function read(text) {
   const parts = text.replace(/^#/, "").split(";").map(part => part.split(",").map(Number));
-  if (parts.length !== 3 || parts.some((part, i) => part.length !== [3, 4, 6][i] || !part.every(Number.isFinite))) return null;
+  if (parts.length !== 3 || parts.some((part, i) => part.length !== [3, 4, 6][i])) return null;
+  if (!parts.flat().every(Number.isFinite)) return null;
   const [eye, turn, lens] = parts;
   if (size(turn) < 1e-6 || [lens[0], lens[1], lens[4], lens[5]].some(v => v <= 0)) return null;
   return {eye, rotation: rotationOf(scaled(turn, 1 / size(turn))), lens};

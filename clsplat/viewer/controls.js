@@ -10,7 +10,9 @@ class Controls {
     this.pressed = new Set();
     canvas.addEventListener("pointerdown", event => this.down(event));
     canvas.addEventListener("pointermove", event => this.moved(event));
-    for (const name of ["pointerup", "pointercancel"]) canvas.addEventListener(name, event => this.pointers.delete(event.pointerId));
+    for (const name of ["pointerup", "pointercancel"]) {
+      canvas.addEventListener(name, event => this.pointers.delete(event.pointerId));
+    }
     canvas.addEventListener("wheel", event => {
       event.preventDefault();
       this.dolly(Math.exp(Math.max(-60, Math.min(60, event.deltaY * (event.deltaMode ? 16 : 1))) / 500));
@@ -94,12 +96,17 @@ class Controls {
   }
 
   key(event) {
-    if (event.ctrlKey || event.metaKey || event.altKey || event.target.matches("input:not([type=range]), select, textarea")) return;
+    if (event.ctrlKey || event.metaKey || event.altKey) return;
     const key = event.key.toLowerCase(), viewer = this.viewer;
-    if (key in KEYS || key === "shift") return void this.pressed.add(key);
+    if (key in KEYS || key === "shift") {
+      this.pressed.add(key);
+      if (key in KEYS) viewer.change();
+      return;
+    }
     const action = {
       arrowleft: () => viewer.photographs.step(-1), arrowright: () => viewer.photographs.step(1),
-      p: () => viewer.photographs.cycle(), r: () => viewer.reset(), l: () => viewer.move(levelled(viewer.camera, viewer.up)),
+      p: () => viewer.photographs.cycle(), r: () => viewer.reset(),
+      l: () => viewer.move(levelled(viewer.camera, viewer.up)),
       o: () => viewer.panel.style(this.style === "orbit" ? "fly" : "orbit"), h: () => viewer.panel.hide(),
       f: () => viewer.panel.fullscreen(), c: () => viewer.screenshot(), "?": () => viewer.panel.help(),
       1: () => viewer.panel.mode("splats"), 2: () => viewer.panel.mode("points"),

@@ -19,9 +19,7 @@ async function inflated(text) {
     for (const bytes of decoded(text)) await writer.write(bytes);
     await writer.close();
   })();
-  const buffer = await new Response(stream.readable).arrayBuffer();
-  await written;
-  return buffer;
+  return (await Promise.all([new Response(stream.readable).arrayBuffer(), written]))[0];
 }
 
 // texels of 16 bytes that hold the colours of a splat: 3 (degree + 1)² codes
@@ -54,7 +52,9 @@ function unpacked(header, buffer, most) {
     const block = 6 * Math.floor(i / BLOCK);
     for (let axis = 0; axis < 3; axis++) {
       const step = steps[axis * whole + i] + 256 * steps[(axis + 3) * whole + i];
-      positions[3 * i + axis] = floats[4 * i + axis] = blocks[block + axis] + blocks[block + 3 + axis] * step;
+      const t = blocks[block + axis] + blocks[block + 3 + axis] * step;
+      const value = header.origin[axis] + header.unit * Math.sign(t) * Math.expm1(Math.abs(t));
+      positions[3 * i + axis] = floats[4 * i + axis] = value;
     }
     places[4 * i + 3] = quats[i];
   }

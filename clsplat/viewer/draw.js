@@ -9,8 +9,9 @@ function program(gl, vertex, fragment) {
     const shader = gl.createShader(kind);
     gl.shaderSource(shader, source);
     gl.compileShader(shader);
-    if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS) && !gl.isContextLost()) throw Error(gl.getShaderInfoLog(shader));
     gl.attachShader(made, shader);
+    if (gl.getShaderParameter(shader, gl.COMPILE_STATUS) || gl.isContextLost()) continue;
+    throw Error(gl.getShaderInfoLog(shader));
   }
   gl.bindAttribLocation(made, 0, "corner");
   gl.bindAttribLocation(made, 1, "id");
@@ -31,7 +32,8 @@ function texture(gl, format, width, height, kind, type, data, filter = gl.NEARES
 
 class Painter {
   constructor(canvas) {
-    const gl = this.gl = canvas.getContext("webgl2", {antialias: false, alpha: false, powerPreference: "high-performance"});
+    const wishes = {antialias: false, alpha: false, powerPreference: "high-performance"};
+    const gl = this.gl = canvas.getContext("webgl2", wishes);
     if (!gl) throw Error("this browser has no WebGL2; switch on its hardware acceleration, or take another browser");
     // Hundreds of layers blended in 8 bits lose 10 dB; half floats lose nothing that an 8-bit image shows.
     this.half = !!(gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float"));
@@ -59,12 +61,13 @@ class Painter {
 
   // The textures of a model; data: of `unpacked`.
   layer(header, data) {
-    const gl = this.gl, rows = rowsOf(data.count, 1), inRow = splatsInRow(data.texels), words = gl.RGBA_INTEGER;
+    const gl = this.gl, rows = rowsOf(data.count, 1), words = gl.RGBA_INTEGER;
+    const wide = splatsInRow(data.texels) * data.texels, high = rowsOf(data.count, data.texels);
     const layer = {header, count: data.count, texels: data.texels, drawn: 0};
     layer.tables = texture(gl, gl.R32F, 256, 4, gl.RED, gl.FLOAT, data.tables);
     layer.places = texture(gl, gl.RGBA32UI, ROW, rows, words, gl.UNSIGNED_INT, data.places);
     layer.sizes = texture(gl, gl.R32UI, ROW, rows, gl.RED_INTEGER, gl.UNSIGNED_INT, data.sizes);
-    layer.codes = texture(gl, gl.RGBA32UI, inRow * data.texels, rowsOf(data.count, data.texels), words, gl.UNSIGNED_INT, data.colours);
+    layer.codes = texture(gl, gl.RGBA32UI, wide, high, words, gl.UNSIGNED_INT, data.colours);
     layer.shown = this.surface(ROW, rows, gl.NEAREST);
     layer.ids = gl.createBuffer();
     layer.array = gl.createVertexArray();
@@ -175,8 +178,8 @@ class Painter {
     gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, bytes);
     gl.deleteFramebuffer(frame);
     gl.deleteTexture(made);
-    const rows = new Uint8ClampedArray(bytes.length);
-    for (let y = 0; y < height; y++) rows.set(bytes.subarray(4 * width * (height - 1 - y), 4 * width * (height - y)), 4 * width * y);
+    const rows = new Uint8ClampedArray(bytes.length), row = 4 * width;
+    for (let y = 0; y < height; y++) rows.set(bytes.subarray(row * (height - 1 - y), row * (height - y)), row * y);
     return rows;
   }
 }

@@ -5,7 +5,7 @@ const REST = 200, SLOW = 40, QUICK = 20; // ms without a change until the full p
 class Viewer {
   constructor(info, layers, painter, canvas) {
     Object.assign(this, {info, layers, painter, canvas, stage: canvas.parentElement, up: info.up, radius: info.radius});
-    Object.assign(this, {mode: "splats", share: 1, quality: 1, background: info.background, at: -1, drawn: 0, ms: null});
+    Object.assign(this, {mode: "splats", share: 1, quality: 1, background: info.background, at: -1, ms: null});
     this.camera = cameraOf(info.start);
     this.pivot = info.pivot;
     for (const layer of layers) layer.sorter = new Sorter(layer.positions, layer.header.near, (order, first) => {
@@ -62,7 +62,8 @@ class Viewer {
   }
 
   widen(degrees) {
-    const [fx, fy, , , width, height] = this.camera.lens, focal = Math.min(width, height) / 2 / Math.tan(degrees * Math.PI / 360);
+    const [fx, fy, , , width, height] = this.camera.lens;
+    const focal = Math.min(width, height) / 2 / Math.tan(degrees * Math.PI / 360);
     this.move({...this.camera, lens: [focal, focal * fy / fx, ...this.camera.lens.slice(2)]});
   }
 
@@ -85,9 +86,9 @@ class Viewer {
     if (this.controls.fly(passed / 1000) || this.flight) this.change();
     const resting = performance.now() - this.changed > REST;
     if (!resting && passed < 2000) this.adapt(passed);
-    if (this.dirty || (resting && !this.rested)) this.draw(resting);
-    if (!this.scheduled && !this.settled) this.scheduled = requestAnimationFrame(later => this.tick(later));
-    if (this.settled) this.time = undefined;
+    if (this.dirty || (resting && !this.whole)) this.draw(resting);
+    if (this.whole && !this.flight && !this.controls.pressed.size) this.time = undefined; // a new order draws again
+    else this.scheduled ??= requestAnimationFrame(later => this.tick(later));
   }
 
   advance(time) {
@@ -109,7 +110,7 @@ class Viewer {
 
   // The number of a layer's splats that are drawn: a whole number of its parts, the most important first.
   first({header, count}, share) {
-    return Math.min(count, header.levels.find(level => level >= share * header.count) ?? count);
+    return Math.min(count, header.levels[Math.max(1, Math.round(share * header.levels.length)) - 1]);
   }
 
   draw(resting) {
@@ -119,25 +120,27 @@ class Viewer {
     const wide = Math.max(1, Math.round(width * ratio)), high = Math.max(1, Math.round(height * ratio));
     const along = this.stage.clientWidth >= this.stage.clientHeight, parts = this.layers.length;
     const [whole, tall] = along ? [wide * parts, high] : [wide, high * parts];
-    if (this.canvas.width !== whole || this.canvas.height !== tall) Object.assign(this.canvas, {width: whole, height: tall});
+    if (this.canvas.width !== whole) this.canvas.width = whole;
+    if (this.canvas.height !== tall) this.canvas.height = tall;
     const exact = this.at >= 0, native = exact ? this.camera.lens[0] : this.info.focal;
-    const frame = framed(this.camera, Math.max(1, Math.round(wide * scale)), Math.max(1, Math.round(high * scale)), exact, native);
-    this.drawn = 0;
+    const [across, down] = [wide, high].map(side => Math.max(1, Math.round(side * scale)));
+    const frame = framed(this.camera, across, down, exact, native);
+    let drawn = 0;
     this.layers.forEach((layer, i) => {
       layer.sorter.ask([...axis(this.camera, 2), frame.translation[2]], this.first(layer, share));
       this.painter.blend(layer, frame, {mode: this.mode, first: layer.first, dot: Math.max(1, 1.5 * ratio * scale)});
-      this.painter.show(along ? [i * wide, 0, wide, high] : [0, (parts - 1 - i) * high, wide, high], this.background);
-      this.drawn += layer.drawn;
+      const corner = along ? [i * wide, 0] : [0, (parts - 1 - i) * high];
+      this.painter.show([...corner, wide, high], this.background);
+      drawn += layer.drawn;
     });
     this.dirty = false;
-    const sorted = this.layers.every(layer => layer.sorter.current);
-    this.rested = resting && sorted;
-    this.settled = this.rested && !this.flight && !this.controls.pressed.size;
-    this.panel.statistics(this.drawn, this.ms, scale);
-    if (this.settled) this.settle();
+    this.whole = resting;
+    this.panel.statistics(drawn, this.ms, scale);
+    if (resting && !this.flight && this.layers.every(layer => layer.sorter.current)) this.settle();
   }
 
   settle() {
+    this.panel.field(this.camera.lens);
     const text = `#${written(this.camera)}`;
     if (text !== location.hash) {
       this.hash = text;
@@ -148,8 +151,9 @@ class Viewer {
 
   // Turn about what is seen at a place of the stage: the nearest splat that covers it.
   focus(x, y) {
-    const {width, height} = this.pane(), frame = framed(this.camera, width, height, false), [fx, fy, cx, cy] = frame.intrinsics;
-    const [layer] = this.layers, rows = [0, 1, 2].map(i => axis(this.camera, i)), [u, v] = [x % width, y % height];
+    const {width, height} = this.pane(), [u, v] = [x % width, y % height], [layer] = this.layers;
+    const frame = framed(this.camera, width, height, false), rows = [0, 1, 2].map(i => axis(this.camera, i));
+    const [fx, fy, cx, cy] = frame.intrinsics;
     let nearest = Infinity;
     for (let i = 0; i < layer.count; i++) {
       const point = [layer.points[4 * i], layer.points[4 * i + 1], layer.points[4 * i + 2]];
@@ -188,9 +192,9 @@ async function open() {
   for (const [i, header] of info.models.entries()) {
     const script = find(`model${i}`), buffer = await inflated(script.textContent.trim());
     script.remove(); // its text is no longer needed
-    const data = unpacked(header, buffer, painter.most), layer = painter.layer(header, data);
+    const data = unpacked(header, buffer, painter.most), points = new Float32Array(data.places.buffer);
     const opacities = Float32Array.from(data.sizes, word => data.tables[256 + (word >>> 24)]);
-    layers.push(Object.assign(layer, {positions: data.positions, points: new Float32Array(data.places.buffer), opacities, first: 0}));
+    layers.push({...painter.layer(header, data), positions: data.positions, points, opacities, first: 0});
   }
   window.viewer = new Viewer(info, layers, painter, canvas);
   find("message").hidden = true;

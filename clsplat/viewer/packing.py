@@ -1,8 +1,9 @@
 """A model as bytes that a page decodes: a header, and planes of one component of all splats each.
 
     tables    [4, 256] float32: scale, opacity, colour of band 0, colour of the other bands; bytes below are indices
-    blocks    [B, 6] float32: least position, then step, of BLOCK splats that follow each other
-    positions [6, N] uint8: low bytes of x, y, z, then high bytes; position = least + step · (low + 256 high)
+    blocks    [B, 6] float32: least t of x, y, z, then step, of BLOCK splats that follow each other
+    positions [6, N] uint8: low bytes of x, y, z, then high bytes; t = least + step · (low + 256 high), and a position
+              is origin + unit · sign(t) (e^|t| - 1): as fine as cameras in the middle see it, near and far
     quats     [N] uint32: index of the largest component in bits 31-30, the others, from x on, 10 bits each
     scales    [3, N], opacity [1, N], colours [3 K, N] uint8: indices; colours by coefficient, then channel
 
@@ -55,8 +56,8 @@ def pack(model: Model, limit: int | None = None) -> Packed:
     limit: the number of splats, the most important ones; None: all.
     """
     model = _drawn(model.baked())
-    order = _order(model, limit)
-    model = model[order]
+    model = model[_order(model, limit)]
+    frame = _frame(model.means.astype(np.float64))
     count = len(model)
     logs = model.log_scales.astype(np.float64)
     logs = np.maximum(logs, logs.max(axis=1, keepdims=True) - FLATTEST)
@@ -64,7 +65,7 @@ def pack(model: Model, limit: int | None = None) -> Packed:
     scales, opacity, base = (_table(values) for values in (logs, model.opacities, model.sh_base))
     rest = _even_table(float(np.abs(sh).max(initial=0.0)))
     tables = np.stack([np.exp(scales), opacity, base, rest]).astype("<f4")
-    blocks, positions = _positions(model.means.astype(np.float64))
+    blocks, positions = _positions(_logarithmic(model.means, *frame))
     codes = [_codes(scales, logs), _codes(opacity, model.opacities[:, None]), _codes(base, model.sh_base)]
     planes = [tables, blocks, positions, _quaternions(model.quats), *(code.T for code in codes), _codes(rest, sh).T]
     header = {
@@ -73,6 +74,8 @@ def pack(model: Model, limit: int | None = None) -> Packed:
         "near": model.rendering.near,
         "variance": model.rendering.screen_variance,
         "compensate": model.rendering.compensate,
+        "origin": frame[0].tolist(),
+        "unit": frame[1],
         "levels": [count * (level + 1) // LEVELS for level in range(LEVELS)],
     }
     data = b"".join(np.ascontiguousarray(plane).tobytes() for plane in planes)
@@ -90,20 +93,34 @@ def _order(model: Model, limit: int | None) -> NDArray[np.intp]:
     """Indices by falling importance in LEVELS parts, and along a curve in each."""
     areas = np.sort(model.log_scales.astype(np.float64), axis=1)[:, 1:].sum(axis=1)
     ranked = np.argsort(-(areas + np.log(model.opacities.astype(np.float64))), kind="stable")[:limit]
-    curve = _curve(model.means.astype(np.float64))
+    curve = _curve(_logarithmic(model.means, *_frame(model.means.astype(np.float64))))
     borders = [len(ranked) * level // LEVELS for level in range(LEVELS + 1)]
     parts = [ranked[begin:end] for begin, end in itertools.pairwise(borders)]
     return np.concatenate([part[np.argsort(curve[part], kind="stable")] for part in parts])
 
 
+def _frame(means: Floats) -> tuple[Floats, float]:
+    """The middle of points, [3], and their median distance from it along an axis, as single precision holds them."""
+    if not len(means):
+        return np.zeros(3), 1.0
+    origin = np.median(means, axis=0).astype(np.float32).astype(np.float64)
+    return origin, float(np.float32(np.median(np.abs(means - origin)))) or 1.0
+
+
+def _logarithmic(means: NDArray[np.floating], origin: Floats, unit: float) -> Floats:
+    """The coordinates that are stored in steps, [N, 3]."""
+    offsets = (means.astype(np.float64) - origin) / unit
+    return np.asarray(np.sign(offsets) * np.log1p(np.abs(offsets)))
+
+
 def _curve(points: Floats) -> NDArray[np.int64]:
-    """Places on a Z-order curve; far points are drawn near, so that they do not coarsen the middle."""
-    if not len(points):
-        return np.empty(0, np.int64)
-    offsets = points - np.median(points, axis=0)
-    offsets /= 2 * np.median(np.abs(offsets)) or 1.0
-    cells = ((offsets / (1 + np.abs(offsets)) + 1) * 2 ** (BITS - 1)).astype(np.int64).clip(0, 2**BITS - 1)
+    """Places on a Z-order curve."""
     place = np.zeros(len(points), np.int64)
+    if not len(points):
+        return place
+    low = points.min(axis=0)
+    extent = np.maximum(points.max(axis=0) - low, 1e-9)
+    cells = ((points - low) / extent * (2**BITS - 1)).astype(np.int64)
     for bit in range(BITS):
         for axis in range(3):
             place |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
@@ -111,7 +128,7 @@ def _curve(points: Floats) -> NDArray[np.int64]:
 
 
 def _positions(means: Floats) -> tuple[NDArray[np.float32], Bytes]:
-    """Least position and step of each block, [B, 6], and the bytes of whole steps, [6, N]."""
+    """Least coordinate and step of each block, [B, 6], and the bytes of whole steps, [6, N]."""
     starts = np.arange(0, len(means), BLOCK)
     least = np.minimum.reduceat(means, starts) if len(means) else np.empty((0, 3))
     most = np.maximum.reduceat(means, starts) if len(means) else np.empty((0, 3))

@@ -2,8 +2,13 @@
 
 const find = name => document.getElementById(name);
 const press = (group, key, value) => {
-  for (const button of find(group).querySelectorAll("button")) button.setAttribute("aria-pressed", button.dataset[key] === value);
+  for (const button of find(group).querySelectorAll("button")) {
+    button.setAttribute("aria-pressed", button.dataset[key] === value);
+  }
 };
+const choices = (group, key, action) => find(group).addEventListener("click", ({target}) => {
+  if (target.dataset[key]) action(target.dataset[key]);
+});
 const thousands = number => number.toLocaleString("en");
 
 class Panel {
@@ -13,12 +18,18 @@ class Panel {
       help: () => this.help(), settings: () => this.toggle(), screenshot: () => viewer.screenshot(),
       fullscreen: () => this.fullscreen(), reset: () => viewer.reset(), show: () => this.hide(),
     })) find(name).addEventListener("click", action);
-    find("modes").addEventListener("click", ({target}) => target.dataset.mode && this.mode(target.dataset.mode));
-    find("styles").addEventListener("click", ({target}) => target.dataset.style && this.style(target.dataset.style));
-    find("backgrounds").addEventListener("click", ({target}) => target.dataset.background && this.background(target.dataset.background));
-    find("share").addEventListener("input", ({target}) => { viewer.share = target.value / 100; this.shares(); viewer.change(); });
+    choices("modes", "mode", mode => this.mode(mode));
+    choices("styles", "style", style => this.style(style));
+    choices("backgrounds", "background", name => this.background(name));
+    find("share").addEventListener("input", ({target}) => {
+      viewer.share = target.value / 100;
+      this.shares();
+      viewer.change();
+    });
     find("field").addEventListener("input", ({target}) => viewer.widen(+target.value));
-    find("keys").addEventListener("click", event => { if (event.target.closest("button") || event.target === find("keys")) find("keys").close(); });
+    find("keys").addEventListener("click", ({target}) => { // the button, or outside of the box
+      if (target.closest("button") || target === find("keys")) find("keys").close();
+    });
     if (!document.fullscreenEnabled) find("fullscreen").hidden = true;
     this.shares();
   }
@@ -64,6 +75,12 @@ class Panel {
     find("shared").textContent = `${Math.round(100 * this.viewer.share)} %`;
   }
 
+  field([fx, fy, , , width, height]) {
+    const angle = Math.atan(Math.min(width / fx, height / fy) / 2) * 360 / Math.PI;
+    find("field").value = angle;
+    find("angle").textContent = `${Math.round(angle)}°`;
+  }
+
   caption(view) {
     find("caption").textContent = view ? view.name : "";
     find("split").textContent = view ? view.split : "";
@@ -74,7 +91,7 @@ class Panel {
   statistics(drawn, ms, scale) {
     const whole = this.viewer.layers.reduce((sum, layer) => sum + layer.header.count, 0);
     const parts = [`${thousands(drawn)} of ${thousands(whole)} splats`];
-    if (ms !== null) parts.push(`${ms < 10 ? ms.toFixed(1) : Math.round(ms)} ms`);
+    if (ms !== null) parts.push(`${ms < 10 ? ms.toFixed(1) : Math.round(ms)} ms a frame`);
     if (scale < 1) parts.push(`${Math.round(100 * scale)} % resolution`);
     find("statistics").textContent = parts.join(" · ");
   }

@@ -12,7 +12,7 @@ class Photographs {
     this.range = this.bar.querySelector("input");
     this.line = this.frame.querySelector("i");
     this.items = views.map((view, i) => this.item(view, i));
-    this.bar.addEventListener("click", ({target}) => target.dataset.comparison && this.compare(target.dataset.comparison));
+    choices("comparison", "comparison", name => this.compare(name));
     this.range.addEventListener("input", () => { this.share = this.range.value / 100; this.place(); });
     this.line.addEventListener("pointerdown", event => this.line.setPointerCapture(event.pointerId));
     this.line.addEventListener("pointermove", event => {
@@ -26,14 +26,15 @@ class Photographs {
   }
 
   item(view, i) {
-    const item = document.createElement("button"), image = document.createElement("img"), name = document.createElement("span");
+    const [item, image, name] = ["button", "img", "span"].map(kind => document.createElement(kind));
     item.className = view.split;
     item.title = `${view.name} (${view.split})${view.photograph ? "" : ", without its photograph"}`;
     image.src = view.thumbnail;
     image.alt = "";
     [image.width, image.height] = [Math.round(64 * view.lens[4] / view.lens[5]), 64];
     image.draggable = false;
-    name.textContent = view.name.split("/").pop();
+    const stem = view.name.split("/").pop().replace(/\.\w+$/, "");
+    name.textContent = stem.length > 8 && image.width < 80 ? `…${stem.slice(-5)}` : stem;
     item.append(image, name);
     item.addEventListener("click", () => this.choose(i));
     this.strip.append(item);
@@ -77,8 +78,8 @@ class Photographs {
 
   compare(comparison) {
     this.comparison = comparison;
-    for (const button of this.bar.querySelectorAll("button")) button.setAttribute("aria-pressed", button.dataset.comparison === comparison);
-    this.range.hidden = comparison !== "slider" && comparison !== "fade";
+    press("comparison", "comparison", comparison);
+    this.range.hidden = comparison !== "fade";
     clearInterval(this.timer);
     this.lit = true;
     if (comparison === "blink") this.timer = setInterval(() => { this.lit = !this.lit; this.place(); }, BLINK);
@@ -92,8 +93,10 @@ class Photographs {
   // Lay the photograph exactly over the area that its camera sees.
   place() {
     if (this.frame.hidden || this.chosen < 0) return;
-    const {width, height} = this.viewer.pane(), {lens} = this.views[this.chosen], {enlarged, left, top} = fitted(lens, width, height);
-    Object.assign(this.frame.style, {left: `${left}px`, top: `${top}px`, width: `${lens[4] * enlarged}px`, height: `${lens[5] * enlarged}px`});
+    const {width, height} = this.viewer.pane(), {lens} = this.views[this.chosen];
+    const {enlarged, left, top} = fitted(lens, width, height);
+    const box = {left, top, width: lens[4] * enlarged, height: lens[5] * enlarged};
+    for (const [name, length] of Object.entries(box)) this.frame.style[name] = `${length}px`;
     const shown = this.comparison !== "off" && this.image.hasAttribute("src");
     const slides = this.comparison === "slider";
     this.image.hidden = !shown || (this.comparison === "blink" && !this.lit);

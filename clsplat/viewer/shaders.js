@@ -2,6 +2,7 @@
 
 const HEAD = `#version 300 es
 precision highp float; precision highp int; precision highp sampler2D; precision highp usampler2D;
+#define SHELL 1.2             // radius of an ellipsoid in standard deviations
 uniform sampler2D tables;  // [4, 256]: scale, opacity, colour of band 0, colour of the other bands
 uniform usampler2D places; // position and quaternion of a splat
 float entry(int table, uint code) { return texelFetch(tables, ivec2(int(code), table), 0).x; }
@@ -59,7 +60,8 @@ in vec2 corner;
 out vec2 p;                  // in standard deviations, or in radii of a point
 flat out vec4 shade;
 vec3 ramp(float t) {         // from violet over green to yellow
-  return t < .5 ? mix(vec3(.27, .05, .40), vec3(.13, .57, .55), 2. * t) : mix(vec3(.13, .57, .55), vec3(.99, .91, .15), 2. * t - 1.);
+  vec3 middle = vec3(.13, .57, .55);
+  return t < .5 ? mix(vec3(.27, .05, .40), middle, 2. * t) : mix(middle, vec3(.99, .91, .15), 2. * t - 1.);
 }
 void main() {
   gl_Position = vec4(0, 0, 2, 1);
@@ -96,11 +98,12 @@ void main() {
   float a = xx + variance, c = yy + variance, half_gap = .5 * (a - c);
   float large = .5 * (a + c) + sqrt(half_gap * half_gap + xy * xy), angle = .5 * atan(2. * xy, a - c);
   vec2 along = vec2(cos(angle), sin(angle));
-  float reach = mode == 2 ? 1.7 : sqrt(2. * log(255. * opacity));
-  vec2 offset = reach * (corner.x * sqrt(large) * along + corner.y * sqrt(determinant / large) * vec2(-along.y, along.x));
+  float reach = mode == 2 ? SHELL : sqrt(2. * log(255. * opacity));
+  vec2 across = vec2(-along.y, along.x), radii = sqrt(vec2(large, determinant / large));
+  vec2 offset = reach * (corner.x * radii.x * along + corner.y * radii.y * across);
   p = corner * reach;
   if (mode == 1) { p = corner; offset = corner * dot_radius; }
-  if (mode == 2 && opacity < .1) return;
+  if (mode == 2 && (opacity < .2 || reach * radii.x > .3 * max(size.x, size.y))) return;  // what would hide the rest
   vec2 at = intrinsics.xy * m.xy / m.z + intrinsics.zw + offset;
   gl_Position = vec4(at.x / size.x * 2. - 1., 1. - at.y / size.y * 2., 0, 1);
   shade = vec4(mode == 3 ? ramp(opacity) : texelFetch(colours, spot(i), 0).rgb, opacity);
@@ -108,6 +111,7 @@ void main() {
 
 const SPLAT_FRAGMENT = `#version 300 es
 precision highp float; precision highp int;
+#define SHELL 1.2
 uniform int mode;
 in vec2 p;
 flat in vec4 shade;
@@ -116,7 +120,7 @@ void main() {
   float square = dot(p, p);
   if (mode == 1) { if (square > 1.) discard; pixel = vec4(shade.rgb, 1); return; }
   if (mode == 2) {
-    float depth = 1. - square / (1.7 * 1.7);
+    float depth = 1. - square / (SHELL * SHELL);
     if (depth < 0.) discard;
     pixel = vec4(shade.rgb * (.45 + .55 * sqrt(depth)), 1);
     return;

@@ -5,6 +5,7 @@ import os
 import select
 import shutil
 import subprocess
+import sys
 import time
 from base64 import b64decode
 from pathlib import Path
@@ -18,6 +19,12 @@ SWITCHES = (
     *("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--hide-scrollbars"),
 )
 
+START = """import os, sys  # the browser reads from 3 and writes to 4
+read, write = (os.dup(os.dup(os.dup(int(number)))) for number in sys.argv[1:3])
+os.dup2(read, 3)
+os.dup2(write, 4)
+os.execv(sys.argv[3], sys.argv[3:])"""
+
 
 class Browser:
     """One page in a browser of its own; `requests` are the addresses that it has asked for."""
@@ -26,9 +33,9 @@ class Browser:
         read, self._to = os.pipe()
         self._from, write = os.pipe()
         arguments = [*SWITCHES, f"--user-data-dir={folder}", f"--window-size={width},{height}", "about:blank"]
-        shell = ["sh", "-c", f'exec "$@" 3<&{read} 4>&{write}', "sh", str(CHROMIUM), *arguments]
+        start = [sys.executable, "-ISc", START, str(read), str(write), str(CHROMIUM), *arguments]
         quiet = subprocess.DEVNULL
-        self._process = subprocess.Popen(shell, pass_fds=(read, write), stdin=quiet, stdout=quiet, stderr=quiet)
+        self._process = subprocess.Popen(start, pass_fds=(read, write), stdin=quiet, stdout=quiet, stderr=quiet)
         os.close(read)
         os.close(write)
         self._number, self._bytes, self.requests, self.errors = 0, b"", [], []
@@ -37,10 +44,13 @@ class Browser:
         self._session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
         for domain in ("Page", "Runtime", "Network", "Log"):
             self.call(f"{domain}.enable")
-        size = {"width": width, "height": height, "deviceScaleFactor": scale, "mobile": touch}
-        self.call("Emulation.setDeviceMetricsOverride", **size)
+        self._screen = {"deviceScaleFactor": scale, "mobile": touch}
+        self.resize(width, height)
         if touch:
             self.call("Emulation.setTouchEmulationEnabled", enabled=True, maxTouchPoints=2)
+
+    def resize(self, width: int, height: int) -> None:
+        self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, **self._screen)
 
     def __enter__(self) -> "Browser":
         return self
@@ -98,12 +108,17 @@ class Browser:
         self.call("Page.navigate", url=file.resolve().as_uri() + part)
         self.rest()
 
-    def rest(self, seconds: float = 60) -> None:
+    def rest(self) -> None:
         """Wait until the page shows its full picture."""
+        self.wait(READY)
+
+    def wait(self, expression: str, seconds: float = 60) -> Any:
+        """Wait until an expression is true; return its value."""
         end = time.monotonic() + seconds
-        while not self.run(READY):
-            assert time.monotonic() < end, f"the page does not come to rest: {self.errors}"
-            time.sleep(0.05)
+        while not (value := self.run(expression)):
+            assert time.monotonic() < end, f"in vain: {expression}; errors of the page: {self.errors}"
+            time.sleep(0.03)
+        return value
 
     def key(self, key: str, kinds: tuple[str, ...] = ("keyDown", "keyUp"), modifiers: int = 0) -> None:
         for kind in kinds:
@@ -113,8 +128,9 @@ class Browser:
         self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button=button, clickCount=1, **more)
 
     def drag(self, start: tuple[float, float], end: tuple[float, float], button: str = "left") -> None:
-        self.mouse("mousePressed", *start, button, buttons=1)
-        self.mouse("mouseMoved", *end, button, buttons=1)
+        held = {"left": 1, "right": 2}[button]
+        self.mouse("mousePressed", *start, button, buttons=held)
+        self.mouse("mouseMoved", *end, button, buttons=held)
         self.mouse("mouseReleased", *end, button)
 
     def touch(self, *steps: list[tuple[float, float]]) -> None:
