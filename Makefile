@@ -14,7 +14,7 @@ test: $(VENV)/tested-with
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(MAKE) docs
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile
 
 torture: $(VENV)/tested-with
 	$(BIN)/python -m tests.torture --write

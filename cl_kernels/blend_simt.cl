@@ -60,7 +60,8 @@ void blend_forward(
         }
         barrier(CLK_LOCAL_MEM_FENCE);
         const uint length = end - begin < BATCH ? end - begin : BATCH;
-        for (uint j = 0; j < length && p.t > 0.0f; j++) {
+        /* one condition alone: with two, a compiler took 40 registers instead of 32, and a quarter fewer groups fit */
+        for (uint j = p.t > 0.0f ? 0 : BATCH; j < length; j = p.t > 0.0f ? j + 1 : BATCH) {
             float4 quads[QUADS];
             for (uint k = 0; k < QUADS; k++)
                 quads[k] = batch[j][k];

@@ -38,8 +38,10 @@ typedef int VI;
 
 #if LANES == 1
 #define ANY(mask) (mask)
+#define first_lane(v) (v)
 #else
 #define ANY(mask) any(mask)
+#define first_lane(v) ((v).s0)
 #endif
 
 #define ROUND_MAGIC 12582912.0f  // 1.5 * 2^23: after adding it, the low mantissa bits are the nearest integer

@@ -4,40 +4,9 @@
  * pair has one writer. */
 #include "tiles.h"
 
-/* Emit the pairs up to `end` of a rectangle too large for a mask: its tiles are tested again, as in count_tiles.  That
- * is another program, whose compiler may round differently at a tile's edge: a tile that is not touched is listed where
- * too few would follow otherwise.  Blending finds no pixel there. */
-static inline void emit_large(__global const float *splat, uint pair, const uint end, const uint i,
-                              __global uint *pair_tile, __global uint *pair_splat, const uint tiles_x,
-                              const uint row_begin, const uint row_end)
-{
-    VF fields[RECORD];
-    for (uint k = 0; k < RECORD; k++)
-        fields[k] = (VF)(splat[k]);
-    const footprint_t f = footprint_of(fields, (VI)(-1), tiles_x, row_begin, row_end);
-    float first_x[LANES], first_y[LANES], columns[LANES], rows[LANES];
-    VSTORE(f.first_x, first_x);
-    VSTORE(f.first_y, first_y);
-    VSTORE(f.columns, columns);
-    VSTORE(f.rows, rows);
-    uint left = (uint)rows[0] * (uint)columns[0];  // tiles of the rectangle from here on
-    for (uint row = 0; row < (uint)rows[0]; row++)
-        for (uint column = 0; column < (uint)columns[0] && pair < end; column++, left--)
-            if (left <= end - pair || ANY(touches_tile(&f, (float)column, (float)row))) {
-                pair_tile[pair] = ((uint)first_y[0] + row) * tiles_x + (uint)first_x[0] + column;
-                pair_splat[pair] = i;
-                pair++;
-            }
-    for (; pair < end; pair++) {  // a rectangle with fewer tiles than were counted: any tile of the band
-        pair_tile[pair] = row_begin * tiles_x;
-        pair_splat[pair] = i;
-    }
-}
-
-/* One item = one place of `order`.  No local memory. */
+/* The pairs of splats with a mask; large.cl adds those of large ones.  One item = one place of `order`. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void emit_pairs(
-    __global const float *restrict splats,      // [N,RECORD]
     __global const uint *restrict tile_box,     // [S] see tiles.h
     __global const uint *restrict tile_mask,    // [S] see tiles.h
     __global const uint *restrict order,        // [N] Gaussian at each place
@@ -46,8 +15,6 @@ void emit_pairs(
     __global uint *restrict pair_splat,         // [P]
     __global uint *restrict first_pair,         // [N] first pair of each Gaussian
     const uint tiles_x,
-    const uint row_begin,                       // of the band of tiles
-    const uint row_end,
     const uint count)
 {
     const uint place = get_global_id(0);
@@ -55,15 +22,10 @@ void emit_pairs(
         return;
     const uint i = order[place];
     uint pair = pair_offset[place];
-    const uint end = pair_offset[place + 1];
     first_pair[i] = pair;
-    if (pair == end)
-        return;
     const uint box = tile_box[i], width = box >> (2 * BOX_BITS), low = (1u << BOX_BITS) - 1;
-    if (width == 0) {
-        emit_large(splats + (size_t)i * RECORD, pair, end, i, pair_tile, pair_splat, tiles_x, row_begin, row_end);
+    if (width == BOX_LARGE)
         return;
-    }
     uint tile = (box >> BOX_BITS & low) * tiles_x + (box & low), column = 0;
     for (uint mask = tile_mask[i]; mask != 0; mask >>= 1) {
         if (mask & 1u) {

@@ -50,7 +50,7 @@ void project_forward(
     __constant camera_t *restrict camera,            // [1]
     __global float *restrict splats,                 // [N,RECORD] see splat.h
     __global uint *restrict depth_key,               // [S] bits of z, all ones when culled
-    __global uint *restrict tile_count,              // [S] tiles touched; 0 when culled
+    __global uint *restrict tile_count,              // [S] tiles touched; 0 when culled or large (large.cl)
     __global uint *restrict tile_box,                // [S] see tiles.h
     __global uint *restrict tile_mask,               // [S] see tiles.h
     __global float *restrict radius,                 // [S] px, 3 sigma; 0 when outside the tile grid

@@ -2,13 +2,14 @@
  *
  * The rectangle of tiles around a splat's extent holds `columns` x `rows` tiles; each is tested exactly.  Pairs are
  * made from two numbers: `tile_box`, the rectangle's corner and width, and `tile_mask`, one bit per touched tile,
- * where the rectangle has no more than 32 tiles; larger ones have width 0 in `tile_box` and are tested again. */
+ * where the rectangle has no more than 32 tiles; larger ones have width BOX_LARGE and are left to large.cl. */
 #ifndef CLSPLAT_TILES_H
 #define CLSPLAT_TILES_H
 #include "splat.h"
 
 #define BOX_BITS 12        // of a tile's column and row: images up to 4096 tiles wide
 #define BOX_TILES_MAX 32   // bits of a mask
+#define BOX_LARGE 33       // width in `tile_box` of a rectangle with more tiles
 
 typedef struct {
     VF x, y;               // mean, px
@@ -57,7 +58,7 @@ static inline footprint_t footprint_of(const VF *splat, const VI visible, const 
 /* Whether the ellipse reaches a pixel centre of the tile in `column` and `row` of the rectangle: the smallest -power
  * over the centres' rectangle lies at the mean or on the edges next to it, where it is a parabola (the test of
  * StopThePop, Radl et al. 2024). */
-static inline VI touches_tile(const footprint_t *f, const float column, const float row)
+static inline VI touches_tile(const footprint_t *f, const VF column, const VF row)
 {
     const VF x0 = (f->first_x + column) * TILE + 0.5f - f->x, x1 = x0 + (TILE - 1.0f);
     const VF y0 = (f->first_y + row) * TILE + 0.5f - f->y, y1 = y0 + (TILE - 1.0f);
@@ -69,25 +70,28 @@ static inline VI touches_tile(const footprint_t *f, const float column, const fl
     return (smaller(on_vertical, on_horizontal) <= f->reach) & (column < f->columns) & (row < f->rows);
 }
 
-/* How many tiles each splat touches; their mask. */
+static inline VI is_large(const footprint_t *f) { return f->columns * f->rows > (float)BOX_TILES_MAX; }
+
+/* How many tiles each splat touches; their mask.  None where the rectangle has more tiles than a mask has bits. */
 static inline VI count_tiles(const footprint_t *f, VI *mask)
 {
     const VI columns = to_VI(f->columns), zero = (VI)(0);
+    const VF rows = is_large(f) ? (VF)(0.0f) : f->rows;
     VI count = zero;
     *mask = zero;
-    for (int row = 0; ANY((float)row < f->rows); row++)
-        for (int column = 0; ANY((column < columns) & ((float)row < f->rows)); column++) {
-            const VI touched = touches_tile(f, (float)column, (float)row);
+    for (int row = 0; ANY((float)row < rows); row++)
+        for (int column = 0; ANY((column < columns) & ((float)row < rows)); column++) {
+            const VI touched = touches_tile(f, (VF)((float)column), (VF)((float)row)) & ((float)row < rows);
             count += touched ? (VI)(1) : zero;
             *mask |= touched ? (VI)(1) << ((row * columns + column) & 31) : zero;
         }
     return count;
 }
 
-/* Corner and width of the rectangles; width 0 where they have more tiles than a mask has bits. */
+/* Corner and width of the rectangles. */
 static inline VI box_of(const footprint_t *f)
 {
-    const VI width = f->columns * f->rows <= (float)BOX_TILES_MAX ? to_VI(f->columns) : (VI)(0);
+    const VI width = is_large(f) ? (VI)(BOX_LARGE) : to_VI(f->columns);
     return to_VI(f->first_x) | to_VI(f->first_y) << BOX_BITS | width << (2 * BOX_BITS);
 }
 

@@ -4,6 +4,7 @@ A message is one line: the fault, its place, what was expected, the remedy.  The
 traceback (`--debug` shows one).
 """
 
+import errno
 import reprlib
 import traceback
 from itertools import islice
@@ -68,7 +69,7 @@ class MemoryLimitError(ClsplatError):
 
 
 class NumericError(ClsplatError):
-    """Training has produced values that are not finite, or no Gaussians."""
+    """Values of training or of a picture are not finite, or no Gaussians are left."""
 
     exit_code = 6
 
@@ -90,9 +91,11 @@ def as_clsplat_error(error: BaseException) -> ClsplatError:
     if isinstance(error, ClsplatError):
         return error
     if isinstance(error, KeyboardInterrupt):
-        return Interrupted("stopped at once; `clsplat resume` continues from the last checkpoint")
+        return Interrupted("stopped at once; to go on, run it again, with --resume where a checkpoint was saved")
     if isinstance(error, MemoryError):
         return MemoryLimitError("out of memory; use fewer Gaussians, smaller images (scene.downscale) or fewer of them")
+    if isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG:  # that of an output is an OutputError already
+        return DataError(f"{error.filename}: cannot be read ({error.strerror}); expected the path of a file or folder")
     if isinstance(error, OSError) and error.strerror:
         place = error.filename or "the output"
         return OutputError(f"{place}: {error.strerror}; check the file, its folder and their space")

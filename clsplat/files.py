@@ -95,6 +95,14 @@ def _is_left(name: str) -> bool:
     return process == os.getpid() or not is_alive(process)  # an earlier container had the same number
 
 
+def is_there(path: Path) -> bool:
+    """Return whether something lies where a file or folder is to be made.  Raises OutputError where nothing can."""
+    try:
+        return path.exists() or path.is_symlink()
+    except OSError as error:
+        raise unwritable(path, error) from error
+
+
 def unwritable(path: Path, error: OSError) -> OutputError:
     """Return the OutputError for a file that cannot be written."""
     return OutputError(f"{path}: cannot be written ({error.strerror or error}); check the folder and its space")

@@ -6,11 +6,26 @@ from typing import Annotated
 
 from pydantic import AfterValidator
 
-RESERVED = {  # what a run or a matrix writes itself
-    *("pipeline.yaml", "metrics.json", "metrics.jsonl", "status.json", "log.txt", "prepared.json", "inputs.json"),
-    *("checksums.json", "run.lock", "checkpoints", "undistorted", "prepared", "compare.html"),
-    *("cameras.json", "view_colours.json"),
-}
+# What a run or a matrix writes itself, in its folder.
+PIPELINE = "pipeline.yaml"
+METRICS = "metrics.json"
+RECORDS = "metrics.jsonl"
+STATUS = "status.json"
+LOG_FILE = "log.txt"
+NOTE = "prepared.json"
+INPUTS = "inputs.json"
+CHECKSUMS = "checksums.json"
+LOCK = "run.lock"
+CHECKPOINTS = "checkpoints"
+UNDISTORTED = "undistorted"
+PREPARED = "prepared"
+COMPARISON = "compare.html"
+RESERVED = frozenset(
+    {
+        *(PIPELINE, METRICS, RECORDS, STATUS, LOG_FILE, NOTE, INPUTS, CHECKSUMS, LOCK),
+        *(CHECKPOINTS, UNDISTORTED, PREPARED, COMPARISON, "cameras.json", "view_colours.json"),
+    }
+)
 LONGEST = 200  # bytes; systems allow 255, and temporary names are longer
 _DEVICES = re.compile(r"(con|prn|aux|nul|conin\$|conout\$|(com|lpt)[0-9¹²³])(\..*)?", re.IGNORECASE)  # of Windows
 

@@ -19,6 +19,7 @@ from pathlib import Path
 from types import ModuleType
 
 from clsplat.errors import PLUGIN_MARK, ClsplatError, ConfigError
+from clsplat.reading import read_file
 from clsplat.settings import Settings, fault_of, rebuild
 
 GROUP = "clsplat.plugins"
@@ -113,7 +114,7 @@ def digest_of(*modules: Path) -> str:
     seen = set(waiting)
     while waiting:
         file = waiting.pop(0)
-        content = file.read_bytes()
+        content = read_file(file, "a file of a plug-in", ConfigError)
         digest.update(f"{file.name}\n{len(content)}\n".encode() + content)
         named = {file.parent / name for name in _KERNEL_FILE.findall(content.decode("utf-8", "replace"))}
         named |= {file.with_suffix(".cl")} if file in modules else set()
@@ -205,7 +206,7 @@ def _helpers(module: ModuleType, folder: Path) -> list[Path]:
 def _imports(module: ModuleType) -> list[ModuleType]:
     """The modules that the import statements of a module name."""
     names: list[str] = []
-    for node in ast.walk(ast.parse(Path(module.__file__ or "").read_bytes())):
+    for node in ast.walk(ast.parse(read_file(Path(module.__file__ or ""), kind=ConfigError))):
         if isinstance(node, ast.Import):
             names += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):

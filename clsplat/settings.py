@@ -8,7 +8,7 @@ import importlib
 import pkgutil
 import typing
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, GetJsonSchemaHandler
 from pydantic_core import CoreSchema, core_schema
@@ -26,6 +26,8 @@ class Settings(BaseModel):
         frozen=True, extra="forbid", strict=True, allow_inf_nan=False, use_attribute_docstrings=True
     )
     defined: ClassVar[list[type["Settings"]]] = []  # every subclass, in the order of definition
+    output_keys: ClassVar[frozenset[str]] = frozenset()  # the model does not depend on them: they may change on resume
+    training_keys: ClassVar[frozenset[str]] = frozenset()  # they may change on resume; bits then no longer compare
 
     @classmethod
     def __pydantic_init_subclass__(cls, **options: Any) -> None:
@@ -38,6 +40,14 @@ def tag_of(kind: type[Settings]) -> tuple[str, str] | None:
         if tag in kind.model_fields and (names := typing.get_args(kind.model_fields[tag].annotation)):
             return tag, str(names[0])
     return None
+
+
+def resumable(kind: type[Settings], key: str) -> Literal["output", "training"] | None:
+    """Return what a change of a key means when a run goes on; None where it cannot.  Subclasses add to their bases."""
+    bases = [base for base in kind.__mro__ if issubclass(base, Settings)]
+    if any(key in base.output_keys for base in bases):
+        return "output"
+    return "training" if any(key in base.training_keys for base in bases) else None
 
 
 def variants(base: type[Base]) -> dict[str, type[Base]]:

@@ -1,6 +1,5 @@
 """Public data sets by name: download, continue an interrupted download, verify, unpack."""
 
-import hashlib
 import shutil
 import tarfile
 import time
@@ -14,7 +13,8 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import BinaryIO
 
 from clsplat.errors import ConfigError, DataError, OutputError
-from clsplat.files import unwritable
+from clsplat.files import is_there, unwritable
+from clsplat.reading import sha256
 
 CHUNK = 1 << 20  # bytes
 MAX_TRIES = 5  # of one download
@@ -58,7 +58,7 @@ def fetch(source: Source, out: Path, report: Report = print) -> Path:
     An interrupted download stays beside `out` as `….part`; the next call continues it.
     Raises DataError when the download fails, the checksum differs or a file lies outside of the archive's folder.
     """
-    if out.exists():
+    if is_there(out):
         report(f"{out} is there already: nothing to do")
         return out
     archive = out.with_name(f"{out.name}.{PurePosixPath(source.url.split('?')[0]).name}")
@@ -89,8 +89,7 @@ def _download(source: Source, archive: Path, report: Report) -> None:
                     f"{part.stat().st_size if part.exists() else 0} bytes"
                 ) from error
             time.sleep(PAUSE)
-    with part.open("rb") as file:
-        seen = hashlib.file_digest(file, "sha256").hexdigest()
+    seen = sha256(part)
     if source.sha256 and seen != source.sha256:
         part.unlink()
         raise DataError(f"{source.url}: sha256 is {seen}, expected {source.sha256}; the file was removed: try again")

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from clsplat.errors import DataError
 from clsplat.files import unwritable
-from clsplat.scene import read_file
+from clsplat.reading import read_file, sha256
 
 RECORD = ".made.jsonl"
 
@@ -65,13 +65,13 @@ def hash_of(*parts: object) -> str:
     """Return a hash of values; a path stands for the content of its file.  Raises DataError."""
     state = hashlib.sha256()
     for part in parts:
-        content = hashlib.sha256(read_file(part)).hexdigest() if isinstance(part, Path) else repr(part)
+        content = sha256(part) if isinstance(part, Path) else repr(part)
         state.update(f"{content}\n".encode())
     return state.hexdigest()
 
 
 def _lines(path: Path) -> list[str]:
     try:
-        return path.read_text(encoding="utf-8", errors="replace").splitlines()
-    except OSError:
+        return read_file(path).decode(errors="replace").splitlines()
+    except DataError:
         return []

@@ -20,10 +20,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from clsplat.errors import ConfigError, DataError
+from clsplat.errors import DataError
 from clsplat.files import write_text
 from clsplat.progress import Count
 from data_tools.gather import MIN_PHOTOGRAPHS, gather, link, list_photographs
+from data_tools.pycolmap_import import require_pycolmap
 from data_tools.vocabulary import alike
 
 LOG = logging.getLogger("clsplat")
@@ -224,16 +225,6 @@ def _without_features(pycolmap: ModuleType, database: Path) -> list[str]:
 def _remove(database: Path) -> None:
     for file in database.parent.glob(f"{database.name}*"):  # with its journal
         file.unlink()
-
-
-def require_pycolmap() -> ModuleType:
-    """Return pycolmap.  Raises ConfigError where it is not installed."""
-    try:
-        import pycolmap
-    except ImportError as error:
-        raise ConfigError("placing photographs needs pycolmap: pip install 'clsplat[photos]'") from error
-    pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR.value)
-    return pycolmap
 
 
 @contextmanager

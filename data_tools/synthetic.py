@@ -22,6 +22,8 @@ from numpy.typing import NDArray
 from rich.progress import track
 
 from clsplat.errors import DataError, OutputError
+from clsplat.files import is_there
+from clsplat.reading import read_file
 from clsplat.scene.points import write_points_ply
 from clsplat.scene.scene import PointCloud
 from data_tools.shapes import Array, Shape, align, disc, dot, rotate, spiral, unit
@@ -151,9 +153,9 @@ def write_dataset(out: Path, options: Options, workers: int | None = None) -> st
     `workers` processes share the views (default: one per core; 1 = this process).  Raises DataError when `out` exists
     and is another data set, OutputError when it cannot be written.
     """
-    if is_complete(out, options):
-        return f"{out} is complete already: nothing to do"
-    if out.exists() or out.is_symlink():
+    if is_there(out):
+        if is_complete(out, options):
+            return f"{out} is complete already: nothing to do"
         raise DataError(f"{out} exists and is not this data set; remove it or choose another folder")
     partial_out = out.parent / f".{out.name}.{os.getpid()}.partial"
     try:
@@ -170,7 +172,7 @@ def write_dataset(out: Path, options: Options, workers: int | None = None) -> st
 def is_complete(out: Path, options: Options) -> bool:
     """Return whether `out` holds every file of the data set with these options."""
     manifest = out / "synthetic.json"
-    if not manifest.is_file() or manifest.read_text("utf-8", errors="replace") != options.manifest():
+    if not manifest.exists() or read_file(manifest).decode(errors="replace") != options.manifest():
         return False
     files = [f"{split}/r_{i:03}.png" for split, poses in options.poses().items() for i in range(len(poses))]
     files += ["transforms_train.json", "transforms_test.json", "points3d.ply"]

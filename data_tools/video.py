@@ -1,6 +1,5 @@
 """Sharp, evenly spaced frames of a video."""
 
-import hashlib
 import json
 import logging
 from collections.abc import Iterator
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 from clsplat.errors import DataError
 from clsplat.files import write_text
 from clsplat.progress import Count
+from clsplat.reading import read_json, sha256
 from clsplat.scene.images import is_image, write_image
 
 LOG = logging.getLogger("clsplat")
@@ -30,7 +30,7 @@ def write_frames(video: Path, out: Path, frames: int = 100, long_side: int | Non
     of the same video and settings stay unchanged.
     Raises DataError when the video cannot be decoded, and when `out` holds other images, which would mix with frames.
     """
-    settings: dict[str, Any] = {"video": _content(video), "frames": frames, "long_side": long_side}
+    settings: dict[str, Any] = {"video": sha256(video, "a video"), "frames": frames, "long_side": long_side}
     chosen = _begun(out, settings)
     if chosen is None:
         LOG.info("%s: looking for sharp frames", video)
@@ -51,8 +51,8 @@ def write_frames(video: Path, out: Path, frames: int = 100, long_side: int | Non
 def _begun(out: Path, settings: dict[str, Any]) -> list[int] | None:
     """The frames that a call with the same settings has chosen, or None.  Raises DataError for a folder of others."""
     record: dict[str, Any] = {}
-    with suppress(OSError, ValueError, TypeError):
-        record = dict(json.loads((out / RECORD).read_text("utf-8")))
+    with suppress(DataError, ValueError, TypeError):
+        record = dict(read_json(out / RECORD))
     chosen: list[int] | None = record.pop("chosen", None)
     if record and record != settings:
         changed = [name for name, value in settings.items() if record.get(name) != value]
@@ -72,17 +72,6 @@ def _begun(out: Path, settings: dict[str, Any]) -> list[int] | None:
 
 def _file(out: Path, number: int) -> Path:
     return out / f"frame_{number:05d}.png"
-
-
-def _content(video: Path) -> str:
-    """SHA-256 of a file.  Raises DataError when it cannot be read."""
-    if not video.is_file():
-        raise DataError(f"{video}: no such file; expected a video")
-    try:
-        with video.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as error:
-        raise DataError(f"{video}: cannot be read ({error.strerror}); check its permissions") from error
 
 
 def sharpest(sharpness: list[float], parts: int) -> list[int]:

@@ -7,7 +7,7 @@ that clsplat would choose), each with the wide schedule at 16 and 8 lanes and wi
 import os
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from clsplat import plugins
+from clsplat.conformance import quick
 from clsplat.opencl.device import Array, Device
 from clsplat.opencl.discovery import DeviceInfo, choose
 from clsplat.opencl.program import Program
@@ -47,6 +48,14 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         items[:] = [same[len(same) // 2] for same in cases.values()]
 
 
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport() -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Make what a test has printed UTF-8: processes that share the tests send it to each other."""
+    report = yield
+    report.sections = [(name, text.encode("utf-8", "replace").decode()) for name, text in report.sections]
+    return report
+
+
 @pytest.fixture(
     scope="session", params=[(name, tuning) for name in NAMES for tuning in TUNINGS], ids=lambda p: "-".join(p)
 )
@@ -57,6 +66,19 @@ def device(request: pytest.FixtureRequest) -> Device:
     opened = Device(choose(name or None), schedule)
     opened.tuning["LANES"] = lanes
     return opened
+
+
+@pytest.fixture(scope="session")
+def info() -> DeviceInfo:
+    """The first device that is tested."""
+    return choose(NAMES[0] or None)
+
+
+@pytest.fixture
+def empty_cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """A folder where no device is known to compute rightly."""
+    monkeypatch.setattr(quick, "cache_folder", lambda: tmp_path)
+    return tmp_path
 
 
 @pytest.fixture

@@ -3,8 +3,6 @@
 import gc
 import inspect
 import json
-import os
-import signal
 import textwrap
 from dataclasses import replace
 from pathlib import Path
@@ -16,12 +14,11 @@ import clsplat
 from clsplat.api.renderer import Renderer
 from clsplat.conformance.scenes import random_case
 from clsplat.density.statistics import SplatStats
-from clsplat.errors import ClsplatError, ConfigError, DataError, NumericError
+from clsplat.errors import ConfigError, DataError
 from clsplat.losses.base import Comparison, HostLoss
 from clsplat.losses.image import L1, Dssim
 from clsplat.render.camera import upload_camera
 from clsplat.render.workspace import Workspace
-from clsplat.stages.schedule import RaiseSh
 from clsplat.training import trainer as steps
 from clsplat.views.photographs import Photographs
 
@@ -91,7 +88,7 @@ def test_a_trainer_goes_on_from_its_checkpoint_or_that_of_the_command(tiny_scene
     part.run(20)  # a density edit is due
     assert part.checkpoint() == tmp_path / "a" / "checkpoints" / "step_000020.npz"
     part.close()
-    again = clsplat.Trainer(tiny_scene, "smoke", out=tmp_path / "a", resume=True)
+    again = clsplat.Trainer(tiny_scene, "smoke", out=tmp_path / "a", start="resume")
     assert repr(again).endswith("step 20)")
     again.run()
     assert equal(again.model, whole.model)
@@ -103,7 +100,7 @@ def test_a_trainer_goes_on_from_its_checkpoint_or_that_of_the_command(tiny_scene
     for file in (tmp_path / "a" / "checkpoints").iterdir():
         if file.name > "step_000040.npz":
             file.unlink()
-    after_command = clsplat.Trainer(tiny_scene, "smoke", out=tmp_path / "a", resume=True)
+    after_command = clsplat.Trainer(tiny_scene, "smoke", out=tmp_path / "a", start="resume")
     after_command.run()
     assert equal(after_command.model, whole.model)
 
@@ -161,115 +158,6 @@ def test_a_loss_that_is_added_acts_from_the_next_step_on(tiny_scene):
     assert images[1] < images[0] - 0.02
 
 
-def test_after_an_error_inside_of_a_step_the_trainer_says_that_it_has_ended(tiny_scene):
-    trainer = clsplat.Trainer(tiny_scene, "smoke")
-    trainer.add_loss(lambda image, photograph: (0.0, np.zeros(3)))
-    with pytest.raises(ValueError, match=r"the loss returned a derivative of \(3,\); expected \(40, 40, 3\)"):
-        trainer.run(2)
-    with pytest.raises(ClsplatError, match="ended with an error; make another, with resume=True"):
-        trainer.run(2)
-
-
-@pytest.mark.parametrize("broken", ["value", "derivative"])
-def test_a_loss_that_is_not_finite_stops_the_step_before_the_model_changes(tiny_scene, broken):
-    def odd(image, photograph):
-        factor = np.float32(np.nan)
-        return (factor, image) if broken == "value" else (0.0, image * factor)
-
-    trainer = clsplat.Trainer(tiny_scene, "smoke")
-    before = trainer.model
-    trainer.add_loss(odd)
-    with pytest.raises(NumericError, match=r"^step 1: the loss 'odd' returned values that are not finite; expected"):
-        trainer.run(3)
-    assert equal(trainer.model, before)
-
-
-def test_the_error_of_a_step_is_in_the_status_and_is_raised_as_it_is(tiny_scene, tmp_path):
-    def broken(image, photograph):
-        raise RuntimeError("no such teapot")
-
-    trainer = clsplat.Trainer(tiny_scene, "smoke", out=tmp_path / "run")
-    trainer.run(2)
-    trainer.add_loss(broken)
-    with pytest.raises(RuntimeError, match="no such teapot"):
-        trainer.run()
-    status = clsplat.status(tmp_path / "run")
-    assert (status["state"], status["step"], status["checkpoint"]) == ("failed", 2, "step_000002.npz")
-    assert "no such teapot" in status["message"]
-
-
-def test_an_edit_that_fails_between_two_trainings_leaves_nothing_to_save(tiny_scene, tmp_path, monkeypatch):
-    two = tmp_path / "two.yaml"
-    part = "  - optimize: {steps: 2, losses: [l1]}\n"
-    two.write_text(f"name: two\nstages:\n  - init\n{part}  - raise_sh\n{part}")
-
-    def fail(stage, run):
-        raise RuntimeError("no such teapot")
-
-    monkeypatch.setattr(RaiseSh, "run", fail)
-    trainer = clsplat.Trainer(tiny_scene, two, out=tmp_path / "run")
-    with pytest.raises(RuntimeError, match="no such teapot"):
-        trainer.run()
-    with pytest.raises(ClsplatError, match="step 2 is half done"):
-        trainer.checkpoint()
-    assert not (tmp_path / "run" / "checkpoints").exists()
-
-
-def test_an_error_before_the_first_step_is_in_the_status(tiny_scene, tmp_path, monkeypatch):
-    def fail(*arguments):
-        raise RuntimeError("no such teapot")
-
-    monkeypatch.setattr("clsplat.api.trainer._run_until_training", fail)
-    with pytest.raises(RuntimeError, match="no such teapot"):
-        clsplat.Trainer(tiny_scene, "smoke", out=tmp_path / "run")
-    assert clsplat.status(tmp_path / "run")["state"] == "failed"
-
-
-def test_an_interrupt_lets_the_step_finish_and_training_go_on(tiny_scene):
-    trainer, whole = (clsplat.Trainer(tiny_scene, "smoke", set={"optimize.steps": 20}) for _ in range(2))
-    pressed = []
-
-    def press(image, photograph):
-        if not pressed:
-            pressed.append(os.kill(os.getpid(), signal.SIGINT))
-        return 0.0, np.zeros_like(image)
-
-    whole.add_loss(lambda image, photograph: (0.0, np.zeros_like(image)))
-    trainer.add_loss(press)
-    with pytest.raises(KeyboardInterrupt):
-        trainer.run()
-    assert repr(trainer).endswith("step 1)")
-    assert trainer.run().step == whole.run().step == 20
-    assert equal(trainer.model, whole.model)
-
-
-def test_a_second_interrupt_leaves_the_step_before_or_nothing_to_save(tiny_scene, tmp_path, monkeypatch):
-    few = {"optimize.steps": 4}
-    for place, step in ((Photographs, 2), (SplatStats, 3)):
-        out = tmp_path / place.__name__
-        trainer = clsplat.Trainer(tiny_scene, "smoke", set=few, out=out)
-        trainer.run(2)
-        with monkeypatch.context() as patch:
-            patch.setattr(place, "get" if place is Photographs else "add", _interrupt)
-            with pytest.raises(KeyboardInterrupt):
-                trainer.step()
-        if place is SplatStats:  # in the middle of the update
-            with pytest.raises(ClsplatError, match="step 3 is half done, so it is not saved"):
-                trainer.checkpoint()
-            assert not (out / "checkpoints").exists()
-            continue
-        assert trainer.checkpoint().name == f"step_00000{step}.npz"
-        again = clsplat.Trainer(tiny_scene, "smoke", set=few, out=out, resume=True)
-        again.run()
-        whole = clsplat.Trainer(tiny_scene, "smoke", set=few)
-        whole.run()
-        assert equal(again.model, whole.model)
-
-
-def _interrupt(*arguments):
-    raise KeyboardInterrupt
-
-
 @pytest.mark.parametrize(
     ("arguments", "error", "message"),
     [
@@ -277,13 +165,13 @@ def _interrupt(*arguments):
         (("photos",), ConfigError, "prepares its scene; use clsplat.run"),
         (("smoke", {"optimize.step": 3}), ConfigError, "did you mean"),
         (("smoke", {"optimize.steps": np.zeros(2)}), ConfigError, "set: Object of type ndarray"),
-        (("smoke", {}, None, True), ConfigError, "resume: expected the folder of a run as `out`"),
+        (("smoke", {}, None, "resume"), ConfigError, "resume: expected the folder of a run as `out`"),
     ],
 )
 def test_what_cannot_be_trained_is_a_sentence(tiny_scene, arguments, error, message):
-    pipeline, settings, out, resume = (*arguments, *({}, None, False)[len(arguments) - 1 :])
+    pipeline, settings, out, start = (*arguments, *({}, None, "new")[len(arguments) - 1 :])
     with pytest.raises(error) as raised:
-        clsplat.Trainer(tiny_scene, pipeline, set=settings, out=out, resume=resume)
+        clsplat.Trainer(tiny_scene, pipeline, set=settings, out=out, start=start)
     assert message in str(raised.value)
     assert "\n" not in str(raised.value)
 
@@ -326,7 +214,7 @@ def test_what_is_left_on_disk_is_a_run(tiny_scene, tmp_path):
     trainer.step()
     assert trainer.checkpoint().is_file()
     assert (clsplat.status(tmp_path / "run")["state"], clsplat.status(tmp_path / "run")["step"]) == ("done", 10)
-    again = clsplat.Trainer(tiny_scene, "smoke", set=settings, out=tmp_path / "run", resume=True)
+    again = clsplat.Trainer(tiny_scene, "smoke", set=settings, out=tmp_path / "run", start="resume")
     assert clsplat.status(tmp_path / "run")["state"] == "done"
     assert again.run() is None
     assert Path(clsplat.check(tmp_path / "run" / "pipeline.yaml")["path"]).name == "pipeline.yaml"

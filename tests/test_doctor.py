@@ -1,6 +1,5 @@
-"""`clsplat doctor` and the check that a run does once: verdicts, reports, and runtimes that die."""
+"""`clsplat doctor`: verdicts, reports, and runtimes that die."""
 
-import io
 import json
 import sys
 from dataclasses import replace
@@ -9,47 +8,24 @@ from types import SimpleNamespace
 import pytest
 
 from clsplat import cli
-from clsplat.conformance import doctor, quick, reference, supervision
-from clsplat.conformance import worker as worker_process
+from clsplat.conformance import doctor, reference, supervision
 from clsplat.conformance.check import Check
-from clsplat.conformance.checks import BY_NAME, ESSENTIAL, KERNELS, SPEED, whole
+from clsplat.conformance.checks import BY_NAME, KERNELS, SPEED, whole
 from clsplat.conformance.comparison import Figure
 from clsplat.conformance.doctor import examine
 from clsplat.conformance.page import report_page
-from clsplat.conformance.report import Report
+from clsplat.conformance.report import DeviceReport
 from clsplat.conformance.supervision import Result, supervised
 from clsplat.conformance.verdict import judge
-from clsplat.errors import DeviceError, MemoryLimitError
+from clsplat.errors import MemoryLimitError
 from clsplat.opencl import runtimes
 from clsplat.opencl.device import Device
-from clsplat.opencl.discovery import choose, resolve_schedule, tuning_of
-from tests.conftest import NAMES
+from clsplat.opencl.discovery import resolve_schedule
 from tests.html_page import Page
+from tests.proving import worker
 
 WRONG = Figure("blend_backward", "gradients of conics, 17 Gaussians", 3e-2, 2e-4)
 RIGHT = Figure("blend_backward", "gradients of colours", 1e-6, 2e-4)
-SCRIPT = """
-import json, os, sys
-print("noise of a runtime", file=sys.stderr)
-for name in sys.argv[4:]:
-    print(json.dumps({"begin": name}), flush=True)
-    if name == "dies":
-        os.abort()
-    if name == "leaves":
-        sys.exit(3)
-    print(json.dumps({"figure": {"kernel": "blend_backward", "what": "x", "value": %s, "bound": 0.1, "counts": False}}))
-    print(json.dumps({"end": name, "seconds": 0.1}), flush=True)
-"""
-
-
-@pytest.fixture(scope="module")
-def info():
-    return choose(NAMES[0] or None)
-
-
-def worker(monkeypatch, value: str = "1e-6") -> None:
-    """Put a script in the place of the process that opens the device."""
-    monkeypatch.setattr(supervision, "WORKER", ("-c", SCRIPT % value))
 
 
 def checks(*names: str) -> list[Check]:
@@ -147,8 +123,8 @@ def test_wide_is_tried_where_somebody_would_use_it(monkeypatch, info, empty_cach
     assert list(examine(device).schedules) == schedules
 
 
-def report_of(info, **schedules: list[Result]) -> Report:
-    return Report(info, "wide", schedules, seconds=2.0)
+def report_of(info, **schedules: list[Result]) -> DeviceReport:
+    return DeviceReport(info, "wide", schedules, seconds=2.0)
 
 
 def test_a_report_is_json_whatever_the_values_are(info):
@@ -171,76 +147,6 @@ def test_the_page_shows_every_figure_and_the_head_of_a_build_log(info):
         assert text in page
 
 
-@pytest.fixture
-def empty_cache(monkeypatch, tmp_path):
-    monkeypatch.setattr(quick, "cache_folder", lambda: tmp_path)
-    return tmp_path
-
-
-OTHER_BUILDS = {
-    "_hash_of_kernels": lambda: "other sources",
-    "BUILD_OPTIONS": ("-cl-std=CL1.2", "-cl-mad-enable"),
-    "tuning_of": lambda info, schedule: {**tuning_of(info, schedule), "DIGIT_BITS": 6},
-}
-
-
-def like(device, **changes):
-    return SimpleNamespace(
-        **{"info": device.info, "schedule": device.schedule, "tuning": device.tuning, "text": "x", **changes}
-    )
-
-
-@pytest.mark.parametrize(
-    ("team", "sort", "bitonic"),
-    [(1, "auto", False), (1, "radix", False), (1, "bitonic", True), (64, "auto", True), (64, "radix", False)],
-)
-def test_bitonic_is_checked_where_the_run_can_choose_it(monkeypatch, info, empty_cache, team, sort, bitonic):
-    found = []
-    monkeypatch.setattr(quick, "supervised", lambda info, schedule, checks, seconds: found.extend(checks) or [])
-    device = like(Device(info), tuning={"TEAM": team})
-    quick.ensure_correct(device, sort)
-    assert any("sort_tiles" in check.kernels for check in found) == bitonic
-    found.clear()
-    quick.ensure_correct(device, sort)
-    assert not found
-    quick.ensure_correct(device, "bitonic")
-    assert bool(found) != bitonic
-
-
-def test_no_check_of_every_run_needs_bitonic():
-    assert not {"count_pairs", "fill_tiles", "sort_tiles"} & {name for check in ESSENTIAL for name in check.kernels}
-
-
-def test_doctor_forgets_a_device_that_it_finds_wrong(monkeypatch, info, empty_cache):
-    worker(monkeypatch)
-    device = Device(info)
-    quick.ensure_correct(device)
-    worker(monkeypatch, "0.3")
-    examine(device)
-    with pytest.raises(DeviceError, match="computes wrongly"):
-        quick.ensure_correct(device)
-
-
-def test_want_of_memory_is_no_fault_of_the_device(monkeypatch, info, empty_cache):
-    def check(device, rng):
-        raise MemoryLimitError("no buffer")
-        yield
-
-    out = io.StringIO()
-    worker_process._run(out, Check("rendering", (), check), None)
-    worker_process._print(out, end="rendering", seconds=0.1)
-    monkeypatch.setattr(supervision, "WORKER", ("-c", f"print({out.getvalue()!r}, end='')"))
-    with pytest.raises(MemoryLimitError, match=r"no buffer.*other programs"):
-        quick.ensure_correct(Device(info))
-
-
-def test_the_log_says_that_a_check_begins(monkeypatch, info, empty_cache, caplog):
-    worker(monkeypatch)
-    with caplog.at_level("INFO", "clsplat"):
-        quick.ensure_correct(Device(info))
-    assert f"checking {info.name}, once for each driver" in caplog.text
-
-
 @pytest.mark.parametrize(("largest", "wrong"), [(2**30 + 4, 0), (2**28, 1), (0, 1)])
 def test_a_buffer_that_the_device_promises_and_refuses_is_wrong(monkeypatch, largest, wrong):
     def buffer(device, size):
@@ -253,51 +159,6 @@ def test_a_buffer_that_the_device_promises_and_refuses_is_wrong(monkeypatch, lar
     device = SimpleNamespace(info=SimpleNamespace(memory=2**33, allocation=2**30 + 4))
     found = [one.text for one in whole.memory(device, None) if isinstance(one, Figure) and not one.holds]
     assert len(found) == wrong
-
-
-def test_a_device_that_computes_wrongly_is_refused(monkeypatch, info, empty_cache):
-    worker(monkeypatch, "0.3")
-    device = Device(info)
-    for _ in range(2):  # it is not remembered
-        with pytest.raises(DeviceError, match=r"computes wrongly: blend_backward differs by 0.3 .*clsplat doctor"):
-            quick.ensure_correct(device)
-
-
-def test_a_device_that_computes_rightly_is_checked_once(monkeypatch, info, empty_cache):
-    worker(monkeypatch)
-    device = Device(info)
-    before = device.allocated, device.peak, dict(device.tuning)
-    quick.ensure_correct(device)
-    monkeypatch.setattr(supervision, "WORKER", ("-c", "raise SystemExit(1)"))
-    quick.ensure_correct(device)
-    assert (device.allocated, device.peak, device.tuning) == before
-    for change in ({"driver": "another"}, {"platform": "another"}, {"name": "another"}):
-        with pytest.raises(DeviceError, match="cannot be trusted"):
-            quick.ensure_correct(like(device, info=replace(info, **change)))
-    other = Device(info, "simt" if device.schedule == "wide" else "wide")
-    with pytest.raises(DeviceError, match="cannot be trusted"):
-        quick.ensure_correct(other)
-    for name, changed in OTHER_BUILDS.items():
-        with monkeypatch.context() as patched:
-            patched.setattr(quick, name, changed)
-            with pytest.raises(DeviceError, match="cannot be trusted"):
-                quick.ensure_correct(device)
-
-
-def test_where_the_cache_cannot_be_written_a_device_is_checked_each_time(monkeypatch, info, tmp_path):
-    blocked = tmp_path / "a file"
-    blocked.write_text("")
-    monkeypatch.setattr(quick, "cache_folder", lambda: blocked)
-    started = []
-    monkeypatch.setattr(quick, "supervised", lambda *arguments: started.append(arguments) or [])
-    for _ in range(2):
-        quick.ensure_correct(Device(info))
-    assert len(started) == 2
-
-
-def test_the_two_second_form_holds(info, empty_cache):
-    quick.ensure_correct(Device(info))
-    assert len(list((empty_cache / "conformance").iterdir())) == 1
 
 
 @pytest.mark.parametrize(("value", "code"), [("1e-6", 0), ("0.3", 4)])

@@ -151,3 +151,33 @@ def test_all_codes_of_the_errors_are_tested_here():
         codes.add(kind.exit_code)
         kinds += kind.__subclasses__()
     assert codes == {code for code, *_ in CAUSES.values()} | {1, 2, 5, 130}
+
+
+LONG = "x" * 300  # longer than a name of any file system
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code"),
+    [
+        (["run", "smoke", "--scene", LONG], 3),
+        (["run", LONG, "--scene", "scene"], 2),
+        (["resume", LONG], 3),
+        (["check", LONG], 3),
+        (["inspect", LONG], 3),
+        (["evaluate", f"{LONG}.ply", "--scene", "scene"], 3),
+        (["compare", LONG], 3),
+        (["--plugin", f"{LONG}.py", "devices"], 3),
+        (["run", "smoke", "--scene", "scene", "--out", LONG], 7),
+        (["pipelines", "smoke", "--copy", LONG], 7),
+        (["data", "synthetic", LONG], 7),
+    ],
+    ids=lambda value: " ".join(value).replace(LONG, "LONG") if isinstance(value, list) else value,
+)
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows says that there is no such file")
+def test_a_name_that_is_too_long_is_that_of_a_missing_file(arguments, code, monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    found, errors = in_this_process(monkeypatch, capsys, *arguments)
+    assert found == code, errors
+    assert len(errors.splitlines()) == 1
+    assert "File name too long" in errors or code == 2
+    assert list(tmp_path.iterdir()) == []

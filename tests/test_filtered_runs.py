@@ -14,7 +14,7 @@ from clsplat.gaussians.ply import read_ply, write_ply
 from clsplat.gaussians.tables import PARAMETERS
 from clsplat.metrics.views import render_view
 from clsplat.pipeline.loading import load
-from clsplat.runs import folders, opening, runner
+from clsplat.runs import opening, runner
 from clsplat.runs.model_file import ModelFile
 from clsplat.training.run import Progress, Run
 from clsplat.views.order import Code
@@ -66,7 +66,6 @@ def test_the_filter_follows_and_then_stays(finished):
 def test_the_same_bits_and_the_same_after_an_interruption(finished, tiny_scene, pipeline, tmp_path):
     """Stopped just after a density edit and just after a refresh."""
     checked = load(pipeline, [f"scene.path='{tiny_scene}'", *MIP, *LEVELS])
-    folders.make_run_folder(tmp_path, resume=False)
     stops = [21, 33]
     while stops:
         run = opening.open_run(checked, tmp_path, None)
@@ -76,7 +75,7 @@ def test_the_same_bits_and_the_same_after_an_interruption(finished, tiny_scene, 
             run.interrupted = progress.step >= stop_at
 
         with pytest.raises(Interrupted):
-            runner.execute(checked, run, True, stop)
+            runner.execute(checked, run, "resume", stop)
     train(tiny_scene, tmp_path, *MIP, *LEVELS, pipeline=pipeline, resume=True)
     assert digest(tmp_path) == digest(finished.out)
     assert (tmp_path / RAW).read_bytes() == (finished.out / RAW).read_bytes()

@@ -118,7 +118,9 @@ def test_commands_call_the_api_alone_and_print(path):
 
 def test_data_tools_use_the_scene_layer_only():
     for path in sorted((PACKAGE.parent / "data_tools").glob("*.py")):
-        allowed = {"scene", "errors", "files", "progress"} | ({"cli", "prepare"} if path.stem == "__main__" else set())
+        allowed = {"scene", "errors", "files", "progress", "reading", "signals"} | (
+            {"cli", "prepare"} if path.stem == "__main__" else set()
+        )
         for line, module in imports(path):
             if module.startswith("clsplat"):
                 assert unit(module) in allowed, f"{path}:{line}: {module}"

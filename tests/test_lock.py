@@ -1,22 +1,19 @@
 """One process at a time in a run folder; the lock is never left behind."""
 
-import errno
 import json
 import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 from pathlib import Path
 
 import pytest
 
 import clsplat
-from clsplat import files
-from clsplat.errors import ConfigError, OutputError
-from clsplat.files import atomic
-from clsplat.runs import experiment, folders, lock
+from clsplat.errors import OutputError
+from clsplat.names import LOCK
+from clsplat.runs import folders, lock
 from clsplat.training import status as writing
 from tests.test_cli import clsplat as command
 
@@ -53,10 +50,10 @@ def test_a_lock_ends_with_its_process_however_it_ends(tmp_path):
         process = holder(tmp_path)
         process.send_signal(number)
         process.wait()
-        assert (tmp_path / lock.FILE).exists()
+        assert (tmp_path / LOCK).exists()
         with lock.held(tmp_path):
-            assert json.loads((tmp_path / lock.FILE).read_text())["process"] == os.getpid()
-        assert not (tmp_path / lock.FILE).exists()
+            assert json.loads((tmp_path / LOCK).read_text())["process"] == os.getpid()
+        assert not (tmp_path / LOCK).exists()
 
 
 def test_children_do_not_hold_the_lock_of_a_killed_parent(tmp_path):
@@ -88,8 +85,18 @@ def test_one_process_holds_a_folder_once_by_whatever_name(tmp_path):
         pass
 
 
-def test_of_many_that_want_a_folder_at_once_one_has_it(tmp_path):
-    code = (
+NO_LOCKS = """
+import errno, fcntl, logging
+def no_locks(*arguments):
+    raise OSError(errno.ENOLCK, "no locks")
+fcntl.flock = no_locks
+logging.disable()
+"""
+
+
+@pytest.mark.parametrize("before", ["", NO_LOCKS], ids=["with locks", "without"])
+def test_of_many_that_want_a_folder_at_once_one_has_it(before, tmp_path):
+    code = before + (
         "import sys, time; from pathlib import Path; from clsplat.runs import lock\n"
         "from clsplat.errors import OutputError\n"
         "folder, n = Path(sys.argv[1]), 0\n"
@@ -113,47 +120,12 @@ def test_a_file_that_its_holder_has_just_removed_is_not_the_lock(tmp_path, monke
     def late(file):
         calls.append(file)
         if len(calls) == 1:
-            (tmp_path / lock.FILE).unlink()
+            (tmp_path / LOCK).unlink()
         return system_lock(file)
 
     monkeypatch.setattr(lock, "_system_lock", late)
     with lock.held(tmp_path):
-        assert json.loads((tmp_path / lock.FILE).read_text())["process"] == os.getpid()
-
-
-@pytest.fixture
-def without_locks(monkeypatch):
-    def no_locks(file):
-        raise OSError(errno.ENOLCK, "No locks available")
-
-    monkeypatch.setattr(lock, "_system_lock", no_locks)
-
-
-def owned_by(folder: Path, **values) -> None:
-    owner = {"process": os.getpid(), "host": lock.socket.gethostname(), "time": time.time(), "command": "clsplat run"}
-    (folder / lock.FILE).write_text(json.dumps({**owner, **values}))
-
-
-def test_a_file_system_without_locks_is_warned_of_and_a_dead_owner_replaced(tmp_path, without_locks, caplog):
-    caplog.set_level("INFO", "clsplat")
-    ended = subprocess.Popen([sys.executable, "-c", ""])
-    ended.wait()
-    for values in ({"process": ended.pid}, {}):  # {}: an earlier process with the number of this one
-        owned_by(tmp_path, **values)
-        with lock.held(tmp_path):
-            assert f"taken over from process {values.get('process', os.getpid())}, which has ended" in caplog.text
-            with pytest.raises(OutputError, match="is in use by this process"), lock.held(tmp_path):
-                pass
-        assert not (tmp_path / lock.FILE).exists()
-    assert "its file system knows no locks" in caplog.text
-
-
-@pytest.mark.parametrize("values", [{"process": 1}, {"host": "another"}, {"host": "another", "time": "x"}])
-def test_a_file_system_without_locks_keeps_the_owner_that_may_live(values, tmp_path, without_locks):
-    owned_by(tmp_path, **values)
-    with pytest.raises(OutputError, match=r"if that process has ended, remove .*run.lock"), lock.held(tmp_path):
-        pass
-    assert (tmp_path / lock.FILE).exists()
+        assert json.loads((tmp_path / LOCK).read_text())["process"] == os.getpid()
 
 
 def test_two_runs_in_one_folder(tiny_scene, tmp_path):
@@ -177,7 +149,7 @@ def test_two_runs_in_one_folder(tiny_scene, tmp_path):
     finally:
         process.send_signal(signal.SIGTERM)
         assert process.wait(60) == 130
-    assert not (out / lock.FILE).exists()
+    assert not (out / LOCK).exists()
     steps = [json.loads(line)["step"] for line in (out / "metrics.jsonl").read_text().splitlines()]
     assert steps == sorted(steps)
 
@@ -188,205 +160,35 @@ def test_trainers_hold_their_folder_until_they_end(tiny_scene, tmp_path):
     first.step()
     first.checkpoint()
     with pytest.raises(OutputError, match="is in use by this process; end that run or trainer first"):
-        clsplat.Trainer(tiny_scene, "smoke", set=few, out=tmp_path / "run", resume=True)
+        clsplat.Trainer(tiny_scene, "smoke", set=few, out=tmp_path / "run", start="resume")
     first.close()
     with pytest.raises(clsplat.errors.ClsplatError, match="is closed; make another"):
         first.step()
-    second = clsplat.Trainer(tiny_scene, "smoke", set=few, out=tmp_path / "run", resume=True)
+    second = clsplat.Trainer(tiny_scene, "smoke", set=few, out=tmp_path / "run", start="resume")
     assert second.run().step == 3
     assert second.checkpoint().exists()
-    third = clsplat.Trainer(tiny_scene, "smoke", set=few, out=tmp_path / "run", resume=True)
+    third = clsplat.Trainer(tiny_scene, "smoke", set=few, out=tmp_path / "run", start="resume")
     assert third.run() is None
-    fourth = clsplat.Trainer(tiny_scene, "smoke", set={"optimize.steps": 4}, out=tmp_path / "run", resume=True)
+    fourth = clsplat.Trainer(tiny_scene, "smoke", set={"optimize.steps": 4}, out=tmp_path / "run", start="resume")
     with pytest.raises(OutputError, match="is in use by this process"):
         clsplat.resume(tmp_path / "run")
     del fourth
-    assert not (tmp_path / "run" / lock.FILE).exists()
+    assert not (tmp_path / "run" / LOCK).exists()
 
 
 def test_a_run_that_is_just_starting_in_the_default_folder_is_not_joined(tmp_path):
-    assert folders.free_folder(tmp_path / "splat", None, resume=False) == tmp_path / "splat"
+    assert folders.free_folder(tmp_path / "splat", None, "new") == tmp_path / "splat"
     (tmp_path / "splat").mkdir()
     with lock.held(tmp_path / "splat"):
-        assert folders.free_folder(tmp_path / "splat", None, resume=False) == tmp_path / "splat-2"
-    assert folders.free_folder(tmp_path / "splat", None, resume=False) == tmp_path / "splat"
+        assert folders.free_folder(tmp_path / "splat", None, "new") == tmp_path / "splat-2"
+    assert folders.free_folder(tmp_path / "splat", None, "new") == tmp_path / "splat"
 
 
 def test_a_folder_that_was_left_is_written_to_no_more(tmp_path, monkeypatch):
     monkeypatch.setattr(writing, "BEAT", 0.002)
-    with folders.opened(tmp_path / "run", resume=False) as status:
+    with folders.opened(tmp_path / "run", "new") as status:
         pass
     (tmp_path / "run" / "status.json").write_text("of the next")
     status._thread.join(5)
     assert not status._thread.is_alive()
     assert (tmp_path / "run" / "status.json").read_text() == "of the next"
-
-
-# What killed processes leave
-
-
-def test_temporary_files_of_killed_runs_are_swept_and_nothing_else(tiny_scene, tmp_path):
-    out = tmp_path / "run"
-    left = [
-        f".status.json.{NONE}-3.partial",
-        f"checkpoints/.step_000010.npz.{NONE}-0.partial",
-        f"renders/test/.r_1.png.{NONE}-12.partial",
-    ]
-    mine = [".status.json.77", ".partial", f"x.{NONE}-2.partial", "own/.x.partial"]
-    mine.append(f"cell/.status.json.{NONE}-3.partial")
-    for name in (*left, *mine, "cell/pipeline.yaml", "pipeline.yaml"):
-        (out / name).parent.mkdir(parents=True, exist_ok=True)
-        (out / name).write_text("x")
-    done = command(
-        "run", "smoke", "--scene", tiny_scene, "--out", out, "--resume", "--set", "optimize.steps=2", "--debug"
-    )
-    assert done.stdout.count("which a killed run has left") == len(left)
-    assert [name for name in left if (out / name).exists()] == []
-    assert [name for name in mine if not (out / name).exists()] == []
-
-
-def test_what_a_process_still_writes_is_not_swept(tmp_path):
-    other, old = tmp_path / f".a.{os.getppid()}-0.partial", tmp_path / f".b.{os.getpid()}-99999999.partial"
-    for path in (other, old):
-        path.write_text("x")
-    with atomic(tmp_path / "c") as file:
-        file.write(b"x")
-        folders.make_run_folder(tmp_path, resume=False).close()
-    assert (tmp_path / "c").read_bytes() == b"x"
-    assert other.exists()
-    assert not old.exists(), "left by an earlier process of this number, as in a container"
-
-
-def test_a_process_killed_at_any_write_leaves_what_the_next_one_sweeps(tmp_path):
-    code = (
-        "import os, signal, sys; from pathlib import Path; from clsplat.files import atomic\n"
-        "with atomic(Path(sys.argv[1]) / 'a.txt') as file:\n"
-        "    file.write(b'x'); file.flush(); os.kill(os.getpid(), signal.SIGKILL)"
-    )
-    subprocess.run([sys.executable, "-c", code, str(tmp_path)], check=False)
-    (name,) = [path.name for path in tmp_path.iterdir()]
-    assert files.PARTIAL.fullmatch(name)
-    files.sweep(tmp_path, border="pipeline.yaml")
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_the_folder_is_synced_after_the_rename_and_before_an_older_checkpoint_goes(tmp_path, monkeypatch):
-    calls = []
-    for name in ("fsync", "replace"):
-        real = getattr(os, name)
-        monkeypatch.setattr(os, name, lambda *a, real=real, name=name: (calls.append((name, *a)), real(*a)))
-    with atomic(tmp_path / "a") as file:
-        file.write(b"x")
-        number = file.fileno()
-    assert [call[0] for call in calls] == ["fsync", "replace", "fsync"]
-    assert calls[0][1] == number
-
-
-@pytest.mark.parametrize("number", [errno.EINVAL, errno.ENOTSUP, errno.EACCES])
-def test_a_folder_that_cannot_be_synced_is_no_failure(number, tmp_path, monkeypatch):
-    real = os.open
-    monkeypatch.setattr(
-        os, "open", lambda path, *a, **k: real(path, *a, **k) if Path(path).is_file() else _raise(number)
-    )
-    with atomic(tmp_path / "a") as file:
-        file.write(b"x")
-    assert (tmp_path / "a").read_bytes() == b"x"
-    monkeypatch.delattr(os, "O_DIRECTORY")
-    with atomic(tmp_path / "a") as file:
-        file.write(b"y")
-    assert (tmp_path / "a").read_bytes() == b"y"
-
-
-def _raise(number: int) -> None:
-    raise OSError(number, os.strerror(number))
-
-
-def test_threads_that_write_one_file_do_not_disturb_each_other(tmp_path):
-    faults = []
-
-    def write(letter: bytes) -> None:
-        try:
-            for _ in range(50):
-                with atomic(tmp_path / "a") as file:
-                    file.write(letter * 1000)
-                assert len(set((tmp_path / "a").read_bytes())) == 1
-        except Exception as error:
-            faults.append(error)
-
-    threads = [threading.Thread(target=write, args=(bytes([65 + i]),)) for i in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert faults == []
-
-
-# Runs that are refused
-
-
-def test_a_refused_run_leaves_no_folder(tiny_scene, tmp_path):
-    for name, arguments in {
-        "a/b": ["smoke", "--scene", tmp_path / "nowhere"],
-        "c": ["smoke", "--scene", tiny_scene, "--device", "no such device"],
-        "d": ["smoke", "--scene", tiny_scene, "--set", "evaluate.lpips=nowhere.onnx"],
-    }.items():
-        out = tmp_path / name
-        done = subprocess.run(
-            [sys.executable, "-m", "clsplat", "run", *map(str, arguments), "--out", str(out)],
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        assert done.returncode in (2, 3, 4), done.stderr
-        assert not (tmp_path / name.split("/")[0]).exists(), name
-        out.mkdir(parents=True)
-        again = subprocess.run(done.args, capture_output=True, text=True, check=False)
-        assert again.returncode == done.returncode
-        status = json.loads((out / "status.json").read_text())
-        assert (status["state"], status["exit_code"]) == ("failed", done.returncode)
-        assert f"error: {status['message']}" in again.stderr
-        assert not (out / lock.FILE).exists()
-
-
-def test_a_folder_with_files_of_others_stays(tiny_scene, tmp_path, monkeypatch):
-    def open_run(pipeline, out, *others):
-        (out / "notes.txt").write_text("mine")
-        raise ConfigError("refused")
-
-    monkeypatch.setattr(experiment.opening, "open_run", open_run)
-    with pytest.raises(ConfigError, match="refused"):
-        clsplat.run("smoke", tiny_scene, tmp_path / "run")
-    assert (tmp_path / "run" / "notes.txt").read_text() == "mine"
-    assert json.loads((tmp_path / "run" / "status.json").read_text())["state"] == "failed"
-
-
-# --restart
-
-
-def test_restart_begins_again_and_leaves_the_files_of_others(tiny_scene, tmp_path):
-    out = tmp_path / "run"
-    arguments = ["run", "smoke", "--scene", tiny_scene, "--out", out, "--set", "optimize.steps=20", "init.count=100"]
-    command(*arguments)
-    (out / "notes.txt").write_text("mine")
-    (out / "checkpoints" / "failed_000003.npz").write_text("x")
-    assert "already holds a run; give another folder, --resume or --restart" in command(*arguments, expect=2).stderr
-    assert "give one of them" in command(*arguments, "--resume", "--restart", expect=2).stderr
-    model = (out / "point_cloud.ply").read_bytes()
-    records = (out / "metrics.jsonl").read_text()
-    refused = command(*arguments, "seed=2", "--restart", "--set", "evaluate.lpips=nowhere.onnx", expect=3)
-    assert "nowhere.onnx" in refused.stderr
-    assert (out / "metrics.jsonl").read_text() == records, "a refused restart removes nothing"
-    command(*arguments, "seed=2", "--restart")
-    assert (out / "point_cloud.ply").read_bytes() != model
-    assert (out / "notes.txt").read_text() == "mine"
-    assert sorted(path.name for path in (out / "checkpoints").iterdir()) == ["step_000010.npz", "step_000020.npz"]
-    lines = [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
-    assert len([line for line in lines if line["kind"] == "train"]) == 2
-    for file in (out / "checkpoints").iterdir():
-        file.write_bytes(b"")
-    broken = command("resume", out, expect=7)
-    assert "no checkpoint is whole" in broken.stderr
-    advice = broken.stderr.split("`")[1].split()
-    assert advice[0] == "clsplat"
-    command(*advice[1:])
-    assert clsplat.status(out)["state"] == "done"

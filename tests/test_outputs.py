@@ -1,26 +1,19 @@
-"""A pipeline, also one from the network, writes inside its run folder alone, and what it writes is read back."""
+"""A pipeline, also one from the network, writes inside its run folder alone."""
 
 import json
-import sys
 import typing
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import pytest
 
-from clsplat import cli, names
-from clsplat.errors import ConfigError, OutputError
+from clsplat import names
+from clsplat.errors import ConfigError
 from clsplat.pipeline.file import PipelineFile
 from clsplat.pipeline.loading import load
 from clsplat.pipeline.matrix import Matrix, MatrixFile, load_experiment
-from clsplat.prepare.cache import NOTE
-from clsplat.runs import folders, lock, opening, outputs, runner
-from clsplat.runs.experiment import PAGE, Job
-from clsplat.scene.images import write_image
 from clsplat.settings import TAGS, Settings, VariantName
 from clsplat.stages.base import Stage, path_in_run
-from clsplat.stages.render import image_paths
-from clsplat.training import checkpoint
 from clsplat.training.run import Run
 
 READ = {  # text that is read, or compared, and never the name of something that is written
@@ -156,149 +149,3 @@ def test_a_field_of_a_plugin_may_be_optional_and_is_found():
     assert Animate(video="a/b.mp4").outputs(Path("run")) == [Path("run/a/b.mp4")]
     with pytest.raises(ValueError, match=r"does not end in \.mp4"):
         Animate(video="status.html")
-
-
-# ---- places of a run
-
-
-def opened(scene: Path, out: Path, *changes: str) -> None:
-    outputs.check_places(load("smoke", [f"scene.path={str(scene)!r}", *changes]), out)
-
-
-def test_the_folder_of_the_photographs_and_the_root_are_no_run_folders(tiny_scene, monkeypatch):
-    for out in (tiny_scene, tiny_scene / "train" / ".."):
-        with pytest.raises(ConfigError, match="is the folder of the photographs"):
-            opened(tiny_scene, out)
-    monkeypatch.chdir(tiny_scene)
-    with pytest.raises(ConfigError, match="is the folder of the photographs"):
-        opened(tiny_scene, Path())
-    with pytest.raises(ConfigError, match="is the root of a file system"):
-        opened(tiny_scene, Path(Path.cwd().anchor))
-    opened(tiny_scene, tiny_scene / "runs" / "a")
-    with pytest.raises(ConfigError, match="is the folder of the photographs, or right in it"):
-        outputs.check_places(load("photos", [f"scene.path={str(tiny_scene)!r}"]), tiny_scene / "run")
-
-
-@pytest.mark.parametrize("name", ["renders", "report.html", "point_cloud.ply", "log.txt"])
-def test_a_link_that_leads_outside_is_not_followed(name, tiny_scene, tmp_path):
-    out = tmp_path / "run"
-    out.mkdir()
-    (out / name).symlink_to(tmp_path / "elsewhere")
-    for _ in ("new", "with a run"):
-        with pytest.raises(ConfigError, match=f"{name}: a link leads outside of the run folder"):
-            opened(tiny_scene, out)
-        (out / "pipeline.yaml").touch()
-    (out / name).unlink()
-    (out / name).symlink_to(out / "inside")
-    opened(tiny_scene, out)
-
-
-def test_files_that_a_new_run_did_not_make_are_not_replaced(tiny_scene, tmp_path):
-    (tmp_path / "holiday").mkdir()
-    (tmp_path / "holiday" / "r_1.png").write_text("mine")
-    (tmp_path / "report.html").write_text("mine")
-    with pytest.raises(ConfigError, match=r"report.html: exists, and is not of this run"):
-        opened(tiny_scene, tmp_path)
-    with pytest.raises(ConfigError, match=r"holiday: exists, and is not of this run"):
-        opened(tiny_scene, tmp_path, "render.folder=holiday", "report.file=other.html")
-    for ways in ({}, {"resume": True}, {"restart": True}):
-        with pytest.raises(ConfigError, match="is not of this run"):
-            Job.open("smoke", tiny_scene, tmp_path).run(**ways)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["holiday", "report.html"]
-    (tmp_path / "pipeline.yaml").touch()
-    opened(tiny_scene, tmp_path)
-
-
-UNWRITABLE = {  # --out -> the exit code, and what the sentence says
-    "FILE/run": (7, "cannot be written (Not a directory)"),
-    "FILE": (7, "cannot be written (File exists)"),
-    "x" * 300: (7, "File name too long"),
-    "SCENE": (2, "is the folder of the photographs"),
-    "ROOT": (2, "is the root of a file system"),
-    "not \udcff text": (0, ""),
-}
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(sys.platform == "win32", reason="names and faults of POSIX")
-@pytest.mark.parametrize("out", UNWRITABLE)
-def test_a_run_folder_that_cannot_be_is_one_sentence(out, tiny_scene, tmp_path, monkeypatch, capsys):
-    (tmp_path / "file").write_text("")
-    place = out.replace("FILE", "file").replace("SCENE", str(tiny_scene)).replace("ROOT", "/")
-    monkeypatch.chdir(tmp_path)
-    quick = ["--set", "optimize.steps=2", "optimize.during=[]"]
-    monkeypatch.setattr(sys, "argv", ["clsplat", "run", "smoke", "--scene", str(tiny_scene), "--out", place, *quick])
-    code, words = UNWRITABLE[out]
-    with pytest.raises(SystemExit) as end:
-        cli.main()
-    assert end.value.code == code
-    errors = capsys.readouterr().err.splitlines()
-    assert len(errors) == (code != 0)
-    assert words in "".join(errors)
-    if code == 0:
-        assert (Path(place) / "report.html").is_file()
-
-
-# ---- reading back
-
-
-@pytest.mark.slow
-def test_what_a_run_writes_itself_is_on_the_table_of_reserved_names(finished):
-    pipeline, run = finished
-    chosen = {path for stage in pipeline.stages for path in stage.outputs(run.out)}
-    made = {path.name for path in run.out.iterdir()} - {path.relative_to(run.out).parts[0] for path in chosen}
-    assert {"status.json", "metrics.jsonl", "checksums.json"} <= made
-    fixed = {lock.FILE, NOTE, PAGE, checkpoint.FOLDER, "log.txt", "undistorted"}
-    assert made | fixed <= names.RESERVED
-
-
-def test_views_that_differ_in_their_suffix_have_a_render_each():
-    names = ["a.jpg", "a.png", "b/a.jpg", "c.jpg", "d"]
-    files = [path.as_posix() for path in image_paths(Path("r"), names)]
-    assert files == ["r/a.jpg.png", "r/a.png.png", "r/b/a.png", "r/c.png", "r/d.png"]
-
-
-def truncate(path: Path) -> None:
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-
-
-DAMAGE = {
-    "a render is missing": ("renders/FIRST", Path.unlink),
-    "a render is cut": ("renders/LAST", truncate),
-    "a render is of another size": ("renders/LAST", None),
-    "the report is cut": ("report.html", truncate),
-    "the metrics are cut": ("metrics.json", truncate),
-    "the model is missing": ("point_cloud.ply", Path.unlink),
-}
-
-
-@pytest.fixture(scope="module")
-def finished(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, Run]:
-    out = tmp_path_factory.mktemp("outputs") / "run"
-    checked = load("smoke", [f"scene.path='{tiny_scene}'", "optimize.steps=3", "optimize.during=[]"])
-    folders.make_run_folder(out, False)
-    run = opening.open_run(checked, out, None)
-    runner.execute(checked, run, False, lambda progress: None)
-    return checked, run
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", DAMAGE)
-def test_what_cannot_be_read_back_is_no_success(name, finished):
-    pipeline, run = finished
-    place, damage = DAMAGE[name]
-    renders = sorted((run.out / "renders").rglob("*.png"))
-    file = {"renders/FIRST": renders[0], "renders/LAST": renders[-1]}.get(place, run.out / place)
-    before = file.read_bytes()
-    try:
-        if damage:
-            damage(file)
-        else:
-            import numpy as np
-
-            write_image(file, np.zeros((3, 3, 3), np.uint8))
-        with pytest.raises(OutputError, match=f"{file.name}.*at the end of the run; see .*log.txt"):
-            outputs.check_outputs(pipeline, run)
-    finally:
-        file.write_bytes(before)
-    outputs.check_outputs(pipeline, run)

@@ -8,7 +8,7 @@ from clsplat.density.edit import Edit, Rule
 from clsplat.errors import Interrupted
 from clsplat.gaussians.tables import Gaussians
 from clsplat.pipeline.loading import load
-from clsplat.runs import folders, opening, runner
+from clsplat.runs import opening, runner
 from clsplat.settings import rebuild
 from clsplat.training.run import Progress
 from tests.test_training import train
@@ -42,14 +42,13 @@ def test_a_table_of_a_rule_returns_on_resume(tiny_scene, tmp_path):
     assert sum(record["causes"].get("edits_seen", 0) for record in whole.records.read("densify")) > 0
     checked = load("smoke", [f"scene.path='{tiny_scene}'", *SETTINGS])
     out = tmp_path / "stopped"
-    folders.make_run_folder(out, resume=False)
     run = opening.open_run(checked, out, None)
 
     def stop(progress: Progress) -> None:
         run.interrupted = progress.step >= 20
 
     with pytest.raises(Interrupted):
-        runner.execute(checked, run, False, stop)
+        runner.execute(checked, run, "new", stop)
     resumed = train(tiny_scene, out, *SETTINGS, resume=True)
     assert resumed.model.gaussians.tables["edits_seen"].zero_fresh
     assert (out / "point_cloud.ply").read_bytes() == (whole.out / "point_cloud.ply").read_bytes()

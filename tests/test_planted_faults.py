@@ -49,6 +49,8 @@ FAULTS = {  # kernel -> file, text, wrong text
     "pixel_loss": ("loss.cl", "(2.0f * l2)", "(1.99f * l2)"),
     "ssim_maps": ("loss.cl", "SSIM_C2 9.0e-4f", "SSIM_C2 9.1e-4f"),
     "ssim_gradient": ("loss.cl", "* covariance);", "* -covariance);"),
+    "count_large": ("large.cl", "tile_count[i] = total;", "tile_count[i] = total / 2;"),
+    "emit_large": ("large.cl", "corner + row * tiles_x", "corner + row * (tiles_x - 1)"),
     "emit_pairs": ("pairs.cl", "tile += tiles_x;", "tile += tiles_x - 1;"),
     "find_tile_offsets": ("pairs.cl", "sorted_tile[pair - 1] + 1", "sorted_tile[pair - 1] + 2"),
     "peak_fma": ("peak.cl", "c = c * m + step", "c = c * m - step"),

@@ -15,7 +15,7 @@ from clsplat.prepare import steps as prepare_steps
 from clsplat.prepare.cache import fingerprint, plan, prepare
 from clsplat.prepare.place import place_photographs
 from clsplat.prepare.steps import Step
-from clsplat.runs import folders, lock, opening, runner
+from clsplat.runs import lock, opening, runner
 from clsplat.settings import Settings
 from tests.refusals import refusal
 
@@ -228,8 +228,7 @@ def test_a_changed_setting_is_another_run(pipeline, photos, tmp_path):
 def test_a_run_does_not_go_on_with_other_photographs(pipeline, photos, tmp_path):
     checked = load(str(pipeline), [f"scene.path='{photos}'", "optimize.steps=3"])
     out = tmp_path / "runs" / "a"
-    folders.make_run_folder(out, False)
-    runner.execute(checked, opening.open_run(checked, out, None), False, lambda progress: None)
+    runner.execute(checked, opening.open_run(checked, out, None), "new", lambda progress: None)
     (photos / "p.txt").write_text("other")
     with pytest.raises(ConfigError, match="other photographs"):
         opening.open_run(checked, out, None)

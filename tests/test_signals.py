@@ -2,6 +2,8 @@
 
 import os
 import signal
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -63,9 +65,9 @@ def signalled(function: Callable[..., Any], call: int, times: int = 1) -> Callab
 
 
 PLACES = {  # what is called for the n-th time when the signal comes -> the message
-    "an evaluation in training": (views, "render_view", 1, "stopped at step 4, saved in "),
+    "an evaluation in training": (views, "render_floats", 1, "stopped at step 4, saved in "),
     "a stage that edits": (densify, "densify", 1, "stopped in densify, saved in "),
-    "an evaluation": (views, "render_view", 4, "stopped in evaluate, saved in "),
+    "an evaluation": (views, "render_floats", 4, "stopped in evaluate, saved in "),
     "renders": (render, "render_view", 1, "stopped in render, saved in "),
     "the report": (report, "render_view", 1, "stopped in report, saved in "),
 }
@@ -82,7 +84,7 @@ def test_a_long_stage_ends_early_with_its_state_saved_and_is_repeated(
             Job.open(pipeline, tiny_scene, tmp_path).run()
     assert read_status(tmp_path)["state"] == "interrupted"
     assert list((tmp_path / "checkpoints").glob("*.npz"))
-    Job.resume(tmp_path).run(resume=True)
+    Job.resume(tmp_path).run()
     assert read_status(tmp_path)["state"] == "done"
     assert digest(tmp_path) == digest(undisturbed)
     for file in (undisturbed / "renders").rglob("*.png"):
@@ -104,3 +106,40 @@ def test_the_first_signal_stops_at_once_where_there_is_no_model_yet(pipeline, ti
         Job.open(pipeline, tiny_scene, tmp_path).run()
     assert read_status(tmp_path)["state"] == "interrupted"
     assert not (tmp_path / "checkpoints").exists()
+
+
+AFTER = """
+import os, signal
+from data_tools.pycolmap_import import require_pycolmap
+
+def handler(number, frame):
+    raise SystemExit("handled")
+
+signal.signal(signal.SIGTERM, handler)
+require_pycolmap()
+os.kill(os.getpid(), signal.SIGTERM)
+"""
+WITHIN = """
+import signal, sys
+from data_tools.pycolmap_import import require_pycolmap
+
+class Finder:
+    def find_spec(name, path, target=None):
+        if name == "pycolmap":
+            signal.raise_signal(signal.SIGINT)
+
+sys.meta_path.insert(0, Finder)
+try:
+    require_pycolmap()
+except KeyboardInterrupt:
+    raise SystemExit("handled" if "pycolmap._core" in sys.modules else "in the middle")
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="SIGTERM ends a process at once there")
+@pytest.mark.parametrize("script", [AFTER, WITHIN], ids=["after its import", "within its import"])
+def test_pycolmap_does_not_take_signals(script):
+    """Its import has SIGTERM end the process with a dump, and turns a KeyboardInterrupt into a defect."""
+    pytest.importorskip("pycolmap")
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (1, "handled\n")

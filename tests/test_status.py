@@ -2,24 +2,19 @@
 
 import gc
 import json
-import subprocess
-import sys
 import threading
 import time
 from pathlib import Path
-from types import SimpleNamespace
 
 import jsonschema
 import pytest
 
 import clsplat
-from clsplat import processes
 from clsplat.errors import ClsplatError, OutputError
 from clsplat.files import write_text
-from clsplat.runs import status as reading
 from clsplat.runs.experiment import Job
 from clsplat.training import status as writing
-from clsplat.training.status import Amount, StatusFile
+from clsplat.training.status import StatusFile
 from tests.test_training import digest, train
 
 pytestmark = pytest.mark.slow
@@ -205,88 +200,3 @@ def test_a_run_that_nobody_holds_has_no_heartbeat(written, tmp_path):
     del status
     gc.collect()
     until(lambda: not thread.is_alive())
-
-
-def put(folder: Path, **values) -> dict:
-    """Write a status of a run whose process has ended, and return what is found."""
-    gone = subprocess.Popen([sys.executable, "-c", ""])
-    gone.wait()
-    now = StatusFile(folder, step=7, steps=9).now.model_copy(
-        update={"state": "running", "process": gone.pid, "time": time.time() - 200, **values}
-    )
-    (folder / "status.json").write_text(json.dumps(now.model_dump(exclude_none=True)))
-    return reading.run_status(folder)
-
-
-def test_a_process_that_is_gone_was_killed(tmp_path):
-    found = put(tmp_path)
-    assert found["state"] == "killed"
-    assert "silent" not in found
-
-
-@pytest.mark.parametrize("elsewhere", [{"host": "another"}, {"pid_namespace": "pid:[1]"}])
-def test_a_run_elsewhere_is_judged_by_its_heartbeat_alone(elsewhere, tmp_path):
-    found = put(tmp_path, **elsewhere)
-    assert found["state"] == "running"
-    assert 199 < found["silent"] < 300
-    place = f"it runs on {elsewhere.get('host', StatusFile(tmp_path).now.host)}"
-    assert f"\n  no sign of life for {found['silent']} s; {place}" in reading.status_text(found)
-    assert "no sign" not in reading.status_text(put(tmp_path, time=time.time() - 2, **elsewhere))
-
-
-def test_a_process_that_is_stopped_shows_no_sign_of_life(tmp_path):
-    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as process:
-        found = put(tmp_path, process=process.pid)
-        process.communicate(b"\n")
-    assert f"no sign of life for {found['silent']} s; process {process.pid}" in reading.status_text(found)
-
-
-def test_the_lines_name_the_stage_and_what_is_left(tmp_path):
-    amount = Amount(done=3, total=20, unit="views")
-    found = put(tmp_path, host="a", time=time.time(), stage="evaluate", progress=amount, seconds_left=71.6)
-    assert reading.status_text(found).splitlines()[0] == (
-        f"{tmp_path}: running at step 7 of 9, evaluate, 3 of 20 views, 72 s left"
-    )
-
-
-def test_a_clock_that_is_late_gives_no_negative_time(tmp_path):
-    assert put(tmp_path, host="a", time=time.time() + 100)["silent"] == 0
-
-
-class Function:
-    """A function of a Windows library, which takes the type of its result."""
-
-    def __init__(self, call) -> None:
-        self.call = call
-
-    def __call__(self, *arguments):
-        return self.call(*arguments)
-
-
-@pytest.mark.parametrize(
-    ("code", "error", "alive"), [(259, 0, True), (1, 0, False), (None, 87, False), (None, 5, True)]
-)
-def test_a_process_of_windows_is_probed_without_ending_it(code, error, alive, monkeypatch):
-    """As Windows answers: the exit code of a process, or the error where there is none or it is another user's."""
-    handles: list[int] = []
-
-    def opened(rights, inherited, process):
-        if code is not None:
-            handles.append(process)
-        return process if code is not None else None
-
-    def asked(handle, place):
-        place._obj.value = code
-        return 1
-
-    kernel = SimpleNamespace(
-        OpenProcess=Function(opened),
-        GetExitCodeProcess=Function(asked),
-        CloseHandle=Function(lambda handle: handles.remove(handle.value)),
-    )
-    monkeypatch.setattr(sys, "platform", "win32")
-    monkeypatch.setattr(processes.ctypes, "WinDLL", lambda name, use_last_error: kernel, raising=False)
-    monkeypatch.setattr(processes.ctypes, "get_last_error", lambda: error, raising=False)
-    monkeypatch.setattr(processes.os, "kill", lambda *arguments: pytest.fail("it would end the process"))
-    assert processes.is_alive(1234) is alive
-    assert handles == [], "the handle is closed"

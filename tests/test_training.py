@@ -17,7 +17,7 @@ from clsplat.errors import ConfigError, DataError, Interrupted, NumericError
 from clsplat.gaussians.ply import read_ply, write_ply
 from clsplat.pipeline.loading import load
 from clsplat.runs import folders, opening, runner
-from clsplat.training import changes, checkpoint
+from clsplat.training import checkpoint
 from clsplat.training.run import Progress, Run
 from clsplat.views.sampling import Sampler
 from tests.onnx_writer import distance_network
@@ -27,9 +27,10 @@ pytestmark = pytest.mark.slow
 
 def train(scene: Path, out: Path, *overrides: str, pipeline: str = "smoke", resume: bool = False) -> Run:
     checked = load(pipeline, [f"scene.path='{scene}'", *overrides])
-    folders.make_run_folder(out, resume)
-    run = opening.open_run(checked, out, None)
-    runner.execute(checked, run, resume, lambda progress: None)
+    start: folders.Start = "resume" if resume else "new"
+    with folders.opened(out, start, step=0) as status:
+        run = opening.open_run(checked, out, None, start, status)
+        runner.execute(checked, run, start, lambda progress: None)
     return run
 
 
@@ -116,14 +117,13 @@ def test_the_sort_does_not_matter(finished, tiny_scene, tmp_path, sort):
 def test_interrupt_saves_and_resume_goes_on(finished, tiny_scene, tmp_path):
     out = tmp_path / "stopped"
     checked = load("smoke", [f"scene.path='{tiny_scene}'"])
-    folders.make_run_folder(out, resume=False)
     run = opening.open_run(checked, out, None)
 
     def stop(progress: Progress) -> None:
         run.interrupted = progress.step == 20
 
     with pytest.raises(Interrupted, match="stopped at step 20"):
-        runner.execute(checked, run, False, stop)
+        runner.execute(checked, run, "new", stop)
     assert json.loads((out / "status.json").read_text())["state"] == "interrupted"
     train(tiny_scene, out, resume=True)
     assert digest(out) == digest(finished)
@@ -224,10 +224,3 @@ def test_views_come_in_random_order_without_repeats(tiny_scene, tmp_path):
     for epoch in epochs:
         assert len(set(epoch)) == 8
     assert epochs[0] != epochs[1] != epochs[2]
-
-
-def test_first_difference():
-    old = {"a": 1, "b": {"c": [1, {"d": 2}]}}
-    assert changes.first_difference(old, old) is None
-    assert str(changes.first_difference(old, {"a": 1, "b": {"c": [1, {"d": 3}]}})) == "b.c[1].d was 2, is 3"
-    assert changes.first_difference(old, {"a": 1}) is not None

@@ -10,7 +10,7 @@ import pytest
 
 from clsplat.errors import DataError, Interrupted
 from clsplat.pipeline.loading import load
-from clsplat.runs import folders, opening, runner
+from clsplat.runs import opening, runner
 from clsplat.scene.detect import read_scene
 from clsplat.training.run import Progress
 from clsplat.views.order import Paper, ViewPool
@@ -50,7 +50,6 @@ def test_a_run_with_changing_views_is_the_same_after_an_interruption(tiny_scene,
     assert load(str(whole.out / "pipeline.yaml")).resolved() == whole.pipeline
     checked = load("smoke", [f"scene.path='{tiny_scene}'", setting])
     out = tmp_path / "stopped"
-    folders.make_run_folder(out, resume=False)
     for stop_at in (10, 30):
         run = opening.open_run(checked, out, None)
 
@@ -58,7 +57,7 @@ def test_a_run_with_changing_views_is_the_same_after_an_interruption(tiny_scene,
             run.interrupted = progress.step >= stop_at
 
         with pytest.raises(Interrupted):
-            runner.execute(checked, run, True, stop)
+            runner.execute(checked, run, "resume", stop)
     train(tiny_scene, out, setting, resume=True)
     assert digest(out) == digest(tmp_path / "whole")
 

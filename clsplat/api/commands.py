@@ -15,6 +15,7 @@ from clsplat.api.arguments import Overrides, PathLike, load_plugins, overrides, 
 if TYPE_CHECKING:  # the command line starts without OpenCL
     from clsplat.opencl.device import Device
     from clsplat.runs.experiment import Job
+    from clsplat.runs.folders import Start
 
 
 def run(
@@ -24,17 +25,16 @@ def run(
     *,
     set: Overrides = (),
     device: "str | Device | None" = None,
-    resume: bool = False,
-    restart: bool = False,
+    start: Literal["new", "resume", "restart"] = "new",
 ) -> Path:
     """Run a pipeline or a matrix, as `clsplat run` does; return the run folder.
 
     pipeline: a file, or the name of a shipped one; scene: default that of the pipeline; out: default runs/NAME; set:
-    settings by place, such as {"optimize.steps": 3000}; resume: go on from the newest checkpoint in `out`; restart:
-    begin again where `out` holds a run, and remove its checkpoints and metrics.
+    settings by place, such as {"optimize.steps": 3000}; start: "resume" goes on from the newest checkpoint in `out`, if
+    there is one, "restart" begins again where `out` holds a run, and removes its checkpoints and metrics.
     """
-    job = _job(pipeline, scene, out, set, resume or restart)
-    job.run(device, resume, restart)
+    job = _job(pipeline, scene, out, set, start)
+    job.run(device)
     return job.out
 
 
@@ -45,11 +45,10 @@ def describe_run(
     *,
     set: Overrides = (),
     device: "str | Device | None" = None,
-    resume: bool = False,
-    restart: bool = False,
+    start: Literal["new", "resume", "restart"] = "new",
 ) -> str:
     """Check all that `run` would need and return what it would do, as lines of text; nothing is written."""
-    return _job(pipeline, scene, out, set, resume or restart).describe(device, resume, restart)
+    return _job(pipeline, scene, out, set, start).describe(device)
 
 
 def resume(folder: PathLike, *, set: Overrides = (), device: "str | Device | None" = None) -> Path:
@@ -58,7 +57,7 @@ def resume(folder: PathLike, *, set: Overrides = (), device: "str | Device | Non
 
     load_plugins()
     job = Job.resume(Path(folder), overrides(set))
-    job.run(device, resume=True)
+    job.run(device)
     return job.out
 
 
@@ -199,8 +198,8 @@ def view(
     )
 
 
-def _job(pipeline: PathLike, scene: PathLike | None, out: PathLike | None, values: Overrides, resume: bool) -> "Job":
+def _job(pipeline: PathLike, scene: PathLike | None, out: PathLike | None, values: Overrides, start: "Start") -> "Job":
     from clsplat.runs.experiment import Job
 
     load_plugins()
-    return Job.open(str(pipeline), path_of(scene), path_of(out), overrides(values), resume)
+    return Job.open(str(pipeline), path_of(scene), path_of(out), overrides(values), start)

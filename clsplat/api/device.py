@@ -4,8 +4,10 @@ import threading
 from functools import cache
 from types import TracebackType
 
+from clsplat.conformance.quick import open_correct
 from clsplat.opencl import device as opencl
 from clsplat.opencl.discovery import Schedule, choose
+from clsplat.render.tiles import Sort
 
 
 class Device(opencl.Device):
@@ -30,6 +32,14 @@ class Device(opencl.Device):
 
     def __repr__(self) -> str:
         return f"Device({self.text!r})"
+
+
+def proved(device: str | opencl.Device | None, schedule: Schedule = "auto", sort: Sort = "auto") -> opencl.Device:
+    """Return an open device, one of a name, or `default_device`, on which pictures and models may be made.
+
+    It was compared with the reference once, as for a run.  Raises DeviceError when it computes wrongly.
+    """
+    return open_correct(default_device(schedule) if device is None else device, schedule, sort)
 
 
 _OPENING = threading.Lock()

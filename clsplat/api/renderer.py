@@ -7,11 +7,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.api.device import default_device
+from clsplat.api.device import proved
 from clsplat.gaussians.model import Model
 from clsplat.gaussians.tables import PARAMETERS, DeviceModel
 from clsplat.metrics.images import to_8_bits
-from clsplat.opencl.device import Array, Device, open_device
+from clsplat.opencl.device import Array, Device
 from clsplat.render.camera import DeviceCamera, upload_camera
 from clsplat.render.rasterizer import Content, Frame, Rasterizer
 from clsplat.scene.view import View, colour_of
@@ -82,9 +82,9 @@ class Renderer:
     def __init__(self, model: Model, device: str | Device | None = None) -> None:
         """Copy a model to a device, or to one by its name; by default `default_device()`.
 
-        Raises DeviceError when there is none.
+        Raises DeviceError when there is none, or when it computes wrongly.
         """
-        self.device = default_device() if device is None else open_device(device)
+        self.device = proved(device)
         self.rasterizer = Rasterizer(self.device)
         self.update(model)
 

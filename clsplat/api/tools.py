@@ -8,7 +8,7 @@ from clsplat.api.arguments import PathLike, load_plugins, path_of
 
 if TYPE_CHECKING:  # the command line starts without OpenCL
     from clsplat.bench.measurement import Measurement
-    from clsplat.conformance.report import Report
+    from clsplat.conformance.report import DeviceReport
     from clsplat.inspect.inspection import Inspection
     from clsplat.opencl.device import Device
 
@@ -29,7 +29,7 @@ def devices() -> list[dict[str, Any]]:
     ]
 
 
-def doctor(device: "str | Device | None" = None, page: PathLike | None = None) -> "Report":
+def doctor(device: "str | Device | None" = None, page: PathLike | None = None) -> "DeviceReport":
     """Compare every kernel with the reference on a device; return a `verdict`, whether it is `usable`, and `data()`.
 
     It takes about a minute on a CPU.  page: a file to write, to be attached to a report.

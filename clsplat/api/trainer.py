@@ -4,21 +4,23 @@ import shutil
 import tempfile
 import weakref
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, nullcontext
+from contextlib import ExitStack, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 from clsplat.api.arguments import PathLike, load_plugins, overrides
-from clsplat.api.device import default_device
-from clsplat.errors import ClsplatError, ConfigError, DataError
+from clsplat.api.device import proved
+from clsplat.errors import ClsplatError, ConfigError, DataError, Interrupted, OutputError
 from clsplat.gaussians.model import Model
 from clsplat.losses.base import HostFunction, HostLoss, ViewGradients
 from clsplat.metrics.views import mean, measure
-from clsplat.opencl.device import Device, open_device
+from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import Pipeline, load
-from clsplat.runs import folders, lock, opening, runner
-from clsplat.runs.experiment import quoted
+from clsplat.runs import folders, lock, opening, outputs, runner
+from clsplat.runs.experiment import as_setting
+from clsplat.runs.folders import Start
+from clsplat.runs.stepwise import is_trained, run_until_training, train
 from clsplat.scene.detect import read_scene
 from clsplat.scene.scene import Scene
 from clsplat.scene.view import NO_FILE
@@ -27,7 +29,7 @@ from clsplat.signals import stopping_on_signals
 from clsplat.stages.optimize import Optimize
 from clsplat.training import checkpoint
 from clsplat.training.rescue import saved_on_failure
-from clsplat.training.run import Run
+from clsplat.training.status import END_STATES, StatusFile
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,50 +64,53 @@ class Trainer:
         set: Mapping[str, Any] | None = None,
         device: str | Device | None = None,
         out: PathLike | None = None,
-        resume: bool = False,
+        start: Start = "new",
     ) -> None:
         """Prepare training.
 
         scene: what `read_scene` returns, whose split is kept, or a folder; pipeline: a file, or the name of a shipped
         one; set: settings by place, such as {"optimize.steps": 3000}; device: a part of its name, or one that is open,
         with the schedule of the pipeline; out: the run folder, by default a temporary one that goes away with the
-        trainer; resume: go on from the newest checkpoint in `out`, also of `clsplat run`.  A trainer holds its folder
-        until its training has ended, `close()`, or it is let go.
+        trainer; start: as for `clsplat.run`.  A trainer holds its folder until its training has ended, `close()`, or it
+        is let go.
         Raises ConfigError, DataError and DeviceError.
         """
         load_plugins()
         folder = scene.path if isinstance(scene, Scene) else Path(scene)
-        place = [f"scene.path={quoted(folder)}"] if folder.is_dir() else []
+        place = [f"scene.path={as_setting(folder)}"] if folder.is_dir() else []
         self.pipeline = load(str(pipeline), [*place, *overrides(set or {})])
         _check(self.pipeline)
         self.scene = scene if isinstance(scene, Scene) else read_scene(folder, self.pipeline.settings.scene.holdout)
         if without := [view.name for view in self.scene.split("train") if view.image_path == NO_FILE]:
             raise DataError(f"{self.scene.path}: the view '{without[0]}' has no photograph; training needs one of each")
-        if resume and out is None:
-            raise ConfigError("resume: expected the folder of a run as `out`")
+        if start != "new" and out is None:
+            raise ConfigError(f"{start}: expected the folder of a run as `out`")
         if out is None:
             out = tempfile.mkdtemp(prefix="clsplat-")
             weakref.finalize(self, shutil.rmtree, out, ignore_errors=True)
         self.out = Path(out)
-        schedule = self.pipeline.settings.rasterizer.schedule
-        opened = default_device(schedule) if device is None else open_device(device, schedule)
+        outputs.check_places(self.pipeline, self.out)
+        rasterizer = self.pipeline.settings.rasterizer
+        opened = proved(device, rasterizer.schedule, rasterizer.sort)
         with ExitStack() as holding:
-            status = holding.enter_context(folders.opened(self.out, resume))
+            status = holding.enter_context(folders.opened(self.out, start, step=0))
             with folders.failures_recorded(status, as_raised=True):
                 self._run = opening.make_run(self.pipeline, self.scene, opened, self.out, status)
-                runner.begin(self.pipeline, self._run, resume)
+                runner.begin(self.pipeline, self._run, start)
                 with saved_on_failure(self._run):
-                    _run_until_training(self.pipeline, self._run)
+                    run_until_training(self.pipeline, self._run)
+            holding.callback(_left, status)
             self._holding = holding.pop_all()
         weakref.finalize(self, self._holding.close)
-        self._steps = _training(self.pipeline, self._run)
+        self._steps = train(self.pipeline, self._run)
         self._state: Literal["open", "done", "failed", "closed"] = "open"
         self._record_end()
 
     def close(self) -> None:
         """Leave the run folder to others.  Training does not go on after it; what is left in `out` can be resumed.
 
-        After its last step, and after an error, a trainer is closed by itself.
+        Before its last step status.json says `interrupted` then.  After it, and after an error, a trainer is closed by
+        itself.
         """
         if self._state == "open":
             self._state = "closed"
@@ -129,7 +134,7 @@ class Trainer:
             raise StopIteration
         if self._state != "open":
             why = "ended with an error" if self._state == "failed" else "is closed"
-            raise ClsplatError(f"{self!r} {why}; make another, with resume=True where `out` holds a checkpoint")
+            raise ClsplatError(f"{self!r} {why}; make another, with start='resume' where `out` holds a checkpoint")
         try:
             with (
                 folders.failures_recorded(self._run.status, as_raised=True),
@@ -199,17 +204,20 @@ class Trainer:
 
     def _record_end(self) -> None:
         """Write `done` to status.json where no step is left."""
-        last = max(_training_stages(self.pipeline))
-        stage, run = self.pipeline.stages[last], self._run
-        if isinstance(stage, Optimize) and (
-            run.cursor > last or (run.cursor == last and run.stage_step >= stage.steps)
-        ):
-            run.status.end("done", exit_code=0)
+        if is_trained(self.pipeline, self._run):
+            self._run.status.end("done", exit_code=0)
             self._state = "done"
             self.close()
 
     def __repr__(self) -> str:
         return f"Trainer({self.pipeline.settings.name} on {self.scene.path.name}, step {self._run.step})"
+
+
+def _left(status: StatusFile) -> None:
+    """Write that a trainer was closed, or let go, before its end; a folder that was removed stays so."""
+    if status.now.state not in END_STATES and status.out.is_dir():
+        with suppress(OutputError):
+            status.end("interrupted", Interrupted.exit_code, "the trainer was closed before its last step")
 
 
 def _check(pipeline: Pipeline) -> None:
@@ -220,31 +228,3 @@ def _check(pipeline: Pipeline) -> None:
         raise ConfigError(f"{pipeline.path}: has no stage 'optimize'; expected one to train with")
     for stage in pipeline.stages:
         stage.check()
-
-
-def _training_stages(pipeline: Pipeline) -> list[int]:
-    return [i for i, stage in enumerate(pipeline.stages) if isinstance(stage, Optimize)]
-
-
-def _run_until_training(pipeline: Pipeline, run: Run) -> None:
-    """Run the stages before the first that trains, from where the run is."""
-    for cursor, stage in enumerate(pipeline.stages):
-        if isinstance(stage, Optimize):
-            return
-        if cursor >= run.cursor:
-            run.cursor = cursor
-            stage.act(run)
-
-
-def _training(pipeline: Pipeline, run: Run) -> Iterator[ViewGradients]:
-    """Run all stages that train, step by step, and those between them."""
-    trains = _training_stages(pipeline)
-    for cursor in range(max(trains[0], run.cursor), trains[-1] + 1):
-        if cursor > run.cursor:
-            run.next_stage(cursor)
-        stage = pipeline.stages[cursor]
-        if isinstance(stage, Optimize):
-            run.status.note(stage=stage.stage, progress=None)
-            yield from stage.iterate(run)
-        else:
-            stage.act(run)

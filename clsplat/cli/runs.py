@@ -1,7 +1,7 @@
 """Commands about runs and pipelines."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -30,7 +30,10 @@ def run(
 ) -> None:
     """Run a pipeline, or all cells of a matrix."""
     work = commands.describe_run if dry_run else commands.run
-    found = work(pipeline, scene, out, set=set_ or (), device=device, resume=resume, restart=restart)
+    if resume and restart:
+        raise ConfigError("--resume goes on with a run and --restart begins it again; give one of them")
+    start: Literal["new", "resume", "restart"] = "resume" if resume else "restart" if restart else "new"
+    found = work(pipeline, scene, out, set=set_ or (), device=device, start=start)
     if isinstance(found, Path):
         terminal.show_summary(found)
     else:

@@ -13,6 +13,7 @@ from pathlib import Path
 from clsplat.compare.differences import differing, flat
 from clsplat.compare.run_folder import RunFolder, read_settings
 from clsplat.errors import ConfigError, DataError
+from clsplat.names import PIPELINE
 from clsplat.pages.svg import COLOURS
 
 MAX_SETTINGS = 3  # differing ones in a variant's name
@@ -109,7 +110,7 @@ class Comparison:
 
 def _cells(path: Path) -> list[Path]:
     """The finished runs below the folder of a matrix; another folder stays as it is."""
-    if not (path / "pipeline.yaml").is_file() or "matrix" not in read_settings(path):
+    if not (path / PIPELINE).is_file() or "matrix" not in read_settings(path):
         return [path]
     cells = sorted(file.parent for file in path.glob("*/metrics.json"))
     if not cells:

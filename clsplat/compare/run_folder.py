@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from clsplat import plugins
 from clsplat.errors import ConfigError, DataError, shortened
+from clsplat.names import METRICS, PIPELINE, STATUS
 from clsplat.pipeline.explanation import explain
 from clsplat.pipeline.file import SceneSettings
 from clsplat.pipeline.renamed import with_new_names
@@ -67,12 +68,12 @@ class RunFolder:
         """
         if not path.is_dir():
             raise DataError(f"{path}: no such folder; expected the folder of a finished run")
-        if not (path / "pipeline.yaml").is_file():
+        if not (path / PIPELINE).is_file():
             raise DataError(f"{path}: has no pipeline.yaml; expected the folder of a finished run")
-        if not (path / "metrics.json").is_file():
+        if not (path / METRICS).is_file():
             raise DataError(f"{path}: has no metrics.json, so the run {_state(path)}; finish it with --resume")
         settings = read_settings(path)
-        return cls(path, settings, _scene(path, settings), read_metrics(path / "metrics.json"))
+        return cls(path, settings, _scene(path, settings), read_metrics(path / METRICS))
 
     @property
     def missing_plugins(self) -> list[str]:
@@ -107,9 +108,9 @@ class RunFolder:
 
 def read_settings(path: Path) -> dict[str, Any]:
     """Return a run folder's pipeline.yaml as plain data.  Raises ConfigError when it holds anything else."""
-    data = read_yaml(path / "pipeline.yaml").data
+    data = read_yaml(path / PIPELINE).data
     if not isinstance(data, dict) or not isinstance(data.get("stages", []), list):
-        raise ConfigError(f"{path / 'pipeline.yaml'}: damaged; expected keys such as name and stages")
+        raise ConfigError(f"{path / PIPELINE}: damaged; expected keys such as name and stages")
     return {"stages": [], **data}
 
 
@@ -117,7 +118,7 @@ def _scene(path: Path, settings: dict[str, Any]) -> SceneSettings:
     try:
         return SceneSettings.model_validate(with_new_names(settings).get("scene", {}))
     except ValidationError as error:
-        file = path / "pipeline.yaml"
+        file = path / PIPELINE
         raise ConfigError(explain(error, SceneSettings, file, read_yaml(file))) from error
 
 
@@ -136,7 +137,7 @@ def read_metrics(path: Path) -> RunMetrics:
 
 def _state(path: Path) -> str:
     try:
-        state = read_json(path / "status.json").get("state")
+        state = read_json(path / STATUS).get("state")
     except (DataError, AttributeError):
         state = None
     return {"failed": "failed", "interrupted": "was interrupted"}.get(str(state), "is not finished")

@@ -6,7 +6,7 @@ from typing import Literal
 
 from clsplat.conformance.checks import KERNELS, SPEED
 from clsplat.conformance.quick import forget, remember
-from clsplat.conformance.report import Report
+from clsplat.conformance.report import DeviceReport
 from clsplat.conformance.supervision import Result, supervised
 from clsplat.opencl.device import Device
 from clsplat.opencl.discovery import choose, resolve_schedule
@@ -16,11 +16,11 @@ LOG = logging.getLogger("clsplat")
 SCHEDULES: tuple[Literal["simt", "wide"], ...] = ("simt", "wide")
 
 
-def examine(device: str | Device | None = None) -> Report:
+def examine(device: str | Device | None = None) -> DeviceReport:
     """Run all checks on a device, or on the one of a name.  Raises DeviceError where there is none that works."""
     info = device.info if isinstance(device, Device) else choose(device)
     default = resolve_schedule(info, "auto")
-    report, started = Report(info, default), time.perf_counter()
+    report, started = DeviceReport(info, default), time.perf_counter()
     LOG.info("device: %s; this takes about a minute on a CPU", info.text)
     for schedule in SCHEDULES:
         if not _is_due(schedule, report):
@@ -40,7 +40,7 @@ def examine(device: str | Device | None = None) -> Report:
     return report
 
 
-def _is_due(schedule: str, report: Report) -> bool:
+def _is_due(schedule: str, report: DeviceReport) -> bool:
     """simt runs everywhere; wide where it is the default, and on a CPU that computes wrongly with simt.
 
     Elsewhere nobody would use it, and some compilers take many minutes for its vectors.

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from clsplat.conformance.comparison import Figure
 from clsplat.conformance.host import system
-from clsplat.conformance.report import GIB, Report, summary
+from clsplat.conformance.report import GIB, DeviceReport, summary
 from clsplat.conformance.supervision import Result
 from clsplat.files import write_text
 from clsplat.pages.page import duration, render
@@ -28,12 +28,12 @@ class Row:
         return f"{100 * self.worst.value / self.worst.bound:.0f} %"
 
 
-def write_page(report: Report, out: Path) -> None:
+def write_page(report: DeviceReport, out: Path) -> None:
     """Write the page.  Raises OutputError when that fails."""
     write_text(out, report_page(report))
 
 
-def report_page(report: Report) -> str:
+def report_page(report: DeviceReport) -> str:
     """Return the page."""
     verdict = report.verdict
     parts = {f"The {name} schedule": results for name, results in report.schedules.items()}
@@ -54,7 +54,7 @@ def report_page(report: Report) -> str:
     )
 
 
-def _facts(report: Report) -> dict[str, str]:
+def _facts(report: DeviceReport) -> dict[str, str]:
     info, host = report.info, system()
     training = report.note("training")
     facts = {

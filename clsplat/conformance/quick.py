@@ -26,8 +26,11 @@ Resolved = Literal["wide", "simt"]
 SORTS = ("radix", "bitonic")  # each with a record of its own
 
 
-def open_correct(device: str | Device | None, schedule: Schedule, sort: Sort = "auto") -> Device:
-    """Open a device as `open_device` does, say which it is, and ensure that it computes correctly."""
+def open_correct(device: str | Device | None, schedule: Schedule = "auto", sort: Sort = "auto") -> Device:
+    """Open a device as `open_device` does, say which it is, and ensure that it computes correctly.
+
+    Whatever makes pictures or models opens its device here.
+    """
     opened = open_device(device, schedule)
     LOG.info("device: %s", opened.text)
     ensure_correct(opened, sort)

@@ -15,7 +15,7 @@ GIB = 2**30
 
 
 @dataclass
-class Report:
+class DeviceReport:
     """What `clsplat.doctor` returns."""
 
     info: DeviceInfo

@@ -1,6 +1,6 @@
 """The rules of adaptive density control: clone, split and prune (Kerbl et al. 2023, section 5)."""
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
@@ -15,6 +15,8 @@ class Grow(Rule):
     With `as_many_as`, the rule chooses as many Gaussians by `statistic` as reach `gradient_above` in that other
     statistic (Gaussian Opacity Fields, Yu et al. 2024).
     """
+
+    training_keys: ClassVar[frozenset[str]] = frozenset({"gradient_above"})
 
     statistic: StatisticName = "screen_grad"
     """Column whose mean is compared."""
@@ -39,6 +41,8 @@ class Clone(Grow):
     """Copy small Gaussians whose statistic is large; the copy starts at the same place."""
 
     type: Literal["clone"] = "clone"
+    training_keys: ClassVar[frozenset[str]] = frozenset({"size_below"})
+
     size_below: Positive = 0.01
     """Largest size, the largest standard deviation as a share of the scene's extent; by step."""
 
@@ -50,6 +54,8 @@ class Split(Grow):
     """Replace large Gaussians whose statistic is large by smaller ones, drawn from their own distribution."""
 
     type: Literal["split"] = "split"
+    training_keys: ClassVar[frozenset[str]] = frozenset({"size_above", "children", "shrink"})
+
     size_above: Positive = 0.01
     """Smallest size, the largest standard deviation as a share of the scene's extent; by step."""
     children: Annotated[int, Field(ge=2, le=8)] = 2
@@ -71,6 +77,8 @@ class PruneFaint(Rule):
     """Remove Gaussians that are almost transparent."""
 
     type: Literal["prune_faint"] = "prune_faint"
+    training_keys: ClassVar[frozenset[str]] = frozenset({"opacity_below"})
+
     opacity_below: Positive = 0.005
     """Opacity below which a Gaussian is removed; by step."""
 
@@ -82,6 +90,8 @@ class PruneLarge(Rule):
     """Remove Gaussians that are large in the scene."""
 
     type: Literal["prune_large"] = "prune_large"
+    training_keys: ClassVar[frozenset[str]] = frozenset({"size_above"})
+
     size_above: Positive = 0.1
     """Size above which a Gaussian is removed: largest standard deviation as a share of the extent; by step."""
 

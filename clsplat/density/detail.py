@@ -3,7 +3,7 @@
 Both rules choose on the host, from tables and statistics: comparing Gaussians with each other is a line of NumPy there.
 """
 
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,8 @@ BETA = 0.5  # Lee et al. 2025: a child's covariance is half its parent's
 
 class Subdivide(Rule):
     """Base of rules that replace Gaussians by smaller ones, a limited share of them at a time."""
+
+    training_keys: ClassVar[frozenset[str]] = frozenset({"children", "beta", "at_most", "radius_above"})
 
     children: Annotated[int, Field(ge=2, le=8)] = 2
     """Number of Gaussians that replace one."""
@@ -58,6 +60,8 @@ class SplitTextured(Subdivide):
     """
 
     type: Literal["split_textured"] = "split_textured"
+    training_keys: ClassVar[frozenset[str]] = frozenset({"texture_above", "gradient_above"})
+
     texture: StatisticName = "texture"
     """Column whose mean is the texture."""
     texture_above: Threshold = PixelQuantile(quantile=0.8, of="pixels")
@@ -85,6 +89,8 @@ class SplitOversized(Subdivide):
     """
 
     type: Literal["split_oversized"] = "split_oversized"
+    training_keys: ClassVar[frozenset[str]] = frozenset({"rms_above"})
+
     rms_above: Annotated[Quantile | Positive, explained(", or {quantile}")] = 0.01
     """Smallest rms scale, a share of the scene's extent by step, or a quantile of all rms scales."""
     pixels: Annotated[float, Field(gt=0)] | None = None

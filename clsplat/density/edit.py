@@ -10,7 +10,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -216,6 +216,8 @@ class Edit:
 
 class Rule(Settings):
     """A condition on Gaussians, and the outcome of those that meet it."""
+
+    training_keys: ClassVar[frozenset[str]] = frozenset({"start"})
 
     start: Annotated[int, Field(ge=0)] = 0
     """Global step after which the rule acts."""

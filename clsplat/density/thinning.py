@@ -1,7 +1,7 @@
 """Rules that reduce the number of Gaussians (the refinement of Micro-splatting's second version, Lee et al.
 2025b; thresholds and formulas are ours)."""
 
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,8 @@ class PruneUnimportant(Rule):
     """Remove a share of all Gaussians: those with the smallest opacity times geometric mean scale."""
 
     type: Literal["prune_unimportant"] = "prune_unimportant"
+    training_keys: ClassVar[frozenset[str]] = frozenset({"share"})
+
     share: Share = 0.05
     """Share of all Gaussians that is removed."""
 
@@ -41,6 +43,8 @@ class MergeNeighbours(Rule):
     """
 
     type: Literal["merge_neighbours"] = "merge_neighbours"
+    training_keys: ClassVar[frozenset[str]] = frozenset({"distance_below", "colour_below"})
+
     distance_below: Positive = 0.5
     """Largest distance, a share of the sum of their mean scales; by step."""
     colour_below: Positive = 0.05

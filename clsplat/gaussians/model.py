@@ -165,12 +165,12 @@ class Model:
         logits = np.maximum(logit, MIN_LOGIT).astype(np.float32)
         return replace(self, log_scales=log_scales, logit_opacity=logits, filter_variance=None)
 
-    def save(self, path: str | Path) -> None:
+    def save(self, path: str | Path) -> str:
         """Write a PLY in the layout of 3DGS; a world filter that is not `baked` is kept, as a property `filter_3D`.
 
-        Raises OutputError when it cannot be written.
+        Returns the SHA-256 of what was written.  Raises OutputError when it cannot be written.
         """
-        write_ply(Path(path), self.tables(), self.rendering.comment())
+        return write_ply(Path(path), self.tables(), self.rendering.comment())
 
     def __repr__(self) -> str:
         return f"Model({len(self):,} Gaussians, SH degree {self.sh_degree})"

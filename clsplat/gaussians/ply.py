@@ -8,6 +8,7 @@ standard deviation (Mip-Splatting).  Comments hold the numbers that a rasterizer
 `SplatRenderMode: mip` when a screen filter reduces opacities to keep their energy, else `default`.
 """
 
+import hashlib
 import json
 import os
 from dataclasses import dataclass, field
@@ -73,8 +74,8 @@ def read_ply(path: Path) -> SplatFile:
     return SplatFile(parameters, rendering, mode)
 
 
-def write_ply(path: Path, parameters: Parameters, rendering: dict[str, Any]) -> None:
-    """Write parameters in the reference's order, and filter_variance where it is given.
+def write_ply(path: Path, parameters: Parameters, rendering: dict[str, Any]) -> str:
+    """Write parameters in the reference's order, and filter_variance where it is given; return the SHA-256 of the file.
 
     `rendering` becomes a comment in JSON; with `compensate` in it, the file's mode is mip.  Raises OutputError.
     """
@@ -104,9 +105,13 @@ def write_ply(path: Path, parameters: Parameters, rendering: dict[str, Any]) -> 
         f"comment {MODE}{mode}",
     ]
     header += [f"element vertex {count}", *(f"property float {name}" for name in names), "end_header"]
+    body = np.ascontiguousarray(np.concatenate(blocks, axis=1), "<f4")
+    written = hashlib.sha256()
     with atomic(path) as file:
-        file.write(("\n".join(header) + "\n").encode())
-        file.write(np.ascontiguousarray(np.concatenate(blocks, axis=1), "<f4").tobytes())
+        for part in (("\n".join(header) + "\n").encode(), body.tobytes()):
+            file.write(part)
+            written.update(part)
+    return written.hexdigest()
 
 
 def _comment(header: PlyHeader, start: str) -> str:

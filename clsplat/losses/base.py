@@ -4,7 +4,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,6 +81,8 @@ class ViewGradients:
 
 class Loss(Settings):
     """A summand of the objective, which training minimises."""
+
+    training_keys: ClassVar[frozenset[str]] = frozenset({"weight"})
 
     weight: Schedule = 1.0
     """Factor of the loss; by step."""

@@ -6,8 +6,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from clsplat.errors import DataError
+from clsplat.errors import DataError, NumericError
 from clsplat.gaussians.tables import DeviceModel
 from clsplat.losses.base import Comparison
 from clsplat.losses.image import ssim_maps
@@ -39,9 +40,24 @@ class ViewMetrics:
 
 def render_view(rasterizer: Rasterizer, model: DeviceModel, camera: DeviceCamera, background: Array) -> Image:
     """Render to 8 bits, [height, width, 3]: clamped to [0, 1], rounded to the nearest.  background: [3]."""
-    frame = rasterizer.forward(model, camera, background)
-    image = frame.image.get()[:, : camera.height, : camera.width]
-    return np.ascontiguousarray(to_8_bits(image).transpose(1, 2, 0))
+    return to_8_bits(render_floats(rasterizer, model, camera, background))
+
+
+def render_floats(
+    rasterizer: Rasterizer, model: DeviceModel, camera: DeviceCamera, background: Array
+) -> NDArray[np.float32]:
+    """Render to floats, [height, width, 3], as they are.  background: [3]."""
+    planes = rasterizer.forward(model, camera, background).image.get()
+    return np.ascontiguousarray(planes[:, : camera.height, : camera.width].transpose(1, 2, 0))
+
+
+def require_finite(image: NDArray[np.float32], view: View) -> None:
+    """Raise NumericError where a picture has values that are not finite."""
+    if not np.isfinite(image).all():
+        raise NumericError(
+            f"view '{view.name}': its picture is not finite, since values of the model are too large for 32 bits; "
+            "export the model again, or train it with lower rates"
+        )
 
 
 def device_ssim(rasterizer: Rasterizer, photograph: Photograph, image: Image) -> float:
@@ -60,10 +76,12 @@ def measure(
     views: Iterable[View],
     photographs: Photographs,
     perceptual: Perceptual = PSNR_AND_SSIM,
+    finite: bool = False,
 ) -> list[ViewMetrics]:
     """Return the metrics of every view.
 
     Masked pixels are black in both images; PSNR and SSIM are means over the other pixels.
+    With `finite`, NumericError is raised for a picture that is not finite, which counts as black otherwise.
     """
     results = []
     for view in views:
@@ -71,7 +89,10 @@ def measure(
         if photograph.empty:
             LOG.warning("%s: not measured, since its mask leaves out every pixel", view.name)
             continue
-        rendered = render_view(rasterizer, model, photograph.camera, photographs.background)
+        floats = render_floats(rasterizer, model, photograph.camera, photographs.background)
+        if finite:
+            require_finite(floats, view)
+        rendered = to_8_bits(floats)
         image, mask = photograph.image(), photograph.counted()
         if mask is None:
             similarity = device_ssim(rasterizer, photograph, rendered)

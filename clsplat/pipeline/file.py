@@ -7,7 +7,7 @@ A file is complete and strict: unknown keys are errors, and every value has its 
 """
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import AfterValidator, Field
 
@@ -27,6 +27,8 @@ from clsplat.stages.optimize import Optimize
 
 class SceneSettings(Settings):
     """The photographs, and how they are read."""
+
+    output_keys: ClassVar[frozenset[str]] = frozenset({"image_budget"})
 
     path: ReadPath | None = None
     """Folder of the dataset; usually given by --scene."""

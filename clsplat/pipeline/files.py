@@ -5,6 +5,7 @@ from pathlib import Path
 
 from clsplat import resource_dir
 from clsplat.errors import ConfigError, quoted
+from clsplat.names import PIPELINE
 
 
 def shipped() -> dict[str, Path]:
@@ -18,7 +19,7 @@ def find(name: str) -> Path:
     try:
         is_folder = path.is_dir()
         is_file = path.exists() and not is_folder  # or a pipe, of which the reader will say so
-        is_run = is_folder and (path / "pipeline.yaml").is_file()
+        is_run = is_folder and (path / PIPELINE).is_file()
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise ConfigError(f"{quoted(name)}: not the name of a file ({reason})") from error

@@ -14,6 +14,7 @@ from clsplat import plugins
 from clsplat.density.edit import Rule
 from clsplat.density.statistics import Statistic
 from clsplat.errors import ConfigError, OverrideError, one_line
+from clsplat.names import PREPARED
 from clsplat.pipeline.explanation import explain, first_fault, place_text
 from clsplat.pipeline.file import STAGE_LISTS, PipelineFile
 from clsplat.pipeline.files import find
@@ -66,7 +67,7 @@ class Pipeline:
 
 def prepared_folder(out: Path) -> Path:
     """Return the folder for results of `prepare:`: beside the run folder, for all runs there."""
-    return out.absolute().parent / "prepared"
+    return out.absolute().parent / PREPARED
 
 
 def load(name: str, overrides: list[str] | None = None) -> Pipeline:

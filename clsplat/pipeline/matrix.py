@@ -28,7 +28,7 @@ from clsplat.pipeline.explanation import explain, place_text
 from clsplat.pipeline.file import Name
 from clsplat.pipeline.files import find
 from clsplat.pipeline.loading import Pipeline, checked
-from clsplat.pipeline.yaml_file import Document, Place, read_yaml
+from clsplat.pipeline.yaml_file import Document, Place, read_pipeline, read_yaml
 from clsplat.settings import Settings
 
 MAX_CELLS = 1000
@@ -117,7 +117,7 @@ def load_experiment(name: str, overrides: Sequence[str] = ()) -> Experiment | No
         _check_choices(path, document, base, axes, overrides)
     cells = [_cell(base, choices, overrides) for base in bases for choices in itertools.product(*axes)]
     _check_names(path, cells)
-    return Experiment(path, file.name, path.read_text(encoding="utf-8"), cells)
+    return Experiment(path, file.name, read_pipeline(path), cells)
 
 
 @dataclass(frozen=True)

@@ -6,10 +6,11 @@ from pathlib import Path
 from typing import Any
 
 from clsplat.errors import ConfigError
-from clsplat.files import write_text
+from clsplat.files import is_there, write_text
 from clsplat.pipeline.files import find, shipped
 from clsplat.pipeline.loading import load
 from clsplat.pipeline.settable import Key, settable
+from clsplat.pipeline.yaml_file import read_pipeline
 
 MAX_KEY_WIDTH = 44  # characters; descriptions stand beside
 
@@ -17,7 +18,7 @@ MAX_KEY_WIDTH = 44  # characters; descriptions stand beside
 def summary(path: Path) -> str:
     """Return the first sentence of a pipeline file's opening comment."""
     lines = []
-    for line in path.read_text(encoding="utf-8").splitlines():
+    for line in read_pipeline(path).splitlines():
         if not line.startswith("#"):
             break
         lines.append(line.removeprefix("#").strip())
@@ -63,8 +64,8 @@ def manual_text(found: dict[str, Any]) -> str:
 def copy(name: str, file: Path) -> Path:
     """Copy a pipeline to a file, or into a folder; return the copy.  Raises ConfigError when the copy exists."""
     source = find(name)
-    target = file / source.name if file.is_dir() else file
-    if target.exists():
+    target = file / source.name if is_there(file) and file.is_dir() else file
+    if is_there(target):
         raise ConfigError(f"{target}: exists and is not overwritten; give another name")
-    write_text(target, source.read_text(encoding="utf-8"))
+    write_text(target, read_pipeline(source))
     return target

@@ -15,7 +15,7 @@ from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 from ruamel.yaml.reader import ReaderError
 
 from clsplat.errors import ConfigError, quoted, shortened
-from clsplat.reading import read_file
+from clsplat.reading import read_text
 
 SIZE_LIMIT = 1 << 20  # bytes
 NODE_LIMIT = 20_000  # values after aliases are expanded, so that aliases to aliases cannot fill the memory
@@ -72,14 +72,12 @@ class _Bounded(Composer):
 
 def read_yaml(path: Path) -> Document:
     """Read one document.  Raises ConfigError with file and line."""
-    try:
-        text = read_file(path, "a pipeline file", ConfigError, SIZE_LIMIT).decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        line = error.object[: error.start].count(b"\n") + 1
-        raise ConfigError(
-            f"{path}:{line}: expected UTF-8 text, found the byte {error.object[error.start]:#x}"
-        ) from error
-    return _parse(text, str(path))
+    return _parse(read_pipeline(path), str(path))
+
+
+def read_pipeline(path: Path) -> str:
+    """Return the text of a pipeline file.  Raises ConfigError."""
+    return read_text(path, "a pipeline file", ConfigError, SIZE_LIMIT)
 
 
 def parse_value(text: str) -> Any:

@@ -14,13 +14,13 @@ from typing import Any
 
 from clsplat.errors import DataError, OutputError
 from clsplat.files import sweep, unwritable, write_text
+from clsplat.names import NOTE
 from clsplat.prepare.steps import Step
 from clsplat.progress import Count
-from clsplat.reading import read_json
+from clsplat.reading import read_json, sha256
 
 LOG = logging.getLogger("clsplat")
 RECORD = "record.json"
-NOTE = "prepared.json"  # in the run folder
 
 
 @dataclass(frozen=True)
@@ -92,12 +92,7 @@ def fingerprint(folder: Path, without: Path) -> str:
         for name in sorted(files):
             path = Path(base) / name
             if name[0] != "." and path.is_file():
-                try:
-                    with path.open("rb") as file:
-                        content = hashlib.file_digest(file, "sha256").hexdigest()
-                except OSError as error:
-                    raise DataError(f"{path}: cannot be read ({error.strerror}); check its permissions") from error
-                parts.append([path.relative_to(folder).as_posix(), content])
+                parts.append([path.relative_to(folder).as_posix(), sha256(path)])
     return _digest(parts)
 
 

@@ -1,6 +1,5 @@
 """Make a COLMAP folder from photographs, without a pipeline: the command `clsplat data photos`."""
 
-import json
 import shutil
 from pathlib import Path
 
@@ -8,6 +7,7 @@ from clsplat.errors import DataError
 from clsplat.files import unwritable
 from clsplat.prepare.cache import RECORD, plan, prepare
 from clsplat.prepare.steps import FindFeatures, MapCameras, MatchFeatures, Step
+from clsplat.reading import read_json
 from data_tools.gather import link
 from data_tools.photos import IMAGES, CameraModel, Mapper, Matching
 
@@ -46,4 +46,4 @@ def place_photographs(
         half.rename(sparse)
     except OSError as error:
         raise unwritable(out, error) from error
-    return int(json.loads((result / RECORD).read_text("utf-8"))["registered"])
+    return int(read_json(result / RECORD)["registered"])

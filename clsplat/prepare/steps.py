@@ -18,11 +18,11 @@ from data_tools.photos import (
     find_features,
     map_cameras,
     match_features,
-    require_pycolmap,
 )
+from data_tools.pycolmap_import import require_pycolmap
 from data_tools.undistort import Blank, undistort_scene
 
-Count = Annotated[int, Field(gt=0)]
+Positive = Annotated[int, Field(gt=0)]
 
 
 class Step(Settings):
@@ -55,9 +55,9 @@ class FindFeatures(Step):
 
     stage: Literal["find_features"] = "find_features"
 
-    long_side: Count = 1600
+    long_side: Positive = 1600
     """Longer side in px of the images in which features are found; larger photographs are made smaller."""
-    features: Count = 8192
+    features: Positive = 8192
     """Largest number of features of a photograph."""
     camera_model: CameraModel = "SIMPLE_RADIAL"
     """Camera model of COLMAP; OPENCV_FISHEYE for fisheye lenses."""
@@ -89,7 +89,7 @@ class MatchFeatures(Step):
 
     matching: Matching = "auto"
     """Which pairs of photographs are matched; auto: exhaustive, and vocabulary for more than 200 photographs."""
-    neighbours: Count = 10
+    neighbours: Positive = 10
     """Number of photographs that each is matched with, where not with all."""
 
     def make(self, source: Path, out: Path, without: Path) -> dict[str, Any]:
@@ -103,7 +103,7 @@ class MapCameras(Step):
 
     mapper: Mapper = "incremental"
     """How cameras are found: one after the other, or all at once (global)."""
-    threads: Count = 1
+    threads: Positive = 1
     """Number of threads; more than one are faster, and the result does not repeat to the bit."""
 
     def make(self, source: Path, out: Path, without: Path) -> dict[str, Any]:
@@ -117,7 +117,7 @@ class Undistort(Step):
 
     stage: Literal["undistort"] = "undistort"
 
-    long_side: Count | None = None
+    long_side: Positive | None = None
     """Longer side of the new images in px; without it, that of the photographs."""
     blank: Blank = "crop"
     """Pixels that no photograph shows; crop: cut them off; mask: keep the whole photograph and mask them."""

@@ -7,7 +7,7 @@ that order and sort stably by tile alone.  Bitonic: emit in order of index, writ
 
 import time
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -82,6 +82,7 @@ class Tiler:
         self._team = int(device.tuning["TEAM"])
         self.sort: Sort = known_sort(device, sort)
         self._pairs = device.program("pairs.cl")
+        self._large = device.program("large.cl")
         self._scan = device.program("scan.cl")
         self._radix = device.program("sort_radix.cl")
         self._digit_bits = int(device.tuning["DIGIT_BITS"])
@@ -95,6 +96,8 @@ class Tiler:
         if self.sort == "auto":
             self.sort = self._faster(splats, footprints, band, count, limit)
         depth_key, tile_count = footprints.depth_key, footprints.tile_count
+        large = self._large_arguments(splats, footprints, band, count)
+        self._large.count_large(**large)
         order = self._depth_order(depth_key, count) if self.sort == "radix" else self._index_order(count)
         ordered_count = self.workspace.array("ordered_count", count, np.uint32)
         self._scan.permute(items=count, values=tile_count, order=order, permuted=ordered_count, count=count)
@@ -108,7 +111,6 @@ class Tiler:
         first_pair = self.workspace.array("first_pair", count, np.uint32)
         self._pairs.emit_pairs(
             items=count,
-            splats=splats,
             tile_box=footprints.tile_box,
             tile_mask=footprints.tile_mask,
             order=order,
@@ -117,16 +119,22 @@ class Tiler:
             pair_splat=pair_splat,
             first_pair=first_pair,
             tiles_x=band.tiles_x,
-            row_begin=band.row_begin,
-            row_end=band.row_end,
             count=count,
         )
+        self._large.emit_large(**large, first_pair=first_pair, pair_tile=pair_tile, pair_splat=pair_splat)
         tiles = band.tiles
         if self.sort == "radix":
             tile_offset, tile_pairs = self._sort_by_tile(pair_tile, pairs, tiles)
         else:
             tile_offset, tile_pairs = self._sort_in_tiles(pair_tile, pair_splat, depth_key, pairs, tiles)
         return TileLists(pairs, pair_splat, first_pair, tile_count, tile_offset, tile_pairs)
+
+    def _large_arguments(self, splats: Array, footprints: Footprints, band: Band, count: int) -> dict[str, Any]:
+        """Return what both kernels for large splats take; a group on a GPU looks through as many as it has items."""
+        run = self._team if self._team > 1 else self._runs(count, shortest=1 << 8)[0]
+        size = {"groups": -(-count // run), "run": run, "count": count}
+        size |= {"tiles_x": band.tiles_x, "row_begin": band.row_begin, "row_end": band.row_end}
+        return {**size, "splats": splats, "tile_box": footprints.tile_box, "tile_count": footprints.tile_count}
 
     def scan(self, values: Array, count: int, name: str) -> Array:
         """Return the exclusive prefix sum, [count + 1] with the total at the end."""

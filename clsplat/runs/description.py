@@ -4,7 +4,7 @@ from pathlib import Path
 
 from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import Pipeline
-from clsplat.runs.folders import check_run_folder, up_to_date
+from clsplat.runs.folders import Start, check_run_folder, up_to_date
 from clsplat.runs.opening import check_start, open_run
 from clsplat.runs.outputs import check_places
 from clsplat.runs.runner import restore
@@ -14,29 +14,27 @@ from clsplat.stages.optimize import Optimize
 from clsplat.training.run import Run
 
 
-def describe(
-    pipeline: Pipeline, out: Path, device: str | Device | None, resume: bool = False, restart: bool = False
-) -> str:
+def describe(pipeline: Pipeline, out: Path, device: str | Device | None, start: Start) -> str:
     """Return a line for each stage of a run in `out`, which is left as it is.
 
     Raises what the run would raise before its first stage; of its photographs only where nothing must be prepared.
     """
     planned = pipeline.preparation(out)
-    if not restart and planned and up_to_date(pipeline, planned, out):
+    if start != "restart" and planned and up_to_date(pipeline, planned, out):
         return f"{out}: up to date"
-    check_run_folder(out, resume or restart)
+    check_run_folder(out, start)
     check_places(pipeline, out)
     lines = [f"  {one.step.stage:<14} {one.why or 'done'}" for one in planned]
-    run, start = None, "would run"
+    run, verdict = None, "would run"
     if any(one.why for one in planned):
-        check_start(pipeline, out, device, restart)
+        check_start(pipeline, out, device, start)
     else:
-        run = open_run(pipeline, out, device, restart)
-        if resume:
+        run = open_run(pipeline, out, device, start)
+        if start == "resume":
             resumed = restore(run)
-            start = f"would go on from step {run.step}" if resumed else "nothing to resume; would run"
+            verdict = f"would go on from step {run.step}" if resumed else "nothing to resume; would run"
     lines += [f"  {stage.stage:<14} {_detail(stage, run)}".rstrip() for stage in pipeline.stages]
-    return f"{start} in {out}:\n" + "\n".join(lines)
+    return f"{verdict} in {out}:\n" + "\n".join(lines)
 
 
 def _detail(stage: Stage, run: Run | None) -> str:

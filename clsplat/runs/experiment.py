@@ -9,18 +9,19 @@ from pathlib import Path
 from clsplat import terminal
 from clsplat.compare.page import write_comparison
 from clsplat.errors import ClsplatError, ConfigError, DataError, Interrupted, as_clsplat_error, one_line
-from clsplat.files import write_text
+from clsplat.files import is_there, write_text
+from clsplat.names import COMPARISON, LOG_FILE, PIPELINE
 from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import Pipeline, load
 from clsplat.pipeline.matrix import Cell, Experiment, load_experiment
 from clsplat.pipeline.yaml_file import read_yaml
 from clsplat.runs import description, folders, opening, outputs, runner
+from clsplat.runs.folders import Start
 from clsplat.signals import stop_at_once, stopping_on_signals
 from clsplat.training.changes import first_difference
 from clsplat.training.status import StatusFile, read_status
 
 LOG = logging.getLogger("clsplat")
-PAGE = "compare.html"
 
 
 @dataclass(frozen=True)
@@ -29,6 +30,7 @@ class Job:
 
     work: Pipeline | Experiment
     out: Path
+    start: Start
 
     @classmethod
     def open(
@@ -37,96 +39,81 @@ class Job:
         scene: Path | None = None,
         out: Path | None = None,
         overrides: Sequence[str] = (),
-        resume: bool = False,
+        start: Start = "new",
     ) -> "Job":
         """Check a pipeline file, or a shipped one by name; `overrides` are 'stage.key=value'.  Raises ConfigError.
 
-        out: default runs/NAME, with a number where that is another run.
+        out: default runs/NAME, with a number where that is another run; start: "resume" goes on from the newest
+        checkpoint, "restart" begins again in a folder that holds a run.
         """
-        changes = [*overrides, *([f"scene.path={quoted(scene)}"] if scene is not None else [])]
+        if out is not None:
+            is_there(out)
+        changes = [*overrides, *([f"scene.path={as_setting(scene)}"] if scene is not None else [])]
         if found := load_experiment(pipeline, changes):
-            return cls(found, out or folders.free_folder(Path("runs") / found.name, None, resume))
+            return cls(found, out or folders.free_folder(Path("runs") / found.name, None, start), start)
         checked = load(pipeline, changes)
-        return cls(checked, out or folders.free_folder(Path("runs") / checked.settings.name, checked, resume))
+        return cls(checked, out or folders.free_folder(Path("runs") / checked.settings.name, checked, start), start)
 
     @classmethod
     def resume(cls, out: Path, overrides: Sequence[str] = ()) -> "Job":
         """Take the pipeline that a run folder holds, to go on with it there.  Raises ConfigError or DataError."""
-        file = out / "pipeline.yaml"
+        file = out / PIPELINE
         if not file.is_file():
             raise DataError(f"{out}: has no pipeline.yaml; expected the folder of a run")
-        return cls.open(str(file), None, out, overrides, resume=True)
+        return cls.open(str(file), None, out, overrides, "resume")
 
-    def describe(self, device: str | Device | None = None, resume: bool = False, restart: bool = False) -> str:
+    def describe(self, device: str | Device | None = None) -> str:
         """What would run, as lines of text.  Raises what `run` raises before it begins."""
-        _require_one(resume, restart)
         if isinstance(self.work, Experiment):
-            check_matrix_folder(self.out, resume or restart)
-            return describe_matrix(self.work, self.out)
-        return description.describe(self.work, self.out, device, resume, restart)
+            return describe_matrix(self.work, self.out, device, self.start)
+        return description.describe(self.work, self.out, device, self.start)
 
-    def run(self, device: str | Device | None = None, resume: bool = False, restart: bool = False) -> None:
-        """Run it; what is up to date is left alone.  Raises ClsplatError; status.json tells why.
-
-        resume: go on from the newest checkpoint; restart: from the beginning, in a folder that holds a run.
-        """
-        _require_one(resume, restart)
+    def run(self, device: str | Device | None = None) -> None:
+        """Run it; what is up to date is left alone.  Raises ClsplatError; status.json tells why."""
         if isinstance(self.work, Experiment):
-            run_matrix(self.work, self.out, device, resume, restart)
-        elif not restart and folders.up_to_date(self.work, self.work.preparation(self.out), self.out):
+            run_matrix(self.work, self.out, device, self.start)
+        elif self.start != "restart" and folders.up_to_date(self.work, self.work.preparation(self.out), self.out):
             LOG.info("%s: up to date; change a setting, or give another folder, to run again", self.out)
         else:
-            run_pipeline(self.work, self.out, device, resume, restart)
+            run_pipeline(self.work, self.out, device, self.start)
 
 
-def _require_one(resume: bool, restart: bool) -> None:
-    if resume and restart:
-        raise ConfigError("--resume goes on with a run and --restart begins it again; give one of them")
-
-
-def run_pipeline(
-    pipeline: Pipeline, out: Path, device: str | Device | None, resume: bool, restart: bool = False
-) -> None:
+def run_pipeline(pipeline: Pipeline, out: Path, device: str | Device | None, start: Start) -> None:
     """Run one pipeline in its folder, with a log and a progress bar.  Raises ClsplatError; status.json tells why."""
-    folders.check_run_folder(out, resume or restart)
     outputs.check_places(pipeline, out)
     with (
-        folders.opened(out, resume or restart) as status,
+        folders.opened(out, start, step=0) as status,
         stopping_on_signals(stop_at_once),
         folders.failures_recorded(status),
-        terminal.logging_to(out / "log.txt"),
+        terminal.logging_to(out / LOG_FILE),
     ):
-        run = opening.open_run(pipeline, out, device, restart, status)
-        if restart:
-            folders.clear(status)
+        run = opening.open_run(pipeline, out, device, start, status)
         with terminal.progress_bar() as show:
-            runner.execute(pipeline, run, resume, show)
+            runner.execute(pipeline, run, start, show)
 
 
-def run_matrix(
-    experiment: Experiment, out: Path, device: str | Device | None, resume: bool, restart: bool = False
-) -> None:
-    """Run every cell in its folder below `out` and write compare.html; with `resume` finished cells are left alone.
+def run_matrix(experiment: Experiment, out: Path, device: str | Device | None, start: Start) -> None:
+    """Run every cell in its folder below `out` and write compare.html; a resumed matrix leaves finished cells alone.
 
     A cell that fails does not stop the others; at the end a ClsplatError is raised with the exit code of the first one.
     Interrupted stops the whole.
     """
-    check_matrix_folder(out, resume or restart)
+    check_matrix_folder(out)
     count = len(experiment.cells)
     with (
-        folders.opened(out, resume or restart, cells=count, done=0, failed={}) as status,
+        folders.opened(out, start, cells=count, done=0, failed={}) as status,
         folders.failures_recorded(status),
     ):
-        write_text(out / folders.PIPELINE, experiment.text)
-        failures = _run_cells(experiment, status, device, resume, restart)
+        write_text(out / PIPELINE, experiment.text)
+        failures = _run_cells(experiment, status, device, start)
         _compare(experiment, out, failures)
         if failures:
-            raise _first_of(failures, count)
+            raise _first_of(failures, count, "failed")
         status.end("done", exit_code=0)
 
 
 def _run_cells(
-    experiment: Experiment, status: StatusFile, device: str | Device | None, resume: bool, restart: bool
+    experiment: Experiment, status: StatusFile, device: str | Device | None, start: Start
 ) -> dict[str, ClsplatError]:
     """Run the cells one after the other; return the failures by the cells' names."""
     failures: dict[str, ClsplatError] = {}
@@ -135,11 +122,11 @@ def _run_cells(
         title, folder = f"cell {number} of {len(experiment.cells)}: {cell.name}", status.out / cell.name
         status.note(stage=cell.name)
         try:
-            if resume and _finished(cell, folder):
+            if start == "resume" and _finished(cell, folder):
                 LOG.info("%s is done", title)
             else:
                 LOG.info("%s", title)
-                run_pipeline(cell.pipeline, folder, device, resume, restart)
+                run_pipeline(cell.pipeline, folder, device, start)
         except Interrupted:
             raise
         except Exception as error:
@@ -150,25 +137,37 @@ def _run_cells(
     return failures
 
 
-def check_matrix_folder(out: Path, resume: bool) -> None:
-    """Raise ConfigError when the folder holds another run, or not those of a matrix."""
-    folders.check_run_folder(out, resume)
-    if (out / "pipeline.yaml").exists() and "matrix" not in (read_yaml(out / "pipeline.yaml").data or {}):
+def check_matrix_folder(out: Path) -> None:
+    """Raise ConfigError when the folder holds a single run."""
+    if (out / PIPELINE).exists() and "matrix" not in (read_yaml(out / PIPELINE).data or {}):
         raise ConfigError(f"{out}: holds a single run, not those of a matrix; give another folder")
 
 
-def describe_matrix(experiment: Experiment, out: Path) -> str:
-    """What would run, a line for each cell.  Raises DataError when a scene cannot be read."""
-    for scene in {c.pipeline.settings.scene for c in experiment.cells if not c.pipeline.settings.prepare}:
-        scene.read(scene.folder)
-    lines = []
+def describe_matrix(experiment: Experiment, out: Path, device: str | Device | None, start: Start) -> str:
+    """What would run, a line for each cell.
+
+    Raises a ClsplatError with the exit code of the first cell that the run would refuse.
+    """
+    folders.check_run_folder(out, start)
+    check_matrix_folder(out)
+    lines, refusals = [], dict[str, ClsplatError]()
     for cell in experiment.cells:
-        state = "done" if _finished(cell, out / cell.name) else "unfinished" if (out / cell.name).exists() else ""
+        folder = out / cell.name
+        state = "unfinished" if folder.exists() else ""
+        try:
+            if start == "resume" and _finished(cell, folder):
+                state = "done"
+            else:
+                description.describe(cell.pipeline, folder, device, start)
+        except ClsplatError as error:
+            refusals[cell.name] = error
         lines.append(f"  {cell.name}  {state}".rstrip())
+    if refusals:
+        raise _first_of(refusals, len(lines), "would fail")
     return f"would run {len(lines)} cells in {out}:\n" + "\n".join(lines)
 
 
-def quoted(folder: Path) -> str:
+def as_setting(folder: Path) -> str:
     """A folder as a value of `--set`, from wherever it is used.  Raises ConfigError when YAML cannot hold its name."""
     path = str(folder.resolve())
     try:
@@ -182,7 +181,7 @@ def _finished(cell: Cell, folder: Path) -> bool:
     """Whether the cell was run to its end.  Raises ConfigError when that was with other settings."""
     if read_status(folder).get("state") != "done":
         return False
-    before = load(str(folder / "pipeline.yaml")).resolved()
+    before = load(str(folder / PIPELINE)).resolved()
     if difference := first_difference(before, cell.pipeline.resolved()):
         raise ConfigError(f"{folder}: was run with other settings: {difference}; use another folder, or those settings")
     return True
@@ -192,13 +191,13 @@ def _compare(experiment: Experiment, out: Path, failures: dict[str, ClsplatError
     finished = [out / cell.name for cell in experiment.cells if cell.name not in failures]
     remarks = [f"{name} failed and is not shown: {error}" for name, error in failures.items()]
     if finished:
-        write_comparison(finished, out / PAGE, experiment.name, remarks)
-        LOG.info("%d runs compared in %s", len(finished), out / PAGE)
+        write_comparison(finished, out / COMPARISON, experiment.name, remarks)
+        LOG.info("%d runs compared in %s", len(finished), out / COMPARISON)
 
 
-def _first_of(failures: dict[str, ClsplatError], cells: int) -> ClsplatError:
+def _first_of(failures: dict[str, ClsplatError], cells: int, what: str) -> ClsplatError:
     """The error that stands for those of the cells, with the exit code of the first."""
     name, first = next(iter(failures.items()))
-    whole = ClsplatError(f"{len(failures)} of {cells} cells failed; the first, {name}: {first}")
+    whole = ClsplatError(f"{len(failures)} of {cells} cells {what}; the first, {name}: {first}")
     whole.exit_code = first.exit_code
     return whole

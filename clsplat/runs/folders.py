@@ -3,28 +3,29 @@
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from clsplat.errors import ConfigError, InternalError, Interrupted, OutputError, as_clsplat_error, one_line
 from clsplat.files import sweep, unwritable
+from clsplat.names import CHECKPOINTS, CHECKSUMS, INPUTS, LOCK, LOG_FILE, METRICS, NOTE, PIPELINE, RECORDS, STATUS
 from clsplat.pipeline.loading import Pipeline, load
-from clsplat.prepare.cache import NOTE, Planned, note, noted
+from clsplat.prepare.cache import Planned, note, noted
 from clsplat.runs import lock
-from clsplat.runs.outputs import CHECKSUMS
 from clsplat.training import checkpoint
 from clsplat.training.status import StatusFile, read_status
 
-PIPELINE = "pipeline.yaml"
-BEFORE_A_RUN = {"status.json", "log.txt", lock.FILE}  # files of a run that has not begun
+Start = Literal["new", "resume", "restart"]
+BEFORE_A_RUN = {STATUS, LOG_FILE, LOCK}  # files of a run that has not begun
 
 
 @contextmanager
-def opened(out: Path, resume: bool, **values: Any) -> Iterator[StatusFile]:
-    """Make the run folder, with `values` in its status, and hold it in the block.
+def opened(out: Path, start: Start, **values: Any) -> Iterator[StatusFile]:
+    """Make the run folder, swept of what killed runs have left, and its status with `values`; hold it in the block.
 
     A run that ends before it has begun leaves no new folder.
     Raises ConfigError when it holds another run, OutputError when it is in use or cannot be written.
     """
+    check_run_folder(out, start)
     made = [folder for folder in (out, *out.parents) if not folder.exists()]
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -32,7 +33,9 @@ def opened(out: Path, resume: bool, **values: Any) -> Iterator[StatusFile]:
         raise unwritable(out, error) from error
     try:
         with lock.held(out):
-            status = make_run_folder(out, resume, **values)
+            sweep(out, border=PIPELINE)
+            status = StatusFile(out, **values)
+            status.begin()
             try:
                 with closing(status):  # the next holder writes its own
                     yield status
@@ -52,7 +55,7 @@ def _remove_unused(out: Path) -> None:
         files = list(out.iterdir())
         if {file.name for file in files} <= BEFORE_A_RUN:
             for file in files:
-                if file.name != lock.FILE:
+                if file.name != LOCK:
                     file.unlink()
 
 
@@ -61,9 +64,9 @@ def clear(status: StatusFile) -> None:
     status.note(checkpoint=None)
     status.write()
     out = status.out
-    checkpoints = out / checkpoint.FOLDER
+    checkpoints = out / CHECKPOINTS
     files = [*checkpoint.saved(out), *checkpoints.glob("failed_*.npz"), *checkpoints.glob("damaged_*.npz")]
-    files += [out / name for name in (CHECKSUMS, "metrics.json", "metrics.jsonl", "inputs.json", NOTE)]
+    files += [out / name for name in (CHECKSUMS, METRICS, RECORDS, INPUTS, NOTE)]
     for file in files:
         try:
             file.unlink(missing_ok=True)
@@ -71,25 +74,11 @@ def clear(status: StatusFile) -> None:
             raise unwritable(file, error) from error
 
 
-def make_run_folder(out: Path, resume: bool, **values: Any) -> StatusFile:
-    """Make the run folder, swept of what killed runs have left, and its status.json with `values`.
-
-    Raises ConfigError when it holds another run, OutputError when it cannot be written.
-    """
-    check_run_folder(out, resume)
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise unwritable(out, error) from error
-    sweep(out, border=PIPELINE)
-    status = StatusFile(out, **(values or {"step": 0}))
-    status.begin()
-    return status
-
-
-def check_run_folder(out: Path, resume: bool) -> None:
-    """Raise ConfigError when the folder holds another run."""
-    if not resume and ((out / PIPELINE).exists() or checkpoint.saved(out)):
+def check_run_folder(out: Path, start: Start) -> None:
+    """Raise ConfigError when a new run finds another one in its folder."""
+    if start not in get_args(Start):
+        raise ConfigError(f"no start '{start}'; there are {', '.join(get_args(Start))}")
+    if start == "new" and ((out / PIPELINE).exists() or checkpoint.saved(out)):
         raise ConfigError(f"{out}: already holds a run; give another folder, --resume or --restart")
 
 
@@ -111,17 +100,17 @@ def failures_recorded(status: StatusFile, as_raised: bool = False) -> Iterator[N
         raise failure from error
 
 
-def free_folder(folder: Path, pipeline: Pipeline | None, resume: bool) -> Path:
-    """Return the default run folder: with the next free number, unless a run is resumed or up to date."""
+def free_folder(folder: Path, pipeline: Pipeline | None, start: Start) -> Path:
+    """Return the default run folder: a new run beside one that is not up to date gets the next free number."""
     number, free = 1, folder
     planned = pipeline.preparation(folder) if pipeline else []
 
     def taken() -> bool:
-        if (free / lock.FILE).exists():  # by a run that has not begun yet
+        if (free / LOCK).exists():  # by a run that has not begun yet
             return True
         return (free / PIPELINE).exists() and not (pipeline and up_to_date(pipeline, planned, free))
 
-    while not resume and taken():
+    while start == "new" and taken():
         number += 1
         free = folder.with_name(f"{folder.name}-{number}")
     return free
@@ -131,6 +120,4 @@ def up_to_date(pipeline: Pipeline, planned: Sequence[Planned], out: Path) -> boo
     """Whether `out` holds a finished run of this pipeline and the same photographs; never where nothing is prepared."""
     if not planned or noted(out) != note(planned):
         return False
-    return (
-        read_status(out).get("state") == "done" and load(str(out / "pipeline.yaml")).resolved() == pipeline.resolved()
-    )
+    return read_status(out).get("state") == "done" and load(str(out / PIPELINE)).resolved() == pipeline.resolved()

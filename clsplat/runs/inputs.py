@@ -4,30 +4,31 @@ import json
 import logging
 from pathlib import Path
 
-from clsplat.errors import ConfigError, shortened
+from clsplat.errors import ConfigError, DataError, shortened
 from clsplat.files import write_text
+from clsplat.names import INPUTS
+from clsplat.reading import read_json
 from clsplat.scene.identity import Identity
 from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
-FILE = "inputs.json"
 
 
 def write_inputs(run: Run) -> None:
     """Write the identity of the run's scene into its folder.  Raises OutputError."""
     if run.identity:
-        write_text(run.out / FILE, json.dumps(run.identity.data()) + "\n")
+        write_text(run.out / INPUTS, json.dumps(run.identity.data()) + "\n")
 
 
 def require_same_inputs(run: Run) -> None:
     """Raise ConfigError, saying what changed, when the run was started with other photographs, cameras or points."""
-    before = _read(run.out / FILE)
+    before = _read(run.out / INPUTS)
     digest = run.inputs_before or (before.digest if before else "")
     if not digest:
-        LOG.warning("%s: missing or damaged; photographs that have changed go unnoticed", run.out / FILE)
+        LOG.warning("%s: missing or damaged; photographs that have changed go unnoticed", run.out / INPUTS)
     elif run.identity and run.identity.digest != digest:
         changes = ", ".join(run.identity.changes(before)) if before else ""
-        changes = changes or f"{FILE} is missing or damaged, so what changed is not known"
+        changes = changes or f"{INPUTS} is missing or damaged, so what changed is not known"
         raise ConfigError(
             f"{run.scene.path}: not what the run was started with: {shortened(changes, 500)}; put that back, or "
             "start anew, with --restart or in another folder (--out)"
@@ -36,6 +37,6 @@ def require_same_inputs(run: Run) -> None:
 
 def _read(path: Path) -> Identity | None:
     try:
-        return Identity.from_data(json.loads(path.read_text("utf-8")))
-    except (OSError, ValueError, RecursionError):
+        return Identity.from_data(read_json(path))
+    except (DataError, ValueError):
         return None

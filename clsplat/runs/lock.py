@@ -1,8 +1,8 @@
 """One process at a time in a run folder.
 
 The system releases the lock when its holder ends, however it ends, so that it is never left behind.  The file
-`run.lock` tells who holds it.  Where a file system knows no locks, that file stands for the lock: one whose process has
-ended on this host is taken over.
+`run.lock` tells who holds it.  Where a file system knows no locks, whoever makes that file holds the folder; one whose
+process has ended on this host is taken over.
 """
 
 import errno
@@ -10,20 +10,20 @@ import io
 import json
 import logging
 import os
-import socket
 import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from clsplat.errors import OutputError
 from clsplat.files import unwritable
-from clsplat.processes import is_alive
+from clsplat.names import LOCK
+from clsplat.processes import Owner
 
 LOG = logging.getLogger("clsplat")
-FILE = "run.lock"
 HELD = {errno.EACCES, errno.EAGAIN, errno.EDEADLK}  # what the systems answer for a lock that another holds
 NO_LOCKS = {errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL}
 BEHIND_THE_TEXT = 1 << 20  # Windows locks bytes for readers too
@@ -36,7 +36,7 @@ def held(folder: Path) -> Iterator[None]:
 
     Raises OutputError, with process and host where another holds it.
     """
-    path = (folder / FILE).resolve()
+    path = (folder / LOCK).resolve()
     if path in _held:
         raise OutputError(f"{folder}: is in use by this process; end that run or trainer first, or give another folder")
     try:
@@ -59,36 +59,62 @@ def held(folder: Path) -> Iterator[None]:
 def _locked(path: Path, folder: Path) -> io.FileIO:
     """Open the file and lock it; write into it who holds it.  Raises OutputError and OSError."""
     while True:
-        file = path.open("a+b", buffering=0)
+        file, is_new = _opened(path)
+        if file is None:
+            continue
         try:
-            _lock(file, folder)
-            if _is_at(file, path):
+            if _is_ours(file, is_new, path, folder):
                 file.seek(0)
                 file.truncate()
-                file.write(json.dumps(_owner()).encode())
+                file.write(_own_text().encode())
                 return file
         except BaseException:
             file.close()
             raise
-        file.close()  # its holder has ended, and removed it
+        file.close()
 
 
-def _lock(file: io.FileIO, folder: Path) -> None:
+def _opened(path: Path) -> tuple[io.FileIO | None, bool]:
+    """Open the file, and tell whether this process made it; None where its holder removes it just now."""
+    with suppress(FileExistsError):
+        return path.open("x+b", buffering=0), True
+    with suppress(FileNotFoundError):
+        return path.open("r+b", buffering=0), False
+    return None, False
+
+
+def _is_ours(file: io.FileIO, is_new: bool, path: Path, folder: Path) -> bool:
+    """Lock the file; False where it is no longer the one at its path.  Where there are no locks, its maker holds it."""
     try:
         if not _system_lock(file):
             raise OutputError(_in_use(folder, _read(file)))
+        return _is_at(file, path)
     except OSError as error:
         if error.errno not in NO_LOCKS:
             raise
+    if not is_new:
         owner = _read(file)
-        if owner and not _has_ended(owner):
+        if not _has_ended(Owner.named_by(owner)):
             raise OutputError(
                 f"{_in_use(folder, owner)}; this file system knows no locks: if that process has ended, "
-                f"remove {folder / FILE}"
-            ) from error
-        if owner:
-            LOG.info("%s: taken over from process %s, which has ended", folder, owner.get("process"))
-        LOG.warning("%s: its file system knows no locks: never run two at once there from different hosts", folder)
+                f"remove {folder / LOCK}"
+            )
+        LOG.info("%s: taken over from process %s, which has ended", folder, owner.get("process"))
+        _remove(file, path)
+        return False
+    LOG.warning("%s: its file system knows no locks; %s alone keeps other processes away", folder, LOCK)
+    return True
+
+
+def _remove(file: io.FileIO, path: Path) -> None:
+    """Remove an open file from its path, but not another that was made there since."""
+    aside = path.with_name(f".{path.name}.{os.getpid()}-0.partial")  # swept where this process is killed
+    with suppress(FileNotFoundError):
+        os.replace(path, aside)
+        if _is_at(file, aside):
+            aside.unlink()
+        else:
+            os.replace(aside, path)
 
 
 def _system_lock(file: io.FileIO) -> bool:
@@ -120,9 +146,10 @@ def _is_at(file: io.FileIO, path: Path) -> bool:
         return False
 
 
-def _owner() -> dict[str, Any]:
+def _own_text() -> str:
+    """What the file says of this process."""
     command = " ".join([Path(sys.argv[0]).name, *sys.argv[1:]])
-    return {"process": os.getpid(), "host": socket.gethostname(), "time": time.time(), "command": command}
+    return json.dumps({**asdict(Owner.this()), "time": time.time(), "command": command})
 
 
 def _read(file: io.FileIO) -> dict[str, Any]:
@@ -135,11 +162,8 @@ def _read(file: io.FileIO) -> dict[str, Any]:
     return owner if isinstance(owner, dict) else {}
 
 
-def _has_ended(owner: dict[str, Any]) -> bool:
-    if owner.get("host") != socket.gethostname():
-        return False
-    process = owner.get("process")
-    return isinstance(process, int) and (process == os.getpid() or not is_alive(process))  # this one does not hold it
+def _has_ended(owner: Owner | None) -> bool:
+    return owner is not None and (owner == Owner.this() or owner.has_ended)  # this process does not hold it
 
 
 def _in_use(folder: Path, owner: dict[str, Any]) -> str:

@@ -1,7 +1,6 @@
 """A model at the views of a scene: rendering and measuring without training."""
 
 import io
-import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,13 +9,16 @@ from typing import Any
 
 import numpy as np
 
+from clsplat.conformance.quick import open_correct
 from clsplat.errors import ConfigError, DataError
 from clsplat.files import atomic
 from clsplat.gaussians.model import MODEL, load
+from clsplat.metrics.images import to_8_bits
 from clsplat.metrics.lpips import InputRange
 from clsplat.metrics.perceptual import Perceptual, metric_names
-from clsplat.metrics.views import PSNR_AND_SSIM, mean, measure, render_view
-from clsplat.opencl.device import Device, open_device
+from clsplat.metrics.views import PSNR_AND_SSIM, mean, measure, render_floats, require_finite
+from clsplat.names import PIPELINE
+from clsplat.opencl.device import Device
 from clsplat.pipeline.file import SceneSettings
 from clsplat.pipeline.loading import load as load_pipeline
 from clsplat.prepare.cache import noted
@@ -29,7 +31,6 @@ from clsplat.views.photographs import Photographs
 
 SPLITS = ("train", "test", "all")
 KINDS = ("png", "npy")  # of files
-LOG = logging.getLogger("clsplat")
 
 
 @dataclass(frozen=True)
@@ -53,9 +54,9 @@ class Source:
                     f"{model}: a model file does not name its scene; give the folder of a scene, or a run folder"
                 )
             return cls(model, scene, SceneSettings())
-        if not (model / "pipeline.yaml").is_file():
+        if not (model / PIPELINE).is_file():
             raise DataError(f"{model}: has no pipeline.yaml; expected a model file or a run folder")
-        settings = load_pipeline(str(model / "pipeline.yaml")).settings.scene
+        settings = load_pipeline(str(model / PIPELINE)).settings.scene
         if not (model / MODEL).is_file():
             raise DataError(f"{model}: has no {MODEL}; finish the run with `clsplat resume {model}`")
         prepared = noted(model)
@@ -78,8 +79,7 @@ class ModelFile:
         """downscale: divisor of the photographs' size; default: that of the run, 1 for a file."""
         source = Source.of(model, scene)
         file = load(source.file)
-        self.device = open_device(device)
-        LOG.info("device: %s", self.device.text)
+        self.device = open_correct(device)
         alpha = source.alpha or file.rendering.alpha
         self.photographs = read_scene(source.folder, source.settings.holdout).with_alpha(alpha)
         self.downscale = downscale or source.settings.downscale
@@ -96,14 +96,13 @@ class ModelFile:
             raise DataError(f"{self.scene.path}: has no {split} views")
         paths = image_paths(out, [view.name for view in views], f".{kind}")
         for path, view in zip(paths, views, strict=True):
-            camera = photographs.camera(view)
+            image = render_floats(self.rasterizer, self.model, photographs.camera(view), photographs.background)
+            require_finite(image, view)
             if kind == "png":
-                write_image(path, render_view(self.rasterizer, self.model, camera, photographs.background))
+                write_image(path, to_8_bits(image))
             else:
-                frame = self.rasterizer.forward(self.model, camera, photographs.background)
-                planes = frame.image.get()[:, : camera.height, : camera.width]
                 buffer = io.BytesIO()
-                np.save(buffer, np.ascontiguousarray(planes.transpose(1, 2, 0)), allow_pickle=False)
+                np.save(buffer, image, allow_pickle=False)
                 with atomic(path) as stream:
                     stream.write(buffer.getvalue())
         return len(views)
@@ -118,7 +117,8 @@ class ModelFile:
             photographs = Photographs(self.device, self.background)
             for split in ("test", "train"):
                 if scene.split(split):
-                    results = measure(self.rasterizer, self.model, scene.split(split), photographs, perceptual)
+                    views = scene.split(split)
+                    results = measure(self.rasterizer, self.model, views, photographs, perceptual, finite=True)
                     metrics[split][f"{downscale:g}"] = mean(results, perceptual)
         return {**metrics, "gaussians": self.model.gaussians.count, "device": self.device.text}
 

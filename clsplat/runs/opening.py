@@ -8,12 +8,14 @@ from pathlib import Path
 from clsplat.conformance.quick import open_correct
 from clsplat.errors import ConfigError
 from clsplat.files import unwritable
+from clsplat.names import UNDISTORTED
 from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import Pipeline, prepared_folder
 from clsplat.prepare.cache import Planned, note, noted, prepare
 from clsplat.progress import heard_by
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.runs import lock
+from clsplat.runs.folders import Start
 from clsplat.scene.decoding import decode_all, require_whole
 from clsplat.scene.detect import read_scene
 from clsplat.scene.identity import Identity
@@ -26,14 +28,14 @@ LOG = logging.getLogger("clsplat")
 
 
 def open_run(
-    pipeline: Pipeline, out: Path, device: str | Device | None, restart: bool = False, status: StatusFile | None = None
+    pipeline: Pipeline, out: Path, device: str | Device | None, start: Start = "new", status: StatusFile | None = None
 ) -> Run:
     """Open the device, prepare and read the scene, decode its photographs, and tell `status` how far that is.
 
-    restart: whatever photographs the run in `out` was started with, others may take their place.
+    start: "restart" lets others take the place of the photographs that the run in `out` was started with.
     Raises the errors of these steps.
     """
-    opened, planned = check_start(pipeline, out, device, restart)
+    opened, planned = check_start(pipeline, out, device, start)
     if status:
         status.enter("preparing", device=opened.text)
     status = status or StatusFile(out)
@@ -60,7 +62,7 @@ def _only_one_preparing(root: Path) -> Iterator[None]:
 
 
 def check_start(
-    pipeline: Pipeline, out: Path, device: str | Device | None, restart: bool = False
+    pipeline: Pipeline, out: Path, device: str | Device | None, start: Start
 ) -> tuple[Device, list[Planned]]:
     """Check all that can be checked before photographs are prepared; return the device and the steps of `prepare`.
 
@@ -71,7 +73,7 @@ def check_start(
         stage.check()
     opened = open_correct(device, settings.rasterizer.schedule, settings.rasterizer.sort)
     planned = pipeline.preparation(out)
-    if planned and not restart and noted(out) not in (None, note(planned)):
+    if planned and start != "restart" and noted(out) not in (None, note(planned)):
         raise ConfigError(
             f"{out}: was started with other photographs, or other settings of `prepare`; give another folder"
         )
@@ -80,7 +82,7 @@ def check_start(
     return opened, planned
 
 
-def make_run(pipeline: Pipeline, scene: Scene, device: Device, out: Path, status: StatusFile | None = None) -> Run:
+def make_run(pipeline: Pipeline, scene: Scene, device: Device, out: Path, status: StatusFile) -> Run:
     """Return a run of the pipeline on a scene, before its first stage; every photograph was decoded.
 
     Raises DataError, naming the files, when some of the training or test photographs and masks cannot be used.
@@ -105,18 +107,18 @@ def make_run(pipeline: Pipeline, scene: Scene, device: Device, out: Path, status
         view for one in (original, downscaled) for split in ("train", "test") for view in one.split(split)
     )
     require_whole(scene.path, files)
-    run = Run(
+    return Run(
         device=device,
         scene=downscaled,
         original=original,
         out=out,
         name=settings.name,
         seed=settings.seed,
+        settings=settings,
         pipeline=pipeline.resolved(),
         rasterizer=Rasterizer(device, settings.rasterizer.sort, settings.rasterizer.budget()),
-        photographs=Photographs(device, background, None if budget is None else budget << 20, out / "undistorted"),
+        photographs=Photographs(device, background, None if budget is None else budget << 20, out / UNDISTORTED),
+        status=status,
         model_settings=settings.model,
         identity=Identity.of(original, files),
     )
-    run.status = status or run.status
-    return run

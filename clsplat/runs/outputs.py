@@ -1,17 +1,19 @@
 """The files that a run has at its end."""
 
-import hashlib
 import json
+from collections.abc import Iterator
 from pathlib import Path
 
 from clsplat.compare.run_folder import read_metrics
 from clsplat.errors import ConfigError, DataError, OutputError
-from clsplat.files import write_text
+from clsplat.files import is_there, write_text
+from clsplat.names import CHECKSUMS, LOG_FILE, METRICS, PIPELINE, RECORDS
 from clsplat.pipeline.loading import Pipeline, load
+from clsplat.reading import sha256
+from clsplat.stages.base import Stage
+from clsplat.stages.optimize import Optimize
 from clsplat.training import checkpoint
 from clsplat.training.run import Run
-
-CHECKSUMS = "checksums.json"
 
 
 def write_metrics(run: Run) -> None:
@@ -26,29 +28,28 @@ def write_metrics(run: Run) -> None:
         "pipeline": run.name,
         **({"changes": run.changes} if run.changes else {}),
     }
-    write_text(run.out / "metrics.json", json.dumps(metrics, indent=1) + "\n")
+    write_text(run.out / METRICS, json.dumps(metrics, indent=1) + "\n")
 
 
 def write_checksums(pipeline: Pipeline, run: Run) -> None:
     """Write the SHA-256 of every file that the run has at its end, by its path in the run folder."""
-    found = [run.out / name for name in ("pipeline.yaml", "metrics.json", "metrics.jsonl")]
+    found = [run.out / name for name in (PIPELINE, METRICS, RECORDS)]
     for place in (path for stage in pipeline.stages for path in stage.outputs(run.out)):
         found += sorted(place.rglob("*")) if place.is_dir() else [place]
-    sums = {path.relative_to(run.out).as_posix(): checksum(path) for path in dict.fromkeys(found) if path.is_file()}
+    sums = {
+        path.relative_to(run.out).as_posix(): sha256(path, kind=OutputError)
+        for path in dict.fromkeys(found)
+        if path.is_file()
+    }
     write_text(run.out / CHECKSUMS, json.dumps(sums, indent=1) + "\n")
 
 
-def checksum(path: Path) -> str:
-    """Return the SHA-256 of a file, as `sha256sum` prints it.  Raises OutputError."""
-    try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be read back ({error.strerror})") from error
-
-
 def check_places(pipeline: Pipeline, out: Path) -> None:
-    """Raise ConfigError where a run in `out` would write elsewhere, or over files that no run there has made."""
+    """Raise ConfigError where a run in `out` would write elsewhere, or over files that no run there has made.
+
+    Raises OutputError where there can be no such folder.
+    """
+    is_there(out)
     folder, scene = out.resolve(), pipeline.settings.scene
     if folder == folder.parent:
         raise ConfigError(f"{out}: is the root of a file system; give another folder for the run")
@@ -56,10 +57,10 @@ def check_places(pipeline: Pipeline, out: Path) -> None:
     if scene.path is not None and scene.folder.resolve() in taken:
         raise ConfigError(f"{out}: is the folder of the photographs, or right in it; give another folder for the run")
     own = [path for stage in pipeline.stages for path in stage.outputs(out)]
-    for path in [*own, out / "log.txt"]:
+    for path in [*own, out / LOG_FILE]:
         if not path.resolve().is_relative_to(folder):
             raise ConfigError(f"{path}: a link leads outside of the run folder; remove it, or choose another name")
-    again = (out / "pipeline.yaml").exists() or checkpoint.saved(out)
+    again = (out / PIPELINE).exists() or checkpoint.saved(out)
     for path in () if again else own:
         if path.is_file() or (path.is_dir() and any(path.iterdir())):
             raise ConfigError(f"{path}: exists, and is not of this run; give another folder for the run")
@@ -68,9 +69,19 @@ def check_places(pipeline: Pipeline, out: Path) -> None:
 def check_outputs(pipeline: Pipeline, run: Run) -> None:
     """Read back the files of a run.  Raises OutputError where one is missing or damaged."""
     try:
-        read_metrics(run.out / "metrics.json")
-        load(str(run.out / "pipeline.yaml"))
-        for stage in pipeline.stages:
+        read_metrics(run.out / METRICS)
+        load(str(run.out / PIPELINE))
+        for stage in _acting(pipeline):
             stage.verify(run)
     except (ConfigError, DataError) as error:
-        raise OutputError(f"{error}, at the end of the run; see {run.out / 'log.txt'}") from error
+        raise OutputError(f"{error}, at the end of the run; see {run.out / LOG_FILE}") from error
+
+
+def _acting(pipeline: Pipeline) -> Iterator[Stage]:
+    """The stages of a whole run, each training with those of its `during` that have run."""
+    step = 0
+    for stage in pipeline.stages:
+        yield stage
+        if isinstance(stage, Optimize):
+            yield from stage.acting(step)
+            step += stage.steps

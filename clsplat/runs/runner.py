@@ -8,11 +8,11 @@ from pathlib import Path
 
 from clsplat.errors import Interrupted
 from clsplat.files import write_text
+from clsplat.names import CHECKSUMS, NOTE, PIPELINE
 from clsplat.pipeline.loading import Pipeline
-from clsplat.prepare.cache import NOTE
-from clsplat.runs.folders import failures_recorded
+from clsplat.runs.folders import Start, clear, failures_recorded
 from clsplat.runs.inputs import require_same_inputs, write_inputs
-from clsplat.runs.outputs import CHECKSUMS, check_outputs, write_checksums, write_metrics
+from clsplat.runs.outputs import check_outputs, write_checksums, write_metrics
 from clsplat.runs.signals import finishing_on_interrupt
 from clsplat.training import checkpoint
 from clsplat.training.rescue import saved_on_failure
@@ -21,10 +21,10 @@ from clsplat.training.run import Progress, Run, Stopped
 LOG = logging.getLogger("clsplat")
 
 
-def execute(pipeline: Pipeline, run: Run, resume: bool, show: Callable[[Progress], None]) -> None:
-    """Run the stages, from the newest checkpoint with `resume`, and write the files of the run folder."""
+def execute(pipeline: Pipeline, run: Run, start: Start, show: Callable[[Progress], None]) -> None:
+    """Run the stages, from the newest checkpoint where the run is resumed, and write the files of the run folder."""
     run.show = show
-    begin(pipeline, run, resume)
+    begin(pipeline, run, start)
     with failures_recorded(run.status):
         with finishing_on_interrupt(run), saved_on_failure(run):
             _run_stages(pipeline, run)
@@ -34,14 +34,16 @@ def execute(pipeline: Pipeline, run: Run, resume: bool, show: Callable[[Progress
         run.status.end("done", exit_code=0)
 
 
-def begin(pipeline: Pipeline, run: Run, resume: bool) -> None:
-    """Take the newest checkpoint when resuming, and write what the run folder holds from the beginning on."""
-    if resume:
+def begin(pipeline: Pipeline, run: Run, start: Start) -> None:
+    """Take the newest checkpoint, or clear the folder, and write what a run folder holds from the beginning on."""
+    if start == "restart":
+        clear(run.status)
+    if start == "resume":
         taken = restore(run)
         LOG.info("resumed at step %d" if taken else "nothing to resume; starting from the beginning%.0s", run.step)
         checkpoint.drop_later(run.out, taken)
     (run.out / CHECKSUMS).unlink(missing_ok=True)
-    write_text(run.out / "pipeline.yaml", f"# resolved from {pipeline.path.name}\n{pipeline.text()}")
+    write_text(run.out / PIPELINE, f"# resolved from {pipeline.path.name}\n{pipeline.text()}")
     write_inputs(run)
     if run.prepared:
         write_text(run.out / NOTE, json.dumps(run.prepared) + "\n")

@@ -1,15 +1,15 @@
 """The state of a run, or of a matrix, from the files of its folder alone."""
 
-import platform
 import time
 from pathlib import Path
 from typing import Any
 
 from clsplat.compare.run_folder import read_metrics
 from clsplat.errors import DataError
-from clsplat.processes import is_alive
+from clsplat.names import METRICS, PIPELINE
+from clsplat.processes import Owner
 from clsplat.training.records import Records
-from clsplat.training.status import END_STATES, pid_namespace, read_status
+from clsplat.training.status import END_STATES, read_status
 
 SILENT = 60  # seconds without a heartbeat that are worth a line
 
@@ -25,13 +25,14 @@ def run_status(out: Path) -> dict[str, Any]:
     if not isinstance(status.get("state"), str):
         raise DataError(f"{out}: has no readable status.json; expected the folder of a run")
     if status["state"] not in END_STATES:
-        if _gone(status):
+        owner = Owner.named_by(status)
+        if owner and owner.has_ended:
             status["state"] = "killed"
         elif isinstance(status.get("time"), int | float):
             status["silent"] = max(0, round(time.time() - status["time"]))
     metrics = None
-    if (out / "metrics.json").exists():
-        metrics = read_metrics(out / "metrics.json").model_dump(exclude_unset=True)
+    if (out / METRICS).exists():
+        metrics = read_metrics(out / METRICS).model_dump(exclude_unset=True)
     lines = Records(out).read("train")
     return {"run": str(out), **status, "last": lines[-1] if lines else None, "metrics": metrics}
 
@@ -47,7 +48,7 @@ def status_text(status: dict[str, Any]) -> str:
     if (
         goes_on
         and status["state"] in ("killed", "failed", "interrupted")
-        and (Path(status["run"]) / "pipeline.yaml").is_file()
+        and (Path(status["run"]) / PIPELINE).is_file()
     ):
         lines.append(f"  `clsplat resume {status['run']}` goes on with it")
     if status["last"] and status["metrics"] is None:
@@ -82,19 +83,7 @@ def _figures(values: dict[str, Any], names: tuple[str, ...]) -> str:
     )
 
 
-def _here(status: dict[str, Any]) -> bool:
-    """Whether the run's process number counts on this machine; older files do not say."""
-    return status.get("host", platform.node()) == platform.node() and status.get("pid_namespace") in (
-        None,
-        pid_namespace(),
-    )
-
-
 def _place(status: dict[str, Any]) -> str:
-    return f"; process {status.get('process')}" if _here(status) else f"; it runs on {status.get('host')}"
-
-
-def _gone(status: dict[str, Any]) -> bool:
-    """Whether the process has ended, as far as that can be known from here."""
-    process = status.get("process")
-    return isinstance(process, int) and process > 0 and _here(status) and not is_alive(process)
+    owner = Owner.named_by(status)
+    elsewhere = owner is not None and not owner.is_here
+    return f"; it runs on {status.get('host')}" if elsewhere else f"; process {status.get('process')}"

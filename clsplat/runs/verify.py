@@ -9,12 +9,11 @@ from clsplat import plugins
 from clsplat.compare.run_folder import read_metrics, read_settings
 from clsplat.errors import ConfigError, DataError, one_line
 from clsplat.gaussians.model import load as load_model
+from clsplat.names import CHECKPOINTS, CHECKSUMS, METRICS, PIPELINE, RECORDS, STATUS
 from clsplat.pipeline.files import shipped
 from clsplat.pipeline.loading import load as load_pipeline
 from clsplat.pipeline.matrix import load_experiment
-from clsplat.reading import read_json
-from clsplat.runs.folders import PIPELINE
-from clsplat.runs.outputs import CHECKSUMS, checksum
+from clsplat.reading import read_json, sha256
 from clsplat.scene.images import read_image
 from clsplat.stages.export import Export
 from clsplat.training import archive, checkpoint
@@ -26,7 +25,7 @@ MISSING = "is missing"
 
 def is_run(folder: Path) -> bool:
     """Whether a folder holds a run or a matrix."""
-    return any((folder / name).is_file() for name in (PIPELINE, "status.json"))
+    return any((folder / name).is_file() for name in (PIPELINE, STATUS))
 
 
 def check(pipeline: str) -> dict[str, Any]:
@@ -93,13 +92,13 @@ def _objects(out: Path) -> Iterator[dict[str, Any]]:
         return _settings(path, settings)
 
     yield one(out / PIPELINE, pipeline)
-    yield one(out / "status.json", _status)
+    yield one(out / STATUS, _status)
     if "matrix" in settings:
         for cell in sorted(folder for folder in out.iterdir() if folder.is_dir() and is_run(folder)):
             yield from ({**found, "file": f"{cell.name}/{found['file']}"} for found in _objects(cell))
         return
     yield from (one(path, _checkpoint) for path in checkpoint.saved(out))
-    yield from (one(path, _failed) for path in sorted((out / checkpoint.FOLDER).glob("failed_*.npz")))
+    yield from (one(path, _failed) for path in sorted((out / CHECKPOINTS).glob("failed_*.npz")))
     sums = _sums(out)
     if (out / CHECKSUMS).exists():
         yield one(out / CHECKSUMS, _listed)
@@ -158,22 +157,22 @@ def _declared(out: Path, settings: dict[str, Any], done: bool) -> list[str]:
     except ConfigError:  # told already
         stages = []
     models = [stage.file for stage in stages if isinstance(stage, Export)]
-    return ["metrics.jsonl", *(["metrics.json", *models] if (out / "metrics.json").exists() or models else [])]
+    return [RECORDS, *([METRICS, *models] if (out / METRICS).exists() or models else [])]
 
 
 def _present(out: Path) -> list[str]:
     """Records and models that are there without a checksum, such as those of a run that is not done."""
-    names = [name for name in ("metrics.json", "metrics.jsonl") if (out / name).exists()]
+    names = [name for name in (METRICS, RECORDS) if (out / name).exists()]
     return [*names, *sorted(path.name for path in out.glob("*.ply"))]
 
 
 def _output(expected: str | None, path: Path) -> str:
     """Look at one output; return what it is.  Raises the errors of its reader, DataError where its bytes changed."""
-    if expected is not None and checksum(path) != expected:
+    if expected is not None and sha256(path) != expected:
         raise DataError("differs from its checksum")
-    if path.name == "metrics.json":
+    if path.name == METRICS:
         return f"{read_metrics(path).gaussians:,} Gaussians"
-    if path.name == "metrics.jsonl":
+    if path.name == RECORDS:
         return f"{len(Records(path.parent).read())} lines"
     if path.suffix == ".ply":
         return f"{len(load_model(path)):,} Gaussians"

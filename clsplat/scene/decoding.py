@@ -95,10 +95,10 @@ class Memory:
         self._known: dict[str, Size] = {}
         self._fresh: dict[str, Size] = {}
         self.path: Path | None = None
-        with suppress(OSError, OutputError):
+        with suppress(DataError, OutputError):
             self.path = cache_folder() / "decoded" / f"opencv-{cv2.__version__}.txt"
-            if self.path.stat().st_size < MAX_REMEMBERED:
-                self._known = dict(filter(None, map(_entry, self.path.read_bytes().splitlines(keepends=True))))
+            lines = read_file(self.path, limit=MAX_REMEMBERED).splitlines(keepends=True)
+            self._known = dict(filter(None, map(_entry, lines)))
 
     def size(self, digest: str, data: bytes, file: Path, upright: bool = False) -> Size:
         """Return (width, height) of the content of `file`, decoding it unless that was done.  Raises DataError."""

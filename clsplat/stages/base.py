@@ -13,6 +13,8 @@ from clsplat.names import fault_of_output
 from clsplat.settings import Settings
 from clsplat.training.run import Run
 
+CADENCE = frozenset({"every", "start", "stop"})
+
 
 @dataclass(frozen=True)
 class PathInRun(AfterValidator):
@@ -73,8 +75,11 @@ class Stage(Settings):
         """Read back what the stage has written.  Raises DataError where it is missing or damaged."""
 
     def act(self, run: Run) -> None:
-        """Run the stage, under its name in status.json; what fails inside of an edit leaves a run that is not whole."""
-        with run.status.stage(self.stage), run.changing() if self.edits else nullcontext():
+        """Run the stage, under its name in status.json; what fails inside of an edit leaves a run that is not whole.
+
+        A stage that fails is repeated from its beginning when the run goes on, so that its records do not stay.
+        """
+        with run.status.stage(self.stage), run.changing() if self.edits else nullcontext(), run.records.of_a_stage():
             self.run(run)
 
 
@@ -83,6 +88,8 @@ class Scheduled(Stage):
 
     It runs at every step that is a multiple of `every`, after `start` and before `stop`.
     """
+
+    training_keys: ClassVar[frozenset[str]] = CADENCE
 
     every: Annotated[int, Field(gt=0)] | None = None
     """Steps from one run of the stage to the next; inside `during` only."""

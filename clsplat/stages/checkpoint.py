@@ -4,7 +4,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from clsplat.stages.base import Scheduled
+from clsplat.stages.base import CADENCE, Scheduled
 from clsplat.training import checkpoint
 from clsplat.training.run import Run
 
@@ -14,6 +14,7 @@ class Checkpoint(Scheduled):
 
     stage: Literal["checkpoint"] = "checkpoint"
     needs: ClassVar[frozenset[str]] = frozenset({"model"})
+    output_keys: ClassVar[frozenset[str]] = CADENCE | {"keep"}
 
     keep: Annotated[int, Field(gt=0)] = 2
     """Number of checkpoints that are kept, the newest ones."""

@@ -23,6 +23,7 @@ class Densify(Scheduled):
     stage: Literal["densify"] = "densify"
     needs: ClassVar[frozenset[str]] = frozenset({"model", "stats"})
     edits: ClassVar[bool] = True
+    training_keys: ClassVar[frozenset[str]] = frozenset({"max_gaussians"})
 
     rules: list[OneOf[Rule]]
     """Which Gaussians grow or are removed; the first growing rule decides, pruning rules override growth."""

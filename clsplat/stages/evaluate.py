@@ -9,7 +9,7 @@ from clsplat.metrics.lpips import InputRange
 from clsplat.metrics.perceptual import Metric, Perceptual
 from clsplat.metrics.views import mean, measure
 from clsplat.names import ReadPath
-from clsplat.stages.base import Scheduled
+from clsplat.stages.base import CADENCE, Scheduled
 from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
@@ -26,6 +26,7 @@ class Evaluate(Scheduled):
     stage: Literal["evaluate"] = "evaluate"
     needs: ClassVar[frozenset[str]] = frozenset({"model"})
     makes: ClassVar[frozenset[str]] = frozenset({"metrics"})
+    output_keys: ClassVar[frozenset[str]] = CADENCE | {"split", "downscales", "metrics", "lpips", "lpips_input"}
 
     split: Literal["test", "train"] = "test"
     """Views that are measured."""

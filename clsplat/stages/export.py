@@ -4,9 +4,10 @@ import logging
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
-from clsplat.errors import DataError
+from clsplat.errors import DataError, OutputError
 from clsplat.gaussians.model import load
-from clsplat.stages.base import Scheduled, path_in_run
+from clsplat.reading import sha256
+from clsplat.stages.base import CADENCE, Scheduled, path_in_run
 from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
@@ -21,6 +22,7 @@ class Export(Scheduled):
 
     stage: Literal["export"] = "export"
     needs: ClassVar[frozenset[str]] = frozenset({"model"})
+    output_keys: ClassVar[frozenset[str]] = CADENCE | {"file"}
 
     file: Annotated[str, path_in_run(".ply")] = "point_cloud.ply"
     """Path inside the run folder."""
@@ -36,11 +38,17 @@ class Export(Scheduled):
         if model.filter_variance is not None:
             files[raw] = model
         for file, one in files.items():
-            one.save(file)
-            load(file)
+            run.written[file] = one.save(file)
+            try:
+                load(file)
+            except DataError as error:
+                raise OutputError(f"{error}; it was written just now: check the disk and its space") from error
             LOG.info("%d Gaussians written to %s", len(one), file)
 
     def verify(self, run: Run) -> None:
-        path = run.out / self.file  # it was read back when it was written
-        if not path.is_file() or path.stat().st_size == 0:
-            raise DataError(f"{path}: is missing or empty")
+        path, raw = self.outputs(run.out)
+        for file in (path, raw) if raw in run.written or raw.exists() else (path,):
+            if file not in run.written:  # before the run was resumed
+                load(file)
+            elif sha256(file) != run.written[file]:
+                raise DataError(f"{file}: differs from what was written")

@@ -42,6 +42,8 @@ class Optimize(Stage):
     stage: Literal["optimize"] = "optimize"
     needs: ClassVar[frozenset[str]] = frozenset({"model"})
     makes: ClassVar[frozenset[str]] = frozenset({"adam", "stats"})
+    output_keys: ClassVar[frozenset[str]] = frozenset({"log_every"})
+    training_keys: ClassVar[frozenset[str]] = frozenset({"steps", "rates"})
 
     steps: Annotated[int, Field(gt=0)]
     """Number of training steps."""
@@ -78,9 +80,18 @@ class Optimize(Stage):
     def outputs(self, out: Path) -> list[Path]:
         return [path for stage in self.during for path in stage.outputs(out)]
 
+    def acting(self, step: int) -> list[Scheduled]:
+        """Return the stages of `during` that run when the training begins after a global step."""
+        steps = range(step + 1, step + self.steps + 1)
+        return [stage for stage in self.during if any(map(stage.due, steps))]
+
     def run(self, run: Run) -> None:
         for _ in self.iterate(run):
             pass
+
+    def act(self, run: Run) -> None:
+        with run.status.stage(self.stage):  # it goes on in its middle, so that its records stay
+            self.run(run)
 
     def iterate(self, run: Run) -> Iterator[ViewGradients]:
         """Train step by step; the gradients that a step yields are valid until the next."""
@@ -233,6 +244,7 @@ class Optimize(Stage):
         run.records.add(run.step, "train", loss=loss, psnr=psnr, gaussians=count, ms=1e3 * seconds, stages=stages)
         if run.step % (DISTRIBUTION_INTERVAL * self.log_every) == 0 or run.step == last_step:
             run.records.add(run.step, "distribution", gaussians=count, **distribution(run.model.gaussians))
+        run.records.write()
         left = seconds * (last_step - run.step)
         run.status.note(gaussians=count, seconds_left=round(left, 1))
         run.show(Progress(run.step, last_step, loss, psnr, count, 1e3 * seconds, left))

@@ -21,6 +21,7 @@ class Render(Stage):
 
     stage: Literal["render"] = "render"
     needs: ClassVar[frozenset[str]] = frozenset({"model"})
+    output_keys: ClassVar[frozenset[str]] = frozenset({"split", "folder"})
 
     split: Literal["test", "train", "all"] = "test"
     """Views that are rendered."""

@@ -17,9 +17,10 @@ from clsplat.files import write_text
 from clsplat.metrics.distribution import SHARES
 from clsplat.metrics.perceptual import Image
 from clsplat.metrics.views import render_view
+from clsplat.names import PIPELINE
 from clsplat.pages.page import charts, counted, duration, embedded, render
 from clsplat.pages.svg import Line, curve
-from clsplat.reading import read_file
+from clsplat.reading import read_file, read_text
 from clsplat.stages.base import Stage, path_in_run
 from clsplat.training.run import Run
 
@@ -32,6 +33,7 @@ class Report(Stage):
 
     stage: Literal["report"] = "report"
     needs: ClassVar[frozenset[str]] = frozenset({"model", "metrics"})
+    output_keys: ClassVar[frozenset[str]] = frozenset({"file"})
 
     file: Annotated[str, path_in_run(".html")] = "report.html"
     """Path inside the run folder."""
@@ -212,5 +214,5 @@ def _figure(record: dict[str, Any], image: Image, photograph: Image) -> ViewFigu
 
 
 def _settings(run: Run) -> str:
-    path = run.out / "pipeline.yaml"
-    return path.read_text(encoding="utf-8") if path.exists() else ""
+    path = run.out / PIPELINE
+    return read_text(path) if path.exists() else ""

@@ -31,6 +31,7 @@ class ResetOpacity(Scheduled):
     stage: Literal["reset_opacity"] = "reset_opacity"
     needs: ClassVar[frozenset[str]] = frozenset({"model"})
     edits: ClassVar[bool] = True
+    training_keys: ClassVar[frozenset[str]] = frozenset({"to"})
 
     to: Annotated[float, Field(gt=0, lt=1)] = 0.01
     """Largest opacity after the reset."""

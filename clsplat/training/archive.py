@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.errors import DataError, OutputError, one_line, shortened
+from clsplat.reading import regular
 
 META, META_DIGEST, DIGESTS = "meta", "meta_sha256", "sha256"
 DAMAGE = {None, errno.EINVAL, errno.EISDIR}  # a place before the file's beginning, or a folder of its name
@@ -42,7 +43,7 @@ def read(path: Path) -> tuple[Notes, Arrays]:
     Raises OutputError and MemoryError where the system cannot read it, which says nothing about the file.
     """
     try:
-        with zipfile.ZipFile(path) as archive:
+        with regular(path) as file, zipfile.ZipFile(file) as archive:
             _require_sizes(archive, path.stat().st_size)
             notes = _notes(archive)
             if DIGESTS not in notes:

@@ -1,27 +1,13 @@
-"""Settings of a run that may change when it goes on, and those in which two resolved pipelines differ."""
+"""Settings in which two resolved pipelines differ, and whether a run can go on with them."""
 
 import re
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from clsplat.errors import shortened
+from clsplat.settings import TAGS, Settings, resumable
 
-STAGE = r"stages\[(?P<stage>\d+)\]"
-DURING = rf"{STAGE}\.\w+\.during\[\d+\]"
-OUTPUTS = (  # what is measured and written; the model does not depend on it
-    r"scene\.image_budget",
-    rf"{STAGE}\.(evaluate|export|render|report|checkpoint)\b.*",
-    rf"{STAGE}\.\w+\.log_every",
-    rf"{DURING}\.(evaluate|export|checkpoint)\..*",
-)
-TRAINING = (  # numbers of the training; no table of the Gaussians depends on them
-    rf"{STAGE}\.\w+\.steps",
-    rf"{STAGE}\.\w+\.rates\..*",
-    rf"{STAGE}\.\w+\.losses\[\d+\]\.weight\b.*",
-    rf"{DURING}\.\w+\.(every|start|stop|to)",
-    rf"{DURING}\.\w+\.max_gaussians\b.*",
-    rf"{DURING}\.\w+\.rules\[\d+\]\.\w+",  # a number in the place of another
-)
+Kind = Literal["output", "training"] | None
 
 
 class Difference(NamedTuple):
@@ -30,37 +16,34 @@ class Difference(NamedTuple):
     place: str  # such as stages[1].optimize.rates.quats
     was: Any
     now: Any
+    kind: Kind  # as its class says; None: a run cannot go on with the new value
 
     def __str__(self) -> str:
         return f"{self.place} was {shortened(repr(self.was), 80)}, is {shortened(repr(self.now), 80)}"
 
     @property
-    def of_outputs(self) -> bool:
-        """Whether the trained model does not depend on the setting."""
-        return self._match(OUTPUTS) is not None
-
-    @property
     def stage(self) -> int | None:
-        """The stage whose training goes on with the new value; None where a run cannot go on with it."""
-        found = self._match(TRAINING)
-        if found is None or (".rules[" in self.place and not (_is_number(self.was) and _is_number(self.now))):
-            return None
-        return int(found["stage"])
-
-    def _match(self, patterns: tuple[str, ...]) -> re.Match[str] | None:
-        return next((found for pattern in patterns if (found := re.fullmatch(pattern, self.place))), None)
+        """The stage of the pipeline that it belongs to, or None."""
+        found = re.match(r"stages\[(\d+)\]", self.place)
+        return int(found[1]) if found else None
 
 
-def differences(old: Any, new: Any, place: str = "") -> Iterator[Difference]:
-    """Yield the settings in which two resolved pipelines differ, in their order."""
+def differences(old: Any, new: Any, settings: Any = None, place: str = "", kind: Kind = None) -> Iterator[Difference]:
+    """Yield the settings in which two resolved pipelines differ, in their order.
+
+    settings: what `new` was resolved from; its classes tell the kinds.
+    """
     if isinstance(old, dict) and isinstance(new, dict):
         for key in [*old, *(key for key in new if key not in old)]:
-            yield from differences(old.get(key), new.get(key), f"{place}.{key}" if place else str(key))
+            inner, of = _inside(settings, key)
+            where = f"{place}.{key}" if place else str(key)
+            yield from differences(old.get(key), new.get(key), inner, where, kind or of)
     elif isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
         for i, (before, after) in enumerate(zip(old, new, strict=True)):
-            yield from differences(before, after, f"{place}[{i}]")
+            inner = settings[i] if isinstance(settings, list) else None
+            yield from differences(before, after, inner, f"{place}[{i}]", kind)
     elif old != new:
-        yield Difference(place, old, new)
+        yield Difference(place, old, new, kind)
 
 
 def first_difference(old: Any, new: Any) -> Difference | None:
@@ -68,5 +51,11 @@ def first_difference(old: Any, new: Any) -> Difference | None:
     return next(differences(old, new), None)
 
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
+def _inside(settings: Any, key: str) -> tuple[Any, Kind]:
+    """The settings below a key, and what a change of the key means."""
+    if not isinstance(settings, Settings):
+        return None, None
+    if key in type(settings).model_fields:
+        return getattr(settings, key), resumable(type(settings), key)
+    named = any(getattr(settings, tag, None) == key for tag in TAGS)  # a stage is written as {name: fields}
+    return settings if named else None, None

@@ -20,6 +20,7 @@ from clsplat.errors import ClsplatError, ConfigError, DataError, NumericError, O
 from clsplat.files import atomic
 from clsplat.gaussians.model import WIDTHS
 from clsplat.gaussians.tables import PARAMETERS, Gaussians, moment_tables
+from clsplat.names import CHECKPOINTS, PIPELINE
 from clsplat.training import archive
 from clsplat.training.adam import Adam
 from clsplat.training.advice import lower_rate
@@ -28,7 +29,6 @@ from clsplat.training.changes import differences
 from clsplat.training.run import Run
 
 FORMAT = 4
-FOLDER = "checkpoints"
 LOG = logging.getLogger("clsplat")
 Count = Annotated[int, Field(ge=0)]
 
@@ -98,7 +98,7 @@ def saved(out: Path) -> list[Path]:
     """Return the checkpoints of a run folder from old to new."""
     steps = {
         int(found[1]): path
-        for path in (out / FOLDER).glob("step_*.npz")
+        for path in (out / CHECKPOINTS).glob("step_*.npz")
         if (found := re.fullmatch(r"step_(\d+)\.npz", path.name))
     }
     return [steps[step] for step in sorted(steps)]
@@ -130,7 +130,7 @@ def restore(run: Run) -> Path | None:
     when no checkpoint is whole, or all are gone.
     """
     paths = saved(run.out)
-    again = f"`clsplat run {run.out / 'pipeline.yaml'} --out {run.out} --restart` starts from the beginning"
+    again = f"`clsplat run {run.out / PIPELINE} --out {run.out} --restart` starts from the beginning"
     for path in reversed(paths):
         try:
             state, tables = load(path)
@@ -145,7 +145,7 @@ def restore(run: Run) -> Path | None:
         _restore(run, state, tables)
         return path
     if last := run.status.now.checkpoint:
-        raise OutputError(f"{run.out / FOLDER}: is empty, but {last} was saved there; put it back, or {again}")
+        raise OutputError(f"{run.out / CHECKPOINTS}: is empty, but {last} was saved there; put it back, or {again}")
     return None
 
 
@@ -158,7 +158,7 @@ def drop_later(out: Path, taken: Path | None) -> None:
 
 
 def _write(run: Run, kind: str) -> Path:
-    model = run.model
+    run.records.write()  # the state counts them
     state = State(
         format=FORMAT,
         version=__version__,
@@ -167,8 +167,8 @@ def _write(run: Run, kind: str) -> Path:
         stage_step=run.stage_step,
         acted=run.acted,
         edited=run.edited,
-        degree=model.degree,
-        zero_fresh=[name for name, table in model.gaussians.tables.items() if table.zero_fresh],
+        degree=run.model.degree,
+        zero_fresh=[name for name, table in run.model.gaussians.tables.items() if table.zero_fresh],
         updates=run.adam.updates if run.adam else {},
         train_seconds=run.train_seconds,
         metrics=run.metrics,
@@ -178,9 +178,9 @@ def _write(run: Run, kind: str) -> Path:
         inputs=run.inputs,
         pipeline=run.pipeline,
     )
-    path = run.out / FOLDER / f"{kind}_{run.step:06d}.npz"
+    path = run.out / CHECKPOINTS / f"{kind}_{run.step:06d}.npz"
     with atomic(path) as file:
-        tables = ((_key(name), model.gaussians.get(name)) for name in model.gaussians.tables)
+        tables = ((_key(name), run.model.gaussians.get(name)) for name in run.model.gaussians.tables)
         archive.write(file, state.model_dump(), tables)
     return path
 
@@ -213,12 +213,12 @@ def _take_changes(run: Run, path: Path, state: State) -> None:
     before = state.pipeline
     if run.inputs and state.inputs == run.inputs:  # the same scene, wherever it lies now
         before = {**before, "scene": {**before["scene"], "path": run.pipeline["scene"]["path"]}}
-    for difference in differences(before, run.pipeline):
-        if difference.of_outputs:
+    for difference in differences(before, run.pipeline, run.settings):
+        if difference.kind == "output":
             continue
-        if difference.stage is None:
+        if difference.kind is None:
             raise ConfigError(f"{path} was made with other settings: {difference}; {remedy}")
-        if difference.stage < state.cursor:
+        if difference.stage is not None and difference.stage < state.cursor:
             raise ConfigError(f"{path} was saved after that stage, at step {state.step}: {difference}; {remedy}")
         changed.append(f"step {state.step}: {difference}")
     run.changes = [*state.changes, *changed]

@@ -6,8 +6,10 @@ from clsplat.opencl.timings import Timings
 
 STAGES = {
     "project_forward": "project",
+    "count_large": "pairs",
     "permute": "pairs",
     "emit_pairs": "pairs",
+    "emit_large": "pairs",
     "find_tile_offsets": "pairs",
     "scan_blocks": "sort",
     "scan_offsets": "sort",

@@ -1,21 +1,29 @@
 """The records of a run: metrics.jsonl."""
 
 import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from clsplat.errors import DataError
 from clsplat.files import unwritable, write_text
+from clsplat.names import RECORDS
 from clsplat.reading import read_file
 
 
 class Records:
-    """Writes a run folder's records; every line of metrics.jsonl has its step."""
+    """Writes a run folder's records; every line of metrics.jsonl has its step.
+
+    Lines wait until what they tell of is done, for a stage that fails is repeated when the run goes on.
+    """
 
     def __init__(self, out: Path) -> None:
         self.out = out
-        self.path = out / "metrics.jsonl"
-        self.lines = 0  # of metrics.jsonl that belong to the state of the run
+        self.path = out / RECORDS
+        self.lines = 0  # of metrics.jsonl that belong to the state of the run, with those that wait
+        self._waiting: list[str] = []
 
     def start(self) -> None:
         """Drop the lines after those of the state, which a resumed run writes again.  Raises DataError."""
@@ -24,14 +32,38 @@ class Records:
         write_text(self.path, "".join(json.dumps(line) + "\n" for line in kept))
 
     def add(self, step: int, kind: str, **values: Any) -> None:
-        """Append one line."""
-        line = json.dumps({"step": step, "kind": kind, **values})
+        """Add one line; `write` writes it, or the end of the stage."""
+        self._waiting.append(json.dumps({"step": step, "kind": kind, **values}) + "\n")
+        self.lines += 1
+
+    def write(self) -> None:
+        """Append the lines that wait.  Raises OutputError; then they wait on, and the file is as it was."""
+        if not self._waiting:
+            return
         try:
-            with self.path.open("a", encoding="utf-8", newline="\n") as file:
-                file.write(line + "\n")
+            size = self.path.stat().st_size if self.path.exists() else 0
+            try:
+                with self.path.open("ab") as file:
+                    file.write("".join(self._waiting).encode())
+            except OSError:
+                with suppress(OSError):
+                    os.truncate(self.path, size)
+                raise
         except OSError as error:
             raise unwritable(self.path, error) from error
-        self.lines += 1
+        self._waiting.clear()
+
+    @contextmanager
+    def of_a_stage(self) -> Iterator[None]:
+        """Write the lines that the block adds at its end; where it fails they do not count."""
+        lines, waiting = self.lines, len(self._waiting)
+        try:
+            yield
+            self.write()
+        except BaseException:
+            del self._waiting[waiting:]
+            self.lines = lines
+            raise
 
     def read(self, kind: str | None = None) -> list[dict[str, Any]]:
         """Return the lines, of one kind or all; a line cut short by a crash is left out.

@@ -18,6 +18,7 @@ from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import PIXEL_SUMS, Rasterizer
 from clsplat.scene.identity import Identity
 from clsplat.scene.scene import Scene
+from clsplat.settings import Settings
 from clsplat.training.adam import Adam
 from clsplat.training.memory import MemoryPlan, plan
 from clsplat.training.records import Records
@@ -56,9 +57,11 @@ class Run:
     out: Path
     name: str
     seed: int
-    pipeline: dict[str, Any]  # resolved settings, as written to pipeline.yaml
+    settings: Settings  # of the pipeline
+    pipeline: dict[str, Any]  # the same, resolved, as written to pipeline.yaml
     rasterizer: Rasterizer
     photographs: Photographs
+    status: StatusFile
     model_settings: ModelSettings
     identity: Identity | None = None  # of the original scene and its photographs
     prepared: dict[str, str] | None = None  # hash of the inputs of `prepare:`, and the folder of its result
@@ -74,13 +77,13 @@ class Run:
     changes: list[str] = field(default_factory=list)  # of settings, with which the run went on
     inputs_before: str = ""  # `inputs` of the checkpoint that the run goes on from
     train_seconds: float = 0.0
+    written: dict[Path, str] = field(default_factory=dict)  # models of this process: file -> SHA-256
     metrics: dict[str, dict[str, Any]] = field(default_factory=dict)  # split -> downscale -> averages
     interrupted: bool = False  # finish the step, save, stop
     show: Callable[[Progress], None] = lambda progress: None
 
     def __post_init__(self) -> None:
         self.records = Records(self.out)
-        self.status = StatusFile(self.out)
         self._model: DeviceModel | None = None
         self._filter_views: FilterViews | None = None
         self._texture_quantiles: dict[float, float] = {}

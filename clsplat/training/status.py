@@ -2,13 +2,12 @@
 
 import json
 import logging
-import os
-import platform
 import threading
 import time
 import weakref
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -17,10 +16,11 @@ from pydantic import BaseModel, ConfigDict
 from clsplat import __version__
 from clsplat.errors import DataError, OutputError
 from clsplat.files import write_text
+from clsplat.names import STATUS
+from clsplat.processes import Owner
 from clsplat.reading import read_json
 
 LOG = logging.getLogger("clsplat")
-FILE = "status.json"
 BEAT = 5.0  # seconds between two writes of a run that goes on
 END_STATES = ("done", "failed", "interrupted")
 Item = TypeVar("Item")
@@ -103,9 +103,7 @@ class StatusFile:
         now = time.time()
         checkpoint = read_status(out).get("checkpoint")
         self.now = Status(
-            host=platform.node(),
-            process=os.getpid(),
-            pid_namespace=pid_namespace(),
+            **asdict(Owner.this()),
             started=now,
             changed=now,
             time=now,
@@ -186,7 +184,7 @@ class StatusFile:
 
     def _write(self) -> None:
         now = self.now.model_copy(update={"time": time.time()})
-        write_text(self.out / FILE, json.dumps(now.model_dump(exclude_none=True), indent=1) + "\n")
+        write_text(self.out / STATUS, json.dumps(now.model_dump(exclude_none=True), indent=1) + "\n")
 
     def _beat(self) -> None:
         if self._thread is None and not self._ended.is_set():
@@ -209,18 +207,10 @@ def _refresh_until(ended: threading.Event, reference: "weakref.ref[StatusFile]")
 def read_status(out: Path) -> dict[str, Any]:
     """Return the contents of status.json; an empty dict when it is missing or damaged."""
     try:
-        status = read_json(out / FILE)
+        status = read_json(out / STATUS)
     except DataError:
         return {}
     return status if isinstance(status, dict) else {}
-
-
-def pid_namespace() -> str | None:
-    """Return where process numbers count, such as 'pid:[4026531836]'; None where the system does not say."""
-    try:
-        return os.readlink("/proc/self/ns/pid")
-    except (OSError, AttributeError):
-        return None
 
 
 def status_schema() -> dict[str, Any]:

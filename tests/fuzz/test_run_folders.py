@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from clsplat.names import INPUTS
 from clsplat.pipeline.files import shipped
-from clsplat.runs.inputs import FILE as INPUTS
 from clsplat.runs.verify import verify
 from clsplat.training import archive
 from clsplat.training.status import read_status

@@ -81,10 +81,8 @@ def test_large_splats_list_as_many_tiles_as_were_counted(device, rng, surplus):
     camera, array = frame.camera, rasterizer.workspace._arrays
     box, mask, count = (array[name].get()[:12] for name in ("tile_box", "tile_mask", "tile_count"))
     touched = [set(_emitted(device, frame, box, mask, count)[n]) for n in range(12)]
-    large = (count > 0) & (box >> 24 == 0)
+    large = (count > 0) & (box >> 24 == 33)
     assert large.any()
-    plenty = np.where(large, camera.tiles + 1, count).astype(np.uint32)
-    rectangle = [set(tiles) - {0} for tiles in _emitted(device, frame, box, mask, plenty)]
     counted = np.where(large, np.maximum(1, count.astype(int) + surplus), count).astype(np.uint32)
     for n, tiles in enumerate(_emitted(device, frame, box, mask, counted)):
         assert len(tiles) == counted[n]
@@ -93,7 +91,48 @@ def test_large_splats_list_as_many_tiles_as_were_counted(device, rng, surplus):
             assert set(tiles) <= touched[n]
         else:
             assert set(tiles) >= touched[n]
-        assert len(set(tiles)) >= min(len(tiles), len(rectangle[n]))
+        assert len(set(tiles)) == min(len(tiles), camera.tiles)
+
+
+@pytest.mark.parametrize("sort", ["radix", "bitonic"])
+@pytest.mark.parametrize("surplus", [-1, 1])
+def test_a_large_splat_that_was_counted_wrongly_is_blended_once(device, rng, monkeypatch, sort, surplus):
+    """It fills its rectangle at the left edge: the surplus place names a tile outside, where it adds nothing."""
+    case = random_case(rng, 12, 400, 300)
+    pose = case.view.world_to_camera
+    case.parameters["means"][0] = ([-0.8, 0, 1.5] - pose[:, 3]) @ pose[:, :3]
+    case.parameters["quats"][0], case.parameters["logit_opacity"][0] = [1, 0, 0, 0], 3
+    case.parameters["log_scales"][0] = [-2, 2, -4]
+    model, camera = case.model(device), case.device_camera(device)
+    rasterizer = Rasterizer(device, sort)
+    gradient = device.upload(rng.normal(0, 1, (3, camera.rows, camera.stride)).astype(np.float32))
+    expected = rasterizer.forward(model, camera, device.zeros(3))
+    image, pairs = expected.image.get(), expected.lists.pairs
+    sums = rasterizer.pixel_sums(model, expected, gradient).get()[:, :12]
+
+    kernels = rasterizer.tiler._large.kernels
+    correct = kernels["count_large"]
+
+    def miscount(**values):
+        correct(**values)
+        count = values["tile_count"].get()
+        assert count[0] > 32
+        count[0] = int(count[0]) + surplus
+        values["tile_count"].set(count)
+
+    monkeypatch.setitem(kernels, "count_large", miscount)
+    frame = rasterizer.forward(model, camera, device.zeros(3))
+    lists = frame.lists
+    assert lists.pairs == pairs + surplus
+    tile = np.repeat(np.arange(frame.camera.tiles), np.diff(lists.tile_offset.get()))
+    names = np.stack([tile, lists.pair_splat.get()[lists.tile_pairs.get()]])
+    assert len(np.unique(names, axis=1)[0]) == lists.pairs
+    if surplus > 0:
+        np.testing.assert_array_equal(frame.image.get(), image)
+        np.testing.assert_array_equal(rasterizer.pixel_sums(model, frame, gradient).get()[:, :12], sums)
+    else:
+        changed = (frame.image.get() != image).any(axis=0).reshape(camera.tiles_y, camera.tile, camera.tiles_x, -1)
+        assert changed.any(axis=(1, 3)).sum() <= 1  # the tile that is missing
 
 
 def _emitted(device, frame, box, mask, count):
@@ -101,20 +140,26 @@ def _emitted(device, frame, box, mask, count):
     offset = np.concatenate([[0], np.cumsum(count)]).astype(np.uint32)
     guarded, untouched = int(offset[-1]) + 64, np.uint32(0xDEADBEEF)
     pair_tile, pair_splat = (device.upload(np.full(guarded, untouched)) for _ in range(2))
+    first_pair = device.zeros(len(count), np.uint32)
+    written = {"first_pair": first_pair, "pair_tile": pair_tile, "pair_splat": pair_splat}
+    size = {"tile_box": device.upload(box), "tiles_x": frame.camera.tiles_x, "count": len(count)}
     device.program("pairs.cl").emit_pairs(
         items=len(count),
-        splats=frame.splats,
-        tile_box=device.upload(box),
         tile_mask=device.upload(mask),
         order=device.upload(np.arange(len(count), dtype=np.uint32)),
         pair_offset=device.upload(offset),
-        pair_tile=pair_tile,
-        pair_splat=pair_splat,
-        first_pair=device.zeros(len(count), np.uint32),
-        tiles_x=frame.camera.tiles_x,
+        **written,
+        **size,
+    )
+    device.program("large.cl").emit_large(
+        groups=1,
+        splats=frame.splats,
+        tile_count=device.upload(count),
         row_begin=0,
         row_end=frame.camera.tiles_y,
-        count=len(count),
+        run=len(count),
+        **written,
+        **size,
     )
     tiles, splats = pair_tile.get(), pair_splat.get()
     assert (tiles[offset[-1] :] == untouched).all()

@@ -82,7 +82,7 @@ class Attempt:
             log = os.open(out.with_suffix(".txt"), os.O_WRONLY | os.O_CREAT | os.O_APPEND)
             os.dup2(log, 1)
             os.dup2(log, 2)
-            clsplat.run(recipe, scene, out, set=SETTINGS[recipe], resume=True)
+            clsplat.run(recipe, scene, out, set=SETTINGS[recipe], start="resume")
             code = 0
         except BaseException:
             traceback.print_exc(file=sys.stderr)

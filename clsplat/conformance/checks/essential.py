@@ -25,6 +25,13 @@ def rendering(device: Device, rng: np.random.Generator) -> Iterator[Figure | Not
     yield from projection.gradient_figures(device, case, rng, what)
 
 
+@CHECKS.add("count_large", "emit_large")
+def large_splats(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    case = random_case(rng, 12, 150, 130)
+    case.parameters["log_scales"][:4] += 2.5
+    yield from tiles.list_figures(device, case, "radix", "a scene of large Gaussians")
+
+
 @CHECKS.add("scan_offsets", "radix_count", "radix_scatter")
 def sorting(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
     yield tiles.scan_figure(device, rng.integers(0, 100, 1025).astype(np.uint32))

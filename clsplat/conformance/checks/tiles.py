@@ -79,9 +79,9 @@ def bitonic_sort(device: Device, rng: np.random.Generator) -> Iterator[Figure | 
         yield from bitonic_figures(device, rng, LENGTHS, deepest)
 
 
-@CHECKS.add("emit_pairs", "find_tile_offsets", "permute")
+@CHECKS.add("count_large", "emit_large", "emit_pairs", "find_tile_offsets", "permute")
 def tile_lists(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
-    for count, width, height in ((1, 16, 16), (60, 17, 15), (150, 100, 70), (64, 5, 3)):
+    for count, width, height in ((1, 16, 16), (60, 17, 15), (150, 100, 70), (64, 5, 3), (40, 210, 130)):
         case = random_case(rng, count, width, height)
         case.parameters["log_scales"][: count // 10] += 1.5
         case.parameters["means"][: count // 3] = case.parameters["means"][count // 3 : 2 * (count // 3)]  # equal depths

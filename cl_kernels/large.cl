@@ -1,0 +1,147 @@
+/* The tiles of large splats, whose rectangles have more tiles than a mask has bits (tiles.h).
+ *
+ * A work-group looks through `run` splats and shares the rows of each large rectangle among its TEAM items, LANES
+ * columns at a time, so that no item walks over a whole image alone.  Deterministic: pairs are listed row by row, as
+ * those of other splats, and each has one writer. */
+#include "tiles.h"
+
+#define IS_LARGE(box) ((box) >> (2 * BOX_BITS) == BOX_LARGE)
+
+typedef struct {
+    uint begin, end;  // of the rectangle's rows
+} rows_t;
+
+/* The footprint of one splat in every lane, and the rows of it that this item takes. */
+static inline footprint_t share_of(__global const float *splat, const uint tiles_x, const uint row_begin,
+                                   const uint row_end, rows_t *share)
+{
+    VF fields[RECORD];
+    for (uint k = 0; k < RECORD; k++)
+        fields[k] = (VF)(splat[k]);
+    const footprint_t f = footprint_of(fields, (VI)(-1), tiles_x, row_begin, row_end);
+    const uint rows = (uint)first_lane(f.rows), each = (rows + TEAM - 1) / TEAM, begin = get_local_id(0) * each;
+    share->begin = begin < rows ? begin : rows;
+    share->end = begin + each < rows ? begin + each : rows;
+    return f;
+}
+
+/* Whether the splat touches each of the LANES tiles from a column of a row on. */
+static inline VI touched_from(const footprint_t *f, const uint column, const uint row)
+{
+    return touches_tile(f, (VF)((float)column) + to_VF(LANE_INDEX), (VF)((float)row));
+}
+
+static inline uint count_share(const footprint_t *f, const rows_t share)
+{
+    const uint columns = (uint)first_lane(f->columns);
+    VF count = (VF)(0.0f);
+    for (uint row = share.begin; row < share.end; row++)
+        for (uint column = 0; column < columns; column += LANES)
+            count += touched_from(f, column, row) ? (VF)(1.0f) : (VF)(0.0f);
+    return (uint)sum_lanes(count);
+}
+
+/* tile_count[i] = tiles that a large splat touches; others are left as they are.  Local memory: TEAM * 4 bytes. */
+__kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
+void count_large(
+    __global const float *restrict splats,   // [N,RECORD] see splat.h
+    __global const uint *restrict tile_box,  // [S] see tiles.h
+    __global uint *restrict tile_count,      // [S]
+    const uint tiles_x,
+    const uint row_begin,                    // of the band of tiles
+    const uint row_end,
+    const uint run,
+    const uint count)
+{
+    __local uint sums[TEAM];
+    const uint item = get_local_id(0), first = get_group_id(0) * run;
+    for (uint i = first; i < first + run && i < count; i++)
+        if (IS_LARGE(tile_box[i])) {
+            rows_t share;
+            const footprint_t f = share_of(splats + (size_t)i * RECORD, tiles_x, row_begin, row_end, &share);
+            sums[item] = count_share(&f, share);
+            barrier(CLK_LOCAL_MEM_FENCE);
+            if (item == 0) {
+                uint total = 0;
+                for (uint k = 0; k < TEAM; k++)
+                    total += sums[k];
+                tile_count[i] = total;
+            }
+            barrier(CLK_LOCAL_MEM_FENCE);
+        }
+}
+
+/* List the touched tiles of an item's rows in the places from `pair` up to `end`; return the place behind them. */
+static inline uint list_share(const footprint_t *f, const rows_t share, uint pair, const uint end, const uint i,
+                              const uint tiles_x, __global uint *pair_tile, __global uint *pair_splat)
+{
+    const uint columns = (uint)first_lane(f->columns);
+    const uint corner = (uint)first_lane(f->first_y) * tiles_x + (uint)first_lane(f->first_x);
+    for (uint row = share.begin; row < share.end; row++)
+        for (uint column = 0; column < columns; column += LANES) {
+            int touched[LANES];
+            VSTORE(touched_from(f, column, row), touched);
+            for (uint lane = 0; lane < LANES && pair < end; lane++)
+                if (touched[lane]) {
+                    pair_tile[pair] = corner + row * tiles_x + column + lane;
+                    pair_splat[pair] = i;
+                    pair++;
+                }
+        }
+    return pair;
+}
+
+/* Fill the places up to `end`, behind the pairs of a splat from `first` to `pair`, with tiles of the band that those do
+ * not name, so that no tile lists the splat twice.  Blending finds no pixel of it there. */
+static inline void fill_up(const uint first, const uint pair, const uint end, const uint i, const uint tiles_x,
+                           const uint row_begin, const uint row_end, __global uint *pair_tile,
+                           __global uint *pair_splat)
+{
+    const uint last = row_end * tiles_x - 1;
+    uint listed = first, place = pair;
+    for (uint tile = row_begin * tiles_x; place < end; tile++)
+        if (listed < pair && pair_tile[listed] == tile) {
+            listed++;
+        } else {
+            pair_tile[place] = tile < last ? tile : last;  // a count beyond the band stays inside it
+            pair_splat[place] = i;
+            place++;
+        }
+}
+
+/* Emit the pairs of large splats.  Tiles are tested again, and a compiler may round differently at a tile's edge in
+ * another kernel: no pair is written behind the splat's places, and none of these stays open.
+ * Local memory: TEAM * 4 bytes. */
+__kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
+void emit_large(
+    __global const float *restrict splats,     // [N,RECORD] see splat.h
+    __global const uint *restrict tile_box,    // [S] see tiles.h
+    __global const uint *restrict tile_count,  // [S]
+    __global const uint *restrict first_pair,  // [N] first pair of each Gaussian
+    __global uint *restrict pair_tile,         // [P]
+    __global uint *restrict pair_splat,        // [P]
+    const uint tiles_x,
+    const uint row_begin,                      // of the band of tiles
+    const uint row_end,
+    const uint run,
+    const uint count)
+{
+    __local uint sums[TEAM];
+    const uint item = get_local_id(0), first = get_group_id(0) * run;
+    for (uint i = first; i < first + run && i < count; i++)
+        if (IS_LARGE(tile_box[i])) {
+            rows_t share;
+            const footprint_t f = share_of(splats + (size_t)i * RECORD, tiles_x, row_begin, row_end, &share);
+            sums[item] = item + 1 < TEAM ? count_share(&f, share) : 0;  // nobody needs that of the last item
+            barrier(CLK_LOCAL_MEM_FENCE);
+            const uint begin = first_pair[i], end = begin + tile_count[i];
+            uint pair = begin;
+            for (uint k = 0; k < item; k++)
+                pair += sums[k];
+            pair = list_share(&f, share, pair, end, i, tiles_x, pair_tile, pair_splat);
+            barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE);
+            if (item + 1 == TEAM)
+                fill_up(begin, pair, end, i, tiles_x, row_begin, row_end, pair_tile, pair_splat);
+            barrier(CLK_LOCAL_MEM_FENCE);  // without it PoCL 3.1 runs the line above for some items only
+        }
+}

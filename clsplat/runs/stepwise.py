@@ -1,0 +1,46 @@
+"""The stages of a pipeline that train, one step at a time."""
+
+from collections.abc import Iterator
+
+from clsplat.losses.base import ViewGradients
+from clsplat.pipeline.loading import Pipeline
+from clsplat.stages.optimize import Optimize
+from clsplat.training.run import Run
+
+
+def run_until_training(pipeline: Pipeline, run: Run) -> None:
+    """Run the stages before the first that trains, from where the run is."""
+    for cursor, stage in enumerate(pipeline.stages):
+        if isinstance(stage, Optimize):
+            return
+        if cursor >= run.cursor:
+            run.cursor = cursor
+            stage.act(run)
+
+
+def train(pipeline: Pipeline, run: Run) -> Iterator[ViewGradients]:
+    """Run all stages that train, and those between them; yield after each step."""
+    first, last = _training_stages(pipeline)
+    for cursor in range(max(first, run.cursor), last + 1):
+        if cursor > run.cursor:
+            run.next_stage(cursor)
+        stage = pipeline.stages[cursor]
+        if isinstance(stage, Optimize):
+            run.status.note(stage=stage.stage, progress=None)
+            yield from stage.iterate(run)
+        else:
+            stage.act(run)
+
+
+def is_trained(pipeline: Pipeline, run: Run) -> bool:
+    """Return whether no step of the training is left."""
+    _, last = _training_stages(pipeline)
+    stage = pipeline.stages[last]
+    in_its_end = isinstance(stage, Optimize) and run.cursor == last and run.stage_step >= stage.steps
+    return run.cursor > last or in_its_end
+
+
+def _training_stages(pipeline: Pipeline) -> tuple[int, int]:
+    """The first stage that trains, and the last."""
+    places = [i for i, stage in enumerate(pipeline.stages) if isinstance(stage, Optimize)]
+    return places[0], places[-1]

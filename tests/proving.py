@@ -1,0 +1,21 @@
+"""A script in the place of the process that proves a device: it answers at once, and as a test wants."""
+
+from clsplat.conformance import supervision
+
+SCRIPT = """
+import json, os, sys
+print("noise of a runtime", file=sys.stderr)
+for name in sys.argv[4:]:
+    print(json.dumps({"begin": name}), flush=True)
+    if name == "dies":
+        os.abort()
+    if name == "leaves":
+        sys.exit(3)
+    print(json.dumps({"figure": {"kernel": "blend_backward", "what": "x", "value": %s, "bound": 0.1, "counts": False}}))
+    print(json.dumps({"end": name, "seconds": 0.1}), flush=True)
+"""
+
+
+def worker(monkeypatch, value: str = "1e-6") -> None:
+    """Put a script in the place of the process that opens the device."""
+    monkeypatch.setattr(supervision, "WORKER", ("-c", SCRIPT % value))

@@ -1,0 +1,68 @@
+"""Who runs something, and whether that process is alive."""
+
+import sys
+from dataclasses import asdict, replace
+from types import SimpleNamespace
+
+import pytest
+
+from clsplat import processes
+from clsplat.processes import Owner
+
+
+def test_a_number_counts_in_its_own_namespace(monkeypatch):
+    this = Owner.this()
+    assert this.is_here
+    assert not this.has_ended
+    assert Owner.named_by(asdict(this)) == this
+    assert Owner.named_by({"process": this.process}) == this, "an older file says no more"
+    for elsewhere in ({"host": "another"}, {"pid_namespace": "pid:[1]"}):
+        monkeypatch.setattr(processes, "is_alive", lambda process: False)
+        other = replace(this, **elsewhere)
+        assert not other.is_here
+        assert not other.has_ended, "nothing is known of it"
+    assert this.has_ended
+
+
+@pytest.mark.parametrize("process", [None, "7", 7.0, True, 0, -1])
+def test_a_file_that_names_no_process_has_no_owner(process):
+    assert Owner.named_by({"process": process, "host": "a"}) is None
+
+
+class Function:
+    """A function of a Windows library, which takes the type of its result."""
+
+    def __init__(self, call) -> None:
+        self.call = call
+
+    def __call__(self, *arguments):
+        return self.call(*arguments)
+
+
+@pytest.mark.parametrize(
+    ("code", "error", "alive"), [(259, 0, True), (1, 0, False), (None, 87, False), (None, 5, True)]
+)
+def test_a_process_of_windows_is_probed_without_ending_it(code, error, alive, monkeypatch):
+    """As Windows answers: the exit code of a process, or the error where there is none or it is another user's."""
+    handles: list[int] = []
+
+    def opened(rights, inherited, process):
+        if code is not None:
+            handles.append(process)
+        return process if code is not None else None
+
+    def asked(handle, place):
+        place._obj.value = code
+        return 1
+
+    kernel = SimpleNamespace(
+        OpenProcess=Function(opened),
+        GetExitCodeProcess=Function(asked),
+        CloseHandle=Function(lambda handle: handles.remove(handle.value)),
+    )
+    monkeypatch.setattr(sys, "platform", "win32")
+    monkeypatch.setattr(processes.ctypes, "WinDLL", lambda name, use_last_error: kernel, raising=False)
+    monkeypatch.setattr(processes.ctypes, "get_last_error", lambda: error, raising=False)
+    monkeypatch.setattr(processes.os, "kill", lambda *arguments: pytest.fail("it would end the process"))
+    assert processes.is_alive(1234) is alive
+    assert handles == [], "the handle is closed"

@@ -1,0 +1,172 @@
+"""The check before a device makes pictures or models: it is done once, and a wrong device is refused everywhere."""
+
+import io
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+import clsplat
+from clsplat.conformance import quick, supervision
+from clsplat.conformance import worker as worker_process
+from clsplat.conformance.check import Check
+from clsplat.conformance.checks import ESSENTIAL
+from clsplat.conformance.doctor import examine
+from clsplat.conformance.scenes import random_case
+from clsplat.errors import DeviceError, MemoryLimitError
+from clsplat.opencl.device import Device
+from clsplat.opencl.discovery import tuning_of
+from tests.proving import worker
+from tests.test_model import model_of
+
+OTHER_BUILDS = {
+    "_hash_of_kernels": lambda: "other sources",
+    "BUILD_OPTIONS": ("-cl-std=CL1.2", "-cl-mad-enable"),
+    "tuning_of": lambda info, schedule: {**tuning_of(info, schedule), "DIGIT_BITS": 6},
+}
+
+
+def like(device, **changes):
+    return SimpleNamespace(
+        **{"info": device.info, "schedule": device.schedule, "tuning": device.tuning, "text": "x", **changes}
+    )
+
+
+@pytest.mark.parametrize(
+    ("team", "sort", "bitonic"),
+    [(1, "auto", False), (1, "radix", False), (1, "bitonic", True), (64, "auto", True), (64, "radix", False)],
+)
+def test_bitonic_is_checked_where_the_run_can_choose_it(monkeypatch, info, empty_cache, team, sort, bitonic):
+    found = []
+    monkeypatch.setattr(quick, "supervised", lambda info, schedule, checks, seconds: found.extend(checks) or [])
+    device = like(Device(info), tuning={"TEAM": team})
+    quick.ensure_correct(device, sort)
+    assert any("sort_tiles" in check.kernels for check in found) == bitonic
+    found.clear()
+    quick.ensure_correct(device, sort)
+    assert not found
+    quick.ensure_correct(device, "bitonic")
+    assert bool(found) != bitonic
+
+
+def test_no_check_of_every_run_needs_bitonic():
+    assert not {"count_pairs", "fill_tiles", "sort_tiles"} & {name for check in ESSENTIAL for name in check.kernels}
+
+
+def test_doctor_forgets_a_device_that_it_finds_wrong(monkeypatch, info, empty_cache):
+    worker(monkeypatch)
+    device = Device(info)
+    quick.ensure_correct(device)
+    worker(monkeypatch, "0.3")
+    examine(device)
+    with pytest.raises(DeviceError, match="computes wrongly"):
+        quick.ensure_correct(device)
+
+
+def test_want_of_memory_is_no_fault_of_the_device(monkeypatch, info, empty_cache):
+    def check(device, rng):
+        raise MemoryLimitError("no buffer")
+        yield
+
+    out = io.StringIO()
+    worker_process._run(out, Check("rendering", (), check), None)
+    worker_process._print(out, end="rendering", seconds=0.1)
+    monkeypatch.setattr(supervision, "WORKER", ("-c", f"print({out.getvalue()!r}, end='')"))
+    with pytest.raises(MemoryLimitError, match=r"no buffer.*other programs"):
+        quick.ensure_correct(Device(info))
+
+
+def test_the_log_says_that_a_check_begins(monkeypatch, info, empty_cache, caplog):
+    worker(monkeypatch)
+    with caplog.at_level("INFO", "clsplat"):
+        quick.ensure_correct(Device(info))
+    assert f"checking {info.name}, once for each driver" in caplog.text
+
+
+def test_a_device_that_computes_wrongly_is_refused(monkeypatch, info, empty_cache):
+    worker(monkeypatch, "0.3")
+    device = Device(info)
+    for _ in range(2):  # it is not remembered
+        with pytest.raises(DeviceError, match=r"computes wrongly: blend_backward differs by 0.3 .*clsplat doctor"):
+            quick.ensure_correct(device)
+
+
+def test_a_device_that_computes_rightly_is_checked_once(monkeypatch, info, empty_cache):
+    worker(monkeypatch)
+    device = Device(info)
+    before = device.allocated, device.peak, dict(device.tuning)
+    quick.ensure_correct(device)
+    monkeypatch.setattr(supervision, "WORKER", ("-c", "raise SystemExit(1)"))
+    quick.ensure_correct(device)
+    assert (device.allocated, device.peak, device.tuning) == before
+    for change in ({"driver": "another"}, {"platform": "another"}, {"name": "another"}):
+        with pytest.raises(DeviceError, match="cannot be trusted"):
+            quick.ensure_correct(like(device, info=replace(info, **change)))
+    other = Device(info, "simt" if device.schedule == "wide" else "wide")
+    with pytest.raises(DeviceError, match="cannot be trusted"):
+        quick.ensure_correct(other)
+    for name, changed in OTHER_BUILDS.items():
+        with monkeypatch.context() as patched:
+            patched.setattr(quick, name, changed)
+            with pytest.raises(DeviceError, match="cannot be trusted"):
+                quick.ensure_correct(device)
+
+
+def test_where_the_cache_cannot_be_written_a_device_is_checked_each_time(monkeypatch, info, tmp_path):
+    blocked = tmp_path / "a file"
+    blocked.write_text("")
+    monkeypatch.setattr(quick, "cache_folder", lambda: blocked)
+    started = []
+    monkeypatch.setattr(quick, "supervised", lambda *arguments: started.append(arguments) or [])
+    for _ in range(2):
+        quick.ensure_correct(Device(info))
+    assert len(started) == 2
+
+
+def test_the_two_second_form_holds(info, empty_cache):
+    quick.ensure_correct(Device(info))
+    assert len(list((empty_cache / "conformance").iterdir())) == 1
+
+
+# ---- wherever a device works
+
+
+@pytest.fixture
+def model(rng, tmp_path) -> Path:
+    """The file of a small model."""
+    model_of(random_case(rng, 3)).save(tmp_path / "model.ply")
+    return tmp_path / "model.ply"
+
+
+WORK: dict[str, Callable[[Path, Path, Path, object], object]] = {
+    "run": lambda scene, model, out, device: clsplat.run("smoke", scene, out / "run", device=device),
+    "describe_run": lambda scene, model, out, device: clsplat.describe_run("smoke", scene, out / "run", device=device),
+    "Trainer": lambda scene, model, out, device: clsplat.Trainer(scene, "smoke", out=out / "run", device=device),
+    "Renderer": lambda scene, model, out, device: clsplat.Renderer(clsplat.load(model), device),
+    "render_views": lambda scene, model, out, device: clsplat.render_views(model, scene, out / "views", device=device),
+    "evaluate": lambda scene, model, out, device: clsplat.evaluate(model, scene, device=device),
+}
+
+
+@pytest.mark.parametrize("given", ["default", "name", "open"])
+@pytest.mark.parametrize("work", WORK)
+def test_a_wrong_device_makes_no_picture_and_no_model(
+    work, given, monkeypatch, info, empty_cache, tiny_scene, model, tmp_path
+):
+    worker(monkeypatch, "0.3")
+    device = {"default": None, "name": info.name, "open": Device(info)}[given]
+    with pytest.raises(DeviceError, match=r"computes wrongly: blend_backward differs by 0.3 .*clsplat doctor"):
+        WORK[work](tiny_scene, model, tmp_path / "out", device)
+    assert not list((tmp_path / "out").rglob("*"))
+
+
+def test_a_device_is_proved_once_for_all_that_it_does(monkeypatch, info, empty_cache, tiny_scene, model, tmp_path):
+    started = []
+    supervised = quick.supervised
+    monkeypatch.setattr(quick, "supervised", lambda *arguments: started.append(1) or supervised(*arguments))
+    worker(monkeypatch)
+    for work in ("Renderer", "render_views", "evaluate", "Trainer"):
+        WORK[work](tiny_scene, model, tmp_path, Device(info))
+        assert len(started) == 1

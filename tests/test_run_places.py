@@ -1,0 +1,90 @@
+"""The folder of a run is its own: not that of the photographs, and without links that lead outside."""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from clsplat import cli
+from clsplat.errors import ConfigError
+from clsplat.pipeline.loading import load
+from clsplat.runs import outputs
+from clsplat.runs.experiment import Job
+
+
+def opened(scene: Path, out: Path, *changes: str) -> None:
+    outputs.check_places(load("smoke", [f"scene.path={str(scene)!r}", *changes]), out)
+
+
+def test_the_folder_of_the_photographs_and_the_root_are_no_run_folders(tiny_scene, monkeypatch):
+    for out in (tiny_scene, tiny_scene / "train" / ".."):
+        with pytest.raises(ConfigError, match="is the folder of the photographs"):
+            opened(tiny_scene, out)
+    monkeypatch.chdir(tiny_scene)
+    with pytest.raises(ConfigError, match="is the folder of the photographs"):
+        opened(tiny_scene, Path())
+    with pytest.raises(ConfigError, match="is the root of a file system"):
+        opened(tiny_scene, Path(Path.cwd().anchor))
+    opened(tiny_scene, tiny_scene / "runs" / "a")
+    with pytest.raises(ConfigError, match="is the folder of the photographs, or right in it"):
+        outputs.check_places(load("photos", [f"scene.path={str(tiny_scene)!r}"]), tiny_scene / "run")
+
+
+@pytest.mark.parametrize("name", ["renders", "report.html", "point_cloud.ply", "log.txt"])
+def test_a_link_that_leads_outside_is_not_followed(name, tiny_scene, tmp_path):
+    out = tmp_path / "run"
+    out.mkdir()
+    (out / name).symlink_to(tmp_path / "elsewhere")
+    for _ in ("new", "with a run"):
+        with pytest.raises(ConfigError, match=f"{name}: a link leads outside of the run folder"):
+            opened(tiny_scene, out)
+        (out / "pipeline.yaml").touch()
+    (out / name).unlink()
+    (out / name).symlink_to(out / "inside")
+    opened(tiny_scene, out)
+
+
+def test_files_that_a_new_run_did_not_make_are_not_replaced(tiny_scene, tmp_path):
+    (tmp_path / "holiday").mkdir()
+    (tmp_path / "holiday" / "r_1.png").write_text("mine")
+    (tmp_path / "report.html").write_text("mine")
+    with pytest.raises(ConfigError, match=r"report.html: exists, and is not of this run"):
+        opened(tiny_scene, tmp_path)
+    with pytest.raises(ConfigError, match=r"holiday: exists, and is not of this run"):
+        opened(tiny_scene, tmp_path, "render.folder=holiday", "report.file=other.html")
+    for start in ("new", "resume", "restart"):
+        with pytest.raises(ConfigError, match="is not of this run"):
+            Job.open("smoke", tiny_scene, tmp_path, start=start).run()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["holiday", "report.html"]
+    (tmp_path / "pipeline.yaml").touch()
+    opened(tiny_scene, tmp_path)
+
+
+UNWRITABLE = {  # --out -> the exit code, and what the sentence says
+    "FILE/run": (7, "cannot be written (Not a directory)"),
+    "FILE": (7, "cannot be written (File exists)"),
+    "x" * 300: (7, "File name too long"),
+    "SCENE": (2, "is the folder of the photographs"),
+    "ROOT": (2, "is the root of a file system"),
+    "not \udcff text": (0, ""),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="names and faults of POSIX")
+@pytest.mark.parametrize("out", UNWRITABLE)
+def test_a_run_folder_that_cannot_be_is_one_sentence(out, tiny_scene, tmp_path, monkeypatch, capsys):
+    (tmp_path / "file").write_text("")
+    place = out.replace("FILE", "file").replace("SCENE", str(tiny_scene)).replace("ROOT", "/")
+    monkeypatch.chdir(tmp_path)
+    quick = ["--set", "optimize.steps=2", "optimize.during=[]"]
+    monkeypatch.setattr(sys, "argv", ["clsplat", "run", "smoke", "--scene", str(tiny_scene), "--out", place, *quick])
+    code, words = UNWRITABLE[out]
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    assert end.value.code == code
+    errors = capsys.readouterr().err.splitlines()
+    assert len(errors) == (code != 0)
+    assert words in "".join(errors)
+    if code == 0:
+        assert (Path(place) / "report.html").is_file()

@@ -1,0 +1,60 @@
+"""`clsplat status`: what is known of a run from its files, here and elsewhere."""
+
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from clsplat.runs import status as reading
+from clsplat.training.status import Amount, StatusFile
+
+pytestmark = pytest.mark.slow
+
+
+def put(folder: Path, **values) -> dict:
+    """Write a status of a run whose process has ended, and return what is found."""
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    now = StatusFile(folder, step=7, steps=9).now.model_copy(
+        update={"state": "running", "process": gone.pid, "time": time.time() - 200, **values}
+    )
+    (folder / "status.json").write_text(json.dumps(now.model_dump(exclude_none=True)))
+    return reading.run_status(folder)
+
+
+def test_a_process_that_is_gone_was_killed(tmp_path):
+    found = put(tmp_path)
+    assert found["state"] == "killed"
+    assert "silent" not in found
+
+
+@pytest.mark.parametrize("elsewhere", [{"host": "another"}, {"pid_namespace": "pid:[1]"}])
+def test_a_run_elsewhere_is_judged_by_its_heartbeat_alone(elsewhere, tmp_path):
+    found = put(tmp_path, **elsewhere)
+    assert found["state"] == "running"
+    assert 199 < found["silent"] < 300
+    place = f"it runs on {elsewhere.get('host', StatusFile(tmp_path).now.host)}"
+    assert f"\n  no sign of life for {found['silent']} s; {place}" in reading.status_text(found)
+    assert "no sign" not in reading.status_text(put(tmp_path, time=time.time() - 2, **elsewhere))
+
+
+def test_a_process_that_is_stopped_shows_no_sign_of_life(tmp_path):
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as process:
+        found = put(tmp_path, process=process.pid)
+        process.communicate(b"\n")
+    assert f"no sign of life for {found['silent']} s; process {process.pid}" in reading.status_text(found)
+
+
+def test_the_lines_name_the_stage_and_what_is_left(tmp_path):
+    amount = Amount(done=3, total=20, unit="views")
+    found = put(tmp_path, host="a", time=time.time(), stage="evaluate", progress=amount, seconds_left=71.6)
+    assert reading.status_text(found).splitlines()[0] == (
+        f"{tmp_path}: running at step 7 of 9, evaluate, 3 of 20 views, 72 s left"
+    )
+
+
+def test_a_clock_that_is_late_gives_no_negative_time(tmp_path):
+    assert put(tmp_path, host="a", time=time.time() + 100)["silent"] == 0
