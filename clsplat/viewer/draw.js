@@ -38,6 +38,7 @@ class Painter {
     // Hundreds of layers blended in 8 bits lose 10 dB; half floats lose nothing that an 8-bit image shows.
     this.half = !!(gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float"));
     this.most = gl.getParameter(gl.MAX_TEXTURE_SIZE);
+    if (this.most < ROW) throw Error(`this device has textures of ${this.most} px; ${ROW} are needed`);
     this.colours = program(gl, COVER, COLOURS);
     this.splats = program(gl, SPLAT_VERTEX, SPLAT_FRAGMENT);
     this.present = program(gl, COVER, PRESENT);

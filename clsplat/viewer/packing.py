@@ -55,19 +55,18 @@ def pack(model: Model, limit: int | None = None) -> Packed:
 
     limit: the number of splats, the most important ones; None: all.
     """
-    model = _drawn(model.baked())
+    model = model.baked()
     model = model[_order(model, limit)]
     frame = _frame(model.means.astype(np.float64))
     count = len(model)
     logs = model.log_scales.astype(np.float64)
     logs = np.maximum(logs, logs.max(axis=1, keepdims=True) - FLATTEST)
-    sh = model.sh_rest.astype(np.float64)
     scales, opacity, base = (_table(values) for values in (logs, model.opacities, model.sh_base))
-    rest = _even_table(float(np.abs(sh).max(initial=0.0)))
+    rest = _even_table(float(max(model.sh_rest.max(initial=0.0), -model.sh_rest.min(initial=0.0))))
     tables = np.stack([np.exp(scales), opacity, base, rest]).astype("<f4")
-    blocks, positions = _positions(_logarithmic(model.means, *frame))
-    codes = [_codes(scales, logs), _codes(opacity, model.opacities[:, None]), _codes(base, model.sh_base)]
-    planes = [tables, blocks, positions, _quaternions(model.quats), *(code.T for code in codes), _codes(rest, sh).T]
+    planes: list[NDArray[Any]] = [tables, *_positions(_logarithmic(model.means, *frame)), _quaternions(model.quats)]
+    columns = (scales, logs), (opacity, model.opacities[:, None]), (base, model.sh_base), (rest, model.sh_rest)
+    planes += [_codes(table, column) for table, values in columns for column in values.T]
     header = {
         "count": count,
         "degree": model.sh_degree,
@@ -82,21 +81,23 @@ def pack(model: Model, limit: int | None = None) -> Packed:
     return Packed(header, gzip.compress(data, 7, mtime=0))
 
 
-def _drawn(model: Model) -> Model:
-    """The Gaussians that some view shows."""
+def _drawn(model: Model) -> NDArray[np.intp]:
+    """Indices of the Gaussians that some view shows."""
     finite = np.logical_and.reduce([np.isfinite(table).all(axis=1) for table in model.tables().values()])
     direction = (model.quats.astype(np.float64) ** 2).sum(axis=1) >= MIN_NORM2
-    return model[finite & direction & (model.opacities > MIN_OPACITY)]
+    return np.flatnonzero(finite & direction & (model.opacities > MIN_OPACITY))
 
 
 def _order(model: Model, limit: int | None) -> NDArray[np.intp]:
-    """Indices by falling importance in LEVELS parts, and along a curve in each."""
-    areas = np.sort(model.log_scales.astype(np.float64), axis=1)[:, 1:].sum(axis=1)
-    ranked = np.argsort(-(areas + np.log(model.opacities.astype(np.float64))), kind="stable")[:limit]
-    curve = _curve(_logarithmic(model.means, *_frame(model.means.astype(np.float64))))
+    """Indices by falling importance in LEVELS parts, and along a curve in each; without what no view shows."""
+    drawn = _drawn(model)
+    means = model.means[drawn].astype(np.float64)
+    areas = np.sort(model.log_scales[drawn].astype(np.float64), axis=1)[:, 1:].sum(axis=1)
+    ranked = np.argsort(-(areas + np.log(model.opacities[drawn].astype(np.float64))), kind="stable")[:limit]
+    curve = _curve(_logarithmic(means, *_frame(means)))
     borders = [len(ranked) * level // LEVELS for level in range(LEVELS + 1)]
     parts = [ranked[begin:end] for begin, end in itertools.pairwise(borders)]
-    return np.concatenate([part[np.argsort(curve[part], kind="stable")] for part in parts])
+    return np.asarray(drawn[np.concatenate([part[np.argsort(curve[part], kind="stable")] for part in parts])])
 
 
 def _frame(means: Floats) -> tuple[Floats, float]:
