@@ -10,7 +10,6 @@ from pydantic import Field
 
 from clsplat.errors import DataError
 from clsplat.reading import read_file
-from clsplat.scene.photographs import load_photograph
 from clsplat.scene.scene import View
 from clsplat.stages.base import Stage, path_in_run
 from clsplat.training.run import Run
@@ -18,7 +17,6 @@ from clsplat.viewer.cameras import Stand
 from clsplat.viewer.packing import pack
 from clsplat.viewer.page import MAX_SIZE, Page
 from clsplat.viewer.photographs import BUDGET, Which, described
-from clsplat.views.photographs import BACKGROUNDS
 
 LOG = logging.getLogger("clsplat")
 
@@ -44,7 +42,7 @@ class Viewer(Stage):
         scene, name = run.scene.downscaled(run.downscale), run.photographs.background_name
 
         def read(view: View) -> NDArray[np.uint8]:
-            return load_photograph(view, BACKGROUNDS[name], run.photographs.undistorted)[:, :, :3]
+            return run.photographs.get(view).image()
 
         def through(views: Iterable[View]) -> Iterable[View]:
             return run.status.counted(run.until_interrupted(views), "views", len(scene.views))

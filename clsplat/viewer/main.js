@@ -85,8 +85,9 @@ class Viewer {
     if (this.flight) this.advance(time);
     if (this.controls.fly(passed / 1000) || this.flight) this.change();
     const resting = performance.now() - this.changed > REST;
-    if (!resting && passed < 2000) this.adapt(passed);
-    if (this.dirty || (resting && !this.whole)) this.draw(resting);
+    if (!resting && this.drew) this.adapt(passed);
+    this.drew = this.dirty || (resting && !this.whole);
+    if (this.drew) this.draw(resting);
     if (this.whole && !this.flight && !this.controls.pressed.size) this.time = undefined; // a new order draws again
     else this.scheduled ??= requestAnimationFrame(later => this.tick(later));
   }
