@@ -108,6 +108,7 @@ class Controls {
       p: () => viewer.photographs.cycle(), r: () => viewer.reset(),
       l: () => viewer.move(levelled(viewer.camera, viewer.up)),
       o: () => viewer.panel.style(this.style === "orbit" ? "fly" : "orbit"), h: () => viewer.panel.hide(),
+      g: () => viewer.panel.cameras(!viewer.frustums.shown),
       f: () => viewer.panel.fullscreen(), c: () => viewer.screenshot(), "?": () => viewer.panel.help(),
       1: () => viewer.panel.mode("splats"), 2: () => viewer.panel.mode("points"),
       3: () => viewer.panel.mode("ellipsoids"), 4: () => viewer.panel.mode("opacity"),

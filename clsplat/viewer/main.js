@@ -15,6 +15,7 @@ class Viewer {
     });
     this.panel = new Panel(this);
     this.photographs = new Photographs(this, info.views);
+    this.frustums = new Frustums(this, info.views);
     this.controls = new Controls(this, canvas);
     this.photographs.compare("off");
     new ResizeObserver(() => { this.photographs.place(); this.change(); }).observe(this.stage);
@@ -134,6 +135,8 @@ class Viewer {
       this.painter.show([...corner, wide, high], this.background);
       drawn += layer.drawn;
     });
+    const corners = this.layers.map((_, i) => along ? [i * width, 0] : [0, i * height]);
+    this.frustums.draw(framed(this.camera, width, height, exact), corners, ratio);
     this.dirty = false;
     this.whole = resting;
     this.panel.statistics(drawn, this.ms, scale);

@@ -14,7 +14,7 @@ from clsplat.viewer.cameras import Stand
 from clsplat.viewer.packing import Packed
 
 FOLDER = Path(__file__).parent
-SCRIPTS = ("data", "sort", "shaders", "draw", "camera", "controls", "photographs", "panel", "main")
+SCRIPTS = ("data", "sort", "shaders", "draw", "camera", "controls", "photographs", "frustums", "panel", "main")
 MAX_SIZE = 200.0  # MB: browsers need several times as much memory
 MARGIN = 0.97  # of that size, for splats that pack worse than the average
 COLOURS = {"black": [0, 0, 0], "white": [1, 1, 1]}

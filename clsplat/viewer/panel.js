@@ -20,6 +20,7 @@ class Panel {
     })) find(name).addEventListener("click", action);
     choices("modes", "mode", mode => this.mode(mode));
     choices("styles", "style", style => this.style(style));
+    choices("cameras", "cameras", state => this.cameras(state === "shown"));
     choices("backgrounds", "background", name => this.background(name));
     find("share").addEventListener("input", ({target}) => {
       viewer.share = target.value / 100;
@@ -62,6 +63,12 @@ class Panel {
   style(style) {
     this.viewer.controls.style = style;
     press("styles", "style", style);
+  }
+
+  cameras(shown) {
+    this.viewer.frustums.shown = shown;
+    press("cameras", "cameras", shown ? "shown" : "hidden");
+    this.viewer.change();
   }
 
   background(name) {

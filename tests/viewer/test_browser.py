@@ -240,6 +240,14 @@ def test_settings_help_and_bareness(opened):
     )
     opened.rest()
     assert opened.run("document.getElementById('angle').textContent") == "90°"
+    assert opened.run(hidden("'frustums'"))
+    opened.click("[data-cameras=shown]")
+    opened.rest()
+    drawn = "document.getElementById('frustums').getContext('2d').getImageData(0, 0, 500, 250).data.some(v => v > 0)"
+    assert opened.run(drawn), "lines of cameras"
+    opened.key("g")
+    opened.rest()
+    assert opened.run(hidden("'frustums'"))
     opened.click("#settings")
     assert opened.run(hidden("'panel'"))
     opened.key("?")

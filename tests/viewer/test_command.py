@@ -34,7 +34,7 @@ def command(*arguments: str | Path) -> str:
 
 def test_a_run_writes_a_viewer_and_its_report_leads_to_it(run):
     viewer, report = ((run / name).read_text() for name in ("viewer.html", "report.html"))
-    assert Page(viewer).elements["canvas"] == 1
+    assert Page(viewer).elements["canvas"] == 2
     assert viewer.count('"split":"test"') == 2
     assert viewer.count('"split":"train"') == 8
     assert viewer.count('"photograph":null') == 8, "training views have a thumbnail alone"
