@@ -91,27 +91,26 @@ static inline uint list_share(const footprint_t *f, const rows_t share, uint pai
     return pair;
 }
 
-/* Fill the places up to `end`, behind the pairs of a splat from `first` to `pair`, with tiles of the band that those do
- * not name, so that no tile lists the splat twice.  Blending finds no pixel of it there. */
-static inline void fill_up(const uint first, const uint pair, const uint end, const uint i, const uint tiles_x,
-                           const uint row_begin, const uint row_end, __global uint *pair_tile,
-                           __global uint *pair_splat)
+/* Fill the places from `place` up to `end` with the tiles from `tile` to `last` that the places from `first` on do not
+ * name, so that no tile lists the splat twice.  Blending finds no pixel of it there. */
+static inline void fill_up(uint place, const uint end, const uint first, uint tile, const uint last, const uint i,
+                           __global uint *pair_tile, __global uint *pair_splat)
 {
-    const uint last = row_end * tiles_x - 1;
-    uint listed = first, place = pair;
-    for (uint tile = row_begin * tiles_x; place < end; tile++)
-        if (listed < pair && pair_tile[listed] == tile) {
+    for (; place < end; tile++) {
+        uint listed = first;
+        while (listed < place && pair_tile[listed] != tile)
             listed++;
-        } else {
-            pair_tile[place] = tile < last ? tile : last;  // a count beyond the band stays inside it
+        if (listed == place) {
+            pair_tile[place] = tile < last ? tile : last;  // a count beyond the tiles stays inside them
             pair_splat[place] = i;
             place++;
         }
+    }
 }
 
 /* Emit the pairs of large splats.  Tiles are tested again, and a compiler may round differently at a tile's edge in
- * another kernel: no pair is written behind the splat's places, and none of these stays open.
- * Local memory: TEAM * 4 bytes. */
+ * another place: no item writes beyond what it has counted, none beyond the splat's places, and none of these stays
+ * open.  Local memory: TEAM * 4 bytes. */
 __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
 void emit_large(
     __global const float *restrict splats,     // [N,RECORD] see splat.h
@@ -132,16 +131,20 @@ void emit_large(
         if (IS_LARGE(tile_box[i])) {
             rows_t share;
             const footprint_t f = share_of(splats + (size_t)i * RECORD, tiles_x, row_begin, row_end, &share);
-            sums[item] = item + 1 < TEAM ? count_share(&f, share) : 0;  // nobody needs that of the last item
+            sums[item] = count_share(&f, share);
             barrier(CLK_LOCAL_MEM_FENCE);
             const uint begin = first_pair[i], end = begin + tile_count[i];
-            uint pair = begin;
+            uint own = begin;
             for (uint k = 0; k < item; k++)
-                pair += sums[k];
-            pair = list_share(&f, share, pair, end, i, tiles_x, pair_tile, pair_splat);
+                own += sums[k];
+            const uint own_end = own + sums[item] < end ? own + sums[item] : end;
+            const uint top = (uint)first_lane(f.first_y);
+            const uint pair = list_share(&f, share, own, own_end, i, tiles_x, pair_tile, pair_splat);
+            fill_up(pair, own_end, own, (top + share.begin) * tiles_x, (top + share.end) * tiles_x - 1, i, pair_tile,
+                    pair_splat);
             barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE);
             if (item + 1 == TEAM)
-                fill_up(begin, pair, end, i, tiles_x, row_begin, row_end, pair_tile, pair_splat);
-            barrier(CLK_LOCAL_MEM_FENCE);  // without it PoCL 3.1 runs the line above for some items only
+                fill_up(own_end, end, begin, row_begin * tiles_x, row_end * tiles_x - 1, i, pair_tile, pair_splat);
+            barrier(CLK_LOCAL_MEM_FENCE);  // keeps the group together: a runtime may split the loop behind a branch
         }
 }

@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 from clsplat.conformance.scenes import random_case
+from clsplat.opencl import program
+from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import Rasterizer
 
 
@@ -94,6 +96,29 @@ def test_large_splats_list_as_many_tiles_as_were_counted(device, rng, surplus):
         assert len(set(tiles)) == min(len(tiles), camera.tiles)
 
 
+@pytest.mark.parametrize("rounds", ["(touched[lane] && (row + column + lane) % 3 != 1)", "1"])
+def test_listing_may_find_other_tiles_than_counting(device, rng, monkeypatch, rounds):
+    """As where a compiler rounds differently there: every place has one writer, and a tile of its own in the image."""
+    case = random_case(rng, 12, 150, 130)
+    case.parameters["log_scales"][:8] += 2.5
+    expected = _listed(device, case)
+    flatten, text = program.flatten, "if (touched[lane])"
+
+    def other(path, seen=None):
+        flat = flatten(path, seen)
+        assert path.name != "large.cl" or flat.count(text) == 1
+        return flat.replace(text, f"if ({rounds} && column + lane < columns)")
+
+    monkeypatch.setattr(program, "flatten", other)
+    different = Device(device.info, device.schedule)
+    different.tuning.update(device.tuning)
+    found = _listed(different, case)
+    assert found == _listed(different, case) != expected
+    for tiles, before in zip(found, expected, strict=True):
+        assert len(tiles) == len(set(tiles)) == len(before)
+        assert max(tiles, default=0) < 90, "tiles of the image"
+
+
 @pytest.mark.parametrize("sort", ["radix", "bitonic"])
 @pytest.mark.parametrize("surplus", [-1, 1])
 def test_a_large_splat_that_was_counted_wrongly_is_blended_once(device, rng, monkeypatch, sort, surplus):
@@ -165,3 +190,13 @@ def _emitted(device, frame, box, mask, count):
     assert (tiles[offset[-1] :] == untouched).all()
     np.testing.assert_array_equal(splats[: offset[-1]], np.repeat(np.arange(len(count)), count))
     return [tiles[offset[n] : offset[n + 1]].tolist() for n in range(len(count))]
+
+
+def _listed(device, case):
+    """Tiles of each Gaussian, with some large ones."""
+    rasterizer = Rasterizer(device, "radix")
+    frame = rasterizer.forward(case.model(device), case.device_camera(device), device.zeros(3))
+    found = (rasterizer.workspace._arrays[name].get()[:12] for name in ("tile_box", "tile_mask", "tile_count"))
+    box, mask, count = found
+    assert ((count > 0) & (box >> 24 == 33)).any()
+    return _emitted(device, frame, box, mask, count)
