@@ -13,7 +13,8 @@ from clsplat.scene.view import View
 
 PRIOR = 1e-3  # weight of the splats' middle, beside the axes: where all are parallel, nothing else says how far
 START = Camera(1200, 900, 1100.0, 1100.0, 600.0, 450.0)  # where there is no view
-DISTANCE = 2.5  # of that start from the middle, in radii
+SHARES = 0.05, 0.95  # of the splats, along each axis, are before and behind the sides of the box that is looked at
+DISTANCE = 2.2  # of that start from its middle, in halves of its diagonal
 
 
 @dataclass(frozen=True)
@@ -28,10 +29,10 @@ class Stand:
 
     @classmethod
     def of(cls, model: Model, views: Sequence[View], first: View | None) -> "Stand":
-        """Look from `first`, else from beside the model's middle."""
-        means = model.means.astype(np.float64)
-        middle = np.median(means, axis=0) if len(means) else np.zeros(3)
-        spread = float(np.median(np.linalg.norm(means - middle, axis=1))) if len(means) else 1.0
+        """Look from `first`, else at most of the model from outside."""
+        means = model.means[np.isfinite(model.means).all(axis=1)].astype(np.float64)
+        low, high = np.quantile(means, SHARES, axis=0) if len(means) else np.zeros((2, 3))
+        middle, spread = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
         if first is None or not views:
             up = np.array([0.0, -1.0, 0.0])  # as cameras of COLMAP stand
             radius = spread or 1.0

@@ -156,6 +156,8 @@ def test_where_a_page_begins(tmp_path):
     towards = alone.pivot - alone.start.position
     np.testing.assert_allclose(forward, towards / np.linalg.norm(towards), atol=1e-9)
     assert Stand.of(model[:0], (), None).radius > 0
+    model.means[::3] = np.nan
+    assert np.isfinite(Stand.of(model, (), None).start.world_to_camera).all()
 
 
 def test_a_camera_keeps_its_digits():
