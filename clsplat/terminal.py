@@ -163,7 +163,8 @@ def show_summary(folder: Path) -> None:
         remark(f"{quality}{metrics['gaussians']:,} Gaussians; {metrics['train_seconds']:.0f} s of training")
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise DataError(f"{folder / METRICS}: the file is damaged; run the pipeline again, --restart") from error
-    for title, name in (("model", "point_cloud.ply"), ("renders", "renders"), ("report", "report.html")):
+    names = {"model": "point_cloud.ply", "renders": "renders", "viewer": "viewer.html", "report": "report.html"}
+    for title, name in names.items():
         if (folder / name).exists():
             remark(f"  {title:<8} {folder / name}")
 

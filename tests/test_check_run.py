@@ -53,7 +53,8 @@ def test_a_whole_run_has_a_line_for_each_file_and_needs_no_device(finished, monk
     assert lines[-1] == f"{finished}: done; all {len(lines) - 1} files are whole"
     text = "\n".join(lines)
     names = ["pipeline.yaml", "status.json, done", "checkpoints/step_000020.npz, step 20, ", "metrics.jsonl, "]
-    names += ["metrics.json, ", "point_cloud.ply, ", "renders/test/", "report.html", "checksums.json, of 7 files"]
+    names += ["metrics.json, ", "point_cloud.ply, ", "renders/test/", "report.html", "checksums.json, of 8 files"]
+    names += ["viewer.html"]
     assert [name for name in names if name not in text] == []
     data = json.loads(command("check", finished, "--json").stdout)
     assert data == clsplat.check(finished)

@@ -20,7 +20,7 @@ ROWS = (  # from the top down; a module imports only from lower rows, or from it
     {"training"},
     {"density", "metrics"},
     {"losses"},
-    {"views", "filters"},
+    {"viewer", "views", "filters"},
     {"render"},
     {"gaussians", "scene"},
     {"formats"},

@@ -49,7 +49,7 @@ def test_one_place_marks_text_as_safe():
 def test_every_template_file_is_part_of_a_page():
     pages = [path.read_text() for path in FOLDER.glob("*.j2")]
     for path in FOLDER.iterdir():
-        page = path.name.removesuffix(".html.j2") in ("report", "compare", "inspect", "notebook", "doctor")
+        page = path.name.removesuffix(".html.j2") in ("report", "compare", "inspect", "notebook", "doctor", "viewer")
         assert page or any(f'"{path.name}"' in text for text in pages), path.name
 
 

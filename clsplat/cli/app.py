@@ -17,7 +17,8 @@ from clsplat.pipeline.files import shipped
 SYNONYMS = {
     **dict.fromkeys(("train", "fit", "optimize", "start"), "run"),
     **dict.fromkeys(("eval", "measure", "metrics", "score"), "evaluate"),
-    **dict.fromkeys(("show", "info", "describe"), "inspect"),
+    **dict.fromkeys(("info", "describe"), "inspect"),
+    **dict.fromkeys(("show", "viewer", "look", "walk"), "view"),
     **dict.fromkeys(("list", "ls", "recipes"), "pipelines"),
     **dict.fromkeys(("validate", "lint", "verify"), "check"),
     **dict.fromkeys(("continue", "restart"), "resume"),
@@ -33,7 +34,7 @@ SYNONYMS = {
 
 ORDER = [
     *("run", "resume", "status", "check", "pipelines", "devices", "doctor", "inspect"),
-    *("render", "evaluate", "convert", "compare", "bench", "data"),
+    *("render", "view", "evaluate", "convert", "compare", "bench", "data"),
 ]
 
 

@@ -94,6 +94,35 @@ def evaluate(
 
 
 @command(
+    "view",
+    "clsplat view runs/splat_7k --out scene.html",
+    "clsplat view point_cloud.ply --scene my_scene --photographs all",
+    "clsplat view runs/splat runs/mip_splatting",
+)
+def view(
+    models: Annotated[
+        list[Path], typer.Argument(metavar="MODEL|RUN [MODEL2]", help="Splat PLYs or run folders; two share a camera.")
+    ],
+    scene: SceneOption = None,
+    out: Annotated[Path, typer.Option(metavar="FILE.html", help="The page to write.")] = Path("viewer.html"),
+    photographs: Annotated[
+        Literal["none", "test", "all"], typer.Option(help="Views whose photographs are in the page.")
+    ] = "test",
+    photograph_budget: Annotated[
+        float, typer.Option(min=0, metavar="MB", help="Photographs up to this size: every second, third, … then.")
+    ] = 4.0,
+    splats: Annotated[
+        int | None, typer.Option(min=1, metavar="N", help="Only so many, the most important ones; default: all.")
+    ] = None,
+) -> None:
+    """Write a page to walk through a model, beside its photographs; it opens offline."""
+    page = commands.view(
+        *models, scene=scene, out=out, photographs=photographs, photograph_budget=photograph_budget, splats=splats
+    )
+    terminal.remark(f"{page}: {page.stat().st_size / 1e6:.1f} MB; open it in a browser")
+
+
+@command(
     "convert",
     "clsplat convert point_cloud.ply scene.spz",
     "clsplat convert a.ply b.sog both.glb --transform 'rotate=90,0,0'",

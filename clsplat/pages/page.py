@@ -1,10 +1,13 @@
 """Pages that open offline: one file of HTML with its style, charts and images inside.
 
-Templates, style and scripts lie in `templates/`.  They escape every value but the charts of `clsplat.pages.svg`.
+Templates, style and scripts lie in `templates/`.  They escape every value but the charts of `clsplat.pages.svg` and
+the scripts and styles of the package.
 """
 
 import base64
+import hashlib
 from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -32,7 +35,27 @@ def render(template: str, **values: Any) -> str:
 
 def charts(drawings: Iterable[str]) -> list[Markup]:
     """Mark SVG drawings as safe and drop empty ones; templates escape all other values."""
-    return [Markup(drawing) for drawing in drawings if drawing]
+    return [_safe(drawing) for drawing in drawings if drawing]
+
+
+@dataclass(frozen=True)
+class Inline:
+    """A script or style of the package, and the hash with which a page's policy admits it and no other."""
+
+    text: Markup
+    hash: str
+
+
+def inline(text: str) -> Inline:
+    """Mark a script or style of the package as safe.  Raises ValueError where it would end its own element."""
+    if "</" in text:
+        raise ValueError("a script or style holds '</', which ends its element")
+    digest = hashlib.sha256(text.encode()).digest()
+    return Inline(_safe(text), f"sha256-{base64.b64encode(digest).decode()}")
+
+
+def _safe(text: str) -> Markup:
+    return Markup(text)
 
 
 def counted(count: int, word: str) -> str:

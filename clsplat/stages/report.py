@@ -1,10 +1,13 @@
 """The run as one page that opens offline: figures, curves, times on the device, views beside photographs, settings."""
 
 import logging
+import os
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
+from urllib.parse import quote
 
 import numpy as np
 from markupsafe import Markup
@@ -40,6 +43,7 @@ class Report(Stage):
             "report.html.j2",
             title=f"{run.name} · {run.scene.path.name}",
             subtitle=run.device.text,
+            viewers=_viewers(run, run.out / self.file),
             figures=_figures(run),
             training=_training_charts(run),
             gaussians=_gaussians_charts(run),
@@ -79,6 +83,12 @@ class ViewFigure:
 
     caption: str
     images: dict[str, str]  # label -> data URL
+
+
+def _viewers(run: Run, page: Path) -> list[str]:
+    """The pages of the pipeline that show the model, as addresses beside this one."""
+    files = [run.out / stage["viewer"]["file"] for stage in run.pipeline["stages"] if "viewer" in stage]
+    return [quote(Path(os.path.relpath(file, page.parent)).as_posix()) for file in files]
 
 
 def _figures(run: Run) -> dict[str, str]:

@@ -1,0 +1,76 @@
+"""Models, of files or run folders, on one page to walk through."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.errors import ConfigError
+from clsplat.gaussians.model import Model, load
+from clsplat.pipeline.file import SceneSettings
+from clsplat.runs.model_file import Source
+from clsplat.scene.detect import read_scene
+from clsplat.scene.photographs import load_photograph
+from clsplat.scene.scene import Scene, View
+from clsplat.viewer.cameras import Stand
+from clsplat.viewer.packing import pack
+from clsplat.viewer.page import Page
+from clsplat.viewer.photographs import BUDGET, Which, described
+from clsplat.views.photographs import BACKGROUNDS
+
+MOST = 2  # models beside each other
+
+
+def view(
+    models: Sequence[Path],
+    scene: Path | None = None,
+    out: Path = Path("viewer.html"),
+    *,
+    photographs: Which = "test",
+    photograph_budget: float = BUDGET,
+    splats: int | None = None,
+) -> Path:
+    """Write a page that shows one model, or two with one camera; return the page.  Raises ClsplatError.
+
+    scene: whose views and photographs are in the page; by default that of the first run folder among the models.
+    """
+    if not 1 <= len(models) <= MOST:
+        raise ConfigError(f"view: expected one model or two, got {len(models)}")
+    if out.suffix.lower() not in (".html", ".htm"):
+        raise ConfigError(f"{out}: expected a name that ends in .html, as browsers open it")
+    if splats is not None and splats < 1:
+        raise ConfigError(f"--splats {splats}: expected a number of at least 1")
+    if photographs not in ("none", "test", "all"):
+        raise ConfigError(f"no photographs '{photographs}'; there are none, test and all")
+    source = next((Source.of(path, scene) for path in models if scene is not None or path.is_dir()), None)
+    loaded = {name: load(path) for name, path in zip(names(models), models, strict=True)}
+    first = next(iter(loaded.values()))
+    found = _scene(source, first) if source else None
+    background = first.rendering.background or (found.background if found else "black")
+
+    def read(one: View) -> NDArray[np.uint8]:
+        return load_photograph(one, BACKGROUNDS[background])[:, :, :3]
+
+    views = described(found, read, photographs, photograph_budget) if found else []
+    start = (found.split("test") or found.views)[0] if found else None
+    stand = Stand.of(first, found.views if found else (), start)
+    title = " and ".join(loaded) + (f" · {found.path.name}" if found else "")
+    Page(title, {name: pack(model, splats) for name, model in loaded.items()}, stand, background, views).write(out)
+    return out
+
+
+def names(models: Sequence[Path]) -> list[str]:
+    """Return a name for each model: its folder's or file's, with more of the path where two are the same."""
+    short = [path.resolve().name if path.is_dir() else path.stem for path in models]
+    parents = [path.resolve().parent.name for path in models]
+    if len(set(short)) < len(short):
+        short = [f"{parent}/{name}" for parent, name in zip(parents, short, strict=True)]
+    return short if len(set(short)) == len(short) else [f"{name} ({i})" for i, name in enumerate(short, 1)]
+
+
+def _scene(source: Source, model: Model) -> Scene:
+    """The views as the model was trained on."""
+    settings: SceneSettings = source.settings
+    scene = read_scene(source.folder, settings.holdout).with_alpha(source.alpha or model.rendering.alpha)
+    return scene.downscaled(settings.downscale)

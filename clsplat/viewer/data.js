@@ -1,0 +1,74 @@
+// The planes of packing.py as arrays that textures take.
+
+const BLOCK = 256, ROW = 4096; // splats of a block; texels of a texture's row: what phones can hold
+
+// Bytes of the text of a script element, piece by piece, so that a large page needs no second copy of its text.
+function* decoded(text) {
+  const step = 1 << 20;
+  for (let begin = 0; begin < text.length; begin += step) {
+    const letters = atob(text.slice(begin, begin + step)), bytes = new Uint8Array(letters.length);
+    for (let i = 0; i < letters.length; i++) bytes[i] = letters.charCodeAt(i);
+    yield bytes;
+  }
+}
+
+async function inflated(text) {
+  if (!self.DecompressionStream) throw Error("this browser is too old: it has no DecompressionStream");
+  const stream = new DecompressionStream("gzip"), writer = stream.writable.getWriter();
+  const written = (async () => {
+    for (const bytes of decoded(text)) await writer.write(bytes);
+    await writer.close();
+  })();
+  return (await Promise.all([new Response(stream.readable).arrayBuffer(), written]))[0];
+}
+
+// texels of 16 bytes that hold the colours of a splat: 3 (degree + 1)² codes
+const colourTexels = degree => Math.ceil(3 * (degree + 1) ** 2 / 16);
+const splatsInRow = texels => Math.floor(ROW / texels);
+const rowsOf = (count, texels) => Math.max(1, Math.ceil(count / splatsInRow(texels)));
+
+// An array for a texture of whole rows.
+const padded = (kind, count, texels, each) => new kind(rowsOf(count, texels) * splatsInRow(texels) * texels * each);
+
+// header, buffer: of packing.py; most: rows that a texture may have.  Splats beyond are left out: the least important.
+function unpacked(header, buffer, most) {
+  const whole = header.count, texels = colourTexels(header.degree);
+  const count = Math.min(whole, most * splatsInRow(texels), most * ROW);
+  let place = 0;
+  const take = (kind, length) => {
+    const part = new kind(buffer, place, length);
+    place += part.byteLength;
+    return part;
+  };
+  const tables = take(Float32Array, 4 * 256), blocks = take(Float32Array, 6 * Math.ceil(whole / BLOCK));
+  const steps = take(Uint8Array, 6 * whole);
+  const quats = new Uint32Array(buffer.slice(place, place + 4 * whole)); // their place is no multiple of 4
+  place += 4 * whole;
+  const shapes = take(Uint8Array, 4 * whole), codes = take(Uint8Array, 3 * (header.degree + 1) ** 2 * whole);
+
+  const positions = new Float32Array(3 * count), places = padded(Uint32Array, count, 1, 4);
+  const floats = new Float32Array(places.buffer);
+  for (let i = 0; i < count; i++) {
+    const block = 6 * Math.floor(i / BLOCK);
+    for (let axis = 0; axis < 3; axis++) {
+      const step = steps[axis * whole + i] + 256 * steps[(axis + 3) * whole + i];
+      const t = blocks[block + axis] + blocks[block + 3 + axis] * step;
+      const value = header.origin[axis] + header.unit * Math.sign(t) * Math.expm1(Math.abs(t));
+      positions[3 * i + axis] = floats[4 * i + axis] = value;
+    }
+    places[4 * i + 3] = quats[i];
+  }
+  const sizes = interleaved(shapes, whole, count, 4, padded(Uint8Array, count, 1, 4), 4);
+  const each = 16 * texels;
+  const colours = interleaved(codes, whole, count, codes.length / whole, padded(Uint8Array, count, texels, 16), each);
+  return {count, whole, texels, tables, positions, places, sizes: new Uint32Array(sizes.buffer),
+    colours: new Uint32Array(colours.buffer)};
+}
+
+// Planes [number, whole] of bytes as `each` bytes of a splat.
+function interleaved(planes, whole, count, number, out, each) {
+  for (let plane = 0; plane < number; plane++) {
+    for (let i = 0, from = plane * whole, to = plane; i < count; i++, from++, to += each) out[to] = planes[from];
+  }
+  return out;
+}

@@ -1,0 +1,186 @@
+// WebGL2: textures of a model, one instanced quad for each splat, blended from back to front.
+
+const QUAD = new Float32Array([-1, -1, 1, -1, -1, 1, 1, 1]);
+const MODES = ["splats", "points", "ellipsoids", "opacity"];
+
+function program(gl, vertex, fragment) {
+  const made = gl.createProgram();
+  for (const [kind, source] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
+    const shader = gl.createShader(kind);
+    gl.shaderSource(shader, source);
+    gl.compileShader(shader);
+    gl.attachShader(made, shader);
+    if (gl.getShaderParameter(shader, gl.COMPILE_STATUS) || gl.isContextLost()) continue;
+    throw Error(gl.getShaderInfoLog(shader));
+  }
+  gl.bindAttribLocation(made, 0, "corner");
+  gl.bindAttribLocation(made, 1, "id");
+  gl.linkProgram(made);
+  if (!gl.getProgramParameter(made, gl.LINK_STATUS) && !gl.isContextLost()) throw Error(gl.getProgramInfoLog(made));
+  const places = {};
+  return {made, at: name => places[name] ??= gl.getUniformLocation(made, name)};
+}
+
+function texture(gl, format, width, height, kind, type, data, filter = gl.NEAREST) {
+  const made = gl.createTexture();
+  gl.bindTexture(gl.TEXTURE_2D, made);
+  for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, name, filter);
+  for (const name of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(gl.TEXTURE_2D, name, gl.CLAMP_TO_EDGE);
+  gl.texImage2D(gl.TEXTURE_2D, 0, format, width, height, 0, kind, type, data);
+  return made;
+}
+
+class Painter {
+  constructor(canvas) {
+    const wishes = {antialias: false, alpha: false, powerPreference: "high-performance"};
+    const gl = this.gl = canvas.getContext("webgl2", wishes);
+    if (!gl) throw Error("this browser has no WebGL2; switch on its hardware acceleration, or take another browser");
+    // Hundreds of layers blended in 8 bits lose 10 dB; half floats lose nothing that an 8-bit image shows.
+    this.half = !!(gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float"));
+    this.most = gl.getParameter(gl.MAX_TEXTURE_SIZE);
+    if (this.most < ROW) throw Error(`this device has textures of ${this.most} px; ${ROW} are needed`);
+    this.colours = program(gl, COVER, COLOURS);
+    this.splats = program(gl, SPLAT_VERTEX, SPLAT_FRAGMENT);
+    this.present = program(gl, COVER, PRESENT);
+    this.empty = gl.createVertexArray();
+    this.quad = gl.createBuffer();
+    gl.bindBuffer(gl.ARRAY_BUFFER, this.quad);
+    gl.bufferData(gl.ARRAY_BUFFER, QUAD, gl.STATIC_DRAW);
+    this.target = {};
+    gl.disable(gl.DEPTH_TEST);
+  }
+
+  // A texture that can be drawn to, with its framebuffer.
+  surface(width, height, filter) {
+    const gl = this.gl, format = this.half ? gl.RGBA16F : gl.RGBA8, type = this.half ? gl.HALF_FLOAT : gl.UNSIGNED_BYTE;
+    const made = {width, height, texture: texture(gl, format, width, height, gl.RGBA, type, null, filter)};
+    made.frame = gl.createFramebuffer();
+    gl.bindFramebuffer(gl.FRAMEBUFFER, made.frame);
+    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, made.texture, 0);
+    return made;
+  }
+
+  // The textures of a model; data: of `unpacked`.
+  layer(header, data) {
+    const gl = this.gl, rows = rowsOf(data.count, 1), words = gl.RGBA_INTEGER;
+    const wide = splatsInRow(data.texels) * data.texels, high = rowsOf(data.count, data.texels);
+    const layer = {header, count: data.count, texels: data.texels, drawn: 0};
+    layer.tables = texture(gl, gl.R32F, 256, 4, gl.RED, gl.FLOAT, data.tables);
+    layer.places = texture(gl, gl.RGBA32UI, ROW, rows, words, gl.UNSIGNED_INT, data.places);
+    layer.sizes = texture(gl, gl.R32UI, ROW, rows, gl.RED_INTEGER, gl.UNSIGNED_INT, data.sizes);
+    layer.codes = texture(gl, gl.RGBA32UI, wide, high, words, gl.UNSIGNED_INT, data.colours);
+    layer.shown = this.surface(ROW, rows, gl.NEAREST);
+    layer.ids = gl.createBuffer();
+    layer.array = gl.createVertexArray();
+    gl.bindVertexArray(layer.array);
+    gl.bindBuffer(gl.ARRAY_BUFFER, this.quad);
+    gl.enableVertexAttribArray(0);
+    gl.vertexAttribPointer(0, 2, gl.FLOAT, false, 0, 0);
+    gl.bindBuffer(gl.ARRAY_BUFFER, layer.ids);
+    gl.bufferData(gl.ARRAY_BUFFER, 4 * Math.max(1, data.count), gl.DYNAMIC_DRAW);
+    gl.enableVertexAttribArray(1);
+    gl.vertexAttribIPointer(1, 1, gl.UNSIGNED_INT, 0, 0);
+    gl.vertexAttribDivisor(1, 1);
+    return layer;
+  }
+
+  // order: ids from back to front
+  reorder(layer, order) {
+    const gl = this.gl;
+    gl.bindBuffer(gl.ARRAY_BUFFER, layer.ids);
+    gl.bufferSubData(gl.ARRAY_BUFFER, 0, order);
+    layer.drawn = order.length;
+  }
+
+  bind(used, textures) {
+    const gl = this.gl;
+    gl.useProgram(used.made);
+    Object.entries(textures).forEach(([name, one], unit) => {
+      gl.activeTexture(gl.TEXTURE0 + unit);
+      gl.bindTexture(gl.TEXTURE_2D, one);
+      gl.uniform1i(used.at(name), unit);
+    });
+  }
+
+  // Compute the colours of the first splats, unless it was done for this place of the camera.
+  shade(layer, eye, first) {
+    const key = [...eye, first].join(), gl = this.gl, used = this.colours;
+    if (key === layer.key) return;
+    layer.key = key;
+    this.bind(used, {tables: layer.tables, places: layer.places, codes: layer.codes});
+    gl.uniform3fv(used.at("eye"), eye);
+    gl.uniform1i(used.at("degree"), layer.header.degree);
+    gl.uniform1i(used.at("texels"), layer.texels);
+    gl.uniform1i(used.at("count"), first);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, layer.shown.frame);
+    gl.viewport(0, 0, ROW, rowsOf(first, 1));
+    gl.disable(gl.BLEND);
+    gl.bindVertexArray(this.empty);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+  }
+
+  // Blend a layer into a surface of the size of `frame`: what `framed` of camera.js returns.
+  blend(layer, frame, {mode = "splats", first = layer.count, dot = 1.5} = {}) {
+    const gl = this.gl, used = this.splats, {header} = layer, {width, height} = frame;
+    this.shade(layer, frame.eye, first);
+    const target = this.sized(width, height);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, target.frame);
+    gl.viewport(0, 0, width, height);
+    gl.clearColor(0, 0, 0, 0);
+    gl.clear(gl.COLOR_BUFFER_BIT);
+    this.bind(used, {tables: layer.tables, places: layer.places, sizes: layer.sizes, colours: layer.shown.texture});
+    gl.uniformMatrix3fv(used.at("rotation"), true, frame.rotation);
+    gl.uniform3fv(used.at("translation"), frame.translation);
+    gl.uniform4fv(used.at("intrinsics"), frame.intrinsics);
+    gl.uniform4fv(used.at("limits"), frame.limits);
+    gl.uniform2f(used.at("size"), width, height);
+    // A filter that compensates is meant for every resolution; one that does not belongs to that of training.
+    const wider = 1 + (1 - header.compensate) * (Math.max(1, frame.enlarged) ** 2 - 1);
+    gl.uniform3f(used.at("filters"), header.near, header.variance * wider, header.compensate);
+    gl.uniform1i(used.at("mode"), MODES.indexOf(mode));
+    gl.uniform1f(used.at("dot_radius"), dot);
+    gl.enable(gl.BLEND);
+    gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+    gl.bindVertexArray(layer.array);
+    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, layer.drawn);
+    return target;
+  }
+
+  sized(width, height) {
+    const gl = this.gl;
+    if (this.target.width !== width || this.target.height !== height) {
+      gl.deleteTexture(this.target.texture);
+      gl.deleteFramebuffer(this.target.frame);
+      this.target = this.surface(width, height, gl.LINEAR);
+    }
+    return this.target;
+  }
+
+  // Show the target on an area of the canvas: left, bottom, width, height in px.
+  show(area, background, frame = null) {
+    const gl = this.gl, used = this.present;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, frame);
+    gl.viewport(...area);
+    gl.disable(gl.BLEND);
+    this.bind(used, {target: this.target.texture});
+    gl.uniform3fv(used.at("background"), background);
+    gl.uniform4fv(used.at("area"), area);
+    gl.bindVertexArray(this.empty);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+  }
+
+  // The target over a background as bytes RGBA, rows from the top.
+  pixels(background) {
+    const gl = this.gl, {width, height} = this.target, bytes = new Uint8Array(4 * width * height);
+    const made = texture(gl, gl.RGBA8, width, height, gl.RGBA, gl.UNSIGNED_BYTE, null), frame = gl.createFramebuffer();
+    gl.bindFramebuffer(gl.FRAMEBUFFER, frame);
+    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, made, 0);
+    this.show([0, 0, width, height], background, frame);
+    gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, bytes);
+    gl.deleteFramebuffer(frame);
+    gl.deleteTexture(made);
+    const rows = new Uint8ClampedArray(bytes.length), row = 4 * width;
+    for (let y = 0; y < height; y++) rows.set(bytes.subarray(row * (height - 1 - y), row * (height - y)), row * y);
+    return rows;
+  }
+}

@@ -1,0 +1,52 @@
+// The cameras of the views as small pyramids over the picture.
+
+const DEPTH = 0.07, COLOUR = {train: "#63b3ed", test: "#f6ad55"}; // of a pyramid, in radii of the scene
+
+class Frustums {
+  constructor(viewer, views) {
+    Object.assign(this, {viewer, canvas: find("frustums"), shown: false});
+    this.shapes = views.map(view => {
+      const {rotation, eye, lens: [fx, fy, cx, cy, width, height]} = cameraOf(view), far = DEPTH * viewer.radius;
+      const corners = [[0, 0], [width, 0], [width, height], [0, height]].map(([x, y]) => {
+        const ray = [(x - cx) / fx, (y - cy) / fy, 1];
+        return eye.map((v, i) => v + far * (ray[0] * rotation[i] + ray[1] * rotation[3 + i] + rotation[6 + i]));
+      });
+      return {points: [eye, ...corners], colour: COLOUR[view.split]};
+    });
+    if (!views.length) find("cameras").previousElementSibling.hidden = find("cameras").hidden = true;
+  }
+
+  // frame: of `framed` for a pane of that size in CSS px; corners: left and top of each pane
+  draw(frame, corners, ratio) {
+    const pen = this.canvas.getContext("2d"), {width, height} = this.viewer.canvas;
+    this.canvas.hidden = !this.shown;
+    if (!this.shown) return;
+    Object.assign(this.canvas, {width, height}); // and empties it
+    for (const [left, top] of corners) {
+      pen.setTransform(ratio, 0, 0, ratio, left * ratio, top * ratio);
+      pen.lineWidth = 1.3;
+      for (const {points, colour} of this.shapes) {
+        pen.strokeStyle = colour;
+        this.pyramid(pen, points.map(point => projected(frame, point)));
+      }
+    }
+  }
+
+  pyramid(pen, points) {
+    if (!points.every(Boolean)) return;
+    const [tip, ...corners] = points;
+    pen.beginPath();
+    corners.forEach((corner, i) => {
+      pen.moveTo(...tip);
+      pen.lineTo(...corner);
+      pen.lineTo(...corners[(i + 1) % 4]);
+    });
+    pen.stroke();
+  }
+}
+
+// The place of a point of the world on the canvas of a frame; null behind the camera.
+function projected({rotation, translation, intrinsics: [fx, fy, cx, cy]}, point) {
+  const [x, y, z] = [0, 1, 2].map(i => dot(rotation.slice(3 * i, 3 * i + 3), point) + translation[i]);
+  return z > 1e-3 ? [fx * x / z + cx, fy * y / z + cy] : null;
+}

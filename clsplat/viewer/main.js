@@ -1,0 +1,207 @@
+// The page: its camera, when it draws, and how finely.
+
+const REST = 200, SLOW = 40, QUICK = 20; // ms without a change until the full picture; of a frame
+
+class Viewer {
+  constructor(info, layers, painter, canvas) {
+    Object.assign(this, {info, layers, painter, canvas, stage: canvas.parentElement, up: info.up, radius: info.radius});
+    Object.assign(this, {mode: "splats", share: 1, quality: 1, background: info.background, at: -1, ms: null});
+    this.camera = cameraOf(info.start);
+    this.pivot = info.pivot;
+    for (const layer of layers) layer.sorter = new Sorter(layer.positions, layer.header.near, (order, first) => {
+      painter.reorder(layer, order);
+      layer.first = first;
+      this.change(false);
+    });
+    this.panel = new Panel(this);
+    this.photographs = new Photographs(this, info.views);
+    this.frustums = new Frustums(this, info.views);
+    this.controls = new Controls(this, canvas);
+    this.photographs.compare("off");
+    new ResizeObserver(() => { this.photographs.place(); this.change(); }).observe(this.stage);
+    addEventListener("hashchange", () => this.adopt());
+    if (!this.adopt() && info.first >= 0) this.photographs.choose(info.first, 0);
+    this.change();
+  }
+
+  // Take the camera of the address; return whether it holds one.
+  adopt() {
+    const camera = location.hash === this.hash ? null : read(location.hash);
+    if (camera) this.move(camera);
+    return !!camera;
+  }
+
+  // Draw again; moved: the camera or a setting has changed.
+  change(moved = true) {
+    if (moved) this.changed = performance.now();
+    this.dirty = true;
+    delete document.documentElement.dataset.ready;
+    this.scheduled ??= requestAnimationFrame(time => this.tick(time));
+  }
+
+  // Go on from another camera, not that of a photograph.
+  move(camera) {
+    this.flight = null;
+    this.at = -1;
+    this.photographs.leave();
+    this.camera = camera;
+    this.change();
+  }
+
+  // Fly to a camera; view: the index of the view that it is of.
+  fly(camera, seconds, view = -1) {
+    this.at = -1;
+    if (matchMedia("(prefers-reduced-motion: reduce)").matches) seconds = 0;
+    this.flight = {from: this.camera, to: camera, begin: performance.now(), seconds, view};
+    this.change();
+  }
+
+  reset() {
+    this.pivot = this.info.pivot;
+    if (this.info.first >= 0) this.photographs.choose(this.info.first);
+    else this.fly(cameraOf(this.info.start), 0.7);
+  }
+
+  widen(degrees) {
+    const [fx, fy, , , width, height] = this.camera.lens;
+    const focal = Math.min(width, height) / 2 / Math.tan(degrees * Math.PI / 360);
+    this.move({...this.camera, lens: [focal, focal * fy / fx, ...this.camera.lens.slice(2)]});
+  }
+
+  // The size of a model's part of the stage, CSS px: halves beside each other, or one above the other.
+  pane() {
+    const {clientWidth: width, clientHeight: height} = this.stage, parts = this.layers.length;
+    return width >= height ? {width: width / parts, height} : {width, height: height / parts};
+  }
+
+  get focal() { // CSS px
+    const {width, height} = this.pane();
+    return this.camera.lens[0] * fitted(this.camera.lens, width, height).enlarged;
+  }
+
+  tick(time) {
+    this.scheduled = undefined;
+    const passed = time - (this.time ?? time);
+    this.time = time;
+    if (this.flight) this.advance(time);
+    if (this.controls.fly(passed / 1000) || this.flight) this.change();
+    const resting = performance.now() - this.changed > REST;
+    if (!resting && this.drew) this.adapt(passed);
+    this.drew = this.dirty || (resting && !this.whole);
+    if (this.drew) this.draw(resting);
+    if (this.whole && !this.flight && !this.controls.pressed.size) this.time = undefined; // a new order draws again
+    else this.scheduled ??= requestAnimationFrame(later => this.tick(later));
+  }
+
+  advance(time) {
+    const {from, to, begin, seconds, view} = this.flight, t = seconds ? (time - begin) / 1000 / seconds : 1;
+    if (t >= 1) {
+      [this.camera, this.at, this.flight] = [to, view, null];
+      this.changed = performance.now();
+      if (view >= 0) this.photographs.arrived();
+    } else this.camera = between(from, to, Math.max(0, t * t * (3 - 2 * t)));
+  }
+
+  // Choose resolution and number of splats from the time of a frame while something moves.
+  adapt(passed) {
+    if (passed <= 0) return;
+    this.ms = this.ms === null ? passed : 0.8 * this.ms + 0.2 * passed;
+    if (passed > SLOW) this.quality = Math.max(0.02, this.quality * Math.max(0.5, 30 / passed));
+    else if (passed < QUICK) this.quality = Math.min(1, this.quality * 1.1);
+  }
+
+  // The number of a layer's splats that are drawn: a whole number of its parts, the most important first.
+  first({header, count}, share) {
+    return Math.min(count, header.levels[Math.max(1, Math.round(share * header.levels.length)) - 1]);
+  }
+
+  draw(resting) {
+    const scale = resting ? 1 : Math.max(0.4, Math.sqrt(this.quality));
+    const share = resting ? this.share : this.share * Math.min(1, this.quality / scale ** 2);
+    const ratio = Math.min(2, devicePixelRatio || 1), {width, height} = this.pane();
+    const wide = Math.max(1, Math.round(width * ratio)), high = Math.max(1, Math.round(height * ratio));
+    const along = this.stage.clientWidth >= this.stage.clientHeight, parts = this.layers.length;
+    const [whole, tall] = along ? [wide * parts, high] : [wide, high * parts];
+    if (this.canvas.width !== whole) this.canvas.width = whole;
+    if (this.canvas.height !== tall) this.canvas.height = tall;
+    const exact = this.at >= 0, native = exact ? this.camera.lens[0] : this.info.focal;
+    const [across, down] = [wide, high].map(side => Math.max(1, Math.round(side * scale)));
+    const frame = framed(this.camera, across, down, exact, native);
+    let drawn = 0;
+    this.layers.forEach((layer, i) => {
+      layer.sorter.ask([...axis(this.camera, 2), frame.translation[2]], this.first(layer, share));
+      this.painter.blend(layer, frame, {mode: this.mode, first: layer.first, dot: Math.max(1, 1.5 * ratio * scale)});
+      const corner = along ? [i * wide, 0] : [0, (parts - 1 - i) * high];
+      this.painter.show([...corner, wide, high], this.background);
+      drawn += layer.drawn;
+    });
+    const corners = this.layers.map((_, i) => along ? [i * width, 0] : [0, i * height]);
+    this.frustums.draw(framed(this.camera, width, height, exact), corners, ratio);
+    this.dirty = false;
+    this.whole = resting;
+    this.panel.statistics(drawn, this.ms, scale);
+    if (resting && !this.flight && this.layers.every(layer => layer.sorter.current)) this.settle();
+  }
+
+  settle() {
+    this.panel.field(this.camera.lens);
+    const text = `#${written(this.camera)}`;
+    if (text !== location.hash) {
+      this.hash = text;
+      try { history.replaceState(null, "", text); } catch { /* too often, or not allowed: the address stays */ }
+    }
+    document.documentElement.dataset.ready = "1";
+  }
+
+  // Turn about what is seen at a place of the stage: the nearest splat that covers it.
+  focus(x, y) {
+    const {width, height} = this.pane(), [u, v] = [x % width, y % height], [layer] = this.layers;
+    const frame = framed(this.camera, width, height, false), rows = [0, 1, 2].map(i => axis(this.camera, i));
+    const [fx, fy, cx, cy] = frame.intrinsics;
+    let nearest = Infinity;
+    for (let i = 0; i < layer.count; i++) {
+      const point = [layer.points[4 * i], layer.points[4 * i + 1], layer.points[4 * i + 2]];
+      const depth = dot(rows[2], point) + frame.translation[2];
+      if (depth < layer.header.near || depth > nearest || layer.opacities[i] < 0.4) continue;
+      const across = fx * (dot(rows[0], point) + frame.translation[0]) / depth + cx - u;
+      const down = fy * (dot(rows[1], point) + frame.translation[1]) / depth + cy - v;
+      if (across * across + down * down < 64) [nearest, this.pivot] = [depth, point];
+    }
+  }
+
+  // The picture as it is, as a file.
+  screenshot() {
+    this.draw(true);
+    this.canvas.toBlob(blob => {
+      const link = document.createElement("a");
+      link.href = URL.createObjectURL(blob);
+      link.download = `${this.info.file}.png`;
+      link.click();
+      setTimeout(() => URL.revokeObjectURL(link.href), 1000);
+    });
+  }
+
+  // The pixels of a view at its own size, after `choose` and once the page is at rest: {width, height, data}.
+  capture(part = 0) {
+    const [width, height] = this.camera.lens.slice(4), layer = this.layers[part];
+    this.painter.blend(layer, framed(this.camera, width, height, true, this.camera.lens[0]), {first: layer.first});
+    return {width, height, data: this.painter.pixels(this.background)};
+  }
+}
+
+async function open() {
+  const canvas = find("canvas"), info = JSON.parse(find("scene").textContent);
+  const painter = new Painter(canvas), layers = [];
+  canvas.addEventListener("webglcontextlost", () => fail("the graphics device was lost; load the page again"));
+  for (const [i, header] of info.models.entries()) {
+    const script = find(`model${i}`), buffer = await inflated(script.textContent.trim());
+    script.remove(); // its text is no longer needed
+    const data = unpacked(header, buffer, painter.most), points = new Float32Array(data.places.buffer);
+    const opacities = Float32Array.from(data.sizes, word => data.tables[256 + (word >>> 24)]);
+    layers.push({...painter.layer(header, data), positions: data.positions, points, opacities, first: 0});
+  }
+  window.viewer = new Viewer(info, layers, painter, canvas);
+  find("message").hidden = true;
+}
+
+open().catch(fail);

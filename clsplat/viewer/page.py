@@ -1,0 +1,92 @@
+"""A page that shows models: one file, which needs no network and opens from a disk."""
+
+import base64
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from clsplat.errors import OutputError
+from clsplat.files import write_text
+from clsplat.pages.page import inline, render
+from clsplat.viewer.cameras import Stand
+from clsplat.viewer.packing import Packed
+
+FOLDER = Path(__file__).parent
+SCRIPTS = ("data", "sort", "shaders", "draw", "camera", "controls", "photographs", "frustums", "panel", "main")
+MAX_SIZE = 200.0  # MB: browsers need several times as much memory
+MARGIN = 0.97  # of that size, for splats that pack worse than the average
+COLOURS = {"black": [0, 0, 0], "white": [1, 1, 1]}
+
+
+@dataclass(frozen=True)
+class Page:
+    """What a page shows: models by their names, with one camera, and the views of a scene."""
+
+    title: str
+    models: Mapping[str, Packed]
+    stand: Stand
+    background: str = "black"
+    views: Sequence[dict[str, Any]] = field(default_factory=list)
+
+    def text(self) -> str:
+        """Return the page; the same models and views give the same bytes."""
+        names = [view["name"] for view in self.views]
+        first = names.index(self.stand.start.name) if self.stand.start.name in names else -1
+        info = {
+            **self.stand.data(),
+            "models": [{"name": name, **packed.header} for name, packed in self.models.items()],
+            "views": self.views,
+            "first": first,
+            "background": COLOURS[self.background],
+            "file": re.sub(r"[^\w.-]+", "_", self.title),
+        }
+        return render(
+            "viewer.html.j2",
+            title=self.title,
+            info=info,
+            models=[base64.b64encode(packed.data).decode() for packed in self.models.values()],
+            facts=self._facts(),
+            background=self.background,
+            style=inline((FOLDER / "viewer.css").read_text("utf-8")),
+            script=inline(script()),
+        )
+
+    @property
+    def size(self) -> float:
+        """About the size of the page, MB."""
+        photographs = sum(len(view["thumbnail"]) + len(view["photograph"] or "") for view in self.views)
+        return (photographs + sum(len(packed.data) * 4 / 3 for packed in self.models.values())) / 1e6 + 0.1
+
+    @property
+    def fitting(self) -> int:
+        """The number of splats of each model with which a page that is too large is not."""
+        splats = sum(len(packed.data) * 4 / 3 for packed in self.models.values()) / 1e6
+        share = max(0.0, MAX_SIZE - (self.size - splats)) / max(splats, 1e-9)
+        return int(MARGIN * share * min(packed.count for packed in self.models.values()))
+
+    def write(self, path: Path) -> None:
+        """Write the page.  Raises OutputError where it is too large for browsers, or cannot be written."""
+        if self.size > MAX_SIZE:
+            raise OutputError(
+                f"{path}: the page would have {self.size:.0f} MB; browsers open {MAX_SIZE:.0f} MB at most: show the "
+                f"{self.fitting:,} most important splats (--splats {self.fitting}), or fewer photographs"
+            )
+        write_text(path, self.text())
+
+    def _facts(self) -> dict[str, str]:
+        facts = {}
+        for name, packed in self.models.items():
+            header, of = packed.header, f" of {name}" if len(self.models) > 1 else ""
+            facts[f"splats{of}"] = f"{packed.count:,}, SH degree {header['degree']}"
+            kept = ", keeps the energy" if header["compensate"] else ""
+            facts[f"screen filter{of}"] = f"{header['variance']:g} px²{kept}"
+            facts[f"size{of}"] = f"{len(packed.data) / 1e6:.2f} MB"
+        return facts | ({"views": f"{len(self.views):,}"} if self.views else {})
+
+
+def script() -> str:
+    """Return the scripts of the page, in one function."""
+    parts = [(FOLDER / f"{name}.js").read_text("utf-8") for name in SCRIPTS]
+    return '(() => {\n"use strict";\n' + "\n".join(parts) + "})();\n"

@@ -1,0 +1,77 @@
+// The splats from back to front, in a worker: two counting sorts of 16 bits order the depths exactly, as the bits of
+// positive floats are in the order of their values.  Splats before the near plane are left out.
+
+function sortInWorker() {
+  let positions, keys, ids, otherKeys, otherIds;
+  const counts = new Uint32Array(65537);
+
+  function pass(shift, count, fromKeys, fromIds, toKeys, toIds) {
+    counts.fill(0);
+    for (let i = 0; i < count; i++) counts[((fromKeys[i] >>> shift) & 65535) + 1]++;
+    for (let i = 0; i < 65536; i++) counts[i + 1] += counts[i];
+    for (let i = 0; i < count; i++) {
+      const to = counts[(fromKeys[i] >>> shift) & 65535]++;
+      toKeys[to] = fromKeys[i];
+      toIds[to] = fromIds[i];
+    }
+  }
+
+  function sorted({row, near, first}) {
+    const [x, y, z, w] = row, depths = new Float32Array(keys.buffer);
+    let count = 0;
+    for (let i = 0; i < first; i++) {
+      const depth = x * positions[3 * i] + y * positions[3 * i + 1] + z * positions[3 * i + 2] + w;
+      if (!(depth >= near)) continue;
+      depths[count] = depth;
+      ids[count++] = i;
+    }
+    for (let i = 0; i < count; i++) keys[i] = ~keys[i]; // far ones first
+    pass(0, count, keys, ids, otherKeys, otherIds);
+    pass(16, count, otherKeys, otherIds, keys, ids);
+    return ids.slice(0, count);
+  }
+
+  onmessage = ({data}) => {
+    if (data.positions) {
+      positions = data.positions;
+      [keys, ids, otherKeys, otherIds] = Array.from({length: 4}, () => new Uint32Array(positions.length / 3));
+    } else {
+      const order = sorted(data);
+      postMessage({order, first: data.first, number: data.number}, [order.buffer]);
+    }
+  };
+}
+
+// One worker; it sorts for one pose at a time, and next for the last one that was asked for.
+class Sorter {
+  constructor(positions, near, done) {
+    const source = URL.createObjectURL(new Blob([`(${sortInWorker})()`], {type: "text/javascript"}));
+    this.worker = new Worker(source);
+    URL.revokeObjectURL(source);
+    this.worker.postMessage({positions}, [positions.buffer]);
+    this.near = near;
+    this.number = 0; // of the last request
+    this.busy = this.current = false; // current: the last order is of the last request
+    this.worker.onmessage = ({data}) => {
+      this.busy = false;
+      this.current = data.number === this.number;
+      done(data.order, data.first);
+      if (!this.current) this.send();
+    };
+  }
+
+  // row: the third row of world_to_camera; first: the number of splats, the most important ones
+  ask(row, first) {
+    const key = [...row, first].join();
+    if (key === this.key) return;
+    Object.assign(this, {key, row, first});
+    this.number++;
+    this.current = false;
+    if (!this.busy) this.send();
+  }
+
+  send() {
+    this.busy = true;
+    this.worker.postMessage({row: this.row, near: this.near, first: this.first, number: this.number});
+  }
+}

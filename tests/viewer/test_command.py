@@ -1,0 +1,152 @@
+"""The stage of pipelines, the command and the function: the same pages, errors in one line."""
+
+import re
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+import clsplat
+from clsplat.cli import app
+from clsplat.errors import ConfigError, DataError, OutputError
+from clsplat.pipeline.files import shipped
+from clsplat.pipeline.loading import load
+from clsplat.runs.viewing import names
+from clsplat.stages.viewer import Viewer
+from clsplat.viewer import page as module
+from tests.html_page import Page
+from tests.test_cli import clsplat as process
+
+pytestmark = pytest.mark.slow
+SHORT = {"optimize.steps": 20}
+
+
+@pytest.fixture(scope="module")
+def run(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return clsplat.run("smoke", tiny_scene, tmp_path_factory.mktemp("viewer") / "run", set=SHORT)
+
+
+def command(*arguments: str | Path) -> str:
+    done = CliRunner().invoke(app, [str(argument) for argument in arguments])
+    assert done.exit_code == 0, done.output
+    return done.stdout
+
+
+def test_a_run_writes_a_viewer_and_its_report_leads_to_it(run):
+    viewer, report = ((run / name).read_text() for name in ("viewer.html", "report.html"))
+    assert Page(viewer).elements["canvas"] == 2
+    assert viewer.count('"split":"test"') == 2
+    assert viewer.count('"split":"train"') == 8
+    assert viewer.count('"photograph":null') == 8, "training views have a thumbnail alone"
+    assert '<a href="viewer.html">' in report
+    assert Page(report).elements["a"] == 1
+
+
+def test_the_stage_and_the_command_show_the_same(run, tmp_path):
+    """But for the name and the digits of a PLY that is read."""
+    command("view", run, "--out", tmp_path / "a.html")
+    sizes = [len(text.read_text()) for text in (run / "viewer.html", tmp_path / "a.html")]
+    assert sizes[0] == pytest.approx(sizes[1], rel=0.01)
+
+
+def test_every_shipped_pipeline_ends_with_a_viewer_and_a_report():
+    for name in shipped():
+        checked = load(name)
+        assert checked.names[-2:] == ["viewer", "report"], name
+        assert isinstance(checked.stages[-2], Viewer)
+
+
+def test_the_model_has_the_same_bits_without_the_stage(run, tiny_scene, tmp_path):
+    text = Path(load("smoke").path).read_text().replace("  - viewer: {file: viewer.html, photographs: test}\n", "")
+    (tmp_path / "plain.yaml").write_text(text)
+    plain = clsplat.run(tmp_path / "plain.yaml", tiny_scene, tmp_path / "plain", set=SHORT)
+    assert not (plain / "viewer.html").exists()
+    assert "<a href" not in (plain / "report.html").read_text()
+    assert (plain / "point_cloud.ply").read_bytes() == (run / "point_cloud.ply").read_bytes()
+
+
+def test_the_link_leads_from_another_folder(tiny_scene, tmp_path):
+    places = {**SHORT, "viewer.file": "pages/my scene.html", "report.file": "more/report.html"}
+    out = clsplat.run("smoke", tiny_scene, tmp_path / "run", set=places)
+    (address,) = re.findall(r'<a href="([^"]*)"', (out / "more" / "report.html").read_text())
+    assert address == "../pages/my%20scene.html"
+    assert (out / "pages" / "my scene.html").is_file()
+
+
+def test_a_run_with_too_many_splats_shows_the_most_important_ones(tiny_scene, tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr(module, "MAX_SIZE", 0.25)
+    monkeypatch.setattr("clsplat.stages.viewer.MAX_SIZE", 0.25)
+    out = clsplat.run("smoke", tiny_scene, tmp_path / "run", set={**SHORT, "init.count": 8000})
+    assert (out / "viewer.html").stat().st_size < 250_000
+    assert any("most important of" in record.message for record in caplog.records)
+
+
+@pytest.mark.parametrize("damage", ["missing", "cut"])
+def test_a_viewer_that_is_damaged_is_noticed(run, tmp_path, damage):
+    (tmp_path / "viewer.html").write_text("<!doctype html><html>")
+    if damage == "missing":
+        (tmp_path / "viewer.html").unlink()
+
+    class Run:
+        out = tmp_path
+
+    with pytest.raises(DataError, match=r"viewer\.html"):
+        Viewer(stage="viewer").verify(Run)
+
+
+def test_the_command_and_the_function_write_the_same_bytes(run, tiny_scene, tmp_path):
+    pairs = [
+        ([run], {}),
+        ([run / "point_cloud.ply"], {}),
+        ([run / "point_cloud.ply"], {"scene": tiny_scene, "photographs": "all"}),
+        ([run], {"photographs": "none", "splats": 500}),
+        ([run, run / "point_cloud.ply"], {}),
+    ]
+    for i, (models, options) in enumerate(pairs):
+        a, b = tmp_path / f"a{i}.html", tmp_path / f"b{i}.html"
+        given = [part for name, value in options.items() for part in (f"--{name}", value)]
+        assert f"{a}: 0." in command("view", *models, "--out", a, *given)
+        assert clsplat.view(*models, out=b, **options) == b
+        assert a.read_bytes() == b.read_bytes()
+    lengths = [len((tmp_path / f"a{i}.html").read_bytes()) for i in range(5)]
+    assert len(set(lengths)) == 5
+    assert (tmp_path / "a1.html").read_text().count('"split":') == 0, "a file alone has no views"
+    assert (tmp_path / "a2.html").read_text().count('"photograph":null') == 0
+
+
+def test_no_device_is_opened(run, tmp_path, monkeypatch):
+    monkeypatch.setattr("clsplat.opencl.device.Device.__init__", lambda *_: pytest.fail("opens a device"))
+    clsplat.view(run, out=tmp_path / "a.html")
+
+
+def test_names_of_models(tmp_path):
+    for name in ("a/run", "b/run", "other"):
+        (tmp_path / name).mkdir(parents=True)
+    assert names([tmp_path / "a" / "run", tmp_path / "other"]) == ["run", "other"]
+    assert names([tmp_path / "a" / "run", tmp_path / "b" / "run"]) == ["a/run", "b/run"]
+    assert names([tmp_path / "x" / "point_cloud.ply", tmp_path / "y" / "point_cloud.ply"]) == [
+        "x/point_cloud",
+        "y/point_cloud",
+    ]
+    assert names([tmp_path / "other", tmp_path / "other"])[0] != names([tmp_path / "other", tmp_path / "other"])[1]
+
+
+def test_errors_are_one_line(run, tmp_path):
+    for arguments, code in (
+        (["view", run, run, run], 2),
+        (["view", run, "--out", tmp_path / "page.txt"], 2),
+        (["view", tmp_path / "none.ply"], 3),
+        (["view", run, "--scene", tmp_path / "nowhere"], 3),
+    ):
+        process(*arguments, expect=code)
+
+
+def test_errors_of_the_function(run, tmp_path, monkeypatch):
+    with pytest.raises(ConfigError, match="one model or two, got 0"):
+        clsplat.view()
+    with pytest.raises(ConfigError, match="no photographs 'some'; there are none, test and all"):
+        clsplat.view(run, out=tmp_path / "a.html", photographs="some")
+    monkeypatch.setattr(module, "MAX_SIZE", 0.12)
+    with pytest.raises(OutputError, match=r"browsers open .* at most: show the [\d,]+ most important splats"):
+        clsplat.view(run, out=tmp_path / "a.html")
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,137 @@
+"""A packed model is the model, within the steps of its tables; the same model gives the same bytes."""
+
+import gzip
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from clsplat.viewer.packing import BLOCK, FLATTEST, KNEE, LEAST_RANGE, LEVELS, STEPS, pack
+from tests.viewer.scenes import MIP, cloud
+from tests.viewer.unpacking import unpacked
+
+RNG = np.random.default_rng(5)
+
+
+def spread(count: int, **changes):
+    """A model whose splats can be told apart by their opacities, which no view leaves out."""
+    model = cloud(count, **changes)
+    opacity = np.linspace(0.05, 0.95, count)[RNG.permutation(count)]
+    return replace(model, logit_opacity=np.log(opacity / (1 - opacity))[:, None])
+
+
+def logarithmic(means, header):
+    offsets = (means.astype(np.float64) - header["origin"]) / header["unit"]
+    return np.sign(offsets) * np.log1p(np.abs(offsets))
+
+
+def matched(model, found):
+    """Rows of the model in the order of what was found, by the nearest mean."""
+    distances = np.linalg.norm(found.means[:, None] - model.means[None].astype(np.float64), axis=2)
+    rows = distances.argmin(axis=1)
+    assert sorted(rows) == list(range(len(model)))
+    return model[rows]
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("count", [1, 2, BLOCK - 1, BLOCK, BLOCK + 1, 3 * BLOCK + 7])
+def test_what_comes_out_is_what_went_in(count, degree):
+    model = spread(count, degree=degree)
+    packed = pack(model)
+    found = unpacked(packed)
+    model = matched(model, found)
+    before, after = (logarithmic(means, packed.header) for means in (model.means, found.means))
+    for part in (slice(begin, begin + BLOCK) for begin in range(0, count, BLOCK)):
+        assert (np.abs(after[part] - before[part]) <= 0.51 * np.ptp(before[part], axis=0) / STEPS + 1e-6).all()
+    unit = model.quats / np.linalg.norm(model.quats, axis=1, keepdims=True)
+    assert (np.abs((found.quats * unit).sum(axis=1)) > 1 - 2e-6).all(), "0.2 degrees"
+    logs = np.maximum(model.log_scales, model.log_scales.max(axis=1, keepdims=True) - FLATTEST)
+    assert np.abs(np.log(found.scales) - logs).max() < 0.03
+    assert np.abs(found.opacities - model.opacities).max() < 0.003
+    assert np.abs(found.sh[:, 0] - model.sh_base).max() < 0.03
+    half_steps = np.hypot(KNEE, model.sh_rest) * np.arcsinh(LEAST_RANGE / KNEE) / 254  # the slope of the table's sinh
+    assert (np.abs(found.sh[:, 1:].reshape(count, -1) - model.sh_rest) <= 1.02 * half_steps).all()
+
+
+def test_the_same_model_gives_the_same_bytes():
+    packed = pack(cloud(500))
+    assert packed == pack(cloud(500))
+    assert packed.data[4:8] == bytes(4), "the time in the header of gzip"
+    assert packed.data != pack(cloud(500, seed=1)).data
+
+
+def test_the_order_of_a_file_does_not_matter():
+    model = spread(700)
+    assert pack(model).data == pack(model[RNG.permutation(700)]).data
+
+
+def test_the_first_parts_are_the_most_important():
+    model = spread(800)
+    packed = pack(model)
+    found = unpacked(packed)
+    assert packed.header["levels"] == [100 * (i + 1) for i in range(LEVELS)]
+    weight = found.opacities * np.sort(found.scales, axis=1)[:, 1:].prod(axis=1)
+    parts = weight.reshape(LEVELS, 100)
+    assert (parts[:-1].min(axis=1) >= 0.9 * parts[1:].max(axis=1)).all()
+
+
+def test_a_limit_keeps_the_most_important():
+    model = spread(800)
+    weight = model.opacities * np.sort(model.scales, axis=1)[:, 1:].prod(axis=1)
+    kept = unpacked(pack(model, 200))
+    best = model[np.argsort(-weight)[:200]]
+    assert len(kept.means) == 200
+    np.testing.assert_allclose(np.sort(kept.means[:, 0]), np.sort(best.means[:, 0]), atol=0.01)
+
+
+def test_what_no_view_shows_is_left_out():
+    model = spread(10)
+    tables = {name: table.copy() for name, table in model.tables().items()}
+    tables["means"][0, 1] = np.nan
+    tables["sh_base"][1, 2] = np.inf
+    tables["quats"][2] = 0
+    tables["logit_opacity"][3] = -5.6  # an opacity below 1/255
+    tables["log_scales"][4] = -np.inf
+    packed = pack(replace(model, **tables))
+    assert packed.count == 5
+    np.testing.assert_allclose(np.sort(unpacked(packed).means[:, 0]), np.sort(model.means[5:, 0]), atol=1e-3)
+
+
+def test_a_model_of_nothing():
+    packed = pack(cloud(4)[:0])
+    assert (packed.count, packed.header["levels"]) == (0, [0] * LEVELS)
+    assert len(unpacked(packed).means) == 0
+
+
+def test_splats_at_one_place_and_of_one_size():
+    model = cloud(300)
+    same = {name: np.repeat(table[:1], 300, axis=0) for name, table in model.tables().items()}
+    found = unpacked(pack(replace(model, **same)))
+    np.testing.assert_allclose(found.means, same["means"], rtol=1e-6)
+    np.testing.assert_allclose(np.log(found.scales), same["log_scales"], rtol=1e-5)
+
+
+def test_colours_far_beyond_the_usual_ones():
+    model = spread(300)
+    wild = replace(model, sh_rest=model.sh_rest * 60, sh_base=model.sh_base * 20)
+    found = unpacked(pack(wild))
+    wild = matched(wild, found)
+    most = np.abs(wild.sh_rest).max()
+    error = np.abs(found.sh[:, 1:].reshape(300, -1) - wild.sh_rest)
+    assert (error < 0.02 * np.abs(wild.sh_rest) + 0.01).all(), most
+    assert np.abs(found.sh[:, 0] - wild.sh_base).max() < 0.02 * np.abs(wild.sh_base).max()
+
+
+def test_the_numbers_for_rendering_and_a_world_filter():
+    model = replace(spread(50), rendering=MIP, filter_variance=np.full((50, 1), 0.01, np.float32))
+    packed = pack(model)
+    header = packed.header
+    assert (header["near"], header["variance"], header["compensate"]) == (0.2, 0.1, 1.0)
+    assert unpacked(packed).scales.min() > 0.098, "the filter is part of the scales"
+    assert packed == pack(model.baked())
+
+
+def test_zero_colours_stay_zero():
+    model = replace(spread(64), sh_rest=np.zeros((64, 45), np.float32))
+    assert (unpacked(pack(model)).sh[:, 1:] == 0).all()
+    assert len(gzip.decompress(pack(model).data)) == 4 * 1024 + 24 + 64 * (6 + 4 + 4 + 48)

@@ -1,0 +1,171 @@
+"""The page as text: escapes, its policy, its size, its photographs, its frame of motion."""
+
+import base64
+import hashlib
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from clsplat.errors import OutputError
+from clsplat.pages.page import inline
+from clsplat.viewer import page as module
+from clsplat.viewer.cameras import Stand, camera_data, closest_point
+from clsplat.viewer.packing import pack
+from clsplat.viewer.page import FOLDER, SCRIPTS, Page, script
+from clsplat.viewer.photographs import described, left_out, shrunk
+from tests.html_page import HOSTILE
+from tests.html_page import Page as Parsed
+from tests.viewer.scenes import cloud, scene, views
+
+
+def flat(view):
+    """A photograph of one colour."""
+    return np.full((view.camera.height, view.camera.width, 3), 90, np.uint8)
+
+
+@pytest.fixture
+def page(tmp_path) -> Page:
+    found, model = scene(tmp_path), cloud(60)
+    stand = Stand.of(model, found.views, found.views[0])
+    return Page("demo", {"model": pack(model)}, stand, "white", described(found, flat, "test"))
+
+
+def test_the_same_input_gives_the_same_page(page, tmp_path):
+    page.write(tmp_path / "page.html")
+    assert (tmp_path / "page.html").read_text() == page.text()
+
+
+def test_names_are_escaped(page):
+    views = [{**view, "name": f"{HOSTILE}{i}"} for i, view in enumerate(page.views)]
+    start = replace(page.stand.start, name=f"{HOSTILE}0")
+    models = {HOSTILE: page.models["model"], f"{HOSTILE}B": page.models["model"]}
+    text = replace(page, title=HOSTILE, models=models, views=views, stand=replace(page.stand, start=start)).text()
+    parsed = Parsed(text)
+    assert parsed.elements["script"] == 4, "the scene, two models and the program"
+    assert parsed.text.count(HOSTILE) == 2 + 2 + 2 * 3, "title twice, a label and three facts of each model"
+    info = json.loads(re.search(r'id="scene">(.*?)</script>', text).group(1))
+    assert [view["name"] for view in info["views"]] == [f"{HOSTILE}{i}" for i in range(4)]
+    assert info["first"] == 0
+    assert re.fullmatch(r"[\w.-]+", info["file"])
+
+
+def test_only_the_script_and_style_of_the_package_may_run(page):
+    text = page.text()
+    policy = re.search(r'Content-Security-Policy" content="([^"]*)"', text).group(1)
+    for element in ("script", "style"):
+        (content,) = re.findall(rf"<{element}>(.*?)</{element}>", text, re.S)
+        digest = base64.b64encode(hashlib.sha256(content.encode()).digest()).decode()
+        assert f"{element}-src 'sha256-{digest}'" in policy.replace("&#39;", "'")
+    assert policy.startswith("default-src 'none'; img-src data:;")
+    assert "unsafe" not in policy
+    assert "http" not in text.replace("http-equiv", ""), "an address of another place"
+
+
+def test_a_script_that_would_end_its_element_is_refused():
+    with pytest.raises(ValueError, match="ends its element"):
+        inline("'</script>'")
+
+
+@pytest.mark.parametrize("path", sorted([*FOLDER.glob("*.js"), *FOLDER.glob("*.css")]), ids=lambda path: path.name)
+def test_scripts_are_short_and_part_of_the_page(path):
+    lines = path.read_text().splitlines()
+    assert len(lines) <= 250
+    assert max(map(len, lines)) <= 120
+    assert path.stem in (*SCRIPTS, "viewer")
+    assert path.suffix == ".css" or path.read_text() in script()
+
+
+def test_a_page_that_browsers_cannot_open_is_refused(page, tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "MAX_SIZE", 0.95 * page.size)
+    with pytest.raises(
+        OutputError, match=r"page would have 0 MB; .*show the \d+ most important splats \(--splats \d+\)"
+    ):
+        page.write(tmp_path / "page.html")
+    assert not list(tmp_path.iterdir())
+
+
+def test_as_many_splats_fit_as_the_advice_says(page, monkeypatch):
+    model = cloud(4000)
+    large = replace(page, models={"model": pack(model)})
+    monkeypatch.setattr(module, "MAX_SIZE", 0.7 * large.size)
+    assert 500 < large.fitting < 3000
+    fitting = replace(large, models={"model": pack(model, large.fitting)})
+    assert 0.5 * module.MAX_SIZE < fitting.size <= module.MAX_SIZE
+
+
+def test_the_size_is_that_of_the_file(page, tmp_path):
+    large = replace(page, models={"model": pack(cloud(20000))})
+    large.write(tmp_path / "page.html")
+    assert large.size == pytest.approx((tmp_path / "page.html").stat().st_size / 1e6, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("sizes", "budget", "kept"),
+    [
+        ([5, 5, 5, 5], 20, [0, 1, 2, 3]),
+        ([5, 5, 5, 5], 19, [0, 2]),
+        ([5, 5, 5, 5, 5, 5, 5], 15, [0, 3, 6]),
+        ([5, 5, 5, 5], 5, [0]),
+        ([5, 5, 5, 5], 4, []),
+        ([], 4, []),
+    ],
+)
+def test_photographs_up_to_a_budget(sizes, budget, kept):
+    assert left_out(sizes, budget) == set(range(len(sizes))) - set(kept)
+
+
+@pytest.mark.parametrize(("which", "held"), [("none", []), ("test", [0, 3]), ("all", [0, 1, 2, 3])])
+def test_photographs_of_the_views_that_are_wanted(tmp_path, which, held):
+    found = described(scene(tmp_path), flat, which)
+    assert [i for i, view in enumerate(found) if view["photograph"]] == held
+    assert all(view["thumbnail"].startswith("data:image/jpeg;base64,") for view in found)
+    assert [view["split"] for view in found] == ["test", "train", "train", "test"]
+    assert all(not view["photograph"] for view in described(scene(tmp_path), flat, which, budget=1e-6))
+
+
+@pytest.mark.parametrize(("shape", "after"), [((300, 200), (128, 85)), ((100, 128), (100, 128)), ((2, 4000), (1, 128))])
+def test_thumbnails_keep_their_aspect(shape, after):
+    assert shrunk(np.zeros((*shape, 3), np.uint8), 128).shape[:2] == after
+
+
+def test_the_pivot_is_where_the_axes_meet():
+    centre = np.array([1.0, -2.0, 3.0])
+    places = np.random.default_rng(0).normal(0, 4, (12, 3))
+    axes = (centre - places) / np.linalg.norm(centre - places, axis=1, keepdims=True)
+    np.testing.assert_allclose(closest_point(places, axes, centre + 5), centre, atol=0.02)
+
+
+def test_parallel_axes_meet_at_the_depth_of_the_splats():
+    places = np.array([[0.0, 0, 0], [2, 0, 0], [0, 2, 0], [2, 2, 0]])
+    found = closest_point(places, np.tile([0.0, 0, 1], (4, 1)), np.array([9.0, 9, 7]))
+    np.testing.assert_allclose(found, [1, 1, 7], atol=0.02)
+
+
+def test_where_a_page_begins(tmp_path):
+    model, found = cloud(200), views()
+    stand = Stand.of(model, found, found[2])
+    assert stand.start is found[2]
+    assert stand.focal == 85.0
+    assert stand.up @ [0, -1, 0] > 0.8
+    alone = Stand.of(model, (), None)
+    forward = alone.start.world_to_camera[2, :3]
+    towards = alone.pivot - alone.start.position
+    np.testing.assert_allclose(forward, towards / np.linalg.norm(towards), atol=1e-9)
+    assert Stand.of(model[:0], (), None).radius > 0
+    model.means[::3] = np.nan
+    assert np.isfinite(Stand.of(model, (), None).start.world_to_camera).all()
+
+
+def test_a_camera_keeps_its_digits():
+    view = views()[1]
+    data = camera_data(view)
+    np.testing.assert_allclose(np.reshape(data["pose"], (3, 4)), view.world_to_camera, rtol=1e-8, atol=1e-12)
+    assert data["lens"] == [80.0, 104.0, pytest.approx(33.6), pytest.approx(56.0), 112, 80]
+
+
+def test_the_folder_holds_no_script_that_is_forgotten():
+    assert sorted(path.stem for path in Path(FOLDER).glob("*.js")) == sorted(SCRIPTS)
