@@ -49,7 +49,7 @@ class Source:
 
         `scene` replaces the folder of the run's photographs.  Raises DataError or ConfigError when one is not known.
         """
-        if not model.is_dir() or (located(model).is_file() and not (model / "pipeline.yaml").is_file()):
+        if not model.is_dir() or (located(model).is_file() and not (model / PIPELINE).is_file()):
             if scene is None:
                 raise ConfigError(
                     f"{model}: a model file does not name its scene; give the folder of a scene, or a run folder"

@@ -184,8 +184,7 @@ class Optimize(Stage):
         try:
             view, stale = self._differentiate(run, trainer, sampler)
         except BaseException:  # a second Ctrl-C too
-            run.step -= 1
-            run.stage_step -= 1
+            run.step, run.stage_step = run.step - 1, run.stage_step - 1
             run.device.timings.sampling = False
             raise
         with run.changing():
