@@ -17,6 +17,7 @@ from pathlib import Path
 
 import clsplat
 from clsplat.files import PARTIAL
+from clsplat.training import checkpoint
 from clsplat.training.records import Records
 
 ATTEMPTS = 200  # of one run: each has time for a step at least, most for many
@@ -65,10 +66,15 @@ def kills(scene: Path, folder: Path, count: int, seed: int = 0) -> Iterator[Coun
 
 
 def identity(out: Path) -> tuple[str, str, list[str]]:
-    """The bits of a run's model, its records without times, and the names of its files."""
+    """The bits of a run's model, its records without times, and the names of its files.
+
+    Of the checkpoints only the newest: a kill between the last that is written and the removal of an older one leaves it.
+    """
     model = hashlib.sha256((out / "point_cloud.ply").read_bytes()).hexdigest()
     lines = [{key: value for key, value in line.items() if key not in TIMES} for line in Records(out).read()]
-    return model, repr(lines), sorted(str(path.relative_to(out)) for path in out.rglob("*") if path.is_file())
+    older = checkpoint.saved(out)[:-1]
+    files = sorted(str(path.relative_to(out)) for path in out.rglob("*") if path.is_file() and path not in older)
+    return model, repr(lines), files
 
 
 class Attempt:
