@@ -72,6 +72,14 @@ FAULTS = {  # kernel -> file, text, wrong text
     "hide_masked": ("texture.cl", "row <= y + 1", "row <= y"),
     "sample_magnitude": ("texture.cl", "magnitude[row * stride + column]", "magnitude[row * stride]"),
 }  # fmt: skip
+MORE = {  # that smaller pictures do not show
+    "emit_large simt, one row an item": ("large.cl", "each = (rows + TEAM - 1) / TEAM", "each = 1"),
+    "emit_large simt, the same rows": ("large.cl", "begin = get_local_id(0) * each", "begin = get_local_id(0)"),
+    "emit_large simt, a tile outside": ("large.cl", "= tile < last ? tile : last;", "= tile + 12345;"),
+    "emit_large wide, a tile outside": ("large.cl", "= tile < last ? tile : last;", "= tile + 12345;"),
+    "project_forward wide, a bit too few": ("tiles.h", "(float)BOX_TILES_MAX;", "(float)(BOX_TILES_MAX + 1);"),
+    "project_forward simt, a bit too few": ("tiles.h", "(float)BOX_TILES_MAX;", "(float)(BOX_TILES_MAX + 1);"),
+}
 
 
 CHECKS = [*KERNELS, *SPEED]
@@ -102,10 +110,10 @@ def first_failure(device: Device, kernel: str) -> str | None:
     return None
 
 
-@pytest.mark.parametrize("planted", FAULTS)
+@pytest.mark.parametrize("planted", [*FAULTS, *MORE])
 def test_a_planted_fault_is_caught(monkeypatch, planted):
     """The sources on disk stay as they are: the text is changed on its way to the compiler."""
-    file, text, wrong = FAULTS[planted]
+    file, text, wrong = {**FAULTS, **MORE}[planted]
     assert (resource_dir("cl_kernels") / file).read_text().count(text) == 1, "the place of the fault is not unique"
     flatten = program.flatten
 
@@ -114,7 +122,7 @@ def test_a_planted_fault_is_caught(monkeypatch, planted):
         return flat.replace(text, wrong) if path.name == file else flat
 
     monkeypatch.setattr(program, "flatten", with_the_fault)
-    kernel, _, schedule = planted.partition(" ")
+    kernel, _, schedule = planted.partition(",")[0].partition(" ")
     device = Device(choose(NAMES[0] or None), schedule or "auto")
     failure = first_failure(device, kernel)
     assert failure, f"a fault in {kernel} goes unnoticed"

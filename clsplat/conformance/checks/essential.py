@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from clsplat.conformance.check import Checks, Note
-from clsplat.conformance.checks import blending, images, projection, tiles, update
+from clsplat.conformance.checks import blending, images, large, projection, tiles, update
 from clsplat.conformance.comparison import Figure
 from clsplat.conformance.scenes import random_case, safe_case
 from clsplat.opencl.device import Device
@@ -25,11 +25,12 @@ def rendering(device: Device, rng: np.random.Generator) -> Iterator[Figure | Not
     yield from projection.gradient_figures(device, case, rng, what)
 
 
-@CHECKS.add("count_large", "emit_large")
+@CHECKS.add("count_large", "emit_large", "project_forward")
 def large_splats(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
     case = random_case(rng, 12, 150, 130)
     case.parameters["log_scales"][:4] += 2.5
     yield from tiles.list_figures(device, case, "radix", "a scene of large Gaussians")
+    yield from large.all_figures(device, rng)
 
 
 @CHECKS.add("scan_blocks", "scan_offsets", "radix_count", "radix_scatter")
