@@ -5,8 +5,8 @@ import re
 import pytest
 
 from clsplat import resource_dir
-from clsplat.conformance.check import Note
-from clsplat.conformance.checks import ESSENTIAL, KERNELS, SPEED
+from clsplat.conformance.check import Check, Note
+from clsplat.conformance.checks import BITONIC, ESSENTIAL, KERNELS, SPEED
 from clsplat.opencl import program
 from clsplat.opencl.device import Device
 from clsplat.opencl.discovery import choose
@@ -82,7 +82,7 @@ MORE = {  # that smaller pictures do not show
 }
 
 
-CHECKS = [*KERNELS, *SPEED]
+CHECKS = {"doctor": [*KERNELS, *SPEED], "a run": [*ESSENTIAL, *BITONIC]}
 
 
 def kernel_names() -> set[str]:
@@ -94,16 +94,26 @@ def kernel_names() -> set[str]:
     return found
 
 
+def checked_by(checks: list[Check]) -> set[str]:
+    return {kernel for check in checks for kernel in check.kernels}
+
+
 def test_every_kernel_has_a_check_and_a_planted_fault():
-    checked = {kernel for check in CHECKS for kernel in check.kernels}
+    checked = checked_by(CHECKS["doctor"])
     assert checked == {name.partition(" ")[0] for name in kernel_names()}
     assert FAULTS.keys() == kernel_names()
-    assert {kernel for check in ESSENTIAL for kernel in check.kernels} < checked
+    assert checked_by(CHECKS["a run"]) < checked
 
 
-def first_failure(device: Device, kernel: str) -> str | None:
+def kernel_of(planted: str) -> tuple[str, str]:
+    """The kernel of a fault, and its schedule or ''."""
+    kernel, _, schedule = planted.partition(",")[0].partition(" ")
+    return kernel, schedule
+
+
+def first_failure(device: Device, kernel: str, checks: list[Check]) -> str | None:
     """The first figure beyond its bound in the checks of a kernel."""
-    for check in CHECKS:
+    for check in checks:
         for found in check.figures(device) if kernel in check.kernels else ():
             if not isinstance(found, Note) and not found.holds:
                 return found.text
@@ -122,7 +132,8 @@ def test_a_planted_fault_is_caught(monkeypatch, planted):
         return flat.replace(text, wrong) if path.name == file else flat
 
     monkeypatch.setattr(program, "flatten", with_the_fault)
-    kernel, _, schedule = planted.partition(",")[0].partition(" ")
+    kernel, schedule = kernel_of(planted)
     device = Device(choose(NAMES[0] or None), schedule or "auto")
-    failure = first_failure(device, kernel)
-    assert failure, f"a fault in {kernel} goes unnoticed"
+    for command, checks in CHECKS.items():
+        if kernel in checked_by(checks):
+            assert first_failure(device, kernel, checks), f"{command} does not notice a fault in {kernel}"
