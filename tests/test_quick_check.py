@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 import clsplat
-from clsplat.conformance import quick, supervision
+from clsplat.conformance import host, quick, supervision
 from clsplat.conformance import worker as worker_process
 from clsplat.conformance.check import Check
 from clsplat.conformance.checks import ESSENTIAL
@@ -112,6 +112,29 @@ def test_a_device_that_computes_rightly_is_checked_once(monkeypatch, info, empty
             patched.setattr(quick, name, changed)
             with pytest.raises(DeviceError, match="cannot be trusted"):
                 quick.ensure_correct(device)
+
+
+@pytest.mark.parametrize("variable", ["PYOPENCL_BUILD_OPTIONS", "POCL_VECTORIZER_PREFER_VECTOR_WIDTH", "CL_CONFIG_X"])
+def test_a_variable_that_changes_code_changes_the_record(monkeypatch, info, variable):
+    before = quick._record(info, "wide", "radix")
+    monkeypatch.setenv(variable, "-DTILE=8")
+    assert quick._record(info, "wide", "radix") != before
+    assert host.system()["environment"][variable] == "-DTILE=8"
+
+
+def test_the_place_of_a_cache_does_not_change_the_record(monkeypatch, info, tmp_path):
+    before = quick._record(info, "wide", "radix")
+    monkeypatch.setenv("POCL_CACHE_DIR", str(tmp_path))
+    assert quick._record(info, "wide", "radix") == before
+
+
+def test_a_device_is_checked_again_with_other_build_options(monkeypatch, info, empty_cache):
+    device = Device(info)
+    quick.remember(info, device.schedule)
+    quick.ensure_correct(device)
+    monkeypatch.setenv("PYOPENCL_BUILD_OPTIONS", "-DTILE=8")
+    with pytest.raises(DeviceError, match="clsplat doctor"):
+        quick.ensure_correct(device)
 
 
 def test_where_the_cache_cannot_be_written_a_device_is_checked_each_time(monkeypatch, info, tmp_path):

@@ -12,6 +12,7 @@ from typing import Literal
 from clsplat import resource_dir
 from clsplat.caches import cache_folder
 from clsplat.conformance.checks import BITONIC, ESSENTIAL
+from clsplat.conformance.host import code_variables
 from clsplat.conformance.supervision import supervised
 from clsplat.errors import DeviceError, MemoryLimitError, OutputError
 from clsplat.files import write_text
@@ -73,10 +74,11 @@ def forget(info: DeviceInfo, schedule: Resolved) -> None:
 
 
 def _record(info: DeviceInfo, schedule: Resolved, sort: str) -> Path:
-    """A file for all that decides what the device computes: its driver, and what is compiled for it."""
+    """A file for all that decides what the device computes: its driver, what is compiled for it, and how."""
     device = (info.platform, info.name, info.driver, version("pyopencl"))
     build = (schedule, sort, BUILD_OPTIONS, sorted(tuning_of(info, schedule).items()), _hash_of_kernels())
-    return cache_folder() / "conformance" / hashlib.sha256(repr((device, build)).encode()).hexdigest()[:16]
+    decisive = repr((device, build, code_variables()))
+    return cache_folder() / "conformance" / hashlib.sha256(decisive.encode()).hexdigest()[:16]
 
 
 @cache
