@@ -66,8 +66,9 @@ def _one_process(info: DeviceInfo, schedule: str, checks: Sequence[Check], secon
     names = [check.name for check in checks]
     with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as errors:
         process = subprocess.Popen(
-            [*command, *names], stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=errors, encoding="utf-8"
+            [*command, *names], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors, encoding="utf-8"
         )
+        assert process.stdin is not None  # open until the end, which is the worker's too
         assert process.stdout is not None
         lines: queue.Queue[str | None] = queue.Queue()
         threading.Thread(target=_pump, args=(process.stdout, lines), daemon=True).start()
@@ -85,6 +86,7 @@ def _one_process(info: DeviceInfo, schedule: str, checks: Sequence[Check], secon
         finally:
             process.kill()
             process.wait()
+            process.stdin.close()
 
 
 def _fill(result: Result, lines: "queue.Queue[str | None]", seconds: float) -> str | None:
