@@ -1,6 +1,7 @@
 """`clsplat doctor`: verdicts, reports, and runtimes that die."""
 
 import json
+import re
 import subprocess
 import sys
 import time
@@ -98,6 +99,20 @@ def test_a_runtime_that_hangs_is_stopped(monkeypatch, info):
     monkeypatch.setattr(supervision, "WORKER", ("-c", "import time; time.sleep(600)"))
     (one,) = supervised(info, "simt", checks("hangs"), 1)
     assert one.fault == "gives no answer for 1 s"
+
+
+def test_a_fault_that_empty_caches_mend_is_one_of_the_caches(monkeypatch, info):
+    worker(monkeypatch)
+    results = list(supervised(info, "simt", checks("first", "cached", "second", "cached", "leaves", "cached")))
+    assert [one.holds for one in results] == [True, True, True, True, False, False], (
+        "nobody tries again without success"
+    )
+    assert [one.damaged_cache for one in results] == [False, True, False, True, False, False]
+    verdict = judge("simt", {"simt": results[:4]}, [])
+    assert verdict.usable
+    assert verdict.text == "use it, once its cache of built kernels, which is damaged, is removed"
+    assert re.search("remove .*pyopencl", verdict.advice)
+    assert not judge("simt", {"simt": results}, []).usable
 
 
 def test_the_process_of_a_check_ends_with_the_one_that_waits_for_it(info, tmp_path):

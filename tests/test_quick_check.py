@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import pyopencl as cl
 import pytest
 
 import clsplat
@@ -76,6 +77,24 @@ def test_want_of_memory_is_no_fault_of_the_device(monkeypatch, info, empty_cache
     monkeypatch.setattr(supervision, "WORKER", ("-c", f"print({out.getvalue()!r}, end='')"))
     with pytest.raises(MemoryLimitError, match=r"no buffer.*other programs"):
         quick.ensure_correct(Device(info))
+
+
+def test_a_damaged_cache_of_kernels_is_no_fault_of_the_device(monkeypatch, info, empty_cache):
+    worker(monkeypatch)
+    monkeypatch.setattr(quick, "ESSENTIAL", [Check("cached", ("blend_backward",), None)])
+    with pytest.raises(DeviceError, match=r"cache of built kernels is damaged: remove .*pyopencl"):
+        quick.ensure_correct(Device(info))
+    assert not list(empty_cache.iterdir())
+
+
+def test_an_exception_of_a_runtime_is_a_sentence():
+    def check(device, rng):
+        raise cl.LogicError("clCreateKernel failed: INVALID_KERNEL_NAME")
+        yield
+
+    out = io.StringIO()
+    worker_process._run(out, Check("rendering", (), check), None)
+    assert "the OpenCL runtime refuses a call: clCreateKernel failed: INVALID_KERNEL_NAME" in out.getvalue()
 
 
 def test_the_log_says_that_a_check_begins(monkeypatch, info, empty_cache, caplog):

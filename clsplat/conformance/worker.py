@@ -41,7 +41,7 @@ def _run(out: TextIO, check: Check, device: Device) -> None:
             else:
                 _print(out, figure=asdict(found))
     except Exception as error:  # a finding about the device, not the end of the checks
-        what = one_line(error) if isinstance(error, ClsplatError) else f"{type(error).__name__}: {one_line(error)}"
+        what = one_line(error) if isinstance(error, ClsplatError) else f"{_source_of(error)}: {one_line(error)}"
         log = str(error.__cause__)[:LOG_LIMIT] if isinstance(error, KernelError) and error.__cause__ else ""
         _print(
             out,
@@ -49,6 +49,12 @@ def _run(out: TextIO, check: Check, device: Device) -> None:
             log=log,
             out_of_memory=isinstance(as_clsplat_error(error), MemoryLimitError),
         )
+
+
+def _source_of(error: Exception) -> str:
+    if type(error).__module__.startswith("pyopencl"):
+        return "the OpenCL runtime refuses a call"
+    return f"the check ends with {type(error).__name__}, which may be a defect of clsplat"
 
 
 def _only_reader_of_stdin() -> int:
