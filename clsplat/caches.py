@@ -43,6 +43,12 @@ def cache_folder() -> Path:
     return ours
 
 
+def kernel_caches() -> str:
+    """Return the folders that keep built kernels, in words."""
+    pyopencl, _, pocl = (Path(platformdirs.user_cache_dir(name, name)) for name in LIBRARIES)
+    return f"{pyopencl} and {next(iter(_named_by_user()), pocl)}"
+
+
 def _named_by_user() -> list[Path]:
     """The folder that PoCL was told to use, which stands before the folder of caches."""
     return [Path(os.environ["POCL_CACHE_DIR"])] if os.environ.get("POCL_CACHE_DIR") else []

@@ -104,14 +104,14 @@ def test_pose_that_is_none(tmp_path: Path, quaternion: tuple[float, ...], transl
 
 
 @pytest.mark.parametrize("kind", ["bin", "txt"])
-@pytest.mark.parametrize("width", [2**20 + 1, 2**63, 99999999999999999999])
+@pytest.mark.parametrize("width", [2**15 + 1, 2**63, 99999999999999999999])
 def test_a_camera_wider_than_any_photograph(tmp_path: Path, width: int, kind: str) -> None:
     if kind == "bin" and width >= 2**64:
         pytest.skip("does not fit the file")
     camera = replace(PINHOLE, width=width)
     message = refusal(read_scene, write_scene(tmp_path, replace(tiny_model(), cameras=[camera]), kind))
     assert f"camera 1 is {width}x48" in message
-    assert "at most 1048576" in message
+    assert "at most 32768" in message
 
 
 def test_a_focal_length_of_almost_nothing(tmp_path: Path, recwarn: pytest.WarningsRecorder) -> None:

@@ -1,7 +1,10 @@
 """`clsplat doctor`: verdicts, reports, and runtimes that die."""
 
 import json
+import re
+import subprocess
 import sys
+import time
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -21,6 +24,7 @@ from clsplat.errors import MemoryLimitError
 from clsplat.opencl import runtimes
 from clsplat.opencl.device import Device
 from clsplat.opencl.discovery import resolve_schedule
+from clsplat.processes import is_alive
 from tests.html_page import Page
 from tests.proving import worker
 
@@ -95,6 +99,52 @@ def test_a_runtime_that_hangs_is_stopped(monkeypatch, info):
     monkeypatch.setattr(supervision, "WORKER", ("-c", "import time; time.sleep(600)"))
     (one,) = supervised(info, "simt", checks("hangs"), 1)
     assert one.fault == "gives no answer for 1 s"
+
+
+def test_a_fault_that_empty_caches_mend_is_one_of_the_caches(monkeypatch, info):
+    worker(monkeypatch)
+    results = list(supervised(info, "simt", checks("first", "cached", "second", "cached", "leaves", "cached")))
+    assert [one.holds for one in results] == [True, True, True, True, False, False], (
+        "nobody tries again without success"
+    )
+    assert [one.damaged_cache for one in results] == [False, True, False, True, False, False]
+    verdict = judge("simt", {"simt": results[:4]}, [])
+    assert verdict.usable
+    assert verdict.text == "use it, once its cache of built kernels, which is damaged, is removed"
+    assert re.search("remove .*pyopencl", verdict.advice)
+    assert not judge("simt", {"simt": results}, []).usable
+
+
+def test_the_process_of_a_check_ends_with_the_one_that_waits_for_it(info, tmp_path):
+    """Killed, it can say nothing to the other, which may hang in a check."""
+    note = tmp_path / "process"
+    hangs = (
+        "import os, sys, time; from pathlib import Path; from clsplat.conformance import worker\n"
+        f"worker._run = lambda *_: Path({str(note)!r}).write_text(str(os.getpid())) and time.sleep(600)\n"
+        "worker.main(int(sys.argv[1]), int(sys.argv[2]), *sys.argv[3:4], sys.argv[4:])"
+    )
+    waits = (
+        "from clsplat.conformance import supervision; from clsplat.conformance.checks import BY_NAME\n"
+        "from clsplat.opencl.discovery import list_devices\n"
+        f"info = next(one for one in list_devices() if one.place == {info.place})\n"
+        f"supervision.WORKER = ('-c', {hangs!r}); list(supervision.supervised(info, 'simt', [BY_NAME['scans']]))"
+    )
+    waiting = subprocess.Popen([sys.executable, "-c", waits])
+    try:
+        assert within(60, lambda: note.exists() and note.read_text())
+    finally:
+        waiting.kill()
+        waiting.wait()
+    process = int(note.read_text())
+    assert within(20, lambda: not is_alive(process))
+
+
+def within(seconds: float, condition) -> bool:
+    """Whether a condition holds before so many seconds are over."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end and not condition():
+        time.sleep(0.05)
+    return bool(condition())
 
 
 def test_a_file_of_the_working_folder_is_not_imported(monkeypatch, info, tmp_path, empty_cache):

@@ -5,8 +5,8 @@ import re
 import pytest
 
 from clsplat import resource_dir
-from clsplat.conformance.check import Note
-from clsplat.conformance.checks import ESSENTIAL, KERNELS, SPEED
+from clsplat.conformance.check import Check, Note
+from clsplat.conformance.checks import BITONIC, ESSENTIAL, KERNELS, SPEED
 from clsplat.opencl import program
 from clsplat.opencl.device import Device
 from clsplat.opencl.discovery import choose
@@ -72,9 +72,17 @@ FAULTS = {  # kernel -> file, text, wrong text
     "hide_masked": ("texture.cl", "row <= y + 1", "row <= y"),
     "sample_magnitude": ("texture.cl", "magnitude[row * stride + column]", "magnitude[row * stride]"),
 }  # fmt: skip
+MORE = {  # that smaller pictures do not show
+    "emit_large simt, one row an item": ("large.cl", "each = (rows + TEAM - 1) / TEAM", "each = 1"),
+    "emit_large simt, the same rows": ("large.cl", "begin = get_local_id(0) * each", "begin = get_local_id(0)"),
+    "emit_large simt, a tile outside": ("large.cl", "= tile < last ? tile : last;", "= tile + 12345;"),
+    "emit_large wide, a tile outside": ("large.cl", "= tile < last ? tile : last;", "= tile + 12345;"),
+    "project_forward wide, a bit too few": ("tiles.h", "(float)BOX_TILES_MAX;", "(float)(BOX_TILES_MAX + 1);"),
+    "project_forward simt, a bit too few": ("tiles.h", "(float)BOX_TILES_MAX;", "(float)(BOX_TILES_MAX + 1);"),
+}
 
 
-CHECKS = [*KERNELS, *SPEED]
+CHECKS = {"doctor": [*KERNELS, *SPEED], "a run": [*ESSENTIAL, *BITONIC]}
 
 
 def kernel_names() -> set[str]:
@@ -86,26 +94,36 @@ def kernel_names() -> set[str]:
     return found
 
 
+def checked_by(checks: list[Check]) -> set[str]:
+    return {kernel for check in checks for kernel in check.kernels}
+
+
 def test_every_kernel_has_a_check_and_a_planted_fault():
-    checked = {kernel for check in CHECKS for kernel in check.kernels}
+    checked = checked_by(CHECKS["doctor"])
     assert checked == {name.partition(" ")[0] for name in kernel_names()}
     assert FAULTS.keys() == kernel_names()
-    assert {kernel for check in ESSENTIAL for kernel in check.kernels} < checked
+    assert checked_by(CHECKS["a run"]) < checked
 
 
-def first_failure(device: Device, kernel: str) -> str | None:
+def kernel_of(planted: str) -> tuple[str, str]:
+    """The kernel of a fault, and its schedule or ''."""
+    kernel, _, schedule = planted.partition(",")[0].partition(" ")
+    return kernel, schedule
+
+
+def first_failure(device: Device, kernel: str, checks: list[Check]) -> str | None:
     """The first figure beyond its bound in the checks of a kernel."""
-    for check in CHECKS:
+    for check in checks:
         for found in check.figures(device) if kernel in check.kernels else ():
             if not isinstance(found, Note) and not found.holds:
                 return found.text
     return None
 
 
-@pytest.mark.parametrize("planted", FAULTS)
+@pytest.mark.parametrize("planted", [*FAULTS, *MORE])
 def test_a_planted_fault_is_caught(monkeypatch, planted):
     """The sources on disk stay as they are: the text is changed on its way to the compiler."""
-    file, text, wrong = FAULTS[planted]
+    file, text, wrong = {**FAULTS, **MORE}[planted]
     assert (resource_dir("cl_kernels") / file).read_text().count(text) == 1, "the place of the fault is not unique"
     flatten = program.flatten
 
@@ -114,7 +132,8 @@ def test_a_planted_fault_is_caught(monkeypatch, planted):
         return flat.replace(text, wrong) if path.name == file else flat
 
     monkeypatch.setattr(program, "flatten", with_the_fault)
-    kernel, _, schedule = planted.partition(" ")
+    kernel, schedule = kernel_of(planted)
     device = Device(choose(NAMES[0] or None), schedule or "auto")
-    failure = first_failure(device, kernel)
-    assert failure, f"a fault in {kernel} goes unnoticed"
+    for command, checks in CHECKS.items():
+        if kernel in checked_by(checks):
+            assert first_failure(device, kernel, checks), f"{command} does not notice a fault in {kernel}"

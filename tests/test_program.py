@@ -1,5 +1,6 @@
 """Kernel files of one's own: what cannot be read or found is refused with the form that is expected."""
 
+import pyopencl as cl
 import pytest
 
 from clsplat.errors import KernelError
@@ -15,6 +16,19 @@ def test_a_kernel_without_a_group_size_is_refused_with_the_form_expected(device,
     file = tmp_path / "own.cl"
     file.write_text("kernel void fade(global float *x) { x[0] = 1; }\n")
     with pytest.raises(KernelError, match=r"own\.cl: cannot read the head of fade; expected .*reqd_work_group_size"):
+        device.program(file)
+
+
+def test_a_program_without_its_kernels_may_come_from_a_damaged_cache(device, tmp_path, monkeypatch):
+    def none(program, name):
+        raise cl.LogicError("clCreateKernel failed: INVALID_KERNEL_NAME")
+
+    file = tmp_path / "own.cl"
+    file.write_text(
+        "__kernel __attribute__((reqd_work_group_size(1, 1, 1)))\nvoid own(__global float *restrict x) {}\n"
+    )
+    monkeypatch.setattr(cl, "Kernel", none)
+    with pytest.raises(KernelError, match=r"INVALID_KERNEL_NAME.* may be damaged: remove .*pyopencl and "):
         device.program(file)
 
 

@@ -6,10 +6,11 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import pyopencl as cl
 import pytest
 
 import clsplat
-from clsplat.conformance import quick, supervision
+from clsplat.conformance import host, quick, supervision
 from clsplat.conformance import worker as worker_process
 from clsplat.conformance.check import Check
 from clsplat.conformance.checks import ESSENTIAL
@@ -78,6 +79,24 @@ def test_want_of_memory_is_no_fault_of_the_device(monkeypatch, info, empty_cache
         quick.ensure_correct(Device(info))
 
 
+def test_a_damaged_cache_of_kernels_is_no_fault_of_the_device(monkeypatch, info, empty_cache):
+    worker(monkeypatch)
+    monkeypatch.setattr(quick, "ESSENTIAL", [Check("cached", ("blend_backward",), None)])
+    with pytest.raises(DeviceError, match=r"cache of built kernels is damaged: remove .*pyopencl"):
+        quick.ensure_correct(Device(info))
+    assert not list(empty_cache.iterdir())
+
+
+def test_an_exception_of_a_runtime_is_a_sentence():
+    def check(device, rng):
+        raise cl.LogicError("clCreateKernel failed: INVALID_KERNEL_NAME")
+        yield
+
+    out = io.StringIO()
+    worker_process._run(out, Check("rendering", (), check), None)
+    assert "the OpenCL runtime refuses a call: clCreateKernel failed: INVALID_KERNEL_NAME" in out.getvalue()
+
+
 def test_the_log_says_that_a_check_begins(monkeypatch, info, empty_cache, caplog):
     worker(monkeypatch)
     with caplog.at_level("INFO", "clsplat"):
@@ -112,6 +131,29 @@ def test_a_device_that_computes_rightly_is_checked_once(monkeypatch, info, empty
             patched.setattr(quick, name, changed)
             with pytest.raises(DeviceError, match="cannot be trusted"):
                 quick.ensure_correct(device)
+
+
+@pytest.mark.parametrize("variable", ["PYOPENCL_BUILD_OPTIONS", "POCL_VECTORIZER_PREFER_VECTOR_WIDTH", "CL_CONFIG_X"])
+def test_a_variable_that_changes_code_changes_the_record(monkeypatch, info, variable):
+    before = quick._record(info, "wide", "radix")
+    monkeypatch.setenv(variable, "-DTILE=8")
+    assert quick._record(info, "wide", "radix") != before
+    assert host.system()["environment"][variable] == "-DTILE=8"
+
+
+def test_the_place_of_a_cache_does_not_change_the_record(monkeypatch, info, tmp_path):
+    before = quick._record(info, "wide", "radix")
+    monkeypatch.setenv("POCL_CACHE_DIR", str(tmp_path))
+    assert quick._record(info, "wide", "radix") == before
+
+
+def test_a_device_is_checked_again_with_other_build_options(monkeypatch, info, empty_cache):
+    device = Device(info)
+    quick.remember(info, device.schedule)
+    quick.ensure_correct(device)
+    monkeypatch.setenv("PYOPENCL_BUILD_OPTIONS", "-DTILE=8")
+    with pytest.raises(DeviceError, match="clsplat doctor"):
+        quick.ensure_correct(device)
 
 
 def test_where_the_cache_cannot_be_written_a_device_is_checked_each_time(monkeypatch, info, tmp_path):

@@ -29,7 +29,7 @@ def examine(device: str | Device | None = None) -> DeviceReport:
         for result in supervised(info, schedule, KERNELS):
             results.append(result)
             LOG.info("%s", progress(schedule, result))
-        if all(result.holds for result in results):
+        if all(result.holds and not result.damaged_cache for result in results):
             remember(info, schedule)
         else:
             forget(info, schedule)

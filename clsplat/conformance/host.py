@@ -11,7 +11,9 @@ import numpy as np
 
 from clsplat import __version__
 
-PREFIXES = ("CLSPLAT_", "OCL_", "POCL_", "RUSTICL_", "PYOPENCL_NO", "PYOPENCL_CTX", "GPU_", "CUDA_", "LP_", "OCLGRIND_")
+CODE = ("PYOPENCL_BUILD", "POCL_", "CL_", "RUSTICL_", "LP_", "IGC_", "AMD_", "GPU_", "CUDA_")  # may change what runs
+CACHES = ("POCL_CACHE", "CUDA_CACHE")  # do not
+PREFIXES = (*CODE, "CLSPLAT_", "OCL_", "PYOPENCL_NO", "PYOPENCL_CTX", "OCLGRIND_")
 CONTAINER = Path("/sys/fs/cgroup")
 
 
@@ -40,5 +42,14 @@ def system() -> dict[str, Any]:
         "python": sys.version.split()[0],
         "numpy": np.__version__,
         "memory_free": available_memory(),
-        "environment": {name: value for name, value in sorted(os.environ.items()) if name.startswith(PREFIXES)},
+        "environment": _variables(PREFIXES),
     }
+
+
+def code_variables() -> dict[str, str]:
+    """Return the variables with which compilers and runtimes may make other code of the same kernels."""
+    return {name: value for name, value in _variables(CODE).items() if not name.startswith(CACHES)}
+
+
+def _variables(prefixes: tuple[str, ...]) -> dict[str, str]:
+    return {name: value for name, value in sorted(os.environ.items()) if name.startswith(prefixes)}

@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Literal
 
 from clsplat import resource_dir
-from clsplat.caches import cache_folder
+from clsplat.caches import cache_folder, kernel_caches
 from clsplat.conformance.checks import BITONIC, ESSENTIAL
+from clsplat.conformance.host import code_variables
 from clsplat.conformance.supervision import supervised
 from clsplat.errors import DeviceError, MemoryLimitError, OutputError
 from clsplat.files import write_text
@@ -52,6 +53,8 @@ def ensure_correct(device: Device, sort: Sort = "auto") -> None:
     for result in supervised(info, schedule, [*ESSENTIAL, *(BITONIC if bitonic else [])], QUICK_SECONDS):
         if result.out_of_memory:
             raise MemoryLimitError(f"{device.text}: {result.failures[0]}; end other programs that use its memory")
+        if result.damaged_cache:
+            raise DeviceError(f"{device.text}: its cache of built kernels is damaged: remove {kernel_caches()}")
         if not result.holds:
             how = "cannot be trusted" if result.fault else "computes wrongly"
             raise DeviceError(f"{device.text} {how}: {result.failures[0]}; `clsplat doctor` tells more")
@@ -73,10 +76,11 @@ def forget(info: DeviceInfo, schedule: Resolved) -> None:
 
 
 def _record(info: DeviceInfo, schedule: Resolved, sort: str) -> Path:
-    """A file for all that decides what the device computes: its driver, and what is compiled for it."""
+    """A file for all that decides what the device computes: its driver, what is compiled for it, and how."""
     device = (info.platform, info.name, info.driver, version("pyopencl"))
     build = (schedule, sort, BUILD_OPTIONS, sorted(tuning_of(info, schedule).items()), _hash_of_kernels())
-    return cache_folder() / "conformance" / hashlib.sha256(repr((device, build)).encode()).hexdigest()[:16]
+    decisive = repr((device, build, code_variables()))
+    return cache_folder() / "conformance" / hashlib.sha256(decisive.encode()).hexdigest()[:16]
 
 
 @cache

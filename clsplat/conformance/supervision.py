@@ -1,13 +1,14 @@
 """Run checks in processes of their own, and go on after one that dies or hangs."""
 
 import json
+import os
 import queue
 import signal
 import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import IO, Any
 
@@ -32,6 +33,8 @@ class Result:
     fault: str | None = None  # why it could not be completed
     log: str = ""  # of a build that failed
     out_of_memory: bool = False  # the fault is no more than that
+    hangs: bool = False  # the fault is that, or an answer that cannot be read
+    damaged_cache: bool = False  # there was a fault, and with empty caches of kernels there is none
 
     @property
     def holds(self) -> bool:
@@ -49,25 +52,46 @@ def supervised(
 ) -> Iterator[Result]:
     """Run checks on a device with a schedule; yield each result when it is complete.
 
-    A check that says nothing for `seconds` is stopped.
+    A check that says nothing for `seconds` is stopped.  One that cannot be completed is tried again with empty caches
+    of built kernels, until that does not help.
     """
-    left = list(checks)
+    left, trying = list(checks), True
     while left:
         done = 0
         for result in _one_process(info, schedule, left, seconds):
+            if trying and result.fault and not result.out_of_memory and not result.hangs:
+                again = _with_empty_caches(info, schedule, left[done], seconds)
+                trying = again.fault is None
+                result = again if trying else result
             done += 1
             yield result
         left = left[done:]
 
 
-def _one_process(info: DeviceInfo, schedule: str, checks: Sequence[Check], seconds: float) -> Iterator[Result]:
+def _with_empty_caches(info: DeviceInfo, schedule: str, check: Check, seconds: float) -> Result:
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+        environment = {"POCL_CACHE_DIR": folder, "PYOPENCL_NO_CACHE": "1"}
+        (result,) = _one_process(info, schedule, [check], seconds, environment)
+    result.damaged_cache = result.fault is None
+    return result
+
+
+def _one_process(
+    info: DeviceInfo, schedule: str, checks: Sequence[Check], seconds: float, variables: Mapping[str, str] | None = None
+) -> Iterator[Result]:
     """Results of the first checks, up to and including one that ends the process: at least one."""
     command = [sys.executable, *WORKER, *map(str, info.place), schedule]
     names = [check.name for check in checks]
     with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as errors:
         process = subprocess.Popen(
-            [*command, *names], stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=errors, encoding="utf-8"
+            [*command, *names],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=errors,
+            encoding="utf-8",
+            env={**os.environ, **(variables or {})},
         )
+        assert process.stdin is not None  # open until the end, which is the worker's too
         assert process.stdout is not None
         lines: queue.Queue[str | None] = queue.Queue()
         threading.Thread(target=_pump, args=(process.stdout, lines), daemon=True).start()
@@ -78,6 +102,7 @@ def _one_process(info: DeviceInfo, schedule: str, checks: Sequence[Check], secon
                 if ended is not None:
                     process.kill()
                     code = process.wait()
+                    result.hangs = bool(ended)
                     result.fault = ended or _death(code, errors)
                 yield result
                 if ended is not None:
@@ -85,6 +110,7 @@ def _one_process(info: DeviceInfo, schedule: str, checks: Sequence[Check], secon
         finally:
             process.kill()
             process.wait()
+            process.stdin.close()
 
 
 def _fill(result: Result, lines: "queue.Queue[str | None]", seconds: float) -> str | None:

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+from clsplat.caches import kernel_caches
 from clsplat.conformance.supervision import Result
 
 BITONIC = {"count_pairs", "fill_tiles", "sort_tiles"}  # what `rasterizer.sort: radix` does without
@@ -26,6 +27,14 @@ class Verdict:
 
 def judge(default: str, schedules: Mapping[str, Sequence[Result]], once: Sequence[Result]) -> Verdict:
     """Judge the results of each schedule, and of the checks that a device needs `once`."""
+    verdict = _of_figures(default, schedules, once)
+    if verdict.usable and any(result.damaged_cache for part in (*schedules.values(), once) for result in part):
+        advice = f"remove {kernel_caches()}, which fill again" + (f"; {verdict.advice}" if verdict.advice else "")
+        return Verdict(True, f"{verdict.text}, once its cache of built kernels, which is damaged, is removed", advice)
+    return verdict
+
+
+def _of_figures(default: str, schedules: Mapping[str, Sequence[Result]], once: Sequence[Result]) -> Verdict:
     failures = {name: [text for result in results for text in result.failures] for name, results in schedules.items()}
     others = [text for result in once for text in result.failures]
     good = [name for name, found in failures.items() if not found]

@@ -1,11 +1,13 @@
 """Run checks on the device of two numbers, in a process of its own, and print what they find: one line of JSON each.
 
-A runtime may abort the process: the check of the next line is then the one that it ended.
+A runtime may abort the process: the check of the next line is then the one that it ended.  The process ends with the
+one that waits for it, which holds the other end of stdin.
 """
 
 import json
 import os
 import sys
+import threading
 import time
 from dataclasses import asdict
 from typing import Any, TextIO
@@ -21,6 +23,7 @@ LOG_LIMIT = 4000  # characters of a build log
 
 def main(platform: int, number: int, schedule: Schedule, names: list[str]) -> None:
     """Open the device and run the checks of these names."""
+    threading.Thread(target=_end_with, args=(_only_reader_of_stdin(),), daemon=True).start()
     out = _only_writer_of_stdout()
     info = next(info for info in list_devices() if info.place == (platform, number))
     device = Device(info, schedule)
@@ -38,7 +41,7 @@ def _run(out: TextIO, check: Check, device: Device) -> None:
             else:
                 _print(out, figure=asdict(found))
     except Exception as error:  # a finding about the device, not the end of the checks
-        what = one_line(error) if isinstance(error, ClsplatError) else f"{type(error).__name__}: {one_line(error)}"
+        what = one_line(error) if isinstance(error, ClsplatError) else f"{_source_of(error)}: {one_line(error)}"
         log = str(error.__cause__)[:LOG_LIMIT] if isinstance(error, KernelError) and error.__cause__ else ""
         _print(
             out,
@@ -46,6 +49,27 @@ def _run(out: TextIO, check: Check, device: Device) -> None:
             log=log,
             out_of_memory=isinstance(as_clsplat_error(error), MemoryLimitError),
         )
+
+
+def _source_of(error: Exception) -> str:
+    if type(error).__module__.startswith("pyopencl"):
+        return "the OpenCL runtime refuses a call"
+    return f"the check ends with {type(error).__name__}, which may be a defect of clsplat"
+
+
+def _only_reader_of_stdin() -> int:
+    """Return a number for stdin; runtimes get an empty one: on Windows asking about a pipe may wait for readers."""
+    pipe, empty = os.dup(0), os.open(os.devnull, os.O_RDONLY)
+    os.dup2(empty, 0)
+    os.close(empty)
+    return pipe
+
+
+def _end_with(pipe: int) -> None:
+    """End this process, whatever it does, when the other one closes its end of a pipe or has ended."""
+    while os.read(pipe, 1024):
+        pass
+    os._exit(1)
 
 
 def _only_writer_of_stdout() -> TextIO:

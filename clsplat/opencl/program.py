@@ -14,6 +14,7 @@ import numpy as np
 import pyopencl as cl
 
 from clsplat import resource_dir
+from clsplat.caches import kernel_caches
 from clsplat.errors import DeviceError, KernelError, MemoryLimitError
 from clsplat.opencl.device import Array
 from clsplat.opencl.discovery import DeviceInfo
@@ -196,8 +197,15 @@ class Program:
             raise KernelError(
                 f"{file} does not build on {device.text} with {' '.join(options)}: {_first_error(error)}"
             ) from error
+        try:
+            made = {name: cl.Kernel(program, name) for name in parse_kernels(source)}
+        except cl.Error as error:
+            raise KernelError(
+                f"{file} was built on {device.text}, and its kernels cannot be made ({error}); the cache of built "
+                f"kernels may be damaged: remove {kernel_caches()}"
+            ) from error
         self.kernels = {
-            name: Kernel(device, f"{path.name}:{name}", cl.Kernel(program, name), arguments)
+            name: Kernel(device, f"{path.name}:{name}", made[name], arguments)
             for name, arguments in parse_kernels(source).items()
         }
         names = program.get_info(cl.program_info.KERNEL_NAMES).split(";")

@@ -6,11 +6,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.errors import DataError
 from clsplat.opencl.device import Array, Device
 from clsplat.opencl.program import constants
 from clsplat.scene.scene import View
 
 RAY_MARGIN = constants()["RAY_MARGIN"]
+TILES_MAX = 1 << int(constants("tiles.h")["BOX_BITS"])  # to a side
 
 # camera_t of cl_kernels/common.h
 CAMERA = np.dtype(
@@ -55,7 +57,7 @@ class DeviceCamera:
 
 
 def upload_camera(device: Device, view: View) -> DeviceCamera:
-    """Copy a view's camera to the device."""
+    """Copy a view's camera to the device.  Raises DataError as `camera_values`."""
     tile = int(device.tuning["TILE"])
     values = camera_values(view, tile)
     tiles_x, tiles_y = int(values["tiles_x"]), int(values["tiles_y"])
@@ -67,9 +69,15 @@ def camera_values(view: View, tile: int) -> NDArray[Any]:
     """Return a view's camera_t, [].
 
     Rays are clamped 30 % of half the field of view beyond the image's edges (gsplat's off-centre form).
+    Raises DataError when the image has more tiles to a side than kernels can name.
     """
     camera = view.camera
     tiles_x, tiles_y = -(-camera.width // tile), -(-camera.height // tile)
+    if max(tiles_x, tiles_y) > TILES_MAX:
+        raise DataError(
+            f"{view.name}: the camera is {camera.width}x{camera.height} pixels; expected at most {TILES_MAX * tile} "
+            "to a side on this device: downscale the image"
+        )
     margin_x = RAY_MARGIN * camera.width / (2 * camera.fx)
     margin_y = RAY_MARGIN * camera.height / (2 * camera.fy)
     values = (

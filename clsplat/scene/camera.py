@@ -4,7 +4,7 @@ import math
 from dataclasses import astuple, dataclass
 from numbers import Integral
 
-MAX_SIDE = 1 << 20  # px: OpenCV decodes no larger image
+MAX_SIDE = 4096 * 8  # px: the tiles that cl_kernels/tiles.h can name, of the smallest size that a device has
 MIN_FOCAL = 1e-3  # px, in a dataset: with less an image shows half of all directions
 
 

@@ -1,12 +1,17 @@
 """pairs.cl and the tile lists: nothing visible is missing, nothing is twice, both sorts agree."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from clsplat.conformance.scenes import random_case
+from clsplat.errors import DataError
 from clsplat.opencl import program
 from clsplat.opencl.device import Device
+from clsplat.render.camera import camera_values
 from clsplat.render.rasterizer import Rasterizer
+from clsplat.scene.camera import MAX_SIDE
 
 
 def lists_of(device, case, sort):
@@ -49,6 +54,22 @@ def test_every_visible_pixel_is_in_a_listed_tile(device, rng, count, width, heig
                 inside = (tx + 1) * tile <= width and (ty + 1) * tile <= height
                 if member and inside:
                     assert strongest > 0.95 / 255 or min(record[12] - record[11], record[10] - record[9]) < 4
+
+
+@pytest.mark.parametrize("tile", [8, 16])
+@pytest.mark.parametrize("side", ["width", "height"])
+def test_a_picture_with_more_tiles_than_a_pair_can_name_is_refused(rng, tile, side):
+    """`tile_box` of tiles.h has 12 bits for each of a tile's column and row."""
+    view = random_case(rng, 1).view
+    largest = replace(view, camera=replace(view.camera, **{side: 4096 * tile}))
+    assert camera_values(largest, tile)["tiles_x" if side == "width" else "tiles_y"] == 4096
+    with pytest.raises(DataError, match=rf"view: .*{4096 * tile + 1}.* at most {4096 * tile} to a side"):
+        camera_values(replace(view, camera=replace(view.camera, **{side: 4096 * tile + 1})), tile)
+
+
+def test_what_readers_accept_has_no_more_tiles_than_any_device_can_name(rng):
+    view = random_case(rng, 1).view
+    camera_values(replace(view, camera=replace(view.camera, width=MAX_SIDE, height=MAX_SIDE).check()), 8)
 
 
 @pytest.mark.parametrize("count", [0, 1, 65, 500])

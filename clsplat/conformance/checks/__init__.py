@@ -1,11 +1,12 @@
 """The checks of all kernels, and those that a run does once on a device that it meets for the first time."""
 
 from clsplat.conformance.check import Check
-from clsplat.conformance.checks import blending, density, essential, images, projection, tiles, update, whole
+from clsplat.conformance.checks import blending, density, essential, images, large, projection, tiles, update, whole
 
 KERNELS: list[Check] = [
     *projection.CHECKS.listed,
     *tiles.CHECKS.listed,
+    *large.CHECKS.listed,
     *blending.CHECKS.listed,
     *images.CHECKS.listed,
     *update.CHECKS.listed,

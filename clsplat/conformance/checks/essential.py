@@ -5,9 +5,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from clsplat.conformance.check import Checks, Note
-from clsplat.conformance.checks import blending, images, projection, tiles, update
+from clsplat.conformance.checks import blending, images, large, projection, tiles, update
 from clsplat.conformance.comparison import Figure
-from clsplat.conformance.scenes import random_case, safe_case
+from clsplat.conformance.scenes import random_case, safe_case, with_world_filter
 from clsplat.opencl.device import Device
 
 CHECKS = Checks()
@@ -23,13 +23,17 @@ def rendering(device: Device, rng: np.random.Generator) -> Iterator[Figure | Not
     weights = rng.normal(size=(3, 30, 40)).astype(np.float32)
     yield from blending.sum_figures(case, blending.pixel_sums_of(device, case, weights), weights, what)
     yield from projection.gradient_figures(device, case, rng, what)
+    filtered = with_world_filter(random_case(rng, 30, variance=0.1, compensate=1.0), rng)
+    yield from projection.record_figures(device, filtered, "30 filtered Gaussians")
+    yield from projection.gradient_figures(device, filtered, rng, "30 filtered Gaussians")
 
 
-@CHECKS.add("count_large", "emit_large")
+@CHECKS.add("count_large", "emit_large", "project_forward")
 def large_splats(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
     case = random_case(rng, 12, 150, 130)
     case.parameters["log_scales"][:4] += 2.5
     yield from tiles.list_figures(device, case, "radix", "a scene of large Gaussians")
+    yield from large.all_figures(device, rng)
 
 
 @CHECKS.add("scan_blocks", "scan_offsets", "radix_count", "radix_scatter")
