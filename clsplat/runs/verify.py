@@ -6,6 +6,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from pydantic import ValidationError
+
 from clsplat import plugins
 from clsplat.compare.run_folder import read_metrics, read_settings
 from clsplat.errors import ConfigError, DataError, one_line, shortened
@@ -34,7 +36,7 @@ from clsplat.scene.identity import Identity
 from clsplat.scene.images import read_image
 from clsplat.training import archive, checkpoint
 from clsplat.training.records import Records
-from clsplat.training.status import END_STATES, read_status
+from clsplat.training.status import END_STATES, Status, read_status
 
 MISSING = "is missing"
 NO_SUMS = "is missing, as in runs of earlier versions and of a Trainer; without it the outputs are not verified"
@@ -145,8 +147,11 @@ def _settings(path: Path, settings: dict[str, Any], expected: str | None) -> str
 
 
 def _status(path: Path) -> str:
-    status = read_json(path)
-    return str(status["state"])
+    try:
+        return Status.model_validate(read_json(path)).state
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise DataError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from error
 
 
 def _checkpoint(path: Path) -> str:
