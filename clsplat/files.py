@@ -11,7 +11,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
-from clsplat.errors import OutputError
+from clsplat.errors import ConfigError, OutputError
+from clsplat.names import COMPARISON, PIPELINE, STATUS
 from clsplat.processes import is_alive
 
 LOG = logging.getLogger("clsplat")
@@ -101,6 +102,16 @@ def is_there(path: Path) -> bool:
         return path.exists() or path.is_symlink()
     except OSError as error:
         raise unwritable(path, error) from error
+
+
+def check_result(path: Path, suffix: str) -> None:
+    """Raise ConfigError where a command would write a file of another kind, or over a file of a run."""
+    if path.suffix.lower() != suffix:
+        raise ConfigError(f"{path}: expected the name of a file that ends in {suffix}")
+    folder = path.absolute().parent
+    run = next((one for one in (folder, *folder.parents) if any((one / n).is_file() for n in (PIPELINE, STATUS))), None)
+    if run and is_there(path) and path.name != COMPARISON:
+        raise ConfigError(f"{path}: is a file of a run; give another name")
 
 
 def unwritable(path: Path, error: OSError) -> OutputError:

@@ -59,6 +59,7 @@ class Stream:
         self.fault = None
         stream = self._raw
         if stream is None:  # closed before the start
+            self.fault = OSError(errno.EBADF, os.strerror(errno.EBADF))
             stream = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="backslashreplace")  # of file names that are not text

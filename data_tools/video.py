@@ -16,7 +16,7 @@ from clsplat.errors import DataError
 from clsplat.files import write_text
 from clsplat.progress import Count
 from clsplat.reading import read_json, sha256
-from clsplat.scene.images import is_image, write_image
+from clsplat.scene.images import image_size, is_image, write_image
 
 LOG = logging.getLogger("clsplat")
 RECORD = ".frames.json"  # beside the frames: what they were made from
@@ -40,11 +40,14 @@ def write_frames(video: Path, out: Path, frames: int = 100, long_side: int | Non
         write_text(out / RECORD, json.dumps({**settings, "chosen": chosen}) + "\n")
     files = {place: _file(out, i) for i, place in enumerate(chosen, 1)}
     count = Count("frames written", len(files))
-    missing = {place for place, path in files.items() if not path.is_file()}
+    missing = {place for place, path in files.items() if not _is_whole(path)}
     for place, image in enumerate(_decoded(video) if missing else ()):
         if place in missing:
             write_image(files[place], np.ascontiguousarray(_limited(image, long_side)[:, :, ::-1]))
+            missing.remove(place)
             count.reach(count.done + 1)
+    if missing:
+        raise DataError(f"{out / RECORD}: names frame {min(missing)}, which the video does not have; remove {out}")
     return len(files)
 
 
@@ -54,13 +57,16 @@ def _begun(out: Path, settings: dict[str, Any]) -> list[int] | None:
     with suppress(DataError, ValueError, TypeError):
         record = dict(read_json(out / RECORD))
     chosen: list[int] | None = record.pop("chosen", None)
+    if not _are_places(chosen):  # damaged: the frames are chosen again
+        chosen = None
     if record and record != settings:
         changed = [name for name, value in settings.items() if record.get(name) != value]
         raise DataError(
             f"{out}: holds frames that were taken with another {' and another '.join(changed)}; give another folder, "
             "or remove it"
         )
-    own = {_file(out, i) for i in range(1, len(chosen or ()) + 1)}
+    count = len(chosen) if chosen else settings["frames"] if record else 0
+    own = {_file(out, i) for i in range(1, count + 1)}
     others = sorted(path for path in out.rglob("*") if is_image(path) and path.name[0] != "." and path not in own)
     if others:
         raise DataError(
@@ -72,6 +78,21 @@ def _begun(out: Path, settings: dict[str, Any]) -> list[int] | None:
 
 def _file(out: Path, number: int) -> Path:
     return out / f"frame_{number:05d}.png"
+
+
+def _are_places(chosen: Any) -> bool:
+    """Whether these are frames of a video, in its order."""
+    if not isinstance(chosen, list) or not all(type(place) is int and place >= 0 for place in chosen):
+        return False
+    return bool(chosen) and sorted(set(chosen)) == chosen
+
+
+def _is_whole(path: Path) -> bool:
+    """Whether a frame was written and can be read."""
+    try:
+        return bool(image_size(path))
+    except DataError:
+        return False
 
 
 def sharpest(sharpness: list[float], parts: int) -> list[int]:

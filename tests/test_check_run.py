@@ -86,12 +86,13 @@ def test_a_changed_byte_in_any_file_is_noticed(finished, copy):
 
 @pytest.mark.parametrize("content", [None, b"", b"[", b"\xff\x00", b"[]", b"1"])
 def test_a_file_that_is_gone_or_no_such_file_is_noticed(content, finished, copy):
+    older = min(path.relative_to(finished).as_posix() for path in finished.glob("checkpoints/*"))
     for one in clsplat.check(finished)["objects"]:
         path = copy / one["file"]
         data = path.read_bytes()
         path.unlink() if content is None else path.write_bytes(content)
         found = damaged(copy)
-        if not (content is None and ("checkpoints" in one["file"] or one["file"] == "checksums.json")):
+        if not (content is None and one["file"] == older):
             assert found, one["file"]
         path.write_bytes(data)
 
@@ -113,7 +114,66 @@ def test_a_run_that_was_killed_is_whole_without_its_outputs(copy):
     (copy / "status.json").write_text(json.dumps({**status, "state": "running"}))
     assert damaged(copy) == {}
     (copy / "status.json").write_text(json.dumps({**status, "state": "done"}))
-    assert damaged(copy) == {"metrics.json": "is missing", "point_cloud.ply": "is missing"}
+    gone = damaged(copy)
+    assert set(gone) == {"checksums.json", "metrics.json", "point_cloud.ply", "report.html"}
+    assert gone["report.html"] == "is missing"
+
+
+@pytest.mark.parametrize("name", ["inputs.json", "checksums.json", "checkpoints/step_000020.npz", "report.html"])
+def test_what_a_run_that_is_done_must_have_is_missed(name, copy):
+    (copy / name).unlink()
+    assert set(damaged(copy)) == {name}
+
+
+def test_renders_are_missed_with_and_without_the_list_of_checksums(copy):
+    shutil.rmtree(copy / "renders")
+    assert all(name.startswith("renders/test/") for name in damaged(copy))
+    (copy / "checksums.json").unlink()
+    assert set(damaged(copy)) == {"checksums.json", "renders"}
+
+
+def test_a_list_without_a_declared_output_is_damaged(copy):
+    (copy / "checksums.json").write_text("{}")
+    assert "'pipeline.yaml' is not in it" in damaged(copy)["checksums.json"]
+
+
+def test_a_run_without_checksums_is_not_called_whole(copy):
+    (copy / "checksums.json").unlink()
+    done = command("check", copy, expect=7)
+    assert "checksums.json is missing, as in runs of earlier versions" in done.stderr
+    assert "whole" not in done.stderr
+
+
+def test_every_file_has_one_line(finished):
+    files = [one["file"] for one in clsplat.check(finished)["objects"]]
+    assert len(files) == len(set(files))
+
+
+def test_a_damaged_note_of_prepared_photographs_is_noticed(copy):
+    (copy / "prepared.json").write_text('{"inputs": "a", "folder": "b"}')
+    assert damaged(copy) == {}
+    (copy / "prepared.json").write_text("{}")
+    assert set(damaged(copy)) == {"prepared.json"}
+
+
+def test_a_run_whose_process_is_gone_is_called_killed(copy):
+    status = json.loads((copy / "status.json").read_text())
+    (copy / "status.json").write_text(json.dumps({**status, "state": "running", "process": 2**22 + 1}))
+    assert clsplat.check(copy)["state"] == clsplat.status(copy)["state"] == "killed"
+
+
+def test_the_remedy_is_one_that_works(copy):
+    (copy / "point_cloud.ply").write_bytes(b"")
+    assert f"`clsplat resume {copy}`" in command("check", copy, expect=7).stderr
+    for path in (copy / "checkpoints").iterdir():
+        path.write_bytes(b"")
+    said = command("check", copy, expect=7).stderr
+    assert f"`clsplat run {copy}/pipeline.yaml --out {copy} --restart`" in said
+    assert "resume" not in said
+
+
+def test_a_path_without_anything_may_have_meant_a_run():
+    assert "expected a pipeline, or the folder of a run" in command("check", "runs/nosuch", expect=2).stderr
 
 
 def test_the_sums_are_those_of_the_run_that_ended_last(copy):
@@ -132,6 +192,12 @@ def test_a_matrix_is_checked_with_its_cells(tiny_scene, tmp_path):
     (cell / "point_cloud.ply").write_bytes(b"ply")
     assert damaged(out) == {f"{cell.name}/point_cloud.ply": "differs from its checksum"}
     assert "cells" in clsplat.check(tmp_path / "two.yaml")
+    assert f"`clsplat resume {cell}`" in command("check", out, expect=7).stderr
+    shutil.rmtree(cell)
+    (out / "compare.html").unlink()
+    found = damaged(out)
+    assert {f"{cell.name}/pipeline.yaml", "compare.html"} <= set(found)
+    assert f"`clsplat resume {out}`" in command("check", out, expect=7).stderr
 
 
 def test_a_folder_without_a_run_is_refused(tmp_path):

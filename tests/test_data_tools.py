@@ -10,6 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from clsplat import cli
+from clsplat.errors import DataError
 from clsplat.scene.images import read_image
 from data_tools import resize as resize_tool
 from data_tools import video as video_tool
@@ -51,6 +52,36 @@ def test_frames_are_not_taken_twice(video, tmp_path):
     assert write_frames(video, tmp_path / "frames", frames=4, long_side=48) == 4
     assert files[0].stat().st_mtime_ns == kept
     assert files[1].is_file()
+
+
+@pytest.mark.parametrize("chosen", [5, [], [[1], 2], ["a"], [True], [3, 1], None])
+def test_a_damaged_list_of_frames_is_made_again(chosen, video, tmp_path):
+    write_frames(video, tmp_path / "frames", frames=4)
+    record = tmp_path / "frames" / ".frames.json"
+    before = record.read_text()
+    record.write_text(json.dumps({**json.loads(before), "chosen": chosen}))
+    (tmp_path / "frames" / "frame_00002.png").unlink()
+    assert write_frames(video, tmp_path / "frames", frames=4) == 4
+    assert record.read_text() == before
+    assert (tmp_path / "frames" / "frame_00002.png").is_file()
+
+
+def test_frames_that_the_video_does_not_have_are_told(video, tmp_path):
+    write_frames(video, tmp_path / "frames", frames=2)
+    record = tmp_path / "frames" / ".frames.json"
+    record.write_text(json.dumps({**json.loads(record.read_text()), "chosen": [0, 10**6]}))
+    (tmp_path / "frames" / "frame_00002.png").unlink()
+    with pytest.raises(DataError, match="names frame 1000000, which the video does not have"):
+        write_frames(video, tmp_path / "frames", frames=2)
+
+
+def test_a_frame_that_was_damaged_is_made_again(video, tmp_path):
+    write_frames(video, tmp_path / "frames", frames=2)
+    frame = tmp_path / "frames" / "frame_00001.png"
+    before = frame.read_bytes()
+    frame.write_bytes(b"")
+    assert write_frames(video, tmp_path / "frames", frames=2) == 2
+    assert frame.read_bytes() == before
 
 
 @pytest.mark.parametrize(

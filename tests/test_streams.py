@@ -89,6 +89,24 @@ def test_no_file_takes_the_place_of_a_descriptor_that_was_closed_before_the_star
     assert int((tmp_path / "x").read_text()) > 2
 
 
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="a shell of POSIX")
+@pytest.mark.parametrize("arguments", [["pipelines"], ["check", "smoke"], ["devices", "--json"]])
+def test_a_product_that_a_closed_stdout_cannot_take_is_missed(arguments):
+    shell = ["sh", "-c", 'exec "$@" >&-', "sh", *command(*arguments)]
+    done = subprocess.run(shell, stderr=subprocess.PIPE, text=True, timeout=60)
+    assert done.returncode == 7
+    assert "stdout: cannot be written" in done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="a shell of POSIX")
+def test_a_run_goes_on_where_stdout_is_closed(tiny_scene, tmp_path):
+    run = command("run", "smoke", "--scene", tiny_scene, "--out", tmp_path, "--set", "optimize.steps=4")
+    done = subprocess.run(["sh", "-c", 'exec "$@" >&-', "sh", *run], timeout=120)
+    assert (done.returncode, status(tmp_path)) == (0, ("done", 0))
+
+
 class Broken:
     """A stream that fails."""
 

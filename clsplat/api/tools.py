@@ -49,10 +49,13 @@ def inspect_scene(scene: PathLike, page: PathLike | None = None) -> "Inspection"
 
     page: a file to write, with the cameras and points in 3D.  Raises DataError only where there is no such folder.
     """
+    from clsplat.files import check_result
     from clsplat.inspect.inspection import Inspection
     from clsplat.inspect.page import write_page
 
     load_plugins()
+    if page is not None:
+        check_result(Path(page), ".html")
     inspection = Inspection.of(Path(scene))
     if page is not None:
         write_page(inspection, Path(page))

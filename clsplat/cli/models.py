@@ -69,10 +69,12 @@ def evaluate(
     device: DeviceOption = None,
 ) -> None:
     """Measure a model on a scene's test and training views."""
-    from clsplat.files import write_text
+    from clsplat.files import check_result, write_text
 
     if out is None:
         terminal.keep_stdout_for_json()
+    else:
+        check_result(out, ".json")
     try:
         divisors = None if downscales is None else [float(text) for text in downscales.split(",")]
     except ValueError:

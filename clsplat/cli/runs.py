@@ -121,7 +121,7 @@ def check(
 
 def _show_verified(found: dict[str, Any], as_json: bool) -> None:
     """Show what was found of a run folder.  Raises OutputError where a file is damaged."""
-    from clsplat.runs.verify import lines, verdict
+    from clsplat.runs.verdict import lines, verdict
 
     if as_json:
         terminal.show_json(found)

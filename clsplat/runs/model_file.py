@@ -1,6 +1,7 @@
 """A model at the views of a scene: rendering and measuring without training."""
 
 import io
+import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,7 +12,7 @@ import numpy as np
 
 from clsplat.conformance.quick import open_correct
 from clsplat.errors import ConfigError, DataError
-from clsplat.files import atomic
+from clsplat.files import atomic, is_there, write_text
 from clsplat.formats.table import located
 from clsplat.gaussians.model import MODEL, load
 from clsplat.metrics.images import to_8_bits
@@ -23,6 +24,7 @@ from clsplat.opencl.device import Device
 from clsplat.pipeline.file import SceneSettings
 from clsplat.pipeline.loading import load as load_pipeline
 from clsplat.prepare.cache import noted
+from clsplat.reading import read_json
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.scene.detect import read_scene
 from clsplat.scene.images import write_image
@@ -32,6 +34,7 @@ from clsplat.views.photographs import Photographs
 
 SPLITS = ("train", "test", "all")
 KINDS = ("png", "npy")  # of files
+RECORD = ".renders.json"  # beside renders: their names
 
 
 @dataclass(frozen=True)
@@ -96,6 +99,10 @@ class ModelFile:
         if not views:
             raise DataError(f"{self.scene.path}: has no {split} views")
         paths = image_paths(out, [view.name for view in views], f".{kind}")
+        images = [view.image_path for split in ("train", "test") for view in self.photographs.split(split)]
+        _check_folder(out, paths, images)
+        names = [path.relative_to(out).as_posix() for path in paths]
+        write_text(out / RECORD, json.dumps(sorted({*_rendered(out), *names}), indent=1) + "\n")
         for path, view in zip(paths, views, strict=True):
             image = render_floats(self.rasterizer, self.model, photographs.camera(view), photographs.background)
             require_finite(image, view)
@@ -122,6 +129,29 @@ class ModelFile:
                     results = measure(self.rasterizer, self.model, views, photographs, perceptual, finite=True)
                     metrics[split][f"{downscale:g}"] = mean(results, perceptual)
         return {**metrics, "gaussians": self.model.gaussians.count, "device": self.device.text}
+
+
+def _check_folder(out: Path, paths: Sequence[Path], photographs: Sequence[Path]) -> None:
+    """Raise ConfigError where renders would mix with photographs, or replace what no earlier call has rendered."""
+    folder = out.resolve()
+    for images in {path.resolve().parent for path in photographs}:
+        if folder == images or folder in images.parents or images in folder.parents:
+            raise ConfigError(
+                f"{out}: is, holds or lies in the folder of the photographs, {images}; give another --out"
+            )
+    own = _rendered(out)
+    for path in paths:
+        if is_there(path) and path.relative_to(out).as_posix() not in own:
+            raise ConfigError(f"{path}: exists, and is no render of an earlier call; give another --out")
+
+
+def _rendered(out: Path) -> list[str]:
+    """The files that earlier calls have rendered into a folder."""
+    try:
+        names = read_json(out / RECORD)
+    except DataError:
+        return []
+    return [name for name in names if isinstance(name, str)] if isinstance(names, list) else []
 
 
 def render(

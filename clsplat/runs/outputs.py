@@ -71,13 +71,13 @@ def check_outputs(pipeline: Pipeline, run: Run) -> None:
     try:
         read_metrics(run.out / METRICS)
         load(str(run.out / PIPELINE))
-        for stage in _acting(pipeline):
+        for stage in acting(pipeline):
             stage.verify(run)
     except (ConfigError, DataError) as error:
         raise OutputError(f"{error}, at the end of the run; see {run.out / LOG_FILE}") from error
 
 
-def _acting(pipeline: Pipeline) -> Iterator[Stage]:
+def acting(pipeline: Pipeline) -> Iterator[Stage]:
     """The stages of a whole run, each training with those of its `during` that have run."""
     step = 0
     for stage in pipeline.stages:

@@ -1,29 +1,47 @@
 """Check a pipeline; verify a run folder from its files alone: checkpoints, settings, records, models, images."""
 
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+from pydantic import ValidationError
+
 from clsplat import plugins
 from clsplat.compare.run_folder import read_metrics, read_settings
 from clsplat.errors import ConfigError, DataError, one_line, shortened
+from clsplat.files import is_there
 from clsplat.formats.table import endings
 from clsplat.gaussians.checkup import examine, is_model
 from clsplat.gaussians.model import load as load_model
-from clsplat.names import CHECKPOINTS, CHECKSUMS, INPUTS, METRICS, PIPELINE, RECORDS, STATUS, is_inside
+from clsplat.names import (
+    CHECKPOINTS,
+    CHECKSUMS,
+    COMPARISON,
+    INPUTS,
+    METRICS,
+    NOTE,
+    PIPELINE,
+    RECORDS,
+    STATUS,
+    is_inside,
+)
 from clsplat.pipeline.files import shipped
 from clsplat.pipeline.loading import load as load_pipeline
 from clsplat.pipeline.matrix import load_experiment
-from clsplat.reading import read_json, sha256
+from clsplat.prepare.cache import noted
+from clsplat.processes import Owner
+from clsplat.reading import read_file, read_json, sha256
+from clsplat.runs.outputs import acting
 from clsplat.scene.identity import Identity
 from clsplat.scene.images import read_image
-from clsplat.stages.export import Export
 from clsplat.training import archive, checkpoint
 from clsplat.training.records import Records
-from clsplat.training.status import read_status
+from clsplat.training.status import END_STATES, Status, read_status
 
 MISSING = "is missing"
+NO_SUMS = "is missing, as in runs of earlier versions and of a Trainer; without it the outputs are not verified"
 
 
 def is_run(folder: Path) -> bool:
@@ -37,6 +55,8 @@ def check(pipeline: str) -> dict[str, Any]:
     Of a run folder and of a model file return what `verify` and `examine` say.
     Raises ConfigError; DataError for a folder without a run.
     """
+    if len(Path(pipeline).parts) > 1 and not is_there(Path(pipeline)):
+        raise ConfigError(f"{pipeline}: no such file or folder; expected a pipeline, a model, or the folder of a run")
     if not is_run(Path(pipeline)) and pipeline not in shipped() and is_model(Path(pipeline)):
         return examine(Path(pipeline))
     if Path(pipeline).is_dir() and (is_run(Path(pipeline)) or pipeline not in shipped()):
@@ -56,33 +76,11 @@ def verify(out: Path) -> dict[str, Any]:
     if not is_run(out):
         raise DataError(f"{out}: holds neither pipeline.yaml nor status.json; expected the folder of a run")
     objects = list(_objects(out))
-    state = str(read_status(out).get("state"))
-    return {"run": str(out), "state": state, "whole": all(one["whole"] for one in objects), "objects": objects}
+    return {"run": str(out), "state": _state(out), "whole": all(one["whole"] for one in objects), "objects": objects}
 
 
-def verdict(found: dict[str, Any]) -> str:
-    """Return a sentence about what `verify` found."""
-    damaged = [one["file"] for one in found["objects"] if not one["whole"]]
-    if not damaged:
-        return f"{found['run']}: {found['state']}; all {len(found['objects'])} files are whole"
-    names = ", ".join(damaged[:3]) + (", …" if len(damaged) > 3 else "")
-    return (
-        f"{found['run']}: {len(damaged)} of {len(found['objects'])} files are damaged or missing: {names}; "
-        "copy them again, or run with --resume or --restart"
-    )
-
-
-def lines(found: dict[str, Any]) -> str:
-    """Return what `verify` found, a line for each file."""
-    rows = [
-        f"{'whole  ' if one['whole'] else 'DAMAGED'}  {one['file']}{', ' if one['detail'] else ''}{one['detail']}"
-        for one in found["objects"]
-    ]
-    return "\n".join(rows)
-
-
-def _objects(out: Path) -> Iterator[dict[str, Any]]:
-    """What is found of each file of a run, or of the cells of a matrix."""
+def _objects(out: Path, whole: bool = False) -> Iterator[dict[str, Any]]:
+    """What is found of each file of a run, or of the cells of a matrix; `whole` expects those of one that is done."""
     settings: dict[str, Any] = {}
 
     def one(path: Path, look: Callable[[Path], str]) -> dict[str, Any]:
@@ -95,27 +93,54 @@ def _objects(out: Path) -> Iterator[dict[str, Any]]:
 
     def pipeline(path: Path) -> str:
         settings.update(read_settings(out))
-        return _settings(path, settings)
+        return _settings(path, settings, sums.get(PIPELINE))
 
+    status, sums = read_status(out), _sums(out)
+    done = whole or status.get("state") == "done"
     yield one(out / PIPELINE, pipeline)
     yield one(out / STATUS, _status)
     if "matrix" in settings:
-        for cell in sorted(one for one in out.iterdir() if one.is_dir() and not one.is_symlink() and is_run(one)):
-            yield from ({**found, "file": f"{cell.name}/{found['file']}"} for found in _objects(cell))
+        for cell in _cells(out, done):
+            yield from ({**found, "file": f"{cell}/{found['file']}"} for found in _objects(out / cell, done))
+        if done or (out / COMPARISON).exists():
+            yield one(out / COMPARISON, _page)
         return
-    yield from (one(path, _checkpoint) for path in checkpoint.saved(out))
+    named = status.get("checkpoint")
+    last = [out / CHECKPOINTS / named] if isinstance(named, str) and is_inside(named) else []
+    yield from (one(path, _checkpoint) for path in dict.fromkeys([*checkpoint.saved(out), *last]))
     yield from (one(path, _failed) for path in sorted((out / CHECKPOINTS).glob("failed_*.npz")))
-    sums = _sums(out)
-    if (out / CHECKSUMS).exists():
-        yield one(out / CHECKSUMS, _listed)
-    if (out / INPUTS).exists():
+    declared = _declared(out, sums) if done else []
+    if done and not (out / CHECKSUMS).exists():
+        yield {"file": CHECKSUMS, "whole": False, "detail": NO_SUMS}
+    elif (out / CHECKSUMS).exists():
+        yield one(out / CHECKSUMS, partial(_listed, [PIPELINE, *declared]))
+    if done or (out / INPUTS).exists():
         yield one(out / INPUTS, _inputs)
-    done = read_status(out).get("state") == "done"
-    for name in dict.fromkeys([*sums, *_declared(out, settings, done), *_present(out)]):
-        yield one(out / name, partial(_output, sums.get(name)))
+    if (done and settings.get("prepare")) or (out / NOTE).exists():
+        yield one(out / NOTE, _note)
+    for name in dict.fromkeys([*sums, *declared, *_present(out)]):
+        if name != PIPELINE:
+            yield one(out / name, partial(_output, sums.get(name)))
 
 
-def _settings(path: Path, settings: dict[str, Any]) -> str:
+def _state(out: Path) -> str:
+    """The state of a run, `killed` where its process has ended without a word."""
+    status = read_status(out)
+    owner = Owner.named_by(status) if status.get("state") not in END_STATES else None
+    return "killed" if owner and owner.has_ended else str(status.get("state", "unknown"))
+
+
+def _cells(out: Path, done: bool) -> list[str]:
+    """The folders of a matrix's cells: those that are there, and of one that is done all of them."""
+    cells = {one.name for one in out.iterdir() if one.is_dir() and not one.is_symlink() and is_run(one)}
+    with suppress(ConfigError):  # told already
+        found = load_experiment(str(out / PIPELINE)) if done else None
+        cells |= {cell.name for cell in found.cells} if found else set()
+    return sorted(cells)
+
+
+def _settings(path: Path, settings: dict[str, Any], expected: str | None) -> str:
+    _require(expected, path)
     if "matrix" in settings:
         load_experiment(str(path))
         return "of a matrix"
@@ -127,8 +152,11 @@ def _settings(path: Path, settings: dict[str, Any]) -> str:
 
 
 def _status(path: Path) -> str:
-    status = read_json(path)
-    return str(status["state"])
+    try:
+        return Status.model_validate(read_json(path)).state
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise DataError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from error
 
 
 def _checkpoint(path: Path) -> str:
@@ -145,12 +173,26 @@ def _inputs(path: Path) -> str:
     return ""
 
 
-def _listed(path: Path) -> str:
+def _note(path: Path) -> str:
+    if noted(path.parent) is None:
+        raise DataError("expected the hash and the folder of prepared photographs")
+    return ""
+
+
+def _page(path: Path) -> str:
+    if not read_file(path).rstrip().endswith(b"</html>"):
+        raise DataError("ends before its end")
+    return ""
+
+
+def _listed(expected: list[str], path: Path) -> str:
     sums = read_json(path)
     if not isinstance(sums, dict) or not all(isinstance(value, str) for value in sums.values()):
         raise DataError("expected the SHA-256 of each file")
     if outside := [name for name in sums if not is_inside(name)]:
         raise DataError(f"'{shortened(outside[0])}' is no file of the run")
+    if absent := [name for name in expected if name not in sums]:
+        raise DataError(f"'{absent[0]}' is not in it")
     return f"of {len(sums)} files"
 
 
@@ -163,16 +205,18 @@ def _sums(out: Path) -> dict[str, str]:
     return {name: str(value) for name, value in sums.items() if is_inside(name)} if isinstance(sums, dict) else {}
 
 
-def _declared(out: Path, settings: dict[str, Any], done: bool) -> list[str]:
-    """Files that a run has when it is done."""
-    if not done:
-        return []
+def _declared(out: Path, sums: dict[str, str]) -> list[str]:
+    """Files that a run has when it is done; a folder stands for its files where no checksum tells them."""
     try:
-        stages = load_pipeline(str(out / PIPELINE)).stages
+        stages = [stage for stage in acting(load_pipeline(str(out / PIPELINE))) if stage.named_outputs()]
     except ConfigError:  # told already
         stages = []
-    models = [stage.file for stage in stages if isinstance(stage, Export)]
-    return [RECORDS, *([METRICS, *models] if (out / METRICS).exists() or models else [])]
+    paths = [(path, stage) for stage in stages for path in stage.outputs(out)]
+    found = {path.relative_to(out).as_posix(): stage for path, stage in paths}
+    files = [name for name, stage in found.items() if Path(name).suffix in set(stage.named_outputs().values()) - {""}]
+    folders = [name for name, stage in found.items() if set(stage.named_outputs().values()) == {""}]
+    optional = [name for name in files if name not in sums and name.endswith("_raw.ply")]  # of a world filter
+    return [RECORDS, METRICS, *(name for name in files if name not in optional), *([] if sums else folders)]
 
 
 def _present(out: Path) -> list[str]:
@@ -181,10 +225,14 @@ def _present(out: Path) -> list[str]:
     return [*names, *sorted(path.name for path in out.glob("*.ply"))]
 
 
-def _output(expected: str | None, path: Path) -> str:
-    """Look at one output; return what it is.  Raises the errors of its reader, DataError where its bytes changed."""
+def _require(expected: str | None, path: Path) -> None:
     if expected is not None and sha256(path) != expected:
         raise DataError("differs from its checksum")
+
+
+def _output(expected: str | None, path: Path) -> str:
+    """Look at one output; return what it is.  Raises the errors of its reader, DataError where its bytes changed."""
+    _require(expected, path)
     if path.name == METRICS:
         return f"{read_metrics(path).gaussians:,} Gaussians"
     if path.name == RECORDS:
