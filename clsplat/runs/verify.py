@@ -213,9 +213,9 @@ def _declared(out: Path, sums: dict[str, str]) -> list[str]:
         stages = []
     paths = [(path, stage) for stage in stages for path in stage.outputs(out)]
     found = {path.relative_to(out).as_posix(): stage for path, stage in paths}
-    files = [name for name, stage in found.items() if Path(name).suffix in set(stage.named_outputs().values()) - {""}]
-    folders = [name for name, stage in found.items() if set(stage.named_outputs().values()) == {""}]
-    optional = [name for name in files if name not in sums and name.endswith("_raw.ply")]  # of a world filter
+    folders = [name for name, stage in found.items() if not any(stage.named_outputs().values())]
+    files = [name for name in found if name not in folders]
+    optional = [name for name in files if name not in sums and Path(name).stem.endswith("_raw")]  # of a world filter
     return [RECORDS, METRICS, *(name for name in files if name not in optional), *([] if sums else folders)]
 
 

@@ -68,7 +68,7 @@ def kills(scene: Path, folder: Path, count: int, seed: int = 0) -> Iterator[Coun
 def identity(out: Path) -> tuple[str, str, list[str]]:
     """The bits of a run's model, its records without times, and the names of its files.
 
-    Of the checkpoints only the newest: a kill between the writing of the last and the removal of an older one leaves it.
+    Of the checkpoints only the newest: a kill between the writing of the last and the removal of an older leaves that.
     """
     model = hashlib.sha256((out / "point_cloud.ply").read_bytes()).hexdigest()
     lines = [{key: value for key, value in line.items() if key not in TIMES} for line in Records(out).read()]
