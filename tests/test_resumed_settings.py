@@ -62,7 +62,11 @@ def test_a_stage_that_is_over_keeps_its_settings(copy, tiny_scene):
 def test_a_run_that_stopped_after_its_last_stage_ends(copy, tiny_scene, finished):
     last = len(archive.read(copy / "checkpoints" / "step_000008.npz")[0]["pipeline"]["stages"])
     shutil.copy(finished / "checkpoints" / "step_000012.npz", copy / "checkpoints")
-    crafted(copy / "checkpoints" / "step_000012.npz", lambda notes, arrays: notes.update(cursor=last, stage_step=0))
+    written = {"point_cloud.ply": model(finished)}
+    crafted(
+        copy / "checkpoints" / "step_000012.npz",
+        lambda notes, arrays: notes.update(cursor=last, stage_step=0, written=written),
+    )
     shutil.copy(finished / "point_cloud.ply", copy)
     before = (copy / "checkpoints" / "step_000012.npz").read_bytes()
     assert train(tiny_scene, copy, *FEW, resume=True).step == 12
