@@ -7,7 +7,7 @@ from typing import Any, Literal, get_args
 
 from clsplat.errors import ConfigError, InternalError, Interrupted, OutputError, as_clsplat_error, one_line
 from clsplat.files import sweep, unwritable
-from clsplat.names import CHECKPOINTS, CHECKSUMS, INPUTS, LOCK, LOG_FILE, METRICS, NOTE, PIPELINE, RECORDS, STATUS
+from clsplat.names import BEFORE_A_RUN, CHECKPOINTS, CHECKSUMS, INPUTS, LOCK, METRICS, NOTE, PIPELINE, RECORDS
 from clsplat.pipeline.loading import Pipeline, load
 from clsplat.prepare.cache import Planned, note, noted
 from clsplat.runs import lock
@@ -15,7 +15,6 @@ from clsplat.training import checkpoint
 from clsplat.training.status import StatusFile, read_status
 
 Start = Literal["new", "resume", "restart"]
-BEFORE_A_RUN = {STATUS, LOG_FILE, LOCK}  # files of a run that has not begun
 
 
 @contextmanager
