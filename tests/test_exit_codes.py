@@ -106,6 +106,7 @@ def test_a_defect_is_code_1(tiny_scene, tmp_path, monkeypatch, capsys):
 
 def test_a_plugin_that_fails_is_code_2(tiny_scene, tmp_path):
     plugin, out = tmp_path / "faulty.py", tmp_path / "run"
+    out.mkdir()  # one that a run makes does not outlive its refusal
     plugin.write_text(BROKEN_PLUGIN)
     sets = ["--set", "optimize.losses=[l1, faulty]"]
     done = clsplat("--plugin", plugin, "run", "smoke", "--scene", tiny_scene, "--out", out, *sets, expect=2)
@@ -121,6 +122,7 @@ def test_too_little_memory_is_code_5(tiny_scene, tmp_path, monkeypatch, capsys):
 
     monkeypatch.setattr(Device, "__init__", with_little_memory)
     out = tmp_path / "run"
+    out.mkdir()
     code, errors = in_this_process(monkeypatch, capsys, "run", "smoke", "--scene", tiny_scene, "--out", out)
     assert code == 5, errors
     check_status(out, 5, "failed", errors)
