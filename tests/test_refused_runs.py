@@ -33,6 +33,8 @@ def test_a_refused_run_leaves_no_folder(tiny_scene, tmp_path):
         )
         assert done.returncode in (2, 3, 4, 5), done.stderr
         assert not (tmp_path / name.split("/")[0]).exists(), name
+        described = subprocess.run([*done.args, "--dry-run"], capture_output=True, text=True, check=False)
+        assert (described.returncode, described.stderr) == (done.returncode, done.stderr)
         out.mkdir(parents=True)
         again = subprocess.run(done.args, capture_output=True, text=True, check=False)
         assert again.returncode == done.returncode

@@ -15,7 +15,7 @@ from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import Pipeline, load
 from clsplat.pipeline.matrix import Cell, Experiment, load_experiment
 from clsplat.pipeline.yaml_file import read_yaml
-from clsplat.runs import description, folders, opening, outputs, runner
+from clsplat.runs import description, folders, lock, opening, outputs, runner
 from clsplat.runs.folders import Start
 from clsplat.signals import stop_at_once, stopping_on_signals
 from clsplat.training.changes import first_difference
@@ -149,8 +149,9 @@ def describe_matrix(experiment: Experiment, out: Path, device: str | Device | No
 
     Raises a ClsplatError with the exit code of the first cell that the run would refuse.
     """
-    folders.check_run_folder(out, start)
     check_matrix_folder(out)
+    folders.check_run_folder(out, start)
+    lock.check_free(out)
     lines, refusals = [], dict[str, ClsplatError]()
     for cell in experiment.cells:
         folder = out / cell.name
