@@ -33,7 +33,7 @@ def describe(pipeline: Pipeline, out: Path, device: str | Device | None, start: 
     else:
         run = open_run(pipeline, out, device, start)
         if start == "resume":
-            resumed = restore(run)
+            resumed = restore(pipeline, run)
             verdict = f"would go on from step {run.step}" if resumed else "nothing to resume; would run"
         for stage in pipeline.stages[run.cursor :]:
             stage.check_in(run)
