@@ -55,8 +55,8 @@ def begin(pipeline: Pipeline, run: Run, start: Start) -> None:
 def restore(pipeline: Pipeline, run: Run) -> Path | None:
     """Take the newest checkpoint that is whole; return it, or None where none was saved so far.  Nothing is written.
 
-    Raises ConfigError when it is of another run: with other settings, photographs, cameras or points, or of one that has
-    trained for longer already; OutputError when no checkpoint is whole.
+    Raises ConfigError when it is of another run: with other settings, photographs, cameras or points, or of one that
+    has trained for longer already; OutputError when no checkpoint is whole.
     """
     taken = checkpoint.restore(run)
     if taken:
