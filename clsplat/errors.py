@@ -92,6 +92,8 @@ class Interrupted(ClsplatError):
 
 def as_clsplat_error(error: BaseException) -> ClsplatError:
     """Return the ClsplatError for any exception; a ClsplatError stays unchanged."""
+    if isinstance(error, RuntimeError) and isinstance(error.__cause__, StopIteration):  # what a generator makes of it
+        error = error.__cause__
     if isinstance(error, ClsplatError):
         return error
     if isinstance(error, KeyboardInterrupt):

@@ -102,7 +102,7 @@ def test_the_one_before_a_damaged_checkpoint_leads_to_the_same_bits(damage, copy
 
 
 @pytest.mark.parametrize(
-    ("error", "code"), [(MemoryError(), 5), (OSError(errno.EIO, "bad disk"), 7), (OSError(errno.EACCES, "refused"), 7)]
+    ("error", "code"), [(MemoryError(), 5), (OSError(errno.ESTALE, "stale"), 7), (OSError(errno.EACCES, "refused"), 7)]
 )
 def test_a_checkpoint_that_cannot_be_read_just_now_is_not_damaged(error, code, copy, tiny_scene, finished, monkeypatch):
     shutil.copy(copy / "checkpoints" / "step_000008.npz", copy / "checkpoints" / "step_000009.npz")
@@ -120,6 +120,21 @@ def test_a_checkpoint_that_cannot_be_read_just_now_is_not_damaged(error, code, c
     assert failure.exit_code == code
     assert code == 5 or f"step_000009.npz: cannot be read ({error.strerror}); check" in str(failure)
     assert steps_saved(copy) == before
+
+
+def test_the_one_before_a_checkpoint_on_a_bad_part_of_the_disk_is_used(copy, tiny_scene, finished, monkeypatch, caplog):
+    shutil.copy(copy / "checkpoints" / "step_000008.npz", copy / "checkpoints" / "step_000009.npz")
+    read = zipfile.ZipFile.read
+
+    def fail(archive, name):
+        if archive.filename.endswith("step_000009.npz"):
+            raise OSError(errno.EIO, "bad disk")
+        return read(archive, name)
+
+    monkeypatch.setattr(zipfile.ZipFile, "read", fail)
+    train(tiny_scene, copy, *FEW, resume=True)
+    assert "step_000009.npz is damaged ([Errno 5] bad disk); using the one before it" in caplog.text
+    assert model(copy) == model(finished)
 
 
 def test_a_run_whose_checkpoints_are_gone_does_not_begin_again(copy, tiny_scene, finished):

@@ -106,10 +106,36 @@ def test_a_defect_is_code_1(tiny_scene, tmp_path, monkeypatch, capsys):
 
 def test_a_plugin_that_fails_is_code_2(tiny_scene, tmp_path):
     plugin, out = tmp_path / "faulty.py", tmp_path / "run"
+    out.mkdir()  # one that a run makes does not outlive its refusal
     plugin.write_text(BROKEN_PLUGIN)
     sets = ["--set", "optimize.losses=[l1, faulty]"]
     done = clsplat("--plugin", plugin, "run", "smoke", "--scene", tiny_scene, "--out", out, *sets, expect=2)
     check_status(out, 2, "failed", done.stderr)
+
+
+STOPPING_PLUGIN = """
+from typing import Literal
+
+from clsplat.stages.base import Scheduled
+
+class Stopping(Scheduled):
+    '''Fails.'''
+    stage: Literal['stopping'] = 'stopping'
+
+    def run(self, run):
+        raise ERROR
+"""
+
+
+@pytest.mark.parametrize("error", ["StopIteration", "SystemExit(0)", "GeneratorExit"])
+def test_a_stage_of_a_plugin_that_stops_training_is_code_2_and_loses_no_step(error, tiny_scene, tmp_path):
+    plugin, out = tmp_path / "stopping.py", tmp_path / "run"
+    plugin.write_text(STOPPING_PLUGIN.replace("ERROR", error))
+    sets = ["--set", "optimize.during=[{stage: stopping, every: 3}]", "optimize.steps=5"]
+    done = clsplat("--plugin", plugin, "run", "smoke", "--scene", tiny_scene, "--out", out, *sets, expect=2)
+    assert f"stopping.py:11: {error.split('(')[0]}" in done.stderr
+    check_status(out, 2, "failed", done.stderr)
+    assert (out / "checkpoints" / "step_000003.npz").exists()
 
 
 def test_too_little_memory_is_code_5(tiny_scene, tmp_path, monkeypatch, capsys):
@@ -121,6 +147,7 @@ def test_too_little_memory_is_code_5(tiny_scene, tmp_path, monkeypatch, capsys):
 
     monkeypatch.setattr(Device, "__init__", with_little_memory)
     out = tmp_path / "run"
+    out.mkdir()
     code, errors = in_this_process(monkeypatch, capsys, "run", "smoke", "--scene", tiny_scene, "--out", out)
     assert code == 5, errors
     check_status(out, 5, "failed", errors)

@@ -72,7 +72,11 @@ def test_a_failure_inside_a_step_leaves_the_step_before(
 
 
 @pytest.mark.parametrize(
-    "error", [DataError("cut"), MemoryError(), ZeroDivisionError(), OSError(errno.EIO, "bad disk")]
+    "error",
+    [
+        *(DataError("cut"), MemoryError(), ZeroDivisionError(), OSError(errno.EIO, "bad disk")),
+        *(SystemExit(3), GeneratorExit(), StopIteration("out")),
+    ],
 )
 @pytest.mark.parametrize("call", [1, 2], ids=["during", "after"])
 def test_an_evaluation_that_fails_loses_nothing(error, call, tiny_scene, tmp_path, monkeypatch, finished):

@@ -142,6 +142,7 @@ def test_two_runs_in_one_folder(tiny_scene, tmp_path):
         for more in ("--resume", "--restart"):
             refused = command(*arguments, more, expect=7)
             assert f"{out}: is in use by process {process.pid} on " in refused.stderr
+            assert command(*arguments, more, "--dry-run", expect=7).stderr == refused.stderr
         refused = command("resume", out, expect=7)
         assert "(__main__.py run smoke" in refused.stderr or "(clsplat run smoke" in refused.stderr
         assert json.loads((out / "status.json").read_text())["process"] == status["process"] == process.pid

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from clsplat import names
-from clsplat.errors import OutputError
+from clsplat.errors import InternalError, OutputError
 from clsplat.gaussians.model import Model
 from clsplat.pipeline.loading import load
 from clsplat.runs import opening, outputs, runner
@@ -18,6 +18,7 @@ from clsplat.scene.images import write_image
 from clsplat.settings import rebuild
 from clsplat.stages.base import Stage
 from clsplat.stages.render import image_paths
+from clsplat.stages.report import Report
 from clsplat.training.run import Run
 from clsplat.training.status import read_status
 
@@ -107,19 +108,29 @@ def test_what_cannot_be_read_back_is_no_success(name, finished):
     outputs.check_outputs(pipeline, run)
 
 
-@pytest.mark.parametrize("damage", [truncate, Path.unlink])
-@pytest.mark.parametrize("name", ["point_cloud.ply", "early.ply"])
-def test_a_model_that_was_written_before_a_kill_is_read_whole(name, damage, finished, monkeypatch):
-    pipeline, run = finished
-    monkeypatch.setattr(run, "written", {})
-    outputs.check_outputs(pipeline, run)
-    before = (run.out / name).read_bytes()
-    try:
-        damage(run.out / name)
+@pytest.mark.parametrize("damage", [truncate, Path.unlink, change_a_value])
+def test_a_model_that_was_written_before_a_kill_is_the_one_that_was_written(damage, tiny_scene, tmp_path, monkeypatch):
+    out, few = tmp_path / "run", [*SETTINGS, "init.count=50"]
+
+    def fail(*arguments):
+        raise ZeroDivisionError
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Report, "run", fail)
+        with pytest.raises(InternalError):
+            Job.open("smoke", tiny_scene, out, few).run()
+    whole = {name: (out / name).read_bytes() for name in ("early.ply", "point_cloud.ply")}
+    for name, data in whole.items():
+        damage(out / name)
         with pytest.raises(OutputError, match=f"{name}.*at the end of the run"):
-            outputs.check_outputs(pipeline, run)
-    finally:
-        (run.out / name).write_bytes(before)
+            Job.resume(out).run()
+        assert not (out / names.CHECKSUMS).exists()
+        (out / name).write_bytes(data)
+    (out / "point_cloud_raw.ply").write_bytes(whole["early.ply"])
+    with pytest.raises(OutputError, match="no record of writing it"):
+        Job.resume(out).run()
+    (out / "point_cloud_raw.ply").unlink()
+    Job.resume(out).run()
 
 
 def test_a_model_of_a_cadence_that_never_came_is_not_expected(finished):

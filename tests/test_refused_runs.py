@@ -8,7 +8,6 @@ import pytest
 
 import clsplat
 from clsplat.errors import ConfigError
-from clsplat.names import LOCK
 from clsplat.runs import experiment
 from tests.test_cli import clsplat as command
 
@@ -16,10 +15,14 @@ pytestmark = pytest.mark.slow
 
 
 def test_a_refused_run_leaves_no_folder(tiny_scene, tmp_path):
+    damaged = tmp_path / "damaged.ply"
+    damaged.write_text("ply")
     for name, arguments in {
         "a/b": ["smoke", "--scene", tmp_path / "nowhere"],
         "c": ["smoke", "--scene", tiny_scene, "--device", "no such device"],
         "d": ["smoke", "--scene", tiny_scene, "--set", "evaluate.lpips=nowhere.onnx"],
+        "e": ["smoke", "--scene", tiny_scene, "--set", "init.source=random", "init.count=50000000"],
+        "f": ["smoke", "--scene", tiny_scene, "--set", "init.source=ply", f"init.file={damaged}"],
     }.items():
         out = tmp_path / name
         done = subprocess.run(
@@ -28,15 +31,17 @@ def test_a_refused_run_leaves_no_folder(tiny_scene, tmp_path):
             text=True,
             check=False,
         )
-        assert done.returncode in (2, 3, 4), done.stderr
+        assert done.returncode in (2, 3, 4, 5), done.stderr
         assert not (tmp_path / name.split("/")[0]).exists(), name
+        described = subprocess.run([*done.args, "--dry-run"], capture_output=True, text=True, check=False)
+        assert (described.returncode, described.stderr) == (done.returncode, done.stderr)
         out.mkdir(parents=True)
         again = subprocess.run(done.args, capture_output=True, text=True, check=False)
         assert again.returncode == done.returncode
         status = json.loads((out / "status.json").read_text())
         assert (status["state"], status["exit_code"]) == ("failed", done.returncode)
         assert f"error: {status['message']}" in again.stderr
-        assert not (out / LOCK).exists()
+        assert {path.name for path in out.iterdir()} == {"status.json", "log.txt"}, "the corrected command can begin"
 
 
 def test_a_folder_with_files_of_others_stays(tiny_scene, tmp_path, monkeypatch):

@@ -53,6 +53,13 @@ def test_what_tables_depend_on_may_not_change(change, copy, tiny_scene):
         train(tiny_scene, copy, *FEW, change, resume=True)
 
 
+def test_a_run_that_has_trained_for_longer_is_refused(copy, tiny_scene):
+    before = (copy / "pipeline.yaml").read_text()
+    with pytest.raises(ConfigError, match=r"already at step 8; optimize.steps=6 would end before it"):
+        train(tiny_scene, copy, *FEW, "optimize.steps=6", resume=True)
+    assert (copy / "pipeline.yaml").read_text() == before
+
+
 def test_a_stage_that_is_over_keeps_its_settings(copy, tiny_scene):
     crafted(copy / "checkpoints" / "step_000008.npz", lambda notes, arrays: notes.update(cursor=2, stage_step=0))
     with pytest.raises(ConfigError, match="was saved after that stage, at step 8"):
@@ -62,7 +69,11 @@ def test_a_stage_that_is_over_keeps_its_settings(copy, tiny_scene):
 def test_a_run_that_stopped_after_its_last_stage_ends(copy, tiny_scene, finished):
     last = len(archive.read(copy / "checkpoints" / "step_000008.npz")[0]["pipeline"]["stages"])
     shutil.copy(finished / "checkpoints" / "step_000012.npz", copy / "checkpoints")
-    crafted(copy / "checkpoints" / "step_000012.npz", lambda notes, arrays: notes.update(cursor=last, stage_step=0))
+    written = {"point_cloud.ply": model(finished)}
+    crafted(
+        copy / "checkpoints" / "step_000012.npz",
+        lambda notes, arrays: notes.update(cursor=last, stage_step=0, written=written),
+    )
     shutil.copy(finished / "point_cloud.ply", copy)
     before = (copy / "checkpoints" / "step_000012.npz").read_bytes()
     assert train(tiny_scene, copy, *FEW, resume=True).step == 12

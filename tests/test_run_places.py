@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from clsplat import cli
+from clsplat import cli, names
 from clsplat.errors import ConfigError
 from clsplat.pipeline.loading import load
-from clsplat.runs import outputs
+from clsplat.runs import experiment, outputs
 from clsplat.runs.experiment import Job
 
 
@@ -30,7 +30,9 @@ def test_the_folder_of_the_photographs_and_the_root_are_no_run_folders(tiny_scen
         outputs.check_places(load("photos", [f"scene.path={str(tiny_scene)!r}"]), tiny_scene / "run")
 
 
-@pytest.mark.parametrize("name", ["renders", "report.html", "point_cloud.ply", "log.txt"])
+@pytest.mark.parametrize(
+    "name", ["renders", "report.html", "point_cloud.ply", *sorted(names.OF_A_RUN - {names.PIPELINE})]
+)
 def test_a_link_that_leads_outside_is_not_followed(name, tiny_scene, tmp_path):
     out = tmp_path / "run"
     out.mkdir()
@@ -57,6 +59,33 @@ def test_files_that_a_new_run_did_not_make_are_not_replaced(tiny_scene, tmp_path
             Job.open("smoke", tiny_scene, tmp_path, start=start).run()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["holiday", "report.html"]
     (tmp_path / "pipeline.yaml").touch()
+    opened(tiny_scene, tmp_path)
+
+
+@pytest.mark.parametrize("name", sorted(names.OF_A_RUN - {names.PIPELINE, names.CHECKPOINTS, names.UNDISTORTED}))
+def test_files_of_others_under_the_names_of_a_run_are_not_replaced(name, tiny_scene, tmp_path):
+    (tmp_path / name).write_text('{"state": "mine"}')
+    for start in ("new", "resume", "restart"):
+        with pytest.raises(ConfigError, match=f"{name}: exists, and is not of this run"):
+            Job.open("smoke", tiny_scene, tmp_path, start=start).run()
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+    assert (tmp_path / name).read_text() == '{"state": "mine"}'
+
+
+@pytest.mark.parametrize("name", sorted(names.OF_A_MATRIX - {names.PIPELINE}))
+def test_files_of_others_under_the_names_of_a_matrix_are_not_replaced(name, tmp_path):
+    (tmp_path / name).write_text("mine")
+    with pytest.raises(ConfigError, match=f"{name}: exists, and is not of this run"):
+        experiment.check_matrix_folder(tmp_path)
+
+
+def test_what_a_run_that_never_began_has_left_is_its_own(tiny_scene, tmp_path):
+    (tmp_path / "run.lock").touch()
+    opened(tiny_scene, tmp_path)
+    (tmp_path / "run.lock").write_text('{"process": 7}')
+    opened(tiny_scene, tmp_path)
+    (tmp_path / "status.json").write_text('{"state": "preparing", "process": 7}')
+    (tmp_path / "log.txt").write_text("a line")
     opened(tiny_scene, tmp_path)
 
 

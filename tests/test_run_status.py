@@ -58,3 +58,21 @@ def test_the_lines_name_the_stage_and_what_is_left(tmp_path):
 
 def test_a_clock_that_is_late_gives_no_negative_time(tmp_path):
     assert put(tmp_path, host="a", time=time.time() + 100)["silent"] == 0
+
+
+@pytest.mark.parametrize("state", ["killed", "failed", "interrupted"])
+def test_the_advice_is_a_command_that_works(state, tmp_path):
+    more = {} if state == "killed" else {"state": state, "message": "stopped at step 7; --resume continues from there"}
+    (tmp_path / "pipeline.yaml").touch()
+    again = f"no checkpoint was saved; `clsplat run {tmp_path / 'pipeline.yaml'} --out {tmp_path} --restart` begins"
+    assert again in reading.status_text(put(tmp_path, **more))
+    (tmp_path / "checkpoints").mkdir()
+    (tmp_path / "checkpoints" / "step_000007.npz").touch()
+    text = reading.status_text(put(tmp_path, **more))
+    assert f"`clsplat resume {tmp_path}` goes on with it" in text
+    assert "--restart" not in text
+
+
+def test_the_step_is_that_of_the_last_report_where_it_is_later(tmp_path):
+    (tmp_path / "metrics.jsonl").write_text('{"step": 8, "kind": "train"}\n')
+    assert ": failed at step 8 of 9" in reading.status_text(put(tmp_path, state="failed"))

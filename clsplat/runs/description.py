@@ -4,6 +4,7 @@ from pathlib import Path
 
 from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import Pipeline
+from clsplat.runs import lock
 from clsplat.runs.folders import Start, check_run_folder, up_to_date
 from clsplat.runs.opening import check_start, open_run
 from clsplat.runs.outputs import check_places
@@ -22,8 +23,9 @@ def describe(pipeline: Pipeline, out: Path, device: str | Device | None, start: 
     planned = pipeline.preparation(out)
     if start != "restart" and planned and up_to_date(pipeline, planned, out):
         return f"{out}: up to date"
-    check_run_folder(out, start)
     check_places(pipeline, out)
+    check_run_folder(out, start)
+    lock.check_free(out)
     lines = [f"  {one.step.stage:<14} {one.why or 'done'}" for one in planned]
     run, verdict = None, "would run"
     if any(one.why for one in planned):
@@ -31,8 +33,10 @@ def describe(pipeline: Pipeline, out: Path, device: str | Device | None, start: 
     else:
         run = open_run(pipeline, out, device, start)
         if start == "resume":
-            resumed = restore(run)
+            resumed = restore(pipeline, run)
             verdict = f"would go on from step {run.step}" if resumed else "nothing to resume; would run"
+        for stage in pipeline.stages[run.cursor :]:
+            stage.check_in(run)
     lines += [f"  {stage.stage:<14} {_detail(stage, run)}".rstrip() for stage in pipeline.stages]
     return f"{verdict} in {out}:\n" + "\n".join(lines)
 

@@ -10,12 +10,12 @@ from clsplat import terminal
 from clsplat.compare.page import write_comparison
 from clsplat.errors import ClsplatError, ConfigError, DataError, Interrupted, as_clsplat_error, one_line
 from clsplat.files import is_there, write_text
-from clsplat.names import COMPARISON, LOG_FILE, PIPELINE
+from clsplat.names import COMPARISON, LOG_FILE, OF_A_MATRIX, PIPELINE
 from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import Pipeline, load
 from clsplat.pipeline.matrix import Cell, Experiment, load_experiment
 from clsplat.pipeline.yaml_file import read_yaml
-from clsplat.runs import description, folders, opening, outputs, runner
+from clsplat.runs import description, folders, lock, opening, outputs, runner
 from clsplat.runs.folders import Start
 from clsplat.signals import stop_at_once, stopping_on_signals
 from clsplat.training.changes import first_difference
@@ -138,7 +138,8 @@ def _run_cells(
 
 
 def check_matrix_folder(out: Path) -> None:
-    """Raise ConfigError when the folder holds a single run."""
+    """Raise ConfigError when the folder holds a single run, or files of others under the names of a matrix."""
+    outputs.check_names(out, OF_A_MATRIX)
     if (out / PIPELINE).exists() and "matrix" not in (read_yaml(out / PIPELINE).data or {}):
         raise ConfigError(f"{out}: holds a single run, not those of a matrix; give another folder")
 
@@ -148,8 +149,9 @@ def describe_matrix(experiment: Experiment, out: Path, device: str | Device | No
 
     Raises a ClsplatError with the exit code of the first cell that the run would refuse.
     """
-    folders.check_run_folder(out, start)
     check_matrix_folder(out)
+    folders.check_run_folder(out, start)
+    lock.check_free(out)
     lines, refusals = [], dict[str, ClsplatError]()
     for cell in experiment.cells:
         folder = out / cell.name

@@ -1,13 +1,14 @@
 """The run folder: made, held, its failures recorded, its state read."""
 
-from collections.abc import Iterator, Sequence
+import shutil
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 from clsplat.errors import ConfigError, InternalError, Interrupted, OutputError, as_clsplat_error, one_line
 from clsplat.files import sweep, unwritable
-from clsplat.names import CHECKPOINTS, CHECKSUMS, INPUTS, LOCK, LOG_FILE, METRICS, NOTE, PIPELINE, RECORDS, STATUS
+from clsplat.names import BEFORE_A_RUN, CHECKPOINTS, CHECKSUMS, INPUTS, LOCK, METRICS, NOTE, OF_A_RUN, PIPELINE, RECORDS
 from clsplat.pipeline.loading import Pipeline, load
 from clsplat.prepare.cache import Planned, note, noted
 from clsplat.runs import lock
@@ -15,18 +16,18 @@ from clsplat.training import checkpoint
 from clsplat.training.status import StatusFile, read_status
 
 Start = Literal["new", "resume", "restart"]
-BEFORE_A_RUN = {STATUS, LOG_FILE, LOCK}  # files of a run that has not begun
 
 
 @contextmanager
 def opened(out: Path, start: Start, **values: Any) -> Iterator[StatusFile]:
     """Make the run folder, swept of what killed runs have left, and its status with `values`; hold it in the block.
 
-    A run that ends before it has begun leaves no new folder.
+    A run that ends before its first step, without a checkpoint, leaves no new folder and no run in one that was there.
     Raises ConfigError when it holds another run, OutputError when it is in use or cannot be written.
     """
     check_run_folder(out, start)
     made = [folder for folder in (out, *out.parents) if not folder.exists()]
+    is_new = not (out / PIPELINE).exists()
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -41,8 +42,10 @@ def opened(out: Path, start: Start, **values: Any) -> Iterator[StatusFile]:
                 with closing(status):  # the next holder writes its own
                     yield status
             except BaseException as error:
-                if made and not isinstance(as_clsplat_error(error), InternalError):  # its log has the traceback
-                    _remove_unused(out)
+                is_defect = isinstance(as_clsplat_error(error), InternalError)  # its log has the traceback
+                if is_new and not status.now.step and not is_defect:
+                    written = BEFORE_A_RUN if status.now.cells else OF_A_RUN - {CHECKPOINTS}
+                    _remove_unused(out, written, kept={LOCK} if made else BEFORE_A_RUN)
                 raise
     except BaseException:
         with suppress(OSError):  # where a folder holds anything, it stays
@@ -51,13 +54,17 @@ def opened(out: Path, start: Start, **values: Any) -> Iterator[StatusFile]:
         raise
 
 
-def _remove_unused(out: Path) -> None:
+def _remove_unused(out: Path, written: Collection[str], kept: Collection[str]) -> None:
+    """Remove what a run has written that ended before its first step, but for the names to keep.
+
+    Where anything else is there, a checkpoint or a file of others, nothing is removed.
+    """
     with suppress(OSError):
         files = list(out.iterdir())
-        if {file.name for file in files} <= BEFORE_A_RUN:
+        if all(file.name in written for file in files):
             for file in files:
-                if file.name != LOCK:
-                    file.unlink()
+                if file.name not in kept:
+                    shutil.rmtree(file) if file.is_dir() else file.unlink()
 
 
 def clear(status: StatusFile) -> None:

@@ -18,7 +18,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from clsplat.errors import OutputError
+from clsplat.errors import OutputError, shortened
 from clsplat.files import unwritable
 from clsplat.names import LOCK
 from clsplat.processes import Owner
@@ -36,11 +36,7 @@ def held(folder: Path) -> Iterator[None]:
 
     Raises OutputError, with process and host where another holds it.
     """
-    path = folder.resolve() / LOCK
-    if path in _held:
-        raise OutputError(f"{folder}: is in use by this process; end that run or trainer first, or give another folder")
-    if path.is_symlink():
-        raise OutputError(f"{folder / LOCK}: is a link, which is not followed; remove it")
+    path = _path(folder)
     try:
         file = _locked(path, folder)
     except OSError as error:
@@ -57,6 +53,32 @@ def held(folder: Path) -> Iterator[None]:
         with suppress(OSError):
             if os.name == "nt":
                 path.unlink()
+
+
+def check_free(folder: Path) -> None:
+    """Raise OutputError where `held` would; nothing is written."""
+    path = _path(folder)
+    try:
+        with suppress(FileNotFoundError), path.open("r+b", buffering=0) as file:
+            try:
+                if not _system_lock(file):
+                    raise OutputError(_in_use(folder, _read(file)))
+            except OSError as error:
+                if error.errno not in NO_LOCKS:
+                    raise
+                _ended_owner(file, folder)
+    except OSError as error:
+        raise unwritable(path, error) from error
+
+
+def _path(folder: Path) -> Path:
+    """The file of a folder that this process does not hold.  Raises OutputError."""
+    path = folder.resolve() / LOCK
+    if path in _held:
+        raise OutputError(f"{folder}: is in use by this process; end that run or trainer first, or give another folder")
+    if path.is_symlink():
+        raise OutputError(f"{folder / LOCK}: is a link, which is not followed; remove it")
+    return path
 
 
 def _locked(path: Path, folder: Path) -> io.FileIO:
@@ -96,17 +118,23 @@ def _is_ours(file: io.FileIO, is_new: bool, path: Path, folder: Path) -> bool:
         if error.errno not in NO_LOCKS:
             raise
     if not is_new:
-        owner = _read(file)
-        if not _has_ended(Owner.named_by(owner)):
-            raise OutputError(
-                f"{_in_use(folder, owner)}; this file system knows no locks: if that process has ended, "
-                f"remove {folder / LOCK}"
-            )
+        owner = _ended_owner(file, folder)
         LOG.info("%s: taken over from process %s, which has ended", folder, owner.get("process"))
         _remove(file, path)
         return False
     LOG.warning("%s: its file system knows no locks; %s alone keeps other processes away", folder, LOCK)
     return True
+
+
+def _ended_owner(file: io.FileIO, folder: Path) -> dict[str, Any]:
+    """Who the file names, where there are no locks.  Raises OutputError unless that process has ended."""
+    owner = _read(file)
+    if not _has_ended(Owner.named_by(owner)):
+        raise OutputError(
+            f"{_in_use(folder, owner)}; this file system knows no locks: if that process has ended, "
+            f"remove {folder / LOCK}"
+        )
+    return owner
 
 
 def _remove(file: io.FileIO, path: Path) -> None:
@@ -180,5 +208,5 @@ def _in_use(folder: Path, owner: dict[str, Any]) -> str:
         since = "an unknown time"
     return (
         f"{folder}: is in use by process {owner.get('process')} on {owner.get('host')} since {since} "
-        f"({str(owner.get('command'))[:80]}); wait for it, or give another folder"
+        f"({shortened(str(owner.get('command')))}); wait for it, or give another folder"
     )

@@ -1,15 +1,16 @@
 """The files that a run has at its end."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 
 from clsplat.compare.run_folder import read_metrics
 from clsplat.errors import ConfigError, DataError, OutputError
 from clsplat.files import is_there, write_text
-from clsplat.names import CHECKSUMS, LOG_FILE, METRICS, PIPELINE, RECORDS
+from clsplat.names import BEFORE_A_RUN, CHECKSUMS, LOCK, LOG_FILE, METRICS, OF_A_RUN, PIPELINE, RECORDS, STATUS
 from clsplat.pipeline.loading import Pipeline, load
-from clsplat.reading import sha256
+from clsplat.processes import Owner
+from clsplat.reading import read_json, sha256
 from clsplat.stages.base import Stage
 from clsplat.stages.optimize import Optimize
 from clsplat.training import checkpoint
@@ -56,12 +57,48 @@ def check_places(pipeline: Pipeline, out: Path) -> None:
     taken = [folder, folder.parent] if pipeline.settings.prepare else [folder]  # the photographs' folder is hashed
     if scene.path is not None and scene.folder.resolve() in taken:
         raise ConfigError(f"{out}: is the folder of the photographs, or right in it; give another folder for the run")
+    check_names(out, OF_A_RUN)
     own = [path for stage in pipeline.stages for path in stage.outputs(out)]
-    for path in [*own, out / LOG_FILE]:
+    _require_inside(out, own)
+    if not _holds_a_run(out):
+        _require_free(own)
+
+
+def check_names(out: Path, names: Collection[str]) -> None:
+    """Raise ConfigError where a name that a run or a matrix writes in `out` is taken by a file that none has made."""
+    files = [out / name for name in sorted(names)]
+    _require_inside(out, files)
+    if not _holds_a_run(out):
+        before = BEFORE_A_RUN if _names_a_process(out / STATUS) else {LOCK} if _is_lock(out / LOCK) else set()
+        _require_free(file for file in files if file.name not in before)
+
+
+def _holds_a_run(out: Path) -> bool:
+    return (out / PIPELINE).exists() or bool(checkpoint.saved(out))
+
+
+def _is_lock(file: Path) -> bool:
+    """Whether a file is run.lock as a process that was killed leaves it, also before it has written into it."""
+    return (file.is_file() and file.stat().st_size == 0) or _names_a_process(file)
+
+
+def _names_a_process(file: Path) -> bool:
+    try:
+        found = read_json(file)
+    except DataError:
+        return False
+    return isinstance(found, dict) and Owner.named_by(found) is not None
+
+
+def _require_inside(out: Path, files: Iterable[Path]) -> None:
+    folder = out.resolve()
+    for path in files:
         if not path.resolve().is_relative_to(folder):
             raise ConfigError(f"{path}: a link leads outside of the run folder; remove it, or choose another name")
-    again = (out / PIPELINE).exists() or checkpoint.saved(out)
-    for path in () if again else own:
+
+
+def _require_free(files: Iterable[Path]) -> None:
+    for path in files:
         if path.is_file() or (path.is_dir() and any(path.iterdir())):
             raise ConfigError(f"{path}: exists, and is not of this run; give another folder for the run")
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
-from clsplat.errors import Interrupted
+from clsplat.errors import ConfigError, Interrupted
 from clsplat.files import write_text
 from clsplat.names import CHECKSUMS, NOTE, PIPELINE
 from clsplat.pipeline.loading import Pipeline
@@ -14,6 +14,7 @@ from clsplat.runs.folders import Start, clear, failures_recorded
 from clsplat.runs.inputs import require_same_inputs, write_inputs
 from clsplat.runs.outputs import check_outputs, write_checksums, write_metrics
 from clsplat.runs.signals import finishing_on_interrupt
+from clsplat.stages.optimize import Optimize
 from clsplat.training import checkpoint
 from clsplat.training.rescue import saved_on_failure
 from clsplat.training.run import Progress, Run, Stopped
@@ -39,7 +40,7 @@ def begin(pipeline: Pipeline, run: Run, start: Start) -> None:
     if start == "restart":
         clear(run.status)
     if start == "resume":
-        taken = restore(run)
+        taken = restore(pipeline, run)
         LOG.info("resumed at step %d" if taken else "nothing to resume; starting from the beginning%.0s", run.step)
         checkpoint.drop_later(run.out, taken)
     (run.out / CHECKSUMS).unlink(missing_ok=True)
@@ -51,15 +52,21 @@ def begin(pipeline: Pipeline, run: Run, start: Start) -> None:
     run.status.enter("running", step=run.step)
 
 
-def restore(run: Run) -> Path | None:
+def restore(pipeline: Pipeline, run: Run) -> Path | None:
     """Take the newest checkpoint that is whole; return it, or None where none was saved so far.  Nothing is written.
 
-    Raises ConfigError when it is of another run: with other settings, photographs, cameras or points; OutputError when
-    no checkpoint is whole.
+    Raises ConfigError when it is of another run: with other settings, photographs, cameras or points, or of one that
+    has trained for longer already; OutputError when no checkpoint is whole.
     """
     taken = checkpoint.restore(run)
     if taken:
         require_same_inputs(run)
+        stage = pipeline.stages[run.cursor] if run.cursor < len(pipeline.stages) else None
+        if isinstance(stage, Optimize) and stage.steps < run.stage_step:
+            raise ConfigError(
+                f"{taken}: already at step {run.step}; optimize.steps={stage.steps} would end before it: give "
+                f"{run.stage_step} or more, or --restart"
+            )
     return taken
 
 

@@ -8,6 +8,7 @@ from clsplat.compare.run_folder import read_metrics
 from clsplat.errors import DataError
 from clsplat.names import METRICS, PIPELINE
 from clsplat.processes import Owner
+from clsplat.training import checkpoint
 from clsplat.training.records import Records
 from clsplat.training.status import END_STATES, read_status
 
@@ -44,13 +45,8 @@ def status_text(status: dict[str, Any]) -> str:
         lines.append(f"  no sign of life for {status['silent']} s{_place(status)}")
     if status.get("message"):
         lines.append(f"  {status['message']}")
-    goes_on = "resume" not in str(status.get("message"))
-    if (
-        goes_on
-        and status["state"] in ("killed", "failed", "interrupted")
-        and (Path(status["run"]) / PIPELINE).is_file()
-    ):
-        lines.append(f"  `clsplat resume {status['run']}` goes on with it")
+    if status["state"] in ("killed", "failed", "interrupted") and (advice := _advice(status)):
+        lines.append(f"  {advice}")
     if status["last"] and status["metrics"] is None:
         lines.append("  last report: " + _figures(status["last"], ("step", "loss", "psnr", "gaussians")))
     for split in ("test", "train"):
@@ -59,21 +55,33 @@ def status_text(status: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
+def _advice(status: dict[str, Any]) -> str:
+    """How to go on with a run that has ended before its end."""
+    out, message = Path(status["run"]), str(status.get("message"))
+    if not (out / PIPELINE).is_file() or f"clsplat resume {out}" in message or "--restart" in message:
+        return ""
+    if "cells" in status or checkpoint.saved(out):
+        return f"`clsplat resume {out}` goes on with it"
+    return f"no checkpoint was saved; `clsplat run {out / PIPELINE} --out {out} --restart` begins it again"
+
+
 def _progress(status: dict[str, Any]) -> str:
     """Where the run is, and how far its stage."""
     if "cells" in status:
         failed = status["failed"] if isinstance(status.get("failed"), dict) else {}
         return f", {status.get('done')} of {status['cells']} cells, {len(failed)} of them failed"
+    last = status["last"] or {}
+    step = max((s for s in (status.get("step"), last.get("step")) if isinstance(s, int)), default=None)
     steps = f" of {status['steps']}" if "steps" in status else ""
     amount, count = status.get("progress"), ""
     if isinstance(amount, dict) and amount.get("unit") != "steps":
         count = f", {amount.get('done')} of {amount.get('total')} {amount.get('unit')}"
     left = status.get("seconds_left")
     if status["state"] in END_STATES:
-        return f" at step {status.get('step')}{steps if status['state'] != 'done' else ''}"
+        return f" at step {step}{steps if status['state'] != 'done' else ''}"
     stage = f", {status['stage']}{count}" if status.get("stage") else ""
     time_left = f", {left:.0f} s left" if isinstance(left, int | float) and status["state"] == "running" else ""
-    return f" at step {status.get('step')}{steps}{stage}{time_left}"
+    return f" at step {step}{steps}{stage}{time_left}"
 
 
 def _figures(values: dict[str, Any], names: tuple[str, ...]) -> str:

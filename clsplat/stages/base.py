@@ -56,6 +56,9 @@ class Stage(Settings):
     def check(self) -> None:
         """Raise errors that do not depend on the run, such as a missing file, before the run starts."""
 
+    def check_in(self, run: Run) -> None:
+        """Raise errors of a run that can be known before its first stage, for one that is only described."""
+
     @abstractmethod
     def run(self, run: Run) -> None:
         """Run the stage."""

@@ -40,7 +40,7 @@ class Export(Scheduled):
         if model.filter_variance is not None:
             files[raw] = model
         for file, one in files.items():
-            run.written[file] = one.save(file)
+            run.written[_name(file, run)] = one.save(file)
             try:
                 if for_writing(file).read:
                     load(file)
@@ -50,10 +50,12 @@ class Export(Scheduled):
 
     def verify(self, run: Run) -> None:
         path, raw = self.outputs(run.out)
-        for file in (path, raw) if raw in run.written or raw.exists() else (path,):
-            found = sha256(file)
-            if file in run.written:
-                if found != run.written[file]:
-                    raise DataError(f"{file}: differs from what was written")
-            elif for_writing(file).read:  # written before the run was resumed
-                load(file)
+        for file in (path, raw) if _name(raw, run) in run.written or raw.exists() else (path,):
+            if _name(file, run) not in run.written:
+                raise DataError(f"{file}: this run has no record of writing it; move it away, and use --restart")
+            if sha256(file) != run.written[_name(file, run)]:
+                raise DataError(f"{file}: differs from what was written; `clsplat run` with --restart writes it again")
+
+
+def _name(file: Path, run: Run) -> str:
+    return file.relative_to(run.out).as_posix()

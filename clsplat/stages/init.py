@@ -53,6 +53,15 @@ class Init(Stage):
     file: ReadPath | None = None
     """Model file of any format, or a run folder, for `source: model`."""
 
+    def check_in(self, run: Run) -> None:
+        source = self._source(run.scene)
+        if source in MODEL_SOURCES:
+            self._read()
+        elif source == "random":
+            self._require_memory(run, self.count)
+        elif source == "points":
+            self._require_memory(run, len(self._points(run.scene)))
+
     def run(self, run: Run) -> None:
         degree = run.model_settings.sh_degree
         gaussians = Gaussians(run.device, self._parameters(run, degree))
@@ -76,31 +85,40 @@ class Init(Stage):
 
     def _parameters(self, run: Run, degree: int) -> Parameters:
         if self.source in MODEL_SOURCES:
-            if self.file is None:
-                raise DataError(f"init: source '{self.source}' needs 'file'")
-            return with_degree(self._read(Path(self.file)), degree)
-        points, source = run.scene.points, self._source(run.scene)
+            return with_degree(self._read(), degree)
+        source = self._source(run.scene)
         if source == "random":
             points = self._random(run)
         elif source == "sweep":
             points = self._swept(run)
-        elif points is None:
-            raise DataError(f"{run.scene.path}: has no points to start from; use init: {{source: sweep}}")
         else:
-            require_ahead(points, run.scene)
-        run.memory_plan(first_tables(degree)).check(len(points))
+            points = self._points(run.scene)
+        self._require_memory(run, len(points))
         return from_points(points, self.opacity, degree)
 
-    @staticmethod
-    def _read(path: Path) -> Parameters:
-        parameters = load(path).tables()
+    def _read(self) -> Parameters:
+        if self.file is None:
+            raise DataError(f"init: source '{self.source}' needs 'file'")
+        parameters = load(Path(self.file)).tables()
         if not len(parameters["means"]):
-            raise DataError(f"{path}: holds no Gaussians; expected one at least to start from")
+            raise DataError(f"{self.file}: holds no Gaussians; expected one at least to start from")
         return parameters
+
+    @staticmethod
+    def _points(scene: Scene) -> PointCloud:
+        if scene.points is None:
+            raise DataError(f"{scene.path}: has no points to start from; use init: {{source: sweep}}")
+        require_ahead(scene.points, scene)
+        return scene.points
+
+    @staticmethod
+    def _require_memory(run: Run, count: int) -> None:
+        """Raise MemoryLimitError where so many Gaussians do not fit."""
+        run.memory_plan(first_tables(run.model_settings.sh_degree)).check(count)
 
     def _random(self, run: Run) -> PointCloud:
         """Random points, where so many Gaussians fit.  Raises MemoryLimitError before any is made."""
-        run.memory_plan(first_tables(run.model_settings.sh_degree)).check(self.count)
+        self._require_memory(run, self.count)
         return random_points(run.scene, self.count, run.seed)
 
     def _swept(self, run: Run) -> PointCloud:

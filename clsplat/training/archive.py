@@ -23,7 +23,7 @@ from clsplat.errors import DataError, OutputError, one_line, shortened
 from clsplat.reading import regular
 
 META, META_DIGEST, DIGESTS = "meta", "meta_sha256", "sha256"
-DAMAGE = {None, errno.EINVAL, errno.EISDIR}  # a place before the file's beginning, or a folder of its name
+DAMAGE = {None, errno.EINVAL, errno.EISDIR, errno.EIO}  # a place before the beginning, a folder, a bad part of the disk
 Notes = dict[str, Any]
 Arrays = dict[str, NDArray[np.float32]]
 

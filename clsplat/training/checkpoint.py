@@ -8,10 +8,9 @@ import logging
 import re
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import ValidationError
 
 from clsplat import __version__
 from clsplat.density.statistics import FOLDER as STATS_FOLDER
@@ -27,34 +26,10 @@ from clsplat.training.advice import lower_rate
 from clsplat.training.archive import Arrays
 from clsplat.training.changes import differences
 from clsplat.training.run import Run
+from clsplat.training.state import State
 
 FORMAT = 4
 LOG = logging.getLogger("clsplat")
-Count = Annotated[int, Field(ge=0)]
-
-
-class State(BaseModel):
-    """What a checkpoint holds beside its tables."""
-
-    model_config = ConfigDict(strict=True, extra="forbid")
-
-    format: int
-    version: str
-    step: Count
-    cursor: Count
-    stage_step: Count
-    acted: Count
-    edited: bool
-    degree: Annotated[int, Field(ge=0, le=3)]
-    zero_fresh: list[str]
-    updates: dict[str, Count]
-    train_seconds: float
-    metrics: dict[str, dict[str, Any]]
-    records: Count  # lines of metrics.jsonl
-    changes: list[str]
-    device: str
-    inputs: str  # identity of the scene
-    pipeline: dict[str, Any]
 
 
 def save(run: Run, keep: int | None = None) -> Path:
@@ -173,6 +148,7 @@ def _write(run: Run, kind: str) -> Path:
         train_seconds=run.train_seconds,
         metrics=run.metrics,
         records=run.records.lines,
+        written=run.written,
         changes=run.changes,
         device=run.device.text,
         inputs=run.inputs,
@@ -242,7 +218,7 @@ def _restore(run: Run, state: State, tables: Arrays) -> None:
     run.step, run.cursor, run.stage_step = state.step, state.cursor, state.stage_step
     run.acted, run.edited, run.whole = state.acted, state.edited, True
     run.train_seconds, run.metrics = state.train_seconds, state.metrics
-    run.records.lines, run.inputs_before = state.records, state.inputs
+    run.records.lines, run.inputs_before, run.written = state.records, state.inputs, state.written
 
 
 def _key(table: str) -> str:

@@ -18,7 +18,7 @@ def saved_on_failure(run: Run) -> Iterator[None]:
         yield
     except (Interrupted, NotFiniteError):  # saved already, or set aside
         raise
-    except Exception:
+    except (Exception, SystemExit, GeneratorExit):  # what a plug-in may raise; a second Ctrl-C stops at once
         if run.step > 0:
             LOG.warning(_rescue(run))
         raise

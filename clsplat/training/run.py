@@ -77,7 +77,7 @@ class Run:
     changes: list[str] = field(default_factory=list)  # of settings, with which the run went on
     inputs_before: str = ""  # `inputs` of the checkpoint that the run goes on from
     train_seconds: float = 0.0
-    written: dict[Path, str] = field(default_factory=dict)  # models of this process: file -> SHA-256
+    written: dict[str, str] = field(default_factory=dict)  # models: path in the run folder -> SHA-256
     metrics: dict[str, dict[str, Any]] = field(default_factory=dict)  # split -> downscale -> averages
     interrupted: bool = False  # finish the step, save, stop
     show: Callable[[Progress], None] = lambda progress: None

@@ -1,0 +1,32 @@
+"""The notes of a checkpoint: all of a run's state but its tables."""
+
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Count = Annotated[int, Field(ge=0)]
+
+
+class State(BaseModel):
+    """What a checkpoint holds beside its tables."""
+
+    model_config = ConfigDict(strict=True, extra="forbid")
+
+    format: int
+    version: str
+    step: Count
+    cursor: Count
+    stage_step: Count
+    acted: Count
+    edited: bool
+    degree: Annotated[int, Field(ge=0, le=3)]
+    zero_fresh: list[str]
+    updates: dict[str, Count]
+    train_seconds: float
+    metrics: dict[str, dict[str, Any]]
+    records: Count  # lines of metrics.jsonl
+    written: dict[str, str] = {}  # models, by path in the run folder, with their SHA-256; older files have none
+    changes: list[str]
+    device: str
+    inputs: str  # identity of the scene
+    pipeline: dict[str, Any]
