@@ -90,7 +90,7 @@ def test_a_run_that_is_resumed_and_one_that_is_only_described(runs, tiny_scene, 
 def test_renders(runs, tmp_path, kind):
     command("render", runs[0], "--out", tmp_path / "command", "--format", kind, "--scale", 2)
     assert clsplat.render_views(runs[0], out=tmp_path / "function", kind=kind, downscale=2) == 2
-    assert len(contents(tmp_path / "command")) == 2
+    assert sorted(contents(tmp_path / "command")) == [".renders.json", *(f"test/r_00{i}.{kind}" for i in (0, 1))]
     assert contents(tmp_path / "command") == contents(tmp_path / "function")
 
 

@@ -172,6 +172,12 @@ def test_the_remedy_is_one_that_works(copy):
     assert "resume" not in said
 
 
+def test_a_dry_resume_says_where_it_would_go_on(copy):
+    before = {path: path.read_bytes() for path in copy.rglob("*") if path.is_file()}
+    assert "step 20" in command("resume", copy, "--dry-run").stdout
+    assert {path: path.read_bytes() for path in copy.rglob("*") if path.is_file()} == before
+
+
 def test_a_path_without_anything_may_have_meant_a_run():
     assert "expected a pipeline, or the folder of a run" in command("check", "runs/nosuch", expect=2).stderr
 

@@ -45,9 +45,14 @@ def resume(
     folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run folder, or that of a matrix.")],
     device: DeviceOption = None,
     set_: SetOption = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Check everything and say what would run.")] = False,
 ) -> None:
     """Go on with a run from its newest checkpoint."""
-    terminal.show_summary(commands.resume(folder, set=set_ or (), device=device))
+    if dry_run:
+        file = folder / "pipeline.yaml"
+        terminal.show(commands.describe_run(file, out=folder, set=set_ or (), device=device, start="resume"))
+    else:
+        terminal.show_summary(commands.resume(folder, set=set_ or (), device=device))
 
 
 @command(
