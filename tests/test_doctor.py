@@ -10,6 +10,7 @@ from types import SimpleNamespace
 
 import pytest
 
+import clsplat
 from clsplat import cli
 from clsplat.conformance import doctor, reference, supervision
 from clsplat.conformance.check import Check
@@ -20,7 +21,7 @@ from clsplat.conformance.page import report_page
 from clsplat.conformance.report import DeviceReport
 from clsplat.conformance.supervision import Result, supervised
 from clsplat.conformance.verdict import judge
-from clsplat.errors import MemoryLimitError
+from clsplat.errors import MemoryLimitError, OutputError
 from clsplat.opencl import runtimes
 from clsplat.opencl.device import Device
 from clsplat.opencl.discovery import resolve_schedule
@@ -225,6 +226,28 @@ def test_the_command_ends_with_4_where_a_device_computes_wrongly(monkeypatch, ca
     assert len(data["once"]) == len(SPEED)
     if code:
         assert "do not use it: blend_backward differs by 0.3" in err
+
+
+@pytest.mark.parametrize("name", ["a folder", "a file/page.html"])
+def test_a_page_that_cannot_be_written_is_refused_before_the_work(monkeypatch, info, tmp_path, name):
+    (tmp_path / "a folder").mkdir()
+    (tmp_path / "a file").write_text("")
+    monkeypatch.setattr(doctor, "supervised", lambda *_: pytest.fail("the work began"))
+    with pytest.raises(OutputError, match=f"{name}: cannot be written"):
+        clsplat.doctor(Device(info), tmp_path / name)
+
+
+def test_the_verdict_is_printed_where_the_page_fails_at_the_end(monkeypatch, capsys, info, empty_cache, tmp_path):
+    def full(*_):
+        raise OutputError("page.html: cannot be written (No space left on device)")
+
+    worker(monkeypatch)
+    monkeypatch.setattr("clsplat.conformance.page.write_page", full)
+    monkeypatch.setattr(sys, "argv", ["clsplat", "doctor", "--html", str(tmp_path / "page.html")])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    assert ended.value.code == 7
+    assert "verdict   use it" in capsys.readouterr().out
 
 
 @pytest.mark.slow

@@ -35,9 +35,11 @@ def doctor(device: "str | Device | None" = None, page: PathLike | None = None) -
     It takes about a minute on a CPU.  page: a file to write, to be attached to a report.
     """
     from clsplat.conformance.doctor import examine
-    from clsplat.conformance.page import write_page
+    from clsplat.conformance.page import check_place, write_page
 
     load_plugins()
+    if page is not None:
+        check_place(Path(page))
     report = examine(device)
     if page is not None:
         write_page(report, Path(page))

@@ -36,13 +36,19 @@ def doctor(
     ] = None,
 ) -> None:
     """Prove that a device computes what the reference says; exit 4 when it does not."""
+    from clsplat.conformance.page import check_place, write_page
+
     if as_json:
         terminal.keep_stdout_for_json()
-    report = tools.doctor(device, page)
+    if page is not None:
+        check_place(page)
+    report = tools.doctor(device)
     if as_json:
         terminal.show_json(report.data())
     else:
         terminal.show(report.text())
+    if page is not None:  # after the verdict, which took a minute
+        write_page(report, page)
     if not report.usable:
         raise DeviceError(f"{report.info.text}: {report.verdict.text}")
 

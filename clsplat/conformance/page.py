@@ -1,5 +1,8 @@
 """A report as one page that opens offline, to be attached to a bug report."""
 
+import errno
+import os
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -7,7 +10,7 @@ from clsplat.conformance.comparison import Figure
 from clsplat.conformance.host import system
 from clsplat.conformance.report import GIB, DeviceReport, summary
 from clsplat.conformance.supervision import Result
-from clsplat.files import write_text
+from clsplat.files import unwritable, write_text
 from clsplat.pages.page import duration, render
 
 
@@ -26,6 +29,18 @@ class Row:
         if self.worst.counts:
             return "exact" if self.worst.value == 0 else f"{self.worst.value:g} wrong"
         return f"{100 * self.worst.value / self.worst.bound:.0f} %"
+
+
+def check_place(out: Path) -> None:
+    """Raise OutputError where a page cannot be written."""
+    try:
+        if out.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+        out.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=out.parent):
+            pass
+    except OSError as error:
+        raise unwritable(out, error) from error
 
 
 def write_page(report: DeviceReport, out: Path) -> None:
