@@ -28,7 +28,7 @@ pytestmark = pytest.mark.slow
 def train(scene: Path, out: Path, *overrides: str, pipeline: str = "smoke", resume: bool = False) -> Run:
     checked = load(pipeline, [f"scene.path='{scene}'", *overrides])
     start: folders.Start = "resume" if resume else "new"
-    with folders.opened(out, start, step=0) as status:
+    with folders.opened(out, start, step=0) as status, folders.failures_recorded(status):
         run = opening.open_run(checked, out, None, start, status)
         runner.execute(checked, run, start, lambda progress: None)
     return run
