@@ -122,7 +122,7 @@ def test_interrupt_saves_and_resume_goes_on(finished, tiny_scene, tmp_path):
     def stop(progress: Progress) -> None:
         run.interrupted = progress.step == 20
 
-    with pytest.raises(Interrupted, match="stopped at step 20"):
+    with pytest.raises(Interrupted, match="stopped at step 20"), folders.failures_recorded(run.status):
         runner.execute(checked, run, "new", stop)
     assert json.loads((out / "status.json").read_text())["state"] == "interrupted"
     train(tiny_scene, out, resume=True)
