@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from clsplat.errors import ConfigError, OutputError, as_clsplat_error
+from clsplat.errors import ConfigError, MemoryLimitError, OutputError, as_clsplat_error
 from clsplat.names import CHECKSUMS
 from clsplat.runs import folders
 from clsplat.training import archive
@@ -114,7 +114,7 @@ def test_a_checkpoint_that_cannot_be_read_just_now_is_not_damaged(error, code, c
         return read(archive, name)
 
     monkeypatch.setattr(zipfile.ZipFile, "read", fail)
-    with pytest.raises((MemoryError, OutputError)) as raised:
+    with pytest.raises((MemoryLimitError, OutputError)) as raised:
         train(tiny_scene, copy, *FEW, resume=True)
     failure = as_clsplat_error(raised.value)
     assert failure.exit_code == code

@@ -8,11 +8,13 @@ from pathlib import Path
 import pytest
 
 from clsplat.density.statistics import SplatStats
-from clsplat.errors import DataError, DeviceError, OutputError, as_clsplat_error
+from clsplat.errors import DataError, DeviceError, InternalError, OutputError, as_clsplat_error
 from clsplat.opencl.program import Kernel
+from clsplat.runs.experiment import Job
 from clsplat.stages.evaluate import Evaluate
 from clsplat.stages.report import Report
 from clsplat.training import checkpoint
+from clsplat.training.status import StatusFile
 from clsplat.views.photographs import Photographs
 from tests.test_checkpoints import FEW, model, steps_saved
 from tests.test_records import records
@@ -96,6 +98,23 @@ def test_an_evaluation_that_fails_loses_nothing(error, call, tiny_scene, tmp_pat
     train(tiny_scene, tmp_path, *FEW, resume=True)
     assert model(tmp_path) == model(finished)
     assert records(tmp_path) == records(finished)
+
+
+def test_a_failure_is_recorded_once(tiny_scene, tmp_path, monkeypatch):
+    end, states = StatusFile.end, []
+
+    def recorded(status, state, *more):
+        states.append(state)
+        end(status, state, *more)
+
+    def fail(stage, run):
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(StatusFile, "end", recorded)
+    monkeypatch.setattr(Report, "run", fail)
+    with pytest.raises(InternalError, match="ZeroDivisionError"):
+        Job.open("smoke", tiny_scene, tmp_path, FEW).run()
+    assert states == ["failed"]
 
 
 def test_a_report_that_fails_is_written_when_the_run_goes_on(tiny_scene, tmp_path, monkeypatch, finished):

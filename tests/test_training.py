@@ -29,7 +29,7 @@ pytestmark = pytest.mark.slow
 def train(scene: Path, out: Path, *overrides: str, pipeline: str = "smoke", resume: bool = False) -> Run:
     checked = load(pipeline, [f"scene.path='{scene}'", *overrides])
     start: folders.Start = "resume" if resume else "new"
-    with folders.opened(out, start, step=0) as status:
+    with folders.opened(out, start, step=0) as status, folders.failures_recorded(status):
         run = opening.open_run(checked, out, None, start, status)
         runner.execute(checked, run, start, lambda progress: None)
     return run
@@ -123,7 +123,7 @@ def test_interrupt_saves_and_resume_goes_on(finished, tiny_scene, tmp_path):
     def stop(progress: Progress) -> None:
         run.interrupted = progress.step == 20
 
-    with pytest.raises(Interrupted, match="stopped at step 20"):
+    with pytest.raises(Interrupted, match="stopped at step 20"), folders.failures_recorded(run.status):
         runner.execute(checked, run, "new", stop)
     assert json.loads((out / "status.json").read_text())["state"] == "interrupted"
     train(tiny_scene, out, resume=True)

@@ -10,7 +10,7 @@ from clsplat.errors import ConfigError, Interrupted
 from clsplat.files import write_text
 from clsplat.names import CHECKSUMS, NOTE, PIPELINE
 from clsplat.pipeline.loading import Pipeline
-from clsplat.runs.folders import Start, clear, failures_recorded
+from clsplat.runs.folders import Start, clear
 from clsplat.runs.inputs import require_same_inputs, write_inputs
 from clsplat.runs.outputs import check_outputs, write_checksums, write_metrics
 from clsplat.runs.signals import finishing_on_interrupt
@@ -23,16 +23,18 @@ LOG = logging.getLogger("clsplat")
 
 
 def execute(pipeline: Pipeline, run: Run, start: Start, show: Callable[[Progress], None]) -> None:
-    """Run the stages, from the newest checkpoint where the run is resumed, and write the files of the run folder."""
+    """Run the stages, from the newest checkpoint where the run is resumed, and write the files of the run folder.
+
+    The caller records a failure.
+    """
     run.show = show
     begin(pipeline, run, start)
-    with failures_recorded(run.status):
-        with finishing_on_interrupt(run), saved_on_failure(run):
-            _run_stages(pipeline, run)
-        write_metrics(run)
-        check_outputs(pipeline, run)
-        write_checksums(pipeline, run)
-        run.status.end("done", exit_code=0)
+    with finishing_on_interrupt(run), saved_on_failure(run):
+        _run_stages(pipeline, run)
+    write_metrics(run)
+    check_outputs(pipeline, run)
+    write_checksums(pipeline, run)
+    run.status.end("done", exit_code=0)
 
 
 def begin(pipeline: Pipeline, run: Run, start: Start) -> None:
