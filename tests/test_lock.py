@@ -1,5 +1,6 @@
 """One process at a time in a run folder; the lock is never left behind."""
 
+import errno
 import json
 import os
 import signal
@@ -7,6 +8,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
 
 import pytest
 
@@ -46,9 +48,9 @@ def test_another_process_is_refused_and_told_who_holds_the_folder(tmp_path):
 
 
 def test_a_lock_ends_with_its_process_however_it_ends(tmp_path):
-    for number in (signal.SIGKILL, signal.SIGTERM):
+    for end in (subprocess.Popen.kill, subprocess.Popen.terminate):
         process = holder(tmp_path)
-        process.send_signal(number)
+        end(process)
         process.wait()
         assert (tmp_path / LOCK).exists()
         with lock.held(tmp_path):
@@ -71,7 +73,7 @@ def test_children_do_not_hold_the_lock_of_a_killed_parent(tmp_path):
         with lock.held(tmp_path):
             pass
     finally:
-        os.kill(child, signal.SIGKILL)
+        os.kill(child, getattr(signal, "SIGKILL", signal.SIGTERM))
 
 
 def test_one_process_holds_a_folder_once_by_whatever_name(tmp_path):
@@ -94,7 +96,12 @@ logging.disable()
 """
 
 
-@pytest.mark.parametrize("before", ["", NO_LOCKS], ids=["with locks", "without"])
+no_windows = pytest.mark.skipif(sys.platform == "win32", reason="has no fcntl to change")
+
+
+@pytest.mark.parametrize(
+    "before", [pytest.param("", id="with locks"), pytest.param(NO_LOCKS, id="without", marks=no_windows)]
+)
 def test_of_many_that_want_a_folder_at_once_one_has_it(before, tmp_path):
     code = before + (
         "import sys, time; from pathlib import Path; from clsplat.runs import lock\n"
@@ -193,3 +200,33 @@ def test_a_folder_that_was_left_is_written_to_no_more(tmp_path, monkeypatch):
     status._thread.join(5)
     assert not status._thread.is_alive()
     assert (tmp_path / "run" / "status.json").read_text() == "of the next"
+
+
+def test_windows_locks_one_byte_behind_the_text(tmp_path, monkeypatch):
+    """With a stand-in for its module: who locks a byte twice is refused, and nothing is truncated or written there."""
+    locked: set[tuple[int, int]] = set()
+    fake = ModuleType("msvcrt")
+    fake.LK_NBLCK = 2
+
+    def locking(number: int, kind: int, size: int) -> None:
+        assert (kind, size) == (fake.LK_NBLCK, 1)
+        place = os.fstat(number).st_ino, os.lseek(number, 0, os.SEEK_CUR)
+        if place in locked:
+            raise OSError(errno.EACCES, "Permission denied")
+        locked.add(place)
+
+    fake.locking = locking
+    monkeypatch.setitem(sys.modules, "msvcrt", fake)
+    monkeypatch.setattr(lock, "os", SimpleNamespace(**{**vars(os), "name": "nt"}))
+    path = tmp_path / LOCK
+    with path.open("w+b", buffering=0) as file, path.open("r+b", buffering=0) as other:
+        file.write(b'{"process": 7}')
+        assert lock._system_lock(file)
+        assert not lock._system_lock(other)
+        assert {place for _, place in locked} == {lock.BEHIND_THE_TEXT}
+        assert lock._read(other) == {"process": 7}, "readers need no lock"
+    path.unlink()
+    locked.clear()
+    with lock.held(tmp_path):
+        assert json.loads(path.read_text())["process"] == os.getpid()
+    assert not path.exists()

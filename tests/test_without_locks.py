@@ -15,6 +15,7 @@ from clsplat.errors import OutputError
 from clsplat.names import LOCK
 from clsplat.runs import lock
 
+pytest.importorskip("fcntl", reason="what they change is of POSIX")
 pytestmark = pytest.mark.slow
 NONE = 99999999  # no process has this number
 
