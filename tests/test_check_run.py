@@ -172,6 +172,16 @@ def test_the_remedy_is_one_that_works(copy):
     assert "resume" not in said
 
 
+def test_a_damaged_checkpoint_is_told_in_plain_words(copy):
+    path = copy / "checkpoints" / "step_000020.npz"
+    data = bytearray(path.read_bytes())
+    path.write_bytes(b"")
+    assert damaged(copy)["checkpoints/step_000020.npz"] == "is empty"
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+    assert damaged(copy)["checkpoints/step_000020.npz"].startswith("differs from its checksum (")
+
+
 def test_a_dry_resume_says_where_it_would_go_on(copy):
     before = {path: path.read_bytes() for path in copy.rglob("*") if path.is_file()}
     assert "step 20" in command("resume", copy, "--dry-run").stdout

@@ -94,7 +94,7 @@ def test_photographs_read_again_and_again_train_to_the_same_bits(tiny_scene, tmp
     assert held == tight
 
 
-def test_dry_run_says_what_fits(tiny_scene, tmp_path):
+def test_a_run_says_what_fits(tiny_scene, tmp_path):
     done = clsplat("run", "smoke", "--scene", tiny_scene, "--out", tmp_path / "run")
     assert "memory: " in done.stdout
     assert " fit in " in done.stdout

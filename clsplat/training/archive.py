@@ -58,7 +58,11 @@ def read(path: Path) -> tuple[Notes, Arrays]:
     except Exception as error:  # zipfile and NumPy raise a dozen kinds for damaged bytes, EOFError and TokenError too
         if isinstance(error, OSError) and error.errno not in DAMAGE:
             raise OutputError(f"{path}: cannot be read ({error.strerror}); check disk and permissions") from error
-        raise DataError(shortened(one_line(error) or type(error).__name__)) from error
+        if isinstance(error, DataError):
+            raise
+        empty = isinstance(error, zipfile.BadZipFile) and path.stat().st_size == 0
+        reason = shortened(one_line(error) or type(error).__name__)
+        raise DataError("is empty" if empty else f"differs from its checksum ({reason})") from error
 
 
 def _add(archive: zipfile.ZipFile, name: str, array: NDArray[Any]) -> str:
