@@ -9,6 +9,7 @@ from clsplat.errors import DataError, Interrupted
 from clsplat.metrics import views
 from clsplat.pipeline.loading import load
 from clsplat.runs import opening, runner
+from clsplat.training.records import Records
 from tests.test_training import train
 
 pytestmark = pytest.mark.slow
@@ -57,3 +58,17 @@ def test_an_evaluate_that_was_half_done_leaves_no_line_twice(
     assert saved[-1] == ("step_000004.npz" if rendered == 3 else "step_000006.npz")
     train(tiny_scene, tmp_path / "run", *FEW, resume=True)
     assert records(tmp_path / "run") == records(finished)
+
+
+@pytest.mark.parametrize(("damage", "left"), [("missing", 0), ("cut", 2), ("changed", 1)])
+def test_lines_that_cannot_be_read_are_told(damage, left, tmp_path, caplog):
+    records = Records(tmp_path)
+    lines = [json.dumps({"step": step, "kind": "train"}) + "\n" for step in range(5)]
+    text = {"missing": "", "cut": "".join(lines[:2]), "changed": lines[0] + "x" + "".join(lines[1:])}[damage]
+    records.path.write_text(text)
+    records.lines = 4
+    with caplog.at_level("WARNING"):
+        records.start()
+    assert f"{left} of 4 lines can be read" in caplog.text
+    assert records.read() == [json.loads(line) for line in lines[:left]]
+    assert records.lines == left

@@ -1,9 +1,11 @@
 """The records of a run: metrics.jsonl."""
 
 import json
+import logging
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +13,8 @@ from clsplat.errors import DataError
 from clsplat.files import unwritable, write_text
 from clsplat.names import RECORDS
 from clsplat.reading import read_file
+
+LOG = logging.getLogger("clsplat")
 
 
 class Records:
@@ -26,8 +30,19 @@ class Records:
         self._waiting: list[str] = []
 
     def start(self) -> None:
-        """Drop the lines after those of the state, which a resumed run writes again.  Raises DataError."""
-        kept = self.read()[: self.lines] if self.lines else []
+        """Drop the lines after those of the state, which a resumed run writes again.
+
+        Those of the state that cannot be read are lost, with all behind them, and a warning says so.
+        """
+        kept: list[dict[str, Any]] = []
+        fault = "it ends before"
+        try:
+            for line in islice(self._each(), self.lines):
+                kept.append(line)
+        except DataError as error:
+            fault = str(error)
+        if len(kept) < self.lines:
+            LOG.warning("%s: %d of %d lines can be read; %s; the run goes on", self.path, len(kept), self.lines, fault)
         self.lines = len(kept)
         write_text(self.path, "".join(json.dumps(line) + "\n" for line in kept))
 
@@ -70,9 +85,11 @@ class Records:
 
         Raises DataError with file and line when the file is damaged in another way.
         """
+        return [line for line in self._each() if kind in (None, line["kind"])]
+
+    def _each(self) -> Iterator[dict[str, Any]]:
         if not self.path.exists():
-            return []
-        lines = []
+            return
         texts = read_file(self.path).decode(errors="replace").split("\n")
         for number, text in enumerate(texts, 1):
             try:
@@ -87,5 +104,4 @@ class Records:
                 )
             if "scale" in line:  # its name in older runs
                 line["downscale"] = line.pop("scale")
-            lines.append(line)
-        return [line for line in lines if kind in (None, line["kind"])]
+            yield line
