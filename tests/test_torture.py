@@ -1,6 +1,10 @@
 """The long form of the tests begins: a few kills of it."""
 
+import json
 import os
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 
@@ -8,11 +12,22 @@ from data_tools.synthetic import Options, write_dataset
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(not hasattr(os, "fork"), reason="attempts are forked")]
 
+SCRIPT = """
+import json, sys
+from pathlib import Path
+from tests.torture.kills import kills
+*_, tally = kills(Path(sys.argv[1]), Path(sys.argv[2]), 2)
+print(json.dumps(tally))
+"""
+
 
 def test_a_few_kills(tmp_path):
-    from tests.torture.kills import kills
-
+    """In a process that has opened no device: one that has cannot be forked."""
     write_dataset(tmp_path / "scene", Options(size=40, train=8, test=2, seed=0), workers=1)
-    *_, tally = kills(tmp_path / "scene", tmp_path / "runs", 2)
+    command = [sys.executable, "-c", SCRIPT, tmp_path / "scene", tmp_path / "runs"]
+    root = Path(__file__).parents[1]
+    done = subprocess.run(command, cwd=root, capture_output=True, text=True, timeout=600)
+    assert done.returncode == 0, done.stderr
+    tally = json.loads(done.stdout.splitlines()[-1])
     assert tally["killed"] >= 2
     assert tally["equal"] == tally["finished"] > 0
