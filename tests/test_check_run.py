@@ -189,7 +189,7 @@ def test_a_dry_resume_says_where_it_would_go_on(copy):
 
 
 def test_a_path_without_anything_may_have_meant_a_run():
-    assert "expected a pipeline, or the folder of a run" in command("check", "runs/nosuch", expect=2).stderr
+    assert "expected a pipeline, a model, or the folder of a run" in command("check", "runs/nosuch", expect=2).stderr
 
 
 def test_the_sums_are_those_of_the_run_that_ended_last(copy):

@@ -220,9 +220,7 @@ def test_status_refuses_damaged_metrics(text, tmp_path):
 def test_damaged_records_are_refused_with_their_line(line, tmp_path):
     (tmp_path / "metrics.jsonl").write_text('{"step": 5, "kind": "train"}\n' + line + "\n")
     (tmp_path / "status.json").write_text('{"state": "done", "step": 7}')
-    records = Records(tmp_path)
-    records.lines = 6
-    for read in (records.start, lambda: run_status(tmp_path)):
+    for read in (Records(tmp_path).read, lambda: run_status(tmp_path)):
         with pytest.raises(DataError, match=r"metrics.jsonl:2: damaged; .*'step' and 'kind'; remove this line"):
             read()
 
@@ -242,7 +240,8 @@ def test_status_tells_from_files(finished, tmp_path):
     (tmp_path / "metrics.jsonl").write_text('{"step": 5, "kind": "train", "loss": 0.25, "psnr": 20.0}\ncut')
     assert status_text(run_status(tmp_path)) == (
         f"{tmp_path}: killed at step 7 of 9\n"
-        f"  `clsplat resume {tmp_path}` goes on with it\n"
+        f"  no checkpoint was saved; `clsplat run {tmp_path / 'pipeline.yaml'} --out {tmp_path} --restart` "
+        "begins it again\n"
         "  last report: step 5, loss 0.25, psnr 20"
     )
     matrix = {"state": "failed", "cells": 4, "done": 4, "failed": {"a": "no"}, "message": "1 of 4 cells failed"}

@@ -39,6 +39,7 @@ def unit(module: str) -> str:
 
 
 TEXTS = {  # what turns results into lines of text
+    "clsplat.conformance.page": {"check_place", "write_page"},
     "clsplat.gaussians.checkup": {"lines", "verdict"},
     "clsplat.inspect.table": {"show"},
     "clsplat.pipeline.recipes": {"manual_text", "summaries_text"},

@@ -32,7 +32,7 @@ def test_a_picture_that_is_not_finite_is_refused_by_the_name_of_its_view(work, r
     file = save(tmp_path / "m.ply", rng, 3e38)
     with pytest.raises(NumericError, match=r"^view 'test/r_000(\.png)?': its picture is not finite.*too large"):
         WORK[work](file, tiny_scene, tmp_path / "out")
-    assert not list((tmp_path / "out").rglob("*.*"))
+    assert not [path for path in (tmp_path / "out").rglob("*.*") if path.name != ".renders.json"]
 
 
 @pytest.mark.parametrize("work", WORK)

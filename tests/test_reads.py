@@ -30,6 +30,8 @@ ALLOWED = {  # module and function -> why it reads by itself
     "clsplat/files.py:sync_folder": "opens a folder",
     "clsplat/training/archive.py:read": "takes a file that `regular` has opened",
     "clsplat/training/archive.py:write": "writes",
+    "clsplat/conformance/worker.py:_only_reader_of_stdin": "opens the null device",
+    "clsplat/runs/lock.py:check_free": "locks what it opens",
     "clsplat/runs/lock.py:_opened": "opens for writing too",
     "clsplat/formats/sog.py:_files": "takes the bytes that `reading` has read",
     "clsplat/formats/sog_writing.py:_zipped": "writes",

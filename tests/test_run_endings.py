@@ -180,11 +180,13 @@ def test_the_terminal_keeps_stdout_for_json(capsys):
 
 
 @pytest.mark.parametrize("arguments", ["status RUN --json", "status RUN", "pipelines", "--version"])
-def test_a_command_without_stdout_writes_nothing(arguments, tmp_path):
+def test_a_command_without_stdout_says_so(arguments, tmp_path):
     (tmp_path / "status.json").write_text('{"state": "done", "step": 7}')
     command = f'"{sys.executable}" -m clsplat {arguments.replace("RUN", str(tmp_path))} >&-'
     done = subprocess.run(command, shell=True, stderr=subprocess.PIPE, text=True, timeout=60)
-    assert (done.returncode, done.stderr) == (0, "")
+    assert done.returncode == 7
+    assert done.stderr.startswith("error: stdout: cannot be written")
+    assert done.stderr.count("\n") == 1
 
 
 def test_running_out_of_memory_names_gaussians_and_images():

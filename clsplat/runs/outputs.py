@@ -10,7 +10,7 @@ from clsplat.files import is_there, write_text
 from clsplat.names import BEFORE_A_RUN, CHECKSUMS, LOCK, LOG_FILE, METRICS, OF_A_RUN, PIPELINE, RECORDS, STATUS
 from clsplat.pipeline.loading import Pipeline, load
 from clsplat.processes import Owner
-from clsplat.reading import read_json, sha256
+from clsplat.reading import read_file, read_json, sha256
 from clsplat.stages.base import Stage
 from clsplat.stages.optimize import Optimize
 from clsplat.training import checkpoint
@@ -78,8 +78,9 @@ def _holds_a_run(out: Path) -> bool:
 
 
 def _is_lock(file: Path) -> bool:
-    """Whether a file is run.lock as a process that was killed leaves it, also before it has written into it."""
-    return (file.is_file() and file.stat().st_size == 0) or _names_a_process(file)
+    """Whether a file is run.lock as a process that was killed leaves it, also before it has written all of it."""
+    begin = b'{"process": '
+    return file.is_file() and begin.startswith(read_file(file)[: len(begin)])
 
 
 def _names_a_process(file: Path) -> bool:

@@ -55,10 +55,10 @@ def check(pipeline: str) -> dict[str, Any]:
     Of a run folder and of a model file return what `verify` and `examine` say.
     Raises ConfigError; DataError for a folder without a run.
     """
-    if len(Path(pipeline).parts) > 1 and not is_there(Path(pipeline)):
-        raise ConfigError(f"{pipeline}: no such file or folder; expected a pipeline, a model, or the folder of a run")
     if not is_run(Path(pipeline)) and pipeline not in shipped() and is_model(Path(pipeline)):
         return examine(Path(pipeline))
+    if len(Path(pipeline).parts) > 1 and not is_there(Path(pipeline)):
+        raise ConfigError(f"{pipeline}: no such file or folder; expected a pipeline, a model, or the folder of a run")
     if Path(pipeline).is_dir() and (is_run(Path(pipeline)) or pipeline not in shipped()):
         return verify(Path(pipeline))
     if found := load_experiment(pipeline):

@@ -169,14 +169,14 @@ class StatusFile:
 
     def refresh(self) -> None:
         """Write the status, before the end; where that fails the run goes on, with a warning the first time."""
-        try:
-            with self._writing:
+        with self._writing:
+            try:
                 if not self._ended.is_set() and os.path.isdir(self.out):  # one that was removed stays so
                     self._write()
-        except (OutputError, OSError) as error:
-            if not self._warned:
-                LOG.warning("%s; the run goes on", error)
-            self._warned = True
+            except (OutputError, OSError) as error:
+                if not self._warned:
+                    LOG.warning("%s; the run goes on", error)
+                self._warned = True
 
     def write(self) -> None:
         """Write the status now.  Raises OutputError."""
