@@ -38,12 +38,15 @@ def pytest_configure() -> None:
     Program.options += ("-Werror",)
 
 
+def pytest_itemcollected(item: pytest.Item) -> None:
+    """Give processes that share the tests whole modules, and one of them all of the kernels."""
+    if item.config.pluginmanager.hasplugin("xdist"):
+        kernels = item.path.parent.name == "kernels"
+        item.add_marker(pytest.mark.xdist_group("kernels" if kernels else item.path.stem))
+
+
 @pytest.hookimpl(trylast=True)  # after -m and -k
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    if config.pluginmanager.hasplugin("xdist"):  # whole modules for each process; for one of them all of the kernels
-        for item in items:
-            kernels = item.path.parent.name == "kernels"
-            item.add_marker(pytest.mark.xdist_group("kernels" if kernels else str(item.path)))
     if config.getoption("--one-each"):
         cases: dict[tuple[str, object], list[pytest.Item]] = {}
         for item in items:
