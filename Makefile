@@ -14,7 +14,7 @@ test: $(VENV)/tested-with
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(MAKE) docs
-	$(BIN)/python -m pytest --numprocesses 2 --dist loadgroup
+	$(BIN)/python -m pytest --numprocesses 2
 
 torture: $(VENV)/tested-with
 	$(BIN)/python -m tests.torture --write

@@ -5,6 +5,7 @@ that clsplat would choose), each with the wide schedule at 16 and 8 lanes and wi
 """
 
 import os
+import shutil
 import signal
 import sys
 from collections.abc import Generator, Iterator
@@ -23,6 +24,7 @@ from clsplat.opencl.program import Program
 from clsplat.scene.readers import Reader
 from clsplat.settings import Settings, rebuild
 from data_tools.synthetic import Options, write_dataset
+from tests.few_steps import FEW
 
 hypothesis.settings.register_profile("suite", deadline=None)  # a busy machine is no fault
 hypothesis.settings.load_profile("suite")
@@ -38,11 +40,16 @@ def pytest_configure() -> None:
     Program.options += ("-Werror",)
 
 
-def pytest_itemcollected(item: pytest.Item) -> None:
+@pytest.hookimpl(optionalhook=True)  # of pytest-xdist
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     """Give processes that share the tests whole modules, and one of them all of the kernels."""
-    if item.config.pluginmanager.hasplugin("xdist"):
-        kernels = item.path.parent.name == "kernels"
-        item.add_marker(pytest.mark.xdist_group("kernels" if kernels else item.path.stem))
+    from xdist.scheduler import LoadFileScheduling
+
+    class Scheduling(LoadFileScheduling):  # type: ignore[misc]
+        def _split_scope(self, nodeid: str) -> str:
+            return "kernels" if nodeid.startswith("tests/kernels/") else str(super()._split_scope(nodeid))
+
+    return Scheduling(config, log)
 
 
 @pytest.hookimpl(trylast=True)  # after -m and -k
@@ -150,3 +157,23 @@ def tiny_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("scene") / "tiny"
     write_dataset(folder, Options(size=40, train=8, test=2, seed=0), workers=1)
     return folder
+
+
+@pytest.fixture(scope="session")
+def few_steps(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run of twelve steps; nothing is changed in it."""
+    from tests.test_training import train
+
+    out = tmp_path_factory.mktemp("runs") / "few"
+    train(tiny_scene, out, *FEW)
+    return out
+
+
+@pytest.fixture
+def killed_run(few_steps: Path, tmp_path: Path) -> Path:
+    """That run as it was killed after step 8 and its checkpoints."""
+    shutil.copytree(few_steps, tmp_path / "run")
+    (tmp_path / "run" / "checkpoints" / "step_000012.npz").unlink()
+    for name in ("point_cloud.ply", "metrics.json", "checksums.json"):
+        (tmp_path / "run" / name).unlink()
+    return tmp_path / "run"

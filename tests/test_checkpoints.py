@@ -1,7 +1,6 @@
 """Damaged checkpoints are passed over, and a run goes on from a whole one."""
 
 import errno
-import hashlib
 import re
 import shutil
 import zipfile
@@ -15,39 +14,12 @@ from clsplat.errors import ConfigError, MemoryLimitError, OutputError, as_clspla
 from clsplat.names import CHECKSUMS
 from clsplat.runs import folders
 from clsplat.training import archive
+from tests.few_steps import FEW, steps_saved
 from tests.test_archive import written
 from tests.test_records import records
-from tests.test_training import train
+from tests.test_training import digest, train
 
 pytestmark = pytest.mark.slow
-
-FEW = ("optimize.steps=12", "init.count=60", "optimize.log_every=5", "checkpoint.every=4", "densify.every=4")
-FEW += ("densify.start=3", "optimize.evaluate.every=6", "reset_opacity.every=100")
-
-
-def model(out: Path) -> str:
-    return hashlib.sha256((out / "point_cloud.ply").read_bytes()).hexdigest()
-
-
-def steps_saved(out: Path) -> list[str]:
-    return sorted(path.name for path in (out / "checkpoints").iterdir())
-
-
-@pytest.fixture(scope="module")
-def finished(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("runs") / "few"
-    train(tiny_scene, out, *FEW)
-    return out
-
-
-@pytest.fixture
-def copy(finished: Path, tmp_path: Path) -> Path:
-    """The run as it was killed after step 8 and its checkpoints."""
-    shutil.copytree(finished, tmp_path / "run")
-    (tmp_path / "run" / "checkpoints" / "step_000012.npz").unlink()
-    for name in ("point_cloud.ply", "metrics.json", "checksums.json"):
-        (tmp_path / "run" / name).unlink()
-    return tmp_path / "run"
 
 
 def crafted(path: Path, change: Callable[[dict, dict], None]) -> None:
@@ -79,34 +51,36 @@ CRAFTED = {
 
 
 @pytest.mark.parametrize("name", CRAFTED)
-def test_a_checkpoint_that_no_run_has_saved_is_passed_over(name, copy, tiny_scene, finished, caplog):
-    crafted(copy / "checkpoints" / "step_000008.npz", CRAFTED[name])
-    (copy / "checkpoints" / "step_000004.npz").write_bytes(b"")
+def test_a_checkpoint_that_no_run_has_saved_is_passed_over(name, killed_run, tiny_scene, few_steps, caplog):
+    crafted(killed_run / "checkpoints" / "step_000008.npz", CRAFTED[name])
+    (killed_run / "checkpoints" / "step_000004.npz").write_bytes(b"")
     with pytest.raises(OutputError, match=r"step_000004.npz is damaged .*--restart` starts from the beginning"):
-        train(tiny_scene, copy, *FEW, resume=True)
+        train(tiny_scene, killed_run, *FEW, resume=True)
     warnings = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
     assert len([text for text in warnings if re.search(r"step_000008.npz is damaged \(.+\); using", text)]) == 1
 
 
 @pytest.mark.parametrize("damage", [lambda data: b"", lambda data: data[:300], lambda data: data[:-30]])
-def test_the_one_before_a_damaged_checkpoint_leads_to_the_same_bits(damage, copy, tiny_scene, finished, caplog):
-    newest = copy / "checkpoints" / "step_000008.npz"
-    shutil.copy(newest, copy / "checkpoints" / "step_000009.npz")
-    last = copy / "checkpoints" / "step_000009.npz"
+def test_the_one_before_a_damaged_checkpoint_leads_to_the_same_bits(damage, killed_run, tiny_scene, few_steps, caplog):
+    newest = killed_run / "checkpoints" / "step_000008.npz"
+    shutil.copy(newest, killed_run / "checkpoints" / "step_000009.npz")
+    last = killed_run / "checkpoints" / "step_000009.npz"
     last.write_bytes(damage(last.read_bytes()))
-    train(tiny_scene, copy, *FEW, resume=True)
-    assert model(copy) == model(finished)
-    assert records(copy) == records(finished)
+    train(tiny_scene, killed_run, *FEW, resume=True)
+    assert digest(killed_run) == digest(few_steps)
+    assert records(killed_run) == records(few_steps)
     kept = ["damaged_000009.npz", "step_000008.npz", "step_000012.npz"]
-    assert steps_saved(copy) == kept, "the damaged one takes no place of a good one"
+    assert steps_saved(killed_run) == kept, "the damaged one takes no place of a good one"
 
 
 @pytest.mark.parametrize(
     ("error", "code"), [(MemoryError(), 5), (OSError(errno.ESTALE, "stale"), 7), (OSError(errno.EACCES, "refused"), 7)]
 )
-def test_a_checkpoint_that_cannot_be_read_just_now_is_not_damaged(error, code, copy, tiny_scene, finished, monkeypatch):
-    shutil.copy(copy / "checkpoints" / "step_000008.npz", copy / "checkpoints" / "step_000009.npz")
-    before, read = steps_saved(copy), zipfile.ZipFile.read
+def test_a_checkpoint_that_cannot_be_read_just_now_is_not_damaged(
+    error, code, killed_run, tiny_scene, few_steps, monkeypatch
+):
+    shutil.copy(killed_run / "checkpoints" / "step_000008.npz", killed_run / "checkpoints" / "step_000009.npz")
+    before, read = steps_saved(killed_run), zipfile.ZipFile.read
 
     def fail(archive, name):
         if archive.filename.endswith("step_000009.npz"):
@@ -115,15 +89,17 @@ def test_a_checkpoint_that_cannot_be_read_just_now_is_not_damaged(error, code, c
 
     monkeypatch.setattr(zipfile.ZipFile, "read", fail)
     with pytest.raises((MemoryLimitError, OutputError)) as raised:
-        train(tiny_scene, copy, *FEW, resume=True)
+        train(tiny_scene, killed_run, *FEW, resume=True)
     failure = as_clsplat_error(raised.value)
     assert failure.exit_code == code
     assert code == 5 or f"step_000009.npz: cannot be read ({error.strerror}); check" in str(failure)
-    assert steps_saved(copy) == before
+    assert steps_saved(killed_run) == before
 
 
-def test_the_one_before_a_checkpoint_on_a_bad_part_of_the_disk_is_used(copy, tiny_scene, finished, monkeypatch, caplog):
-    shutil.copy(copy / "checkpoints" / "step_000008.npz", copy / "checkpoints" / "step_000009.npz")
+def test_the_one_before_a_checkpoint_on_a_bad_part_of_the_disk_is_used(
+    killed_run, tiny_scene, few_steps, monkeypatch, caplog
+):
+    shutil.copy(killed_run / "checkpoints" / "step_000008.npz", killed_run / "checkpoints" / "step_000009.npz")
     read = zipfile.ZipFile.read
 
     def fail(archive, name):
@@ -132,24 +108,24 @@ def test_the_one_before_a_checkpoint_on_a_bad_part_of_the_disk_is_used(copy, tin
         return read(archive, name)
 
     monkeypatch.setattr(zipfile.ZipFile, "read", fail)
-    train(tiny_scene, copy, *FEW, resume=True)
+    train(tiny_scene, killed_run, *FEW, resume=True)
     assert "bad disk)); using the one before it" in caplog.text
-    assert model(copy) == model(finished)
+    assert digest(killed_run) == digest(few_steps)
 
 
-def test_a_run_whose_checkpoints_are_gone_does_not_begin_again(copy, tiny_scene, finished):
-    before = (copy / "metrics.jsonl").read_bytes()
-    shutil.rmtree(copy / "checkpoints")
+def test_a_run_whose_checkpoints_are_gone_does_not_begin_again(killed_run, tiny_scene, few_steps):
+    before = (killed_run / "metrics.jsonl").read_bytes()
+    shutil.rmtree(killed_run / "checkpoints")
     with pytest.raises(OutputError, match=r"is empty, but step_000012.npz was saved there; .*--restart` starts"):
-        train(tiny_scene, copy, *FEW, resume=True)
-    assert (copy / "metrics.jsonl").read_bytes() == before
+        train(tiny_scene, killed_run, *FEW, resume=True)
+    assert (killed_run / "metrics.jsonl").read_bytes() == before
 
 
-def test_a_run_without_a_checkpoint_so_far_begins_from_the_start(tiny_scene, tmp_path, caplog, finished):
+def test_a_run_without_a_checkpoint_so_far_begins_from_the_start(tiny_scene, tmp_path, caplog, few_steps):
     caplog.set_level("INFO", "clsplat")
     train(tiny_scene, tmp_path / "run", *FEW, resume=True)
     assert "nothing to resume; starting from the beginning" in caplog.text
-    assert model(tmp_path / "run") == model(finished)
+    assert digest(tmp_path / "run") == digest(few_steps)
 
 
 def test_restoring_reads_no_other_run(tiny_scene, tmp_path):

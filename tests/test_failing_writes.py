@@ -2,7 +2,6 @@
 
 import builtins
 import errno
-import hashlib
 import io
 import json
 import os
@@ -16,6 +15,7 @@ import pytest
 from clsplat import cli
 from clsplat.training import checkpoint
 from tests.test_records import records
+from tests.test_training import digest
 
 pytestmark = pytest.mark.slow
 TINY = ("optimize.steps=4", "init.count=20", "checkpoint.every=2", "optimize.log_every=2", "optimize.evaluate.every=3")
@@ -99,10 +99,6 @@ def run(tiny_scene: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captur
     return run
 
 
-def model(out: Path) -> str:
-    return hashlib.sha256((out / "point_cloud.ply").read_bytes()).hexdigest()
-
-
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EIO], ids=errno.errorcode.get)
 def test_whichever_write_fails_nothing_is_lost(number, run, tmp_path):
     whole = tmp_path / "whole"
@@ -122,7 +118,7 @@ def test_whichever_write_fails_nothing_is_lost(number, run, tmp_path):
                 checkpoint.load(file)
             assert not list(out.rglob("*.partial")), case
             assert run(out, "--resume") == 0, case
-            assert model(out) == model(whole), case
+            assert digest(out) == digest(whole), case
             assert records(out) == records(whole), case
             assert json.loads((out / "status.json").read_text())["state"] == "done", case
     assert failed > 3

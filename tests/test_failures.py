@@ -3,7 +3,6 @@
 import errno
 import json
 import re
-from pathlib import Path
 
 import pytest
 
@@ -16,18 +15,11 @@ from clsplat.stages.report import Report
 from clsplat.training import checkpoint
 from clsplat.training.status import StatusFile
 from clsplat.views.photographs import Photographs
-from tests.test_checkpoints import FEW, model, steps_saved
+from tests.few_steps import FEW, steps_saved
 from tests.test_records import records
-from tests.test_training import train
+from tests.test_training import digest, train
 
 pytestmark = pytest.mark.slow
-
-
-@pytest.fixture(scope="module")
-def finished(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("runs") / "few"
-    train(tiny_scene, out, *FEW)
-    return out
 
 
 def fails_at(step: int, monkeypatch: pytest.MonkeyPatch, where: str) -> type[Exception]:
@@ -58,7 +50,7 @@ def fails_at(step: int, monkeypatch: pytest.MonkeyPatch, where: str) -> type[Exc
 @pytest.mark.parametrize("where", ["photograph", "kernel"])
 @pytest.mark.parametrize("step", [5, 6])  # 5: after the edit of step 4, before the update
 def test_a_failure_inside_a_step_leaves_the_step_before(
-    where, step, tiny_scene, tmp_path, monkeypatch, finished, caplog
+    where, step, tiny_scene, tmp_path, monkeypatch, few_steps, caplog
 ):
     raised = fails_at(step, monkeypatch, where)
     with pytest.raises(raised):
@@ -69,8 +61,8 @@ def test_a_failure_inside_a_step_leaves_the_step_before(
     status = json.loads((tmp_path / "status.json").read_text())
     assert (status["state"], status["step"], status["checkpoint"]) == ("failed", step - 1, steps_saved(tmp_path)[-1])
     train(tiny_scene, tmp_path, *FEW, resume=True)
-    assert model(tmp_path) == model(finished)
-    assert records(tmp_path) == records(finished)
+    assert digest(tmp_path) == digest(few_steps)
+    assert records(tmp_path) == records(few_steps)
 
 
 @pytest.mark.parametrize(
@@ -81,7 +73,7 @@ def test_a_failure_inside_a_step_leaves_the_step_before(
     ],
 )
 @pytest.mark.parametrize("call", [1, 2], ids=["during", "after"])
-def test_an_evaluation_that_fails_loses_nothing(error, call, tiny_scene, tmp_path, monkeypatch, finished):
+def test_an_evaluation_that_fails_loses_nothing(error, call, tiny_scene, tmp_path, monkeypatch, few_steps):
     evaluate, calls = Evaluate.run, []
 
     def run(stage, run):
@@ -96,8 +88,8 @@ def test_an_evaluation_that_fails_loses_nothing(error, call, tiny_scene, tmp_pat
     monkeypatch.undo()
     assert steps_saved(tmp_path)[-1] == ("step_000006.npz" if call == 1 else "step_000012.npz")
     train(tiny_scene, tmp_path, *FEW, resume=True)
-    assert model(tmp_path) == model(finished)
-    assert records(tmp_path) == records(finished)
+    assert digest(tmp_path) == digest(few_steps)
+    assert records(tmp_path) == records(few_steps)
 
 
 def test_a_failure_is_recorded_once(tiny_scene, tmp_path, monkeypatch):
@@ -117,7 +109,7 @@ def test_a_failure_is_recorded_once(tiny_scene, tmp_path, monkeypatch):
     assert states == ["failed"]
 
 
-def test_a_report_that_fails_is_written_when_the_run_goes_on(tiny_scene, tmp_path, monkeypatch, finished):
+def test_a_report_that_fails_is_written_when_the_run_goes_on(tiny_scene, tmp_path, monkeypatch, few_steps):
     def fail(stage, run):
         raise ZeroDivisionError
 
@@ -128,11 +120,11 @@ def test_a_report_that_fails_is_written_when_the_run_goes_on(tiny_scene, tmp_pat
     assert not (tmp_path / "report.html").exists()
     assert train(tiny_scene, tmp_path, *FEW, resume=True).step == 12
     assert (tmp_path / "report.html").exists()
-    assert model(tmp_path) == model(finished)
+    assert digest(tmp_path) == digest(few_steps)
 
 
 @pytest.mark.parametrize("place", ["SplatStats.add", "Edit.apply"])
-def test_a_step_that_is_half_done_is_not_saved(place, tiny_scene, tmp_path, monkeypatch, finished, caplog):
+def test_a_step_that_is_half_done_is_not_saved(place, tiny_scene, tmp_path, monkeypatch, few_steps, caplog):
     name, method = place.split(".")
     kind = {"SplatStats": SplatStats, "Edit": __import__("clsplat.density.edit", fromlist=["Edit"]).Edit}[name]
     before, calls = getattr(kind, method), []
@@ -151,8 +143,8 @@ def test_a_step_that_is_half_done_is_not_saved(place, tiny_scene, tmp_path, monk
     assert newest in ("step_000004.npz", "step_000008.npz")
     assert f"was not whole; the last good state is {tmp_path / 'checkpoints' / newest}" in caplog.text
     train(tiny_scene, tmp_path, *FEW, resume=True)
-    assert model(tmp_path) == model(finished)
-    assert records(tmp_path) == records(finished)
+    assert digest(tmp_path) == digest(few_steps)
+    assert records(tmp_path) == records(few_steps)
 
 
 def test_a_state_that_cannot_be_saved_does_not_hide_the_failure(tiny_scene, tmp_path, monkeypatch, caplog):

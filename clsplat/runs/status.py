@@ -25,17 +25,20 @@ def run_status(out: Path) -> dict[str, Any]:
     status = read_status(out)
     if not isinstance(status.get("state"), str):
         raise DataError(f"{out}: has no readable status.json; expected the folder of a run")
-    if status["state"] not in END_STATES:
-        owner = Owner.named_by(status)
-        if owner and owner.has_ended:
-            status["state"] = "killed"
-        elif isinstance(status.get("time"), int | float):
-            status["silent"] = max(0, round(time.time() - status["time"]))
+    status["state"] = state_of(status)
+    if status["state"] not in (*END_STATES, "killed") and isinstance(status.get("time"), int | float):
+        status["silent"] = max(0, round(time.time() - status["time"]))
     metrics = None
     if (out / METRICS).exists():
         metrics = read_metrics(out / METRICS).model_dump(exclude_unset=True)
     lines = Records(out).read("train")
     return {"run": str(out), **status, "last": lines[-1] if lines else None, "metrics": metrics}
+
+
+def state_of(status: dict[str, Any]) -> str:
+    """Return the state that status.json tells, `killed` where its process has ended without a word."""
+    owner = Owner.named_by(status) if status.get("state") not in END_STATES else None
+    return "killed" if owner and owner.has_ended else str(status.get("state", "unknown"))
 
 
 def status_text(status: dict[str, Any]) -> str:

@@ -31,14 +31,14 @@ from clsplat.pipeline.files import shipped
 from clsplat.pipeline.loading import load as load_pipeline
 from clsplat.pipeline.matrix import load_experiment
 from clsplat.prepare.cache import noted
-from clsplat.processes import Owner
 from clsplat.reading import read_file, read_json, sha256
 from clsplat.runs.outputs import acting
+from clsplat.runs.status import state_of
 from clsplat.scene.identity import Identity
 from clsplat.scene.images import read_image
 from clsplat.training import archive, checkpoint
 from clsplat.training.records import Records
-from clsplat.training.status import END_STATES, Status, read_status
+from clsplat.training.status import Status, read_status
 
 MISSING = "is missing"
 NO_SUMS = "is missing, as in runs of earlier versions and of a Trainer; without it the outputs are not verified"
@@ -76,7 +76,12 @@ def verify(out: Path) -> dict[str, Any]:
     if not is_run(out):
         raise DataError(f"{out}: holds neither pipeline.yaml nor status.json; expected the folder of a run")
     objects = list(_objects(out))
-    return {"run": str(out), "state": _state(out), "whole": all(one["whole"] for one in objects), "objects": objects}
+    return {
+        "run": str(out),
+        "state": state_of(read_status(out)),
+        "whole": all(one["whole"] for one in objects),
+        "objects": objects,
+    }
 
 
 def _objects(out: Path, whole: bool = False) -> Iterator[dict[str, Any]]:
@@ -121,13 +126,6 @@ def _objects(out: Path, whole: bool = False) -> Iterator[dict[str, Any]]:
     for name in dict.fromkeys([*sums, *declared, *_present(out)]):
         if name != PIPELINE:
             yield one(out / name, partial(_output, sums.get(name)))
-
-
-def _state(out: Path) -> str:
-    """The state of a run, `killed` where its process has ended without a word."""
-    status = read_status(out)
-    owner = Owner.named_by(status) if status.get("state") not in END_STATES else None
-    return "killed" if owner and owner.has_ended else str(status.get("state", "unknown"))
 
 
 def _cells(out: Path, done: bool) -> list[str]:
