@@ -71,41 +71,45 @@ void count_large(
         }
 }
 
-/* List the touched tiles of an item's rows in the places from `pair` up to `end`; return the place behind them. */
-static inline uint list_share(const footprint_t *f, const rows_t share, uint pair, const uint end, const uint i,
+/* List the touched tiles of an item's rows in the places from `pair` up to `end`, and as many more as fill the places:
+ * blending finds no pixel of the splat there. */
+static inline void list_share(const footprint_t *f, const rows_t share, uint pair, const uint end, const uint i,
                               const uint tiles_x, __global uint *pair_tile, __global uint *pair_splat)
 {
     const uint columns = (uint)first_lane(f->columns);
     const uint corner = (uint)first_lane(f->first_y) * tiles_x + (uint)first_lane(f->first_x);
+    uint left = columns * (share.end - share.begin);
     for (uint row = share.begin; row < share.end; row++)
         for (uint column = 0; column < columns; column += LANES) {
             int touched[LANES];
             VSTORE(touched_from(f, column, row), touched);
-            for (uint lane = 0; lane < LANES && pair < end; lane++)
-                if (touched[lane]) {
+            for (uint lane = 0; lane < LANES && column + lane < columns && pair < end; lane++) {
+                if (touched[lane] || end - pair >= left) {
                     pair_tile[pair] = corner + row * tiles_x + column + lane;
                     pair_splat[pair] = i;
                     pair++;
                 }
+                left--;
+            }
         }
-    return pair;
 }
 
-/* Fill the places from `place` up to `end` with the tiles from `tile` to `last` that the places from `first` on do not
- * name, so that no tile lists the splat twice.  Blending finds no pixel of it there. */
-static inline void fill_up(uint place, const uint end, const uint first, uint tile, const uint last, const uint i,
+/* Fill the places from `place` up to `end` with tiles from `tile` to `last` that those from `named` to `place` do not
+ * name; these are in order of tiles.  None lists the splat twice.  Return the place behind those that were filled. */
+static inline uint fill_up(uint place, const uint end, uint named, uint tile, const uint last, const uint i,
                            __global uint *pair_tile, __global uint *pair_splat)
 {
-    for (; place < end; tile++) {
-        uint listed = first;
-        while (listed < place && pair_tile[listed] != tile)
-            listed++;
-        if (listed == place) {
-            pair_tile[place] = tile < last ? tile : last;  // a count beyond the tiles stays inside them
+    const uint listed = place;
+    for (; place < end && tile <= last; tile++) {
+        while (named < listed && pair_tile[named] < tile)
+            named++;
+        if (named == listed || pair_tile[named] != tile) {
+            pair_tile[place] = tile;
             pair_splat[place] = i;
             place++;
         }
     }
+    return place;
 }
 
 /* Emit the pairs of large splats.  Tiles are tested again, and a compiler may round differently at a tile's edge in
@@ -138,13 +142,16 @@ void emit_large(
             for (uint k = 0; k < item; k++)
                 own += sums[k];
             const uint own_end = own + sums[item] < end ? own + sums[item] : end;
-            const uint top = (uint)first_lane(f.first_y);
-            const uint pair = list_share(&f, share, own, own_end, i, tiles_x, pair_tile, pair_splat);
-            fill_up(pair, own_end, own, (top + share.begin) * tiles_x, (top + share.end) * tiles_x - 1, i, pair_tile,
-                    pair_splat);
+            list_share(&f, share, own, own_end, i, tiles_x, pair_tile, pair_splat);
             barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE);
+            const uint last = row_end * tiles_x - 1;
             if (item + 1 == TEAM)
-                fill_up(own_end, end, begin, row_begin * tiles_x, row_end * tiles_x - 1, i, pair_tile, pair_splat);
+                sums[0] = fill_up(own_end, end, begin, row_begin * tiles_x, last, i, pair_tile, pair_splat);
+            barrier(CLK_LOCAL_MEM_FENCE);
+            for (uint place = sums[0] + item; place < end; place += TEAM) {  // a count beyond the tiles stays inside
+                pair_tile[place] = last;
+                pair_splat[place] = i;
+            }
             barrier(CLK_LOCAL_MEM_FENCE);  // keeps the group together: a runtime may split the loop behind a branch
         }
 }

@@ -75,8 +75,8 @@ FAULTS = {  # kernel -> file, text, wrong text
 MORE = {  # that smaller pictures do not show
     "emit_large simt, one row an item": ("large.cl", "each = (rows + TEAM - 1) / TEAM", "each = 1"),
     "emit_large simt, the same rows": ("large.cl", "begin = get_local_id(0) * each", "begin = get_local_id(0)"),
-    "emit_large simt, a tile outside": ("large.cl", "= tile < last ? tile : last;", "= tile + 12345;"),
-    "emit_large wide, a tile outside": ("large.cl", "= tile < last ? tile : last;", "= tile + 12345;"),
+    "emit_large simt, a tile outside": ("large.cl", "pair_tile[place] = last;", "pair_tile[place] = last + 12345;"),
+    "emit_large wide, a tile outside": ("large.cl", "pair_tile[place] = last;", "pair_tile[place] = last + 12345;"),
     "project_forward wide, a bit too few": ("tiles.h", "(float)BOX_TILES_MAX;", "(float)(BOX_TILES_MAX + 1);"),
     "project_forward simt, a bit too few": ("tiles.h", "(float)BOX_TILES_MAX;", "(float)(BOX_TILES_MAX + 1);"),
 }

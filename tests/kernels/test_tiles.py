@@ -94,7 +94,7 @@ def test_auto_measures_and_agrees(device, rng):
         np.testing.assert_array_equal(a, b)
 
 
-@pytest.mark.parametrize("surplus", [-7, -1, 0, 1, 7, 10_000])
+@pytest.mark.parametrize("surplus", [-7, -1, 0, 1, 7, 1000])
 def test_large_splats_list_as_many_tiles_as_were_counted(device, rng, surplus):
     """Whatever another compiler counted, emission stays inside its places and leaves none open."""
     case = random_case(rng, 12, 150, 130)
@@ -123,12 +123,12 @@ def test_listing_may_find_other_tiles_than_counting(device, rng, monkeypatch, ro
     case = random_case(rng, 12, 150, 130)
     case.parameters["log_scales"][:8] += 2.5
     expected = _listed(device, case)
-    flatten, text = program.flatten, "if (touched[lane])"
+    flatten, text = program.flatten, "if (touched[lane] || "
 
     def other(path, seen=None):
         flat = flatten(path, seen)
         assert path.name != "large.cl" or flat.count(text) == 1
-        return flat.replace(text, f"if ({rounds} && column + lane < columns)")
+        return flat.replace(text, f"if ({rounds} || ")
 
     monkeypatch.setattr(program, "flatten", other)
     different = Device(device.info, device.schedule)
