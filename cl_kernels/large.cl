@@ -11,18 +11,17 @@ typedef struct {
     uint begin, end;  // of the rectangle's rows
 } rows_t;
 
-/* The footprint of one splat in every lane, and the rows of it that this item takes. */
-static inline footprint_t share_of(__global const float *splat, const uint tiles_x, const uint row_begin,
-                                   const uint row_end, rows_t *share)
+/* The footprint of one splat in every lane; return the rows of it that this item takes. */
+static inline rows_t share_of(__global const float *splat, const uint tiles_x, const uint row_begin,
+                              const uint row_end, footprint_t *f)
 {
     VF fields[RECORD];
     for (uint k = 0; k < RECORD; k++)
         fields[k] = (VF)(splat[k]);
-    const footprint_t f = footprint_of(fields, (VI)(-1), tiles_x, row_begin, row_end);
-    const uint rows = (uint)first_lane(f.rows), each = (rows + TEAM - 1) / TEAM, begin = get_local_id(0) * each;
-    share->begin = begin < rows ? begin : rows;
-    share->end = begin + each < rows ? begin + each : rows;
-    return f;
+    *f = footprint_of(fields, (VI)(-1), tiles_x, row_begin, row_end);
+    const uint rows = (uint)first_lane(f->rows), each = (rows + TEAM - 1) / TEAM, begin = get_local_id(0) * each;
+    const rows_t share = {begin < rows ? begin : rows, begin + each < rows ? begin + each : rows};
+    return share;
 }
 
 /* Whether the splat touches each of the LANES tiles from a column of a row on. */
@@ -57,8 +56,8 @@ void count_large(
     const uint item = get_local_id(0), first = get_group_id(0) * run;
     for (uint i = first; i < first + run && i < count; i++)
         if (IS_LARGE(tile_box[i])) {
-            rows_t share;
-            const footprint_t f = share_of(splats + (size_t)i * RECORD, tiles_x, row_begin, row_end, &share);
+            footprint_t f;
+            const rows_t share = share_of(splats + (size_t)i * RECORD, tiles_x, row_begin, row_end, &f);
             sums[item] = count_share(&f, share);
             barrier(CLK_LOCAL_MEM_FENCE);
             if (item == 0) {
@@ -133,8 +132,8 @@ void emit_large(
     const uint item = get_local_id(0), first = get_group_id(0) * run;
     for (uint i = first; i < first + run && i < count; i++)
         if (IS_LARGE(tile_box[i])) {
-            rows_t share;
-            const footprint_t f = share_of(splats + (size_t)i * RECORD, tiles_x, row_begin, row_end, &share);
+            footprint_t f;
+            const rows_t share = share_of(splats + (size_t)i * RECORD, tiles_x, row_begin, row_end, &f);
             sums[item] = count_share(&f, share);
             barrier(CLK_LOCAL_MEM_FENCE);
             const uint begin = first_pair[i], end = begin + tile_count[i];

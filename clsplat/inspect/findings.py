@@ -5,6 +5,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+from clsplat.errors import shortened
 from clsplat.inspect.survey import MAX_DISTANCE, MIN_SEEN, CameraFacts, Facts, PointFacts
 
 Level = Literal["error", "warning", "note"]
@@ -108,7 +109,7 @@ def _photographs(facts: Facts) -> Iterator[Finding]:
         fault = f"{_are(len(photographs.larger), 'image file')} larger than the camera"
         yield Finding("note", fault, "clsplat reduces them when it reads them; smaller copies load faster")
     for names in facts.same_but_case[:MAX_NAMES]:
-        fault = f"{' and '.join(names)} differ only in upper and lower case"
+        fault = f"{' and '.join(map(shortened, names))} differ only in upper and lower case"
         yield Finding("warning", fault, "they overwrite each other on Windows and macOS; rename one")
     if colmap and facts.same_base:
         fault = f"{_are(facts.same_base, 'file name')} in several folders"
@@ -210,4 +211,4 @@ def _are(count: int, word: str, before: str = "") -> str:
 
 
 def _listed(names: Sequence[str], limit: int = MAX_NAMES) -> str:
-    return ", ".join(names[:limit]) + (", …" if len(names) > limit else "")
+    return ", ".join(map(shortened, names[:limit])) + (", …" if len(names) > limit else "")

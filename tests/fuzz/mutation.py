@@ -1,19 +1,21 @@
 """Damage to valid files: flips, cuts, copies, splices, and numbers and words that have been fatal to programs.
 
-CLSPLAT_FUZZ is the number of examples of each test; without it there are few, and always the same.
+CLSPLAT_FUZZ is the number of examples of each test; without it there are few.  An example is given by its number: the
+same damage every time.
 """
 
 import os
 import re
 import struct
 from collections.abc import Callable, Sequence
+from random import Random
 from typing import Any
 
-from hypothesis import HealthCheck, Phase, given, settings
-from hypothesis import strategies as st
+import pytest
 
 EXAMPLES = int(os.environ.get("CLSPLAT_FUZZ", "0"))
 MAX_SIZE = 1 << 16  # bytes of a damaged file
+SHOWN = 400  # characters of an example
 WHOLE = [0, 1, 2, 127, 255, 2**15, 2**16, 2**20 + 1, *(2**n + d for n in (31, 32, 53, 63, 64) for d in (-1, 0)), 10**20]
 REAL = [float("nan"), float("inf"), -float("inf"), 0.0, -0.0, 1e308, -1e308, 1e39, 1e15, 5e-324, -1.0]
 WORDS = [
@@ -33,83 +35,90 @@ BYTES = [
     *(b"\xff", b"\0" * 8, b"\x80", b"\xed\xa0\x80", b"\xff\xfe", b"PK\3\4"),
 ]
 NUMBER = re.compile(rb"-?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
-share = st.floats(0, 1, exclude_max=True)  # of the length: a place
+Drawn = Callable[[Random], Any]
 
 
-@st.composite
-def damaged(draw: st.DrawFn, seeds: Sequence[bytes], words: Sequence[str] = ()) -> bytes:
+def damaged(seeds: Sequence[bytes], words: Sequence[str] = ()) -> Callable[[Random], bytes]:
     """Draw one of the valid files with one to six changes; `words` are those of the format."""
-    data = draw(st.sampled_from(list(seeds)))
     known = [*BYTES, *(word.encode() for word in (*WORDS, *words))]
-    for _ in range(draw(st.integers(1, 6))):
-        kind = draw(st.sampled_from(CHANGES))
-        at = int(draw(share) * len(data))
-        data = kind(draw, data, at, known, seeds)[:MAX_SIZE]
-    return data
+
+    def draw(random: Random) -> bytes:
+        data = random.choice(seeds)
+        for _ in range(random.randint(1, 6)):
+            change = random.choice(CHANGES)
+            data = change(random, data, int(random.random() * len(data)), known, seeds)[:MAX_SIZE]
+        return data
+
+    return draw
 
 
-def _flip(draw: st.DrawFn, data: bytes, at: int, known: Sequence[bytes], seeds: Sequence[bytes]) -> bytes:
-    return data[:at] + bytes([data[at] ^ (1 << draw(st.integers(0, 7)))]) + data[at + 1 :] if data else data
+def one_of(values: Sequence[Any]) -> Drawn:
+    """Draw one of some values."""
+    return lambda random: random.choice(values)
 
 
-def _byte(draw: st.DrawFn, data: bytes, at: int, known: Sequence[bytes], seeds: Sequence[bytes]) -> bytes:
-    return data[:at] + bytes([draw(st.integers(0, 255))]) + data[at + 1 :]
+def _flip(random: Random, data: bytes, at: int, known: Sequence[bytes], seeds: Sequence[bytes]) -> bytes:
+    return data[:at] + bytes([data[at] ^ (1 << random.randint(0, 7))]) + data[at + 1 :] if data else data
 
 
-def _cut(draw: st.DrawFn, data: bytes, at: int, known: Sequence[bytes], seeds: Sequence[bytes]) -> bytes:
+def _byte(random: Random, data: bytes, at: int, known: Sequence[bytes], seeds: Sequence[bytes]) -> bytes:
+    return data[:at] + bytes([random.randint(0, 255)]) + data[at + 1 :]
+
+
+def _cut(random: Random, data: bytes, at: int, known: Sequence[bytes], seeds: Sequence[bytes]) -> bytes:
     return data[:at]
 
 
-def _remove(draw: st.DrawFn, data: bytes, at: int, known: Sequence[bytes], seeds: Sequence[bytes]) -> bytes:
-    return data[:at] + data[at + draw(st.integers(1, 40)) :]
+def _remove(random: Random, data: bytes, at: int, known: Sequence[bytes], seeds: Sequence[bytes]) -> bytes:
+    return data[:at] + data[at + random.randint(1, 40) :]
 
 
-def _repeat(draw: st.DrawFn, data: bytes, at: int, known: Sequence[bytes], seeds: Sequence[bytes]) -> bytes:
-    return data[:at] + data[at : at + draw(st.integers(1, 60))] * draw(st.sampled_from([2, 3, 50])) + data[at:]
+def _repeat(random: Random, data: bytes, at: int, known: Sequence[bytes], seeds: Sequence[bytes]) -> bytes:
+    return data[:at] + data[at : at + random.randint(1, 60)] * random.choice([2, 3, 50]) + data[at:]
 
 
-def _insert(draw: st.DrawFn, data: bytes, at: int, known: Sequence[bytes], seeds: Sequence[bytes]) -> bytes:
-    return data[:at] + draw(st.sampled_from(known)) + data[at:]
+def _insert(random: Random, data: bytes, at: int, known: Sequence[bytes], seeds: Sequence[bytes]) -> bytes:
+    return data[:at] + random.choice(known) + data[at:]
 
 
-def _overwrite(draw: st.DrawFn, data: bytes, at: int, known: Sequence[bytes], seeds: Sequence[bytes]) -> bytes:
-    word = draw(st.sampled_from(known))
+def _overwrite(random: Random, data: bytes, at: int, known: Sequence[bytes], seeds: Sequence[bytes]) -> bytes:
+    word = random.choice(known)
     return data[:at] + word + data[at + len(word) :]
 
 
-def _splice(draw: st.DrawFn, data: bytes, at: int, known: Sequence[bytes], seeds: Sequence[bytes]) -> bytes:
-    other = draw(st.sampled_from(list(seeds)))
-    return data[:at] + other[int(draw(share) * len(other)) :]
+def _splice(random: Random, data: bytes, at: int, known: Sequence[bytes], seeds: Sequence[bytes]) -> bytes:
+    other = random.choice(seeds)
+    return data[:at] + other[int(random.random() * len(other)) :]
 
 
-def _number(draw: st.DrawFn, data: bytes, at: int, known: Sequence[bytes], seeds: Sequence[bytes]) -> bytes:
+def _number(random: Random, data: bytes, at: int, known: Sequence[bytes], seeds: Sequence[bytes]) -> bytes:
     """Replace a number in text by a word."""
     found = NUMBER.search(data, at) or NUMBER.search(data)
-    return data[: found.start()] + draw(st.sampled_from(known)) + data[found.end() :] if found else data
+    return data[: found.start()] + random.choice(known) + data[found.end() :] if found else data
 
 
-def _word(draw: st.DrawFn, data: bytes, at: int, known: Sequence[bytes], seeds: Sequence[bytes]) -> bytes:
+def _word(random: Random, data: bytes, at: int, known: Sequence[bytes], seeds: Sequence[bytes]) -> bytes:
     """Replace a word, or what stands in quotes, by another."""
     found = re.compile(rb'"[^"]*"|\w+').search(data, at)
-    return data[: found.start()] + draw(st.sampled_from(known)) + data[found.end() :] if found else data
+    return data[: found.start()] + random.choice(known) + data[found.end() :] if found else data
 
 
 CHANGES = [_flip, _byte, _cut, _remove, _repeat, _insert, _overwrite, _splice, _number, _number, _word]
 
 
-def fuzzed(
-    examples: int = 60, **strategies: st.SearchStrategy[Any]
-) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Give a test damaged files: `examples` that are always the same, or CLSPLAT_FUZZ others.
+def fuzzed(examples: int = 60, **drawn: Drawn) -> Callable[[Callable[..., None]], Callable[[], None]]:
+    """Give a test examples, each drawn from its number alone; a failure tells the number."""
 
-    Of those that fail hypothesis keeps the seeds.
-    """
-    chosen = settings(
-        max_examples=EXAMPLES or examples,
-        derandomize=not EXAMPLES,
-        deadline=None,
-        suppress_health_check=list(HealthCheck),
-        print_blob=True,
-        phases=[Phase.reuse, Phase.generate] if EXAMPLES else settings.default.phases,  # shrinking takes minutes
-    )
-    return lambda test: chosen(given(**strategies)(test))
+    def repeated(test: Callable[..., None]) -> Callable[[], None]:
+        def run() -> None:
+            for number in range(EXAMPLES or examples):
+                random = Random(number)
+                values = {name: draw(random) for name, draw in drawn.items()}
+                try:
+                    test(**values)
+                except Exception as error:
+                    pytest.fail(f"example {number}: {repr(error)[:SHOWN]} of {str(values)[:SHOWN]}", pytrace=False)
+
+        return run
+
+    return repeated
