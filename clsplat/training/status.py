@@ -85,6 +85,8 @@ class Status(BaseModel):
     """Number of the process on that machine."""
     pid_namespace: str | None = None
     """Linux: where that number counts; containers on one machine have their own."""
+    boot: str | None = None
+    """Linux: the start of the machine at which that number was given; the next one begins anew."""
     started: float
     """When this process began with the run."""
     changed: float
