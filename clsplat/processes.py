@@ -9,6 +9,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from clsplat.errors import DataError
+from clsplat.reading import read_text
+
 FIRST_PID_NAMESPACE = "pid:[4026531836]"  # of Linux itself, outside of containers: PROC_PID_INIT_INO of its headers
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 QUERY_LIMITED_INFORMATION, STILL_ACTIVE, ACCESS_DENIED = 0x1000, 259, 5  # of Windows
@@ -64,8 +67,8 @@ def _pid_namespace() -> str | None:
 def _boot() -> str | None:
     """Which start of the machine this is; None where the system does not say."""
     try:
-        return BOOT_ID.read_text("ascii").strip() or None
-    except (OSError, ValueError):
+        return read_text(BOOT_ID).strip() or None
+    except DataError:
         return None
 
 

@@ -25,7 +25,7 @@ def test_a_number_counts_in_its_own_namespace(monkeypatch):
 
 
 def test_a_process_before_the_machine_started_again_has_ended(monkeypatch, tmp_path):
-    """Its number may be another's by now.  In a container the host's name and namespace may be those of two machines."""
+    """Its number may be another's by now.  In containers, host name and namespace may be those of two machines."""
     boot = tmp_path / "boot_id"
     monkeypatch.setattr(processes, "BOOT_ID", boot)
     for namespace, ended in ((processes.FIRST_PID_NAMESPACE, True), ("pid:[4026532000]", False), (None, False)):

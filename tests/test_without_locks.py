@@ -11,10 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from clsplat import processes
+from clsplat import lock, processes
 from clsplat.errors import OutputError
 from clsplat.names import LOCK
-from clsplat.runs import lock
 
 pytest.importorskip("fcntl", reason="what they change is of POSIX")
 pytestmark = pytest.mark.slow

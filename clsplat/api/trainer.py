@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from clsplat import lock
 from clsplat.api.arguments import PathLike, load_plugins, overrides
 from clsplat.api.device import proved
 from clsplat.errors import ClsplatError, ConfigError, DataError, Interrupted, OutputError
@@ -17,7 +18,7 @@ from clsplat.losses.base import HostFunction, HostLoss, ViewGradients
 from clsplat.metrics.views import mean, measure
 from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import Pipeline, load
-from clsplat.runs import folders, lock, opening, outputs, runner
+from clsplat.runs import folders, opening, outputs, runner
 from clsplat.runs.experiment import as_setting
 from clsplat.runs.folders import Start
 from clsplat.runs.stepwise import is_trained, run_until_training, train

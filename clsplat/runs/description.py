@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
+from clsplat import lock
 from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import Pipeline
-from clsplat.runs import lock
 from clsplat.runs.folders import Start, check_run_folder, up_to_date
 from clsplat.runs.opening import check_start, open_run
 from clsplat.runs.outputs import check_places

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from clsplat import terminal
+from clsplat import lock, terminal
 from clsplat.compare.page import write_comparison
 from clsplat.errors import ClsplatError, ConfigError, DataError, Interrupted, as_clsplat_error, one_line
 from clsplat.files import is_there, write_text
@@ -15,7 +15,7 @@ from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import Pipeline, load
 from clsplat.pipeline.matrix import Cell, Experiment, load_experiment
 from clsplat.pipeline.yaml_file import read_yaml
-from clsplat.runs import description, folders, lock, opening, outputs, runner
+from clsplat.runs import description, folders, opening, outputs, runner
 from clsplat.runs.folders import Start
 from clsplat.signals import stop_at_once, stopping_on_signals
 from clsplat.training.changes import first_difference
@@ -106,6 +106,7 @@ def run_matrix(experiment: Experiment, out: Path, device: str | Device | None, s
     ):
         write_text(out / PIPELINE, experiment.text)
         failures = _run_cells(experiment, status, device, start)
+        status.require_held()
         _compare(experiment, out, failures)
         if failures:
             raise _first_of(failures, count, "failed")

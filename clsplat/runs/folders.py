@@ -6,12 +6,12 @@ from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any, Literal, get_args
 
+from clsplat import lock
 from clsplat.errors import ConfigError, InternalError, Interrupted, OutputError, as_clsplat_error, one_line
 from clsplat.files import sweep, unwritable
 from clsplat.names import BEFORE_A_RUN, CHECKPOINTS, CHECKSUMS, INPUTS, LOCK, METRICS, NOTE, OF_A_RUN, PIPELINE, RECORDS
 from clsplat.pipeline.loading import Pipeline, load
 from clsplat.prepare.cache import Planned, note, noted
-from clsplat.runs import lock
 from clsplat.training import checkpoint
 from clsplat.training.status import StatusFile, read_status
 
@@ -33,10 +33,10 @@ def opened(out: Path, start: Start, **values: Any) -> Iterator[StatusFile]:
     except OSError as error:
         raise unwritable(out, error) from error
     try:
-        with lock.held(out):
+        with lock.held(out) as require_held:
             check_run_folder(out, start)  # again: another run may have ended since
             sweep(out, border=PIPELINE)
-            status = StatusFile(out, **values)
+            status = StatusFile(out, require_held, **values)
             status.begin()
             try:
                 with closing(status):  # the next holder writes its own
@@ -45,7 +45,9 @@ def opened(out: Path, start: Start, **values: Any) -> Iterator[StatusFile]:
                 is_defect = isinstance(as_clsplat_error(error), InternalError)  # its log has the traceback
                 if is_new and not status.now.step and not is_defect:
                     written = BEFORE_A_RUN if status.now.cells else OF_A_RUN - {CHECKPOINTS}
-                    _remove_unused(out, written, kept={LOCK} if made else BEFORE_A_RUN)
+                    with suppress(OutputError):
+                        status.require_held()
+                        _remove_unused(out, written, kept={LOCK} if made else BEFORE_A_RUN)
                 raise
     except BaseException:
         with suppress(OSError):  # where a folder holds anything, it stays

@@ -1,20 +1,16 @@
 """Open what a run needs: the device, the photographs' preparation, the scene."""
 
 import logging
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
 from clsplat.conformance.quick import open_correct
 from clsplat.errors import ConfigError
-from clsplat.files import unwritable
 from clsplat.names import UNDISTORTED
 from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import Pipeline, prepared_folder
 from clsplat.prepare.cache import Planned, note, noted, prepare
 from clsplat.progress import heard_by
 from clsplat.render.rasterizer import Rasterizer
-from clsplat.runs import lock
 from clsplat.runs.folders import Start
 from clsplat.scene.decoding import decode_all, require_whole
 from clsplat.scene.detect import read_scene
@@ -41,24 +37,12 @@ def open_run(
     status = status or StatusFile(out)
     folder, root = pipeline.settings.scene.folder, prepared_folder(out)
     with heard_by(status.count):
-        with _only_one_preparing(root) if any(one.why for one in planned) else nullcontext():
-            folder = prepare(planned, folder, root, status.stage)
+        folder = prepare(planned, folder, root, status.stage)
         with status.stage("read_scene"):
             scene = read_scene(folder, pipeline.settings.scene.holdout)
             run = make_run(pipeline, scene, opened, out, status)
     run.prepared = note(planned) if planned else None
     return run
-
-
-@contextmanager
-def _only_one_preparing(root: Path) -> Iterator[None]:
-    """Hold the folder of results: an interrupted step is gone on with by one process alone."""
-    try:
-        root.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise unwritable(root, error) from error
-    with lock.held(root):
-        yield
 
 
 def check_start(
