@@ -17,6 +17,7 @@ from clsplat import lock
 from clsplat.errors import OutputError
 from clsplat.names import LOCK
 from clsplat.runs import folders
+from clsplat.runs.default_folder import free_folder
 from clsplat.training import status as writing
 from tests.test_cli import clsplat as command
 
@@ -186,11 +187,11 @@ def test_trainers_hold_their_folder_until_they_end(tiny_scene, tmp_path):
 
 
 def test_a_run_that_is_just_starting_in_the_default_folder_is_not_joined(tmp_path):
-    assert folders.free_folder(tmp_path / "splat", None, "new") == tmp_path / "splat"
+    assert free_folder(tmp_path / "splat", None, "new") == tmp_path / "splat"
     (tmp_path / "splat").mkdir()
     with lock.held(tmp_path / "splat"):
-        assert folders.free_folder(tmp_path / "splat", None, "new") == tmp_path / "splat-2"
-    assert folders.free_folder(tmp_path / "splat", None, "new") == tmp_path / "splat"
+        assert free_folder(tmp_path / "splat", None, "new") == tmp_path / "splat-2"
+    assert free_folder(tmp_path / "splat", None, "new") == tmp_path / "splat"
 
 
 def test_a_folder_that_was_left_is_written_to_no_more(tmp_path, monkeypatch):

@@ -20,6 +20,7 @@ from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import Pipeline, load
 from clsplat.runs import folders, opening, outputs, runner
 from clsplat.runs.experiment import as_setting
+from clsplat.runs.failures import failures_recorded
 from clsplat.runs.folders import Start
 from clsplat.runs.stepwise import is_trained, run_until_training, train
 from clsplat.scene.detect import read_scene
@@ -95,7 +96,7 @@ class Trainer:
         opened = proved(device, rasterizer.schedule, rasterizer.sort)
         with ExitStack() as holding:
             status = holding.enter_context(folders.opened(self.out, start, step=0))
-            with folders.failures_recorded(status, as_raised=True):
+            with failures_recorded(status, as_raised=True):
                 self._run = opening.make_run(self.pipeline, self.scene, opened, self.out, status)
                 runner.begin(self.pipeline, self._run, start)
                 with saved_on_failure(self._run):
@@ -138,7 +139,7 @@ class Trainer:
             raise ClsplatError(f"{self!r} {why}; make another, with start='resume' where `out` holds a checkpoint")
         try:
             with (
-                folders.failures_recorded(self._run.status, as_raised=True),
+                failures_recorded(self._run.status, as_raised=True),
                 stopping_on_signals(finish_step),
                 saved_on_failure(self._run),
             ):

@@ -5,7 +5,8 @@ from pathlib import Path
 from clsplat import lock
 from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import Pipeline
-from clsplat.runs.folders import Start, check_run_folder, up_to_date
+from clsplat.runs.default_folder import up_to_date
+from clsplat.runs.folders import Start, check_run_folder
 from clsplat.runs.opening import check_start, open_run
 from clsplat.runs.outputs import check_places
 from clsplat.runs.runner import restore

@@ -16,6 +16,8 @@ from clsplat.pipeline.loading import Pipeline, load
 from clsplat.pipeline.matrix import Cell, Experiment, load_experiment
 from clsplat.pipeline.yaml_file import read_yaml
 from clsplat.runs import description, folders, opening, outputs, runner
+from clsplat.runs.default_folder import free_folder, up_to_date
+from clsplat.runs.failures import failures_recorded
 from clsplat.runs.folders import Start
 from clsplat.signals import stop_at_once, stopping_on_signals
 from clsplat.training.changes import first_difference
@@ -50,9 +52,9 @@ class Job:
             is_there(out)
         changes = [*overrides, *([f"scene.path={as_setting(scene)}"] if scene is not None else [])]
         if found := load_experiment(pipeline, changes):
-            return cls(found, out or folders.free_folder(Path("runs") / found.name, None, start), start)
+            return cls(found, out or free_folder(Path("runs") / found.name, None, start), start)
         checked = load(pipeline, changes)
-        return cls(checked, out or folders.free_folder(Path("runs") / checked.settings.name, checked, start), start)
+        return cls(checked, out or free_folder(Path("runs") / checked.settings.name, checked, start), start)
 
     @classmethod
     def resume(cls, out: Path, overrides: Sequence[str] = ()) -> "Job":
@@ -72,7 +74,7 @@ class Job:
         """Run it; what is up to date is left alone.  Raises ClsplatError; status.json tells why."""
         if isinstance(self.work, Experiment):
             run_matrix(self.work, self.out, device, self.start)
-        elif self.start != "restart" and folders.up_to_date(self.work, self.work.preparation(self.out), self.out):
+        elif self.start != "restart" and up_to_date(self.work, self.work.preparation(self.out), self.out):
             LOG.info("%s: up to date; change a setting, or give another folder, to run again", self.out)
         else:
             run_pipeline(self.work, self.out, device, self.start)
@@ -84,7 +86,7 @@ def run_pipeline(pipeline: Pipeline, out: Path, device: str | Device | None, sta
     with (
         folders.opened(out, start, step=0) as status,
         stopping_on_signals(stop_at_once),
-        folders.failures_recorded(status),
+        failures_recorded(status),
         terminal.logging_to(out / LOG_FILE),
     ):
         run = opening.open_run(pipeline, out, device, start, status)
@@ -102,7 +104,7 @@ def run_matrix(experiment: Experiment, out: Path, device: str | Device | None, s
     count = len(experiment.cells)
     with (
         folders.opened(out, start, cells=count, done=0, failed={}) as status,
-        folders.failures_recorded(status),
+        failures_recorded(status),
     ):
         write_text(out / PIPELINE, experiment.text)
         failures = _run_cells(experiment, status, device, start)
