@@ -22,6 +22,7 @@ from clsplat.runs import folders, opening, outputs, runner
 from clsplat.runs.experiment import as_setting
 from clsplat.runs.failures import failures_recorded
 from clsplat.runs.folders import Start
+from clsplat.runs.scenes import RunScene
 from clsplat.runs.stepwise import is_trained, run_until_training, train
 from clsplat.scene.detect import read_scene
 from clsplat.scene.scene import Scene
@@ -97,7 +98,8 @@ class Trainer:
         with ExitStack() as holding:
             status = holding.enter_context(folders.opened(self.out, start, step=0))
             with failures_recorded(status, as_raised=True):
-                self._run = opening.make_run(self.pipeline, self.scene, opened, self.out, status)
+                scene_of_run = RunScene.of(self.pipeline.settings.scene, self.scene)
+                self._run = opening.make_run(self.pipeline, scene_of_run, opened, self.out, status)
                 runner.begin(self.pipeline, self._run, start)
                 with saved_on_failure(self._run):
                     run_until_training(self.pipeline, self._run)

@@ -4,6 +4,7 @@ import json
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 from clsplat import lock, terminal
@@ -19,6 +20,7 @@ from clsplat.runs import description, folders, opening, outputs, runner
 from clsplat.runs.default_folder import free_folder, up_to_date
 from clsplat.runs.failures import failures_recorded
 from clsplat.runs.folders import Start
+from clsplat.runs.scenes import read_run_scene
 from clsplat.signals import stop_at_once, stopping_on_signals
 from clsplat.training.changes import first_difference
 from clsplat.training.status import StatusFile, read_status
@@ -156,6 +158,7 @@ def describe_matrix(experiment: Experiment, out: Path, device: str | Device | No
     folders.check_run_folder(out, start)
     lock.check_free(out)
     lines, refusals = [], dict[str, ClsplatError]()
+    read = cache(read_run_scene)  # each distinct scene once
     for cell in experiment.cells:
         folder = out / cell.name
         state = "unfinished" if folder.exists() else ""
@@ -163,7 +166,7 @@ def describe_matrix(experiment: Experiment, out: Path, device: str | Device | No
             if start == "resume" and _finished(cell, folder):
                 state = "done"
             else:
-                description.describe(cell.pipeline, folder, device, start)
+                description.describe(cell.pipeline, folder, device, start, read)
         except ClsplatError as error:
             refusals[cell.name] = error
         lines.append(f"  {cell.name}  {state}".rstrip())
