@@ -6,6 +6,8 @@ import os
 import shutil
 import stat
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 
@@ -47,6 +49,18 @@ def kernel_caches() -> str:
     """Return the folders that keep built kernels, in words."""
     pyopencl, _, pocl = (Path(platformdirs.user_cache_dir(name, name)) for name in LIBRARIES)
     return f"{pyopencl} and {next(iter(_named_by_user()), pocl)}"
+
+
+def damaged_kernels() -> str:
+    """Say of a device that works with empty caches alone what to do."""
+    return f"its cache of built kernels is damaged: remove {kernel_caches()}"
+
+
+@contextmanager
+def empty_kernel_caches() -> Iterator[dict[str, str]]:
+    """Yield the variables with which a process that starts in the block keeps built kernels in an empty folder."""
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+        yield {"POCL_CACHE_DIR": folder, "PYOPENCL_NO_CACHE": "1"}
 
 
 def _named_by_user() -> list[Path]:

@@ -5,9 +5,15 @@ import os
 import platform
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
+from clsplat.errors import DataError
+from clsplat.reading import read_text
+
+FIRST_PID_NAMESPACE = "pid:[4026531836]"  # of Linux itself, outside of containers: PROC_PID_INIT_INO of its headers
+BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 QUERY_LIMITED_INFORMATION, STILL_ACTIVE, ACCESS_DENIED = 0x1000, 259, 5  # of Windows
 
 
@@ -18,11 +24,12 @@ class Owner:
     process: int
     host: str  # name of the machine, or of the container
     pid_namespace: str | None  # of Linux, such as 'pid:[4026531836]'; containers on one machine have their own
+    boot: str | None  # of Linux: another after each start of the machine, and the same in all its containers
 
     @classmethod
     def this(cls) -> "Owner":
         """Return this process."""
-        return cls(os.getpid(), platform.node(), _pid_namespace())
+        return cls(os.getpid(), platform.node(), _pid_namespace(), _boot())
 
     @classmethod
     def named_by(cls, values: Mapping[str, Any]) -> "Owner | None":
@@ -30,18 +37,23 @@ class Owner:
         process, this = values.get("process"), cls.this()
         if type(process) is not int or process <= 0:
             return None
-        return cls(process, values.get("host", this.host), values.get("pid_namespace") or this.pid_namespace)
+        host, namespace = values.get("host", this.host), values.get("pid_namespace") or this.pid_namespace
+        return cls(process, host, namespace, values.get("boot") or this.boot)
 
     @property
     def is_here(self) -> bool:
         """Whether its number counts here."""
-        this = Owner.this()
-        return (self.host, self.pid_namespace) == (this.host, this.pid_namespace)
+        return replace(self, process=os.getpid()) == Owner.this()
 
     @property
     def has_ended(self) -> bool:
-        """Whether it is known to have ended; of a process elsewhere that is not known."""
-        return self.is_here and not is_alive(self.process)
+        """Whether it is known to have ended; of a process elsewhere that is not known.
+
+        One of another boot has, where the host is a machine: containers of one name may be on two of them.
+        """
+        if self.is_here:
+            return not is_alive(self.process)
+        return replace(self, boot=_boot()).is_here and self.pid_namespace == FIRST_PID_NAMESPACE and _boot() is not None
 
 
 def _pid_namespace() -> str | None:
@@ -49,6 +61,14 @@ def _pid_namespace() -> str | None:
     try:
         return os.readlink("/proc/self/ns/pid")
     except (OSError, AttributeError):
+        return None
+
+
+def _boot() -> str | None:
+    """Which start of the machine this is; None where the system does not say."""
+    try:
+        return read_text(BOOT_ID).strip() or None
+    except DataError:
         return None
 
 

@@ -1,6 +1,7 @@
 """`clsplat check RUN`: whatever changes in a run folder is noticed, from its files alone."""
 
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import pytest
 import clsplat
 from clsplat.errors import DataError
 from clsplat.opencl import device
-from clsplat.runs import verify
+from clsplat.runs.verify import verify
 from tests.test_cli import clsplat as command
 
 pytestmark = pytest.mark.slow
@@ -134,7 +135,60 @@ def test_renders_are_missed_with_and_without_the_list_of_checksums(copy):
 
 def test_a_list_without_a_declared_output_is_damaged(copy):
     (copy / "checksums.json").write_text("{}")
-    assert "'pipeline.yaml' is not in it" in damaged(copy)["checksums.json"]
+    names = ["pipeline.yaml", "metrics.jsonl", "metrics.json", "point_cloud.ply", "viewer.html", "report.html"]
+    assert damaged(copy) == {"checksums.json": f"lacks {', '.join(map(repr, names))}"}
+    (copy / "checksums.json").write_text('{"../a": "", "/b": ""}')
+    assert damaged(copy)["checksums.json"].startswith(
+        "'../a' is no file of the run; '/b' is no file of the run; lacks "
+    )
+
+
+KINDS = {"a folder": Path.mkdir, "a pipe": getattr(os, "mkfifo", None), "a link that leads to nothing": None}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_is_in_the_place_of_a_file_is_told(kind, finished, copy):
+    if kind == "a pipe" and not hasattr(os, "mkfifo"):
+        pytest.skip("this system has no pipes with names")
+    make = KINDS[kind] or (lambda path: path.symlink_to("nowhere"))
+    files = [one["file"] for one in clsplat.check(finished)["objects"]]
+    for name in files:
+        (copy / name).unlink()
+        make(copy / name)
+        found = damaged(copy)
+        assert found.keys() == {name}
+        assert found[name].startswith(f"is {kind}"), (name, found[name])
+        (copy / name).rmdir() if kind == "a folder" else (copy / name).unlink()
+        shutil.copyfile(finished / name, copy / name)
+    (copy / "checksums.json").unlink()
+    (copy / "metrics.jsonl").unlink()
+    make(copy / "metrics.jsonl")
+    assert damaged(copy)["metrics.jsonl"].startswith(f"is {kind}")
+    shutil.rmtree(copy / "renders")
+    (copy / "renders").write_text("")
+    assert damaged(copy)["renders"] == "is a file; expected a folder"
+
+
+def test_every_file_that_is_gone_is_named(finished, copy):
+    """The list of checksums tells them, or the pipeline, or what every run has."""
+    files = {one["file"] for one in clsplat.check(finished)["objects"]}
+    outputs = {name for name in files if name.endswith((".ply", ".html", ".png"))}
+    of_every_run = {"inputs.json", "metrics.json", "metrics.jsonl"}
+    newest, renders = {"checkpoints/step_000020.npz"}, {"renders"}
+    pages = {name for name in outputs if not name.startswith("renders/")}
+    for kept, told in (
+        ({"checksums.json", "pipeline.yaml"}, of_every_run | outputs | {"status.json"}),
+        ({"checksums.json", "status.json"}, of_every_run | outputs | newest | {"pipeline.yaml"}),
+        ({"pipeline.yaml", "status.json"}, of_every_run | pages | renders | newest | {"checksums.json"}),
+        ({"status.json"}, of_every_run | newest | {"pipeline.yaml", "checksums.json"}),
+    ):
+        shutil.rmtree(copy)
+        shutil.copytree(finished, copy)
+        for name in files - kept:
+            (copy / name).unlink()
+        for folder in (copy / "renders" / "test", copy / "renders"):
+            folder.rmdir()
+        assert damaged(copy).keys() == told, kept
 
 
 def test_a_run_without_checksums_is_not_called_whole(copy):
@@ -214,9 +268,11 @@ def test_a_matrix_is_checked_with_its_cells(tiny_scene, tmp_path):
     found = damaged(out)
     assert {f"{cell.name}/pipeline.yaml", "compare.html"} <= set(found)
     assert f"`clsplat resume {out}`" in command("check", out, expect=7).stderr
+    (out / "pipeline.yaml").unlink()
+    assert "inputs.json" not in damaged(out), "which is of a run, not of a matrix"
 
 
 def test_a_folder_without_a_run_is_refused(tmp_path):
     with pytest.raises(DataError, match=r"holds neither pipeline.yaml nor status.json"):
-        verify.verify(tmp_path)
+        verify(tmp_path)
     assert "expected the folder of a run" in command("check", tmp_path, expect=3).stderr

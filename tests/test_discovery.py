@@ -1,11 +1,14 @@
 """Which device is chosen, what keeps one from working, and what a compiler's limits lead to."""
 
 import logging
+import os
+import subprocess
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from clsplat.caches import kernel_caches
 from clsplat.conformance.scenes import random_case
 from clsplat.errors import DeviceError, KernelError
 from clsplat.opencl import discovery, program, runtimes
@@ -65,6 +68,27 @@ def test_a_device_with_small_groups_does_not_work(found, info, least):
     found(small)
     with pytest.raises(DeviceError, match="work-groups have at most"):
         choose()
+
+
+def test_a_device_that_fails_with_a_damaged_cache_alone_is_told_so(monkeypatch, tmp_path):
+    """Its second try has an empty folder for kernels; of a device that fails there, too, the first fault is told."""
+    broken, folders = False, []
+
+    def probe(*arguments, env, **values):
+        folder = env.get("POCL_CACHE_DIR") if "PYOPENCL_NO_CACHE" in env else None
+        folders.append(folder)
+        assert folder is None or not os.listdir(folder)
+        return subprocess.CompletedProcess([], int(broken or folder is None), "", f"error: fault {len(folders)}")
+
+    monkeypatch.delenv("PYOPENCL_NO_CACHE", raising=False)
+    monkeypatch.setattr(runtimes.subprocess, "run", probe)
+    monkeypatch.setattr(runtimes, "cache_folder", lambda: tmp_path)
+    fault = CPU.fault()
+    assert fault == f"its cache of built kernels is damaged: remove {kernel_caches()}"
+    assert (len(folders), folders[0], os.path.exists(folders[1])) == (2, None, False)
+    assert list(tmp_path.iterdir()) == [], "it is tried again"
+    broken = True
+    assert CPU.fault() == "error: fault 3"
 
 
 @pytest.fixture

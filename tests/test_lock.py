@@ -13,9 +13,11 @@ from types import ModuleType, SimpleNamespace
 import pytest
 
 import clsplat
+from clsplat import lock
 from clsplat.errors import OutputError
 from clsplat.names import LOCK
-from clsplat.runs import folders, lock
+from clsplat.runs import folders
+from clsplat.runs.default_folder import free_folder
 from clsplat.training import status as writing
 from tests.test_cli import clsplat as command
 
@@ -26,7 +28,7 @@ NONE = 99999999  # no process has this number
 def holder(folder: Path) -> subprocess.Popen:
     """A process that holds a folder until it is killed."""
     code = (
-        "import sys, time; from pathlib import Path; from clsplat.runs import lock\n"
+        "import sys, time; from pathlib import Path; from clsplat import lock\n"
         "with lock.held(Path(sys.argv[1])): print('held', flush=True); time.sleep(600)"
     )
     process = subprocess.Popen([sys.executable, "-c", code, str(folder)], stdout=subprocess.PIPE, text=True)
@@ -60,7 +62,7 @@ def test_a_lock_ends_with_its_process_however_it_ends(tmp_path):
 
 def test_children_do_not_hold_the_lock_of_a_killed_parent(tmp_path):
     code = (
-        "import subprocess, sys, time; from pathlib import Path; from clsplat.runs import lock\n"
+        "import subprocess, sys, time; from pathlib import Path; from clsplat import lock\n"
         "with lock.held(Path(sys.argv[1])):\n"
         "    child = subprocess.Popen([sys.executable, '-c', 'import time; time.sleep(60)'])\n"
         "    print(child.pid, flush=True); time.sleep(600)"
@@ -104,7 +106,7 @@ no_windows = pytest.mark.skipif(sys.platform == "win32", reason="has no fcntl to
 )
 def test_of_many_that_want_a_folder_at_once_one_has_it(before, tmp_path):
     code = before + (
-        "import sys, time; from pathlib import Path; from clsplat.runs import lock\n"
+        "import sys, time; from pathlib import Path; from clsplat import lock\n"
         "from clsplat.errors import OutputError\n"
         "folder, n = Path(sys.argv[1]), 0\n"
         "for _ in range(60):\n"
@@ -185,11 +187,11 @@ def test_trainers_hold_their_folder_until_they_end(tiny_scene, tmp_path):
 
 
 def test_a_run_that_is_just_starting_in_the_default_folder_is_not_joined(tmp_path):
-    assert folders.free_folder(tmp_path / "splat", None, "new") == tmp_path / "splat"
+    assert free_folder(tmp_path / "splat", None, "new") == tmp_path / "splat"
     (tmp_path / "splat").mkdir()
     with lock.held(tmp_path / "splat"):
-        assert folders.free_folder(tmp_path / "splat", None, "new") == tmp_path / "splat-2"
-    assert folders.free_folder(tmp_path / "splat", None, "new") == tmp_path / "splat"
+        assert free_folder(tmp_path / "splat", None, "new") == tmp_path / "splat-2"
+    assert free_folder(tmp_path / "splat", None, "new") == tmp_path / "splat"
 
 
 def test_a_folder_that_was_left_is_written_to_no_more(tmp_path, monkeypatch):

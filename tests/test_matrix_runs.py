@@ -12,7 +12,7 @@ import pytest
 from clsplat.errors import ClsplatError, ConfigError, DataError, InternalError, Interrupted, NumericError
 from clsplat.pipeline.loading import load
 from clsplat.pipeline.matrix import load_experiment
-from clsplat.runs import experiment, runner
+from clsplat.runs import experiment, runner, scenes
 from tests.test_cli import clsplat
 from tests.test_matrix import SMALL, STAGES, names
 
@@ -58,6 +58,24 @@ def test_the_folder_of_a_matrix_stands_for_its_cells(finished, tmp_path):
     shutil.copy(finished[1] / "pipeline.yaml", tmp_path / "empty")
     done = clsplat("compare", tmp_path / "empty", "--out", tmp_path / "d.html", expect=3)
     assert "no cell of this matrix has finished" in done.stderr
+
+
+def test_a_dry_run_reads_each_distinct_scene_once(tiny_scene, tmp_path, monkeypatch):
+    read, folders = scenes.read_scene, []
+
+    def counted(folder, holdout):
+        folders.append(folder.name)
+        return read(folder, holdout)
+
+    monkeypatch.setattr(scenes, "read_scene", counted)
+    shutil.copytree(tiny_scene, tmp_path / "other")
+    axes = f"scenes: ['{tiny_scene}', '{tmp_path / 'other'}'], seeds: [0, 1, 2], set: {{scene.downscale: [1, 2]}}"
+    (tmp_path / "x.yaml").write_text(f"name: sweep\nmatrix: {{{axes}}}\n{STAGES}")
+    found = load_experiment(str(tmp_path / "x.yaml"))
+    assert len(found.cells) == 12
+    assert "would run 12 cells" in experiment.describe_matrix(found, tmp_path / "run", None, "new")
+    assert sorted(folders) == sorted([tiny_scene.name, "other"] * 2), "at each of two sizes"
+    assert not (tmp_path / "run").exists()
 
 
 def test_resume_runs_what_is_missing_only(finished, tmp_path):

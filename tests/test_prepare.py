@@ -8,14 +8,14 @@ from typing import Any, ClassVar, Literal
 import pytest
 from typer.testing import CliRunner
 
-from clsplat import cli
+from clsplat import cli, lock
 from clsplat.errors import ConfigError, DataError, OutputError
 from clsplat.pipeline.loading import load
 from clsplat.prepare import steps as prepare_steps
 from clsplat.prepare.cache import fingerprint, plan, prepare
 from clsplat.prepare.place import place_photographs
 from clsplat.prepare.steps import Step
-from clsplat.runs import lock, opening, runner
+from clsplat.runs import opening, runner
 from clsplat.settings import Settings
 from tests.refusals import refusal
 
@@ -234,17 +234,39 @@ def test_a_run_does_not_go_on_with_other_photographs(pipeline, photos, tmp_path)
         opening.open_run(checked, out, None)
 
 
-def test_one_process_prepares_at_a_time(pipeline, photos, tmp_path):
+def test_one_process_makes_a_result_at_a_time(pipeline, photos, tmp_path):
     checked = load(str(pipeline), [f"scene.path='{photos}'", "optimize.steps=3"])
-    (tmp_path / "runs" / "prepared").mkdir(parents=True)
-    with (
-        lock.held(tmp_path / "runs" / "prepared"),
-        pytest.raises(OutputError, match="prepared: is in use by this process"),
-    ):
-        opening.open_run(checked, tmp_path / "runs" / "a", None)
+    (one,) = checked.preparation(tmp_path / "runs" / "a")
+    other = load(str(pipeline), [f"scene.path='{photos}'", "optimize.steps=3", "find_features.long_side=50"])
+    one.folder.parent.mkdir(parents=True)
+    with lock.held(one.folder, one.folder.with_name(f".{one.folder.name}.lock")):
+        with pytest.raises(OutputError, match=f"{one.folder.name}: is in use by this process"):
+            opening.open_run(checked, tmp_path / "runs" / "a", None)
+        opening.open_run(other, tmp_path / "runs" / "c", None)  # another result
     opening.open_run(checked, tmp_path / "runs" / "a", None)
-    with lock.held(tmp_path / "runs" / "prepared"):  # where nothing must be prepared, nobody waits
+    with lock.held(one.folder, one.folder.with_name(f".{one.folder.name}.lock")):  # where all is there, nobody waits
         opening.open_run(checked, tmp_path / "runs" / "b", None)
+    assert not list(one.folder.parent.glob(".*")), "no lock is left"
+
+
+def test_runs_of_different_photographs_prepare_at_once(pipeline, photos, tmp_path, monkeypatch):
+    """One begins while the other is in the middle of its step."""
+    (tmp_path / "others").mkdir()
+    (tmp_path / "others" / "p.txt").write_text("others")
+    make = prepare_steps.FindFeatures.make
+
+    def begins_another(step: Step, source: Path, out: Path, without: Path) -> dict[str, Any]:
+        if source.name == "photos":
+            prepared("others")
+        return make(step, source, out, without)
+
+    def prepared(name: str) -> None:
+        checked = load(str(pipeline), [f"scene.path='{tmp_path / name}'", "optimize.steps=3"])
+        opening.open_run(checked, tmp_path / "runs" / name, None)
+
+    monkeypatch.setattr(prepare_steps.FindFeatures, "make", begins_another)
+    prepared("photos")
+    assert len(list((tmp_path / "runs" / "prepared").glob("find_features-*/record.json"))) == 2
 
 
 def test_a_restarted_run_may_have_other_photographs(pipeline, photos, tmp_path):
@@ -309,6 +331,22 @@ def test_photographs_are_not_placed_from_steps_with_other_settings(photos, tmp_p
     done.clear()
     assert place_photographs(photos, out, matching="sequential") == 5
     assert done == ["match_features", "map_cameras"]
+
+
+def test_one_process_places_photographs_in_a_folder_at_a_time(photos, tmp_path, done, monkeypatch):
+    make, refused = prepare_steps.MatchFeatures.make, []
+
+    def begins_another(step: Step, source: Path, out: Path, without: Path) -> dict[str, Any]:
+        with pytest.raises(OutputError) as error:
+            place_photographs(photos, tmp_path / "out")
+        refused.append(str(error.value))
+        return make(step, source, out, without)
+
+    monkeypatch.setattr(prepare_steps.MatchFeatures, "make", begins_another)
+    assert place_photographs(photos, tmp_path / "out") == 5
+    assert [message.partition(";")[0] for message in refused] == [f"{tmp_path / 'out'}: is in use by this process"]
+    assert done == ["find_features", "match_features", "map_cameras"]
+    assert not (tmp_path / "out" / ".steps" / "run.lock").exists()
 
 
 def test_images_of_the_user_are_not_overwritten(photos, tmp_path, done):

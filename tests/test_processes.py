@@ -24,6 +24,25 @@ def test_a_number_counts_in_its_own_namespace(monkeypatch):
     assert this.has_ended
 
 
+def test_a_process_before_the_machine_started_again_has_ended(monkeypatch, tmp_path):
+    """Its number may be another's by now.  In containers, host name and namespace may be those of two machines."""
+    boot = tmp_path / "boot_id"
+    monkeypatch.setattr(processes, "BOOT_ID", boot)
+    for namespace, ended in ((processes.FIRST_PID_NAMESPACE, True), ("pid:[4026532000]", False), (None, False)):
+        monkeypatch.setattr(processes, "_pid_namespace", lambda namespace=namespace: namespace)
+        boot.write_text("first\n")
+        before = Owner.this()
+        assert (before.boot, before.is_here, before.has_ended) == ("first", True, False)
+        boot.write_text("second\n")
+        assert (before.is_here, before.has_ended) == (False, ended)
+        assert not replace(before, host="another").has_ended
+        older = {key: value for key, value in asdict(before).items() if key != "boot"}
+        assert Owner.named_by(older) == Owner.this(), "an older file does not say"
+        boot.unlink()
+        assert Owner.this().boot is None
+        assert not before.has_ended, "nothing is known of it"
+
+
 @pytest.mark.parametrize("process", [None, "7", 7.0, True, 0, -1])
 def test_a_file_that_names_no_process_has_no_owner(process):
     assert Owner.named_by({"process": process, "host": "a"}) is None

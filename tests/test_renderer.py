@@ -11,6 +11,7 @@ import pytest
 from clsplat.api import device as devices
 from clsplat.api.renderer import Renderer
 from clsplat.conformance.scenes import random_case, with_world_filter
+from clsplat.errors import NumericError
 from clsplat.gaussians.model import Model, Rendering
 from clsplat.opencl import program
 
@@ -47,6 +48,26 @@ def test_depth_changes_neither_image_nor_alpha(device, rng):
     without, with_depth = renderer.render(case.view), renderer.render(case.view, depth=True)
     np.testing.assert_array_equal(without.image, with_depth.image)
     np.testing.assert_array_equal(without.alpha, with_depth.alpha)
+
+
+@pytest.mark.parametrize(("array", "values"), [("image", np.nan), ("image", -np.inf), ("transmittance", np.nan)])
+def test_a_picture_with_values_that_are_not_finite_is_an_error(device, rng, monkeypatch, array, values):
+    """Of a device, or a model, that gives them, as `clsplat render` says; one pixel is enough."""
+    case = random_case(rng, 20, *SIZE)
+    renderer = Renderer(model_of(case), device)
+    forward = renderer.rasterizer.forward
+
+    def broken(*arguments):
+        frame = forward(*arguments)
+        numbers = getattr(frame, array).get()
+        numbers[..., 3, 5] = values
+        getattr(frame, array).set(numbers)
+        return frame
+
+    renderer.render(case.view)
+    monkeypatch.setattr(renderer.rasterizer, "forward", broken)
+    with pytest.raises(NumericError, match=f"^view '{case.view.name}': its picture is not finite"):
+        renderer.render(case.view)
 
 
 @pytest.mark.parametrize("background", [0.0, (0.2, 0.5, 0.9)])

@@ -13,9 +13,9 @@ import pytest
 from clsplat.errors import Interrupted
 from clsplat.metrics import views
 from clsplat.runs.experiment import Job
-from clsplat.runs.folders import read_status
 from clsplat.stages import densify, render, report
 from clsplat.stages.init import Init
+from clsplat.training.status import read_status
 from tests.test_training import digest
 
 pytestmark = pytest.mark.slow

@@ -18,6 +18,7 @@ from clsplat.formats.ply import write_ply
 from clsplat.formats.table import read as read_ply
 from clsplat.pipeline.loading import load
 from clsplat.runs import folders, opening, runner
+from clsplat.runs.failures import failures_recorded
 from clsplat.training import checkpoint
 from clsplat.training.run import Progress, Run
 from clsplat.views.sampling import Sampler
@@ -29,7 +30,7 @@ pytestmark = pytest.mark.slow
 def train(scene: Path, out: Path, *overrides: str, pipeline: str = "smoke", resume: bool = False) -> Run:
     checked = load(pipeline, [f"scene.path='{scene}'", *overrides])
     start: folders.Start = "resume" if resume else "new"
-    with folders.opened(out, start, step=0) as status, folders.failures_recorded(status):
+    with folders.opened(out, start, step=0) as status, failures_recorded(status):
         run = opening.open_run(checked, out, None, start, status)
         runner.execute(checked, run, start, lambda progress: None)
     return run
@@ -123,7 +124,7 @@ def test_interrupt_saves_and_resume_goes_on(finished, tiny_scene, tmp_path):
     def stop(progress: Progress) -> None:
         run.interrupted = progress.step == 20
 
-    with pytest.raises(Interrupted, match="stopped at step 20"), folders.failures_recorded(run.status):
+    with pytest.raises(Interrupted, match="stopped at step 20"), failures_recorded(run.status):
         runner.execute(checked, run, "new", stop)
     assert json.loads((out / "status.json").read_text())["state"] == "interrupted"
     train(tiny_scene, out, resume=True)

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
+from clsplat import lock, processes
 from clsplat.errors import OutputError
 from clsplat.names import LOCK
-from clsplat.runs import lock
 
 pytest.importorskip("fcntl", reason="what they change is of POSIX")
 pytestmark = pytest.mark.slow
@@ -45,6 +45,15 @@ def test_a_file_system_without_locks_is_warned_of_and_a_dead_owner_replaced(tmp_
                 pass
         assert not (tmp_path / LOCK).exists()
     assert "its file system knows no locks" in caplog.text
+
+
+def test_the_owner_before_a_start_of_the_machine_has_ended(tmp_path, without_locks, monkeypatch):
+    """Its number is that of a living process by now."""
+    monkeypatch.setattr(processes, "_pid_namespace", lambda: processes.FIRST_PID_NAMESPACE)
+    monkeypatch.setattr(processes, "_boot", lambda: "now")
+    owned_by(tmp_path, process=os.getppid(), boot="before")
+    with lock.held(tmp_path):
+        assert json.loads((tmp_path / LOCK).read_text())["boot"] == "now"
 
 
 def test_a_lock_that_is_just_being_made_is_somebodys(tmp_path, without_locks):
@@ -81,6 +90,7 @@ def test_a_lock_that_was_made_since_is_not_removed_with_a_dead_one(tmp_path, wit
         pytest.param({"host": "another"}, id="on another host"),
         pytest.param({"host": "another", "time": "x"}, id="since when is not known"),
         pytest.param({"process": NONE, "pid_namespace": "pid:[1]"}, id="in a container"),
+        pytest.param({"process": NONE, "host": "another", "boot": "before"}, id="on another host, since its start"),
     ],
 )
 def test_a_file_system_without_locks_keeps_the_owner_that_may_live(values, tmp_path, without_locks):

@@ -85,10 +85,10 @@ def check(pipeline: PathLike) -> dict[str, Any]:
     Of a run folder return `whole`, its `state`, and `objects`: every file, whether it is `whole`, and a `detail`.  Of a
     model file return its `format`, `ranges`, `bounds`, `degenerate` counts, `findings`, and whether it is `valid`.
     """
-    from clsplat.runs import verify
+    from clsplat.runs.check import check
 
     load_plugins()
-    return verify.check(str(pipeline))
+    return check(str(pipeline))
 
 
 def pipeline_schema() -> dict[str, Any]:

@@ -11,6 +11,7 @@ from clsplat.api.device import proved
 from clsplat.gaussians.model import Model
 from clsplat.gaussians.tables import PARAMETERS, DeviceModel
 from clsplat.metrics.images import to_8_bits
+from clsplat.metrics.views import require_finite
 from clsplat.opencl.device import Array, Device
 from clsplat.render.camera import DeviceCamera, upload_camera
 from clsplat.render.rasterizer import Content, Frame, Rasterizer
@@ -96,7 +97,8 @@ class Renderer:
         """Render a view.
 
         background: a colour in [0, 1], one number or three; by default that of the model, else black; depth: compute
-        it, which takes another pass.  Raises ValueError for a camera that cannot be and for other backgrounds.
+        it, which takes another pass.  Raises ValueError for a camera that cannot be and for other backgrounds,
+        NumericError where a value of the picture is not finite.
         """
         view.camera.check()
         camera, colour = upload_camera(self.device, view), self._colour(background)
@@ -104,6 +106,8 @@ class Renderer:
         image = _inside(frame, frame.image.get())
         alpha = _inside(frame, 1 - np.abs(frame.transmittance.get())[None])[:, :, 0]
         mean = self._depth(camera) if depth else None
+        for values in (image, alpha, *([] if mean is None else [mean])):
+            require_finite(values, view)
         return Picture(image, alpha, mean, view, colour, self._model, self)
 
     def backward(self, picture: Picture, image: Floats | None, alpha: Floats | None) -> Gradients:

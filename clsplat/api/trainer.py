@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from clsplat import lock
 from clsplat.api.arguments import PathLike, load_plugins, overrides
 from clsplat.api.device import proved
 from clsplat.errors import ClsplatError, ConfigError, DataError, Interrupted, OutputError
@@ -17,9 +18,11 @@ from clsplat.losses.base import HostFunction, HostLoss, ViewGradients
 from clsplat.metrics.views import mean, measure
 from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import Pipeline, load
-from clsplat.runs import folders, lock, opening, outputs, runner
+from clsplat.runs import folders, opening, outputs, runner
 from clsplat.runs.experiment import as_setting
+from clsplat.runs.failures import failures_recorded
 from clsplat.runs.folders import Start
+from clsplat.runs.scenes import RunScene
 from clsplat.runs.stepwise import is_trained, run_until_training, train
 from clsplat.scene.detect import read_scene
 from clsplat.scene.scene import Scene
@@ -94,8 +97,9 @@ class Trainer:
         opened = proved(device, rasterizer.schedule, rasterizer.sort)
         with ExitStack() as holding:
             status = holding.enter_context(folders.opened(self.out, start, step=0))
-            with folders.failures_recorded(status, as_raised=True):
-                self._run = opening.make_run(self.pipeline, self.scene, opened, self.out, status)
+            with failures_recorded(status, as_raised=True):
+                scene_of_run = RunScene.of(self.pipeline.settings.scene, self.scene)
+                self._run = opening.make_run(self.pipeline, scene_of_run, opened, self.out, status)
                 runner.begin(self.pipeline, self._run, start)
                 with saved_on_failure(self._run):
                     run_until_training(self.pipeline, self._run)
@@ -137,7 +141,7 @@ class Trainer:
             raise ClsplatError(f"{self!r} {why}; make another, with start='resume' where `out` holds a checkpoint")
         try:
             with (
-                folders.failures_recorded(self._run.status, as_raised=True),
+                failures_recorded(self._run.status, as_raised=True),
                 stopping_on_signals(finish_step),
                 saved_on_failure(self._run),
             ):

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Literal
 
 from clsplat import resource_dir
-from clsplat.caches import cache_folder, kernel_caches
+from clsplat.caches import cache_folder, damaged_kernels
 from clsplat.conformance.checks import BITONIC, ESSENTIAL
 from clsplat.conformance.host import code_variables
 from clsplat.conformance.supervision import supervised
@@ -54,7 +54,7 @@ def ensure_correct(device: Device, sort: Sort = "auto") -> None:
         if result.out_of_memory:
             raise MemoryLimitError(f"{device.text}: {result.failures[0]}; end other programs that use its memory")
         if result.damaged_cache:
-            raise DeviceError(f"{device.text}: its cache of built kernels is damaged: remove {kernel_caches()}")
+            raise DeviceError(f"{device.text}: {damaged_kernels()}")
         if not result.holds:
             how = "cannot be trusted" if result.fault else "computes wrongly"
             raise DeviceError(f"{device.text} {how}: {result.failures[0]}; `clsplat doctor` tells more")

@@ -12,6 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import IO, Any
 
+from clsplat.caches import empty_kernel_caches
 from clsplat.conformance.check import Check, Note
 from clsplat.conformance.comparison import Figure
 from clsplat.errors import shortened
@@ -69,9 +70,8 @@ def supervised(
 
 
 def _with_empty_caches(info: DeviceInfo, schedule: str, check: Check, seconds: float) -> Result:
-    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
-        environment = {"POCL_CACHE_DIR": folder, "PYOPENCL_NO_CACHE": "1"}
-        (result,) = _one_process(info, schedule, [check], seconds, environment)
+    with empty_kernel_caches() as variables:
+        (result,) = _one_process(info, schedule, [check], seconds, variables)
     result.damaged_cache = result.fault is None
     return result
 

@@ -9,20 +9,19 @@ import os
 import subprocess
 import sys
 import sysconfig
+from collections.abc import Mapping
 from pathlib import Path
 
-from clsplat.caches import cache_folder
+from clsplat.caches import cache_folder, damaged_kernels, empty_kernel_caches
 
 SYSTEM_DRIVERS = Path("/etc/OpenCL/vendors")
 PROBE_SECONDS = 120  # a first build may compile for many seconds on a slow machine
 
+_HANGS = f"a test kernel did not finish in {PROBE_SECONDS} s"
+_NO_EXECUTION = "PoCL's cache lies where nothing may be executed: mount it with `exec`, or set POCL_CACHE_DIR"
 _OTHER_RUNTIMES = "apt install pocl-opencl-icd, or pip install 'clsplat[intel]'"
 _ADVICE = (  # words in the output of a failed test kernel -> remedy
     ("unknown target cpu", f"this PoCL does not support the processor: {_OTHER_RUNTIMES}"),
-    (
-        "failed to map segment",
-        "PoCL's cache lies where nothing may be executed: mount it with `exec`, or set POCL_CACHE_DIR",
-    ),
     ("linker", f"PoCL needs a linker: apt install binutils libc6-dev; or use another runtime: {_OTHER_RUNTIMES}"),
     ("abort", f"PoCL may lack a linker: apt install binutils libc6-dev; or use another runtime: {_OTHER_RUNTIMES}"),
 )
@@ -60,23 +59,43 @@ def _add_intel_runtime() -> None:
 def fault_of(key: str, platform: int, device: int) -> str | None:
     """Return None when the device builds and runs a kernel, else one sentence with the fault and the remedy.
 
-    `key` identifies the runtime.  Only successes are stored, so a runtime that was fixed is tested again.
+    `key` identifies the runtime.  Only successes are stored, so a runtime that was fixed is tested again.  A device
+    that fails is tried again with empty caches of built kernels.
     """
     record = cache_folder() / "probes" / hashlib.sha256(key.encode()).hexdigest()[:16]
     if record.exists():
         return None
+    fault = _probed(platform, device, {})
+    if fault is None:
+        record.parent.mkdir(parents=True, exist_ok=True)
+        _write(record, key)
+    elif fault not in (_HANGS, _NO_EXECUTION):
+        with empty_kernel_caches() as variables:
+            if _probed(platform, device, variables) is None:
+                return damaged_kernels()
+    return fault
+
+
+def _probed(platform: int, device: int, variables: Mapping[str, str]) -> str | None:
+    """Try a device in a process with these variables besides ours; return the fault, or None."""
     command = [sys.executable, "-P", "-m", "clsplat.opencl.probe", str(platform), str(device)]
     try:
         done = subprocess.run(
-            command, capture_output=True, encoding="utf-8", errors="replace", timeout=PROBE_SECONDS, check=False
+            command,
+            capture_output=True,
+            encoding="utf-8",
+            errors="replace",
+            timeout=PROBE_SECONDS,
+            check=False,
+            env={**os.environ, **variables},
         )
     except subprocess.TimeoutExpired:
-        return f"a test kernel did not finish in {PROBE_SECONDS} s"
+        return _HANGS
     if done.returncode == 0:
-        record.parent.mkdir(parents=True, exist_ok=True)
-        _write(record, key)
         return None
     output = f"{done.stdout}\n{done.stderr}"
+    if "failed to map segment" in output.lower():
+        return _NO_EXECUTION
     reason = "the runtime aborts the process" if done.returncode not in range(256) else _error_line(output)
     for word, advice in _ADVICE:
         if word in f"{output} {reason}".lower():

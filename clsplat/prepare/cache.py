@@ -6,12 +6,13 @@ import logging
 import os
 import shutil
 import time
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from clsplat import lock
 from clsplat.errors import DataError, OutputError
 from clsplat.files import sweep, unwritable, write_text
 from clsplat.names import NOTE
@@ -65,18 +66,30 @@ def prepare(
 ) -> Path:
     """Run the steps that have a reason, each inside of `begun(name)`, and return the last result.
 
-    Raises the errors of the steps.
+    Raises OutputError where another process makes one of the results, and the errors of the steps.
     """
     count = Count("steps of the preparation", len(planned))
     for number, one in enumerate(planned):
         count.reach(number)
-        if one.why and not (one.folder / RECORD).is_file():  # made by another process since
-            with begun(one.step.stage):
-                _do(one, source, root)
-        else:
-            LOG.info("%s: exists in %s", one.step.stage, one.folder)
+        with _only_one_making(one) if one.why else nullcontext():
+            if one.why and not (one.folder / RECORD).is_file():  # made by another process since
+                with begun(one.step.stage):
+                    _do(one, source, root)
+            else:
+                LOG.info("%s: exists in %s", one.step.stage, one.folder)
         source = one.folder
     return source
+
+
+@contextmanager
+def _only_one_making(one: Planned) -> Iterator[None]:
+    """Hold a result: what an interrupted call left is gone on with by one process alone."""
+    try:
+        one.folder.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise unwritable(one.folder.parent, error) from error
+    with lock.held(one.folder, one.folder.with_name(f".{one.folder.name}.lock")):
+        yield
 
 
 def fingerprint(folder: Path, without: Path) -> str:

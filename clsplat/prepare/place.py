@@ -3,14 +3,17 @@
 import shutil
 from pathlib import Path
 
+from clsplat import lock
 from clsplat.errors import DataError
 from clsplat.files import unwritable
+from clsplat.names import LOCK
 from clsplat.prepare.cache import RECORD, plan, prepare
 from clsplat.prepare.steps import FindFeatures, MapCameras, MatchFeatures, Step
 from clsplat.reading import read_json
 from data_tools.gather import link
 from data_tools.photos import IMAGES, CameraModel, Mapper, Matching
 
+MODEL = "sparse"
 STEPS = ".steps"  # in the folder of the scene: results from which an interrupted call continues
 
 
@@ -24,26 +27,43 @@ def place_photographs(
 ) -> int:
     """Find the cameras of the photographs in `source`, write a COLMAP folder `out`; return the number of its images.
 
-    Raises DataError when `out` holds a model or images of another origin, and the errors of the steps.
+    Raises DataError when `out` holds a model or images of another origin, OutputError when another process uses it,
+    and the errors of the steps.
     """
-    images, sparse = out / IMAGES, out / "sparse"
-    if sparse.exists():
-        raise DataError(f"{out}: holds a model already, `sparse`; remove it, or give another folder")
-    if images.exists() and not images.is_symlink():
-        raise DataError(f"{out}: holds `{IMAGES}` already; give another folder")
+    _require_free(out)
     steps: list[Step] = [
         FindFeatures(long_side=long_side, camera_model=camera_model),
         MatchFeatures(matching=matching),
         MapCameras(mapper=mapper),
     ]
-    result = prepare(plan(steps, source, out / STEPS), source, out / STEPS)
     try:
-        images.unlink(missing_ok=True)
-        link(result / IMAGES, images)
-        half = out / STEPS / ".sparse"
-        shutil.rmtree(half, ignore_errors=True)
-        shutil.copytree(result / "sparse", half)
-        half.rename(sparse)
+        (out / STEPS).mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise unwritable(out, error) from error
+    with lock.held(out, out / STEPS / LOCK):
+        _require_free(out)  # again: another call may have ended since
+        result = prepare(plan(steps, source, out / STEPS), source, out / STEPS)
+        _show(result, out)
     return int(read_json(result / RECORD)["registered"])
+
+
+def _require_free(out: Path) -> None:
+    """Raise DataError where the folder holds what would be written there."""
+    images = out / IMAGES
+    if (out / MODEL).exists():
+        raise DataError(f"{out}: holds a model already, `{MODEL}`; remove it, or give another folder")
+    if images.exists() and not images.is_symlink():
+        raise DataError(f"{out}: holds `{IMAGES}` already; give another folder")
+
+
+def _show(result: Path, out: Path) -> None:
+    """Let `out` be a COLMAP folder: link the images of the last step, copy its model.  Raises OutputError."""
+    try:
+        (out / IMAGES).unlink(missing_ok=True)
+        link(result / IMAGES, out / IMAGES)
+        half = out / STEPS / f".{MODEL}"
+        shutil.rmtree(half, ignore_errors=True)
+        shutil.copytree(result / MODEL, half)
+        half.rename(out / MODEL)
+    except OSError as error:
+        raise unwritable(out, error) from error

@@ -2,21 +2,25 @@
 
 from pathlib import Path
 
+from clsplat import lock
 from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import Pipeline
-from clsplat.runs import lock
-from clsplat.runs.folders import Start, check_run_folder, up_to_date
+from clsplat.runs.default_folder import up_to_date
+from clsplat.runs.folders import Start, check_run_folder
 from clsplat.runs.opening import check_start, open_run
 from clsplat.runs.outputs import check_places
 from clsplat.runs.runner import restore
+from clsplat.runs.scenes import ReadScene, read_run_scene
 from clsplat.stages.base import Stage
 from clsplat.stages.evaluate import Evaluate
 from clsplat.stages.optimize import Optimize
 from clsplat.training.run import Run
 
 
-def describe(pipeline: Pipeline, out: Path, device: str | Device | None, start: Start) -> str:
-    """Return a line for each stage of a run in `out`, which is left as it is.
+def describe(
+    pipeline: Pipeline, out: Path, device: str | Device | None, start: Start, read: ReadScene = read_run_scene
+) -> str:
+    """Return a line for each stage of a run in `out`, which is left as it is; `read` reads the scene.
 
     Raises what the run would raise before its first stage; of its photographs only where nothing must be prepared.
     """
@@ -31,7 +35,7 @@ def describe(pipeline: Pipeline, out: Path, device: str | Device | None, start: 
     if any(one.why for one in planned):
         check_start(pipeline, out, device, start)
     else:
-        run = open_run(pipeline, out, device, start)
+        run = open_run(pipeline, out, device, start, read=read)
         if start == "resume":
             resumed = restore(pipeline, run)
             verdict = f"would go on from step {run.step}" if resumed else "nothing to resume; would run"

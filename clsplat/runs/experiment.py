@@ -4,9 +4,10 @@ import json
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
-from clsplat import terminal
+from clsplat import lock, terminal
 from clsplat.compare.page import write_comparison
 from clsplat.errors import ClsplatError, ConfigError, DataError, Interrupted, as_clsplat_error, one_line
 from clsplat.files import is_there, write_text
@@ -15,8 +16,11 @@ from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import Pipeline, load
 from clsplat.pipeline.matrix import Cell, Experiment, load_experiment
 from clsplat.pipeline.yaml_file import read_yaml
-from clsplat.runs import description, folders, lock, opening, outputs, runner
+from clsplat.runs import description, folders, opening, outputs, runner
+from clsplat.runs.default_folder import free_folder, up_to_date
+from clsplat.runs.failures import failures_recorded
 from clsplat.runs.folders import Start
+from clsplat.runs.scenes import read_run_scene
 from clsplat.signals import stop_at_once, stopping_on_signals
 from clsplat.training.changes import first_difference
 from clsplat.training.status import StatusFile, read_status
@@ -50,9 +54,9 @@ class Job:
             is_there(out)
         changes = [*overrides, *([f"scene.path={as_setting(scene)}"] if scene is not None else [])]
         if found := load_experiment(pipeline, changes):
-            return cls(found, out or folders.free_folder(Path("runs") / found.name, None, start), start)
+            return cls(found, out or free_folder(Path("runs") / found.name, None, start), start)
         checked = load(pipeline, changes)
-        return cls(checked, out or folders.free_folder(Path("runs") / checked.settings.name, checked, start), start)
+        return cls(checked, out or free_folder(Path("runs") / checked.settings.name, checked, start), start)
 
     @classmethod
     def resume(cls, out: Path, overrides: Sequence[str] = ()) -> "Job":
@@ -72,7 +76,7 @@ class Job:
         """Run it; what is up to date is left alone.  Raises ClsplatError; status.json tells why."""
         if isinstance(self.work, Experiment):
             run_matrix(self.work, self.out, device, self.start)
-        elif self.start != "restart" and folders.up_to_date(self.work, self.work.preparation(self.out), self.out):
+        elif self.start != "restart" and up_to_date(self.work, self.work.preparation(self.out), self.out):
             LOG.info("%s: up to date; change a setting, or give another folder, to run again", self.out)
         else:
             run_pipeline(self.work, self.out, device, self.start)
@@ -84,7 +88,7 @@ def run_pipeline(pipeline: Pipeline, out: Path, device: str | Device | None, sta
     with (
         folders.opened(out, start, step=0) as status,
         stopping_on_signals(stop_at_once),
-        folders.failures_recorded(status),
+        failures_recorded(status),
         terminal.logging_to(out / LOG_FILE),
     ):
         run = opening.open_run(pipeline, out, device, start, status)
@@ -102,10 +106,11 @@ def run_matrix(experiment: Experiment, out: Path, device: str | Device | None, s
     count = len(experiment.cells)
     with (
         folders.opened(out, start, cells=count, done=0, failed={}) as status,
-        folders.failures_recorded(status),
+        failures_recorded(status),
     ):
         write_text(out / PIPELINE, experiment.text)
         failures = _run_cells(experiment, status, device, start)
+        status.require_held()
         _compare(experiment, out, failures)
         if failures:
             raise _first_of(failures, count, "failed")
@@ -153,6 +158,7 @@ def describe_matrix(experiment: Experiment, out: Path, device: str | Device | No
     folders.check_run_folder(out, start)
     lock.check_free(out)
     lines, refusals = [], dict[str, ClsplatError]()
+    read = cache(read_run_scene)  # each distinct scene once
     for cell in experiment.cells:
         folder = out / cell.name
         state = "unfinished" if folder.exists() else ""
@@ -160,7 +166,7 @@ def describe_matrix(experiment: Experiment, out: Path, device: str | Device | No
             if start == "resume" and _finished(cell, folder):
                 state = "done"
             else:
-                description.describe(cell.pipeline, folder, device, start)
+                description.describe(cell.pipeline, folder, device, start, read)
         except ClsplatError as error:
             refusals[cell.name] = error
         lines.append(f"  {cell.name}  {state}".rstrip())

@@ -1,19 +1,17 @@
-"""The run folder: made, held, its failures recorded, its state read."""
+"""The run folder: made and held, cleared, left as it was by a run that has not begun."""
 
 import shutil
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from clsplat.errors import ConfigError, InternalError, Interrupted, OutputError, as_clsplat_error, one_line
+from clsplat import lock
+from clsplat.errors import ConfigError, InternalError, OutputError, as_clsplat_error
 from clsplat.files import sweep, unwritable
 from clsplat.names import BEFORE_A_RUN, CHECKPOINTS, CHECKSUMS, INPUTS, LOCK, METRICS, NOTE, OF_A_RUN, PIPELINE, RECORDS
-from clsplat.pipeline.loading import Pipeline, load
-from clsplat.prepare.cache import Planned, note, noted
-from clsplat.runs import lock
 from clsplat.training import checkpoint
-from clsplat.training.status import StatusFile, read_status
+from clsplat.training.status import StatusFile
 
 Start = Literal["new", "resume", "restart"]
 
@@ -33,10 +31,10 @@ def opened(out: Path, start: Start, **values: Any) -> Iterator[StatusFile]:
     except OSError as error:
         raise unwritable(out, error) from error
     try:
-        with lock.held(out):
+        with lock.held(out) as require_held:
             check_run_folder(out, start)  # again: another run may have ended since
             sweep(out, border=PIPELINE)
-            status = StatusFile(out, **values)
+            status = StatusFile(out, require_held, **values)
             status.begin()
             try:
                 with closing(status):  # the next holder writes its own
@@ -45,7 +43,9 @@ def opened(out: Path, start: Start, **values: Any) -> Iterator[StatusFile]:
                 is_defect = isinstance(as_clsplat_error(error), InternalError)  # its log has the traceback
                 if is_new and not status.now.step and not is_defect:
                     written = BEFORE_A_RUN if status.now.cells else OF_A_RUN - {CHECKPOINTS}
-                    _remove_unused(out, written, kept={LOCK} if made else BEFORE_A_RUN)
+                    with suppress(OutputError):
+                        status.require_held()
+                        _remove_unused(out, written, kept={LOCK} if made else BEFORE_A_RUN)
                 raise
     except BaseException:
         with suppress(OSError):  # where a folder holds anything, it stays
@@ -88,44 +88,3 @@ def check_run_folder(out: Path, start: Start) -> None:
         raise ConfigError(f"no start '{start}'; there are {', '.join(get_args(Start))}")
     if start == "new" and ((out / PIPELINE).exists() or checkpoint.saved(out)):
         raise ConfigError(f"{out}: already holds a run; give another folder, --resume or --restart")
-
-
-@contextmanager
-def failures_recorded(status: StatusFile, as_raised: bool = False) -> Iterator[None]:
-    """Turn every failure of the block into a ClsplatError, and write it to status.json.
-
-    With `as_raised` the failure itself is raised.
-    """
-    try:
-        yield
-    except BaseException as error:
-        failure = as_clsplat_error(error)
-        with suppress(OutputError):  # the failure itself is more important
-            state: Literal["interrupted", "failed"] = "interrupted" if isinstance(failure, Interrupted) else "failed"
-            status.end(state, failure.exit_code, one_line(failure))
-        if failure is error or as_raised:
-            raise
-        raise failure from error
-
-
-def free_folder(folder: Path, pipeline: Pipeline | None, start: Start) -> Path:
-    """Return the default run folder: a new run beside one that is not up to date gets the next free number."""
-    number, free = 1, folder
-    planned = pipeline.preparation(folder) if pipeline else []
-
-    def taken() -> bool:
-        if (free / LOCK).exists():  # by a run that has not begun yet
-            return True
-        return (free / PIPELINE).exists() and not (pipeline and up_to_date(pipeline, planned, free))
-
-    while start == "new" and taken():
-        number += 1
-        free = folder.with_name(f"{folder.name}-{number}")
-    return free
-
-
-def up_to_date(pipeline: Pipeline, planned: Sequence[Planned], out: Path) -> bool:
-    """Whether `out` holds a finished run of this pipeline and the same photographs; never where nothing is prepared."""
-    if not planned or noted(out) != note(planned):
-        return False
-    return read_status(out).get("state") == "done" and load(str(out / PIPELINE)).resolved() == pipeline.resolved()

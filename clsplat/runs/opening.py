@@ -1,34 +1,29 @@
 """Open what a run needs: the device, the photographs' preparation, the scene."""
 
-import logging
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
 from clsplat.conformance.quick import open_correct
 from clsplat.errors import ConfigError
-from clsplat.files import unwritable
 from clsplat.names import UNDISTORTED
 from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import Pipeline, prepared_folder
 from clsplat.prepare.cache import Planned, note, noted, prepare
 from clsplat.progress import heard_by
 from clsplat.render.rasterizer import Rasterizer
-from clsplat.runs import lock
 from clsplat.runs.folders import Start
-from clsplat.scene.decoding import decode_all, require_whole
-from clsplat.scene.detect import read_scene
-from clsplat.scene.identity import Identity
-from clsplat.scene.scene import Scene
+from clsplat.runs.scenes import ReadScene, RunScene, read_run_scene
 from clsplat.training.run import Run
 from clsplat.training.status import StatusFile
 from clsplat.views.photographs import Photographs
 
-LOG = logging.getLogger("clsplat")
-
 
 def open_run(
-    pipeline: Pipeline, out: Path, device: str | Device | None, start: Start = "new", status: StatusFile | None = None
+    pipeline: Pipeline,
+    out: Path,
+    device: str | Device | None,
+    start: Start = "new",
+    status: StatusFile | None = None,
+    read: ReadScene = read_run_scene,
 ) -> Run:
     """Open the device, prepare and read the scene, decode its photographs, and tell `status` how far that is.
 
@@ -41,24 +36,11 @@ def open_run(
     status = status or StatusFile(out)
     folder, root = pipeline.settings.scene.folder, prepared_folder(out)
     with heard_by(status.count):
-        with _only_one_preparing(root) if any(one.why for one in planned) else nullcontext():
-            folder = prepare(planned, folder, root, status.stage)
+        folder = prepare(planned, folder, root, status.stage)
         with status.stage("read_scene"):
-            scene = read_scene(folder, pipeline.settings.scene.holdout)
-            run = make_run(pipeline, scene, opened, out, status)
+            run = make_run(pipeline, read(pipeline.settings.scene, folder), opened, out, status)
     run.prepared = note(planned) if planned else None
     return run
-
-
-@contextmanager
-def _only_one_preparing(root: Path) -> Iterator[None]:
-    """Hold the folder of results: an interrupted step is gone on with by one process alone."""
-    try:
-        root.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise unwritable(root, error) from error
-    with lock.held(root):
-        yield
 
 
 def check_start(
@@ -82,43 +64,22 @@ def check_start(
     return opened, planned
 
 
-def make_run(pipeline: Pipeline, scene: Scene, device: Device, out: Path, status: StatusFile) -> Run:
-    """Return a run of the pipeline on a scene, before its first stage; every photograph was decoded.
-
-    Raises DataError, naming the files, when some of the training or test photographs and masks cannot be used.
-    """
+def make_run(pipeline: Pipeline, scene: RunScene, device: Device, out: Path, status: StatusFile) -> Run:
+    """Return a run of the pipeline on a scene, before its first stage."""
     settings = pipeline.settings
-    original, background = settings.scene.applied(scene)
-    downscaled, budget = original.downscaled(*settings.scene.downscales), settings.scene.image_budget
-    camera = downscaled.views[0].camera
-    LOG.info(
-        "scene: %s, %d training and %d test views, %d x %d px, %s background, extent %.3g",
-        *(
-            scene.path,
-            len(downscaled.train),
-            len(downscaled.test),
-            camera.width,
-            camera.height,
-            background,
-            downscaled.extent,
-        ),
-    )
-    files = decode_all(
-        view for one in (original, downscaled) for split in ("train", "test") for view in one.split(split)
-    )
-    require_whole(scene.path, files)
+    budget = settings.scene.image_budget
     return Run(
         device=device,
-        scene=downscaled,
-        original=original,
+        scene=scene.scene,
+        original=scene.original,
         out=out,
         name=settings.name,
         seed=settings.seed,
         settings=settings,
         pipeline=pipeline.resolved(),
         rasterizer=Rasterizer(device, settings.rasterizer.sort, settings.rasterizer.budget()),
-        photographs=Photographs(device, background, None if budget is None else budget << 20, out / UNDISTORTED),
+        photographs=Photographs(device, scene.background, None if budget is None else budget << 20, out / UNDISTORTED),
         status=status,
         model_settings=settings.model,
-        identity=Identity.of(original, files),
+        identity=scene.identity,
     )

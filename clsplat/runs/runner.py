@@ -31,6 +31,7 @@ def execute(pipeline: Pipeline, run: Run, start: Start, show: Callable[[Progress
     begin(pipeline, run, start)
     with finishing_on_interrupt(run), saved_on_failure(run):
         _run_stages(pipeline, run)
+    run.status.require_held()
     write_metrics(run)
     check_outputs(pipeline, run)
     write_checksums(pipeline, run)

@@ -133,6 +133,7 @@ def drop_later(out: Path, taken: Path | None) -> None:
 
 
 def _write(run: Run, kind: str) -> Path:
+    run.status.require_held()
     run.records.write()  # the state counts them
     state = State(
         format=FORMAT,

@@ -3,7 +3,7 @@
 import json
 import logging
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from itertools import islice
 from pathlib import Path
@@ -23,8 +23,10 @@ class Records:
     Lines wait until what they tell of is done, for a stage that fails is repeated when the run goes on.
     """
 
-    def __init__(self, out: Path) -> None:
+    def __init__(self, out: Path, require_held: Callable[[], None] = lambda: None) -> None:
+        """`require_held` raises OutputError when the folder is no longer held."""
         self.out = out
+        self._require_held = require_held
         self.path = out / RECORDS
         self.lines = 0  # of metrics.jsonl that belong to the state of the run, with those that wait
         self._waiting: list[str] = []
@@ -55,6 +57,7 @@ class Records:
         """Append the lines that wait.  Raises OutputError; then they wait on, and the file is as it was."""
         if not self._waiting:
             return
+        self._require_held()
         try:
             size = self.path.stat().st_size if self.path.exists() else 0
             try:

@@ -19,7 +19,7 @@ def saved_on_failure(run: Run) -> Iterator[None]:
     except (Interrupted, NotFiniteError):  # saved already, or set aside
         raise
     except (Exception, SystemExit, GeneratorExit):  # what a plug-in may raise; a second Ctrl-C stops at once
-        if run.step > 0:
+        if run.step > 0 and not run.status.lost:
             LOG.warning(_rescue(run))
         raise
 

@@ -83,7 +83,7 @@ class Run:
     show: Callable[[Progress], None] = lambda progress: None
 
     def __post_init__(self) -> None:
-        self.records = Records(self.out)
+        self.records = Records(self.out, self.status.require_held)
         self._model: DeviceModel | None = None
         self._filter_views: FilterViews | None = None
         self._texture_quantiles: dict[float, float] = {}

@@ -6,7 +6,7 @@ import os
 import threading
 import time
 import weakref
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -85,6 +85,8 @@ class Status(BaseModel):
     """Number of the process on that machine."""
     pid_namespace: str | None = None
     """Linux: where that number counts; containers on one machine have their own."""
+    boot: str | None = None
+    """Linux: the start of the machine at which that number was given; the next one begins anew."""
     started: float
     """When this process began with the run."""
     changed: float
@@ -97,10 +99,14 @@ class StatusFile:
     """The status.json of one run: held in memory, written at its beginning and end and every few seconds between.
 
     A thread does the writing in between, so that training never waits for a disk; where it fails, the run goes on.
+    Where the folder is another's by now, nothing is written, and the run is told when it next says what it does.
     """
 
-    def __init__(self, out: Path, **values: Any) -> None:
+    def __init__(self, out: Path, require_held: Callable[[], None] = lambda: None, **values: Any) -> None:
+        """`require_held` raises OutputError when the folder is no longer held."""
         self.out = out
+        self.lost: OutputError | None = None  # what it has raised
+        self._require_held = require_held
         now = time.time()
         checkpoint = read_status(out).get("checkpoint")
         self.now = Status(
@@ -122,8 +128,19 @@ class StatusFile:
         self.write()
         self._beat()
 
+    def require_held(self) -> None:
+        """Raise OutputError when the run no longer holds its folder: before anything is written there."""
+        try:
+            self._require_held()
+        except OutputError as error:
+            self.lost = error
+        if self.lost:
+            raise self.lost
+
     def note(self, **values: Any) -> None:
-        """Change fields; the next heartbeat writes them."""
+        """Change fields; the next heartbeat writes them.  Raises OutputError where one has found the folder lost."""
+        if self.lost:
+            raise self.lost
         with self._changing:
             self.now = self.now.model_copy(update={"changed": time.time(), **values})
 
@@ -158,7 +175,11 @@ class StatusFile:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Name the stage in progress; one inside of another gives way to it again, unless it fails."""
+        """Name the stage in progress; one inside of another gives way to it again, unless it fails.
+
+        Raises OutputError when the folder is no longer held.
+        """
+        self.require_held()
         around = {"stage": self.now.stage, "progress": self.now.progress}
         self._depth += 1
         self.note(stage=name, progress=None)
@@ -174,7 +195,7 @@ class StatusFile:
                 if not self._ended.is_set() and os.path.isdir(self.out):  # one that was removed stays so
                     self._write()
             except (OutputError, OSError) as error:
-                if not self._warned:
+                if not self._warned and not self.lost:
                     LOG.warning("%s; the run goes on", error)
                 self._warned = True
 
@@ -184,6 +205,7 @@ class StatusFile:
             self._write()
 
     def _write(self) -> None:
+        self.require_held()
         now = self.now.model_copy(update={"time": time.time()})
         write_text(self.out / STATUS, json.dumps(now.model_dump(exclude_none=True), indent=1) + "\n")
 

@@ -1,4 +1,4 @@
-"""One process at a time in a run folder.
+"""One process at a time in a folder.
 
 The system releases the lock when its holder ends, however it ends, so that it is never left behind.  The file
 `run.lock` tells who holds it.  Where a file system knows no locks, whoever makes that file holds the folder; one whose
@@ -12,16 +12,17 @@ import logging
 import os
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from clsplat.errors import OutputError, shortened
+from clsplat.errors import DataError, OutputError, shortened
 from clsplat.files import unwritable
 from clsplat.names import LOCK
 from clsplat.processes import Owner
+from clsplat.reading import read_json
 
 LOG = logging.getLogger("clsplat")
 HELD = {errno.EACCES, errno.EAGAIN, errno.EDEADLK}  # what the systems answer for a lock that another holds
@@ -31,19 +32,26 @@ _held: set[Path] = set()  # by this process
 
 
 @contextmanager
-def held(folder: Path) -> Iterator[None]:
-    """Hold the lock of a folder in the block.
+def held(folder: Path, path: Path | None = None) -> Iterator[Callable[[], None]]:
+    """Hold the lock of a folder in the block: a file `path`, by default `run.lock` in it.
 
-    Raises OutputError, with process and host where another holds it.
+    Yields a function that raises OutputError where that file was removed or replaced, so that another may hold the
+    folder.  Raises OutputError, with process and host where another holds it.
     """
-    path = _path(folder)
+    path = _path(folder, path or folder / LOCK)
     try:
         file = _locked(path, folder)
     except OSError as error:
         raise unwritable(path, error) from error
+
+    def require_held() -> None:
+        with suppress(OSError):  # whoever writes there is told of that
+            if not file.closed and not _is_at(file, path):
+                raise OutputError(_lost(path, folder))
+
     _held.add(path)
     try:
-        yield
+        yield require_held
     finally:
         _held.discard(path)
         with suppress(OSError):  # Windows removes no open file
@@ -57,7 +65,7 @@ def held(folder: Path) -> Iterator[None]:
 
 def check_free(folder: Path) -> None:
     """Raise OutputError where `held` would; nothing is written."""
-    path = _path(folder)
+    path = _path(folder, folder / LOCK)
     try:
         with suppress(FileNotFoundError), path.open("r+b", buffering=0) as file:
             try:
@@ -66,18 +74,18 @@ def check_free(folder: Path) -> None:
             except OSError as error:
                 if error.errno not in NO_LOCKS:
                     raise
-                _ended_owner(file, folder)
+                _ended_owner(file, path, folder)
     except OSError as error:
         raise unwritable(path, error) from error
 
 
-def _path(folder: Path) -> Path:
-    """The file of a folder that this process does not hold.  Raises OutputError."""
-    path = folder.resolve() / LOCK
+def _path(folder: Path, file: Path) -> Path:
+    """The one path of a lock's file that this process does not hold.  Raises OutputError."""
+    path = file.parent.resolve() / file.name
     if path in _held:
         raise OutputError(f"{folder}: is in use by this process; end that run or trainer first, or give another folder")
     if path.is_symlink():
-        raise OutputError(f"{folder / LOCK}: is a link, which is not followed; remove it")
+        raise OutputError(f"{file}: is a link, which is not followed; remove it")
     return path
 
 
@@ -118,21 +126,20 @@ def _is_ours(file: io.FileIO, is_new: bool, path: Path, folder: Path) -> bool:
         if error.errno not in NO_LOCKS:
             raise
     if not is_new:
-        owner = _ended_owner(file, folder)
+        owner = _ended_owner(file, path, folder)
         LOG.info("%s: taken over from process %s, which has ended", folder, owner.get("process"))
         _remove(file, path)
         return False
-    LOG.warning("%s: its file system knows no locks; %s alone keeps other processes away", folder, LOCK)
+    LOG.warning("%s: its file system knows no locks; %s alone keeps other processes away", folder, path.name)
     return True
 
 
-def _ended_owner(file: io.FileIO, folder: Path) -> dict[str, Any]:
+def _ended_owner(file: io.FileIO, path: Path, folder: Path) -> dict[str, Any]:
     """Who the file names, where there are no locks.  Raises OutputError unless that process has ended."""
     owner = _read(file)
     if not _has_ended(Owner.named_by(owner)):
         raise OutputError(
-            f"{_in_use(folder, owner)}; this file system knows no locks: if that process has ended, "
-            f"remove {folder / LOCK}"
+            f"{_in_use(folder, owner)}; this file system knows no locks: if that process has ended, remove {path}"
         )
     return owner
 
@@ -175,7 +182,7 @@ def _is_at(file: io.FileIO, path: Path) -> bool:
     """Whether an open file is still the one at a path."""
     try:
         return os.path.samestat(os.fstat(file.fileno()), path.stat())
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         return False
 
 
@@ -197,6 +204,19 @@ def _read(file: io.FileIO) -> dict[str, Any]:
 
 def _has_ended(owner: Owner | None) -> bool:
     return owner is not None and (owner == Owner.this() or owner.has_ended)  # this process does not hold it
+
+
+def _lost(path: Path, folder: Path) -> str:
+    """What to tell of a lock whose file is no longer at its path."""
+    try:
+        owner = read_json(path, limit=BEHIND_THE_TEXT)
+        by = f", and process {owner['process']} on {owner['host']} holds it now"
+    except (DataError, KeyError, TypeError):
+        by = ""
+    return (
+        f"{folder}: {path.name} was removed or replaced while this process held it{by}; nothing more was written; "
+        "to go on, resume the run when no other process uses it"
+    )
 
 
 def _in_use(folder: Path, owner: dict[str, Any]) -> str:

@@ -1,0 +1,33 @@
+"""The folder of a run that was given none, and whether a folder has what a run would make."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from clsplat.names import LOCK, PIPELINE
+from clsplat.pipeline.loading import Pipeline, load
+from clsplat.prepare.cache import Planned, note, noted
+from clsplat.runs.folders import Start
+from clsplat.training.status import read_status
+
+
+def free_folder(folder: Path, pipeline: Pipeline | None, start: Start) -> Path:
+    """Return the default run folder: a new run beside one that is not up to date gets the next free number."""
+    number, free = 1, folder
+    planned = pipeline.preparation(folder) if pipeline else []
+
+    def taken() -> bool:
+        if (free / LOCK).exists():  # by a run that has not begun yet
+            return True
+        return (free / PIPELINE).exists() and not (pipeline and up_to_date(pipeline, planned, free))
+
+    while start == "new" and taken():
+        number += 1
+        free = folder.with_name(f"{folder.name}-{number}")
+    return free
+
+
+def up_to_date(pipeline: Pipeline, planned: Sequence[Planned], out: Path) -> bool:
+    """Whether `out` holds a finished run of this pipeline and the same photographs; never where nothing is prepared."""
+    if not planned or noted(out) != note(planned):
+        return False
+    return read_status(out).get("state") == "done" and load(str(out / PIPELINE)).resolved() == pipeline.resolved()
