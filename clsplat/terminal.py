@@ -13,10 +13,8 @@ from rich.live import Live
 from rich.progress import BarColumn, Progress, TextColumn
 
 from clsplat import __version__, streams
-from clsplat.errors import DataError, OutputError
+from clsplat.errors import OutputError
 from clsplat.files import unwritable
-from clsplat.names import METRICS
-from clsplat.reading import read_json
 
 if TYPE_CHECKING:  # the command line starts without OpenCL
     from clsplat.training import run as training
@@ -150,23 +148,6 @@ def device_text(device: dict[str, Any]) -> str:
         f"  schedule  {d['schedule']}\n"
         f"  state     {'does not work: ' + d['fault'] if d['fault'] else 'works'}"
     )
-
-
-def show_summary(folder: Path) -> None:
-    """Print the metrics of a run and the paths of its files; nothing for a matrix."""
-    if not (folder / METRICS).exists():
-        return
-    metrics = read_json(folder / METRICS)
-    try:
-        test = next(iter(metrics["test"].values()), None)
-        quality = f"test PSNR {test['psnr']:.2f} dB, SSIM {test['ssim']:.4f}; " if test else ""
-        remark(f"{quality}{metrics['gaussians']:,} Gaussians; {metrics['train_seconds']:.0f} s of training")
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise DataError(f"{folder / METRICS}: the file is damaged; run the pipeline again, --restart") from error
-    names = {"model": "point_cloud.ply", "renders": "renders", "viewer": "viewer.html", "report": "report.html"}
-    for title, name in names.items():
-        if (folder / name).exists():
-            remark(f"  {title:<8} {folder / name}")
 
 
 @contextmanager

@@ -17,6 +17,7 @@ ROWS = (  # from the top down; a module imports only from lower rows, or from it
     {"compare", "inspect", "terminal"},
     {"pipeline"},
     {"stages", "prepare"},
+    {"report"},
     {"training"},
     {"density", "metrics"},
     {"losses"},

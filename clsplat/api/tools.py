@@ -49,16 +49,18 @@ def doctor(device: "str | Device | None" = None, page: PathLike | None = None) -
 def inspect_scene(scene: PathLike, page: PathLike | None = None) -> "Inspection":
     """Look at a dataset; return its `verdict`, `findings`, whether it is `trainable`, and all as `data()`.
 
-    page: a file to write, with the cameras and points in 3D.  Raises DataError only where there is no such folder.
+    scene: a folder, or that of a run, which stands for the one it was trained on; page: a file to write, with the
+    cameras and points in 3D.  Raises DataError only where there is no such folder.
     """
     from clsplat.files import check_result
     from clsplat.inspect.inspection import Inspection
     from clsplat.inspect.page import write_page
+    from clsplat.runs.source import photographs_of
 
     load_plugins()
     if page is not None:
         check_result(Path(page), ".html")
-    inspection = Inspection.of(Path(scene))
+    inspection = Inspection.of(photographs_of(Path(scene)))
     if page is not None:
         write_page(inspection, Path(page))
     return inspection

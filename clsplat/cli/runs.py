@@ -35,24 +35,36 @@ def run(
     start: Literal["new", "resume", "restart"] = "resume" if resume else "restart" if restart else "new"
     found = work(pipeline, scene, out, set=set_ or (), device=device, start=start)
     if isinstance(found, Path):
-        terminal.show_summary(found)
+        _show_summary(found)
     else:
         terminal.show(found)
 
 
-@command("resume", "clsplat resume runs/splat_7k")
+@command("resume", "clsplat resume runs/splat_7k", "clsplat resume runs/splat_7k --steps 14000")
 def resume(
     folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run folder, or that of a matrix.")],
     device: DeviceOption = None,
+    steps: Annotated[
+        int | None,
+        typer.Option(min=1, metavar="N", help="Train to this step, further than before; as --set optimize.steps."),
+    ] = None,
     set_: SetOption = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Check everything and say what would run.")] = False,
 ) -> None:
-    """Go on with a run from its newest checkpoint."""
+    """Go on with a run from its newest checkpoint, or train one that is done for longer."""
+    changes = [*(set_ or ()), *([f"optimize.steps={steps}"] if steps is not None else [])]
     if dry_run:
         file = folder / "pipeline.yaml"
-        terminal.show(commands.describe_run(file, out=folder, set=set_ or (), device=device, start="resume"))
+        terminal.show(commands.describe_run(file, out=folder, set=changes, device=device, start="resume"))
     else:
-        terminal.show_summary(commands.resume(folder, set=set_ or (), device=device))
+        _show_summary(commands.resume(folder, set=changes, device=device))
+
+
+def _show_summary(folder: Path) -> None:
+    from clsplat.runs.summary import summary
+
+    for line in summary(folder):
+        terminal.remark(line)
 
 
 @command(

@@ -1,16 +1,19 @@
 """Runs side by side, as one page that opens offline: metrics, curves, crops, differing settings."""
 
 import logging
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
+from urllib.parse import quote
 
 from markupsafe import Markup
 
 from clsplat.compare import tables
 from clsplat.compare.comparison import Comparison, Row, Variant
 from clsplat.compare.crops import Crop, find_crops
+from clsplat.compare.run_folder import RunFolder
 from clsplat.errors import ConfigError, DataError
 from clsplat.files import write_text
 from clsplat.pages.page import charts, counted, embedded, render
@@ -55,12 +58,12 @@ def write_comparison(paths: Sequence[Path], out: Path, title: str = "", remarks:
     for fault in faults:
         LOG.warning("%s", fault)
     remarks = [*remarks, *faults]
-    write_text(out, comparison_page(comparison, title, remarks))
+    write_text(out, comparison_page(comparison, title, remarks, out.parent))
     return len(comparison.runs)
 
 
-def comparison_page(comparison: Comparison, title: str, remarks: Sequence[str]) -> str:
-    """Return the page; the default title is the names of the pipelines; `remarks` are at the top."""
+def comparison_page(comparison: Comparison, title: str, remarks: Sequence[str], folder: Path) -> str:
+    """Return the page for a folder; the default title is the names of the pipelines; `remarks` are at the top."""
     runs, scenes, variants = comparison.runs, comparison.scenes, comparison.variants
     names = list(dict.fromkeys(run.metrics.pipeline for run in runs))
     title = title or " · ".join([*names[:MAX_NAMES], *(["…"] if len(names) > MAX_NAMES else [])])
@@ -75,8 +78,18 @@ def comparison_page(comparison: Comparison, title: str, remarks: Sequence[str]) 
         scenes=[_section(name, rows) for name, rows in scenes.items()],
         variants=variants,
         settings=tables.differing_settings(variants),
-        runs=[(comparison.variant(run), str(run.path), run.metrics.seed) for run in runs],
+        runs=[(comparison.variant(run), str(run.path), run.metrics.seed, _links(run, folder)) for run in runs],
     )
+
+
+def _links(run: RunFolder, folder: Path) -> dict[str, str]:
+    """The pages of a run, with their addresses from a folder."""
+    files = {stage: run.path / run.metrics.files.get(stage, "") for stage in ("report", "viewer")}
+    return {
+        stage: quote(Path(os.path.relpath(file.resolve(), folder.resolve())).as_posix())
+        for stage, file in files.items()
+        if file.is_file()
+    }
 
 
 def _section(name: str, rows: Sequence[Row]) -> SceneSection:
@@ -101,8 +114,8 @@ def _curves(rows: Sequence[Row]) -> list[Markup]:
     """PSNR and Gaussians over steps, a line for each run; then quality over image sizes."""
 
     def lines(kind: str, figure: str, **where: object) -> list[Line]:
-        found = [(row.variant.colour, run.points(kind, figure, **where)) for row in rows for run in row.runs]
-        return [Line(points, colour=colour) for colour, points in found if len(points) > 1]
+        found = [(row, run, run.points(kind, figure, **where)) for row in rows for run in row.runs]
+        return [Line(points, _seed(row, run), row.variant.colour) for row, run, points in found if len(points) > 1]
 
     downscale = rows[0].runs[0].scene.downscale
     drawings = [
@@ -111,6 +124,11 @@ def _curves(rows: Sequence[Row]) -> list[Markup]:
         curve("Gaussians over steps", lines("train", "gaussians")),
     ]
     return charts(drawings + _size_charts(rows, "test") + _size_charts(rows, "train"))
+
+
+def _seed(row: Row, run: RunFolder) -> str:
+    """The name of a line where its variant has several seeds."""
+    return f"{row.variant.letter} seed {run.metrics.seed}" if len(row.runs) > 1 else ""
 
 
 def _size_charts(rows: Sequence[Row], split: str) -> list[str]:

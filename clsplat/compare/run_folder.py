@@ -49,6 +49,7 @@ class RunMetrics(BaseModel):
     seed: int
     device: str
     pipeline: str
+    files: dict[str, str] = {}  # of the last stage of each name, in the run folder
 
 
 @dataclass(frozen=True)

@@ -50,12 +50,13 @@ def curve(
     parts.append(f'<text x="{LEFT}" y="15" class="title">{html.escape(title)}</text>')
     for i, row in enumerate(legend, 1):
         parts.append(f'<text x="{LEFT}" y="{15 + LEGEND_ROW * i}">{row}</text>')
-    for tick in _decade_ticks(y_low, y_high) if logarithmic else _ticks(y_low, y_high):
+    rows = _decade_ticks(y_low, y_high) if logarithmic else _ticks(y_low, y_high)
+    for tick, label in zip(rows, _numbers([10**row if logarithmic else row for row in rows]), strict=True):
         _, y = place(x_low, tick)
-        label = _number(10**tick if logarithmic else tick)
         parts.append(f'<line x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{y:.1f}" y2="{y:.1f}" class="grid"/>')
         parts.append(f'<text x="{LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">{label}</text>')
-    for tick, label in (ticks or {tick: _number(tick) for tick in _ticks(x_low, x_high)}).items():
+    columns = _ticks(x_low, x_high)
+    for tick, label in (ticks or dict(zip(columns, _numbers(columns), strict=True))).items():
         x, _ = place(tick, y_low)
         parts.append(f'<text x="{x:.1f}" y="{HEIGHT - 10}" text-anchor="middle">{html.escape(label)}</text>')
     for i, line in enumerate(drawn):
@@ -79,19 +80,20 @@ def histogram(title: str, values: Sequence[float], bins: int = 24) -> str:
     width, height = WIDTH - LEFT - RIGHT, HEIGHT - BOTTOM - TOP
     parts = [f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{html.escape(title)}">']
     parts.append(f'<text x="{LEFT}" y="15" class="title">{html.escape(title)}</text>')
-    for tick in _ticks(0, max(counts)):
-        if tick % 1 == 0:
-            y = HEIGHT - BOTTOM - tick / max(counts) * height
-            parts.append(f'<line x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{y:.1f}" y2="{y:.1f}" class="grid"/>')
-            parts.append(f'<text x="{LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">{_number(tick)}</text>')
+    rows = [tick for tick in _ticks(0, max(counts)) if tick % 1 == 0]
+    for tick, label in zip(rows, _numbers(rows), strict=True):
+        y = HEIGHT - BOTTOM - tick / max(counts) * height
+        parts.append(f'<line x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{y:.1f}" y2="{y:.1f}" class="grid"/>')
+        parts.append(f'<text x="{LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">{label}</text>')
     for i, count in enumerate(counts):
         if count:
             tall = count / max(counts) * height
             place = f'x="{LEFT + i * width / bins + 1:.1f}" y="{HEIGHT - BOTTOM - tall:.1f}"'
             parts.append(f'<rect {place} width="{width / bins - 2:.1f}" height="{tall:.1f}" fill="{COLOURS[0]}"/>')
-    for tick in _ticks(0, high):
+    columns = _ticks(0, high)
+    for tick, label in zip(columns, _numbers(columns), strict=True):
         x = LEFT + tick / high * width
-        parts.append(f'<text x="{x:.1f}" y="{HEIGHT - 10}" text-anchor="middle">{_number(tick)}</text>')
+        parts.append(f'<text x="{x:.1f}" y="{HEIGHT - 10}" text-anchor="middle">{label}</text>')
     return "".join([*parts, "</svg>"])
 
 
@@ -138,8 +140,14 @@ def _decade_ticks(low: float, high: float) -> list[float]:
     return ticks if len(ticks) > 1 else [math.log10(tick) for tick in _ticks(10**low, 10**high)]
 
 
-def _number(value: float) -> str:
+def _numbers(values: Sequence[float]) -> list[str]:
+    """Labels of ticks, with the digits that tell them apart: 100k, 100.2k, not 100k twice."""
+    found = [[_number(value, digits) for value in values] for digits in range(3, 10)]
+    return next((labels for labels in found if len(set(labels)) == len(set(values))), found[-1])
+
+
+def _number(value: float, digits: int) -> str:
     for limit, suffix in ((1e6, "M"), (1e3, "k")):
         if abs(value) >= limit:
-            return f"{value / limit:.3g}{suffix}"
-    return f"{value:.3g}"
+            return f"{value / limit:.{digits}g}{suffix}"
+    return f"{value:.{digits}g}"

@@ -21,6 +21,7 @@ from clsplat.runs.default_folder import free_folder, up_to_date
 from clsplat.runs.failures import failures_recorded
 from clsplat.runs.folders import Start
 from clsplat.runs.scenes import read_run_scene
+from clsplat.runs.source import photographs_of
 from clsplat.signals import stop_at_once, stopping_on_signals
 from clsplat.training.changes import first_difference
 from clsplat.training.status import StatusFile, read_status
@@ -52,7 +53,7 @@ class Job:
         """
         if out is not None:
             is_there(out)
-        changes = [*overrides, *([f"scene.path={as_setting(scene)}"] if scene is not None else [])]
+        changes = [*overrides, *([f"scene.path={as_setting(photographs_of(scene))}"] if scene is not None else [])]
         if found := load_experiment(pipeline, changes):
             return cls(found, out or free_folder(Path("runs") / found.name, None, start), start)
         checked = load(pipeline, changes)

@@ -11,7 +11,7 @@ from clsplat.errors import ConfigError, InternalError, OutputError, as_clsplat_e
 from clsplat.files import sweep, unwritable
 from clsplat.names import BEFORE_A_RUN, CHECKPOINTS, CHECKSUMS, INPUTS, LOCK, METRICS, NOTE, OF_A_RUN, PIPELINE, RECORDS
 from clsplat.training import checkpoint
-from clsplat.training.status import StatusFile
+from clsplat.training.status import StatusFile, read_status
 
 Start = Literal["new", "resume", "restart"]
 
@@ -88,3 +88,6 @@ def check_run_folder(out: Path, start: Start) -> None:
         raise ConfigError(f"no start '{start}'; there are {', '.join(get_args(Start))}")
     if start == "new" and ((out / PIPELINE).exists() or checkpoint.saved(out)):
         raise ConfigError(f"{out}: already holds a run; give another folder, --resume or --restart")
+    status = read_status(out) if start == "resume" else {}
+    if status.get("state") == "done" and "cells" not in status and not checkpoint.saved(out):
+        raise ConfigError(f"{out}: is done, and has no checkpoint to go on from; --restart trains it again")

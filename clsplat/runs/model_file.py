@@ -4,7 +4,6 @@ import io
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,61 +12,23 @@ import numpy as np
 from clsplat.conformance.quick import open_correct
 from clsplat.errors import ConfigError, DataError
 from clsplat.files import atomic, is_there, write_text
-from clsplat.formats.table import located
-from clsplat.gaussians.model import MODEL, load
+from clsplat.gaussians.model import load
 from clsplat.metrics.images import to_8_bits
 from clsplat.metrics.lpips import InputRange
 from clsplat.metrics.perceptual import Perceptual, metric_names
 from clsplat.metrics.views import PSNR_AND_SSIM, mean, measure, render_floats, require_finite
-from clsplat.names import PIPELINE
 from clsplat.opencl.device import Device
-from clsplat.pipeline.file import SceneSettings
-from clsplat.pipeline.loading import load as load_pipeline
-from clsplat.prepare.cache import noted
 from clsplat.reading import read_json
 from clsplat.render.rasterizer import Rasterizer
+from clsplat.runs.source import Source
 from clsplat.scene.detect import read_scene
 from clsplat.scene.images import write_image
-from clsplat.scene.scene import Alpha
 from clsplat.stages.render import image_paths
 from clsplat.views.photographs import Photographs
 
 SPLITS = ("train", "test", "all")
 KINDS = ("png", "npy")  # of files
 RECORD = ".renders.json"  # beside renders: their names
-
-
-@dataclass(frozen=True)
-class Source:
-    """A model file, and the photographs whose cameras look at it."""
-
-    file: Path
-    folder: Path  # of the photographs
-    settings: SceneSettings  # how they are read
-    alpha: Alpha | None = None  # None: as the model file says
-
-    @classmethod
-    def of(cls, model: Path, scene: Path | None) -> "Source":
-        """Take a model file with its scene, or a run folder, which has both.
-
-        `scene` replaces the folder of the run's photographs.  Raises DataError or ConfigError when one is not known.
-        """
-        if not model.is_dir() or (located(model).is_file() and not (model / PIPELINE).is_file()):
-            if scene is None:
-                raise ConfigError(
-                    f"{model}: a model file does not name its scene; give the folder of a scene, or a run folder"
-                )
-            return cls(model, scene, SceneSettings())
-        if not (model / PIPELINE).is_file():
-            raise DataError(f"{model}: has no pipeline.yaml; expected a model file or a run folder")
-        settings = load_pipeline(str(model / PIPELINE)).settings.scene
-        if not (model / MODEL).is_file():
-            raise DataError(f"{model}: has no {MODEL}; finish the run with `clsplat resume {model}`")
-        prepared = noted(model)
-        folder = scene or Path(prepared["folder"] if prepared else settings.folder)
-        if not folder.is_dir():
-            raise DataError(f"{model}: the folder of its photographs, {folder}, is missing; give the folder of a scene")
-        return cls(model / MODEL, folder, settings, settings.alpha)
 
 
 class ModelFile:

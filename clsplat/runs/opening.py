@@ -8,6 +8,7 @@ from clsplat.names import UNDISTORTED
 from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import Pipeline, prepared_folder
 from clsplat.prepare.cache import Planned, note, noted, prepare
+from clsplat.prepare.facts import facts
 from clsplat.progress import heard_by
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.runs.folders import Start
@@ -39,7 +40,7 @@ def open_run(
         folder = prepare(planned, folder, root, status.stage)
         with status.stage("read_scene"):
             run = make_run(pipeline, read(pipeline.settings.scene, folder), opened, out, status)
-    run.prepared = note(planned) if planned else None
+    run.prepared, run.found = note(planned) if planned else None, facts(planned)
     return run
 
 

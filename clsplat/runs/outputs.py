@@ -17,7 +17,10 @@ from clsplat.training import checkpoint
 from clsplat.training.run import Run
 
 
-def write_metrics(run: Run) -> None:
+def write_metrics(pipeline: Pipeline, run: Run) -> None:
+    """Write what the run has come to, and where its files are: of each kind of stage that of the last."""
+    spent = {**run.status.seconds, "optimize": run.train_seconds}  # of this process, but training of all
+    files = {stage.stage: path for stage in pipeline.stages for path in stage.outputs(run.out)[:1]}
     metrics = {
         "test": run.metrics.get("test", {}),
         "train": run.metrics.get("train", {}),
@@ -27,6 +30,10 @@ def write_metrics(run: Run) -> None:
         "seed": run.seed,
         "device": run.device.text,
         "pipeline": run.name,
+        "seconds": {name: round(seconds, 3) for name, seconds in spent.items()},
+        "scene": str(run.scene.path.resolve()),
+        "files": {name: path.relative_to(run.out).as_posix() for name, path in files.items()},
+        **({"prepared": run.found} if run.found else {}),
         **({"changes": run.changes} if run.changes else {}),
     }
     write_text(run.out / METRICS, json.dumps(metrics, indent=1) + "\n")

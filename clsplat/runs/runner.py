@@ -32,7 +32,7 @@ def execute(pipeline: Pipeline, run: Run, start: Start, show: Callable[[Progress
     with finishing_on_interrupt(run), saved_on_failure(run):
         _run_stages(pipeline, run)
     run.status.require_held()
-    write_metrics(run)
+    write_metrics(pipeline, run)
     check_outputs(pipeline, run)
     write_checksums(pipeline, run)
     run.status.end("done", exit_code=0)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from clsplat.errors import ConfigError
 from clsplat.gaussians.model import Model, load
 from clsplat.pipeline.file import SceneSettings
-from clsplat.runs.model_file import Source
+from clsplat.runs.source import Source, run_of
 from clsplat.scene.detect import read_scene
 from clsplat.scene.photographs import load_photograph
 from clsplat.scene.scene import Scene, View
@@ -43,7 +43,7 @@ def view(
         raise ConfigError(f"--splats {splats}: expected a number of at least 1")
     if photographs not in ("none", "test", "all"):
         raise ConfigError(f"no photographs '{photographs}'; there are none, test and all")
-    source = next((Source.of(path, scene) for path in models if scene is not None or path.is_dir()), None)
+    source = next((Source.of(path, scene) for path in models if scene is not None or run_of(path)), None)
     loaded = {name: load(path) for name, path in zip(names(models), models, strict=True)}
     first = next(iter(loaded.values()))
     found = _scene(source, first) if source else None

@@ -10,10 +10,11 @@ from clsplat.training.run import Run
 
 
 class Checkpoint(Scheduled):
-    """Write everything that a resumed run needs to reach the same bits."""
+    """Write everything that a resumed run needs to reach the same bits; also after the last step, to train longer."""
 
     stage: Literal["checkpoint"] = "checkpoint"
     needs: ClassVar[frozenset[str]] = frozenset({"model"})
+    ends: ClassVar[bool] = True
     output_keys: ClassVar[frozenset[str]] = CADENCE | {"keep"}
 
     keep: Annotated[int, Field(gt=0)] = 2

@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
+from statistics import median
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, field_validator
@@ -112,7 +113,7 @@ class Optimize(Stage):
             seconds.append(time.perf_counter() - start)
             run.train_seconds += seconds[-1]
             if report:
-                self._report(run, last_step, loss, psnr, sum(seconds) / len(seconds))
+                self._report(run, last_step, loss, psnr, median(seconds))
                 seconds.clear()
             with suppress(Stopped):
                 self._act(run)
@@ -158,7 +159,8 @@ class Optimize(Stage):
     def _act(self, run: Run) -> None:
         """Run the stages that are due and do not edit; those that fail run again when the run goes on."""
         for place, stage in enumerate(self.during):
-            if run.stage_step == 0 or place < run.acted or stage.edits or not stage.due(run.step):
+            is_end = stage.ends and run.stage_step == self.steps
+            if run.stage_step == 0 or place < run.acted or stage.edits or not (is_end or stage.due(run.step)):
                 continue
             run.acted = place + 1  # a checkpoint is of the state after it
             try:

@@ -65,6 +65,7 @@ class Run:
     model_settings: ModelSettings
     identity: Identity | None = None  # of the original scene and its photographs
     prepared: dict[str, str] | None = None  # hash of the inputs of `prepare:`, and the folder of its result
+    found: dict[str, dict[str, Any]] = field(default_factory=dict)  # by the steps of `prepare:`
     losses: list[Loss] = field(default_factory=list)  # added from Python, beside those of the pipeline
     adam: Adam | None = None
     stats: SplatStats | None = None

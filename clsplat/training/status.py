@@ -120,6 +120,8 @@ class StatusFile:
         self._changing, self._writing = threading.Lock(), threading.Lock()
         self._ended = threading.Event()
         self._thread: threading.Thread | None = None
+        self.seconds: dict[str, float] = {}  # spent in each stage that has ended, without those inside of it
+        self._inside = 0.0  # seconds of the stages that have ended inside of the present one
         self._depth = 0  # of stages in progress
         self._warned = False
 
@@ -181,10 +183,15 @@ class StatusFile:
         """
         self.require_held()
         around = {"stage": self.now.stage, "progress": self.now.progress}
+        start, before = time.perf_counter(), self._inside
+        self._inside = 0.0
         self._depth += 1
         self.note(stage=name, progress=None)
         yield
         self._depth -= 1
+        spent = time.perf_counter() - start
+        self.seconds[name] = self.seconds.get(name, 0.0) + spent - self._inside
+        self._inside = before + spent
         if self._depth:
             self.note(**around)
 

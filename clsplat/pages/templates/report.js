@@ -1,0 +1,10 @@
+// A picture that is chosen fills the window, until it is chosen again or Escape is pressed.
+const grown = () => document.querySelector("button.grown");
+document.addEventListener("click", event => {
+  const chosen = event.target.closest("button.tagged"), before = grown();
+  if (before) before.classList.remove("grown");
+  if (chosen && chosen !== before) chosen.classList.add("grown");
+});
+document.addEventListener("keydown", event => {
+  if (event.key === "Escape" && grown()) grown().classList.remove("grown");
+});

@@ -1,0 +1,1 @@
+"""The parts of report.html: pictures, cameras, figures, curves, times."""

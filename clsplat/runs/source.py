@@ -1,0 +1,83 @@
+"""Which model and which photographs a command names: by a file, by the folder of a scene, or by that of a run."""
+
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from clsplat.errors import ConfigError, DataError
+from clsplat.formats.table import located
+from clsplat.gaussians.model import model_of_run
+from clsplat.names import PIPELINE
+from clsplat.pipeline.file import SceneSettings
+from clsplat.pipeline.loading import Pipeline, load
+from clsplat.prepare.cache import noted
+from clsplat.scene.scene import Alpha
+from clsplat.stages.export import Export
+
+
+@dataclass(frozen=True)
+class Source:
+    """A model file, and the photographs whose cameras look at it."""
+
+    file: Path
+    folder: Path  # of the photographs
+    settings: SceneSettings  # how they are read
+    alpha: Alpha | None = None  # None: as the model file says
+
+    @classmethod
+    def of(cls, model: Path, scene: Path | None) -> "Source":
+        """Take a run folder, or a file that a run has exported, with its photographs; other files need `scene`.
+
+        `scene`, a folder of photographs or of a run, replaces those of the model's run.  Raises DataError or
+        ConfigError when one is not known.
+        """
+        run = run_of(model)
+        trained = scene if scene is not None and is_run(scene) else run
+        if trained is None and scene is None:
+            if model.is_dir() and not located(model).is_file():
+                raise DataError(f"{model}: has no pipeline.yaml; expected a model file or a run folder")
+            raise ConfigError(
+                f"{model}: a model file does not name its scene; give the folder of a scene, or a run folder"
+            )
+        settings = load(str(trained / PIPELINE)).settings.scene if trained is not None else SceneSettings()
+        file = model_of_run(model) if run == model else model
+        if run == model and not file.is_file():
+            raise DataError(f"{model}: has no {file.name}; finish the run with `clsplat resume {model}`")
+        folder = photographs_of(scene if scene is not None else run or model)
+        return cls(file, folder, settings, settings.alpha)
+
+
+def is_run(folder: Path) -> bool:
+    """Whether a folder holds the pipeline of a run, or of a matrix."""
+    return (folder / PIPELINE).is_file()
+
+
+def run_of(model: Path) -> Path | None:
+    """Return the folder of the run that a model is of: itself, or one that has exported the file; None without one."""
+    if model.is_dir():
+        return model if is_run(model) else None
+    file = model.resolve()
+    for folder in filter(is_run, file.parents):
+        with suppress(ConfigError):
+            if file in {path for stage in _exports(load(str(folder / PIPELINE))) for path in stage.outputs(folder)}:
+                return folder
+    return None
+
+
+def photographs_of(scene: Path) -> Path:
+    """Return the folder of a scene: of a run that of the photographs it was trained on, else the folder itself.
+
+    Raises ConfigError for a run whose pipeline names none or cannot be read, DataError where the folder is missing.
+    """
+    if not is_run(scene):
+        return scene
+    prepared = noted(scene)
+    folder = Path(prepared["folder"]) if prepared else load(str(scene / PIPELINE)).settings.scene.folder
+    if not folder.is_dir():
+        raise DataError(f"{scene}: the folder of its photographs, {folder}, is missing; give the folder of a scene")
+    return folder
+
+
+def _exports(pipeline: Pipeline) -> list[Export]:
+    stages = [part for stage in pipeline.stages for part in (stage, *getattr(stage, "during", ()))]
+    return [stage for stage in stages if isinstance(stage, Export)]

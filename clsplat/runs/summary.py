@@ -1,0 +1,45 @@
+"""What a run has come to, in a few lines: its quality, its files, its photographs, its time, and what comes next."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from clsplat.errors import DataError
+from clsplat.names import METRICS
+from clsplat.reading import read_json
+from clsplat.training.found import photographs_text
+
+TITLES = {"export": "model", "render": "renders"}  # of what these stages write; others give their own names
+BEFORE_FILES = {"export": "point_cloud.ply", "render": "renders", "viewer": "viewer.html", "report": "report.html"}
+SHORTEST = 0.5  # seconds of a stage that is told
+
+
+def summary(folder: Path) -> list[str]:
+    """Return the lines; none for a run that is not done, or a matrix.  Raises DataError where a file is damaged."""
+    if not (folder / METRICS).exists():
+        return []
+    metrics = read_json(folder / METRICS)
+    try:
+        return list(_lines(folder, metrics))
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise DataError(f"{folder / METRICS}: the file is damaged; run the pipeline again, --restart") from error
+
+
+def _lines(folder: Path, metrics: dict[str, Any]) -> Iterator[str]:
+    test = next(iter(metrics["test"].values()), None)
+    quality = f"test PSNR {test['psnr']:.2f} dB, SSIM {test['ssim']:.4f}; " if test else ""
+    yield f"{quality}{metrics['gaussians']:,} Gaussians; {metrics['train_seconds']:.0f} s of training"
+    placed = photographs_text(metrics.get("prepared", {}))
+    if scene := metrics.get("scene"):
+        yield f"  scene    {scene}" + (f"; {placed}" if placed else "")
+    files = {stage: folder / name for stage, name in metrics.get("files", BEFORE_FILES).items()}
+    for stage, file in files.items():
+        if file.exists():
+            yield f"  {TITLES.get(stage, stage):<8} {file}"
+    steps = {name: found["seconds"] for name, found in metrics.get("prepared", {}).items()}
+    spent = {**steps, **metrics.get("seconds", {})}
+    if told := [f"{name} {seconds:.0f} s" for name, seconds in spent.items() if seconds >= SHORTEST]:
+        yield f"  time     {', '.join(told)}"
+    page = next((files[stage] for stage in ("report", "viewer") if stage in files and files[stage].exists()), None)
+    if page:
+        yield f"next: open {page} in a browser; `clsplat resume {folder} --steps {2 * metrics['steps']}` trains longer"
