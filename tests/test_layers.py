@@ -45,6 +45,7 @@ TEXTS = {  # what turns results into lines of text
     "clsplat.inspect.table": {"show"},
     "clsplat.pipeline.recipes": {"manual_text", "summaries_text"},
     "clsplat.runs.status": {"status_text"},
+    "clsplat.runs.summary": {"summary"},
     "clsplat.runs.verdict": {"lines", "verdict"},
     "clsplat.pipeline.files": {"shipped"},  # for completion, which must be fast
 }

@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 
 import clsplat
-from clsplat import terminal
 from clsplat.errors import ClsplatError, ConfigError, DataError
 from clsplat.pipeline import recipes
 from clsplat.pipeline.matrix import load_experiment
 from clsplat.plugins import digest_of
+from clsplat.runs.summary import summary
 from clsplat.scene import decoding
 from clsplat.training import archive
 from data_tools.made import Made, hash_of
@@ -138,4 +138,4 @@ def test_a_pipeline_that_is_no_text_is_not_copied(tmp_path):
 def test_metrics_that_are_damaged_are_one_sentence_after_a_run(text, tmp_path):
     (tmp_path / "metrics.json").write_text(text)
     with pytest.raises(DataError, match=r"metrics\.json: "):
-        terminal.show_summary(tmp_path)
+        summary(tmp_path)

@@ -39,7 +39,9 @@ AveragesByDownscale = dict[Annotated[str, Field(pattern=r"^\d+(\.\d+)?$")], Aver
 
 
 class RunMetrics(BaseModel):
-    """The contents of metrics.json."""
+    """The contents of metrics.json; figures of stages and of photographs are extra fields."""
+
+    model_config = ConfigDict(extra="allow")
 
     test: AveragesByDownscale
     train: AveragesByDownscale

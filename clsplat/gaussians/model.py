@@ -22,13 +22,11 @@ from clsplat.formats.splats import (
     sh_coefficients,
 )
 from clsplat.formats.table import for_writing, located, read, write
+from clsplat.gaussians.run_model import model_of_run
 from clsplat.gaussians.sh import rotated_sh
 from clsplat.gaussians.tables import DeviceModel, Gaussians
-from clsplat.names import METRICS, is_inside
 from clsplat.opencl.device import Device
-from clsplat.reading import read_json
 
-MODEL = "point_cloud.ply"  # of a run folder that does not name its own
 Floats = NDArray[np.float32]
 WIDTHS = {  # of the tables
     **{"means": (3,), "quats": (4,), "log_scales": (3,), "logit_opacity": (1,), "sh_base": (3,)},
@@ -223,15 +221,6 @@ def load(path: str | Path, options: Reading | None = None) -> Model:
         return model.transformed(scale, file.placement[:3, :3] / (scale or 1), file.placement[:3, 3])
     except ValueError as error:
         raise DataError(f"{path}: a node stretches or mirrors its Gaussians; export it again") from error
-
-
-def model_of_run(folder: Path) -> Path:
-    """Return the model file of a run folder: the last export, as its metrics.json names it."""
-    try:
-        name = read_json(folder / METRICS)["files"]["export"]
-    except (DataError, KeyError, TypeError):  # not finished, or of an earlier version
-        name = MODEL
-    return folder / (name if isinstance(name, str) and is_inside(name) else MODEL)
 
 
 def _quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:

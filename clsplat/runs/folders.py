@@ -89,5 +89,5 @@ def check_run_folder(out: Path, start: Start) -> None:
     if start == "new" and ((out / PIPELINE).exists() or checkpoint.saved(out)):
         raise ConfigError(f"{out}: already holds a run; give another folder, --resume or --restart")
     status = read_status(out) if start == "resume" else {}
-    if status.get("state") == "done" and "cells" not in status and not checkpoint.saved(out):
+    if status.get("state") == "done" and not ({"cells", "checkpoint"} & status.keys()):
         raise ConfigError(f"{out}: is done, and has no checkpoint to go on from; --restart trains it again")

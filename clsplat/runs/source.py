@@ -6,7 +6,7 @@ from pathlib import Path
 
 from clsplat.errors import ConfigError, DataError
 from clsplat.formats.table import located
-from clsplat.gaussians.model import model_of_run
+from clsplat.gaussians.run_model import model_of_run
 from clsplat.names import PIPELINE
 from clsplat.pipeline.file import SceneSettings
 from clsplat.pipeline.loading import Pipeline, load

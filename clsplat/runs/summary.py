@@ -36,7 +36,7 @@ def _lines(folder: Path, metrics: dict[str, Any]) -> Iterator[str]:
     for stage, file in files.items():
         if file.exists():
             yield f"  {TITLES.get(stage, stage):<8} {file}"
-    steps = {name: found["seconds"] for name, found in metrics.get("prepared", {}).items()}
+    steps = {name: found.get("seconds", 0) for name, found in metrics.get("prepared", {}).items()}
     spent = {**steps, **metrics.get("seconds", {})}
     if told := [f"{name} {seconds:.0f} s" for name, seconds in spent.items() if seconds >= SHORTEST]:
         yield f"  time     {', '.join(told)}"

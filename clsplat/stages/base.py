@@ -102,9 +102,9 @@ class Scheduled(Stage):
     stop: Annotated[int, Field(gt=0)] | None = None
     """Global step before which the stage runs."""
 
-    def due(self, step: int) -> bool:
-        """Return whether the stage runs at a global step, counted from 1."""
-        if self.every is None or step % self.every != 0:
+    def due(self, step: int, is_last: bool = False) -> bool:
+        """Return whether the stage runs at a global step, counted from 1; `is_last` of the training."""
+        if self.every is None or (step % self.every != 0 and not (is_last and self.ends)):
             return False
         return step > self.start and (self.stop is None or step < self.stop)
 

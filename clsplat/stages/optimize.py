@@ -83,8 +83,8 @@ class Optimize(Stage):
 
     def acting(self, step: int) -> list[Scheduled]:
         """Return the stages of `during` that run when the training begins after a global step."""
-        steps = range(step + 1, step + self.steps + 1)
-        return [stage for stage in self.during if any(map(stage.due, steps))]
+        last = step + self.steps
+        return [stage for stage in self.during if any(stage.due(i, i == last) for i in range(step + 1, last + 1))]
 
     def run(self, run: Run) -> None:
         for _ in self.iterate(run):
@@ -159,8 +159,8 @@ class Optimize(Stage):
     def _act(self, run: Run) -> None:
         """Run the stages that are due and do not edit; those that fail run again when the run goes on."""
         for place, stage in enumerate(self.during):
-            is_end = stage.ends and run.stage_step == self.steps
-            if run.stage_step == 0 or place < run.acted or stage.edits or not (is_end or stage.due(run.step)):
+            due = run.stage_step > 0 and stage.due(run.step, run.stage_step == self.steps)
+            if place < run.acted or stage.edits or not due:
                 continue
             run.acted = place + 1  # a checkpoint is of the state after it
             try:
@@ -207,10 +207,9 @@ class Optimize(Stage):
         ahead = range(1, min(READ_AHEAD, self.steps - run.stage_step) + 1)
         run.photographs.announce(sampler.at(run.step + number).view for number in ahead)
         stale = {name for stage in self.during if stage.due(run.step) for name in stage.stale(run)}
-        if run.stage_step == self.steps:
-            stale = set()
         trainer.losses = [*self.losses, *run.losses]
-        return trainer.differentiate(photograph, run.step, sample.transforms), stale
+        gradients = trainer.differentiate(photograph, run.step, sample.transforms)
+        return gradients, set() if run.stage_step == self.steps else stale
 
     def _photograph(self, run: Run, sample: Sample) -> Photograph:
         """The photograph of a step; at its full size where a mask leaves nothing of the smaller one.
@@ -231,13 +230,12 @@ class Optimize(Stage):
     def _values(self, run: Run, view: ViewGradients, sampler: Sampler) -> tuple[float, float]:
         """Read the step's loss and PSNR.  Raises NotFiniteError, with the state set aside, when not finite."""
         loss = view.loss
-        squared = float(pixel_loss(view.comparison, l1=0.0, l2=0.0).get()[..., 1].sum(dtype="float64"))
-        error = squared / view.comparison.counted
+        squares = pixel_loss(view.comparison, l1=0.0, l2=0.0).get()[..., 1]
+        error = float(squares.sum(dtype="float64")) / view.comparison.counted
         broken = run.model.gaussians.not_finite()
         if broken or not math.isfinite(loss):
-            view_name = sampler.at(run.step).view.name
-            told = checkpoint.set_aside(run, broken)
-            raise NotFiniteError(f"step {run.step}, view '{view_name}': the loss is {loss}; {told}")
+            name, told = sampler.at(run.step).view.name, checkpoint.set_aside(run, broken)
+            raise NotFiniteError(f"step {run.step}, view '{name}': the loss is {loss}; {told}")
         return loss, -10 * math.log10(max(error, 1e-10))
 
     def _report(self, run: Run, last_step: int, loss: float, psnr: float, seconds: float) -> None:
