@@ -43,6 +43,9 @@ if TYPE_CHECKING:
     from clsplat.api.tools import read_measurement as read_measurement
     from clsplat.api.trainer import Report as Report
     from clsplat.api.trainer import Trainer as Trainer
+    from clsplat.api.video import camera_path as camera_path
+    from clsplat.api.video import render_path as render_path
+    from clsplat.api.video import write_video as write_video
     from clsplat.formats.splats import Reading as Reading
     from clsplat.formats.splats import Writing as Writing
     from clsplat.gaussians.model import Model as Model
@@ -63,6 +66,7 @@ _ROOMS = {  # where the names come from, which `import clsplat` does not import
     "clsplat.api.renderer": "Gradients Picture Renderer",
     "clsplat.api.tools": "devices doctor inspect_scene load_plugin measure_growth measure_speed read_measurement",
     "clsplat.api.trainer": "Report Trainer",
+    "clsplat.api.video": "camera_path render_path write_video",
     "clsplat.formats.splats": "Reading Writing",
     "clsplat.gaussians.model": "Model Rendering load",
     "clsplat.scene.camera": "Camera",

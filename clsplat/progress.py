@@ -28,7 +28,7 @@ class Count:
 
     def __init__(self, what: str, total: int) -> None:
         self.what, self.total, self.done = what, total, 0
-        self._logged = time.monotonic()
+        self._begun = self._logged = time.monotonic()
         self.reach(0)
 
     def reach(self, done: int) -> None:
@@ -38,4 +38,12 @@ class Count:
             listener(self.what, done, self.total)
         if done and time.monotonic() - self._logged >= INTERVAL:
             self._logged = time.monotonic()
-            LOG.info("%s: %d of %d", self.what, done, self.total)
+            left = (self._logged - self._begun) / done * (self.total - done)
+            LOG.info("%s: %d of %d, about %s left", self.what, done, self.total, clock(left))
+
+
+def clock(seconds: float) -> str:
+    """Return a time as 0:07 or 1:02:03."""
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"

@@ -18,6 +18,7 @@ ROWS = (  # from the top down; a module imports only from lower rows, or from it
     {"pipeline"},
     {"stages", "prepare"},
     {"training"},
+    {"video"},
     {"density", "metrics"},
     {"losses"},
     {"viewer", "views", "filters"},
