@@ -28,10 +28,15 @@ WITHOUT = "or write pictures alone, into --out DIR, which any encoder reads"
 
 def check_file(path: Path) -> None:
     """Raise ConfigError where no video of this name can be written: its suffix, its encoder, or a file of a run."""
+    check_encoder(path)
+    check_result(path, path.suffix.lower())
+
+
+def check_encoder(path: Path) -> None:
+    """Raise ConfigError where there is no encoder for the suffix of a video."""
     suffix = path.suffix.lower()
     if suffix not in WRITERS:
         raise ConfigError(f"{path}: expected the name of a video that ends in {' or '.join(WRITERS)}")
-    check_result(path, suffix)
     if suffix == ".mp4":
         _av()
 

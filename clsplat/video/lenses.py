@@ -29,6 +29,15 @@ def checked_size(size: str | Size) -> Size:
     return pair
 
 
+def size_of(text: str) -> str:
+    """Return a size as it is.  Raises ValueError, as a validator does, where no film has it."""
+    try:
+        checked_size(text)
+    except ConfigError as error:
+        raise ValueError(str(error)) from error
+    return text
+
+
 def checked_frames(frames: int) -> int:
     """Return a number of frames.  Raises ConfigError where it is out of bounds."""
     if isinstance(frames, bool) or not isinstance(frames, int) or not 1 <= frames <= MAX_FRAMES:
