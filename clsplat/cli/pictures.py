@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from clsplat import terminal
-from clsplat.api import commands, video
+from clsplat.api import pictures
 from clsplat.cli.app import DeviceOption, ModelArgument, SceneOption, command
 from clsplat.errors import ConfigError
 
@@ -66,12 +66,12 @@ def render(
             raise ConfigError("--split is for pictures of views; of a film, --path views shows all views")
         options: dict[str, Any] = {"path": path or "ellipse", "frames": frames, "fps": fps, "size": size, "side": side}
         options |= {"depth": depth, "alpha": alpha, "save_path": save_path, "downscale": scale, "kind": format_}
-        terminal.remark(_told(video.render_path(model, scene, file, out=out, device=device, **options)))
+        terminal.remark(_told(pictures.render_path(model, scene, file, out=out, device=device, **options)))
         return
     of_films = {"--frames": frames, "--fps": fps, "--size": size, "--side": side, "--save-path": save_path}
     if given := [name for name, value in of_films.items() if value is not None]:
         raise ConfigError(f"{given[0]} is for films; give --path or --video, too")
-    count = commands.render_views(
+    count = pictures.render_views(
         model,
         scene,
         out,

@@ -1,4 +1,4 @@
-"""Camera paths in files: nerfstudio's camera_path.json, read and written.
+"""Camera paths in files: nerfstudio's camera_path.json, read and written, and the list of cameras of 3DGS, read.
 
 render_width, render_height  px       fps, seconds      camera_type  perspective
 camera_path  a frame each: camera_to_world (16 numbers by rows, OpenGL axes), fov (degrees, vertical), aspect
@@ -8,14 +8,14 @@ import json
 import logging
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from itertools import pairwise
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
+from clsplat.cameras import inria
 from clsplat.errors import DataError, quoted
 from clsplat.files import write_text
 from clsplat.reading import read_json
@@ -23,7 +23,7 @@ from clsplat.scene.camera import Camera
 from clsplat.scene.nerfstudio import FILE as TRANSFORMS
 from clsplat.scene.transforms import Frame, pose_of
 from clsplat.scene.view import View
-from clsplat.video.lenses import MAX_FRAMES, Size, checked_rate, checked_size
+from clsplat.video.lenses import MAX_FRAMES, Size, around, checked_rate, checked_size, even_size
 from clsplat.video.rig import Floats
 
 LOG = logging.getLogger("clsplat")
@@ -44,7 +44,7 @@ class CameraPath:
     def resized(self, size: Size) -> list[View]:
         """Return the views at another size, with the vertical field of view."""
         return [
-            View(view.name, _camera(size, 2 * math.atan(view.camera.height / 2 / view.camera.fy)), view.world_to_camera)
+            replace(view, camera=_camera(size, 2 * math.atan(view.camera.height / 2 / view.camera.fy)))
             for view in self.views
         ]
 
@@ -56,7 +56,9 @@ def read(path: Path, scene: Path | None = None) -> CameraPath:
     the poses are taken as they are, with a warning unless clsplat has written them.
     Raises DataError for another file, for damaged numbers and for a camera that is not perspective.
     """
-    table = read_json(path, "a camera_path.json of nerfstudio", limit=MAX_BYTES)
+    table = read_json(path, "a camera_path.json of nerfstudio, or a cameras.json of 3DGS", limit=MAX_BYTES)
+    if isinstance(table, list):
+        return _of_cameras(path)
     frames = table.get("camera_path") if isinstance(table, dict) else None
     if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
         raise DataError(f"{path}: expected a table with a list `camera_path`, as nerfstudio exports it")
@@ -76,6 +78,13 @@ def read(path: Path, scene: Path | None = None) -> CameraPath:
         pose = pose_of(Frame(path.parent, frame.where, {"transform_matrix": _rows(own.get("camera_to_world"))}))
         views.append(View(f"frame_{i + 1:05d}", _camera(size, math.radians(fov)), move(pose)))
     return CameraPath(views, checked_rate(whole.number("fps") or 30), size)
+
+
+def _of_cameras(path: Path) -> CameraPath:
+    """The cameras of a cameras.json as frames, each fitted into the size of the first."""
+    views = inria.read(path)
+    size = even_size(views[0].camera)
+    return CameraPath([replace(view, camera=around(view.camera, size)) for view in views], 30.0, size)
 
 
 def write(path: Path, views: Sequence[View], fps: float) -> None:
@@ -123,11 +132,6 @@ def spread(views: Sequence[View], frames: int) -> list[View]:
         )
         for i, (turn, centre, (fx, fy)) in enumerate(zip(turns, centres, focals, strict=True), 1)
     ]
-
-
-def length(views: Sequence[View]) -> float:
-    """Return how far the camera moves, scene units."""
-    return float(sum(np.linalg.norm(b.position - a.position) for a, b in pairwise(views)))
 
 
 def _frame(view: View) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Films and cameras as functions; errors and `device` as in `clsplat.api.commands`."""
+"""Pictures, films and cameras as functions; errors and `device` as in `clsplat.api.commands`."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -15,6 +15,40 @@ if TYPE_CHECKING:  # the command line starts without OpenCL
     from clsplat.scene.view import View
 
 Size = str | tuple[int, int]  # 640x480, or width and height, px
+
+
+def render_views(
+    model: PathLike,
+    scene: PathLike | None = None,
+    out: PathLike = "renders",
+    *,
+    split: Literal["test", "train", "all"] = "test",
+    downscale: float | None = None,
+    kind: Literal["png", "npy"] = "png",
+    depth: bool = False,
+    alpha: bool = False,
+    device: "str | Device | None" = None,
+) -> int:
+    """Render a model at the views of a scene, one file for each view; return the number of files.
+
+    model: a file, with `scene`, or a run folder, whose scene is the default; downscale: divisor of the photographs'
+    size, by default that of the run, 1 for a file; kind: 8-bit images, or float32 arrays [height, width, 3]; depth,
+    alpha: files NAME_depth and NAME_alpha beside, as arrays [height, width] in scene units and in [0, 1].
+    """
+    from clsplat.runs import model_file
+
+    load_plugins()
+    layers = ("colour", *(name for name, wanted in (("depth", depth), ("alpha", alpha)) if wanted))
+    return model_file.render(
+        Path(model),
+        path_of(scene),
+        Path(out),
+        split=split,
+        downscale=downscale,
+        kind=kind,
+        layers=layers,
+        device=device,
+    )
 
 
 def render_path(
@@ -75,3 +109,22 @@ def write_video(file: PathLike, images: "Iterable[NDArray[np.generic]]", fps: fl
     from clsplat.video.encoding import write_all
 
     return write_all(Path(file), images, fps)
+
+
+def write_cameras(
+    scene: "PathLike | Scene",
+    out: PathLike,
+    format: Literal["colmap", "nerfstudio", "inria"] = "colmap",
+    images: Literal["none", "copy"] = "none",
+) -> list[Path]:
+    """Write the cameras of a dataset or a run folder for other programs, as `clsplat data cameras` does.
+
+    format: sparse/0/*.txt of COLMAP, transforms.json of nerfstudio, or cameras.json of the reference implementation;
+    images: copy the photographs to out/images, too.  Returns the files of cameras.  Raises DataError for a lens that
+    the format cannot hold, ConfigError where a file is there.
+    """
+    from clsplat.runs import cameras
+    from clsplat.scene.scene import Scene
+
+    load_plugins()
+    return cameras.write(scene if isinstance(scene, Scene) else Path(scene), Path(out), format, images)
