@@ -37,8 +37,8 @@ SavePathOption = Annotated[
     "render",
     "clsplat render runs/splat_7k --out images",
     "clsplat render point_cloud.ply --scene my_scene --split all --format npy",
-    "clsplat render runs/splat_7k --path ellipse --frames 240 --size 1280x720 --video orbit.webm",
-    "clsplat render runs/splat_7k --path views --video compared.webm --side photograph",
+    "clsplat render runs/splat_7k --video ellipse.webm --size 1280x720",
+    "clsplat render runs/a --path views --side photograph --video both.webm",
 )
 def render(
     model: ModelArgument,
