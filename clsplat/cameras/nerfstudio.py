@@ -14,7 +14,7 @@ from clsplat.scene.points import write_points_ply
 from clsplat.scene.scene import PointCloud
 
 FILE, POINTS = "transforms.json", "points3d.ply"
-OPENGL = np.diag([1.0, -1.0, -1.0])  # axes of cameras: y up, z backwards
+OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # axes of cameras: y up, z backwards
 DISTORTION = {  # of COLMAP's models: the model that nerfstudio knows, and the names of what follows the middle
     "SIMPLE_PINHOLE": ("OPENCV", ()),
     "PINHOLE": ("OPENCV", ()),
@@ -53,9 +53,8 @@ def write(out: Path, views: list[Posed], points: PointCloud | None) -> list[Path
 
 def _matrix(one: Posed) -> list[list[float]]:
     """Camera to world, [4, 4], with OpenGL axes."""
-    rotation = one.view.world_to_camera[:, :3]
-    top = np.column_stack([rotation.T @ OPENGL, one.view.position])
-    return [*top.tolist(), [0.0, 0.0, 0.0, 1.0]]
+    matrix = np.linalg.inv(np.vstack([one.view.world_to_camera, [0, 0, 0, 1]])) @ OPENGL
+    return [*matrix[:3].tolist(), [0.0, 0.0, 0.0, 1.0]]
 
 
 def _lens(one: Posed) -> dict[str, Any]:

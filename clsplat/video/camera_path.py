@@ -84,7 +84,8 @@ def _of_cameras(path: Path) -> CameraPath:
     """The cameras of a cameras.json as frames, each fitted into the size of the first."""
     views = inria.read(path)
     size = even_size(views[0].camera)
-    return CameraPath([replace(view, camera=around(view.camera, size)) for view in views], 30.0, size)
+    frames = [replace(view, name=f"frame_{i:05d}", camera=around(view.camera, size)) for i, view in enumerate(views, 1)]
+    return CameraPath(frames, 30.0, size)
 
 
 def write(path: Path, views: Sequence[View], fps: float) -> None:
