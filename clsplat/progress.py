@@ -2,13 +2,15 @@
 
 import logging
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from typing import TypeVar
 
 LOG = logging.getLogger("clsplat")
 INTERVAL = 5.0  # seconds between lines of the log
 
+Item = TypeVar("Item")
 Listener = Callable[[str, int, int], None]  # what is counted, how many are done, how many there are
 _listener: ContextVar[Listener | None] = ContextVar("listener", default=None)
 
@@ -40,6 +42,14 @@ class Count:
             self._logged = time.monotonic()
             left = (self._logged - self._begun) / done * (self.total - done)
             LOG.info("%s: %d of %d, about %s left", self.what, done, self.total, clock(left))
+
+
+def counted(items: Iterable[Item], what: str, total: int) -> Iterator[Item]:
+    """Yield the items and count them; what was yielded is done when the next is asked for."""
+    count = Count(what, total)
+    for number, item in enumerate(items, 1):
+        yield item
+        count.reach(number)
 
 
 def clock(seconds: float) -> str:

@@ -8,7 +8,7 @@ from clsplat.cameras import colmap, inria, nerfstudio
 from clsplat.cameras.posed import IMAGES, Posed, image_files, posed
 from clsplat.errors import ConfigError, quoted
 from clsplat.files import atomic, is_there
-from clsplat.progress import Count
+from clsplat.progress import counted
 from clsplat.reading import opened
 from clsplat.scene.scene import PointCloud, Scene
 
@@ -40,9 +40,7 @@ def write_cameras(scene: Scene, out: Path, format_: str, images: str = "none", o
         if is_there(path):
             raise ConfigError(f"{path}: exists; give another folder for the cameras, or remove it")
     written = WRITERS[format_](out, views, scene.points)
-    count = Count("photographs copied", len(copies))
-    for number, (path, source) in enumerate(copies.items(), 1):
+    for path, source in counted(copies.items(), "photographs copied", len(copies)):
         with opened(source, "an image") as old, atomic(path) as new:
             shutil.copyfileobj(old, new)
-        count.reach(number)
     return written

@@ -1,7 +1,6 @@
 """Films of models: along a path, beside photographs or another model."""
 
 import time
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -11,7 +10,7 @@ from clsplat.conformance.quick import open_correct
 from clsplat.errors import ConfigError
 from clsplat.gaussians.model import Model, load
 from clsplat.opencl.device import Device
-from clsplat.progress import Count
+from clsplat.progress import counted
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.runs.model_file import Source
 from clsplat.runs.pictures import KINDS, write_pictures
@@ -80,7 +79,7 @@ def film(
         written = write_pictures(canvas, made.views, place.out, place.kind, extras.layers, taken)
     else:
         side = _side(extras.side, made, found, background, opened)
-        shoot(canvas, made, videos, side, _counted)
+        shoot(canvas, made, videos, side, lambda views: counted(views, "frames rendered", len(views)))
         written = list(videos.values())
     return {
         "files": [str(path) for path in written],
@@ -124,10 +123,3 @@ def _side(name: str | None, made: Film, scene: Scene | None, background: Backgro
         return photograph(taken.index(nearest(view, taken, reach)))
 
     return side
-
-
-def _counted(views: Sequence[View]) -> Iterator[View]:
-    count = Count("frames rendered", len(views))
-    for number, view in enumerate(views, 1):
-        yield view
-        count.reach(number)

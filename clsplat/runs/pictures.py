@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from clsplat.errors import ConfigError, DataError
 from clsplat.files import atomic, is_there, write_text
-from clsplat.progress import Count
+from clsplat.progress import counted
 from clsplat.reading import read_json
 from clsplat.scene.images import write_image
 from clsplat.scene.view import View
@@ -37,15 +37,13 @@ def write_pictures(
     names = [path.relative_to(out).as_posix() for path in paths]
     write_text(out / RECORD, json.dumps(sorted({*_rendered(out), *names}), indent=1) + "\n")
     depths = canvas.depth_range(views) if "depth" in layers and kind == "png" else (0.0, 0.0)
-    count = Count("views rendered", len(views))
-    for number, (view, of_view) in enumerate(zip(views, files, strict=True), 1):
+    for view, of_view in counted(zip(views, files, strict=True), "views rendered", len(views)):
         found = canvas.layers(view, "depth" in layers)
         for layer, path in of_view.items():
             if kind == "png":
                 write_image(path, shown(found, layer, depths))
             else:
                 _write_array(path, values(found, layer))
-        count.reach(number)
     return paths
 
 

@@ -16,7 +16,7 @@ from clsplat.training.run import Run
 from clsplat.video import encoding
 from clsplat.video.film import still
 from clsplat.video.lenses import RATES, checked_size, size_of
-from clsplat.video.pictures import Canvas
+from clsplat.video.pictures import Canvas, letterboxed
 
 LOG = logging.getLogger("clsplat")
 KIND = "snapshot"  # of lines in metrics.jsonl
@@ -96,10 +96,7 @@ class Timelapse(Stage):
         size = image_size(files[-1])
         with encoding.opened(run.out / self.file, size, self.fps) as write:
             for path in run.status.counted(run.until_interrupted(files), "frames", len(files)):
-                picture = read_image(path)
-                if picture.shape != (size[1], size[0], 3):  # the size was changed when the run went on
-                    raise DataError(f"{path}: is not {size[0]}x{size[1]} pixels as the last; start the run again")
-                write(np.asarray(picture, np.uint8))
+                write(letterboxed(np.asarray(read_image(path), np.uint8)[:, :, :3], size))  # one size for all
         LOG.info("time-lapse of %d frames written to %s", len(files), run.out / self.file)
 
     def verify(self, run: Run) -> None:

@@ -7,6 +7,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, field_validator
 
+from clsplat.progress import counted, heard_by
 from clsplat.scene.view import View
 from clsplat.settings import ReadPath
 from clsplat.stages.base import Stage, path_in_run
@@ -58,10 +59,11 @@ class Video(Stage):
         film, path = self._plan(run), run.out / self.file
 
         def through(views: Sequence[View]) -> Iterator[View]:
-            return run.status.counted(run.until_interrupted(views), "frames", len(views))
+            return counted(run.until_interrupted(views), "frames rendered", len(views))
 
         canvas = Canvas(run.rasterizer, run.model, run.photographs.background)
-        shoot(canvas, film, {"colour": path}, None, through)
+        with heard_by(run.status.count):
+            shoot(canvas, film, {"colour": path}, None, through)
         LOG.info("video of %d frames written to %s, %.2f MB", len(film.views), path, path.stat().st_size / 1e6)
 
     def verify(self, run: Run) -> None:

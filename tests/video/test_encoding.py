@@ -66,13 +66,15 @@ def test_an_encoder_is_silent(tmp_path, capfd):
     assert capfd.readouterr() == ("", "")
 
 
-def test_a_failure_leaves_the_file_that_was_there(tmp_path):
-    (tmp_path / "a.webm").write_bytes(b"old")
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_a_failure_leaves_the_file_that_was_there(suffix, tmp_path):
+    file = tmp_path / f"a{suffix}"
+    file.write_bytes(b"old")
     with pytest.raises(ValueError, match="picture 1 has shape"):
-        clsplat.write_video(tmp_path / "a.webm", [pictures()[0], pictures(1, (32, 48))[0]])
+        clsplat.write_video(file, [pictures()[0], pictures(1, (32, 48))[0]])
     with pytest.raises(ValueError, match="at least one picture"):
-        clsplat.write_video(tmp_path / "a.webm", [])
-    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == {"a.webm": b"old"}
+        clsplat.write_video(file, [])
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == {file.name: b"old"}
 
 
 def test_a_file_that_lost_frames_is_no_result(tmp_path, monkeypatch):
