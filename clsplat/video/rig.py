@@ -17,6 +17,8 @@ Floats = NDArray[np.floating]
 MOST_POINTS = 20_000  # that are looked at for near and far
 SHARES = 0.05, 0.95  # of what a camera sees lies before near, and before far
 MIN_UP = 0.1  # length of the mean of the upward axes: below it the cameras do not agree
+PARALLEL = 0.9  # length of the mean direction of view, from which on the axes hardly say where they meet
+BEYOND = 1.5  # times near and far: farther from what is seen they do not meet
 TOWARDS = 0.5  # share of the cameras that must have the focus before them
 
 
@@ -63,15 +65,25 @@ class Rig:
 
     @cached_property
     def focus(self) -> Floats:
-        """The point nearest to the optical axes, [3].  Raises DataError where most cameras look away from it."""
+        """The point nearest to the optical axes, [3]; of axes that are almost parallel, one amid what they show.
+
+        Raises DataError where most cameras look away from it.
+        """
         middle = np.median(self.points, axis=0) if len(self.points) else self.positions.mean(axis=0)
         focus = closest_point(self.positions, self.forwards, middle)
-        before = ((focus - self.positions) * self.forwards).sum(axis=1) > 0
-        if before.mean() < TOWARDS:
+        forward, (near, far) = self.forwards.mean(axis=0), self.depths
+        ahead = float(np.median(self._before(focus)))
+        if np.linalg.norm(forward) > PARALLEL and not near / BEYOND < ahead < far * BEYOND:
+            focus = self.positions.mean(axis=0) + unit(forward) * (near + far) / 2
+        if (self._before(focus) > 0).mean() < TOWARDS:
             raise DataError(
                 "the cameras look away from each other, so that there is nothing to turn about; use the path through"
             )
         return focus
+
+    def _before(self, point: Floats) -> Floats:
+        """The depth of a point in each view, [V]."""
+        return np.asarray(((point - self.positions) * self.forwards).sum(axis=1))
 
     @cached_property
     def depths(self) -> tuple[float, float]:

@@ -120,6 +120,22 @@ def test_a_spiral_sways_no_farther_than_the_cameras_and_looks_ahead(rng):
     assert 4 < rig.depths[0] < rig.depths[1] < 6
 
 
+def test_axes_that_are_almost_parallel_meet_amid_what_they_show(rng):
+    """As from a drone that looks straight down: the axes alone would meet far below the ground."""
+    places = np.column_stack([rng.uniform(-2, 2, (30, 2)), np.full(30, 5.0)])
+    slopes = np.column_stack([0.02 * -places[:, :2], np.full(30, -1.0)])
+    views = [
+        View.looking_at(p, p + s, (0, 1, 0), CAMERA, f"{i:03d}")
+        for i, (p, s) in enumerate(zip(places, slopes, strict=True))
+    ]
+    ground = np.column_stack([rng.uniform(-4, 4, (800, 2)), rng.uniform(-0.2, 0.2, 800)])
+    rig = Rig.of(views, ground)
+    np.testing.assert_allclose(rig.focus, (0, 0, 0), atol=0.8)
+    for view in PATHS["ellipse"](rig, 40, SIZE):
+        assert view.position[2] > 2, "above the ground"
+        assert view.world_to_camera[2, 2] < -0.7, "looking down"
+
+
 def test_a_ring_has_no_front_for_a_spiral(rng):
     with pytest.raises(DataError, match="use ellipse or through"):
         PATHS["spiral"](rig_of(ring(np.linspace(0, 2 * np.pi, 12, endpoint=False)), rng), 4, SIZE)
