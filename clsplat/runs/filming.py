@@ -62,6 +62,8 @@ def film(
     videos = files(place.video, extras.layers) if place.video else {}
     if place.kind not in KINDS:
         raise ConfigError(f"no kind '{place.kind}'; there are {', '.join(KINDS)}")
+    if videos and place.kind != KINDS[0]:
+        raise ConfigError(f"--format {place.kind} is for pictures; a video has 8 bits: leave --video out")
     if extras.save_path:
         check_path_file(extras.save_path)
     if extras.side and not videos:

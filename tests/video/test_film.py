@@ -138,6 +138,7 @@ def test_a_command_that_makes_no_film_ends_in_a_line(options, message, few_steps
         ({"video": None, "side": "photograph"}, "--side needs --video"),
         ({"save_path": "x.txt"}, "ends in .json"),
         ({"kind": "gif", "video": None}, "no kind 'gif'"),
+        ({"kind": "npy"}, "--format npy is for pictures"),
         ({"side": "no.ply"}, "no.ply"),
     ],
 )
