@@ -24,13 +24,17 @@ if TYPE_CHECKING:
     from clsplat.api.commands import evaluate as evaluate
     from clsplat.api.commands import pipeline_schema as pipeline_schema
     from clsplat.api.commands import pipelines as pipelines
-    from clsplat.api.commands import render_views as render_views
     from clsplat.api.commands import resume as resume
     from clsplat.api.commands import run as run
     from clsplat.api.commands import status as status
     from clsplat.api.commands import status_schema as status_schema
     from clsplat.api.commands import view as view
     from clsplat.api.device import Device as Device
+    from clsplat.api.pictures import camera_path as camera_path
+    from clsplat.api.pictures import render_path as render_path
+    from clsplat.api.pictures import render_views as render_views
+    from clsplat.api.pictures import write_cameras as write_cameras
+    from clsplat.api.pictures import write_video as write_video
     from clsplat.api.renderer import Gradients as Gradients
     from clsplat.api.renderer import Picture as Picture
     from clsplat.api.renderer import Renderer as Renderer
@@ -58,11 +62,12 @@ __version__ = "0.1.0"
 _HERE = Path(__file__).resolve().parent
 _ROOMS = {  # where the names come from, which `import clsplat` does not import
     "clsplat.api.commands": "check compare_runs convert copy_pipeline describe_run evaluate pipeline_schema pipelines"
-    " render_views resume run status status_schema view",
+    " resume run status status_schema view",
     "clsplat.api.device": "Device",
     "clsplat.api.renderer": "Gradients Picture Renderer",
     "clsplat.api.tools": "devices doctor inspect_scene load_plugin measure_growth measure_speed read_measurement",
     "clsplat.api.trainer": "Report Trainer",
+    "clsplat.api.pictures": "camera_path render_path render_views write_cameras write_video",
     "clsplat.formats.splats": "Reading Writing",
     "clsplat.gaussians.model": "Model Rendering load",
     "clsplat.scene.camera": "Camera",

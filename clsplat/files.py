@@ -16,7 +16,8 @@ from clsplat.names import COMPARISON, PIPELINE, STATUS
 from clsplat.processes import is_alive
 
 LOG = logging.getLogger("clsplat")
-PARTIAL = re.compile(r"\..+\.(\d+)-\d+\.partial")  # what a process that was killed leaves: .NAME.PROCESS-NUMBER.partial
+# what a process that was killed leaves: .NAME.PROCESS-NUMBER.partial
+PARTIAL = re.compile(r"\..+\.(\d+)-\d+\.partial(\.\w+)?")
 NO_SYNC = {errno.EINVAL, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EBADF, errno.EACCES, errno.EPERM}
 SYSTEM = os.name
 _number = itertools.count()
@@ -30,16 +31,25 @@ def atomic(path: Path) -> Iterator[BinaryIO]:
     Then the folder is synced, so that the new name outlasts a power cut.
     Raises OutputError with the file's name when it cannot be written; an earlier file then stays unchanged.
     """
+    with atomic_name(path) as temporary, temporary.open("wb") as file:
+        yield file
+        file.flush()
+        os.fsync(file.fileno())
+
+
+@contextmanager
+def atomic_name(path: Path, suffix: str = "") -> Iterator[Path]:
+    """Yield a temporary name beside `path` for what opens files itself and looks at their suffix; then as `atomic`.
+
+    Who takes the name syncs the file.
+    """
     if not path.name:
         raise OutputError(f"{path}: cannot be written (it has no name); expected the path of a file")
-    temporary = path.with_name(f".{path.name}.{os.getpid()}-{next(_number)}.partial")
+    temporary = path.with_name(f".{path.name}.{os.getpid()}-{next(_number)}.partial{suffix}")
     _open.add(temporary.name)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with temporary.open("wb") as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
+        yield temporary
         _replace(temporary, path)
         sync_folder(path.parent)
     except OSError as error:

@@ -15,6 +15,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 from clsplat import __version__, streams
 from clsplat.errors import OutputError
 from clsplat.files import unwritable
+from clsplat.progress import clock
 
 if TYPE_CHECKING:  # the command line starts without OpenCL
     from clsplat.training import run as training
@@ -132,7 +133,7 @@ def line(progress: "training.Progress") -> str:
     p = progress
     return (
         f"step {p.step}/{p.steps}  loss {p.loss:.4f}  psnr {p.psnr:.1f}  gaussians {p.gaussians:,}  "
-        f"{p.milliseconds:.1f} ms/step  {_clock(p.seconds_left)} left"
+        f"{p.milliseconds:.1f} ms/step  {clock(p.seconds_left)} left"
     )
 
 
@@ -165,9 +166,3 @@ def progress_bar() -> Iterator[Callable[["training.Progress"], None]]:
             LOG.debug(line(progress))
 
         yield update
-
-
-def _clock(seconds: float) -> str:
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"

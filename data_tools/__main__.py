@@ -1,7 +1,7 @@
 """Dataset preparation: `clsplat data COMMAND …`, or `python -m data_tools COMMAND …`."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -107,6 +107,22 @@ def masks(
     from data_tools.masks import write_masks
 
     print(f"{write_masks(scene, folder, out, threshold)} masks written")
+
+
+@app.command()
+def cameras(
+    scene: Annotated[Path, typer.Argument(help=f"{DATASET[:-1]}, or of a run.")],
+    out: Annotated[Path, typer.Argument(help="Folder for the files.")],
+    format_: Annotated[
+        Literal["colmap", "nerfstudio", "inria"],
+        typer.Option("--format", help="sparse/0/*.txt, transforms.json, or cameras.json of the first 3DGS."),
+    ] = "colmap",
+    images: Annotated[Literal["none", "copy"], typer.Option(help="Photographs: stay, or are copied too.")] = "none",
+) -> None:
+    """Write the cameras of a scene for other programs."""
+    from clsplat.api.pictures import write_cameras
+
+    print("\n".join(str(path) for path in write_cameras(scene, out, format_, images)))
 
 
 @app.command()

@@ -47,3 +47,8 @@ def load_plugins() -> None:
 def path_of(value: PathLike | None) -> Path | None:
     """Return a path as one."""
     return None if value is None else Path(value)
+
+
+def layer_names(depth: bool, alpha: bool) -> tuple[str, ...]:
+    """Return the layers that are rendered."""
+    return ("colour", *(name for name, wanted in (("depth", depth), ("alpha", alpha)) if wanted))

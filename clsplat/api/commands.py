@@ -114,29 +114,6 @@ def copy_pipeline(name: PathLike, file: PathLike) -> Path:
     return recipes.copy(str(name), Path(file))
 
 
-def render_views(
-    model: PathLike,
-    scene: PathLike | None = None,
-    out: PathLike = "renders",
-    *,
-    split: Literal["test", "train", "all"] = "test",
-    downscale: float | None = None,
-    kind: Literal["png", "npy"] = "png",
-    device: "str | Device | None" = None,
-) -> int:
-    """Render a model at the views of a scene, one file for each view; return their number.
-
-    model: a file, with `scene`, or a run folder, whose scene is the default; downscale: divisor of the photographs'
-    size, by default that of the run, 1 for a file; kind: 8-bit images, or float32 arrays [height, width, 3].
-    """
-    from clsplat.runs import model_file
-
-    load_plugins()
-    return model_file.render(
-        Path(model), path_of(scene), Path(out), split=split, downscale=downscale, kind=kind, device=device
-    )
-
-
 def evaluate(
     model: PathLike,
     scene: PathLike | None = None,

@@ -14,6 +14,7 @@ from clsplat.metrics.images import to_8_bits
 from clsplat.metrics.views import require_finite
 from clsplat.opencl.device import Array, Device
 from clsplat.render.camera import DeviceCamera, upload_camera
+from clsplat.render.pictures import layers
 from clsplat.render.rasterizer import Content, Frame, Rasterizer
 from clsplat.scene.view import View, colour_of
 from clsplat.views.photographs import BACKGROUNDS
@@ -102,13 +103,10 @@ class Renderer:
         """
         view.camera.check()
         camera, colour = upload_camera(self.device, view), self._colour(background)
-        frame = self._forward(self._model, camera, colour)
-        image = _inside(frame, frame.image.get())
-        alpha = _inside(frame, 1 - np.abs(frame.transmittance.get())[None])[:, :, 0]
-        mean = self._depth(camera) if depth else None
-        for values in (image, alpha, *([] if mean is None else [mean])):
+        found = layers(self.rasterizer, self._model, camera, self.device.upload(colour), depth)
+        for values in found.arrays:
             require_finite(values, view)
-        return Picture(image, alpha, mean, view, colour, self._model, self)
+        return Picture(found.image, found.alpha, found.depth, view, colour, self._model, self)
 
     def backward(self, picture: Picture, image: Floats | None, alpha: Floats | None) -> Gradients:
         """Return the gradients of a loss, as Picture.backward does."""
@@ -138,12 +136,6 @@ class Renderer:
     ) -> Frame:
         return self.rasterizer.forward(model, camera, self.device.upload(background), content)
 
-    def _depth(self, camera: DeviceCamera) -> Floats:
-        frame = self._forward(self._model, camera, np.zeros(3, np.float32), "depth")
-        planes = _inside(frame, frame.image.get())
-        weight = planes[:, :, 1]
-        return np.divide(planes[:, :, 0], weight, out=np.zeros_like(weight), where=weight > 0)
-
     def _pixel_sums(self, model: DeviceModel, frame: Frame, derivative: Floats) -> Array:
         camera = frame.camera
         planes = np.zeros((3, camera.rows, camera.stride), np.float32)
@@ -154,11 +146,6 @@ class Renderer:
         if background is None:
             background = BACKGROUNDS[self.model.rendering.background or "black"]
         return np.ascontiguousarray(colour_of(background), np.float32)
-
-
-def _inside(frame: Frame, planes: Floats) -> Floats:
-    """[channels, rows, stride] -> [height, width, channels]."""
-    return np.ascontiguousarray(planes[:, : frame.camera.height, : frame.camera.width].transpose(1, 2, 0))
 
 
 def _checked(name: str, derivative: Floats, shape: tuple[int, ...]) -> Floats:

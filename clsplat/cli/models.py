@@ -1,7 +1,6 @@
 """Commands about trained models."""
 
 import json
-import math
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -11,32 +10,6 @@ from clsplat import terminal
 from clsplat.api import commands
 from clsplat.cli.app import DeviceOption, ModelArgument, SceneOption, command
 from clsplat.errors import ConfigError, quoted
-
-
-@command(
-    "render",
-    "clsplat render runs/splat_7k --out images",
-    "clsplat render point_cloud.ply --scene my_scene --split all --format npy",
-)
-def render(
-    model: ModelArgument,
-    scene: SceneOption = None,
-    split: Annotated[Literal["test", "train", "all"], typer.Option(help="Which views.")] = "test",
-    scale: Annotated[
-        float | None,
-        typer.Option(min=1, metavar="N", help="Divide image sizes by this; default: as the run did, 1 for a file."),
-    ] = None,
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the images.")] = Path("renders"),
-    format_: Annotated[
-        Literal["png", "npy"], typer.Option("--format", help="8-bit images, or float32 arrays.")
-    ] = "png",
-    device: DeviceOption = None,
-) -> None:
-    """Render a model at the views of a scene, one file for each, named as the view."""
-    if scale is not None and not math.isfinite(scale):
-        raise ConfigError(f"--scale {scale}: expected a finite number of at least 1")
-    count = commands.render_views(model, scene, out, split=split, downscale=scale, kind=format_, device=device)
-    terminal.remark(f"{count} images written to {out}")
 
 
 @command(

@@ -25,6 +25,7 @@ from clsplat.pipeline.yaml_file import Document, read_yaml
 from clsplat.prepare.cache import Planned, plan
 from clsplat.settings import Settings, variants
 from clsplat.stages.base import Scheduled, Stage, written_twice
+from clsplat.stages.optimize import Optimize
 
 
 @dataclass(frozen=True)
@@ -180,7 +181,7 @@ def _untagged(stage: dict[str, Any]) -> dict[str, Any]:
 
 def _check_order(path: Path, settings: PipelineFile) -> None:
     """Raise ConfigError where a stage needs a part of the run that no earlier stage makes."""
-    made = {"scene"}
+    made, step = {"scene"}, 0
     for i, stage in enumerate(settings.stages):
         for key in CADENCE if isinstance(stage, Scheduled) else ():
             if getattr(stage, key) != type(stage).model_fields[key].default:
@@ -191,5 +192,8 @@ def _check_order(path: Path, settings: PipelineFile) -> None:
                 f"{path}: stages[{i}] {stage.stage} needs '{need}', which no earlier stage makes ({makers} makes it)"
             )
         made |= stage.makes
+        if isinstance(stage, Optimize):
+            made.update(part for inner in stage.acting(step) for part in inner.makes)
+            step += stage.steps
     if place := written_twice(settings.stages):
         raise ConfigError(f"{path}: two stages write '{place}'; give one of them another name")

@@ -6,12 +6,14 @@ from pathlib import Path
 
 from clsplat.errors import ConfigError, DataError
 from clsplat.formats.table import located
+from clsplat.gaussians.model import Model
 from clsplat.gaussians.run_model import model_of_run
 from clsplat.names import PIPELINE
 from clsplat.pipeline.file import SceneSettings
 from clsplat.pipeline.loading import Pipeline, load
 from clsplat.prepare.cache import noted
-from clsplat.scene.scene import Alpha
+from clsplat.scene.detect import read_scene
+from clsplat.scene.scene import Alpha, Scene
 from clsplat.stages.export import Export
 
 
@@ -45,6 +47,10 @@ class Source:
             raise DataError(f"{model}: has no {file.name}; finish the run with `clsplat resume {model}`")
         folder = photographs_of(scene if scene is not None else run or model)
         return cls(file, folder, settings, settings.alpha)
+
+    def scene(self, model: Model) -> Scene:
+        """Read the photographs as the model was trained on, at their full size."""
+        return read_scene(self.folder, self.settings.holdout).with_alpha(self.alpha or model.rendering.alpha)
 
 
 def is_run(folder: Path) -> bool:

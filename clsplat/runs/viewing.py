@@ -7,12 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.errors import ConfigError
-from clsplat.gaussians.model import Model, load
-from clsplat.pipeline.file import SceneSettings
+from clsplat.gaussians.model import load
 from clsplat.runs.source import Source, run_of
-from clsplat.scene.detect import read_scene
 from clsplat.scene.photographs import load_photograph
-from clsplat.scene.scene import Scene, View
+from clsplat.scene.scene import View
 from clsplat.viewer.cameras import Stand
 from clsplat.viewer.packing import pack
 from clsplat.viewer.page import Page
@@ -46,7 +44,7 @@ def view(
     source = next((Source.of(path, scene) for path in models if scene is not None or run_of(path)), None)
     loaded = {name: load(path) for name, path in zip(names(models), models, strict=True)}
     first = next(iter(loaded.values()))
-    found = _scene(source, first) if source else None
+    found = source.scene(first).downscaled(source.settings.downscale) if source else None
     background = first.rendering.background or (found.background if found else "black")
 
     def read(one: View) -> NDArray[np.uint8]:
@@ -67,10 +65,3 @@ def names(models: Sequence[Path]) -> list[str]:
     if len(set(short)) < len(short):
         short = [f"{parent}/{name}" for parent, name in zip(parents, short, strict=True)]
     return short if len(set(short)) == len(short) else [f"{name} ({i})" for i, name in enumerate(short, 1)]
-
-
-def _scene(source: Source, model: Model) -> Scene:
-    """The views as the model was trained on."""
-    settings: SceneSettings = source.settings
-    scene = read_scene(source.folder, settings.holdout).with_alpha(source.alpha or model.rendering.alpha)
-    return scene.downscaled(settings.downscale)

@@ -1,0 +1,1 @@
+"""Cameras of a scene in the files of other programs."""

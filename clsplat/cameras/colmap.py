@@ -1,0 +1,51 @@
+"""COLMAP's model as text: cameras.txt, images.txt and points3D.txt, without tracks."""
+
+from pathlib import Path
+
+import numpy as np
+
+from clsplat.cameras.posed import Posed
+from clsplat.files import write_text
+from clsplat.scene.lens import Lens
+from clsplat.scene.quaternion import unit_quaternions
+from clsplat.scene.scene import PointCloud
+
+MODEL = Path("sparse/0")  # the folder of the model, beside that of the images
+
+
+def write(out: Path, views: list[Posed], points: PointCloud | None) -> list[Path]:
+    """Write the model into out/sparse/0; return its files.  Raises OutputError."""
+    lenses = {lens: number for number, lens in enumerate(dict.fromkeys(one.lens for one in views), 1)}
+    cameras = ["# CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]", *(_camera(lens, number) for lens, number in lenses.items())]
+    images = ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then a line of POINTS2D[] as (X Y POINT3D_ID)"]
+    for number, one in enumerate(views, 1):
+        images += [_image(one, number, lenses[one.lens]), ""]
+    rows = ["# POINT3D_ID X Y Z R G B ERROR TRACK[] as (IMAGE_ID POINT2D_IDX)", *(_points(points) if points else [])]
+    files = {"cameras.txt": cameras, "images.txt": images, "points3D.txt": rows}
+    for name, lines in files.items():
+        write_text(out / MODEL / name, "\n".join(lines) + "\n")
+    return [out / MODEL / name for name in files]
+
+
+def _camera(lens: Lens, number: int) -> str:
+    return f"{number} {lens.model} {lens.width} {lens.height} {numbers(lens.params)}"
+
+
+def _image(one: Posed, number: int, camera: int) -> str:
+    pose = one.view.world_to_camera
+    quaternion = unit_quaternions(pose[:, :3])
+    return f"{number} {numbers(quaternion)} {numbers(pose[:, 3])} {camera} {one.name}"
+
+
+def _points(points: PointCloud) -> list[str]:
+    rgb = np.rint(points.colours * 255).astype(int).tolist()
+    places = points.positions.astype(float).tolist()
+    return [
+        f"{number} {numbers(place)} {colour[0]} {colour[1]} {colour[2]} 0"
+        for number, (place, colour) in enumerate(zip(places, rgb, strict=True), 1)
+    ]
+
+
+def numbers(values: object) -> str:
+    """Return numbers with all digits that tell them apart."""
+    return " ".join(repr(float(value)) for value in values)  # type: ignore[attr-defined]

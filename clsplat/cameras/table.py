@@ -1,0 +1,46 @@
+"""The formats of cameras, by name."""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+from clsplat.cameras import colmap, inria, nerfstudio
+from clsplat.cameras.posed import IMAGES, Posed, image_files, posed
+from clsplat.errors import ConfigError, quoted
+from clsplat.files import atomic, is_there
+from clsplat.progress import counted
+from clsplat.reading import opened
+from clsplat.scene.scene import PointCloud, Scene
+
+WRITERS: dict[str, Callable[[Path, list[Posed], PointCloud | None], list[Path]]] = {
+    "colmap": colmap.write,
+    "nerfstudio": nerfstudio.write,
+    "inria": inria.write,
+}
+PLACES = {  # that each writes
+    "colmap": [colmap.MODEL / name for name in ("cameras.txt", "images.txt", "points3D.txt")],
+    "nerfstudio": [Path(nerfstudio.FILE), Path(nerfstudio.POINTS)],
+    "inria": [Path(inria.FILE)],
+}
+COPIES = ("none", "copy")  # of the photographs
+
+
+def write_cameras(scene: Scene, out: Path, format_: str, images: str = "none", over: bool = False) -> list[Path]:
+    """Write the cameras of a scene, and the photographs where they are to be copied; return the files of cameras.
+
+    The views have the size of the dataset.  over: whether files there may be replaced.
+    Raises ConfigError for another name and where a file is there, DataError where the format cannot hold the scene.
+    """
+    for what, value, known in (("format", format_, tuple(WRITERS)), ("images", images, COPIES)):
+        if value not in known:
+            raise ConfigError(f"no {what} {quoted(value)}; there are {', '.join(known)}")
+    views = posed(scene)
+    copies = image_files(views, out / IMAGES) if images == "copy" else {}
+    for path in () if over else (*(out / place for place in PLACES[format_]), *copies):
+        if is_there(path):
+            raise ConfigError(f"{path}: exists; give another folder for the cameras, or remove it")
+    written = WRITERS[format_](out, views, scene.points)
+    for path, source in counted(copies.items(), "photographs copied", len(copies)):
+        with opened(source, "an image") as old, atomic(path) as new:
+            shutil.copyfileobj(old, new)
+    return written

@@ -1,0 +1,27 @@
+"""The cameras of a dataset, or of the dataset of a run, as files of other programs."""
+
+from pathlib import Path
+
+from clsplat.cameras.table import write_cameras
+from clsplat.errors import ConfigError
+from clsplat.names import PIPELINE
+from clsplat.runs.source import Source
+from clsplat.scene.detect import read_scene
+from clsplat.scene.scene import HOLDOUT, Scene
+
+
+def write(scene: Path | Scene, out: Path, format_: str, images: str = "none") -> list[Path]:
+    """Write the cameras; return the files.  scene: a dataset, in a folder or as read, or a run folder.
+
+    Raises ClsplatError.
+    """
+    if out.exists() and not out.is_dir():
+        raise ConfigError(f"{out}: expected a folder to write into")
+    return write_cameras(scene if isinstance(scene, Scene) else _read(scene), out, format_, images)
+
+
+def _read(folder: Path) -> Scene:
+    if not (folder / PIPELINE).is_file():
+        return read_scene(folder, HOLDOUT)
+    source = Source.of(folder, None)
+    return read_scene(source.folder, source.settings.holdout)

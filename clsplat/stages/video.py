@@ -1,0 +1,70 @@
+"""The model as a video."""
+
+import logging
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Annotated, ClassVar, Literal
+
+from pydantic import Field, field_validator
+
+from clsplat.progress import counted, heard_by
+from clsplat.scene.view import View
+from clsplat.settings import ReadPath
+from clsplat.stages.base import Stage, path_in_run
+from clsplat.stages.timelapse import verify_video
+from clsplat.training.run import Run
+from clsplat.video import encoding
+from clsplat.video.film import FPS, FRAMES, Film, Wish, plan, shoot
+from clsplat.video.lenses import MAX_FRAMES, RATES, size_of
+from clsplat.video.pictures import Canvas
+
+LOG = logging.getLogger("clsplat")
+
+
+class Video(Stage):
+    """Film the model along a camera path: about the scene (ellipse, orbit, spiral) or along the photographs."""
+
+    stage: Literal["video"] = "video"
+    needs: ClassVar[frozenset[str]] = frozenset({"model"})
+    output_keys: ClassVar[frozenset[str]] = frozenset({"path", "frames", "fps", "size", "file"})
+
+    path: ReadPath = "ellipse"
+    """One of ellipse, spiral, orbit, through and views, or a file camera_path.json of nerfstudio."""
+    frames: Annotated[int, Field(gt=0, le=MAX_FRAMES)] = FRAMES
+    """Number of frames."""
+    fps: Annotated[float, Field(ge=RATES[0], le=RATES[1])] = FPS
+    """Frames a second."""
+    size: str | None = None
+    """WIDTHxHEIGHT, even numbers; without it, that of the photographs in training."""
+    file: Annotated[str, path_in_run(*encoding.WRITERS)] = "video.webm"
+    """Path inside the run folder; .webm, or .mp4 with the extra video."""
+
+    @field_validator("size")
+    @classmethod
+    def _of_a_video(cls, size: str | None) -> str | None:
+        return None if size is None else size_of(size)
+
+    def _wish(self) -> Wish:
+        return Wish.of(self.path, self.frames, self.fps, self.size)
+
+    def _plan(self, run: Run) -> Film:
+        means = run.model.gaussians.get("means")
+        return plan(self._wish(), run.scene.downscaled(run.downscale), means)
+
+    def check(self) -> None:
+        self._wish()
+        encoding.check_encoder(Path(self.file))
+
+    def run(self, run: Run) -> None:
+        film, path = self._plan(run), run.out / self.file
+
+        def through(views: Sequence[View]) -> Iterator[View]:
+            return counted(run.until_interrupted(views), "frames rendered", len(views))
+
+        canvas = Canvas(run.rasterizer, run.model, run.photographs.background)
+        with heard_by(run.status.count):
+            shoot(canvas, film, {"colour": path}, None, through)
+        LOG.info("video of %d frames written to %s, %.2f MB", len(film.views), path, path.stat().st_size / 1e6)
+
+    def verify(self, run: Run) -> None:
+        verify_video(run.out / self.file, len(self._plan(run).views))

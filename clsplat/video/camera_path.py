@@ -1,0 +1,228 @@
+"""Camera paths in files: nerfstudio's camera_path.json, read and written, and the list of cameras of 3DGS, read.
+
+render_width, render_height  px       fps, seconds      camera_type  perspective
+camera_path  a frame each: camera_to_world (16 numbers by rows, OpenGL axes), fov (degrees, vertical), aspect
+"""
+
+import json
+import logging
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from clsplat.cameras import inria
+from clsplat.errors import DataError, quoted
+from clsplat.files import write_text
+from clsplat.reading import read_json
+from clsplat.scene.camera import Camera
+from clsplat.scene.nerfstudio import FILE as TRANSFORMS
+from clsplat.scene.transforms import Frame, pose_of
+from clsplat.scene.view import View
+from clsplat.video.lenses import MAX_FRAMES, Size, around, checked_rate, checked_size, even_size
+from clsplat.video.rig import Floats
+
+LOG = logging.getLogger("clsplat")
+WORLD = "dataparser_transforms.json"  # beside a path: how nerfstudio moved the scene
+MAX_BYTES = 1 << 27
+KEYS = 24  # frames that nerfstudio's viewer shows as handles, at most
+OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # the axes of OpenCV's cameras in those of OpenGL's
+
+
+@dataclass(frozen=True)
+class CameraPath:
+    """A path of a file."""
+
+    views: list[View]
+    fps: float
+    size: Size  # px
+
+    def resized(self, size: Size) -> list[View]:
+        """Return the views at another size, with the vertical field of view."""
+        return [
+            replace(view, camera=_camera(size, 2 * math.atan(view.camera.height / 2 / view.camera.fy)))
+            for view in self.views
+        ]
+
+
+def read(path: Path, scene: Path | None = None) -> CameraPath:
+    """Read a camera_path.json, with its poses in the world of the scene in a folder.
+
+    nerfstudio moves and scales a scene, and says how in a file WORLD, which is looked for beside the path; without it
+    the poses are taken as they are, with a warning unless clsplat has written them.
+    Raises DataError for another file, for damaged numbers and for a camera that is not perspective.
+    """
+    table = read_json(path, "a camera_path.json of nerfstudio, or a cameras.json of 3DGS", limit=MAX_BYTES)
+    if isinstance(table, list):
+        return _of_cameras(path)
+    frames = table.get("camera_path") if isinstance(table, dict) else None
+    if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
+        raise DataError(f"{path}: expected a table with a list `camera_path`, as nerfstudio exports it")
+    if not 1 <= len(frames) <= MAX_FRAMES:
+        raise DataError(f"{path}: has {len(frames)} frames; expected 1 to {MAX_FRAMES}")
+    if (kind := table.get("camera_type", "perspective")) != "perspective":
+        raise DataError(f"{path}: camera_type is {quoted(kind)}; expected perspective: export the path again")
+    whole = Frame(path.parent, str(path), table)
+    size = _size(whole)
+    move = _world(path, scene, known=table.get("world") == "scene")
+    views = []
+    for i, own in enumerate(frames):
+        frame = Frame(path.parent, f"{path}: camera_path[{i}]", own)
+        fov = frame.number("fov")
+        if fov is None or not 0 < fov < 179:
+            raise DataError(f"{frame.where}: fov is {quoted(fov)}; expected degrees from 0 to 179")
+        pose = pose_of(Frame(path.parent, frame.where, {"transform_matrix": _rows(own.get("camera_to_world"))}))
+        views.append(View(f"frame_{i + 1:05d}", _camera(size, math.radians(fov)), move(pose)))
+    return CameraPath(views, checked_rate(whole.number("fps") or 30), size)
+
+
+def _of_cameras(path: Path) -> CameraPath:
+    """The cameras of a cameras.json as frames, each fitted into the size of the first."""
+    views = inria.read(path)
+    size = even_size(views[0].camera)
+    frames = [replace(view, name=f"frame_{i:05d}", camera=around(view.camera, size)) for i, view in enumerate(views, 1)]
+    return CameraPath(frames, 30.0, size)
+
+
+def write(path: Path, views: Sequence[View], fps: float) -> None:
+    """Write views as a camera_path.json, for nerfstudio's viewer and for `read`.  Raises OutputError."""
+    camera = views[0].camera
+    frames = [_frame(view) for view in views]
+    keys = np.unique(np.linspace(0, len(frames) - 1, min(KEYS, len(frames))).round().astype(int))
+    table = {
+        "world": "scene",  # ours: not moved as nerfstudio would
+        "camera_type": "perspective",
+        "render_width": camera.width,
+        "render_height": camera.height,
+        "fps": fps,
+        "seconds": len(views) / fps,
+        "is_cycle": False,
+        "smoothness_value": 0.0,
+        "default_fov": frames[0]["fov"],
+        "default_transition_sec": len(views) / fps / max(1, len(keys) - 1),
+        "keyframes": [{"matrix": frames[i]["camera_to_world"], **_lens(frames[i])} for i in keys],
+        "camera_path": frames,
+    }
+    write_text(path, json.dumps(table, indent=1) + "\n")
+
+
+def spread(views: Sequence[View], frames: int) -> list[View]:
+    """Return views at even places along a path, between two poses on the straight and the shortest turn."""
+    if frames == len(views):
+        return list(views)
+    if len(views) == 1:
+        return [View(f"frame_{i:05d}", views[0].camera, views[0].world_to_camera) for i in range(1, frames + 1)]
+    places = np.linspace(0, len(views) - 1, frames)
+    poses = np.stack([view.world_to_camera for view in views])
+    turns = Slerp(np.arange(len(views)), Rotation.from_matrix(poses[:, :, :3]))(places).as_matrix()
+    lenses = np.array([[view.camera.fx, view.camera.fy] for view in views])
+    centres, focals = (
+        np.stack([np.interp(places, np.arange(len(views)), column) for column in columns.T], axis=1)
+        for columns in (np.stack([view.position for view in views]), lenses)
+    )
+    first = views[0].camera
+    return [
+        View(
+            f"frame_{i:05d}",
+            Camera(first.width, first.height, float(fx), float(fy), first.cx, first.cy),
+            np.column_stack([turn, -turn @ centre]),
+        )
+        for i, (turn, centre, (fx, fy)) in enumerate(zip(turns, centres, focals, strict=True), 1)
+    ]
+
+
+def _frame(view: View) -> dict[str, Any]:
+    camera_to_world = np.linalg.inv(np.vstack([view.world_to_camera, [0, 0, 0, 1]])) @ OPENGL
+    camera = view.camera
+    fov = math.degrees(2 * math.atan(camera.height / 2 / camera.fy))
+    return {"camera_to_world": camera_to_world.ravel().tolist(), "fov": fov, "aspect": camera.width / camera.height}
+
+
+def _lens(frame: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "fov": frame["fov"],
+        "aspect": frame["aspect"],
+        "override_transition_enabled": False,
+        "override_transition_sec": None,
+    }
+
+
+def _camera(size: Size, fov: float) -> Camera:
+    """A camera with a vertical field of view in rad."""
+    focal = size[1] / 2 / math.tan(fov / 2)
+    return Camera(*size, focal, focal, size[0] / 2, size[1] / 2)
+
+
+def _size(whole: Frame) -> Size:
+    width, height = (int(whole.number(key) or 0) // 2 * 2 for key in ("render_width", "render_height"))
+    return checked_size((width, height)) if width or height else (1280, 720)
+
+
+def _rows(numbers: Any) -> Any:
+    """16 numbers as four rows; what is nothing of the kind stays."""
+    if not isinstance(numbers, list) or len(numbers) != 16:
+        return numbers
+    return [numbers[i : i + 4] for i in range(0, 16, 4)]
+
+
+def _world(path: Path, scene: Path | None, known: bool) -> Any:
+    """A function that takes poses, [3, 4] world to camera, to the world of the scene."""
+    file = path.parent / WORLD
+    if not file.is_file():
+        if not known:
+            LOG.warning(
+                "%s: its poses are taken as those of the scene; where nerfstudio has moved it, put %s beside the path",
+                *(path, WORLD),
+            )
+        return lambda pose: pose
+    matrix, scale = _affine(file)
+    rotation, shift = matrix[:, :3], matrix[:, 3]
+    before = _applied(scene)
+
+    def move(pose: Floats) -> Floats:
+        """x' = scale · (rotation x + shift) is nerfstudio's world."""
+        centre = -pose[:, :3].T @ pose[:, 3]
+        turned = pose[:, :3] @ rotation @ before[:, :3].T
+        place = before[:, :3] @ (rotation.T @ (centre / scale - shift)) + before[:, 3]
+        return np.column_stack([turned, -turned @ place])
+
+    return move
+
+
+def _affine(file: Path) -> tuple[Floats, float]:
+    """The rotation with its shift, [3, 4], and the scale of a file WORLD.  Raises DataError."""
+    table = read_json(file, "a rotation and a scale in JSON", limit=MAX_BYTES)
+    frame = Frame(file.parent, str(file), table if isinstance(table, dict) else {})
+    scale = frame.number("scale")
+    return _rigid(frame, "transform"), _positive(file, scale)
+
+
+def _positive(file: Path, scale: float | None) -> float:
+    if scale is None or not scale > 0:
+        raise DataError(f"{file}: scale is {quoted(scale)}; expected a number above 0: export the file again")
+    return scale
+
+
+def _rigid(frame: Frame, key: str) -> Floats:
+    """A rotation and a shift, [3, 4].  Raises DataError."""
+    try:
+        matrix = np.array(frame.value(key), np.float64)[:3]
+    except (ValueError, TypeError, OverflowError, IndexError):
+        matrix = np.empty(0)
+    if matrix.shape != (3, 4) or not np.isfinite(matrix).all() or abs(np.linalg.det(matrix[:, :3]) - 1) > 1e-3:
+        raise DataError(f"{frame.where}: {key} is not 3x4 numbers with a rotation; export the file again")
+    return matrix
+
+
+def _applied(scene: Path | None) -> Floats:
+    """What nerfstudio did to the poses of a scene's transforms.json before: a rotation and a shift, [3, 4]."""
+    file = scene / TRANSFORMS if scene else None
+    if file is None or not file.is_file():
+        return np.eye(3, 4)
+    table = read_json(file, "cameras in JSON", limit=MAX_BYTES)
+    frame = Frame(file.parent, str(file), table if isinstance(table, dict) else {})
+    return np.eye(3, 4) if frame.value("applied_transform") is None else _rigid(frame, "applied_transform")

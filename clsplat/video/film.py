@@ -1,0 +1,125 @@
+"""Choose the views of a film, and draw them one after the other."""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+from clsplat.errors import ConfigError, quoted
+from clsplat.files import check_result
+from clsplat.scene.scene import Scene
+from clsplat.scene.view import View
+from clsplat.video import camera_path, encoding
+from clsplat.video.lenses import Size, checked_frames, checked_rate, checked_size, even_size, like
+from clsplat.video.paths import PATHS
+from clsplat.video.pictures import LAYERS, Canvas, Image, beside, shown
+from clsplat.video.rig import Floats, Rig
+
+FRAMES, FPS = 120, 30.0  # where neither the caller nor a file says
+Through = Callable[[Sequence[View]], Iterable[View]]  # what views pass, such as a display of progress
+Side = Callable[[View], Image]  # what stands beside a view's picture
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What film was asked for, checked before any work: None is a default."""
+
+    path: str = "ellipse"  # one of PATHS, or a file of a camera path
+    frames: int | None = None
+    fps: float | None = None
+    size: Size | None = None
+
+    @classmethod
+    def of(cls, path: str, frames: int | None, fps: float | None, size: str | Size | None) -> "Wish":
+        """Check what can be checked without a scene.  Raises ConfigError."""
+        if path not in PATHS and not path.lower().endswith(".json"):
+            raise ConfigError(f"no path {quoted(path)}; there are {', '.join(PATHS)}, and files of nerfstudio (.json)")
+        return cls(
+            path,
+            None if frames is None else checked_frames(frames),
+            None if fps is None else checked_rate(fps),
+            None if size is None else checked_size(size),
+        )
+
+    @property
+    def of_a_file(self) -> bool:
+        """Whether the path is in a file, and needs no scene."""
+        return self.path not in PATHS
+
+
+@dataclass(frozen=True)
+class Film:
+    """The views of a film, one a frame, all of one size."""
+
+    views: list[View]
+    fps: float
+
+    @property
+    def size(self) -> Size:
+        """Width and height of a picture, px."""
+        camera = self.views[0].camera
+        return camera.width, camera.height
+
+    @property
+    def seconds(self) -> float:
+        """How long it lasts."""
+        return len(self.views) / self.fps
+
+
+def plan(wish: Wish, scene: Scene | None, points: Floats) -> Film:
+    """Return the film of a scene.  points: [M, 3], means of a model, or points of the scene.
+
+    Raises ConfigError without a scene where the path needs one, DataError where the scene has no such path.
+    """
+    if wish.of_a_file:
+        found = camera_path.read(Path(wish.path), scene.path if scene else None)
+        views = found.resized(wish.size) if wish.size else found.views
+        return Film(camera_path.spread(views, wish.frames or len(views)), wish.fps or found.fps)
+    if scene is None:
+        raise ConfigError(f"the path {wish.path} needs the cameras of a scene; give --scene, a run folder, or a file")
+    rig = Rig.of(scene.views, points)
+    size = wish.size or even_size(rig.camera)
+    return Film(PATHS[wish.path](rig, wish.frames or FRAMES, size), wish.fps or FPS)
+
+
+def files(video: Path, layers: Sequence[str]) -> dict[str, Path]:
+    """Return the file of each layer: that of the colours, and others beside it.  Raises ConfigError for their names."""
+    found = {
+        layer: video if layer == LAYERS[0] else video.with_name(f"{video.stem}_{layer}{video.suffix}")
+        for layer in layers
+    }
+    for path in found.values():
+        encoding.check_file(path)
+    return found
+
+
+def shoot(canvas: Canvas, film: Film, videos: Mapping[str, Path], side: Side | None, through: Through) -> None:
+    """Render the views into videos, one a layer.  side: what stands on the right of the colours."""
+    wide = film.size[0] * (1 if side is None else 2)
+    checked_size((wide, film.size[1]))
+    depths = canvas.depth_range(film.views) if "depth" in videos else (0.0, 0.0)
+    with ExitStack() as stack:
+        writers = {
+            layer: stack.enter_context(
+                encoding.opened(path, (wide if layer == LAYERS[0] else film.size[0], film.size[1]), film.fps)
+            )
+            for layer, path in videos.items()
+        }
+        for view in through(film.views):
+            found = canvas.layers(view, "depth" in videos)
+            for layer, write in writers.items():
+                picture = shown(found, layer, depths)
+                write(beside(picture, side(view)) if side and layer == LAYERS[0] else picture)
+
+
+def still(view: View, size: Size | None = None) -> View:
+    """Return a view for a film from one place: at another size, or with even sides."""
+    wanted = size or even_size(view.camera)
+    if wanted == (view.camera.width, view.camera.height):
+        return view
+    return View(view.name, like(view.camera, wanted), view.world_to_camera, view.image_path)
+
+
+def check_path_file(path: Path) -> None:
+    """Raise ConfigError where no camera path can be written."""
+    check_result(path, ".json")

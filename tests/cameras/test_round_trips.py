@@ -1,0 +1,207 @@
+"""Cameras written for other programs come back: poses, lenses, distortion, points, the split."""
+
+import json
+import logging
+import shutil
+
+import numpy as np
+import pytest
+
+import clsplat
+from clsplat.cameras import inria
+from clsplat.cameras.nerfstudio import DISTORTION
+from clsplat.errors import ConfigError, DataError
+from clsplat.scene.lens import MODELS, Lens
+from clsplat.scene.quaternion import rotation_matrix
+from clsplat.scene.scene import PointCloud, make_scene
+from clsplat.scene.view import View
+from tests.data_sets import data_set
+from tests.test_cli import clsplat as command
+
+LENSES = {  # parameters after the focal lengths and the middle
+    "SIMPLE_PINHOLE": (),
+    "PINHOLE": (),
+    "SIMPLE_RADIAL": (0.05,),
+    "RADIAL": (0.05, -0.02),
+    "OPENCV": (0.05, -0.02, 1e-3, -2e-3),
+    "FULL_OPENCV": (0.05, -0.02, 1e-3, -2e-3, 0.01, 0.02, -0.01, 0.003),
+    "OPENCV_FISHEYE": (0.02, -0.01, 0.003, 0.001),
+    "SIMPLE_RADIAL_FISHEYE": (0.02,),
+    "RADIAL_FISHEYE": (0.02, -0.01),
+    "FOV": (0.4,),
+    "THIN_PRISM_FISHEYE": (0.02, -0.01, 1e-3, -2e-3, 0.001, 0.002, 1e-3, 2e-3),
+}
+SIZE = 60, 40
+
+
+def lens_of(model, i=0):
+    focals = (61.25 + i / 7, 63.5)[: MODELS[model][0]]
+    return Lens(*SIZE, model, (*focals, 31.125, 18.75 + i / 3, *LENSES[model]))
+
+
+@pytest.fixture
+def scene_of(rng, tmp_path):
+    """A function that makes a dataset of a lens: five views, two of them for testing, in two folders."""
+
+    def make(model, lenses=1):
+        views = []
+        for i in range(5):
+            quaternion = rng.normal(size=4)
+            rotation = rotation_matrix(*(quaternion / np.linalg.norm(quaternion)))
+            pose = np.column_stack([rotation, rng.normal(size=3) * 3])
+            lens = lens_of(model, i % lenses)
+            name = f"left/ä {i}.png" if i < 3 else f"right/{i}.png"
+            file = tmp_path / "photographs" / name
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_bytes(f"photograph {i}".encode())
+            camera, distortion = (lens.pinhole, lens) if lens.distorts else (lens.camera, None)
+            views.append(View(name, camera, pose, file, lens=distortion))
+        points = PointCloud(rng.normal(size=(7, 3)).astype(np.float32), np.float32(rng.integers(0, 256, (7, 3)) / 255))
+        return make_scene(tmp_path / "photographs", views, {0, 3}, points)
+
+    return make
+
+
+def same(old, new, prefix=""):
+    assert [prefix + view.name for view in old.views] == [view.name for view in new.views]
+    for a, b in zip(old.views, new.views, strict=True):
+        np.testing.assert_allclose(b.world_to_camera, a.world_to_camera, atol=4e-15)
+        assert b.camera == a.camera
+        assert (b.lens is None) == (a.lens is None)
+        assert b.image_path.read_bytes() == a.image_path.read_bytes()
+    np.testing.assert_array_equal(new.points.positions, old.points.positions)
+    np.testing.assert_array_equal(new.points.colours, old.points.colours)
+
+
+@pytest.mark.parametrize("lenses", [1, 3])
+@pytest.mark.parametrize("model", LENSES)
+def test_colmap_gives_back_what_it_got(model, lenses, scene_of, tmp_path):
+    scene = scene_of(model, lenses)
+    files = clsplat.write_cameras(scene, tmp_path / "out", "colmap", images="copy")
+    assert [file.name for file in files] == ["cameras.txt", "images.txt", "points3D.txt"]
+    assert len((tmp_path / "out/sparse/0/cameras.txt").read_text().splitlines()) == 1 + lenses
+    found = clsplat.read_scene(tmp_path / "out")
+    same(scene, found)
+    assert [view.lens for view in found.views] == [view.lens for view in scene.views]
+
+
+@pytest.mark.parametrize("lenses", [1, 3])
+@pytest.mark.parametrize("model", DISTORTION)
+def test_nerfstudio_gives_back_what_it_got(model, lenses, scene_of, tmp_path, rng):
+    scene = scene_of(model, lenses)
+    clsplat.write_cameras(scene, tmp_path / "out", "nerfstudio", images="copy")
+    found = clsplat.read_scene(tmp_path / "out")
+    same(scene, found, "images/")
+    assert (found.train, found.test) == (scene.train, scene.test)
+    rays = np.column_stack([rng.uniform(-0.3, 0.3, (20, 2)), np.ones(20)])
+    for a, b in zip(scene.views, found.views, strict=True):
+        if a.lens is not None:
+            np.testing.assert_allclose(b.lens.project(rays), a.lens.project(rays), rtol=1e-13)
+
+
+@pytest.mark.parametrize("model", sorted(LENSES.keys() - DISTORTION.keys()))
+def test_a_lens_that_nerfstudio_does_not_know_is_refused(model, scene_of, tmp_path):
+    with pytest.raises(DataError, match=f"no camera model {model}; write colmap, or `clsplat data undistort` first"):
+        clsplat.write_cameras(scene_of(model), tmp_path / "out", "nerfstudio")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("model", ["PINHOLE", "OPENCV"])
+def test_cameras_json_holds_the_undistorted_cameras(model, scene_of, tmp_path, caplog):
+    scene = scene_of(model, 3)
+    with caplog.at_level(logging.WARNING, "clsplat"):
+        clsplat.write_cameras(scene, tmp_path, "inria")
+    assert "the middle of the image for the principal point, which is up to" in caplog.text
+    found = inria.read(tmp_path / "cameras.json")
+    for a, b in zip(scene.views, found, strict=True):
+        assert (b.name, b.camera) == (a.name, a.camera)
+        np.testing.assert_allclose(b.world_to_camera, a.world_to_camera, atol=1e-14)
+    first = json.loads((tmp_path / "cameras.json").read_text())[0]
+    np.testing.assert_allclose(first["position"], scene.views[0].position)
+    np.testing.assert_allclose(np.array(first["rotation"])[:, 2], scene.views[0].world_to_camera[2, :3])
+
+
+FAULTS = {
+    "a table": (lambda d: {"frames": d}, "expected a list of 1 to"),
+    "nothing": (lambda d: [], "expected a list of 1 to"),
+    "no focal length": (lambda d: [{**d[0], "fx": 0}], r"\[0\]: the camera is 60x40 with focal lengths 0"),
+    "no rotation": (lambda d: [{**d[0], "rotation": [[0] * 3] * 3}], "no rotation"),
+    "text": (lambda d: [{**d[0], "position": "x"}], "position is 'x'"),
+    "ragged": (lambda d: [{**d[0], "rotation": [[1], [2, 3]]}], "rotation is"),
+    "large": (lambda d: [{**d[0], "width": 1e9}], "sizes of at most"),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_damaged_cameras_json_is_refused(fault, scene_of, tmp_path):
+    clsplat.write_cameras(scene_of("PINHOLE"), tmp_path, "inria")
+    change, message = FAULTS[fault]
+    file = tmp_path / "cameras.json"
+    file.write_text(json.dumps(change(json.loads(file.read_text()))))
+    with pytest.raises(DataError, match=message):
+        inria.read(file)
+
+
+@pytest.mark.parametrize("form", ["colmap", "nerfstudio", "inria"])
+def test_files_that_are_there_stay(form, scene_of, tmp_path):
+    scene = scene_of("PINHOLE")
+    first = clsplat.write_cameras(scene, tmp_path / "a", form)
+    again = clsplat.write_cameras(scene, tmp_path / "b", form)
+    assert [a.read_bytes() for a in first] == [b.read_bytes() for b in again], "the same bytes"
+    with pytest.raises(ConfigError, match="exists; give another folder"):
+        clsplat.write_cameras(scene, tmp_path / "a", form)
+
+
+def test_what_cannot_be_written_is_refused(scene_of, tmp_path):
+    scene = scene_of("PINHOLE")
+    with pytest.raises(ConfigError, match="no format 'meshroom'; there are colmap, nerfstudio, inria"):
+        clsplat.write_cameras(scene, tmp_path / "out", "meshroom")
+    with pytest.raises(ConfigError, match="no images 'link'"):
+        clsplat.write_cameras(scene, tmp_path / "out", images="link")
+    view = View("two\nlines", scene.views[0].camera, scene.views[0].world_to_camera)
+    alone = make_scene(tmp_path, [view], set(), None)
+    with pytest.raises(DataError, match="a name in one line of text"):
+        clsplat.write_cameras(alone, tmp_path / "out")
+    nameless = make_scene(tmp_path, [View("a", view.camera, view.world_to_camera)], set(), None)
+    with pytest.raises(DataError, match="has no photograph to copy"):
+        clsplat.write_cameras(nameless, tmp_path / "out", images="copy")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_blender_scene_becomes_one_of_colmap(tiny_scene, tmp_path):
+    clsplat.write_cameras(tiny_scene, tmp_path / "out", images="copy")
+    old, new = clsplat.read_scene(tiny_scene), clsplat.read_scene(tmp_path / "out")
+    found = {view.name: view for view in new.views}
+    assert found.keys() == {f"{view.name}.png" for view in old.views}
+    for view in old.views:
+        np.testing.assert_allclose(found[f"{view.name}.png"].world_to_camera, view.world_to_camera, atol=1e-14)
+        np.testing.assert_array_equal(found[f"{view.name}.png"].photograph(), view.photograph())
+
+
+@pytest.mark.slow
+def test_the_command_takes_a_dataset_and_a_run(few_steps, tiny_scene, tmp_path):
+    command("data", "cameras", few_steps, tmp_path / "run", "--format", "nerfstudio", "--images", "copy")
+    command("data", "cameras", tiny_scene, tmp_path / "set", "--format", "nerfstudio", "--images", "copy")
+    files = [
+        sorted(path.relative_to(tmp_path / name) for path in (tmp_path / name).rglob("*")) for name in ("run", "set")
+    ]
+    assert files[0] == files[1]
+    assert (tmp_path / "run/transforms.json").read_bytes() == (tmp_path / "set/transforms.json").read_bytes()
+    told = command("data", "cameras", tmp_path / "none", tmp_path / "x", expect=3).stderr
+    assert "no such folder" in told
+
+
+@pytest.mark.parametrize("name", ["fox_opencv", "fox_nerfstudio", "brighton"])
+def test_data_sets_come_back_from_both(name, tmp_path):
+    scene = clsplat.read_scene(data_set(name))
+    for form in ("colmap", "nerfstudio"):
+        clsplat.write_cameras(scene, tmp_path / form, form, images="copy")
+        found = clsplat.read_scene(tmp_path / form)
+        assert len(found.views) == len(scene.views)
+        for a, b in zip(scene.views, found.views, strict=True):
+            turn = a.world_to_camera[:, :3]
+            rounding = np.abs(turn @ turn.T - np.eye(3)).max() if form == "colmap" else 0  # a quaternion has none
+            np.testing.assert_allclose(b.world_to_camera, a.world_to_camera, atol=2e-13 + 10 * rounding)
+            assert b.camera == a.camera
+            assert b.image_path.name == a.image_path.name
+        shutil.rmtree(tmp_path / form)

@@ -1,0 +1,54 @@
+"""Damaged camera paths and lists of cameras: read or refused, soon and in little memory."""
+
+import json
+
+import numpy as np
+import pytest
+
+from clsplat.cameras import inria
+from clsplat.cameras.posed import posed
+from clsplat.scene.scene import make_scene
+from clsplat.video import camera_path
+from clsplat.video.lenses import MAX_FRAMES, SIDES
+from tests.fuzz.mutation import damaged, fuzzed
+from tests.fuzz.outcome import outcome
+from tests.video.test_paths import ring
+
+VIEWS = ring(np.linspace(0, 2, 3))
+WORLD = {"transform": np.eye(3, 4).tolist(), "scale": 0.5}
+WORDS = ['"camera_path"', '"camera_to_world"', '"fov"', '"fisheye"', "179.9", '"render_width"', '"fps"', '"rotation"']
+
+
+@pytest.fixture(scope="module")
+def seeds(folder):
+    camera_path.write(folder / "a.json", VIEWS, 24)
+    inria.write(folder, posed(make_scene(folder, VIEWS, set(), None)), None)
+    moved = json.loads((folder / "a.json").read_text())
+    del moved["world"], moved["keyframes"]
+    return [(folder / "a.json").read_bytes(), (folder / "cameras.json").read_bytes(), json.dumps(moved).encode()]
+
+
+def test_a_damaged_path_is_read_or_refused(seeds, folder):
+    @fuzzed(80, data=damaged(seeds, WORDS))
+    def reads(data):
+        (folder / "b.json").write_bytes(data)
+        found = outcome(camera_path.read, folder / "b.json")
+        outcome(inria.read, folder / "b.json")
+        if found is not None:
+            assert 1 <= len(found.views) <= MAX_FRAMES
+            assert all(view.camera.check() and max(found.size) <= SIDES[1] for view in found.views)
+            assert all(view.name == f"frame_{i:05d}" for i, view in enumerate(found.views, 1))
+
+    reads()
+
+
+def test_a_damaged_move_is_read_or_refused(seeds, folder):
+    (folder / "own").mkdir()
+    (folder / "own" / "a.json").write_bytes(seeds[2])
+
+    @fuzzed(40, data=damaged([json.dumps(WORLD).encode()], ['"scale"', '"transform"']))
+    def reads(data):
+        (folder / "own" / camera_path.WORLD).write_bytes(data)
+        outcome(camera_path.read, folder / "own" / "a.json")
+
+    reads()
