@@ -116,6 +116,7 @@ class Optimize(Stage):
                 seconds.clear()
             with suppress(Stopped):
                 self._act(run)
+            run.between()
             if run.interrupted:
                 path = checkpoint.save(run)
                 raise Interrupted(f"stopped at step {run.step}, saved in {path}; --resume continues from there")

@@ -81,6 +81,7 @@ class Run:
     metrics: dict[str, dict[str, Any]] = field(default_factory=dict)  # split -> downscale -> averages
     interrupted: bool = False  # finish the step, save, stop
     show: Callable[[Progress], None] = lambda progress: None
+    between: Callable[[], None] = lambda: None  # between two steps, or items of a long stage; it reads, and may wait
 
     def __post_init__(self) -> None:
         self.records = Records(self.out, self.status.require_held)
@@ -125,6 +126,7 @@ class Run:
         for item in items:
             if self.interrupted:
                 raise Stopped("stopped")
+            self.between()
             yield item
 
     @property
