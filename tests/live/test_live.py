@@ -19,12 +19,14 @@ from clsplat.live import live as module
 from clsplat.live.budget import Budget
 from clsplat.live.curves import MOST, Curves
 from clsplat.live.live import Live
-from clsplat.live.preview import AIMS, SIDES, Preview
+from clsplat.live.orders import Order
+from clsplat.live.preview import AIMS, QUALITY, SIDES, Preview
+from clsplat.metrics.views import render_view
 from clsplat.pipeline.loading import load
 from clsplat.runs import folders, opening, runner
 from clsplat.runs.experiment import Job
 from clsplat.scene.detect import read_scene
-from clsplat.training.run import Progress
+from clsplat.training.run import Progress, Run
 from tests.few_steps import FEW
 from tests.test_training import digest
 
@@ -65,13 +67,14 @@ def live():
         yield opened
 
 
-def trained(live: Live, scene: Path, out: Path, *overrides: str) -> None:
+def trained(live: Live, scene: Path, out: Path, *overrides: str) -> Run:
     checked = load("smoke", [f"scene.path='{scene}'", *FEW, *overrides])
     with folders.opened(out, "new", step=0) as status, folders.failures_recorded(status):
         live.follow(status)
         run = opening.open_run(checked, out, None, "new", status)
         with live.showing(run):
             runner.execute(checked, run, "new", live.reporting(lambda progress: None))
+    return run
 
 
 @contextmanager
@@ -209,6 +212,17 @@ def test_a_port_in_use_ends_the_run_before_it_begins(live, tiny_scene, tmp_path)
     with pytest.raises(ConfigError, match=f"port {port} of 127.0.0.1 cannot be used"):
         Job.open("smoke", tiny_scene, tmp_path / "run", FEW).run(live=port)
     assert not (tmp_path / "run").exists()
+
+
+def test_a_picture_of_a_view_is_its_render(live, tiny_scene, tmp_path):
+    run = trained(live, tiny_scene, tmp_path / "run")
+    for view in run.scene.views[:3]:
+        jpeg = Preview(run).draw(Order(1, view, "still")).jpeg
+        photograph = run.photographs.get(view)
+        render = render_view(run.rasterizer, run.model, photograph.camera, run.photographs.background)
+        assert np.ptp(render) > 60
+        _, data = cv2.imencode(".jpg", np.ascontiguousarray(render[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+        assert jpeg == data.tobytes()
 
 
 def test_the_side_of_a_picture_follows_its_time():
