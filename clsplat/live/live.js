@@ -162,7 +162,8 @@ class Watch {
 
   end({state, message}) {
     const how = {done: "The run is done", failed: "The run has failed", interrupted: "The run was interrupted"}[state];
-    return `${how ?? "The run has ended"}${message ? `: ${message}` : "; its folder holds viewer.html and report.html"}.`;
+    const folder = "; its folder holds viewer.html and report.html";
+    return `${how ?? "The run has ended"}${message ? `: ${message}` : folder}.`;
   }
 
   lost() {

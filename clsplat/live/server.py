@@ -36,27 +36,24 @@ class Server(socketserver.ThreadingTCPServer):
         self._slots, self._rate = threading.Semaphore(CONNECTIONS), Budget(RATE, BURST)
         self._rate.spend(-BURST)
         super().__init__((LOOPBACK, 0), _Connection, bind_and_activate=False)
-        self._bind(port)
+        self.port = self._bind(port)
         self._thread = threading.Thread(target=self.serve_forever, args=(POLL,), name="live", daemon=True)
         self._thread.start()
-
-    @property
-    def port(self) -> int:
-        return int(self.socket.getsockname()[1])
 
     def stop(self) -> None:
         """Answer no more."""
         self.shutdown()
         self.server_close()
 
-    def _bind(self, port: int) -> None:
+    def _bind(self, port: int) -> int:
+        """Listen; return the port."""
         ports = [port] if port else range(PORT, PORT + TRIED)
         for one in ports:
             try:
                 self.server_address = LOOPBACK, one
                 self.server_bind()
                 self.server_activate()
-                return
+                return one
             except OSError as error:
                 fault: OSError = error
                 self.socket.close()
