@@ -132,9 +132,10 @@ def logging_to(path: Path) -> Iterator[None]:
 def line(progress: "training.Progress") -> str:
     """Return the progress at a step as text."""
     p = progress
+    least = "" if p.growth_known else "at least "
     return (
         f"step {p.step}/{p.steps}  loss {p.loss:.4f}  psnr {p.psnr:.1f}  gaussians {p.gaussians:,}  "
-        f"{p.milliseconds:.1f} ms/step  {_clock(p.seconds_left)} left"
+        f"{p.milliseconds:.1f} ms/step  {least}{_clock(p.seconds_left)} left"
     )
 
 

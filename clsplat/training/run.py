@@ -41,10 +41,11 @@ class Progress:
     step: int
     steps: int
     loss: float
-    psnr: float  # dB, of the training view just rendered, before 8 bits
+    psnr: float  # dB, the mean over the training views of the last reports, before 8 bits
     gaussians: int
     milliseconds: float  # per step
     seconds_left: float
+    growth_known: bool = True  # False: rules will make steps slower, and it is not known yet how much
 
 
 @dataclass

@@ -41,9 +41,7 @@ def test_only_get_is_answered(method):
     assert refusal(head(method=method)) == 405
 
 
-@pytest.mark.parametrize(
-    "target", ["/", "/state.json", "/secret-toke/", "/secret-token2/x", "/%FF/", "//x/"]
-)
+@pytest.mark.parametrize("target", ["/", "/state.json", "/secret-toke/", "/secret-token2/x", "/%FF/", "//x/"])
 def test_without_the_secret_nothing_is_there(target):
     assert refusal(head(target)) == 404
 
