@@ -1,22 +1,41 @@
 """How far a piece of work on the host is: a line of the log now and then, and whoever else listens."""
 
+import contextvars
 import logging
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from typing import Protocol
 
 LOG = logging.getLogger("clsplat")
 INTERVAL = 5.0  # seconds between lines of the log
+WATCH = 0.5  # seconds between two looks at work that does not count by itself
 
-Listener = Callable[[str, int, int], None]  # what is counted, how many are done, how many there are
+
+class Listener(Protocol):
+    """Hears what is counted, how many are done, how many there are, and the time left, where that is known."""
+
+    def __call__(self, what: str, done: int, total: int, /, *, seconds_left: float | None) -> None: ...
+
+
 _listener: ContextVar[Listener | None] = ContextVar("listener", default=None)
 
 
 @contextmanager
 def heard_by(listener: Listener) -> Iterator[None]:
-    """Call `listener` for each step of the work in this block; it is called from the thread of the block."""
-    token = _listener.set(listener)
+    """Call `listener` for each step of the work in this block, beside those of blocks around it.
+
+    It is called from the thread of the block, or of a `watched` one.
+    """
+    around = _listener.get()
+
+    def both(what: str, done: int, total: int, /, *, seconds_left: float | None) -> None:
+        for one in filter(None, (around, listener)):
+            one(what, done, total, seconds_left=seconds_left)
+
+    token = _listener.set(both)
     try:
         yield
     finally:
@@ -28,14 +47,53 @@ class Count:
 
     def __init__(self, what: str, total: int) -> None:
         self.what, self.total, self.done = what, total, 0
+        self._began: tuple[float, int] | None = None  # when, and with how many done by an earlier call
         self._logged = time.monotonic()
         self.reach(0)
+
+    @property
+    def seconds_left(self) -> float | None:
+        """The time that the other pieces take at the speed of those done so far; None before the first."""
+        if self._began is None or self.done <= self._began[1]:
+            return None
+        began, before = self._began
+        return (time.monotonic() - began) / (self.done - before) * (self.total - self.done)
 
     def reach(self, done: int) -> None:
         """Note how many pieces are done."""
         self.done = done
+        if self._began is None or self.done < self._began[1]:
+            self._began = time.monotonic(), done
+        left = self.seconds_left
         if listener := _listener.get():
-            listener(self.what, done, self.total)
+            listener(self.what, done, self.total, seconds_left=left)
         if done and time.monotonic() - self._logged >= INTERVAL:
             self._logged = time.monotonic()
-            LOG.info("%s: %d of %d", self.what, done, self.total)
+            LOG.info("%s: %d of %d%s", self.what, done, self.total, f", {clock(left)} left" if left else "")
+
+
+@contextmanager
+def watched(count: Count, look: Callable[[], int]) -> Iterator[None]:
+    """Count work that does not count by itself: a thread looks now and then how many pieces are done."""
+    ended, context = threading.Event(), contextvars.copy_context()
+
+    def watch() -> None:
+        while not ended.wait(WATCH):
+            done = look()
+            if done > count.done:
+                count.reach(min(done, count.total))
+
+    thread = threading.Thread(target=context.run, args=(watch,), name="count", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+
+
+def clock(seconds: float) -> str:
+    """Return a time as h:mm:ss, or m:ss."""
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"

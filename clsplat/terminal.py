@@ -16,6 +16,7 @@ from clsplat import __version__, streams
 from clsplat.errors import DataError, OutputError
 from clsplat.files import unwritable
 from clsplat.names import METRICS
+from clsplat.progress import clock, heard_by
 from clsplat.reading import read_json
 
 if TYPE_CHECKING:  # the command line starts without OpenCL
@@ -135,7 +136,7 @@ def line(progress: "training.Progress") -> str:
     least = "" if p.growth_known else "at least "
     return (
         f"step {p.step}/{p.steps}  loss {p.loss:.4f}  psnr {p.psnr:.1f}  gaussians {p.gaussians:,}  "
-        f"{p.milliseconds:.1f} ms/step  {least}{_clock(p.seconds_left)} left"
+        f"{p.milliseconds:.1f} ms/step  {least}{clock(p.seconds_left)} left"
     )
 
 
@@ -168,6 +169,8 @@ def show_summary(folder: Path) -> None:
     for title, name in names.items():
         if (folder / name).exists():
             remark(f"  {title:<8} {folder / name}")
+    if (folder / names["viewer"]).exists():
+        remark(f"next: open {folder / names['viewer']} in a browser; `clsplat convert --help` makes the model smaller")
 
 
 @contextmanager
@@ -187,7 +190,18 @@ def progress_bar() -> Iterator[Callable[["training.Progress"], None]]:
         yield update
 
 
-def _clock(seconds: float) -> str:
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+@contextmanager
+def counted() -> Iterator[None]:
+    """Show how far the counted work of the block is, where the output is a terminal; a log has its lines."""
+    if not CONSOLE.is_terminal:
+        yield
+        return
+    bar = Progress(BarColumn(bar_width=24), TextColumn("{task.description}"), console=CONSOLE)
+    task = bar.add_task("", total=None, visible=False)
+
+    def update(what: str, done: int, total: int, /, *, seconds_left: float | None) -> None:
+        left = "" if seconds_left is None or done == total else f"  {clock(seconds_left)} left"
+        bar.update(task, total=total, completed=done, description=f"{what}: {done} of {total}{left}", visible=True)
+
+    with Live(bar, console=CONSOLE, refresh_per_second=8, transient=True), heard_by(update):
+        yield

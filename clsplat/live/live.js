@@ -156,7 +156,7 @@ class Watch {
       parts.push(`${thousands(progress.done)} of ${thousands(progress.total)} ${progress.unit}`);
     }
     if (step && steps) parts.push(`step ${thousands(step)} of ${thousands(steps)}`);
-    if (left && state === "running" && !paused) parts.push(`${clock(left)} left`);
+    if (left && !paused && ["preparing", "running"].includes(state)) parts.push(`${clock(left)} left`);
     return parts.join(" · ");
   }
 

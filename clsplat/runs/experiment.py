@@ -115,7 +115,8 @@ def run_pipeline(
     ):
         if live:
             live.follow(status)
-        run = opening.open_run(pipeline, out, device, start, status)
+        with terminal.counted():
+            run = opening.open_run(pipeline, out, device, start, status)
         with terminal.progress_bar() as show, live.showing(run) if live else nullcontext():
             runner.execute(pipeline, run, start, live.reporting(show) if live else show)
 
