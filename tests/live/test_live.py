@@ -25,6 +25,7 @@ from clsplat.metrics.views import render_view
 from clsplat.pipeline.loading import load
 from clsplat.runs import folders, opening, runner
 from clsplat.runs.experiment import Job
+from clsplat.runs.failures import failures_recorded
 from clsplat.scene.detect import read_scene
 from clsplat.training.run import Progress, Run
 from tests.few_steps import FEW
@@ -69,7 +70,7 @@ def live():
 
 def trained(live: Live, scene: Path, out: Path, *overrides: str) -> Run:
     checked = load("smoke", [f"scene.path='{scene}'", *FEW, *overrides])
-    with folders.opened(out, "new", step=0) as status, folders.failures_recorded(status):
+    with folders.opened(out, "new", step=0) as status, failures_recorded(status):
         live.follow(status)
         run = opening.open_run(checked, out, None, "new", status)
         with live.showing(run):

@@ -48,7 +48,7 @@ def test_requests_of_one_connection_are_answered_one_after_the_other(server):
 def test_a_request_that_is_too_long_is_refused_and_no_more_of_it_read(server):
     data = b"GET /token/ HTTP/1.1\r\nHost: localhost\r\nX: " + b"x" * (2 * LONGEST)
     found = b""
-    with suppress(ConnectionResetError):  # the rest was not read
+    with suppress(OSError):  # the rest was not read
         found = talk(server, data)
     assert found[:12] in (b"HTTP/1.1 431", b"")
     assert talk(server, b"GET /token/ HTTP/1.1\r\nHost: localhost\r\n\r\n").startswith(b"HTTP/1.1 200")
