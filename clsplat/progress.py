@@ -1,24 +1,42 @@
 """How far a piece of work on the host is: a line of the log now and then, and whoever else listens."""
 
+import contextvars
 import logging
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import TypeVar
+from typing import Protocol, TypeVar
 
 LOG = logging.getLogger("clsplat")
-INTERVAL = 5.0  # seconds between lines of the log
-
 Item = TypeVar("Item")
-Listener = Callable[[str, int, int], None]  # what is counted, how many are done, how many there are
+INTERVAL = 5.0  # seconds between lines of the log
+WATCH = 0.5  # seconds between two looks at work that does not count by itself
+
+
+class Listener(Protocol):
+    """Hears what is counted, how many are done, how many there are, and the time left, where that is known."""
+
+    def __call__(self, what: str, done: int, total: int, /, *, seconds_left: float | None) -> None: ...
+
+
 _listener: ContextVar[Listener | None] = ContextVar("listener", default=None)
 
 
 @contextmanager
 def heard_by(listener: Listener) -> Iterator[None]:
-    """Call `listener` for each step of the work in this block; it is called from the thread of the block."""
-    token = _listener.set(listener)
+    """Call `listener` for each step of the work in this block, beside those of blocks around it.
+
+    It is called from the thread of the block, or of a `watched` one.
+    """
+    around = _listener.get()
+
+    def both(what: str, done: int, total: int, /, *, seconds_left: float | None) -> None:
+        for one in filter(None, (around, listener)):
+            one(what, done, total, seconds_left=seconds_left)
+
+    token = _listener.set(both)
     try:
         yield
     finally:
@@ -30,18 +48,29 @@ class Count:
 
     def __init__(self, what: str, total: int) -> None:
         self.what, self.total, self.done = what, total, 0
-        self._begun = self._logged = time.monotonic()
+        self._began: tuple[float, int] | None = None  # when, and with how many done by an earlier call
+        self._logged = time.monotonic()
         self.reach(0)
+
+    @property
+    def seconds_left(self) -> float | None:
+        """The time that the other pieces take at the speed of those done so far; None before the first."""
+        if self._began is None or self.done <= self._began[1]:
+            return None
+        began, before = self._began
+        return (time.monotonic() - began) / (self.done - before) * (self.total - self.done)
 
     def reach(self, done: int) -> None:
         """Note how many pieces are done."""
         self.done = done
+        if self._began is None or self.done < self._began[1]:
+            self._began = time.monotonic(), done
+        left = self.seconds_left
         if listener := _listener.get():
-            listener(self.what, done, self.total)
+            listener(self.what, done, self.total, seconds_left=left)
         if done and time.monotonic() - self._logged >= INTERVAL:
             self._logged = time.monotonic()
-            left = (self._logged - self._begun) / done * (self.total - done)
-            LOG.info("%s: %d of %d, about %s left", self.what, done, self.total, clock(left))
+            LOG.info("%s: %d of %d%s", self.what, done, self.total, f", {clock(left)} left" if left else "")
 
 
 def counted(items: Iterable[Item], what: str, total: int) -> Iterator[Item]:
@@ -52,8 +81,28 @@ def counted(items: Iterable[Item], what: str, total: int) -> Iterator[Item]:
         count.reach(number)
 
 
+@contextmanager
+def watched(count: Count, look: Callable[[], int]) -> Iterator[None]:
+    """Count work that does not count by itself: a thread looks now and then how many pieces are done."""
+    ended, context = threading.Event(), contextvars.copy_context()
+
+    def watch() -> None:
+        while not ended.wait(WATCH):
+            done = look()
+            if done > count.done:
+                count.reach(min(done, count.total))
+
+    thread = threading.Thread(target=context.run, args=(watch,), name="count", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+
+
 def clock(seconds: float) -> str:
-    """Return a time as 0:07 or 1:02:03."""
+    """Return a time as h:mm:ss, or m:ss."""
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"

@@ -15,7 +15,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 from clsplat import __version__, streams
 from clsplat.errors import OutputError
 from clsplat.files import unwritable
-from clsplat.progress import clock
+from clsplat.progress import clock, heard_by
 
 if TYPE_CHECKING:  # the command line starts without OpenCL
     from clsplat.training import run as training
@@ -131,9 +131,10 @@ def logging_to(path: Path) -> Iterator[None]:
 def line(progress: "training.Progress") -> str:
     """Return the progress at a step as text."""
     p = progress
+    least = "" if p.growth_known else "at least "
     return (
         f"step {p.step}/{p.steps}  loss {p.loss:.4f}  psnr {p.psnr:.1f}  gaussians {p.gaussians:,}  "
-        f"{p.milliseconds:.1f} ms/step  {clock(p.seconds_left)} left"
+        f"{p.milliseconds:.1f} ms/step  {least}{clock(p.seconds_left)} left"
     )
 
 
@@ -166,3 +167,20 @@ def progress_bar() -> Iterator[Callable[["training.Progress"], None]]:
             LOG.debug(line(progress))
 
         yield update
+
+
+@contextmanager
+def counted() -> Iterator[None]:
+    """Show how far the counted work of the block is, where the output is a terminal; a log has its lines."""
+    if not CONSOLE.is_terminal:
+        yield
+        return
+    bar = Progress(BarColumn(bar_width=24), TextColumn("{task.description}"), console=CONSOLE)
+    task = bar.add_task("", total=None, visible=False)
+
+    def update(what: str, done: int, total: int, /, *, seconds_left: float | None) -> None:
+        left = "" if seconds_left is None or done == total else f"  {clock(seconds_left)} left"
+        bar.update(task, total=total, completed=done, description=f"{what}: {done} of {total}{left}", visible=True)
+
+    with Live(bar, console=CONSOLE, refresh_per_second=8, transient=True), heard_by(update):
+        yield

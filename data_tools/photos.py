@@ -22,7 +22,8 @@ import numpy as np
 
 from clsplat.errors import DataError
 from clsplat.files import write_text
-from clsplat.progress import Count
+from clsplat.progress import Count, watched
+from data_tools.database import image_names, matched_pairs, pairs_done, remove, without_features
 from data_tools.gather import MIN_PHOTOGRAPHS, gather, link, list_photographs
 from data_tools.pycolmap_import import require_pycolmap
 from data_tools.vocabulary import alike
@@ -33,8 +34,9 @@ Mapper = Literal["incremental", "global"]
 Cameras = Literal["auto", "one", "per_folder", "per_image"]
 CameraModel = Literal["SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "PINHOLE", "SIMPLE_PINHOLE"]
 MAX_EXHAUSTIVE = 200  # photographs whose pairs are all matched: the time grows with the square of their number
+MAX_NAMED = 8  # photographs in a message
 CHUNK = 10  # photographs between two counts
-DATABASE, IMAGES = "database.db", "images"
+DATABASE, IMAGES, PAIRS = "database.db", "images", "pairs.txt"
 
 
 def find_features(
@@ -60,13 +62,13 @@ def find_features(
     extraction.sift.max_num_features = features
     with _explained(photographs, "find features"):
         pycolmap.Database.open(database).close()
-        if _image_names(pycolmap, out / DATABASE) != sorted(names):  # a new database, or one cut short
-            _remove(out / DATABASE)
+        if image_names(pycolmap, out / DATABASE) != sorted(names):  # a new database, or one cut short
+            remove(out / DATABASE)
             pycolmap.Database.open(database).close()
             pycolmap.import_images(
                 database, str(out / IMAGES), getattr(pycolmap.CameraMode, mode), image_names=names, options=reader
             )
-        missing, count = _without_features(pycolmap, out / DATABASE), Count("photographs with features", len(names))
+        missing, count = without_features(pycolmap, out / DATABASE), Count("photographs with features", len(names))
         for start in range(0, len(missing), CHUNK):
             count.reach(len(names) - len(missing) + start)
             pycolmap.extract_features(
@@ -94,7 +96,7 @@ def match_features(source: Path, out: Path, matching: Matching = "auto", neighbo
         half = out / f".{DATABASE}"
         shutil.copyfile(source / DATABASE, half)
         half.replace(database)
-    count = len(_image_names(pycolmap, database))
+    count = len(image_names(pycolmap, database))
     chosen = ("exhaustive" if count <= MAX_EXHAUSTIVE else "vocabulary") if matching == "auto" else matching
     options, verification = pycolmap.FeatureMatchingOptions(), pycolmap.TwoViewGeometryOptions()
     options.use_gpu, verification.ransac.random_seed = False, 0
@@ -107,17 +109,21 @@ def match_features(source: Path, out: Path, matching: Matching = "auto", neighbo
     with _explained(source, "match photographs"):
         if chosen == "sequential":
             pairing = pycolmap.SequentialPairingOptions()
-            pairing.overlap = neighbours
-            pycolmap.match_sequential(str(database), pairing_options=pairing, **common)
+            pairing.overlap, pairing.quadratic_overlap = neighbours, True
+            steps = {*range(1, neighbours + 1), *(1 << power for power in range(neighbours))}
+            with _counted(database, sum(max(0, count - step) for step in steps)):
+                pycolmap.match_sequential(str(database), pairing_options=pairing, **common)
         elif chosen == "vocabulary":
-            pairs = out / "pairs.txt"
-            write_text(pairs, "".join(f"{a} {b}\n" for a, b in _alike_pairs(pycolmap, database, 2 * neighbours)))
+            pairs = _alike_pairs(pycolmap, database, 2 * neighbours)
+            write_text(out / PAIRS, "".join(f"{a} {b}\n" for a, b in pairs))
             imported = pycolmap.ImportedPairingOptions()
-            imported.match_list_path = pairs
-            pycolmap.match_image_pairs(str(database), pairing_options=imported, **common)
+            imported.match_list_path = out / PAIRS
+            with _counted(database, len(pairs)):
+                pycolmap.match_image_pairs(str(database), pairing_options=imported, **common)
         else:
-            pycolmap.match_exhaustive(str(database), **common)
-    verified = _matched_pairs(pycolmap, database)
+            with _counted(database, count * (count - 1) // 2):
+                pycolmap.match_exhaustive(str(database), **common)
+    verified = matched_pairs(pycolmap, database)
     if verified == 0:
         raise DataError(
             f"{source / IMAGES}: no two of the {count} photographs show the same features; take photographs with more "
@@ -136,7 +142,7 @@ def map_cameras(source: Path, out: Path, mapper: Mapper = "incremental", threads
     link(source / IMAGES, out / IMAGES)
     work = out / ".models"
     work.mkdir()
-    names = _image_names(pycolmap, source / DATABASE)
+    names = image_names(pycolmap, source / DATABASE)
     is_global = mapper == "global"
     options = pycolmap.GlobalPipelineOptions() if is_global else pycolmap.IncrementalPipelineOptions()
     options.num_threads = options.mapper.num_threads = threads
@@ -166,10 +172,17 @@ def map_cameras(source: Path, out: Path, mapper: Mapper = "incremental", threads
     registered = {best.images[number].name for number in best.reg_image_ids()}
     missing = [name for name in names if name not in registered]
     if missing:
-        LOG.warning("%d photographs could not be placed: %s", len(missing), ", ".join(missing[:8]))
+        LOG.warning(
+            "%d of %d photographs could not be placed: %s; the scene is made of the others: for more, add photographs "
+            "from places between, or raise match_features.neighbours",
+            *(len(missing), len(names), named(missing)),
+        )
     others = [model.num_reg_images() for model in models[1:]]
     if others:
-        LOG.warning("%d smaller models, of %s images, are left out", len(others), ", ".join(map(str, others)))
+        LOG.warning(
+            "%d smaller models, of %s photographs, are left out: add photographs that join them to the largest",
+            *(len(others), ", ".join(map(str, others))),
+        )
     return {
         "registered": len(registered),
         "not_registered": missing,
@@ -177,6 +190,12 @@ def map_cameras(source: Path, out: Path, mapper: Mapper = "incremental", threads
         "points": best.num_points3D(),
         "error_px": round(best.compute_mean_reprojection_error(), 3),
     }
+
+
+def named(photographs: list[str]) -> str:
+    """Return the first few names."""
+    more = f", and {len(photographs) - MAX_NAMED} more" if len(photographs) > MAX_NAMED else ""
+    return ", ".join(photographs[:MAX_NAMED]) + more
 
 
 def _alike_pairs(pycolmap: ModuleType, database: Path, neighbours: int) -> list[tuple[str, str]]:
@@ -191,40 +210,13 @@ def _alike_pairs(pycolmap: ModuleType, database: Path, neighbours: int) -> list[
     return [(images[i].name, images[j].name) for i, j in alike(tables, neighbours)]
 
 
-def _matched_pairs(pycolmap: ModuleType, database: Path) -> int:
-    """Number of pairs whose matches pass geometric verification."""
-    opened = pycolmap.Database.open(str(database))
-    try:
-        _, inliers = opened.read_two_view_geometry_num_inliers()
-        return int(np.count_nonzero(inliers))
-    finally:
-        opened.close()
-
-
-def _image_names(pycolmap: ModuleType, database: Path) -> list[str]:
-    opened = pycolmap.Database.open(str(database))
-    try:
-        return sorted(image.name for image in opened.read_all_images())
-    finally:
-        opened.close()
-
-
-def _without_features(pycolmap: ModuleType, database: Path) -> list[str]:
-    """The names of images whose features are not in the database, or not all, sorted."""
-    opened = pycolmap.Database.open(str(database))
-    try:
-        return sorted(
-            image.name
-            for image in opened.read_all_images()
-            if not (opened.exists_keypoints(image.image_id) and opened.exists_descriptors(image.image_id))
-        )
-    finally:
-        opened.close()
-
-
-def _remove(database: Path) -> None:
-    for file in database.parent.glob(f"{database.name}*"):  # with its journal
-        file.unlink()
+@contextmanager
+def _counted(database: Path, pairs: int) -> Iterator[None]:
+    """Count the pairs that pycolmap looks at in the block."""
+    count = Count("pairs matched", pairs)
+    with watched(count, lambda: pairs_done(database)):
+        yield
+    count.reach(pairs)
 
 
 @contextmanager

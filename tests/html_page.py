@@ -5,7 +5,7 @@ from collections import Counter
 from html.parser import HTMLParser
 
 HOSTILE = "<script>\"'&amp;<b>"  # also a valid name of a file
-VOID = {"meta", "img", "br", "input"}  # elements without an end
+VOID = {"meta", "link", "img", "br", "input"}  # elements without an end
 ADDRESSES = {"src", "href", "action", "srcset", "data", "poster"}
 
 

@@ -14,7 +14,7 @@ ROWS = (  # from the top down; a module imports only from lower rows, or from it
     {"runs"},
     {"conformance"},
     {"bench"},
-    {"compare", "inspect", "terminal"},
+    {"compare", "inspect", "live", "terminal"},
     {"pipeline"},
     {"stages", "prepare"},
     {"report"},

@@ -306,7 +306,7 @@ def done(monkeypatch: pytest.MonkeyPatch) -> list[str]:
                 raise DataError("broken")
             (out / "sparse" / "0").mkdir(parents=True)
             (out / "sparse" / "0" / "cameras.bin").write_text(str(len(ran)))
-        return {"registered": 5}
+        return {"registered": 5, "not_registered": [], "error_px": 0.5}
 
     for step in (prepare_steps.FindFeatures, prepare_steps.MatchFeatures, prepare_steps.MapCameras):
         monkeypatch.setattr(step, "make", make)

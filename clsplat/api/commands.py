@@ -26,15 +26,17 @@ def run(
     set: Overrides = (),
     device: "str | Device | None" = None,
     start: Literal["new", "resume", "restart"] = "new",
+    live: int | None = None,
 ) -> Path:
     """Run a pipeline or a matrix, as `clsplat run` does; return the run folder.
 
     pipeline: a file, or the name of a shipped one; scene: default that of the pipeline; out: default runs/NAME; set:
     settings by place, such as {"optimize.steps": 3000}; start: "resume" goes on from the newest checkpoint in `out`, if
-    there is one, "restart" begins again where `out` holds a run, and removes its checkpoints and metrics.
+    there is one, "restart" begins again where `out` holds a run, and removes its checkpoints and metrics; live: the
+    port of a page on this machine that shows the model while it trains, 0 for the usual one.
     """
     job = _job(pipeline, scene, out, set, start)
-    job.run(device)
+    job.run(device, live)
     return job.out
 
 
@@ -51,13 +53,18 @@ def describe_run(
     return _job(pipeline, scene, out, set, start).describe(device)
 
 
-def resume(folder: PathLike, *, set: Overrides = (), device: "str | Device | None" = None) -> Path:
-    """Go on with a run, or a matrix, from its newest checkpoint, as `clsplat resume` does; return the run folder."""
+def resume(
+    folder: PathLike, *, set: Overrides = (), device: "str | Device | None" = None, live: int | None = None
+) -> Path:
+    """Go on with a run, or a matrix, from its newest checkpoint, as `clsplat resume` does; return the run folder.
+
+    live: as for `run`.
+    """
     from clsplat.runs.experiment import Job
 
     load_plugins()
     job = Job.resume(Path(folder), overrides(set))
-    job.run(device)
+    job.run(device, live)
     return job.out
 
 

@@ -14,6 +14,7 @@ from clsplat.errors import Interrupted, as_clsplat_error, one_line
 from clsplat.signals import stop_at_once, stopping_on_signals
 
 DEBUG, PLUGIN = "--debug", "--plugin"  # options that stand before the command or after it
+LIVE = "--live"  # its port may be left out
 
 
 def main(*before: str) -> None:
@@ -22,7 +23,7 @@ def main(*before: str) -> None:
     before: arguments that stand before those of the process.
     """
     streams.install()
-    arguments = _options_first(_one_set_each([*before, *sys.argv[1:]]))
+    arguments = _options_first(_with_port(_one_set_each([*before, *sys.argv[1:]])))
     try:
         with stopping_on_signals(stop_at_once):
             shown = app(arguments, prog_name="clsplat", standalone_mode=False)
@@ -74,6 +75,15 @@ def _one_set_each(arguments: list[str]) -> list[str]:
         follows = len(spread) >= 2 and spread[-2] == "--set"
         spread += ["--set", argument] if follows and "=" in argument and argument[0] != "-" else [argument]
     return spread
+
+
+def _with_port(arguments: list[str]) -> list[str]:
+    """Let `--live` without a number stand for `--live=0`."""
+    following = [*arguments[1:], ""]
+    return [
+        f"{LIVE}=0" if argument == LIVE and not after.isdecimal() else argument
+        for argument, after in zip(arguments, following, strict=True)
+    ]
 
 
 def _options_first(arguments: list[str]) -> list[str]:

@@ -176,4 +176,14 @@ SetOption = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE …", help="Change settings; `clsplat pipelines NAME` lists them."),
 ]
+LiveOption = Annotated[
+    int | None,
+    typer.Option(
+        "--live",
+        metavar="[PORT]",
+        min=0,
+        max=65535,
+        help="Show the model in a browser while it trains; without PORT: 8710, or the next that is free.",
+    ),
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]

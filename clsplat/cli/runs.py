@@ -7,7 +7,7 @@ import typer
 
 from clsplat import terminal
 from clsplat.api import commands
-from clsplat.cli.app import DeviceOption, JsonOption, PipelineArgument, SetOption, command, recipe_names
+from clsplat.cli.app import DeviceOption, JsonOption, LiveOption, PipelineArgument, SetOption, command, recipe_names
 from clsplat.errors import ConfigError, DataError, OutputError
 
 
@@ -15,6 +15,7 @@ from clsplat.errors import ConfigError, DataError, OutputError
     "run",
     "clsplat run splat_7k --scene my_scene",
     "clsplat run splat_7k --scene my_scene --out runs/a --set optimize.steps=3000",
+    "clsplat run splat_7k --scene my_scene --live",
 )
 def run(
     pipeline: PipelineArgument,
@@ -27,17 +28,17 @@ def run(
         bool, typer.Option("--restart", help="Begin again in a folder that holds a run, without its checkpoints.")
     ] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Check everything and say what would run.")] = False,
+    live: LiveOption = None,
 ) -> None:
     """Run a pipeline, or all cells of a matrix."""
-    work = commands.describe_run if dry_run else commands.run
     if resume and restart:
         raise ConfigError("--resume goes on with a run and --restart begins it again; give one of them")
     start: Literal["new", "resume", "restart"] = "resume" if resume else "restart" if restart else "new"
-    found = work(pipeline, scene, out, set=set_ or (), device=device, start=start)
-    if isinstance(found, Path):
-        _show_summary(found)
+    if dry_run:
+        terminal.show(commands.describe_run(pipeline, scene, out, set=set_ or (), device=device, start=start))
     else:
-        terminal.show(found)
+        found = commands.run(pipeline, scene, out, set=set_ or (), device=device, start=start, live=live)
+        _show_summary(found)
 
 
 @command("resume", "clsplat resume runs/splat_7k", "clsplat resume runs/splat_7k --steps 14000")
@@ -50,6 +51,7 @@ def resume(
     ] = None,
     set_: SetOption = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Check everything and say what would run.")] = False,
+    live: LiveOption = None,
 ) -> None:
     """Go on with a run from its newest checkpoint, or train one that is done for longer."""
     changes = [*(set_ or ()), *([f"optimize.steps={steps}"] if steps is not None else [])]
@@ -57,7 +59,7 @@ def resume(
         file = folder / "pipeline.yaml"
         terminal.show(commands.describe_run(file, out=folder, set=changes, device=device, start="resume"))
     else:
-        _show_summary(commands.resume(folder, set=changes, device=device))
+        _show_summary(commands.resume(folder, set=changes, device=device, live=live))
 
 
 def _show_summary(folder: Path) -> None:

@@ -153,8 +153,7 @@ def _do(one: Planned, source: Path, root: Path) -> None:
         if isinstance(error, OSError):
             raise unwritable(one.folder, error) from error
         raise
-    figures = ", ".join(f"{name} {value}" for name, value in summary.items() if value not in ([], ""))
-    LOG.info("%s: %s  %.0f s", one.step.stage, figures, seconds)
+    LOG.info("%s: %s  %.0f s", one.step.stage, one.step.told(summary), seconds)
 
 
 def _why(step: Step, inputs: str, folder: Path, source: Path) -> str:

@@ -18,6 +18,7 @@ from data_tools.photos import (
     find_features,
     map_cameras,
     match_features,
+    named,
 )
 from data_tools.pycolmap_import import require_pycolmap
 from data_tools.undistort import Blank, undistort_scene
@@ -46,6 +47,10 @@ class Step(Settings):
 
         `out` is empty, or of a step that `resumes` holds what an interrupted call of the same inputs and settings made.
         """
+
+    def told(self, figures: dict[str, Any]) -> str:
+        """Return what `make` returned in words."""
+        return ", ".join(f"{name} {value}" for name, value in figures.items() if value not in ([], ""))
 
 
 class FindFeatures(Step):
@@ -108,6 +113,11 @@ class MapCameras(Step):
 
     def make(self, source: Path, out: Path, without: Path) -> dict[str, Any]:
         return map_cameras(source, out, self.mapper, self.threads)
+
+    def told(self, figures: dict[str, Any]) -> str:
+        placed, missing = figures["registered"], figures["not_registered"]
+        text = f"{placed} of {placed + len(missing)} photographs placed, {figures['error_px']:.2f} px"
+        return text + (f"; left out: {named(missing)}" if missing else "")
 
 
 class Undistort(Step):

@@ -2,7 +2,8 @@
 
 import json
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -11,6 +12,7 @@ from clsplat import lock, terminal
 from clsplat.compare.page import write_comparison
 from clsplat.errors import ClsplatError, ConfigError, DataError, Interrupted, as_clsplat_error, one_line
 from clsplat.files import is_there, write_text
+from clsplat.live.live import Live
 from clsplat.names import COMPARISON, LOG_FILE, OF_A_MATRIX, PIPELINE
 from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import Pipeline, load
@@ -73,17 +75,37 @@ class Job:
             return describe_matrix(self.work, self.out, device, self.start)
         return description.describe(self.work, self.out, device, self.start)
 
-    def run(self, device: str | Device | None = None) -> None:
-        """Run it; what is up to date is left alone.  Raises ClsplatError; status.json tells why."""
+    def run(self, device: str | Device | None = None, live: int | None = None) -> None:
+        """Run it; what is up to date is left alone.  Raises ClsplatError; status.json tells why.
+
+        live: the port of a live preview, 0 for any; None: there is none.
+        """
+        with previewed(live) as preview:
+            self._run(device, preview)
+
+    def _run(self, device: str | Device | None, live: Live | None) -> None:
         if isinstance(self.work, Experiment):
-            run_matrix(self.work, self.out, device, self.start)
+            run_matrix(self.work, self.out, device, self.start, live)
         elif self.start != "restart" and up_to_date(self.work, self.work.preparation(self.out), self.out):
             LOG.info("%s: up to date; change a setting, or give another folder, to run again", self.out)
         else:
-            run_pipeline(self.work, self.out, device, self.start)
+            run_pipeline(self.work, self.out, device, self.start, live)
 
 
-def run_pipeline(pipeline: Pipeline, out: Path, device: str | Device | None, start: Start) -> None:
+@contextmanager
+def previewed(port: int | None) -> Iterator[Live | None]:
+    """Serve a live preview for the block, and say where; None: without one.  Raises ConfigError."""
+    if port is None:
+        yield None
+        return
+    with Live(port) as live:
+        terminal.remark(live.text)  # not in the log, which others may read: its address is a secret
+        yield live
+
+
+def run_pipeline(
+    pipeline: Pipeline, out: Path, device: str | Device | None, start: Start, live: Live | None = None
+) -> None:
     """Run one pipeline in its folder, with a log and a progress bar.  Raises ClsplatError; status.json tells why."""
     outputs.check_places(pipeline, out)
     with (
@@ -92,12 +114,17 @@ def run_pipeline(pipeline: Pipeline, out: Path, device: str | Device | None, sta
         failures_recorded(status),
         terminal.logging_to(out / LOG_FILE),
     ):
-        run = opening.open_run(pipeline, out, device, start, status)
-        with terminal.progress_bar() as show:
-            runner.execute(pipeline, run, start, show)
+        if live:
+            live.follow(status)
+        with terminal.counted():
+            run = opening.open_run(pipeline, out, device, start, status)
+        with terminal.progress_bar() as show, live.showing(run) if live else nullcontext():
+            runner.execute(pipeline, run, start, live.reporting(show) if live else show)
 
 
-def run_matrix(experiment: Experiment, out: Path, device: str | Device | None, start: Start) -> None:
+def run_matrix(
+    experiment: Experiment, out: Path, device: str | Device | None, start: Start, live: Live | None = None
+) -> None:
     """Run every cell in its folder below `out` and write compare.html; a resumed matrix leaves finished cells alone.
 
     A cell that fails does not stop the others; at the end a ClsplatError is raised with the exit code of the first one.
@@ -110,7 +137,7 @@ def run_matrix(experiment: Experiment, out: Path, device: str | Device | None, s
         failures_recorded(status),
     ):
         write_text(out / PIPELINE, experiment.text)
-        failures = _run_cells(experiment, status, device, start)
+        failures = _run_cells(experiment, status, device, start, live)
         status.require_held()
         _compare(experiment, out, failures)
         if failures:
@@ -119,7 +146,7 @@ def run_matrix(experiment: Experiment, out: Path, device: str | Device | None, s
 
 
 def _run_cells(
-    experiment: Experiment, status: StatusFile, device: str | Device | None, start: Start
+    experiment: Experiment, status: StatusFile, device: str | Device | None, start: Start, live: Live | None
 ) -> dict[str, ClsplatError]:
     """Run the cells one after the other; return the failures by the cells' names."""
     failures: dict[str, ClsplatError] = {}
@@ -132,7 +159,7 @@ def _run_cells(
                 LOG.info("%s is done", title)
             else:
                 LOG.info("%s", title)
-                run_pipeline(cell.pipeline, folder, device, start)
+                run_pipeline(cell.pipeline, folder, device, start, live)
         except Interrupted:
             raise
         except Exception as error:

@@ -83,7 +83,7 @@ def _progress(status: dict[str, Any]) -> str:
     if status["state"] in END_STATES:
         return f" at step {step}{steps if status['state'] != 'done' else ''}"
     stage = f", {status['stage']}{count}" if status.get("stage") else ""
-    time_left = f", {left:.0f} s left" if isinstance(left, int | float) and status["state"] == "running" else ""
+    time_left = f", {left:.0f} s left" if isinstance(left, int | float) else ""
     return f" at step {step}{steps}{stage}{time_left}"
 
 

@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
-from statistics import median
+from statistics import fmean, median
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, field_validator
@@ -21,6 +21,7 @@ from clsplat.stages.base import Scheduled, Stage
 from clsplat.stages.densify import Densify
 from clsplat.training import checkpoint
 from clsplat.training.adam import Adam, Rates
+from clsplat.training.forecast import Forecast
 from clsplat.training.profile import stage_milliseconds
 from clsplat.training.run import Progress, Run, Stopped
 from clsplat.training.trainer import Trainer
@@ -101,6 +102,7 @@ class Optimize(Stage):
         LOG.info(memory.text(count))
         memory.check(count)
         last_step = run.step - run.stage_step + self.steps
+        forecast = Forecast.of(run.step, last_step, [stage.due for stage in self._density])
         seconds: list[float] = []  # of the steps since the last report
         self._act(run)
         while run.stage_step < self.steps:
@@ -113,10 +115,11 @@ class Optimize(Stage):
             seconds.append(time.perf_counter() - start)
             run.train_seconds += seconds[-1]
             if report:
-                self._report(run, last_step, loss, psnr, median(seconds))
+                self._report(run, forecast, loss, psnr, seconds)
                 seconds.clear()
             with suppress(Stopped):
                 self._act(run)
+            run.between()
             if run.interrupted:
                 path = checkpoint.save(run)
                 raise Interrupted(f"stopped at step {run.step}, saved in {path}; --resume continues from there")
@@ -145,16 +148,8 @@ class Optimize(Stage):
         for name in sorted(self.tables - gaussians.tables.keys()):
             gaussians.add(name, 1)
             run.refresh_filter()
-        return Trainer(
-            run.rasterizer,
-            run.model,
-            run.adam,
-            run.stats,
-            photographs.background,
-            self.losses,
-            self.rates,
-            run.scene.extent,
-        )
+        parts = run.rasterizer, run.model, run.adam, run.stats, photographs.background
+        return Trainer(*parts, self.losses, self.rates, run.scene.extent)
 
     def _act(self, run: Run) -> None:
         """Run the stages that are due and do not edit; those that fail run again when the run goes on."""
@@ -238,13 +233,14 @@ class Optimize(Stage):
             raise NotFiniteError(f"step {run.step}, view '{name}': the loss is {loss}; {told}")
         return loss, -10 * math.log10(max(error, 1e-10))
 
-    def _report(self, run: Run, last_step: int, loss: float, psnr: float, seconds: float) -> None:
+    def _report(self, run: Run, forecast: Forecast, loss: float, psnr: float, seconds: list[float]) -> None:
         count = run.model.gaussians.count
-        stages = stage_milliseconds(run.device.timings)
-        run.records.add(run.step, "train", loss=loss, psnr=psnr, gaussians=count, ms=1e3 * seconds, stages=stages)
-        if run.step % (DISTRIBUTION_INTERVAL * self.log_every) == 0 or run.step == last_step:
+        stages, ms = stage_milliseconds(run.device.timings), 1e3 * median(seconds)  # the first step may load much
+        run.records.add(run.step, "train", loss=loss, psnr=psnr, gaussians=count, ms=ms, stages=stages)
+        if run.step % (DISTRIBUTION_INTERVAL * self.log_every) == 0 or run.step == forecast.last_step:
             run.records.add(run.step, "distribution", gaussians=count, **distribution(run.model.gaussians))
         run.records.write()
-        left = seconds * (last_step - run.step)
+        forecast.add(run.step, psnr, count, fmean(seconds))
+        left, known = forecast.seconds_left, forecast.growth_known
         run.status.note(gaussians=count, seconds_left=round(left, 1))
-        run.show(Progress(run.step, last_step, loss, psnr, count, 1e3 * seconds, left))
+        run.show(Progress(run.step, forecast.last_step, loss, forecast.psnr, count, ms, left, known))

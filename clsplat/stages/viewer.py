@@ -48,7 +48,7 @@ class Viewer(Stage):
             return run.status.counted(run.until_interrupted(views), "views", len(scene.views))
 
         views = described(scene, read, self.photographs, self.photograph_budget, through)
-        stand = Stand.of(model, scene.views, (scene.split("test") or scene.views)[0])
+        stand = Stand.of(model.means, scene.views, (scene.split("test") or scene.views)[0])
         page = Page(f"{run.name} · {run.scene.path.name}", {run.name: pack(model)}, stand, name, views)
         if page.size > MAX_SIZE:
             LOG.warning(

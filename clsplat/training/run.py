@@ -41,10 +41,11 @@ class Progress:
     step: int
     steps: int
     loss: float
-    psnr: float  # dB, of the training view just rendered, before 8 bits
+    psnr: float  # dB, the mean over the training views of the last reports, before 8 bits
     gaussians: int
     milliseconds: float  # per step
     seconds_left: float
+    growth_known: bool = True  # False: rules will make steps slower, and it is not known yet how much
 
 
 @dataclass
@@ -82,6 +83,7 @@ class Run:
     metrics: dict[str, dict[str, Any]] = field(default_factory=dict)  # split -> downscale -> averages
     interrupted: bool = False  # finish the step, save, stop
     show: Callable[[Progress], None] = lambda progress: None
+    between: Callable[[], None] = lambda: None  # between two steps, or items of a long stage; it reads, and may wait
 
     def __post_init__(self) -> None:
         self.records = Records(self.out, self.status.require_held)
@@ -126,6 +128,7 @@ class Run:
         for item in items:
             if self.interrupted:
                 raise Stopped("stopped")
+            self.between()
             yield item
 
     @property

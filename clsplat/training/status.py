@@ -62,7 +62,7 @@ class Status(BaseModel):
     gaussians: int | None = None
     """Number of Gaussians at the last report."""
     seconds_left: float | None = None
-    """Time that the training in progress still needs, estimated at the last report."""
+    """Time that the training in progress still needs, estimated at the last report; in a preparation, its step."""
     checkpoint: str | None = None
     """Newest checkpoint that was saved, a file in the folder `checkpoints`."""
     cells: int | None = None
@@ -148,7 +148,7 @@ class StatusFile:
 
     def enter(self, state: Literal["preparing", "running"], **values: Any) -> None:
         """Change the state, and write it at once."""
-        self.note(state=state, stage=None, progress=None, **values)
+        self.note(state=state, stage=None, progress=None, seconds_left=None, **values)
         self.refresh()
         self._beat()
 

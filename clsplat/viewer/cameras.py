@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.gaussians.model import Model
 from clsplat.scene.camera import Camera
 from clsplat.scene.view import View
 
@@ -28,9 +27,9 @@ class Stand:
     start: View
 
     @classmethod
-    def of(cls, model: Model, views: Sequence[View], first: View | None) -> "Stand":
-        """Look from `first`, else at most of the model from outside."""
-        means = model.means[np.isfinite(model.means).all(axis=1)].astype(np.float64)
+    def of(cls, points: NDArray[np.floating], views: Sequence[View], first: View | None) -> "Stand":
+        """Look from `first`, else at most of the points from outside.  points: [N, 3], what is to be seen."""
+        means = points[np.isfinite(points).all(axis=1)].astype(np.float64)
         low, high = np.quantile(means, SHARES, axis=0) if len(means) else np.zeros((2, 3))
         middle, spread = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
         if first is None or not views:

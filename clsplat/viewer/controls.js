@@ -110,10 +110,12 @@ class Controls {
       o: () => viewer.panel.style(this.style === "orbit" ? "fly" : "orbit"), h: () => viewer.panel.hide(),
       g: () => viewer.panel.cameras(!viewer.frustums.shown),
       f: () => viewer.panel.fullscreen(), c: () => viewer.screenshot(), "?": () => viewer.panel.help(),
-      1: () => viewer.panel.mode("splats"), 2: () => viewer.panel.mode("points"),
-      3: () => viewer.panel.mode("ellipsoids"), 4: () => viewer.panel.mode("opacity"),
+      1: () => viewer.panel.mode?.("splats"), 2: () => viewer.panel.mode?.("points"),
+      3: () => viewer.panel.mode?.("ellipsoids"), 4: () => viewer.panel.mode?.("opacity"),
+      " ": viewer.pause && (() => viewer.pause()),
     }[key];
     if (!action || (event.target.matches("input") && key.startsWith("arrow"))) return;
+    if (key === " " && event.target.closest("button")) return;
     event.preventDefault();
     action();
   }

@@ -2,18 +2,16 @@
 
 const REST = 200, SLOW = 40, QUICK = 20; // ms without a change until the full picture; of a frame
 
-class Viewer {
+class Viewer extends Walk {
   constructor(info, layers, painter, canvas) {
-    Object.assign(this, {info, layers, painter, canvas, stage: canvas.parentElement, up: info.up, radius: info.radius});
-    Object.assign(this, {mode: "splats", share: 1, quality: 1, background: info.background, at: -1, ms: null});
-    this.camera = cameraOf(info.start);
-    this.pivot = info.pivot;
+    super(info, canvas);
+    Object.assign(this, {layers, painter, mode: "splats", share: 1, quality: 1, background: info.background, ms: null});
     for (const layer of layers) layer.sorter = new Sorter(layer.positions, layer.header.near, (order, first) => {
       painter.reorder(layer, order);
       layer.first = first;
       this.change(false);
     });
-    this.panel = new Panel(this);
+    this.panel = new Settings(this);
     this.photographs = new Photographs(this, info.views);
     this.frustums = new Frustums(this, info.views);
     this.controls = new Controls(this, canvas);
@@ -24,13 +22,6 @@ class Viewer {
     this.change();
   }
 
-  // Take the camera of the address; return whether it holds one.
-  adopt() {
-    const camera = location.hash === this.hash ? null : read(location.hash);
-    if (camera) this.move(camera);
-    return !!camera;
-  }
-
   // Draw again; moved: the camera or a setting has changed.
   change(moved = true) {
     if (moved) this.changed = performance.now();
@@ -39,44 +30,10 @@ class Viewer {
     this.scheduled ??= requestAnimationFrame(time => this.tick(time));
   }
 
-  // Go on from another camera, not that of a photograph.
-  move(camera) {
-    this.flight = null;
-    this.at = -1;
-    this.photographs.leave();
-    this.camera = camera;
-    this.change();
-  }
-
-  // Fly to a camera; view: the index of the view that it is of.
-  fly(camera, seconds, view = -1) {
-    this.at = -1;
-    if (matchMedia("(prefers-reduced-motion: reduce)").matches) seconds = 0;
-    this.flight = {from: this.camera, to: camera, begin: performance.now(), seconds, view};
-    this.change();
-  }
-
-  reset() {
-    this.pivot = this.info.pivot;
-    if (this.info.first >= 0) this.photographs.choose(this.info.first);
-    else this.fly(cameraOf(this.info.start), 0.7);
-  }
-
-  widen(degrees) {
-    const [fx, fy, , , width, height] = this.camera.lens;
-    const focal = Math.min(width, height) / 2 / Math.tan(degrees * Math.PI / 360);
-    this.move({...this.camera, lens: [focal, focal * fy / fx, ...this.camera.lens.slice(2)]});
-  }
-
   // The size of a model's part of the stage, CSS px: halves beside each other, or one above the other.
   pane() {
     const {clientWidth: width, clientHeight: height} = this.stage, parts = this.layers.length;
     return width >= height ? {width: width / parts, height} : {width, height: height / parts};
-  }
-
-  get focal() { // CSS px
-    const {width, height} = this.pane();
-    return this.camera.lens[0] * fitted(this.camera.lens, width, height).enlarged;
   }
 
   tick(time) {
@@ -91,15 +48,6 @@ class Viewer {
     if (this.drew) this.draw(resting);
     if (this.whole && !this.flight && !this.controls.pressed.size) this.time = undefined; // a new order draws again
     else this.scheduled ??= requestAnimationFrame(later => this.tick(later));
-  }
-
-  advance(time) {
-    const {from, to, begin, seconds, view} = this.flight, t = seconds ? (time - begin) / 1000 / seconds : 1;
-    if (t >= 1) {
-      [this.camera, this.at, this.flight] = [to, view, null];
-      this.changed = performance.now();
-      if (view >= 0) this.photographs.arrived();
-    } else this.camera = between(from, to, Math.max(0, t * t * (3 - 2 * t)));
   }
 
   // Choose resolution and number of splats from the time of a frame while something moves.
@@ -145,11 +93,7 @@ class Viewer {
 
   settle() {
     this.panel.field(this.camera.lens);
-    const text = `#${written(this.camera)}`;
-    if (text !== location.hash) {
-      this.hash = text;
-      try { history.replaceState(null, "", text); } catch { /* too often, or not allowed: the address stays */ }
-    }
+    this.remember();
     document.documentElement.dataset.ready = "1";
   }
 

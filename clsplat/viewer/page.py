@@ -14,7 +14,10 @@ from clsplat.viewer.cameras import Stand
 from clsplat.viewer.packing import Packed
 
 FOLDER = Path(__file__).parent
-SCRIPTS = ("data", "sort", "shaders", "draw", "camera", "controls", "photographs", "frustums", "panel", "main")
+SCRIPTS = (
+    *("data", "sort", "shaders", "draw", "camera", "motion", "controls", "photographs", "frustums"),
+    *("panel", "settings", "main"),
+)
 MAX_SIZE = 200.0  # MB: browsers need several times as much memory
 MARGIN = 0.97  # of that size, for splats that pack worse than the average
 COLOURS = {"black": [0, 0, 0], "white": [1, 1, 1]}
@@ -49,7 +52,7 @@ class Page:
             models=[base64.b64encode(packed.data).decode() for packed in self.models.values()],
             facts=self._facts(),
             background=self.background,
-            style=inline((FOLDER / "viewer.css").read_text("utf-8")),
+            style=inline(style()),
             script=inline(script()),
         )
 
@@ -88,5 +91,15 @@ class Page:
 
 def script() -> str:
     """Return the scripts of the page, in one function."""
-    parts = [(FOLDER / f"{name}.js").read_text("utf-8") for name in SCRIPTS]
+    return joined(SCRIPTS)
+
+
+def joined(names: Sequence[str], others: Sequence[str] = ()) -> str:
+    """Return scripts of this folder by their names, and the text of others, in one function."""
+    parts = [*((FOLDER / f"{name}.js").read_text("utf-8") for name in names), *others]
     return '(() => {\n"use strict";\n' + "\n".join(parts) + "})();\n"
+
+
+def style() -> str:
+    """Return the style of the page."""
+    return (FOLDER / "viewer.css").read_text("utf-8")

@@ -1,4 +1,4 @@
-// What stands around the picture: buttons, settings, help, statistics.
+// What stands around the picture of every page: buttons, help, the name of the view.
 
 const find = name => document.getElementById(name);
 const press = (group, key, value) => {
@@ -18,21 +18,12 @@ class Panel {
       help: () => this.help(), settings: () => this.toggle(), screenshot: () => viewer.screenshot(),
       fullscreen: () => this.fullscreen(), reset: () => viewer.reset(), show: () => this.hide(),
     })) find(name).addEventListener("click", action);
-    choices("modes", "mode", mode => this.mode(mode));
     choices("styles", "style", style => this.style(style));
     choices("cameras", "cameras", state => this.cameras(state === "shown"));
-    choices("backgrounds", "background", name => this.background(name));
-    find("share").addEventListener("input", ({target}) => {
-      viewer.share = target.value / 100;
-      this.shares();
-      viewer.change();
-    });
-    find("field").addEventListener("input", ({target}) => viewer.widen(+target.value));
     find("keys").addEventListener("click", ({target}) => { // the button, or outside of the box
       if (target.closest("button") || target === find("keys")) find("keys").close();
     });
     if (!document.fullscreenEnabled) find("fullscreen").hidden = true;
-    this.shares();
   }
 
   toggle() {
@@ -54,12 +45,6 @@ class Panel {
     else document.documentElement.requestFullscreen?.().catch(() => {});
   }
 
-  mode(mode) {
-    this.viewer.mode = mode;
-    press("modes", "mode", mode);
-    this.viewer.change();
-  }
-
   style(style) {
     this.viewer.controls.style = style;
     press("styles", "style", style);
@@ -71,36 +56,10 @@ class Panel {
     this.viewer.change();
   }
 
-  background(name) {
-    this.viewer.background = {black: [0, 0, 0], white: [1, 1, 1], grey: [0.22, 0.23, 0.26]}[name];
-    press("backgrounds", "background", name);
-    this.viewer.change();
-  }
-
-  shares() {
-    find("share").value = 100 * this.viewer.share;
-    find("shared").textContent = `${Math.round(100 * this.viewer.share)} %`;
-  }
-
-  field([fx, fy, , , width, height]) {
-    const angle = Math.atan(Math.min(width / fx, height / fy) / 2) * 360 / Math.PI;
-    find("field").value = angle;
-    find("angle").textContent = `${Math.round(angle)}°`;
-  }
-
   caption(view) {
     find("caption").textContent = view ? view.name : "";
     find("split").textContent = view ? view.split : "";
     find("split").className = view ? view.split : "";
-  }
-
-  // drawn: splats; ms: of a frame while moving, null when not measured; scale: of the picture's resolution
-  statistics(drawn, ms, scale) {
-    const whole = this.viewer.layers.reduce((sum, layer) => sum + layer.header.count, 0);
-    const parts = [`${thousands(drawn)} of ${thousands(whole)} splats`];
-    if (ms !== null) parts.push(`${ms < 10 ? ms.toFixed(1) : Math.round(ms)} ms a frame`);
-    if (scale < 1) parts.push(`${Math.round(100 * scale)} % resolution`);
-    find("statistics").textContent = parts.join(" · ");
   }
 }
 

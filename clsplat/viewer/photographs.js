@@ -29,6 +29,7 @@ class Photographs {
     const [item, image, name] = ["button", "img", "span"].map(kind => document.createElement(kind));
     item.className = view.split;
     item.title = `${view.name} (${view.split})${view.photograph ? "" : ", without its photograph"}`;
+    if (!view.thumbnail.startsWith("data:")) image.loading = "lazy"; // a server has to read it first
     image.src = view.thumbnail;
     image.alt = "";
     [image.width, image.height] = [Math.round(64 * view.lens[4] / view.lens[5]), 64];

@@ -105,7 +105,11 @@ class Browser:
 
     def open(self, file: Path, part: str = "") -> None:
         """Open a page, with a part behind #, and wait until it is at rest."""
-        self.call("Page.navigate", url=file.resolve().as_uri() + part)
+        self.visit(file.resolve().as_uri() + part)
+
+    def visit(self, address: str) -> None:
+        """Open a page at an address, and wait until it is at rest."""
+        self.call("Page.navigate", url=address)
         self.rest()
 
     def rest(self) -> None:

@@ -45,7 +45,7 @@ def render(model, view):
 def write_page(folder: Path, model, **names) -> Path:
     """Write a page whose photographs are renders of its model, as JPEG."""
     found = scene(folder)
-    stand = Stand.of(model, found.views, found.views[0])
+    stand = Stand.of(model.means, found.views, found.views[0])
     views = described(found, lambda view: render(model, view), "test")
     for view, name in zip(views, names.get("views", ()), strict=False):
         view["name"] = name
@@ -316,7 +316,7 @@ def test_hostile_names_are_text(browser, tmp_path):
 
 def test_two_models_share_a_camera(browser, tmp_path):
     model, other = cloud(300), cloud(300, seed=3)
-    stand = Stand.of(model, (), None)
+    stand = Stand.of(model.means, (), None)
     Page("two", {"a": pack(model), "b": pack(other)}, stand, "black").write(tmp_path / "page.html")
     browser.open(tmp_path / "page.html")
     picture = shown(browser)[70:400]
@@ -328,7 +328,7 @@ def test_two_models_share_a_camera(browser, tmp_path):
 
 
 def test_nothing_to_show_and_damaged_bytes(browser, tmp_path):
-    stand = Stand.of(cloud(4)[:0], (), None)
+    stand = Stand.of(cloud(4)[:0].means, (), None)
     page = tmp_path / "page.html"
     Page("nothing", {"a": pack(cloud(4)[:0])}, stand, "black").write(page)
     browser.open(page)

@@ -30,7 +30,7 @@ def flat(view):
 @pytest.fixture
 def page(tmp_path) -> Page:
     found, model = scene(tmp_path), cloud(60)
-    stand = Stand.of(model, found.views, found.views[0])
+    stand = Stand.of(model.means, found.views, found.views[0])
     return Page("demo", {"model": pack(model)}, stand, "white", described(found, flat, "test"))
 
 
@@ -147,17 +147,17 @@ def test_parallel_axes_meet_at_the_depth_of_the_splats():
 
 def test_where_a_page_begins(tmp_path):
     model, found = cloud(200), views()
-    stand = Stand.of(model, found, found[2])
+    stand = Stand.of(model.means, found, found[2])
     assert stand.start is found[2]
     assert stand.focal == 85.0
     assert stand.up @ [0, -1, 0] > 0.8
-    alone = Stand.of(model, (), None)
+    alone = Stand.of(model.means, (), None)
     forward = alone.start.world_to_camera[2, :3]
     towards = alone.pivot - alone.start.position
     np.testing.assert_allclose(forward, towards / np.linalg.norm(towards), atol=1e-9)
-    assert Stand.of(model[:0], (), None).radius > 0
+    assert Stand.of(model.means[:0], (), None).radius > 0
     model.means[::3] = np.nan
-    assert np.isfinite(Stand.of(model, (), None).start.world_to_camera).all()
+    assert np.isfinite(Stand.of(model.means, (), None).start.world_to_camera).all()
 
 
 def test_a_camera_keeps_its_digits():

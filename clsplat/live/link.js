@@ -1,0 +1,55 @@
+// What the page asks of the run: its state now and then, and pictures one at a time.
+
+const STATE = 1000, HIDDEN = 10000, AGAIN = 1000, PATIENCE = 250, PUMP = 60; // ms
+const PAGE = Math.floor(Math.random() * 1e9); // of two pages one does not take the place of the other in the queue
+
+class Link {
+  constructor(live) {
+    Object.assign(this, {live, number: 0, shown: 0, waiting: null, failures: 0});
+    this.poll();
+    setInterval(() => this.pump(), PUMP);
+    document.addEventListener("visibilitychange", () => { if (!document.hidden) this.poll(); });
+  }
+
+  async poll() {
+    clearTimeout(this.timer);
+    try {
+      const answer = await fetch(`state.json?after=${this.live.curves.last}`);
+      if (!answer.ok) throw Error(await answer.text());
+      this.failures = 0;
+      await this.live.take(await answer.json());
+    } catch (error) {
+      if (++this.failures > 2) this.live.lost();
+    }
+    this.timer = setTimeout(() => this.poll(), document.hidden ? HIDDEN : STATE);
+  }
+
+  async press(paused) {
+    await fetch(paused ? "pause" : "resume").catch(() => {});
+    this.poll();
+  }
+
+  // Ask for a picture where the one that is shown is not of this camera, or not of this step.
+  pump() {
+    const {live, waiting} = this, now = performance.now(), wish = live.wish();
+    if (!wish || document.hidden || now < (this.rest ?? 0)) return;
+    const {key, pace} = wish;
+    if (waiting && (waiting.key === key && waiting.pace === pace || now - waiting.begin < PATIENCE)) return;
+    if (pace === "again" && now - this.arrived < AGAIN) return;
+    this.ask({key, pace, camera: wish.camera, number: ++this.number, begin: now});
+  }
+
+  async ask(order) {
+    this.waiting = order;
+    try {
+      const answer = await fetch(`frame.jpg?page=${PAGE}&pace=${order.pace}&${order.key}`);
+      if (answer.status === 200 && order.number > this.shown) {
+        const bitmap = await createImageBitmap(await answer.blob());
+        [this.shown, this.arrived] = [order.number, performance.now()];
+        this.live.show({...order, bitmap, step: +answer.headers.get("X-Step")});
+      } else if (!answer.ok) this.rest = performance.now() + AGAIN;
+    } catch { this.rest = performance.now() + AGAIN; }
+    if (this.waiting === order) this.waiting = null;
+    this.pump();
+  }
+}

@@ -1,0 +1,72 @@
+// The camera of a page and its ways: moved by the controls, flown to a view, held by the address.
+
+class Walk {
+  constructor(info, canvas) {
+    Object.assign(this, {info, canvas, stage: canvas.parentElement, up: info.up, radius: info.radius, at: -1});
+    this.camera = cameraOf(info.start);
+    this.pivot = info.pivot;
+  }
+
+  // Take the camera of the address; return whether it holds one.
+  adopt() {
+    const camera = location.hash === this.hash ? null : read(location.hash);
+    if (camera) this.move(camera);
+    return !!camera;
+  }
+
+  // Go on from another camera, not that of a photograph.
+  move(camera) {
+    this.flight = null;
+    this.at = -1;
+    this.photographs.leave();
+    this.camera = camera;
+    this.change();
+  }
+
+  // Fly to a camera; view: the index of the view that it is of.
+  fly(camera, seconds, view = -1) {
+    this.at = -1;
+    if (matchMedia("(prefers-reduced-motion: reduce)").matches) seconds = 0;
+    this.flight = {from: this.camera, to: camera, begin: performance.now(), seconds, view};
+    this.change();
+  }
+
+  reset() {
+    this.pivot = this.info.pivot;
+    if (this.info.first >= 0) this.photographs.choose(this.info.first);
+    else this.fly(cameraOf(this.info.start), 0.7);
+  }
+
+  widen(degrees) {
+    const [fx, fy, , , width, height] = this.camera.lens;
+    const focal = Math.min(width, height) / 2 / Math.tan(degrees * Math.PI / 360);
+    this.move({...this.camera, lens: [focal, focal * fy / fx, ...this.camera.lens.slice(2)]});
+  }
+
+  // The size of a picture, CSS px.
+  pane() {
+    return {width: this.stage.clientWidth, height: this.stage.clientHeight};
+  }
+
+  get focal() { // CSS px
+    const {width, height} = this.pane();
+    return this.camera.lens[0] * fitted(this.camera.lens, width, height).enlarged;
+  }
+
+  advance(time) {
+    const {from, to, begin, seconds, view} = this.flight, t = seconds ? (time - begin) / 1000 / seconds : 1;
+    if (t >= 1) {
+      [this.camera, this.at, this.flight] = [to, view, null];
+      this.changed = performance.now();
+      if (view >= 0) this.photographs.arrived();
+    } else this.camera = between(from, to, Math.max(0, t * t * (3 - 2 * t)));
+  }
+
+  // The camera is at rest: note it in the address.
+  remember() {
+    const text = `#${written(this.camera)}`;
+    if (text === location.hash) return;
+    this.hash = text;
+    try { history.replaceState(null, "", text); } catch { /* too often, or not allowed: the address stays */ }
+  }
+}

@@ -1,0 +1,48 @@
+// The settings of a page that draws the model itself, and its statistics.
+
+class Settings extends Panel {
+  constructor(viewer) {
+    super(viewer);
+    choices("modes", "mode", mode => this.mode(mode));
+    choices("backgrounds", "background", name => this.background(name));
+    find("share").addEventListener("input", ({target}) => {
+      viewer.share = target.value / 100;
+      this.shares();
+      viewer.change();
+    });
+    find("field").addEventListener("input", ({target}) => viewer.widen(+target.value));
+    this.shares();
+  }
+
+  mode(mode) {
+    this.viewer.mode = mode;
+    press("modes", "mode", mode);
+    this.viewer.change();
+  }
+
+  background(name) {
+    this.viewer.background = {black: [0, 0, 0], white: [1, 1, 1], grey: [0.22, 0.23, 0.26]}[name];
+    press("backgrounds", "background", name);
+    this.viewer.change();
+  }
+
+  shares() {
+    find("share").value = 100 * this.viewer.share;
+    find("shared").textContent = `${Math.round(100 * this.viewer.share)} %`;
+  }
+
+  field([fx, fy, , , width, height]) {
+    const angle = Math.atan(Math.min(width / fx, height / fy) / 2) * 360 / Math.PI;
+    find("field").value = angle;
+    find("angle").textContent = `${Math.round(angle)}°`;
+  }
+
+  // drawn: splats; ms: of a frame while moving, null when not measured; scale: of the picture's resolution
+  statistics(drawn, ms, scale) {
+    const whole = this.viewer.layers.reduce((sum, layer) => sum + layer.header.count, 0);
+    const parts = [`${thousands(drawn)} of ${thousands(whole)} splats`];
+    if (ms !== null) parts.push(`${ms < 10 ? ms.toFixed(1) : Math.round(ms)} ms a frame`);
+    if (scale < 1) parts.push(`${Math.round(100 * scale)} % resolution`);
+    find("statistics").textContent = parts.join(" · ");
+  }
+}

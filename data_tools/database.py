@@ -1,0 +1,56 @@
+"""What COLMAP's database holds so far."""
+
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+
+
+def image_names(pycolmap: ModuleType, database: Path) -> list[str]:
+    """Return the names of the images, sorted."""
+    opened = pycolmap.Database.open(str(database))
+    try:
+        return sorted(image.name for image in opened.read_all_images())
+    finally:
+        opened.close()
+
+
+def without_features(pycolmap: ModuleType, database: Path) -> list[str]:
+    """Return the names of images whose features are not in the database, or not all, sorted."""
+    opened = pycolmap.Database.open(str(database))
+    try:
+        return sorted(
+            image.name
+            for image in opened.read_all_images()
+            if not (opened.exists_keypoints(image.image_id) and opened.exists_descriptors(image.image_id))
+        )
+    finally:
+        opened.close()
+
+
+def matched_pairs(pycolmap: ModuleType, database: Path) -> int:
+    """Return the number of pairs whose matches pass geometric verification."""
+    opened = pycolmap.Database.open(str(database))
+    try:
+        _, inliers = opened.read_two_view_geometry_num_inliers()
+        return int(np.count_nonzero(inliers))
+    finally:
+        opened.close()
+
+
+def pairs_done(database: Path) -> int:
+    """Return the number of pairs that were looked at, while pycolmap writes; 0 where that cannot be read just now."""
+    address = f"{database.resolve().as_uri()}?mode=ro"
+    try:
+        with closing(sqlite3.connect(address, uri=True, timeout=0.1)) as opened:
+            return int(opened.execute("SELECT COUNT(*) FROM two_view_geometries").fetchone()[0])
+    except sqlite3.Error:
+        return 0
+
+
+def remove(database: Path) -> None:
+    """Remove a database with its journal."""
+    for file in database.parent.glob(f"{database.name}*"):
+        file.unlink()

@@ -1,0 +1,101 @@
+"""How far work on the host is: who hears it, and the time that is left."""
+
+import threading
+
+import pytest
+
+from clsplat import progress, terminal
+from clsplat.prepare.steps import FindFeatures, MapCameras
+from clsplat.progress import Count, clock, heard_by, watched
+from clsplat.training.status import StatusFile
+
+
+@pytest.fixture
+def now(monkeypatch):
+    """The time, which stands still but for the test."""
+    clocked = [100.0]
+    monkeypatch.setattr(progress.time, "monotonic", lambda: clocked[0])
+    return clocked
+
+
+def test_the_time_left_follows_from_what_this_call_has_done(now):
+    count = Count("photographs", 30)
+    assert count.seconds_left is None
+    now[0] += 10
+    count.reach(5)
+    assert count.seconds_left == 50
+    now[0] += 50
+    count.reach(30)
+    assert count.seconds_left == 0
+
+
+def test_what_an_earlier_call_has_done_took_no_time(now, monkeypatch):
+    began = Count("photographs", 30)
+    began.reach(20)  # at once: it was there
+    now[0] += 5
+    began.reach(25)
+    assert began.seconds_left == pytest.approx(5, rel=0.9)
+
+
+def test_everyone_around_hears(now):
+    inner, outer = [], []
+    with (
+        heard_by(lambda *what, seconds_left: outer.append((*what, seconds_left))),
+        heard_by(lambda *what, seconds_left: inner.append(what)),
+    ):
+        count = Count("pairs", 4)
+        now[0] += 3
+        count.reach(1)
+    Count("others", 1)
+    assert inner == [("pairs", 0, 4), ("pairs", 1, 4)]
+    assert outer == [("pairs", 0, 4, None), ("pairs", 1, 4, 9)]
+
+
+def test_work_that_does_not_count_is_watched(monkeypatch):
+    monkeypatch.setattr(progress, "WATCH", 0.001)
+    heard, seen = [], threading.Event()
+
+    def listen(what, done, total, /, *, seconds_left):
+        heard.append(done)
+        if done == 2:
+            seen.set()
+
+    with heard_by(listen), watched(Count("pairs", 9), lambda: 2):
+        assert seen.wait(5)
+    assert heard == [0, 2]
+    assert not [thread for thread in threading.enumerate() if thread.name == "count"]
+
+
+def test_status_json_has_the_time_left_of_a_preparation_until_the_training(tmp_path):
+    status = StatusFile(tmp_path)
+    with heard_by(status.count):
+        status.count("pairs", 3, 9, seconds_left=4.0)
+    assert status.now.seconds_left == 4
+    assert status.now.progress.unit == "pairs"
+    status.enter("running")
+    assert status.now.seconds_left is None
+
+
+def test_a_terminal_shows_a_bar_and_a_pipe_does_not(monkeypatch, capsys):
+    with terminal.counted():
+        Count("pairs matched", 4).reach(2)
+    assert capsys.readouterr().out == ""
+    console = terminal.Console(force_terminal=True, width=100)
+    monkeypatch.setattr(terminal, "CONSOLE", console)
+    with console.capture() as shown, terminal.counted():
+        Count("pairs matched", 4).reach(2)
+    assert "pairs matched: 2 of 4" in shown.get()
+
+
+def test_what_was_placed_is_told_in_words():
+    figures = {"registered": 32, "not_registered": ["IMG_0034.jpg"], "points": 9, "error_px": 1.268}
+    step = MapCameras(stage="map_cameras")
+    assert step.told(figures) == "32 of 33 photographs placed, 1.27 px; left out: IMG_0034.jpg"
+    assert step.told({**figures, "not_registered": []}) == "32 of 32 photographs placed, 1.27 px"
+    many = step.told({**figures, "not_registered": [f"{i}.jpg" for i in range(20)]})
+    assert many.endswith("6.jpg, 7.jpg, and 12 more")
+    assert FindFeatures(stage="find_features").told({"photographs": 5, "none": ""}) == "photographs 5"
+
+
+def test_times_are_read_as_on_a_clock():
+    assert [clock(seconds) for seconds in (0, 59.6, 3600, 3725)] == ["0:00", "1:00", "1:00:00", "1:02:05"]
