@@ -17,9 +17,7 @@ from clsplat.render.rasterizer import Rasterizer
 from clsplat.views.photographs import Mask, Photograph
 
 
-def contributions(
-    rasterizer: Rasterizer, model: DeviceModel, photographs: Iterable[Photograph]
-) -> NDArray[np.float32]:
+def contributions(rasterizer: Rasterizer, model: DeviceModel, photographs: Iterable[Photograph]) -> NDArray[np.float32]:
     """Return the sum of blend weights over the pixels of photographs, [N]; 0 where a Gaussian is seen nowhere.
 
     Pixels that a mask leaves out do not count, nor do those beyond the image's edge in its last tiles.  The sums are

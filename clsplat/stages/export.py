@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
 from clsplat.errors import DataError, OutputError
+from clsplat.formats.splats import Writing
 from clsplat.formats.table import endings, for_writing
 from clsplat.gaussians.model import load
 from clsplat.reading import sha256
@@ -24,10 +25,12 @@ class Export(Scheduled):
 
     stage: Literal["export"] = "export"
     needs: ClassVar[frozenset[str]] = frozenset({"model"})
-    output_keys: ClassVar[frozenset[str]] = CADENCE | {"file"}
+    output_keys: ClassVar[frozenset[str]] = CADENCE | {"file", "quality"}
 
     file: Annotated[str, path_in_run(*WRITTEN)] = "point_cloud.ply"
     """Path inside the run folder; its ending is the format: .ply, .compressed.ply, .spz, .sog, .glb, .splat, .usda."""
+    quality: Literal["small", "balanced", "high"] = "balanced"
+    """Of SPZ, bits of the harmonics; of SOG, entries of their palette."""
 
     def outputs(self, out: Path) -> list[Path]:
         path = out / self.file
@@ -40,7 +43,7 @@ class Export(Scheduled):
         if model.filter_variance is not None:
             files[raw] = model
         for file, one in files.items():
-            run.written[_name(file, run)] = one.save(file)
+            run.written[_name(file, run)] = one.save(file, Writing(quality=self.quality))
             try:
                 if for_writing(file).read:
                     load(file)

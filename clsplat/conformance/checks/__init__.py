@@ -1,7 +1,18 @@
 """The checks of all kernels, and those that a run does once on a device that it meets for the first time."""
 
 from clsplat.conformance.check import Check
-from clsplat.conformance.checks import blending, compression, density, essential, images, large, projection, tiles, update, whole
+from clsplat.conformance.checks import (
+    blending,
+    compression,
+    density,
+    essential,
+    images,
+    large,
+    projection,
+    tiles,
+    update,
+    whole,
+)
 
 KERNELS: list[Check] = [
     *projection.CHECKS.listed,
