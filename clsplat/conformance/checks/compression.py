@@ -1,4 +1,4 @@
-"""What compression of a model computes on the device: each Gaussian's contribution."""
+"""What compression of a model computes on the device: each Gaussian's contribution, and clusters for a palette."""
 
 from collections.abc import Iterator
 
@@ -10,6 +10,8 @@ from clsplat.conformance.checks.blending import MARGIN
 from clsplat.conformance.comparison import SUM, Figure, by_element, equal
 from clsplat.conformance.scenes import Case, safe_case
 from clsplat.density.contribution import contributions
+from clsplat.formats.palette import LEVELS
+from clsplat.gaussians.clusters import DeviceClusters
 from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.views.photographs import Mask, Photograph
@@ -36,3 +38,21 @@ def contribution(device: Device, rng: np.random.Generator) -> Iterator[Figure | 
         what = f"blend weights of {count} Gaussians"
         yield by_element("accumulate_pixel_sum", what, found, np.asarray(expected), SUM, floor=0.1)
         yield equal("accumulate_pixel_sum", f"{what}, a second time", again, found)
+
+
+@CHECKS.add("nearest_vectors", "sum_members")
+def clusters(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    """Whole numbers: every label, distance and sum is exact."""
+    for count, entries, components in ((1, 1, 3), (17, 9, 45), (130, 21, 9)):
+        points, vectors = (
+            rng.integers(-LEVELS, LEVELS + 1, (rows, components)).astype(np.float32) for rows in (count, entries)
+        )
+        vectors[-1], points[-1] = vectors[0], vectors[0]  # equally near: the first counts
+        held = DeviceClusters(device, points)
+        labels, distance = held.nearest(vectors)
+        what = f"{count} points and {entries} vectors"
+        expected, half = ref.nearest_vectors(points, vectors)
+        yield equal("nearest_vectors", f"labels of {what}", labels, expected)
+        yield equal("nearest_vectors", f"distances of {what}", distance, half.astype(np.float32))
+        sums = held.sums(expected, entries)
+        yield equal("sum_members", f"sums of {what}", sums, ref.member_sums(points, expected, entries))
