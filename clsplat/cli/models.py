@@ -180,7 +180,7 @@ def convert(
 @command(
     "compress",
     "clsplat compress runs/splat_7k --target -0.1dB",
-    "clsplat compress point_cloud.ply --scene my_scene --target 5MB --out runs/small",
+    "clsplat compress point_cloud.ply --scene my_scene --target 5MB",
 )
 def compress(
     model: ModelArgument,
