@@ -1,6 +1,7 @@
 """`clsplat compress`: what a target is, how far the search goes, and what it leaves."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,11 +10,12 @@ from typer.testing import CliRunner
 import clsplat
 from clsplat.cli import app
 from clsplat.compress.page import page, table
-from clsplat.compress.rungs import checked_keeps
+from clsplat.compress.rungs import Ladder, checked_keeps
 from clsplat.compress.target import Point, Target
 from clsplat.errors import ConfigError
 from clsplat.formats.table import detect, read
-from clsplat.runs.model_file import evaluate
+from clsplat.gaussians.model import Rendering
+from clsplat.runs.model_file import Source, evaluate
 from tests.html_page import Page
 
 pytestmark = pytest.mark.slow
@@ -151,3 +153,16 @@ def test_the_command_prints_a_table(searched, few_steps):
     assert found.exit_code == 0, found.output
     assert table(json.loads((searched / "compress.json").read_text())) in found.output
     assert "compressed.sog: " in found.output
+
+
+def test_a_rung_is_trained_as_the_model_is_rendered(few_steps, tmp_path):
+    """A mip model keeps its filter, and photographs are read as the model's run read them."""
+    model = clsplat.load(few_steps / "point_cloud.ply")
+    mip = replace(model, rendering=Rendering(near=0.05, screen_variance=0.1, compensate=1.0, background="white"))
+    ladder = Ladder(tmp_path, Source.of(few_steps, None), mip, 7, None)
+    settings = ladder.pipeline(few_steps / "point_cloud.ply", 0.7).settings
+    screen = settings.model.screen_filter
+    assert (settings.model.near, screen.variance, screen.compensate) == (0.05, 0.1, 1)
+    assert (settings.scene.background, settings.model.sh_degree) == ("white", model.sh_degree)
+    assert (settings.stages[1].keep, settings.training.steps, settings.training.rates.means.over) == (0.7, 7, 7)
+    assert [stage.stage for stage in settings.stages] == ["init", "prune_least", "optimize", "export"]
