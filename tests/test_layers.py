@@ -11,6 +11,7 @@ ROWS = (  # from the top down; a module imports only from lower rows, or from it
     {"cli"},
     {"torch"},
     {"api"},
+    {"compress"},
     {"runs"},
     {"conformance"},
     {"bench"},
@@ -41,6 +42,7 @@ def unit(module: str) -> str:
 
 
 TEXTS = {  # what turns results into lines of text
+    "clsplat.compress.page": {"table"},
     "clsplat.conformance.page": {"check_place", "write_page"},
     "clsplat.gaussians.checkup": {"lines", "verdict"},
     "clsplat.inspect.table": {"show"},

@@ -17,8 +17,8 @@ from clsplat.stages.base import Stage, path_in_run
 from clsplat.training.run import Run
 
 READ = {  # text that is read, or compared, and never the name of something that is written
-    "SceneSettings.path", "Init.file", "Evaluate.lpips", "Matrix.pipelines", "Matrix.scenes", "Matrix.set",
-    "PipelineFile.plugins",
+    "SceneSettings.path", "Init.file", "Evaluate.file", "Evaluate.lpips", "Matrix.pipelines", "Matrix.scenes",
+    "Matrix.set", "PipelineFile.plugins",
 }  # fmt: skip
 NAMES = {"PipelineFile.name", "MatrixFile.name"}  # of folders
 OUTSIDE = [

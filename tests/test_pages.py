@@ -17,6 +17,7 @@ from tests.html_page import HOSTILE, Page
 from tests.test_cli import clsplat
 
 SOURCES = sorted(Path(package.__file__).parent.rglob("*.py"))
+PAGES = ("report", "compare", "compress", "inspect", "notebook", "doctor", "viewer")
 FOLDER = Path(package.__file__).parent / "pages" / "templates"
 DRAWINGS = {"clsplat/pages/svg.py", "clsplat/pages/plan.py", "clsplat/bench/table.py"}  # SVG, escaped there
 TAG = re.compile(r"</?(html|head|body|p|div|span|table|t[rdh]|h\d|ul|li|a|b|i|br|img|pre|figure|svg|style|script)[\s>]")
@@ -49,7 +50,7 @@ def test_one_place_marks_text_as_safe():
 def test_every_template_file_is_part_of_a_page():
     pages = [path.read_text() for path in FOLDER.glob("*.j2")]
     for path in FOLDER.iterdir():
-        page = path.name.removesuffix(".html.j2") in ("report", "compare", "inspect", "notebook", "doctor", "viewer")
+        page = path.name.removesuffix(".html.j2") in PAGES
         assert page or any(f'"{path.name}"' in text for text in pages), path.name
 
 

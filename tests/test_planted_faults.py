@@ -24,6 +24,8 @@ FAULTS = {  # kernel -> file, text, wrong text
     "blend_backward simt": ("blend_simt.cl", "{m.power, m.x, m.y", "{m.power, -m.x, m.y"),
     "blur_rows": ("blur.cl", "column <= last", "column < last"),
     "blur_columns": ("blur.cl", "row <= last", "row < last"),
+    "nearest_vectors": ("clusters.cl", "difference < nearest", "difference <= nearest"),
+    "sum_members": ("clusters.cl", "components + k, (int)p)", "components + k, (int)p / 2)"),
     "count_not_finite": ("check.cl", "<= FLT_MAX", "<= INFINITY"),
     "count_seen": ("density.cl", "seen[i] += 1.0f", "seen[i] += 1.001f"),
     "accumulate_norm": ("density.cl", "sqrt(x * x + y * y)", "sqrt(x * x - y * y * 0.5f)"),

@@ -26,6 +26,7 @@ SYNONYMS = {
     **dict.fromkeys(("benchmark", "time", "profile"), "bench"),
     **dict.fromkeys(("prove", "diagnose", "selftest"), "doctor"),
     **dict.fromkeys(("export", "transform", "merge"), "convert"),
+    **dict.fromkeys(("shrink", "prune", "quantise", "quantize"), "compress"),
     "diff": "compare",
     "help": "--help",
     "version": "--version",
@@ -34,7 +35,7 @@ SYNONYMS = {
 
 ORDER = [
     *("run", "resume", "status", "check", "pipelines", "devices", "doctor", "inspect"),
-    *("render", "view", "evaluate", "convert", "compare", "bench", "data"),
+    *("render", "view", "evaluate", "convert", "compress", "compare", "bench", "data"),
 ]
 
 

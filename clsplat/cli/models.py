@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import typer
 
 from clsplat import terminal
-from clsplat.api import commands
+from clsplat.api import commands, compression
 from clsplat.cli.app import DeviceOption, ModelArgument, SceneOption, command
 from clsplat.errors import ConfigError, quoted
 
@@ -148,6 +148,45 @@ def convert(
     share = 100 * done["bytes"] / max(done["bytes_read"], 1)
     size = f"{done['bytes'] / 1e6:.3g} MB, {share:.3g} % of what was read"
     terminal.remark(f"{done['file']}: {done['format']}, {done['gaussians']:,} Gaussians, {size}")
+
+
+@command(
+    "compress",
+    "clsplat compress runs/splat_7k --target -0.1dB",
+    "clsplat compress point_cloud.ply --scene my_scene --target 5MB",
+)
+def compress(
+    model: ModelArgument,
+    scene: SceneOption = None,
+    target: Annotated[
+        str, typer.Option(metavar="SIZE|LOSS", help="The best file of this size, or the smallest of this loss.")
+    ] = "-0.1dB",
+    out: Annotated[
+        Path, typer.Option(metavar="DIR", help="Folder for the file, the page and all that is tried.")
+    ] = Path("runs/compress"),
+    format_: Annotated[Literal["sog", "spz"], typer.Option("--format", help="Of the files.")] = "sog",
+    keep: Annotated[
+        str | None, typer.Option(metavar="SHARE,…", help="Of the Gaussians; default: 1,0.7,0.5,0.35,0.25,0.18.")
+    ] = None,
+    steps: Annotated[
+        int | None, typer.Option(min=1, metavar="N", help="Of training after each pruning; default: 1000.")
+    ] = None,
+    device: DeviceOption = None,
+) -> None:
+    """Prune, train and quantise a model until it meets a target; every file is measured as it is read back."""
+    from clsplat.compress.page import table
+
+    try:
+        shares = None if keep is None else [float(text) for text in keep.split(",")]
+    except ValueError:
+        raise ConfigError(f"--keep {quoted(keep)}: expected shares, separated by commas, such as 1,0.7,0.5") from None
+    found = compression.compress_model(
+        model, scene, target, out, format=format_, keep=shares, steps=steps, device=device
+    )
+    terminal.show(table(found))
+    chosen, source = found["chosen"], found["source"]
+    size = f"{chosen['bytes'] / 1e6:.3g} MB, {chosen['bytes'] / source['bytes']:.1%} of the model"
+    terminal.remark(f"{found['file']}: {size}, {chosen['psnr'] - source['psnr']:+.2f} dB; page: {found['page']}")
 
 
 @command("compare", "clsplat compare runs/splat runs/mip_splatting --out compare.html")

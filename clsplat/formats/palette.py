@@ -4,6 +4,9 @@ Sums that depend on an order run in one; products of matrices, whose order is th
 float32 holds exactly, so that no order changes them.
 """
 
+from collections.abc import Callable
+from typing import Protocol
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -86,47 +89,77 @@ def nearest(values: NDArray[np.floating], entries: NDArray[np.float64]) -> NDArr
     return np.searchsorted((entries[1:] + entries[:-1]) / 2, values).astype(np.uint8)
 
 
-def palette(points: NDArray[np.float32], entries: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+class Clusters(Protocol):
+    """Points, [N, c], whole numbers from -LEVELS to LEVELS, at most 45 to a point: what k-means asks of them.
+
+    Every number is exact, so that whoever computes them, the host or a device, computes the same bits.
+    """
+
+    def nearest(self, vectors: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+        """Return the nearest of the vectors [E, c] for each point, the first of equally near ones, and half the squared
+        distance."""
+
+    def sums(self, labels: NDArray[np.int64], entries: int) -> NDArray[np.int64]:
+        """Return the sums of the points that have each label, [entries, c]."""
+
+
+Clustering = Callable[[NDArray[np.float32]], Clusters]
+
+
+class HostClusters:
+    """Clusters by products of matrices."""
+
+    def __init__(self, points: NDArray[np.float32]) -> None:
+        self.points = points
+
+    def nearest(self, vectors: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+        points, half = self.points, np.square(vectors).sum(axis=1) / 2
+        labels, distance = np.empty(len(points), np.int64), np.empty(len(points), np.float32)
+        space = np.empty((BLOCK, len(vectors)), np.float32)
+        for start in range(0, len(points), BLOCK):
+            block = points[start : start + BLOCK]
+            apart = np.matmul(block, vectors.T, out=space[: len(block)])
+            np.subtract(half, apart, out=apart)
+            best = apart.argmin(axis=1)
+            labels[start : start + BLOCK] = best
+            distance[start : start + BLOCK] = apart[np.arange(len(block)), best] + np.square(block).sum(axis=1) / 2
+        return labels, distance
+
+    def sums(self, labels: NDArray[np.int64], entries: int) -> NDArray[np.int64]:
+        columns = [np.bincount(labels, column, minlength=entries) for column in self.points.T]
+        return np.stack(columns, axis=1).astype(np.int64)
+
+
+def palette(
+    points: NDArray[np.float32], entries: int, clustering: Clustering = HostClusters
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Return vectors [entries, c] that stand for points [N, c], and for each point the index of its vector.
 
     Lloyd's iteration on a share of the points, from evenly spaced ones; a vector without points gets one that is far
-    from its own.  At most 45 components.
+    from its own.  At most 45 components.  `clustering` makes the clusters of points: the host's, or those of a device.
     """
     whole = _whole_numbers(points)
     chosen = np.linspace(0, len(points) - 1, min(len(points), SAMPLE * entries)).astype(np.int64)
     sample, sample_whole = points[chosen].astype(np.float64), whole[chosen]
     starts = np.linspace(0, len(sample) - 1, entries).astype(np.int64)
-    vectors, vectors_whole = sample[starts], sample_whole[starts]
+    vectors, moved = sample[starts], sample_whole[starts]
+    clusters = clustering(sample_whole)
     for _ in range(PALETTE_ROUNDS):
-        labels, distance = _assign(sample_whole, vectors_whole)
+        labels, distance = clusters.nearest(moved)
         held = np.bincount(labels, minlength=entries)
-        for column in range(points.shape[1]):
-            total = np.bincount(labels, sample[:, column], minlength=entries)
-            vectors[:, column] = total / np.maximum(held, 1)
+        moved = np.rint(clusters.sums(labels, entries) / np.maximum(held, 1)[:, None]).astype(np.float32)
         empty = np.flatnonzero(held == 0)
-        vectors[empty] = sample[np.argsort(-distance, kind="stable")[: len(empty)]]
-        vectors_whole = _whole_numbers(vectors.astype(np.float32), points)
-    return vectors, _assign(whole, vectors_whole)[0]
+        farthest = np.argsort(-distance, kind="stable")[: len(empty)]
+        moved[empty] = sample_whole[farthest]
+    for column in range(points.shape[1]):
+        vectors[:, column] = np.bincount(labels, sample[:, column], minlength=entries) / np.maximum(held, 1)
+    vectors[empty] = sample[farthest]
+    return vectors, clustering(whole).nearest(moved)[0]
 
 
-def _whole_numbers(values: NDArray[np.float32], of: NDArray[np.float32] | None = None) -> NDArray[np.float32]:
-    """Values as whole numbers from -LEVELS to LEVELS, in the scale of the points `of`."""
-    size = np.abs(values if of is None else of).ravel()
+def _whole_numbers(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Values as whole numbers from -LEVELS to LEVELS."""
+    size = np.abs(values).ravel()
     place = min(int((1 - TAIL) * size.size), size.size - 1)
     largest = np.partition(size, place)[place] or np.float32(1)
     return np.rint(np.clip(values / largest, -1, 1) * np.float32(LEVELS))
-
-
-def _assign(points: NDArray[np.float32], vectors: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """The nearest vector of each point, the first of those that are equally near, and half the squared distance."""
-    half = np.square(vectors).sum(axis=1) / 2
-    labels, distance = np.empty(len(points), np.int64), np.empty(len(points), np.float32)
-    space = np.empty((BLOCK, len(vectors)), np.float32)
-    for start in range(0, len(points), BLOCK):
-        block = points[start : start + BLOCK]
-        apart = np.matmul(block, vectors.T, out=space[: len(block)])
-        np.subtract(half, apart, out=apart)
-        best = apart.argmin(axis=1)
-        labels[start : start + BLOCK] = best
-        distance[start : start + BLOCK] = apart[np.arange(len(block)), best] + np.square(block).sum(axis=1) / 2
-    return labels, distance

@@ -48,7 +48,7 @@ def write_sog(path: Path, splats: SplatFile, options: Writing) -> str:
         planes = nearest(p[table], entries).T
         meta[name] = {"codebook": _short(entries), "files": [image(name, *planes, *more)]}
     if p["sh_rest"].shape[1]:
-        meta["shN"] = _harmonics(p["sh_rest"], PALETTES[options.quality], image)
+        meta["shN"] = _harmonics(p["sh_rest"], options, image)
     images[META] = json.dumps(meta, separators=(",", ":"), sort_keys=True).encode()
     if path.name == META:
         files = {path.with_name(name): data for name, data in images.items()}  # meta.json is the last
@@ -75,9 +75,9 @@ def _alpha(p: Parameters) -> NDArray[np.float64]:
     return np.maximum(np.rint(255 * opacities(p["logit_opacity"][:, 0])), 1)
 
 
-def _harmonics(rest: NDArray[np.float32], most: int, image: Any) -> dict[str, Any]:
-    entries = min(most, max(1, int(SMALLEST * 2.0 ** np.floor(np.log2(len(rest) / SMALLEST)))))
-    vectors, labels = palette(rest, entries)
+def _harmonics(rest: NDArray[np.float32], options: Writing, image: Any) -> dict[str, Any]:
+    entries = min(PALETTES[options.quality], max(1, int(SMALLEST * 2.0 ** np.floor(np.log2(len(rest) / SMALLEST)))))
+    vectors, labels = palette(rest, entries, options.clustering)
     size = rest.shape[1] // 3
     numbers = codebook(vectors)
     centroids = nearest(vectors, numbers).reshape(entries * size, 3)

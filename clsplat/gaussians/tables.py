@@ -114,6 +114,16 @@ class Gaussians:
                 count=len(rows),
             )
 
+    def lower_sh_degree(self, degree: int) -> None:
+        """Drop the bands of spherical harmonics above a degree, and their moments; a lower degree stays."""
+        if degree >= self.sh_degree:
+            return
+        self.sh_degree, components = degree, 3 * (sh_coefficients(degree) - 1)
+        for name in self.tables.keys() & {"sh_rest", *moment_tables("sh_rest")}:
+            kept = self.get(name)[:, :components]
+            self.add(name, components, self.tables[name].zero_fresh)
+            self.set(name, kept)
+
     def not_finite(self) -> list[str]:
         """Return the names of the parameters that hold NaN or infinity, or whose moments do."""
         program = self.device.program("check.cl")

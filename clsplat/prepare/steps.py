@@ -9,6 +9,7 @@ from pydantic import Field
 from clsplat.errors import DataError
 from clsplat.scene.detect import holds_scene
 from clsplat.settings import Settings
+from clsplat.training.found import photographs_text
 from data_tools.gather import require_photographs
 from data_tools.photos import (
     CameraModel,
@@ -18,7 +19,6 @@ from data_tools.photos import (
     find_features,
     map_cameras,
     match_features,
-    named,
 )
 from data_tools.pycolmap_import import require_pycolmap
 from data_tools.undistort import Blank, undistort_scene
@@ -115,9 +115,7 @@ class MapCameras(Step):
         return map_cameras(source, out, self.mapper, self.threads)
 
     def told(self, figures: dict[str, Any]) -> str:
-        placed, missing = figures["registered"], figures["not_registered"]
-        text = f"{placed} of {placed + len(missing)} photographs placed, {figures['error_px']:.2f} px"
-        return text + (f"; left out: {named(missing)}" if missing else "")
+        return photographs_text({self.stage: figures})
 
 
 class Undistort(Step):

@@ -3,11 +3,14 @@
 import logging
 from typing import Annotated, ClassVar, Literal
 
-from pydantic import Field, field_validator
+from pydantic import AfterValidator, Field, field_validator
 
+from clsplat.gaussians.model import load
+from clsplat.gaussians.tables import DeviceModel
 from clsplat.metrics.lpips import InputRange
 from clsplat.metrics.perceptual import Metric, Perceptual
 from clsplat.metrics.views import mean, measure
+from clsplat.names import fault_of_output
 from clsplat.settings import ReadPath
 from clsplat.stages.base import CADENCE, Scheduled
 from clsplat.training.run import Run
@@ -16,17 +19,24 @@ LOG = logging.getLogger("clsplat")
 Downscale = Annotated[float, Field(ge=1)]
 
 
+def _inside(text: str) -> str:
+    if fault := fault_of_output(text):
+        raise ValueError(f"expected a path inside the run folder: {fault}")
+    return text
+
+
 class Evaluate(Scheduled):
     """Render the views of a split and compare them, as 8-bit images, with the photographs.
 
     Each of `downscales` divides the size of the original photographs, not the training size: `downscales: [8, 4, 2, 1]`
-    zooms into a scene that was trained at `downscale: 8`.
+    zooms into a scene that was trained at `downscale: 8`.  With `file`, what is measured is a file that an earlier
+    `export` has written, as a viewer reads it.
     """
 
     stage: Literal["evaluate"] = "evaluate"
     needs: ClassVar[frozenset[str]] = frozenset({"model"})
     makes: ClassVar[frozenset[str]] = frozenset({"metrics"})
-    output_keys: ClassVar[frozenset[str]] = CADENCE | {"split", "downscales", "metrics", "lpips", "lpips_input"}
+    output_keys: ClassVar[frozenset[str]] = CADENCE | {"split", "downscales", "metrics", "lpips", "lpips_input", "file"}
 
     split: Literal["test", "train"] = "test"
     """Views that are measured."""
@@ -38,6 +48,8 @@ class Evaluate(Scheduled):
     """ONNX file of LPIPS."""
     lpips_input: InputRange = "-1..1"
     """Range of the values for LPIPS; 0..1 as in the tables of 3DGS and Mip-Splatting."""
+    file: Annotated[str, AfterValidator(_inside)] | None = None
+    """Model file in the run folder, which is read and measured; without it, the model that is trained."""
 
     @field_validator("metrics")
     @classmethod
@@ -52,16 +64,19 @@ class Evaluate(Scheduled):
     def _perceptual(self) -> Perceptual:
         return Perceptual.open(self.metrics, self.lpips, self.lpips_input)
 
+    def _model(self, run: Run) -> DeviceModel:
+        return run.model if self.file is None else load(run.out / self.file).upload(run.device)
+
     def run(self, run: Run) -> None:
         if not run.scene.split(self.split):
             LOG.warning("no %s views: nothing to evaluate (scene.holdout chooses them)", self.split)
             return
-        perceptual = self._perceptual()
+        perceptual, model = self._perceptual(), self._model(run)
         for downscale in self.downscales or [run.downscale]:
             views = run.original.downscaled(downscale).split(self.split)
             photographs = run.photographs if downscale in run.scene.downscales else run.photographs.fresh()
             counted = run.status.counted(run.until_interrupted(views), "views", len(views))
-            results = measure(run.rasterizer, run.model, counted, photographs, perceptual)
+            results = measure(run.rasterizer, model, counted, photographs, perceptual)
             if not results:
                 continue
             for result in results:
@@ -70,6 +85,7 @@ class Evaluate(Scheduled):
             run.records.add(run.step, "evaluate", split=self.split, downscale=downscale, **averages)
             run.metrics.setdefault(self.split, {})[f"{downscale:g}"] = averages
             LOG.info(
-                "step %d  %s views at 1/%g: PSNR %.2f dB  SSIM %.4f  (%d views)",
-                *(run.step, self.split, downscale, averages["psnr"], averages["ssim"], len(results)),
+                "step %d  %s%s views at 1/%g: PSNR %.2f dB  SSIM %.4f  (%d views)",
+                *(run.step, f"{self.file}, " if self.file else "", self.split, downscale),
+                *(averages["psnr"], averages["ssim"], len(results)),
             )

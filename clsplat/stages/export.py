@@ -1,11 +1,14 @@
 """The model as a file."""
 
 import logging
+from functools import partial
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
 from clsplat.errors import DataError, OutputError
+from clsplat.formats.splats import Writing
 from clsplat.formats.table import endings, for_writing
+from clsplat.gaussians.clusters import DeviceClusters
 from clsplat.gaussians.model import load
 from clsplat.reading import sha256
 from clsplat.stages.base import CADENCE, Scheduled, path_in_run
@@ -24,10 +27,12 @@ class Export(Scheduled):
 
     stage: Literal["export"] = "export"
     needs: ClassVar[frozenset[str]] = frozenset({"model"})
-    output_keys: ClassVar[frozenset[str]] = CADENCE | {"file"}
+    output_keys: ClassVar[frozenset[str]] = CADENCE | {"file", "quality"}
 
     file: Annotated[str, path_in_run(*WRITTEN)] = "point_cloud.ply"
     """Path inside the run folder; its ending is the format: .ply, .compressed.ply, .spz, .sog, .glb, .splat, .usda."""
+    quality: Literal["small", "balanced", "high"] = "balanced"
+    """Of SPZ, bits of the harmonics; of SOG, entries of their palette."""
 
     def outputs(self, out: Path) -> list[Path]:
         path = out / self.file
@@ -39,8 +44,9 @@ class Export(Scheduled):
         files = {path: model.baked()}
         if model.filter_variance is not None:
             files[raw] = model
+        options = Writing(quality=self.quality, clustering=partial(DeviceClusters, run.device))
         for file, one in files.items():
-            run.written[_name(file, run)] = one.save(file)
+            run.written[_name(file, run)] = one.save(file, options)
             try:
                 if for_writing(file).read:
                     load(file)

@@ -1,7 +1,18 @@
 """The checks of all kernels, and those that a run does once on a device that it meets for the first time."""
 
 from clsplat.conformance.check import Check
-from clsplat.conformance.checks import blending, density, essential, images, large, projection, tiles, update, whole
+from clsplat.conformance.checks import (
+    blending,
+    compression,
+    density,
+    essential,
+    images,
+    large,
+    projection,
+    tiles,
+    update,
+    whole,
+)
 
 KERNELS: list[Check] = [
     *projection.CHECKS.listed,
@@ -11,6 +22,7 @@ KERNELS: list[Check] = [
     *images.CHECKS.listed,
     *update.CHECKS.listed,
     *density.CHECKS.listed,
+    *compression.CHECKS.listed,
     *whole.CHECKS.listed,
 ]
 SPEED: list[Check] = whole.SPEED.listed

@@ -14,6 +14,7 @@ from clsplat.conformance.reference.blending import (
     blend_backward,
     blend_steps,
     blend_weights,
+    contribution,
     margin,
     render,
     render_backward,
@@ -21,6 +22,7 @@ from clsplat.conformance.reference.blending import (
 from clsplat.conformance.reference.blur import (
     blurred,
 )
+from clsplat.conformance.reference.clusters import member_sums, nearest_vectors
 from clsplat.conformance.reference.density import (
     ABSGS,
     CLONE,
@@ -94,6 +96,7 @@ __all__ = [
     "blend_weights",
     "blurred",
     "clamped_ray",
+    "contribution",
     "covariance_trace",
     "dssim",
     "filtered",
@@ -102,7 +105,9 @@ __all__ = [
     "l2",
     "margin",
     "mean_gradient",
+    "member_sums",
     "ms_ssim",
+    "nearest_vectors",
     "normal3",
     "philox",
     "project",

@@ -77,6 +77,14 @@ def blend_weights(splats: Splats, width: int, height: int, thresholds: Threshold
     return weights
 
 
+def contribution(
+    splats: Splats, width: int, height: int, mask: NDArray[Any] | None = None, thresholds: Thresholds = Thresholds()
+) -> NDArray[Any]:
+    """Blend weights summed over the pixels of a view that count, [N]; `mask`: [H,W], None: all count."""
+    weights = blend_weights(splats, width, height, thresholds)
+    return np.sum(weights if mask is None else weights * mask, axis=(1, 2))
+
+
 def blend_backward(
     splats: Splats,
     width: int,

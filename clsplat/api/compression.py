@@ -1,0 +1,37 @@
+"""A model made small, as a function; errors and `device` as in `clsplat.api.commands`."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from clsplat.api.arguments import PathLike, load_plugins, path_of
+
+if TYPE_CHECKING:  # the command line starts without OpenCL
+    from clsplat.opencl.device import Device
+
+
+def compress_model(
+    model: PathLike,
+    scene: PathLike | None = None,
+    target: str = "-0.1dB",
+    out: PathLike = "runs/compress",
+    *,
+    format: Literal["sog", "spz"] = "sog",
+    keep: Sequence[float] | None = None,
+    steps: int | None = None,
+    device: "str | Device | None" = None,
+) -> dict[str, Any]:
+    """Look for the smallest file of a model that loses no more than `target`, or the best one of that size.
+
+    model, scene: as for `render_views`; target: "-0.1dB" or "5MB"; out: a folder, which holds the file, a page and all
+    that was tried; keep: shares of the Gaussians to try; steps: of training after each pruning, default 1000.  Returns
+    what compress.json holds, `file` and `page`.  Raises ConfigError for a target that no file meets.
+    """
+    from clsplat.compress import search
+
+    load_plugins()
+    shares = search.KEEPS if keep is None else keep
+    folder = Path(out)
+    return search.compress(
+        Path(model), path_of(scene), target, folder, form=format, keeps=shares, steps=steps, device=device
+    )

@@ -1,0 +1,184 @@
+"""Look for the file that meets a target: a ladder of pruning shares by settings of the harmonics, all measured."""
+
+import json
+import logging
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+from clsplat.compress.page import page
+from clsplat.compress.rungs import Ladder, checked_keeps, of_degree
+from clsplat.compress.target import Point, Target
+from clsplat.errors import ConfigError, DataError
+from clsplat.files import is_there, unwritable, write_text
+from clsplat.formats.output import written
+from clsplat.formats.splats import Writing
+from clsplat.formats.table import located
+from clsplat.gaussians.clusters import DeviceClusters
+from clsplat.gaussians.model import Model, load
+from clsplat.metrics.views import mean, measure
+from clsplat.reading import read_file, read_json, sha256
+from clsplat.runs.model_file import ModelFile
+from clsplat.runs.source import Source
+from clsplat.views.photographs import Photographs
+
+LOG = logging.getLogger("clsplat")
+Format = Literal["sog", "spz"]
+Quality = Literal["small", "balanced"]
+KEEPS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18)  # shares of the Gaussians
+SETTINGS: tuple[tuple[int, Quality], ...] = ((3, "balanced"), (3, "small"), (2, "small"), (1, "small"), (0, "small"))
+RECORD, PAGE, TRIALS = "compress.json", "compress.html", "trials"
+
+
+@dataclass
+class Search:
+    """A search in its folder: what was measured so far."""
+
+    out: Path
+    target: Target
+    question: dict[str, Any]  # what is compressed, and how
+    source: Point  # the model itself
+    split: str  # views that are measured
+    points: list[Point] = field(default_factory=list)
+
+    @property
+    def chosen(self) -> Point | None:
+        return self.target.best(self.points, self.source.psnr)
+
+    def data(self) -> dict[str, Any]:
+        """Return all as plain data."""
+        chosen = self.chosen
+        return {
+            **self.question,
+            "target": self.target.text,
+            "split": self.split,
+            "source": asdict(self.source),
+            "points": [asdict(point) for point in self.points],
+            "chosen": chosen and asdict(chosen),
+        }
+
+    def write(self) -> None:
+        """Write what was measured, as JSON and as a page."""
+        write_text(self.out / RECORD, json.dumps(self.data(), indent=1) + "\n")
+        write_text(self.out / PAGE, page(self.target, self.source, self.points, self.chosen, self.split))
+
+
+class Measurer:
+    """Measures files at the test views of a scene; at its training views where it has no others."""
+
+    def __init__(self, opened: ModelFile) -> None:
+        self.opened = opened
+        self.split = "test" if opened.scene.split("test") else "train"
+        if self.split == "train":
+            LOG.warning("%s: has no test views; the training views are measured", opened.scene.path)
+        self.photographs = Photographs(opened.device, opened.background)
+
+    def figures(self, model: Model) -> tuple[float, float]:
+        """Return PSNR, dB, and SSIM."""
+        views = self.opened.scene.split(self.split)
+        results = measure(self.opened.rasterizer, model.upload(self.opened.device), views, self.photographs)
+        averages = mean(results)
+        return averages["psnr"], averages["ssim"]
+
+
+def compress(
+    model: Path,
+    scene: Path | None,
+    target: str,
+    out: Path,
+    *,
+    form: Format = "sog",
+    keeps: Sequence[float] = KEEPS,
+    steps: int | None = None,
+    device: Any = None,
+) -> dict[str, Any]:
+    """Look for a file that meets a target; write it, a page and a record; return the record.
+
+    From one share of the Gaussians to the next the model is pruned and trained for some steps.  Each rung is written
+    with several settings of its harmonics, and every file is read back and measured.  The search goes down until files
+    of fewer Gaussians cannot be better.  A search that was interrupted goes on.
+    Raises ConfigError for a target that no file meets, after the page is written.
+    """
+    wanted, shares = Target.of(target), checked_keeps(keeps)
+    if steps is not None and steps < 1:
+        raise ConfigError(f"--steps {steps}: expected a number of at least 1")
+    opened = ModelFile(model, scene, device)
+    source = Source.of(model, scene)
+    first, measurer = load(source.file), Measurer(opened)
+    question: dict[str, Any] = {"model": str(source.file), "sha256": sha256(located(source.file))}
+    question |= {"scene": str(source.folder), "keeps": shares, "steps": steps}
+    _claim(out, question)
+    size = _bytes(source.file)
+    whole = Point(source.file.name, 1, first.sh_degree, "", len(first), size, *measurer.figures(first))
+    search = Search(out, wanted, question, whole, measurer.split)
+    ladder = Ladder(out, source, first, steps, opened.device)
+    before = 1.0
+    for keep in shares:
+        rung = _measured(out / TRIALS, load(ladder.rung(keep, before)), keep, form, measurer)
+        search.points += rung
+        search.write()
+        before = keep
+        if wanted.ends(rung, whole.psnr) and keep < 1:
+            break
+    return _finished(search, form)
+
+
+def _bytes(model: Path) -> int:
+    """The size of a model file, or of a folder of SOG."""
+    return sum(path.stat().st_size for path in (model.iterdir() if model.is_dir() else [model]))
+
+
+def _measured(trials: Path, model: Model, keep: float, form: Format, measurer: Measurer) -> list[Point]:
+    """Write a rung with each setting of its harmonics, and measure the files as they are read back."""
+    points, degrees = [], set[tuple[int, str]]()
+    for degree, quality in SETTINGS:
+        setting = min(degree, model.sh_degree), quality
+        if setting in degrees:
+            continue
+        degrees.add(setting)
+        file = trials / f"keep_{round(100 * keep):02d}_degree_{setting[0]}_{quality}.{form}"
+        options = Writing(quality=quality, clustering=partial(DeviceClusters, measurer.opened.device))
+        of_degree(model, setting[0]).save(file, options)
+        size = file.stat().st_size
+        point = Point(
+            file.relative_to(trials.parent).as_posix(), keep, *setting, len(model), size, *measurer.figures(load(file))
+        )
+        LOG.info("%s: %.3g MB, %.2f dB", file.name, size / 1e6, point.psnr)
+        points.append(point)
+    return points
+
+
+def _finished(search: Search, form: Format) -> dict[str, Any]:
+    """Write the chosen file under its own name.  Raises ConfigError where there is none."""
+    chosen, psnr = search.chosen, search.source.psnr
+    if chosen is None:
+        near = search.target.nearest(search.points)
+        raise ConfigError(
+            f"--target {search.target.text}: no file meets it; the nearest, {search.out / near.file}, has "
+            f"{near.bytes / 1e6:.3g} MB and {near.psnr - psnr:+.2f} dB; ask for less, or train for longer with --steps"
+        )
+    file = search.out / f"compressed.{form}"
+    with written(file) as output:
+        output.write(read_file(search.out / chosen.file))
+    return {**search.data(), "file": str(file), "page": str(search.out / PAGE)}
+
+
+def _claim(out: Path, question: dict[str, Any]) -> None:
+    """Make the folder.  Raises ConfigError where it holds something else than this search."""
+    if is_there(out) and (not out.is_dir() or any(out.iterdir())):
+        try:
+            before = read_json(out / RECORD)
+        except DataError:
+            before = None
+        if not isinstance(before, dict):
+            raise ConfigError(f"{out}: holds something else than a search; give another --out")
+        if differing := [key for key, value in question.items() if before.get(key) != value]:
+            raise ConfigError(f"{out}: holds a search with another {differing[0]}; give another --out")
+        return
+    try:
+        (out / TRIALS).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise unwritable(out, error) from error
+    write_text(out / RECORD, json.dumps(question, indent=1) + "\n")

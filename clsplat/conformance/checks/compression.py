@@ -1,0 +1,58 @@
+"""What compression of a model computes on the device: each Gaussian's contribution, and clusters for a palette."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from clsplat.conformance import reference as ref
+from clsplat.conformance.check import Checks, Note
+from clsplat.conformance.checks.blending import MARGIN
+from clsplat.conformance.comparison import SUM, Figure, by_element, equal
+from clsplat.conformance.scenes import Case, safe_case
+from clsplat.density.contribution import contributions
+from clsplat.formats.palette import LEVELS
+from clsplat.gaussians.clusters import DeviceClusters
+from clsplat.opencl.device import Device
+from clsplat.render.rasterizer import Rasterizer
+from clsplat.views.photographs import Mask, Photograph
+
+CHECKS = Checks()
+SIZES = ((1, 16, 16), (17, 33, 15), (30, 40, 30))  # Gaussians, and px: tiles that end at the edge, and beyond it
+
+
+def photograph_of(device: Device, case: Case, mask: Mask | None = None) -> Photograph:
+    """A black photograph at the camera of a scene."""
+    camera = case.device_camera(device)
+    colours = device.upload(np.zeros((3, camera.height, camera.width), np.uint8))
+    return Photograph(camera, colours, None if mask is None else device.upload(mask[None].astype(np.uint8)))
+
+
+@CHECKS.add("accumulate_pixel_sum", "blend_backward")
+def contribution(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    for count, width, height in SIZES:
+        case = safe_case(rng, count, width, height, MARGIN)
+        masks = (None, rng.random((height, width)) < 0.6)
+        photographs = [photograph_of(device, case, mask) for mask in masks]
+        expected = sum(ref.contribution(case.project(), width, height, mask) for mask in masks)
+        found, again = (contributions(Rasterizer(device, "radix"), case.model(device), photographs) for _ in range(2))
+        what = f"blend weights of {count} Gaussians"
+        yield by_element("accumulate_pixel_sum", what, found, np.asarray(expected), SUM, floor=0.1)
+        yield equal("accumulate_pixel_sum", f"{what}, a second time", again, found)
+
+
+@CHECKS.add("nearest_vectors", "sum_members")
+def clusters(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    """Whole numbers: every label, distance and sum is exact."""
+    for count, entries, components in ((1, 1, 3), (17, 9, 45), (130, 21, 9)):
+        points, vectors = (
+            rng.integers(-LEVELS, LEVELS + 1, (rows, components)).astype(np.float32) for rows in (count, entries)
+        )
+        vectors[-1], points[-1] = vectors[0], vectors[0]  # equally near: the first counts
+        held = DeviceClusters(device, points)
+        labels, distance = held.nearest(vectors)
+        what = f"{count} points and {entries} vectors"
+        expected, half = ref.nearest_vectors(points, vectors)
+        yield equal("nearest_vectors", f"labels of {what}", labels, expected)
+        yield equal("nearest_vectors", f"distances of {what}", distance, half.astype(np.float32))
+        sums = held.sums(expected, entries)
+        yield equal("sum_members", f"sums of {what}", sums, ref.member_sums(points, expected, entries))

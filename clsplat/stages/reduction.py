@@ -1,0 +1,130 @@
+"""Make a trained model smaller: fewer Gaussians, fewer harmonics."""
+
+import logging
+from collections.abc import Collection
+from itertools import pairwise
+from typing import Annotated, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from clsplat.density.contribution import contributions
+from clsplat.density.thresholds import Share
+from clsplat.formats.splats import MAX_DEGREE, sh_coefficients
+from clsplat.gaussians.tables import PARAMETERS
+from clsplat.stages.base import Scheduled
+from clsplat.training.run import Run
+
+LOG = logging.getLogger("clsplat")
+Part = Annotated[float, Field(gt=0, lt=1)]
+
+
+def scores(run: Run) -> NDArray[np.float64]:
+    """Return what each Gaussian contributes to the training views, [N]: its blend weight summed over their pixels."""
+    views = run.scene.split("train")
+    photographs = (run.photographs.get(view) for view in run.status.counted(views, "views", len(views)))
+    return contributions(run.rasterizer, run.model, photographs).astype(np.float64)
+
+
+class PruneLeast(Scheduled):
+    """Remove the Gaussians that contribute least to the training views.
+
+    The score of a Gaussian is its weight in the image, summed over all pixels of all training views; pixels that a mask
+    leaves out do not count.
+    """
+
+    stage: Literal["prune_least"] = "prune_least"
+    needs: ClassVar[frozenset[str]] = frozenset({"model"})
+    edits: ClassVar[bool] = True
+    training_keys: ClassVar[frozenset[str]] = frozenset({"keep", "remove"})
+
+    keep: Part | None = None
+    """Share of the Gaussians that stays; this or `remove`."""
+    remove: Part | None = None
+    """Share of the Gaussians that is removed; this or `keep`."""
+
+    @model_validator(mode="after")
+    def _one_share(self) -> "PruneLeast":
+        if (self.keep is None) == (self.remove is None):
+            raise ValueError("expected one of 'keep' and 'remove', a share of the Gaussians")
+        return self
+
+    def stale(self, run: Run) -> Collection[str]:
+        return PARAMETERS
+
+    def run(self, run: Run) -> None:
+        gaussians, score = run.model.gaussians, scores(run)
+        share = 1 - (self.remove or 0) if self.keep is None else self.keep
+        kept = best(score, max(1, round(share * len(score))))
+        before = gaussians.count
+        source = run.device.upload(kept.astype(np.uint32))
+        gaussians.rearrange(source, run.device.zeros(len(kept), np.uint32), len(kept))
+        run.refresh_filter()
+        causes = {self.stage: before - len(kept)}
+        run.records.add(run.step, "densify", before=before, after=len(kept), causes=causes, grown={})
+        lost = 100 * (1 - score[kept].sum() / (score.sum() or 1))
+        LOG.info("%d of %d Gaussians kept; the others had %.2g %% of the weight", len(kept), before, lost)
+
+
+class ReduceSh(Scheduled):
+    """Drop bands of spherical harmonics: those above a degree, and of the others those that matter least.
+
+    What a band of a Gaussian matters is the mean square of its colours over all directions, times the Gaussian's weight
+    in the training views.  Bands that are dropped by `share` are zeros, which formats store in few bytes; training that
+    follows gives them values again.
+    """
+
+    stage: Literal["reduce_sh"] = "reduce_sh"
+    needs: ClassVar[frozenset[str]] = frozenset({"model"})
+    edits: ClassVar[bool] = True
+    training_keys: ClassVar[frozenset[str]] = frozenset({"share"})
+
+    degree: Annotated[int, Field(ge=0, le=MAX_DEGREE)] = MAX_DEGREE
+    """Highest degree that stays, for all Gaussians."""
+    share: Share = 0
+    """Share of all bands of all Gaussians that become zero: those that matter least."""
+
+    def stale(self, run: Run) -> Collection[str]:
+        return ("sh_rest",)
+
+    def run(self, run: Run) -> None:
+        model, gaussians = run.model, run.model.gaussians
+        gaussians.lower_sh_degree(self.degree)
+        model.degree = min(model.degree, self.degree)
+        if not self.share or not gaussians.sh_degree:
+            return
+        rest = gaussians.get("sh_rest")
+        energy = band_energy(rest) * scores(run)[:, None]
+        dropped = np.ones(energy.size, bool)
+        dropped[best(energy.ravel(), energy.size - round(self.share * energy.size))] = False
+        gaussians.set("sh_rest", np.where(columns_of(dropped.reshape(energy.shape)), 0, rest))
+        if run.adam is not None:
+            run.adam.forget("sh_rest")
+        LOG.info("%d of %d bands of harmonics are zero", dropped.sum(), dropped.size)
+
+
+def best(score: NDArray[np.float64], count: int) -> NDArray[np.int64]:
+    """Return the places of the `count` largest scores, ascending; of equal ones the first."""
+    return np.sort(np.argsort(-score, kind="stable")[:count])
+
+
+def band_energy(rest: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Return the mean square over the sphere of each band above 0, [N, degree], of coefficients [N, (K-1)*3].
+
+    The basis is orthonormal: the mean square of a function is the sum of its squared coefficients by 4 pi.
+    """
+    squares = np.square(rest.astype(np.float64)) / (4 * np.pi)
+    return np.stack([squares[:, first:end].sum(axis=1) for first, end in _bands(rest.shape[1])], axis=1)
+
+
+def columns_of(bands: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return for each coefficient whether its band, [N, degree], is set, [N, (K-1)*3]."""
+    widths = [3 * (2 * band + 3) for band in range(bands.shape[1])]
+    return np.repeat(bands, widths, axis=1)
+
+
+def _bands(columns: int) -> list[tuple[int, int]]:
+    """First column and end of each band above 0."""
+    ends = [3 * (sh_coefficients(degree) - 1) for degree in range(MAX_DEGREE + 1)]
+    return [(first, end) for first, end in pairwise(ends) if end <= columns]

@@ -1,0 +1,168 @@
+"""`clsplat compress`: what a target is, how far the search goes, and what it leaves."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+import clsplat
+from clsplat.cli import app
+from clsplat.compress.page import page, table
+from clsplat.compress.rungs import Ladder, checked_keeps
+from clsplat.compress.target import Point, Target
+from clsplat.errors import ConfigError
+from clsplat.formats.table import detect, read
+from clsplat.gaussians.model import Rendering
+from clsplat.runs.model_file import Source, evaluate
+from tests.html_page import Page
+
+pytestmark = pytest.mark.slow
+
+KEEP, STEPS = (1.0, 0.5), 3
+
+
+def point(size: int, psnr: float, keep: float = 0.5) -> Point:
+    return Point("a<b>.sog", keep, 3, "small", 10, size, psnr, 0.9)
+
+
+@pytest.fixture(scope="module")
+def searched(few_steps: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished search for a file of any size."""
+    out = tmp_path_factory.mktemp("search") / "small"
+    clsplat.compress_model(few_steps, target="1MB", out=out, keep=KEEP, steps=STEPS)
+    return out
+
+
+@pytest.mark.parametrize(
+    ("text", "most", "change"),
+    [
+        ("5MB", 5_000_000, None),
+        ("1.5 mb", 1_500_000, None),
+        ("2MiB", 2_097_152, None),
+        ("900kB", 900_000, None),
+        ("-0.1dB", None, -0.1),
+        ("-.5 dB", None, -0.5),
+        ("0dB", None, 0),
+    ],
+)
+def test_targets(text, most, change):
+    found = Target.of(text)
+    assert (found.most, found.change) == (most, change)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "5", "MB", "-5MB", "0MB", "0.1dB", "1e3MB", "5 apples", "-0.1 dB\n5MB", "٥MB", "nandB"]
+)
+def test_what_is_no_target_is_refused(text):
+    with pytest.raises(ConfigError, match="expected a size such as 5MB"):
+        Target.of(text)
+
+
+def test_the_best_of_a_size_and_the_smallest_of_a_loss():
+    points = [point(900, 30.0), point(700, 29.95), point(500, 29.5)]
+    assert Target.of("800B").best(points, 30) is points[1]
+    assert Target.of("-0.1dB").best(points, 30) is points[1]
+    assert Target.of("-0.6dB").best(points, 30) is points[2]
+    assert Target.of("0dB").best(points, 31) is None
+    assert Target.of("400B").best(points, 30) is None
+    assert Target.of("400B").nearest(points) is points[2]
+    assert Target.of("0dB").nearest(points) is points[0]
+
+
+def test_the_search_goes_down_until_it_cannot_be_better():
+    rung = [point(900, 30.0), point(500, 29.5)]
+    assert not Target.of("600B").ends(rung, 30), "fewer Gaussians let more settings fit"
+    assert Target.of("1kB").ends(rung, 30), "all fit"
+    assert not Target.of("-0.1dB").ends(rung, 30)
+    assert Target.of("0dB").ends(rung, 31), "none is good enough"
+
+
+@pytest.mark.parametrize("keeps", [[], [0.0], [1.2], [-0.5], [float("nan")], [0.501, 0.5]])
+def test_what_are_no_shares_is_refused(keeps):
+    with pytest.raises(ConfigError, match="--keep: expected shares"):
+        checked_keeps(keeps)
+    assert checked_keeps([0.5, 1, 0.7, 0.5]) == [1, 0.7, 0.5]
+
+
+def test_every_file_is_measured_as_it_is_read_back(searched, few_steps, tiny_scene):
+    found = json.loads((searched / "compress.json").read_text())
+    whole = len(read(few_steps / "point_cloud.ply"))
+    assert found["source"]["gaussians"] == whole
+    assert {(one["keep"], one["gaussians"]) for one in found["points"]} == {(1.0, whole), (0.5, round(whole / 2))}
+    for one in found["points"][::3]:
+        file = searched / one["file"]
+        assert file.stat().st_size == one["bytes"]
+        assert read(file).sh_degree == one["degree"]
+        assert evaluate(file, tiny_scene)["test"]["1"]["psnr"] == pytest.approx(one["psnr"], abs=1e-9)
+
+
+def test_the_chosen_file_is_the_best(searched):
+    found = json.loads((searched / "compress.json").read_text())
+    assert found["chosen"]["psnr"] == max(one["psnr"] for one in found["points"])
+    assert (searched / "compressed.sog").read_bytes() == (searched / found["chosen"]["file"]).read_bytes()
+
+
+def test_the_page_shows_every_file_and_the_curve(searched):
+    text = (searched / "compress.html").read_text()
+    found = json.loads((searched / "compress.json").read_text())
+    assert all(one["file"] in text for one in found["points"])
+    assert text.count("<polyline") == len(KEEP)
+    assert text.count('class="chosen"') == 1
+    Page(text)
+
+
+def test_names_of_files_are_escaped():
+    source = point(2000, 31)
+    text = page(Target.of("-1dB"), source, [point(900, 30.5)], None, "test")
+    assert "a<b>" not in text
+    assert "a&lt;b&gt;" in text
+    assert "No file meets the target" in text
+
+
+def test_the_same_search_again_trains_nothing_and_gives_the_same_bytes(searched, few_steps):
+    before = {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in searched.rglob("*.ply")}
+    files = {path.name: path.read_bytes() for path in (searched / "trials").iterdir()}
+    found = clsplat.compress_model(few_steps, target="-40dB", out=searched, keep=KEEP, steps=STEPS)
+    assert {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in before} == before
+    assert {path.name: path.read_bytes() for path in (searched / "trials").iterdir()} == files
+    assert found["chosen"]["bytes"] == min(one["bytes"] for one in found["points"])
+
+
+def test_another_search_needs_another_folder(searched, few_steps, tmp_path):
+    with pytest.raises(ConfigError, match="a search with another steps"):
+        clsplat.compress_model(few_steps, target="1MB", out=searched, keep=KEEP, steps=STEPS + 1)
+    (tmp_path / "own.txt").write_text("mine")
+    with pytest.raises(ConfigError, match="holds something else than a search"):
+        clsplat.compress_model(few_steps, target="1MB", out=tmp_path, keep=KEEP, steps=STEPS)
+
+
+def test_a_target_that_no_file_meets_leaves_page_and_nearest_file(few_steps, tmp_path):
+    with pytest.raises(ConfigError, match=r"no file meets it; the nearest, .*_degree_0_small\.spz") as error:
+        clsplat.compress_model(few_steps, target="1B", out=tmp_path / "out", format="spz", keep=[1.0])
+    assert "ask for less" in str(error.value)
+    assert not (tmp_path / "out" / "compressed.spz").exists()
+    assert "No file meets" in (tmp_path / "out" / "compress.html").read_text()
+    assert detect(tmp_path / "out" / "trials" / "keep_100_degree_0_small.spz").name == "SPZ"
+
+
+def test_the_command_prints_a_table(searched, few_steps):
+    arguments = ["--target", "-40dB", "--out", str(searched), "--keep", "1,0.5", "--steps", str(STEPS)]
+    found = CliRunner().invoke(app, ["compress", str(few_steps), *arguments])
+    assert found.exit_code == 0, found.output
+    assert table(json.loads((searched / "compress.json").read_text())) in found.output
+    assert "compressed.sog: " in found.output
+
+
+def test_a_rung_is_trained_as_the_model_is_rendered(few_steps, tmp_path):
+    """A mip model keeps its filter, and photographs are read as the model's run read them."""
+    model = clsplat.load(few_steps / "point_cloud.ply")
+    mip = replace(model, rendering=Rendering(near=0.05, screen_variance=0.1, compensate=1.0, background="white"))
+    ladder = Ladder(tmp_path, Source.of(few_steps, None), mip, 7, None)
+    settings = ladder.pipeline(few_steps / "point_cloud.ply", 0.7).settings
+    screen = settings.model.screen_filter
+    assert (settings.model.near, screen.variance, screen.compensate) == (0.05, 0.1, 1)
+    assert (settings.scene.background, settings.model.sh_degree) == ("white", model.sh_degree)
+    assert (settings.stages[1].keep, settings.training.steps, settings.training.rates.means.over) == (0.7, 7, 7)
+    assert [stage.stage for stage in settings.stages] == ["init", "prune_least", "optimize", "export"]
