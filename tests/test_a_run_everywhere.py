@@ -100,7 +100,7 @@ def test_the_summary_tells_which_photographs_are_lost(done, tmp_path):
     assert photographs_text(FOUND) == "32 of 33 photographs placed, 1.27 px; left out: IMG_0034.jpg"
     assert photographs_text({}) == photographs_text({"map_cameras": {"registered": "x"}}) == ""
     many = {"map_cameras": {**FOUND["map_cameras"], "not_registered": [f"{i}.jpg" for i in range(10)]}}
-    assert photographs_text(many).endswith("7.jpg and 2 more")
+    assert photographs_text(many).endswith("7.jpg, and 2 more")
     metrics = json.loads((done / "metrics.json").read_text())
     (tmp_path / "metrics.json").write_text(json.dumps({**metrics, "prepared": FOUND | {"undistort": {"seconds": 7.2}}}))
     text = "\n".join(summary(tmp_path))

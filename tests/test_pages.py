@@ -17,7 +17,7 @@ from tests.html_page import HOSTILE, Page
 from tests.test_cli import clsplat
 
 SOURCES = sorted(Path(package.__file__).parent.rglob("*.py"))
-PAGES = ("report", "compare", "compress", "inspect", "notebook", "doctor", "viewer")
+PAGES = ("report", "compare", "compress", "inspect", "notebook", "doctor", "viewer", "live")
 FOLDER = Path(package.__file__).parent / "pages" / "templates"
 DRAWINGS = {"clsplat/pages/svg.py", "clsplat/pages/plan.py", "clsplat/bench/table.py"}  # SVG, escaped there
 TAG = re.compile(r"</?(html|head|body|p|div|span|table|t[rdh]|h\d|ul|li|a|b|i|br|img|pre|figure|svg|style|script)[\s>]")
