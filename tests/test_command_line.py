@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -217,12 +218,15 @@ def test_status_refuses_damaged_metrics(text, tmp_path):
 
 
 @pytest.mark.parametrize("line", ["null", '{"step": null}', '{"step": 3}', '{"step": "3", "kind": "train"}'])
-def test_damaged_records_are_refused_with_their_line(line, tmp_path):
+def test_damaged_records_are_told_with_their_line(line, tmp_path, caplog):
     (tmp_path / "metrics.jsonl").write_text('{"step": 5, "kind": "train"}\n' + line + "\n")
     (tmp_path / "status.json").write_text('{"state": "done", "step": 7}')
-    for read in (Records(tmp_path).read, lambda: run_status(tmp_path)):
-        with pytest.raises(DataError, match=r"metrics.jsonl:2: damaged; .*'step' and 'kind'; remove this line"):
-            read()
+    fault = r"metrics.jsonl:2: damaged; .*'step' and 'kind'; remove this line"
+    with pytest.raises(DataError, match=fault):
+        Records(tmp_path).read()
+    found = run_status(tmp_path)
+    assert (found["state"], found["step"], found["last"]) == ("done", 7, None), "the state is told all the same"
+    assert re.search(fault, caplog.text)
 
 
 def test_status_tells_from_files(finished, tmp_path):

@@ -1,5 +1,6 @@
 """The state of a run, or of a matrix, from the files of its folder alone."""
 
+import logging
 import time
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from clsplat.training import checkpoint
 from clsplat.training.records import Records
 from clsplat.training.status import END_STATES, read_status
 
+LOG = logging.getLogger("clsplat")
 SILENT = 60  # seconds without a heartbeat that are worth a line
 
 
@@ -20,7 +22,7 @@ def run_status(out: Path) -> dict[str, Any]:
 
     state: as there, or killed where its process on this machine has ended; silent: seconds since the heartbeat of a run
     that has not ended, on whatever machine it runs.
-    Raises DataError when the folder holds no run, or a damaged file.
+    Raises DataError when the folder holds no run, or a damaged metrics.json.
     """
     status = read_status(out)
     if not isinstance(status.get("state"), str):
@@ -31,8 +33,17 @@ def run_status(out: Path) -> dict[str, Any]:
     metrics = None
     if (out / METRICS).exists():
         metrics = read_metrics(out / METRICS).model_dump(exclude_unset=True)
-    lines = Records(out).read("train")
-    return {"run": str(out), **status, "last": lines[-1] if lines else None, "metrics": metrics}
+    return {"run": str(out), **status, "last": _last(out), "metrics": metrics}
+
+
+def _last(out: Path) -> dict[str, Any] | None:
+    """The last report; None where there is none, or the records are damaged, which a warning says."""
+    try:
+        lines = Records(out).read("train")
+    except DataError as error:
+        LOG.warning("%s", error)
+        return None
+    return lines[-1] if lines else None
 
 
 def state_of(status: dict[str, Any]) -> str:
