@@ -4,14 +4,14 @@
  * One item = 16 words.  No local memory.  Deterministic. */
 #include "common.h"
 
-/* values[i] = word for i < count, rounded up to 16: buffers are whole 64-byte lines. */
+/* values[i] = word for i < 16 * lines: buffers are whole 64-byte lines, and a number of words may pass 32 bits. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void fill_words(
-    __global uint *restrict values,  // [count]
+    __global uint *restrict values,  // [16*lines]
     const uint word,
-    const uint count)
+    const uint lines)
 {
-    const size_t i = get_global_id(0) * (size_t)16;
-    if (i < count)
-        vstore16((uint16)(word), 0, values + i);
+    const size_t line = get_global_id(0);
+    if (line < lines)
+        vstore16((uint16)(word), line, values);
 }

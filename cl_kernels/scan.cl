@@ -1,8 +1,15 @@
 /* Exclusive prefix sum of unsigned integers: sum each block, then scan inside blocks, each behind the sums before it.
  *
  * A block is one work-group; each of its TEAM items owns `run` consecutive values, long on CPUs (one item per
- * group) and short on GPUs.  Integer sums: deterministic.  No group depends on another. */
+ * group) and short on GPUs.  Integer sums: deterministic.  No group depends on another.  Sums that would wrap stay at
+ * UINT_MAX, in any order of additions, so that the total is never a small number by mistake. */
 #include "common.h"
+
+static inline uint added(const uint a, const uint b)
+{
+    const uint sum = a + b;
+    return sum < a ? UINT_MAX : sum;
+}
 
 /* Sum of each block.  Local memory: TEAM * 4 bytes. */
 __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
@@ -17,13 +24,13 @@ void scan_blocks(
     const uint first = (get_group_id(0) * TEAM + item) * run;
     uint sum = 0;
     for (uint i = first; i < first + run && i < count; i++)
-        sum += values[i];
+        sum = added(sum, values[i]);
     sums[item] = sum;
     barrier(CLK_LOCAL_MEM_FENCE);
     if (item == 0) {
         uint total = 0;
         for (uint i = 0; i < TEAM; i++)
-            total += sums[i];
+            total = added(total, sums[i]);
         block_sum[get_group_id(0)] = total;
     }
 }
@@ -43,19 +50,19 @@ void scan_offsets(
     const uint first = (get_group_id(0) * TEAM + item) * run;
     uint sum = 0;
     for (uint i = first; i < first + run && i < count; i++)
-        sum += values[i];
+        sum = added(sum, values[i]);
     uint before = 0;
     for (uint block = item; block < get_group_id(0); block += TEAM)
-        before += block_sum[block];
+        before = added(before, block_sum[block]);
     sums[item] = sum;
     sums_before[item] = before;
     barrier(CLK_LOCAL_MEM_FENCE);
     sum = 0;
     for (uint i = 0; i < TEAM; i++)
-        sum += sums_before[i] + (i < item ? sums[i] : 0);
+        sum = added(sum, added(sums_before[i], i < item ? sums[i] : 0));
     for (uint i = first; i < first + run && i < count; i++) {
         offset[i] = sum;
-        sum += values[i];
+        sum = added(sum, values[i]);
         if (i + 1 == count)
             offset[count] = sum;
     }

@@ -62,7 +62,7 @@ FAULTS = {  # kernel -> file, text, wrong text
     "anisotropy": ("penalty.cl", "(up - down)", "(up + down)"),
     "project_forward": ("gaussian.h", "2.0f * (x * y - w * z)", "2.0f * (x * y + w * z)"),
     "project_backward": ("backward.h", "energy2 = larger(1.0f + compensate", "energy2 = larger(1.0f - compensate"),
-    "scan_blocks": ("scan.cl", "total += sums[i]", "total = sums[i] + 1"),
+    "scan_blocks": ("scan.cl", "total = added(total, sums[i])", "total = sums[i] + 1"),
     "scan_offsets": ("scan.cl", "offset[count] = sum", "offset[count] = sum - 1"),
     "permute": ("scan.cl", "values[order[place]]", "values[order[place]] + 1"),
     "count_pairs": ("sort_bitonic.cl", "if (pair < count)\n", "if (pair + 1 < count)\n"),
@@ -75,6 +75,7 @@ FAULTS = {  # kernel -> file, text, wrong text
     "sample_magnitude": ("texture.cl", "magnitude[row * stride + column]", "magnitude[row * stride]"),
 }  # fmt: skip
 MORE = {  # that smaller pictures do not show
+    "scan_offsets simt, a sum that wraps": ("scan.cl", "sum < a ? UINT_MAX : sum", "sum"),
     "emit_large simt, one row an item": ("large.cl", "each = (rows + TEAM - 1) / TEAM", "each = 1"),
     "emit_large simt, the same rows": ("large.cl", "begin = get_local_id(0) * each", "begin = get_local_id(0)"),
     "emit_large simt, a tile outside": ("large.cl", "pair_tile[place] = last;", "pair_tile[place] = last + 12345;"),

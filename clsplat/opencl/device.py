@@ -72,8 +72,8 @@ class Array:
         """Set every value of an array of floats or 32-bit integers."""
         word = int(np.array(value, self.dtype).view(np.uint32))
         words = Array(self.device, self.buffer, self.shape, np.dtype(np.uint32))
-        count = self.nbytes // 4
-        self.device.program("fill.cl").fill_words(items=-(-count // 16), values=words, word=word, count=count)
+        lines = -(-self.nbytes // 64)  # a number of words would not fit in 32 bits from 16 GiB on
+        self.device.program("fill.cl").fill_words(items=lines, values=words, word=word, lines=lines)
 
 
 class Device:
@@ -104,7 +104,7 @@ class Device:
         except KernelError as error:
             if self.tuning["TILE"] == 8:
                 raise
-            LOG.info(f"tiles of 8 x 8 px instead of 16 x 16: {error}")
+            LOG.info("tiles of 8 x 8 px instead of 16 x 16: %s", error)
             self.tuning["TILE"] = 8
             blend = self.program("blend_simt.cl")
         if blend.blend_backward.together >= 64:

@@ -1,7 +1,12 @@
 """fill.cl."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
+
+from clsplat.opencl import program
+from clsplat.opencl.device import Array
 
 
 @pytest.mark.parametrize("count", [0, 1, 15, 16, 17, 1023, 1024, 1025])
@@ -10,3 +15,15 @@ def test_fill(device, count, dtype, value):
     array = device.upload(np.full(count, 3, dtype))
     array.fill(value)
     np.testing.assert_array_equal(array.get(), np.full(count, value, dtype))
+
+
+@pytest.mark.parametrize(("count", "lines"), [(2**32, 2**28), (2**32 + 1, 2**28 + 1), (2**33 - 16, 2**29 - 1)])
+def test_the_number_of_words_may_pass_32_bits(device, monkeypatch, count, lines):
+    """A stand-in for the queue takes the launch: the buffer is small."""
+    launched = []
+    fill = device.program("fill.cl").fill_words
+    queue = SimpleNamespace(**vars(program.cl) | {"enqueue_nd_range_kernel": lambda *launch: launched.append(launch)})
+    monkeypatch.setattr(program, "cl", queue)
+    Array(device, device.empty(16).buffer, (count,), np.dtype(np.float32)).fill(1.5)
+    ((_, _, (items,), (group,)),) = launched
+    assert items == -(-lines // group) * group

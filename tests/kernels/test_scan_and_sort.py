@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from clsplat.conformance.checks.tiles import bitonic_figures, radix_figures, scan_figure
+from clsplat.conformance.checks.tiles import bitonic_figures, radix_figures, scan_figure, tiler_of
 from tests.kernels.figures import hold
 
 # around the team's run (8 * 64), the CPU's shortest run and block, and powers of two
@@ -15,6 +15,16 @@ COUNTS = (1, 2, 7, 63, 64, 65, 511, 512, 513, 1023, 1024, 1025, *LARGE)
 def test_scan(device, rng, count):
     values = rng.integers(0, 100, count).astype(np.uint32)
     hold([scan_figure(device, values)])
+
+
+@pytest.mark.parametrize("before", [0, 3, 511, pytest.param(70_000, marks=pytest.mark.large)])
+def test_sums_of_a_scan_stay_at_the_largest_number(device, before):
+    """Where sums would wrap they end at 2^32 - 1: in an item, a group, and behind the sums of other groups."""
+    values = np.ones(before + 4, np.uint32)
+    values[[0, -2, -1]] = 2**31, 2**31 - 3, 5
+    hold([scan_figure(device, values)])
+    assert tiler_of(device).scan(device.upload(values), len(values), "test").get()[-1] == 2**32 - 1
+    hold([scan_figure(device, np.array([2**31, 2**31, 5], np.uint32))])
 
 
 @pytest.mark.parametrize("count", COUNTS)

@@ -40,6 +40,7 @@ def large_splats(device: Device, rng: np.random.Generator) -> Iterator[Figure | 
 def sorting(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
     for count in (1025, 40_001):  # one block, and several
         yield tiles.scan_figure(device, rng.integers(0, 100, count).astype(np.uint32))
+    yield tiles.scan_figure(device, np.full(40_001, 2**31, np.uint32))  # sums that would wrap
     yield from tiles.radix_figures(device, rng.integers(0, 2**20, 1025).astype(np.uint32), 20)
 
 
