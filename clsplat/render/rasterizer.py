@@ -16,7 +16,7 @@ from clsplat.render.workspace import Workspace
 
 RECORD = int(constants()["RECORD"])
 PIXEL_SUMS = int(constants()["PIXEL_SUMS"])
-MAX_PAIRS = 2**31  # more than any frame has: no limit
+MAX_PAIRS = 2**31  # more than fit in memory, and few enough for sums of 32 bits: no other limit
 Content = Literal["colour", "depth"]  # channels of the splats: colour, or (depth of the mean in scene units, 1, 0)
 
 
@@ -49,7 +49,8 @@ class Rasterizer:
     def __init__(self, device: Device, sort: Sort = "auto", budget: Budget | None = None) -> None:
         self.device = device
         self.budget = budget or Budget(MAX_PAIRS)
-        self._limit = min(self.budget.pairs, device.info.allocation // (4 * RECORD))  # records are in one buffer
+        records = device.info.allocation // (4 * RECORD)  # of pairs, in one buffer
+        self._limit = min(self.budget.pairs, records, MAX_PAIRS)
         self._bands: dict[int, int] = {}  # rows of tiles of a frame -> number of bands
         self.workspace = Workspace(device)
         self.tiler = Tiler(device, self.workspace, sort)
@@ -69,7 +70,13 @@ class Rasterizer:
         while True:
             try:
                 return self._forward(model, camera, background, content)
-            except (TooManyPairs, MemoryLimitError):
+            except TooManyPairs as error:
+                if not self._narrow(camera):
+                    raise MemoryLimitError(
+                        f"a picture of {camera.width}x{camera.height} pixels: one row of its tiles has more than "
+                        f"{MAX_PAIRS:,} pairs of a tile and a Gaussian; use smaller images or fewer Gaussians"
+                    ) from error
+            except MemoryLimitError:
                 if not self._narrow(camera):
                     raise
 

@@ -9,6 +9,7 @@ from clsplat.conformance.scenes import random_case
 from clsplat.errors import MemoryLimitError
 from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import MAX_PAIRS, Budget, Rasterizer
+from clsplat.render.tiles import Band, Footprints, Tiler, TooManyPairs
 from clsplat.render.workspace import Workspace
 
 
@@ -107,3 +108,41 @@ def test_memory_that_one_row_of_tiles_exceeds_is_refused(device, rng):
     small = limited(device, 300 * 64)
     with pytest.raises(MemoryLimitError):
         results(small, random_case(rng, 301, 60, 70), 0.0)
+
+
+@pytest.mark.parametrize("sort", ["radix", "bitonic"])
+@pytest.mark.parametrize("counts", [[2**31, 2**31, 5], [2**31, 5, 2**31], [MAX_PAIRS + 1], [2**24] * 300])
+def test_more_pairs_than_32_bits_count_are_too_many(device, sort, counts):
+    counts = np.array(counts, np.uint32)
+    nothing = np.zeros_like(counts)
+    footprints = Footprints(device.upload(nothing), device.upload(counts), *map(device.upload, (nothing, nothing)))
+    with pytest.raises(TooManyPairs):
+        Tiler(device, Workspace(device), sort).build(
+            device.zeros((len(counts), 16)), footprints, Band(4, 4, 0, 4), len(counts), MAX_PAIRS
+        )
+
+
+def test_a_frame_with_more_pairs_than_32_bits_count_is_rendered_in_bands(device, rng, monkeypatch):
+    """Each Gaussian of a band of several rows stands for many: the counts, which nothing but their sum reads."""
+    case = random_case(rng, 300, 60, 70)
+    weights = rng.normal(size=(3, 70, 60)).astype(np.float32)
+    image, pixel_sums, _ = results(device, case, weights)
+    build = Tiler.build
+
+    def crowded(tiler, splats, footprints, band, count, limit):
+        if band.row_end - band.row_begin > 1:
+            footprints = replace(footprints, tile_count=device.upload(np.full(count, 2**32 // count + 1, np.uint32)))
+        return build(tiler, splats, footprints, band, count, limit)
+
+    monkeypatch.setattr(Tiler, "build", crowded)
+    banded_image, banded_sums, banded = results(device, case, weights)
+    assert len(banded.bands) == banded.camera.tiles_y
+    np.testing.assert_array_equal(banded_image, image)
+    np.testing.assert_array_equal(banded_sums, pixel_sums)
+
+
+def test_one_row_of_tiles_with_too_many_pairs_is_refused_in_a_sentence(device, rng, monkeypatch):
+    monkeypatch.setattr("clsplat.render.rasterizer.MAX_PAIRS", 50)
+    case = random_case(rng, 300, 60, 70)
+    with pytest.raises(MemoryLimitError, match=r"60x70 pixels: .*more than 50 .*; use smaller images or fewer"):
+        results(device, case, 0.0)
