@@ -18,7 +18,7 @@ from pydantic import Field
 
 from clsplat.density.statistics import SEEN, SplatStats
 from clsplat.density.thresholds import PixelQuantile, Quantile, Threshold
-from clsplat.errors import ConfigError
+from clsplat.errors import ConfigError, MemoryLimitError
 from clsplat.gaussians.tables import PARAMETERS, Gaussians, moment_tables
 from clsplat.render.tiles import Tiler
 from clsplat.schedule import Schedule, at_step
@@ -26,12 +26,14 @@ from clsplat.settings import Settings
 
 MAX_BOUND = 3.0e38  # a bound above all values
 MIN_BOUND = 1.2e-38  # the smallest normal float: a bound that all values but zero reach
+MAX_ROWS = 2**32 - 2  # sums of 32 bits stay at one more, whatever more there is (cl_kernels/scan.cl)
 
 
 def _require_rows(copies: int, kept: int) -> None:
     for name, number in (("copies", copies), ("kept", kept)):
-        if number < 0:
-            raise ValueError(f"{name}: expected a number of rows, 0 or more, got {number}")
+        if not 0 <= number <= MAX_ROWS:
+            bound = "0 or more" if number < 0 else f"at most {MAX_ROWS}"
+            raise ValueError(f"{name}: expected a number of rows, {bound}, got {number}")
 
 
 def _no_photographs(share: float) -> float:
@@ -85,7 +87,7 @@ class Edit:
     ) -> None:
         """Give an outcome to every Gaussian in the box; sizes are shares of the extent.
 
-        Raises ValueError for negative copies or kept.
+        Raises ValueError for negative copies or kept, and beyond MAX_ROWS.
         """
         _require_rows(copies, kept)
         gaussians = self.gaussians
@@ -131,7 +133,8 @@ class Edit:
         """Give an outcome to the Gaussians that are `chosen`, [N].
 
         copies: rows that each becomes, one number or [N]; kept: how many of them are the old row, with its moments and
-        statistics; the others are fresh.  Raises ValueError for another shape or type, and for negative numbers.
+        statistics; the others are fresh.  Raises ValueError for another shape or type, and for numbers of rows below 0
+        or beyond MAX_ROWS.
         """
         count, numbers = self.gaussians.count, np.asarray(copies)
         if chosen.dtype != np.bool_ or chosen.shape != (count,):
@@ -141,6 +144,7 @@ class Edit:
                 f"copies: expected an integer or integers [{count}], got {numbers.dtype} {list(numbers.shape)}"
             )
         _require_rows(int(numbers.min(initial=0)), kept)
+        _require_rows(int(numbers.max(initial=0)), kept)
         outcome = np.where(chosen, numbers.astype(np.int64) + 1, 0)
         self._program.mark_chosen(
             items=count,
@@ -184,10 +188,18 @@ class Edit:
         self.kept.set(kept)
 
     def apply(self, tiler: Tiler) -> None:
-        """Rearrange all tables and place the children of split Gaussians."""
+        """Rearrange all tables and place the children of split Gaussians.
+
+        Raises MemoryLimitError where these are more rows than memory holds; all tables stay as they are.
+        """
         gaussians, device, count = self.gaussians, self.gaussians.device, self.gaussians.count
         row_offset = tiler.scan(self.copies, count, "row_offset")
         rows = int(row_offset.get_item(count))
+        if rows > MAX_ROWS:
+            raise MemoryLimitError(
+                f"step {self.step}: the rules ask for more than {MAX_ROWS:,} Gaussians; use densify.max_gaussians or rules "
+                "that make fewer copies"
+            )
         source, fresh = device.empty(rows, np.uint32), device.empty(rows, np.uint32)
         self._program.list_rows(
             items=count,

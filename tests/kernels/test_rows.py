@@ -7,8 +7,11 @@ from clsplat.conformance.scenes import random_case
 from clsplat.density.control import densify
 from clsplat.density.edit import Edit, Rule, SceneScale
 from clsplat.density.statistics import SplatStats
+from clsplat.errors import MemoryLimitError
 from clsplat.gaussians.tables import PARAMETERS, Gaussians, moment_tables
 from clsplat.render.rasterizer import Rasterizer
+from clsplat.render.tiles import Tiler
+from clsplat.render.workspace import Workspace
 from clsplat.training.adam import Adam
 
 COUNT = 150
@@ -89,6 +92,10 @@ WRONG_CHOICES = {
         r"copies: expected an integer or integers \[150\], got int64 \[3\]",
     ),
     "copies with a fraction": ((np.ones(COUNT, bool), 1.5, 0), "copies: expected an integer or .*, got float64"),
+    "copies beyond 32 bits": (
+        (np.arange(COUNT) == 7, np.full(COUNT, 2**32), 0),
+        "copies: expected a number of rows, at most 4294967294, got 4294967296",
+    ),
     "negative kept": ((np.ones(COUNT, bool), 2, -1), "kept: expected a number of rows, 0 or more, got -1"),
 }
 
@@ -107,6 +114,18 @@ def test_a_mark_with_negative_numbers_is_refused(device, rng, numbers):
     edit = edit_of(gaussians_of(device, rng))
     with pytest.raises(ValueError, match="expected a number of rows, 0 or more, got -1"):
         edit.mark(**numbers)
+
+
+def test_an_edit_with_more_rows_than_32_bits_count_is_refused_and_changes_nothing(device, rng):
+    gaussians = gaussians_of(device, rng)
+    before = {table: gaussians[table].get() for table in gaussians.tables}
+    edit = edit_of(gaussians)
+    edit.choose(np.ones(COUNT, bool), 2**32 // COUNT + 1, 1)
+    with pytest.raises(MemoryLimitError, match="step 600: the rules ask for more than 4,294,967,294 Gaussians; use"):
+        edit.apply(Tiler(device, Workspace(device)))
+    assert gaussians.count == COUNT
+    for table, planes in before.items():
+        np.testing.assert_array_equal(gaussians[table].get(), planes, err_msg=table)
 
 
 @pytest.mark.parametrize("count", ROWS)
