@@ -35,6 +35,7 @@ PATIENCE = 40.0  # s of training after which a slow device does as many steps as
 MEMORY_SHARE = 0.25  # of what device and host have free, which they may share: nothing must be swapped out
 FIRST_BUFFER = 128 << 20  # bytes
 TOUCH_SECONDS = 4.0  # of writing a buffer, after which no larger one is tried
+CLAIMED = "other programs may hold memory of the device; end them and run `clsplat doctor` again to see what it gives"
 BENCH = (256, 256, 20_000)  # width, height, Gaussians
 
 
@@ -94,7 +95,10 @@ def training(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note
 
 @SPEED.add()
 def memory(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
-    """Allocate buffers of growing size, write all of each, and read its ends: up to what one buffer may have."""
+    """Allocate buffers of growing size, write all of each, and read samples: up to what one buffer may have.
+
+    A refusal is no fault of the device: other programs may hold its memory, which OpenCL does not tell.
+    """
     promised, free = device.info.allocation, available_memory()
     room = int(MEMORY_SHARE * min(device.info.memory, device.info.memory if free is None else free))
     limit = min(promised, room) // 64 * 64  # allocations are rounded up to 64
@@ -104,9 +108,8 @@ def memory(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
         started = time.perf_counter()
         try:
             yield from _buffer_figures(device, size)
-        except MemoryLimitError as error:
-            stopped = str(error)
-            yield Figure("fill_words", f"a buffer of {size / 2**20:,.0f} MiB, which is refused", 1, 0, counts=True)
+        except MemoryLimitError:
+            stopped = f"a buffer of {size / 2**20:,.0f} MiB is refused: {CLAIMED}"
             break
         held, size = size, min(2 * size, limit)
         if 2 * (time.perf_counter() - started) > TOUCH_SECONDS and size > held:
