@@ -21,6 +21,8 @@ INTEGRATED = replace(CPU, name="Small", kind="GPU", units=96, clock=1300, group=
 LARGE = replace(INTEGRATED, name="Large", units=28, clock=1800, unified=False, place=(2, 0))
 LARGER = replace(LARGE, name="Larger", units=80, clock=1700, place=(2, 1))
 
+OTHER = replace(CPU, name="Accelerator", kind="other", units=96, group=256, place=(3, 0))
+
 
 @pytest.fixture
 def found(monkeypatch):
@@ -39,6 +41,9 @@ def found(monkeypatch):
         ([INTEGRATED, LARGE, LARGER, CPU], LARGER),
         ([INTEGRATED, replace(INTEGRATED, clock=1400), LARGE], LARGE),
         ([CPU, replace(CPU, units=64)], CPU),
+        ([OTHER, CPU], CPU),
+        ([OTHER, CPU, LARGE], LARGE),
+        ([OTHER, replace(OTHER, units=64)], OTHER),
     ],
 )
 def test_the_strongest_gpu_is_chosen_and_of_cpus_the_first(found, devices, first):

@@ -4,12 +4,14 @@ from typing import Literal
 
 import numpy as np
 
+from clsplat.errors import DataError
 from clsplat.losses.base import Comparison, ImageLoss, LossValue
 from clsplat.opencl.device import Array
 from clsplat.opencl.program import constants
 from clsplat.schedule import at_step
 
 SSIM_BLOCK = int(constants("loss.cl")["BLOCK"])
+SSIM_PIXELS_MAX = 2**32 // 9  # the kernels index nine planes in 32 bits
 
 
 class L1(ImageLoss):
@@ -76,8 +78,16 @@ def pixel_loss(comparison: Comparison, l1: float, l2: float) -> Array:
 
 
 def ssim_maps(comparison: Comparison) -> tuple[Array, Array]:
-    """Return the derivatives of the SSIM map [3, 3, rows, stride] and the map's sums [3, height, blocks]."""
+    """Return the derivatives of the SSIM map [3, 3, rows, stride] and the map's sums [3, height, blocks].
+
+    Raises DataError for pictures of more than SSIM_PIXELS_MAX pixels, in whole tiles.
+    """
     camera, array = comparison.camera, comparison.workspace.array
+    if camera.rows * camera.stride > SSIM_PIXELS_MAX:
+        raise DataError(
+            f"SSIM of a picture of {camera.width}x{camera.height} pixels; expected at most {SSIM_PIXELS_MAX:,}: "
+            "downscale the image"
+        )
     blocks = -(-camera.stride // SSIM_BLOCK)
     maps = array("ssim_maps", (3, 3, camera.rows, camera.stride))
     sums = array("ssim_sums", (3, camera.height, blocks))

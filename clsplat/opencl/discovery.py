@@ -106,8 +106,8 @@ def choose(device_name: str | None = None) -> DeviceInfo:
     """Choose a device; log the devices that do not work.
 
     `device_name` is a part of a runtime's or device's name, with `:n` for the n-th match, from 0.  Without it the
-    variable CLSPLAT_DEVICE holds the name, else the strongest GPU that works is chosen, else the first CPU.  Raises
-    DeviceError with the names of all devices.
+    variable CLSPLAT_DEVICE holds the name, else the strongest GPU that works is chosen, else the first CPU, else
+    the first other device.  Raises DeviceError with the names of all devices.
     """
     device_name = device_name or os.environ.get(DEVICE_VARIABLE)
     devices = list_devices()
@@ -124,20 +124,21 @@ def choose(device_name: str | None = None) -> DeviceInfo:
         if fault is None:
             others = [other.text for other in devices if other.kind == info.kind == "GPU" and other is not info]
             if others:
-                LOG.info(f"chose {info.text}; other GPUs: {'; '.join(others)}; --device NAME chooses one")
+                LOG.info("chose %s; other GPUs: %s; --device NAME chooses one", info.text, "; ".join(others))
             return info
         faults.append(f"{info.text} does not work: {fault}")
-        LOG.warning(faults[-1])
+        LOG.warning("%s", faults[-1])
     raise DeviceError("; ".join(faults))
 
 
-def _rank(info: DeviceInfo) -> tuple[bool, bool, int]:
-    """GPUs first, those with memory of their own before integrated ones, then by units times clock; CPUs as found.
+def _rank(info: DeviceInfo) -> tuple[int, bool, int]:
+    """GPUs first, those with memory of their own before integrated ones, then by units times clock; then CPUs as found,
+    then other devices as found.
 
     Units alone compare badly: some vendors count whole processors, others their parts.
     """
     gpu = info.kind == "GPU"
-    return not gpu, gpu and info.unified, -info.units * info.clock if gpu else 0
+    return ("GPU", "CPU", "other").index(info.kind), gpu and info.unified, -info.units * info.clock if gpu else 0
 
 
 def _named(device_name: str, devices: list[DeviceInfo]) -> DeviceInfo:

@@ -13,6 +13,7 @@ from clsplat.scene.scene import View
 
 RAY_MARGIN = constants()["RAY_MARGIN"]
 TILES_MAX = 1 << int(constants("tiles.h")["BOX_BITS"])  # to a side
+PIXELS_MAX = 2**30  # of whole tiles: kernels index up to four planes of a picture in 32 bits
 
 # camera_t of cl_kernels/common.h
 CAMERA = np.dtype(
@@ -69,7 +70,7 @@ def camera_values(view: View, tile: int) -> NDArray[Any]:
     """Return a view's camera_t, [].
 
     Rays are clamped 30 % of half the field of view beyond the image's edges (gsplat's off-centre form).
-    Raises DataError when the image has more tiles to a side than kernels can name.
+    Raises DataError when the image has more tiles to a side than kernels can name, or more pixels than they can index.
     """
     camera = view.camera
     tiles_x, tiles_y = -(-camera.width // tile), -(-camera.height // tile)
@@ -77,6 +78,11 @@ def camera_values(view: View, tile: int) -> NDArray[Any]:
         raise DataError(
             f"{view.name}: the camera is {camera.width}x{camera.height} pixels; expected at most {TILES_MAX * tile} "
             "to a side on this device: downscale the image"
+        )
+    if tiles_x * tiles_y * tile**2 > PIXELS_MAX:
+        raise DataError(
+            f"{view.name}: the camera is {camera.width}x{camera.height} pixels; expected at most {PIXELS_MAX:,} in whole "
+            f"tiles of {tile}x{tile}: downscale the image"
         )
     margin_x = RAY_MARGIN * camera.width / (2 * camera.fx)
     margin_y = RAY_MARGIN * camera.height / (2 * camera.fy)

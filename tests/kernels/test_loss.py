@@ -1,11 +1,14 @@
 """loss.cl: values and gradients against the oracle."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from clsplat.conformance import reference as ref
 from clsplat.conformance.checks.images import LOSSES, camera_of, comparison_of, loss_figures
 from clsplat.conformance.checks.images import pictures as images
+from clsplat.errors import DataError
 from clsplat.losses.base import Comparison, ImageLoss
 from clsplat.losses.image import L1, L2, Dssim, ssim_maps
 from clsplat.render.workspace import Workspace
@@ -30,6 +33,15 @@ def gradient_of(comparison: Comparison) -> np.ndarray:
 def test_value_and_gradient(device, rng, width, height, loss, oracle, kernel):
     x, y = images(rng, width, height)
     hold(loss_figures(device, loss(weight=0.7), 0.7, oracle, kernel, x, y))
+
+
+def test_ssim_of_more_pixels_than_nine_planes_may_have_is_refused_before_memory_is_taken(device, rng):
+    comparison = comparison_of(device, *images(rng, 5, 3))
+    tile = comparison.camera.tile
+    large = replace(comparison.camera, width=2**15, height=2**14, tiles_x=2**15 // tile, tiles_y=2**14 // tile)
+    with pytest.raises(DataError, match="SSIM of a picture of 32768x16384 pixels; expected at most 477,218,588: "):
+        ssim_maps(replace(comparison, camera=large))
+    assert comparison.workspace.nbytes < 2**20
 
 
 def test_losses_add_up(device, rng):

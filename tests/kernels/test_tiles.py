@@ -67,6 +67,20 @@ def test_a_picture_with_more_tiles_than_a_pair_can_name_is_refused(rng, tile, si
         camera_values(replace(view, camera=replace(view.camera, **{side: 4096 * tile + 1})), tile)
 
 
+@pytest.mark.parametrize("tile", [8, 16])
+@pytest.mark.parametrize(("size", "fits"), [((2**15, 2**15), True), ((2**15, 2**15 + 1), False), ((1, 2**15), True)])
+def test_a_picture_with_more_pixels_than_kernels_index_is_refused(rng, tile, size, fits):
+    """Four planes, of a blur, reach 2^32 values."""
+    view = random_case(rng, 1).view
+    width, height = size
+    large = replace(view, camera=replace(view.camera, width=width, height=height))
+    if fits:
+        camera_values(large, tile)
+    else:
+        with pytest.raises(DataError, match=rf"view: the camera is {width}x{height} pixels; expected at most "):
+            camera_values(large, tile)
+
+
 def test_what_readers_accept_has_no_more_tiles_than_any_device_can_name(rng):
     view = random_case(rng, 1).view
     camera_values(replace(view, camera=replace(view.camera, width=MAX_SIDE, height=MAX_SIDE).check()), 8)
