@@ -219,8 +219,8 @@ def memory_of(monkeypatch, largest: int, figure: Figure = RIGHT) -> tuple[list[s
     ("largest", "words"),
     [
         (2**30 + 4, "wrote and read 1.00 GiB of the 1.00 GiB that one buffer may have; that is all"),
-        (2**28, "wrote and read 0.25 GiB of the 1.00 GiB that one buffer may have; a buffer of 512 MiB is refused: other"
-         " programs may hold memory of the device; end them and run `clsplat doctor` again to see what it gives"),
+        (2**28, "wrote and read 0.25 GiB of the 1.00 GiB that one buffer may have; a buffer of 512 MiB is refused: "
+         "other programs may hold memory of the device; end them and run `clsplat doctor` again to see what it gives"),
         (0, "wrote and read 0.00 GiB of the 1.00 GiB that one buffer may have; a buffer of 128 MiB is refused: other"),
     ],
 )  # fmt: skip

@@ -9,11 +9,12 @@ import sys
 from pathlib import Path
 
 import pytest
+from ruamel.yaml import YAML
 
 from clsplat.opencl.discovery import tuning_of
 from clsplat.opencl.program import BUILD_OPTIONS, parse_kernels
 from tests.targets import amd, figures, intel, nvidia, page
-from tests.targets.__main__ import compile_all, compile_one, versions_of
+from tests.targets.__main__ import VENDOR_OF, VENDORS, compile_all, compile_one, versions_of
 from tests.targets.builds import GPU, KERNELS, PASSED, Build, builds
 from tests.targets.compilers import CompileError
 from tests.targets.figures import Figures, Place
@@ -356,6 +357,30 @@ def test_an_unknown_target_is_refused():
     done = command("gfx1")
     assert done.returncode == 2
     assert "no target named gfx1; there are amd, nvidia, intel, gfx900" in done.stderr
+
+
+def figures_of_all_targets() -> figures.Table:
+    counts = dict.fromkeys(page.COUNTS, 2)
+    small = Figures(**(vars(FINE) | {"local": 0, "counts": counts}))
+    kernels = [(small, "scale"), *((Figures(**(vars(FINE) | {"counts": counts})), name) for name in page.COUNTED)]
+    return {Place(target, "simt", name): of for target in VENDOR_OF for of, name in kernels}
+
+
+def test_a_page_with_other_figures_is_found(tmp_path, monkeypatch):
+    table, versions = figures_of_all_targets(), dict.fromkeys(VENDORS, "a compiler 1.0")
+    monkeypatch.setattr(page, "PAGE", tmp_path / "devices.md")
+    page.PAGE.write_text(f"before\n{page.BEGIN}\n{page.END}\nafter\n")
+    page.write(table, versions, VENDOR_OF)
+    assert page.faults(table, versions, VENDOR_OF) == []
+    place = Place("sm_86", "simt", "blend_forward")
+    table[place] = Figures(**(vars(table[place]) | {"registers": 41}))
+    (fault,) = page.faults(table, versions, VENDOR_OF)
+    assert re.match(r"devices.md shows '\| `blend_forward` .*40.*', expected '.*41.*': run .* --write", fault)
+
+
+def test_continuous_integration_compares_the_page_with_fresh_figures():
+    jobs = YAML(typ="safe").load(ROOT / ".github" / "workflows" / "ci.yml")["jobs"]
+    assert "-m tests.targets --check" in jobs["targets"]["steps"][-1]["run"]
 
 
 def test_the_page_shows_the_kernels_that_there_are():

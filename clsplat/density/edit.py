@@ -197,8 +197,8 @@ class Edit:
         rows = int(row_offset.get_item(count))
         if rows > MAX_ROWS:
             raise MemoryLimitError(
-                f"step {self.step}: the rules ask for more than {MAX_ROWS:,} Gaussians; use densify.max_gaussians or rules "
-                "that make fewer copies"
+                f"step {self.step}: the rules ask for more than {MAX_ROWS:,} Gaussians; use densify.max_gaussians, or "
+                "rules that make fewer copies"
             )
         source, fresh = device.empty(rows, np.uint32), device.empty(rows, np.uint32)
         self._program.list_rows(

@@ -47,6 +47,8 @@ def main() -> int:
         failures += missing.values()
     if asked.json:
         figures.save(table, asked.json)
+    if asked.check and not failures:
+        failures += page.faults(table, versions, VENDOR_OF)
     if asked.write and not failures:
         page.write(table, versions, VENDOR_OF)
     if asked.compare:
@@ -73,12 +75,15 @@ def arguments() -> argparse.Namespace:
     parser.add_argument(
         "--write", action="store_true", help=f"write the figures into {page.PAGE.name}; takes no others"
     )
+    parser.add_argument(
+        "--check", action="store_true", help=f"fail where {page.PAGE.name} shows other figures; takes no others"
+    )
     asked = parser.parse_args()
-    if asked.write and (asked.targets or asked.schedule or asked.file):
-        parser.error("--write takes all targets, both schedules and all files")
+    if (asked.write or asked.check) and (asked.targets or asked.schedule or asked.file):
+        parser.error("--write and --check take all targets, both schedules and all files")
     if unknown := sorted({*asked.targets} - {*names}):
         parser.error(f"no target named {', '.join(unknown)}; there are {', '.join(names)}")
-    asked.required = asked.write or bool(asked.targets)
+    asked.required = asked.write or asked.check or bool(asked.targets)
     wanted = {*(asked.targets or names)}
     asked.targets = [target for target, vendor in VENDOR_OF.items() if {target, vendor} & wanted]
     return asked

@@ -1,6 +1,7 @@
 """The part of docs/devices.md that the figures make."""
 
 from collections.abc import Iterable, Mapping
+from itertools import zip_longest
 
 from tests.targets.builds import KERNELS
 from tests.targets.figures import MAX_GROUP, MAX_LOCAL, Figures, Place, Table
@@ -27,11 +28,26 @@ Row = tuple[str, str]  # kernel, variant
 
 def write(table: Table, versions: Mapping[str, str], vendor_of: Mapping[str, str]) -> None:
     """Replace the figures of docs/devices.md."""
+    PAGE.write_text(_with(text(table, versions, vendor_of)), encoding="utf-8")
+
+
+def faults(table: Table, versions: Mapping[str, str], vendor_of: Mapping[str, str]) -> list[str]:
+    """Return a sentence where docs/devices.md shows other figures than these, with the first line that differs."""
+    shown, fresh = PAGE.read_text(encoding="utf-8"), _with(text(table, versions, vendor_of))
+    if shown == fresh:
+        return []
+    pairs = zip_longest(shown.splitlines(), fresh.splitlines(), fillvalue="")
+    old, new = next((old, new) for old, new in pairs if old != new)
+    return [f"{PAGE.name} shows '{old}', expected '{new}': run python -m tests.targets --write"]
+
+
+def _with(figures: str) -> str:
+    """The page with these figures."""
     before, begin, rest = PAGE.read_text(encoding="utf-8").partition(BEGIN)
     _, end, after = rest.partition(END)
     if not begin or not end:
         raise SystemExit(f"{PAGE}: expected a line '{BEGIN}' and, after it, '{END}'")
-    PAGE.write_text(f"{before}{BEGIN}\n\n{text(table, versions, vendor_of)}\n{END}{after}", encoding="utf-8")
+    return f"{before}{BEGIN}\n\n{figures}\n{END}{after}"
 
 
 def text(table: Table, versions: Mapping[str, str], vendor_of: Mapping[str, str]) -> str:
