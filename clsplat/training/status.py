@@ -23,7 +23,6 @@ from clsplat.reading import read_json
 
 LOG = logging.getLogger("clsplat")
 BEAT = 5.0  # seconds between two writes of a run that goes on
-END_STATES = ("done", "failed", "interrupted")
 Item = TypeVar("Item")
 
 
