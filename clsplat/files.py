@@ -48,14 +48,12 @@ def atomic_name(path: Path, suffix: str = "") -> Iterator[Path]:
     temporary = path.with_name(f".{path.name}.{os.getpid()}-{next(_number)}.partial{suffix}")
     _open.add(temporary.name)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(path.parent)
         yield temporary
         _replace(temporary, path)
         sync_folder(path.parent)
     except OSError as error:
-        raise OutputError(
-            f"{path}: cannot be written ({error.strerror or error}); check the folder and its space"
-        ) from error
+        raise unwritable(path, error) from error
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
@@ -73,12 +71,51 @@ def _replace(temporary: Path, path: Path) -> None:
             time.sleep(0.05)
 
 
+def append(path: Path, data: bytes) -> None:
+    """Append to a file and sync it; where that fails it is as it was.  Raises OutputError."""
+    try:
+        size = path.stat().st_size if path.exists() else None
+        try:
+            with path.open("ab") as file:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+            if size is None:
+                sync_folder(path.parent)
+        except OSError:
+            with suppress(OSError):
+                os.truncate(path, size or 0)
+            raise
+    except OSError as error:
+        raise unwritable(path, error) from error
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder, with those above it, so that their names outlast a power cut.  Raises OSError."""
+    new = list(itertools.takewhile(lambda one: not one.exists(), (folder, *folder.parents)))
+    folder.mkdir(parents=True, exist_ok=True)
+    for one in new:
+        sync_folder(one.parent)
+
+
+def sync_below(folder: Path) -> None:
+    """Wait until the files below a folder, and their names, are on the disk; no link is followed.  Raises OSError."""
+    for base, _, names in os.walk(folder):
+        for path in (Path(base, name) for name in names):
+            if path.is_file() and not path.is_symlink():
+                _sync(path, os.O_RDWR if SYSTEM == "nt" else os.O_RDONLY)  # Windows syncs what may be written
+        sync_folder(Path(base))
+
+
 def sync_folder(folder: Path) -> None:
     """Wait until the names in a folder are on the disk; without effect where a system cannot.  Raises OSError."""
-    if not hasattr(os, "O_DIRECTORY"):  # Windows writes names with the file
-        return
+    if hasattr(os, "O_DIRECTORY"):  # Windows writes names with the file
+        _sync(folder, os.O_RDONLY | os.O_DIRECTORY)
+
+
+def _sync(path: Path, flags: int) -> None:
     try:
-        number = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+        number = os.open(path, flags)
         try:
             os.fsync(number)
         finally:

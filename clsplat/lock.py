@@ -2,33 +2,31 @@
 
 The system releases the lock when its holder ends, however it ends, so that it is never left behind.  The file
 `run.lock` tells who holds it.  Where a file system knows no locks, whoever makes that file holds the folder; one whose
-process has ended on this host is taken over.
+process has ended on this host is taken over.  Where locks count on each machine alone, as some mounts of NFS and sshfs
+have them, a run on another machine is noticed by its heartbeat.
 """
 
 import errno
 import io
-import json
 import logging
 import os
-import sys
-import time
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from clsplat.errors import DataError, OutputError, shortened
+from clsplat.errors import OutputError
 from clsplat.files import unwritable
+from clsplat.holder import BEHIND_THE_TEXT, in_use, lost, own_text, read, require_silent
 from clsplat.names import LOCK
 from clsplat.processes import Owner
-from clsplat.reading import read_json
 
 LOG = logging.getLogger("clsplat")
 HELD = {errno.EACCES, errno.EAGAIN, errno.EDEADLK}  # what the systems answer for a lock that another holds
 NO_LOCKS = {errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL}
-BEHIND_THE_TEXT = 1 << 20  # Windows locks bytes for readers too
-_held: set[Path] = set()  # by this process
+_held: set[Path] = set()  # by this process, or being locked by it
+_reserving = threading.Lock()
 
 
 @contextmanager
@@ -39,28 +37,39 @@ def held(folder: Path, path: Path | None = None) -> Iterator[Callable[[], None]]
     folder.  Raises OutputError, with process and host where another holds it.
     """
     path = _path(folder, path or folder / LOCK)
-    try:
-        file = _locked(path, folder)
-    except OSError as error:
-        raise unwritable(path, error) from error
+    with _reserved(path, folder):
+        try:
+            file = _locked(path, folder)
+        except OSError as error:
+            raise unwritable(path, error) from error
 
-    def require_held() -> None:
-        with suppress(OSError):  # whoever writes there is told of that
-            if not file.closed and not _is_at(file, path):
-                raise OutputError(_lost(path, folder))
+        def require_held() -> None:
+            with suppress(OSError):  # whoever writes there is told of that
+                if not file.closed and not _is_at(file, path):
+                    raise OutputError(lost(path, folder))
 
-    _held.add(path)
+        try:
+            yield require_held
+        finally:
+            with suppress(OSError):  # Windows removes no open file
+                if _is_at(file, path):
+                    path.unlink()
+            file.close()
+            with suppress(OSError):
+                if os.name == "nt":
+                    path.unlink()
+
+
+@contextmanager
+def _reserved(path: Path, folder: Path) -> Iterator[None]:
+    """Keep other threads of this process away.  Raises OutputError."""
+    with _reserving:
+        _require_not_held(path, folder)
+        _held.add(path)
     try:
-        yield require_held
+        yield
     finally:
         _held.discard(path)
-        with suppress(OSError):  # Windows removes no open file
-            if _is_at(file, path):
-                path.unlink()
-        file.close()
-        with suppress(OSError):
-            if os.name == "nt":
-                path.unlink()
 
 
 def check_free(folder: Path) -> None:
@@ -70,7 +79,8 @@ def check_free(folder: Path) -> None:
         with suppress(FileNotFoundError), path.open("r+b", buffering=0) as file:
             try:
                 if not _system_lock(file):
-                    raise OutputError(_in_use(folder, _read(file)))
+                    raise OutputError(in_use(folder, read(file)))
+                require_silent(file, path, folder)
             except OSError as error:
                 if error.errno not in NO_LOCKS:
                     raise
@@ -82,11 +92,15 @@ def check_free(folder: Path) -> None:
 def _path(folder: Path, file: Path) -> Path:
     """The one path of a lock's file that this process does not hold.  Raises OutputError."""
     path = file.parent.resolve() / file.name
-    if path in _held:
-        raise OutputError(f"{folder}: is in use by this process; end that run or trainer first, or give another folder")
+    _require_not_held(path, folder)
     if path.is_symlink():
         raise OutputError(f"{file}: is a link, which is not followed; remove it")
     return path
+
+
+def _require_not_held(path: Path, folder: Path) -> None:
+    if path in _held:
+        raise OutputError(f"{folder}: is in use by this process; end that run or trainer first, or give another folder")
 
 
 def _locked(path: Path, folder: Path) -> io.FileIO:
@@ -99,7 +113,7 @@ def _locked(path: Path, folder: Path) -> io.FileIO:
             if _is_ours(file, is_new, path, folder):
                 file.seek(0)
                 file.truncate()
-                file.write(_own_text().encode())
+                file.write(own_text().encode())
                 return file
         except BaseException:
             file.close()
@@ -120,8 +134,12 @@ def _is_ours(file: io.FileIO, is_new: bool, path: Path, folder: Path) -> bool:
     """Lock the file; False where it is no longer the one at its path.  Where there are no locks, its maker holds it."""
     try:
         if not _system_lock(file):
-            raise OutputError(_in_use(folder, _read(file)))
-        return _is_at(file, path)
+            raise OutputError(in_use(folder, read(file)))
+        if not _is_at(file, path):
+            return False
+        if not is_new and (owner := require_silent(file, path, folder)):
+            LOG.info("%s: taken over from process %s on %s", folder, owner.get("process"), owner.get("host"))
+        return True
     except OSError as error:
         if error.errno not in NO_LOCKS:
             raise
@@ -136,10 +154,10 @@ def _is_ours(file: io.FileIO, is_new: bool, path: Path, folder: Path) -> bool:
 
 def _ended_owner(file: io.FileIO, path: Path, folder: Path) -> dict[str, Any]:
     """Who the file names, where there are no locks.  Raises OutputError unless that process has ended."""
-    owner = _read(file)
+    owner = read(file)
     if not _has_ended(Owner.named_by(owner)):
         raise OutputError(
-            f"{_in_use(folder, owner)}; this file system knows no locks: if that process has ended, remove {path}"
+            f"{in_use(folder, owner)}; this file system knows no locks: if that process has ended, remove {path}"
         )
     return owner
 
@@ -186,47 +204,5 @@ def _is_at(file: io.FileIO, path: Path) -> bool:
         return False
 
 
-def _own_text() -> str:
-    """What the file says of this process."""
-    command = " ".join([Path(sys.argv[0]).name, *sys.argv[1:]])
-    return json.dumps({**asdict(Owner.this()), "time": time.time(), "command": command})
-
-
-def _read(file: io.FileIO) -> dict[str, Any]:
-    """Who the file names; nobody where it is empty or damaged."""
-    try:
-        file.seek(0)
-        owner = json.loads(file.read(BEHIND_THE_TEXT))
-    except (OSError, ValueError, RecursionError):
-        return {}
-    return owner if isinstance(owner, dict) else {}
-
-
 def _has_ended(owner: Owner | None) -> bool:
     return owner is not None and (owner == Owner.this() or owner.has_ended)  # this process does not hold it
-
-
-def _lost(path: Path, folder: Path) -> str:
-    """What to tell of a lock whose file is no longer at its path."""
-    try:
-        owner = read_json(path, limit=BEHIND_THE_TEXT)
-        by = f", and process {owner['process']} on {owner['host']} holds it now"
-    except (DataError, KeyError, TypeError):
-        by = ""
-    return (
-        f"{folder}: {path.name} was removed or replaced while this process held it{by}; nothing more was written; "
-        "to go on, resume the run when no other process uses it"
-    )
-
-
-def _in_use(folder: Path, owner: dict[str, Any]) -> str:
-    if not owner:
-        return f"{folder}: is in use by another process"
-    try:
-        since = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(float(owner.get("time", 0))))
-    except (TypeError, ValueError, OverflowError, OSError):
-        since = "an unknown time"
-    return (
-        f"{folder}: is in use by process {owner.get('process')} on {owner.get('host')} since {since} "
-        f"({shortened(str(owner.get('command')))}); wait for it, or give another folder"
-    )

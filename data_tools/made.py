@@ -5,7 +5,7 @@ import json
 from pathlib import Path
 
 from clsplat.errors import DataError
-from clsplat.files import unwritable
+from clsplat.files import append, make_folder, unwritable
 from clsplat.reading import read_file, sha256
 
 RECORD = ".made.jsonl"
@@ -14,7 +14,8 @@ RECORD = ".made.jsonl"
 class Made:
     """The record of a folder: a line for each file, with a hash of what it is made from.
 
-    Files are written whole, after their line; a file that was made from something else is removed before its new line.
+    Files are written whole, after their line is on the disk; a file that was made from something else is removed before
+    its new line.
     So a file that exists is complete, and made from what its last line says.
     """
 
@@ -44,9 +45,9 @@ class Made:
             for file in (path, *beside):
                 file.unlink(missing_ok=True)
             if self._sources.get(name) != source:
-                self.folder.mkdir(parents=True, exist_ok=True)
-                with (self.folder / RECORD).open("a", encoding="utf-8") as record:
-                    record.write("\n" + json.dumps({"file": name, "from": source}))  # behind a line cut short
+                make_folder(self.folder)
+                line = "\n" + json.dumps({"file": name, "from": source})  # behind a line cut short
+                append(self.folder / RECORD, line.encode())
         except OSError as error:
             raise unwritable(path, error) from error
         self._sources[name] = source

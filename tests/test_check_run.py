@@ -5,6 +5,7 @@ import os
 import shutil
 from pathlib import Path
 
+import jsonschema
 import pytest
 
 import clsplat
@@ -44,6 +45,24 @@ def damaged(out: Path) -> dict[str, str]:
     found = clsplat.check(out)
     assert found["whole"] == all(one["whole"] for one in found["objects"])
     return {one["file"]: one["detail"] for one in found["objects"] if not one["whole"]}
+
+
+def test_a_status_of_a_newer_version_is_not_damaged(copy):
+    """A key that is new does not change the format; one of another format is not judged."""
+    path = copy / "status.json"
+    status = json.loads(path.read_text())
+    newer = {**status, "new": 1, "progress": {"done": 1, "total": 2, "unit": "steps", "new": "x"}}
+    jsonschema.validate(newer, clsplat.status_schema())
+    path.write_text(json.dumps(newer))
+    assert damaged(copy) == {}
+    assert clsplat.status(copy)["new"] == 1
+    path.write_text(json.dumps({**status, "format": 2, "step": "of words"}))
+    assert damaged(copy) == {}
+    details = {one["file"]: one["detail"] for one in clsplat.check(copy)["objects"]}
+    assert details["status.json"] == "not checked further: format 2, of a newer clsplat"
+    for fault in ({"step": "of words"}, {"format": 0}, {"format": "1"}):
+        path.write_text(json.dumps({**status, **fault}))
+        assert list(damaged(copy)) == ["status.json"]
 
 
 def test_a_whole_run_has_a_line_for_each_file_and_needs_no_device(finished, monkeypatch):

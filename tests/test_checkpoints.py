@@ -109,7 +109,7 @@ def test_the_one_before_a_checkpoint_on_a_bad_part_of_the_disk_is_used(
 
     monkeypatch.setattr(zipfile.ZipFile, "read", fail)
     train(tiny_scene, killed_run, *FEW, resume=True)
-    assert "bad disk)); using the one before it" in caplog.text
+    assert "step_000009.npz is damaged (the disk cannot read it: bad disk); using the one before it" in caplog.text
     assert digest(killed_run) == digest(few_steps)
 
 

@@ -100,12 +100,12 @@ def run(tiny_scene: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captur
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EIO], ids=errno.errorcode.get)
-def test_whichever_write_fails_nothing_is_lost(number, run, tmp_path):
+def test_whichever_write_fails_nothing_is_lost(number, run, tmp_path, record_property):
     whole = tmp_path / "whole"
     with pytest.MonkeyPatch.context() as patch:
         counts = Faults(patch, whole).counts
         assert run(whole) == 0
-    failed = 0
+    failed = cases = 0
     for kind, total in counts.items():
         assert total > 30
         stride = max(1, total // CASES)
@@ -121,4 +121,6 @@ def test_whichever_write_fails_nothing_is_lost(number, run, tmp_path):
             assert digest(out) == digest(whole), case
             assert records(out) == records(whole), case
             assert json.loads((out / "status.json").read_text())["state"] == "done", case
+            cases += 1
     assert failed > 3
+    record_property("cases", cases)

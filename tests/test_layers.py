@@ -28,7 +28,19 @@ ROWS = (  # from the top down; a module imports only from lower rows, or from it
     {"gaussians", "scene"},
     {"formats"},
     {"opencl", "pages"},
-    {"caches", "errors", "files", "lock", "names", "ply_header", "plugins", "processes", "progress", "reading"}
+    {
+        "caches",
+        "errors",
+        "files",
+        "holder",
+        "lock",
+        "names",
+        "ply_header",
+        "plugins",
+        "processes",
+        "progress",
+        "reading",
+    }
     | {"schedule", "settings", "signals", "streams", ""},
 )
 ROW = {name: i for i, row in enumerate(ROWS) for name in row}

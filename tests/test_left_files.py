@@ -9,9 +9,17 @@ from pathlib import Path
 
 import pytest
 
+import clsplat
 from clsplat import files
 from clsplat.files import atomic
+from clsplat.prepare.cache import RECORD, Planned, prepare
+from clsplat.prepare.place import STEPS, _show
+from clsplat.prepare.steps import Step
 from clsplat.runs import folders
+from clsplat.settings import Settings
+from clsplat.training import checkpoint
+from data_tools.made import RECORD as RECORD_OF_A_TOOL
+from data_tools.made import Made
 from tests.test_cli import clsplat as command
 
 pytestmark = pytest.mark.slow
@@ -64,16 +72,110 @@ def test_a_process_killed_at_any_write_leaves_what_the_next_one_sweeps(tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_folder_is_synced_after_the_rename_and_before_an_older_checkpoint_goes(tmp_path, monkeypatch):
-    calls = []
-    for name in ("fsync", "replace"):
-        real = getattr(os, name)
-        monkeypatch.setattr(os, name, lambda *a, real=real, name=name: (calls.append((name, *a)), real(*a)))
-    with atomic(tmp_path / "a") as file:
+@pytest.fixture
+def calls(monkeypatch):
+    """What the disk is told, in order: sync, replace or unlink, and the name of the file or folder."""
+    found: list[tuple[str, str]] = []
+    real = {name: getattr(os, name) for name in ("fsync", "replace", "rename", "unlink")}
+
+    def fsync(number):
+        found.append(("sync", Path(os.readlink(f"/proc/self/fd/{number}")).name))
+        real["fsync"](number)
+
+    def replace(old, new):
+        found.append(("replace", Path(new).name))
+        real["replace"](old, new)
+
+    def rename(old, new):
+        found.append(("rename", Path(new).name))
+        real["rename"](old, new)
+
+    def unlink(path, **more):
+        if os.path.lexists(path):
+            found.append(("unlink", Path(path).name))
+        real["unlink"](path, **more)
+
+    for function in (fsync, replace, rename, unlink):
+        monkeypatch.setattr(os, function.__name__, function)
+    return found
+
+
+has_proc = pytest.mark.skipif(not os.path.isdir("/proc/self/fd"), reason="the names of open files are read from there")
+
+
+@has_proc
+def test_a_checkpoint_and_the_records_that_it_counts_are_on_the_disk_before_an_older_one_goes(
+    tiny_scene, tmp_path, calls
+):
+    few = {"optimize.steps": 4, "init.count": 20, "checkpoint.every": 100, "optimize.log_every": 100}
+    trainer = clsplat.Trainer(tiny_scene, "smoke", set=few, out=tmp_path / "run")
+    trainer.step()
+    trainer.checkpoint()
+    trainer.step()
+    trainer._run.records.add(2, "note")
+    calls.clear()
+    checkpoint.save(trainer._run, keep=1)
+    trainer.close()
+    new, old = "step_000002.npz", "step_000001.npz"
+    seen = [call for call in calls if "status.json" not in call[1]]
+    assert seen[0] == ("sync", "metrics.jsonl")
+    assert seen[1][0] == "sync"
+    assert seen[1][1].startswith(f".{new}.")
+    assert [call for call in seen[2:] if call[1] in (new, old, "checkpoints")] == [
+        ("replace", new),
+        ("sync", "checkpoints"),
+        ("unlink", old),
+    ]
+
+
+@has_proc
+def test_a_folder_that_is_made_is_on_the_disk_with_its_file(tmp_path, calls):
+    with atomic(tmp_path / "a" / "b" / "c.txt") as file:
         file.write(b"x")
-        number = file.fileno()
-    assert [call[0] for call in calls] == ["fsync", "replace", "fsync"]
-    assert calls[0][1] == number
+    synced = [name for kind, name in calls if kind == "sync"]
+    assert (synced[:2], synced[3:]) == (["a", tmp_path.name], ["b"])
+    calls.clear()
+    with atomic(tmp_path / "a" / "b" / "c.txt") as file:
+        file.write(b"y")
+    assert [name for kind, name in calls if kind == "sync"][1:] == ["b"], "the others are there since"
+
+
+@has_proc
+def test_a_result_of_the_preparation_is_on_the_disk_before_it_is_trusted(tmp_path, calls):
+    class Write(Step):
+        def make(self, source: Path, out: Path, without: Path) -> dict:
+            (out / "deep").mkdir()
+            (out / "deep" / "x.png").write_bytes(b"x")
+            return {}
+
+    Settings.defined.remove(Write)  # not a step in other tests
+    root = tmp_path / "prepared"
+    planned = [Planned(Write(stage="write"), "", "", root / "write-1", "no result yet")]
+    prepare(planned, tmp_path, root)
+    order = [call for call in calls if ".lock" not in call[1]]
+    places = [order.index(call) for call in (("sync", "x.png"), ("sync", "deep"), ("replace", RECORD))]
+    assert places == sorted(places)
+    assert order[places[-1] + 1 :] == [("sync", ".write-1"), ("replace", "write-1"), ("sync", "prepared")]
+
+
+@has_proc
+def test_a_model_of_photographs_is_on_the_disk_before_it_has_its_name(tmp_path, calls):
+    result = tmp_path / "result"
+    for name in ("sparse", "images"):
+        (result / name).mkdir(parents=True)
+    (result / "sparse" / "cameras.bin").write_bytes(b"x")
+    (tmp_path / "out" / STEPS).mkdir(parents=True)
+    _show(result, tmp_path / "out")
+    assert calls == [("sync", "cameras.bin"), ("sync", ".sparse"), ("rename", "sparse"), ("sync", "out")]
+
+
+@has_proc
+def test_a_line_of_a_tool_is_on_the_disk_before_its_file_is_made(tmp_path, calls):
+    assert Made(tmp_path / "frames").is_due(tmp_path / "frames" / "a.png", "x")
+    assert calls == [("sync", tmp_path.name), ("sync", RECORD_OF_A_TOOL), ("sync", "frames")]
+    calls.clear()
+    assert Made(tmp_path / "frames").is_due(tmp_path / "frames" / "b.png", "x")
+    assert calls == [("sync", RECORD_OF_A_TOOL)]
 
 
 @pytest.mark.parametrize("number", [errno.EINVAL, errno.ENOTSUP, errno.EACCES])

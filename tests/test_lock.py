@@ -3,9 +3,11 @@
 import errno
 import json
 import os
+import platform
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -13,9 +15,11 @@ from types import ModuleType, SimpleNamespace
 import pytest
 
 import clsplat
+from clsplat import holder as holder_file
 from clsplat import lock
 from clsplat.errors import OutputError
 from clsplat.names import LOCK
+from clsplat.processes import Owner
 from clsplat.runs import folders
 from clsplat.runs.default_folder import free_folder
 from clsplat.training import status as writing
@@ -194,6 +198,87 @@ def test_a_run_that_is_just_starting_in_the_default_folder_is_not_joined(tmp_pat
     assert free_folder(tmp_path / "splat", None, "new") == tmp_path / "splat"
 
 
+def test_the_lock_of_a_killed_start_gives_no_other_name(tmp_path):
+    (tmp_path / "splat").mkdir()
+    process = holder(tmp_path / "splat")
+    assert free_folder(tmp_path / "splat", None, "new") == tmp_path / "splat-2"
+    process.kill()
+    process.wait()
+    assert (tmp_path / "splat" / LOCK).exists()
+    assert free_folder(tmp_path / "splat", None, "new") == tmp_path / "splat"
+
+
+def test_a_folder_that_another_thread_is_locking_is_held(tmp_path, monkeypatch):
+    """Where there are no locks, it would be taken for one that an earlier process of this number has left."""
+    locked, waiting, go_on = lock._locked, threading.Event(), threading.Event()
+
+    def slow(path, folder):
+        if threading.current_thread() is thread:
+            waiting.set()
+            go_on.wait(20)
+        return locked(path, folder)
+
+    def hold():
+        with lock.held(tmp_path):
+            pass
+
+    monkeypatch.setattr(lock, "_locked", slow)
+    thread = threading.Thread(target=hold)
+    thread.start()
+    try:
+        assert waiting.wait(20)
+        with pytest.raises(OutputError, match="is in use by this process"):
+            hold()
+    finally:
+        go_on.set()
+        thread.join()
+    hold()
+
+
+ELSEWHERE = {"process": 7, "host": "another", "boot": "of another", "time": 0.0, "command": "clsplat run"}
+FRESH = {"state": "running", "time": 2.0}
+known_boot = pytest.mark.skipif(Owner.this().boot is None, reason="the system does not say which start this is")
+
+
+@pytest.mark.parametrize("status", [FRESH, {"state": "starting", "time": -30.0}, {"state": "running", "time": -3600.0}])
+def test_a_run_on_another_machine_is_not_joined_where_locks_count_here_alone(status, tmp_path):
+    """As with NFS and `local_lock`: the lock is free here.  A negative age is that of a clock that is ahead."""
+    (tmp_path / LOCK).write_text(json.dumps(ELSEWHERE))
+    before = (tmp_path / LOCK).read_text()
+    (tmp_path / "status.json").write_text(json.dumps({**status, "time": time.time() - status["time"]}))
+    for attempt in (lambda: lock.check_free(tmp_path), lambda: lock.held(tmp_path).__enter__()):
+        with pytest.raises(OutputError, match=r"by process 7 on another .*heartbeat is \d+ s old.*remove .*lock"):
+            attempt()
+    assert (tmp_path / LOCK).read_text() == before
+
+
+@pytest.mark.parametrize(
+    ("owner", "status"),
+    [
+        ({}, {"state": "done", "time": 1.0}),
+        ({}, {"state": "running", "time": 61.0}),
+        ({}, {"state": "running"}),
+        ({}, ["running"]),
+        ({}, None),
+        pytest.param({"boot": Owner.this().boot}, FRESH, marks=known_boot),
+        ({"host": platform.node()}, FRESH),
+    ],
+    ids=["ended", "silent", "without a time", "damaged", "no status", "in a container here", "here before a restart"],
+)
+def test_the_lock_of_a_run_that_has_ended_elsewhere_is_taken_over(owner, status, tmp_path, caplog):
+    caplog.set_level("INFO", "clsplat")
+    (tmp_path / LOCK).write_text(json.dumps({**ELSEWHERE, **owner}))
+    if isinstance(status, dict) and "time" in status:
+        status = {**status, "time": time.time() - status["time"]}
+    if status is not None:
+        (tmp_path / "status.json").write_text(json.dumps(status))
+    lock.check_free(tmp_path)
+    with lock.held(tmp_path):
+        assert json.loads((tmp_path / LOCK).read_text())["process"] == os.getpid()
+    lines = [f"{tmp_path}: taken over from process 7 on another"] * (not owner)
+    assert [line for line in caplog.messages if "taken over" in line] == lines
+
+
 def test_a_folder_that_was_left_is_written_to_no_more(tmp_path, monkeypatch):
     monkeypatch.setattr(writing, "BEAT", 0.002)
     with folders.opened(tmp_path / "run", "new") as status:
@@ -225,8 +310,8 @@ def test_windows_locks_one_byte_behind_the_text(tmp_path, monkeypatch):
         file.write(b'{"process": 7}')
         assert lock._system_lock(file)
         assert not lock._system_lock(other)
-        assert {place for _, place in locked} == {lock.BEHIND_THE_TEXT}
-        assert lock._read(other) == {"process": 7}, "readers need no lock"
+        assert {place for _, place in locked} == {holder_file.BEHIND_THE_TEXT}
+        assert holder_file.read(other) == {"process": 7}, "readers need no lock"
     path.unlink()
     locked.clear()
     with lock.held(tmp_path):

@@ -80,8 +80,9 @@ def test_a_long_stage_ends_early_with_its_state_saved_and_is_repeated(
     module, name, call, message = PLACES[place]
     with monkeypatch.context() as patch:
         patch.setattr(module, name, signalled(getattr(module, name), call))
-        with pytest.raises(Interrupted, match=message):
+        with pytest.raises(Interrupted, match=message) as stopped:
             Job.open(pipeline, tiny_scene, tmp_path).run()
+    assert str(stopped.value).endswith(f"; `clsplat resume {tmp_path}` goes on from it")
     assert read_status(tmp_path)["state"] == "interrupted"
     assert list((tmp_path / "checkpoints").glob("*.npz"))
     Job.resume(tmp_path).run()

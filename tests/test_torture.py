@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from data_tools.synthetic import Options, write_dataset
+from tests.torture.__main__ import tested
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(not hasattr(os, "fork"), reason="attempts are forked")]
 
@@ -31,3 +32,14 @@ def test_a_few_kills(tmp_path):
     tally = json.loads(done.stdout.splitlines()[-1])
     assert tally["killed"] >= 2
     assert tally["equal"] == tally["finished"] > 0
+
+
+def test_a_row_counts_the_cases_that_its_tests_have_tried(tmp_path):
+    """And not the number of examples that was asked for, where there are as many as there are writes."""
+    (tmp_path / "test_three.py").write_text(
+        "def test_three(record_property):\n    record_property('cases', 3)\ndef test_two(record_property):\n"
+        "    record_property('cases', 2)\n"
+    )
+    (tmp_path / "test_none.py").write_text("def test_none():\n    pass\n")
+    assert tested("a", 1, str(tmp_path / "test_three.py")).cases == 5
+    assert tested("a", 7, str(tmp_path / "test_none.py")).cases == 7

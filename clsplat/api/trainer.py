@@ -16,6 +16,7 @@ from clsplat.errors import ClsplatError, ConfigError, DataError, Interrupted, Ou
 from clsplat.gaussians.model import Model
 from clsplat.losses.base import HostFunction, HostLoss, ViewGradients
 from clsplat.metrics.views import mean, measure
+from clsplat.names import END_STATES
 from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import Pipeline, load
 from clsplat.runs import folders, opening, outputs, runner
@@ -32,7 +33,7 @@ from clsplat.signals import stopping_on_signals
 from clsplat.stages.optimize import Optimize
 from clsplat.training import checkpoint
 from clsplat.training.rescue import saved_on_failure
-from clsplat.training.status import END_STATES, StatusFile
+from clsplat.training.status import StatusFile
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ from typing import Any
 
 from clsplat import lock
 from clsplat.errors import DataError, OutputError
-from clsplat.files import sweep, unwritable, write_text
+from clsplat.files import make_folder, sweep, sync_below, sync_folder, unwritable, write_text
 from clsplat.names import NOTE
 from clsplat.prepare.steps import Step
 from clsplat.progress import Count
@@ -85,7 +85,7 @@ def prepare(
 def _only_one_making(one: Planned) -> Iterator[None]:
     """Hold a result: what an interrupted call left is gone on with by one process alone."""
     try:
-        one.folder.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(one.folder.parent)
     except OSError as error:
         raise unwritable(one.folder.parent, error) from error
     with lock.held(one.folder, one.folder.with_name(f".{one.folder.name}.lock")):
@@ -128,7 +128,7 @@ def _same(path: Path, other: Path) -> bool:
 
 
 def _do(one: Planned, source: Path, root: Path) -> None:
-    """Make a result in a hidden folder beside its own, and rename it when it is complete.
+    """Make a result in a hidden folder beside its own, and rename it when it is complete and on the disk.
 
     A step that resumes finds there what an interrupted call has made of the same inputs with the same settings.
     """
@@ -145,8 +145,10 @@ def _do(one: Planned, source: Path, root: Path) -> None:
         seconds = round(time.perf_counter() - start, 1)
         settings = one.step.model_dump(mode="json")
         record = {"origin": one.origin, "inputs": one.inputs, "settings": settings, "seconds": seconds, **summary}
+        sync_below(temporary)
         write_text(temporary / RECORD, json.dumps(record, indent=1) + "\n")
         os.replace(temporary, one.folder)
+        sync_folder(one.folder.parent)
     except BaseException as error:
         if isinstance(error, DataError) or not one.step.resumes:  # the same data would be refused again
             shutil.rmtree(temporary, ignore_errors=True)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from clsplat import lock
 from clsplat.errors import DataError
-from clsplat.files import unwritable
+from clsplat.files import make_folder, sync_below, sync_folder, unwritable
 from clsplat.names import LOCK
 from clsplat.prepare.cache import RECORD, plan, prepare
 from clsplat.prepare.steps import FindFeatures, MapCameras, MatchFeatures, Step
@@ -37,7 +37,7 @@ def place_photographs(
         MapCameras(mapper=mapper),
     ]
     try:
-        (out / STEPS).mkdir(parents=True, exist_ok=True)
+        make_folder(out / STEPS)
     except OSError as error:
         raise unwritable(out, error) from error
     with lock.held(out, out / STEPS / LOCK):
@@ -64,6 +64,8 @@ def _show(result: Path, out: Path) -> None:
         half = out / STEPS / f".{MODEL}"
         shutil.rmtree(half, ignore_errors=True)
         shutil.copytree(result / MODEL, half)
+        sync_below(half)
         half.rename(out / MODEL)
+        sync_folder(out)
     except OSError as error:
         raise unwritable(out, error) from error

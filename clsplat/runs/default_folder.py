@@ -3,6 +3,8 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+from clsplat import lock
+from clsplat.errors import OutputError
 from clsplat.names import LOCK, PIPELINE
 from clsplat.pipeline.loading import Pipeline, load
 from clsplat.prepare.cache import Planned, note, noted
@@ -16,8 +18,11 @@ def free_folder(folder: Path, pipeline: Pipeline | None, start: Start) -> Path:
     planned = pipeline.preparation(folder) if pipeline else []
 
     def taken() -> bool:
-        if (free / LOCK).exists():  # by a run that has not begun yet
-            return True
+        if (free / LOCK).exists():
+            try:
+                lock.check_free(free)
+            except OutputError:  # by a run that may not have begun yet
+                return True
         return (free / PIPELINE).exists() and not (pipeline and up_to_date(pipeline, planned, free))
 
     while start == "new" and taken():

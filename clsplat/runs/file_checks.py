@@ -20,7 +20,7 @@ from clsplat.scene.identity import Identity
 from clsplat.scene.images import read_image
 from clsplat.training import archive, checkpoint
 from clsplat.training.records import Records
-from clsplat.training.status import Status
+from clsplat.training.status import FORMAT, Status
 
 
 def require(path: Path, kind: int = stat.S_IFREG) -> None:
@@ -53,8 +53,11 @@ def settings_file(path: Path, settings: dict[str, Any], expected: str | None) ->
 
 
 def status_file(path: Path) -> str:
+    status = read_json(path)
+    if isinstance(status, dict) and type(made := status.get("format")) is int and made > FORMAT:
+        return f"not checked further: format {made}, of a newer clsplat"
     try:
-        return Status.model_validate(read_json(path)).state
+        return Status.model_validate(status).state
     except ValidationError as error:
         first = error.errors()[0]
         raise DataError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from error

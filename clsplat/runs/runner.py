@@ -82,4 +82,4 @@ def _run_stages(pipeline: Pipeline, run: Run) -> None:
             run.next_stage(cursor + 1)  # a resumed run must not repeat an edit
         if run.interrupted:
             path = checkpoint.save(run)
-            raise Interrupted(f"stopped in {stage.stage}, saved in {path}; resume the run to go on")
+            raise Interrupted(f"stopped in {stage.stage}, saved in {path}; `clsplat resume {run.out}` goes on from it")

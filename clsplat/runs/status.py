@@ -7,11 +7,11 @@ from typing import Any
 
 from clsplat.compare.run_folder import read_metrics
 from clsplat.errors import DataError
-from clsplat.names import METRICS, PIPELINE
+from clsplat.names import END_STATES, METRICS, PIPELINE
 from clsplat.processes import Owner
 from clsplat.training import checkpoint
 from clsplat.training.records import Records
-from clsplat.training.status import END_STATES, read_status
+from clsplat.training.status import read_status
 
 LOG = logging.getLogger("clsplat")
 SILENT = 60  # seconds without a heartbeat that are worth a line

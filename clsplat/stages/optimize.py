@@ -122,7 +122,9 @@ class Optimize(Stage):
             run.between()
             if run.interrupted:
                 path = checkpoint.save(run)
-                raise Interrupted(f"stopped at step {run.step}, saved in {path}; --resume continues from there")
+                raise Interrupted(
+                    f"stopped at step {run.step}, saved in {path}; `clsplat resume {run.out}` goes on from it"
+                )
             yield view
 
     @property

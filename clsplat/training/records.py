@@ -2,15 +2,14 @@
 
 import json
 import logging
-import os
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
 from clsplat.errors import DataError
-from clsplat.files import unwritable, write_text
+from clsplat.files import append, write_text
 from clsplat.names import RECORDS
 from clsplat.reading import read_file
 
@@ -54,21 +53,14 @@ class Records:
         self.lines += 1
 
     def write(self) -> None:
-        """Append the lines that wait.  Raises OutputError; then they wait on, and the file is as it was."""
+        """Append the lines that wait, and sync them: a checkpoint counts them.
+
+        Raises OutputError; then they wait on, and the file is as it was.
+        """
         if not self._waiting:
             return
         self._require_held()
-        try:
-            size = self.path.stat().st_size if self.path.exists() else 0
-            try:
-                with self.path.open("ab") as file:
-                    file.write("".join(self._waiting).encode())
-            except OSError:
-                with suppress(OSError):
-                    os.truncate(self.path, size)
-                raise
-        except OSError as error:
-            raise unwritable(self.path, error) from error
+        append(self.path, "".join(self._waiting).encode())
         self._waiting.clear()
 
     @contextmanager

@@ -22,15 +22,15 @@ from clsplat.processes import Owner
 from clsplat.reading import read_json
 
 LOG = logging.getLogger("clsplat")
+FORMAT: Literal[1] = 1
 BEAT = 5.0  # seconds between two writes of a run that goes on
-END_STATES = ("done", "failed", "interrupted")
 Item = TypeVar("Item")
 
 
 class Amount(BaseModel):
     """How much of a stage is done."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True)
 
     done: int
     """Number of units that are done."""
@@ -41,13 +41,13 @@ class Amount(BaseModel):
 
 
 class Status(BaseModel):
-    """The contents of status.json.  What does not apply, or is not known yet, is left out.  Times are in seconds since
-    1970, UTC.
+    """The contents of status.json.  What does not apply, or is not known yet, is left out; newer versions may have more
+    keys.  Times are in seconds since 1970, UTC.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+    model_config = ConfigDict(frozen=True, use_attribute_docstrings=True)
 
-    format: Literal[1] = 1
+    format: Literal[1] = FORMAT
     """Version of this schema: a key that is new does not change it, one that goes or has another meaning does."""
     state: Literal["starting", "preparing", "running", "done", "failed", "interrupted"] = "starting"
     """starting: opens the device; preparing: makes and reads the scene; running: the stages; the others are the end."""

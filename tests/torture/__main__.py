@@ -14,6 +14,7 @@ import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from xml.etree import ElementTree
 
 from clsplat import __version__
 from data_tools.synthetic import Options, write_dataset
@@ -57,15 +58,26 @@ def killed(count: int, folder: Path) -> Row:
 
 
 def tested(what: str, count: int, *arguments: str) -> Row:
-    """Tests with many more examples than in the suite: CLSPLAT_FUZZ of each."""
+    """Tests with many more examples than in the suite: CLSPLAT_FUZZ of each, or as many as they say they have tried."""
     start = time.perf_counter()
     environment = {**os.environ, "CLSPLAT_FUZZ": str(count)}
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *arguments]
-    end = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
+    with tempfile.TemporaryDirectory() as folder:
+        results = Path(folder) / "results.xml"
+        command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", f"--junit-xml={results}", *arguments]
+        end = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
+        cases = cases_in(results) or count
     last = (end.stdout.strip().splitlines() or [end.stderr.strip()])[-1]
     if end.returncode:
         print(end.stdout[-4000:])
-    return Row(what, count, last, end.returncode == 0, time.perf_counter() - start)
+    return Row(what, cases, last, end.returncode == 0, time.perf_counter() - start)
+
+
+def cases_in(results: Path) -> int:
+    """The sum of what tests have recorded as the property `cases`, in a file of results; 0 where none has."""
+    if not results.exists():
+        return 0
+    properties = ElementTree.parse(results).iter("property")
+    return sum(int(one.get("value", 0)) for one in properties if one.get("name") == "cases")
 
 
 def main() -> int:
@@ -78,6 +90,7 @@ def main() -> int:
         rows = [killed(options.kills, Path(folder))]
     rows.append(tested("damaged inputs, for each reader", options.inputs, "tests/fuzz"))
     rows.append(tested("a write that fails, every one of a run", 1, "tests/test_failing_writes.py"))
+    rows.append(tested("`kill -9` at each file, on either side of its rename", 1, "tests/test_killed_writes.py"))
     table = "\n".join(["| what | cases | seen | time |", "|---|---|---|---|", *(row.text for row in rows)])
     print(table)
     if options.write:

@@ -92,7 +92,7 @@ class Attempt:
             log = os.open(out.with_suffix(".txt"), os.O_WRONLY | os.O_CREAT | os.O_APPEND)
             os.dup2(log, 1)
             os.dup2(log, 2)
-            clsplat.run(recipe, scene, out, set=SETTINGS[recipe], start="resume")
+            self._train(scene, out, recipe)
             code = 0
         except BaseException:
             traceback.print_exc(file=sys.stderr)
@@ -100,9 +100,16 @@ class Attempt:
             sys.stderr.flush()
             os._exit(code)
 
-    def wait(self) -> None:
+    def _train(self, scene: Path, out: Path, recipe: str) -> None:
+        clsplat.run(recipe, scene, out, set=SETTINGS[recipe], start="resume")
+
+    def end(self) -> int:
+        """Wait for the process; return its exit code, the negative number of a signal where one has ended it."""
         self.code = os.waitstatus_to_exitcode(os.waitpid(self.process, 0)[1])
-        if self.code != 0:
+        return self.code
+
+    def wait(self) -> None:
+        if self.end() != 0:
             raise RuntimeError("the undisturbed run failed")
 
     def killed_after(self, seconds: float) -> bool:
@@ -113,8 +120,7 @@ class Attempt:
                 return False
             time.sleep(0.002)
         os.kill(self.process, signal.SIGKILL)
-        self.code = os.waitstatus_to_exitcode(os.waitpid(self.process, 0)[1])
-        return self.code == -signal.SIGKILL
+        return self.end() == -signal.SIGKILL
 
     def _ended(self) -> bool:
         process, status = os.waitpid(self.process, os.WNOHANG)

@@ -1,0 +1,80 @@
+"""Who holds a folder: what the file of its lock says, and what is told of it."""
+
+import io
+import json
+import sys
+import time
+from contextlib import suppress
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from clsplat.errors import DataError, OutputError, shortened
+from clsplat.names import END_STATES, STATUS
+from clsplat.processes import Owner
+from clsplat.reading import read_json
+
+BEHIND_THE_TEXT = 1 << 20  # bytes: Windows locks a byte for readers too, and this one is not read
+SILENT = 60  # seconds without a heartbeat after which a run on another machine is taken to have ended
+
+
+def own_text() -> str:
+    """What the file says of this process."""
+    command = " ".join([Path(sys.argv[0]).name, *sys.argv[1:]])
+    return json.dumps({**asdict(Owner.this()), "time": time.time(), "command": command})
+
+
+def read(file: io.FileIO) -> dict[str, Any]:
+    """Who the file names; nobody where it is empty or damaged."""
+    try:
+        file.seek(0)
+        owner = json.loads(file.read(BEHIND_THE_TEXT))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return owner if isinstance(owner, dict) else {}
+
+
+def require_silent(file: io.FileIO, path: Path, folder: Path) -> dict[str, Any]:
+    """Who the file names, where that is a process of another machine, whose locks may not reach this one; else {}.
+
+    Raises OutputError where the run's status beside the file shows that it goes on.
+    """
+    owner = read(file)
+    named, this = Owner.named_by(owner), Owner.this()
+    if named is None or named.host == this.host or (owner.get("boot") and named.boot == this.boot):
+        return {}
+    with suppress(DataError, AttributeError, KeyError, TypeError, ValueError):
+        status = read_json(path.with_name(STATUS), limit=BEHIND_THE_TEXT)
+        silent = time.time() - float(status["time"])
+        if status.get("state") not in END_STATES and silent < SILENT:
+            raise OutputError(
+                f"{in_use(folder, owner)}; its heartbeat is {max(0, silent):.0f} s old, though the lock is free here: "
+                f"if that process has ended, wait for a minute, or remove {path}"
+            )
+    return owner
+
+
+def lost(path: Path, folder: Path) -> str:
+    """What to tell of a lock whose file is no longer at its path."""
+    try:
+        owner = read_json(path, limit=BEHIND_THE_TEXT)
+        by = f", and process {owner['process']} on {owner['host']} holds it now"
+    except (DataError, KeyError, TypeError):
+        by = ""
+    return (
+        f"{folder}: {path.name} was removed or replaced while this process held it{by}; nothing more was written; "
+        "to go on, resume the run when no other process uses it"
+    )
+
+
+def in_use(folder: Path, owner: dict[str, Any]) -> str:
+    if not owner:
+        return f"{folder}: is in use by another process"
+    try:
+        since = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(float(owner.get("time", 0))))
+    except (TypeError, ValueError, OverflowError, OSError):
+        since = "an unknown time"
+    return (
+        f"{folder}: is in use by process {owner.get('process')} on {owner.get('host')} since {since} "
+        f"({shortened(str(owner.get('command')))}); wait for it, or give another folder"
+    )
