@@ -1,3 +1,15 @@
-from clsplat.cli import main
+"""The command `clsplat`, also as `python -m clsplat`."""
 
-main()
+from clsplat.signals import end_at_once_on_signals
+
+
+def main() -> None:
+    """Run the command line; a signal that comes while it is imported ends it as one that comes later."""
+    end_at_once_on_signals()
+    from clsplat.cli import main as command_line
+
+    command_line()
+
+
+if __name__ == "__main__":
+    main()

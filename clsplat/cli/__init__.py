@@ -27,6 +27,8 @@ def main(*before: str) -> None:
     try:
         with stopping_on_signals(stop_at_once):
             shown = app(arguments, prog_name="clsplat", standalone_mode=False)
+            if shown:  # typer makes the code 130 of a KeyboardInterrupt before the command begins
+                raise KeyboardInterrupt
             if shown is not None:  # the code of --help and --version; commands return nothing
                 streams.check_output()
             code = 0

@@ -20,6 +20,7 @@ def finishing_on_interrupt(run: Run) -> Iterator[None]:
     def finish() -> None:
         if run.interrupted or not run.has_model:
             stop_at_once()
+            return
         run.interrupted = True
         LOG.info("finishing the step; press Ctrl-C again to stop at once")
 
