@@ -1,6 +1,8 @@
 """The check before a device makes pictures or models: it is done once, and a wrong device is refused everywhere."""
 
 import io
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -85,6 +87,37 @@ def test_a_damaged_cache_of_kernels_is_no_fault_of_the_device(monkeypatch, info,
     with pytest.raises(DeviceError, match=r"cache of built kernels is damaged: remove .*pyopencl"):
         quick.ensure_correct(Device(info))
     assert not list(empty_cache.iterdir())
+
+
+USE = """
+import os, sys
+from pathlib import Path
+from clsplat.conformance import uses
+uses.begin([Path(name) for name in sys.argv[2:]])
+if sys.argv[1] == "suddenly":
+    os.abort()
+"""
+
+
+@pytest.mark.parametrize("end", ["suddenly", "in order"])
+def test_a_device_is_checked_again_after_a_process_that_ended_without_a_word(monkeypatch, info, empty_cache, end):
+    worker(monkeypatch)
+    device = Device(info)
+    quick.ensure_correct(device)
+    monkeypatch.setattr(quick, "ESSENTIAL", [Check("cached", ("blend_backward",), None)])
+    records = [quick._record(info, device.schedule, "radix")]
+    subprocess.run([sys.executable, "-c", USE, end, *map(str, records)], check=False, capture_output=True)
+    if end == "in order":
+        quick.ensure_correct(device)
+        return
+    for _ in range(2):  # until that helps
+        with pytest.raises(DeviceError, match="cache of built kernels is damaged"):
+            quick.ensure_correct(device)
+    worker(monkeypatch)
+    monkeypatch.setattr(quick, "ESSENTIAL", ESSENTIAL)
+    quick.ensure_correct(device)
+    monkeypatch.setattr(supervision, "WORKER", ("-c", "raise SystemExit(1)"))
+    quick.ensure_correct(device)
 
 
 def test_an_exception_of_a_runtime_is_a_sentence():

@@ -32,6 +32,8 @@ def main(*before: str) -> None:
             if shown is not None:  # the code of --help and --version; commands return nothing
                 streams.check_output()
             code = 0
+    except SystemExit:  # of completion
+        raise
     except BaseException as error:
         code = _report(error, DEBUG in arguments[:1])
     sys.exit(code)
@@ -81,7 +83,7 @@ def _one_set_each(arguments: list[str]) -> list[str]:
 
 def _with_port(arguments: list[str]) -> list[str]:
     """Let `--live` without a number stand for `--live=0`."""
-    following = [*arguments[1:], ""]
+    following = [*arguments, ""][1:]
     return [
         f"{LIVE}=0" if argument == LIVE and not after.isdecimal() else argument
         for argument, after in zip(arguments, following, strict=True)

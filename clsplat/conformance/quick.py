@@ -11,6 +11,7 @@ from typing import Literal
 
 from clsplat import resource_dir
 from clsplat.caches import cache_folder, damaged_kernels
+from clsplat.conformance import uses
 from clsplat.conformance.checks import BITONIC, ESSENTIAL
 from clsplat.conformance.host import code_variables
 from clsplat.conformance.supervision import supervised
@@ -42,12 +43,16 @@ def ensure_correct(device: Device, sort: Sort = "auto") -> None:
     """Compare the essential kernels with the reference when this device, driver and kernels meet for the first time.
 
     It happens in a process of its own, so that nothing of the device changes; the bitonic sort is checked where the run
-    may choose it.  Raises DeviceError when the device computes wrongly, MemoryLimitError.
+    may choose it.  After a process that used the device and ended without a word, the comparison is repeated.
+    Raises DeviceError when the device computes wrongly, MemoryLimitError.
     """
     info, schedule = device.info, device.schedule
     bitonic = known_sort(device, sort) != "radix"
     sorts = SORTS if bitonic else SORTS[:1]
-    if all(_record(info, schedule, one).exists() for one in sorts):
+    records = [_record(info, schedule, one) for one in sorts]
+    uses.forget_after_sudden_ends(cache_folder())
+    if all(record.exists() for record in records):
+        uses.begin(records)
         return
     LOG.info("checking %s, once for each driver; this takes some seconds, more where it builds slowly", info.name)
     for result in supervised(info, schedule, [*ESSENTIAL, *(BITONIC if bitonic else [])], QUICK_SECONDS):
@@ -59,6 +64,7 @@ def ensure_correct(device: Device, sort: Sort = "auto") -> None:
             how = "cannot be trusted" if result.fault else "computes wrongly"
             raise DeviceError(f"{device.text} {how}: {result.failures[0]}; `clsplat doctor` tells more")
     remember(info, schedule, sorts)
+    uses.begin(records)
 
 
 def remember(info: DeviceInfo, schedule: Resolved, sorts: Sequence[str] = SORTS) -> None:

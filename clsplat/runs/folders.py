@@ -7,9 +7,23 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from clsplat import lock
-from clsplat.errors import ConfigError, InternalError, OutputError, as_clsplat_error
+from clsplat.errors import ConfigError, DataError, InternalError, OutputError, as_clsplat_error
 from clsplat.files import sweep, unwritable
-from clsplat.names import BEFORE_A_RUN, CHECKPOINTS, CHECKSUMS, INPUTS, LOCK, METRICS, NOTE, OF_A_RUN, PIPELINE, RECORDS
+from clsplat.names import (
+    BEFORE_A_RUN,
+    CHECKPOINTS,
+    CHECKSUMS,
+    INPUTS,
+    LOCK,
+    METRICS,
+    NOTE,
+    OF_A_RUN,
+    PIPELINE,
+    RECORDS,
+    RESOLVED,
+    STATUS,
+)
+from clsplat.reading import read_text
 from clsplat.training import checkpoint
 from clsplat.training.status import StatusFile, read_status
 
@@ -82,10 +96,23 @@ def clear(status: StatusFile) -> None:
             raise unwritable(file, error) from error
 
 
+def _is_of_a_run(out: Path) -> bool:
+    """Whether a folder's pipeline.yaml, where there is one, was written by a run."""
+    if not (out / PIPELINE).is_file() or (out / STATUS).exists() or checkpoint.saved(out):
+        return True
+    with suppress(DataError):
+        return read_text(out / PIPELINE).startswith(RESOLVED)
+    return False
+
+
 def check_run_folder(out: Path, start: Start) -> None:
-    """Raise ConfigError when a new run finds another one in its folder."""
+    """Raise ConfigError when a new run finds another one in its folder, or any finds a pipeline.yaml of the user's."""
     if start not in get_args(Start):
         raise ConfigError(f"no start '{start}'; there are {', '.join(get_args(Start))}")
+    if not _is_of_a_run(out):
+        raise ConfigError(
+            f"{out / PIPELINE}: is not that of a run, which would write its own in its place; give another folder"
+        )
     if start == "new" and ((out / PIPELINE).exists() or checkpoint.saved(out)):
         raise ConfigError(f"{out}: already holds a run; give another folder, --resume or --restart")
     status = read_status(out) if start == "resume" else {}

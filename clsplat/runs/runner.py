@@ -8,7 +8,7 @@ from pathlib import Path
 
 from clsplat.errors import ConfigError, Interrupted
 from clsplat.files import write_text
-from clsplat.names import CHECKSUMS, NOTE, PIPELINE
+from clsplat.names import CHECKSUMS, NOTE, PIPELINE, RESOLVED
 from clsplat.pipeline.loading import Pipeline
 from clsplat.runs.folders import Start, clear
 from clsplat.runs.inputs import require_same_inputs, write_inputs
@@ -47,7 +47,7 @@ def begin(pipeline: Pipeline, run: Run, start: Start) -> None:
         LOG.info("resumed at step %d" if taken else "nothing to resume; starting from the beginning%.0s", run.step)
         checkpoint.drop_later(run.out, taken)
     (run.out / CHECKSUMS).unlink(missing_ok=True)
-    write_text(run.out / PIPELINE, f"# resolved from {pipeline.path.name}\n{pipeline.text()}")
+    write_text(run.out / PIPELINE, f"{RESOLVED}{pipeline.path.name}\n{pipeline.text()}")
     write_inputs(run)
     if run.prepared:
         write_text(run.out / NOTE, json.dumps(run.prepared) + "\n")
