@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from clsplat.formats.ply import MAX_NUMBER
 from clsplat.gaussians.tables import DeviceModel, Gaussians
 from clsplat.opencl.device import Array, Device
 from clsplat.render.camera import camera_values
@@ -88,7 +89,7 @@ def measure_intervals(
 class ScreenFilter(Settings):
     """A blur of splats in the image."""
 
-    variance: Annotated[float, Field(ge=0)]
+    variance: Annotated[float, Field(ge=0, lt=MAX_NUMBER)]
     """Added to the variance of every splat, px²."""
     compensate: Literal[0, 1]
     """1: the opacity falls as the area grows, so that a splat keeps its energy."""
@@ -98,7 +99,7 @@ class Dilation(ScreenFilter):
     """Add a variance to every splat, so that each covers about a pixel or more (Kerbl et al. 2023)."""
 
     type: Literal["dilation"] = "dilation"
-    variance: Annotated[float, Field(ge=0)] = 0.3
+    variance: Annotated[float, Field(ge=0, lt=MAX_NUMBER)] = 0.3
     """Added to the variance of every splat, px²."""
     compensate: Literal[0, 1] = 0
     """1: the opacity falls as the area grows, so that a splat keeps its energy."""
@@ -108,7 +109,7 @@ class Ewa(ScreenFilter):
     """Add a variance to every splat and keep its energy (Zwicker et al. 2001; "3DGS + EWA" in Yu et al. 2024)."""
 
     type: Literal["ewa"] = "ewa"
-    variance: Annotated[float, Field(ge=0)] = 0.3
+    variance: Annotated[float, Field(ge=0, lt=MAX_NUMBER)] = 0.3
     """Added to the variance of every splat, px²."""
     compensate: Literal[0, 1] = 1
     """1: the opacity falls as the area grows, so that a splat keeps its energy."""
@@ -118,7 +119,7 @@ class Mip(ScreenFilter):
     """Blur every splat by about a pixel and keep its energy (2D Mip filter, Yu et al. 2024, eq. 11)."""
 
     type: Literal["mip"] = "mip"
-    variance: Annotated[float, Field(ge=0)] = 0.1
+    variance: Annotated[float, Field(ge=0, lt=MAX_NUMBER)] = 0.1
     """Added to the variance of every splat, px²."""
     compensate: Literal[0, 1] = 1
     """1: the opacity falls as the area grows, so that a splat keeps its energy."""
@@ -129,7 +130,7 @@ class ModelSettings(Settings):
 
     sh_degree: Annotated[int, Field(ge=0, le=3)] = 3
     """Highest degree of the spherical harmonics."""
-    near: Annotated[float, Field(gt=0)] = 0.2
+    near: Annotated[float, Field(gt=0, lt=MAX_NUMBER)] = 0.2
     """Smallest depth in scene units that is drawn."""
     world_filter: OneOf[WorldFilter] = NoWorldFilter()
     """Blur of Gaussians in the world."""

@@ -157,3 +157,10 @@ def test_every_variant_says_what_it_is():
             assert kind.__doc__, name
             for key, field in kind.model_fields.items():
                 assert key in ("stage", "type") or field.description, f"{name}.{key} has no docstring"
+
+
+@pytest.mark.parametrize("key", ["screen_filter.variance", "near"])
+def test_a_number_that_no_model_file_may_say_is_refused_before_training(key):
+    with pytest.raises(ConfigError, match=key.rpartition(".")[2]):
+        load("smoke", [f"model.{key}=1e38"])
+    load("smoke", [f"model.{key}=1e14"])
