@@ -7,7 +7,7 @@ import shutil
 import stat
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 
@@ -17,6 +17,7 @@ from clsplat.errors import OutputError
 
 LOG = logging.getLogger("clsplat")
 LIBRARIES = ("pyopencl", "pytools", "pocl")  # keep caches beside ours, and fail where they cannot
+LEAST_SPACE = 2**20  # bytes; the built kernels of a device are some MB
 
 
 @cache
@@ -47,12 +48,13 @@ def cache_folder() -> Path:
 
 def kernel_caches() -> str:
     """Return the folders that keep built kernels, in words."""
-    pyopencl, _, pocl = (Path(platformdirs.user_cache_dir(name, name)) for name in LIBRARIES)
-    return f"{pyopencl} and {next(iter(_named_by_user()), pocl)}"
+    return " and ".join(map(str, _kernel_folders()))
 
 
 def damaged_kernels() -> str:
     """Say of a device that works with empty caches alone what to do."""
+    if full := [folder for folder in _kernel_folders() if _is_full(folder)]:
+        return f"{full[0]}: has no space for built kernels; free some, or let XDG_CACHE_HOME name another folder"
     return f"its cache of built kernels is damaged: remove {kernel_caches()}"
 
 
@@ -61,6 +63,17 @@ def empty_kernel_caches() -> Iterator[dict[str, str]]:
     """Yield the variables with which a process that starts in the block keeps built kernels in an empty folder."""
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         yield {"POCL_CACHE_DIR": folder, "PYOPENCL_NO_CACHE": "1"}
+
+
+def _kernel_folders() -> list[Path]:
+    pyopencl, _, pocl = (Path(platformdirs.user_cache_dir(name, name)) for name in LIBRARIES)
+    return [pyopencl, next(iter(_named_by_user()), pocl)]
+
+
+def _is_full(folder: Path) -> bool:
+    with suppress(OSError):
+        return shutil.disk_usage(folder).free < LEAST_SPACE
+    return False
 
 
 def _named_by_user() -> list[Path]:

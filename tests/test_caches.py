@@ -9,11 +9,12 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import platformdirs
 import pytest
 
-from clsplat.caches import cache_folder
+from clsplat.caches import cache_folder, damaged_kernels
 from clsplat.errors import OutputError
 
 linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the folders of Linux")
@@ -132,3 +133,13 @@ def test_a_device_works_without_a_home(tmp_path):
     assert "state     works" in done.stdout
     assert done.stderr.count("\n") == 1
     assert "caches are in" in done.stderr
+
+
+@linux
+@pytest.mark.parametrize("free", [0, 2**30])
+def test_a_full_folder_is_not_called_damaged(machine, monkeypatch, free):
+    cache_folder()
+    monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=free))
+    text = damaged_kernels()
+    assert ("has no space for built kernels; free some" in text) == (not free)
+    assert ("is damaged: remove" in text) == bool(free)
