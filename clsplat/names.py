@@ -5,7 +5,6 @@ from pathlib import PureWindowsPath
 
 # What a run or a matrix writes itself, in its folder.
 PIPELINE = "pipeline.yaml"
-RESOLVED = "# resolved from "  # its beginning, of a single run
 METRICS = "metrics.json"
 RECORDS = "metrics.jsonl"
 STATUS = "status.json"

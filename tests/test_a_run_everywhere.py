@@ -102,7 +102,9 @@ def test_the_summary_tells_which_photographs_are_lost(done, tmp_path):
     many = {"map_cameras": {**FOUND["map_cameras"], "not_registered": [f"{i}.jpg" for i in range(10)]}}
     assert photographs_text(many).endswith("7.jpg, and 2 more")
     metrics = json.loads((done / "metrics.json").read_text())
-    (tmp_path / "metrics.json").write_text(json.dumps({**metrics, "prepared": FOUND | {"undistort": {"seconds": 7.2}}}))
+    (tmp_path / "metrics.json").write_text(
+        json.dumps({**metrics, "preparation": FOUND | {"undistort": {"seconds": 7.2}}})
+    )
     text = "\n".join(summary(tmp_path))
     assert "; 32 of 33 photographs placed" in text
     assert "undistort 7 s" in text

@@ -167,8 +167,8 @@ def test_a_later_stage_that_damages_the_model_ends_the_run_with_an_error(tiny_sc
 def test_a_writer_that_loses_bytes_is_noticed_at_once(tiny_scene, tmp_path, monkeypatch):
     save = Model.save
 
-    def saved_and_cut(model: Model, path: Path) -> Any:
-        result = save(model, path)
+    def saved_and_cut(model: Model, path: Path, *more: Any) -> Any:
+        result = save(model, path, *more)
         truncate(Path(path))
         return result
 

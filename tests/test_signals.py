@@ -12,8 +12,9 @@ import pytest
 
 from clsplat.errors import Interrupted
 from clsplat.metrics import views
+from clsplat.report import views as report
 from clsplat.runs.experiment import Job
-from clsplat.stages import densify, render, report
+from clsplat.stages import densify, render
 from clsplat.stages.init import Init
 from clsplat.training.status import read_status
 from tests.test_training import digest

@@ -20,13 +20,13 @@ from clsplat.names import (
     OF_A_RUN,
     PIPELINE,
     RECORDS,
-    RESOLVED,
     STATUS,
 )
 from clsplat.reading import read_text
 from clsplat.training import checkpoint
 from clsplat.training.status import StatusFile, read_status
 
+RESOLVED = "# resolved from "  # the beginning of a pipeline.yaml that a single run has written
 Start = Literal["new", "resume", "restart"]
 
 

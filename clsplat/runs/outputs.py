@@ -33,7 +33,7 @@ def write_metrics(pipeline: Pipeline, run: Run) -> None:
         "seconds": {name: round(seconds, 3) for name, seconds in spent.items()},
         "scene": str(run.scene.path.resolve()),
         "files": {name: path.relative_to(run.out).as_posix() for name, path in files.items()},
-        **({"prepared": run.found} if run.found else {}),
+        **({"preparation": run.found} if run.found else {}),
         **({"changes": run.changes} if run.changes else {}),
     }
     write_text(run.out / METRICS, json.dumps(metrics, indent=1) + "\n")

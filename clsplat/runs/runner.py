@@ -8,9 +8,9 @@ from pathlib import Path
 
 from clsplat.errors import ConfigError, Interrupted
 from clsplat.files import write_text
-from clsplat.names import CHECKSUMS, NOTE, PIPELINE, RESOLVED
+from clsplat.names import CHECKSUMS, NOTE, PIPELINE
 from clsplat.pipeline.loading import Pipeline
-from clsplat.runs.folders import Start, clear
+from clsplat.runs.folders import RESOLVED, Start, clear
 from clsplat.runs.inputs import require_same_inputs, write_inputs
 from clsplat.runs.outputs import check_outputs, write_checksums, write_metrics
 from clsplat.runs.signals import finishing_on_interrupt

@@ -29,14 +29,14 @@ def _lines(folder: Path, metrics: dict[str, Any]) -> Iterator[str]:
     test = next(iter(metrics["test"].values()), None)
     quality = f"test PSNR {test['psnr']:.2f} dB, SSIM {test['ssim']:.4f}; " if test else ""
     yield f"{quality}{metrics['gaussians']:,} Gaussians; {metrics['train_seconds']:.0f} s of training"
-    placed = photographs_text(metrics.get("prepared", {}))
+    placed = photographs_text(metrics.get("preparation", {}))
     if scene := metrics.get("scene"):
         yield f"  scene    {scene}" + (f"; {placed}" if placed else "")
     files = {stage: folder / name for stage, name in metrics.get("files", BEFORE_FILES).items()}
     for stage, file in files.items():
         if file.exists():
             yield f"  {TITLES.get(stage, stage):<8} {file}"
-    steps = {name: found.get("seconds", 0) for name, found in metrics.get("prepared", {}).items()}
+    steps = {name: found.get("seconds", 0) for name, found in metrics.get("preparation", {}).items()}
     spent = {**steps, **metrics.get("seconds", {})}
     if told := [f"{name} {seconds:.0f} s" for name, seconds in spent.items() if seconds >= SHORTEST]:
         yield f"  time     {', '.join(told)}"

@@ -1,6 +1,7 @@
 """The stage of pipelines, the command and the function: the same pages, errors in one line."""
 
 import re
+import shutil
 from pathlib import Path
 
 import pytest
@@ -38,8 +39,8 @@ def test_a_run_writes_a_viewer_and_its_report_leads_to_it(run):
     assert viewer.count('"split":"test"') == 2
     assert viewer.count('"split":"train"') == 8
     assert viewer.count('"photograph":null') == 8, "training views have a thumbnail alone"
-    assert '<a href="viewer.html">' in report
-    assert Page(report).elements["a"] == 1
+    assert '<a class="viewer" href="viewer.html">' in report
+    assert Page(report).elements["a"] == 2, "the viewer and the model"
 
 
 def test_the_stage_and_the_command_show_the_same(run, tmp_path):
@@ -61,14 +62,14 @@ def test_the_model_has_the_same_bits_without_the_stage(run, tiny_scene, tmp_path
     (tmp_path / "plain.yaml").write_text(text)
     plain = clsplat.run(tmp_path / "plain.yaml", tiny_scene, tmp_path / "plain", set=SHORT)
     assert not (plain / "viewer.html").exists()
-    assert "<a href" not in (plain / "report.html").read_text()
+    assert 'class="viewer"' not in (plain / "report.html").read_text()
     assert (plain / "point_cloud.ply").read_bytes() == (run / "point_cloud.ply").read_bytes()
 
 
 def test_the_link_leads_from_another_folder(tiny_scene, tmp_path):
     places = {**SHORT, "viewer.file": "pages/my scene.html", "report.file": "more/report.html"}
     out = clsplat.run("smoke", tiny_scene, tmp_path / "run", set=places)
-    (address,) = re.findall(r'<a href="([^"]*)"', (out / "more" / "report.html").read_text())
+    (address,) = re.findall(r'<a class="viewer" href="([^"]*)"', (out / "more" / "report.html").read_text())
     assert address == "../pages/my%20scene.html"
     assert (out / "pages" / "my scene.html").is_file()
 
@@ -97,7 +98,7 @@ def test_a_viewer_that_is_damaged_is_noticed(run, tmp_path, damage):
 def test_the_command_and_the_function_write_the_same_bytes(run, tiny_scene, tmp_path):
     pairs = [
         ([run], {}),
-        ([run / "point_cloud.ply"], {}),
+        ([Path(shutil.copy(run / "point_cloud.ply", tmp_path))], {}),
         ([run / "point_cloud.ply"], {"scene": tiny_scene, "photographs": "all"}),
         ([run], {"photographs": "none", "splats": 500}),
         ([run, run / "point_cloud.ply"], {}),
