@@ -121,6 +121,18 @@ def test_a_run_whose_checkpoints_are_gone_does_not_begin_again(killed_run, tiny_
     assert (killed_run / "metrics.jsonl").read_bytes() == before
 
 
+@pytest.mark.parametrize("status", [None, ""])
+def test_a_run_that_has_lost_its_status_too_does_not_begin_again(killed_run, tiny_scene, few_steps, status):
+    before = (killed_run / "metrics.jsonl").read_bytes()
+    shutil.rmtree(killed_run / "checkpoints")
+    (killed_run / "status.json").unlink()
+    if status is not None:
+        (killed_run / "status.json").write_text(status)
+    with pytest.raises(OutputError, match=r"neither a readable status\.json nor a checkpoint, .*--restart"):
+        train(tiny_scene, killed_run, *FEW, resume=True)
+    assert (killed_run / "metrics.jsonl").read_bytes() == before
+
+
 def test_a_run_without_a_checkpoint_so_far_begins_from_the_start(tiny_scene, tmp_path, caplog, few_steps):
     caplog.set_level("INFO", "clsplat")
     train(tiny_scene, tmp_path / "run", *FEW, resume=True)

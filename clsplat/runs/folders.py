@@ -106,7 +106,10 @@ def _is_of_a_run(out: Path) -> bool:
 
 
 def check_run_folder(out: Path, start: Start) -> None:
-    """Raise ConfigError when a new run finds another one in its folder, or any finds a pipeline.yaml of the user's."""
+    """Raise ConfigError when a new run finds another one in its folder, or any finds a pipeline.yaml of the user's.
+
+    Raises OutputError when a run that is to go on has lost its state.
+    """
     if start not in get_args(Start):
         raise ConfigError(f"no start '{start}'; there are {', '.join(get_args(Start))}")
     if not _is_of_a_run(out):
@@ -118,3 +121,8 @@ def check_run_folder(out: Path, start: Start) -> None:
     status = read_status(out) if start == "resume" else {}
     if status.get("state") == "done" and not ({"cells", "checkpoint"} & status.keys()):
         raise ConfigError(f"{out}: is done, and has no checkpoint to go on from; --restart trains it again")
+    if start == "resume" and not status and (out / INPUTS).exists() and not checkpoint.saved(out):
+        raise OutputError(
+            f"{out}: has neither a readable {STATUS} nor a checkpoint, though a run has begun there; put them back, or "
+            "give --restart, which begins it again"
+        )
