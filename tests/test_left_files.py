@@ -38,6 +38,7 @@ def test_temporary_files_of_killed_runs_are_swept_and_nothing_else(tiny_scene, t
     for name in (*left, *mine, "cell/pipeline.yaml", "pipeline.yaml"):
         (out / name).parent.mkdir(parents=True, exist_ok=True)
         (out / name).write_text("x")
+    (out / "pipeline.yaml").write_text("# resolved from smoke.yaml\n")
     done = command(
         "run", "smoke", "--scene", tiny_scene, "--out", out, "--resume", "--set", "optimize.steps=2", "--debug"
     )

@@ -27,7 +27,7 @@ ALLOWED = {  # module and function -> why it reads by itself
     "clsplat/reading.py:regular": "the place where files are opened",
     "clsplat/reading.py:sha256": "the place where they are hashed",
     "clsplat/streams.py": "opens the null device",
-    "clsplat/files.py:sync_folder": "opens a folder",
+    "clsplat/files.py:_sync": "syncs what was written",
     "clsplat/training/archive.py:read": "takes a file that `regular` has opened",
     "clsplat/training/archive.py:write": "writes",
     "clsplat/conformance/worker.py:_only_reader_of_stdin": "opens the null device",

@@ -1,6 +1,7 @@
 """The commands.  Each prints one line for an error, and exits with that error's code."""
 
 import difflib
+import os
 import sys
 import traceback
 from typing import Any
@@ -13,6 +14,7 @@ from clsplat.cli.app import Passed, app
 from clsplat.errors import Interrupted, as_clsplat_error, one_line
 from clsplat.signals import stop_at_once, stopping_on_signals
 
+COMPLETION = "_CLSPLAT_COMPLETE"  # set where a shell asks for completions
 DEBUG, PLUGIN = "--debug", "--plugin"  # options that stand before the command or after it
 LIVE = "--live"  # its port may be left out
 
@@ -32,9 +34,9 @@ def main(*before: str) -> None:
             if shown is not None:  # the code of --help and --version; commands return nothing
                 streams.check_output()
             code = 0
-    except SystemExit:  # of completion
-        raise
     except BaseException as error:
+        if isinstance(error, SystemExit) and COMPLETION in os.environ:
+            raise
         code = _report(error, DEBUG in arguments[:1])
     sys.exit(code)
 

@@ -16,6 +16,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import clsplat
+from clsplat.caches import cache_folder
+from clsplat.conformance import uses
 from clsplat.files import PARTIAL
 from clsplat.training import checkpoint
 from clsplat.training.records import Records
@@ -106,6 +108,8 @@ class Attempt:
     def end(self) -> int:
         """Wait for the process; return its exit code, the negative number of a signal where one has ended it."""
         self.code = os.waitstatus_to_exitcode(os.waitpid(self.process, 0)[1])
+        for mark in (cache_folder() / uses.FOLDER).glob(f"{self.process}-*.json"):
+            mark.unlink()  # after each kill the check of the device would take longer than the run
         return self.code
 
     def wait(self) -> None:
