@@ -16,7 +16,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import clsplat
-from clsplat.caches import cache_folder
 from clsplat.conformance import uses
 from clsplat.files import PARTIAL
 from clsplat.training import checkpoint
@@ -103,13 +102,12 @@ class Attempt:
             os._exit(code)
 
     def _train(self, scene: Path, out: Path, recipe: str) -> None:
+        uses.forget_after_sudden_ends = lambda cache: None  # the check of a device after a kill is longer than the run
         clsplat.run(recipe, scene, out, set=SETTINGS[recipe], start="resume")
 
     def end(self) -> int:
         """Wait for the process; return its exit code, the negative number of a signal where one has ended it."""
         self.code = os.waitstatus_to_exitcode(os.waitpid(self.process, 0)[1])
-        for mark in (cache_folder() / uses.FOLDER).glob(f"{self.process}-*.json"):
-            mark.unlink()  # after each kill the check of the device would take longer than the run
         return self.code
 
     def wait(self) -> None:
