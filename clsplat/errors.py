@@ -7,10 +7,12 @@ traceback (`--debug` shows one).
 import errno
 import reprlib
 import traceback
+from collections.abc import Sequence
 from itertools import islice
 
 MESSAGE_LIMIT = 1000  # characters
 QUOTE_LIMIT = 80  # characters of a value in a message
+NAMES_SHOWN = 8  # of a list, in a message
 PLUGIN_MARK = "__clsplat_plugin__"  # the name of the plug-in, a variable of its module
 
 
@@ -121,6 +123,12 @@ def one_line(error: BaseException) -> str:
     """Return the message of an error, in one line of limited length, without characters that a terminal obeys."""
     text = shortened(" ".join(str(error).split()), MESSAGE_LIMIT)
     return shortened("".join(c if c.isprintable() else ascii(c)[1:-1] for c in text), MESSAGE_LIMIT)
+
+
+def first_few(names: Sequence[str]) -> str:
+    """Return the first names of a list, and how many more there are, for a message."""
+    more = f", and {len(names) - NAMES_SHOWN} more" if len(names) > NAMES_SHOWN else ""
+    return ", ".join(names[:NAMES_SHOWN]) + more
 
 
 def shortened(text: str, limit: int = QUOTE_LIMIT) -> str:

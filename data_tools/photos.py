@@ -20,7 +20,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from clsplat.errors import DataError
+from clsplat.errors import DataError, first_few
 from clsplat.files import write_text
 from clsplat.progress import Count, watched
 from data_tools.database import image_names, matched_pairs, pairs_done, remove, without_features
@@ -34,7 +34,6 @@ Mapper = Literal["incremental", "global"]
 Cameras = Literal["auto", "one", "per_folder", "per_image"]
 CameraModel = Literal["SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "PINHOLE", "SIMPLE_PINHOLE"]
 MAX_EXHAUSTIVE = 200  # photographs whose pairs are all matched: the time grows with the square of their number
-MAX_NAMED = 8  # photographs in a message
 CHUNK = 10  # photographs between two counts
 DATABASE, IMAGES, PAIRS = "database.db", "images", "pairs.txt"
 
@@ -175,7 +174,7 @@ def map_cameras(source: Path, out: Path, mapper: Mapper = "incremental", threads
         LOG.warning(
             "%d of %d photographs could not be placed: %s; the scene is made of the others: for more, add photographs "
             "from places between, or raise match_features.neighbours",
-            *(len(missing), len(names), named(missing)),
+            *(len(missing), len(names), first_few(missing)),
         )
     others = [model.num_reg_images() for model in models[1:]]
     if others:
@@ -190,12 +189,6 @@ def map_cameras(source: Path, out: Path, mapper: Mapper = "incremental", threads
         "points": best.num_points3D(),
         "error_px": round(best.compute_mean_reprojection_error(), 3),
     }
-
-
-def named(photographs: list[str]) -> str:
-    """Return the first few names."""
-    more = f", and {len(photographs) - MAX_NAMED} more" if len(photographs) > MAX_NAMED else ""
-    return ", ".join(photographs[:MAX_NAMED]) + more
 
 
 def _alike_pairs(pycolmap: ModuleType, database: Path, neighbours: int) -> list[tuple[str, str]]:

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-NAMES_SHOWN = 8
+from clsplat.errors import first_few
 
 
 def photographs_text(found: Mapping[str, Mapping[str, Any]]) -> str:
@@ -17,5 +17,4 @@ def photographs_text(found: Mapping[str, Mapping[str, Any]]) -> str:
         text = f"{placed} of {placed + len(lost)} photographs placed, {float(cameras['error_px']):.2f} px"
     except (KeyError, TypeError, ValueError):
         return ""
-    names = ", ".join(lost[:NAMES_SHOWN]) + (f", and {len(lost) - NAMES_SHOWN} more" if len(lost) > NAMES_SHOWN else "")
-    return text + (f"; left out: {names}" if lost else "")
+    return text + (f"; left out: {first_few(lost)}" if lost else "")
