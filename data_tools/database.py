@@ -1,11 +1,17 @@
 """What COLMAP's database holds so far."""
 
-import sqlite3
-from contextlib import closing
+import subprocess
+import sys
 from pathlib import Path
 from types import ModuleType
 
 import numpy as np
+
+COUNT_PAIRS = """
+import sqlite3, sys
+with sqlite3.connect(sys.argv[1], uri=True, timeout=0.1) as opened:
+    print(opened.execute("SELECT COUNT(*) FROM two_view_geometries").fetchone()[0])
+"""
 
 
 def image_names(pycolmap: ModuleType, database: Path) -> list[str]:
@@ -41,13 +47,14 @@ def matched_pairs(pycolmap: ModuleType, database: Path) -> int:
 
 
 def pairs_done(database: Path) -> int:
-    """Return the number of pairs that were looked at, while pycolmap writes; 0 where that cannot be read just now."""
+    """Return the number of pairs that were looked at, while pycolmap writes; 0 where that cannot be read just now.
+
+    A process of its own reads it: a second SQLite library in pycolmap's process would release the locks of the first
+    (https://www.sqlite.org/howtocorrupt.html, 2.2.1), and matches would be lost.
+    """
     address = f"{database.resolve().as_uri()}?mode=ro"
-    try:
-        with closing(sqlite3.connect(address, uri=True, timeout=0.1)) as opened:
-            return int(opened.execute("SELECT COUNT(*) FROM two_view_geometries").fetchone()[0])
-    except sqlite3.Error:
-        return 0
+    read = subprocess.run([sys.executable, "-I", "-S", "-c", COUNT_PAIRS, address], capture_output=True, check=False)
+    return int(read.stdout) if read.returncode == 0 else 0
 
 
 def remove(database: Path) -> None:

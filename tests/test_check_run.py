@@ -63,6 +63,9 @@ def test_a_status_of_a_newer_version_is_not_damaged(copy):
     for fault in ({"step": "of words"}, {"format": 0}, {"format": "1"}):
         path.write_text(json.dumps({**status, **fault}))
         assert list(damaged(copy)) == ["status.json"]
+    for name in ("format", "state", "version"):
+        path.write_text(json.dumps({key: value for key, value in status.items() if key != name}))
+        assert damaged(copy)["status.json"] == f"{name}: Field required"
 
 
 def test_a_whole_run_has_a_line_for_each_file_and_needs_no_device(finished, monkeypatch):

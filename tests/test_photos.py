@@ -9,7 +9,9 @@ import cv2
 import numpy as np
 import pytest
 
+from clsplat import progress
 from clsplat.errors import DataError
+from clsplat.progress import heard_by
 from clsplat.scene.detect import read_scene
 from clsplat.scene.lens import Lens
 from clsplat.scene.scene import Camera, View
@@ -195,6 +197,17 @@ def test_pairs_are_matched_once(photos, placed, tmp_path):
         assert (tmp_path / "cameras" / "sparse" / "0" / name).read_bytes() == (
             placed / "sparse" / "0" / name
         ).read_bytes()
+
+
+def test_counting_pairs_loses_none(placed, tmp_path, monkeypatch):
+    """A reader in pycolmap's own process would release the locks of its writes."""
+    monkeypatch.setattr(progress, "WATCH", 0.01)
+    heard: set[int] = set()
+    with heard_by(lambda what, done, total, seconds_left: heard.add(done)):
+        match_features(placed.parent / "features", tmp_path)
+    assert max(heard) == 14 * 13 // 2
+    assert len(heard) > 2, "counts between none and all of them"
+    assert rows(tmp_path / "database.db") == rows(placed.parent / "matches" / "database.db")
 
 
 @pytest.mark.parametrize("blank", ["crop", "mask"])

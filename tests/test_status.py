@@ -172,8 +172,9 @@ def test_a_full_disk_does_not_stop_a_run(tiny_scene, tmp_path, monkeypatch, capl
     monkeypatch.setattr(writing, "BEAT", 0.002)
     clsplat.run("smoke", tiny_scene, tmp_path / "run")
     assert json.loads((tmp_path / "run" / "status.json").read_text())["state"] == "done"
-    assert [m for m in caplog.messages if "status.json" in m] == [
-        f"{tmp_path / 'run' / 'status.json'}: cannot be written (No space left on device); the run goes on"
+    name = tmp_path / "run" / "status.json"
+    assert [m for m in caplog.messages if str(name) in m] == [
+        f"{name}: cannot be written (No space left on device); the run goes on"
     ]
 
 

@@ -96,9 +96,11 @@ class MatchFeatures(Step):
     """Which pairs of photographs are matched; auto: exhaustive, and vocabulary for more than 200 photographs."""
     neighbours: Positive = 10
     """Number of photographs that each is matched with, where not with all."""
+    threads: Positive = 1
+    """Number of threads; more than one are faster, and the result does not always repeat to the bit."""
 
     def make(self, source: Path, out: Path, without: Path) -> dict[str, Any]:
-        return match_features(source, out, self.matching, self.neighbours)
+        return match_features(source, out, self.matching, self.neighbours, self.threads)
 
 
 class MapCameras(Step):

@@ -47,9 +47,9 @@ class Status(BaseModel):
 
     model_config = ConfigDict(frozen=True, use_attribute_docstrings=True)
 
-    format: Literal[1] = FORMAT
+    format: Literal[1]
     """Version of this schema: a key that is new does not change it, one that goes or has another meaning does."""
-    state: Literal["starting", "preparing", "running", "done", "failed", "interrupted"] = "starting"
+    state: Literal["starting", "preparing", "running", "done", "failed", "interrupted"]
     """starting: opens the device; preparing: makes and reads the scene; running: the stages; the others are the end."""
     stage: str | None = None
     """Stage or step of `prepare` in progress, or the last that was; of a matrix, the cell."""
@@ -77,7 +77,7 @@ class Status(BaseModel):
     """The one line that says why a run failed or was interrupted."""
     device: str | None = None
     """OpenCL device and runtime."""
-    version: str = __version__
+    version: str
     """Version of clsplat."""
     host: str
     """Name of the machine, or of the container."""
@@ -110,6 +110,9 @@ class StatusFile:
         now = time.time()
         checkpoint = read_status(out).get("checkpoint")
         self.now = Status(
+            format=FORMAT,
+            state="starting",
+            version=__version__,
             **asdict(Owner.this()),
             started=now,
             changed=now,
