@@ -22,6 +22,16 @@ from tests.torture.kills import kills
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "reliability.md"
+READERS = (  # what is damaged, the tests, and the share of --inputs that each gets: in some a case takes 10 ms and more
+    ("PLY files", ["test_ply.py"], 1.0),
+    ("other formats of models", ["test_formats.py"], 1.0),
+    ("photographs", ["test_images.py"], 1.0),
+    ("files of cameras", ["test_camera_files.py"], 1.0),
+    ("scenes", ["test_scenes.py"], 0.2),
+    ("pipelines and records", ["test_pipelines.py"], 0.05),
+    ("files of a whole run", ["test_run_folders.py", "-k", "whole_run"], 0.01),
+    ("archives of a checkpoint", ["test_run_folders.py", "-k", "archive"], 1.0),
+)
 BEGIN, END = "<!-- torture: begin -->", "<!-- torture: end -->"
 
 
@@ -58,26 +68,29 @@ def killed(count: int, folder: Path) -> Row:
 
 
 def tested(what: str, count: int, *arguments: str) -> Row:
-    """Tests with many more examples than in the suite: CLSPLAT_FUZZ of each, or as many as they say they have tried."""
+    """Tests with many more examples than in the suite: `count` of each, or as many as it says that it has tried."""
     start = time.perf_counter()
     environment = {**os.environ, "CLSPLAT_FUZZ": str(count)}
     with tempfile.TemporaryDirectory() as folder:
         results = Path(folder) / "results.xml"
         command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", f"--junit-xml={results}", *arguments]
         end = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
-        cases = cases_in(results) or count
+        cases = cases_in(results, count)
     last = (end.stdout.strip().splitlines() or [end.stderr.strip()])[-1]
     if end.returncode:
         print(end.stdout[-4000:])
     return Row(what, cases, last, end.returncode == 0, time.perf_counter() - start)
 
 
-def cases_in(results: Path) -> int:
-    """The sum of what tests have recorded as the property `cases`, in a file of results; 0 where none has."""
+def cases_in(results: Path, count: int) -> int:
+    """The number of cases in a file of results: what a test has recorded as the property `cases`, or `count`."""
     if not results.exists():
         return 0
-    properties = ElementTree.parse(results).iter("property")
-    return sum(int(one.get("value", 0)) for one in properties if one.get("name") == "cases")
+    tests = ElementTree.parse(results).iter("testcase")
+    recorded = (
+        [int(one.get("value", 0)) for one in test.iter("property") if one.get("name") == "cases"] for test in tests
+    )
+    return sum(sum(cases) if cases else count for cases in recorded)
 
 
 def main() -> int:
@@ -86,9 +99,11 @@ def main() -> int:
     parser.add_argument("--inputs", type=int, default=100_000, help="number of damaged inputs of each reader")
     parser.add_argument("--write", action="store_true", help="write the table to docs/reliability.md")
     options = parser.parse_args()
+    rows: list[Row] = []
     with tempfile.TemporaryDirectory() as folder:
-        rows = [killed(options.kills, Path(folder))]
-    rows.append(tested("damaged inputs, for each reader", options.inputs, "tests/fuzz"))
+        rows.append(killed(options.kills, Path(folder)))
+    for what, (file, *only), share in READERS:
+        rows.append(tested(f"damaged {what}", max(1, int(share * options.inputs)), f"tests/fuzz/{file}", *only))
     rows.append(tested("a write that fails, every one of a run", 1, "tests/test_failing_writes.py"))
     rows.append(tested("`kill -9` at each file, on either side of its rename", 1, "tests/test_killed_writes.py"))
     table = "\n".join(["| what | cases | seen | time |", "|---|---|---|---|", *(row.text for row in rows)])
