@@ -75,6 +75,13 @@ FAULTS = {  # kernel -> file, text, wrong text
     "sample_magnitude": ("texture.cl", "magnitude[row * stride + column]", "magnitude[row * stride]"),
 }  # fmt: skip
 MORE = {  # that smaller pictures do not show
+    "blend_forward wide, dim pixels": (
+        "blend_wide.cl",
+        "bool open = ANY((upper.t > 0.0f)",
+        "bool open = ANY((upper.t > 0.01f)",
+    ),
+    "blend_forward simt, dim pixels": ("blend_simt.cl", "if (p.t > 0.0f)", "if (p.t > 0.01f)"),
+    "pixel_loss, pixels that are equal": ("loss.cl", "difference < 0.0f ?", "difference <= 0.0f ?"),
     "scan_offsets simt, a sum that wraps": ("scan.cl", "sum < a ? UINT_MAX : sum", "sum"),
     "emit_large simt, one row an item": ("large.cl", "each = (rows + TEAM - 1) / TEAM", "each = 1"),
     "emit_large simt, the same rows": ("large.cl", "begin = get_local_id(0) * each", "begin = get_local_id(0)"),

@@ -81,6 +81,12 @@ def _opaque(parameters: dict[str, NDArray[Any]]) -> None:
     parameters["logit_opacity"] += 2
 
 
+def dim(parameters: dict[str, NDArray[Any]]) -> None:
+    """Transmittance falls below 0.01 in a batch of 256, and 40 more still show."""
+    parameters["log_scales"] += 4
+    parameters["logit_opacity"][:] = -3.7
+
+
 def _of_all_sizes(parameters: dict[str, NDArray[Any]]) -> None:
     parameters["log_scales"][:10] += 4
     parameters["log_scales"][10:20] -= 6
@@ -92,6 +98,7 @@ def images(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
         case = safe_case(rng, count, width, height, MARGIN)
         yield from blend_figures(device, case, f"{count} Gaussians, {width} x {height} px")
     yield from blend_figures(device, safe_case(rng, 300, 14, 14, 2e-6, _opaque), "long tiles, finished pixels")
+    yield from blend_figures(device, safe_case(rng, 300, 14, 14, 2e-6, dim), "long tiles, dim pixels")
     yield from blend_figures(device, safe_case(rng, 30, 40, 40, MARGIN, _of_all_sizes), "huge and tiny splats")
 
 

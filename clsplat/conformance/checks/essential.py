@@ -20,6 +20,8 @@ def rendering(device: Device, rng: np.random.Generator) -> Iterator[Figure | Not
     yield from projection.record_figures(device, case, what)
     yield from tiles.list_figures(device, case, "radix", what)
     yield from blending.blend_figures(device, case, what)
+    many = safe_case(rng, 300, 14, 14, change=blending.dim)
+    yield from blending.blend_figures(device, many, "300 that cover each other")
     weights = rng.normal(size=(3, 30, 40)).astype(np.float32)
     yield from blending.sum_figures(case, blending.pixel_sums_of(device, case, weights), weights, what)
     yield from projection.gradient_figures(device, case, rng, what)
