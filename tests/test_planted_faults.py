@@ -74,11 +74,12 @@ FAULTS = {  # kernel -> file, text, wrong text
     "hide_masked": ("texture.cl", "row <= y + 1", "row <= y"),
     "sample_magnitude": ("texture.cl", "magnitude[row * stride + column]", "magnitude[row * stride]"),
 }  # fmt: skip
+OPEN = "ANY((upper.t > 0.0f) | (lower.t > 0.0f))"
 MORE = {  # that smaller pictures do not show
     "blend_forward wide, dim pixels": (
         "blend_wide.cl",
-        "bool open = ANY((upper.t > 0.0f)",
-        "bool open = ANY((upper.t > 0.01f)",
+        f"bool open = {OPEN}",
+        f"bool open = {OPEN}".replace("0.0", "0.01"),
     ),
     "blend_forward simt, dim pixels": ("blend_simt.cl", "if (p.t > 0.0f)", "if (p.t > 0.01f)"),
     "pixel_loss, pixels that are equal": ("loss.cl", "difference < 0.0f ?", "difference <= 0.0f ?"),

@@ -59,7 +59,7 @@ def read_compressed_ply(path: Path) -> SplatFile:
             length = section.count * section.dtype.itemsize
             require_held(path, size, section.start + length, f"{section.count} rows of '{name}'")
             file.seek(section.start)
-            tables[name] = np.frombuffer(file.read(length), section.dtype)
+            tables[name] = np.ndarray(section.count, section.dtype, file.read(length))
     chunks, vertices = _checked(path, header, tables)
     per_splat = np.repeat(np.arange(len(chunks)), CHUNK)[: len(vertices)]
     colour, alpha = _colours(vertices, chunks, per_splat)

@@ -75,6 +75,7 @@ def _unpacked(path: Path, data: bytes) -> tuple[Header, list[bytes]]:
         _check_size(path, header, len(data) * GZIP_RATIO)
         stream = zlib.decompressobj(31)
         body = stream.decompress(data, expected + 1)
+        rest = stream.decompress(stream.unconsumed_tail, MAX_DEGREE * 1024) if header.flags & EXTENSIONS else b""
     except zlib.error as error:
         raise DataError(f"{path}: {error}; expected {EXPECTED} in gzip: copy or export it again") from error
     if header.version > 3:
@@ -82,7 +83,6 @@ def _unpacked(path: Path, data: bytes) -> tuple[Header, list[bytes]]:
     if len(body) < expected:
         raise DataError(f"{path}: ends early: {header.count} splats take {expected} bytes; copy or export it again")
     if header.flags & EXTENSIONS:
-        rest = stream.decompress(stream.unconsumed_tail, MAX_DEGREE * 1024)
         _check_extensions(path, body[expected:] + rest)
     elif len(body) > expected:
         raise DataError(f"{path}: goes on after {header.count} splats; copy or export it again")

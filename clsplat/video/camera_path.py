@@ -73,8 +73,8 @@ def read(path: Path, scene: Path | None = None) -> CameraPath:
     for i, own in enumerate(frames):
         frame = Frame(path.parent, f"{path}: camera_path[{i}]", own)
         fov = frame.number("fov")
-        if fov is None or not 0 < fov < 179:
-            raise DataError(f"{frame.where}: fov is {quoted(fov)}; expected degrees from 0 to 179")
+        if fov is None or not 0.01 <= fov < 179:
+            raise DataError(f"{frame.where}: fov is {quoted(fov)}; expected degrees from 0.01 to 179")
         pose = pose_of(Frame(path.parent, frame.where, {"transform_matrix": _rows(own.get("camera_to_world"))}))
         views.append(View(f"frame_{i + 1:05d}", _camera(size, math.radians(fov)), move(pose)))
     return CameraPath(views, checked_rate(whole.number("fps") or 30), size)

@@ -1,5 +1,7 @@
 """PLY files of many programs: marks, discs, packed splats."""
 
+import re
+
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
@@ -106,6 +108,10 @@ BROKEN = {
     "too few chunks": (lambda h, b: (h.replace(b"element chunk 3", b"element chunk 2"), b), "2 chunks for 600 splats"),
     "floats": (lambda h, b: (h.replace(b"uint packed_scale", b"float packed_scale"), b), "'property uint'"),
     "short harmonics": (lambda h, b: (h, b[:-1]), "truncated"),
+    "harmonics of nothing": (
+        lambda h, b: (re.sub(rb"property uchar \w+\n", b"", h.replace(b"sh 600", b"sh 5")), b),
+        "5 rows of 0 properties",
+    ),
     "harmonics of others": (lambda h, b: (h.replace(b"element sh 600", b"element sh 599"), b), "599 rows"),
     "harmonics from 1 on": (lambda h, b: (h.replace(b"f_rest_0\n", b"f_rest_9\n"), b), "numbered from 0 on"),
 }

@@ -126,6 +126,11 @@ def test_an_extension_that_turns_the_axes_is_refused_and_others_are_skipped(tmp_
     other = struct.pack("<2I4s", 7, 4, b"abcd")
     path.write_bytes(gzip.compress(legacy(2, flags=2, rest=other)))
     assert len(read(path)) == 2
+    damaged = bytearray(gzip.compress(legacy(2, flags=2, rest=other)))
+    damaged[-5] ^= 1  # of the checksum, which is read with the records
+    path.write_bytes(damaged)
+    with pytest.raises(DataError, match="incorrect data check"):
+        read(path)
     path.write_bytes(gzip.compress(legacy(2, flags=2, rest=other + struct.pack("<2II", 0xADBE0003, 4, 1))))
     with pytest.raises(DataError, match="axes of its own, in the record 0xadbe0003"):
         read(path)

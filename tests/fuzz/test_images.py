@@ -48,10 +48,11 @@ def test_a_damaged_image_is_read_or_refused(suffix, folder: Path):
         path.write_bytes(data)
         header = outcome(read_header, path)
         pixels = outcome(read_image, path)
-        outcome(read_image, path, True)
         if pixels is not None:
             assert pixels.dtype in (np.uint8, np.uint16)
             assert pixels.shape[2] in (3, 4)
             assert header is not None
+        del pixels  # bytes may say 150 million pixels: those of one image are within the bound on memory, of two not
+        outcome(read_image, path, True)
 
     reads()

@@ -78,7 +78,10 @@ def tested(what: str, count: int, *arguments: str) -> Row:
         cases = cases_in(results, count)
     last = (end.stdout.strip().splitlines() or [end.stderr.strip()])[-1]
     if end.returncode:
-        print(end.stdout[-4000:])
+        print(
+            *(line[:2000] for line in end.stdout.splitlines() if line.startswith(("example", "E  ", "FAILED"))),
+            sep="\n",
+        )
     return Row(what, cases, last, end.returncode == 0, time.perf_counter() - start)
 
 
