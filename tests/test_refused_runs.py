@@ -23,6 +23,7 @@ def test_a_refused_run_leaves_no_folder(tiny_scene, tmp_path):
         "d": ["smoke", "--scene", tiny_scene, "--set", "evaluate.lpips=nowhere.onnx"],
         "e": ["smoke", "--scene", tiny_scene, "--set", "init.source=random", "init.count=50000000"],
         "f": ["smoke", "--scene", tiny_scene, "--set", "init.source=ply", f"init.file={damaged}"],
+        "g": ["smoke", "--scene", tiny_scene, "--set", "init.source=ply"],
     }.items():
         out = tmp_path / name
         done = subprocess.run(

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 from scipy.spatial import cKDTree
 
-from clsplat.errors import DataError
+from clsplat.errors import ConfigError, DataError
 from clsplat.formats.splats import Parameters, with_degree
 from clsplat.gaussians.model import load
 from clsplat.gaussians.tables import SH_C0, Gaussians, sh_coefficients
@@ -52,6 +52,10 @@ class Init(Stage):
     """Largest number of points of a plane sweep."""
     file: ReadPath | None = None
     """Model file of any format, or a run folder, for `source: model`."""
+
+    def check(self) -> None:
+        if self.source in MODEL_SOURCES and self.file is None:
+            raise ConfigError(f"init.file: source '{self.source}' needs a model file, or the folder of a run; give one")
 
     def check_in(self, run: Run) -> None:
         source = self._source(run.scene)
@@ -97,9 +101,7 @@ class Init(Stage):
         return from_points(points, self.opacity, degree)
 
     def _read(self) -> Parameters:
-        if self.file is None:
-            raise DataError(f"init: source '{self.source}' needs 'file'")
-        parameters = load(Path(self.file)).tables()
+        parameters = load(Path(str(self.file))).tables()
         if not len(parameters["means"]):
             raise DataError(f"{self.file}: holds no Gaussians; expected one at least to start from")
         return parameters
