@@ -119,8 +119,8 @@ def _plugin_place(error: BaseException) -> str | None:
     return next((f"{f.f_code.co_filename}:{line}" for f, line in frames if PLUGIN_MARK in f.f_globals), None)
 
 
-def one_line(error: BaseException) -> str:
-    """Return the message of an error, in one line of limited length, without characters that a terminal obeys."""
+def one_line(error: BaseException | str) -> str:
+    """Return a message as one line of limited length, without characters that a terminal obeys."""
     text = shortened(" ".join(str(error).split()), MESSAGE_LIMIT)
     return shortened("".join(c if c.isprintable() else ascii(c)[1:-1] for c in text), MESSAGE_LIMIT)
 

@@ -20,6 +20,7 @@ from clsplat.pipeline.recipes import copy, manual, summary
 from clsplat.pipeline.settable import settable
 from clsplat.runs.status import run_status, status_text
 from clsplat.training.records import Records
+from tests.statuses import write_status
 from tests.test_cli import clsplat
 from tests.test_training import train
 
@@ -211,7 +212,7 @@ def test_a_plugin_may_stand_after_the_command(tmp_path):
 
 @pytest.mark.parametrize("text", ["[1]", '{"test": 5}', '{"test": {"1": 5}}', "{"])
 def test_status_refuses_damaged_metrics(text, tmp_path):
-    (tmp_path / "status.json").write_text('{"state": "done", "step": 7}')
+    write_status(tmp_path, state="done", step=7)
     (tmp_path / "metrics.json").write_text(text)
     with pytest.raises(DataError, match=r"metrics.json: .*the file is damaged: run the pipeline again"):
         run_status(tmp_path)
@@ -220,7 +221,7 @@ def test_status_refuses_damaged_metrics(text, tmp_path):
 @pytest.mark.parametrize("line", ["null", '{"step": null}', '{"step": 3}', '{"step": "3", "kind": "train"}'])
 def test_damaged_records_are_told_with_their_line(line, tmp_path, caplog):
     (tmp_path / "metrics.jsonl").write_text('{"step": 5, "kind": "train"}\n' + line + "\n")
-    (tmp_path / "status.json").write_text('{"state": "done", "step": 7}')
+    write_status(tmp_path, state="done", step=7)
     fault = r"metrics.jsonl:2: damaged; .*'step' and 'kind'; remove this line"
     with pytest.raises(DataError, match=fault):
         Records(tmp_path).read()
@@ -240,7 +241,7 @@ def test_status_tells_from_files(finished, tmp_path):
     (tmp_path / "pipeline.yaml").write_text("")
     gone = subprocess.Popen([sys.executable, "-c", ""])
     gone.wait()
-    (tmp_path / "status.json").write_text(json.dumps({"state": "running", "step": 7, "steps": 9, "process": gone.pid}))
+    write_status(tmp_path, state="running", step=7, steps=9, process=gone.pid)
     (tmp_path / "metrics.jsonl").write_text('{"step": 5, "kind": "train", "loss": 0.25, "psnr": 20.0}\ncut')
     assert status_text(run_status(tmp_path)) == (
         f"{tmp_path}: killed at step 7 of 9\n"
@@ -249,5 +250,5 @@ def test_status_tells_from_files(finished, tmp_path):
         "  last report: step 5, loss 0.25, psnr 20"
     )
     matrix = {"state": "failed", "cells": 4, "done": 4, "failed": {"a": "no"}, "message": "1 of 4 cells failed"}
-    (tmp_path / "status.json").write_text(json.dumps(matrix))
+    write_status(tmp_path, **matrix)
     assert "failed, 4 of 4 cells, 1 of them failed\n  1 of 4 cells failed\n" in status_text(run_status(tmp_path))

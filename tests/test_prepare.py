@@ -98,6 +98,21 @@ def test_a_step_that_fails_leaves_nothing(photos, tmp_path):
     assert do([Copy(letter="a"), Copy(letter="b")], photos, root) == ("pab", ["b"])
 
 
+@pytest.mark.parametrize("fault", ["no record", "no JSON", "a list", "a file less"])
+def test_a_damaged_result_is_made_again(photos, tmp_path, fault):
+    root, steps = tmp_path / "runs" / "prepared", [Copy(letter="a"), Copy(letter="b")]
+    do(steps, photos, root)
+    last = next(one.folder for one in plan(steps, photos, root) if one.step.letter == "b")
+    record = last / "record.json"
+    (last / "x.txt" if fault == "a file less" else record).unlink()
+    if fault in ("no JSON", "a list"):
+        record.write_text({"no JSON": "{", "a list": "[]"}[fault])
+    assert [one.why for one in plan(steps, photos, root)] == ["", "its result lacks files, or its record"]
+    assert plan([steps[0], Copy(letter="z")], photos, root)[1].why.startswith("letter is z")
+    assert do(steps, photos, root) == ("pab", ["b"])
+    assert do(steps, photos, root) == ("pab", [])
+
+
 def test_what_a_killed_run_left_is_removed(photos, tmp_path):
     root, steps = tmp_path / "runs" / "prepared", [Copy(letter="a")]
     folder = plan(steps, photos, root)[0].folder

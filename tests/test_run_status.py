@@ -10,6 +10,8 @@ import pytest
 
 from clsplat.runs import status as reading
 from clsplat.training.status import Amount, StatusFile
+from tests.refusals import refusal
+from tests.statuses import write_status
 
 pytestmark = pytest.mark.slow
 
@@ -18,10 +20,8 @@ def put(folder: Path, **values) -> dict:
     """Write a status of a run whose process has ended, and return what is found."""
     gone = subprocess.Popen([sys.executable, "-c", ""])
     gone.wait()
-    now = StatusFile(folder, step=7, steps=9).now.model_copy(
-        update={"state": "running", "process": gone.pid, "time": time.time() - 200, **values}
-    )
-    (folder / "status.json").write_text(json.dumps(now.model_dump(exclude_none=True)))
+    killed = {"step": 7, "steps": 9, "state": "running", "process": gone.pid, "time": time.time() - 200}
+    write_status(folder, **{**killed, **values})
     return reading.run_status(folder)
 
 
@@ -76,3 +76,42 @@ def test_the_advice_is_a_command_that_works(state, tmp_path):
 def test_the_step_is_that_of_the_last_report_where_it_is_later(tmp_path):
     (tmp_path / "metrics.jsonl").write_text('{"step": 8, "kind": "train"}\n')
     assert ": failed at step 8 of 9" in reading.status_text(put(tmp_path, state="failed"))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("time", "1e999"),
+        ("time", "NaN"),
+        ("time", "9" * 400),
+        ("seconds_left", "9" * 4000),
+        ("step", "9" * 4000),
+        ("cells", "[]"),
+        ("host", "{}"),
+        ("message", "[1]"),
+        ("state", '"x"'),
+    ],
+)
+def test_a_damaged_status_is_refused(name, value, tmp_path):
+    put(tmp_path, host="a")
+    path = tmp_path / "status.json"
+    status = {**json.loads(path.read_text()), name: "HERE"}
+    path.write_text(json.dumps(status).replace('"HERE"', value))
+    message = refusal(reading.run_status, tmp_path)
+    assert message.startswith(f"{path}: damaged ({name}: ")
+
+
+def test_a_status_of_a_newer_version_is_refused(tmp_path):
+    put(tmp_path)
+    path = tmp_path / "status.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "format": 2}))
+    assert "of a newer clsplat" in refusal(reading.run_status, tmp_path)
+
+
+def test_no_line_holds_what_a_terminal_obeys(tmp_path):
+    (tmp_path / "metrics.jsonl").write_text('{"step": 8, "kind": "train", "loss": ' + "9" * 4000 + "}\n")
+    found = put(tmp_path, host="a", stage="\x1b[2J\x1b[31mhi", silent="x")
+    text = reading.status_text(found)
+    assert "\x1b" not in text
+    assert "[31mhi" in text
+    assert max(map(len, text.splitlines())) <= 1010

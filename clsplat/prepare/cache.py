@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from clsplat import lock
-from clsplat.errors import DataError, OutputError
+from clsplat.errors import DataError
 from clsplat.files import make_folder, sweep, sync_below, sync_folder, unwritable, write_text
 from clsplat.names import NOTE
 from clsplat.prepare.steps import Step
@@ -72,7 +72,7 @@ def prepare(
     for number, one in enumerate(planned):
         count.reach(number)
         with _only_one_making(one) if one.why else nullcontext():
-            if one.why and not (one.folder / RECORD).is_file():  # made by another process since
+            if one.why and not _is_whole(one.folder):  # or made by another process since
                 with begun(one.step.stage):
                     _do(one, source, root)
             else:
@@ -144,9 +144,12 @@ def _do(one: Planned, source: Path, root: Path) -> None:
         summary = one.step.make(source.resolve(), temporary, root.parent)
         seconds = round(time.perf_counter() - start, 1)
         settings = one.step.model_dump(mode="json")
-        record = {"origin": one.origin, "inputs": one.inputs, "settings": settings, "seconds": seconds, **summary}
+        files = sorted(path.relative_to(temporary).as_posix() for path in temporary.rglob("*") if not path.is_dir())
+        made = {"origin": one.origin, "inputs": one.inputs, "settings": settings, "seconds": seconds, **summary}
         sync_below(temporary)
-        write_text(temporary / RECORD, json.dumps(record, indent=1) + "\n")
+        write_text(temporary / RECORD, json.dumps({**made, "files": files}, indent=1) + "\n")
+        if one.folder.exists():  # a damaged result
+            shutil.rmtree(one.folder)
         os.replace(temporary, one.folder)
         sync_folder(one.folder.parent)
     except BaseException as error:
@@ -158,22 +161,38 @@ def _do(one: Planned, source: Path, root: Path) -> None:
     LOG.info("%s: %s  %.0f s", one.step.stage, one.step.told(summary), seconds)
 
 
+def record_of(folder: Path) -> dict[str, Any]:
+    """The record of a result; empty where there is none, or a damaged one."""
+    try:
+        record = read_json(folder / RECORD)
+    except DataError:
+        return {}
+    is_one = isinstance(record, dict) and isinstance(record.get("settings"), dict)
+    return record if is_one and isinstance(record.get("files", []), list) else {}
+
+
+def _is_whole(folder: Path) -> bool:
+    """Whether a result has its record, and all the files that it lists."""
+    record = record_of(folder)
+    return bool(record) and all(os.path.exists(folder / str(name)) for name in record.get("files", []))
+
+
 def _why(step: Step, inputs: str, folder: Path, source: Path) -> str:
     """The reason to run a step, "" when its result exists: the difference from the newest result."""
-    if (folder / RECORD).is_file():
-        return ""
+    if folder.exists():
+        return "" if _is_whole(folder) else "its result lacks files, or its record"
     found = []
-    for path in folder.parent.glob(f"{step.stage}-*/{RECORD}"):
-        record = read_json(path, "the record of a result, or no such folder", OutputError)
+    for other in folder.parent.glob(f"{step.stage}-*"):
+        record = record_of(other)
         if record.get("origin") == str(source.resolve()):
-            found.append((path.stat().st_mtime, record))
+            found.append((other.stat().st_mtime, record))
     if not found:
         return "no result yet"
     before = max(found, key=lambda pair: pair[0])[1]
     for name, value in step.model_dump(mode="json").items():
         if before["settings"].get(name) != value:
             return f"{name} is {value}, was {before['settings'].get(name)}"
-    return "its input has changed" if before["inputs"] != inputs else "the step itself has changed"
+    return "its input has changed" if before.get("inputs") != inputs else "the step itself has changed"
 
 
 def _digest(data: Any) -> str:

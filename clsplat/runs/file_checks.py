@@ -4,8 +4,6 @@ import stat
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
-
 from clsplat import plugins
 from clsplat.compare.run_folder import read_metrics
 from clsplat.errors import DataError, shortened
@@ -20,7 +18,7 @@ from clsplat.scene.identity import Identity
 from clsplat.scene.images import read_image
 from clsplat.training import archive, checkpoint
 from clsplat.training.records import Records
-from clsplat.training.status import FORMAT, Status
+from clsplat.training.status import status_of
 
 
 def require(path: Path, kind: int = stat.S_IFREG) -> None:
@@ -53,14 +51,9 @@ def settings_file(path: Path, settings: dict[str, Any], expected: str | None) ->
 
 
 def status_file(path: Path) -> str:
-    status = read_json(path)
-    if isinstance(status, dict) and type(made := status.get("format")) is int and made > FORMAT:
-        return f"not checked further: format {made}, of a newer clsplat"
-    try:
-        return Status.model_validate(status).state
-    except ValidationError as error:
-        first = error.errors()[0]
-        raise DataError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from error
+    content = read_json(path)
+    status = status_of(content)
+    return status.state if status else f"not checked further: format {content['format']}, of a newer clsplat"
 
 
 def checkpoint_file(path: Path) -> str:

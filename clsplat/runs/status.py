@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import Any
 
 from clsplat.compare.run_folder import read_metrics
-from clsplat.errors import DataError
-from clsplat.names import END_STATES, METRICS, PIPELINE
+from clsplat.errors import DataError, one_line
+from clsplat.names import END_STATES, METRICS, PIPELINE, STATUS
 from clsplat.processes import Owner
 from clsplat.training import checkpoint
 from clsplat.training.records import Records
-from clsplat.training.status import read_status
+from clsplat.training.status import read_status, status_of
 
 LOG = logging.getLogger("clsplat")
 SILENT = 60  # seconds without a heartbeat that are worth a line
@@ -22,14 +22,21 @@ def run_status(out: Path) -> dict[str, Any]:
 
     state: as there, or killed where its process on this machine has ended; silent: seconds since the heartbeat of a run
     that has not ended, on whatever machine it runs.
-    Raises DataError when the folder holds no run, or a damaged metrics.json.
+    Raises DataError when the folder holds no run, or a damaged status.json or metrics.json.
     """
     status = read_status(out)
-    if not isinstance(status.get("state"), str):
+    if not status:
         raise DataError(f"{out}: has no readable status.json; expected the folder of a run")
+    try:
+        known = status_of(status)
+    except DataError as error:
+        raise DataError(f"{out / STATUS}: damaged ({error}); `clsplat check {out}` tells what else is") from error
+    if known is None:
+        raise DataError(f"{out / STATUS}: of a newer clsplat; update clsplat to read it")
     status["state"] = state_of(status)
-    if status["state"] not in (*END_STATES, "killed") and isinstance(status.get("time"), int | float):
-        status["silent"] = max(0, round(time.time() - status["time"]))
+    status.pop("silent", None)
+    if status["state"] not in (*END_STATES, "killed"):
+        status["silent"] = max(0, round(time.time() - known.time))
     metrics = None
     if (out / METRICS).exists():
         metrics = read_metrics(out / METRICS).model_dump(exclude_unset=True)
@@ -66,7 +73,7 @@ def status_text(status: dict[str, Any]) -> str:
     for split in ("test", "train"):
         for downscale, figures in ((status["metrics"] or {}).get(split) or {}).items():
             lines.append(f"  {split} 1/{downscale}: {_figures(figures, ('psnr', 'ssim', 'lpips', 'views'))}")
-    return "\n".join(lines)
+    return "\n".join(line[: len(line) - len(line.lstrip())] + one_line(line) for line in lines)
 
 
 def _advice(status: dict[str, Any]) -> str:

@@ -10,9 +10,9 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from clsplat import __version__
 from clsplat.errors import DataError, OutputError
@@ -25,6 +25,8 @@ LOG = logging.getLogger("clsplat")
 FORMAT: Literal[1] = 1
 BEAT = 5.0  # seconds between two writes of a run that goes on
 Item = TypeVar("Item")
+Whole = Annotated[int, Field(ge=0, lt=1 << 63)]
+Seconds = Annotated[float, Field(gt=-1e15, lt=1e15)]
 
 
 class Amount(BaseModel):
@@ -32,9 +34,9 @@ class Amount(BaseModel):
 
     model_config = ConfigDict(frozen=True)
 
-    done: int
+    done: Whole
     """Number of units that are done."""
-    total: int
+    total: Whole
     """Number of units in all."""
     unit: str
     """What is counted, in words: steps, views, cells, photographs decoded, …"""
@@ -55,19 +57,19 @@ class Status(BaseModel):
     """Stage or step of `prepare` in progress, or the last that was; of a matrix, the cell."""
     progress: Amount | None = None
     """How much of that stage is done, where it can be counted."""
-    step: int | None = None
+    step: Whole | None = None
     """Training steps done, of all stages; not of a matrix."""
-    steps: int | None = None
+    steps: Whole | None = None
     """Step at which the training in progress ends."""
-    gaussians: int | None = None
+    gaussians: Whole | None = None
     """Number of Gaussians at the last report."""
-    seconds_left: float | None = None
+    seconds_left: Seconds | None = None
     """Time that the training in progress still needs, estimated at the last report; in a preparation, its step."""
     checkpoint: str | None = None
     """Newest checkpoint that was saved, a file in the folder `checkpoints`."""
-    cells: int | None = None
+    cells: Whole | None = None
     """Number of cells; of a matrix alone."""
-    done: int | None = None
+    done: Whole | None = None
     """Number of cells that have ended; of a matrix alone."""
     failed: dict[str, str] | None = None
     """Names of the cells that failed, and why; of a matrix alone."""
@@ -81,17 +83,17 @@ class Status(BaseModel):
     """Version of clsplat."""
     host: str
     """Name of the machine, or of the container."""
-    process: int
+    process: Whole
     """Number of the process on that machine."""
     pid_namespace: str | None = None
     """Linux: where that number counts; containers on one machine have their own."""
     boot: str | None = None
     """Linux: the start of the machine at which that number was given; the next one begins anew."""
-    started: float
+    started: Seconds
     """When this process began with the run."""
-    changed: float
+    changed: Seconds
     """When state, stage, progress or step last changed."""
-    time: float
+    time: Seconds
     """Heartbeat: when this file was written; at least every 10 s while the process lives."""
 
 
@@ -244,6 +246,20 @@ def read_status(out: Path) -> dict[str, Any]:
     except DataError:
         return {}
     return status if isinstance(status, dict) else {}
+
+
+def status_of(content: Any) -> Status | None:
+    """Return what a status.json holds; None where a newer version wrote it.
+
+    Raises DataError with the first field that is wrong.
+    """
+    if isinstance(content, dict) and type(made := content.get("format")) is int and made > FORMAT:
+        return None
+    try:
+        return Status.model_validate(content)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise DataError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from error
 
 
 def status_schema() -> dict[str, Any]:
