@@ -4,6 +4,7 @@ import base64
 import json
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -19,6 +20,7 @@ from clsplat.errors import ClsplatError, ConfigError, DataError
 from clsplat.pipeline.loading import load
 from clsplat.scene.detect import read_scene
 from clsplat.scene.images import write_image
+from clsplat.scene.lens import Lens
 from clsplat.scene.view import load_image
 from tests.html_page import HOSTILE, Page
 from tests.test_cli import clsplat
@@ -140,6 +142,21 @@ def test_a_single_run_is_held_against_the_photograph(make_run):
     found = crops_of(make_run("alone", error=60))
     assert len(found) == 2
     assert all(len(crop.psnrs) == 1 and crop.psnrs[0] < 20 for crop in found)
+
+
+def test_renders_of_a_bent_lens_are_pinhole_images(make_run):
+    folder = make_run("bent", error=0)
+    run = RunFolder.read(folder)
+    scene, background = run.scene.read(run.photographs)
+    views = []
+    for view in scene.views:
+        taken = load_image(view, WHITE).shape
+        lens = Lens(taken[1], taken[0], "SIMPLE_RADIAL", (40.0, taken[1] / 2, taken[0] / 2, 0.2))
+        views.append(replace(view, lens=lens, camera=lens.pinhole))
+        if (folder / "renders" / f"{view.name}.png").is_file():
+            write_image(folder / "renders" / f"{view.name}.png", load_image(views[-1], WHITE))
+    found = crops.find_crops([run], replace(scene, views=tuple(views)), background)
+    assert [crop.psnrs for crop in found] == [[100.0]] * 2
 
 
 def test_the_page_of_a_single_run_speaks_of_no_best_and_no_seeds(make_run, tmp_path):

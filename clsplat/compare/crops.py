@@ -78,7 +78,7 @@ def find_crops(runs: Sequence[RunFolder], scene: Scene, background: Background) 
     rendered = [view for view in scene.views if all(_file(run, view).is_file() for run in runs)]
     chosen: list[Crop] = []  # these and one more view are in memory at a time
     for view in rendered:
-        renders = [load_image(replace(view, image_path=_file(run, view))) for run in runs]
+        renders = [load_image(replace(view, image_path=_file(run, view), lens=None)) for run in runs]  # a pinhole's
         chosen.append(_crop(view.name, load_image(view, BACKGROUNDS[background]), renders))
         chosen = sorted(chosen, key=lambda crop: -crop.difference)[:MAX_CROPS]
     return chosen
