@@ -52,12 +52,12 @@ def read_glb(path: Path) -> SplatFile:
         found = Gltf(path, tree, binary)
         parts = [_parameters(path, found, primitive) for primitive in found.primitives]
         degrees = {part["sh_rest"].shape[1] for part in parts}
+        extras = tree.get("asset", {}).get("extras")
     except (ValueError, KeyError, IndexError, TypeError, AttributeError, RecursionError, OverflowError) as error:
         raise DataError(f"{path}: its JSON is damaged ({quoted(error)}); copy or export the file again") from error
     if len(degrees) > 1:
         raise DataError(f"{path}: its parts have different SH degrees; expected one: export them apart")
     parameters = flipped({name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
-    extras = tree.get("asset", {}).get("extras")
     ours = extras.get("clsplat") if isinstance(extras, dict) else None
     rendering = checked_numbers(path, ours) if isinstance(ours, dict) else {}
     return SplatFile(parameters, rendering, "mip" if rendering.get("compensate") else "default", found.placement)

@@ -14,7 +14,6 @@ EXTENSION = "KHR_gaussian_splatting"
 PREFIX = f"{EXTENSION}:"
 COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
-MAX_DEPTH = 64  # of nodes
 FLIP = np.diag([1.0, -1, -1, 1])  # between the axes of glTF and those of a PLY
 
 
@@ -74,17 +73,29 @@ class Gltf:
         """The meshes of the scene, each with the matrix of its node."""
         nodes = self.tree["nodes"]
         found: list[tuple[int, NDArray[np.float64]]] = []
-        roots = self.tree["scenes"][_index(self.tree.get("scene", 0))]["nodes"] if "scenes" in self.tree else []
-        waiting = [(_index(root), np.eye(4), 0) for root in roots or range(len(nodes))]
+        seen: set[int] = set()
+        waiting = [(_index(root), np.eye(4)) for root in self._roots()]
         while waiting:
-            number, above, depth = waiting.pop()
-            if depth > MAX_DEPTH or len(found) > len(nodes):
-                raise DataError(f"{self.path}: its nodes are no tree; export it again")
+            number, above = waiting.pop()
+            if number in seen:
+                raise DataError(f"{self.path}: its nodes are no tree, node {number} occurs twice; export it again")
+            seen.add(number)
             matrix = above @ _matrix(nodes[number])
+            if not np.isfinite(matrix).all():
+                raise DataError(
+                    f"{self.path}: node {number} has no finite place; expected finite numbers: export it again"
+                )
             if "mesh" in nodes[number]:
                 found.append((_index(nodes[number]["mesh"]), matrix))
-            waiting += [(_index(child), matrix, depth + 1) for child in nodes[number].get("children", [])]
+            waiting += [(_index(child), matrix) for child in nodes[number].get("children", [])]
         return found
+
+    def _roots(self) -> list[int]:
+        """The nodes of the scene; without one, those that are nobody's child."""
+        if "scenes" in self.tree and (roots := self.tree["scenes"][_index(self.tree.get("scene", 0))]["nodes"]):
+            return list(roots)
+        nodes = self.tree["nodes"]
+        return sorted(set(range(len(nodes))) - {child for node in nodes for child in node.get("children", [])})
 
 
 def _index(value: Any) -> int:

@@ -161,6 +161,14 @@ REFUSED = {
     "negative": (change(["bufferViews", 0, "byteOffset"], -4), "its JSON is damaged"),
     "text": (change(["nodes", 0], "x"), "its JSON is damaged"),
     "circle": (change(["nodes", 0], {"children": [0]}), "no tree"),
+    "doubled": (change(["nodes"], [*({"children": [i + 1] * 2} for i in range(50)), {}]), "no tree"),
+    "shared": (change(["nodes"], [{"children": [1, 2]}, {"children": [2]}, {"mesh": 0}]), "node 2 occurs twice"),
+    "no place": (change(["nodes", 0, "translation"], [float("nan"), 0, 0]), "node 0 has no finite place"),
+    "far place": (
+        change(["nodes"], [{"children": [1], "scale": [1e200] * 3}, {"mesh": 0, "scale": [1e200] * 3}]),
+        "node 1 has no finite place",
+    ),
+    "asset": (change(["asset"], []), "its JSON is damaged"),
     "no splats": (change(["meshes", 0, "primitives", 0, "extensions"], {}), "holds no Gaussians"),
     "kernel": (change(["meshes", 0, "primitives", 0, "extensions", KHR, "kernel"], "box"), "kernel is 'box'"),
     "elsewhere": (change(["buffers", 0, "uri"], "a.bin"), "in the file itself"),
@@ -176,6 +184,15 @@ def test_a_damaged_glb_is_refused(fault, tmp_path, rng):
     (tmp_path / "a.glb").write_bytes(glued(tree, binary))
     with pytest.raises(DataError, match=words):
         read(tmp_path / "a.glb")
+
+
+def test_nodes_without_a_scene_stand_in_their_parents(tmp_path, rng):
+    _, path = moved(tmp_path, rng, translation=[1, 0, 0])
+    tree, binary = parts(path.read_bytes())
+    del tree["scenes"], tree["scene"]
+    expected = load(path).means
+    path.write_bytes(glued(tree, binary))
+    np.testing.assert_array_equal(load(path).means, expected)
 
 
 def test_a_cut_glb_is_refused(tmp_path, rng):
