@@ -29,7 +29,6 @@ LOG = logging.getLogger("clsplat")
 HEADER4 = 32  # bytes, of version 4
 GZIP_RATIO, ZSTD_RATIO = 1032, 1 << 17  # most bytes that one byte of a stream can stand for
 ADOBE_AXES = 0xADBE0003  # an extension that changes the axes
-MAX_FRACTION, FINE_FRACTION = 12, 20  # bits; the second for quality high
 EXPECTED = "an SPZ file"
 
 
@@ -50,8 +49,7 @@ def write_spz(path: Path, splats: SplatFile, options: Writing) -> str:
     """Write splats along a Morton curve.  Raises OutputError; DataError where positions are too large."""
     require_some(path, splats)
     p = splats.rows(morton_order(splats.parameters["means"])).parameters
-    most = FINE_FRACTION if options.quality == "high" else MAX_FRACTION
-    fraction = fraction_of(path, p["means"], most)
+    fraction = fraction_of(path, p["means"], options.quality == "high")
     planes = packed(path, flipped(p) if options.axes == "spz" else p, fraction, options)
     numbers = (options.spz_version, len(splats), splats.sh_degree, fraction, MIP if splats.mode == "mip" else 0)
     start = MAGIC + struct.pack("<2I3B", *numbers)

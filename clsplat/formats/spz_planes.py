@@ -20,6 +20,7 @@ HEADER = 16  # bytes
 STORED_DEGREE = 4  # which the format knows; bands beyond MAX_DEGREE are dropped
 COLOUR = 0.15
 MAX_INT24 = 2**23 - 1
+FRACTION, FINE_FRACTION = 12, 20  # bits of positions; the second for quality high
 QUALITY = {"small": (6, 5), "balanced": (8, 8), "high": (8, 8)}  # bits of band 1 and of the others
 
 
@@ -89,12 +90,23 @@ def _four_bytes(packed: NDArray[np.uint8]) -> NDArray[np.float32]:
     return np.roll(xyzw, 1, axis=1)
 
 
-def fraction_of(path: Path, means: NDArray[np.float32], most: int) -> int:
-    """Return bits after the point with which every position fits into 24, at most so many.  Raises DataError."""
+def fraction_of(path: Path, means: NDArray[np.float32], fine: bool) -> int:
+    """Return bits after the point with which every position fits into 24; where they are few, say so.
+
+    Raises DataError for positions that do not fit without any.
+    """
     largest = float(np.abs(means).max(initial=0))
-    bits = min(most, 22 - math.ceil(math.log2(max(largest, 1e-9))))
+    bits = min(FINE_FRACTION if fine else FRACTION, math.floor(math.log2(MAX_INT24 / max(largest, 1e-9))))
     if bits < 0:
-        raise DataError(f"{path}: SPZ holds positions to {MAX_INT24 // 2}; the model has {largest:g}: crop it")
+        raise DataError(f"{path}: SPZ holds positions to {MAX_INT24}; the model has {largest:g}: crop it")
+    if bits < FRACTION:
+        LOG.warning(
+            "%s: a position of %g leaves steps of %g scene units to all, not of %g; a crop keeps them finer",
+            path,
+            largest,
+            2.0**-bits,
+            2.0**-FRACTION,
+        )
     return bits
 
 

@@ -78,14 +78,17 @@ def test_bits_of_harmonics_are_a_choice(tmp_path, rng, bits, band1, others):
 
 
 def test_positions_get_the_bits_that_they_need(tmp_path, rng, caplog):
-    for largest, fraction in ((1.0, 12), (1000.0, 12), (5000.0, 9), (4e6, 0)):
+    for largest, fraction in ((1.0, 12), (2047.0, 12), (2049.0, 11), (4095.0, 11), (5000.0, 10), (8388607.0, 0)):
         source = splats(rng, 50)
+        caplog.clear()
         source.parameters["means"][0] = largest
         found = there_and_back(tmp_path / "a.spz", source).parameters["means"]
         expected = source.rows(morton_order(source.parameters["means"])).parameters["means"]
         assert np.abs(found - expected).max() <= 2.0 ** -(fraction + 1)
-    source.parameters["means"][0] = 1e8
-    with pytest.raises(DataError, match="crop it"):
+        lost = f"a position of {largest:g} leaves steps of {2.0**-fraction:g} scene units to all, not of 0.000244141"
+        assert (lost in caplog.text) == bool(caplog.text) == (fraction < 12)
+    source.parameters["means"][0] = 8388608.0
+    with pytest.raises(DataError, match=r"SPZ holds positions to 8388607; the model has 8\.38861e\+06: crop it"):
         write(tmp_path / "a.spz", source)
     source = splats(rng, 50)
     fine = there_and_back(tmp_path / "a.spz", source, Writing(quality="high")).parameters["means"]
