@@ -33,7 +33,7 @@ ALLOWED = {  # module and function -> why it reads by itself
     "clsplat/conformance/worker.py:_only_reader_of_stdin": "opens the null device",
     "clsplat/lock.py:check_free": "locks what it opens",
     "clsplat/lock.py:_opened": "opens for writing too",
-    "clsplat/formats/sog.py:_files": "takes the bytes that `reading` has read",
+    "clsplat/formats/sog_files.py:sog_files": "takes the bytes that `reading` has read",
     "clsplat/formats/sog_writing.py:_zipped": "writes",
     "clsplat/video/encoding.py:opened": "syncs what it has written",
     "clsplat/video/encoding.py:frames_of": "decodes what was written before",

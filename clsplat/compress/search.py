@@ -15,7 +15,7 @@ from clsplat.errors import ConfigError, DataError
 from clsplat.files import is_there, unwritable, write_text
 from clsplat.formats.output import written
 from clsplat.formats.splats import Writing
-from clsplat.formats.table import located
+from clsplat.formats.table import bytes_of, located
 from clsplat.gaussians.clusters import DeviceClusters
 from clsplat.gaussians.model import Model, load
 from clsplat.metrics.views import mean, measure
@@ -110,7 +110,7 @@ def compress(
     question: dict[str, Any] = {"model": str(source.file), "sha256": sha256(located(source.file))}
     question |= {"scene": str(source.folder), "keeps": shares, "steps": steps}
     _claim(out, question)
-    size = _bytes(source.file)
+    size = bytes_of(source.file)
     whole = Point(source.file.name, 1, first.sh_degree, "", len(first), size, *measurer.figures(first))
     search = Search(out, wanted, question, whole, measurer.split)
     ladder = Ladder(out, source, first, steps, opened.device)
@@ -123,11 +123,6 @@ def compress(
         if wanted.ends(rung, whole.psnr) and keep < 1:
             break
     return _finished(search, form)
-
-
-def _bytes(model: Path) -> int:
-    """The size of a model file, or of a folder of SOG."""
-    return sum(path.stat().st_size for path in (model.iterdir() if model.is_dir() else [model]))
 
 
 def _measured(trials: Path, model: Model, keep: float, form: Format, measurer: Measurer) -> list[Point]:

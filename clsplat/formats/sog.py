@@ -8,13 +8,8 @@
 In version 1 scales, sh0, the logit of opacity, and shN lie between a least and a largest value, in 8 bits.
 """
 
-import io
 import json
 import math
-import zipfile
-import zlib
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -25,19 +20,13 @@ from clsplat.errors import DataError, quoted
 from clsplat.formats import webp
 from clsplat.formats.packing import from_smallest_three
 from clsplat.formats.ply import checked_numbers
-from clsplat.formats.splats import MAX_DEGREE, MAX_FILE, SplatFile, logits, sh_coefficients
-from clsplat.reading import read_file
+from clsplat.formats.sog_files import META, PARTS, SLACK, Files, is_beside, sog_files
+from clsplat.formats.splats import MAX_DEGREE, SplatFile, logits, sh_coefficients
 
-META = "meta.json"
-MAX_META = 1 << 24  # bytes
-MAX_IMAGE = 1 << 30
-RATIO = 1032  # most bytes that one byte of a ZIP can stand for
-PIXELS_PER_BYTE = 32  # of all images; real ones have less than one
-SLACK = 1 << 16  # px beyond what the numbers need
+PIXELS_PER_BYTE = 16  # of all images; real ones have less than one
 PER_ROW = 64  # centroids
 WIDTHS = {3: 1, 8: 2, 15: 3}  # degree by coefficients of a centroid
 ROTATED = 252  # alpha of a quaternion whose largest component is w
-Files = Callable[[str], bytes]
 
 
 def looks_like_sog(data: bytes) -> bool:
@@ -47,39 +36,12 @@ def looks_like_sog(data: bytes) -> bool:
 
 def read_sog(path: Path) -> SplatFile:
     """Read a `.sog`, or the meta.json of a folder.  Raises DataError when it is missing or damaged."""
-    with _files(path) as files:
+    with sog_files(path) as files:
         try:
-            meta = json.loads(files(META))
+            meta = json.loads(files.read(META))
         except (ValueError, RecursionError) as error:
             raise DataError(f"{path}: {META} is no JSON; copy or export the file again") from error
         return _Sog(path, meta, files).splats()
-
-
-@contextmanager
-def _files(path: Path) -> Iterator[Files]:
-    """What reads a file of the ZIP or of the folder by its name."""
-    if path.name == META:
-        yield lambda name: read_file(path.with_name(name), "a file of a SOG", limit=MAX_IMAGE)
-        return
-    data = read_file(path, "a .sog file", limit=MAX_FILE)
-    try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            yield lambda name: _member(path, archive, name, RATIO * len(data))
-    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, RuntimeError, ValueError, KeyError) as error:
-        raise DataError(f"{path}: a damaged ZIP ({quoted(error)}); copy or export the file again") from error
-
-
-def _member(path: Path, archive: zipfile.ZipFile, name: str, limit: int) -> bytes:
-    """The bytes of a file in the ZIP, wherever it lies in it."""
-    found = [one for one in archive.infolist() if one.filename.rpartition("/")[2] == name]
-    if not found:
-        raise DataError(f"{path}: has no {quoted(name)}; expected the files that {META} names: export it again")
-    with archive.open(found[0]) as member:
-        most = min(limit, MAX_META if name == META else MAX_IMAGE)
-        data = member.read(most + 1)
-    if len(data) > most:
-        raise DataError(f"{path}: {quoted(name)} has more than {most} bytes; export it again")
-    return data
 
 
 class _Sog:
@@ -93,10 +55,9 @@ class _Sog:
         if version not in (1, 2):
             raise DataError(f"{path}: SOG of version {quoted(version)}; expected 1 or 2: export it again")
         self.count = self._whole("count", first[0] if self.old and first else meta.get("count"))
-        self.images = {name: self._data(name) for name in ("means", "scales", "quats", "sh0")}
-        bytes_held = sum(len(data) for group in self.images.values() for data in group)
-        if self.count > SLACK + PIXELS_PER_BYTE * bytes_held:
-            raise DataError(f"{path}: declares {self.count} splats; its images have {bytes_held} bytes: copy it again")
+        self.images = {name: self._data(name) for name in PARTS}
+        if self.count > SLACK + PIXELS_PER_BYTE * files.size:
+            raise DataError(f"{path}: declares {self.count} splats; its files have {files.size} bytes: copy it again")
 
     def splats(self) -> SplatFile:
         """Everything, as parameters."""
@@ -200,9 +161,9 @@ class _Sog:
         names = self._part(name).get("files")
         if not isinstance(names, list) or not 1 <= len(names) <= 2 or not all(isinstance(one, str) for one in names):
             raise DataError(f"{self.path}: {name}.files is {quoted(names)}; expected the names of one or two files")
-        if wrong := [one for one in names if one != Path(one).name or "\\" in one or not one.strip(".")]:
+        if wrong := [one for one in names if not is_beside(one)]:
             raise DataError(f"{self.path}: {name}.files has {quoted(wrong[0])}; expected the name of a file beside it")
-        return [self.files(one) for one in names]
+        return [self.files.read(one) for one in names]
 
     def _ends(self, name: str, count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         part = self._part(name)

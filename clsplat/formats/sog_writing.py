@@ -3,6 +3,8 @@
 import io
 import json
 import zipfile
+from contextlib import suppress
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -13,17 +15,23 @@ from clsplat.formats import webp
 from clsplat.formats.output import written
 from clsplat.formats.packing import morton_order, smallest_three
 from clsplat.formats.palette import codebook, nearest, palette
-from clsplat.formats.sog import META, PER_ROW, ROTATED
+from clsplat.formats.sog import PER_ROW, ROTATED
+from clsplat.formats.sog_files import META, with_images
 from clsplat.formats.splats import Parameters, SplatFile, Writing, opacities, require_some, unit
 
 PALETTES = {"small": 1024, "balanced": 4096, "high": 16384}  # entries at most
 SMALLEST = 1024  # entries for so many splats, and twice as many for twice as many
+DIGITS = 16  # of the SHA-256 of an image in a folder, in its name
 EPOCH = (1980, 1, 1, 0, 0, 0)  # of files in the ZIP: the same model gives the same bytes
 
 
 def write_sog(path: Path, splats: SplatFile, options: Writing) -> str:
-    """Write a `.sog`, or where the name is meta.json the files of a folder, it last.  Raises OutputError, DataError."""
+    """Write a `.sog`, or where the name is meta.json the files of a folder.  Raises OutputError, DataError.
+
+    The images of a folder have their content in their names, so that none of another model is replaced.
+    """
     require_some(path, splats)
+    in_folder = path.name == META
     p = splats.rows(morton_order(splats.parameters["means"])).parameters
     width = -(-int(np.ceil(np.sqrt(len(splats)))) // 4) * 4
     images: dict[str, bytes] = {}
@@ -36,8 +44,10 @@ def write_sog(path: Path, splats: SplatFile, options: Writing) -> str:
     def image(name: str, *planes: NDArray[Any], across: int = width) -> str:
         pixels = np.full((len(planes[0]), 4), 255, np.uint8)
         pixels[:, : len(planes)] = np.stack(planes, axis=1)
-        images[f"{name}.webp"] = webp.encode(path, pixels, across)
-        return f"{name}.webp"
+        data = webp.encode(path, pixels, across)
+        name += f"_{sha256(data).hexdigest()[:DIGITS]}" * in_folder + ".webp"
+        images[name] = data
+        return name
 
     meta["means"] = _means(p, image)
     largest, others = smallest_three(unit(p["quats"]))
@@ -50,13 +60,27 @@ def write_sog(path: Path, splats: SplatFile, options: Writing) -> str:
     if p["sh_rest"].shape[1]:
         meta["shN"] = _harmonics(p["sh_rest"], options, image)
     images[META] = json.dumps(meta, separators=(",", ":"), sort_keys=True).encode()
-    if path.name == META:
-        files = {path.with_name(name): data for name, data in images.items()}  # meta.json is the last
-    else:
-        files = {path: _zipped(images)}
-    for place, data in files.items():
-        with written(place) as file:
-            file.write(data)
+    return _write_beside(path, images) if in_folder else _write(path, _zipped(images))
+
+
+def _write_beside(path: Path, images: dict[str, bytes]) -> str:
+    """Write images and then their meta.json: until it is renamed, the model before is whole.  Images of no use go."""
+    before, new = set(with_images(path)), {path.with_name(name) for name in images}
+    kept = before
+    try:
+        sums = [_write(path.with_name(name), data) for name, data in images.items()]
+        kept = new
+    finally:
+        for one in (before | new) - kept - set(with_images(path)):
+            if one.suffix == ".webp":
+                with suppress(OSError):
+                    one.unlink()
+    return sums[-1]
+
+
+def _write(path: Path, data: bytes) -> str:
+    with written(path) as file:
+        file.write(data)
     return file.sha256
 
 

@@ -12,7 +12,8 @@ from clsplat.formats.compressed_ply import is_compressed, read_compressed_ply, w
 from clsplat.formats.glb import read_glb, write_glb
 from clsplat.formats.ksplat import looks_like_ksplat, read_ksplat
 from clsplat.formats.ply import read_ply, write_ply
-from clsplat.formats.sog import META, looks_like_sog, read_sog
+from clsplat.formats.sog import looks_like_sog, read_sog
+from clsplat.formats.sog_files import META, with_images
 from clsplat.formats.sog_writing import write_sog
 from clsplat.formats.splat import looks_like_splat, read_splat, write_splat
 from clsplat.formats.splats import MIP_VARIANCE, NEAR, VARIANCE, Reading, SplatFile, Writing, not_finite
@@ -132,6 +133,12 @@ def located(path: Path) -> Path:
     return path / META if path.is_dir() and (path / META).is_file() else path
 
 
+def bytes_of(path: Path) -> int:
+    """Return the size of a model: of a folder of SOG that of its meta.json and of the images that it names."""
+    place = located(path)
+    return sum(one.stat().st_size for one in (with_images(place) if place.name == META else [place]))
+
+
 def detect(path: Path) -> Codec | None:
     """Return the format of a file by its content, or None.  Raises DataError when it cannot be read."""
     with opened(path, "a model file") as file:
@@ -180,7 +187,9 @@ def write(path: Path, splats: SplatFile, options: Writing | None = None) -> str:
 
     Returns the SHA-256 of what was written, of a folder of SOG that of its meta.json.
 
-    A world filter must be part of the scales and opacities already, but for a PLY.  Raises ConfigError and OutputError.
+    Raises ConfigError for a name of no format, DataError for a model that the format cannot hold, OutputError where
+    the file cannot be written, and ValueError for a world filter that is not part of the scales and opacities already:
+    a PLY alone holds one.
     """
     codec = for_writing(path)
     assert codec.write is not None

@@ -15,6 +15,7 @@ FLAT = 1e-6  # scene units: a smaller scale is that of a disc or a needle
 FAINT = 0.999 / 255  # opacity: less is not drawn
 LARGE = 0.05  # of the model's extent: linear scales, taken for logarithms, become larger
 NEARLY_ALL = 0.99
+DEGENERATE = {"not_finite": "not finite", "no_rotation": "without rotation", "flat": "flat", "invisible": "invisible"}
 
 
 def is_model(path: Path) -> bool:
@@ -74,8 +75,8 @@ def lines(found: dict[str, Any]) -> str:
         text = (", ".join(f"{value:.4g}" for value in corner) for corner in (low, high))
         rows.append(f"  {'bounds':<12} ({next(text)}) to ({next(text)})")
     counts = found["degenerate"]
-    rows.append(f"  {'degenerate':<12} " + ", ".join(f"{number} {name}" for name, number in counts.items()))
-    return "\n".join(rows).replace("not_finite", "not finite").replace("no_rotation", "without rotation")
+    rows.append(f"  {'degenerate':<12} " + ", ".join(f"{counts[name]} {words}" for name, words in DEGENERATE.items()))
+    return "\n".join(rows)
 
 
 def verdict(found: dict[str, Any]) -> str:

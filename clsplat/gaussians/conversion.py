@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from clsplat.errors import ConfigError, DataError, quoted
 from clsplat.formats.splats import MAX_DEGREE, Reading, Writing, with_degree
-from clsplat.formats.table import detect, for_writing
+from clsplat.formats.table import bytes_of, detect, for_writing
 from clsplat.gaussians.model import Model, load
+from clsplat.gaussians.run_model import model_at
 
 LOG = logging.getLogger("clsplat")
 WORDS = ("scale", "rotate", "translate")
@@ -81,9 +82,9 @@ def convert(
     reading, writing = (options or Options()).of(sources, out)
     models = [load(source, reading) for source in sources]
     model = (changes or Changes()).of(merged(models, [str(source) for source in sources]))
+    size = sum(bytes_of(model_at(source)) for source in sources)
     model.save(out, writing)
-    size = sum(_bytes(source) for source in sources)
-    return {"file": str(out), "format": codec.name, "gaussians": len(model), "bytes": _bytes(out), "bytes_read": size}
+    return {"file": str(out), "format": codec.name, "gaussians": len(model), "bytes": bytes_of(out), "bytes_read": size}
 
 
 def merged(models: Sequence[Model], names: Sequence[str]) -> Model:
@@ -186,12 +187,5 @@ def checked_degree(degree: int | None) -> int | None:
 
 def _reads_spz(sources: Sequence[Path]) -> bool:
     """Whether one of the files is an SPZ file."""
-    found = [detect(source) for source in sources if source.is_file()]
+    found = [detect(place) for place in map(model_at, sources) if place.is_file()]
     return any(codec is not None and codec.name == "SPZ" for codec in found)
-
-
-def _bytes(path: Path) -> int:
-    """The size of a file, or of the files of a folder or beside a meta.json."""
-    if path.is_dir():
-        return sum(one.stat().st_size for one in path.iterdir() if one.is_file())
-    return _bytes(path.parent) if path.name == "meta.json" else path.stat().st_size

@@ -21,8 +21,8 @@ from clsplat.formats.splats import (
     Writing,
     sh_coefficients,
 )
-from clsplat.formats.table import for_writing, located, read, write
-from clsplat.gaussians.run_model import model_of_run
+from clsplat.formats.table import for_writing, read, write
+from clsplat.gaussians.run_model import model_at
 from clsplat.gaussians.sh import rotated_sh
 from clsplat.gaussians.tables import DeviceModel, Gaussians
 from clsplat.opencl.device import Device
@@ -212,7 +212,7 @@ def load(path: str | Path, options: Reading | None = None) -> Model:
     Raises DataError when it is missing, damaged or not a splat.
     """
     path = Path(path)
-    file = read(model_of_run(path) if path.is_dir() and located(path) == path else path, options)
+    file = read(model_at(path), options)
     model = Model(**file.parameters, rendering=Rendering.of(file.rendering, file.mode))
     if file.placement is None:
         return model

@@ -1,12 +1,19 @@
-"""Where a run folder has its model."""
+"""Where a run folder, or another path, has its model."""
 
 from pathlib import Path
 
 from clsplat.errors import DataError
+from clsplat.formats.table import located
 from clsplat.names import METRICS, is_inside
 from clsplat.reading import read_json
 
 MODEL = "point_cloud.ply"  # of a run that does not name its own
+
+
+def model_at(path: Path) -> Path:
+    """Return the model file that a path names: of a folder of SOG its meta.json, of a run folder its model."""
+    place = located(path)
+    return model_of_run(place) if place.is_dir() else place
 
 
 def model_of_run(folder: Path) -> Path:

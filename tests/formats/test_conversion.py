@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 import clsplat
 from clsplat.errors import ConfigError, DataError
 from clsplat.formats.ply import write_ply
-from clsplat.formats.table import CODECS, detect, read, write
+from clsplat.formats.table import CODECS, bytes_of, detect, read, write
 from clsplat.gaussians.checkup import lines, verdict
 from clsplat.gaussians.conversion import transform_of
 from clsplat.gaussians.model import load
@@ -156,6 +156,25 @@ def test_a_model_that_is_missing_cannot_be_read_and_a_pipeline_is_none(tmp_path)
     with pytest.raises(DataError, match=r"a\.spz: cannot be read \(No such file or directory\)"):
         clsplat.check(tmp_path / "a.spz")
     assert "stages" in clsplat.check("smoke")
+
+
+def test_the_size_of_a_model_is_that_of_its_own_files(few_steps, source, tmp_path):
+    size = (few_steps / "point_cloud.ply").stat().st_size
+    folder = tmp_path / "f" / "meta.json"
+    assert clsplat.convert(few_steps, tmp_path / "b.ply")["bytes_read"] == size
+    (tmp_path / "f").mkdir()
+    (tmp_path / "f" / "film.webp").write_bytes(bytes(10**6))
+    written = clsplat.convert(source, folder)["bytes"]
+    assert written == sum(file.stat().st_size for file in (tmp_path / "f").iterdir()) - 10**6
+    for place in (folder, tmp_path / "f"):
+        assert clsplat.convert(place, tmp_path / "b.ply")["bytes_read"] == written == bytes_of(place)
+
+
+def test_a_name_stands_as_it_is(source, tmp_path):
+    write(tmp_path / "not_finite_no_rotation.ply", read(source))
+    found = clsplat.check(tmp_path / "not_finite_no_rotation.ply")
+    assert lines(found).startswith(f"{tmp_path / 'not_finite_no_rotation.ply'}: PLY")
+    assert "0 not finite, 0 without rotation, 0 flat, " in lines(found)
 
 
 def test_check_counts_what_shows_nothing(tmp_path, rng):
