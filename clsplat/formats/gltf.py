@@ -14,6 +14,7 @@ EXTENSION = "KHR_gaussian_splatting"
 PREFIX = f"{EXTENSION}:"
 COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+SHARED = 8  # times that a byte is read, on average: equal columns may be one accessor
 FLIP = np.diag([1.0, -1, -1, 1])  # between the axes of glTF and those of a PLY
 
 
@@ -25,6 +26,7 @@ class Gltf:
 
     def __init__(self, path: Path, tree: dict[str, Any], binary: bytes) -> None:
         self.path, self.tree, self.binary = path, tree, binary
+        self.left = SHARED * len(binary)  # bytes that may still be read
         self.primitives: list[dict[str, Any]] = []
         self.placement: NDArray[np.float64] | None = None  # [4, 4] in the axes of a PLY
         placements = []
@@ -57,6 +59,9 @@ class Gltf:
         start += _index(view.get("byteOffset", 0))
         if stride < size or start + stride * max(count - 1, 0) + size * min(count, 1) > len(self.binary):
             raise DataError(f"{self.path}: accessor {number} has {count} rows, more than the file; copy it again")
+        self.left -= count * size
+        if self.left < 0:
+            raise DataError(f"{self.path}: its accessors share their numbers too often; export it again")
         rows = np.ndarray((count, width), kind, self.binary, start, (stride, np.dtype(kind).itemsize))
         if not one.get("normalized") or kind == "<f4":
             return rows.astype(np.float32)

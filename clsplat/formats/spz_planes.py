@@ -101,7 +101,8 @@ def fraction_of(path: Path, means: NDArray[np.float32], fine: bool) -> int:
         raise DataError(f"{path}: SPZ holds positions to {MAX_INT24}; the model has {largest:g}: crop it")
     if bits < FRACTION:
         LOG.warning(
-            "%s: a position of %g leaves steps of %g scene units to all, not of %g; a crop keeps them finer",
+            "%s: its largest coordinate is %g: SPZ keeps all positions in steps of %.3g, not %.3g, scene units; a crop "
+            "keeps them finer",
             path,
             largest,
             2.0**-bits,

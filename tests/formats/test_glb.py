@@ -168,6 +168,7 @@ REFUSED = {
         change(["nodes"], [{"children": [1], "scale": [1e200] * 3}, {"mesh": 0, "scale": [1e200] * 3}]),
         "node 1 has no finite place",
     ),
+    "bomb": (change(["nodes"], [{"children": [*range(1, 20)]}] + [{"mesh": 0}] * 19), "share their numbers too often"),
     "asset": (change(["asset"], []), "its JSON is damaged"),
     "no splats": (change(["meshes", 0, "primitives", 0, "extensions"], {}), "holds no Gaussians"),
     "kernel": (change(["meshes", 0, "primitives", 0, "extensions", KHR, "kernel"], "box"), "kernel is 'box'"),

@@ -85,7 +85,9 @@ def test_positions_get_the_bits_that_they_need(tmp_path, rng, caplog):
         found = there_and_back(tmp_path / "a.spz", source).parameters["means"]
         expected = source.rows(morton_order(source.parameters["means"])).parameters["means"]
         assert np.abs(found - expected).max() <= 2.0 ** -(fraction + 1)
-        lost = f"a position of {largest:g} leaves steps of {2.0**-fraction:g} scene units to all, not of 0.000244141"
+        lost = (
+            f"coordinate is {largest:g}: SPZ keeps all positions in steps of {2.0**-fraction:.3g}, not 0.000244, scene"
+        )
         assert (lost in caplog.text) == bool(caplog.text) == (fraction < 12)
     source.parameters["means"][0] = 8388608.0
     with pytest.raises(DataError, match=r"SPZ holds positions to 8388607; the model has 8\.38861e\+06: crop it"):

@@ -4,6 +4,8 @@ CLSPLAT_FUZZ is the number of examples of each test; without it there are few.  
 same damage every time.
 """
 
+import copy
+import json
 import os
 import re
 import struct
@@ -34,6 +36,7 @@ BYTES = [
     *(struct.pack("<f", number) for number in REAL if abs(number) < 1e38),
     *(b"\xff", b"\0" * 8, b"\x80", b"\xed\xa0\x80", b"\xff\xfe", b"PK\3\4"),
 ]
+KINDS: list[Any] = [None, True, "", "x", [], {}, [[]], {"x": 1}]  # of JSON
 NUMBER = re.compile(rb"-?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 Drawn = Callable[[Random], Any]
 
@@ -50,6 +53,50 @@ def damaged(seeds: Sequence[bytes], words: Sequence[str] = ()) -> Callable[[Rand
         return data
 
     return draw
+
+
+def misbuilt(trees: Sequence[Any]) -> Callable[[Random], bytes]:
+    """Draw one of the valid trees of JSON with one to three parts exchanged: it stays JSON, of another shape."""
+
+    def draw(random: Random) -> bytes:
+        tree = copy.deepcopy(random.choice(trees))
+        for _ in range(random.randint(1, 3)):
+            held, key = _place(random, tree)
+            held[key] = random.choice(PARTS)(random, held[key], tree)
+        return json.dumps(tree).encode()[:MAX_SIZE]
+
+    return draw
+
+
+def _place(random: Random, tree: Any) -> tuple[Any, Any]:
+    """A list or mapping of a tree, and the key of one of its parts: half of them near the root."""
+    while True:
+        key = random.choice(list(tree)) if isinstance(tree, dict) else random.randrange(len(tree))
+        if not isinstance(tree[key], dict | list) or not tree[key] or random.random() < 0.5:
+            return tree, key
+        tree = tree[key]
+
+
+def _other_kind(random: Random, part: Any, tree: Any) -> Any:
+    return random.choice([*KINDS, *WHOLE, *REAL])
+
+
+def _emptied(random: Random, part: Any, tree: Any) -> Any:
+    return type(part)()
+
+
+def _doubled(random: Random, part: Any, tree: Any) -> Any:
+    """A list with an element more than once."""
+    return part + [random.choice(part)] * random.choice([1, 2, 50]) if isinstance(part, list) and part else [part] * 2
+
+
+def _elsewhere(random: Random, part: Any, tree: Any) -> Any:
+    """What stands in another place."""
+    held, key = _place(random, tree)
+    return copy.deepcopy(held[key])
+
+
+PARTS = [_other_kind, _emptied, _doubled, _elsewhere]
 
 
 def one_of(values: Sequence[Any]) -> Drawn:

@@ -1,6 +1,7 @@
 """Damaged model files of every format: read or refused, soon and in little memory."""
 
 import io
+import json
 import warnings
 import zipfile
 import zlib
@@ -14,8 +15,9 @@ from clsplat.formats.splats import Reading, Writing
 from clsplat.formats.table import CODECS, detect, read, write
 from clsplat.gaussians.checkup import examine
 from tests.formats.models import splats
+from tests.formats.test_glb import glued, parts
 from tests.formats.test_splat_files import ksplat
-from tests.fuzz.mutation import damaged, fuzzed
+from tests.fuzz.mutation import damaged, fuzzed, misbuilt, one_of
 from tests.fuzz.outcome import outcome
 
 RNG = np.random.default_rng(0)
@@ -35,6 +37,7 @@ WORDS = {
         '"uri":""',
     ],
 }
+KINDS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA)
 NAMES = {"compressed PLY": "a.compressed.ply", "SPZ": "a.spz", "SOG": "a.sog", "GLB": "a.glb", "splat": "a.splat"}
 
 
@@ -108,6 +111,46 @@ def test_a_damaged_part_of_a_sog_is_read_or_refused(folder: Path):
         with zipfile.ZipFile(folder / "b.sog", "w") as archive:
             for name, held in members.items():
                 archive.writestr(name, data if name == like else held)
+        reads_or_refuses(folder / "b.sog")
+
+    reads()
+
+
+def test_a_glb_of_another_shape_is_read_or_refused(folder: Path):
+    """Its JSON is whole, but no glTF."""
+    tree, binary = parts(seeds("GLB", folder)[0])
+    doubled = {**tree, "nodes": [*({"children": [i + 1] * 2} for i in range(50)), {}]}
+
+    @fuzzed(300, data=misbuilt([tree, tree, tree, doubled]))
+    def reads(data):
+        (folder / "b.glb").write_bytes(glued(json.loads(data), binary))
+        reads_or_refuses(folder / "b.glb")
+
+    reads()
+
+
+def test_a_sog_of_another_shape_is_read_or_refused(folder: Path):
+    """Its meta.json is whole, but no SOG; its ZIP, of any kind, may have a damaged byte, and may unpack to much."""
+    with zipfile.ZipFile(io.BytesIO(seeds("SOG", folder)[1])) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    meta = json.loads(members.pop("meta.json"))
+    bomb = {**meta, **{name: {**meta[name], "files": ["large"] * 2} for name in ("means", "scales", "quats", "sh0")}}
+    for kind in KINDS:
+        with zipfile.ZipFile(folder / f"{kind}.sog", "w", kind) as archive:
+            for name, data in members.items():
+                archive.writestr(name, data)
+            if kind == zipfile.ZIP_DEFLATED:
+                archive.writestr("large", bytes(160_000_000))
+
+    @fuzzed(60, data=misbuilt([meta, meta, bomb]), kind=one_of(KINDS), place=lambda random: 2 * random.random())
+    def reads(data, kind, place):
+        packed = io.BytesIO((folder / f"{kind}.sog").read_bytes())
+        with zipfile.ZipFile(packed, "a", kind) as archive:
+            archive.writestr("meta.json", data)
+        found = bytearray(packed.getvalue())
+        if place < 1:
+            found[int(place * len(found))] ^= 1 << 4
+        (folder / "b.sog").write_bytes(found)
         reads_or_refuses(folder / "b.sog")
 
     reads()
