@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 from clsplat.runs import status as reading
-from clsplat.training.status import Amount, StatusFile
+from clsplat.training.status import StatusFile
+from clsplat.training.status_schema import Amount
 from tests.refusals import refusal
 from tests.statuses import write_status
 

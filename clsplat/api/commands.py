@@ -81,7 +81,7 @@ def status(folder: PathLike) -> dict[str, Any]:
 
 def status_schema() -> dict[str, Any]:
     """Return the JSON schema of status.json, for programs that watch runs."""
-    from clsplat.training.status import status_schema
+    from clsplat.training.status_schema import status_schema
 
     return status_schema()
 

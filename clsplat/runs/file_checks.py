@@ -18,7 +18,7 @@ from clsplat.scene.identity import Identity
 from clsplat.scene.images import read_image
 from clsplat.training import archive, checkpoint
 from clsplat.training.records import Records
-from clsplat.training.status import status_of
+from clsplat.training.status_schema import status_of
 
 
 def require(path: Path, kind: int = stat.S_IFREG) -> None:

@@ -11,7 +11,8 @@ from clsplat.names import END_STATES, METRICS, PIPELINE, STATUS
 from clsplat.processes import Owner
 from clsplat.training import checkpoint
 from clsplat.training.records import Records
-from clsplat.training.status import read_status, status_of
+from clsplat.training.status import read_status
+from clsplat.training.status_schema import status_of
 
 LOG = logging.getLogger("clsplat")
 SILENT = 60  # seconds without a heartbeat that are worth a line
