@@ -20,6 +20,7 @@ from clsplat.inspect.survey import distortion
 from clsplat.scene.detect import read_scene
 from clsplat.scene.lens import Lens
 from clsplat.scene.view import load_image, load_mask
+from clsplat.stages.init import require_ahead
 from tests.colmap_writer import CameraEntry, ColmapModel, ImageEntry, PointEntry, tiny_model, write_model, write_scene
 from tests.data_sets import data_set
 from tests.html_page import HOSTILE, Page
@@ -236,8 +237,11 @@ def test_trainable_is_what_the_readers_can_read(tmp_path_factory, kind: str, dat
     json.dumps(inspection.data(), allow_nan=False)
     inspection_page(inspection)
     try:
-        for view in read_scene(path).views:
+        scene = read_scene(path)
+        for view in scene.views:
             load_image(view)
+        if scene.points is not None:
+            require_ahead(scene.points, scene)
     except DataError:
         assert not inspection.trainable
     else:
