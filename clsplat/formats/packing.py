@@ -1,8 +1,12 @@
-"""What compact formats share: quaternions as their three smallest components, and an order that compresses."""
+"""What compact formats share: quaternions as their three smallest components, an order that compresses, bytes."""
+
+import logging
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+LOG = logging.getLogger("clsplat")
 MORTON_BITS = 21  # an axis: three fit into 63 bits
 _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # the components beside each, in order
 _SPREAD = ((32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F), (4, 0x10C30C30C30C30C3))
@@ -46,3 +50,14 @@ def _spread(values: NDArray[np.uint64]) -> NDArray[np.uint64]:
     for shift, mask in (*_SPREAD, (2, 0x1249249249249249)):
         values = (values | (values << np.uint64(shift))) & np.uint64(mask)
     return values
+
+
+def beyond_bytes(levels: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which levels no byte holds, by more than rounding, as the shape of `levels`."""
+    return (levels < -0.5) | (levels > 255.5)
+
+
+def tell_cut(path: Path, name: str, what: str, beyond: NDArray[np.bool_]) -> None:
+    """Log how many Gaussians, rows of `beyond`, have values outside of what a format holds."""
+    if count := int(beyond.any(axis=1).sum()):
+        LOG.warning("%s: %s holds %s; those of %d Gaussians were cut", path, name, what, count)

@@ -6,15 +6,18 @@
 The largest and most opaque come first, for viewers that show a file while it arrives.
 """
 
+import logging
 from pathlib import Path
 
 import numpy as np
 
 from clsplat.errors import DataError
 from clsplat.formats.output import written
+from clsplat.formats.packing import beyond_bytes, tell_cut
 from clsplat.formats.splats import MAX_FILE, SH_C0, Parameters, SplatFile, Writing, logits, logs, opacities, unit
 from clsplat.reading import read_file
 
+LOG = logging.getLogger("clsplat")
 ROW = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("colour", "u1", 4), ("rotation", "u1", 4)])
 LARGEST_SCALE = 1e6  # scene units: text, read as numbers, has larger ones
 EXPECTED = "a .splat file, 32 bytes a splat"
@@ -64,6 +67,9 @@ def write_splat(path: Path, splats: SplatFile, options: Writing) -> str:
     with np.errstate(over="ignore"):
         rows["scale"] = np.minimum(np.exp(p["log_scales"].astype(np.float64)), LARGEST_SCALE / 2)
     colour = np.concatenate([p["sh_base"].astype(np.float64) * SH_C0 + 0.5, alpha], axis=1)
+    tell_cut(path, "splat", "colours from 0 to 1", beyond_bytes(255 * colour))
+    if p["sh_rest"].shape[1]:
+        LOG.warning("%s: splat holds no harmonics: the colours are the same from everywhere", path)
     rows["colour"] = np.clip(np.rint(255 * colour), 0, 255)
     rows["rotation"] = np.clip(np.rint(128 * unit(p["quats"]) + 128), 0, 255)
     with written(path) as file:

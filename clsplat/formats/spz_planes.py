@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.errors import DataError
-from clsplat.formats.packing import from_smallest_three, smallest_three
+from clsplat.formats.packing import beyond_bytes, from_smallest_three, smallest_three, tell_cut
 from clsplat.formats.splats import MAX_DEGREE, Parameters, Writing, logits, opacities, sh_coefficients, unit
 
 LOG = logging.getLogger("clsplat")
@@ -126,9 +126,9 @@ def packed(path: Path, p: Parameters, fraction: int, options: Writing) -> list[b
         "scales": 16 * (p["log_scales"].astype(np.float64) + 10),
         "harmonics": _rounded_bits(p["sh_rest"], options.sh_bits or QUALITY[options.quality]),
     }
-    beyond = int((np.abs(p["sh_rest"]) > 1).any(axis=1).sum())
-    if beyond:
-        LOG.warning("%s: SPZ holds harmonics from -1 to 1; those of %d Gaussians were cut", path, beyond)
+    tell_cut(path, "SPZ", "harmonics from -1 to 1", np.abs(p["sh_rest"]) > 1)
+    tell_cut(path, "SPZ", "colours from -0.44 to 1.44", beyond_bytes(cut["colours"]))
+    tell_cut(path, "SPZ", "scales from 4.5e-05 to 379", beyond_bytes(cut["scales"]))
     alphas, colours, scales, harmonics = (np.clip(np.rint(v), 0, 255).astype(np.uint8).tobytes() for v in cut.values())
     positions = np.ascontiguousarray(fixed.view(np.uint8).reshape(-1, 4)[:, :3]).tobytes()
     return [positions, alphas, colours, scales, rotations.astype("<u4").tobytes(), harmonics]

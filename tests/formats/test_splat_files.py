@@ -53,6 +53,15 @@ def test_a_splat_comes_back_within_its_steps(tmp_path, rng):
     assert_close(found, expected, 0.8, **bounds)
 
 
+def test_what_a_splat_does_not_hold_is_said(tmp_path, rng, caplog):
+    source = splats(rng, 10)
+    source.parameters["sh_base"][:] = 0
+    source.parameters["sh_base"][4:7] = -3
+    write(tmp_path / "a.splat", source)
+    assert "splat holds colours from 0 to 1; those of 3 Gaussians were cut" in caplog.text
+    assert "splat holds no harmonics" in caplog.text
+
+
 def test_numbers_as_text_are_no_splat(tmp_path):
     (tmp_path / "a.txt").write_bytes(b"0.001 0.0020.001 0.0020.001 0.02" * 5)
     assert detect(tmp_path / "a.txt") is None
