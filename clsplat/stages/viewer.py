@@ -50,7 +50,7 @@ class Viewer(Stage):
         views = described(scene, read, self.photographs, self.photograph_budget, through)
         stand = Stand.of(model.means, scene.views, (scene.split("test") or scene.views)[0])
         page = Page(f"{run.name} · {run.scene.path.name}", {run.name: pack(model)}, stand, name, views)
-        if page.size > MAX_SIZE:
+        if page.size > MAX_SIZE and page.fitting:  # else the photographs are the fault, which the page says
             LOG.warning(
                 "%s: shows the %d most important of %d Gaussians, so that browsers can open it",
                 *(path, page.fitting, len(model)),

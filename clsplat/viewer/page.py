@@ -72,9 +72,12 @@ class Page:
     def write(self, path: Path) -> None:
         """Write the page.  Raises OutputError where it is too large for browsers, or cannot be written."""
         if self.size > MAX_SIZE:
+            splats = (
+                f"the {self.fitting:,} most important splats (--splats {self.fitting}), or " if self.fitting else ""
+            )
             raise OutputError(
-                f"{path}: the page would have {self.size:.0f} MB; browsers open {MAX_SIZE:.0f} MB at most: show the "
-                f"{self.fitting:,} most important splats (--splats {self.fitting}), or fewer photographs"
+                f"{path}: the page would have {self.size:.0f} MB; browsers open {MAX_SIZE:.0f} MB at most: show "
+                f"{splats}fewer photographs (--photographs, --photograph-budget)"
             )
         write_text(path, self.text())
 

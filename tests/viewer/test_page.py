@@ -88,6 +88,14 @@ def test_a_page_that_browsers_cannot_open_is_refused(page, tmp_path, monkeypatch
     assert not list(tmp_path.iterdir())
 
 
+def test_of_a_page_with_too_many_photographs_these_are_the_fault(page, tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "MAX_SIZE", 0.2)
+    large = replace(page, views=[{"name": "a", "thumbnail": "", "photograph": "x" * 300_000}])
+    with pytest.raises(OutputError, match="at most: show fewer photographs") as raised:
+        large.write(tmp_path / "page.html")
+    assert "splats" not in str(raised.value)
+
+
 def test_as_many_splats_fit_as_the_advice_says(page, monkeypatch):
     model = cloud(4000)
     large = replace(page, models={"model": pack(model)})
