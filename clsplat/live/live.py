@@ -17,9 +17,9 @@ from clsplat.live.page import scene_data
 from clsplat.live.pictures import Pictures
 from clsplat.live.preview import Preview
 from clsplat.live.server import LOOPBACK, Server
+from clsplat.scene.stand import Stand
 from clsplat.training.run import Progress, Run
 from clsplat.training.status import StatusFile
-from clsplat.viewer.cameras import Stand
 from clsplat.views.photographs import BACKGROUNDS
 
 LOG = logging.getLogger("clsplat")

@@ -11,9 +11,9 @@ from pydantic import Field
 from clsplat.errors import DataError
 from clsplat.reading import read_file
 from clsplat.scene.scene import View
+from clsplat.scene.stand import Stand
 from clsplat.stages.base import Stage, path_in_run
 from clsplat.training.run import Run
-from clsplat.viewer.cameras import Stand
 from clsplat.viewer.packing import pack
 from clsplat.viewer.page import MAX_SIZE, Page
 from clsplat.viewer.photographs import BUDGET, Which, described

@@ -22,7 +22,7 @@ from clsplat.files import write_text
 from clsplat.reading import read_json
 from clsplat.scene.camera import Camera
 from clsplat.scene.nerfstudio import FILE as TRANSFORMS
-from clsplat.scene.transforms import Frame, pose_of
+from clsplat.scene.transforms import Frame, opengl_matrix, pose_of
 from clsplat.scene.view import View
 from clsplat.video.lenses import MAX_FRAMES, Size, around, checked_rate, checked_size, even_size, placed
 from clsplat.video.rig import Floats
@@ -31,7 +31,6 @@ LOG = logging.getLogger("clsplat")
 WORLD = "dataparser_transforms.json"  # beside a path: how nerfstudio moved the scene
 MAX_BYTES = 1 << 27
 KEYS = 24  # frames that nerfstudio's viewer shows as handles, at most
-OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # the axes of OpenCV's cameras in those of OpenGL's
 
 
 @dataclass(frozen=True)
@@ -139,10 +138,9 @@ def spread(views: Sequence[View], frames: int) -> list[View]:
 
 
 def _frame(view: View) -> dict[str, Any]:
-    camera_to_world = np.linalg.inv(np.vstack([view.world_to_camera, [0, 0, 0, 1]])) @ OPENGL
-    camera = view.camera
+    camera, matrix = view.camera, opengl_matrix(view.world_to_camera)
     fov = math.degrees(2 * math.atan(camera.height / 2 / camera.fy))
-    return {"camera_to_world": camera_to_world.ravel().tolist(), "fov": fov, "aspect": camera.width / camera.height}
+    return {"camera_to_world": matrix.ravel().tolist(), "fov": fov, "aspect": camera.width / camera.height}
 
 
 def _lens(frame: dict[str, Any]) -> dict[str, Any]:

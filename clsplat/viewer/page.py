@@ -10,7 +10,8 @@ from typing import Any
 from clsplat.errors import OutputError
 from clsplat.files import write_text
 from clsplat.pages.page import inline, render
-from clsplat.viewer.cameras import Stand
+from clsplat.scene.stand import Stand
+from clsplat.viewer.cameras import stand_data
 from clsplat.viewer.packing import Packed
 
 FOLDER = Path(__file__).parent
@@ -38,7 +39,7 @@ class Page:
         names = [view["name"] for view in self.views]
         first = names.index(self.stand.start.name) if self.stand.start.name in names else -1
         info = {
-            **self.stand.data(),
+            **stand_data(self.stand),
             "models": [{"name": name, **packed.header} for name, packed in self.models.items()],
             "views": self.views,
             "first": first,
