@@ -101,7 +101,7 @@ def _check_folder(out: Path, paths: Sequence[Path], photographs: Sequence[Path])
 def _rendered(out: Path) -> dict[str, bool]:
     """The files that earlier calls have rendered into a folder, and whether each is a frame of a film.
 
-    A list is of version 0.1.0, and knows of no films.
+    A list is of an earlier version, and knows of no films.
     """
     try:
         found = read_json(out / RECORD)
