@@ -65,6 +65,7 @@ class Live:
         try:
             end = time.monotonic() + FAREWELL
             while desk.silent() < LOOKING and not desk.told and time.monotonic() < end:
+                self._leave()  # a page that waits for a picture asks for nothing else
                 time.sleep(0.05)
         finally:
             self._server.stop()
