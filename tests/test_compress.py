@@ -9,12 +9,14 @@ from typer.testing import CliRunner
 
 import clsplat
 from clsplat.cli import app
+from clsplat.compress import search
 from clsplat.compress.page import page, table
 from clsplat.compress.rungs import Ladder, checked_keeps
 from clsplat.compress.target import Point, Target
 from clsplat.errors import ConfigError
 from clsplat.formats.table import detect, read
 from clsplat.gaussians.model import Rendering
+from clsplat.runs import model_file
 from clsplat.runs.model_file import Source, evaluate
 from tests.html_page import Page
 
@@ -128,6 +130,21 @@ def test_the_same_search_again_trains_nothing_and_gives_the_same_bytes(searched,
     assert {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in before} == before
     assert {path.name: path.read_bytes() for path in (searched / "trials").iterdir()} == files
     assert found["chosen"]["bytes"] == min(one["bytes"] for one in found["points"])
+
+
+def test_the_model_and_its_scene_are_opened_once(few_steps, tmp_path, monkeypatch):
+    opened: list[Path] = []
+
+    def load(path):
+        opened.append(path)
+        return clsplat.load(path)
+
+    monkeypatch.setattr(model_file, "load", load)
+    monkeypatch.setattr(search, "load", load)
+    (tmp_path / "own.txt").write_text("mine")
+    with pytest.raises(ConfigError, match="holds something else"):
+        clsplat.compress_model(few_steps, target="1MB", out=tmp_path, keep=KEEP, steps=STEPS)
+    assert opened == [few_steps / "point_cloud.ply"]
 
 
 def test_another_search_needs_another_folder(searched, few_steps, tmp_path):

@@ -69,13 +69,20 @@ def render_path(
     kind: Literal["png", "npy"] = "png",
     device: "str | Device | None" = None,
 ) -> dict[str, Any]:
-    """Film a model along a camera path, as `clsplat render --path` does; return `files`, `frames`, `fps`, `seconds`.
+    """Film a model along a camera path, as `clsplat render --path` does.
+
+    Return a table: `files`, the number of `frames`, `fps`, the `seconds` that the film lasts, the `size` of a picture
+    and how long it `took`, s.
 
     model, scene: a file and its scene, or a run folder; video: a file that ends in .webm, or .mp4 with the extra
     `video`; None: pictures of this `kind` into the folder `out`; path: ellipse, spiral, orbit, through, views, or a
     file camera_path.json; frames: by default 120; fps: by default 30; size: even numbers, by default that of the
     photographs by `downscale`; side: "photograph", of the nearest camera, or another model, on the right; depth, alpha:
     files of these beside; save_path: a camera_path.json to write.
+
+    Raises ConfigError for values out of bounds, without a scene that the path needs, and where other files would be
+    replaced; DataError for files that cannot be read, and where the scene's cameras give no such path; NumericError for
+    pictures that are not finite; OutputError where files cannot be written; the errors of the device.
     """
     from clsplat.runs import filming
     from clsplat.video.film import Wish

@@ -6,12 +6,12 @@ programs pass over.
 """
 
 import json
-import logging
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from clsplat.cameras.lost import centre_lost
 from clsplat.cameras.posed import Posed
 from clsplat.errors import DataError, PoseError, quoted
 from clsplat.files import write_text
@@ -21,22 +21,15 @@ from clsplat.scene.scene import PointCloud
 from clsplat.scene.transforms import Frame
 from clsplat.scene.view import View
 
-LOG = logging.getLogger("clsplat")
 FILE = "cameras.json"
 MAX_BYTES = 1 << 27
 MAX_VIEWS = 100_000
-OFF_CENTRE = 0.5  # px: less is no more than a convention about the middle of a pixel
 
 
 def write(out: Path, views: list[Posed], points: PointCloud | None) -> list[Path]:
     """Write out/cameras.json; return it.  The points have no place in it.  Raises OutputError."""
     write_text(out / FILE, json.dumps([_camera(one, i) for i, one in enumerate(views)], indent=1) + "\n")
-    off = max(max(abs(c.cx - c.width / 2), abs(c.cy - c.height / 2)) for c in (one.view.camera for one in views))
-    if off > OFF_CENTRE:
-        LOG.warning(
-            "%s: other programs take the middle of the image for the principal point, which is up to %.1f px away",
-            *(out / FILE, off),
-        )
+    centre_lost(out / FILE, [one.view.camera for one in views], "other programs")
     return [out / FILE]
 
 

@@ -4,17 +4,15 @@ import json
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from clsplat.cameras.posed import IMAGES, Posed
 from clsplat.errors import DataError
 from clsplat.files import write_text
 from clsplat.scene.lens import Lens
 from clsplat.scene.points import write_points_ply
 from clsplat.scene.scene import PointCloud
+from clsplat.scene.transforms import opengl_matrix
 
 FILE, POINTS = "transforms.json", "points3d.ply"
-OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # axes of cameras: y up, z backwards
 DISTORTION = {  # of COLMAP's models: the model that nerfstudio knows, and the names of what follows the middle
     "SIMPLE_PINHOLE": ("OPENCV", ()),
     "PINHOLE": ("OPENCV", ()),
@@ -35,9 +33,10 @@ def write(out: Path, views: list[Posed], points: PointCloud | None) -> list[Path
     """
     lenses = [_lens(one) for one in views]
     common = lenses[0] if all(lens == lenses[0] for lens in lenses) else {}
+    matrices = [opengl_matrix(one.view.world_to_camera).tolist() for one in views]
     frames = [
-        {"file_path": f"{IMAGES}/{one.name}", **({} if common else lens), "transform_matrix": _matrix(one)}
-        for one, lens in zip(views, lenses, strict=True)
+        {"file_path": f"{IMAGES}/{one.name}", **({} if common else lens), "transform_matrix": matrix}
+        for one, lens, matrix in zip(views, lenses, matrices, strict=True)
     ]
     table: dict[str, Any] = {**common, "frames": frames}
     for name, test in (("train_filenames", False), ("test_filenames", True)):
@@ -49,12 +48,6 @@ def write(out: Path, views: list[Posed], points: PointCloud | None) -> list[Path
         written.append(out / POINTS)
     write_text(out / FILE, json.dumps(table, indent=1) + "\n")
     return written
-
-
-def _matrix(one: Posed) -> list[list[float]]:
-    """Camera to world, [4, 4], with OpenGL axes."""
-    matrix = np.linalg.inv(np.vstack([one.view.world_to_camera, [0, 0, 0, 1]])) @ OPENGL
-    return [*matrix[:3].tolist(), [0.0, 0.0, 0.0, 1.0]]
 
 
 def _lens(one: Posed) -> dict[str, Any]:

@@ -21,7 +21,6 @@ from clsplat.gaussians.model import Model, load
 from clsplat.metrics.views import mean, measure
 from clsplat.reading import read_file, read_json, sha256
 from clsplat.runs.model_file import ModelFile
-from clsplat.runs.source import Source
 from clsplat.views.photographs import Photographs
 
 LOG = logging.getLogger("clsplat")
@@ -105,8 +104,7 @@ def compress(
     if steps is not None and steps < 1:
         raise ConfigError(f"--steps {steps}: expected a number of at least 1")
     opened = ModelFile(model, scene, device)
-    source = Source.of(model, scene)
-    first, measurer = load(source.file), Measurer(opened)
+    source, first, measurer = opened.source, opened.loaded, Measurer(opened)
     question: dict[str, Any] = {"model": str(source.file), "sha256": sha256(located(source.file))}
     question |= {"scene": str(source.folder), "keeps": shares, "steps": steps}
     _claim(out, question)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from clsplat.inspect.inspection import Inspection
 from clsplat.scene.points import MAX_VALUE
 from clsplat.scene.scene import View
+from clsplat.scene.stand import upward
 
 MAX_POINTS = 5000
 RADIUS = 1000  # of the scene, in the numbers of the page
@@ -99,8 +100,7 @@ def _axes(views: list[View]) -> NDArray[np.float64]:
 
     Forward is where most cameras look, so that the first view is from behind them; without such a side it is arbitrary.
     """
-    up = -np.mean([view.world_to_camera[1, :3] for view in views], axis=0)
-    up = up / np.linalg.norm(up) if np.linalg.norm(up) > 0.1 else np.array([0.0, 0.0, 1.0])
+    up = upward(views)
     forward = np.mean([view.world_to_camera[2, :3] for view in views], axis=0)
     right = np.cross(forward, up)
     if np.linalg.norm(right) < 0.2:

@@ -17,9 +17,9 @@ from clsplat.live.page import scene_data
 from clsplat.live.pictures import Pictures
 from clsplat.live.preview import Preview
 from clsplat.live.server import LOOPBACK, Server
+from clsplat.scene.stand import Stand
 from clsplat.training.run import Progress, Run
 from clsplat.training.status import StatusFile
-from clsplat.viewer.cameras import Stand
 from clsplat.views.photographs import BACKGROUNDS
 
 LOG = logging.getLogger("clsplat")
@@ -65,6 +65,7 @@ class Live:
         try:
             end = time.monotonic() + FAREWELL
             while desk.silent() < LOOKING and not desk.told and time.monotonic() < end:
+                self._leave()  # a page that waits for a picture asks for nothing else
                 time.sleep(0.05)
         finally:
             self._server.stop()

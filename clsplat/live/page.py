@@ -5,8 +5,9 @@ from pathlib import Path
 from typing import Any
 
 from clsplat.pages.page import inline, render
+from clsplat.scene.stand import Stand
 from clsplat.scene.view import View
-from clsplat.viewer.cameras import Stand, camera_data
+from clsplat.viewer.cameras import camera_data, stand_data
 from clsplat.viewer.page import joined, style
 
 FOLDER = Path(__file__).parent
@@ -36,4 +37,4 @@ def scene_data(number: int, title: str, views: Sequence[View], test: set[str], s
 
     first = next((i for i, view in enumerate(views) if view is stand.start), -1)
     described_views = [described(i, view) for i, view in enumerate(views)]
-    return {"number": number, "title": title, **stand.data(), "views": described_views, "first": first}
+    return {"number": number, "title": title, **stand_data(stand), "views": described_views, "first": first}

@@ -6,6 +6,7 @@ import socket
 import socketserver
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from time import sleep
 from typing import Any
 
@@ -35,15 +36,21 @@ class Server(socketserver.ThreadingTCPServer):
         self.token, self.answer = token, answer
         self._slots, self._rate = threading.Semaphore(CONNECTIONS), Budget(RATE, BURST)
         self._rate.spend(-BURST)
+        self.ended, self._open, self._lock = False, set[Any](), threading.Lock()
         super().__init__((LOOPBACK, 0), _Connection, bind_and_activate=False)
         self.port = self._bind(port)
         self._thread = threading.Thread(target=self.serve_forever, args=(POLL,), name="live", daemon=True)
         self._thread.start()
 
     def stop(self) -> None:
-        """Answer no more."""
+        """Answer no more; a connection that is open ends after the answer that it is being given."""
+        self.ended = True
         self.shutdown()
         self.server_close()
+        with self._lock:
+            for one in self._open:
+                with suppress(OSError):  # the other side has closed it
+                    one.shutdown(socket.SHUT_RD)
 
     def _bind(self, port: int) -> int:
         """Listen; return the port."""
@@ -73,6 +80,8 @@ class Server(socketserver.ThreadingTCPServer):
 
     def process_request(self, request: Any, client_address: Any) -> None:
         if self._slots.acquire(timeout=POLL):
+            with self._lock:
+                self._open.add(request)
             super().process_request(request, client_address)
         else:
             self.shutdown_request(request)
@@ -82,6 +91,11 @@ class Server(socketserver.ThreadingTCPServer):
             super().process_request_thread(request, client_address)
         finally:
             self._slots.release()
+
+    def shutdown_request(self, request: Any) -> None:
+        with self._lock:
+            self._open.discard(request)
+            super().shutdown_request(request)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         LOG.debug("live: a request failed", exc_info=True)
@@ -96,7 +110,7 @@ class _Connection(socketserver.StreamRequestHandler):
 
     def handle(self) -> None:
         try:
-            while (head := self._head()) is not None:
+            while (head := self._head()) is not None and not self.server.ended:
                 self.server.paced()
                 answer = self._answer(head)
                 self.wfile.write(answer.bytes())

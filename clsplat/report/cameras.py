@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from clsplat.pages.page import charts
 from clsplat.pages.plan import Marks, plan
+from clsplat.scene.stand import upward
 from clsplat.scene.view import View
 from clsplat.training.run import Run
 
@@ -41,8 +42,7 @@ def cameras(run: Run) -> list[Markup]:
 
 def _axes(views: Sequence[View]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Two directions across the mean upward one of the cameras, each [3]."""
-    up = -np.mean([view.world_to_camera[1, :3] for view in views], axis=0)
-    up = up / np.linalg.norm(up) if np.linalg.norm(up) > 0.1 else np.array([0.0, -1.0, 0.0])
+    up = upward(views)
     across = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
     across /= np.linalg.norm(across)
     return across, np.cross(across, up)

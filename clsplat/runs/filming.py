@@ -13,7 +13,7 @@ from clsplat.opencl.device import Device
 from clsplat.progress import counted
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.runs.pictures import KINDS, write_pictures
-from clsplat.runs.source import Source
+from clsplat.runs.source import Source, is_run
 from clsplat.scene.photographs import load_photograph
 from clsplat.scene.scene import Background, Scene
 from clsplat.scene.view import NO_FILE, View
@@ -78,7 +78,7 @@ def film(
     canvas = _canvas(loaded, opened, background)
     if not videos:
         taken = [view.image_path for view in found.views] if found else []
-        written = write_pictures(canvas, made.views, place.out, place.kind, extras.layers, taken)
+        written = write_pictures(canvas, made.views, place.out, place.kind, extras.layers, taken, film=True)
     else:
         side = _side(extras.side, made, found, background, opened)
         shoot(canvas, made, videos, side, lambda views: counted(views, "frames rendered", len(views)))
@@ -95,7 +95,7 @@ def film(
 
 def _scene(model: Path, scene: Path | None, loaded: Model, downscale: float | None, needed: bool) -> Scene | None:
     """The scene of a model at the size of its run; None where none is known and none is needed."""
-    if not needed and scene is None and not model.is_dir():
+    if not needed and scene is None and not is_run(model):
         return None
     source = Source.of(model, scene)
     return source.scene(loaded).downscaled(downscale or source.settings.downscale)

@@ -2,12 +2,14 @@
 
 import math
 from collections.abc import Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from clsplat.conformance.quick import open_correct
 from clsplat.errors import ConfigError, DataError
 from clsplat.gaussians.model import load
+from clsplat.gaussians.tables import DeviceModel
 from clsplat.metrics.lpips import InputRange
 from clsplat.metrics.perceptual import Perceptual, metric_names
 from clsplat.metrics.views import PSNR_AND_SSIM, mean, measure
@@ -32,15 +34,19 @@ class ModelFile:
         self, model: Path, scene: Path | None = None, device: str | Device | None = None, downscale: float | None = None
     ) -> None:
         """downscale: divisor of the photographs' size; default: that of the run, 1 for a file."""
-        source = Source.of(model, scene)
-        file = load(source.file)
+        self.source = Source.of(model, scene)
+        self.loaded = load(self.source.file)
         self.device = open_correct(device)
-        self.photographs = source.scene(file)
-        self.downscale = downscale or source.settings.downscale
+        self.photographs = self.source.scene(self.loaded)
+        self.downscale = downscale or self.source.settings.downscale
         self.scene = self.photographs.downscaled(self.downscale)
-        self.model = file.upload(self.device)
-        self.background = file.rendering.background or self.scene.background
+        self.background = self.loaded.rendering.background or self.scene.background
         self.rasterizer = Rasterizer(self.device)
+
+    @cached_property
+    def model(self) -> DeviceModel:
+        """The model on the device."""
+        return self.loaded.upload(self.device)
 
     def render(self, split: str, out: Path, kind: str, layers: Sequence[str] = LAYERS[:1]) -> int:
         """Write images (`kind` png) or float32 arrays (npy) of layers of the views of a split; return their number."""

@@ -11,7 +11,7 @@ from clsplat.gaussians.model import load
 from clsplat.runs.source import Source, run_of
 from clsplat.scene.photographs import load_photograph
 from clsplat.scene.scene import View
-from clsplat.viewer.cameras import Stand
+from clsplat.scene.stand import Stand
 from clsplat.viewer.packing import pack
 from clsplat.viewer.page import Page
 from clsplat.viewer.photographs import BUDGET, Which, described

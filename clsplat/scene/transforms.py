@@ -197,6 +197,13 @@ def pose_of(frame: Frame) -> Floats:
     return np.linalg.inv(camera_to_world)[:3]
 
 
+def opengl_matrix(pose: Floats) -> Floats:
+    """Return the camera-to-world matrix with OpenGL axes, [4, 4], from [3, 4]: the inverse of `pose_of`."""
+    matrix: Floats = np.linalg.inv(np.vstack([pose, [0, 0, 0, 1]])) @ np.diag([1.0, -1.0, -1.0, 1.0])
+    matrix[3] = 0, 0, 0, 1
+    return matrix
+
+
 def _is_rotation(matrix: Floats) -> bool:
     """Return whether [3, 3] is a rotation, to 1e-3: some exporters write few digits."""
     return np.allclose(matrix.T @ matrix, np.eye(3), atol=1e-3) and np.linalg.det(matrix) > 0

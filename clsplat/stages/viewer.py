@@ -11,9 +11,9 @@ from pydantic import Field
 from clsplat.errors import DataError
 from clsplat.reading import read_file
 from clsplat.scene.scene import View
+from clsplat.scene.stand import Stand
 from clsplat.stages.base import Stage, path_in_run
 from clsplat.training.run import Run
-from clsplat.viewer.cameras import Stand
 from clsplat.viewer.packing import pack
 from clsplat.viewer.page import MAX_SIZE, Page
 from clsplat.viewer.photographs import BUDGET, Which, described
@@ -50,7 +50,7 @@ class Viewer(Stage):
         views = described(scene, read, self.photographs, self.photograph_budget, through)
         stand = Stand.of(model.means, scene.views, (scene.split("test") or scene.views)[0])
         page = Page(f"{run.name} · {run.scene.path.name}", {run.name: pack(model)}, stand, name, views)
-        if page.size > MAX_SIZE:
+        if page.size > MAX_SIZE and page.fitting:  # else the photographs are the fault, which the page says
             LOG.warning(
                 "%s: shows the %d most important of %d Gaussians, so that browsers can open it",
                 *(path, page.fitting, len(model)),

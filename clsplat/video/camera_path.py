@@ -16,21 +16,21 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from clsplat.cameras import inria
-from clsplat.errors import DataError, quoted
+from clsplat.cameras.lost import centre_lost, width_lost
+from clsplat.errors import ConfigError, DataError, quoted
 from clsplat.files import write_text
 from clsplat.reading import read_json
 from clsplat.scene.camera import Camera
 from clsplat.scene.nerfstudio import FILE as TRANSFORMS
-from clsplat.scene.transforms import Frame, pose_of
+from clsplat.scene.transforms import Frame, opengl_matrix, pose_of
 from clsplat.scene.view import View
-from clsplat.video.lenses import MAX_FRAMES, Size, around, checked_rate, checked_size, even_size
+from clsplat.video.lenses import MAX_FRAMES, Size, around, checked_rate, checked_size, even_size, placed
 from clsplat.video.rig import Floats
 
 LOG = logging.getLogger("clsplat")
 WORLD = "dataparser_transforms.json"  # beside a path: how nerfstudio moved the scene
 MAX_BYTES = 1 << 27
 KEYS = 24  # frames that nerfstudio's viewer shows as handles, at most
-OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # the axes of OpenCV's cameras in those of OpenGL's
 
 
 @dataclass(frozen=True)
@@ -42,11 +42,9 @@ class CameraPath:
     size: Size  # px
 
     def resized(self, size: Size) -> list[View]:
-        """Return the views at another size, with the vertical field of view."""
-        return [
-            replace(view, camera=_camera(size, 2 * math.atan(view.camera.height / 2 / view.camera.fy)))
-            for view in self.views
-        ]
+        """Return the views at another size, with the vertical field of view and all else of the lens."""
+        scale = size[1] / self.size[1]
+        return [replace(view, camera=placed(view.camera, size, scale)) for view in self.views]
 
 
 def read(path: Path, scene: Path | None = None) -> CameraPath:
@@ -66,8 +64,7 @@ def read(path: Path, scene: Path | None = None) -> CameraPath:
         raise DataError(f"{path}: has {len(frames)} frames; expected 1 to {MAX_FRAMES}")
     if (kind := table.get("camera_type", "perspective")) != "perspective":
         raise DataError(f"{path}: camera_type is {quoted(kind)}; expected perspective: export the path again")
-    whole = Frame(path.parent, str(path), table)
-    size = _size(whole)
+    size, rate = _size_and_rate(Frame(path.parent, str(path), table))
     move = _world(path, scene, known=table.get("world") == "scene")
     views = []
     for i, own in enumerate(frames):
@@ -77,7 +74,7 @@ def read(path: Path, scene: Path | None = None) -> CameraPath:
             raise DataError(f"{frame.where}: fov is {quoted(fov)}; expected degrees from 0.01 to 179")
         pose = pose_of(Frame(path.parent, frame.where, {"transform_matrix": _rows(own.get("camera_to_world"))}))
         views.append(View(f"frame_{i + 1:05d}", _camera(size, math.radians(fov)), move(pose)))
-    return CameraPath(views, checked_rate(whole.number("fps") or 30), size)
+    return CameraPath(views, rate, size)
 
 
 def _of_cameras(path: Path) -> CameraPath:
@@ -89,7 +86,10 @@ def _of_cameras(path: Path) -> CameraPath:
 
 
 def write(path: Path, views: Sequence[View], fps: float) -> None:
-    """Write views as a camera_path.json, for nerfstudio's viewer and for `read`.  Raises OutputError."""
+    """Write views as a camera_path.json, for nerfstudio's viewer and for `read`; of a lens it holds `fov` alone.
+
+    Raises OutputError.
+    """
     camera = views[0].camera
     frames = [_frame(view) for view in views]
     keys = np.unique(np.linspace(0, len(frames) - 1, min(KEYS, len(frames))).round().astype(int))
@@ -108,6 +108,8 @@ def write(path: Path, views: Sequence[View], fps: float) -> None:
         "camera_path": frames,
     }
     write_text(path, json.dumps(table, indent=1) + "\n")
+    for warn in (centre_lost, width_lost):
+        warn(path, [view.camera for view in views], "its readers")
 
 
 def spread(views: Sequence[View], frames: int) -> list[View]:
@@ -119,8 +121,8 @@ def spread(views: Sequence[View], frames: int) -> list[View]:
     places = np.linspace(0, len(views) - 1, frames)
     poses = np.stack([view.world_to_camera for view in views])
     turns = Slerp(np.arange(len(views)), Rotation.from_matrix(poses[:, :, :3]))(places).as_matrix()
-    lenses = np.array([[view.camera.fx, view.camera.fy] for view in views])
-    centres, focals = (
+    lenses = np.array([[c.fx, c.fy, c.cx, c.cy] for c in (view.camera for view in views)])
+    centres, lenses = (
         np.stack([np.interp(places, np.arange(len(views)), column) for column in columns.T], axis=1)
         for columns in (np.stack([view.position for view in views]), lenses)
     )
@@ -128,18 +130,17 @@ def spread(views: Sequence[View], frames: int) -> list[View]:
     return [
         View(
             f"frame_{i:05d}",
-            Camera(first.width, first.height, float(fx), float(fy), first.cx, first.cy),
+            Camera(first.width, first.height, *lens),
             np.column_stack([turn, -turn @ centre]),
         )
-        for i, (turn, centre, (fx, fy)) in enumerate(zip(turns, centres, focals, strict=True), 1)
+        for i, (turn, centre, lens) in enumerate(zip(turns, centres, lenses.tolist(), strict=True), 1)
     ]
 
 
 def _frame(view: View) -> dict[str, Any]:
-    camera_to_world = np.linalg.inv(np.vstack([view.world_to_camera, [0, 0, 0, 1]])) @ OPENGL
-    camera = view.camera
+    camera, matrix = view.camera, opengl_matrix(view.world_to_camera)
     fov = math.degrees(2 * math.atan(camera.height / 2 / camera.fy))
-    return {"camera_to_world": camera_to_world.ravel().tolist(), "fov": fov, "aspect": camera.width / camera.height}
+    return {"camera_to_world": matrix.ravel().tolist(), "fov": fov, "aspect": camera.width / camera.height}
 
 
 def _lens(frame: dict[str, Any]) -> dict[str, Any]:
@@ -157,9 +158,14 @@ def _camera(size: Size, fov: float) -> Camera:
     return Camera(*size, focal, focal, size[0] / 2, size[1] / 2)
 
 
-def _size(whole: Frame) -> Size:
-    width, height = (int(whole.number(key) or 0) // 2 * 2 for key in ("render_width", "render_height"))
-    return checked_size((width, height)) if width or height else (1280, 720)
+def _size_and_rate(whole: Frame) -> tuple[Size, float]:
+    """The size of the pictures, in even numbers, and how many a second: the usual ones where a file says none."""
+    sides, fps = [whole.number(key) for key in ("render_width", "render_height")], whole.number("fps")
+    width, height = (1280, 720) if sides == [None, None] else (int(side or 0) // 2 * 2 for side in sides)
+    try:
+        return checked_size((width, height)), checked_rate(30.0 if fps is None else fps)
+    except ConfigError as error:
+        raise DataError(f"{whole.where}: {error}; export the path again") from error
 
 
 def _rows(numbers: Any) -> Any:

@@ -68,7 +68,12 @@ def like(camera: Camera, size: Size) -> Camera:
 
 def around(camera: Camera, size: Size) -> Camera:
     """Return a camera of another size whose image holds all of a camera's, in its middle."""
-    (width, height), scale = size, fit(camera, size)
+    return placed(camera, size, fit(camera, size))
+
+
+def placed(camera: Camera, size: Size, scale: float) -> Camera:
+    """Return a camera of another size whose image has a camera's, larger by a factor, in its middle."""
+    width, height = size
     left, top = (width - scale * camera.width) / 2, (height - scale * camera.height) / 2
     return Camera(
         width, height, camera.fx * scale, camera.fy * scale, scale * camera.cx + left, scale * camera.cy + top

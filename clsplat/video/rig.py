@@ -10,13 +10,12 @@ from numpy.typing import NDArray
 from clsplat.errors import DataError
 from clsplat.scene.camera import Camera
 from clsplat.scene.scene import strayed
+from clsplat.scene.stand import closest_point, upward
 from clsplat.scene.view import View
-from clsplat.viewer.cameras import closest_point
 
 Floats = NDArray[np.floating]
 MOST_POINTS = 20_000  # that are looked at for near and far
 SHARES = 0.05, 0.95  # of what a camera sees lies before near, and before far
-MIN_UP = 0.1  # length of the mean of the upward axes: below it the cameras do not agree
 PARALLEL = 0.9  # length of the mean direction of view, from which on the axes hardly say where they meet
 BEYOND = 1.5  # times near and far: farther from what is seen they do not meet
 TOWARDS = 0.5  # share of the cameras that must have the focus before them
@@ -60,8 +59,7 @@ class Rig:
     @cached_property
     def up(self) -> Floats:
         """The mean of the upward axes, [3]; that of the first image where they cancel out."""
-        mean = self.ups.mean(axis=0)
-        return unit(mean) if np.linalg.norm(mean) > MIN_UP else self.ups[0]
+        return upward(self.views)
 
     @cached_property
     def focus(self) -> Floats:

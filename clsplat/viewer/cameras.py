@@ -1,72 +1,23 @@
-"""Where a page begins to look, what it turns about, and which way is up."""
+"""Cameras as the scripts of a page read them."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.scene.camera import Camera
+from clsplat.scene.stand import Stand
 from clsplat.scene.view import View
 
-PRIOR = 1e-3  # weight of the splats' middle, beside the axes: where all are parallel, nothing else says how far
-START = Camera(1200, 900, 1100.0, 1100.0, 600.0, 450.0)  # where there is no view
-SHARES = 0.05, 0.95  # of the splats, along each axis, are before and behind the sides of the box that is looked at
-DISTANCE = 2.2  # of that start from its middle, in halves of its diagonal
 
-
-@dataclass(frozen=True)
-class Stand:
-    """The frame of all motion of a page, in scene units."""
-
-    pivot: NDArray[np.floating]  # [3]
-    up: NDArray[np.floating]  # [3], unit
-    radius: float
-    focal: float  # px, the median of the views: what a screen filter without compensation belongs to
-    start: View
-
-    @classmethod
-    def of(cls, points: NDArray[np.floating], views: Sequence[View], first: View | None) -> "Stand":
-        """Look from `first`, else at most of the points from outside.  points: [N, 3], what is to be seen."""
-        means = points[np.isfinite(points).all(axis=1)].astype(np.float64)
-        low, high = np.quantile(means, SHARES, axis=0) if len(means) else np.zeros((2, 3))
-        middle, spread = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
-        if first is None or not views:
-            up = np.array([0.0, -1.0, 0.0])  # as cameras of COLMAP stand
-            radius = spread or 1.0
-            eye = middle + DISTANCE * radius * np.array([0.35, -0.25, -0.9])
-            return cls(middle, up, radius, START.fx, View.looking_at(eye, middle, up, START, "start"))
-        poses = np.stack([view.world_to_camera for view in views])
-        centres = np.stack([view.position for view in views])
-        pivot = closest_point(centres, poses[:, 2, :3], middle)
-        up = -poses[:, 1, :3].mean(axis=0)
-        up = up / np.linalg.norm(up) if np.linalg.norm(up) > 0.1 else -poses[0, 1, :3]
-        radius = float(np.median(np.linalg.norm(centres - pivot, axis=1))) or spread or 1.0
-        return cls(pivot, up, radius, float(np.median([view.camera.fx for view in views])), first)
-
-    def data(self) -> dict[str, Any]:
-        """Return what main.js reads."""
-        return {
-            "pivot": rounded(self.pivot),
-            "up": rounded(self.up),
-            "radius": self.radius,
-            "focal": self.focal,
-            "start": camera_data(self.start),
-        }
-
-
-def closest_point(
-    centres: NDArray[np.floating], axes: NDArray[np.floating], prior: NDArray[np.floating]
-) -> NDArray[np.float64]:
-    """Return the point, [3], with the least squared distances to lines; weakly drawn to `prior`.
-
-    centres, axes: [V, 3], a point of each line and its unit direction.
-    """
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    weight = PRIOR * len(centres)
-    matrix = across.sum(axis=0) + weight * np.eye(3)
-    return np.asarray(np.linalg.solve(matrix, np.einsum("vij,vj->i", across, centres) + weight * prior))
+def stand_data(stand: Stand) -> dict[str, Any]:
+    """Return where a page begins to look, as main.js reads it."""
+    return {
+        "pivot": rounded(stand.pivot),
+        "up": rounded(stand.up),
+        "radius": stand.radius,
+        "focal": stand.focal,
+        "start": camera_data(stand.start),
+    }
 
 
 def camera_data(view: View) -> dict[str, Any]:

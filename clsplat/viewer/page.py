@@ -10,7 +10,8 @@ from typing import Any
 from clsplat.errors import OutputError
 from clsplat.files import write_text
 from clsplat.pages.page import inline, render
-from clsplat.viewer.cameras import Stand
+from clsplat.scene.stand import Stand
+from clsplat.viewer.cameras import stand_data
 from clsplat.viewer.packing import Packed
 
 FOLDER = Path(__file__).parent
@@ -38,7 +39,7 @@ class Page:
         names = [view["name"] for view in self.views]
         first = names.index(self.stand.start.name) if self.stand.start.name in names else -1
         info = {
-            **self.stand.data(),
+            **stand_data(self.stand),
             "models": [{"name": name, **packed.header} for name, packed in self.models.items()],
             "views": self.views,
             "first": first,
@@ -72,9 +73,12 @@ class Page:
     def write(self, path: Path) -> None:
         """Write the page.  Raises OutputError where it is too large for browsers, or cannot be written."""
         if self.size > MAX_SIZE:
+            splats = (
+                f"the {self.fitting:,} most important splats (--splats {self.fitting}), or " if self.fitting else ""
+            )
             raise OutputError(
-                f"{path}: the page would have {self.size:.0f} MB; browsers open {MAX_SIZE:.0f} MB at most: show the "
-                f"{self.fitting:,} most important splats (--splats {self.fitting}), or fewer photographs"
+                f"{path}: the page would have {self.size:.0f} MB; browsers open {MAX_SIZE:.0f} MB at most: show "
+                f"{splats}fewer photographs (--photographs, --photograph-budget)"
             )
         write_text(path, self.text())
 

@@ -97,7 +97,8 @@ def beside(act):
     assert not faults, faults
 
 
-def test_a_run_that_is_looked_at_has_the_bits_of_one_that_is_not(live, few_steps, tiny_scene, tmp_path):
+def test_a_run_that_is_looked_at_has_the_bits_of_one_that_is_not(live, few_steps, tiny_scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "FAREWELL", 30.0)  # it ends as soon as the page has heard
     client, seen = Client(live), {}
 
     def look():

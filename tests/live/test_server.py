@@ -78,6 +78,43 @@ def test_more_connections_than_there_are_slots_are_closed_and_the_server_goes_on
         one.close()
 
 
+def test_the_end_of_the_server_ends_its_connections(server):
+    request = b"GET /token/a HTTP/1.1\r\nHost: localhost\r\n\r\n"
+    with socket.create_connection(("127.0.0.1", server.port), timeout=10) as connection:
+        connection.sendall(request)
+        assert connection.recv(1 << 16).startswith(b"HTTP/1.1 200")
+        (thread,) = (one for one in threading.enumerate() if "process_request_thread" in one.name)
+        server.stop()
+        with suppress(OSError):
+            connection.sendall(request)
+            assert connection.recv(1 << 16) == b""
+        thread.join(10)
+        assert not thread.is_alive()
+
+
+def test_the_answer_that_is_given_at_the_end_is_whole_and_the_last():
+    given, going = threading.Event(), threading.Event()
+
+    def answer(request):
+        given.set()
+        going.wait(10)
+        return Answer(200, b"farewell")
+
+    server = Server(0, "token", answer)
+    request = b"GET /token/a HTTP/1.1\r\nHost: localhost\r\n\r\n"
+    with socket.create_connection(("127.0.0.1", server.port), timeout=10) as connection:
+        connection.sendall(2 * request)
+        given.wait(10)
+        server.stop()
+        going.set()
+        found = b""
+        with suppress(ConnectionError):
+            while more := connection.recv(1 << 16):
+                found += more
+    assert found.endswith(b"farewell")
+    assert found.count(b"HTTP/1.1 200") == 1
+
+
 def test_a_port_in_use_is_one_sentence_and_without_one_the_next_is_taken(server):
     with pytest.raises(ConfigError, match=rf"--live: port {server.port} of 127.0.0.1 cannot be used \(.*\); give ano"):
         Server(server.port, "token", server.answer)

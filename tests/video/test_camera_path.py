@@ -7,7 +7,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from clsplat.errors import ConfigError, DataError
+from clsplat.cameras import inria
+from clsplat.cameras.posed import Posed
+from clsplat.errors import DataError
+from clsplat.scene.camera import Camera
+from clsplat.scene.view import View
 from clsplat.video import camera_path
 from clsplat.video.paths import PATHS
 from tests.video.test_paths import SIZE, rig_of, ring
@@ -95,6 +99,42 @@ def test_another_size_keeps_the_vertical_field_of_view(views, tmp_path):
     assert (wide.width, wide.cx, wide.cy) == (200, 100, 48)
 
 
+@pytest.fixture
+def oblique(tmp_path):
+    """A cameras.json with two lenses off the middle, and its path."""
+    cameras = [Camera(640, 480, 500.0, 400.0, cx, 200.0) for cx in (300.0, 350.0)]
+    views = [View(f"{i}.png", camera, np.eye(3, 4)) for i, camera in enumerate(cameras)]
+    inria.write(tmp_path, [Posed(view.name, view, False) for view in views], None)
+    return camera_path.read(tmp_path / "cameras.json")
+
+
+def lenses(views):
+    return [(c.fx, c.fy, c.cx, c.cy) for c in (view.camera for view in views)]
+
+
+def test_another_size_keeps_the_lens(oblique):
+    assert (
+        lenses(oblique.resized(oblique.size)) == lenses(oblique.views) == [(500, 400, 300, 200), (500, 400, 350, 200)]
+    )
+    assert lenses(oblique.resized((640, 240))) == [(250, 200, 310, 100), (250, 200, 335, 100)]
+
+
+def test_between_two_views_the_lens_is_between_theirs(oblique):
+    assert lenses(camera_path.spread(oblique.views, 3)) == [(500, 400, cx, 200) for cx in (300, 325, 350)]
+
+
+def test_what_a_path_loses_of_a_lens_is_said(oblique, tmp_path, caplog):
+    caplog.clear()
+    camera_path.write(tmp_path / "p.json", oblique.views, 30)
+    centre, sides = caplog.messages
+    assert f"{tmp_path / 'p.json'}: " in centre
+    assert "the middle of the image for the principal point, which is up to 40.0 px away" in centre
+    assert "the vertical focal length for the horizontal one, which moves the sides by up to 64.0 px" in sides
+    caplog.clear()
+    camera_path.write(tmp_path / "p.json", camera_path.read(tmp_path / "p.json").views, 30)
+    assert not caplog.messages
+
+
 FAULTS = {
     "not a path": (lambda d: d.pop("camera_path"), "a list `camera_path`"),
     "no frames": (lambda d: d.update(camera_path=[]), "has 0 frames"),
@@ -106,7 +146,11 @@ FAULTS = {
     "few numbers": (lambda d: d["camera_path"][2]["camera_to_world"].pop(), "camera_path\\[2\\]"),
     "no rotation": (lambda d: d["camera_path"][0].update(camera_to_world=[0.0] * 16), "rotation"),
     "huge": (lambda d: d.update(render_width=10**9), "size"),
-    "a rate": (lambda d: d.update(fps=100000), "frames a second"),
+    "no height": (lambda d: d.update(render_height=0), r"size \(64, 0\).*; export the path again"),
+    "a width alone": (lambda d: d.pop("render_height"), r"size \(64, 0\)"),
+    "no size": (lambda d: d.update(render_width=0, render_height=0), r"size \(0, 0\)"),
+    "a rate": (lambda d: d.update(fps=100000), "frames a second.*; export the path again"),
+    "no rate": (lambda d: d.update(fps=0), "fps 0.0"),
 }
 
 
@@ -117,8 +161,9 @@ def test_damaged_paths_are_refused_in_a_line(fault, views, tmp_path):
     change, message = FAULTS[fault]
     change(data)
     (tmp_path / "p.json").write_text(json.dumps(data))
-    with pytest.raises((DataError, ConfigError), match=message):
+    with pytest.raises(DataError, match=message) as raised:
         camera_path.read(tmp_path / "p.json")
+    assert str(raised.value).startswith(f"{tmp_path / 'p.json'}: ")
 
 
 @pytest.mark.parametrize("world", [{}, {"transform": [[1, 0, 0, 0]], "scale": 1}, {"scale": 0}, [], {"transform": "x"}])

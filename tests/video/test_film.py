@@ -1,14 +1,16 @@
 """Films of a model by command and by function: colours, depth, coverage, photographs and models beside."""
 
+import json
 import shutil
+import zipfile
 
 import numpy as np
 import pytest
 
 import clsplat
-from clsplat.errors import ConfigError, DataError
+from clsplat.errors import ConfigError, DataError, NumericError
 from clsplat.scene.images import read_image
-from clsplat.video.pictures import depth_picture, letterboxed
+from clsplat.video.pictures import Canvas, depth_picture, letterboxed
 from tests.test_cli import clsplat as command
 from tests.video.test_encoding import decoded
 
@@ -48,6 +50,63 @@ def test_a_path_of_a_file_needs_no_scene(few_steps, tmp_path):
     assert (told["frames"], told["size"]) == (5, [32, 32])
     with pytest.raises(ConfigError, match="does not name its scene"):
         clsplat.render_path(model, video=tmp_path / "a.webm")
+
+
+def test_the_pictures_of_a_film_stand_alone(few_steps, tiny_scene, tmp_path):
+    out, options = tmp_path / "out", {"video": None, "out": tmp_path / "out", "size": (16, 16)}
+    clsplat.render_path(few_steps, **options, frames=5, depth=True)
+    clsplat.render_views(few_steps, out=out)
+    clsplat.render_path(few_steps, **options, frames=1, kind="npy")
+    (out / "frame_00007.png").write_bytes(b"a drawing")
+    renders = [path.relative_to(tiny_scene).as_posix() for path in sorted((tiny_scene / "test").glob("*.png"))]
+    clsplat.render_path(few_steps, **options, frames=2)
+    found = sorted(path.relative_to(out).as_posix() for path in out.rglob("*.*") if path.is_file())
+    frames = ["frame_00001.npy", "frame_00001.png", "frame_00002.png", "frame_00007.png"]
+    assert found == [".renders.json", *frames, *renders]
+    with pytest.raises(ConfigError, match=r"frame_00007\.png: exists, and is no render"):
+        clsplat.render_path(few_steps, **options, frames=7)
+    (out / "frame_00003.png").write_bytes(b"a drawing")
+    with pytest.raises(ConfigError, match=r"frame_00003\.png: exists, and is no render"):
+        clsplat.render_path(few_steps, **options, frames=3)
+
+
+def test_a_film_that_fails_leaves_the_earlier_one(few_steps, tmp_path, monkeypatch):
+    clsplat.render_path(few_steps, video=None, out=tmp_path / "out", frames=3, size=(16, 16))
+    before = pictures(tmp_path / "out")
+    monkeypatch.setattr(Canvas, "layers", lambda *_: (_ for _ in ()).throw(NumericError("no picture")))
+    with pytest.raises(NumericError, match="no picture"):
+        clsplat.render_path(few_steps, video=None, out=tmp_path / "out", frames=1, size=(16, 16))
+    assert pictures(tmp_path / "out").keys() == before.keys()
+    monkeypatch.undo()
+    clsplat.render_path(few_steps, video=None, out=tmp_path / "out", frames=1, size=(16, 16))
+    assert list(pictures(tmp_path / "out")) == ["frame_00001.png"]
+
+
+@pytest.mark.parametrize(
+    "record", [["../a.png", "frame_00001.png"], {"../a.png": True, "sub/b.png": True, "\0.png": True}, "x", [[]]]
+)
+def test_a_record_that_is_not_ours_removes_nothing(record, few_steps, tmp_path):
+    (tmp_path / "out" / "sub").mkdir(parents=True)
+    for name in ("a.png", "out/sub/b.png"):
+        (tmp_path / name).write_bytes(b"a drawing")
+    (tmp_path / "out" / ".renders.json").write_text(json.dumps(record))
+    clsplat.render_path(few_steps, video=None, out=tmp_path / "out", frames=2, size=(16, 16))
+    assert (tmp_path / "a.png").is_file()
+    assert (tmp_path / "out" / "sub" / "b.png").is_file()
+
+
+def test_a_folder_of_sog_needs_no_scene_for_a_path_of_a_file(few_steps, tmp_path):
+    clsplat.render_path(few_steps, video=None, out=tmp_path / "o", frames=2, save_path=tmp_path / "p.json")
+    clsplat.load(few_steps).save(tmp_path / "m.sog")
+    with zipfile.ZipFile(tmp_path / "m.sog") as archive:
+        archive.extractall(tmp_path / "m")
+    options = {"path": str(tmp_path / "p.json"), "size": "32x32"}
+    told = clsplat.render_path(tmp_path / "m", video=tmp_path / "a.webm", **options)
+    assert told["frames"] == 2
+    clsplat.render_path(tmp_path / "m" / "meta.json", video=tmp_path / "b.webm", **options)
+    assert (tmp_path / "a.webm").read_bytes() == (tmp_path / "b.webm").read_bytes()
+    with pytest.raises(ConfigError, match="does not name its scene"):
+        clsplat.render_path(tmp_path / "m", video=tmp_path / "a.webm")
 
 
 def test_command_and_function_write_the_same_bytes(few_steps, tmp_path):

@@ -11,7 +11,7 @@ import pytest
 
 import clsplat
 from clsplat.metrics.images import psnr, to_8_bits
-from clsplat.viewer.cameras import Stand
+from clsplat.scene.stand import Stand
 from clsplat.viewer.packing import pack
 from clsplat.viewer.page import Page
 from clsplat.viewer.photographs import described

@@ -147,7 +147,7 @@ def test_errors_of_the_function(run, tmp_path, monkeypatch):
         clsplat.view()
     with pytest.raises(ConfigError, match="no photographs 'some'; there are none, test and all"):
         clsplat.view(run, out=tmp_path / "a.html", photographs="some")
-    monkeypatch.setattr(module, "MAX_SIZE", 0.12)
+    monkeypatch.setattr(module, "MAX_SIZE", 0.15)
     with pytest.raises(OutputError, match=r"browsers open .* at most: show the [\d,]+ most important splats"):
         clsplat.view(run, out=tmp_path / "a.html")
     assert list(tmp_path.iterdir()) == []

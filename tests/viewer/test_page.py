@@ -12,8 +12,9 @@ import pytest
 
 from clsplat.errors import OutputError
 from clsplat.pages.page import inline
+from clsplat.scene.stand import Stand
 from clsplat.viewer import page as module
-from clsplat.viewer.cameras import Stand, camera_data, closest_point
+from clsplat.viewer.cameras import camera_data
 from clsplat.viewer.packing import pack
 from clsplat.viewer.page import FOLDER, SCRIPTS, Page, script
 from clsplat.viewer.photographs import described, left_out, shrunk
@@ -88,6 +89,14 @@ def test_a_page_that_browsers_cannot_open_is_refused(page, tmp_path, monkeypatch
     assert not list(tmp_path.iterdir())
 
 
+def test_of_a_page_with_too_many_photographs_these_are_the_fault(page, tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "MAX_SIZE", 0.2)
+    large = replace(page, views=[{"name": "a", "thumbnail": "", "photograph": "x" * 300_000}])
+    with pytest.raises(OutputError, match="at most: show fewer photographs") as raised:
+        large.write(tmp_path / "page.html")
+    assert "splats" not in str(raised.value)
+
+
 def test_as_many_splats_fit_as_the_advice_says(page, monkeypatch):
     model = cloud(4000)
     large = replace(page, models={"model": pack(model)})
@@ -130,19 +139,6 @@ def test_photographs_of_the_views_that_are_wanted(tmp_path, which, held):
 @pytest.mark.parametrize(("shape", "after"), [((300, 200), (128, 85)), ((100, 128), (100, 128)), ((2, 4000), (1, 128))])
 def test_thumbnails_keep_their_aspect(shape, after):
     assert shrunk(np.zeros((*shape, 3), np.uint8), 128).shape[:2] == after
-
-
-def test_the_pivot_is_where_the_axes_meet():
-    centre = np.array([1.0, -2.0, 3.0])
-    places = np.random.default_rng(0).normal(0, 4, (12, 3))
-    axes = (centre - places) / np.linalg.norm(centre - places, axis=1, keepdims=True)
-    np.testing.assert_allclose(closest_point(places, axes, centre + 5), centre, atol=0.02)
-
-
-def test_parallel_axes_meet_at_the_depth_of_the_splats():
-    places = np.array([[0.0, 0, 0], [2, 0, 0], [0, 2, 0], [2, 2, 0]])
-    found = closest_point(places, np.tile([0.0, 0, 1], (4, 1)), np.array([9.0, 9, 7]))
-    np.testing.assert_allclose(found, [1, 1, 7], atol=0.02)
 
 
 def test_where_a_page_begins(tmp_path):
