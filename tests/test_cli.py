@@ -41,7 +41,9 @@ def test_run_names_the_device_first_and_says_where_things_are(tiny_scene, tmp_pa
     assert "schedule" in lines[0]
     assert any("test PSNR" in line for line in lines)
     assert any(str(tmp_path / "run" / "report.html") in line for line in lines)
-    assert "loss" in (tmp_path / "run" / "log.txt").read_text()
+    log = (tmp_path / "run" / "log.txt").read_text()
+    assert "loss" in log
+    assert [line for line in lines if line not in log] == []
 
 
 def test_dry_run_touches_nothing(tiny_scene, tmp_path):

@@ -13,11 +13,13 @@ from clsplat.compress import search
 from clsplat.compress.page import page, table
 from clsplat.compress.rungs import Ladder, checked_keeps
 from clsplat.compress.target import Point, Target
-from clsplat.errors import ConfigError
+from clsplat.errors import ConfigError, Interrupted
 from clsplat.formats.table import detect, read
 from clsplat.gaussians.model import Rendering
-from clsplat.runs import model_file
+from clsplat.pipeline.loading import Pipeline
+from clsplat.runs import model_file, runner
 from clsplat.runs.model_file import Source, evaluate
+from clsplat.training.run import Run
 from tests.html_page import Page
 
 pytestmark = pytest.mark.slow
@@ -34,6 +36,7 @@ def searched(few_steps: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished search for a file of any size."""
     out = tmp_path_factory.mktemp("search") / "small"
     clsplat.compress_model(few_steps, target="1MB", out=out, keep=KEEP, steps=STEPS)
+    assert "nothing to resume" not in (out / "keep_50" / "log.txt").read_text()
     return out
 
 
@@ -145,6 +148,21 @@ def test_the_model_and_its_scene_are_opened_once(few_steps, tmp_path, monkeypatc
     with pytest.raises(ConfigError, match="holds something else"):
         clsplat.compress_model(few_steps, target="1MB", out=tmp_path, keep=KEEP, steps=STEPS)
     assert opened == [few_steps / "point_cloud.ply"]
+
+
+def test_a_search_that_is_interrupted_goes_on_when_it_is_asked_again(few_steps, tmp_path, monkeypatch):
+    def interrupted(pipeline: Pipeline, run: Run) -> None:
+        run.interrupted = True
+        run_stages(pipeline, run)
+
+    run_stages = runner._run_stages
+    monkeypatch.setattr(runner, "_run_stages", interrupted)
+    search = {"target": "1MB", "out": tmp_path / "out", "keep": [0.5], "steps": STEPS}
+    with pytest.raises(Interrupted, match=r"^stopped in keep_50; the same command goes on with the search$"):
+        clsplat.compress_model(few_steps, **search)
+    monkeypatch.setattr(runner, "_run_stages", run_stages)
+    assert Path(clsplat.compress_model(few_steps, **search)["file"]).is_file()
+    assert "resumed at step 0" in (tmp_path / "out" / "keep_50" / "log.txt").read_text()
 
 
 def test_another_search_needs_another_folder(searched, few_steps, tmp_path):

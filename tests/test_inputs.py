@@ -324,7 +324,7 @@ def test_a_run_does_not_go_on_with_other_inputs(scene, tmp_path, what):
     for more in (["--dry-run"], []):
         done = command("run", "smoke", "--scene", scene, "--out", out, "--resume", *more, expect=2)
         assert f"{scene}: not what the run was started with: {word}" in done.stderr
-        assert "put that back, or start anew, with --restart or in another folder (--out)" in done.stderr
+        assert "put that back, or begin anew: `clsplat run` with --restart or another --out" in done.stderr
         if more:
             assert sorted((path.name, path.read_bytes()) for path in out.iterdir() if path.is_file()) == before
     for path, content in kept.items():

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from clsplat.errors import DataError
+from clsplat.formats.table import write as write_splats
 from clsplat.inspect.inspection import Inspection
 from clsplat.inspect.page import MAX_NAMES, inspection_page
 from clsplat.inspect.survey import distortion
@@ -23,6 +24,7 @@ from clsplat.scene.view import load_image, load_mask
 from clsplat.stages.init import require_ahead
 from tests.colmap_writer import CameraEntry, ColmapModel, ImageEntry, PointEntry, tiny_model, write_model, write_scene
 from tests.data_sets import data_set
+from tests.formats.models import splats
 from tests.html_page import HOSTILE, Page
 from tests.test_cli import clsplat
 from tests.test_image_headers import with_exif
@@ -447,3 +449,12 @@ def test_long_lists_of_names_are_cut(tmp_path):
     assert f"more{MAX_NAMES - 1:03}.png" in text
     assert f"more{MAX_NAMES:03}.png" not in text
     assert "… and 5 more" in text
+
+
+def test_a_model_is_no_dataset(tmp_path, rng):
+    write_splats(tmp_path / "a.ply", splats(rng, 3))
+    done = clsplat("inspect", tmp_path / "a.ply", expect=3)
+    assert "a.ply: is a model (PLY), which `clsplat check` reads; expected the folder of a dataset" in done.stderr
+    (tmp_path / "b.txt").write_text("text")
+    done = clsplat("inspect", tmp_path / "b.txt", expect=3)
+    assert "b.txt: is a file; expected the folder of a dataset" in done.stderr

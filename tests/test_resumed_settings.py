@@ -23,23 +23,26 @@ def test_what_no_table_depends_on_may_change(killed_run, tiny_scene, few_steps, 
 
 
 @pytest.mark.parametrize("change", ["optimize.steps=14", "densify.stop=6", "optimize.losses.0.weight=0.7"])
-def test_numbers_of_the_training_may_change(change, killed_run, tiny_scene, few_steps):
+def test_numbers_of_the_training_may_change(change, killed_run, tiny_scene, caplog):
     run = train(tiny_scene, killed_run, *FEW, change, resume=True)
     assert run.step == (14 if "steps" in change else 12)
+    assert caplog.text.count("from here on the bits are not those of a run without a change") == 1
     assert len(json.loads((killed_run / "metrics.json").read_text())["changes"]) == 1
     assert f"{change.split('=')[1]}" in (killed_run / "pipeline.yaml").read_text()
 
 
 @pytest.mark.parametrize("change", ["seed=3", "init.count=70", "model.sh_degree=2", "optimize.losses=[l1]"])
 def test_what_tables_depend_on_may_not_change(change, killed_run, tiny_scene):
-    with pytest.raises(ConfigError, match=r"was made with other settings: .*those settings, or --restart"):
+    with pytest.raises(ConfigError, match=r"was made with other settings: .*those settings, or begin anew: `clsp"):
         train(tiny_scene, killed_run, *FEW, change, resume=True)
 
 
-def test_a_run_that_has_trained_for_longer_is_refused(killed_run, tiny_scene):
+def test_a_run_that_has_trained_for_longer_is_refused(killed_run, tiny_scene, caplog):
     before = (killed_run / "pipeline.yaml").read_text()
-    with pytest.raises(ConfigError, match=r"already at step 8; optimize.steps=6 would end before it"):
+    words = r"already at step 8; optimize.steps=6 would end before it: give 8 or more, or begin anew: `clsplat run`"
+    with pytest.raises(ConfigError, match=words):
         train(tiny_scene, killed_run, *FEW, "optimize.steps=6", resume=True)
+    assert "bits" not in caplog.text, "nothing goes on"
     assert (killed_run / "pipeline.yaml").read_text() == before
 
 

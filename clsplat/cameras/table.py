@@ -1,5 +1,6 @@
 """The formats of cameras, by name."""
 
+import logging
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -12,6 +13,7 @@ from clsplat.progress import counted
 from clsplat.reading import opened
 from clsplat.scene.scene import PointCloud, Scene
 
+LOG = logging.getLogger("clsplat")
 WRITERS: dict[str, Callable[[Path, list[Posed], PointCloud | None], list[Path]]] = {
     "colmap": colmap.write,
     "nerfstudio": nerfstudio.write,
@@ -23,6 +25,7 @@ PLACES = {  # that each writes
     "inria": [Path(inria.FILE)],
 }
 COPIES = ("none", "copy")  # of the photographs
+SPLIT = "nerfstudio"  # what keeps it
 
 
 def write_cameras(scene: Scene, out: Path, format_: str, images: str = "none", over: bool = False) -> list[Path]:
@@ -40,6 +43,9 @@ def write_cameras(scene: Scene, out: Path, format_: str, images: str = "none", o
         if is_there(path):
             raise ConfigError(f"{path}: exists; give another folder for the cameras, or remove it")
     written = WRITERS[format_](out, views, scene.points)
+    if format_ != SPLIT and scene.test:
+        lost = f"{len(scene.test)} of {len(views)}"
+        LOG.warning("%s: %s does not keep which views are for testing, %s; %s does", out, format_, lost, SPLIT)
     for path, source in counted(copies.items(), "photographs copied", len(copies)):
         with opened(source, "an image") as old, atomic(path) as new:
             shutil.copyfileobj(old, new)

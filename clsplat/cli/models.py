@@ -76,7 +76,7 @@ def evaluate(
 )
 def view(
     models: Annotated[
-        list[Path], typer.Argument(metavar="MODEL|RUN [MODEL2]", help="Splat PLYs or run folders; two share a camera.")
+        list[Path], typer.Argument(metavar="MODEL|RUN [MODEL2]", help="Model files or run folders; two share a camera.")
     ],
     scene: SceneOption = None,
     out: Annotated[Path, typer.Option(metavar="FILE.html", help="The page to write.")] = Path("viewer.html"),
@@ -146,7 +146,7 @@ def convert(
         drop_below=drop_below,
     )
     share = 100 * done["bytes"] / max(done["bytes_read"], 1)
-    size = f"{done['bytes'] / 1e6:.3g} MB, {share:.3g} % of what was read"
+    size = f"{done['bytes'] / 1e6:.3g} MB, {share:,.1f} % of what was read"
     terminal.remark(f"{done['file']}: {done['format']}, {done['gaussians']:,} Gaussians, {size}")
 
 

@@ -66,7 +66,8 @@ def render(
             raise ConfigError("--split is for pictures of views; of a film, --path views shows all views")
         options: dict[str, Any] = {"path": path or "ellipse", "frames": frames, "fps": fps, "size": size, "side": side}
         options |= {"depth": depth, "alpha": alpha, "save_path": save_path, "downscale": scale, "kind": format_}
-        terminal.remark(_told(pictures.render_path(model, scene, file, out=out, device=device, **options)))
+        found = pictures.render_path(model, scene, file, out=out, device=device, **options)
+        terminal.remark(_told(found, pictures_wide=1 if side is None else 2))
         return
     of_films = {"--frames": frames, "--fps": fps, "--size": size, "--side": side, "--save-path": save_path}
     if given := [name for name, value in of_films.items() if value is not None]:
@@ -85,10 +86,11 @@ def render(
     terminal.remark(f"{count} images written to {out}")
 
 
-def _told(found: dict[str, Any]) -> str:
+def _told(found: dict[str, Any], pictures_wide: int) -> str:
     """What was filmed, in a line."""
     first, *others = (Path(name) for name in found["files"])
-    made = f"{found['frames']} frames of {found['size'][0]} x {found['size'][1]} px in {found['took']:.1f} s"
+    width, height = found["size"]
+    made = f"{found['frames']} frames of {pictures_wide * width} x {height} px in {found['took']:.1f} s"
     if first.suffix in (".png", ".npy"):
         return f"{first.parent}: {made}"
     also = "".join(f", {path.name}" for path in others)

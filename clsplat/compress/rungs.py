@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from clsplat.errors import ConfigError
+from clsplat.errors import ConfigError, Interrupted
+from clsplat.files import is_there
 from clsplat.gaussians.model import Model
 from clsplat.gaussians.run_model import MODEL
 from clsplat.names import PIPELINE
@@ -42,7 +43,10 @@ class Ladder:
         file = self.source.file if before == 1 else self.folder(before) / MODEL
         pipeline, folder = self.pipeline(file, keep / before), self.folder(keep)
         if not _is_done(pipeline, folder):
-            run_pipeline(pipeline, folder, self.device, "resume")
+            try:
+                run_pipeline(pipeline, folder, self.device, "resume" if is_there(folder) else "new")
+            except Interrupted as error:
+                raise Interrupted(f"stopped in {folder.name}; the same command goes on with the search") from error
         return folder / MODEL
 
     def folder(self, keep: float) -> Path:

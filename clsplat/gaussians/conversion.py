@@ -56,13 +56,18 @@ class Options:
 
     def of(self, sources: Sequence[Path], out: Path) -> tuple[Reading, Writing]:
         """Return them for these files.  Raises ConfigError where one has no meaning there."""
-        to_spz, from_spz = for_writing(out).name == "SPZ", _reads_spz(sources)
+        codec, from_spz = for_writing(out), _reads_spz(sources)
+        to_spz = codec.name == "SPZ"
         if self.spz_version not in (3, 4):
             raise ConfigError(f"--spz-version {self.spz_version}: expected 3 or 4")
         if not to_spz and (self.sh_bits is not None or self.spz_version != 3):
             raise ConfigError(f"{out}: --sh-bits and --spz-version are of SPZ; expected a name that ends in .spz")
         if self.axes != "spz" and not to_spz and not from_spz:
             raise ConfigError("--axes is of SPZ; expected an SPZ file to read or to write")
+        if self.quality != "balanced" and codec.name not in ("SPZ", "SOG"):
+            raise ConfigError(f"{out}: --quality is of SPZ and SOG; expected a name that ends in .spz or .sog")
+        if self.keep_nan and not codec.keeps_nan:
+            raise ConfigError(f"{out}: --keep-nan is of PLY; expected a name that ends in .ply")
         bits = None if self.sh_bits is None else sh_bits_of(self.sh_bits)
         version: Literal[3, 4] = 4 if self.spz_version == 4 else 3
         written = Writing(bits, "spz" if from_spz else self.axes, version, self.quality)
@@ -79,6 +84,8 @@ def convert(
     if not sources:
         raise ConfigError("convert: expected a model file to read, and one to write")
     codec = for_writing(out)
+    if any(_is_same(out, model_at(source)) for source in sources):
+        raise ConfigError(f"{out}: is one of the files that are read; give another name")
     reading, writing = (options or Options()).of(sources, out)
     models = [load(source, reading) for source in sources]
     model = (changes or Changes()).of(merged(models, [str(source) for source in sources]))
@@ -189,3 +196,11 @@ def _reads_spz(sources: Sequence[Path]) -> bool:
     """Whether one of the files is an SPZ file."""
     found = [detect(place) for place in map(model_at, sources) if place.is_file()]
     return any(codec is not None and codec.name == "SPZ" for codec in found)
+
+
+def _is_same(one: Path, other: Path) -> bool:
+    """Whether two names are of one file."""
+    try:
+        return one.samefile(other)
+    except (OSError, ValueError):  # there is no such file
+        return False

@@ -11,14 +11,14 @@ FIELDS = 8  # of a query
 NAMES = frozenset({"127.0.0.1", "localhost", "[::1]"})  # another one is a page elsewhere whose name leads here
 PHRASES = {200: "OK", 204: "No Content", 400: "Bad Request", 403: "Forbidden", 404: "Not Found"}
 PHRASES |= {405: "Method Not Allowed", 431: "Request Header Fields Too Large", 503: "Service Unavailable"}
-HEADERS = (
-    ("Cache-Control", "no-store"),
-    ("Referrer-Policy", "no-referrer"),  # the address holds the secret
-    ("X-Content-Type-Options", "nosniff"),
-    ("X-Frame-Options", "DENY"),
-    ("Cross-Origin-Resource-Policy", "same-origin"),
-    ("Cross-Origin-Opener-Policy", "same-origin"),
-)
+HEADERS = {  # where an answer has no others
+    "Cache-Control": "no-store",
+    "Referrer-Policy": "no-referrer",  # the address holds the secret
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cross-Origin-Opener-Policy": "same-origin",
+}
 
 
 @dataclass(frozen=True)
@@ -40,9 +40,9 @@ class Answer:
 
     def bytes(self) -> bytes:
         """Return the answer as it is sent."""
-        lines = [f"HTTP/1.1 {self.status} {PHRASES[self.status]}", f"Content-Type: {self.kind}"]
-        lines += [f"Content-Length: {len(self.body)}", *(f"{name}: {value}" for name, value in HEADERS)]
-        lines += [f"{name}: {value}" for name, value in self.headers.items()]
+        headers = {"Content-Type": self.kind, "Content-Length": len(self.body), **HEADERS, **self.headers}
+        lines = [f"HTTP/1.1 {self.status} {PHRASES[self.status]}"]
+        lines += [f"{name}: {value}" for name, value in headers.items()]
         if self.status in (400, 405, 431):
             lines.append("Connection: close")
         return "\r\n".join([*lines, "", ""]).encode("latin-1") + self.body

@@ -24,6 +24,7 @@ from clsplat.runs.failures import failures_recorded
 from clsplat.runs.folders import Start
 from clsplat.runs.scenes import read_run_scene
 from clsplat.runs.source import photographs_of
+from clsplat.runs.summary import summary
 from clsplat.signals import stop_at_once, stop_if_signalled, stopping_on_signals
 from clsplat.training.changes import first_difference
 from clsplat.training.status import StatusFile, read_status
@@ -121,6 +122,8 @@ def run_pipeline(
             stop_if_signalled()
         with terminal.progress_bar() as show, live.showing(run) if live else nullcontext():
             runner.execute(pipeline, run, start, live.reporting(show) if live else show)
+        for line in summary(out):
+            LOG.debug("%s", line)  # who asked for the run shows it
 
 
 def run_matrix(

@@ -31,7 +31,7 @@ def require_same_inputs(run: Run) -> None:
         changes = changes or f"{INPUTS} is missing or damaged, so what changed is not known"
         raise ConfigError(
             f"{run.scene.path}: not what the run was started with: {shortened(changes, 500)}; put that back, or "
-            "start anew, with --restart or in another folder (--out)"
+            "begin anew: `clsplat run` with --restart or another --out"
         )
 
 

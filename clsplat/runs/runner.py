@@ -61,15 +61,17 @@ def restore(pipeline: Pipeline, run: Run) -> Path | None:
     Raises ConfigError when it is of another run: with other settings, photographs, cameras or points, or of one that
     has trained for longer already; OutputError when no checkpoint is whole.
     """
-    taken = checkpoint.restore(run)
+    taken, remarks = checkpoint.restore(run)
     if taken:
         require_same_inputs(run)
         stage = pipeline.stages[run.cursor] if run.cursor < len(pipeline.stages) else None
         if isinstance(stage, Optimize) and stage.steps < run.stage_step:
             raise ConfigError(
                 f"{taken}: already at step {run.step}; optimize.steps={stage.steps} would end before it: give "
-                f"{run.stage_step} or more, or --restart"
+                f"{run.stage_step} or more, or begin anew: `clsplat run` with --restart or another --out"
             )
+    for remark in remarks:
+        LOG.warning("%s", remark)
     return taken
 
 

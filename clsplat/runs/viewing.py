@@ -42,6 +42,8 @@ def view(
     if photographs not in ("none", "test", "all"):
         raise ConfigError(f"no photographs '{photographs}'; there are none, test and all")
     source = next((Source.of(path, scene) for path in models if scene is not None or run_of(path)), None)
+    if photographs == "all" and source is None:
+        raise ConfigError("--photographs all needs the photographs of a scene; give --scene, or a run folder")
     loaded = {name: load(path) for name, path in zip(names(models), models, strict=True)}
     first = next(iter(loaded.values()))
     found = source.scene(first).downscaled(source.settings.downscale) if source else None

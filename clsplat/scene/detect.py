@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from clsplat.errors import ConfigError, DataError
+from clsplat.formats.table import detect as model_format
 from clsplat.scene.blender import BlenderReader
 from clsplat.scene.colmap import ColmapReader
 from clsplat.scene.images import is_image
@@ -57,7 +58,11 @@ def read_scene(path: str | Path, holdout: int = HOLDOUT) -> Scene:
     """
     path = Path(path)
     if not path.is_dir():
-        raise DataError(f"{path}: no such folder; expected the folder of a dataset")
+        found = "no such folder"
+        if path.is_file():
+            model = model_format(path)
+            found = f"is a model ({model.name}), which `clsplat check` reads" if model else "is a file"
+        raise DataError(f"{path}: {found}; expected the folder of a dataset")
     if reader := reader_of(path):
         return reader.read(path, holdout)
     if any(is_image(file) for file in path.iterdir()):

@@ -98,8 +98,10 @@ def load(path: Path) -> tuple[State, Arrays]:
     return state, tables
 
 
-def restore(run: Run) -> Path | None:
+def restore(run: Run) -> tuple[Path | None, list[str]]:
     """Take the newest checkpoint that is whole; return its file, or None where the run has saved none so far.
+
+    Also returns what to say where the run goes on: the settings and the device that have changed.
 
     Raises ConfigError when it was made with settings that a run cannot go on with, or has another format; OutputError
     when no checkpoint is whole, or all are gone.
@@ -114,14 +116,15 @@ def restore(run: Run) -> Path | None:
                 raise OutputError(f"{path} is damaged ({error}), and no checkpoint is whole; {again}") from error
             LOG.warning("%s is damaged (%s); using the one before it", path, error)
             continue
-        _take_changes(run, path, state)
+        changed = _take_changes(run, path, state)
+        remarks = [f"{text}; from here on the bits are not those of a run without a change" for text in changed]
         if state.device != run.device.text:
-            LOG.warning("the run was started on %s: the bits may differ from here on", state.device)
+            remarks.append(f"the run was started on {state.device}: the bits may differ from here on")
         _restore(run, state, tables)
-        return path
+        return path, remarks
     if last := run.status.now.checkpoint:
         raise OutputError(f"{run.out / CHECKPOINTS}: is empty, but {last} was saved there; put it back, or {again}")
-    return None
+    return None, []
 
 
 def drop_later(out: Path, taken: Path | None) -> None:
@@ -184,9 +187,9 @@ def _check(state: State, tables: Arrays) -> None:
         raise DataError("it counts updates of other parameters")
 
 
-def _take_changes(run: Run, path: Path, state: State) -> None:
-    """Note the settings that have changed.  Raises ConfigError for one that a run cannot go on with."""
-    changed, remedy = [], "use another --out, those settings, or --restart"
+def _take_changes(run: Run, path: Path, state: State) -> list[str]:
+    """Note the settings that have changed, and return them.  Raises ConfigError where a run cannot go on."""
+    changed, remedy = [], "give those settings, or begin anew: `clsplat run` with --restart or another --out"
     before = state.pipeline
     if run.inputs and state.inputs == run.inputs:  # the same scene, wherever it lies now
         before = {**before, "scene": {**before["scene"], "path": run.pipeline["scene"]["path"]}}
@@ -199,8 +202,7 @@ def _take_changes(run: Run, path: Path, state: State) -> None:
             raise ConfigError(f"{path} was saved after that stage, at step {state.step}: {difference}; {remedy}")
         changed.append(f"step {state.step}: {difference}")
     run.changes = [*state.changes, *changed]
-    for text in changed:
-        LOG.warning("%s; from here on the bits are not those of a run without a change", text)
+    return changed
 
 
 def _restore(run: Run, state: State, tables: Arrays) -> None:

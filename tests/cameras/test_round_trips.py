@@ -142,6 +142,13 @@ def test_a_damaged_cameras_json_is_refused(fault, scene_of, tmp_path):
         inria.read(file)
 
 
+@pytest.mark.parametrize(("form", "lines"), [("colmap", 1), ("inria", 1), ("nerfstudio", 0)])
+def test_a_lost_split_is_said_in_a_line(form, lines, scene_of, tmp_path, caplog):
+    clsplat.write_cameras(scene_of("PINHOLE"), tmp_path, form)
+    words = f"{tmp_path}: {form} does not keep which views are for testing, 2 of 5; nerfstudio does"
+    assert [record.levelname for record in caplog.records if record.getMessage() == words] == ["WARNING"] * lines
+
+
 @pytest.mark.parametrize("form", ["colmap", "nerfstudio", "inria"])
 def test_files_that_are_there_stay(form, scene_of, tmp_path):
     scene = scene_of("PINHOLE")

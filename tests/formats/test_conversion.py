@@ -1,13 +1,16 @@
 """`clsplat convert` and `clsplat check MODEL`."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
 
 import clsplat
+from clsplat.cli import app
 from clsplat.errors import ConfigError, DataError
 from clsplat.formats.ply import write_ply
 from clsplat.formats.table import CODECS, bytes_of, detect, read, write
@@ -97,6 +100,9 @@ def test_a_wrong_option_is_refused_before_anything_is_written(option, text, sour
         ("b.ply", {"spz_version": 4}, "are of SPZ"),
         ("b.spz", {"spz_version": 2}, "expected 3 or 4"),
         ("b.ply", {"axes": "ply"}, "--axes is of SPZ"),
+        ("b.glb", {"quality": "small"}, r"b\.glb: --quality is of SPZ and SOG; expected a name that ends in \.spz or "),
+        ("b.compressed.ply", {"quality": "high"}, "--quality is of SPZ and SOG"),
+        ("b.spz", {"keep_nan": True}, r"b\.spz: --keep-nan is of PLY; expected a name that ends in \.ply"),
         ("b.xyz", {}, r"no format has the name 'b.xyz'; expected a name that ends in \.ply, "),
         ("b.ply", {"sh_degree": 4}, "expected 0 to 3"),
     ],
@@ -104,6 +110,26 @@ def test_a_wrong_option_is_refused_before_anything_is_written(option, text, sour
 def test_an_option_without_meaning_is_refused(name, options, words, source, tmp_path):
     with pytest.raises(ConfigError, match=words):
         clsplat.convert(source, tmp_path / name, **options)
+    assert not (tmp_path / name).exists()
+
+
+def test_no_input_is_written_over(source, tmp_path, rng):
+    write(tmp_path / "b.ply", splats(rng, 30))
+    (tmp_path / "link.ply").symlink_to(source)
+    clsplat.convert(source, tmp_path / "f" / "meta.json", sh_degree=0)
+    data = source.read_bytes()
+    for sources, out in [
+        (source, source),
+        (source, tmp_path / "f" / ".." / "a.ply"),
+        (tmp_path / "link.ply", source),
+        (source, tmp_path / "link.ply"),
+        ([tmp_path / "b.ply", source], source),
+        (tmp_path / "f", tmp_path / "f" / "meta.json"),
+    ]:
+        with pytest.raises(ConfigError, match="is one of the files that are read; give another name"):
+            clsplat.convert(sources, out, sh_degree=0)
+    assert source.read_bytes() == data
+    assert (tmp_path / "link.ply").is_symlink()
 
 
 def test_a_crop_and_an_opacity_leave_what_they_say(source, tmp_path):
@@ -137,7 +163,23 @@ def test_gaussians_that_are_not_finite_are_dropped_or_kept(tmp_path, rng, caplog
     assert "dropped 2 Gaussians" in caplog.text
     assert clsplat.convert(tmp_path / "a.ply", tmp_path / "b.ply", keep_nan=True)["gaussians"] == 20
     with pytest.raises(DataError, match="2 Gaussians hold values that are not finite, which GLB cannot hold"):
-        clsplat.convert(tmp_path / "a.ply", tmp_path / "b.glb", keep_nan=True)
+        write(tmp_path / "b.glb", bad)
+
+
+def test_sizes_are_figures_for_people(tmp_path, rng):
+    same = splats(rng, 300).rows(np.zeros(300, int))
+    write(tmp_path / "a.spz", same)
+    done = CliRunner().invoke(app, ["convert", str(tmp_path / "a.spz"), str(tmp_path / "b.ply")])
+    assert done.exit_code == 0, done.output
+    assert re.search(r" MB, \d{1,3},\d{3}\.\d % of what was read", done.output), done.output
+
+
+def test_a_run_folder_stands_for_its_model(source, tmp_path):
+    (tmp_path / "point_cloud.ply").write_bytes(source.read_bytes())
+    (tmp_path / "log.txt").write_bytes(bytes(5000))
+    assert clsplat.convert(tmp_path, tmp_path / "b.spz")["bytes_read"] == source.stat().st_size
+    with pytest.raises(ConfigError, match="is one of the files that are read"):
+        clsplat.convert(tmp_path, tmp_path / "point_cloud.ply")
 
 
 def test_check_tells_what_a_model_is(source, tmp_path):

@@ -76,6 +76,8 @@ def test_an_answer_forbids_frames_caches_and_referrers():
     lines = Answer.json({"a": 1}).bytes().decode().split("\r\n")
     assert lines[0] == "HTTP/1.1 200 OK"
     assert lines[-1] == '{"a":1}'
+    kept = Answer(200, headers={"Cache-Control": "private"}).bytes()
+    assert kept.count(b"Cache-Control: ") == kept.count(b"Cache-Control: private") == 1
     for line in ("Cache-Control: no-store", "Referrer-Policy: no-referrer", "X-Frame-Options: DENY"):
         assert line in lines
     assert "X-Content-Type-Options: nosniff" in lines

@@ -114,7 +114,7 @@ def test_command_and_function_write_the_same_bytes(few_steps, tmp_path):
         *("render", few_steps, "--path", "views", "--frames", "3", "--video", tmp_path / "a.webm"),
         *("--side", "photograph", "--depth", "--alpha", "--size", "40x40", "--fps", "2"),
     ).stdout
-    assert "3 frames of 40 x 40 px" in shown
+    assert "3 frames of 80 x 40 px" in shown
     assert "a.webm, a_depth.webm, a_alpha.webm" in shown
     clsplat.render_path(
         few_steps, None, tmp_path / "b.webm", path="views", frames=3, fps=2, size="40x40", side="photograph", depth=True

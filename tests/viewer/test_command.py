@@ -132,6 +132,10 @@ def test_names_of_models(tmp_path):
     assert names([tmp_path / "other", tmp_path / "other"])[0] != names([tmp_path / "other", tmp_path / "other"])[1]
 
 
+def test_the_help_says_what_is_shown():
+    assert "Model files or run folders" in command("view", "--help")
+
+
 def test_errors_are_one_line(run, tmp_path):
     for arguments, code in (
         (["view", run, run, run], 2),
@@ -147,6 +151,10 @@ def test_errors_of_the_function(run, tmp_path, monkeypatch):
         clsplat.view()
     with pytest.raises(ConfigError, match="no photographs 'some'; there are none, test and all"):
         clsplat.view(run, out=tmp_path / "a.html", photographs="some")
+    alone = shutil.copy(run / "point_cloud.ply", tmp_path)
+    with pytest.raises(ConfigError, match="--photographs all needs the photographs of a scene; give --scene"):
+        clsplat.view(alone, out=tmp_path / "a.html", photographs="all")
+    Path(alone).unlink()
     monkeypatch.setattr(module, "MAX_SIZE", 0.15)
     with pytest.raises(OutputError, match=r"browsers open .* at most: show the [\d,]+ most important splats"):
         clsplat.view(run, out=tmp_path / "a.html")
