@@ -49,7 +49,9 @@ class View:
         rotation = self.world_to_camera[:, :3]
         if not np.isfinite(self.world_to_camera).all():
             raise PoseError(f"the pose of {quoted(self.name)} has values that are not finite; expected finite numbers")
-        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=ROTATION_TOLERANCE) or np.linalg.det(rotation) < 0:
+        with np.errstate(all="ignore"):  # numbers near the end of the range
+            turned = rotation @ rotation.T
+        if not np.allclose(turned, np.eye(3), atol=ROTATION_TOLERANCE) or np.linalg.det(rotation) < 0:
             raise PoseError(
                 f"the pose of {quoted(self.name)} has no rotation in its first three columns; "
                 "expected axes of length 1 at right angles, not mirrored"

@@ -189,6 +189,7 @@ def _world(path: Path, scene: Path | None, known: bool) -> Any:
     rotation, shift = matrix[:, :3], matrix[:, 3]
     before = _applied(scene)
 
+    @np.errstate(all="ignore")  # a pose that is not finite is refused
     def move(pose: Floats) -> Floats:
         """x' = scale · (rotation x + shift) is nerfstudio's world."""
         centre = -pose[:, :3].T @ pose[:, 3]
