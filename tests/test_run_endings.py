@@ -24,6 +24,7 @@ from clsplat.errors import (
 from clsplat.runs import experiment, opening
 from clsplat.runs.experiment import Job
 from clsplat.signals import stopping_on_signals
+from tests.statuses import write_status
 from tests.test_cli import clsplat
 
 pytestmark = pytest.mark.slow
@@ -181,7 +182,7 @@ def test_the_terminal_keeps_stdout_for_json(capsys):
 
 @pytest.mark.parametrize("arguments", ["status RUN --json", "status RUN", "pipelines", "--version"])
 def test_a_command_without_stdout_says_so(arguments, tmp_path):
-    (tmp_path / "status.json").write_text('{"state": "done", "step": 7}')
+    write_status(tmp_path, state="done", step=7)
     command = f'"{sys.executable}" -m clsplat {arguments.replace("RUN", str(tmp_path))} >&-'
     done = subprocess.run(command, shell=True, stderr=subprocess.PIPE, text=True, timeout=60)
     assert done.returncode == 7

@@ -41,5 +41,5 @@ def test_a_row_counts_the_cases_that_its_tests_have_tried(tmp_path):
         "    record_property('cases', 2)\n"
     )
     (tmp_path / "test_none.py").write_text("def test_none():\n    pass\n")
-    assert torture.tested("a", 1, str(tmp_path / "test_three.py")).cases == 5
-    assert torture.tested("a", 7, str(tmp_path / "test_none.py")).cases == 7
+    assert torture.tested("a", "holds", 1, str(tmp_path / "test_three.py")).cases == 5
+    assert torture.tested("a", "holds", 7, str(tmp_path / "test_none.py")).cases == 7
