@@ -21,6 +21,7 @@ class _Received:
         self.blocks = 0
         self.number = 0  # of the last one; 0: there was none
         self.since = 0.0  # when the first one came
+        self.at_once = False  # whether one of them is to stop the block at once
 
     def take(self, number: int) -> None:
         self.since = self.since if self.number else time.monotonic()
@@ -70,17 +71,22 @@ def stopping_on_signals(stop: Callable[[], None]) -> Iterator[None]:
         for number in before:
             signal.signal(number, handler)
         yield
+    except Exception as error:
+        if _received.at_once:  # the block has failed before it was stopped, or what stopped it was caught
+            raise KeyboardInterrupt from error
+        raise
     finally:
         for number, other in before.items():
             signal.signal(number, other)
         _received.blocks -= 1
         if not _received.blocks:
-            _received.number = 0
+            _received.number, _received.at_once = 0, False
 
 
 def stop_at_once() -> None:
     """Raise KeyboardInterrupt; in the middle of an import, which it would break, soon after its end."""
     waited = time.monotonic() - _received.since if _received.number else 0.0
+    _received.at_once = True
     if waited < IMPORT_SECONDS and _is_importing():
         _thread.start_new_thread(_again, (_received.number or signal.SIGINT,))  # takes no lock, as `threading` does
     else:
