@@ -10,6 +10,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from typing import Any, NoReturn
 
+from clsplat.errors import Interrupted
+
 NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK")  # the last is of Windows: Ctrl-Break, or the window closes
 IMPORT_SECONDS = 10.0  # that a signal waits for the end of an import: a plug-in's may have none
 
@@ -72,7 +74,8 @@ def stopping_on_signals(stop: Callable[[], None]) -> Iterator[None]:
             signal.signal(number, handler)
         yield
     except Exception as error:
-        if _received.at_once:  # the block has failed before it was stopped, or what stopped it was caught
+        # the block has failed before it was stopped, or what stopped it was caught
+        if _received.at_once and not isinstance(error, Interrupted):
             raise KeyboardInterrupt from error
         raise
     finally:
