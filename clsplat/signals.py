@@ -10,8 +10,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from typing import Any, NoReturn
 
-from clsplat.errors import Interrupted
-
 NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK")  # the last is of Windows: Ctrl-Break, or the window closes
 IMPORT_SECONDS = 10.0  # that a signal waits for the end of an import: a plug-in's may have none
 
@@ -23,7 +21,6 @@ class _Received:
         self.blocks = 0
         self.number = 0  # of the last one; 0: there was none
         self.since = 0.0  # when the first one came
-        self.at_once = False  # whether one of them is to stop the block at once
 
     def take(self, number: int) -> None:
         self.since = self.since if self.number else time.monotonic()
@@ -73,23 +70,17 @@ def stopping_on_signals(stop: Callable[[], None]) -> Iterator[None]:
         for number in before:
             signal.signal(number, handler)
         yield
-    except Exception as error:
-        # the block has failed before it was stopped, or what stopped it was caught
-        if _received.at_once and not isinstance(error, Interrupted):
-            raise KeyboardInterrupt from error
-        raise
     finally:
         for number, other in before.items():
             signal.signal(number, other)
         _received.blocks -= 1
         if not _received.blocks:
-            _received.number, _received.at_once = 0, False
+            _received.number = 0
 
 
 def stop_at_once() -> None:
     """Raise KeyboardInterrupt; in the middle of an import, which it would break, soon after its end."""
     waited = time.monotonic() - _received.since if _received.number else 0.0
-    _received.at_once = True
     if waited < IMPORT_SECONDS and _is_importing():
         _thread.start_new_thread(_again, (_received.number or signal.SIGINT,))  # takes no lock, as `threading` does
     else:

@@ -16,7 +16,11 @@ from clsplat.signals import stop_at_once, stopping_on_signals
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="SIGTERM ends a process at once there")
 
-START = "import signal, sys\nsys.argv = ['clsplat', 'run', 'smoke', '--scene', 'nowhere']\n"
+START = """
+import signal, sys
+signal.signal(signal.SIGHUP, signal.SIG_DFL)  # under nohup it is ignored
+sys.argv = ["clsplat", "run", "smoke", "--scene", "nowhere"]
+"""
 END = "\nimport runpy\nrunpy.run_module('clsplat', run_name='__main__', alter_sys=False)\n"
 IN_TYPER = """
 import typer.core
