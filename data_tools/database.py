@@ -53,8 +53,12 @@ def pairs_done(database: Path) -> int:
     (https://www.sqlite.org/howtocorrupt.html, 2.2.1), and matches would be lost.
     """
     address = f"{database.resolve().as_uri()}?mode=ro"
-    read = subprocess.run([sys.executable, "-I", "-S", "-c", COUNT_PAIRS, address], capture_output=True, check=False)
-    return int(read.stdout) if read.returncode == 0 else 0
+    try:
+        return int(
+            subprocess.check_output([sys.executable, "-I", "-S", "-c", COUNT_PAIRS, address], stderr=subprocess.DEVNULL)
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return 0
 
 
 def remove(database: Path) -> None:

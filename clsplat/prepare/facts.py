@@ -5,7 +5,7 @@ from typing import Any
 
 from clsplat.prepare.cache import Planned, record_of
 
-INTERNAL = ("origin", "inputs", "settings", "files")  # keys of a record that identify a result
+INTERNAL = ("origin", "inputs", "settings", "files")  # keys of a record that are not what a step has found
 
 
 def facts(planned: Sequence[Planned]) -> dict[str, dict[str, Any]]:

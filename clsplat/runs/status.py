@@ -64,17 +64,17 @@ def status_text(status: dict[str, Any]) -> str:
     """Return what run_status found as lines of text."""
     lines = [f"{status['run']}: {status['state']}{_progress(status)}"]
     if status.get("silent", 0) >= SILENT:
-        lines.append(f"  no sign of life for {status['silent']} s{_place(status)}")
+        lines.append(f"no sign of life for {status['silent']} s{_place(status)}")
     if status.get("message"):
-        lines.append(f"  {status['message']}")
+        lines.append(status["message"])
     if status["state"] in ("killed", "failed", "interrupted") and (advice := _advice(status)):
-        lines.append(f"  {advice}")
+        lines.append(advice)
     if status["last"] and status["metrics"] is None:
-        lines.append("  last report: " + _figures(status["last"], ("step", "loss", "psnr", "gaussians")))
+        lines.append("last report: " + _figures(status["last"], ("step", "loss", "psnr", "gaussians")))
     for split in ("test", "train"):
         for downscale, figures in ((status["metrics"] or {}).get(split) or {}).items():
-            lines.append(f"  {split} 1/{downscale}: {_figures(figures, ('psnr', 'ssim', 'lpips', 'views'))}")
-    return "\n".join(line[: len(line) - len(line.lstrip())] + one_line(line) for line in lines)
+            lines.append(f"{split} 1/{downscale}: {_figures(figures, ('psnr', 'ssim', 'lpips', 'views'))}")
+    return "\n  ".join(map(one_line, lines))
 
 
 def _advice(status: dict[str, Any]) -> str:

@@ -101,7 +101,8 @@ class Init(Stage):
         return from_points(points, self.opacity, degree)
 
     def _read(self) -> Parameters:
-        parameters = load(Path(str(self.file))).tables()
+        assert self.file is not None  # as `check` requires
+        parameters = load(Path(self.file)).tables()
         if not len(parameters["means"]):
             raise DataError(f"{self.file}: holds no Gaussians; expected one at least to start from")
         return parameters
