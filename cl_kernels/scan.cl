@@ -8,7 +8,9 @@
 static inline uint added(const uint a, const uint b)
 {
     const uint sum = a + b;
-    return sum < a ? UINT_MAX : sum;
+    // Oclgrind 21.10 lacks the saturating addition that compilers make of `sum < a ? UINT_MAX : sum`.
+    const uint carry = ((a & b) | ((a | b) & ~sum)) >> 31;
+    return sum | (0u - carry);
 }
 
 /* Sum of each block.  Local memory: TEAM * 4 bytes. */
