@@ -4,6 +4,7 @@ import logging
 import os
 import subprocess
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -94,6 +95,31 @@ def test_a_device_that_fails_with_a_damaged_cache_alone_is_told_so(monkeypatch, 
     assert list(tmp_path.iterdir()) == [], "it is tried again"
     broken = True
     assert CPU.fault() == "error: fault 3"
+
+
+def test_a_runtime_that_does_not_know_the_processor_is_told_so(monkeypatch, tmp_path):
+    """PoCL 3.0 builds kernels for a newer processor without an error, and then has none that takes whole roots."""
+    said = "error: a test kernel fails (clCreateKernel failed: INVALID_KERNEL_NAME)"
+    monkeypatch.setattr(
+        runtimes.subprocess,
+        "run",
+        lambda *_, **__: subprocess.CompletedProcess([], 1, "", f"{said}\nreferences to IRs"),
+    )
+    monkeypatch.setattr(runtimes, "cache_folder", lambda: tmp_path)
+    assert CPU.fault().startswith(f"{said}; this runtime may not support the processor: apt install pocl-opencl-icd")
+
+
+def test_a_success_counts_for_the_very_test_kernels(monkeypatch, tmp_path):
+    results = []
+    monkeypatch.setattr(
+        runtimes.subprocess, "run", lambda *_, **__: subprocess.CompletedProcess([], len(results), "", "error: none")
+    )
+    monkeypatch.setattr(runtimes, "cache_folder", lambda: tmp_path)
+    assert CPU.fault() is None
+    results.append("fails from now on")
+    assert CPU.fault() is None, "it is not tried again"
+    monkeypatch.setattr(runtimes, "PROBE", Path(__file__))
+    assert CPU.fault() == "error: none"
 
 
 @pytest.fixture

@@ -1,5 +1,6 @@
-"""Build and run one small kernel on the device of two numbers; exit status 0 means that it worked."""
+"""Build and run two small kernels on the device of two numbers; exit status 0 means that they worked."""
 
+import os
 import sys
 
 from clsplat.opencl import runtimes
@@ -18,11 +19,18 @@ void reverse(__global const float *restrict from, __global float *restrict to)
     barrier(CLK_LOCAL_MEM_FENCE);
     to[get_global_id(0)] = part[7 - get_local_id(0)];
 }
+
+// The root and the conversions of whole vectors are what a runtime lacks that does not know the processor.
+__kernel __attribute__((reqd_work_group_size(1, 1, 1)))
+void whole_root(__global float *restrict squares)
+{
+    vstore16(convert_float16(convert_int16(sqrt(vload16(0, squares)))), 0, squares);
+}
 """
 
 
 def main(platform: int, device: int) -> None:
-    """Double and reverse eight numbers on the device, or raise."""
+    """Double and reverse eight numbers on the device, and take the roots of sixteen, or raise."""
     chosen = cl.get_platforms()[platform].get_devices()[device]
     context = cl.Context([chosen])
     queue = cl.CommandQueue(context)
@@ -36,7 +44,18 @@ def main(platform: int, device: int) -> None:
     cl.enqueue_copy(queue, result, reversed_numbers)
     if not np.array_equal(result, 2 * numbers[::-1]):
         raise SystemExit(f"error: the test kernel computed {result.tolist()}")
+    numbers = np.arange(16, dtype=np.float32)
+    squares = cl.Buffer(context, flags.READ_WRITE | flags.COPY_HOST_PTR, hostbuf=numbers**2)
+    cl.Kernel(program, "whole_root")(queue, (1,), (1,), squares)
+    roots = np.empty_like(numbers)
+    cl.enqueue_copy(queue, roots, squares)
+    if not np.array_equal(roots, numbers):
+        raise SystemExit(f"error: the test kernel computed roots {roots.tolist()}")
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]), int(sys.argv[2]))
+    try:
+        main(int(sys.argv[1]), int(sys.argv[2]))
+    except cl.Error as error:
+        print(f"error: a test kernel fails ({error})", file=sys.stderr, flush=True)
+        os._exit(1)  # a runtime whose compiler has failed may hang where it is closed

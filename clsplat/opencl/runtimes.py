@@ -15,6 +15,7 @@ from pathlib import Path
 from clsplat.caches import cache_folder, damaged_kernels, empty_kernel_caches
 
 SYSTEM_DRIVERS = Path("/etc/OpenCL/vendors")
+PROBE = Path(__file__).with_name("probe.py")
 PROBE_SECONDS = 120  # a first build may compile for many seconds on a slow machine
 
 _HANGS = f"a test kernel did not finish in {PROBE_SECONDS} s"
@@ -22,6 +23,7 @@ _NO_EXECUTION = "PoCL's cache lies where nothing may be executed: mount it with 
 _OTHER_RUNTIMES = "apt install pocl-opencl-icd, or pip install 'clsplat[intel]'"
 _ADVICE = (  # words in the output of a failed test kernel -> remedy
     ("unknown target cpu", f"this PoCL does not support the processor: {_OTHER_RUNTIMES}"),
+    ("invalid_kernel_name", f"this runtime may not support the processor: {_OTHER_RUNTIMES}"),
     ("linker", f"PoCL needs a linker: apt install binutils libc6-dev; or use another runtime: {_OTHER_RUNTIMES}"),
     ("abort", f"PoCL may lack a linker: apt install binutils libc6-dev; or use another runtime: {_OTHER_RUNTIMES}"),
 )
@@ -62,7 +64,8 @@ def fault_of(key: str, platform: int, device: int) -> str | None:
     `key` identifies the runtime.  Only successes are stored, so a runtime that was fixed is tested again.  A device
     that fails is tried again with empty caches of built kernels.
     """
-    record = cache_folder() / "probes" / hashlib.sha256(key.encode()).hexdigest()[:16]
+    tested = PROBE.read_bytes() + key.encode()
+    record = cache_folder() / "probes" / hashlib.sha256(tested).hexdigest()[:16]
     if record.exists():
         return None
     fault = _probed(platform, device, {})

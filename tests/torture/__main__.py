@@ -76,7 +76,8 @@ def tested(what: str, holds: str, count: int, *arguments: str) -> Row:
     environment = {**os.environ, "CLSPLAT_FUZZ": str(count)}
     with tempfile.TemporaryDirectory() as folder:
         results = Path(folder) / "results.xml"
-        command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", f"--junit-xml={results}", *arguments]
+        pytest = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "no:logging"]
+        command = [*pytest, f"--junit-xml={results}", *arguments]
         end = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
         cases = cases_in(results, count)
     if end.returncode:
