@@ -78,6 +78,7 @@ def test_a_palette_is_the_same_bits_with_and_without_a_device(device, rng, count
         np.testing.assert_array_equal(found, expected)
 
 
+@pytest.mark.large
 def test_a_sog_is_the_same_bytes_with_and_without_a_device(device, rng, tmp_path):
     source: SplatFile = splats(rng, 1100, 3)
     write(tmp_path / "host.sog", source)
