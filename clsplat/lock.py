@@ -139,6 +139,9 @@ def _is_ours(file: io.FileIO, is_new: bool, path: Path, folder: Path) -> bool:
             return False
         if not is_new and (owner := require_silent(file, path, folder)):
             LOG.info("%s: taken over from process %s on %s", folder, owner.get("process"), owner.get("host"))
+            with suppress(PermissionError):  # Windows renames no open file
+                _remove(file, path)  # so that the one before notices, where it goes on after all
+                return False
         return True
     except OSError as error:
         if error.errno not in NO_LOCKS:

@@ -279,6 +279,24 @@ def test_the_lock_of_a_run_that_has_ended_elsewhere_is_taken_over(owner, status,
     assert [line for line in caplog.messages if "taken over" in line] == lines
 
 
+def test_a_run_that_was_silent_and_goes_on_notices_who_took_over(tmp_path, monkeypatch):
+    """As one that was suspended for a minute, where locks count on each machine alone."""
+    monkeypatch.setattr(lock, "_system_lock", lambda file: True)
+    own = lock.own_text
+    with monkeypatch.context() as patch:
+        patch.setattr(lock, "own_text", lambda: json.dumps({**json.loads(own()), "host": "another", "boot": "another"}))
+        first = lock.held(tmp_path)
+        require_held = first.__enter__()
+    (tmp_path / "status.json").write_text(json.dumps({"state": "running", "time": time.time() - 61}))
+    lock._held.clear()
+    with lock.held(tmp_path) as second:
+        with pytest.raises(OutputError, match=f"replaced while .* process {os.getpid()} on .* holds it now"):
+            require_held()
+        first.__exit__(None, None, None)
+        second()
+    assert not (tmp_path / LOCK).exists()
+
+
 def test_a_folder_that_was_left_is_written_to_no_more(tmp_path, monkeypatch):
     monkeypatch.setattr(writing, "BEAT", 0.002)
     with folders.opened(tmp_path / "run", "new") as status:

@@ -12,7 +12,7 @@ from clsplat import names
 from clsplat.errors import InternalError, OutputError
 from clsplat.gaussians.model import Model
 from clsplat.pipeline.loading import load
-from clsplat.runs import opening, outputs, runner
+from clsplat.runs import opening, outputs, runner, verify
 from clsplat.runs.experiment import Job
 from clsplat.scene.images import write_image
 from clsplat.settings import rebuild
@@ -120,17 +120,20 @@ def test_a_model_that_was_written_before_a_kill_is_the_one_that_was_written(dama
         with pytest.raises(InternalError):
             Job.open("smoke", tiny_scene, out, few).run()
     whole = {name: (out / name).read_bytes() for name in ("early.ply", "point_cloud.ply")}
-    for name, data in whole.items():
-        damage(out / name)
-        with pytest.raises(OutputError, match=f"{name}.*at the end of the run"):
-            Job.resume(out).run()
-        assert not (out / names.CHECKSUMS).exists()
-        (out / name).write_bytes(data)
+    damage(out / "early.ply")  # its model has been trained further
+    with pytest.raises(OutputError, match="early.ply.*at the end of the run"):
+        Job.resume(out).run()
+    assert not (out / names.CHECKSUMS).exists()
+    (out / "early.ply").write_bytes(whole["early.ply"])
     (out / "point_cloud_raw.ply").write_bytes(whole["early.ply"])
     with pytest.raises(OutputError, match="no record of writing it"):
         Job.resume(out).run()
     (out / "point_cloud_raw.ply").unlink()
+    damage(out / "point_cloud.ply")
+    found = {one["file"]: one["whole"] for one in verify.verify(out)["objects"]}
+    assert [name for name, good in found.items() if not good] == ["point_cloud.ply"]
     Job.resume(out).run()
+    assert {name: (out / name).read_bytes() for name in whole} == whole
 
 
 def test_a_model_of_a_cadence_that_never_came_is_not_expected(finished):

@@ -9,7 +9,7 @@ from clsplat.names import LOCK, PIPELINE
 from clsplat.pipeline.loading import Pipeline, load
 from clsplat.prepare.cache import Planned, note, noted
 from clsplat.runs.folders import Start
-from clsplat.training.status import read_status
+from clsplat.runs.outputs import is_finished
 
 
 def free_folder(folder: Path, pipeline: Pipeline | None, start: Start) -> Path:
@@ -35,4 +35,4 @@ def up_to_date(pipeline: Pipeline, planned: Sequence[Planned], out: Path) -> boo
     """Whether `out` holds a finished run of this pipeline and the same photographs; never where nothing is prepared."""
     if not planned or noted(out) != note(planned):
         return False
-    return read_status(out).get("state") == "done" and load(str(out / PIPELINE)).resolved() == pipeline.resolved()
+    return is_finished(out) and load(str(out / PIPELINE)).resolved() == pipeline.resolved()

@@ -218,8 +218,8 @@ def as_setting(folder: Path) -> str:
 
 
 def _finished(cell: Cell, folder: Path) -> bool:
-    """Whether the cell was run to its end.  Raises ConfigError when that was with other settings."""
-    if read_status(folder).get("state") != "done":
+    """Whether the cell was run to its end, and has its files.  Raises ConfigError when that was with other settings."""
+    if not outputs.is_finished(folder):
         return False
     before = load(str(folder / PIPELINE)).resolved()
     if difference := first_difference(before, cell.pipeline.resolved()):

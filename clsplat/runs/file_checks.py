@@ -56,8 +56,11 @@ def status_file(path: Path) -> str:
     return status.state if status else f"not checked further: format {content['format']}, of a newer clsplat"
 
 
-def checkpoint_file(path: Path) -> str:
+def checkpoint_file(written: dict[str, str], path: Path) -> str:
+    """Also note in `written` the checksums of models, where no training follows that may write them anew."""
     state, tables = checkpoint.load(path)
+    if not any("optimize" in stage for stage in state.pipeline["stages"][state.cursor :]):
+        written.update(state.written)
     return f"step {state.step}, {len(tables['gaussians/means']):,} Gaussians"
 
 

@@ -15,6 +15,7 @@ from clsplat.stages.base import Stage
 from clsplat.stages.optimize import Optimize
 from clsplat.training import checkpoint
 from clsplat.training.run import Run
+from clsplat.training.status import read_status
 
 
 def write_metrics(pipeline: Pipeline, run: Run) -> None:
@@ -50,6 +51,17 @@ def write_checksums(pipeline: Pipeline, run: Run) -> None:
         if path.is_file()
     }
     write_text(run.out / CHECKSUMS, json.dumps(sums, indent=1) + "\n")
+
+
+def is_finished(out: Path) -> bool:
+    """Whether a folder holds a run that is done, with every file as it was written."""
+    if read_status(out).get("state") != "done":
+        return False
+    try:
+        sums = read_json(out / CHECKSUMS)
+        return isinstance(sums, dict) and all(sha256(out / name) == sum_ for name, sum_ in sums.items())
+    except DataError:
+        return False
 
 
 def check_places(pipeline: Pipeline, out: Path) -> None:

@@ -4,9 +4,10 @@ import json
 import logging
 from collections.abc import Callable
 from contextlib import suppress
+from itertools import takewhile
 from pathlib import Path
 
-from clsplat.errors import ConfigError, Interrupted
+from clsplat.errors import ConfigError, DataError, Interrupted
 from clsplat.files import write_text
 from clsplat.names import CHECKSUMS, NOTE, PIPELINE
 from clsplat.pipeline.loading import Pipeline
@@ -30,6 +31,7 @@ def execute(pipeline: Pipeline, run: Run, start: Start, show: Callable[[Progress
     run.show = show
     begin(pipeline, run, start)
     with finishing_on_interrupt(run), saved_on_failure(run):
+        _write_again(pipeline, run)
         _run_stages(pipeline, run)
     run.status.require_held()
     write_metrics(pipeline, run)
@@ -73,6 +75,18 @@ def restore(pipeline: Pipeline, run: Run) -> Path | None:
     for remark in remarks:
         LOG.warning("%s", remark)
     return taken
+
+
+def _write_again(pipeline: Pipeline, run: Run) -> None:
+    """Repeat the stages whose files are missing or damaged, of those that ended since the model changed last."""
+    ended = pipeline.stages[: 0 if run.stage_step else run.cursor]
+    unchanged = list(takewhile(lambda stage: not (stage.edits or isinstance(stage, Optimize)), reversed(ended)))
+    for stage in reversed(unchanged):
+        try:
+            stage.verify(run)
+        except DataError as error:
+            LOG.warning("%s; it is written again", error)
+            stage.act(run)
 
 
 def _run_stages(pipeline: Pipeline, run: Run) -> None:

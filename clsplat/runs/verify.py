@@ -75,7 +75,9 @@ def _objects(out: Path, whole: bool = False) -> Iterator[dict[str, Any]]:
         if done or (out / COMPARISON).exists():
             yield one(COMPARISON, file_checks.page)
         return
-    yield from (one(name, file_checks.checkpoint_file) for name in _checkpoints(out, status))
+    written: dict[str, str] = {}  # models of a run that is not done
+    yield from (one(name, partial(file_checks.checkpoint_file, written)) for name in _checkpoints(out, status))
+    expected = sums or {name: value for name, value in written.items() if is_inside(name)}
     for path in sorted((out / CHECKPOINTS).glob("failed_*.npz")):
         yield one(f"{CHECKPOINTS}/{path.name}", file_checks.failed_state)
     files, folders = _declared(out, sums) if done else ([], [])
@@ -87,9 +89,9 @@ def _objects(out: Path, whole: bool = False) -> Iterator[dict[str, Any]]:
         yield one(INPUTS, file_checks.inputs_file)
     if (done and settings.get("prepare")) or is_there(out / NOTE):
         yield one(NOTE, file_checks.note_file)
-    for name in dict.fromkeys([*sums, *files, *_present(out)]):
+    for name in dict.fromkeys([*expected, *files, *_present(out)]):
         if name != PIPELINE:
-            yield one(name, partial(file_checks.output, sums.get(name)))
+            yield one(name, partial(file_checks.output, expected.get(name)))
     yield from (one(name, file_checks.folder, stat.S_IFDIR) for name in folders)
 
 

@@ -60,7 +60,8 @@ class Export(Scheduled):
             if _name(file, run) not in run.written:
                 raise DataError(f"{file}: this run has no record of writing it; move it away, and use --restart")
             if sha256(file) != run.written[_name(file, run)]:
-                raise DataError(f"{file}: differs from what was written; `clsplat run` with --restart writes it again")
+                again = "`clsplat resume` writes those of the last model again, `clsplat run` with --restart all"
+                raise DataError(f"{file}: differs from what was written; {again}")
 
 
 def _name(file: Path, run: Run) -> str:
