@@ -121,7 +121,7 @@ def test_a_model_that_was_written_before_a_kill_is_the_one_that_was_written(dama
             Job.open("smoke", tiny_scene, out, few).run()
     whole = {name: (out / name).read_bytes() for name in ("early.ply", "point_cloud.ply")}
     damage(out / "early.ply")  # its model has been trained further
-    with pytest.raises(OutputError, match="early.ply.*at the end of the run"):
+    with pytest.raises(OutputError, match=r"early\.ply.*at the end of the run"):
         Job.resume(out).run()
     assert not (out / names.CHECKSUMS).exists()
     (out / "early.ply").write_bytes(whole["early.ply"])

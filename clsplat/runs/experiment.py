@@ -27,7 +27,7 @@ from clsplat.runs.source import photographs_of
 from clsplat.runs.summary import summary
 from clsplat.signals import stop_at_once, stop_if_signalled, stopping_on_signals
 from clsplat.training.changes import first_difference
-from clsplat.training.status import StatusFile, read_status
+from clsplat.training.status import StatusFile
 
 LOG = logging.getLogger("clsplat")
 
