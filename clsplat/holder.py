@@ -2,6 +2,7 @@
 
 import io
 import json
+import logging
 import sys
 import time
 from contextlib import suppress
@@ -14,6 +15,7 @@ from clsplat.names import END_STATES, STATUS
 from clsplat.processes import Owner
 from clsplat.reading import read_json
 
+LOG = logging.getLogger("clsplat")
 BEHIND_THE_TEXT = 1 << 20  # bytes: Windows locks a byte for readers too, and this one is not read
 SILENT = 60  # seconds without a heartbeat after which a run on another machine is taken to have ended
 
@@ -37,21 +39,47 @@ def read(file: io.FileIO) -> dict[str, Any]:
 def require_silent(file: io.FileIO, path: Path, folder: Path) -> dict[str, Any]:
     """Who the file names, where that is a process of another machine, whose locks may not reach this one; else {}.
 
+    Machines may have the same name: where the systems say which start they are of, that counts.
     Raises OutputError where the run's status beside the file shows that it goes on.
     """
     owner = read(file)
     named, this = Owner.named_by(owner), Owner.this()
-    if named is None or named.host == this.host or (owner.get("boot") and named.boot == this.boot):
+    if named is None or (named.boot == this.boot if owner.get("boot") and this.boot else named.host == this.host):
         return {}
+    beat = _heartbeat(path)
+    if beat is not None and (silent := time.time() - beat) < SILENT:
+        raise OutputError(
+            f"{in_use(folder, owner)}; its heartbeat is {max(0, silent):.0f} s old, though the lock is free here: "
+            f"if that process has ended, wait for a minute, or remove {path}"
+        )
+    return owner
+
+
+def until_silent(file: io.FileIO, path: Path, folder: Path) -> dict[str, Any]:
+    """Do as `require_silent`, but wait for the next heartbeat: without one the process ended just now, by any clock."""
+    beat, end, told = _heartbeat(path), time.monotonic() + SILENT, False
+    while True:
+        try:
+            return require_silent(file, path, folder)
+        except OutputError:
+            if _heartbeat(path) != beat:
+                raise
+            if time.monotonic() >= end:
+                return read(file)
+            if not told:
+                told = True
+                LOG.info(
+                    "%s: another machine's run was alive just now; waiting for its heartbeat, a minute at most", folder
+                )
+        time.sleep(1)
+
+
+def _heartbeat(path: Path) -> float | None:
+    """When the status beside a lock was written, in seconds since 1970; None where there is none, or the run ended."""
     with suppress(DataError, AttributeError, KeyError, TypeError, ValueError):
         status = read_json(path.with_name(STATUS), limit=BEHIND_THE_TEXT)
-        silent = time.time() - float(status["time"])
-        if status.get("state") not in END_STATES and silent < SILENT:
-            raise OutputError(
-                f"{in_use(folder, owner)}; its heartbeat is {max(0, silent):.0f} s old, though the lock is free here: "
-                f"if that process has ended, wait for a minute, or remove {path}"
-            )
-    return owner
+        return None if status.get("state") in END_STATES else float(status["time"])
+    return None
 
 
 def lost(path: Path, folder: Path) -> str:

@@ -18,7 +18,7 @@ from typing import Any
 
 from clsplat.errors import OutputError
 from clsplat.files import unwritable
-from clsplat.holder import BEHIND_THE_TEXT, in_use, lost, own_text, read, require_silent
+from clsplat.holder import BEHIND_THE_TEXT, in_use, lost, own_text, read, require_silent, until_silent
 from clsplat.names import LOCK
 from clsplat.processes import Owner
 
@@ -137,7 +137,7 @@ def _is_ours(file: io.FileIO, is_new: bool, path: Path, folder: Path) -> bool:
             raise OutputError(in_use(folder, read(file)))
         if not _is_at(file, path):
             return False
-        if not is_new and (owner := require_silent(file, path, folder)):
+        if not is_new and (owner := until_silent(file, path, folder)):
             LOG.info("%s: taken over from process %s on %s", folder, owner.get("process"), owner.get("host"))
             with suppress(PermissionError):  # Windows renames no open file
                 _remove(file, path)  # so that the one before notices, where it goes on after all

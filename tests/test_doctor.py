@@ -21,7 +21,7 @@ from clsplat.conformance.page import report_page
 from clsplat.conformance.report import DeviceReport
 from clsplat.conformance.supervision import Result, supervised
 from clsplat.conformance.verdict import judge
-from clsplat.errors import MemoryLimitError, OutputError
+from clsplat.errors import ConfigError, MemoryLimitError, OutputError
 from clsplat.opencl import runtimes
 from clsplat.opencl.device import Device
 from clsplat.opencl.discovery import resolve_schedule
@@ -254,12 +254,20 @@ def test_the_command_ends_with_4_where_a_device_computes_wrongly(monkeypatch, ca
         assert "do not use it: blend_backward differs by 0.3" in err
 
 
-@pytest.mark.parametrize("name", ["a folder", "a file/page.html"])
-def test_a_page_that_cannot_be_written_is_refused_before_the_work(monkeypatch, info, tmp_path, name):
-    (tmp_path / "a folder").mkdir()
+@pytest.mark.parametrize(
+    ("name", "error", "words"),
+    [
+        ("a folder.html", OutputError, "cannot be written"),
+        ("a file/page.html", OutputError, "cannot be written"),
+        ("pipeline.yaml", ConfigError, "ends in .html"),
+        ("null", ConfigError, "ends in .html"),
+    ],
+)
+def test_a_page_that_cannot_be_written_is_refused_before_the_work(monkeypatch, info, tmp_path, name, error, words):
+    (tmp_path / "a folder.html").mkdir()
     (tmp_path / "a file").write_text("")
     monkeypatch.setattr(doctor, "supervised", lambda *_: pytest.fail("the work began"))
-    with pytest.raises(OutputError, match=f"{name}: cannot be written"):
+    with pytest.raises(error, match=f"{name}: .*{words}"):
         clsplat.doctor(Device(info), tmp_path / name)
 
 

@@ -2,6 +2,7 @@
 
 import errno
 import os
+import stat
 import subprocess
 import sys
 import threading
@@ -11,7 +12,8 @@ import pytest
 
 import clsplat
 from clsplat import files
-from clsplat.files import atomic
+from clsplat.errors import OutputError
+from clsplat.files import atomic, write_text
 from clsplat.prepare.cache import RECORD, Planned, prepare
 from clsplat.prepare.place import STEPS, _show
 from clsplat.prepare.steps import Step
@@ -216,3 +218,12 @@ def test_threads_that_write_one_file_do_not_disturb_each_other(tmp_path):
     for thread in threads:
         thread.join()
     assert faults == []
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes have names on POSIX systems")
+def test_what_is_no_file_is_not_replaced(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(OutputError, match=r"pipe: cannot be written \(it is not a file\)"):
+        write_text(tmp_path / "pipe", "text")
+    assert stat.S_ISFIFO((tmp_path / "pipe").stat().st_mode)
+    assert [path.name for path in tmp_path.iterdir()] == ["pipe"]

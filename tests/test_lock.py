@@ -240,16 +240,42 @@ FRESH = {"state": "running", "time": 2.0}
 known_boot = pytest.mark.skipif(Owner.this().boot is None, reason="the system does not say which start this is")
 
 
+@pytest.mark.parametrize("name", ["another", pytest.param(platform.node(), marks=known_boot)])
 @pytest.mark.parametrize("status", [FRESH, {"state": "starting", "time": -30.0}, {"state": "running", "time": -3600.0}])
-def test_a_run_on_another_machine_is_not_joined_where_locks_count_here_alone(status, tmp_path):
+def test_a_run_on_another_machine_is_not_joined_where_locks_count_here_alone(name, status, tmp_path, monkeypatch):
     """As with NFS and `local_lock`: the lock is free here.  A negative age is that of a clock that is ahead."""
-    (tmp_path / LOCK).write_text(json.dumps(ELSEWHERE))
+    (tmp_path / LOCK).write_text(json.dumps({**ELSEWHERE, "host": name}))
     before = (tmp_path / LOCK).read_text()
     (tmp_path / "status.json").write_text(json.dumps({**status, "time": time.time() - status["time"]}))
+    beats = []
+
+    def beat(seconds):  # of the other machine
+        beats.append(seconds)
+        (tmp_path / "status.json").write_text(json.dumps({**status, "time": time.time() - status["time"] + 1}))
+
+    monkeypatch.setattr(holder_file.time, "sleep", beat)
     for attempt in (lambda: lock.check_free(tmp_path), lambda: lock.held(tmp_path).__enter__()):
-        with pytest.raises(OutputError, match=r"by process 7 on another .*heartbeat is \d+ s old.*remove .*lock"):
+        with pytest.raises(OutputError, match=rf"by process 7 on {name} .*heartbeat is \d+ s old.*remove .*lock"):
             attempt()
     assert (tmp_path / LOCK).read_text() == before
+    assert len(beats) == 1
+
+
+@pytest.mark.parametrize("ahead", [-2, 86400])
+def test_a_run_that_gives_no_sign_of_life_for_a_minute_is_taken_over_by_any_clock(ahead, tmp_path, monkeypatch, caplog):
+    """As a job that is started again on another machine right after the first was killed."""
+    caplog.set_level("INFO", "clsplat")
+    start = time.time()
+    (tmp_path / LOCK).write_text(json.dumps(ELSEWHERE))
+    (tmp_path / "status.json").write_text(json.dumps({"state": "running", "time": start + ahead}))
+    now = [0.0]
+    monkeypatch.setattr(holder_file.time, "sleep", lambda seconds: now.append(now[-1] + seconds))
+    monkeypatch.setattr(holder_file.time, "monotonic", lambda: now[-1])
+    monkeypatch.setattr(holder_file.time, "time", lambda: start + now[-1])
+    with lock.held(tmp_path):
+        pass
+    assert now[-1] == (58 if ahead < 0 else 60)
+    assert "waiting for its heartbeat, a minute at most" in caplog.text
 
 
 @pytest.mark.parametrize(
@@ -261,9 +287,8 @@ def test_a_run_on_another_machine_is_not_joined_where_locks_count_here_alone(sta
         ({}, ["running"]),
         ({}, None),
         pytest.param({"boot": Owner.this().boot}, FRESH, marks=known_boot),
-        ({"host": platform.node()}, FRESH),
     ],
-    ids=["ended", "silent", "without a time", "damaged", "no status", "in a container here", "here before a restart"],
+    ids=["ended", "silent", "without a time", "damaged", "no status", "in a container here"],
 )
 def test_the_lock_of_a_run_that_has_ended_elsewhere_is_taken_over(owner, status, tmp_path, caplog):
     caplog.set_level("INFO", "clsplat")

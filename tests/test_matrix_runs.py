@@ -96,6 +96,19 @@ def test_resume_runs_what_is_missing_only(finished, tmp_path):
     assert {path.parent.name: path.read_bytes() for path in out.glob("*/point_cloud.ply")} == bits
 
 
+def test_a_matrix_that_has_lost_its_status_goes_on(finished, tmp_path):
+    out = tmp_path / "run"
+    shutil.copytree(finished[1], out)
+    (out / "status.json").unlink()
+    experiment.run_matrix(load_experiment(str(out / "pipeline.yaml")), out, None, "resume")
+    assert json.loads((out / "status.json").read_text())["state"] == "done"
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    shutil.copy(finished[0], mine / "pipeline.yaml")
+    with pytest.raises(ConfigError, match="is not that of a run"):
+        experiment.run_matrix(load_experiment(finished[0]), mine, None, "restart")
+
+
 def test_a_cell_that_fails_does_not_stop_the_others(finished, tmp_path, monkeypatch):
     execute = runner.execute
 

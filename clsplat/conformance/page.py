@@ -10,7 +10,7 @@ from clsplat.conformance.comparison import Figure
 from clsplat.conformance.host import system
 from clsplat.conformance.report import GIB, DeviceReport, summary
 from clsplat.conformance.supervision import Result
-from clsplat.files import unwritable, write_text
+from clsplat.files import check_result, unwritable, write_text
 from clsplat.pages.page import duration, render
 
 
@@ -32,7 +32,8 @@ class Row:
 
 
 def check_place(out: Path) -> None:
-    """Raise OutputError where a page cannot be written."""
+    """Raise ConfigError for a file of another kind or of a run, OutputError where a page cannot be written."""
+    check_result(out, ".html")
     try:
         if out.is_dir():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from clsplat import lock
-from clsplat.errors import ConfigError, DataError, InternalError, OutputError, as_clsplat_error
+from clsplat.errors import ClsplatError, ConfigError, InternalError, OutputError, as_clsplat_error
 from clsplat.files import sweep, unwritable
 from clsplat.names import (
     BEFORE_A_RUN,
@@ -22,6 +22,7 @@ from clsplat.names import (
     RECORDS,
     STATUS,
 )
+from clsplat.pipeline.matrix import load_experiment
 from clsplat.reading import read_text
 from clsplat.training import checkpoint
 from clsplat.training.status import StatusFile, read_status
@@ -97,11 +98,15 @@ def clear(status: StatusFile) -> None:
 
 
 def _is_of_a_run(out: Path) -> bool:
-    """Whether a folder's pipeline.yaml, where there is one, was written by a run."""
+    """Whether a folder's pipeline.yaml, where there is one, was written by a run, or by that of a matrix."""
     if not (out / PIPELINE).is_file() or (out / STATUS).exists() or checkpoint.saved(out):
         return True
-    with suppress(DataError):
-        return read_text(out / PIPELINE).startswith(RESOLVED)
+    with suppress(ClsplatError):
+        if read_text(out / PIPELINE).startswith(RESOLVED):
+            return True
+        found = load_experiment(str(out / PIPELINE))
+        cells = found.cells if found else ()
+        return any(read_text(out / cell.name / PIPELINE).startswith(RESOLVED) for cell in cells)
     return False
 
 
@@ -119,7 +124,7 @@ def check_run_folder(out: Path, start: Start) -> None:
     if start == "new" and ((out / PIPELINE).exists() or checkpoint.saved(out)):
         raise ConfigError(f"{out}: already holds a run; give another folder, --resume or --restart")
     status = read_status(out) if start == "resume" else {}
-    if status.get("state") == "done" and not ({"cells", "checkpoint"} & status.keys()):
+    if status.get("state") == "done" and not ({"cells", "checkpoint"} & status.keys() or checkpoint.saved(out)):
         raise ConfigError(f"{out}: is done, and has no checkpoint to go on from; --restart trains it again")
     if start == "resume" and not status and (out / INPUTS).exists() and not checkpoint.saved(out):
         raise OutputError(
