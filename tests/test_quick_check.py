@@ -74,7 +74,7 @@ def test_want_of_memory_is_no_fault_of_the_device(monkeypatch, info, empty_cache
         yield
 
     out = io.StringIO()
-    worker_process._run(out, Check("rendering", (), check), None)
+    worker_process._run(out, Check("rendering", (), check), lambda: None)
     worker_process._print(out, end="rendering", seconds=0.1)
     monkeypatch.setattr(supervision, "WORKER", ("-c", f"print({out.getvalue()!r}, end='')"))
     with pytest.raises(MemoryLimitError, match=r"no buffer.*other programs"):
@@ -126,7 +126,7 @@ def test_an_exception_of_a_runtime_is_a_sentence():
         yield
 
     out = io.StringIO()
-    worker_process._run(out, Check("rendering", (), check), None)
+    worker_process._run(out, Check("rendering", (), check), lambda: None)
     assert "the OpenCL runtime refuses a call: clCreateKernel failed: INVALID_KERNEL_NAME" in out.getvalue()
 
 
