@@ -5,6 +5,7 @@ import os
 import subprocess
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ import pytest
 from clsplat.caches import kernel_caches
 from clsplat.conformance.scenes import random_case
 from clsplat.errors import DeviceError, KernelError
-from clsplat.opencl import discovery, program, runtimes
+from clsplat.opencl import discovery, probe, program, runtimes
 from clsplat.opencl.device import Device
 from clsplat.opencl.discovery import DeviceInfo, choose
 from clsplat.render.rasterizer import Rasterizer
@@ -107,6 +108,32 @@ def test_a_runtime_that_does_not_know_the_processor_is_told_so(monkeypatch, tmp_
     )
     monkeypatch.setattr(runtimes, "cache_folder", lambda: tmp_path)
     assert CPU.fault().startswith(f"{said}; this runtime may not support the processor: apt install pocl-opencl-icd")
+
+
+@pytest.mark.parametrize(("width", "lanes"), [(16, 16), (8, 8), (4, 4), (1, 4)])
+def test_kernels_compiled_without_the_vectors_of_the_processor_are_not_made(monkeypatch, width, lanes):
+    """PoCL 3.0 on a newer processor may take minutes to make one; the warning is in the log of the build."""
+    warning = f"'float{lanes}' (vector of {lanes} 'float' values) without 'avx512f' enabled changes the ABI"
+    built = []
+
+    class Program:
+        def __init__(self, context, source):
+            built.append(source)
+
+        def build(self, options):
+            return self
+
+        def get_build_info(self, device, what):
+            return f"1 warning generated: {warning}"
+
+    chosen = SimpleNamespace(native_vector_width_float=width)
+    monkeypatch.setattr(probe.cl, "get_platforms", lambda: [SimpleNamespace(get_devices=lambda: [chosen])])
+    for name in ("Context", "CommandQueue", "Buffer"):
+        monkeypatch.setattr(probe.cl, name, lambda *_, **__: None)
+    monkeypatch.setattr(probe.cl, "Program", Program)
+    with pytest.raises(SystemExit, match="error: kernels are compiled without the vectors of the processor"):
+        probe.main(0, 0)
+    assert f"vload{lanes}(" in built[0]
 
 
 def test_a_success_counts_for_the_very_test_kernels(monkeypatch, tmp_path):

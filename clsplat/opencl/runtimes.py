@@ -22,6 +22,7 @@ _HANGS = f"a test kernel did not finish in {PROBE_SECONDS} s"
 _NO_EXECUTION = "PoCL's cache lies where nothing may be executed: mount it with `exec`, or set POCL_CACHE_DIR"
 _OTHER_RUNTIMES = "apt install pocl-opencl-icd, or pip install 'clsplat[intel]'"
 _ADVICE = (  # words in the output of a failed test kernel -> remedy
+    ("without the vectors", f"this runtime does not support the processor: {_OTHER_RUNTIMES}"),
     ("unknown target cpu", f"this PoCL does not support the processor: {_OTHER_RUNTIMES}"),
     ("invalid_kernel_name", f"this runtime may not support the processor: {_OTHER_RUNTIMES}"),
     ("linker", f"PoCL needs a linker: apt install binutils libc6-dev; or use another runtime: {_OTHER_RUNTIMES}"),
