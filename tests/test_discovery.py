@@ -8,7 +8,9 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+import pyopencl as cl
 import pytest
+from pyopencl import _cl
 
 from clsplat.caches import kernel_caches
 from clsplat.conformance.scenes import random_case
@@ -134,6 +136,61 @@ def test_kernels_compiled_without_the_vectors_of_the_processor_are_not_made(monk
     with pytest.raises(SystemExit, match="error: kernels are compiled without the vectors of the processor"):
         probe.main(0, 0)
     assert f"vload{lanes}(" in built[0]
+
+
+def refusal(code: int) -> cl.Error:
+    return cl.LogicError(_cl._ErrorRecord("clGetInfo", code, ""))
+
+
+class BrokenDevice:
+    """A device that tells nothing of itself."""
+
+    @property
+    def name(self):
+        raise refusal(cl.status_code.INVALID_VALUE)
+
+
+class Platform:
+    """A runtime with these devices, or one that refuses to tell them."""
+
+    name, version = "Runtime", "OpenCL 3.0"
+
+    def __init__(self, *found) -> None:
+        self.found = found
+
+    def get_devices(self):
+        for error in self.found:
+            if isinstance(error, cl.Error):
+                raise error
+        return list(self.found)
+
+
+def test_a_broken_runtime_takes_no_other_down_and_is_told(monkeypatch, info, caplog):
+    platform, number = info.place
+    good = discovery.platforms()[platform]
+    devices = [BrokenDevice(), good.get_devices()[number]]
+    runtimes_found = [
+        Platform(refusal(cl.status_code.DEVICE_NOT_FOUND)),
+        Platform(refusal(cl.status_code.OUT_OF_HOST_MEMORY)),
+        Platform(*devices),
+    ]
+    monkeypatch.setattr(discovery.cl, "get_platforms", lambda: runtimes_found)
+    (found,) = discovery.list_devices()
+    assert (found.name, found.place) == (info.name, (2, 1))
+    told = [record.getMessage() for record in caplog.records]
+    assert len(told) == 2, "one without a device is no fault"
+    assert "OpenCL platform 1: its devices cannot be listed (clGetInfo failed: OUT_OF_HOST_MEMORY" in told[0]
+    assert "OpenCL platform 2: its device 0 cannot be asked (clGetInfo failed: INVALID_VALUE" in told[1]
+
+
+@pytest.mark.parametrize(("code", "lines"), [("PLATFORM_NOT_FOUND_KHR", 0), ("OUT_OF_HOST_MEMORY", 1)])
+def test_a_loader_that_fails_is_told_and_one_without_a_runtime_is_not(monkeypatch, caplog, code, lines):
+    def refuse():
+        raise refusal(getattr(cl.status_code, code))
+
+    monkeypatch.setattr(discovery.cl, "get_platforms", refuse)
+    assert discovery.list_devices() == []
+    assert len(caplog.records) == lines
 
 
 def test_a_success_counts_for_the_very_test_kernels(monkeypatch, tmp_path):
