@@ -138,6 +138,15 @@ def test_kernels_compiled_without_the_vectors_of_the_processor_are_not_made(monk
     assert f"vload{lanes}(" in built[0]
 
 
+def test_a_device_works_where_a_success_cannot_be_noted(monkeypatch, tmp_path):
+    """As in a cache with a folder of another user."""
+    monkeypatch.setattr(runtimes.subprocess, "run", lambda *_, **__: subprocess.CompletedProcess([], 0, "", ""))
+    monkeypatch.setattr(runtimes, "cache_folder", lambda: tmp_path)
+    (tmp_path / "probes").touch()
+    assert CPU.fault() is None
+    assert [path.name for path in tmp_path.iterdir()] == ["probes"]
+
+
 def refusal(code: int) -> cl.Error:
     return cl.LogicError(_cl._ErrorRecord("clGetInfo", code, ""))
 
