@@ -8,7 +8,7 @@ print("noise of a runtime", file=sys.stderr)
 for name in sys.argv[4:]:
     if name == "dies":
         os.abort()
-    if name == "cached" and "PYOPENCL_NO_CACHE" not in os.environ:
+    if %s and "PYOPENCL_NO_CACHE" not in os.environ:
         print(json.dumps({"fault": "x.cl does not build", "log": "", "out_of_memory": False}))
         print(json.dumps({"end": name, "seconds": 0.1}), flush=True)
         continue
@@ -19,6 +19,6 @@ for name in sys.argv[4:]:
 """
 
 
-def worker(monkeypatch, value: str = "1e-6") -> None:
-    """Put a script in the place of the process that opens the device."""
-    monkeypatch.setattr(supervision, "WORKER", ("-c", SCRIPT % value))
+def worker(monkeypatch, value: str = "1e-6", damaged: str = 'name == "cached"') -> None:
+    """Put a script in the place of the process that opens the device; `damaged` says where empty caches help."""
+    monkeypatch.setattr(supervision, "WORKER", ("-c", SCRIPT % (damaged, value)))

@@ -298,3 +298,9 @@ def test_a_folder_without_a_run_is_refused(tmp_path):
     with pytest.raises(DataError, match=r"holds neither pipeline.yaml nor status.json"):
         verify(tmp_path)
     assert "expected the folder of a run" in command("check", tmp_path, expect=3).stderr
+
+
+def test_the_schema_of_a_status_describes_every_key():
+    schema = clsplat.status_schema()
+    for part in (schema, *schema["$defs"].values()):
+        assert [name for name, value in part["properties"].items() if "description" not in value] == []

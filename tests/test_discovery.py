@@ -5,14 +5,17 @@ import os
 import subprocess
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
+import pyopencl as cl
 import pytest
+from pyopencl import _cl
 
 from clsplat.caches import kernel_caches
 from clsplat.conformance.scenes import random_case
 from clsplat.errors import DeviceError, KernelError
-from clsplat.opencl import discovery, program, runtimes
+from clsplat.opencl import discovery, probe, program, runtimes
 from clsplat.opencl.device import Device
 from clsplat.opencl.discovery import DeviceInfo, choose
 from clsplat.render.rasterizer import Rasterizer
@@ -107,6 +110,96 @@ def test_a_runtime_that_does_not_know_the_processor_is_told_so(monkeypatch, tmp_
     )
     monkeypatch.setattr(runtimes, "cache_folder", lambda: tmp_path)
     assert CPU.fault().startswith(f"{said}; this runtime may not support the processor: apt install pocl-opencl-icd")
+
+
+@pytest.mark.parametrize(("width", "lanes"), [(16, 16), (8, 8), (4, 4), (1, 4)])
+def test_kernels_compiled_without_the_vectors_of_the_processor_are_not_made(monkeypatch, width, lanes):
+    """PoCL 3.0 on a newer processor may take minutes to make one; the warning is in the log of the build."""
+    warning = f"'float{lanes}' (vector of {lanes} 'float' values) without 'avx512f' enabled changes the ABI"
+    built = []
+
+    class Program:
+        def __init__(self, context, source):
+            built.append(source)
+
+        def build(self, options):
+            return self
+
+        def get_build_info(self, device, what):
+            return f"1 warning generated: {warning}"
+
+    chosen = SimpleNamespace(native_vector_width_float=width)
+    monkeypatch.setattr(probe.cl, "get_platforms", lambda: [SimpleNamespace(get_devices=lambda: [chosen])])
+    for name in ("Context", "CommandQueue", "Buffer"):
+        monkeypatch.setattr(probe.cl, name, lambda *_, **__: None)
+    monkeypatch.setattr(probe.cl, "Program", Program)
+    with pytest.raises(SystemExit, match="error: kernels are compiled without the vectors of the processor"):
+        probe.main(0, 0)
+    assert f"vload{lanes}(" in built[0]
+
+
+def test_a_device_works_where_a_success_cannot_be_noted(monkeypatch, tmp_path):
+    """As in a cache with a folder of another user."""
+    monkeypatch.setattr(runtimes.subprocess, "run", lambda *_, **__: subprocess.CompletedProcess([], 0, "", ""))
+    monkeypatch.setattr(runtimes, "cache_folder", lambda: tmp_path)
+    (tmp_path / "probes").touch()
+    assert CPU.fault() is None
+    assert [path.name for path in tmp_path.iterdir()] == ["probes"]
+
+
+def refusal(code: int) -> cl.Error:
+    return cl.LogicError(_cl._ErrorRecord("clGetInfo", code, ""))
+
+
+class BrokenDevice:
+    """A device that tells nothing of itself."""
+
+    @property
+    def name(self):
+        raise refusal(cl.status_code.INVALID_VALUE)
+
+
+class Platform:
+    """A runtime with these devices, or one that refuses to tell them."""
+
+    name, version = "Runtime", "OpenCL 3.0"
+
+    def __init__(self, *found) -> None:
+        self.found = found
+
+    def get_devices(self):
+        for error in self.found:
+            if isinstance(error, cl.Error):
+                raise error
+        return list(self.found)
+
+
+def test_a_broken_runtime_takes_no_other_down_and_is_told(monkeypatch, info, caplog):
+    platform, number = info.place
+    good = discovery.platforms()[platform]
+    devices = [BrokenDevice(), good.get_devices()[number]]
+    runtimes_found = [
+        Platform(refusal(cl.status_code.DEVICE_NOT_FOUND)),
+        Platform(refusal(cl.status_code.OUT_OF_HOST_MEMORY)),
+        Platform(*devices),
+    ]
+    monkeypatch.setattr(discovery.cl, "get_platforms", lambda: runtimes_found)
+    (found,) = discovery.list_devices()
+    assert (found.name, found.place) == (info.name, (2, 1))
+    told = [record.getMessage() for record in caplog.records]
+    assert len(told) == 2, "one without a device is no fault"
+    assert "OpenCL platform 1: its devices cannot be listed (clGetInfo failed: OUT_OF_HOST_MEMORY" in told[0]
+    assert "OpenCL platform 2: its device 0 cannot be asked (clGetInfo failed: INVALID_VALUE" in told[1]
+
+
+@pytest.mark.parametrize(("code", "lines"), [("PLATFORM_NOT_FOUND_KHR", 0), ("OUT_OF_HOST_MEMORY", 1)])
+def test_a_loader_that_fails_is_told_and_one_without_a_runtime_is_not(monkeypatch, caplog, code, lines):
+    def refuse():
+        raise refusal(getattr(cl.status_code, code))
+
+    monkeypatch.setattr(discovery.cl, "get_platforms", refuse)
+    assert discovery.list_devices() == []
+    assert len(caplog.records) == lines
 
 
 def test_a_success_counts_for_the_very_test_kernels(monkeypatch, tmp_path):

@@ -102,6 +102,31 @@ def test_a_runtime_that_hangs_is_stopped(monkeypatch, info):
     assert one.fault == "gives no answer for 1 s"
 
 
+@pytest.mark.parametrize(
+    ("end", "fault"),
+    [
+        ("time.sleep(0.5); raise KeyError('rows')", "the process ends with code 1 (KeyError: 'rows')"),
+        ("time.sleep(600)", "closes its output, and does not end"),
+    ],
+)
+def test_a_process_is_given_time_for_its_code(monkeypatch, info, end, fault):
+    """Its output closes before it has one."""
+    monkeypatch.setattr(supervision, "END_SECONDS", 5, raising=False)
+    monkeypatch.setattr(supervision, "WORKER", ("-c", f"import os, time; os.close(1); {end}"))
+    assert [one.fault for one in supervised(info, "simt", checks("rows"))] == [fault]
+
+
+def test_a_device_that_does_not_open_for_want_of_memory_is_told_so(monkeypatch, info):
+    script = (
+        "import sys; from clsplat.conformance import worker; from clsplat.errors import MemoryLimitError\n"
+        "def refuse(*_): raise MemoryLimitError('opening it: no memory')\n"
+        "worker.Device = refuse; worker.main(int(sys.argv[1]), int(sys.argv[2]), *sys.argv[3:4], sys.argv[4:])"
+    )
+    monkeypatch.setattr(supervision, "WORKER", ("-c", script))
+    results = list(supervised(info, "simt", [BY_NAME["scans"], BY_NAME["rendering"]]))
+    assert [(one.fault, one.out_of_memory) for one in results] == [("opening it: no memory", True)] * 2
+
+
 def test_a_fault_that_empty_caches_mend_is_one_of_the_caches(monkeypatch, info):
     worker(monkeypatch)
     results = list(supervised(info, "simt", checks("first", "cached", "second", "cached", "leaves", "cached")))

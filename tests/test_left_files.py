@@ -132,6 +132,13 @@ def test_a_checkpoint_and_the_records_that_it_counts_are_on_the_disk_before_an_o
 
 
 @has_proc
+def test_a_run_folder_is_on_the_disk_with_the_folders_above_it(tmp_path, calls):
+    with folders.opened(tmp_path / "a" / "run", "new"):
+        synced = [name for kind, name in calls if kind == "sync"]
+    assert {tmp_path.name, "a"} <= {*synced}
+
+
+@has_proc
 def test_a_folder_that_is_made_is_on_the_disk_with_its_file(tmp_path, calls):
     with atomic(tmp_path / "a" / "b" / "c.txt") as file:
         file.write(b"x")

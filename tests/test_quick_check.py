@@ -12,7 +12,8 @@ import pyopencl as cl
 import pytest
 
 import clsplat
-from clsplat.conformance import host, quick, supervision
+from clsplat import processes
+from clsplat.conformance import host, quick, supervision, uses
 from clsplat.conformance import worker as worker_process
 from clsplat.conformance.check import Check
 from clsplat.conformance.checks import ESSENTIAL
@@ -25,6 +26,8 @@ from tests.proving import worker
 from tests.test_model import model_of
 
 OTHER_BUILDS = {
+    "__version__": "0.0",
+    "ESSENTIAL": ESSENTIAL[1:],
     "_hash_of_kernels": lambda: "other sources",
     "BUILD_OPTIONS": ("-cl-std=CL1.2", "-cl-mad-enable"),
     "tuning_of": lambda info, schedule: {**tuning_of(info, schedule), "DIGIT_BITS": 6},
@@ -74,7 +77,7 @@ def test_want_of_memory_is_no_fault_of_the_device(monkeypatch, info, empty_cache
         yield
 
     out = io.StringIO()
-    worker_process._run(out, Check("rendering", (), check), None)
+    worker_process._run(out, Check("rendering", (), check), lambda: None)
     worker_process._print(out, end="rendering", seconds=0.1)
     monkeypatch.setattr(supervision, "WORKER", ("-c", f"print({out.getvalue()!r}, end='')"))
     with pytest.raises(MemoryLimitError, match=r"no buffer.*other programs"):
@@ -104,7 +107,7 @@ def test_a_device_is_checked_again_after_a_process_that_ended_without_a_word(mon
     worker(monkeypatch)
     device = Device(info)
     quick.ensure_correct(device)
-    monkeypatch.setattr(quick, "ESSENTIAL", [Check("cached", ("blend_backward",), None)])
+    worker(monkeypatch, damaged="True")
     records = [quick._record(info, device.schedule, "radix")]
     subprocess.run([sys.executable, "-c", USE, end, *map(str, records)], check=False, capture_output=True)
     if end == "in order":
@@ -114,10 +117,21 @@ def test_a_device_is_checked_again_after_a_process_that_ended_without_a_word(mon
         with pytest.raises(DeviceError, match="cache of built kernels is damaged"):
             quick.ensure_correct(device)
     worker(monkeypatch)
-    monkeypatch.setattr(quick, "ESSENTIAL", ESSENTIAL)
     quick.ensure_correct(device)
     monkeypatch.setattr(supervision, "WORKER", ("-c", "raise SystemExit(1)"))
     quick.ensure_correct(device)
+
+
+def test_the_first_processes_of_two_containers_have_a_mark_each(monkeypatch, tmp_path):
+    """An orderly end of one says nothing of the other."""
+    marks = []
+    for namespace in ("pid:[1]", "pid:[2]"):
+        monkeypatch.setattr(processes, "_pid_namespace", lambda namespace=namespace: namespace)
+        monkeypatch.setattr(uses, "_own", set())
+        uses.begin([tmp_path / "conformance" / "record"])
+        marks += uses._own
+    assert sorted(marks) == sorted((tmp_path / uses.FOLDER).iterdir())
+    assert len(marks) == 2
 
 
 def test_an_exception_of_a_runtime_is_a_sentence():
@@ -126,7 +140,7 @@ def test_an_exception_of_a_runtime_is_a_sentence():
         yield
 
     out = io.StringIO()
-    worker_process._run(out, Check("rendering", (), check), None)
+    worker_process._run(out, Check("rendering", (), check), lambda: None)
     assert "the OpenCL runtime refuses a call: clCreateKernel failed: INVALID_KERNEL_NAME" in out.getvalue()
 
 
@@ -161,7 +175,7 @@ def test_a_device_that_computes_rightly_is_checked_once(monkeypatch, info, empty
         quick.ensure_correct(other)
     for name, changed in OTHER_BUILDS.items():
         with monkeypatch.context() as patched:
-            patched.setattr(quick, name, changed)
+            patched.setattr(quick, name, changed, raising=False)
             with pytest.raises(DeviceError, match="cannot be trusted"):
                 quick.ensure_correct(device)
 

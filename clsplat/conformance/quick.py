@@ -9,7 +9,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Literal
 
-from clsplat import resource_dir
+from clsplat import __version__, resource_dir
 from clsplat.caches import cache_folder, damaged_kernels
 from clsplat.conformance import uses
 from clsplat.conformance.checks import BITONIC, ESSENTIAL
@@ -82,10 +82,11 @@ def forget(info: DeviceInfo, schedule: Resolved) -> None:
 
 
 def _record(info: DeviceInfo, schedule: Resolved, sort: str) -> Path:
-    """A file for all that decides what the device computes: its driver, what is compiled for it, and how."""
+    """A file for all that decides what was found: the checks, the driver, what is compiled for the device, and how."""
+    checks = (__version__, [check.name for check in (*ESSENTIAL, *BITONIC)])
     device = (info.platform, info.name, info.driver, version("pyopencl"))
     build = (schedule, sort, BUILD_OPTIONS, sorted(tuning_of(info, schedule).items()), _hash_of_kernels())
-    decisive = repr((device, build, code_variables()))
+    decisive = repr((checks, device, build, code_variables()))
     return cache_folder() / "conformance" / hashlib.sha256(decisive.encode()).hexdigest()[:16]
 
 

@@ -20,6 +20,7 @@ from clsplat.opencl.discovery import DeviceInfo
 
 WORKER = ("-P", "-m", "clsplat.conformance.worker")  # -P: nothing of the working folder is imported
 CHECK_SECONDS = 900  # without a word from a check; an interpreter of kernels needs minutes
+END_SECONDS = 30  # between the end of the output and that of the process, which may write its memory to a file
 
 
 @dataclass
@@ -100,10 +101,8 @@ def _one_process(
                 result = Result(check.name, check.kernels)
                 ended = _fill(result, lines, seconds)
                 if ended is not None:
-                    process.kill()
-                    code = process.wait()
+                    result.fault = ended or _death(process, errors)
                     result.hangs = bool(ended)
-                    result.fault = ended or _death(code, errors)
                 yield result
                 if ended is not None:
                     return
@@ -143,8 +142,12 @@ def _pump(stdout: IO[str], lines: "queue.Queue[str | None]") -> None:
     lines.put(None)
 
 
-def _death(code: int, errors: IO[str]) -> str:
+def _death(process: "subprocess.Popen[str]", errors: IO[str]) -> str:
     """Why a process ended: its signal or exit code, and the last line that it wrote."""
+    try:
+        code = process.wait(END_SECONDS)
+    except subprocess.TimeoutExpired:
+        return "closes its output, and does not end"
     errors.seek(0)
     written = [line.strip() for line in errors.read().splitlines() if line.strip()]
     last = f" ({shortened(written[-1], 300)})" if written else ""

@@ -4,6 +4,7 @@ A file of built kernels that is cut off ends a process so, and the record of an 
 """
 
 import atexit
+import hashlib
 import json
 import os
 from collections.abc import Sequence
@@ -22,11 +23,12 @@ _own: set[Path] = set()  # marks of this process
 
 def begin(records: Sequence[Path]) -> None:
     """Mark the records of a device as in use by this process, until it ends in an orderly way."""
-    folder = records[0].parent.parent / FOLDER
-    mark = folder / f"{os.getpid()}-{records[0].name}.json"
+    folder, owner = records[0].parent.parent / FOLDER, Owner.this()
+    place = hashlib.sha256(repr(owner).encode()).hexdigest()[:8]  # containers with one cache have equal numbers
+    mark = folder / f"{owner.process}-{place}-{records[0].name}.json"
     if mark not in _own:
         with suppress(OutputError):
-            write_text(mark, json.dumps({**asdict(Owner.this()), "records": [record.name for record in records]}))
+            write_text(mark, json.dumps({**asdict(owner), "records": [record.name for record in records]}))
             _own.add(mark)
             atexit.register(_end, mark)
 

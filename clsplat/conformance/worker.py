@@ -9,7 +9,9 @@ import os
 import sys
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import asdict
+from functools import cache
 from typing import Any, TextIO
 
 from clsplat.conformance.check import Check, Note
@@ -26,16 +28,16 @@ def main(platform: int, number: int, schedule: Schedule, names: list[str]) -> No
     threading.Thread(target=_end_with, args=(_only_reader_of_stdin(),), daemon=True).start()
     out = _only_writer_of_stdout()
     info = next(info for info in list_devices() if info.place == (platform, number))
-    device = Device(info, schedule)
+    opened = cache(lambda: Device(info, schedule))
     for name in names:
         started = time.perf_counter()
-        _run(out, BY_NAME[name], device)
+        _run(out, BY_NAME[name], opened)
         _print(out, end=name, seconds=round(time.perf_counter() - started, 3))
 
 
-def _run(out: TextIO, check: Check, device: Device) -> None:
+def _run(out: TextIO, check: Check, opened: Callable[[], Device]) -> None:
     try:
-        for found in check.figures(device):
+        for found in check.figures(opened()):
             if isinstance(found, Note):
                 _print(out, note=asdict(found))
             else:

@@ -8,6 +8,7 @@ import math
 import threading
 import warnings
 import weakref
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +18,7 @@ from numpy.typing import DTypeLike, NDArray
 from clsplat.errors import ConfigError, KernelError, MemoryLimitError
 from clsplat.opencl import runtimes
 from clsplat.opencl.discovery import DeviceInfo, Schedule, choose, platforms, resolve_schedule, tuning_of
+from clsplat.opencl.refusals import refusals
 from clsplat.opencl.timings import Timings
 
 runtimes.prepare()
@@ -48,25 +50,28 @@ class Array:
         return math.prod(self.shape) * self.dtype.itemsize
 
     def get(self) -> NDArray[Any]:
-        """Copy to the host; waits for the device."""
+        """Copy to the host; waits for the device.  Raises MemoryLimitError, DeviceError."""
         host = np.empty(self.shape, self.dtype)
         if host.size:
-            cl.enqueue_copy(self.device.queue, host, self.buffer)
+            with self.device.refusals("a copy to the host"):
+                cl.enqueue_copy(self.device.queue, host, self.buffer)
         return host
 
     def get_item(self, index: int) -> Any:
-        """Copy one value of a one-dimensional array to the host; waits for the device."""
+        """Copy one value of a one-dimensional array to the host.  As `get`."""
         host = np.empty(1, self.dtype)
-        cl.enqueue_copy(self.device.queue, host, self.buffer, src_offset=index * self.dtype.itemsize)
+        with self.device.refusals("a copy to the host"):
+            cl.enqueue_copy(self.device.queue, host, self.buffer, src_offset=index * self.dtype.itemsize)
         return host[0]
 
     def set(self, values: NDArray[Any]) -> None:
-        """Copy from the host; the shapes must agree."""
+        """Copy from the host; the shapes must agree.  Raises MemoryLimitError, DeviceError."""
         host = np.ascontiguousarray(values, self.dtype)
         if host.shape != self.shape:
             raise ValueError(f"cannot copy {host.shape} into {self.shape}")
         if host.size:
-            cl.enqueue_copy(self.device.queue, self.buffer, host)
+            with self.device.refusals("a copy to the device"):
+                cl.enqueue_copy(self.device.queue, self.buffer, host)
 
     def fill(self, value: float) -> None:
         """Set every value of an array of floats or 32-bit integers."""
@@ -77,18 +82,22 @@ class Array:
 
 
 class Device:
-    """An open device: one context, one order of commands, programs built once."""
+    """An open device: one context, one order of commands, programs built once.
+
+    Raises MemoryLimitError or DeviceError where the runtime refuses to open it, KernelError where nothing can blend.
+    """
 
     def __init__(self, info: DeviceInfo, schedule: Schedule = "auto") -> None:
         platform, number = info.place
         self.info = info
-        self.context = cl.Context([platforms()[platform].get_devices()[number]])
         timed = cl.command_queue_properties.PROFILING_ENABLE
-        self._queues = {False: cl.CommandQueue(self.context), True: cl.CommandQueue(self.context, properties=timed)}
+        with self.refusals("opening it"):
+            self.context = cl.Context([platforms()[platform].get_devices()[number]])
+            self._queues = {False: cl.CommandQueue(self.context), True: cl.CommandQueue(self.context, properties=timed)}
         self._sampling = False  # whether the timed queue is in use: it costs the host
         self.schedule = resolve_schedule(info, schedule)
         self.tuning = tuning_of(info, self.schedule)
-        self.timings = Timings()
+        self.timings = Timings(info.name)
         self.allocated = 0  # bytes of all buffers that are alive
         self.peak = 0  # largest value of `allocated`
         self.lock = threading.Lock()  # of what threads share: the programs, and the arguments of their kernels
@@ -165,7 +174,7 @@ class Device:
     def program(self, file: str | Path, **defines: int | str) -> "Program":
         """Build `cl_kernels/<file>`, or a file by its absolute path, with this device's tuning and `defines`, once.
 
-        Raises KernelError when it does not build, FileNotFoundError when it is missing.
+        Raises KernelError when it does not build or is missing.
         """
         from clsplat.opencl.program import Program
 
@@ -176,8 +185,13 @@ class Device:
             return self._programs[key]
 
     def finish(self) -> None:
-        """Wait for all enqueued work."""
-        self.queue.finish()
+        """Wait for all enqueued work.  Raises MemoryLimitError, DeviceError."""
+        with self.refusals("work in progress"):
+            self.queue.finish()
+
+    def refusals(self, what: str) -> AbstractContextManager[None]:
+        """Convert what the runtime refuses in a block, in which `what` is done."""
+        return refusals(what, self.info.name)
 
 
 def open_device(device: str | Device | None = None, schedule: Schedule = "auto") -> Device:

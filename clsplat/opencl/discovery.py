@@ -6,10 +6,12 @@ The device is chosen once and passed explicitly; no other device replaces it sil
 import logging
 import os
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from clsplat.errors import ConfigError, DeviceError, quoted
+from clsplat.errors import ConfigError, DeviceError, one_line, quoted
 from clsplat.opencl import runtimes
 
 runtimes.prepare()
@@ -58,24 +60,36 @@ class DeviceInfo:
 
 
 def list_devices() -> list[DeviceInfo]:
-    """Return every device of every runtime, in the loader's order; a runtime may have no device."""
+    """Return every device of every runtime, in the loader's order; a runtime may have no device.
+
+    One that refuses an answer is left out, and a line says so.
+    """
     found = []
     for p, platform in enumerate(platforms()):
-        try:
+        devices: list[Any] = []
+        with _told(f"OpenCL platform {p}: its devices cannot be listed", "DEVICE_NOT_FOUND"):
             devices = platform.get_devices()
-        except cl.Error:
-            continue
         for d, device in enumerate(devices):
-            found.append(_info(platform, device, (p, d)))
+            with _told(f"OpenCL platform {p}: its device {d} cannot be asked"):
+                found.append(_info(platform, device, (p, d)))
     return found
 
 
 def platforms() -> list[Any]:
     """Return the platforms of the loader; none when it finds no runtime."""
-    try:
+    with _told("the OpenCL loader fails", "PLATFORM_NOT_FOUND_KHR"):
         return list(cl.get_platforms())
-    except cl.Error:  # the loader found no runtime
-        return []
+    return []
+
+
+@contextmanager
+def _told(what: str, nothing_there: str = "") -> Iterator[None]:
+    """Log a refusal in the block, but for the one that says that nothing is there."""
+    try:
+        yield
+    except cl.Error as error:
+        if error.code != getattr(cl.status_code, nothing_there, None):
+            LOG.warning("%s (%s); its driver may need to be installed again", what, one_line(error))
 
 
 def _info(platform: Any, device: Any, place: tuple[int, int]) -> DeviceInfo:

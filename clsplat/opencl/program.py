@@ -15,7 +15,7 @@ import pyopencl as cl
 
 from clsplat import resource_dir
 from clsplat.caches import kernel_caches
-from clsplat.errors import DeviceError, KernelError, MemoryLimitError
+from clsplat.errors import KernelError
 from clsplat.opencl.device import Array
 from clsplat.opencl.discovery import DeviceInfo
 
@@ -143,14 +143,12 @@ class Kernel:
         if 0 in size:
             return
         arguments = self._checked(values)
-        try:
-            with self._device.lock:  # the kernel object holds the arguments until it is enqueued
-                self._kernel.set_args(*arguments)
-                event = cl.enqueue_nd_range_kernel(self._device.queue, self._kernel, size, local)
-        except cl.MemoryError as error:
-            raise MemoryLimitError(f"{self.label}: {self._device.info.name} is out of memory ({error})") from error
-        except cl.Error as error:
-            raise DeviceError(f"{self.label} failed on {self._device.info.name}: {error}") from error
+        with (
+            self._device.lock,
+            self._device.refusals(self.label),
+        ):  # the kernel holds the arguments until it is enqueued
+            self._kernel.set_args(*arguments)
+            event = cl.enqueue_nd_range_kernel(self._device.queue, self._kernel, size, local)
         self._device.timings.add(self.label, event)
 
     def _checked(self, values: dict[str, Any]) -> list[Any]:

@@ -10,9 +10,12 @@ import subprocess
 import sys
 import sysconfig
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 
 from clsplat.caches import cache_folder, damaged_kernels, empty_kernel_caches
+from clsplat.errors import OutputError
+from clsplat.files import write_text
 
 SYSTEM_DRIVERS = Path("/etc/OpenCL/vendors")
 PROBE = Path(__file__).with_name("probe.py")
@@ -22,6 +25,7 @@ _HANGS = f"a test kernel did not finish in {PROBE_SECONDS} s"
 _NO_EXECUTION = "PoCL's cache lies where nothing may be executed: mount it with `exec`, or set POCL_CACHE_DIR"
 _OTHER_RUNTIMES = "apt install pocl-opencl-icd, or pip install 'clsplat[intel]'"
 _ADVICE = (  # words in the output of a failed test kernel -> remedy
+    ("without the vectors", f"this runtime does not support the processor: {_OTHER_RUNTIMES}"),
     ("unknown target cpu", f"this PoCL does not support the processor: {_OTHER_RUNTIMES}"),
     ("invalid_kernel_name", f"this runtime may not support the processor: {_OTHER_RUNTIMES}"),
     ("linker", f"PoCL needs a linker: apt install binutils libc6-dev; or use another runtime: {_OTHER_RUNTIMES}"),
@@ -48,13 +52,13 @@ def _add_intel_runtime() -> None:
     if not library.exists() or "OCL_ICD_VENDORS" in os.environ:
         return
     folder = cache_folder() / "drivers" / hashlib.sha256(str(library).encode()).hexdigest()[:12]
-    folder.mkdir(parents=True, exist_ok=True)
     for old in folder.glob("*.icd"):
         if old.name != "intel-pip.icd" and not (SYSTEM_DRIVERS / old.name).exists():
             old.unlink(missing_ok=True)
-    for driver in SYSTEM_DRIVERS.glob("*.icd"):
-        _write(folder / driver.name, driver.read_text("utf-8", errors="replace"))
-    _write(folder / "intel-pip.icd", f"{library}\n")
+    texts = {driver.name: driver.read_text("utf-8", errors="replace") for driver in SYSTEM_DRIVERS.glob("*.icd")}
+    for name, text in {**texts, "intel-pip.icd": f"{library}\n"}.items():
+        if not (folder / name).exists() or (folder / name).read_text("utf-8", errors="replace") != text:
+            write_text(folder / name, text)
     os.environ["OCL_ICD_VENDORS"] = str(folder)
 
 
@@ -62,16 +66,17 @@ def fault_of(key: str, platform: int, device: int) -> str | None:
     """Return None when the device builds and runs a kernel, else one sentence with the fault and the remedy.
 
     `key` identifies the runtime.  Only successes are stored, so a runtime that was fixed is tested again.  A device
-    that fails is tried again with empty caches of built kernels.
+    that fails is tried again with empty caches of built kernels.  It is tested at every
+    start where the cache cannot be written.
     """
     tested = PROBE.read_bytes() + key.encode()
     record = cache_folder() / "probes" / hashlib.sha256(tested).hexdigest()[:16]
-    if record.exists():
+    if os.path.exists(record):  # False in a folder of another user
         return None
     fault = _probed(platform, device, {})
     if fault is None:
-        record.parent.mkdir(parents=True, exist_ok=True)
-        _write(record, key)
+        with suppress(OutputError):
+            write_text(record, key)
     elif fault not in (_HANGS, _NO_EXECUTION):
         with empty_kernel_caches() as variables:
             if _probed(platform, device, variables) is None:
@@ -111,11 +116,3 @@ def _error_line(output: str) -> str:
     lines = [line.strip() for line in output.splitlines() if line.strip()]
     errors = [line for line in lines if line.lower().startswith("error:")]
     return (errors or lines or ["the test kernel failed without a message"])[-1 if not errors else 0]
-
-
-def _write(path: Path, text: str) -> None:
-    if path.exists() and path.read_text("utf-8", errors="replace") == text:
-        return
-    temporary = path.with_name(f"{path.name}.{os.getpid()}")
-    temporary.write_text(text, "utf-8")
-    os.replace(temporary, path)

@@ -8,7 +8,7 @@ from typing import Any, Literal, get_args
 
 from clsplat import lock
 from clsplat.errors import ClsplatError, ConfigError, InternalError, OutputError, as_clsplat_error
-from clsplat.files import sweep, unwritable
+from clsplat.files import make_folder, sweep, unwritable
 from clsplat.names import (
     BEFORE_A_RUN,
     CHECKPOINTS,
@@ -42,7 +42,7 @@ def opened(out: Path, start: Start, **values: Any) -> Iterator[StatusFile]:
     made = [folder for folder in (out, *out.parents) if not folder.exists()]
     is_new = not (out / PIPELINE).exists()
     try:
-        out.mkdir(parents=True, exist_ok=True)
+        make_folder(out)
     except OSError as error:
         raise unwritable(out, error) from error
     try:

@@ -5,8 +5,10 @@ finite is no checkpoint: it lies beside them as failed_N.npz, and a run goes on 
 """
 
 import logging
+import math
 import re
-from contextlib import suppress
+from collections.abc import Iterable
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -33,7 +35,7 @@ LOG = logging.getLogger("clsplat")
 
 
 def save(run: Run, keep: int | None = None) -> Path:
-    """Write checkpoints/step_N.npz, whole or not at all; with `keep` remove all but so many of the newest.
+    """Write checkpoints/step_N.npz, whole or not at all; with `keep` remove all but so many of the newest, up to it.
 
     Raises NotFiniteError, after writing failed_N.npz, where the model is not finite; then nothing is removed.  Raises
     ClsplatError where a step or an edit is half done.
@@ -46,8 +48,7 @@ def save(run: Run, keep: int | None = None) -> Path:
     run.status.note(checkpoint=path.name)
     run.status.refresh()
     if keep is not None:
-        for other in saved(run.out)[:-keep]:
-            other.unlink(missing_ok=True)
+        _remove(saved(run.out, run.step)[:-keep])  # a later one is damaged, and could not be renamed
     return path
 
 
@@ -55,9 +56,7 @@ def set_aside(run: Run, broken: list[str]) -> str:
     """Write a state that is not finite as failed_N.npz, the only one of its kind; return what to tell and to do."""
     try:
         path = _write(run, "failed")
-        for other in path.parent.glob("failed_*.npz"):
-            if other != path:
-                other.unlink(missing_ok=True)
+        _remove(other for other in path.parent.glob("failed_*.npz") if other != path)
         state = f"the state is in {path}"
     except OutputError as error:
         state = f"the state is lost: {error}"
@@ -69,14 +68,14 @@ def set_aside(run: Run, broken: list[str]) -> str:
     )
 
 
-def saved(out: Path) -> list[Path]:
-    """Return the checkpoints of a run folder from old to new."""
+def saved(out: Path, last: float = math.inf) -> list[Path]:
+    """Return the checkpoints of a run folder from old to new, up to the step `last`."""
     steps = {
         int(found[1]): path
         for path in (out / CHECKPOINTS).glob("step_*.npz")
         if (found := re.fullmatch(r"step_(\d+)\.npz", path.name))
     }
-    return [steps[step] for step in sorted(steps)]
+    return [steps[step] for step in sorted(steps) if step <= last]
 
 
 def load(path: Path) -> tuple[State, Arrays]:
@@ -131,8 +130,24 @@ def drop_later(out: Path, taken: Path | None) -> None:
     """Rename the damaged checkpoints after the one that was taken: they take no place among those that are kept."""
     files = saved(out)
     for damaged in files[files.index(taken) + 1 :] if taken else ():
-        with suppress(OSError):
+        try:
             damaged.rename(damaged.with_name(damaged.name.replace("step", "damaged")))
+        except OSError as error:
+            LOG.warning("%s: cannot be renamed (%s); remove it", damaged, error.strerror)
+
+
+def _remove(files: Iterable[Path]) -> None:
+    """Remove older states; one that cannot go, as where Windows lets another program read it, stays until the next."""
+    for file in files:
+        try:
+            file.unlink(missing_ok=True)
+        except OSError as error:
+            _tell_once(f"{file}: cannot be removed ({error.strerror}); it stays")
+
+
+@cache
+def _tell_once(text: str) -> None:
+    LOG.warning("%s", text)
 
 
 def _write(run: Run, kind: str) -> Path:

@@ -14,7 +14,7 @@ Seconds = Annotated[float, Field(gt=-1e15, lt=1e15)]
 class Amount(BaseModel):
     """How much of a stage is done."""
 
-    model_config = ConfigDict(frozen=True)
+    model_config = ConfigDict(frozen=True, use_attribute_docstrings=True)
 
     done: Whole
     """Number of units that are done."""

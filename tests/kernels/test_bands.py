@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pyopencl as cl
 import pytest
 
 from clsplat.conformance.scenes import random_case
@@ -102,6 +103,26 @@ def test_a_refusal_of_memory_leads_to_bands_and_the_same_bits(device, rng, monke
         np.testing.assert_array_equal(refused_image, image)
         np.testing.assert_array_equal(refused_sums, pixel_sums)
     assert max(rasterizer._bands.values()) > 1
+
+
+def test_memory_that_a_runtime_refuses_at_a_copy_leads_to_bands(device, rng, monkeypatch):
+    """Some take it at the first use."""
+    case, copy, refused = random_case(rng, 300, 60, 70), cl.enqueue_copy, []
+    weights = rng.normal(size=(3, 70, 60)).astype(np.float32)
+    image, pixel_sums, _ = results(device, case, weights)
+
+    def refusing(queue, to, source, **values):
+        if "src_offset" in values and not refused:  # the number of pairs
+            refused.append(to)
+            raise cl.MemoryError("clEnqueueReadBuffer failed: MEM_OBJECT_ALLOCATION_FAILURE")
+        return copy(queue, to, source, **values)
+
+    monkeypatch.setattr(cl, "enqueue_copy", refusing)
+    banded_image, banded_sums, frame = results(device, case, weights)
+    assert refused
+    assert len(frame.bands) == 2
+    np.testing.assert_array_equal(banded_image, image)
+    np.testing.assert_array_equal(banded_sums, pixel_sums)
 
 
 def test_memory_that_one_row_of_tiles_exceeds_is_refused(device, rng):

@@ -52,10 +52,11 @@ def kills(scene: Path, folder: Path, count: int, seed: int = 0) -> Iterator[Coun
         recipe = list(SETTINGS)[tally["finished"] % len(SETTINGS)]
         out = folder / f"{recipe}-{tally['finished']}"
         for _ in range(ATTEMPTS):
+            left = partials(out)  # by earlier kills: the next one may come before they are swept
             attempt = Attempt(scene, out, recipe)
             if attempt.killed_after(chance.uniform(0.05, 1.0) * seconds[recipe]):
                 tally["killed"] += 1
-                tally["in a write"] += any(PARTIAL.fullmatch(path.name) for path in out.rglob(".*"))
+                tally["in a write"] += bool(partials(out) - left)
                 yield tally
             else:
                 break
@@ -64,6 +65,11 @@ def kills(scene: Path, folder: Path, count: int, seed: int = 0) -> Iterator[Coun
         tally["finished"] += 1
         tally["equal"] += attempt.code == 0 and identity(out) == expected[recipe]
         yield tally
+
+
+def partials(out: Path) -> set[Path]:
+    """The temporary files below a folder."""
+    return {path for path in out.rglob(".*") if PARTIAL.fullmatch(path.name)}
 
 
 def identity(out: Path) -> tuple[str, str, list[str]]:
@@ -93,6 +99,7 @@ class Attempt:
             log = os.open(out.with_suffix(".txt"), os.O_WRONLY | os.O_CREAT | os.O_APPEND)
             os.dup2(log, 1)
             os.dup2(log, 2)
+            uses.forget_after_sudden_ends = lambda cache: None  # a check of the device is longer than the run
             self._train(scene, out, recipe)
             code = 0
         except BaseException:
@@ -102,7 +109,6 @@ class Attempt:
             os._exit(code)
 
     def _train(self, scene: Path, out: Path, recipe: str) -> None:
-        uses.forget_after_sudden_ends = lambda cache: None  # the check of a device after a kill is longer than the run
         clsplat.run(recipe, scene, out, set=SETTINGS[recipe], start="resume")
 
     def end(self) -> int:
