@@ -1,6 +1,8 @@
 """The check before a device makes pictures or models: it is done once, and a wrong device is refused everywhere."""
 
 import io
+import json
+import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -259,3 +261,11 @@ def test_a_device_is_proved_once_for_all_that_it_does(monkeypatch, info, empty_c
     for work in ("Renderer", "render_views", "evaluate", "Trainer"):
         WORK[work](tiny_scene, model, tmp_path, Device(info))
         assert len(started) == 1
+
+
+@pytest.mark.parametrize("records", [5, None, "name", [None, "a\0b", "../x"]])
+def test_a_damaged_mark_of_a_use_stops_nothing(records, tmp_path):
+    (tmp_path / "in_use").mkdir()
+    (tmp_path / "in_use" / "7-x.json").write_text(json.dumps({"process": os.getpid(), "records": records}))
+    uses.forget_after_sudden_ends(tmp_path)
+    assert not list((tmp_path / "in_use").iterdir())
