@@ -11,6 +11,7 @@ ROWS = (  # from the top down; a module imports only from lower rows, or from it
     {"cli"},
     {"torch"},
     {"api"},
+    {"lod"},
     {"compress"},
     {"runs"},
     {"conformance"},
