@@ -67,4 +67,5 @@ def half_boxes(level: Parameters) -> Floats:
     from scipy.spatial.transform import Rotation
 
     turned = np.abs(Rotation.from_quat(np.roll(unit(level["quats"]), -1, axis=1)).as_matrix())
-    return np.einsum("nij,nj->ni", turned, np.exp(level["log_scales"].astype(np.float64)))
+    half: Floats = np.einsum("nij,nj->ni", turned, np.exp(level["log_scales"].astype(np.float64)))
+    return half

@@ -45,8 +45,8 @@ def write_lod(folder: Path, levels: Sequence[SplatFile], options: Writing | None
         "tree": shape,
     }
     with _new_folder(folder) as place:
-        for name, (level, rows) in files.rows.items():
-            write_as_ordered(place / name, levels[level].rows(np.concatenate(rows)), options or Writing())
+        for name, (number, rows) in files.rows.items():
+            write_as_ordered(place / name, levels[number].rows(np.concatenate(rows)), options or Writing())
         with written(place / LOD_META) as file:
             file.write(json.dumps(meta, separators=(",", ":")).encode())
     return file.sha256

@@ -11,12 +11,12 @@ over the cube root of the mixture's volume, for a picture shows areas.
 """
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from clsplat.density.mixture import Floats, Mixtures, Rows, covariance_of, log_scales_of, mass_of, merged, surface
+from clsplat.density.mixture import Floats, Mixtures, Rows, covariance_of, log_scales_of, merged, surface
 from clsplat.errors import ConfigError, DataError
 from clsplat.formats.splats import not_finite, opacities, unit
 from clsplat.gaussians.model import Model
@@ -46,7 +46,8 @@ def decimated(model: Model, keep: float = 0.5) -> Model:
     while (count := len(tables["means"])) > target:
         first, second = matched(tables)
         tables = _joined(tables, first[: count - target], second[: count - target])
-    return replace(plain, **{name: table.astype(np.float32) for name, table in tables.items()})
+    fewer: dict[str, Any] = {name: table.astype(np.float32) for name, table in tables.items()}
+    return replace(plain, **fewer)
 
 
 def matched(tables: Tables) -> tuple[Rows, Rows]:
@@ -70,7 +71,7 @@ def matched(tables: Tables) -> tuple[Rows, Rows]:
 def pair_cost(tables: Tables, first: Rows, second: Rows) -> Floats:
     """Return what merging changes, [pairs]; symmetric in the pair up to rounding."""
     mixtures = Mixtures.of(tables, first, second, surface)
-    size = log_scales_of(np.linalg.eigvalsh(mixtures.covariance))
+    size = log_scales_of(np.asarray(np.linalg.eigvalsh(mixtures.covariance), np.float64))
     share = mixtures.share
     colours = np.maximum(0.5 + SH_C0 * tables["sh_base"], 0)
     colour = np.concatenate([np.ones((len(colours), 1)), colours], axis=1)
@@ -90,7 +91,8 @@ def pair_cost(tables: Tables, first: Rows, second: Rows) -> Floats:
         for b, (other_weight, other_mean, other_covariance) in enumerate(fields[: a + 1]):
             overlap = _overlap(mean - other_mean, covariance, other_covariance)
             error += (1 if a == b else 2) * (weight * other_weight).sum(axis=1) * overlap
-    return error / np.exp(size.mean(axis=1))
+    cost: Floats = error / np.exp(size.mean(axis=1))
+    return cost
 
 
 def _overlap(apart: Floats, one: Floats, two: Floats) -> Floats:
