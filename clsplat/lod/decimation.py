@@ -2,12 +2,12 @@
 photographs.
 
 Pairs come from the nearest neighbours of each Gaussian; the cheapest go first, and none is in two pairs.  A mixture
-keeps mean, covariance and mass, opacity times surface, as in NanoGS (arXiv 2603.16103).  A pair costs what the mixture
-changes: the integral over space of the squared difference of the fields Σ α c G(x), c = (1, red, green, blue), where
+keeps mean, covariance and mass, opacity times surface, as in NanoGS (arXiv 2603.16103).  A pair costs
 
-    ∫ Ga Gb = (2π)^(3/2) (|Σa| |Σb| / |Σa + Σb|)^(1/2) exp(-½ dᵀ (Σa + Σb)⁻¹ d)
+    ½ (log |Σ| - a log |Σa| - b log |Σb|) + |SHa - SHb|²
 
-over the cube root of the mixture's volume, for a picture shows areas.
+with the shares a + b = 1 of its mass: the bound of Runnalls (2007, eq. 16) on the Kullback-Leibler divergence that
+merging causes, for a mass of 1, and the integral over all directions of the squared difference of the colours.
 """
 
 from dataclasses import replace
@@ -16,16 +16,14 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from clsplat.density.mixture import Floats, Mixtures, Rows, covariance_of, log_scales_of, merged, surface
+from clsplat.density.mixture import Floats, Mixtures, Rows, log_scales_of, merged, surface
 from clsplat.errors import ConfigError, DataError
-from clsplat.formats.splats import not_finite, opacities, unit
+from clsplat.formats.splats import not_finite, unit
 from clsplat.gaussians.model import Model
-from clsplat.gaussians.tables import SH_C0
 
 NEIGHBOURS = 8  # of a Gaussian, among which its partner is
 BLOCK = 1 << 16  # pairs whose costs are computed together
-LOG_SCALE, LOGIT = 60.0, 80.0  # beyond which numbers that follow from them leave float64
-THIN = 1e-8  # share of the largest variance that is added to all: discs have an inverse
+LOG_SCALES, LOGIT = (-17.0, 60.0), 80.0  # beyond which numbers that follow from them leave float64
 Tables = dict[str, Floats]
 
 
@@ -71,49 +69,29 @@ def matched(tables: Tables) -> tuple[Rows, Rows]:
 def pair_cost(tables: Tables, first: Rows, second: Rows) -> Floats:
     """Return what merging changes, [pairs]; symmetric in the pair up to rounding."""
     mixtures = Mixtures.of(tables, first, second, surface)
-    size = log_scales_of(np.asarray(np.linalg.eigvalsh(mixtures.covariance), np.float64))
-    share = mixtures.share
-    colours = np.maximum(0.5 + SH_C0 * tables["sh_base"], 0)
-    colour = np.concatenate([np.ones((len(colours), 1)), colours], axis=1)
-    opacity = opacities(tables["logit_opacity"][:, :1])
-    fields = [
-        (
-            opacity[rows] * colour[rows],
-            tables["means"][rows],
-            covariance_of(tables["quats"][rows], tables["log_scales"][rows]),
-        )
-        for rows in (first, second)
-    ]
-    mean_colour = (1 - share) * colour[first] + share * colour[second]
-    fields.append((-mixtures.opacity(size, surface)[:, None] * mean_colour, mixtures.means, mixtures.covariance))
-    error = np.zeros(len(first))
-    for a, (weight, mean, covariance) in enumerate(fields):
-        for b, (other_weight, other_mean, other_covariance) in enumerate(fields[: a + 1]):
-            overlap = _overlap(mean - other_mean, covariance, other_covariance)
-            error += (1 if a == b else 2) * (weight * other_weight).sum(axis=1) * overlap
-    cost: Floats = error / np.exp(size.mean(axis=1))
+    share = mixtures.share[:, 0]
+    size = tables["log_scales"].sum(axis=1)
+    variances = np.linalg.eigvalsh(mixtures.covariance).astype(np.float64)
+    cost: Floats = log_scales_of(variances).sum(axis=1) - (1 - share) * size[first] - share * size[second]
+    for name in ("sh_base", "sh_rest"):
+        cost += np.square(tables[name][first] - tables[name][second]).sum(axis=1)
     return cost
 
 
-def _overlap(apart: Floats, one: Floats, two: Floats) -> Floats:
-    """The integral of the product of two Gaussians of height 1, [pairs], over (2π)^(3/2)."""
-    thick = THIN * np.maximum(np.trace(one, axis1=1, axis2=2), np.trace(two, axis1=1, axis2=2))
-    one, two = (part + thick[:, None, None] * np.eye(3) for part in (one, two))
-    both = one + two
-    distance = (apart * np.linalg.solve(both, apart[:, :, None])[:, :, 0]).sum(axis=1)
-    ratio = np.linalg.det(one) * np.linalg.det(two) / np.linalg.det(both)
-    found: Floats = np.sqrt(np.maximum(ratio, 0)) * np.exp(-0.5 * distance)
-    return found
-
-
 def _neighbours(means: Floats) -> tuple[Rows, Rows]:
-    """Pairs of a row and one of its nearest neighbours, the lower row first, each once and in ascending order."""
-    count = len(means)
-    found = cKDTree(means).query(means, k=min(NEIGHBOURS + 1, count))[1]
-    rows = np.broadcast_to(np.arange(count)[:, None], found.shape)
-    apart = found != rows  # of many in one place, the row itself may be missing
-    low, high = np.minimum(found, rows)[apart], np.maximum(found, rows)[apart]
-    pairs = np.unique(low.astype(np.int64) * count + high)
+    """Pairs of a row and one of its nearest neighbours, the lower row first, each once and in ascending order.
+
+    Of rows in one place, each has the next one, and the first one has neighbours in other places.
+    """
+    places, first, place = np.unique(means, axis=0, return_index=True, return_inverse=True)
+    found = cKDTree(places).query(places, k=min(NEIGHBOURS + 1, len(places)))[1].reshape(len(places), -1)
+    one, two = first[np.repeat(np.arange(len(places)), found.shape[1])], first[found.ravel()]
+    by_place = np.argsort(place.ravel(), kind="stable")
+    same = np.diff(place.ravel()[by_place]) == 0
+    one = np.concatenate([one, by_place[:-1][same]])
+    two = np.concatenate([two, by_place[1:][same]])
+    count, apart = len(means), one != two
+    pairs = np.unique(np.minimum(one, two)[apart].astype(np.int64) * count + np.maximum(one, two)[apart])
     return pairs // count, pairs % count
 
 
@@ -121,7 +99,7 @@ def _settled(model: Model) -> Tables:
     """The tables in float64, with what the formulas can hold."""
     tables = {name: table.astype(np.float64) for name, table in model.tables().items()}
     tables["quats"] = unit(tables["quats"])
-    tables["log_scales"] = np.clip(tables["log_scales"], -LOG_SCALE, LOG_SCALE)
+    tables["log_scales"] = np.clip(tables["log_scales"], *LOG_SCALES)
     tables["logit_opacity"] = np.clip(tables["logit_opacity"], -LOGIT, LOGIT)
     return tables
 
