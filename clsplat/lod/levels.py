@@ -1,6 +1,7 @@
 """Levels of detail of a model: each merged from the one before, trained where photographs are there, and measured."""
 
 import logging
+import math
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -24,7 +25,6 @@ LOG = logging.getLogger("clsplat")
 MOST = 12  # levels; halves of a million Gaussians are 500 then
 FEW = 1_000_000  # Gaussians, below which PlayCanvas advises one SOG
 STAGES = ("init", "optimize")  # of the recipe
-COARSER = 2  # divisor of the photographs' size, over that of the model's run: what is far away is small
 RECORD = "lod.json"
 
 
@@ -35,6 +35,7 @@ class Plan:
     levels: int = 4
     keep: float = 0.5  # share of the Gaussians of the level before
     steps: int = 500  # of training each level where there are photographs; 0: none
+    downscale: float | None = None  # divisor of their size in this training; None: as the model was trained
 
     def __post_init__(self) -> None:
         if not 1 <= self.levels <= MOST:
@@ -43,6 +44,8 @@ class Plan:
             raise ConfigError(
                 f"--keep {self.keep:g}: expected a share of the Gaussians from 0.01 to below 1, such as 0.5"
             )
+        if self.downscale is not None and not 1 <= self.downscale < math.inf:
+            raise ConfigError(f"--downscale {self.downscale:g}: expected a divisor of at least 1")
         if self.steps < 0:
             raise ConfigError(f"--steps {self.steps}: expected a number of at least 0")
 
@@ -64,7 +67,7 @@ class Training:
         self.measurer = Measurer(opened)
         self.tuning = Tuning(opened.source, opened.loaded, plan.steps, opened.device)
         question: dict[str, Any] = {"sha256": sha256(opened.source.file), "scene": str(opened.source.folder)}
-        question |= {"keep": plan.keep, "steps": plan.steps}
+        question |= {"keep": plan.keep, "steps": plan.steps, "downscale": plan.downscale}
         if plan.steps:
             claim(place, question, RECORD, "the training of levels", "the name of another folder")
 
@@ -80,8 +83,8 @@ class Training:
             return merged
         file = self.place / f"level_{number}.ply"
         model.save(file)
-        divisor = COARSER * self.tuning.source.settings.downscale
-        pipeline = self.tuning.pipeline(STAGES, {"init.file": str(file.resolve()), "scene.downscale": divisor})
+        size = {"scene.downscale": self.plan.downscale} if self.plan.downscale else {}
+        pipeline = self.tuning.pipeline(STAGES, {"init.file": str(file.resolve()), **size})
         found = load(self.tuning.trained(pipeline, self.place / f"level_{number}"))
         return Level(found, merged.psnr, self.measured(found).psnr)
 
