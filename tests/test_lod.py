@@ -104,6 +104,12 @@ def test_a_training_that_is_interrupted_goes_on(few_steps, tmp_path, monkeypatch
     assert tree(tmp_path / "site") == tree(trained[0])
 
 
+def test_a_folder_of_levels_is_a_model_too(trained, tiny_scene, tmp_path):
+    """With a scene of its own, as any model file."""
+    found = clsplat.write_levels(trained[0], tmp_path / "site", tiny_scene, levels=2, steps=STEPS)
+    assert found["levels"][0]["gaussians"] == trained[1]["levels"][0]["gaussians"]
+
+
 def test_photographs_are_as_small_as_is_asked(few_steps, tmp_path):
     clsplat.write_levels(few_steps, tmp_path / "site", levels=2, steps=STEPS, downscale=2)
     assert "20 x 20 px" in (tmp_path / "site.training" / "level_1" / "log.txt").read_text()

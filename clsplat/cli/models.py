@@ -191,7 +191,7 @@ def compress(
 
 @command("lod", "clsplat lod runs/splat_7k site/scene", "clsplat lod point_cloud.ply site/scene --levels 3")
 def lod(
-    model: ModelArgument,
+    model: Annotated[Path, typer.Argument(metavar="MODEL|RUN", help="A model file, or a run folder.")],
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="The folder to make, with its lod-meta.json.")],
     levels: Annotated[int, typer.Option(metavar="N", help="Levels, with the model itself.")] = 4,
     keep: Annotated[float, typer.Option(metavar="SHARE", help="Of the Gaussians of the level before.")] = 0.5,

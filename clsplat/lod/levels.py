@@ -13,7 +13,7 @@ from clsplat.compress.tuning import Tuning
 from clsplat.errors import ConfigError, DataError
 from clsplat.formats.lod_writing import require_free, write_lod
 from clsplat.formats.splats import Writing
-from clsplat.formats.table import bytes_of
+from clsplat.formats.table import bytes_of, located
 from clsplat.gaussians.clusters import DeviceClusters
 from clsplat.gaussians.model import Model, load
 from clsplat.lod.decimation import decimated
@@ -66,7 +66,7 @@ class Training:
         self.place, self.plan = place, plan
         self.measurer = Measurer(opened)
         self.tuning = Tuning(opened.source, opened.loaded, plan.steps, opened.device)
-        question: dict[str, Any] = {"sha256": sha256(opened.source.file), "scene": str(opened.source.folder)}
+        question: dict[str, Any] = {"sha256": sha256(located(opened.source.file)), "scene": str(opened.source.folder)}
         question |= {"keep": plan.keep, "steps": plan.steps, "downscale": plan.downscale}
         if plan.steps:
             claim(place, question, RECORD, "the training of levels", "the name of another folder")
