@@ -54,7 +54,7 @@ def write_lod(folder: Path, levels: Sequence[SplatFile], options: Writing | None
 
 def require_free(folder: Path) -> None:
     """Raise ConfigError where something lies at the place of a new folder."""
-    if is_there(folder) and (not folder.is_dir() or any(folder.iterdir())):
+    if not folder.name or (is_there(folder) and (not folder.is_dir() or any(folder.iterdir()))):
         raise ConfigError(f"{folder}: is in use; give the name of a new folder")
 
 

@@ -152,10 +152,12 @@ def test_a_folder_is_there_once_it_is_whole(tmp_path, rng, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_folder_in_use_and_an_empty_level_are_refused(written, tmp_path, rng):
+def test_a_folder_in_use_and_an_empty_level_are_refused(written, tmp_path, rng, monkeypatch):
     folder, made = written
     (tmp_path / "file").write_text("mine")
-    for place in (folder, tmp_path / "file"):
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    for place in (folder, tmp_path / "file", Path()):
         with pytest.raises(ConfigError, match="is in use; give the name of a new folder"):
             write_lod(place, made)
     with pytest.raises(DataError, match="holds no Gaussians"):
