@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from clsplat.api.commands import status_schema as status_schema
     from clsplat.api.commands import view as view
     from clsplat.api.compression import compress_model as compress_model
+    from clsplat.api.compression import write_levels as write_levels
     from clsplat.api.device import Device as Device
     from clsplat.api.pictures import camera_path as camera_path
     from clsplat.api.pictures import render_path as render_path
@@ -64,7 +65,7 @@ _HERE = Path(__file__).resolve().parent
 _ROOMS = {  # where the names come from, which `import clsplat` does not import
     "clsplat.api.commands": "check compare_runs convert copy_pipeline describe_run evaluate pipeline_schema pipelines"
     " resume run status status_schema view",
-    "clsplat.api.compression": "compress_model",
+    "clsplat.api.compression": "compress_model write_levels",
     "clsplat.api.device": "Device",
     "clsplat.api.renderer": "Gradients Picture Renderer",
     "clsplat.api.tools": "devices doctor inspect_scene load_plugin measure_growth measure_speed read_measurement",

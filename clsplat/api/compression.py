@@ -1,4 +1,4 @@
-"""A model made small, as a function; errors and `device` as in `clsplat.api.commands`."""
+"""A model made small, or in levels of detail, as functions; errors and `device` as in `clsplat.api.commands`."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -35,3 +35,28 @@ def compress_model(
     return search.compress(
         Path(model), path_of(scene), target, folder, form=format, keeps=shares, steps=steps, device=device
     )
+
+
+def write_levels(
+    model: PathLike,
+    folder: PathLike,
+    scene: PathLike | None = None,
+    *,
+    levels: int = 4,
+    keep: float = 0.5,
+    steps: int = 500,
+    downscale: float | None = None,
+    device: "str | Device | None" = None,
+) -> dict[str, Any]:
+    """Write a model in levels of detail, as streamed SOG (lod-meta.json): each level has a share of the one before.
+
+    model, scene: as for `render_views`, but without a scene nothing is trained; levels: with the model itself; keep:
+    the share; steps: of training each coarser level, 0 for none; downscale: divisor of the photographs' size there,
+    by default that of the model's run.  Returns `folder`, `bytes`, the `split` that is measured, and `levels` with
+    `gaussians`, `bytes`, and in dB `merged_psnr`, before the training, and `psnr`.
+    """
+    from clsplat.lod import levels as detail
+
+    load_plugins()
+    plan = detail.Plan(levels, keep, steps, downscale)
+    return detail.levels_of_detail(Path(model), Path(folder), path_of(scene), plan, device)

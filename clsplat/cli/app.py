@@ -27,6 +27,7 @@ SYNONYMS = {
     **dict.fromkeys(("prove", "diagnose", "selftest"), "doctor"),
     **dict.fromkeys(("export", "transform", "merge"), "convert"),
     **dict.fromkeys(("shrink", "prune", "quantise", "quantize"), "compress"),
+    **dict.fromkeys(("decimate", "simplify", "levels", "stream"), "lod"),
     "diff": "compare",
     "help": "--help",
     "version": "--version",
@@ -35,7 +36,7 @@ SYNONYMS = {
 
 ORDER = [
     *("run", "resume", "status", "check", "pipelines", "devices", "doctor", "inspect"),
-    *("render", "view", "evaluate", "convert", "compress", "compare", "bench", "data"),
+    *("render", "view", "evaluate", "convert", "compress", "lod", "compare", "bench", "data"),
 ]
 
 

@@ -189,6 +189,31 @@ def compress(
     terminal.remark(f"{found['file']}: {size}, {chosen['psnr'] - source['psnr']:+.2f} dB; page: {found['page']}")
 
 
+@command("lod", "clsplat lod runs/splat_7k site/scene", "clsplat lod point_cloud.ply site/scene --levels 3")
+def lod(
+    model: Annotated[Path, typer.Argument(metavar="MODEL|RUN", help="A model file, or a run folder.")],
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="The folder to make, with its lod-meta.json.")],
+    levels: Annotated[int, typer.Option(metavar="N", help="Levels, with the model itself.")] = 4,
+    keep: Annotated[float, typer.Option(metavar="SHARE", help="Of the Gaussians of the level before.")] = 0.5,
+    scene: SceneOption = None,
+    steps: Annotated[int, typer.Option(metavar="N", help="Of training each coarser level; 0: none.")] = 500,
+    downscale: Annotated[
+        float | None,
+        typer.Option(metavar="N", help="Divide the photographs' size in this training; default: as the run."),
+    ] = None,
+    device: DeviceOption = None,
+) -> None:
+    """Write a model in levels of detail for the web (streamed SOG); with photographs each level is trained."""
+    from clsplat.lod.levels import table
+
+    found = compression.write_levels(
+        model, folder, scene, levels=levels, keep=keep, steps=steps, downscale=downscale, device=device
+    )
+    terminal.show(table(found))
+    measured = f"; PSNR of {found['split']} views, not yet quantised" if found["split"] else ""
+    terminal.remark(f"{found['folder']}/lod-meta.json: {found['bytes'] / 1e6:.3g} MB{measured}")
+
+
 @command("compare", "clsplat compare runs/splat runs/mip_splatting --out compare.html")
 def compare(
     runs: Annotated[

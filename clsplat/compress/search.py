@@ -8,18 +8,20 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
+from clsplat.compress.folder import claim
 from clsplat.compress.page import page
 from clsplat.compress.rungs import Ladder, checked_keeps, of_degree
 from clsplat.compress.target import Point, Target
-from clsplat.errors import ConfigError, DataError
-from clsplat.files import is_there, unwritable, write_text
+from clsplat.compress.tuning import Tuning
+from clsplat.errors import ConfigError
+from clsplat.files import write_text
 from clsplat.formats.output import written
 from clsplat.formats.splats import Writing
 from clsplat.formats.table import bytes_of, located
 from clsplat.gaussians.clusters import DeviceClusters
 from clsplat.gaussians.model import Model, load
 from clsplat.metrics.views import mean, measure
-from clsplat.reading import read_file, read_json, sha256
+from clsplat.reading import read_file, sha256
 from clsplat.runs.model_file import ModelFile
 from clsplat.views.photographs import Photographs
 
@@ -107,11 +109,11 @@ def compress(
     source, first, measurer = opened.source, opened.loaded, Measurer(opened)
     question: dict[str, Any] = {"model": str(source.file), "sha256": sha256(located(source.file))}
     question |= {"scene": str(source.folder), "keeps": shares, "steps": steps}
-    _claim(out, question)
+    claim(out, question, RECORD, "a search", "another --out")
     size = bytes_of(source.file)
     whole = Point(source.file.name, 1, first.sh_degree, "", len(first), size, *measurer.figures(first))
     search = Search(out, wanted, question, whole, measurer.split)
-    ladder = Ladder(out, source, first, steps, opened.device)
+    ladder = Ladder(out, Tuning(source, first, steps, opened.device))
     before = 1.0
     for keep in shares:
         rung = _measured(out / TRIALS, load(ladder.rung(keep, before)), keep, form, measurer)
@@ -156,22 +158,3 @@ def _finished(search: Search, form: Format) -> dict[str, Any]:
     with written(file) as output:
         output.write(read_file(search.out / chosen.file))
     return {**search.data(), "file": str(file), "page": str(search.out / PAGE)}
-
-
-def _claim(out: Path, question: dict[str, Any]) -> None:
-    """Make the folder.  Raises ConfigError where it holds something else than this search."""
-    if is_there(out) and (not out.is_dir() or any(out.iterdir())):
-        try:
-            before = read_json(out / RECORD)
-        except DataError:
-            before = None
-        if not isinstance(before, dict):
-            raise ConfigError(f"{out}: holds something else than a search; give another --out")
-        if differing := [key for key, value in question.items() if before.get(key) != value]:
-            raise ConfigError(f"{out}: holds a search with another {differing[0]}; give another --out")
-        return
-    try:
-        (out / TRIALS).mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise unwritable(out, error) from error
-    write_text(out / RECORD, json.dumps(question, indent=1) + "\n")

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from clsplat.density.edit import Edit, Rule
+from clsplat.density.mixture import mass_of, merged
 from clsplat.density.thresholds import Share
 from clsplat.gaussians.tables import SH_C0
-from clsplat.scene.quaternion import rotation_matrix, unit_quaternions
 from clsplat.schedule import Positive
 
 Floats = NDArray[np.float64]
@@ -84,44 +84,3 @@ class MergeNeighbours(Rule):
         two = nearest[one]
         heavier = mass[one] >= mass[two]
         return np.where(heavier, one, two), np.where(heavier, two, one)
-
-
-def mass_of(tables: dict[str, Floats]) -> Floats:
-    """Return opacity times volume, up to a constant, [N]."""
-    mass: Floats = np.exp(tables["log_scales"].sum(axis=1)) / (1 + np.exp(-tables["logit_opacity"][:, 0]))
-    return mass
-
-
-def merged(tables: dict[str, Floats], first: NDArray[np.int64], second: NDArray[np.int64]) -> dict[str, Floats]:
-    """Return Gaussians with mean and covariance of mixtures of `first` and `second`, by parameter, [pairs, ...]."""
-    mass = mass_of(tables)
-    total = mass[first] + mass[second]
-    share = (mass[second] / total)[:, None]
-    means = (1 - share) * tables["means"][first] + share * tables["means"][second]
-    covariance = np.zeros((len(first), 3, 3))
-    for rows, weight in ((first, 1 - share), (second, share)):
-        offset = tables["means"][rows] - means
-        own = covariance_of(tables["quats"][rows], tables["log_scales"][rows])
-        covariance += weight[:, :, None] * (own + offset[:, :, None] * offset[:, None, :])
-    variances, axes = np.linalg.eigh(covariance)  # scene units²
-    log_scales = 0.5 * np.log(np.maximum(variances, 1e-30))
-    axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]  # a rotation, not a reflection
-    opacity = np.clip(total / np.exp(log_scales.sum(axis=1)), 1e-6, 0.99)
-    colours = {
-        name: (1 - share) * tables[name][first] + share * tables[name][second] for name in ("sh_base", "sh_rest")
-    }
-    return {
-        "means": means,
-        "quats": unit_quaternions(axes),
-        "log_scales": log_scales,
-        "logit_opacity": np.log(opacity / (1 - opacity))[:, None],
-        **colours,
-    }
-
-
-def covariance_of(quats: Floats, log_scales: Floats) -> Floats:
-    """Return R diag(s²) Rᵀ, [N, 3, 3] scene units²."""
-    rotations = rotation_matrix(*(quats / np.linalg.norm(quats, axis=1, keepdims=True)).T)
-    axes = rotations * np.exp(log_scales)[:, None, :]
-    covariance: Floats = np.einsum("nij,nkj->nik", axes, axes)
-    return covariance

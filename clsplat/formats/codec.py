@@ -34,7 +34,7 @@ class Codec:
     name: str
     endings: tuple[str, ...]  # of names of files; the first is the usual one
     reads: str  # in words; "" where there is no reader
-    writes: str  # in words; "" where there is no writer
+    writes: str  # in words; "" where there is no writer, "by …" where a command alone writes it
     loses: str  # in words: what writing changes
     is_one: Callable[[Start], bool] = lambda start: False
     read: Callable[[Path, Reading], SplatFile] | None = None

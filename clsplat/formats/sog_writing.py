@@ -31,8 +31,13 @@ def write_sog(path: Path, splats: SplatFile, options: Writing) -> str:
     The images of a folder have their content in their names, so that none of another model is replaced.
     """
     require_some(path, splats)
+    return write_as_ordered(path, splats.rows(morton_order(splats.parameters["means"])), options)
+
+
+def write_as_ordered(path: Path, splats: SplatFile, options: Writing) -> str:
+    """Write a SOG as `write_sog` does, whose splats stay in the order that they have."""
     in_folder = path.name == META
-    p = splats.rows(morton_order(splats.parameters["means"])).parameters
+    p = splats.parameters
     width = -(-int(np.ceil(np.sqrt(len(splats)))) // 4) * 4
     images: dict[str, bytes] = {}
     meta: dict[str, Any] = {"version": 2, "count": len(splats), "asset": {"generator": "clsplat"}}

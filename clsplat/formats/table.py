@@ -11,6 +11,7 @@ from clsplat.formats.codec import Codec, Start
 from clsplat.formats.compressed_ply import is_compressed, read_compressed_ply, write_compressed_ply
 from clsplat.formats.glb import read_glb, write_glb
 from clsplat.formats.ksplat import looks_like_ksplat, read_ksplat
+from clsplat.formats.lod import LOD_META, files_of_lod, looks_like_lod, read_lod
 from clsplat.formats.ply import read_ply, write_ply
 from clsplat.formats.sog import looks_like_sog, read_sog
 from clsplat.formats.sog_files import META, with_images
@@ -79,6 +80,16 @@ CODECS = (
         keeps_numbers=True,
     ),
     Codec(
+        "streamed SOG",
+        (LOD_META,),
+        "version 1: the finest level, and the environment",
+        "by `clsplat lod`: levels of detail, along a Morton curve in each leaf of a tree",
+        "as SOG",
+        lambda start: looks_like_lod(start.data),
+        lambda path, options: read_lod(path),
+        keeps_numbers=True,
+    ),
+    Codec(
         "GLB",
         (".glb",),
         "KHR_gaussian_splatting, numbers of every kind, nodes that are moved, turned or scaled",
@@ -129,14 +140,16 @@ def endings(reads: bool = False) -> list[str]:
 
 
 def located(path: Path) -> Path:
-    """Return the file of a model: of a folder with a meta.json that one."""
-    return path / META if path.is_dir() and (path / META).is_file() else path
+    """Return the file of a model: of a folder with a meta.json, or a lod-meta.json, that one."""
+    places = (path / name for name in (META, LOD_META)) if path.is_dir() else ()
+    return next(filter(Path.is_file, places), path)
 
 
 def bytes_of(path: Path) -> int:
-    """Return the size of a model: of a folder of SOG that of its meta.json and of the images that it names."""
+    """Return the size of a model: of a folder of SOG, or of levels, that of all files that its JSON names."""
     place = located(path)
-    return sum(one.stat().st_size for one in (with_images(place) if place.name == META else [place]))
+    files = {META: with_images, LOD_META: files_of_lod}.get(place.name, lambda one: [one])
+    return sum(one.stat().st_size for one in files(place))
 
 
 def detect(path: Path) -> Codec | None:
@@ -177,7 +190,8 @@ def for_writing(path: Path) -> Codec:
         raise OutputError(f"{path}: cannot be written (it has no name); expected the path of a file")
     codec = named(path)
     if codec is None or codec.write is None:
-        what = f"{codec.name} is read, not written" if codec else f"no format has the name {quoted(path.name)}"
+        how = "written " + codec.writes.partition(":")[0] if codec and codec.writes else "read, not written"
+        what = f"{codec.name} is {how}" if codec else f"no format has the name {quoted(path.name)}"
         raise ConfigError(f"{shortened(str(path))}: {what}; expected a name that ends in {', '.join(endings())}")
     return codec
 

@@ -185,8 +185,11 @@ class Model:
         Raises ConfigError for another name, and OutputError when the file cannot be written.
         """
         model = self if for_writing(Path(path)).keeps_filter else self.baked()
-        mode = "mip" if self.rendering.compensate else "default"
-        return write(Path(path), SplatFile(model.tables(), self.rendering.comment(), mode), options)
+        return write(Path(path), model.as_file(), options)
+
+    def as_file(self) -> SplatFile:
+        """Return what a model file holds, with the arrays of the model."""
+        return SplatFile(self.tables(), self.rendering.comment(), "mip" if self.rendering.compensate else "default")
 
     def __repr__(self) -> str:
         return f"Model({len(self):,} Gaussians, SH degree {self.sh_degree})"

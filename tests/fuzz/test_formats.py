@@ -11,8 +11,10 @@ import numpy as np
 import pytest
 
 from clsplat.errors import ConfigError
+from clsplat.formats.lod_tree import Limits
+from clsplat.formats.lod_writing import write_lod
 from clsplat.formats.splats import Reading, Writing
-from clsplat.formats.table import CODECS, detect, read, write
+from clsplat.formats.table import CODECS, bytes_of, detect, read, write
 from clsplat.gaussians.checkup import examine
 from tests.formats.models import splats
 from tests.formats.test_glb import glued, parts
@@ -25,6 +27,7 @@ WORDS = {
     "compressed PLY": ["element chunk 1\n", "element sh 5\n", "property uchar f_rest_0\n", "uint packed_scale\n"],
     "SPZ": ["NGSP", "\x1f\x8b"],
     "SOG": ["meta.json", "means_l.webp", "../x", '"files":["a"]', '"count":', "RIFF", "VP8L", "WEBP", '"codebook":[]'],
+    "streamed SOG": ["lodLevels", "filenames", "0_0/meta.json", '"lods":{}', '"children":[]', '"count":', "../", "-1"],
     "GLB": [
         "glTF",
         "JSON",
@@ -72,7 +75,7 @@ def reads_or_refuses(path: Path) -> None:
 
 
 def test_every_reader_of_the_table_is_here():
-    own = {"PLY"}  # in test_ply.py
+    own = {"PLY", "streamed SOG"}  # in test_ply.py, and below
     assert {codec.name for codec in CODECS if codec.read} == own | NAMES.keys() | {"ksplat"}
 
 
@@ -112,6 +115,24 @@ def test_a_damaged_part_of_a_sog_is_read_or_refused(folder: Path):
             for name, held in members.items():
                 archive.writestr(name, data if name == like else held)
         reads_or_refuses(folder / "b.sog")
+
+    reads()
+
+
+def test_a_damaged_tree_of_levels_is_read_or_refused(folder: Path):
+    """The parts are whole; their lod-meta.json is not, or is another tree."""
+    levels = [splats(RNG, count, 1) for count in (60, 20)]
+    write_lod(folder / "levels", levels, limits=Limits(40, 2.0, 10))
+    path = folder / "levels" / "lod-meta.json"
+    whole = path.read_bytes()
+
+    @fuzzed(60, data=damaged([whole], WORDS["streamed SOG"]), other=misbuilt([json.loads(whole)]))
+    def reads(data, other):
+        path.write_bytes(data)
+        reads_or_refuses(path)
+        path.write_bytes(other)
+        reads_or_refuses(path)
+        outcome(bytes_of, path)
 
     reads()
 

@@ -1,0 +1,77 @@
+"""A model file trained further, from the photographs of its scene: stages of the recipe `compress`, as runs."""
+
+import json
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from clsplat.errors import Interrupted
+from clsplat.files import is_there
+from clsplat.gaussians.model import Model
+from clsplat.gaussians.run_model import MODEL
+from clsplat.names import PIPELINE
+from clsplat.opencl.device import Device
+from clsplat.pipeline.files import find
+from clsplat.pipeline.loading import Pipeline, checked, load
+from clsplat.pipeline.yaml_file import Document, read_yaml
+from clsplat.runs.experiment import run_pipeline
+from clsplat.runs.source import Source
+from clsplat.training.status import read_status
+
+RECIPE = "compress"
+
+
+@dataclass(frozen=True)
+class Tuning:
+    """With which photographs models are trained, as one is rendered, and how long."""
+
+    source: Source
+    model: Model
+    steps: int | None  # None: those of the recipe
+    device: Device
+
+    def pipeline(self, stages: Collection[str], values: Mapping[str, Any]) -> Pipeline:
+        """Return some stages of the recipe, which write a PLY, with other values by place."""
+        path = find(RECIPE)
+        data = read_yaml(path).data
+        chosen = [stage for stage in data["stages"] if isinstance(stage, dict) and next(iter(stage)) in stages]
+        document = Document({**data, "stages": [*chosen, {"export": {"file": MODEL}}]})
+        settings = {**self._scene(), **self._rendering(), **values}
+        if self.steps is not None:
+            settings |= {"optimize.steps": self.steps, "optimize.rates.means.over": self.steps}
+        return checked(path, document, [f"{place}={json.dumps(value)}" for place, value in settings.items()])
+
+    def trained(self, pipeline: Pipeline, folder: Path) -> Path:
+        """Run a pipeline in a folder; return the model's file.
+
+        What an earlier call has finished is left alone, and what it has begun goes on.
+        """
+        if not _is_done(pipeline, folder):
+            try:
+                run_pipeline(pipeline, folder, self.device, "resume" if is_there(folder) else "new")
+            except Interrupted as error:
+                raise Interrupted(f"stopped in {folder.name}; the same command goes on") from error
+        return folder / MODEL
+
+    def _scene(self) -> dict[str, Any]:
+        settings, numbers = self.source.settings, self.model.rendering
+        return {
+            "scene.path": str(self.source.folder.resolve()),
+            "scene.downscale": settings.downscale,
+            "scene.holdout": settings.holdout,
+            "scene.alpha": self.source.alpha or numbers.alpha,
+            "scene.background": numbers.background or settings.background,
+        }
+
+    def _rendering(self) -> dict[str, Any]:
+        numbers = self.model.rendering
+        screen = {"type": "dilation", "variance": numbers.screen_variance, "compensate": int(numbers.compensate)}
+        return {"model.sh_degree": self.model.sh_degree, "model.near": numbers.near, "model.screen_filter": screen}
+
+
+def _is_done(pipeline: Pipeline, folder: Path) -> bool:
+    """Whether a run folder holds the finished run of a pipeline."""
+    if read_status(folder).get("state") != "done" or not (folder / MODEL).is_file():
+        return False
+    return load(str(folder / PIPELINE)).resolved() == pipeline.resolved()
