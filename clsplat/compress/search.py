@@ -2,23 +2,26 @@
 
 import json
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
+from clsplat import lock
 from clsplat.compress.page import page
 from clsplat.compress.rungs import Ladder, checked_keeps, of_degree
 from clsplat.compress.target import Point, Target
 from clsplat.errors import ConfigError, DataError
-from clsplat.files import is_there, unwritable, write_text
+from clsplat.files import is_there, make_folder, sweep, unwritable, write_text
 from clsplat.formats.output import written
 from clsplat.formats.splats import Writing
 from clsplat.formats.table import bytes_of, located
 from clsplat.gaussians.clusters import DeviceClusters
 from clsplat.gaussians.model import Model, load
 from clsplat.metrics.views import mean, measure
+from clsplat.names import LOCK, PIPELINE
 from clsplat.reading import read_file, read_json, sha256
 from clsplat.runs.model_file import ModelFile
 from clsplat.views.photographs import Photographs
@@ -98,7 +101,8 @@ def compress(
     From one share of the Gaussians to the next the model is pruned and trained for some steps.  Each rung is written
     with several settings of its harmonics, and every file is read back and measured.  The search goes down until files
     of fewer Gaussians cannot be better.  A search that was interrupted goes on.
-    Raises ConfigError for a target that no file meets, after the page is written.
+    Raises ConfigError for a target that no file meets, after the page is written; OutputError where another process
+    searches in `out`.
     """
     wanted, shares = Target.of(target), checked_keeps(keeps)
     if steps is not None and steps < 1:
@@ -107,20 +111,20 @@ def compress(
     source, first, measurer = opened.source, opened.loaded, Measurer(opened)
     question: dict[str, Any] = {"model": str(source.file), "sha256": sha256(located(source.file))}
     question |= {"scene": str(source.folder), "keeps": shares, "steps": steps}
-    _claim(out, question)
-    size = bytes_of(source.file)
-    whole = Point(source.file.name, 1, first.sh_degree, "", len(first), size, *measurer.figures(first))
-    search = Search(out, wanted, question, whole, measurer.split)
-    ladder = Ladder(out, source, first, steps, opened.device)
-    before = 1.0
-    for keep in shares:
-        rung = _measured(out / TRIALS, load(ladder.rung(keep, before)), keep, form, measurer)
-        search.points += rung
-        search.write()
-        before = keep
-        if wanted.ends(rung, whole.psnr) and keep < 1:
-            break
-    return _finished(search, form)
+    with _held(out, question):
+        size = bytes_of(source.file)
+        whole = Point(source.file.name, 1, first.sh_degree, "", len(first), size, *measurer.figures(first))
+        search = Search(out, wanted, question, whole, measurer.split)
+        ladder = Ladder(out, source, first, steps, opened.device)
+        before = 1.0
+        for keep in shares:
+            rung = _measured(out / TRIALS, load(ladder.rung(keep, before)), keep, form, measurer)
+            search.points += rung
+            search.write()
+            before = keep
+            if wanted.ends(rung, whole.psnr) and keep < 1:
+                break
+        return _finished(search, form)
 
 
 def _measured(trials: Path, model: Model, keep: float, form: Format, measurer: Measurer) -> list[Point]:
@@ -158,20 +162,41 @@ def _finished(search: Search, form: Format) -> dict[str, Any]:
     return {**search.data(), "file": str(file), "page": str(search.out / PAGE)}
 
 
-def _claim(out: Path, question: dict[str, Any]) -> None:
-    """Make the folder.  Raises ConfigError where it holds something else than this search."""
-    if is_there(out) and (not out.is_dir() or any(out.iterdir())):
-        try:
-            before = read_json(out / RECORD)
-        except DataError:
-            before = None
-        if not isinstance(before, dict):
-            raise ConfigError(f"{out}: holds something else than a search; give another --out")
-        if differing := [key for key, value in question.items() if before.get(key) != value]:
-            raise ConfigError(f"{out}: holds a search with another {differing[0]}; give another --out")
-        return
+@contextmanager
+def _held(out: Path, question: dict[str, Any]) -> Iterator[None]:
+    """Make the folder of a search, swept of what killed ones have left, and hold it in the block.
+
+    Raises ConfigError where it holds something else than this search, OutputError where another process uses it.
+    """
+    _require_own(out, question)
     try:
-        (out / TRIALS).mkdir(parents=True, exist_ok=True)
+        make_folder(out)
     except OSError as error:
         raise unwritable(out, error) from error
-    write_text(out / RECORD, json.dumps(question, indent=1) + "\n")
+    with lock.held(out):
+        _require_own(out, question)  # again: another search may have begun since
+        sweep(out, border=PIPELINE)
+        if not (out / RECORD).exists():
+            write_text(out / RECORD, json.dumps(question, indent=1) + "\n")
+        yield
+
+
+def _require_own(out: Path, question: dict[str, Any]) -> None:
+    """Raise ConfigError where a folder holds something else than this search."""
+    if not is_there(out / RECORD):
+        if is_there(out) and not (out.is_dir() and all(_is_nobodys(path.name) for path in out.iterdir())):
+            raise ConfigError(f"{out}: holds something else than a search; give another --out")
+        return
+    try:
+        before = read_json(out / RECORD)
+    except DataError:
+        before = None
+    if not isinstance(before, dict):
+        raise ConfigError(f"{out / RECORD}: is not the record of a search; remove {out}, or give another --out")
+    if differing := [key for key, value in question.items() if before.get(key) != value]:
+        raise ConfigError(f"{out}: holds a search with another {differing[0]}; give another --out")
+
+
+def _is_nobodys(name: str) -> bool:
+    """Whether a file may be what a search leaves that was killed before its record: its lock, or a hidden file."""
+    return name == LOCK or name[0] == "."
