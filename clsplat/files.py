@@ -86,7 +86,7 @@ def append(path: Path, data: bytes) -> None:
                 sync_folder(path.parent)
         except OSError:
             with suppress(OSError):
-                os.truncate(path, size or 0)
+                path.unlink() if size is None else os.truncate(path, size)
             raise
     except OSError as error:
         raise unwritable(path, error) from error

@@ -86,13 +86,17 @@ def gather(photographs: Path, images: Path, names: list[str]) -> list[str]:
 
 
 def link(source: Path, target: Path) -> None:
-    """Link a file or folder, or copy it where links are not supported; what is there already stays."""
+    """Link a file or folder, or copy it where links are not supported; what is there already stays.
+
+    The link is relative: moved together, both are found.
+    """
     if _is_there(source, target):
         return
     try:
         target.unlink(missing_ok=True)
-        target.symlink_to(source.resolve(), target_is_directory=source.is_dir())
-    except OSError:
+        there = os.path.relpath(source.resolve(), target.parent.resolve())
+        target.symlink_to(there, target_is_directory=source.is_dir())
+    except (OSError, ValueError):  # no path leads to another drive of Windows
         half = target.with_name(f".{target.name}")
         if source.is_dir():
             shutil.rmtree(half, ignore_errors=True)

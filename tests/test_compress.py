@@ -8,20 +8,23 @@ import pytest
 from typer.testing import CliRunner
 
 import clsplat
+from clsplat import lock
 from clsplat.cli import app
 from clsplat.compress import search
 from clsplat.compress.page import page, table
 from clsplat.compress.rungs import Ladder, checked_keeps
 from clsplat.compress.target import Point, Target
 from clsplat.compress.tuning import Tuning
-from clsplat.errors import ConfigError, Interrupted
+from clsplat.errors import ConfigError, Interrupted, OutputError
 from clsplat.formats.table import detect, read
 from clsplat.gaussians.model import Rendering
+from clsplat.names import LOCK
 from clsplat.pipeline.loading import Pipeline
 from clsplat.runs import model_file, runner
 from clsplat.runs.model_file import Source, evaluate
 from clsplat.training.run import Run
 from tests.html_page import Page
+from tests.test_left_files import NONE
 
 pytestmark = pytest.mark.slow
 
@@ -172,6 +175,34 @@ def test_another_search_needs_another_folder(searched, few_steps, tmp_path):
     (tmp_path / "own.txt").write_text("mine")
     with pytest.raises(ConfigError, match="holds something else than a search"):
         clsplat.compress_model(few_steps, target="1MB", out=tmp_path, keep=KEEP, steps=STEPS)
+
+
+def test_one_process_searches_in_a_folder_at_a_time(few_steps, tmp_path):
+    with lock.held(tmp_path), pytest.raises(OutputError, match="is in use by this process"):
+        clsplat.compress_model(few_steps, target="1MB", out=tmp_path, keep=[1.0])
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_search_killed_at_any_of_its_first_writes_goes_on_and_its_leftovers_are_swept(few_steps, tmp_path):
+    out, names = tmp_path / "out", [LOCK, f".compress.json.{NONE}-0.partial"]
+    out.mkdir()
+    for name in names:
+        (out / name).write_text("x")
+    search = {"target": "1MB", "out": out, "keep": [1.0]}
+    clsplat.compress_model(few_steps, **search)
+    before = sorted(out.rglob("*"))
+    assert not {path.name for path in before} & set(names)
+    for name in (f".compress.html.{NONE}-0.partial", f"trials/.keep_100_degree_0_small.sog.{NONE}-0.partial"):
+        (out / name).write_text("x")
+    clsplat.compress_model(few_steps, **search)
+    assert sorted(out.rglob("*")) == before
+
+
+@pytest.mark.parametrize("text", ["", "[]"])
+def test_a_damaged_record_of_a_search_is_told_with_its_remedy(text, few_steps, tmp_path):
+    (tmp_path / "compress.json").write_text(text)
+    with pytest.raises(ConfigError, match=r"compress\.json: is not the record of a search; remove .*, or give another"):
+        clsplat.compress_model(few_steps, target="1MB", out=tmp_path, keep=[1.0])
 
 
 def test_a_target_that_no_file_meets_leaves_page_and_nearest_file(few_steps, tmp_path):

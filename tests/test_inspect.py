@@ -1,6 +1,7 @@
 """The inspection of datasets: constructed ones with one fault each, and real ones that have none."""
 
 import json
+import os
 import shutil
 import struct
 from dataclasses import replace
@@ -143,6 +144,15 @@ def test_a_missing_image(scene):
     assert inspection.facts.points.in_two == 1.0  # the rest is inspected all the same
 
 
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no pipes")
+def test_a_pipe_in_the_place_of_an_image_is_not_told_to_be_missing(scene):
+    (scene / "images" / "03.png").unlink()
+    os.mkfifo(scene / "images" / "03.png")
+    inspection = Inspection.of(scene)
+    assert inspection.facts.missing == []
+    assert "decoded (03.png): cannot be read (it is a pipe); copy or export" in said(inspection, "error")
+
+
 @pytest.mark.parametrize(
     ("size", "word"), [((32, 20), "not of the camera's size"), ((48, 64), "width and height are swapped")]
 )
@@ -175,7 +185,9 @@ def test_a_test_view_whose_pixels_are_damaged(scene):
     assert "08.png" in {view.name for view in read_scene(scene).split("test")}
     assert inspection.verdict == "cannot train: 1 image file cannot be decoded (08.png)"
     done = clsplat("inspect", scene, expect=3)
-    assert "1 image file cannot be decoded (08.png): copy or export them again" in done.stdout
+    said = " ".join(done.stdout.split())
+    assert "1 image file cannot be decoded (08.png): not an image, or a damaged one" in said
+    assert "is wrong); copy or export them again" in said
 
 
 def test_a_pose_that_is_not_finite_in_a_text_model(tmp_path):

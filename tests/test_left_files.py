@@ -13,7 +13,7 @@ import pytest
 import clsplat
 from clsplat import files
 from clsplat.errors import OutputError
-from clsplat.files import atomic, write_text
+from clsplat.files import append, atomic, write_text
 from clsplat.prepare.cache import RECORD, Planned, prepare
 from clsplat.prepare.place import STEPS, _show
 from clsplat.prepare.steps import Step
@@ -205,6 +205,17 @@ def test_a_folder_that_cannot_be_synced_is_no_failure(number, tmp_path, monkeypa
 
 def _raise(number: int) -> None:
     raise OSError(number, os.strerror(number))
+
+
+@pytest.mark.parametrize("before", [None, b"", b"first"])
+def test_where_nothing_can_be_appended_a_file_is_as_it_was(before, tmp_path, monkeypatch):
+    path = tmp_path / "a"
+    if before is not None:
+        path.write_bytes(before)
+    monkeypatch.setattr(os, "fsync", lambda number: _raise(errno.ENOSPC))
+    with pytest.raises(OutputError, match="No space left"):
+        append(path, b"second")
+    assert (path.read_bytes() if path.exists() else None) == before
 
 
 def test_threads_that_write_one_file_do_not_disturb_each_other(tmp_path):

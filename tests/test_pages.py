@@ -11,9 +11,10 @@ import pytest
 from jinja2 import UndefinedError
 
 import clsplat as package
-from clsplat.pages.page import TEMPLATES, charts, duration, embedded, render
+from clsplat.pages.page import TEMPLATES, charts, duration, embedded, render, require_end
 from clsplat.pages.svg import Line, curve
 from tests.html_page import HOSTILE, Page
+from tests.refusals import refusal
 from tests.test_cli import clsplat
 
 SOURCES = sorted(Path(package.__file__).parent.rglob("*.py"))
@@ -116,3 +117,11 @@ def test_the_report_of_a_scene_with_markup_in_its_names(tiny_scene, tmp_path):
     settings = page.text.partition("Settings")[2]
     assert "stages:" in settings
     assert "<script>" in settings, "the scene's path"
+
+
+@pytest.mark.parametrize("text", ["", "<html>", "<html></html", "<html></html><p>"])
+def test_a_page_that_has_lost_its_end_is_refused(text, tmp_path):
+    (tmp_path / "a.html").write_text(text)
+    assert refusal(require_end, tmp_path / "a.html") == f"{tmp_path / 'a.html'}: ends before its end"
+    (tmp_path / "a.html").write_text("<html></html>\n")
+    require_end(tmp_path / "a.html")

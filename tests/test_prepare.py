@@ -17,6 +17,7 @@ from clsplat.prepare.place import place_photographs
 from clsplat.prepare.steps import Step
 from clsplat.runs import opening, runner
 from clsplat.settings import Settings
+from data_tools.gather import link
 from tests.refusals import refusal
 
 
@@ -98,19 +99,76 @@ def test_a_step_that_fails_leaves_nothing(photos, tmp_path):
     assert do([Copy(letter="a"), Copy(letter="b")], photos, root) == ("pab", ["b"])
 
 
-@pytest.mark.parametrize("fault", ["no record", "no JSON", "a list", "a file less"])
-def test_a_damaged_result_is_made_again(photos, tmp_path, fault):
+@pytest.mark.parametrize("fault", ["no record", "no JSON", "a list", "a file less", "an empty file", "a folder"])
+def test_a_damaged_result_is_made_again(photos, tmp_path, fault, caplog):
+    caplog.set_level("INFO")
     root, steps = tmp_path / "runs" / "prepared", [Copy(letter="a"), Copy(letter="b")]
     do(steps, photos, root)
     last = next(one.folder for one in plan(steps, photos, root) if one.step.letter == "b")
-    record = last / "record.json"
-    (last / "x.txt" if fault == "a file less" else record).unlink()
-    if fault in ("no JSON", "a list"):
-        record.write_text({"no JSON": "{", "a list": "[]"}[fault])
-    assert [one.why for one in plan(steps, photos, root)] == ["", "its result lacks files, or its record"]
+    damaged = "record.json" if fault in ("no record", "no JSON", "a list") else "x.txt"
+    (last / damaged).unlink()
+    if fault == "a folder":
+        (last / damaged).mkdir()
+    if fault in ("no JSON", "a list", "an empty file"):
+        (last / damaged).write_text({"no JSON": "{", "a list": "[]"}.get(fault, ""))
+    why = {"a file less": "x.txt is missing", "an empty file": "x.txt was changed", "a folder": "x.txt is missing"}
+    why = f"{why.get(fault, 'record.json is missing or damaged')}; the result is made again"
+    assert [one.why for one in plan(steps, photos, root)] == ["", why]
     assert plan([steps[0], Copy(letter="z")], photos, root)[1].why.startswith("letter is z")
     assert do(steps, photos, root) == ("pab", ["b"])
+    assert f"copy: {why}" in caplog.messages
     assert do(steps, photos, root) == ("pab", [])
+
+
+def test_a_result_of_an_earlier_version_whose_record_knows_no_sizes_is_kept(photos, tmp_path):
+    root, steps = tmp_path / "runs" / "prepared", [Copy(letter="a")]
+    do(steps, photos, root)
+    record = plan(steps, photos, root)[0].folder / "record.json"
+    record.write_text(json.dumps({**json.loads(record.read_text()), "files": ["x.txt"]}))
+    assert do(steps, photos, root) == ("pa", [])
+    (record.parent / "x.txt").unlink()
+    assert do(steps, photos, root) == ("pa", ["a"])
+
+
+class Linked(Copy):
+    """Leaves the images of the step before where they are, as the matches and the cameras do."""
+
+    stage: Literal["linked"] = "linked"
+
+    def make(self, source: Path, out: Path, without: Path) -> dict[str, Any]:
+        self.calls.append(self.letter)
+        if (source / "images").exists():
+            link(source / "images", out / "images")
+        else:
+            (out / "images").mkdir()
+            link(source / "p.txt", out / "images" / "p.txt")
+        return {}
+
+
+Settings.defined.remove(Linked)
+
+
+def test_a_result_whose_images_are_gone_is_made_again(photos, tmp_path):
+    root, steps = tmp_path / "runs" / "prepared", [Linked(letter="a"), Linked(letter="b")]
+    prepare(plan(steps, photos, root), photos, root)
+    assert [one.why for one in plan(steps, photos, root)] == ["", ""]
+    shutil.rmtree(plan(steps, photos, root)[0].folder)
+    planned = plan(steps, photos, root)
+    assert [one.why for one in planned] == ["letter is a, was b", "images/p.txt is missing; the result is made again"]
+    assert (prepare(planned, photos, root) / "images" / "p.txt").read_text() == "p"
+    assert Linked.calls == ["a", "b", "a"], "the link of the second leads to images again"
+
+
+def test_results_that_were_moved_with_their_photographs_are_whole(tmp_path):
+    photos, root = tmp_path / "work" / "photos", tmp_path / "work" / "runs" / "prepared"
+    photos.mkdir(parents=True)
+    (photos / "p.txt").write_text("p")
+    steps = [Linked(letter="a"), Linked(letter="b"), Linked(letter="c")]
+    prepare(plan(steps, photos, root), photos, root)
+    (tmp_path / "work").rename(tmp_path / "moved")
+    planned = plan(steps, tmp_path / "moved" / "photos", tmp_path / "moved" / "runs" / "prepared")
+    assert [one.why for one in planned] == ["", "", ""]
+    assert (planned[-1].folder / "images" / "p.txt").read_text() == "p"
 
 
 def test_what_a_killed_run_left_is_removed(photos, tmp_path):

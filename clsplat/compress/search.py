@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
-from clsplat.compress.folder import claim
+from clsplat.compress.folder import claimed
 from clsplat.compress.page import page
 from clsplat.compress.rungs import Ladder, checked_keeps, of_degree
 from clsplat.compress.target import Point, Target
@@ -100,7 +100,8 @@ def compress(
     From one share of the Gaussians to the next the model is pruned and trained for some steps.  Each rung is written
     with several settings of its harmonics, and every file is read back and measured.  The search goes down until files
     of fewer Gaussians cannot be better.  A search that was interrupted goes on.
-    Raises ConfigError for a target that no file meets, after the page is written.
+    Raises ConfigError for a target that no file meets, after the page is written; OutputError where another process
+    searches in `out`.
     """
     wanted, shares = Target.of(target), checked_keeps(keeps)
     if steps is not None and steps < 1:
@@ -109,20 +110,20 @@ def compress(
     source, first, measurer = opened.source, opened.loaded, Measurer(opened)
     question: dict[str, Any] = {"model": str(source.file), "sha256": sha256(located(source.file))}
     question |= {"scene": str(source.folder), "keeps": shares, "steps": steps}
-    claim(out, question, RECORD, "a search", "another --out")
-    size = bytes_of(source.file)
-    whole = Point(source.file.name, 1, first.sh_degree, "", len(first), size, *measurer.figures(first))
-    search = Search(out, wanted, question, whole, measurer.split)
-    ladder = Ladder(out, Tuning(source, first, steps, opened.device))
-    before = 1.0
-    for keep in shares:
-        rung = _measured(out / TRIALS, load(ladder.rung(keep, before)), keep, form, measurer)
-        search.points += rung
-        search.write()
-        before = keep
-        if wanted.ends(rung, whole.psnr) and keep < 1:
-            break
-    return _finished(search, form)
+    with claimed(out, question, RECORD, "a search", "another --out"):
+        size = bytes_of(source.file)
+        whole = Point(source.file.name, 1, first.sh_degree, "", len(first), size, *measurer.figures(first))
+        search = Search(out, wanted, question, whole, measurer.split)
+        ladder = Ladder(out, Tuning(source, first, steps, opened.device))
+        before = 1.0
+        for keep in shares:
+            rung = _measured(out / TRIALS, load(ladder.rung(keep, before)), keep, form, measurer)
+            search.points += rung
+            search.write()
+            before = keep
+            if wanted.ends(rung, whole.psnr) and keep < 1:
+                break
+        return _finished(search, form)
 
 
 def _measured(trials: Path, model: Model, keep: float, form: Format, measurer: Measurer) -> list[Point]:

@@ -76,9 +76,9 @@ def _photographs(facts: Facts) -> Iterator[Finding]:
             "error", f"{fault} ({_listed(facts.missing)})", "put the files back, or remove them from the dataset"
         )
     if photographs.unreadable:
-        unreadable = _listed(list(photographs.unreadable))
+        unreadable, reason = _listed(list(photographs.unreadable)), next(iter(photographs.unreadable.values()))
         fault = f"{_counted(len(photographs.unreadable), 'image file')} cannot be decoded ({unreadable})"
-        yield Finding("error", fault, "copy or export them again")
+        yield Finding("error", fault, f"{reason.partition(';')[0]}; copy or export them again")
     if photographs.cut:
         fault = f"the end is missing from {_counted(len(photographs.cut), 'image file')} ({_listed(photographs.cut)})"
         yield Finding("error", fault, "copy them again")

@@ -71,7 +71,7 @@ def _lists(inspection: Inspection) -> list[NameList]:
     lists = {
         "registered but missing on disk": facts.missing,
         "on disk but without a pose": facts.unregistered,
-        "cannot be read": list(photographs.unreadable.values()),
+        "cannot be read": [f"{name}: {reason}" for name, reason in photographs.unreadable.items()],
         "not of the camera's size": [f"{name}: {size}" for name, size in photographs.misfits.items()],
         "end of the file is missing": photographs.cut,
         "rotated by the EXIF data": photographs.exif_turned,

@@ -97,7 +97,7 @@ class Facts:
 def survey(parts: Parts) -> Facts:
     """Measure a dataset that was read in pieces."""
     views, expected = parts.views, parts.expected
-    missing = [file for file in expected if not os.path.isfile(file)]
+    missing = [file for file in expected if not os.path.exists(file)]  # never raises
     known = {*expected, *(view.mask_path for view in views)}
     names = [view.name for view in views]
     centres = np.stack([view.position for view in views]) if views else np.empty((0, 3))
@@ -175,17 +175,17 @@ def _photographs(views: Sequence[View], missing: set[Path]) -> PhotographFacts:
         files = {view.name: view.image_path, f"mask of {view.name}": view.mask_path}
         for name, file in files.items():
             if file in decoded:
-                _photograph(facts, view, name, decoded[file])
+                _photograph(facts, view, name, file, decoded[file])
     return facts
 
 
-def _photograph(facts: PhotographFacts, view: View, name: str, file: ImageFile) -> None:
+def _photograph(facts: PhotographFacts, view: View, name: str, path: Path, file: ImageFile) -> None:
     """Note what there is to say about a view's photograph or mask."""
     camera = view.lens or view.camera
     if file.cut:
         facts.cut.append(name)
     elif file.size is None:
-        facts.unreadable[name] = file.fault
+        facts.unreadable[name] = file.fault.removeprefix(f"{path}: ")
     elif file.fault and not fits(view, file.size):
         facts.misfits[name] = f"{file.size[0]}x{file.size[1]}, its camera {camera.width}x{camera.height}"
         if fits(view, file.size[::-1]):

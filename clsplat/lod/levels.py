@@ -2,12 +2,13 @@
 
 import logging
 import math
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from clsplat.compress.folder import claim
+from clsplat.compress.folder import claimed
 from clsplat.compress.search import Measurer
 from clsplat.compress.tuning import Tuning
 from clsplat.errors import ConfigError, DataError
@@ -66,10 +67,17 @@ class Training:
         self.place, self.plan = place, plan
         self.measurer = Measurer(opened)
         self.tuning = Tuning(opened.source, opened.loaded, plan.steps, opened.device)
-        question: dict[str, Any] = {"sha256": sha256(located(opened.source.file)), "scene": str(opened.source.folder)}
-        question |= {"keep": plan.keep, "steps": plan.steps, "downscale": plan.downscale}
-        if plan.steps:
-            claim(place, question, RECORD, "the training of levels", "the name of another folder")
+        self.question: dict[str, Any] = {
+            "sha256": sha256(located(opened.source.file)),
+            "scene": str(opened.source.folder),
+        }
+        self.question |= {"keep": plan.keep, "steps": plan.steps, "downscale": plan.downscale}
+
+    def held(self) -> AbstractContextManager[None]:
+        """Hold the folder of the training in a block, where there is any."""
+        if not self.plan.steps:
+            return nullcontext()
+        return claimed(self.place, self.question, RECORD, "the training of levels", "the name of another folder")
 
     def measured(self, model: Model) -> Level:
         """Return a level that is not trained."""
@@ -107,10 +115,11 @@ def levels_of_detail(
         LOG.warning("%s: has %d Gaussians; below a million one SOG is better: `clsplat convert`", model, len(first))
     training = Training(opened, folder.with_name(f"{folder.name}.training"), plan) if opened else None
     levels = [training.measured(first) if training else Level(first)]
-    for number in range(1, plan.levels):
-        fewer = decimated(levels[-1].model, plan.keep)
-        LOG.info("level %d: %d Gaussians", number, len(fewer))
-        levels.append(training.trained(number, fewer) if training else Level(fewer))
+    with training.held() if training else nullcontext():
+        for number in range(1, plan.levels):
+            fewer = decimated(levels[-1].model, plan.keep)
+            LOG.info("level %d: %d Gaussians", number, len(fewer))
+            levels.append(training.trained(number, fewer) if training else Level(fewer))
     writing = Writing(clustering=partial(DeviceClusters, opened.device)) if opened else Writing()
     write_lod(folder, [level.model.as_file() for level in levels], writing)
     return {

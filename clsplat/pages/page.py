@@ -8,6 +8,7 @@ import base64
 import hashlib
 from collections.abc import Iterable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -15,6 +16,9 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from numpy.typing import NDArray
+
+from clsplat.errors import DataError
+from clsplat.reading import read_file
 
 TEMPLATES = Environment(
     loader=PackageLoader("clsplat.pages"),
@@ -31,6 +35,12 @@ def render(template: str, **values: Any) -> str:
     """Fill a template of `templates/`; return the page.  Invalid Unicode becomes `?`."""
     text = TEMPLATES.get_template(template).render(**values)
     return text.encode("utf-8", "replace").decode("utf-8")
+
+
+def require_end(path: Path) -> None:
+    """Raise DataError where the file of a page cannot be read, or has lost its end."""
+    if not read_file(path).rstrip().endswith(b"</html>"):
+        raise DataError(f"{path}: ends before its end")
 
 
 def charts(drawings: Iterable[str]) -> list[Markup]:

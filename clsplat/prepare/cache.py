@@ -72,7 +72,7 @@ def prepare(
     for number, one in enumerate(planned):
         count.reach(number)
         with _only_one_making(one) if one.why else nullcontext():
-            if one.why and not _is_whole(one.folder):  # or made by another process since
+            if one.why and _fault(one.folder):  # or made by another process since
                 with begun(one.step.stage):
                     _do(one, source, root)
             else:
@@ -144,10 +144,9 @@ def _do(one: Planned, source: Path, root: Path) -> None:
         summary = one.step.make(source.resolve(), temporary, root.parent)
         seconds = round(time.perf_counter() - start, 1)
         settings = one.step.model_dump(mode="json")
-        files = sorted(path.relative_to(temporary).as_posix() for path in temporary.rglob("*") if not path.is_dir())
         made = {"origin": one.origin, "inputs": one.inputs, "settings": settings, "seconds": seconds, **summary}
         sync_below(temporary)
-        write_text(temporary / RECORD, json.dumps({**made, "files": files}, indent=1) + "\n")
+        write_text(temporary / RECORD, json.dumps({**made, "files": _sizes(temporary)}, indent=1) + "\n")
         if one.folder.exists():  # a damaged result
             shutil.rmtree(one.folder)
         os.replace(temporary, one.folder)
@@ -168,19 +167,35 @@ def record_of(folder: Path) -> dict[str, Any]:
     except DataError:
         return {}
     is_one = isinstance(record, dict) and isinstance(record.get("settings"), dict)
-    return record if is_one and isinstance(record.get("files", []), list) else {}
+    return record if is_one and isinstance(record.get("files", []), dict | list) else {}
 
 
-def _is_whole(folder: Path) -> bool:
-    """Whether a result has its record, and all the files that it lists."""
+def _sizes(folder: Path) -> dict[str, int]:
+    """The bytes of each file below a folder, by its name there; those behind links, such as photographs, count too."""
+    files = (Path(base, name) for base, _, names in os.walk(folder, followlinks=True) for name in names)
+    return {path.relative_to(folder).as_posix(): path.stat().st_size for path in sorted(files) if path.is_file()}
+
+
+def _fault(folder: Path) -> str:
+    """What is wrong with a result, "" where it has its record, and all the files that it lists with their sizes."""
     record = record_of(folder)
-    return bool(record) and all(os.path.exists(folder / str(name)) for name in record.get("files", []))
+    if not record:
+        return f"{RECORD} is missing or damaged"
+    files = record.get("files", {})
+    for name in files:
+        path = folder / str(name)
+        if not os.path.isfile(path):
+            return f"{name} is missing"
+        if isinstance(files, dict) and path.stat().st_size != files[name]:  # a list is of an earlier version
+            return f"{name} was changed"
+    return ""
 
 
 def _why(step: Step, inputs: str, folder: Path, source: Path) -> str:
     """The reason to run a step, "" when its result exists: the difference from the newest result."""
     if folder.exists():
-        return "" if _is_whole(folder) else "its result lacks files, or its record"
+        fault = _fault(folder)
+        return fault and f"{fault}; the result is made again"
     found = []
     for other in folder.parent.glob(f"{step.stage}-*"):
         record = record_of(other)

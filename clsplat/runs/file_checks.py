@@ -10,10 +10,11 @@ from clsplat.errors import DataError, shortened
 from clsplat.formats.table import endings
 from clsplat.gaussians.model import load as load_model
 from clsplat.names import METRICS, RECORDS, is_inside
+from clsplat.pages.page import require_end
 from clsplat.pipeline.loading import load as load_pipeline
 from clsplat.pipeline.matrix import load_experiment
 from clsplat.prepare.cache import noted
-from clsplat.reading import KINDS, read_file, read_json, sha256
+from clsplat.reading import KINDS, read_json, sha256
 from clsplat.scene.identity import Identity
 from clsplat.scene.images import read_image
 from clsplat.training import archive, checkpoint
@@ -80,8 +81,7 @@ def note_file(path: Path) -> str:
 
 
 def page(path: Path) -> str:
-    if not read_file(path).rstrip().endswith(b"</html>"):
-        raise DataError("ends before its end")
+    require_end(path)
     return ""
 
 

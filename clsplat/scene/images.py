@@ -51,7 +51,7 @@ def inside(folder: Path, name: str, where: str) -> Path:
 def require_files(path: Path, files: Iterable[Path]) -> None:
     """Raise DataError, naming the first few, when some of the `files` of the dataset at `path` do not exist."""
     expected = list(files)
-    missing = [str(file) for file in expected if not os.path.isfile(file)]  # unlike Path.is_file, never raises
+    missing = [str(file) for file in expected if not os.path.exists(file)]  # unlike Path.exists, never raises
     if missing:
         names = ", ".join(map(shortened, missing[:3])) + (", ..." if len(missing) > 3 else "")
         raise DataError(f"{path}: {len(missing)} of {len(expected)} image files are missing: {names}; put them back")

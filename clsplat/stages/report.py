@@ -6,11 +6,10 @@ from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 from urllib.parse import quote
 
-from clsplat.errors import DataError
 from clsplat.files import write_text
 from clsplat.names import PIPELINE
-from clsplat.pages.page import counted, duration, render
-from clsplat.reading import read_file, read_text
+from clsplat.pages.page import counted, duration, render, require_end
+from clsplat.reading import read_text
 from clsplat.report.cameras import cameras
 from clsplat.report.charts import gaussians_charts, training_charts
 from clsplat.report.times import times
@@ -52,8 +51,7 @@ class Report(Stage):
         LOG.info("report written to %s", run.out / self.file)
 
     def verify(self, run: Run) -> None:
-        if not read_file(run.out / self.file).rstrip().endswith(b"</html>"):
-            raise DataError(f"{run.out / self.file}: ends before its end")
+        require_end(run.out / self.file)
 
 
 def _addresses(run: Run, stage: str, page: Path) -> dict[str, str]:

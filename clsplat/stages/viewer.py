@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from clsplat.errors import DataError
-from clsplat.reading import read_file
+from clsplat.pages.page import require_end
 from clsplat.scene.scene import View
 from clsplat.scene.stand import Stand
 from clsplat.stages.base import Stage, path_in_run
@@ -60,5 +59,4 @@ class Viewer(Stage):
         LOG.info("viewer written to %s, %.1f MB", path, path.stat().st_size / 1e6)
 
     def verify(self, run: Run) -> None:
-        if not read_file(run.out / self.file).rstrip().endswith(b"</html>"):
-            raise DataError(f"{run.out / self.file}: ends before its end")
+        require_end(run.out / self.file)
