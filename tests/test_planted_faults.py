@@ -83,7 +83,7 @@ MORE = {  # that smaller pictures do not show
     ),
     "blend_forward simt, dim pixels": ("blend_simt.cl", "if (p.t > 0.0f)", "if (p.t > 0.01f)"),
     "pixel_loss, pixels that are equal": ("loss.cl", "difference < 0.0f ?", "difference <= 0.0f ?"),
-    "scan_offsets simt, a sum that wraps": ("scan.cl", "sum < a ? UINT_MAX : sum", "sum"),
+    "scan_offsets simt, a sum that wraps": ("scan.cl", "sum | (0u - carry)", "sum"),
     "emit_large simt, one row an item": ("large.cl", "each = (rows + TEAM - 1) / TEAM", "each = 1"),
     "emit_large simt, the same rows": ("large.cl", "begin = get_local_id(0) * each", "begin = get_local_id(0)"),
     "emit_large simt, a tile outside": ("large.cl", "pair_tile[place] = last;", "pair_tile[place] = last + 12345;"),

@@ -35,7 +35,8 @@ for name in ("fork", "geteuid", "getgid", "getegid", "getpgid", "mkfifo", "sysco
 def kill(process, number):
     raise OSError(87, "os.kill ends a process of Windows")
 
-os.kill = kill
+end, os.kill = os.kill, kill
+subprocess.Popen.kill = subprocess.Popen.terminate = lambda process: process.poll() is None and end(process.pid, 9)
 '''
 LIKE_MACOS = '''
 """No /proc, no numbers of processors by affinity, and workers that are started anew."""
