@@ -56,7 +56,10 @@ def require_silent(file: io.FileIO, path: Path, folder: Path) -> dict[str, Any]:
 
 
 def until_silent(file: io.FileIO, path: Path, folder: Path) -> dict[str, Any]:
-    """Do as `require_silent`, but wait for the next heartbeat: without one the process ended just now, by any clock."""
+    """Do as `require_silent`, but wait for the next heartbeat: where none comes in time, the process has ended.
+
+    That it comes counts, not its time: the clocks of two machines may differ.
+    """
     beat, end, told = _heartbeat(path), time.monotonic() + SILENT, False
     while True:
         try:
@@ -68,9 +71,7 @@ def until_silent(file: io.FileIO, path: Path, folder: Path) -> dict[str, Any]:
                 return read(file)
             if not told:
                 told = True
-                LOG.info(
-                    "%s: another machine's run was alive just now; waiting for its heartbeat, a minute at most", folder
-                )
+                LOG.info("%s: was in use elsewhere just now; waiting for its heartbeat, a minute at most", folder)
         time.sleep(1)
 
 
