@@ -11,13 +11,12 @@ from pathlib import Path
 from typing import Any
 
 from clsplat.errors import DataError, OutputError, shortened
-from clsplat.names import END_STATES, STATUS
+from clsplat.names import END_STATES, SILENT, STATUS
 from clsplat.processes import Owner
 from clsplat.reading import read_json
 
 LOG = logging.getLogger("clsplat")
 BEHIND_THE_TEXT = 1 << 20  # bytes: Windows locks a byte for readers too, and this one is not read
-SILENT = 60  # seconds without a heartbeat after which a run on another machine is taken to have ended
 
 
 def own_text() -> str:

@@ -27,6 +27,7 @@ BEFORE_A_RUN = frozenset({STATUS, LOG_FILE, LOCK, UNDISTORTED})  # written befor
 OF_A_RUN = BEFORE_A_RUN | {PIPELINE, METRICS, RECORDS, NOTE, INPUTS, CHECKSUMS, CHECKPOINTS}
 OF_A_MATRIX = frozenset({STATUS, LOCK, PIPELINE, COMPARISON})
 END_STATES = ("done", "failed", "interrupted")  # of status.json
+SILENT = 60  # seconds without a heartbeat there after which a run may have ended
 LONGEST = 200  # bytes; systems allow 255, and temporary names are longer
 _DEVICES = re.compile(r"(con|prn|aux|nul|conin\$|conout\$|(com|lpt)[0-9¹²³])(\..*)?", re.IGNORECASE)  # of Windows
 

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from clsplat.api.arguments import PathLike, load_plugins, path_of
+from clsplat.opencl.runtimes import INSTALL as INSTALL
 
 if TYPE_CHECKING:  # the command line starts without OpenCL
     from clsplat.bench.measurement import Measurement

@@ -21,10 +21,7 @@ def devices(as_json: JsonOption = False) -> None:
         for device in found:
             terminal.show(terminal.device_text(device))
     if all(device["fault"] for device in found):
-        raise DeviceError(
-            "no OpenCL device works; install a runtime: pip install 'clsplat[pocl]', pip install 'clsplat[intel]', "
-            "apt install pocl-opencl-icd, or your GPU's driver"
-        )
+        raise DeviceError(f"no OpenCL device works; {tools.INSTALL}")
 
 
 @command("doctor", "clsplat doctor", "clsplat doctor --device radeonsi --html device.html")

@@ -10,14 +10,13 @@ from clsplat.errors import Interrupted
 from clsplat.files import is_there
 from clsplat.gaussians.model import Model
 from clsplat.gaussians.run_model import MODEL
-from clsplat.names import PIPELINE
 from clsplat.opencl.device import Device
 from clsplat.pipeline.files import find
-from clsplat.pipeline.loading import Pipeline, checked, load
+from clsplat.pipeline.loading import Pipeline, checked
 from clsplat.pipeline.yaml_file import Document, read_yaml
 from clsplat.runs.experiment import run_pipeline
+from clsplat.runs.found import is_finished_run_of
 from clsplat.runs.source import Source
-from clsplat.training.status import read_status
 
 RECIPE = "compress"
 
@@ -47,7 +46,7 @@ class Tuning:
 
         What an earlier call has finished is left alone, and what it has begun goes on.
         """
-        if not _is_done(pipeline, folder):
+        if not is_finished_run_of(pipeline, folder):
             try:
                 run_pipeline(pipeline, folder, self.device, "resume" if is_there(folder) else "new")
             except Interrupted as error:
@@ -68,10 +67,3 @@ class Tuning:
         numbers = self.model.rendering
         screen = {"type": "dilation", "variance": numbers.screen_variance, "compensate": int(numbers.compensate)}
         return {"model.sh_degree": self.model.sh_degree, "model.near": numbers.near, "model.screen_filter": screen}
-
-
-def _is_done(pipeline: Pipeline, folder: Path) -> bool:
-    """Whether a run folder holds the finished run of a pipeline."""
-    if read_status(folder).get("state") != "done" or not (folder / MODEL).is_file():
-        return False
-    return load(str(folder / PIPELINE)).resolved() == pipeline.resolved()

@@ -126,10 +126,7 @@ def choose(device_name: str | None = None) -> DeviceInfo:
     device_name = device_name or os.environ.get(DEVICE_VARIABLE)
     devices = list_devices()
     if not devices:
-        raise DeviceError(
-            "no OpenCL device was found; install a runtime: pip install 'clsplat[pocl]', pip install 'clsplat[intel]', "
-            "apt install pocl-opencl-icd, or your GPU's driver"
-        )
+        raise DeviceError(f"no OpenCL device was found; {runtimes.INSTALL}")
     if device_name:
         return _named(device_name, devices)
     faults = []

@@ -21,6 +21,10 @@ SYSTEM_DRIVERS = Path("/etc/OpenCL/vendors")
 PROBE = Path(__file__).with_name("probe.py")
 PROBE_SECONDS = 120  # a first build may compile for many seconds on a slow machine
 
+INSTALL = (
+    "install a runtime: pip install 'clsplat[pocl]', pip install 'clsplat[intel]', apt install pocl-opencl-icd, or "
+    "your GPU's driver"
+)
 _HANGS = f"a test kernel did not finish in {PROBE_SECONDS} s"
 _NO_EXECUTION = "PoCL's cache lies where nothing may be executed: mount it with `exec`, or set POCL_CACHE_DIR"
 _OTHER_RUNTIMES = "apt install pocl-opencl-icd, or pip install 'clsplat[intel]'"

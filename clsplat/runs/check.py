@@ -9,7 +9,8 @@ from clsplat.gaussians.checkup import examine, is_model
 from clsplat.pipeline.files import shipped
 from clsplat.pipeline.loading import load
 from clsplat.pipeline.matrix import load_experiment
-from clsplat.runs.verify import is_run, verify
+from clsplat.runs.found import has_state
+from clsplat.runs.verify import verify
 
 
 def check(pipeline: str) -> dict[str, Any]:
@@ -18,11 +19,11 @@ def check(pipeline: str) -> dict[str, Any]:
     Of a run folder and of a model file return what `verify` and `examine` say.
     Raises ConfigError; DataError for a folder without a run.
     """
-    if not is_run(Path(pipeline)) and pipeline not in shipped() and is_model(Path(pipeline)):
+    if not has_state(Path(pipeline)) and pipeline not in shipped() and is_model(Path(pipeline)):
         return examine(Path(pipeline))
     if len(Path(pipeline).parts) > 1 and not is_there(Path(pipeline)):
         raise ConfigError(f"{pipeline}: no such file or folder; expected a pipeline, a model, or the folder of a run")
-    if Path(pipeline).is_dir() and (is_run(Path(pipeline)) or pipeline not in shipped()):
+    if Path(pipeline).is_dir() and (has_state(Path(pipeline)) or pipeline not in shipped()):
         return verify(Path(pipeline))
     if found := load_experiment(pipeline):
         return {"path": str(found.path), "name": found.name, "cells": [cell.name for cell in found.cells]}

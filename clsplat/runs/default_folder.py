@@ -6,10 +6,10 @@ from pathlib import Path
 from clsplat import lock
 from clsplat.errors import OutputError
 from clsplat.names import LOCK, PIPELINE
-from clsplat.pipeline.loading import Pipeline, load
+from clsplat.pipeline.loading import Pipeline
 from clsplat.prepare.cache import Planned, note, noted
 from clsplat.runs.folders import Start
-from clsplat.runs.outputs import is_finished
+from clsplat.runs.found import is_finished_run_of
 
 
 def free_folder(folder: Path, pipeline: Pipeline | None, start: Start) -> Path:
@@ -33,6 +33,4 @@ def free_folder(folder: Path, pipeline: Pipeline | None, start: Start) -> Path:
 
 def up_to_date(pipeline: Pipeline, planned: Sequence[Planned], out: Path) -> bool:
     """Whether `out` holds a finished run of this pipeline and the same photographs; never where nothing is prepared."""
-    if not planned or noted(out) != note(planned):
-        return False
-    return is_finished(out) and load(str(out / PIPELINE)).resolved() == pipeline.resolved()
+    return bool(planned) and noted(out) == note(planned) and is_finished_run_of(pipeline, out)

@@ -22,6 +22,7 @@ from clsplat.runs import description, folders, opening, outputs, runner
 from clsplat.runs.default_folder import free_folder, up_to_date
 from clsplat.runs.failures import failures_recorded
 from clsplat.runs.folders import Start
+from clsplat.runs.found import is_finished
 from clsplat.runs.scenes import read_run_scene
 from clsplat.runs.source import photographs_of
 from clsplat.runs.summary import summary
@@ -219,7 +220,7 @@ def as_setting(folder: Path) -> str:
 
 def _finished(cell: Cell, folder: Path) -> bool:
     """Whether the cell was run to its end, and has its files.  Raises ConfigError when that was with other settings."""
-    if not outputs.is_finished(folder):
+    if not is_finished(folder):
         return False
     before = load(str(folder / PIPELINE)).resolved()
     if difference := first_difference(before, cell.pipeline.resolved()):

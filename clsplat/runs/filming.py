@@ -12,8 +12,9 @@ from clsplat.gaussians.model import Model, load
 from clsplat.opencl.device import Device
 from clsplat.progress import counted
 from clsplat.render.rasterizer import Rasterizer
+from clsplat.runs.found import has_pipeline
 from clsplat.runs.pictures import KINDS, write_pictures
-from clsplat.runs.source import Source, is_run
+from clsplat.runs.source import Source
 from clsplat.scene.photographs import load_photograph
 from clsplat.scene.scene import Background, Scene
 from clsplat.scene.view import NO_FILE, View
@@ -95,7 +96,7 @@ def film(
 
 def _scene(model: Path, scene: Path | None, loaded: Model, downscale: float | None, needed: bool) -> Scene | None:
     """The scene of a model at the size of its run; None where none is known and none is needed."""
-    if not needed and scene is None and not is_run(model):
+    if not needed and scene is None and not has_pipeline(model):
         return None
     source = Source.of(model, scene)
     return source.scene(loaded).downscaled(downscale or source.settings.downscale)

@@ -24,6 +24,7 @@ from clsplat.names import (
 )
 from clsplat.pipeline.matrix import load_experiment
 from clsplat.reading import read_text
+from clsplat.runs.found import has_begun
 from clsplat.training import checkpoint
 from clsplat.training.status import StatusFile, read_status
 
@@ -121,7 +122,7 @@ def check_run_folder(out: Path, start: Start) -> None:
         raise ConfigError(
             f"{out / PIPELINE}: is not that of a run, which would write its own in its place; give another folder"
         )
-    if start == "new" and ((out / PIPELINE).exists() or checkpoint.saved(out)):
+    if start == "new" and (has_begun(out)):
         raise ConfigError(f"{out}: already holds a run; give another folder, --resume or --restart")
     status = read_status(out) if start == "resume" else {}
     if status.get("state") == "done" and not ({"cells", "checkpoint"} & status.keys() or checkpoint.saved(out)):

@@ -11,11 +11,10 @@ from clsplat.names import BEFORE_A_RUN, CHECKSUMS, LOCK, LOG_FILE, METRICS, OF_A
 from clsplat.pipeline.loading import Pipeline, load
 from clsplat.processes import Owner
 from clsplat.reading import read_file, read_json, sha256
+from clsplat.runs.found import has_begun
 from clsplat.stages.base import Stage
 from clsplat.stages.optimize import Optimize
-from clsplat.training import checkpoint
 from clsplat.training.run import Run
-from clsplat.training.status import read_status
 
 
 def write_metrics(pipeline: Pipeline, run: Run) -> None:
@@ -53,17 +52,6 @@ def write_checksums(pipeline: Pipeline, run: Run) -> None:
     write_text(run.out / CHECKSUMS, json.dumps(sums, indent=1) + "\n")
 
 
-def is_finished(out: Path) -> bool:
-    """Whether a folder holds a run that is done, with every file as it was written."""
-    if read_status(out).get("state") != "done":
-        return False
-    try:
-        sums = read_json(out / CHECKSUMS)
-        return isinstance(sums, dict) and all(sha256(out / name) == sum_ for name, sum_ in sums.items())
-    except DataError:
-        return False
-
-
 def check_places(pipeline: Pipeline, out: Path) -> None:
     """Raise ConfigError where a run in `out` would write elsewhere, or over files that no run there has made.
 
@@ -79,7 +67,7 @@ def check_places(pipeline: Pipeline, out: Path) -> None:
     check_names(out, OF_A_RUN)
     own = [path for stage in pipeline.stages for path in stage.outputs(out)]
     _require_inside(out, own)
-    if not _holds_a_run(out):
+    if not has_begun(out):
         _require_free(own)
 
 
@@ -87,13 +75,9 @@ def check_names(out: Path, names: Collection[str]) -> None:
     """Raise ConfigError where a name that a run or a matrix writes in `out` is taken by a file that none has made."""
     files = [out / name for name in sorted(names)]
     _require_inside(out, files)
-    if not _holds_a_run(out):
+    if not has_begun(out):
         before = BEFORE_A_RUN if _names_a_process(out / STATUS) else {LOCK} if _is_lock(out / LOCK) else set()
         _require_free(file for file in files if file.name not in before)
-
-
-def _holds_a_run(out: Path) -> bool:
-    return (out / PIPELINE).exists() or bool(checkpoint.saved(out))
 
 
 def _is_lock(file: Path) -> bool:

@@ -12,6 +12,7 @@ from clsplat.names import PIPELINE
 from clsplat.pipeline.file import SceneSettings
 from clsplat.pipeline.loading import Pipeline, load
 from clsplat.prepare.cache import noted
+from clsplat.runs.found import has_pipeline
 from clsplat.scene.detect import read_scene
 from clsplat.scene.scene import Alpha, Scene
 from clsplat.stages.export import Export
@@ -34,7 +35,7 @@ class Source:
         ConfigError when one is not known.
         """
         run = run_of(model)
-        trained = scene if scene is not None and is_run(scene) else run
+        trained = scene if scene is not None and has_pipeline(scene) else run
         if trained is None and scene is None:
             if model.is_dir() and not located(model).is_file():
                 raise DataError(f"{model}: has no pipeline.yaml; expected a model file or a run folder")
@@ -53,17 +54,12 @@ class Source:
         return read_scene(self.folder, self.settings.holdout).with_alpha(self.alpha or model.rendering.alpha)
 
 
-def is_run(folder: Path) -> bool:
-    """Whether a folder holds the pipeline of a run, or of a matrix."""
-    return (folder / PIPELINE).is_file()
-
-
 def run_of(model: Path) -> Path | None:
     """Return the folder of the run that a model is of: itself, or one that has exported the file; None without one."""
     if model.is_dir():
-        return model if is_run(model) else None
+        return model if has_pipeline(model) else None
     file = model.resolve()
-    for folder in filter(is_run, file.parents):
+    for folder in filter(has_pipeline, file.parents):
         with suppress(ConfigError):
             if file in {path for stage in _exports(load(str(folder / PIPELINE))) for path in stage.outputs(folder)}:
                 return folder
@@ -75,7 +71,7 @@ def photographs_of(scene: Path) -> Path:
 
     Raises ConfigError for a run whose pipeline names none or cannot be read, DataError where the folder is missing.
     """
-    if not is_run(scene):
+    if not has_pipeline(scene):
         return scene
     prepared = noted(scene)
     folder = Path(prepared["folder"]) if prepared else load(str(scene / PIPELINE)).settings.scene.folder

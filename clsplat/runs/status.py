@@ -7,7 +7,7 @@ from typing import Any
 
 from clsplat.compare.run_folder import read_metrics
 from clsplat.errors import DataError, one_line
-from clsplat.names import END_STATES, METRICS, PIPELINE, STATUS
+from clsplat.names import END_STATES, METRICS, PIPELINE, SILENT, STATUS
 from clsplat.processes import Owner
 from clsplat.training import checkpoint
 from clsplat.training.records import Records
@@ -15,7 +15,6 @@ from clsplat.training.status import read_status
 from clsplat.training.status_schema import status_of
 
 LOG = logging.getLogger("clsplat")
-SILENT = 60  # seconds without a heartbeat that are worth a line
 
 
 def run_status(out: Path) -> dict[str, Any]:

@@ -4,7 +4,8 @@ from pathlib import Path
 from typing import Any
 
 from clsplat.names import CHECKPOINTS, PIPELINE
-from clsplat.runs.verify import NO_SUMS, is_run
+from clsplat.runs.found import has_state
+from clsplat.runs.verify import NO_SUMS
 
 
 def verdict(found: dict[str, Any]) -> str:
@@ -24,7 +25,7 @@ def verdict(found: dict[str, Any]) -> str:
 def _remedy(found: dict[str, Any], file: str) -> str:
     """How the run of a damaged file is mended by running it again."""
     out = Path(found["run"])
-    cell = next((one for one in (out / file).parents if one != out and out in one.parents and is_run(one)), out)
+    cell = next((one for one in (out / file).parents if one != out and out in one.parents and has_state(one)), out)
     prefix = "" if cell == out else f"{cell.relative_to(out).as_posix()}/"
     whole = {one["file"].removeprefix(prefix): one["whole"] for one in found["objects"]}
     checkpoints = [good for name, good in whole.items() if name.startswith(f"{CHECKPOINTS}/step_")]

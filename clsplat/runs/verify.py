@@ -26,6 +26,7 @@ from clsplat.pipeline.loading import load
 from clsplat.pipeline.matrix import load_experiment
 from clsplat.reading import read_json
 from clsplat.runs import file_checks
+from clsplat.runs.found import has_state
 from clsplat.runs.outputs import acting
 from clsplat.runs.status import state_of
 from clsplat.training import checkpoint
@@ -34,18 +35,13 @@ from clsplat.training.status import read_status
 NO_SUMS = "is missing, as in runs of earlier versions and of a Trainer; without it the outputs are not verified"
 
 
-def is_run(folder: Path) -> bool:
-    """Whether a folder holds a run or a matrix."""
-    return any((folder / name).is_file() for name in (PIPELINE, STATUS))
-
-
 def verify(out: Path) -> dict[str, Any]:
     """Return `whole`, the `state` of the run, and for each file in `objects` whether it is whole, and a detail.
 
     Files that a run declares and does not have yet are no fault while it is not done.  Raises DataError where the
     folder holds no run.
     """
-    if not is_run(out):
+    if not has_state(out):
         raise DataError(f"{out}: holds neither pipeline.yaml nor status.json; expected the folder of a run")
     objects = list(_objects(out))
     return {
@@ -117,7 +113,7 @@ def _checkpoints(out: Path, status: dict[str, Any]) -> list[str]:
 
 def _cells(out: Path, done: bool) -> list[str]:
     """The folders of a matrix's cells: those that are there, and of one that is done all of them."""
-    cells = {one.name for one in out.iterdir() if one.is_dir() and not one.is_symlink() and is_run(one)}
+    cells = {one.name for one in out.iterdir() if one.is_dir() and not one.is_symlink() and has_state(one)}
     with suppress(ConfigError):  # told already
         found = load_experiment(str(out / PIPELINE)) if done else None
         cells |= {cell.name for cell in found.cells} if found else set()
