@@ -72,21 +72,29 @@ def _reserved(path: Path, folder: Path) -> Iterator[None]:
         _held.discard(path)
 
 
-def check_free(folder: Path) -> None:
-    """Raise OutputError where `held` would; nothing is written."""
+def check_free(folder: Path) -> bool:
+    """Raise OutputError where `held` would at once; nothing is written.
+
+    Returns False where `held` would wait for the heartbeat of a run on another machine.
+    """
     path = _path(folder, folder / LOCK)
     try:
         with suppress(FileNotFoundError), path.open("r+b", buffering=0) as file:
             try:
                 if not _system_lock(file):
                     raise OutputError(in_use(folder, read(file)))
-                require_silent(file, path, folder)
             except OSError as error:
                 if error.errno not in NO_LOCKS:
                     raise
                 _ended_owner(file, path, folder)
+                return True
+            try:
+                require_silent(file, path, folder)
+            except OutputError:
+                return False
     except OSError as error:
         raise unwritable(path, error) from error
+    return True
 
 
 def _path(folder: Path, file: Path) -> Path:

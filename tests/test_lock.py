@@ -254,9 +254,12 @@ def test_a_run_on_another_machine_is_not_joined_where_locks_count_here_alone(nam
         (tmp_path / "status.json").write_text(json.dumps({**status, "time": time.time() - status["time"] + 1}))
 
     monkeypatch.setattr(holder_file.time, "sleep", beat)
-    for attempt in (lambda: lock.check_free(tmp_path), lambda: lock.held(tmp_path).__enter__()):
-        with pytest.raises(OutputError, match=rf"by process 7 on {name} .*heartbeat is \d+ s old.*remove .*lock"):
-            attempt()
+    assert not lock.check_free(tmp_path)
+    with (
+        pytest.raises(OutputError, match=rf"by process 7 on {name} .*heartbeat is \d+ s old.*remove .*lock"),
+        lock.held(tmp_path),
+    ):
+        pass
     assert (tmp_path / LOCK).read_text() == before
     assert len(beats) == 1
 
@@ -297,7 +300,7 @@ def test_the_lock_of_a_run_that_has_ended_elsewhere_is_taken_over(owner, status,
         status = {**status, "time": time.time() - status["time"]}
     if status is not None:
         (tmp_path / "status.json").write_text(json.dumps(status))
-    lock.check_free(tmp_path)
+    assert lock.check_free(tmp_path)
     with lock.held(tmp_path):
         assert json.loads((tmp_path / LOCK).read_text())["process"] == os.getpid()
     lines = [f"{tmp_path}: taken over from process 7 on another"] * (not owner)

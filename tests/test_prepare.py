@@ -286,6 +286,10 @@ def test_a_pipeline_that_was_run_is_up_to_date(pipeline, photos, tmp_path):
     assert "up to date" in run(pipeline, photos)
     assert (tmp_path / "runs" / "smoke" / "point_cloud.ply").stat().st_mtime_ns == model
     assert sorted(path.name for path in (tmp_path / "runs").iterdir()) == ["prepared", "smoke"]
+    (tmp_path / "runs" / "smoke" / "point_cloud.ply").unlink()
+    run(pipeline, photos)
+    assert (tmp_path / "runs" / "smoke" / "point_cloud.ply").exists(), "made again, in its place"
+    assert sorted(path.name for path in (tmp_path / "runs").iterdir()) == ["prepared", "smoke"]
 
 
 def test_a_changed_setting_is_another_run(pipeline, photos, tmp_path):

@@ -100,5 +100,5 @@ def test_a_file_system_without_locks_keeps_the_owner_that_may_live(values, tmp_p
     with pytest.raises(OutputError, match=r"if that process has ended, remove .*run.lock"):
         lock.check_free(tmp_path)
     owned_by(tmp_path, process=NONE)
-    lock.check_free(tmp_path)
+    assert lock.check_free(tmp_path)
     assert (tmp_path / LOCK).exists()

@@ -15,8 +15,10 @@ from clsplat.pipeline.files import find
 from clsplat.pipeline.loading import Pipeline, checked
 from clsplat.pipeline.yaml_file import Document, read_yaml
 from clsplat.runs.experiment import run_pipeline
-from clsplat.runs.found import is_finished_run_of
+from clsplat.runs.folders import Start
+from clsplat.runs.found import changed, is_done, is_done_with
 from clsplat.runs.source import Source
+from clsplat.training import checkpoint
 
 RECIPE = "compress"
 
@@ -44,11 +46,13 @@ class Tuning:
     def trained(self, pipeline: Pipeline, folder: Path) -> Path:
         """Run a pipeline in a folder; return the model's file.
 
-        What an earlier call has finished is left alone, and what it has begun goes on.
+        What an earlier call has finished is left alone, what it has begun goes on, and what was lost is made again.
         """
-        if not is_finished_run_of(pipeline, folder):
+        if not is_done_with(pipeline, folder) or changed(folder):
+            is_lost = is_done(folder) and not checkpoint.saved(folder)
+            start: Start = "restart" if is_lost else "resume" if is_there(folder) else "new"
             try:
-                run_pipeline(pipeline, folder, self.device, "resume" if is_there(folder) else "new")
+                run_pipeline(pipeline, folder, self.device, start)
             except Interrupted as error:
                 raise Interrupted(f"stopped in {folder.name}; the same command goes on") from error
         return folder / MODEL

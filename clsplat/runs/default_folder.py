@@ -9,7 +9,7 @@ from clsplat.names import LOCK, PIPELINE
 from clsplat.pipeline.loading import Pipeline
 from clsplat.prepare.cache import Planned, note, noted
 from clsplat.runs.folders import Start
-from clsplat.runs.found import is_finished_run_of
+from clsplat.runs.found import is_done_with
 
 
 def free_folder(folder: Path, pipeline: Pipeline | None, start: Start) -> Path:
@@ -20,10 +20,11 @@ def free_folder(folder: Path, pipeline: Pipeline | None, start: Start) -> Path:
     def taken() -> bool:
         if (free / LOCK).exists():
             try:
-                lock.check_free(free)
+                if not lock.check_free(free):
+                    return True
             except OutputError:  # by a run that may not have begun yet
                 return True
-        return (free / PIPELINE).exists() and not (pipeline and up_to_date(pipeline, planned, free))
+        return (free / PIPELINE).exists() and not (pipeline and is_same(pipeline, planned, free))
 
     while start == "new" and taken():
         number += 1
@@ -31,6 +32,7 @@ def free_folder(folder: Path, pipeline: Pipeline | None, start: Start) -> Path:
     return free
 
 
-def up_to_date(pipeline: Pipeline, planned: Sequence[Planned], out: Path) -> bool:
-    """Whether `out` holds a finished run of this pipeline and the same photographs; never where nothing is prepared."""
-    return bool(planned) and noted(out) == note(planned) and is_finished_run_of(pipeline, out)
+def is_same(pipeline: Pipeline, planned: Sequence[Planned], out: Path) -> bool:
+    """Whether a run of this pipeline and the same photographs has come to its end in `out`; never where nothing is
+    prepared."""
+    return bool(planned) and noted(out) == note(planned) and is_done_with(pipeline, out)

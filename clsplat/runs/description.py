@@ -1,12 +1,14 @@
 """What a run would do, before it does it."""
 
+import logging
 from pathlib import Path
 
 from clsplat import lock
 from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import Pipeline
-from clsplat.runs.default_folder import up_to_date
+from clsplat.runs.default_folder import is_same
 from clsplat.runs.folders import Start, check_run_folder
+from clsplat.runs.found import is_complete
 from clsplat.runs.opening import check_start, open_run
 from clsplat.runs.outputs import check_places
 from clsplat.runs.runner import restore
@@ -15,6 +17,8 @@ from clsplat.stages.base import Stage
 from clsplat.stages.evaluate import Evaluate
 from clsplat.stages.optimize import Optimize
 from clsplat.training.run import Run
+
+LOG = logging.getLogger("clsplat")
 
 
 def describe(
@@ -25,11 +29,13 @@ def describe(
     Raises what the run would raise before its first stage; of its photographs only where nothing must be prepared.
     """
     planned = pipeline.preparation(out)
-    if start != "restart" and planned and up_to_date(pipeline, planned, out):
-        return f"{out}: up to date"
+    if start != "restart" and is_same(pipeline, planned, out):
+        if is_complete(out):
+            return f"{out}: up to date"
+        start = "resume"
     check_places(pipeline, out)
     check_run_folder(out, start)
-    lock.check_free(out)
+    tell_of_waiting(out)
     lines = [f"  {one.step.stage:<14} {one.why or 'done'}" for one in planned]
     run, verdict = None, "would run"
     if any(one.why for one in planned):
@@ -43,6 +49,12 @@ def describe(
             stage.check_in(run)
     lines += [f"  {stage.stage:<14} {_detail(stage, run)}".rstrip() for stage in pipeline.stages]
     return f"{verdict} in {out}:\n" + "\n".join(lines)
+
+
+def tell_of_waiting(out: Path) -> None:
+    """Raise OutputError where a run in `out` would be refused as it is in use; say where it would wait to know."""
+    if not lock.check_free(out):
+        LOG.info("%s: was in use elsewhere just now; the run would wait for its heartbeat, a minute at most", out)
 
 
 def _detail(stage: Stage, run: Run | None) -> str:

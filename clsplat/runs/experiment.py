@@ -8,21 +8,21 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-from clsplat import lock, terminal
+from clsplat import terminal
 from clsplat.compare.page import write_comparison
 from clsplat.errors import ClsplatError, ConfigError, DataError, Interrupted, as_clsplat_error, one_line
 from clsplat.files import is_there, write_text
 from clsplat.live.live import Live
-from clsplat.names import COMPARISON, LOG_FILE, OF_A_MATRIX, PIPELINE
+from clsplat.names import COMPARISON, LOG_FILE, OF_A_MATRIX, PIPELINE, STATUS
 from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import Pipeline, load
 from clsplat.pipeline.matrix import Cell, Experiment, load_experiment
 from clsplat.pipeline.yaml_file import read_yaml
 from clsplat.runs import description, folders, opening, outputs, runner
-from clsplat.runs.default_folder import free_folder, up_to_date
+from clsplat.runs.default_folder import free_folder, is_same
 from clsplat.runs.failures import failures_recorded
 from clsplat.runs.folders import Start
-from clsplat.runs.found import is_finished
+from clsplat.runs.found import has_pipeline, is_complete, is_done
 from clsplat.runs.scenes import read_run_scene
 from clsplat.runs.source import photographs_of
 from clsplat.runs.summary import summary
@@ -68,7 +68,8 @@ class Job:
         """Take the pipeline that a run folder holds, to go on with it there.  Raises ConfigError or DataError."""
         file = out / PIPELINE
         if not file.is_file():
-            raise DataError(f"{out}: has no pipeline.yaml; expected the folder of a run")
+            again = f"; give its `clsplat run … --out {out} --resume` again" if (out / STATUS).is_file() else ""
+            raise DataError(f"{out}: has no pipeline.yaml; expected the folder of a run that has begun{again}")
         return cls.open(str(file), None, out, overrides, "resume")
 
     def describe(self, device: str | Device | None = None) -> str:
@@ -88,10 +89,12 @@ class Job:
     def _run(self, device: str | Device | None, live: Live | None) -> None:
         if isinstance(self.work, Experiment):
             run_matrix(self.work, self.out, device, self.start, live)
-        elif self.start != "restart" and up_to_date(self.work, self.work.preparation(self.out), self.out):
+            return
+        same = self.start != "restart" and is_same(self.work, self.work.preparation(self.out), self.out)
+        if same and is_complete(self.out):
             LOG.info("%s: up to date; change a setting, or give another folder, to run again", self.out)
         else:
-            run_pipeline(self.work, self.out, device, self.start, live)
+            run_pipeline(self.work, self.out, device, "resume" if same else self.start, live)
 
 
 @contextmanager
@@ -189,7 +192,7 @@ def describe_matrix(experiment: Experiment, out: Path, device: str | Device | No
     """
     check_matrix_folder(out)
     folders.check_run_folder(out, start)
-    lock.check_free(out)
+    description.tell_of_waiting(out)
     lines, refusals = [], dict[str, ClsplatError]()
     read = cache(read_run_scene)  # each distinct scene once
     for cell in experiment.cells:
@@ -220,12 +223,12 @@ def as_setting(folder: Path) -> str:
 
 def _finished(cell: Cell, folder: Path) -> bool:
     """Whether the cell was run to its end, and has its files.  Raises ConfigError when that was with other settings."""
-    if not is_finished(folder):
+    if not is_done(folder) or not has_pipeline(folder):
         return False
     before = load(str(folder / PIPELINE)).resolved()
     if difference := first_difference(before, cell.pipeline.resolved()):
         raise ConfigError(f"{folder}: was run with other settings: {difference}; use another folder, or those settings")
-    return True
+    return is_complete(folder)
 
 
 def _compare(experiment: Experiment, out: Path, failures: dict[str, ClsplatError]) -> None:

@@ -2,16 +2,17 @@
 
 import json
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from itertools import takewhile
 from pathlib import Path
 
 from clsplat.errors import ConfigError, DataError, Interrupted
 from clsplat.files import write_text
-from clsplat.names import CHECKSUMS, NOTE, PIPELINE
+from clsplat.names import CHECKSUMS, METRICS, NOTE, PIPELINE
 from clsplat.pipeline.loading import Pipeline
 from clsplat.runs.folders import RESOLVED, Start, clear
+from clsplat.runs.found import changed
 from clsplat.runs.inputs import require_same_inputs, write_inputs
 from clsplat.runs.outputs import check_outputs, write_checksums, write_metrics
 from clsplat.runs.signals import finishing_on_interrupt
@@ -29,9 +30,10 @@ def execute(pipeline: Pipeline, run: Run, start: Start, show: Callable[[Progress
     The caller records a failure.
     """
     run.show = show
+    lost = changed(run.out) if start == "resume" else []  # before the list of checksums goes
     begin(pipeline, run, start)
     with finishing_on_interrupt(run), saved_on_failure(run):
-        _write_again(pipeline, run)
+        _write_again(pipeline, run, lost)
         _run_stages(pipeline, run)
     run.status.require_held()
     write_metrics(pipeline, run)
@@ -77,16 +79,28 @@ def restore(pipeline: Pipeline, run: Run) -> Path | None:
     return taken
 
 
-def _write_again(pipeline: Pipeline, run: Run) -> None:
-    """Repeat the stages whose files are missing or damaged, of those that ended since the model changed last."""
+def _write_again(pipeline: Pipeline, run: Run, lost: Sequence[Path]) -> None:
+    """Repeat the stages whose files are `lost` or damaged, of those that ended since the model changed last.
+
+    Files that are lost and that no stage writes again are named in a warning.
+    """
     ended = pipeline.stages[: 0 if run.stage_step else run.cursor]
     unchanged = list(takewhile(lambda stage: not (stage.edits or isinstance(stage, Optimize)), reversed(ended)))
+    left = [file for file in lost if file.name not in (CHECKSUMS, PIPELINE, METRICS)]
     for stage in reversed(unchanged):
+        own = [file for file in left if any(file.is_relative_to(place) for place in stage.outputs(run.out))]
         try:
             stage.verify(run)
+            if own:
+                raise DataError(f"{own[0]}: is missing or was changed")
         except DataError as error:
             LOG.warning("%s; it is written again", error)
             stage.act(run)
+        left = [file for file in left if file not in own]
+    coming = [place for stage in pipeline.stages[run.cursor :] for place in stage.outputs(run.out)]
+    for file in left:
+        if not any(file.is_relative_to(place) for place in coming):
+            LOG.warning("%s: is missing or was changed since it was written, and cannot be made again", file)
 
 
 def _run_stages(pipeline: Pipeline, run: Run) -> None:

@@ -30,7 +30,8 @@ def _remedy(found: dict[str, Any], file: str) -> str:
     whole = {one["file"].removeprefix(prefix): one["whole"] for one in found["objects"]}
     checkpoints = [good for name, good in whole.items() if name.startswith(f"{CHECKPOINTS}/step_")]
     if not whole.get(PIPELINE):
-        return "run its pipeline again with --restart"
+        start = "--restart" if checkpoints and not any(checkpoints) else "--resume"
+        return f"give its `clsplat run … --out {cell}` again, with {start}"
     if checkpoints and not any(checkpoints):
         return f"begin again: `clsplat run {cell / PIPELINE} --out {cell} --restart`"
     return f"`clsplat resume {cell}` makes them again"

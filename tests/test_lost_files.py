@@ -1,0 +1,118 @@
+"""Files of a finished run that were lost or changed: made again where that can be, and named where it cannot."""
+
+import json
+import logging
+import shutil
+from pathlib import Path
+
+import pytest
+
+import clsplat
+from clsplat.compress.tuning import Tuning
+from clsplat.gaussians.model import load as load_model
+from clsplat.opencl.device import Device
+from clsplat.pipeline.matrix import load_experiment
+from clsplat.runs import found
+from clsplat.runs.experiment import run_matrix
+from clsplat.runs.source import Source
+from tests.test_cli import clsplat as command
+
+pytestmark = pytest.mark.slow
+
+SAVED_LATE = """
+name: late
+scene: {{path: '{scene}'}}
+stages:
+  - init: {{count: 50}}
+  - optimize: {{steps: 4, losses: [l1]}}
+  - evaluate
+  - export
+  - cameras
+  - viewer: {{file: viewer.html, photographs: test}}
+  - report
+  - checkpoint
+"""
+MATRIX = """
+name: two
+matrix: {{set: {{seed: [1, 2]}}}}
+scene: {{path: '{scene}'}}
+stages:
+  - init: {{count: 50}}
+  - optimize: {{steps: 4, losses: [l1]}}
+  - evaluate
+  - export
+"""
+
+
+@pytest.fixture(scope="module")
+def saved_late(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run whose checkpoint is behind all that it has written."""
+    folder = tmp_path_factory.mktemp("late")
+    (folder / "late.yaml").write_text(SAVED_LATE.format(scene=tiny_scene))
+    return clsplat.run(str(folder / "late.yaml"), out=folder / "run")
+
+
+@pytest.mark.parametrize("name", ["viewer.html", "report.html", "cameras/cameras.json", "point_cloud.ply"])
+def test_a_file_whose_bytes_changed_is_written_again(name, saved_late, tmp_path):
+    """Also where it still ends as a page does."""
+    out = tmp_path / "run"
+    shutil.copytree(saved_late, out)
+    whole = (out / name).read_bytes()
+    (out / name).write_bytes(whole[:40] + b"x" * 20 + whole[60:])
+    assert [path.name for path in found.changed(out)] == [Path(name).name]
+    said = command("resume", out).stderr
+    assert f"{name}: is missing or was changed; it is written again" in said or f"{name}: differs from what" in said
+    assert clsplat.check(out)["whole"]
+    assert b"x" * 20 not in (out / name).read_bytes()
+
+
+def test_what_cannot_be_made_again_is_named(saved_late, tmp_path):
+    out = tmp_path / "run"
+    shutil.copytree(saved_late, out)
+    records = out / "metrics.jsonl"
+    records.write_text(records.read_text().replace('"step": 4', '"step": 3'))
+    assert f"{records}: is missing or was changed since it was written, and cannot" in command("resume", out).stderr
+    assert "cannot be made again" not in command("resume", out).stderr
+
+
+def test_a_cell_without_a_checkpoint_that_lost_a_file_is_kept(tiny_scene, tmp_path, caplog):
+    (tmp_path / "two.yaml").write_text(MATRIX.format(scene=tiny_scene))
+    matrix = load_experiment(str(tmp_path / "two.yaml"))
+    assert matrix is not None
+    run_matrix(matrix, tmp_path / "run", None, "new")
+    lost = tmp_path / "run" / "seed=1" / "point_cloud.ply"
+    lost.unlink()
+    with caplog.at_level(logging.WARNING, "clsplat"):
+        run_matrix(matrix, tmp_path / "run", None, "resume")
+    assert f"{lost}: is missing or was changed; without a checkpoint only --restart makes it again" in caplog.text
+    assert json.loads((tmp_path / "run" / "status.json").read_text())["failed"] == {}
+    assert "seed=1" in (tmp_path / "run" / "compare.html").read_text()
+
+
+@pytest.mark.parametrize("content", [None, b"", b"ply\n"])
+def test_a_rung_that_lost_its_model_is_trained_again(content, few_steps, info, tmp_path):
+    """Compress and lod would publish a damaged one."""
+    source = Source.of(few_steps, None)
+    model = load_model(source.file)
+    tuning = Tuning(source, model, 3, Device(info))
+    pipeline = tuning.pipeline(("init", "optimize"), {"init.file": str(source.file.resolve())})
+    file = tuning.trained(pipeline, tmp_path / "rung")
+    whole = file.read_bytes()
+    file.unlink()
+    if content is not None:
+        file.write_bytes(content)
+    assert tuning.trained(pipeline, tmp_path / "rung").read_bytes() == whole
+    written = file.stat().st_mtime_ns
+    tuning.trained(pipeline, tmp_path / "rung")
+    assert file.stat().st_mtime_ns == written
+
+
+def test_a_run_that_was_killed_before_it_began_is_told_how_to_begin(tmp_path):
+    """As by `kill -9` while the device is proved: there is no pipeline to go on with."""
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "status.json").write_text('{"state": "preparing", "process": 4194305}')
+    again = f"give its `clsplat run … --out {tmp_path / 'run'} --resume` again"
+    assert again in command("resume", tmp_path / "run", expect=3).stderr
+    assert f"give its `clsplat run … --out {tmp_path / 'run'}` again, with --resume" in (
+        command("check", tmp_path / "run", expect=7).stderr
+    )
