@@ -137,7 +137,10 @@ def palette(
 
     Lloyd's iteration on a share of the points, from evenly spaced ones; a vector without points gets one that is far
     from its own.  At most 45 components.  `clustering` makes the clusters of points: the host's, or those of a device.
+    Points that are at most `entries` different ones are kept; the last is then repeated.
     """
+    if (kept := _different(points, entries)) is not None:
+        return kept
     whole = _whole_numbers(points)
     chosen = np.linspace(0, len(points) - 1, min(len(points), SAMPLE * entries)).astype(np.int64)
     sample, sample_whole = points[chosen].astype(np.float64), whole[chosen]
@@ -155,6 +158,19 @@ def palette(
         vectors[:, column] = np.bincount(labels, sample[:, column], minlength=entries) / np.maximum(held, 1)
     vectors[empty] = sample[farthest]
     return vectors, clustering(whole).nearest(moved)[0]
+
+
+def _different(
+    points: NDArray[np.float32], most: int
+) -> tuple[NDArray[np.float64], NDArray[np.int64]] | None:
+    """The points themselves as a palette of `most` vectors, and their labels; None where more of them differ."""
+    if len(np.unique(points[:, 0])) > most:  # at once for most models
+        return None
+    different, labels = np.unique(points, axis=0, return_inverse=True)
+    if len(different) > most:
+        return None
+    repeated = np.repeat(different[-1:], most - len(different), axis=0)
+    return np.concatenate([different, repeated]).astype(np.float64), labels.reshape(-1)
 
 
 def _whole_numbers(values: NDArray[np.float32]) -> NDArray[np.float32]:

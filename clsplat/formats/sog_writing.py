@@ -4,6 +4,7 @@ import io
 import json
 import zipfile
 from contextlib import suppress
+from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -61,7 +62,7 @@ def write_as_ordered(path: Path, splats: SplatFile, options: Writing) -> str:
     for name, table, more in (("scales", "log_scales", []), ("sh0", "sh_base", [_alpha(p)])):
         entries = codebook(p[table])
         planes = nearest(p[table], entries).T
-        meta[name] = {"codebook": _short(entries), "files": [image(name, *planes, *more)]}
+        meta[name] = {"codebook": [_short(number) for number in entries], "files": [image(name, *planes, *more)]}
     if p["sh_rest"].shape[1]:
         meta["shN"] = _harmonics(p["sh_rest"], options, image)
     images[META] = json.dumps(meta, separators=(",", ":"), sort_keys=True).encode()
@@ -104,21 +105,39 @@ def _alpha(p: Parameters) -> NDArray[np.float64]:
     return np.maximum(np.rint(255 * opacities(p["logit_opacity"][:, 0])), 1)
 
 
+@dataclass(frozen=True)
+class Harmonics:
+    """What a SOG holds of harmonics: numbers [256], a palette [E, c] of their indices, and a label for each splat."""
+
+    numbers: NDArray[np.float64]
+    palette: NDArray[np.uint8]
+    labels: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, rest: NDArray[np.float32], options: Writing) -> "Harmonics":
+        """Quantise harmonics [N, c].  Those of `values` come out as they are."""
+        entries = min(PALETTES[options.quality], max(1, int(SMALLEST * 2.0 ** np.floor(np.log2(len(rest) / SMALLEST)))))
+        vectors, labels = palette(rest, entries, options.clustering)
+        numbers = np.array([_short(number) for number in codebook(vectors)])
+        return cls(numbers, nearest(vectors, numbers), labels)
+
+    @property
+    def values(self) -> NDArray[np.float32]:
+        """The harmonics as they are read back, [N, c]."""
+        return self.numbers.astype(np.float32)[self.palette][self.labels]
+
+
 def _harmonics(rest: NDArray[np.float32], options: Writing, image: Any) -> dict[str, Any]:
-    entries = min(PALETTES[options.quality], max(1, int(SMALLEST * 2.0 ** np.floor(np.log2(len(rest) / SMALLEST)))))
-    vectors, labels = palette(rest, entries, options.clustering)
-    size = rest.shape[1] // 3
-    numbers = codebook(vectors)
-    centroids = nearest(vectors, numbers).reshape(entries * size, 3)
+    found, size = Harmonics.of(rest, options), rest.shape[1] // 3
     degree = round((size + 1) ** 0.5) - 1
-    files = [image("shN_centroids", *centroids.T, across=PER_ROW * size)]
-    files.append(image("shN_labels", labels & 255, labels >> 8, np.zeros_like(labels)))
-    return {"count": entries, "bands": degree, "codebook": _short(numbers), "files": files}
+    files = [image("shN_centroids", *found.palette.reshape(-1, 3).T, across=PER_ROW * size)]
+    files.append(image("shN_labels", found.labels & 255, found.labels >> 8, np.zeros_like(found.labels)))
+    return {"count": len(found.palette), "bands": degree, "codebook": found.numbers.tolist(), "files": files}
 
 
-def _short(numbers: NDArray[np.float64]) -> list[float]:
-    """Numbers as float32 has them, in few digits."""
-    return [float(f"{number:.8g}") for number in numbers]
+def _short(number: float) -> float:
+    """A number as float32 has it, in few digits."""
+    return float(f"{number:.8g}")
 
 
 def _zipped(images: dict[str, bytes]) -> bytes:
