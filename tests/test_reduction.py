@@ -171,3 +171,47 @@ def test_a_measured_file_lies_in_the_run_folder(tmp_path):
     path.write_text("name: x\nstages:\n  - init\n  - evaluate: {file: ../model.ply}\n")
     with pytest.raises(ConfigError, match="inside the run folder"):
         load_pipeline(str(path))
+
+
+PALETTE = """\
+name: palette
+model: {sh_degree: 2}
+stages:
+  - init: {source: model, file: MODEL}
+  - palette_sh: {quality: small}
+  - optimize: {steps: 4, rates: {sh_rest: 0, sh_base: 0.01}, losses: [l1]}
+  - export
+  - export: {file: model.sog, quality: small}
+"""
+
+
+@pytest.fixture(scope="module")
+def many(source: Path) -> Path:
+    """A model with more harmonics than a small palette has vectors."""
+    tables, rng = load(source).tables(), np.random.default_rng(1)
+    of = rng.integers(0, len(tables["means"]), 3000)
+    rest = rng.normal(0, 0.05, (3000, 24)).astype(np.float32)
+    file = source.parent / "many.ply"
+    Model(**{**{name: table[of] for name, table in tables.items()}, "sh_rest": rest}).save(file)
+    return file
+
+
+def test_a_sog_holds_the_harmonics_that_a_model_was_trained_with(many, tiny_scene, tmp_path):
+    (tmp_path / "palette.yaml").write_text(PALETTE.replace("MODEL", json.dumps(str(many))))
+    run = train(tiny_scene, tmp_path / "run", pipeline=str(tmp_path / "palette.yaml"))
+    model, back = load(run.out / "point_cloud.ply"), load(run.out / "model.sog")
+    assert len(np.unique(model.sh_rest, axis=0)) <= 1024 < len(model)
+    assert len(np.unique(model.sh_rest)) <= 256
+    assert not np.array_equal(model.sh_base, load(many).sh_base), "the other tables were trained"
+    ours, theirs = (np.unique(one.sh_rest, axis=0, return_counts=True) for one in (model, back))
+    np.testing.assert_array_equal(ours[0], theirs[0])
+    np.testing.assert_array_equal(ours[1], theirs[1])
+
+
+def test_a_palette_of_a_model_without_harmonics_changes_nothing(few_steps, tiny_scene, tmp_path):
+    text = PALETTE.replace("MODEL", json.dumps(str(few_steps / "point_cloud.ply"))).replace(
+        "sh_degree: 2", "sh_degree: 0"
+    )
+    (tmp_path / "palette.yaml").write_text(text.replace("sh_degree: 2", "sh_degree: 0").replace("sh_rest: 0, ", ""))
+    run = train(tiny_scene, tmp_path / "run", pipeline=str(tmp_path / "palette.yaml"))
+    assert len(load(run.out / "model.sog")) == len(load(few_steps / "point_cloud.ply"))

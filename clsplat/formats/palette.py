@@ -160,9 +160,7 @@ def palette(
     return vectors, clustering(whole).nearest(moved)[0]
 
 
-def _different(
-    points: NDArray[np.float32], most: int
-) -> tuple[NDArray[np.float64], NDArray[np.int64]] | None:
+def _different(points: NDArray[np.float32], most: int) -> tuple[NDArray[np.float64], NDArray[np.int64]] | None:
     """The points themselves as a palette of `most` vectors, and their labels; None where more of them differ."""
     if len(np.unique(points[:, 0])) > most:  # at once for most models
         return None
