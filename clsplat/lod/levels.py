@@ -12,7 +12,8 @@ from clsplat.compress.folder import claimed
 from clsplat.compress.search import Measurer
 from clsplat.compress.tuning import Tuning
 from clsplat.errors import ConfigError, DataError
-from clsplat.formats.lod_writing import require_free, write_lod
+from clsplat.files import new_folder, require_free
+from clsplat.formats.lod_writing import write_lod
 from clsplat.formats.splats import Writing
 from clsplat.formats.table import bytes_of, located
 from clsplat.gaussians.clusters import DeviceClusters
@@ -121,7 +122,8 @@ def levels_of_detail(
             LOG.info("level %d: %d Gaussians", number, len(fewer))
             levels.append(training.trained(number, fewer) if training else Level(fewer))
     writing = Writing(clustering=partial(DeviceClusters, opened.device)) if opened else Writing()
-    write_lod(folder, [level.model.as_file() for level in levels], writing)
+    with new_folder(folder) as place:
+        write_lod(place, [level.model.as_file() for level in levels], writing)
     return {
         "folder": str(folder),
         "bytes": bytes_of(folder),
