@@ -8,9 +8,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from clsplat.compress.folder import claimed
-from clsplat.compress.search import Measurer
-from clsplat.compress.tuning import Tuning
 from clsplat.errors import ConfigError, DataError
 from clsplat.files import new_folder, require_free
 from clsplat.formats.lod_writing import write_lod
@@ -22,6 +19,9 @@ from clsplat.lod.decimation import decimated
 from clsplat.reading import sha256
 from clsplat.runs.model_file import ModelFile
 from clsplat.runs.source import run_of
+from clsplat.tuning.folder import claimed
+from clsplat.tuning.measuring import Measurer
+from clsplat.tuning.tuning import Tuning
 
 LOG = logging.getLogger("clsplat")
 MOST = 12  # levels; halves of a million Gaussians are 500 then
@@ -67,7 +67,7 @@ class Training:
     def __init__(self, opened: ModelFile, place: Path, plan: Plan) -> None:
         self.place, self.plan = place, plan
         self.measurer = Measurer(opened)
-        self.tuning = Tuning(opened.source, opened.loaded, plan.steps, opened.device)
+        self.tuning = Tuning("lod", opened.source, opened.loaded, plan.steps, opened.device)
         self.question: dict[str, Any] = {
             "sha256": sha256(located(opened.source.file)),
             "scene": str(opened.source.folder),
