@@ -11,6 +11,8 @@ from clsplat.pipeline.loading import Pipeline
 from clsplat.tuning.tuning import Tuning
 
 STAGES = ("init", "prune_least", "optimize")  # of the recipe; what a rung writes is a PLY
+FITTING = ("init", "reduce_sh", "palette_sh", "optimize")  # what is trained with the harmonics that a SOG holds
+FITTED, SOG = "fitted", "model.sog"
 
 
 @dataclass(frozen=True)
@@ -33,6 +35,12 @@ class Ladder:
     def folder(self, keep: float) -> Path:
         """Return the run folder of a rung."""
         return self.out / f"keep_{round(100 * keep):02d}"
+
+    def fitted(self, file: Path, name: str, degree: int, quality: str) -> Path:
+        """Train a rung with the harmonics of a SOG of it; return that SOG."""
+        values = {"init.file": str(file.resolve()), "reduce_sh.degree": degree, "palette_sh.quality": quality}
+        pipeline = self.tuning.pipeline(FITTING, values, file=SOG, quality=quality)
+        return self.tuning.trained(pipeline, self.out / FITTED / name, SOG)
 
     def pipeline(self, file: Path, keep: float) -> Pipeline:
         """Return the recipe as it is run: to prune a model file to a share of it."""

@@ -4,7 +4,6 @@ import json
 import logging
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,8 +15,7 @@ from clsplat.files import write_text
 from clsplat.formats.output import written
 from clsplat.formats.splats import Writing
 from clsplat.formats.table import bytes_of, located
-from clsplat.gaussians.clusters import DeviceClusters
-from clsplat.gaussians.model import Model, load
+from clsplat.gaussians.model import load
 from clsplat.reading import read_file, sha256
 from clsplat.runs.model_file import ModelFile
 from clsplat.tuning.folder import claimed
@@ -98,7 +96,7 @@ def compress(
         ladder = Ladder(out, Tuning("compress", source, first, steps, opened.device))
         before = 1.0
         for keep in shares:
-            rung = _measured(out / TRIALS, load(ladder.rung(keep, before)), keep, form, measurer)
+            rung = _measured(ladder, ladder.rung(keep, before), keep, form, measurer)
             search.points += rung
             search.write()
             before = keep
@@ -107,21 +105,22 @@ def compress(
         return _finished(search, form)
 
 
-def _measured(trials: Path, model: Model, keep: float, form: Format, measurer: Measurer) -> list[Point]:
+def _measured(ladder: Ladder, source: Path, keep: float, form: Format, measurer: Measurer) -> list[Point]:
     """Write a rung with each setting of its harmonics, and measure the files as they are read back."""
-    points, degrees = [], set[tuple[int, str]]()
+    points, degrees, model = [], set[tuple[int, str]](), load(source)
     for degree, quality in SETTINGS:
         setting = min(degree, model.sh_degree), quality
         if setting in degrees:
             continue
         degrees.add(setting)
-        file = trials / f"keep_{round(100 * keep):02d}_degree_{setting[0]}_{quality}.{form}"
-        options = Writing(quality=quality, clustering=partial(DeviceClusters, measurer.opened.device))
-        of_degree(model, setting[0]).save(file, options)
-        size = file.stat().st_size
-        point = Point(
-            file.relative_to(trials.parent).as_posix(), keep, *setting, len(model), size, *measurer.figures(load(file))
-        )
+        name = f"keep_{round(100 * keep):02d}_degree_{setting[0]}_{quality}"
+        file = ladder.out / TRIALS / f"{name}.{form}"
+        if form == "sog":
+            _copy(ladder.fitted(source, name, *setting), file)
+        else:
+            of_degree(model, setting[0]).save(file, Writing(quality=quality))
+        size, figures = file.stat().st_size, measurer.figures(load(file))
+        point = Point(f"{TRIALS}/{file.name}", keep, *setting, len(model), size, *figures)
         LOG.info("%s: %.3g MB, %.2f dB", file.name, size / 1e6, point.psnr)
         points.append(point)
     return points
@@ -137,6 +136,10 @@ def _finished(search: Search, form: Format) -> dict[str, Any]:
             f"{near.bytes / 1e6:.3g} MB and {near.psnr - psnr:+.2f} dB; ask for less, or train for longer with --steps"
         )
     file = search.out / f"compressed.{form}"
-    with written(file) as output:
-        output.write(read_file(search.out / chosen.file))
+    _copy(search.out / chosen.file, file)
     return {**search.data(), "file": str(file), "page": str(search.out / PAGE)}
+
+
+def _copy(source: Path, file: Path) -> None:
+    with written(file) as output:
+        output.write(read_file(source))

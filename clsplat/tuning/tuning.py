@@ -1,7 +1,7 @@
 """A model file trained further, from the photographs of its scene: stages of the recipe `compress`, as runs."""
 
 import json
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -33,19 +33,22 @@ class Tuning:
     steps: int | None  # None: those of the recipe
     device: Device
 
-    def pipeline(self, stages: Collection[str], values: Mapping[str, Any]) -> Pipeline:
-        """Return some stages of the recipe, which write a PLY, with other values by place."""
+    def pipeline(self, stages: Sequence[str], values: Mapping[str, Any], **export: str) -> Pipeline:
+        """Return stages of the recipe, in its order, and one that writes the model, with other values by place."""
         path = find(RECIPE)
         data = read_yaml(path).data
-        chosen = [stage for stage in data["stages"] if isinstance(stage, dict) and next(iter(stage)) in stages]
-        document = Document({**data, "name": self.name, "stages": [*chosen, {"export": {"file": MODEL}}]})
+        left = iter(data["stages"])
+        chosen = [next(stage for stage in left if isinstance(stage, dict) and name in stage) for name in stages]
+        document = Document({**data, "name": self.name, "stages": [*chosen, {"export": {"file": MODEL, **export}}]})
         settings = {**self._scene(), **self._rendering(), **values}
         if self.steps is not None:
-            settings |= {"optimize.steps": self.steps, "optimize.rates.means.over": self.steps}
+            first, own = (_training(part)["steps"] for part in (data["stages"], chosen))
+            steps = max(1, round(self.steps * own / first))
+            settings |= {"optimize.steps": steps, "optimize.rates.means.over": steps}
         return checked(path, document, [f"{place}={json.dumps(value)}" for place, value in settings.items()])
 
-    def trained(self, pipeline: Pipeline, folder: Path) -> Path:
-        """Run a pipeline in a folder; return the model's file.
+    def trained(self, pipeline: Pipeline, folder: Path, file: str = MODEL) -> Path:
+        """Run a pipeline in a folder; return the file that it writes there.
 
         What an earlier call has finished is left alone, what it has begun goes on, and what was lost is made again.
         """
@@ -56,7 +59,7 @@ class Tuning:
                 run_pipeline(pipeline, folder, self.device, start)
             except Interrupted as error:
                 raise Interrupted(f"stopped in {folder.name}; the same command goes on") from error
-        return folder / MODEL
+        return folder / file
 
     def _scene(self) -> dict[str, Any]:
         settings, numbers = self.source.settings, self.model.rendering
@@ -72,3 +75,8 @@ class Tuning:
         numbers = self.model.rendering
         screen = {"type": "dilation", "variance": numbers.screen_variance, "compensate": int(numbers.compensate)}
         return {"model.sh_degree": self.model.sh_degree, "model.near": numbers.near, "model.screen_filter": screen}
+
+
+def _training(stages: Sequence[Any]) -> Any:
+    """The settings of the first stage that trains."""
+    return next(stage["optimize"] for stage in stages if isinstance(stage, dict) and "optimize" in stage)
