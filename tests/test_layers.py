@@ -59,7 +59,7 @@ TEXTS = {  # what turns results into lines of text
     "clsplat.conformance.page": {"check_place", "write_page"},
     "clsplat.gaussians.checkup": {"lines", "verdict"},
     "clsplat.inspect.table": {"show"},
-    "clsplat.lod.levels": {"table"},
+    "clsplat.lod.table": {"table"},
     "clsplat.pipeline.recipes": {"manual_text", "summaries_text"},
     "clsplat.runs.status": {"status_text"},
     "clsplat.runs.summary": {"summary"},
