@@ -5,6 +5,7 @@ import itertools
 import logging
 import os
 import re
+import shutil
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -45,10 +46,9 @@ def atomic_name(path: Path, suffix: str = "") -> Iterator[Path]:
     """
     if not path.name:
         raise OutputError(f"{path}: cannot be written (it has no name); expected the path of a file")
-    if path.exists() and not (path.is_file() or path.is_dir()):  # a rename would replace a device, too
+    if path.exists() and not path.is_file():  # a rename would replace a device, too
         raise OutputError(f"{path}: cannot be written (it is not a file); give another name")
-    temporary = path.with_name(f".{path.name}.{os.getpid()}-{next(_number)}.partial{suffix}")
-    _open.add(temporary.name)
+    temporary = _temporary(path, suffix)
     try:
         make_folder(path.parent)
         yield temporary
@@ -62,8 +62,57 @@ def atomic_name(path: Path, suffix: str = "") -> Iterator[Path]:
         _open.discard(temporary.name)
 
 
+@contextmanager
+def new_folder(folder: Path) -> Iterator[Path]:
+    """Yield a hidden folder beside `folder`, which takes its name when the block ends without an error.
+
+    Those that killed processes left there are removed.  Who takes the folder syncs its files.
+    Raises ConfigError where `folder` is in use, OutputError, before the block too, where it cannot be made.
+    """
+    require_free(folder)
+    temporary = _temporary(folder)
+    try:
+        with _told_as(folder):
+            make_folder(folder.parent)
+            temporary.mkdir()
+            _sweep_beside(folder)
+        yield temporary
+        with _told_as(folder):
+            if folder.exists():
+                folder.rmdir()  # it is empty; Windows replaces no folder
+            _replace(temporary, folder)
+            sync_folder(folder.parent)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+        _open.discard(temporary.name)
+
+
+def require_free(folder: Path) -> None:
+    """Raise ConfigError where something but an empty folder lies at the place of a new one."""
+    with _told_as(folder):
+        is_free = not is_there(folder) or (folder.is_dir() and not any(folder.iterdir()))
+    if not (is_free and folder.name) or folder.is_symlink() or os.path.ismount(folder):  # which a rename cannot replace
+        raise ConfigError(f"{folder}: is in use; give the name of a new folder")
+
+
+@contextmanager
+def _told_as(path: Path) -> Iterator[None]:
+    """Raise OutputError for an OSError."""
+    try:
+        yield
+    except OSError as error:
+        raise unwritable(path, error) from error
+
+
+def _temporary(path: Path, suffix: str = "") -> Path:
+    """A hidden name beside `path`, which this process writes now."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}-{next(_number)}.partial{suffix}")
+    _open.add(temporary.name)
+    return temporary
+
+
 def _replace(temporary: Path, path: Path) -> None:
-    """Rename a file; where Windows refuses because somebody reads the other one just now, try again for a second."""
+    """Rename; where Windows refuses because somebody reads the other one just now, try again for a second."""
     for attempt in range(20):
         try:
             return os.replace(temporary, path)
@@ -137,8 +186,17 @@ def sweep(folder: Path, border: str) -> None:
                 LOG.debug("removed %s, which a killed run has left", os.path.join(base, name))
 
 
+def _sweep_beside(folder: Path) -> None:
+    """Remove the temporary folders for one that killed processes have left."""
+    with suppress(OSError):
+        for path in folder.parent.iterdir():
+            if path.name.startswith(f".{folder.name}.") and _is_left(path.name):
+                shutil.rmtree(path, ignore_errors=True)
+                LOG.debug("removed %s, which a killed process has left", path)
+
+
 def _is_left(name: str) -> bool:
-    """Whether a file is a temporary one that no process of this machine writes any more."""
+    """Whether a file or folder is a temporary one that no process of this machine writes any more."""
     if not (found := PARTIAL.fullmatch(name)) or name in _open:
         return False
     process = int(found[1])

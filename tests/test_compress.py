@@ -14,7 +14,6 @@ from clsplat.compress import search
 from clsplat.compress.page import page, table
 from clsplat.compress.rungs import Ladder, checked_keeps
 from clsplat.compress.target import Point, Target
-from clsplat.compress.tuning import Tuning
 from clsplat.errors import ConfigError, Interrupted, OutputError
 from clsplat.formats.table import detect, read
 from clsplat.gaussians.model import Rendering
@@ -23,6 +22,7 @@ from clsplat.pipeline.loading import Pipeline
 from clsplat.runs import model_file, runner
 from clsplat.runs.model_file import Source, evaluate
 from clsplat.training.run import Run
+from clsplat.tuning.tuning import Tuning
 from tests.html_page import Page
 from tests.test_left_files import NONE
 
@@ -226,7 +226,7 @@ def test_a_rung_is_trained_as_the_model_is_rendered(few_steps, tmp_path):
     """A mip model keeps its filter, and photographs are read as the model's run read them."""
     model = clsplat.load(few_steps / "point_cloud.ply")
     mip = replace(model, rendering=Rendering(near=0.05, screen_variance=0.1, compensate=1.0, background="white"))
-    ladder = Ladder(tmp_path, Tuning(Source.of(few_steps, None), mip, 7, None))
+    ladder = Ladder(tmp_path, Tuning("compress", Source.of(few_steps, None), mip, 7, None))
     settings = ladder.pipeline(few_steps / "point_cloud.ply", 0.7).settings
     screen = settings.model.screen_filter
     assert (settings.model.near, screen.variance, screen.compensate) == (0.05, 0.1, 1)

@@ -3,10 +3,12 @@
 import numpy as np
 import pytest
 
+from clsplat.density import mixture
 from clsplat.density.mixture import covariance_of, mass_of, merged, surface, volume
 from clsplat.errors import ConfigError, DataError
 from clsplat.formats.splats import PARAMETERS
 from clsplat.gaussians.model import Model, Rendering
+from clsplat.lod import decimation
 from clsplat.lod.decimation import decimated, matched, pair_cost
 from tests.formats.models import splats
 
@@ -128,6 +130,21 @@ def test_thousands_in_one_place_are_no_more_work_than_others(rng):
     one = model(rng, 1, degree=0)
     rows = [len(pairs) for pairs in matched(wide(one[np.zeros(30_000, int)]))]
     assert rows == [15_000, 15_000]
+
+
+def test_work_grows_with_rows_and_pairs_not_with_their_product(rng, monkeypatch):
+    """Masses are those of all rows once, and not again for each block of pairs."""
+    rows: list[int] = []
+    monkeypatch.setattr(
+        mixture, "mass_of", lambda tables, size: rows.append(len(tables["means"])) or mass_of(tables, size)
+    )
+    monkeypatch.setattr(decimation, "mass_of", mixture.mass_of, raising=False)
+    source = wide(model(rng, 300))
+    whole = matched(source)
+    monkeypatch.setattr(decimation, "BLOCK", 50)
+    for one, two in zip(matched(source), whole, strict=True):
+        np.testing.assert_array_equal(one, two)
+    assert rows == [300, 300]
 
 
 def test_the_cheapest_pair_goes_first_and_none_is_in_two():

@@ -1,6 +1,7 @@
 """`clsplat lod`: levels are merged, trained, measured and written, and what cannot be is refused."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -9,12 +10,14 @@ from typer.testing import CliRunner
 
 import clsplat
 from clsplat.cli import app
-from clsplat.errors import ConfigError, DataError, Interrupted
+from clsplat.errors import ConfigError, DataError, Interrupted, OutputError
 from clsplat.formats.table import bytes_of, read
 from clsplat.lod.decimation import decimated
-from clsplat.lod.levels import Plan, table
+from clsplat.lod.table import table
+from clsplat.lod.training import Plan
 from clsplat.runs import runner
 from clsplat.runs.model_file import evaluate
+from tests.test_left_files import NONE
 
 pytestmark = pytest.mark.slow
 
@@ -44,6 +47,7 @@ def test_levels_are_trained_and_measured(trained, few_steps, tiny_scene):
             measured = evaluate(training / file, tiny_scene)["test"]["1"]["psnr"]
             assert found["levels"][number][key] == pytest.approx(measured, abs=1e-9)
         assert json.loads((training / f"level_{number}" / "metrics.json").read_text())["steps"] == STEPS
+        assert "\nname: lod\n" in (training / f"level_{number}" / "pipeline.yaml").read_text()
     first = found["levels"][0]
     assert first["psnr"] == first["merged_psnr"] == evaluate(few_steps)["test"]["1"]["psnr"]
 
@@ -84,7 +88,85 @@ def test_a_file_alone_is_merged_without_a_device(few_steps, tmp_path, monkeypatc
     assert [level["gaussians"] for level in found["levels"]] == [whole, int(0.3 * whole + 0.5)]
     assert found["split"] is None
     assert [path.name for path in sorted(tmp_path.iterdir())] == ["model.ply", "site"]
-    assert "PSNR" not in table(found)
+    assert table(found).splitlines()[0].split() == ["level", "Gaussians", "MB"]
+
+
+@pytest.fixture
+def alone(few_steps: Path, tmp_path: Path) -> Path:
+    """The file of a model whose photographs are not known."""
+    file = tmp_path / "model.ply"
+    file.write_bytes((few_steps / "point_cloud.ply").read_bytes())
+    return file
+
+
+def test_that_a_file_is_merged_alone_is_said(alone, tmp_path):
+    found = CliRunner().invoke(app, ["lod", str(alone), str(tmp_path / "site"), "--steps", "0"])
+    assert found.exit_code == 0, found.output
+    assert "model.ply: no photographs: merged alone" in found.output
+
+
+@pytest.mark.parametrize("option", ["steps", "downscale", "device"])
+def test_options_that_need_photographs_are_refused_without_them(option, alone, tmp_path):
+    message = rf"model\.ply: no photographs are known, needed for --{option}; give --scene, or leave that out$"
+    with pytest.raises(ConfigError, match=message):
+        clsplat.write_levels(alone, tmp_path / "site", **{option: 2})
+    assert [path.name for path in tmp_path.iterdir()] == ["model.ply"]
+
+
+@pytest.fixture
+def moved(few_steps: Path, tiny_scene: Path, tmp_path: Path) -> Path:
+    """A run whose photographs have moved."""
+    run = tmp_path / "run"
+    shutil.copytree(few_steps, run)
+    settings = (run / "pipeline.yaml").read_text()
+    (run / "pipeline.yaml").write_text(settings.replace(str(tiny_scene), str(tmp_path / "gone")))
+    return run
+
+
+@pytest.mark.parametrize("there", [False, True])
+def test_without_steps_a_run_needs_no_photographs(there, moved, tmp_path, caplog):
+    if there:
+        (tmp_path / "gone").mkdir()
+    found = clsplat.write_levels(moved, tmp_path / "site", levels=2, steps=0)
+    assert (len(found["levels"]), found["split"]) == (2, None)
+    assert "levels are merged alone, and not measured" in caplog.text
+
+
+def test_a_training_without_its_photographs_names_the_way_out(moved, tmp_path):
+    with pytest.raises(DataError, match=r"gone, is missing; .* \(--scene DIR names another; --steps 0 needs none\)$"):
+        clsplat.write_levels(moved, tmp_path / "site")
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+def test_a_damaged_model_is_told_as_such(few_steps, tmp_path):
+    shutil.copytree(few_steps, tmp_path / "run")
+    (tmp_path / "run" / "point_cloud.ply").write_bytes(b"")
+    with pytest.raises(DataError, match=r"point_cloud\.ply: .*[^)]$"):
+        clsplat.write_levels(tmp_path / "run", tmp_path / "site")
+
+
+def test_one_level_is_not_trained(few_steps, tmp_path):
+    clsplat.write_levels(few_steps, tmp_path / "site", levels=1)
+    assert [path.name for path in tmp_path.iterdir()] == ["site"]
+
+
+@pytest.mark.parametrize(("name", "steps"), [("file/site", 0), ("n" * 245, STEPS)])
+def test_a_place_that_cannot_be_written_is_refused_before_the_work(name, steps, few_steps, tmp_path, monkeypatch):
+    def works(*_):
+        raise AssertionError("the work begins")
+
+    monkeypatch.setattr("clsplat.lod.levels.decimated", works)
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(OutputError, match="cannot be written"):
+        clsplat.write_levels(few_steps, tmp_path / name, steps=steps)
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_what_a_killed_process_left_is_removed(alone, tmp_path):
+    for name in (f".site.{NONE}-0.partial", f".other.{NONE}-0.partial"):
+        (tmp_path / name / "0_0").mkdir(parents=True)
+    clsplat.write_levels(alone, tmp_path / "site", levels=2)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [f".other.{NONE}-0.partial", "model.ply", "site"]
 
 
 def test_a_training_that_is_interrupted_goes_on(few_steps, tmp_path, monkeypatch, trained):
@@ -131,6 +213,7 @@ def test_without_steps_levels_are_measured_alone(few_steps, tmp_path):
         ({"keep": float("nan")}, "--keep nan: expected a share"),
         ({"steps": -1}, "--steps -1: expected a number of at least 0"),
         ({"downscale": 0.5}, "--downscale 0.5: expected a divisor"),
+        ({"downscale": 2.0, "steps": 0}, "--downscale 2: belongs to a training; expected --steps above 0"),
     ],
 )
 def test_what_cannot_be_asked_is_refused(plan, message):

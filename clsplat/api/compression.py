@@ -44,19 +44,21 @@ def write_levels(
     *,
     levels: int = 4,
     keep: float = 0.5,
-    steps: int = 500,
+    steps: int | None = None,
     downscale: float | None = None,
     device: "str | Device | None" = None,
 ) -> dict[str, Any]:
     """Write a model in levels of detail, as streamed SOG (lod-meta.json): each level has a share of the one before.
 
-    model, scene: as for `render_views`, but without a scene nothing is trained; levels: with the model itself; keep:
-    the share; steps: of training each coarser level, 0 for none; downscale: divisor of the photographs' size there,
-    by default that of the model's run.  Returns `folder`, `bytes`, the `split` that is measured, and `levels` with
+    model, scene: as for `render_views`, but without a scene nothing is trained, and ConfigError is raised for `steps`,
+    `downscale` or `device`; levels: with the model itself; keep: the share; steps: of training each coarser level,
+    default 500, 0 for none; downscale: divisor of the photographs' size there, by default that of the model's run.
+    Returns `folder`, `bytes`, the `split` that is measured, and `levels` with
     `gaussians`, `bytes`, and in dB `merged_psnr`, before the training, and `psnr`.
     """
-    from clsplat.lod import levels as detail
+    from clsplat.lod.levels import levels_of_detail
+    from clsplat.lod.training import Plan
 
     load_plugins()
-    plan = detail.Plan(levels, keep, steps, downscale)
-    return detail.levels_of_detail(Path(model), Path(folder), path_of(scene), plan, device)
+    plan = Plan(levels, keep, steps, downscale)
+    return levels_of_detail(Path(model), Path(folder), path_of(scene), plan, device)

@@ -196,7 +196,9 @@ def lod(
     levels: Annotated[int, typer.Option(metavar="N", help="Levels, with the model itself.")] = 4,
     keep: Annotated[float, typer.Option(metavar="SHARE", help="Of the Gaussians of the level before.")] = 0.5,
     scene: SceneOption = None,
-    steps: Annotated[int, typer.Option(metavar="N", help="Of training each coarser level; 0: none.")] = 500,
+    steps: Annotated[
+        int | None, typer.Option(metavar="N", help="Of training each coarser level, 0: none; default: 500.")
+    ] = None,
     downscale: Annotated[
         float | None,
         typer.Option(metavar="N", help="Divide the photographs' size in this training; default: as the run."),
@@ -204,7 +206,7 @@ def lod(
     device: DeviceOption = None,
 ) -> None:
     """Write a model in levels of detail for the web (streamed SOG); with photographs each level is trained."""
-    from clsplat.lod.levels import table
+    from clsplat.lod.table import table
 
     found = compression.write_levels(
         model, folder, scene, levels=levels, keep=keep, steps=steps, downscale=downscale, device=device

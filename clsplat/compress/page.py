@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from clsplat.compress.target import Point, Target
+from clsplat.pages.columns import columns
 from clsplat.pages.page import charts, render
 from clsplat.pages.svg import Line, curve
 
@@ -29,13 +30,9 @@ def table(found: dict[str, Any]) -> str:
     """Return the record of a search as lines of text; a star marks the file that was chosen."""
     source, points = Point(**found["source"]), [Point(**point) for point in found["points"]]
     chosen = found["chosen"] and Point(**found["chosen"])
-    rows = [list(HEADINGS), *(cells(point, source) for point in (source, *points))]
-    marks = ["", "", *("*" if point == chosen else "" for point in points)]
-    widths = [max(len(row[i]) for row in rows) for i in range(len(HEADINGS))]
-    return "\n".join(
-        "  ".join([f"{mark:1}", *(text.rjust(width) for text, width in zip(row, widths, strict=True))])
-        for mark, row in zip(marks, rows, strict=True)
-    )
+    marks = [" ", " ", *("*" if point == chosen else " " for point in points)]
+    rows = [HEADINGS, *(cells(point, source) for point in (source, *points))]
+    return columns([[mark, *row] for mark, row in zip(marks, rows, strict=True)])
 
 
 def page(target: Target, source: Point, points: Sequence[Point], chosen: Point | None, split: str) -> str:

@@ -4,11 +4,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from clsplat.compress.tuning import Tuning
 from clsplat.errors import ConfigError
 from clsplat.gaussians.model import Model
 from clsplat.gaussians.run_model import MODEL
 from clsplat.pipeline.loading import Pipeline
+from clsplat.tuning.tuning import Tuning
 
 STAGES = ("init", "prune_least", "optimize")  # of the recipe; what a rung writes is a PLY
 

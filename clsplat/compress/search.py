@@ -8,11 +8,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
-from clsplat.compress.folder import claimed
 from clsplat.compress.page import page
 from clsplat.compress.rungs import Ladder, checked_keeps, of_degree
 from clsplat.compress.target import Point, Target
-from clsplat.compress.tuning import Tuning
 from clsplat.errors import ConfigError
 from clsplat.files import write_text
 from clsplat.formats.output import written
@@ -20,10 +18,11 @@ from clsplat.formats.splats import Writing
 from clsplat.formats.table import bytes_of, located
 from clsplat.gaussians.clusters import DeviceClusters
 from clsplat.gaussians.model import Model, load
-from clsplat.metrics.views import mean, measure
 from clsplat.reading import read_file, sha256
 from clsplat.runs.model_file import ModelFile
-from clsplat.views.photographs import Photographs
+from clsplat.tuning.folder import claimed
+from clsplat.tuning.measuring import Measurer
+from clsplat.tuning.tuning import Tuning
 
 LOG = logging.getLogger("clsplat")
 Format = Literal["sog", "spz"]
@@ -66,24 +65,6 @@ class Search:
         write_text(self.out / PAGE, page(self.target, self.source, self.points, self.chosen, self.split))
 
 
-class Measurer:
-    """Measures files at the test views of a scene; at its training views where it has no others."""
-
-    def __init__(self, opened: ModelFile) -> None:
-        self.opened = opened
-        self.split = "test" if opened.scene.split("test") else "train"
-        if self.split == "train":
-            LOG.warning("%s: has no test views; the training views are measured", opened.scene.path)
-        self.photographs = Photographs(opened.device, opened.background)
-
-    def figures(self, model: Model) -> tuple[float, float]:
-        """Return PSNR, dB, and SSIM."""
-        views = self.opened.scene.split(self.split)
-        results = measure(self.opened.rasterizer, model.upload(self.opened.device), views, self.photographs)
-        averages = mean(results)
-        return averages["psnr"], averages["ssim"]
-
-
 def compress(
     model: Path,
     scene: Path | None,
@@ -114,7 +95,7 @@ def compress(
         size = bytes_of(source.file)
         whole = Point(source.file.name, 1, first.sh_degree, "", len(first), size, *measurer.figures(first))
         search = Search(out, wanted, question, whole, measurer.split)
-        ladder = Ladder(out, Tuning(source, first, steps, opened.device))
+        ladder = Ladder(out, Tuning("compress", source, first, steps, opened.device))
         before = 1.0
         for keep in shares:
             rung = _measured(out / TRIALS, load(ladder.rung(keep, before)), keep, form, measurer)

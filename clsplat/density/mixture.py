@@ -44,9 +44,8 @@ class Mixtures:
     covariance: Floats  # [pairs, 3, 3] scene units²
 
     @classmethod
-    def of(cls, tables: dict[str, Floats], first: Rows, second: Rows, size: Size = volume) -> "Mixtures":
-        """Return those of rows `first` and `second`, [pairs]."""
-        mass = mass_of(tables, size)
+    def of(cls, tables: dict[str, Floats], mass: Floats, first: Rows, second: Rows) -> "Mixtures":
+        """Return those of rows `first` and `second`, [pairs]; mass: of all rows, as `mass_of` returns it."""
         total = mass[first] + mass[second]
         share = (mass[second] / total)[:, None]
         means = (1 - share) * tables["means"][first] + share * tables["means"][second]
@@ -64,7 +63,7 @@ class Mixtures:
 
 def merged(tables: dict[str, Floats], first: Rows, second: Rows, size: Size = volume) -> dict[str, Floats]:
     """Return Gaussians with mean and covariance of mixtures of `first` and `second`, by parameter, [pairs, ...]."""
-    mixtures = Mixtures.of(tables, first, second, size)
+    mixtures = Mixtures.of(tables, mass_of(tables, size), first, second)
     share = mixtures.share
     variances, axes = np.linalg.eigh(mixtures.covariance)  # scene units²
     log_scales = log_scales_of(variances)

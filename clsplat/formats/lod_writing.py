@@ -1,9 +1,7 @@
 """Write streamed SOG, version 1 (layout: lod.py): the same levels give the same bytes."""
 
 import json
-import shutil
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -11,8 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.errors import ConfigError
-from clsplat.files import atomic_name, is_there
 from clsplat.formats.lod import LOD_META
 from clsplat.formats.lod_tree import Limits, Node, Rows, tree
 from clsplat.formats.output import written
@@ -24,11 +20,10 @@ USUAL = Limits()
 
 
 def write_lod(folder: Path, levels: Sequence[SplatFile], options: Writing | None = None, limits: Limits = USUAL) -> str:
-    """Write levels, the finest first, as a folder that is there once it is whole; return the SHA-256 of its JSON.
+    """Write levels, the finest first, into a folder; return the SHA-256 of its JSON, which is written last.
 
-    Raises ConfigError where the folder is in use, DataError for a level without Gaussians, OutputError.
+    Raises DataError for a level without Gaussians, OutputError.
     """
-    require_free(folder)
     for level in levels:
         require_some(folder / LOD_META, level)
     root = tree([level.parameters for level in levels], limits)
@@ -44,30 +39,11 @@ def write_lod(folder: Path, levels: Sequence[SplatFile], options: Writing | None
         "filenames": list(files.rows),
         "tree": shape,
     }
-    with _new_folder(folder) as place:
-        for name, (number, rows) in files.rows.items():
-            write_as_ordered(place / name, levels[number].rows(np.concatenate(rows)), options or Writing())
-        with written(place / LOD_META) as file:
-            file.write(json.dumps(meta, separators=(",", ":")).encode())
+    for name, (number, rows) in files.rows.items():
+        write_as_ordered(folder / name, levels[number].rows(np.concatenate(rows)), options or Writing())
+    with written(folder / LOD_META) as file:
+        file.write(json.dumps(meta, separators=(",", ":")).encode())
     return file.sha256
-
-
-def require_free(folder: Path) -> None:
-    """Raise ConfigError where something lies at the place of a new folder."""
-    if not folder.name or (is_there(folder) and (not folder.is_dir() or any(folder.iterdir()))):
-        raise ConfigError(f"{folder}: is in use; give the name of a new folder")
-
-
-@contextmanager
-def _new_folder(folder: Path) -> Iterator[Path]:
-    """Yield a folder beside the one that is to be, which takes its name at the end."""
-    with atomic_name(folder) as temporary:
-        try:
-            temporary.mkdir()
-            yield temporary
-        except BaseException:
-            shutil.rmtree(temporary, ignore_errors=True)
-            raise
 
 
 @dataclass

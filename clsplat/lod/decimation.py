@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from clsplat.density.mixture import Floats, Mixtures, Rows, log_scales_of, merged, surface
+from clsplat.density.mixture import Floats, Mixtures, Rows, log_scales_of, mass_of, merged, surface
 from clsplat.errors import ConfigError, DataError
 from clsplat.formats.splats import not_finite, unit
 from clsplat.gaussians.model import Model
@@ -51,9 +51,7 @@ def decimated(model: Model, keep: float = 0.5) -> Model:
 def matched(tables: Tables) -> tuple[Rows, Rows]:
     """Return pairs of rows, the cheapest first, of which none shares a row: one at least, where there are two rows."""
     one, two = _neighbours(tables["means"])
-    cost = np.concatenate(
-        [pair_cost(tables, one[i : i + BLOCK], two[i : i + BLOCK]) for i in range(0, len(one), BLOCK)]
-    )
+    cost = pair_cost(tables, one, two)
     order = np.lexsort((two, one, np.where(np.isfinite(cost), cost, np.inf)))
     free = bytearray(b"\1") * len(tables["means"])
     chosen = []
@@ -68,9 +66,14 @@ def matched(tables: Tables) -> tuple[Rows, Rows]:
 
 def pair_cost(tables: Tables, first: Rows, second: Rows) -> Floats:
     """Return what merging changes, [pairs]; symmetric in the pair up to rounding."""
-    mixtures = Mixtures.of(tables, first, second, surface)
+    mass, size = mass_of(tables, surface), tables["log_scales"].sum(axis=1)  # of all rows: once, not for each block
+    blocks = [slice(start, start + BLOCK) for start in range(0, len(first), BLOCK)]
+    return np.concatenate([_block_cost(tables, mass, size, first[block], second[block]) for block in blocks])
+
+
+def _block_cost(tables: Tables, mass: Floats, size: Floats, first: Rows, second: Rows) -> Floats:
+    mixtures = Mixtures.of(tables, mass, first, second)
     share = mixtures.share[:, 0]
-    size = tables["log_scales"].sum(axis=1)
     variances = np.linalg.eigvalsh(mixtures.covariance).astype(np.float64)
     cost: Floats = log_scales_of(variances).sum(axis=1) - (1 - share) * size[first] - share * size[second]
     for name in ("sh_base", "sh_rest"):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from clsplat.errors import ConfigError, DataError, OutputError
+from clsplat.files import new_folder
 from clsplat.formats.lod_tree import Limits, half_boxes, tree
 from clsplat.formats.lod_writing import write_lod
 from clsplat.formats.packing import morton_order
@@ -16,6 +17,7 @@ from clsplat.formats.splats import SplatFile
 from clsplat.formats.table import bytes_of, detect, read, write
 from clsplat.gaussians.model import load
 from tests.formats.models import assert_close, interop, splats
+from tests.test_left_files import NONE
 
 BOUND = (-13.10682, -4.463487, -3.914306), (10.55131, 2.742857, 14.0425)  # of its root
 SMALL = Limits(splats=300, extent=4.0, few=50)
@@ -147,26 +149,63 @@ def test_a_folder_is_there_once_it_is_whole(tmp_path, rng, monkeypatch):
         real(number)
 
     monkeypatch.setattr(os, "fsync", fsync)
-    with pytest.raises(OutputError, match="No space left"):
-        write_lod(tmp_path / "site", made, limits=SMALL)
+    with pytest.raises(OutputError, match="No space left"), new_folder(tmp_path / "site") as place:
+        write_lod(place, made, limits=SMALL)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_folder_in_use_and_an_empty_level_are_refused(written, tmp_path, rng, monkeypatch):
-    folder, made = written
+def test_a_folder_in_use_is_refused(tmp_path, monkeypatch):
+    for name in ("used/inner", "here", "empty"):
+        (tmp_path / name).mkdir(parents=True)
     (tmp_path / "file").write_text("mine")
-    (tmp_path / "here").mkdir()
+    (tmp_path / "link").symlink_to("empty")
     monkeypatch.chdir(tmp_path / "here")
-    for place in (folder, tmp_path / "file", Path()):
-        with pytest.raises(ConfigError, match="is in use; give the name of a new folder"):
-            write_lod(place, made)
+    for place in (*(tmp_path / name for name in ("used", "file", "link")), Path()):
+        with pytest.raises(ConfigError, match="is in use; give the name of a new folder"), new_folder(place):
+            pytest.fail("the work begins")
+
+
+@pytest.mark.parametrize("name", ["file/x", "n" * 245])
+def test_a_folder_that_cannot_be_is_refused_before_the_work(name, tmp_path):
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(OutputError, match="cannot be written"), new_folder(tmp_path / name):
+        pytest.fail("the work begins")
+
+
+def test_an_empty_folder_is_replaced_also_where_a_rename_replaces_none(tmp_path, monkeypatch):
+    """As on Windows."""
+
+    def replace(old: Path, new: Path) -> None:
+        if new.exists():
+            raise PermissionError(errno.EACCES, "Access is denied")
+        real(old, new)
+
+    real = os.replace
+    monkeypatch.setattr(os, "replace", replace)
+    (tmp_path / "empty").mkdir()
+    with new_folder(tmp_path / "empty") as place:
+        (place / "a").write_text("x")
+    assert [path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*")] == ["empty", "empty/a"]
+
+
+def test_folders_of_killed_processes_go_before_a_new_one_is_made(tmp_path):
+    left = f".site.{NONE}-0.partial"
+    others = [f".other.{NONE}-0.partial", f".site.{os.getppid()}-0.partial", ".site.partial"]
+    for name in (left, *others):
+        (tmp_path / name / "0_0").mkdir(parents=True)
+    with new_folder(tmp_path / "site") as place:
+        assert sorted(path.name for path in tmp_path.iterdir()) == sorted([*others, place.name])
+        with new_folder(tmp_path / "site.2"):
+            pass
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([*others, "site", "site.2"])
+
+
+def test_an_empty_level_is_refused(written, tmp_path):
+    _, made = written
     with pytest.raises(DataError, match="holds no Gaussians"):
         write_lod(tmp_path / "b", [made[0], made[1].rows([])])
     with pytest.raises(ConfigError, match="streamed SOG is written by `clsplat lod`"):
         write(tmp_path / "lod-meta.json", made[0])
-    (tmp_path / "empty").mkdir()
-    write_lod(tmp_path / "empty", made)
-    assert len(read(tmp_path / "empty")) == 700
 
 
 def test_an_environment_is_part_of_the_model(written, rng):

@@ -27,6 +27,7 @@ RECIPE = "compress"
 class Tuning:
     """With which photographs models are trained, as one is rendered, and how long."""
 
+    name: str  # of the pipelines that are run
     source: Source
     model: Model
     steps: int | None  # None: those of the recipe
@@ -37,7 +38,7 @@ class Tuning:
         path = find(RECIPE)
         data = read_yaml(path).data
         chosen = [stage for stage in data["stages"] if isinstance(stage, dict) and next(iter(stage)) in stages]
-        document = Document({**data, "stages": [*chosen, {"export": {"file": MODEL}}]})
+        document = Document({**data, "name": self.name, "stages": [*chosen, {"export": {"file": MODEL}}]})
         settings = {**self._scene(), **self._rendering(), **values}
         if self.steps is not None:
             settings |= {"optimize.steps": self.steps, "optimize.rates.means.over": self.steps}

@@ -1,0 +1,28 @@
+"""Models measured at the views of a scene, as they come from training and from files."""
+
+import logging
+
+from clsplat.gaussians.model import Model
+from clsplat.metrics.views import mean, measure
+from clsplat.runs.model_file import ModelFile
+from clsplat.views.photographs import Photographs
+
+LOG = logging.getLogger("clsplat")
+
+
+class Measurer:
+    """Measures models at the test views of a scene; at its training views where it has no others."""
+
+    def __init__(self, opened: ModelFile) -> None:
+        self.opened = opened
+        self.split = "test" if opened.scene.split("test") else "train"
+        if self.split == "train":
+            LOG.warning("%s: has no test views; the training views are measured", opened.scene.path)
+        self.photographs = Photographs(opened.device, opened.background)
+
+    def figures(self, model: Model) -> tuple[float, float]:
+        """Return PSNR, dB, and SSIM."""
+        views = self.opened.scene.split(self.split)
+        results = measure(self.opened.rasterizer, model.upload(self.opened.device), views, self.photographs)
+        averages = mean(results)
+        return averages["psnr"], averages["ssim"]
