@@ -180,7 +180,7 @@ def test_a_training_that_is_interrupted_goes_on(few_steps, tmp_path, monkeypatch
         clsplat.write_levels(few_steps, tmp_path / "site", levels=3, steps=STEPS)
     assert not (tmp_path / "site").exists()
     monkeypatch.setattr(runner, "_run_stages", run_stages)
-    with pytest.raises(ConfigError, match=r"site\.training: holds the training of levels with another steps"):
+    with pytest.raises(ConfigError, match=r"site\.training: holds the training of levels that differs in steps"):
         clsplat.write_levels(few_steps, tmp_path / "site", levels=3, steps=STEPS + 1)
     clsplat.write_levels(few_steps, tmp_path / "site", levels=3, steps=STEPS)
     assert tree(tmp_path / "site") == tree(trained[0])

@@ -90,7 +90,7 @@ def compress(
     opened = ModelFile(model, scene, device)
     source, first, measurer = opened.source, opened.loaded, Measurer(opened)
     question: dict[str, Any] = {"model": str(source.file), "sha256": sha256(located(source.file))}
-    question |= {"scene": str(source.folder), "keeps": shares, "steps": steps}
+    question |= {"scene": str(source.folder), "photographs": measurer.identity(), "keeps": shares, "steps": steps}
     with claimed(out, question, RECORD, "a search", "another --out"):
         size = bytes_of(source.file)
         whole = Point(source.file.name, 1, first.sh_degree, "", len(first), size, *measurer.figures(first))
