@@ -45,11 +45,11 @@ def atomic_name(path: Path, suffix: str = "") -> Iterator[Path]:
     """
     if not path.name:
         raise OutputError(f"{path}: cannot be written (it has no name); expected the path of a file")
-    if path.exists() and not (path.is_file() or path.is_dir()):  # a rename would replace a device, too
-        raise OutputError(f"{path}: cannot be written (it is not a file); give another name")
     temporary = path.with_name(f".{path.name}.{os.getpid()}-{next(_number)}.partial{suffix}")
     _open.add(temporary.name)
     try:
+        if path.exists() and not (path.is_file() or path.is_dir()):  # a rename would replace a device, too
+            raise OutputError(f"{path}: cannot be written (it is not a file); give another name")
         make_folder(path.parent)
         yield temporary
         _replace(temporary, path)

@@ -13,7 +13,8 @@ from pathlib import Path
 import pytest
 
 from clsplat import cli
-from clsplat.errors import ClsplatError
+from clsplat.errors import ClsplatError, OutputError
+from clsplat.files import write_text
 from clsplat.opencl.device import Device
 from tests.test_cli import clsplat
 
@@ -210,3 +211,9 @@ def test_a_name_that_is_too_long_is_that_of_a_missing_file(arguments, code, monk
     assert len(errors.splitlines()) == 1
     assert "File name too long" in errors or code == 2
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows says that there is no such file")
+def test_an_output_whose_name_is_too_long_cannot_be_written(tmp_path):
+    with pytest.raises(OutputError, match=r"xxx\.ply: cannot be written \(File name too long\)"):
+        write_text(tmp_path / f"{LONG}.ply", "")
