@@ -49,7 +49,13 @@ def test_run_names_the_device_first_and_says_where_things_are(tiny_scene, tmp_pa
 def test_dry_run_touches_nothing(tiny_scene, tmp_path):
     done = clsplat("run", "smoke", "--scene", tiny_scene, "--out", tmp_path / "run", "--dry-run")
     assert "50 steps" in done.stdout
+    assert "densify every 10 (start 15, stop 45), reset_opacity every 20 (stop 30)" in done.stdout
     assert not (tmp_path / "run").exists()
+
+
+def test_a_dry_run_says_when_a_stage_acts(tiny_scene, tmp_path):
+    done = clsplat("run", "splat_7k", "--scene", tiny_scene, "--out", tmp_path / "run", "--dry-run")
+    assert "reset_opacity every 500 (stop 501, when_background white)" in done.stdout
 
 
 def test_set_takes_several_values(tiny_scene, tmp_path):

@@ -80,6 +80,9 @@ def check_status(out: Path, code: int, state: str | None, errors: str) -> None:
         return
     status = json.loads((out / "status.json").read_text())
     assert (status["state"], status["exit_code"]) == (state, code)
+    if code == 130:  # nothing went wrong
+        assert errors.splitlines()[-1] == status["message"]
+        return
     shown = [line.removeprefix("error: ") for line in errors.splitlines() if line.startswith("error: ")]
     assert shown == ([status["message"]] if code else [])
 
@@ -166,7 +169,7 @@ def test_a_signal_is_code_130(number, tiny_scene, tmp_path):
     process.send_signal(number)
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 130
-    assert len([line for line in errors.splitlines() if line.startswith("error: ")]) == 1
+    assert "error" not in errors
     check_status(out, 130, "interrupted", errors)
     done = clsplat("run", "smoke", "--scene", tiny_scene, "--out", out, "--resume", "--set", "seed=9", expect=2)
     assert "seed" in done.stderr

@@ -11,7 +11,7 @@ from clsplat.runs.opening import check_start, open_run
 from clsplat.runs.outputs import check_places
 from clsplat.runs.runner import restore
 from clsplat.runs.scenes import ReadScene, read_run_scene
-from clsplat.stages.base import Stage
+from clsplat.stages.base import Scheduled, Stage
 from clsplat.stages.evaluate import Evaluate
 from clsplat.stages.optimize import Optimize
 from clsplat.training.run import Run
@@ -47,10 +47,16 @@ def describe(
 
 def _detail(stage: Stage, run: Run | None) -> str:
     if isinstance(stage, Optimize):
-        cadences = (f"{inner.stage} every {inner.every}" for inner in stage.during)
-        return f"{stage.steps} steps; " + ", ".join(cadences)
+        return f"{stage.steps} steps; " + ", ".join(map(_cadence, stage.during))
     if isinstance(stage, Evaluate) and run:
         views = run.original.downscaled(run.downscale).split(stage.split)
         sizes = ", ".join(f"1/{downscale:g}" for downscale in stage.downscales or [run.downscale])
         return f"{len(views)} {stage.split} views at {sizes}"
     return ""
+
+
+def _cadence(stage: Scheduled) -> str:
+    """How often a stage acts, and what else must hold."""
+    limits = [("start", stage.start), ("stop", stage.stop), ("when_background", getattr(stage, "when_background", None))]
+    given = ", ".join(f"{name} {value}" for name, value in limits if value)
+    return f"{stage.stage} every {stage.every}" + (f" ({given})" if given else "")
