@@ -100,7 +100,9 @@ def resize(
 def masks(
     scene: Annotated[Path, typer.Argument(help=DATASET)],
     folder: Annotated[Path | None, typer.Option(help="Folder of existing masks; default: the images' alpha.")] = None,
-    out: Annotated[Path | None, typer.Option(help="Folder for the masks; default: `masks` beside COLMAP's `images`.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for the masks; default: masks beside COLMAP's images.")
+    ] = None,
     threshold: Annotated[float, typer.Option(min=0, max=1, help="Smallest alpha of a pixel that counts.")] = 0.5,
 ) -> None:
     """Write masks, white in pixels that count, from alpha or from a folder."""

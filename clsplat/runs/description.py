@@ -57,6 +57,6 @@ def _detail(stage: Stage, run: Run | None) -> str:
 
 def _cadence(stage: Scheduled) -> str:
     """How often a stage acts, and what else must hold."""
-    limits = [("start", stage.start), ("stop", stage.stop), ("when_background", getattr(stage, "when_background", None))]
-    given = ", ".join(f"{name} {value}" for name, value in limits if value)
+    limits = {name: getattr(stage, name, None) for name in ("start", "stop", "when_background")}
+    given = ", ".join(f"{name} {value}" for name, value in limits.items() if value)
     return f"{stage.stage} every {stage.every}" + (f" ({given})" if given else "")
