@@ -62,8 +62,8 @@ CODECS = (
         (".spz",),
         "versions 1 to 4",
         "version 3, or 4 with the extra `spz`, along a Morton curve",
-        "position to 2^-12, log scale to 1/16, quaternions to 9 bits, colours, opacity and harmonics to 8; harmonics "
-        "beyond 1, colours beyond -0.44 and 1.44, scales beyond 4.5e-5 and 379; order",
+        "rounds: position to 2^-12, log scale to 1/16, quaternions to 9 bits, colours, opacity and harmonics to 8; "
+        "cuts: harmonics beyond 1, colours beyond -0.44 and 1.44, scales beyond 4.5e-5 and 379; order",
         lambda start: start.data.startswith((b"NGSP", b"\x1f\x8b")),
         read_spz,
         write_spz,
