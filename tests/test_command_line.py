@@ -16,7 +16,7 @@ from clsplat.cli.app import ORDER, SYNONYMS
 from clsplat.errors import DataError
 from clsplat.pipeline.files import shipped
 from clsplat.pipeline.loading import load
-from clsplat.pipeline.recipes import copy, manual, summary
+from clsplat.pipeline.recipes import copy, manual, summaries, summary
 from clsplat.pipeline.settable import settable
 from clsplat.runs.status import run_status, status_text
 from clsplat.training.records import Records
@@ -252,3 +252,9 @@ def test_status_tells_from_files(finished, tmp_path):
     matrix = {"state": "failed", "cells": 4, "done": 4, "failed": {"a": "no"}, "message": "1 of 4 cells failed"}
     write_status(tmp_path, **matrix)
     assert "failed, 4 of 4 cells, 1 of them failed\n  1 of 4 cells failed\n" in status_text(run_status(tmp_path))
+
+
+def test_no_two_recipes_have_one_description():
+    described = [one["summary"] for one in summaries()]
+    assert len(set(described)) == len(described)
+    assert all("7 000 steps" in one["summary"] for one in summaries() if one["name"].endswith("_7k"))

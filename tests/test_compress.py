@@ -233,6 +233,16 @@ def test_the_command_prints_a_table(searched, few_steps):
     assert "compressed.sog: " in found.output
 
 
+def test_a_loss_of_nothing_has_no_sign(monkeypatch):
+    same = {"psnr": 30.0, "bytes": 10}
+    found = {"chosen": {**same, "psnr": 29.999}, "source": same, "file": "a.sog", "page": "a.html"}
+    monkeypatch.setattr("clsplat.api.compression.compress_model", lambda *_, **__: found)
+    monkeypatch.setattr("clsplat.compress.page.table", lambda _: "")
+    told = CliRunner().invoke(app, ["compress", "a.ply"]).output
+    assert "0.00 dB" in told
+    assert "-0.00" not in told
+
+
 def test_a_rung_is_trained_as_the_model_is_rendered(few_steps, tmp_path):
     """A mip model keeps its filter, and photographs are read as the model's run read them."""
     model = clsplat.load(few_steps / "point_cloud.ply")

@@ -24,6 +24,7 @@ from clsplat.ply_header import MAX_HEADER
 from clsplat.reading import opened
 
 LOG = logging.getLogger("clsplat")
+_told: set[tuple[Path, str, str]] = set()  # what was said to be lost of the files in a folder
 
 
 def _is_ply(start: Start) -> bool:
@@ -61,8 +62,8 @@ CODECS = (
         (".spz",),
         "versions 1 to 4",
         "version 3, or 4 with the extra `spz`, along a Morton curve",
-        "position to 2^-12, log scale to 1/16, quaternions to 9 bits, colours, opacity and harmonics to 8; harmonics "
-        "beyond 1, colours beyond -0.44 and 1.44, scales beyond 4.5e-5 and 379; order",
+        "rounds: position to 2^-12, log scale to 1/16, quaternions to 9 bits, colours, opacity and harmonics to 8; "
+        "cuts: harmonics beyond 1, colours beyond -0.44 and 1.44, scales beyond 4.5e-5 and 379; order",
         lambda start: start.data.startswith((b"NGSP", b"\x1f\x8b")),
         read_spz,
         write_spz,
@@ -197,7 +198,8 @@ def for_writing(path: Path) -> Codec:
 
 
 def write(path: Path, splats: SplatFile, options: Writing | None = None) -> str:
-    """Write a model file in the format that its name stands for; log in a line what the format does not hold.
+    """Write a model file in the format that its name stands for; log in a line what the format does not hold,
+    numbers of the renderer once for a folder.
 
     Returns the SHA-256 of what was written, of a folder of SOG that of its meta.json.
 
@@ -211,12 +213,13 @@ def write(path: Path, splats: SplatFile, options: Writing | None = None) -> str:
         raise ValueError(f"{path}: {codec.name} holds no world filter; call baked() first")
     if not codec.keeps_nan and (bad := int(not_finite(splats.parameters).sum())):
         raise DataError(
-            f"{path}: {bad} Gaussians hold values that are not finite, which {codec.name} cannot hold; drop them, "
+            f"{path}: {bad:,} Gaussians hold values that are not finite, which {codec.name} cannot hold; drop them, "
             "or write a PLY"
         )
     if not codec.keeps_mode and splats.mode == "mip":
         LOG.warning("%s: %s has no mark for a mip model; viewers show it as plain 3DGS", path, codec.name)
-    if not codec.keeps_numbers and (lost := _unusual(splats)):
+    if not codec.keeps_numbers and (lost := _unusual(splats)) and (path.parent, codec.name, lost) not in _told:
+        _told.add((path.parent, codec.name, lost))
         LOG.warning("%s: %s does not keep %s; PLY, SOG and GLB do", path, codec.name, lost)
     return codec.write(path, splats, options or Writing())
 
@@ -234,7 +237,7 @@ def _settled(path: Path, splats: SplatFile, options: Reading) -> SplatFile:
     if options.not_finite == "keep" or not bad.any():
         return splats
     if options.not_finite == "drop":
-        LOG.warning("%s: dropped %d Gaussians with values that are not finite", path, int(bad.sum()))
+        LOG.warning("%s: dropped %s Gaussians with values that are not finite", path, f"{bad.sum():,}")
         return splats.rows(~bad)
     names = [name for name, table in splats.parameters.items() if not_finite({"means": table}).any()]
     raise DataError(

@@ -36,7 +36,7 @@ def examine(path: Path) -> dict[str, Any]:
     model = load(path, Reading(not_finite="keep"))
     bad = not_finite(model.tables())
     whole = model[~bad] if bad.any() else model
-    findings = [f"{int(bad.sum())} of {len(model)} Gaussians hold values that are not finite"] if bad.any() else []
+    findings = [f"{int(bad.sum()):,} of {len(model):,} Gaussians hold values that are not finite"] if bad.any() else []
     findings += _activated(whole)
     length = np.linalg.norm(whole.quats.astype(np.float64), axis=1)
     if zero := int((length == 0).sum()):
