@@ -146,10 +146,17 @@ def located(path: Path) -> Path:
 
 
 def bytes_of(path: Path) -> int:
-    """Return the size of a model: of a folder of SOG, or of levels, that of all files that its JSON names."""
+    """Return the size of a model: of a folder of SOG, or of levels, that of all files that its JSON names.
+
+    Raises DataError where one is missing.
+    """
     place = located(path)
     files = {META: with_images, LOD_META: files_of_lod}.get(place.name, lambda one: [one])
-    return sum(one.stat().st_size for one in files(place))
+    try:
+        return sum(one.stat().st_size for one in files(place))
+    except OSError as error:
+        missing = "" if error.filename == str(place) else f"names {quoted(error.filename)}, which "
+        raise DataError(f"{place}: {missing}cannot be read ({error.strerror}); copy or export it again") from error
 
 
 def detect(path: Path) -> Codec | None:

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.formats.lod import LOD_META, faults_of_levels
 from clsplat.formats.splats import Reading, not_finite
 from clsplat.formats.table import detect, located, named
 from clsplat.gaussians.model import Model, load
@@ -43,6 +44,8 @@ def examine(path: Path) -> dict[str, Any]:
         findings.append(f"{zero} quaternions have no length")
     if not len(model):
         findings.append("it holds no Gaussians")
+    if located(path).name == LOD_META:
+        findings += faults_of_levels(located(path))
     return {
         "model": str(path),
         "format": codec.name if codec else "",
@@ -83,7 +86,10 @@ def verdict(found: dict[str, Any]) -> str:
     """Return a sentence about what `examine` found."""
     if found["valid"]:
         return f"{found['model']}: valid"
-    return f"{found['model']}: {'; '.join(found['findings'])}; export it again, or mend it with `clsplat convert`"
+    remedy = (
+        "write it again" if found["format"] == "streamed SOG" else "export it again, or mend it with `clsplat convert`"
+    )
+    return f"{found['model']}: {'; '.join(found['findings'])}; {remedy}"
 
 
 def _activated(model: Model) -> list[str]:
