@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.formats.lod import LOD_META, faults_of_levels
-from clsplat.formats.splats import Reading, not_finite
+from clsplat.formats.splats import Reading, not_finite, told_too_large
 from clsplat.formats.table import detect, located, named
 from clsplat.gaussians.model import Model, load
 
@@ -38,6 +38,7 @@ def examine(path: Path) -> dict[str, Any]:
     bad = not_finite(model.tables())
     whole = model[~bad] if bad.any() else model
     findings = [f"{int(bad.sum())} of {len(model)} Gaussians hold values that are not finite"] if bad.any() else []
+    findings += [told] if (told := told_too_large(whole.tables())) else []
     findings += _activated(whole)
     length = np.linalg.norm(whole.quats.astype(np.float64), axis=1)
     if zero := int((length == 0).sum()):

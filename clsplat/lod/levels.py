@@ -13,7 +13,7 @@ from clsplat.compress.search import Measurer
 from clsplat.compress.tuning import Tuning
 from clsplat.errors import ConfigError, DataError
 from clsplat.formats.lod_writing import require_free, write_lod
-from clsplat.formats.splats import Writing
+from clsplat.formats.splats import Writing, require_moderate
 from clsplat.formats.table import bytes_of, located
 from clsplat.gaussians.clusters import DeviceClusters
 from clsplat.gaussians.model import Model, load
@@ -111,6 +111,7 @@ def levels_of_detail(
     first = (opened.loaded if opened else load(model)).baked()
     if not len(first):
         raise DataError(f"{model}: the model holds no Gaussians; expected some to merge")
+    require_moderate(model, first.as_file(), "SOG")
     if len(first) < FEW:
         LOG.warning("%s: has %d Gaussians; below a million one SOG is better: `clsplat convert`", model, len(first))
     training = Training(opened, folder.with_name(f"{folder.name}.training"), plan) if opened else None

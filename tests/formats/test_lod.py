@@ -18,6 +18,7 @@ from clsplat.formats.table import bytes_of, detect, read, write
 from clsplat.gaussians.checkup import examine, verdict
 from clsplat.gaussians.conversion import convert
 from clsplat.gaussians.model import load
+from clsplat.lod.levels import levels_of_detail
 from tests.formats.models import assert_close, interop, splats
 
 BOUND = (-13.10682, -4.463487, -3.914306), (10.55131, 2.742857, 14.0425)  # of its root
@@ -170,6 +171,21 @@ def test_a_folder_in_use_and_an_empty_level_are_refused(written, tmp_path, rng, 
     (tmp_path / "empty").mkdir()
     write_lod(tmp_path / "empty", made)
     assert len(read(tmp_path / "empty")) == 700
+
+
+def test_values_beyond_those_that_sog_holds_are_refused_and_boxes_stay_finite(tmp_path, rng):
+    large = splats(rng, 50)
+    large.parameters["log_scales"][7] = 1000
+    write_lod(tmp_path / "a", [large])
+    json.loads((tmp_path / "a" / "lod-meta.json").read_text(), parse_constant=lambda text: pytest.fail(text))
+    large.parameters["log_scales"][7] = 3e38
+    write(tmp_path / "a.ply", large)
+    told = r"1 of 50 Gaussians hold log_scales beyond 1e\+15, which SOG cannot hold"
+    with pytest.raises(DataError, match=told):
+        write_lod(tmp_path / "b", [large])
+    with pytest.raises(DataError, match=told):
+        levels_of_detail(tmp_path / "a.ply", tmp_path / "b")
+    assert not (tmp_path / "b").exists()
 
 
 def test_an_environment_is_part_of_the_model(written, rng):
