@@ -245,8 +245,7 @@ def test_status_tells_from_files(finished, tmp_path):
     (tmp_path / "metrics.jsonl").write_text('{"step": 5, "kind": "train", "loss": 0.25, "psnr": 20.0}\ncut')
     assert status_text(run_status(tmp_path)) == (
         f"{tmp_path}: killed at step 7 of 9\n"
-        f"  no checkpoint was saved; `clsplat run {tmp_path / 'pipeline.yaml'} --out {tmp_path} --restart` "
-        "begins it again\n"
+        f"  no checkpoint was saved; `clsplat resume {tmp_path}` begins it again\n"
         "  last report: step 5, loss 0.25, psnr 20"
     )
     matrix = {"state": "failed", "cells": 4, "done": 4, "failed": {"a": "no"}, "message": "1 of 4 cells failed"}

@@ -121,7 +121,9 @@ def convert(
     quality: Annotated[
         Literal["small", "balanced", "high"], typer.Option(help="Of SPZ (bits) and SOG (palette).")
     ] = "balanced",
-    keep_nan: Annotated[bool, typer.Option("--keep-nan", help="Keep Gaussians that are not finite, in a PLY.")] = False,
+    keep_nan: Annotated[
+        bool, typer.Option("--keep-nan", help="Keep Gaussians that are not finite or too large, in a PLY.")
+    ] = False,
     crop: Annotated[
         str | None, typer.Option(metavar="X0,Y0,Z0,X1,Y1,Z1", help="Keep what lies in this box after --transform.")
     ] = None,
