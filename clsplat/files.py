@@ -46,10 +46,10 @@ def atomic_name(path: Path, suffix: str = "") -> Iterator[Path]:
     """
     if not path.name:
         raise OutputError(f"{path}: cannot be written (it has no name); expected the path of a file")
-    if path.exists() and not path.is_file():  # a rename would replace a device, too
-        raise OutputError(f"{path}: cannot be written (it is not a file); give another name")
     temporary = _temporary(path, suffix)
     try:
+        if path.exists() and not path.is_file():  # a rename would replace a device, too
+            raise OutputError(f"{path}: cannot be written (it is not a file); give another name")
         make_folder(path.parent)
         yield temporary
         _replace(temporary, path)

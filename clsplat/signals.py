@@ -42,7 +42,7 @@ def end_at_once_on_signals() -> None:
 
 def _end_at_once(number: int, frame: Any) -> NoReturn:
     with suppress(OSError):
-        os.write(2, b"error: stopped\n")
+        os.write(2, b"stopped\n")
     os._exit(130)
 
 

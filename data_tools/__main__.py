@@ -100,7 +100,9 @@ def resize(
 def masks(
     scene: Annotated[Path, typer.Argument(help=DATASET)],
     folder: Annotated[Path | None, typer.Option(help="Folder of existing masks; default: the images' alpha.")] = None,
-    out: Annotated[Path | None, typer.Option(help="Folder for the masks; default: SCENE/masks.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for the masks; default: masks beside COLMAP's images.")
+    ] = None,
     threshold: Annotated[float, typer.Option(min=0, max=1, help="Smallest alpha of a pixel that counts.")] = 0.5,
 ) -> None:
     """Write masks, white in pixels that count, from alpha or from a folder."""
@@ -123,6 +125,8 @@ def cameras(
     from clsplat.api.pictures import write_cameras
 
     print("\n".join(str(path) for path in write_cameras(scene, out, format_, images)))
+    if images == "none" and format_ != "inria":
+        print("the photographs are not beside them: to train on the folder, write it with --images copy")
 
 
 @app.command()

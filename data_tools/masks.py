@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from clsplat.errors import DataError
 from clsplat.progress import Count
-from clsplat.scene.detect import read_scene
+from clsplat.scene.colmap import ColmapReader, image_folder
+from clsplat.scene.detect import read_scene, reader_of
 from clsplat.scene.images import read_image, write_image
 from clsplat.scene.scene import View
 from clsplat.scene.view import load_mask
@@ -18,14 +19,16 @@ MIN_ALPHA = 0.5  # of the largest value
 
 
 def write_masks(scene: Path, folder: Path | None = None, out: Path | None = None, threshold: float = MIN_ALPHA) -> int:
-    """Write a mask for every photograph into `scene`/masks, or `out`; return the number written.
+    """Write a mask for every photograph into `masks` beside `images`, or `out`; return the number written.
 
     A mask is white in pixels that count: those of its file in `folder` (NAME.png, or STEM.png), else those whose alpha
     is at least `threshold`, in [0, 1].  Masks that exist stay unchanged, unless an earlier call has made
     them of others.
-    Raises DataError when a mask is missing or of another size than its photograph, or a photograph has no alpha.
+    Raises DataError when a mask is missing or of another size than its photograph, a photograph has no alpha, or the
+    scene's layout reads no folder of masks and `out` is None.
     """
     views = read_scene(scene, holdout=0).views
+    target = out or _place(scene)
     sources = [None if folder is None else _file(folder, view.name) for view in views]
     missing = [view.name for view, source in zip(views, sources, strict=True) if folder and source is None]
     if missing:
@@ -33,7 +36,7 @@ def write_masks(scene: Path, folder: Path | None = None, out: Path | None = None
             f"{folder}: has no masks for {len(missing)} of {len(views)} photographs: {', '.join(missing[:3])}; "
             "expected the photograph's name with .png appended, or in place of its suffix"
         )
-    target, written, count = out or scene / "masks", 0, Count("masks written", len(views))
+    written, count = 0, Count("masks written", len(views))
     made = Made(target)
     for number, (view, source) in enumerate(zip(views, sources, strict=True), 1):
         path = target / Path(view.name).with_suffix(".png")
@@ -43,6 +46,17 @@ def write_masks(scene: Path, folder: Path | None = None, out: Path | None = None
             written += 1
         count.reach(number)
     return written
+
+
+def _place(scene: Path) -> Path:
+    """The folder of masks that the reader of a scene looks into.  Raises DataError where it looks into none."""
+    reader = reader_of(scene)
+    if reader is not None and not isinstance(reader, ColmapReader):
+        raise DataError(
+            f"{scene}: {reader.name} scenes have no folder of masks; train with `--set scene.alpha=mask` to take the "
+            "alpha as mask, or give --out, and name each mask as the `mask_path` of its frame"
+        )
+    return image_folder(scene).with_name("masks")
 
 
 def _file(folder: Path, name: str) -> Path | None:

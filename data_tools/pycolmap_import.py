@@ -17,7 +17,7 @@ def require_pycolmap() -> ModuleType:
         with stopping_on_signals(lambda: signals.append(None)):
             import pycolmap
     except ImportError as error:
-        raise ConfigError("placing photographs needs pycolmap: pip install 'clsplat[photos]'") from error
+        raise ConfigError("placing photographs needs pycolmap: pip install 'pycolmap>=4,<5'") from error
     if signals:
         raise KeyboardInterrupt
     pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL.value)  # what ends a step is raised too

@@ -166,7 +166,7 @@ def write_dataset(out: Path, options: Options, workers: int | None = None) -> st
         raise OutputError(f"{out}: cannot write the data set: {error}") from error
     finally:
         shutil.rmtree(partial_out, ignore_errors=True)
-    return f"wrote {out}: {options.train} training and {options.test} test views, {options.size} px, {count} points"
+    return f"wrote {out}: {options.train} training and {options.test} test views, {options.size} px, {count:,} points"
 
 
 def is_complete(out: Path, options: Options) -> bool:

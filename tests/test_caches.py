@@ -4,6 +4,7 @@ import logging
 import os
 import shutil
 import stat
+import struct
 import subprocess
 import sys
 import tempfile
@@ -14,7 +15,7 @@ from types import SimpleNamespace
 import platformdirs
 import pytest
 
-from clsplat.caches import cache_folder, damaged_kernels
+from clsplat.caches import cache_folder, damaged_kernels, kernel_caches, remove_cut_kernels
 from clsplat.errors import OutputError
 
 linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the folders of Linux")
@@ -30,9 +31,11 @@ def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
         monkeypatch.setenv(name, "")  # so that what the test sets is taken back
         monkeypatch.delenv(name)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "tmp"))
-    cache_folder.cache_clear()
+    for once in (cache_folder, remove_cut_kernels):
+        once.cache_clear()
     yield tmp_path
-    cache_folder.cache_clear()
+    for once in (cache_folder, remove_cut_kernels):
+        once.cache_clear()
 
 
 @pytest.fixture
@@ -143,3 +146,59 @@ def test_a_full_folder_is_not_called_damaged(machine, monkeypatch, free):
     text = damaged_kernels()
     assert ("has no space for built kernels; free some" in text) == (not free)
     assert ("is damaged: remove" in text) == bool(free)
+
+
+def library(sections: int) -> bytes:
+    """A file as a linker writes it, in short: a header, code, and at its end a table of sections."""
+    head = struct.pack(
+        "<4s5B7x2HI3QI6H", b"\x7fELF", 2, 1, 1, 0, 0, 3, 62, 1, 0, 64, 500, 0, 64, 56, 1, 64, sections, 1
+    )
+    return head + bytes(500 - len(head) + 64 * sections)
+
+
+@linux
+def test_kernels_that_are_cut_off_are_removed_and_no_others(machine, caplog):
+    """Nor those that another process writes now."""
+    pocl, pytools = (machine / "home" / ".cache" / name for name in ("pocl", "pytools"))
+    whole, database = library(3), b"SQLite format 3\0" + bytes(84)
+    files = {
+        **{f"kcache/AB/C/{name}/a.so": whole[:size] for name, size in (("empty", 0), ("head", 60), ("table", 690))},
+        "kcache/AB/C/zeros/a.so": bytes(692),
+        "kcache/AB/C/whole/a.so": whole,
+        "kcache/AB/C/bare/a.so": library(0),
+        "kcache/AB/C/program.bc": b"",
+        "kcache/tempfile_abc.so": b"",
+    }
+    for name, data in files.items():
+        (pocl / name).parent.mkdir(parents=True, exist_ok=True)
+        (pocl / name).write_bytes(data)
+    pytools.mkdir(parents=True)
+    for name, data in {"scan": bytes(50), "invoker": database, "new": b""}.items():
+        (pytools / f"pdict-v5-pyopencl-{name}-cache.sqlite").write_bytes(data)
+    (pytools / "pdict-v5-another.sqlite").write_bytes(b"of others")
+    remove_cut_kernels()
+    left = {file.relative_to(pocl).as_posix() for file in pocl.rglob("*") if file.is_file()}
+    assert files.keys() - left == {f"kcache/AB/C/{name}/a.so" for name in ("empty", "head", "table", "zeros")}
+    assert {file.name.split("-")[-2] for file in pytools.iterdir()} == {"invoker", "new", "v5"}
+    (record,) = caplog.records
+    assert record.getMessage().startswith("5 files of built kernels are cut off (")
+    remove_cut_kernels()
+    assert len(caplog.records) == 1
+
+
+@linux
+@pytest.mark.slow
+def test_a_device_is_opened_without_the_kernels_that_are_cut_off(machine, caplog):
+    from clsplat.opencl.device import open_device
+
+    broken = machine / "home" / ".cache" / "pytools" / "pdict-v5-pyopencl-invoker-cache.sqlite"
+    broken.parent.mkdir(parents=True)
+    broken.write_bytes(b"fifty bytes")
+    open_device()
+    assert not broken.exists()
+
+
+@linux
+def test_the_remedy_names_every_folder_of_kernels(machine):
+    caches = machine / "home" / ".cache"
+    assert kernel_caches() == f"{caches}/pyopencl, {caches}/pytools and {caches}/pocl"

@@ -1,6 +1,7 @@
 """The command line as scripts see it: outputs, one-line errors, exit codes."""
 
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -41,6 +42,8 @@ def test_run_names_the_device_first_and_says_where_things_are(tiny_scene, tmp_pa
     assert "schedule" in lines[0]
     assert any("test PSNR" in line for line in lines)
     assert any(str(tmp_path / "run" / "report.html") in line for line in lines)
+    assert any(re.match(r"\d+,\d{3} Gaussians from ", line) for line in lines)
+    assert any(re.match(r"\d+,\d{3} Gaussians written to ", line) for line in lines)
     log = (tmp_path / "run" / "log.txt").read_text()
     assert "loss" in log
     assert [line for line in lines if line not in log] == []
@@ -49,7 +52,13 @@ def test_run_names_the_device_first_and_says_where_things_are(tiny_scene, tmp_pa
 def test_dry_run_touches_nothing(tiny_scene, tmp_path):
     done = clsplat("run", "smoke", "--scene", tiny_scene, "--out", tmp_path / "run", "--dry-run")
     assert "50 steps" in done.stdout
+    assert "densify every 10 (start 15, stop 45), reset_opacity every 20 (stop 30)" in done.stdout
     assert not (tmp_path / "run").exists()
+
+
+def test_a_dry_run_says_when_a_stage_acts(tiny_scene, tmp_path):
+    done = clsplat("run", "splat_7k", "--scene", tiny_scene, "--out", tmp_path / "run", "--dry-run")
+    assert "reset_opacity every 500 (stop 501, when_background white)" in done.stdout
 
 
 def test_set_takes_several_values(tiny_scene, tmp_path):

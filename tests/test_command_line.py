@@ -16,7 +16,7 @@ from clsplat.cli.app import ORDER, SYNONYMS
 from clsplat.errors import DataError
 from clsplat.pipeline.files import shipped
 from clsplat.pipeline.loading import load
-from clsplat.pipeline.recipes import copy, manual, summary
+from clsplat.pipeline.recipes import copy, manual, summaries, summary
 from clsplat.pipeline.settable import settable
 from clsplat.runs.status import run_status, status_text
 from clsplat.training.records import Records
@@ -245,10 +245,15 @@ def test_status_tells_from_files(finished, tmp_path):
     (tmp_path / "metrics.jsonl").write_text('{"step": 5, "kind": "train", "loss": 0.25, "psnr": 20.0}\ncut')
     assert status_text(run_status(tmp_path)) == (
         f"{tmp_path}: killed at step 7 of 9\n"
-        f"  no checkpoint was saved; `clsplat run {tmp_path / 'pipeline.yaml'} --out {tmp_path} --restart` "
-        "begins it again\n"
+        f"  no checkpoint was saved; `clsplat resume {tmp_path}` begins it again\n"
         "  last report: step 5, loss 0.25, psnr 20"
     )
     matrix = {"state": "failed", "cells": 4, "done": 4, "failed": {"a": "no"}, "message": "1 of 4 cells failed"}
     write_status(tmp_path, **matrix)
     assert "failed, 4 of 4 cells, 1 of them failed\n  1 of 4 cells failed\n" in status_text(run_status(tmp_path))
+
+
+def test_no_two_recipes_have_one_description():
+    described = [one["summary"] for one in summaries()]
+    assert len(set(described)) == len(described)
+    assert all("7 000 steps" in one["summary"] for one in summaries() if one["name"].endswith("_7k"))

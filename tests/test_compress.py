@@ -1,6 +1,7 @@
 """`clsplat compress`: what a target is, how far the search goes, and what it leaves."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -170,11 +171,21 @@ def test_a_search_that_is_interrupted_goes_on_when_it_is_asked_again(few_steps, 
 
 
 def test_another_search_needs_another_folder(searched, few_steps, tmp_path):
-    with pytest.raises(ConfigError, match="a search with another steps"):
+    with pytest.raises(ConfigError, match="a search that differs in steps; remove it, or give another --out"):
         clsplat.compress_model(few_steps, target="1MB", out=searched, keep=KEEP, steps=STEPS + 1)
     (tmp_path / "own.txt").write_text("mine")
     with pytest.raises(ConfigError, match="holds something else than a search"):
         clsplat.compress_model(few_steps, target="1MB", out=tmp_path, keep=KEEP, steps=STEPS)
+
+
+def test_a_search_does_not_go_on_with_other_photographs(few_steps, tiny_scene, tmp_path):
+    shutil.copytree(tiny_scene, tmp_path / "scene")
+    ask = {"target": "1MB", "out": tmp_path / "out", "keep": [1.0], "steps": 1}
+    clsplat.compress_model(few_steps, tmp_path / "scene", **ask)
+    first, second, *_ = sorted((tmp_path / "scene" / "train").iterdir())
+    second.write_bytes(first.read_bytes())
+    with pytest.raises(ConfigError, match=r"a search that differs in photographs"):
+        clsplat.compress_model(few_steps, tmp_path / "scene", **ask)
 
 
 def test_one_process_searches_in_a_folder_at_a_time(few_steps, tmp_path):
@@ -220,6 +231,16 @@ def test_the_command_prints_a_table(searched, few_steps):
     assert found.exit_code == 0, found.output
     assert table(json.loads((searched / "compress.json").read_text())) in found.output
     assert "compressed.sog: " in found.output
+
+
+def test_a_loss_of_nothing_has_no_sign(monkeypatch):
+    same = {"psnr": 30.0, "bytes": 10}
+    found = {"chosen": {**same, "psnr": 29.999}, "source": same, "file": "a.sog", "page": "a.html"}
+    monkeypatch.setattr("clsplat.api.compression.compress_model", lambda *_, **__: found)
+    monkeypatch.setattr("clsplat.compress.page.table", lambda _: "")
+    told = CliRunner().invoke(app, ["compress", "a.ply"]).output
+    assert "0.00 dB" in told
+    assert "-0.00" not in told
 
 
 def test_a_rung_is_trained_as_the_model_is_rendered(few_steps, tmp_path):

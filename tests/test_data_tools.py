@@ -11,12 +11,14 @@ from typer.testing import CliRunner
 
 from clsplat import cli
 from clsplat.errors import DataError
+from clsplat.scene.detect import read_scene
 from clsplat.scene.images import read_image
 from data_tools import resize as resize_tool
 from data_tools import video as video_tool
 from data_tools.masks import write_masks
 from data_tools.resize import write_pyramid
 from data_tools.video import sharpest, write_frames
+from tests.colmap_writer import CameraEntry, ColmapModel, ImageEntry, write_scene
 from tests.refusals import refusal
 
 # ---- video
@@ -200,31 +202,58 @@ def test_pyramids_go_on_and_keep_what_others_made(tmp_path, rng, monkeypatch):
 # ---- masks
 
 
-def blender_scene(path: Path, channels: int) -> Path:
-    (path / "train").mkdir(parents=True)
-    frames = []
+def store_photos(folder: Path, channels: int) -> None:
+    """Two photographs, of whose alpha the first three columns are 100."""
+    (folder / "train").mkdir(parents=True, exist_ok=True)
     for i in range(2):
         pixels = np.full((6, 8, channels), 250, np.uint8)
         pixels[:, :3, 3:] = 100
-        cv2.imwrite(str(path / "train" / f"{i}.png"), pixels)
-        frames.append({"file_path": f"./train/{i}", "transform_matrix": np.eye(4).tolist()})
-    (path / "transforms_train.json").write_text(json.dumps({"camera_angle_x": 0.8, "frames": frames}))
+        cv2.imwrite(str(folder / "train" / f"{i}.png"), pixels)
+
+
+def colmap_scene(path: Path, channels: int) -> Path:
+    camera = CameraEntry(1, "PINHOLE", 8, 6, (8.0, 8.0, 4.0, 3.0))
+    write_scene(path, ColmapModel([camera], [ImageEntry(f"train/{i}.png") for i in range(2)]))
+    store_photos(path / "images", channels)
     return path
 
 
+def blender_scene(path: Path, name: str) -> Path:
+    store_photos(path, 4)
+    frames = [{"file_path": f"./train/{i}", "transform_matrix": np.eye(4).tolist()} for i in range(2)]
+    (path / name).write_text(json.dumps({"camera_angle_x": 0.8, "frames": frames}))
+    return path
+
+
+@pytest.mark.parametrize("name", ["transforms_train.json", "transforms.json"])
+def test_masks_that_nothing_would_read_are_refused(name, tmp_path):
+    scene = blender_scene(tmp_path / "scene", name)
+    told = refusal(write_masks, scene)
+    assert "scenes have no folder of masks" in told
+    assert "scene.alpha=mask" in told
+    assert not (scene / "masks").exists()
+    assert write_masks(scene, out=tmp_path / "masks") == 2
+
+
+def test_masks_lie_where_the_reader_looks_for_them(tmp_path):
+    scene = colmap_scene(tmp_path / "scene", 4)
+    assert write_masks(scene / "sparse" / "0") == 2
+    assert all(view.mask_path is not None for view in read_scene(scene).views)
+
+
 def test_masks_from_alpha(tmp_path):
-    scene = blender_scene(tmp_path / "scene", 4)
+    scene = colmap_scene(tmp_path / "scene", 4)
     assert write_masks(scene) == 2
     mask = read_image(scene / "masks" / "train" / "0.png")[:, :, 0]
     np.testing.assert_array_equal(mask, [[0] * 3 + [255] * 5] * 6)
     assert write_masks(scene) == 0
     assert write_masks(scene, out=tmp_path / "others", threshold=0.3) == 2
     assert read_image(tmp_path / "others" / "train" / "0.png").min() == 255
-    assert "has no alpha" in refusal(write_masks, blender_scene(tmp_path / "opaque", 3))
+    assert "has no alpha" in refusal(write_masks, colmap_scene(tmp_path / "opaque", 3))
 
 
 def test_masks_follow_their_source_but_not_over_those_of_others(tmp_path):
-    scene = blender_scene(tmp_path / "scene", 4)
+    scene = colmap_scene(tmp_path / "scene", 4)
     (scene / "masks" / "train").mkdir(parents=True)
     cv2.imwrite(str(scene / "masks" / "train" / "1.png"), np.zeros((6, 8), np.uint8))
     assert write_masks(scene) == 1
@@ -235,7 +264,7 @@ def test_masks_follow_their_source_but_not_over_those_of_others(tmp_path):
 
 
 def test_masks_from_a_folder(tmp_path):
-    scene, folder = blender_scene(tmp_path / "scene", 3), tmp_path / "made" / "train"
+    scene, folder = colmap_scene(tmp_path / "scene", 3), tmp_path / "made" / "train"
     folder.mkdir(parents=True)
     cv2.imwrite(str(folder / "0.png"), np.full((6, 8), 255, np.uint8))
     assert "no masks for 1 of 2 photographs: train/1" in refusal(write_masks, scene, tmp_path / "made")
@@ -251,9 +280,9 @@ def test_masks_from_a_folder(tmp_path):
 
 
 def test_data_tools_are_commands(tmp_path):
-    scene = blender_scene(tmp_path / "scene", 4)
+    scene = colmap_scene(tmp_path / "scene", 4)
     result = CliRunner().invoke(cli.app, ["data", "masks", str(scene)])
-    assert result.output == "2 masks written\n"
+    assert result.output.endswith("2 masks written\n")
     listing = CliRunner().invoke(cli.app, ["data", "--help"]).output
     for name in ("photos", "video", "undistort", "resize", "masks", "multiscale", "synthetic", "fetch"):
         assert name in listing

@@ -219,7 +219,13 @@ def test_the_page_shows_every_figure_and_the_head_of_a_build_log(info):
     broken = Result("projection", ("project_forward",), fault="project.cl does not build", log="error: <unknown>")
     page = report_page(report_of(info, wide=[*result(WRONG, RIGHT), broken], simt=result(RIGHT)))
     assert Page(page).text
-    for text in (info.platform, "gradients of conics, 17 Gaussians", "gradients of colours", "error: &lt;unknown&gt;"):
+    for text in (
+        info.platform,
+        "gradients of conics, 17 Gaussians",
+        "gradients of colours",
+        "error: &lt;unknown&gt;",
+        "<i>worst</i>: the largest error",
+    ):
         assert text in page
 
 

@@ -53,7 +53,7 @@ def test_a_signal_at_the_start_ends_with_code_130_and_a_sentence(place, tmp_path
     command = [sys.executable, "-c", script]
     done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, timeout=60, check=False)
     assert done.returncode == 130, done.stderr
-    assert done.stderr.startswith("error: stopped")  # at once, where the run has been opened by then
+    assert done.stderr.startswith("stopped")  # at once, where the run has been opened by then
     assert done.stderr.count("\n") == 1
     assert not list(tmp_path.iterdir())
 

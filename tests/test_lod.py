@@ -107,7 +107,7 @@ def test_that_a_file_is_merged_alone_is_said(alone, tmp_path):
 
 @pytest.mark.parametrize("option", ["steps", "downscale", "device"])
 def test_options_that_need_photographs_are_refused_without_them(option, alone, tmp_path):
-    message = rf"model\.ply: no photographs are known, which --{option} would need; give --scene, or drop that$"
+    message = rf"model\.ply: no photographs are known, needed for --{option}; give --scene, or leave that out$"
     with pytest.raises(ConfigError, match=message):
         clsplat.write_levels(alone, tmp_path / "site", **{option: 2})
     assert [path.name for path in tmp_path.iterdir()] == ["model.ply"]
@@ -180,7 +180,7 @@ def test_a_training_that_is_interrupted_goes_on(few_steps, tmp_path, monkeypatch
         clsplat.write_levels(few_steps, tmp_path / "site", levels=3, steps=STEPS)
     assert not (tmp_path / "site").exists()
     monkeypatch.setattr(runner, "_run_stages", run_stages)
-    with pytest.raises(ConfigError, match=r"site\.training: holds the training of levels with another steps"):
+    with pytest.raises(ConfigError, match=r"site\.training: holds the training of levels that differs in steps"):
         clsplat.write_levels(few_steps, tmp_path / "site", levels=3, steps=STEPS + 1)
     clsplat.write_levels(few_steps, tmp_path / "site", levels=3, steps=STEPS)
     assert tree(tmp_path / "site") == tree(trained[0])

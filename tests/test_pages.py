@@ -112,6 +112,8 @@ def test_the_report_of_a_scene_with_markup_in_its_names(tiny_scene, tmp_path):
     clsplat("run", "smoke", "--scene", scene, "--out", out, "--set", "optimize.steps=30", "optimize.log_every=10")
     page = Page((out / "report.html").read_text())
     assert (page.elements["script"], page.elements["b"]) == (1, 6), "the page's own, and labels of six images"
+    first = page.text.partition("Walk through")[0]
+    assert re.search(r"test PSNR \d+\.\d\d dB, SSIM 0\.\d{4} · \d+,\d{3} Gaussians · trained for \d+ s", first)
     assert page.text.count(HOSTILE) >= 2, "its title, twice"
     assert all(f"test/{HOSTILE}{i} (test): " in page.text for i in (0, 1))
     settings = page.text.partition("Settings")[2]

@@ -1,6 +1,7 @@
 """Pipeline files: what is accepted, what is refused and in which words."""
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -264,7 +265,7 @@ def test_a_folder_is_no_pipeline_and_hides_none(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "splat").mkdir()
     assert load("splat").settings.name == "splat"
-    with pytest.raises(ConfigError, match="is a folder, expected a pipeline file"):
+    with pytest.raises(ConfigError, match=re.escape(f"`clsplat run splat_7k --scene {tmp_path}`")):
         load(str(tmp_path))
     (tmp_path / "pipeline.yaml").write_text(SMALL)
     with pytest.raises(ConfigError, match=r"is a run folder.* `clsplat resume .*` goes on"):

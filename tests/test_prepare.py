@@ -220,6 +220,16 @@ def test_a_step_that_resumes_keeps_what_an_interrupted_call_made(photos, tmp_pat
     assert [path.name for path in root.iterdir()] == [folder.name]
 
 
+def test_a_record_that_a_killed_call_left_is_not_among_the_files_of_the_result(photos, tmp_path):
+    root, steps = tmp_path / "runs" / "prepared", [Slow()]
+    folder = plan(steps, photos, root)[0].folder
+    left = folder.with_name(f".{folder.name}")
+    left.mkdir(parents=True)
+    (left / "record.json").write_text("{}")  # killed between the record and the renaming
+    prepare(plan(steps, photos, root), photos, root)
+    assert [one.why for one in plan(steps, photos, root)] == [""]
+
+
 def test_what_was_made_of_other_photographs_is_not_gone_on_with(photos, tmp_path, monkeypatch):
     root = tmp_path / "runs" / "prepared"
     for letter, text in (("a", "p"), ("b", "p"), ("a", "q")):

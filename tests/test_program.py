@@ -1,5 +1,8 @@
 """Kernel files of one's own: what cannot be read or found is refused with the form that is expected."""
 
+import sqlite3
+from pickle import UnpicklingError
+
 import pyopencl as cl
 import pytest
 
@@ -19,16 +22,24 @@ def test_a_kernel_without_a_group_size_is_refused_with_the_form_expected(device,
         device.program(file)
 
 
-def test_a_program_without_its_kernels_may_come_from_a_damaged_cache(device, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    "fault",
+    [
+        cl.LogicError("clCreateKernel failed: INVALID_KERNEL_NAME"),
+        sqlite3.DatabaseError("file is not a database"),
+        UnpicklingError("pickle data was truncated"),
+    ],
+)
+def test_a_program_without_its_kernels_may_come_from_a_damaged_cache(device, tmp_path, monkeypatch, fault):
     def none(program, name):
-        raise cl.LogicError("clCreateKernel failed: INVALID_KERNEL_NAME")
+        raise fault
 
     file = tmp_path / "own.cl"
     file.write_text(
         "__kernel __attribute__((reqd_work_group_size(1, 1, 1)))\nvoid own(__global float *restrict x) {}\n"
     )
     monkeypatch.setattr(cl, "Kernel", none)
-    with pytest.raises(KernelError, match=r"INVALID_KERNEL_NAME.* may be damaged: remove .*pyopencl and "):
+    with pytest.raises(KernelError, match=rf"{fault}.* may be damaged: remove .*pyopencl, .*pytools and "):
         device.program(file)
 
 

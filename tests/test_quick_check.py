@@ -150,7 +150,7 @@ def test_the_log_says_that_a_check_begins(monkeypatch, info, empty_cache, caplog
     worker(monkeypatch)
     with caplog.at_level("INFO", "clsplat"):
         quick.ensure_correct(Device(info))
-    assert f"checking {info.name}, once for each driver" in caplog.text
+    assert f"checking {info.name}; this takes some seconds" in caplog.text
 
 
 def test_a_device_that_computes_wrongly_is_refused(monkeypatch, info, empty_cache):

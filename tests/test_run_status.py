@@ -57,16 +57,24 @@ def test_the_lines_name_the_stage_and_what_is_left(tmp_path):
     )
 
 
-def test_a_clock_that_is_late_gives_no_negative_time(tmp_path):
-    assert put(tmp_path, host="a", time=time.time() + 100)["silent"] == 0
+def test_a_clock_that_is_ahead_gives_no_negative_time_and_is_told(tmp_path):
+    found = put(tmp_path, host="a", time=time.time() + 500)
+    assert found["silent"] == 0
+    assert 490 < found["ahead"] <= 500
+    assert f"\n  its clock is ahead by {found['ahead']} s; it runs on a: " in reading.status_text(found)
+    found = put(tmp_path, host="a", time=time.time() + 5)
+    assert "ahead" not in found
+    assert "its clock" not in reading.status_text(found)
 
 
 @pytest.mark.parametrize("state", ["killed", "failed", "interrupted"])
 def test_the_advice_is_a_command_that_works(state, tmp_path):
     more = {} if state == "killed" else {"state": state, "message": "stopped at step 7; --resume continues from there"}
     (tmp_path / "pipeline.yaml").touch()
-    again = f"no checkpoint was saved; `clsplat run {tmp_path / 'pipeline.yaml'} --out {tmp_path} --restart` begins"
-    assert again in reading.status_text(put(tmp_path, **more))
+    text = reading.status_text(put(tmp_path, **more))
+    assert f"no checkpoint was saved; `clsplat resume {tmp_path}` begins it again" in text
+    gone = reading.status_text(put(tmp_path, checkpoint="checkpoints/step_000005.npz", **more))
+    assert f"are gone; `clsplat run {tmp_path / 'pipeline.yaml'} --out {tmp_path} --restart` begins" in gone
     (tmp_path / "checkpoints").mkdir()
     (tmp_path / "checkpoints" / "step_000007.npz").touch()
     text = reading.status_text(put(tmp_path, **more))

@@ -368,14 +368,14 @@ def figures_of_all_targets() -> figures.Table:
 
 def test_a_page_with_other_figures_is_found(tmp_path, monkeypatch):
     table, versions = figures_of_all_targets(), dict.fromkeys(VENDORS, "a compiler 1.0")
-    monkeypatch.setattr(page, "PAGE", tmp_path / "devices.md")
+    monkeypatch.setattr(page, "PAGE", tmp_path / "performance.md")
     page.PAGE.write_text(f"before\n{page.BEGIN}\n{page.END}\nafter\n")
     page.write(table, versions, VENDOR_OF)
     assert page.faults(table, versions, VENDOR_OF) == []
     place = Place("sm_86", "simt", "blend_forward")
     table[place] = Figures(**(vars(table[place]) | {"registers": 41}))
     (fault,) = page.faults(table, versions, VENDOR_OF)
-    assert re.match(r"devices.md shows '\| `blend_forward` .*40.*', expected '.*41.*': run .* --write", fault)
+    assert re.match(r"performance.md shows '\| `blend_forward` .*40.*', expected '.*41.*': run .* --write", fault)
 
 
 def test_continuous_integration_compares_the_page_with_fresh_figures():

@@ -72,7 +72,8 @@ def status(folder: PathLike) -> dict[str, Any]:
     """Return how far a run or a matrix is, from its files: what status.json holds, `last` report, `metrics` at the end.
 
     A matrix has `cells`, `done` and `failed` in the place of the step.  `silent` is the time in s since the last
-    heartbeat of a run that has not ended; the state is `killed` where its process is gone.
+    heartbeat of a run that has not ended, `ahead` that by which it lies in the future, from a minute on; the state is
+    `killed` where its process is gone.
     """
     from clsplat.runs.status import run_status
 

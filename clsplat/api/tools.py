@@ -33,7 +33,7 @@ def devices() -> list[dict[str, Any]]:
 def doctor(device: "str | Device | None" = None, page: PathLike | None = None) -> "DeviceReport":
     """Compare every kernel with the reference on a device; return a `verdict`, whether it is `usable`, and `data()`.
 
-    It takes about a minute on a CPU.  page: a file to write, to be attached to a report.
+    It takes a minute or two on a CPU.  page: a file to write, to be attached to a report.
     """
     from clsplat.conformance.doctor import examine
     from clsplat.conformance.page import check_place, write_page

@@ -42,7 +42,7 @@ def main(*before: str) -> None:
 
 
 def _report(error: BaseException, debugging: bool) -> int:
-    """Print the line for an error; return the exit code."""
+    """Print the line for an error, or for what the user has stopped; return the exit code."""
     if isinstance(error, Passed | typer.Abort):
         error = error.__cause__ or error
     if isinstance(error, KeyboardInterrupt):  # not of a run, whose message tells how to go on
@@ -54,7 +54,7 @@ def _report(error: BaseException, debugging: bool) -> int:
     else:
         failure = as_clsplat_error(error)
         message, code = one_line(failure) or type(failure).__name__, failure.exit_code
-    terminal.ERRORS.print(f"error: {message}", markup=False)
+    terminal.ERRORS.print(message if code == Interrupted.exit_code else f"error: {message}", markup=False)
     return code
 
 

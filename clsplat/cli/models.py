@@ -10,6 +10,7 @@ from clsplat import terminal
 from clsplat.api import commands, compression
 from clsplat.cli.app import DeviceOption, ModelArgument, SceneOption, command
 from clsplat.errors import ConfigError, quoted
+from clsplat.files import is_there
 
 
 @command(
@@ -91,10 +92,11 @@ def view(
     ] = None,
 ) -> None:
     """Write a page to walk through a model, beside its photographs; it opens offline."""
+    before = "replaced; " if is_there(out) else ""
     page = commands.view(
         *models, scene=scene, out=out, photographs=photographs, photograph_budget=photograph_budget, splats=splats
     )
-    terminal.remark(f"{page}: {page.stat().st_size / 1e6:.1f} MB; open it in a browser")
+    terminal.remark(f"{page}: {before}{page.stat().st_size / 1e6:.1f} MB; open it in a browser")
 
 
 @command(
@@ -119,7 +121,9 @@ def convert(
     quality: Annotated[
         Literal["small", "balanced", "high"], typer.Option(help="Of SPZ (bits) and SOG (palette).")
     ] = "balanced",
-    keep_nan: Annotated[bool, typer.Option("--keep-nan", help="Keep Gaussians that are not finite, in a PLY.")] = False,
+    keep_nan: Annotated[
+        bool, typer.Option("--keep-nan", help="Keep Gaussians that are not finite or too large, in a PLY.")
+    ] = False,
     crop: Annotated[
         str | None, typer.Option(metavar="X0,Y0,Z0,X1,Y1,Z1", help="Keep what lies in this box after --transform.")
     ] = None,
@@ -186,7 +190,7 @@ def compress(
     terminal.show(table(found))
     chosen, source = found["chosen"], found["source"]
     size = f"{chosen['bytes'] / 1e6:.3g} MB, {chosen['bytes'] / source['bytes']:.1%} of the model"
-    terminal.remark(f"{found['file']}: {size}, {chosen['psnr'] - source['psnr']:+.2f} dB; page: {found['page']}")
+    terminal.remark(f"{found['file']}: {size}, {chosen['psnr'] - source['psnr']:+z.2f} dB; page: {found['page']}")
 
 
 @command("lod", "clsplat lod runs/splat_7k site/scene", "clsplat lod point_cloud.ply site/scene --levels 3")

@@ -44,7 +44,7 @@ def doctor(
         terminal.show_json(report.data())
     else:
         terminal.show(report.text())
-    if page is not None:  # after the verdict, which took a minute
+    if page is not None:  # after the verdict, which took minutes
         write_page(report, page)
     if not report.usable:
         raise DeviceError(f"{report.info.text}: {report.verdict.text}")

@@ -88,9 +88,9 @@ def compress(
     opened = ModelFile(model, scene, device)
     source, first, measurer = opened.source, opened.loaded, Measurer(opened)
     question: dict[str, Any] = {"model": str(source.file), "sha256": sha256(located(source.file))}
-    question |= {"scene": str(source.folder), "keeps": shares, "steps": steps}
+    question |= {"scene": str(source.folder), "photographs": measurer.identity(), "keeps": shares, "steps": steps}
+    size = bytes_of(source.file)  # which a damaged model has not: before the folder is made
     with claimed(out, question, RECORD, "a search", "another --out"):
-        size = bytes_of(source.file)
         whole = Point(source.file.name, 1, first.sh_degree, "", len(first), size, *measurer.figures(first))
         search = Search(out, wanted, question, whole, measurer.split)
         ladder = Ladder(out, Tuning("compress", source, first, steps, opened.device))

@@ -54,7 +54,7 @@ def ensure_correct(device: Device, sort: Sort = "auto") -> None:
     if all(record.exists() for record in records):
         uses.begin(records)
         return
-    LOG.info("checking %s, once for each driver; this takes some seconds, more where it builds slowly", info.name)
+    LOG.info("checking %s; this takes some seconds, more where it builds slowly", info.name)
     for result in supervised(info, schedule, [*ESSENTIAL, *(BITONIC if bitonic else [])], QUICK_SECONDS):
         if result.out_of_memory:
             raise MemoryLimitError(f"{device.text}: {result.failures[0]}; end other programs that use its memory")

@@ -101,7 +101,7 @@ def write_glb(path: Path, splats: SplatFile, options: Writing) -> str:
         "bufferViews": views,
         "buffers": [{"byteLength": start}],
     }
-    text = json.dumps(tree, separators=(",", ":"), sort_keys=True).encode()
+    text = json.dumps(tree, separators=(",", ":"), sort_keys=True, allow_nan=False).encode()
     text += b" " * (-len(text) % 4)
     with written(path) as file:
         file.write(struct.pack("<4s2I", MAGIC, 2, 12 + 8 + len(text) + 8 + start))

@@ -8,7 +8,7 @@ A program that shows it takes of each leaf the level that its distance asks for.
 """
 
 from collections.abc import Iterator
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from clsplat.errors import DataError, quoted
 from clsplat.formats.sog import read_sog
 from clsplat.formats.sog_files import MAX_META, META, with_images
 from clsplat.formats.splats import MAX_DEGREE, SplatFile, with_degree
-from clsplat.names import is_inside
+from clsplat.names import fault_of_name, is_inside
 from clsplat.reading import read_json
 
 LOD_META = "lod-meta.json"
@@ -32,24 +32,43 @@ def looks_like_lod(data: bytes) -> bool:
 def read_lod(path: Path) -> SplatFile:
     """Read the finest level of a lod-meta.json, and its environment.  Raises DataError when it is damaged."""
     meta = _meta(path)
-    runs: dict[int, list[Run]] = {}
-    for leaf in _leaves(path, meta.get("tree")):
-        if "0" in leaf:
-            file, offset, count = (_whole(path, key, leaf["0"]) for key in ("file", "offset", "count"))
-            runs.setdefault(file, []).append((offset, count))
-    names = meta["filenames"]
-    if not runs or max(runs) >= len(names):
-        raise DataError(f"{path}: its leaves name no file of level 0, or one that it has not; export it again")
-    parts = [_part(path, names[file], sorted(runs[file])) for file in sorted(runs)]
-    found, declared = sum(map(len, parts)), meta["counts"][0]
-    if found != declared:
-        raise DataError(f"{path}: declares {quoted(declared)} splats of level 0; its leaves have {found}: export again")
+    runs = _runs(path, meta, 0)
+    if not runs:
+        raise DataError(f"{path}: its leaves name no file of level 0; export it again")
+    parts = [_part(path, meta["filenames"][file], runs[file]) for file in sorted(runs)]
+    _require_count(path, meta, 0, runs)
     if "environment" in meta:
         parts.append(read_sog(path.parent / _inside(path, meta["environment"])))
     degree = min(MAX_DEGREE, max(part.sh_degree for part in parts))
     tables = [with_degree(part.parameters, degree) for part in parts]
     joined = {name: np.concatenate([table[name] for table in tables]) for name in tables[0]}
     return SplatFile(joined, parts[0].rendering, parts[0].mode)
+
+
+def faults_of_levels(path: Path) -> list[str]:
+    """Return a sentence for each file of the coarser levels that is missing or damaged; `read_lod` reads the others."""
+    meta, faults = _meta(path), []
+    spare = {file: list[Run]() for file in range(len(meta["filenames"]))}  # of those that no leaf names, too
+    for level in range(len(meta["counts"])):
+        try:
+            runs = _runs(path, meta, level)
+            spare = {file: none for file, none in spare.items() if file not in runs}
+            faults += _faults(path, meta, runs) if level else []
+            _require_count(path, meta, level, runs)
+        except DataError as error:
+            faults.append(str(error))
+    return faults + _faults(path, meta, spare)
+
+
+def _faults(path: Path, meta: dict[str, Any], runs: dict[int, list[Run]]) -> list[str]:
+    """A sentence for each of some files that is missing or damaged."""
+    faults = []
+    for file, own in sorted(runs.items()):
+        try:
+            _part(path, meta["filenames"][file], own)
+        except DataError as error:
+            faults.append(str(error))
+    return faults
 
 
 def files_of_lod(path: Path) -> list[Path]:
@@ -75,9 +94,34 @@ def _meta(path: Path) -> dict[str, Any]:
 
 def _inside(path: Path, name: Any) -> str:
     """The name of a meta.json below the folder."""
-    if not isinstance(name, str) or not is_inside(name) or Path(name).name != META or "\\" in name:
+    if not isinstance(name, str) or not _is_meta_below(name):
         raise DataError(f"{path}: names {quoted(name)}; expected a {META} in a folder below; export it again")
     return name
+
+
+def _is_meta_below(name: str) -> bool:
+    path = PureWindowsPath(name)
+    return is_inside(name) and path.name == META and "\\" not in name and not any(map(fault_of_name, path.parts))
+
+
+def _runs(path: Path, meta: dict[str, Any], level: int) -> dict[int, list[Run]]:
+    """The runs of a level, ascending, by the number of their file."""
+    runs: dict[int, list[Run]] = {}
+    for leaf in _leaves(path, meta.get("tree")):
+        if str(level) in leaf:
+            file, offset, count = (_whole(path, key, leaf[str(level)]) for key in ("file", "offset", "count"))
+            runs.setdefault(file, []).append((offset, count))
+    if max(runs, default=-1) >= len(meta["filenames"]):
+        raise DataError(f"{path}: its leaves name a file of level {level} that it has not; export it again")
+    return {file: sorted(one) for file, one in runs.items()}
+
+
+def _require_count(path: Path, meta: dict[str, Any], level: int, runs: dict[int, list[Run]]) -> None:
+    found, declared = sum(count for one in runs.values() for _, count in one), meta["counts"][level]
+    if found != declared:
+        raise DataError(
+            f"{path}: declares {quoted(declared)} splats of level {level}; its leaves have {found}: export it again"
+        )
 
 
 def _leaves(path: Path, tree: Any) -> Iterator[dict[str, Any]]:
@@ -104,7 +148,7 @@ def _whole(path: Path, key: str, run: Any) -> int:
 def _part(path: Path, name: str, runs: list[Run]) -> SplatFile:
     """The splats of a file that are in leaves.  runs: ascending."""
     part = read_sog(path.parent / name)
-    rows, end = [], 0
+    rows, end = [np.arange(0)], 0
     for offset, count in runs:
         if offset < end or offset + count > len(part):
             raise DataError(

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from clsplat.formats.packing import morton_order
 from clsplat.formats.splats import Parameters, unit
 
+MAX_LOG_SCALE = 80.0  # of a box: JSON has no infinity
 Floats = NDArray[np.float64]
 Rows = NDArray[np.intp]
 
@@ -67,5 +68,6 @@ def half_boxes(level: Parameters) -> Floats:
     from scipy.spatial.transform import Rotation
 
     turned = np.abs(Rotation.from_quat(np.roll(unit(level["quats"]), -1, axis=1)).as_matrix())
-    half: Floats = np.einsum("nij,nj->ni", turned, np.exp(level["log_scales"].astype(np.float64)))
+    scales = np.exp(np.minimum(level["log_scales"].astype(np.float64), MAX_LOG_SCALE))
+    half: Floats = np.einsum("nij,nj->ni", turned, scales)
     return half

@@ -14,7 +14,7 @@ from clsplat.formats.lod_tree import Limits, Node, Rows, tree
 from clsplat.formats.output import written
 from clsplat.formats.sog_files import META
 from clsplat.formats.sog_writing import write_as_ordered
-from clsplat.formats.splats import SplatFile, Writing, require_some
+from clsplat.formats.splats import SplatFile, Writing, require_moderate, require_some
 
 USUAL = Limits()
 
@@ -22,10 +22,11 @@ USUAL = Limits()
 def write_lod(folder: Path, levels: Sequence[SplatFile], options: Writing | None = None, limits: Limits = USUAL) -> str:
     """Write levels, the finest first, into a folder; return the SHA-256 of its JSON, which is written last.
 
-    Raises DataError for a level without Gaussians, OutputError.
+    Raises DataError for a level without Gaussians, or one that SOG cannot hold, OutputError.
     """
     for level in levels:
         require_some(folder / LOD_META, level)
+        require_moderate(folder / LOD_META, level, "SOG")
     root = tree([level.parameters for level in levels], limits)
     files = _Files(limits.splats)
     shape = files.shape(root)
@@ -42,7 +43,7 @@ def write_lod(folder: Path, levels: Sequence[SplatFile], options: Writing | None
     for name, (number, rows) in files.rows.items():
         write_as_ordered(folder / name, levels[number].rows(np.concatenate(rows)), options or Writing())
     with written(folder / LOD_META) as file:
-        file.write(json.dumps(meta, separators=(",", ":")).encode())
+        file.write(json.dumps(meta, separators=(",", ":"), allow_nan=False).encode())
     return file.sha256
 
 

@@ -60,4 +60,4 @@ def beyond_bytes(levels: NDArray[np.float64]) -> NDArray[np.bool_]:
 def tell_cut(path: Path, name: str, what: str, beyond: NDArray[np.bool_]) -> None:
     """Log how many Gaussians, rows of `beyond`, have values outside of what a format holds."""
     if count := int(beyond.any(axis=1).sum()):
-        LOG.warning("%s: %s holds %s; those of %d Gaussians were cut", path, name, what, count)
+        LOG.warning("%s: %s holds %s; those of %s Gaussians were cut", path, name, what, f"{count:,}")

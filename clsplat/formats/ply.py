@@ -97,7 +97,7 @@ def write_ply(path: Path, parameters: Parameters, rendering: dict[str, Any]) -> 
 def comments(rendering: dict[str, Any]) -> list[str]:
     """Return the lines of a header that say how a model is rendered."""
     mode = "mip" if rendering.get("compensate") else "default"
-    return [f"comment {RENDERING}{json.dumps(rendering, sort_keys=True)}", f"comment {MODE}{mode}"]
+    return [f"comment {RENDERING}{json.dumps(rendering, sort_keys=True, allow_nan=False)}", f"comment {MODE}{mode}"]
 
 
 def mode_of(header: PlyHeader) -> str:
@@ -124,6 +124,12 @@ def checked_numbers(path: Path, values: dict[str, Any]) -> dict[str, Any]:
                 f"{path}: its comment says {name} = {quoted(value)}; expected a number from 0 to {MAX_NUMBER:g}: "
                 "export it again, or correct that line"
             )
+    try:
+        json.dumps(values, allow_nan=False)
+    except (ValueError, RecursionError) as error:
+        raise DataError(
+            f"{path}: its comment holds what no JSON holds ({quoted(error)}); export it again, or correct it"
+        ) from error
     return values
 
 

@@ -26,6 +26,7 @@ from clsplat.formats.splats import MAX_DEGREE, SplatFile, logits, sh_coefficient
 PIXELS_PER_BYTE = 16  # of all images; real ones have less than one
 PER_ROW = 64  # centroids
 WIDTHS = {3: 1, 8: 2, 15: 3}  # degree by coefficients of a centroid
+LIMIT = 1e30  # of numbers in meta.json
 ROTATED = 252  # alpha of a quaternion whose largest component is w
 
 
@@ -173,8 +174,10 @@ class _Sog:
     def _numbers(self, place: str, value: Any, count: int) -> NDArray[np.float64]:
         """A list of numbers, `count` at least."""
         fits = isinstance(value, list) and count <= len(value) <= 256
-        if not fits or not all(isinstance(one, int | float) and abs(one) < 1e30 for one in value):
-            raise DataError(f"{self.path}: {place} is {quoted(value)}; expected {count} numbers: export it again")
+        if not fits or not all(isinstance(one, int | float) and abs(one) < LIMIT for one in value):
+            raise DataError(
+                f"{self.path}: {place} is {quoted(value)}; expected {count} numbers below {LIMIT:g}: export it again"
+            )
         return np.array(value, np.float64)
 
     def _whole(self, place: str, value: Any, most: int = webp.MAX_SIDE**2) -> int:

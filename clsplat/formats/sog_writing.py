@@ -18,7 +18,7 @@ from clsplat.formats.packing import morton_order, smallest_three
 from clsplat.formats.palette import codebook, nearest, palette
 from clsplat.formats.sog import PER_ROW, ROTATED
 from clsplat.formats.sog_files import META, with_images
-from clsplat.formats.splats import Parameters, SplatFile, Writing, opacities, require_some, unit
+from clsplat.formats.splats import Parameters, SplatFile, Writing, opacities, require_moderate, require_some, unit
 
 PALETTES = {"small": 1024, "balanced": 4096, "high": 16384}  # entries at most
 SMALLEST = 1024  # entries for so many splats, and twice as many for twice as many
@@ -32,6 +32,7 @@ def write_sog(path: Path, splats: SplatFile, options: Writing) -> str:
     The images of a folder have their content in their names, so that none of another model is replaced.
     """
     require_some(path, splats)
+    require_moderate(path, splats, "SOG")
     return write_as_ordered(path, splats.rows(morton_order(splats.parameters["means"])), options)
 
 
@@ -65,7 +66,7 @@ def write_as_ordered(path: Path, splats: SplatFile, options: Writing) -> str:
         meta[name] = {"codebook": [_short(number) for number in entries], "files": [image(name, *planes, *more)]}
     if p["sh_rest"].shape[1]:
         meta["shN"] = _harmonics(p["sh_rest"], options, image)
-    images[META] = json.dumps(meta, separators=(",", ":"), sort_keys=True).encode()
+    images[META] = json.dumps(meta, separators=(",", ":"), sort_keys=True, allow_nan=False).encode()
     return _write_beside(path, images) if in_folder else _write(path, _zipped(images))
 
 

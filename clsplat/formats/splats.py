@@ -7,6 +7,7 @@
 Axes are those of the PLY of 3DGS: x right, y down, z ahead.
 """
 
+import logging
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -23,11 +24,14 @@ MAX_DEGREE = 3
 NEAR, VARIANCE = 0.2, 0.3  # scene units and px²: nearest distance and screen filter of 3DGS
 MIP_VARIANCE = 0.1  # px², of files that say no more than `mip` (Yu et al. 2024)
 MAX_FILE = 1 << 33  # bytes
+LARGEST = 1e15  # of LIMITED: beyond it neither viewers nor codebooks hold anything
+LIMITED = ("log_scales", "sh_base", "sh_rest")
 MIN_ALPHA = 1e-6  # opacities of 0 and 1 have no logit
 FLAT_LOG_SCALE = -13.815511  # log 1e-6: of the third axis of a disc
 FLIP_SH = (-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1)  # y and z change sign: bands 1 to 3
 Parameters = dict[str, NDArray[np.float32]]  # by the names of PARAMETERS, each [N, components]
 Floats = NDArray[np.floating]
+LOG = logging.getLogger("clsplat")
 
 
 @dataclass(frozen=True)
@@ -140,6 +144,48 @@ def not_finite(parameters: Parameters) -> NDArray[np.bool_]:
     for table in parameters.values():
         found |= ~np.isfinite(table).all(axis=1)
     return found
+
+
+def too_large(parameters: Parameters) -> NDArray[np.bool_]:
+    """Return which Gaussians hold finite logarithms of scales or coefficients beyond LARGEST, [N]."""
+    found = np.zeros(len(parameters["means"]), np.bool_)
+    for name in LIMITED:
+        size = np.abs(parameters[name])
+        found |= ((size > LARGEST) & (size < np.inf)).any(axis=1)
+    return found
+
+
+def told_too_large(parameters: Parameters) -> str:
+    """Say how many Gaussians hold values that are too large, and of which tables; '' of none."""
+    if not (count := int(too_large(parameters).sum())):
+        return ""
+    names = [name for name in LIMITED if (np.abs(parameters[name]) > LARGEST).any()]
+    return f"{count} of {len(parameters['means'])} Gaussians hold {', '.join(names)} beyond {LARGEST:g}"
+
+
+def settled(path: Path, splats: SplatFile, options: Reading) -> SplatFile:
+    """Refuse, drop or keep Gaussians that are not finite; drop those that are too large, too.  Raises DataError."""
+    bad = not_finite(splats.parameters)
+    if options.not_finite == "drop":
+        if told := told_too_large(splats.parameters):
+            LOG.warning("%s: %s; they are dropped", path, told)
+        if bad.any():
+            LOG.warning("%s: dropped %s Gaussians with values that are not finite", path, f"{int(bad.sum()):,}")
+        bad |= too_large(splats.parameters)
+        return splats.rows(~bad) if bad.any() else splats
+    if options.not_finite == "keep" or not bad.any():
+        return splats
+    names = [name for name, table in splats.parameters.items() if not_finite({"means": table}).any()]
+    raise DataError(
+        f"{path}: {', '.join(names)} hold values that are not finite; export the file again, or drop those Gaussians "
+        "with `clsplat convert`"
+    )
+
+
+def require_moderate(path: Path, splats: SplatFile, name: str) -> None:
+    """Raise DataError for values that the format `name` cannot hold."""
+    if told := told_too_large(splats.parameters):
+        raise DataError(f"{path}: {told}, which {name} cannot hold; `clsplat convert MODEL OTHER.ply` drops them")
 
 
 def require_held(path: Path, held: int, expected: int, what: str) -> None:

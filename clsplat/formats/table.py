@@ -12,18 +12,19 @@ from clsplat.formats.compressed_ply import is_compressed, read_compressed_ply, w
 from clsplat.formats.glb import read_glb, write_glb
 from clsplat.formats.ksplat import looks_like_ksplat, read_ksplat
 from clsplat.formats.lod import LOD_META, files_of_lod, looks_like_lod, read_lod
-from clsplat.formats.ply import read_ply, write_ply
+from clsplat.formats.ply import checked_numbers, read_ply, write_ply
 from clsplat.formats.sog import looks_like_sog, read_sog
 from clsplat.formats.sog_files import META, with_images
 from clsplat.formats.sog_writing import write_sog
 from clsplat.formats.splat import looks_like_splat, read_splat, write_splat
-from clsplat.formats.splats import MIP_VARIANCE, NEAR, VARIANCE, Reading, SplatFile, Writing, not_finite
+from clsplat.formats.splats import MIP_VARIANCE, NEAR, VARIANCE, Reading, SplatFile, Writing, not_finite, settled
 from clsplat.formats.spz import read_spz, write_spz
 from clsplat.formats.usda import write_usda
 from clsplat.ply_header import MAX_HEADER
 from clsplat.reading import opened
 
 LOG = logging.getLogger("clsplat")
+_told: set[tuple[Path, str, str]] = set()  # what was said to be lost of the files in a folder
 
 
 def _is_ply(start: Start) -> bool:
@@ -61,8 +62,8 @@ CODECS = (
         (".spz",),
         "versions 1 to 4",
         "version 3, or 4 with the extra `spz`, along a Morton curve",
-        "position to 2^-12, log scale to 1/16, quaternions to 9 bits, colours, opacity and harmonics to 8; harmonics "
-        "beyond 1, colours beyond -0.44 and 1.44, scales beyond 4.5e-5 and 379; order",
+        "rounds: position to 2^-12, log scale to 1/16, quaternions to 9 bits, colours, opacity and harmonics to 8; "
+        "cuts: harmonics beyond 1, colours beyond -0.44 and 1.44, scales beyond 4.5e-5 and 379; order",
         lambda start: start.data.startswith((b"NGSP", b"\x1f\x8b")),
         read_spz,
         write_spz,
@@ -146,10 +147,17 @@ def located(path: Path) -> Path:
 
 
 def bytes_of(path: Path) -> int:
-    """Return the size of a model: of a folder of SOG, or of levels, that of all files that its JSON names."""
+    """Return the size of a model: of a folder of SOG, or of levels, that of all files that its JSON names.
+
+    Raises DataError where one is missing.
+    """
     place = located(path)
     files = {META: with_images, LOD_META: files_of_lod}.get(place.name, lambda one: [one])
-    return sum(one.stat().st_size for one in files(place))
+    try:
+        return sum(one.stat().st_size for one in files(place))
+    except OSError as error:
+        missing = "" if error.filename == str(place) else f"names {quoted(error.filename)}, which "
+        raise DataError(f"{place}: {missing}cannot be read ({error.strerror}); copy or export it again") from error
 
 
 def detect(path: Path) -> Codec | None:
@@ -178,7 +186,7 @@ def read(path: Path, options: Reading | None = None) -> SplatFile:
     if codec.read is None:
         raise DataError(f"{path}: {codec.name} is written, not read; convert the model that it was made from")
     with np.errstate(all="ignore"):  # what is not finite is refused, dropped or kept
-        return _settled(path, codec.read(path, options), options)
+        return settled(path, codec.read(path, options), options)
 
 
 def for_writing(path: Path) -> Codec:
@@ -197,7 +205,8 @@ def for_writing(path: Path) -> Codec:
 
 
 def write(path: Path, splats: SplatFile, options: Writing | None = None) -> str:
-    """Write a model file in the format that its name stands for; log in a line what the format does not hold.
+    """Write a model file in the format that its name stands for; log in a line what the format does not hold,
+    numbers of the renderer once for a folder.
 
     Returns the SHA-256 of what was written, of a folder of SOG that of its meta.json.
 
@@ -211,13 +220,16 @@ def write(path: Path, splats: SplatFile, options: Writing | None = None) -> str:
         raise ValueError(f"{path}: {codec.name} holds no world filter; call baked() first")
     if not codec.keeps_nan and (bad := int(not_finite(splats.parameters).sum())):
         raise DataError(
-            f"{path}: {bad} Gaussians hold values that are not finite, which {codec.name} cannot hold; drop them, "
+            f"{path}: {bad:,} Gaussians hold values that are not finite, which {codec.name} cannot hold; drop them, "
             "or write a PLY"
         )
     if not codec.keeps_mode and splats.mode == "mip":
         LOG.warning("%s: %s has no mark for a mip model; viewers show it as plain 3DGS", path, codec.name)
-    if not codec.keeps_numbers and (lost := _unusual(splats)):
+    if not codec.keeps_numbers and (lost := _unusual(splats)) and (path.parent, codec.name, lost) not in _told:
+        _told.add((path.parent, codec.name, lost))
         LOG.warning("%s: %s does not keep %s; PLY, SOG and GLB do", path, codec.name, lost)
+    if codec.keeps_numbers:
+        checked_numbers(path, splats.rendering)  # its reader would refuse them
     return codec.write(path, splats, options or Writing())
 
 
@@ -226,18 +238,3 @@ def _unusual(splats: SplatFile) -> str:
     usual = {"near": NEAR, "screen_variance": MIP_VARIANCE if splats.mode == "mip" else VARIANCE, "background": None}
     given = {name: splats.rendering.get(name, value) for name, value in usual.items()}
     return ", ".join(f"{name} = {value}" for name, value in given.items() if value != usual[name])
-
-
-def _settled(path: Path, splats: SplatFile, options: Reading) -> SplatFile:
-    """Refuse, drop or keep Gaussians that are not finite."""
-    bad = not_finite(splats.parameters)
-    if options.not_finite == "keep" or not bad.any():
-        return splats
-    if options.not_finite == "drop":
-        LOG.warning("%s: dropped %d Gaussians with values that are not finite", path, int(bad.sum()))
-        return splats.rows(~bad)
-    names = [name for name, table in splats.parameters.items() if not_finite({"means": table}).any()]
-    raise DataError(
-        f"{path}: {', '.join(names)} hold values that are not finite; export the file again, or drop those Gaussians "
-        "with `clsplat convert`"
-    )

@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.formats.splats import Reading, not_finite
+from clsplat.formats.lod import LOD_META, faults_of_levels
+from clsplat.formats.splats import Reading, not_finite, told_too_large
 from clsplat.formats.table import detect, located, named
 from clsplat.gaussians.model import Model, load
 
@@ -36,13 +37,16 @@ def examine(path: Path) -> dict[str, Any]:
     model = load(path, Reading(not_finite="keep"))
     bad = not_finite(model.tables())
     whole = model[~bad] if bad.any() else model
-    findings = [f"{int(bad.sum())} of {len(model)} Gaussians hold values that are not finite"] if bad.any() else []
+    findings = [f"{int(bad.sum()):,} of {len(model):,} Gaussians hold values that are not finite"] if bad.any() else []
+    findings += [told] if (told := told_too_large(whole.tables())) else []
     findings += _activated(whole)
     length = np.linalg.norm(whole.quats.astype(np.float64), axis=1)
     if zero := int((length == 0).sum()):
         findings.append(f"{zero} quaternions have no length")
     if not len(model):
         findings.append("it holds no Gaussians")
+    if located(path).name == LOD_META:
+        findings += faults_of_levels(located(path))
     return {
         "model": str(path),
         "format": codec.name if codec else "",
@@ -83,7 +87,10 @@ def verdict(found: dict[str, Any]) -> str:
     """Return a sentence about what `examine` found."""
     if found["valid"]:
         return f"{found['model']}: valid"
-    return f"{found['model']}: {'; '.join(found['findings'])}; export it again, or mend it with `clsplat convert`"
+    remedy = (
+        "write it again" if found["format"] == "streamed SOG" else "export it again, or mend it with `clsplat convert`"
+    )
+    return f"{found['model']}: {'; '.join(found['findings'])}; {remedy}"
 
 
 def _activated(model: Model) -> list[str]:

@@ -40,7 +40,7 @@ class Changes:
         if self.sh_degree is not None and self.sh_degree < kept.sh_degree:
             kept = replace(kept, **with_degree(kept.tables(), self.sh_degree))  # type: ignore[arg-type]
         if not len(kept) and len(model):
-            raise DataError(f"none of {len(model)} Gaussians is left; expected some inside of the crop and as opaque")
+            raise DataError(f"none of {len(model):,} Gaussians is left; expected some inside of the crop and as opaque")
         return kept
 
 

@@ -9,7 +9,7 @@ from typing import Any
 from clsplat.errors import ConfigError, DataError
 from clsplat.files import new_folder, require_free
 from clsplat.formats.lod_writing import write_lod
-from clsplat.formats.splats import Writing
+from clsplat.formats.splats import Writing, require_moderate
 from clsplat.formats.table import bytes_of
 from clsplat.gaussians.clusters import DeviceClusters
 from clsplat.gaussians.model import Model, load
@@ -36,6 +36,7 @@ def levels_of_detail(
     opened, first = _opened(model, scene, plan, device)
     if not len(first):
         raise DataError(f"{model}: the model holds no Gaussians; expected some to merge")
+    require_moderate(model, first.as_file(), "SOG")
     if len(first) < FEW:
         LOG.warning("%s: has %d Gaussians; below a million one SOG is better: `clsplat convert`", model, len(first))
     training = Training(opened, folder.with_name(f"{folder.name}.training"), plan) if opened else None
@@ -57,10 +58,8 @@ def _opened(model: Path, scene: Path | None, plan: Plan, device: Any) -> tuple[M
     if scene is None and run_of(model) is None:
         alone = load(model).baked()
         given = {"--steps": plan.steps, "--downscale": plan.downscale, "--device": device}
-        if names := " and ".join(name for name, value in given.items() if value):
-            raise ConfigError(
-                f"{model}: no photographs are known, which {names} would need; give --scene, or drop that"
-            )
+        if names := ", ".join(name for name, value in given.items() if value):
+            raise ConfigError(f"{model}: no photographs are known, needed for {names}; give --scene, or leave that out")
         LOG.info("%s: no photographs: merged alone", model)
         return None, alone
     try:

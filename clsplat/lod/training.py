@@ -72,6 +72,7 @@ class Training:
         """Hold the folder of the training in a block, where anything is trained."""
         if not self.steps or self.plan.levels == 1:
             return nullcontext()
+        self.question["photographs"] = self.measurer.identity()
         return claimed(self.place, self.question, RECORD, "the training of levels", "the name of another folder")
 
     def measured(self, model: Model) -> Level:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from clsplat.caches import remove_cut_kernels
 from clsplat.errors import ConfigError, KernelError, MemoryLimitError
 from clsplat.opencl import runtimes
 from clsplat.opencl.discovery import DeviceInfo, Schedule, choose, platforms, resolve_schedule, tuning_of
@@ -90,6 +91,7 @@ class Device:
     def __init__(self, info: DeviceInfo, schedule: Schedule = "auto") -> None:
         platform, number = info.place
         self.info = info
+        remove_cut_kernels()
         timed = cl.command_queue_properties.PROFILING_ENABLE
         with self.refusals("opening it"):
             self.context = cl.Context([platforms()[platform].get_devices()[number]])

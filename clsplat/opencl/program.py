@@ -5,9 +5,11 @@ Arguments are passed by the names in the kernel's signature; missing, surplus or
 
 import math
 import re
+import sqlite3
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from pickle import UnpicklingError
 from typing import TYPE_CHECKING, Any, ClassVar, NoReturn
 
 import numpy as np
@@ -22,6 +24,7 @@ from clsplat.opencl.discovery import DeviceInfo
 if TYPE_CHECKING:
     from clsplat.opencl.device import Device
 
+DAMAGES = (cl.Error, sqlite3.Error, UnpicklingError)  # where a kernel is made: of a runtime's cache, and of pyopencl's
 BUILD_OPTIONS = ("-cl-std=CL1.2",)
 
 _INCLUDE = re.compile(r'^#include "(\w+\.h)"')
@@ -196,16 +199,15 @@ class Program:
                 f"{file} does not build on {device.text} with {' '.join(options)}: {_first_error(error)}"
             ) from error
         try:
-            made = {name: cl.Kernel(program, name) for name in parse_kernels(source)}
-        except cl.Error as error:
+            self.kernels = {
+                name: Kernel(device, f"{path.name}:{name}", cl.Kernel(program, name), arguments)
+                for name, arguments in parse_kernels(source).items()
+            }
+        except DAMAGES as error:
             raise KernelError(
                 f"{file} was built on {device.text}, and its kernels cannot be made ({error}); the cache of built "
                 f"kernels may be damaged: remove {kernel_caches()}"
             ) from error
-        self.kernels = {
-            name: Kernel(device, f"{path.name}:{name}", made[name], arguments)
-            for name, arguments in parse_kernels(source).items()
-        }
         names = program.get_info(cl.program_info.KERNEL_NAMES).split(";")
         if unread := sorted({name for name in names if name} - self.kernels.keys()):
             raise KernelError(

@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 
-from clsplat.caches import cache_folder, damaged_kernels, empty_kernel_caches
+from clsplat.caches import cache_folder, damaged_kernels, empty_kernel_caches, remove_cut_kernels
 from clsplat.errors import OutputError
 from clsplat.files import write_text
 
@@ -77,6 +77,7 @@ def fault_of(key: str, platform: int, device: int) -> str | None:
     record = cache_folder() / "probes" / hashlib.sha256(tested).hexdigest()[:16]
     if os.path.exists(record):  # False in a folder of another user
         return None
+    remove_cut_kernels()
     fault = _probed(platform, device, {})
     if fault is None:
         with suppress(OutputError):

@@ -33,7 +33,8 @@ def find(name: str) -> Path:
     if is_run:
         raise ConfigError(f"{path}: is a run folder, expected a pipeline; `clsplat resume {path}` goes on with the run")
     if is_folder:
-        raise ConfigError(f"{path}: is a folder, expected a pipeline file")
+        remedy = f"with a scene it is `clsplat run splat_7k --scene {path}`"
+        raise ConfigError(f"{path}: is a folder, expected a pipeline file; {remedy}")
     near = difflib.get_close_matches(name, files, n=1)
     hint = f"; did you mean '{near[0]}'?" if near else f"; there are {', '.join(files)}, or give a path"
     raise ConfigError(f"no pipeline named {quoted(name)}{hint}")

@@ -171,9 +171,13 @@ def record_of(folder: Path) -> dict[str, Any]:
 
 
 def _sizes(folder: Path) -> dict[str, int]:
-    """The bytes of each file below a folder, by its name there; those behind links, such as photographs, count too."""
+    """The bytes of each file below a folder, by its name there, but for a record that a killed call left.
+
+    Files behind links, such as photographs, count too.
+    """
     files = (Path(base, name) for base, _, names in os.walk(folder, followlinks=True) for name in names)
-    return {path.relative_to(folder).as_posix(): path.stat().st_size for path in sorted(files) if path.is_file()}
+    found = {path.relative_to(folder).as_posix(): path.stat().st_size for path in sorted(files) if path.is_file()}
+    return {name: size for name, size in found.items() if name != RECORD}
 
 
 def _fault(folder: Path) -> str:

@@ -13,7 +13,7 @@ from clsplat.runs.opening import check_start, open_run
 from clsplat.runs.outputs import check_places
 from clsplat.runs.runner import restore
 from clsplat.runs.scenes import ReadScene, read_run_scene
-from clsplat.stages.base import Stage
+from clsplat.stages.base import Scheduled, Stage
 from clsplat.stages.evaluate import Evaluate
 from clsplat.stages.optimize import Optimize
 from clsplat.training.run import Run
@@ -59,10 +59,16 @@ def tell_of_waiting(out: Path) -> None:
 
 def _detail(stage: Stage, run: Run | None) -> str:
     if isinstance(stage, Optimize):
-        cadences = (f"{inner.stage} every {inner.every}" for inner in stage.during)
-        return f"{stage.steps} steps; " + ", ".join(cadences)
+        return f"{stage.steps} steps; " + ", ".join(map(_cadence, stage.during))
     if isinstance(stage, Evaluate) and run:
         views = run.original.downscaled(run.downscale).split(stage.split)
         sizes = ", ".join(f"1/{downscale:g}" for downscale in stage.downscales or [run.downscale])
         return f"{len(views)} {stage.split} views at {sizes}"
     return ""
+
+
+def _cadence(stage: Scheduled) -> str:
+    """How often a stage acts, and what else must hold."""
+    limits = {name: getattr(stage, name, None) for name in ("start", "stop", "when_background")}
+    given = ", ".join(f"{name} {value}" for name, value in limits.items() if value)
+    return f"{stage.stage} every {stage.every}" + (f" ({given})" if given else "")

@@ -21,7 +21,7 @@ def run_status(out: Path) -> dict[str, Any]:
     """Return what status.json says, the last report and the metrics of a run folder; of a matrix no step.
 
     state: as there, or killed where its process on this machine has ended; silent: seconds since the heartbeat of a run
-    that has not ended, on whatever machine it runs.
+    that has not ended, on whatever machine it runs; ahead: seconds by which that is in the future, from a minute on.
     Raises DataError when the folder holds no run, or a damaged status.json or metrics.json.
     """
     status = read_status(out)
@@ -34,9 +34,13 @@ def run_status(out: Path) -> dict[str, Any]:
     if known is None:
         raise DataError(f"{out / STATUS}: of a newer clsplat; update clsplat to read it")
     status["state"] = state_of(status)
-    status.pop("silent", None)
+    for own in ("silent", "ahead"):
+        status.pop(own, None)
     if status["state"] not in (*END_STATES, "killed"):
-        status["silent"] = max(0, round(time.time() - known.time))
+        silent = round(time.time() - known.time)
+        status["silent"] = max(0, silent)
+        if silent <= -SILENT:
+            status["ahead"] = -silent
     metrics = None
     if (out / METRICS).exists():
         metrics = read_metrics(out / METRICS).model_dump(exclude_unset=True)
@@ -64,6 +68,8 @@ def status_text(status: dict[str, Any]) -> str:
     lines = [f"{status['run']}: {status['state']}{_progress(status)}"]
     if status.get("silent", 0) >= SILENT:
         lines.append(f"no sign of life for {status['silent']} s{_place(status)}")
+    if status.get("ahead"):
+        lines.append(f"its clock is ahead by {status['ahead']} s{_place(status)}: its silence cannot be told")
     if status.get("message"):
         lines.append(status["message"])
     if status["state"] in ("killed", "failed", "interrupted") and (advice := _advice(status)):
@@ -83,7 +89,9 @@ def _advice(status: dict[str, Any]) -> str:
         return ""
     if "cells" in status or checkpoint.saved(out):
         return f"`clsplat resume {out}` goes on with it"
-    return f"no checkpoint was saved; `clsplat run {out / PIPELINE} --out {out} --restart` begins it again"
+    if status.get("checkpoint"):  # without which it does not go on
+        return f"its checkpoints are gone; `clsplat run {out / PIPELINE} --out {out} --restart` begins it again"
+    return f"no checkpoint was saved; `clsplat resume {out}` begins it again"
 
 
 def _progress(status: dict[str, Any]) -> str:

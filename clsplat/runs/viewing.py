@@ -1,5 +1,6 @@
 """Models, of files or run folders, on one page to walk through."""
 
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from clsplat.viewer.page import Page
 from clsplat.viewer.photographs import BUDGET, Which, described
 from clsplat.views.photographs import BACKGROUNDS
 
+LOG = logging.getLogger("clsplat")
 MOST = 2  # models beside each other
 
 
@@ -56,6 +58,8 @@ def view(
     start = (found.split("test") or found.views)[0] if found else None
     stand = Stand.of(first.means, found.views if found else (), start)
     title = " and ".join(loaded) + (f" · {found.path.name}" if found else "")
+    if found is None:
+        LOG.info("without a scene up is -y; give --scene where the picture stands on its head")
     Page(title, {name: pack(model, splats) for name, model in loaded.items()}, stand, background, views).write(out)
     return out
 

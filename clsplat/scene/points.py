@@ -33,7 +33,7 @@ class PointTable(NamedTuple):
         """Return the points that are finite; log the number of the others."""
         kept = (np.abs(self.positions) < MAX_VALUE).all(axis=1)
         if not kept.all():
-            logger.warning("%s: dropped %d points that are not finite", self.file, np.count_nonzero(~kept))
+            logger.warning("%s: dropped %s points that are not finite", self.file, f"{np.count_nonzero(~kept):,}")
         colours = np.asarray(self.rgb[kept], np.float32) / np.float32(255)
         return PointCloud(np.asarray(self.positions[kept], np.float32), colours)
 

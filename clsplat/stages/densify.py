@@ -53,9 +53,8 @@ class Densify(Scheduled):
         change = densify(edit, self.rules, run.rasterizer.tiler, limit)
         run.refresh_filter()
         if change.after == fits:
-            LOG.warning(
-                "step %d: growth stops at %d Gaussians, the most that fit in the device's memory", run.step, fits
-            )
+            most = f"{fits:,} Gaussians, the most that fit in the device's memory"
+            LOG.warning("step %d: growth stops at %s", run.step, most)
         run.records.add(run.step, "densify", **asdict(change))
         LOG.debug("step %d: %d -> %d Gaussians", run.step, change.before, change.after)
         if change.after == 0:

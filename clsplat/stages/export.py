@@ -52,7 +52,7 @@ class Export(Scheduled):
                     load(file)
             except DataError as error:
                 raise OutputError(f"{error}; it was written just now: check the disk and its space") from error
-            LOG.info("%d Gaussians written to %s", len(one), file)
+            LOG.info("%s Gaussians written to %s", f"{len(one):,}", file)
 
     def verify(self, run: Run) -> None:
         path, raw = self.outputs(run.out)

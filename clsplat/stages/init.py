@@ -71,7 +71,7 @@ class Init(Stage):
         gaussians = Gaussians(run.device, self._parameters(run, degree))
         run.model = run.model_settings.model(gaussians, degree if self.source in MODEL_SOURCES else 0)
         run.refresh_filter()
-        LOG.info("%d Gaussians from %s", run.model.gaussians.count, self._origin(run.scene))
+        LOG.info("%s Gaussians from %s", f"{run.model.gaussians.count:,}", self._origin(run.scene))
 
     def _origin(self, scene: Scene) -> str:
         names = {"points": "the scene's points", "random": "random points", "sweep": "a sweep over the photographs"}
@@ -138,7 +138,7 @@ def require_ahead(points: PointCloud, scene: Scene) -> None:
     poses = np.stack([view.world_to_camera for view in scene.split("train")])
     if not any((points.positions @ pose[2, :3] + pose[2, 3] > 0).any() for pose in poses):
         raise DataError(
-            f"{scene.path}: all {len(points)} points lie behind all training cameras; poses and points follow "
+            f"{scene.path}: all {len(points):,} points lie behind all training cameras; poses and points follow "
             "different conventions: export both again, or use init: {source: sweep}"
         )
 

@@ -67,7 +67,7 @@ class PruneLeast(Scheduled):
         causes = {self.stage: before - len(kept)}
         run.records.add(run.step, "densify", before=before, after=len(kept), causes=causes, grown={})
         lost = 100 * (1 - score[kept].sum() / (score.sum() or 1))
-        LOG.info("%d of %d Gaussians kept; the others had %.2g %% of the weight", len(kept), before, lost)
+        LOG.info("%s Gaussians kept; the others had %.2g %% of the weight", f"{len(kept):,} of {before:,}", lost)
 
 
 class ReduceSh(Scheduled):

@@ -36,6 +36,7 @@ class Report(Stage):
             "report.html.j2",
             title=Path(run.pipeline["scene"]["path"] or run.scene.path).resolve().name,
             subtitle=f"{run.name} · {run.device.text}",
+            main=_main(run),
             photographs=photographs_text(run.found) or f"{counted(len(run.original.views), 'photograph')}",
             viewers=_addresses(run, "viewer", run.out / self.file),
             models=_addresses(run, "export", run.out / self.file),
@@ -58,6 +59,14 @@ def _addresses(run: Run, stage: str, page: Path) -> dict[str, str]:
     """The files that stages of this name write, with their addresses beside the page."""
     files = [run.out / one[stage]["file"] for one in run.pipeline["stages"] if stage in one]
     return {file.name: quote(Path(os.path.relpath(file, page.parent)).as_posix()) for file in files}
+
+
+def _main(run: Run) -> str:
+    """The figures that are looked for first."""
+    test = run.metrics.get("test", {}).get(f"{run.downscale:g}")
+    quality = [f"test PSNR {test['psnr']:.2f} dB, SSIM {test['ssim']:.4f}"] if test else []
+    others = f"{run.model.gaussians.count:,} Gaussians", f"trained for {duration(run.train_seconds)}"
+    return " · ".join([*quality, *others])
 
 
 def _figures(run: Run) -> dict[str, str]:

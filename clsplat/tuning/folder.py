@@ -12,6 +12,8 @@ from clsplat.files import is_there, make_folder, sweep, unwritable, write_text
 from clsplat.names import LOCK, PIPELINE
 from clsplat.reading import read_json
 
+WORDS = {"sha256": "the model's bytes"}  # for keys of a question, where they are no words
+
 
 @contextmanager
 def claimed(out: Path, question: dict[str, Any], record: str, what: str, remedy: str) -> Iterator[None]:
@@ -45,8 +47,9 @@ def _require_own(out: Path, question: dict[str, Any], record: str, what: str, re
         before = None
     if not isinstance(before, dict):
         raise ConfigError(f"{out / record}: is not the record of {what}; remove {out}, or give {remedy}")
-    if differing := [key for key, value in question.items() if before.get(key) != value]:
-        raise ConfigError(f"{out}: holds {what} with another {differing[0]}; give {remedy}")
+    differing = [WORDS.get(key, key) for key, value in question.items() if before.get(key) != value]
+    if differing:
+        raise ConfigError(f"{out}: holds {what} that differs in {', '.join(differing)}; remove it, or give {remedy}")
 
 
 def _is_nobodys(name: str) -> bool:

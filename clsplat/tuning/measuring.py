@@ -5,6 +5,8 @@ import logging
 from clsplat.gaussians.model import Model
 from clsplat.metrics.views import mean, measure
 from clsplat.runs.model_file import ModelFile
+from clsplat.scene.decoding import decode_all, require_whole
+from clsplat.scene.identity import Identity
 from clsplat.views.photographs import Photographs
 
 LOG = logging.getLogger("clsplat")
@@ -19,6 +21,13 @@ class Measurer:
         if self.split == "train":
             LOG.warning("%s: has no test views; the training views are measured", opened.scene.path)
         self.photographs = Photographs(opened.device, opened.background)
+
+    def identity(self) -> str:
+        """Return a hash of the photographs, cameras and points.  Raises DataError where a photograph is damaged."""
+        scene = self.opened.scene
+        files = decode_all(scene.views)
+        require_whole(scene.path, files)
+        return Identity.of(scene, files).digest
 
     def figures(self, model: Model) -> tuple[float, float]:
         """Return PSNR, dB, and SSIM."""

@@ -6,8 +6,10 @@ import shutil
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 import clsplat
+from clsplat import cli
 from clsplat.cameras import inria
 from clsplat.cameras.nerfstudio import DISTORTION
 from clsplat.errors import ConfigError, DataError
@@ -196,6 +198,13 @@ def test_the_command_takes_a_dataset_and_a_run(few_steps, tiny_scene, tmp_path):
     assert (tmp_path / "run/transforms.json").read_bytes() == (tmp_path / "set/transforms.json").read_bytes()
     told = command("data", "cameras", tmp_path / "none", tmp_path / "x", expect=3).stderr
     assert "no such folder" in told
+
+
+@pytest.mark.parametrize(("format_", "images"), [("nerfstudio", "none"), ("colmap", "none"), ("colmap", "copy")])
+def test_a_folder_without_photographs_is_told(format_, images, tiny_scene, tmp_path):
+    words = ["data", "cameras", str(tiny_scene), str(tmp_path / "out"), "--format", format_, "--images", images]
+    told = CliRunner().invoke(cli.app, words).output
+    assert ("with --images copy" in told) == (images == "none")
 
 
 @pytest.mark.parametrize("name", ["fox_opencv", "fox_nerfstudio", "brighton"])

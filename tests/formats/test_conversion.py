@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -164,6 +165,43 @@ def test_gaussians_that_are_not_finite_are_dropped_or_kept(tmp_path, rng, caplog
     assert clsplat.convert(tmp_path / "a.ply", tmp_path / "b.ply", keep_nan=True)["gaussians"] == 20
     with pytest.raises(DataError, match="2 Gaussians hold values that are not finite, which GLB cannot hold"):
         write(tmp_path / "b.glb", bad)
+
+
+@pytest.mark.parametrize(("table", "value"), [("log_scales", 3e38), ("sh_base", -3e38), ("sh_rest", 1e16)])
+def test_gaussians_that_no_codebook_holds_are_refused_and_convert_drops_them(table, value, tmp_path, rng, caplog):
+    large = splats(rng, 20, 1)
+    large.parameters[table][3:5, 1] = value
+    write_ply(tmp_path / "a.ply", large.parameters, {})
+    told = f"2 of 20 Gaussians hold {table} beyond 1e+15"
+    (tmp_path / "out").mkdir()
+    for place in ("a.sog", "meta.json"):
+        with pytest.raises(DataError, match=re.escape(f"{told}, which SOG cannot hold; `clsplat convert MODEL OTHER")):
+            write(tmp_path / "out" / place, large)
+    assert list((tmp_path / "out").iterdir()) == []
+    found = clsplat.check(tmp_path / "a.ply")
+    assert told in found["findings"]
+    json.dumps(found, allow_nan=False)
+    assert clsplat.convert(tmp_path / "a.ply", tmp_path / "b.sog")["gaussians"] == 18
+    assert f"{told}; they are dropped" in caplog.text
+    assert len(load(tmp_path / "b.sog")) == 18
+    assert clsplat.convert(tmp_path / "a.ply", tmp_path / "b.ply", keep_nan=True)["gaussians"] == 20
+
+
+@pytest.mark.parametrize("name", ["b.ply", "b.compressed.ply", "b.sog", "b.glb"])
+def test_a_number_that_no_reader_takes_is_not_written(name, source, tmp_path):
+    with pytest.raises(DataError, match=r"says near = .*; expected a number from 0 to 1e\+15"):
+        clsplat.convert(source, tmp_path / name, transform="scale=1e17")
+    assert not (tmp_path / name).exists()
+
+
+@pytest.mark.parametrize("number", ["NaN", "1e999"])
+def test_a_comment_of_numbers_that_are_not_finite_is_refused(number, source, tmp_path):
+    write(tmp_path / "a.ply", replace(read(source), rendering={"note": 5}))
+    (tmp_path / "a.ply").write_bytes(
+        (tmp_path / "a.ply").read_bytes().replace(b'{"note": 5}', f'{{"note": {number}}}'.encode())
+    )
+    with pytest.raises(DataError, match=r"a\.ply: its comment holds what no JSON holds"):
+        clsplat.convert(tmp_path / "a.ply", tmp_path / "b.glb")
 
 
 def test_sizes_are_figures_for_people(tmp_path, rng):

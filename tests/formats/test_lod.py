@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,10 @@ from clsplat.formats.lod_writing import write_lod
 from clsplat.formats.packing import morton_order
 from clsplat.formats.splats import SplatFile
 from clsplat.formats.table import bytes_of, detect, read, write
+from clsplat.gaussians.checkup import examine, verdict
+from clsplat.gaussians.conversion import convert
 from clsplat.gaussians.model import load
+from clsplat.lod.levels import levels_of_detail
 from tests.formats.models import assert_close, interop, splats
 from tests.test_left_files import NONE
 
@@ -208,6 +212,21 @@ def test_an_empty_level_is_refused(written, tmp_path):
         write(tmp_path / "lod-meta.json", made[0])
 
 
+def test_values_beyond_those_that_sog_holds_are_refused_and_boxes_stay_finite(tmp_path, rng):
+    large = splats(rng, 50)
+    large.parameters["log_scales"][7] = 1000
+    write_lod(tmp_path / "a", [large])
+    json.loads((tmp_path / "a" / "lod-meta.json").read_text(), parse_constant=lambda text: pytest.fail(text))
+    large.parameters["log_scales"][7] = 3e38
+    write(tmp_path / "a.ply", large)
+    told = r"1 of 50 Gaussians hold log_scales beyond 1e\+15, which SOG cannot hold"
+    with pytest.raises(DataError, match=told):
+        write_lod(tmp_path / "b", [large])
+    with pytest.raises(DataError, match=told):
+        levels_of_detail(tmp_path / "a.ply", tmp_path / "b")
+    assert not (tmp_path / "b").exists()
+
+
 def test_an_environment_is_part_of_the_model(written, rng):
     folder, _ = written
     write(folder / "env" / "meta.json", splats(rng, 20, 2))
@@ -223,12 +242,18 @@ WRONG = {
     "a name twice": ({"filenames": ["0_0/meta.json", "0_0/meta.json"]}, "each once"),
     "a name that leads out": ({"filenames": ["../meta.json"]}, "expected a meta.json in a folder below"),
     "an absolute name": ({"filenames": ["/etc/meta.json"]}, "expected a meta.json in a folder below"),
+    "a NUL in a name": ({"filenames": ["0_0/meta.json", "\0/meta.json"]}, "expected a meta.json in a folder below"),
+    "a name that is no text": (
+        {"filenames": ["0_0/meta.json", "\ud800/meta.json"]},
+        "expected a meta.json in a folder",
+    ),
+    "a name of 5,000 letters": ({"filenames": [f"{'a' * 5000}/meta.json"]}, "expected a meta.json in a folder below"),
     "a name of another file": ({"filenames": ["0_0/lod-meta.json"]}, "expected a meta.json in a folder below"),
     "no such file": (
         {"filenames": [f"{i}_9/meta.json" for i in range(20)]},
         "_9/meta.json: cannot be read (No such file",
     ),
-    "too few names": ({"filenames": []}, "name no file of level 0"),
+    "too few names": ({"filenames": []}, "name a file of level 0 that it has not"),
     "no counts": ({"counts": []}, "expected a number for each level"),
     "another count": ({"counts": [701, 0, 0]}, "declares 701 splats of level 0; its leaves have 700"),
     "no tree": ({"tree": 7}, "a node of its tree is 7"),
@@ -250,3 +275,44 @@ def test_a_damaged_one_is_refused_in_a_line(written, name):
         read(folder)
     assert message in str(error.value)
     assert "\n" not in str(error.value)
+    assert len(str(error.value)) < len(str(folder)) + 300
+
+
+def renamed(folder: Path, file: int, name: str) -> Path:
+    """Give a file of the levels another name, in their JSON alone; return its path under the old name."""
+    path = folder / "lod-meta.json"
+    meta = json.loads(path.read_text())
+    old, meta["filenames"][file] = meta["filenames"][file], name
+    path.write_text(json.dumps(meta))
+    return folder / old
+
+
+def test_a_coarser_level_that_is_missing_is_damage_of_the_model(written, tmp_path):
+    folder, _ = written
+    renamed(folder, 1, "9_9/meta.json")
+    assert len(read(folder)) == 700
+    with pytest.raises(
+        DataError, match=r"lod-meta\.json: names '.*9_9/meta\.json', which cannot be read \(No such file"
+    ):
+        convert([folder], tmp_path / "a.ply")
+    assert not (tmp_path / "a.ply").exists()
+
+
+def test_a_check_names_each_file_of_the_levels_that_is_missing_or_damaged(written):
+    folder, _ = written
+    assert examine(folder)["valid"]
+    path = folder / "lod-meta.json"
+    meta = json.loads(path.read_text())
+    coarse = [name for name in meta["filenames"] if not name.startswith("0_")]
+    shutil.rmtree(folder / coarse[0].split("/")[0])
+    next((folder / coarse[1]).parent.glob("scales*.webp")).write_bytes(b"RIFF")
+    meta["counts"][2] += 1
+    path.write_text(json.dumps({**meta, "filenames": [*meta["filenames"], "more/meta.json"]}))
+    found = examine(folder)
+    assert not found["valid"]
+    missing, damaged, count, spare = found["findings"]
+    assert missing.startswith(f"{folder / coarse[0]}: cannot be read (No such file")
+    assert str(folder / coarse[1]) in damaged
+    assert "splats of level 2; its leaves have 100" in count
+    assert spare.startswith(f"{folder / 'more'}")
+    assert verdict(found).endswith("; write it again")

@@ -115,6 +115,18 @@ def test_the_command_and_the_function_write_the_same_bytes(run, tiny_scene, tmp_
     assert (tmp_path / "a2.html").read_text().count('"photograph":null') == 0
 
 
+def test_a_page_over_an_earlier_one_says_so(run, tmp_path):
+    words = ["view", run, "--out", tmp_path / "a.html"]
+    assert "replaced" not in command(*words)
+    assert "a.html: replaced; 0." in command(*words)
+
+
+def test_which_way_is_up_is_said_where_no_view_tells(run, tmp_path):
+    for_all = ["--out", tmp_path / "a.html"]
+    assert "up is -y; give --scene" in command("view", shutil.copy(run / "point_cloud.ply", tmp_path), *for_all)
+    assert "-y" not in command("view", run, *for_all)
+
+
 def test_no_device_is_opened(run, tmp_path, monkeypatch):
     monkeypatch.setattr("clsplat.opencl.device.Device.__init__", lambda *_: pytest.fail("opens a device"))
     clsplat.view(run, out=tmp_path / "a.html")
