@@ -26,7 +26,10 @@ LOG = logging.getLogger("clsplat")
 Format = Literal["sog", "spz"]
 Quality = Literal["small", "balanced"]
 KEEPS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18)  # shares of the Gaussians
-SETTINGS: tuple[tuple[int, Quality], ...] = ((3, "balanced"), (3, "small"), (2, "small"), (1, "small"), (0, "small"))
+SETTINGS: dict[Format, tuple[tuple[int, Quality], ...]] = {  # of the harmonics: degree, quality
+    "sog": ((3, "balanced"), (3, "small"), (0, "small")),  # a palette of degree 2 or 1 is hardly smaller
+    "spz": ((3, "balanced"), (3, "small"), (2, "small"), (1, "small"), (0, "small")),
+}
 RECORD, PAGE, TRIALS = "compress.json", "compress.html", "trials"
 
 
@@ -108,7 +111,7 @@ def compress(
 def _measured(ladder: Ladder, source: Path, keep: float, form: Format, measurer: Measurer) -> list[Point]:
     """Write a rung with each setting of its harmonics, and measure the files as they are read back."""
     points, degrees, model = [], set[tuple[int, str]](), load(source)
-    for degree, quality in SETTINGS:
+    for degree, quality in SETTINGS[form]:
         setting = min(degree, model.sh_degree), quality
         if setting in degrees:
             continue
