@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from clsplat.compress.tuning import Tuning
 from typer.testing import CliRunner
 
 import clsplat
@@ -15,7 +16,7 @@ from clsplat.compress import search
 from clsplat.compress.page import page, table
 from clsplat.compress.rungs import Ladder, checked_keeps
 from clsplat.compress.target import Point, Target
-from clsplat.errors import ConfigError, Interrupted, OutputError
+from clsplat.errors import ConfigError, DataError, Interrupted, OutputError
 from clsplat.formats.table import detect, read
 from clsplat.gaussians.model import Rendering
 from clsplat.names import LOCK
@@ -254,3 +255,13 @@ def test_a_rung_is_trained_as_the_model_is_rendered(few_steps, tmp_path):
     assert (settings.scene.background, settings.model.sh_degree) == ("white", model.sh_degree)
     assert (settings.stages[1].keep, settings.training.steps, settings.training.rates.means.over) == (0.7, 7, 7)
     assert [stage.stage for stage in settings.stages] == ["init", "prune_least", "optimize", "export"]
+
+
+def test_a_model_whose_size_cannot_be_told_leaves_no_folder(few_steps, tmp_path, monkeypatch):
+    def damaged(path):
+        raise DataError("a level is missing")
+
+    monkeypatch.setattr(search, "bytes_of", damaged)
+    with pytest.raises(DataError, match="a level is missing"):
+        clsplat.compress_model(few_steps, target="1MB", out=tmp_path / "out")
+    assert not (tmp_path / "out").exists()
