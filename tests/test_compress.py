@@ -6,7 +6,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from clsplat.compress.tuning import Tuning
 from typer.testing import CliRunner
 
 import clsplat
