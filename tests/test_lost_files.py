@@ -8,13 +8,13 @@ from pathlib import Path
 import pytest
 
 import clsplat
-from clsplat.compress.tuning import Tuning
 from clsplat.gaussians.model import load as load_model
 from clsplat.opencl.device import Device
 from clsplat.pipeline.matrix import load_experiment
 from clsplat.runs import found
 from clsplat.runs.experiment import run_matrix
 from clsplat.runs.source import Source
+from clsplat.tuning.tuning import Tuning
 from tests.test_cli import clsplat as command
 
 pytestmark = pytest.mark.slow
