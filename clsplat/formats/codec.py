@@ -43,3 +43,4 @@ class Codec:
     keeps_mode: bool = True  # the mark of a mip model
     keeps_numbers: bool = False  # of the rasterizer
     keeps_nan: bool = False
+    has_quality: bool = False  # writing heeds Writing.quality

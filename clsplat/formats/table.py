@@ -67,6 +67,7 @@ CODECS = (
         lambda start: start.data.startswith((b"NGSP", b"\x1f\x8b")),
         read_spz,
         write_spz,
+        has_quality=True,
     ),
     Codec(
         "SOG",
@@ -79,6 +80,7 @@ CODECS = (
         lambda path, options: read_sog(path),
         write_sog,
         keeps_numbers=True,
+        has_quality=True,
     ),
     Codec(
         "streamed SOG",

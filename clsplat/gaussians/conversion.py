@@ -64,7 +64,7 @@ class Options:
             raise ConfigError(f"{out}: --sh-bits and --spz-version are of SPZ; expected a name that ends in .spz")
         if self.axes != "spz" and not to_spz and not from_spz:
             raise ConfigError("--axes is of SPZ; expected an SPZ file to read or to write")
-        if self.quality != "balanced" and codec.name not in ("SPZ", "SOG"):
+        if self.quality != "balanced" and not codec.has_quality:
             raise ConfigError(f"{out}: --quality is of SPZ and SOG; expected a name that ends in .spz or .sog")
         if self.keep_nan and not codec.keeps_nan:
             raise ConfigError(f"{out}: --keep-nan is of PLY; expected a name that ends in .ply")

@@ -5,6 +5,8 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
+from pydantic import model_validator
+
 from clsplat.errors import DataError, OutputError
 from clsplat.formats.splats import Writing
 from clsplat.formats.table import endings, for_writing
@@ -33,6 +35,14 @@ class Export(Scheduled):
     """Path inside the run folder; its ending is the format: .ply, .compressed.ply, .spz, .sog, .glb, .splat, .usda."""
     quality: Literal["small", "balanced", "high"] = "balanced"
     """Of SPZ, bits of the harmonics; of SOG, entries of their palette."""
+
+    @model_validator(mode="after")
+    def _quality_of_its_format(self) -> "Export":
+        if self.quality != "balanced" and not for_writing(Path(self.file)).has_quality:
+            raise ValueError(
+                f"'quality' is of SPZ and SOG; expected a file that ends in .spz or .sog, got '{self.file}'"
+            )
+        return self
 
     def outputs(self, out: Path) -> list[Path]:
         path = out / self.file
