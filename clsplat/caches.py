@@ -16,6 +16,7 @@ from pathlib import Path
 import platformdirs
 
 from clsplat.errors import OutputError
+from clsplat.reading import regular
 
 LOG = logging.getLogger("clsplat")
 LIBRARIES = ("pyopencl", "pytools", "pocl")  # keep caches beside ours, and fail where they cannot
@@ -80,7 +81,7 @@ def remove_cut_kernels() -> None:
 def _is_cut(library: Path) -> bool:
     """Whether a library is empty, is none, or ends before its table of sections, which linkers write last."""
     try:
-        with library.open("rb") as file:
+        with regular(library) as file:
             head, size = file.read(ELF_HEADER), file.seek(0, os.SEEK_END)
     except OSError:
         return False
@@ -95,7 +96,7 @@ def _is_cut(library: Path) -> bool:
 
 def _is_database(file: Path) -> bool:
     """Whether a file can be that of SQLite; an empty one is a new one."""
-    with suppress(OSError), file.open("rb") as opened:
+    with suppress(OSError), regular(file) as opened:
         return opened.read(len(SQLITE)) in (b"", SQLITE)
     return True
 

@@ -94,7 +94,7 @@ def test_a_rung_that_lost_its_model_is_trained_again(content, few_steps, info, t
     """Compress and lod would publish a damaged one."""
     source = Source.of(few_steps, None)
     model = load_model(source.file)
-    tuning = Tuning(source, model, 3, Device(info))
+    tuning = Tuning("rungs", source, model, 3, Device(info))
     pipeline = tuning.pipeline(("init", "optimize"), {"init.file": str(source.file.resolve())})
     file = tuning.trained(pipeline, tmp_path / "rung")
     whole = file.read_bytes()
