@@ -36,6 +36,8 @@ def test_a_refused_run_leaves_no_folder(tiny_scene, tmp_path):
         assert not (tmp_path / name.split("/")[0]).exists(), name
         described = subprocess.run([*done.args, "--dry-run"], capture_output=True, text=True, check=False)
         assert (described.returncode, described.stderr) == (done.returncode, done.stderr)
+        if name not in ("a/b", "f"):  # before the device is opened, and after
+            continue
         out.mkdir(parents=True)
         again = subprocess.run(done.args, capture_output=True, text=True, check=False)
         assert again.returncode == done.returncode
