@@ -69,7 +69,9 @@ def write_splat(path: Path, splats: SplatFile, options: Writing) -> str:
     colour = np.concatenate([p["sh_base"].astype(np.float64) * SH_C0 + 0.5, alpha], axis=1)
     tell_cut(path, "splat", "colours from 0 to 1", beyond_bytes(255 * colour))
     if p["sh_rest"].shape[1]:
-        LOG.warning("%s: splat holds no harmonics: the colours are the same from everywhere", path)
+        LOG.warning(
+            "%s: splat holds no harmonics: the colours are the same from everywhere; other formats hold them", path
+        )
     rows["colour"] = np.clip(np.rint(255 * colour), 0, 255)
     rows["rotation"] = np.clip(np.rint(128 * unit(p["quats"]) + 128), 0, 255)
     with written(path) as file:

@@ -226,7 +226,11 @@ def write(path: Path, splats: SplatFile, options: Writing | None = None) -> str:
             "or write a PLY"
         )
     if not codec.keeps_mode and splats.mode == "mip":
-        LOG.warning("%s: %s has no mark for a mip model; viewers show it as plain 3DGS", path, codec.name)
+        LOG.warning(
+            "%s: %s has no mark for a mip model, which viewers then show as plain 3DGS; PLY, SPZ, SOG and GLB have one",
+            path,
+            codec.name,
+        )
     if not codec.keeps_numbers and (lost := _unusual(splats)) and (path.parent, codec.name, lost) not in _told:
         _told.add((path.parent, codec.name, lost))
         LOG.warning("%s: %s does not keep %s; PLY, SOG and GLB do", path, codec.name, lost)

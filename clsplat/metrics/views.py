@@ -87,7 +87,7 @@ def measure(
     for view in views:
         photograph = photographs.get(view)
         if photograph.empty:
-            LOG.warning("%s: not measured, since its mask leaves out every pixel", view.name)
+            LOG.warning("%s: not measured, since its mask leaves out every pixel; look at the mask", view.name)
             continue
         floats = render_floats(rasterizer, model, photograph.camera, photographs.background)
         if finite:

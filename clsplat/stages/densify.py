@@ -53,7 +53,7 @@ class Densify(Scheduled):
         change = densify(edit, self.rules, run.rasterizer.tiler, limit)
         run.refresh_filter()
         if change.after == fits:
-            most = f"{fits:,} Gaussians, the most that fit in the device's memory"
+            most = f"{fits:,} Gaussians, the most that fit in the device's memory; with smaller photographs more do"
             LOG.warning("step %d: growth stops at %s", run.step, most)
         run.records.add(run.step, "densify", **asdict(change))
         LOG.debug("step %d: %d -> %d Gaussians", run.step, change.before, change.after)

@@ -128,7 +128,8 @@ class Init(Stage):
         views = [view for view in run.scene.split("train") if view.downscale == run.downscale]
         points = swept_points(views, centre_of(views), load_image, self.swept, run.seed)
         if len(points) < MIN_SWEPT_POINTS:
-            LOG.warning("the photographs agree on %d points only; starting from random ones", len(points))
+            remedy = "photographs from places that lie closer together agree on more"
+            LOG.warning("the photographs agree on %d points only; starting from random ones; %s", len(points), remedy)
             return self._random(run)
         return points
 

@@ -51,7 +51,8 @@ class Viewer(Stage):
         page = Page(f"{run.name} · {run.scene.path.name}", {run.name: pack(model)}, stand, name, views)
         if page.size > MAX_SIZE and page.fitting:  # else the photographs are the fault, which the page says
             LOG.warning(
-                "%s: shows the %s most important of %s Gaussians, so that browsers can open it",
+                "%s: shows the %s most important of %s Gaussians, so that browsers can open it; "
+                "`clsplat compress` makes models of fewer",
                 *(path, f"{page.fitting:,}", f"{len(model):,}"),
             )
             page = Page(page.title, {run.name: pack(model, page.fitting)}, stand, name, views)

@@ -19,7 +19,10 @@ class Measurer:
         self.opened = opened
         self.split = "test" if opened.scene.split("test") else "train"
         if self.split == "train":
-            LOG.warning("%s: has no test views; the training views are measured", opened.scene.path)
+            LOG.warning(
+                "%s: has no test views; the training views are measured; scene.holdout keeps some for it",
+                opened.scene.path,
+            )
         self.photographs = Photographs(opened.device, opened.background)
 
     def identity(self) -> str:
