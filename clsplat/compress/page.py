@@ -21,7 +21,7 @@ def cells(point: Point, source: Point) -> list[str]:
         f"{point.bytes / 1e6:.3g}",
         f"{point.bytes / source.bytes:.1%}",
         f"{point.psnr:.2f}",
-        f"{point.psnr - source.psnr:+.2f}",
+        f"{point.psnr - source.psnr:+z.2f}",
         f"{point.ssim:.4f}",
     ]
 
@@ -53,7 +53,7 @@ def _verdict(target: Target, source: Point, chosen: Point | None) -> str:
         return f"No file meets the target {target.text} so far."
     return (
         f"{chosen.file}: {chosen.bytes / 1e6:.3g} MB, {chosen.bytes / source.bytes:.1%} of the model, "
-        f"{chosen.psnr:.2f} dB, {chosen.psnr - source.psnr:+.2f} dB"
+        f"{chosen.psnr:.2f} dB, {chosen.psnr - source.psnr:+z.2f} dB"
     )
 
 

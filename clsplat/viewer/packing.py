@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.formats.packing import morton_order, smallest_three
 from clsplat.gaussians.model import Model
 
 BLOCK = 256  # splats
@@ -31,7 +32,7 @@ STEPS = 2**14 - 1  # of a block's extent
 RANK_SHARE = 0.25  # of a table's spacing; the rest is by value
 KNEE = 0.5  # of colours of bands above 0: below it the table is even, above it logarithmic
 LEAST_RANGE = 3.0  # of that table: finer steps than of 0.01 cost bytes and show nothing
-BITS = 10  # of an axis of the curve, and of a component of a quaternion
+BITS = 10  # of a component of a quaternion
 
 Bytes = NDArray[np.uint8]
 Floats = NDArray[np.float64]
@@ -94,10 +95,10 @@ def _order(model: Model, limit: int | None) -> NDArray[np.intp]:
     means = model.means[drawn].astype(np.float64)
     areas = np.sort(model.log_scales[drawn].astype(np.float64), axis=1)[:, 1:].sum(axis=1)
     ranked = np.argsort(-(areas + np.log(model.opacities[drawn].astype(np.float64))), kind="stable")[:limit]
-    curve = _curve(_logarithmic(means, *_frame(means)))
+    points = _logarithmic(means, *_frame(means))
     borders = [len(ranked) * level // LEVELS for level in range(LEVELS + 1)]
     parts = [ranked[begin:end] for begin, end in itertools.pairwise(borders)]
-    return np.asarray(drawn[np.concatenate([part[np.argsort(curve[part], kind="stable")] for part in parts])])
+    return np.asarray(drawn[np.concatenate([part[morton_order(points[part])] for part in parts])])
 
 
 def _frame(means: Floats) -> tuple[Floats, float]:
@@ -112,20 +113,6 @@ def _logarithmic(means: NDArray[np.floating], origin: Floats, unit: float) -> Fl
     """The coordinates that are stored in steps, [N, 3]."""
     offsets = (means.astype(np.float64) - origin) / unit
     return np.asarray(np.sign(offsets) * np.log1p(np.abs(offsets)))
-
-
-def _curve(points: Floats) -> NDArray[np.int64]:
-    """Places on a Z-order curve."""
-    place = np.zeros(len(points), np.int64)
-    if not len(points):
-        return place
-    low = points.min(axis=0)
-    extent = np.maximum(points.max(axis=0) - low, 1e-9)
-    cells = ((points - low) / extent * (2**BITS - 1)).astype(np.int64)
-    for bit in range(BITS):
-        for axis in range(3):
-            place |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
-    return place
 
 
 def _positions(means: Floats) -> tuple[NDArray[np.float32], Bytes]:
@@ -144,9 +131,7 @@ def _quaternions(quats: NDArray[np.float32]) -> NDArray[np.unsignedinteger]:
     """The three smaller components of unit quaternions (x, y, z, w), the largest made positive, [N]."""
     unit = np.roll(quats.astype(np.float64), -1, axis=1)
     unit /= np.linalg.norm(unit, axis=1, keepdims=True)
-    largest = np.abs(unit).argmax(axis=1)
-    unit *= np.where(np.take_along_axis(unit, largest[:, None], 1) < 0, -1.0, 1.0)
-    others = unit[np.arange(4) != largest[:, None]].reshape(-1, 3)
+    largest, others = smallest_three(unit)
     top = 2**BITS - 1
     codes = np.rint((others * np.sqrt(0.5) + 0.5) * top).clip(0, top).astype(np.uint32)
     shifts = np.array([2 * BITS, BITS, 0], np.uint32)
