@@ -3,6 +3,7 @@
 import atexit
 import logging
 import os
+import re
 import shutil
 import stat
 import struct
@@ -22,6 +23,7 @@ LOG = logging.getLogger("clsplat")
 LIBRARIES = ("pyopencl", "pytools", "pocl")  # keep caches beside ours, and fail where they cannot
 SQLITE = b"SQLite format 3\0"
 ELF, ELF_HEADER = b"\x7fELF", 64  # bytes, of its 64-bit form
+KERNEL_OF_POCL = re.compile(r"[A-P]{2}/[A-P]{30,}/([^/]+)/\d+-\d+-\d+[^/]*/\1\.so")  # hash, kernel, group
 LEAST_SPACE = 2**20  # bytes; the built kernels of a device are some MB
 
 
@@ -68,14 +70,19 @@ def damaged_kernels() -> str:
 def remove_cut_kernels() -> None:
     """Remove, once in a process, what a loss of power has cut off: PoCL loads such kernels and ends the process."""
     _, pytools, pocl = _kernel_folders()
-    kernels = (Path(folder) / name for folder, _, names in os.walk(pocl) for name in names if name.endswith(".so"))
-    cut = [file for file in kernels if not file.name.startswith("tempfile") and _is_cut(file)]  # those are written now
+    cut = [file for file in _kernels_of_pocl(pocl) if _is_cut(file)]
     cut += [file for file in pytools.glob("pdict-*pyopencl*.sqlite") if not _is_database(file)]
     for file in cut:
         with suppress(OSError):
             file.unlink()
     if cut:
         LOG.warning("%d files of built kernels are cut off (%s); they are removed, and made again", len(cut), cut[0])
+
+
+def _kernels_of_pocl(folder: Path) -> list[Path]:
+    """The kernels in a cache of PoCL, by the names that it gives: the folder may hold files of others."""
+    places = [(base, file) for base in (folder, folder / "kcache") for file in base.glob("[A-P][A-P]/*/*/*/*.so")]
+    return [file for base, file in places if KERNEL_OF_POCL.fullmatch(file.relative_to(base).as_posix())]
 
 
 def _is_cut(library: Path) -> bool:

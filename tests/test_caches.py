@@ -156,18 +156,30 @@ def library(sections: int) -> bytes:
     return head + bytes(500 - len(head) + 64 * sections)
 
 
+def kernel(base: str, name: str) -> str:
+    """Where PoCL keeps a kernel."""
+    return (
+        Path(base) / "EJ" / "DJJFLNOJFIADELNGLENLPDIGKEKLICMJHAOIO" / name / "16-1-1-goffs0" / f"{name}.so"
+    ).as_posix()
+
+
 @linux
 def test_kernels_that_are_cut_off_are_removed_and_no_others(machine, caplog):
-    """Nor those that another process writes now."""
+    """Nor those that another process writes now, nor what others keep in the folder."""
     pocl, pytools = (machine / "home" / ".cache" / name for name in ("pocl", "pytools"))
     whole, database = library(3), b"SQLite format 3\0" + bytes(84)
     files = {
-        **{f"kcache/AB/C/{name}/a.so": whole[:size] for name, size in (("empty", 0), ("head", 60), ("table", 690))},
-        "kcache/AB/C/zeros/a.so": bytes(692),
-        "kcache/AB/C/whole/a.so": whole,
-        "kcache/AB/C/bare/a.so": library(0),
+        **{kernel("kcache", name): whole[:size] for name, size in (("empty", 0), ("head", 60), ("table", 690))},
+        kernel("kcache", "zeros"): bytes(692),
+        kernel("kcache", "whole"): whole,
+        kernel("kcache", "bare"): library(0),
+        kernel("", "empty"): b"",  # without a folder between, as below POCL_CACHE_DIR
         "kcache/AB/C/program.bc": b"",
         "kcache/tempfile_abc.so": b"",
+        kernel("", "tempfile").replace("/tempfile.so", "/tempfile_abc.so"): b"",
+        "libm.so": b"/* GNU ld script */ GROUP ( /lib/libm.so.6 )",
+        "project/AB/lib/1-1-1/lib.so": b"GROUP ( /lib/libm.so.6 )",
+        "AB/project/lib/1-1-1/lib.so": b"GROUP ( /lib/libm.so.6 )",
     }
     for name, data in files.items():
         (pocl / name).parent.mkdir(parents=True, exist_ok=True)
@@ -178,10 +190,11 @@ def test_kernels_that_are_cut_off_are_removed_and_no_others(machine, caplog):
     (pytools / "pdict-v5-another.sqlite").write_bytes(b"of others")
     remove_cut_kernels()
     left = {file.relative_to(pocl).as_posix() for file in pocl.rglob("*") if file.is_file()}
-    assert files.keys() - left == {f"kcache/AB/C/{name}/a.so" for name in ("empty", "head", "table", "zeros")}
+    cut = {kernel("kcache", name) for name in ("empty", "head", "table", "zeros")}
+    assert files.keys() - left == {*cut, kernel("", "empty")}
     assert {file.name.split("-")[-2] for file in pytools.iterdir()} == {"invoker", "new", "v5"}
     (record,) = caplog.records
-    assert record.getMessage().startswith("5 files of built kernels are cut off (")
+    assert record.getMessage().startswith("6 files of built kernels are cut off (")
     remove_cut_kernels()
     assert len(caplog.records) == 1
 
