@@ -21,7 +21,7 @@ from clsplat.reading import regular
 
 LOG = logging.getLogger("clsplat")
 LIBRARIES = ("pyopencl", "pytools", "pocl")  # keep caches beside ours, and fail where they cannot
-SQLITE = b"SQLite format 3\0"
+SQLITE, SQLITE_HEADER = b"SQLite format 3\0", 100  # bytes
 ELF, ELF_HEADER = b"\x7fELF", 64  # bytes, of its 64-bit form
 KERNEL_OF_POCL = re.compile(r"[A-P]{2}/[A-P]{30,}/([^/]+)/\d+-\d+-\d+[^/]*/\1\.so")  # hash, kernel, group
 LEAST_SPACE = 2**20  # bytes; the built kernels of a device are some MB
@@ -102,9 +102,15 @@ def _is_cut(library: Path) -> bool:
 
 
 def _is_database(file: Path) -> bool:
-    """Whether a file can be that of SQLite; an empty one is a new one."""
+    """Whether a file can be that of SQLite, with all pages that its header counts; an empty one is a new one."""
     with suppress(OSError), regular(file) as opened:
-        return opened.read(len(SQLITE)) in (b"", SQLITE)
+        head = opened.read(SQLITE_HEADER)
+        if len(head) < SQLITE_HEADER or not head.startswith(SQLITE):
+            return not head
+        page, changes, pages, counted_at = struct.unpack(">16xH6x2I60xI4x", head)
+        if changes != counted_at or any(file.with_name(f"{file.name}-{end}").exists() for end in ("journal", "wal")):
+            return True  # the count is not kept up, or somebody writes: hence the size is looked at last
+        return opened.seek(0, os.SEEK_END) >= pages * (65536 if page == 1 else page)
     return True
 
 

@@ -3,12 +3,14 @@
 import logging
 import os
 import shutil
+import sqlite3
 import stat
 import struct
 import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -185,7 +187,7 @@ def test_kernels_that_are_cut_off_are_removed_and_no_others(machine, caplog):
         (pocl / name).parent.mkdir(parents=True, exist_ok=True)
         (pocl / name).write_bytes(data)
     pytools.mkdir(parents=True)
-    for name, data in {"scan": bytes(50), "invoker": database, "new": b""}.items():
+    for name, data in {"scan": bytes(50), "invoker": database, "head": database[:50], "new": b""}.items():
         (pytools / f"pdict-v5-pyopencl-{name}-cache.sqlite").write_bytes(data)
     (pytools / "pdict-v5-another.sqlite").write_bytes(b"of others")
     remove_cut_kernels()
@@ -194,9 +196,32 @@ def test_kernels_that_are_cut_off_are_removed_and_no_others(machine, caplog):
     assert files.keys() - left == {*cut, kernel("", "empty")}
     assert {file.name.split("-")[-2] for file in pytools.iterdir()} == {"invoker", "new", "v5"}
     (record,) = caplog.records
-    assert record.getMessage().startswith("6 files of built kernels are cut off (")
+    assert record.getMessage().startswith("7 files of built kernels are cut off (")
     remove_cut_kernels()
     assert len(caplog.records) == 1
+
+
+@linux
+@pytest.mark.parametrize("page", [512, 65536])
+def test_a_database_that_is_cut_off_is_removed_but_not_one_that_is_written_now(page, machine):
+    pytools = machine / "home" / ".cache" / "pytools"
+    pytools.mkdir(parents=True)
+    whole = pytools / "pdict-v5-pyopencl-whole.sqlite"
+    with closing(sqlite3.connect(whole)) as database:
+        database.execute(f"PRAGMA page_size = {page}")
+        database.execute("CREATE TABLE dict (keyhash BLOB)")
+        database.execute("INSERT INTO dict VALUES (zeroblob(99999))")
+        database.commit()
+    data = whole.read_bytes()
+    for name, size in (("cut", len(data) // 2), ("last", len(data) - 1), ("journal", page), ("wal", page)):
+        (pytools / f"pdict-v5-pyopencl-{name}.sqlite").write_bytes(data[:size])
+    for name in ("journal", "wal"):
+        (pytools / f"pdict-v5-pyopencl-{name}.sqlite-{name}").write_bytes(b"of a writer")
+    old = data[:92] + bytes(8) + data[100:page]  # by a writer that keeps no count
+    (pytools / "pdict-v5-pyopencl-old.sqlite").write_bytes(old)
+    remove_cut_kernels()
+    left = {file.stem.split("-")[-1] for file in pytools.glob("*.sqlite")}
+    assert left == {"whole", "journal", "wal", "old"}
 
 
 @linux
