@@ -17,8 +17,9 @@ from types import SimpleNamespace
 import platformdirs
 import pytest
 
-from clsplat.caches import cache_folder, damaged_kernels, kernel_caches, remove_cut_kernels
+from clsplat.caches import cache_folder
 from clsplat.errors import OutputError
+from clsplat.opencl.kernel_caches import damaged_kernels, kernel_caches, remove_cut_kernels
 
 linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the folders of Linux")
 
