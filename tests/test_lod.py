@@ -132,6 +132,13 @@ def test_without_steps_a_run_needs_no_photographs(there, moved, tmp_path, caplog
     assert "levels are merged alone, and not measured" in caplog.text
 
 
+def test_a_device_is_refused_where_the_photographs_have_moved(moved, tmp_path):
+    message = r"run: its photographs cannot be read, needed for --device; give --scene, or leave that out$"
+    with pytest.raises(ConfigError, match=message):
+        clsplat.write_levels(moved, tmp_path / "site", levels=2, steps=0, device="nosuch")
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
 def test_a_training_without_its_photographs_names_the_way_out(moved, tmp_path):
     with pytest.raises(DataError, match=r"gone, is missing; .* \(--scene DIR names another; --steps 0 needs none\)$"):
         clsplat.write_levels(moved, tmp_path / "site")
