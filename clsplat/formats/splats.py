@@ -148,19 +148,21 @@ def not_finite(parameters: Parameters) -> NDArray[np.bool_]:
 
 def too_large(parameters: Parameters) -> NDArray[np.bool_]:
     """Return which Gaussians hold finite logarithms of scales or coefficients beyond LARGEST, [N]."""
-    found = np.zeros(len(parameters["means"]), np.bool_)
-    for name in LIMITED:
-        size = np.abs(parameters[name])
-        found |= ((size > LARGEST) & (size < np.inf)).any(axis=1)
-    return found
+    return np.asarray(np.any([_beyond(parameters[name]) for name in LIMITED], axis=0))
 
 
 def told_too_large(parameters: Parameters) -> str:
     """Say how many Gaussians hold values that are too large, and of which tables; '' of none."""
     if not (count := int(too_large(parameters).sum())):
         return ""
-    names = [name for name in LIMITED if (np.abs(parameters[name]) > LARGEST).any()]
-    return f"{count} of {len(parameters['means'])} Gaussians hold {', '.join(names)} beyond {LARGEST:g}"
+    names = ", ".join(name for name in LIMITED if _beyond(parameters[name]).any())
+    return f"{count:,} of {len(parameters['means']):,} Gaussians hold {names} beyond {LARGEST:g}"
+
+
+def _beyond(table: Floats) -> NDArray[np.bool_]:
+    """Which rows hold finite values beyond LARGEST, [N]."""
+    size = np.abs(table)
+    return np.asarray(((size > LARGEST) & (size < np.inf)).any(axis=1))
 
 
 def settled(path: Path, splats: SplatFile, options: Reading) -> SplatFile:

@@ -187,6 +187,15 @@ def test_gaussians_that_no_codebook_holds_are_refused_and_convert_drops_them(tab
     assert clsplat.convert(tmp_path / "a.ply", tmp_path / "b.ply", keep_nan=True)["gaussians"] == 20
 
 
+def test_tables_that_are_not_finite_are_not_called_too_large(tmp_path, rng, caplog):
+    large = splats(rng, 1200)
+    large.parameters["sh_base"][:1100, 1] = 1e20
+    large.parameters["log_scales"][7] = np.inf
+    write_ply(tmp_path / "a.ply", large.parameters, {})
+    assert clsplat.convert(tmp_path / "a.ply", tmp_path / "b.ply")["gaussians"] == 100
+    assert "1,100 of 1,200 Gaussians hold sh_base beyond 1e+15; they are dropped" in caplog.text
+
+
 @pytest.mark.parametrize("name", ["b.ply", "b.compressed.ply", "b.sog", "b.glb"])
 def test_a_number_that_no_reader_takes_is_not_written(name, source, tmp_path):
     with pytest.raises(DataError, match=r"says near = .*; expected a number from 0 to 1e\+15"):
