@@ -19,6 +19,8 @@ import pytest
 
 from clsplat.caches import cache_folder
 from clsplat.errors import OutputError
+from clsplat.opencl import runtimes
+from clsplat.opencl.device import Device
 from clsplat.opencl.kernel_caches import damaged_kernels, kernel_caches, remove_cut_kernels
 
 linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the folders of Linux")
@@ -225,15 +227,30 @@ def test_a_database_that_is_cut_off_is_removed_but_not_one_that_is_written_now(p
     assert left == {"whole", "journal", "wal", "old"}
 
 
+@pytest.fixture
+def broken(machine: Path) -> Path:
+    """A damaged table of pyopencl's."""
+    file = machine / "home" / ".cache" / "pytools" / "pdict-v5-pyopencl-invoker-cache.sqlite"
+    file.parent.mkdir(parents=True)
+    file.write_bytes(b"fifty bytes")
+    return file
+
+
+@linux
+def test_a_device_is_tested_without_the_kernels_that_are_cut_off(broken, monkeypatch):
+    def probe(*arguments, **values):
+        assert not broken.exists()
+        return subprocess.CompletedProcess([], 0, "", "")
+
+    monkeypatch.setattr(runtimes.subprocess, "run", probe)
+    assert runtimes.fault_of("key", 0, 0) is None
+    assert not broken.exists()
+
+
 @linux
 @pytest.mark.slow
-def test_a_device_is_opened_without_the_kernels_that_are_cut_off(machine, caplog):
-    from clsplat.opencl.device import open_device
-
-    broken = machine / "home" / ".cache" / "pytools" / "pdict-v5-pyopencl-invoker-cache.sqlite"
-    broken.parent.mkdir(parents=True)
-    broken.write_bytes(b"fifty bytes")
-    open_device()
+def test_a_device_that_was_tested_before_is_opened_without_the_kernels_that_are_cut_off(broken, info):
+    Device(info)
     assert not broken.exists()
 
 
