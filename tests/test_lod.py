@@ -193,6 +193,17 @@ def test_a_training_that_is_interrupted_goes_on(few_steps, tmp_path, monkeypatch
     assert tree(tmp_path / "site") == tree(trained[0])
 
 
+def test_a_training_does_not_go_on_with_other_photographs(few_steps, tiny_scene, tmp_path):
+    shutil.copytree(tiny_scene, tmp_path / "scene")
+    ask = {"folder": tmp_path / "site", "scene": tmp_path / "scene", "levels": 2, "steps": 1}
+    clsplat.write_levels(few_steps, **ask)
+    shutil.rmtree(tmp_path / "site")
+    first, second, *_ = sorted((tmp_path / "scene" / "train").iterdir())
+    second.write_bytes(first.read_bytes())
+    with pytest.raises(ConfigError, match=r"the training of levels that differs in photographs"):
+        clsplat.write_levels(few_steps, **ask)
+
+
 def test_a_folder_of_levels_is_a_model_too(trained, tiny_scene, tmp_path):
     """With a scene of its own, as any model file."""
     found = clsplat.write_levels(trained[0], tmp_path / "site", tiny_scene, levels=2, steps=STEPS)
