@@ -62,6 +62,7 @@ class Reading:
 
     axes: Literal["spz", "ply"] = "spz"  # of an SPZ file: as its specification says, or those of a PLY, unturned
     not_finite: Literal["refuse", "drop", "keep"] = "refuse"  # Gaussians with NaN or infinity
+    quiet: bool = False  # no line about the axes of an SPZ file: whoever reads it wrote it
 
 
 @dataclass(frozen=True)
@@ -73,6 +74,7 @@ class Writing:
     spz_version: Literal[3, 4] = 3
     quality: Literal["small", "balanced", "high"] = "balanced"  # SPZ and SOG
     clustering: Clustering = HostClusters  # SOG: who computes its palette; the bytes do not depend on it
+    quiet: bool = False  # no line about what the format does not keep: it was said
 
 
 def sh_coefficients(degree: int) -> int:

@@ -312,12 +312,14 @@ stages:
 
 
 @pytest.mark.parametrize("name", ["a.spz", "a.sog"])
-def test_a_run_starts_from_any_format_and_exports_any(name, tiny_scene, tmp_path, rng):
+def test_a_run_starts_from_any_format_and_exports_any(name, tiny_scene, tmp_path, rng, caplog):
+    caplog.set_level("INFO")
     out = tmp_path / "run"
     write(tmp_path / name, splats(rng, 40, 1))
     text = PIPELINE.replace("SCENE", str(tiny_scene)).replace("FILE", name)
     (tmp_path / "p.yaml").write_text(text.replace("INIT", f"{{source: model, file: '{tmp_path / name}'}}"))
     clsplat.run(tmp_path / "p.yaml", out=out)
+    assert f"{out / name}: axes" not in caplog.text  # which it wrote itself
     found = load(out / name)
     assert len(found) == 40
     assert detect(out / name).name == detect(tmp_path / name).name
