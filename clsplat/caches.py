@@ -5,24 +5,16 @@ import logging
 import os
 import shutil
 import stat
-import struct
-import sys
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 
 import platformdirs
 
 from clsplat.errors import OutputError
-from clsplat.reading import regular
 
 LOG = logging.getLogger("clsplat")
 LIBRARIES = ("pyopencl", "pytools", "pocl")  # keep caches beside ours, and fail where they cannot
-SQLITE = b"SQLite format 3\0"
-ELF, ELF_HEADER = b"\x7fELF", 64  # bytes, of its 64-bit form
-LEAST_SPACE = 2**20  # bytes; the built kernels of a device are some MB
 
 
 @cache
@@ -37,13 +29,13 @@ def cache_folder() -> Path:
     except RuntimeError:  # no HOME, and a user that the system does not know
         fault = "there is no home folder"
     else:
-        fault = next(filter(None, map(_fault, [*folders, *_named_by_user()])), "")
+        fault = next(filter(None, map(_fault, [*folders, *named_by_user()])), "")
         if not fault:
             return folders[0]
     moved = _temporary()
     LOG.warning("%s; caches are in %s instead; XDG_CACHE_HOME can name a folder that lasts", fault, moved)
     os.environ["XDG_CACHE_HOME"] = str(moved)  # what all libraries read, in this process and those that it starts
-    if _named_by_user():
+    if named_by_user():
         os.environ["POCL_CACHE_DIR"] = str(moved / "pocl")
     ours = moved / "clsplat"
     if fault := _fault(ours):
@@ -51,75 +43,7 @@ def cache_folder() -> Path:
     return ours
 
 
-def kernel_caches() -> str:
-    """Return the folders that keep built kernels, in words."""
-    *others, last = map(str, _kernel_folders())
-    return f"{', '.join(others)} and {last}"
-
-
-def damaged_kernels() -> str:
-    """Say of a device that works with empty caches alone what to do."""
-    if full := [folder for folder in _kernel_folders() if _is_full(folder)]:
-        return f"{full[0]}: has no space for built kernels; free some, or let XDG_CACHE_HOME name another folder"
-    return f"its cache of built kernels is damaged: remove {kernel_caches()}"
-
-
-@cache
-def remove_cut_kernels() -> None:
-    """Remove, once in a process, what a loss of power has cut off: PoCL loads such kernels and ends the process."""
-    _, pytools, pocl = _kernel_folders()
-    kernels = (Path(folder) / name for folder, _, names in os.walk(pocl) for name in names if name.endswith(".so"))
-    cut = [file for file in kernels if not file.name.startswith("tempfile") and _is_cut(file)]  # those are written now
-    cut += [file for file in pytools.glob("pdict-*pyopencl*.sqlite") if not _is_database(file)]
-    for file in cut:
-        with suppress(OSError):
-            file.unlink()
-    if cut:
-        LOG.warning("%d files of built kernels are cut off (%s); they are removed, and made again", len(cut), cut[0])
-
-
-def _is_cut(library: Path) -> bool:
-    """Whether a library is empty, is none, or ends before its table of sections, which linkers write last."""
-    try:
-        with regular(library) as file:
-            head, size = file.read(ELF_HEADER), file.seek(0, os.SEEK_END)
-    except OSError:
-        return False
-    if head[:4] != ELF:
-        return not head or sys.platform.startswith("linux")
-    if len(head) < ELF_HEADER or head[4] != 2:  # of 32 bits
-        return len(head) < ELF_HEADER
-    order = "<" if head[5] == 1 else ">"
-    (start,), (length, count) = struct.unpack_from(f"{order}Q", head, 40), struct.unpack_from(f"{order}2H", head, 58)
-    return bool(start + length * count > size)
-
-
-def _is_database(file: Path) -> bool:
-    """Whether a file can be that of SQLite; an empty one is a new one."""
-    with suppress(OSError), regular(file) as opened:
-        return opened.read(len(SQLITE)) in (b"", SQLITE)
-    return True
-
-
-@contextmanager
-def empty_kernel_caches() -> Iterator[dict[str, str]]:
-    """Yield the variables with which a process that starts in the block keeps built kernels in an empty folder."""
-    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
-        yield {"POCL_CACHE_DIR": folder, "PYOPENCL_NO_CACHE": "1"}
-
-
-def _kernel_folders() -> list[Path]:
-    pyopencl, pytools, pocl = (Path(platformdirs.user_cache_dir(name, name)) for name in LIBRARIES)
-    return [pyopencl, pytools, next(iter(_named_by_user()), pocl)]
-
-
-def _is_full(folder: Path) -> bool:
-    with suppress(OSError):
-        return shutil.disk_usage(folder).free < LEAST_SPACE
-    return False
-
-
-def _named_by_user() -> list[Path]:
+def named_by_user() -> list[Path]:
     """The folder that PoCL was told to use, which stands before the folder of caches."""
     return [Path(os.environ["POCL_CACHE_DIR"])] if os.environ.get("POCL_CACHE_DIR") else []
 

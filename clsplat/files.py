@@ -72,12 +72,12 @@ def new_folder(folder: Path) -> Iterator[Path]:
     require_free(folder)
     temporary = _temporary(folder)
     try:
-        with _told_as(folder):
+        with told_as(folder):
             make_folder(folder.parent)
             temporary.mkdir()
             _sweep_beside(folder)
         yield temporary
-        with _told_as(folder):
+        with told_as(folder):
             if folder.exists():
                 folder.rmdir()  # it is empty; Windows replaces no folder
             _replace(temporary, folder)
@@ -89,15 +89,15 @@ def new_folder(folder: Path) -> Iterator[Path]:
 
 def require_free(folder: Path) -> None:
     """Raise ConfigError where something but an empty folder lies at the place of a new one."""
-    with _told_as(folder):
+    with told_as(folder):
         is_free = not is_there(folder) or (folder.is_dir() and not any(folder.iterdir()))
     if not (is_free and folder.name) or folder.is_symlink() or os.path.ismount(folder):  # which a rename cannot replace
         raise ConfigError(f"{folder}: is in use; give the name of a new folder")
 
 
 @contextmanager
-def _told_as(path: Path) -> Iterator[None]:
-    """Raise OutputError for an OSError."""
+def told_as(path: Path) -> Iterator[None]:
+    """Raise OutputError, with the name of what cannot be written, for an OSError of the block."""
     try:
         yield
     except OSError as error:
@@ -124,7 +124,7 @@ def _replace(temporary: Path, path: Path) -> None:
 
 def append(path: Path, data: bytes) -> None:
     """Append to a file and sync it; where that fails it is as it was.  Raises OutputError."""
-    try:
+    with told_as(path):
         size = path.stat().st_size if path.exists() else None
         try:
             with path.open("ab") as file:
@@ -137,8 +137,6 @@ def append(path: Path, data: bytes) -> None:
             with suppress(OSError):
                 path.unlink() if size is None else os.truncate(path, size)
             raise
-    except OSError as error:
-        raise unwritable(path, error) from error
 
 
 def make_folder(folder: Path) -> None:
@@ -205,10 +203,8 @@ def _is_left(name: str) -> bool:
 
 def is_there(path: Path) -> bool:
     """Return whether something lies where a file or folder is to be made.  Raises OutputError where nothing can."""
-    try:
+    with told_as(path):
         return path.exists() or path.is_symlink()
-    except OSError as error:
-        raise unwritable(path, error) from error
 
 
 def check_result(path: Path, suffix: str) -> None:

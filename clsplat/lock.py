@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from clsplat.errors import OutputError
-from clsplat.files import unwritable
+from clsplat.files import told_as
 from clsplat.holder import BEHIND_THE_TEXT, in_use, lost, own_text, read, require_silent, until_silent
 from clsplat.names import LOCK
 from clsplat.processes import Owner
@@ -38,10 +38,8 @@ def held(folder: Path, path: Path | None = None) -> Iterator[Callable[[], None]]
     """
     path = _path(folder, path or folder / LOCK)
     with _reserved(path, folder):
-        try:
+        with told_as(path):
             file = _locked(path, folder)
-        except OSError as error:
-            raise unwritable(path, error) from error
 
         def require_held() -> None:
             with suppress(OSError):  # whoever writes there is told of that
@@ -78,22 +76,19 @@ def check_free(folder: Path) -> bool:
     Returns False where `held` would wait for the heartbeat of a run on another machine.
     """
     path = _path(folder, folder / LOCK)
-    try:
-        with suppress(FileNotFoundError), path.open("r+b", buffering=0) as file:
-            try:
-                if not _system_lock(file):
-                    raise OutputError(in_use(folder, read(file)))
-            except OSError as error:
-                if error.errno not in NO_LOCKS:
-                    raise
-                _ended_owner(file, path, folder)
-                return True
-            try:
-                require_silent(file, path, folder)
-            except OutputError:
-                return False
-    except OSError as error:
-        raise unwritable(path, error) from error
+    with told_as(path), suppress(FileNotFoundError), path.open("r+b", buffering=0) as file:
+        try:
+            if not _system_lock(file):
+                raise OutputError(in_use(folder, read(file)))
+        except OSError as error:
+            if error.errno not in NO_LOCKS:
+                raise
+            _ended_owner(file, path, folder)
+            return True
+        try:
+            require_silent(file, path, folder)
+        except OutputError:
+            return False
     return True
 
 

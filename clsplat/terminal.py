@@ -14,7 +14,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 
 from clsplat import __version__, streams
 from clsplat.errors import OutputError
-from clsplat.files import unwritable
+from clsplat.files import told_as
 from clsplat.progress import clock, heard_by
 
 if TYPE_CHECKING:  # the command line starts without OpenCL
@@ -104,12 +104,10 @@ def logging_to(path: Path) -> Iterator[None]:
         raise OutputError(f"{path}: cannot be written (it is not a file); remove it, or give another folder")
     form = logging.Formatter("%(asctime)s %(levelname)s %(message)s")
     first = logging.LogRecord(LOG.name, logging.DEBUG, __file__, 0, "clsplat %s", (__version__,), None)
-    try:
+    with told_as(path):
         with path.open("a", encoding="utf-8") as file:
             file.write(form.format(first) + "\n")
         handler = _LogFile(path)
-    except OSError as error:
-        raise unwritable(path, error) from error
     handler.setFormatter(form)
     level = LOG.level
     LOG.setLevel(logging.DEBUG)

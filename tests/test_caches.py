@@ -3,20 +3,25 @@
 import logging
 import os
 import shutil
+import sqlite3
 import stat
 import struct
 import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
 
 import platformdirs
 import pytest
 
-from clsplat.caches import cache_folder, damaged_kernels, kernel_caches, remove_cut_kernels
+from clsplat.caches import cache_folder
 from clsplat.errors import OutputError
+from clsplat.opencl import runtimes
+from clsplat.opencl.device import Device
+from clsplat.opencl.kernel_caches import damaged_kernels, kernel_caches, remove_cut_kernels
 
 linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the folders of Linux")
 
@@ -156,45 +161,96 @@ def library(sections: int) -> bytes:
     return head + bytes(500 - len(head) + 64 * sections)
 
 
+def kernel(base: str, name: str) -> str:
+    """Where PoCL keeps a kernel."""
+    return (
+        Path(base) / "EJ" / "DJJFLNOJFIADELNGLENLPDIGKEKLICMJHAOIO" / name / "16-1-1-goffs0" / f"{name}.so"
+    ).as_posix()
+
+
 @linux
 def test_kernels_that_are_cut_off_are_removed_and_no_others(machine, caplog):
-    """Nor those that another process writes now."""
+    """Nor those that another process writes now, nor what others keep in the folder."""
     pocl, pytools = (machine / "home" / ".cache" / name for name in ("pocl", "pytools"))
     whole, database = library(3), b"SQLite format 3\0" + bytes(84)
     files = {
-        **{f"kcache/AB/C/{name}/a.so": whole[:size] for name, size in (("empty", 0), ("head", 60), ("table", 690))},
-        "kcache/AB/C/zeros/a.so": bytes(692),
-        "kcache/AB/C/whole/a.so": whole,
-        "kcache/AB/C/bare/a.so": library(0),
+        **{kernel("kcache", name): whole[:size] for name, size in (("empty", 0), ("head", 60), ("table", 690))},
+        kernel("kcache", "zeros"): bytes(692),
+        kernel("kcache", "whole"): whole,
+        kernel("kcache", "bare"): library(0),
+        kernel("", "empty"): b"",  # without a folder between, as below POCL_CACHE_DIR
         "kcache/AB/C/program.bc": b"",
         "kcache/tempfile_abc.so": b"",
+        kernel("", "tempfile").replace("/tempfile.so", "/tempfile_abc.so"): b"",
+        "libm.so": b"/* GNU ld script */ GROUP ( /lib/libm.so.6 )",
+        "project/AB/lib/1-1-1/lib.so": b"GROUP ( /lib/libm.so.6 )",
+        "AB/project/lib/1-1-1/lib.so": b"GROUP ( /lib/libm.so.6 )",
     }
     for name, data in files.items():
         (pocl / name).parent.mkdir(parents=True, exist_ok=True)
         (pocl / name).write_bytes(data)
     pytools.mkdir(parents=True)
-    for name, data in {"scan": bytes(50), "invoker": database, "new": b""}.items():
+    for name, data in {"scan": bytes(50), "invoker": database, "head": database[:50], "new": b""}.items():
         (pytools / f"pdict-v5-pyopencl-{name}-cache.sqlite").write_bytes(data)
     (pytools / "pdict-v5-another.sqlite").write_bytes(b"of others")
     remove_cut_kernels()
     left = {file.relative_to(pocl).as_posix() for file in pocl.rglob("*") if file.is_file()}
-    assert files.keys() - left == {f"kcache/AB/C/{name}/a.so" for name in ("empty", "head", "table", "zeros")}
+    cut = {kernel("kcache", name) for name in ("empty", "head", "table", "zeros")}
+    assert files.keys() - left == {*cut, kernel("", "empty")}
     assert {file.name.split("-")[-2] for file in pytools.iterdir()} == {"invoker", "new", "v5"}
     (record,) = caplog.records
-    assert record.getMessage().startswith("5 files of built kernels are cut off (")
+    assert record.getMessage().startswith("7 files of built kernels are cut off (")
     remove_cut_kernels()
     assert len(caplog.records) == 1
 
 
 @linux
-@pytest.mark.slow
-def test_a_device_is_opened_without_the_kernels_that_are_cut_off(machine, caplog):
-    from clsplat.opencl.device import open_device
+@pytest.mark.parametrize("page", [512, 65536])
+def test_a_database_that_is_cut_off_is_removed_but_not_one_that_is_written_now(page, machine):
+    pytools = machine / "home" / ".cache" / "pytools"
+    pytools.mkdir(parents=True)
+    whole = pytools / "pdict-v5-pyopencl-whole.sqlite"
+    with closing(sqlite3.connect(whole)) as database:
+        database.execute(f"PRAGMA page_size = {page}")
+        database.execute("CREATE TABLE dict (keyhash BLOB)")
+        database.execute("INSERT INTO dict VALUES (zeroblob(99999))")
+        database.commit()
+    data = whole.read_bytes()
+    for name, size in (("cut", len(data) // 2), ("last", len(data) - 1), ("journal", page), ("wal", page)):
+        (pytools / f"pdict-v5-pyopencl-{name}.sqlite").write_bytes(data[:size])
+    for name in ("journal", "wal"):
+        (pytools / f"pdict-v5-pyopencl-{name}.sqlite-{name}").write_bytes(b"of a writer")
+    old = data[:92] + bytes(8) + data[100:page]  # by a writer that keeps no count
+    (pytools / "pdict-v5-pyopencl-old.sqlite").write_bytes(old)
+    remove_cut_kernels()
+    left = {file.stem.split("-")[-1] for file in pytools.glob("*.sqlite")}
+    assert left == {"whole", "journal", "wal", "old"}
 
-    broken = machine / "home" / ".cache" / "pytools" / "pdict-v5-pyopencl-invoker-cache.sqlite"
-    broken.parent.mkdir(parents=True)
-    broken.write_bytes(b"fifty bytes")
-    open_device()
+
+@pytest.fixture
+def broken(machine: Path) -> Path:
+    """A damaged table of pyopencl's."""
+    file = machine / "home" / ".cache" / "pytools" / "pdict-v5-pyopencl-invoker-cache.sqlite"
+    file.parent.mkdir(parents=True)
+    file.write_bytes(b"fifty bytes")
+    return file
+
+
+@linux
+def test_a_device_is_tested_without_the_kernels_that_are_cut_off(broken, monkeypatch):
+    def probe(*arguments, **values):
+        assert not broken.exists()
+        return subprocess.CompletedProcess([], 0, "", "")
+
+    monkeypatch.setattr(runtimes.subprocess, "run", probe)
+    assert runtimes.fault_of("key", 0, 0) is None
+    assert not broken.exists()
+
+
+@linux
+@pytest.mark.slow
+def test_a_device_that_was_tested_before_is_opened_without_the_kernels_that_are_cut_off(broken, info):
+    Device(info)
     assert not broken.exists()
 
 

@@ -225,6 +225,19 @@ def test_a_target_that_no_file_meets_leaves_page_and_nearest_file(few_steps, tmp
     assert detect(tmp_path / "out" / "trials" / "keep_100_degree_0_small.spz").name == "SPZ"
 
 
+def test_what_spz_loses_is_said_once_for_a_search(few_steps, tiny_scene, tmp_path, caplog):
+    caplog.set_level("INFO")
+    model = clsplat.load(few_steps / "point_cloud.ply")
+    model = replace(model, rendering=replace(model.rendering, near=0.05))
+    model.save(tmp_path / "a.ply")
+    ask = {"out": tmp_path / "out", "format": "spz", "keep": KEEP, "steps": STEPS}
+    clsplat.compress_model(tmp_path / "a.ply", tiny_scene, target="-90dB", **ask)
+    assert len(list((tmp_path / "out" / "trials").iterdir())) > 1
+    (told,) = [text for text in caplog.messages if "does not keep" in text]
+    assert told.startswith(f"{tmp_path / 'out' / 'compressed.spz'}: SPZ does not keep near = 0.05")
+    assert "axes as the format says" not in caplog.text
+
+
 def test_the_command_prints_a_table(searched, few_steps):
     arguments = ["--target", "-40dB", "--out", str(searched), "--keep", "1,0.5", "--steps", str(STEPS)]
     found = CliRunner().invoke(app, ["compress", str(few_steps), *arguments])

@@ -12,12 +12,12 @@ import pyopencl as cl
 import pytest
 from pyopencl import _cl
 
-from clsplat.caches import kernel_caches
 from clsplat.conformance.scenes import random_case
 from clsplat.errors import DeviceError, KernelError
 from clsplat.opencl import discovery, probe, program, runtimes
 from clsplat.opencl.device import Device
 from clsplat.opencl.discovery import DeviceInfo, choose
+from clsplat.opencl.kernel_caches import kernel_caches
 from clsplat.render.rasterizer import Rasterizer
 
 CPU = DeviceInfo("Two Cores", "Runtime A", "CPU", "1", 2, 2**32, 2**31, 2**15, 4096, 16, (0, 0), 3000, True)

@@ -132,6 +132,13 @@ def test_without_steps_a_run_needs_no_photographs(there, moved, tmp_path, caplog
     assert "levels are merged alone, and not measured" in caplog.text
 
 
+def test_a_device_is_refused_where_the_photographs_have_moved(moved, tmp_path):
+    message = r"run: its photographs cannot be read, needed for --device; give --scene, or leave that out$"
+    with pytest.raises(ConfigError, match=message):
+        clsplat.write_levels(moved, tmp_path / "site", levels=2, steps=0, device="nosuch")
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
 def test_a_training_without_its_photographs_names_the_way_out(moved, tmp_path):
     with pytest.raises(DataError, match=r"gone, is missing; .* \(--scene DIR names another; --steps 0 needs none\)$"):
         clsplat.write_levels(moved, tmp_path / "site")
@@ -184,6 +191,17 @@ def test_a_training_that_is_interrupted_goes_on(few_steps, tmp_path, monkeypatch
         clsplat.write_levels(few_steps, tmp_path / "site", levels=3, steps=STEPS + 1)
     clsplat.write_levels(few_steps, tmp_path / "site", levels=3, steps=STEPS)
     assert tree(tmp_path / "site") == tree(trained[0])
+
+
+def test_a_training_does_not_go_on_with_other_photographs(few_steps, tiny_scene, tmp_path):
+    shutil.copytree(tiny_scene, tmp_path / "scene")
+    ask = {"folder": tmp_path / "site", "scene": tmp_path / "scene", "levels": 2, "steps": 1}
+    clsplat.write_levels(few_steps, **ask)
+    shutil.rmtree(tmp_path / "site")
+    first, second, *_ = sorted((tmp_path / "scene" / "train").iterdir())
+    second.write_bytes(first.read_bytes())
+    with pytest.raises(ConfigError, match=r"the training of levels that differs in photographs"):
+        clsplat.write_levels(few_steps, **ask)
 
 
 def test_a_folder_of_levels_is_a_model_too(trained, tiny_scene, tmp_path):

@@ -13,8 +13,8 @@ from clsplat.compress.target import Point, Target
 from clsplat.errors import ConfigError
 from clsplat.files import write_text
 from clsplat.formats.output import written
-from clsplat.formats.splats import Writing
-from clsplat.formats.table import bytes_of, located
+from clsplat.formats.splats import Reading, Writing
+from clsplat.formats.table import bytes_of, located, tell_losses
 from clsplat.gaussians.model import load
 from clsplat.reading import read_file, sha256
 from clsplat.runs.model_file import ModelFile
@@ -94,6 +94,7 @@ def compress(
     question |= {"scene": str(source.folder), "photographs": measurer.identity(), "keeps": shares, "steps": steps}
     size = bytes_of(source.file)  # which a damaged model has not: before the folder is made
     with claimed(out, question, RECORD, "a search", "another --out"):
+        tell_losses(_result(out, form), first.as_file())
         whole = Point(source.file.name, 1, first.sh_degree, "", len(first), size, *measurer.figures(first))
         search = Search(out, wanted, question, whole, measurer.split)
         ladder = Ladder(out, Tuning("compress", source, first, steps, opened.device))
@@ -121,8 +122,8 @@ def _measured(ladder: Ladder, source: Path, keep: float, form: Format, measurer:
         if form == "sog":
             _copy(ladder.fitted(source, name, *setting), file)
         else:
-            of_degree(model, setting[0]).save(file, Writing(quality=quality))
-        size, figures = file.stat().st_size, measurer.figures(load(file))
+            of_degree(model, setting[0]).save(file, Writing(quality=quality, quiet=True))
+        size, figures = file.stat().st_size, measurer.figures(load(file, Reading(quiet=True)))
         point = Point(f"{TRIALS}/{file.name}", keep, *setting, len(model), size, *figures)
         LOG.info("%s: %.3g MB, %.2f dB", file.name, size / 1e6, point.psnr)
         points.append(point)
@@ -138,9 +139,13 @@ def _finished(search: Search, form: Format) -> dict[str, Any]:
             f"--target {search.target.text}: no file meets it; the nearest, {search.out / near.file}, has "
             f"{near.bytes / 1e6:.3g} MB and {near.psnr - psnr:+z.2f} dB; ask for less, or train for longer with --steps"
         )
-    file = search.out / f"compressed.{form}"
+    file = _result(search.out, form)
     _copy(search.out / chosen.file, file)
     return {**search.data(), "file": str(file), "page": str(search.out / PAGE)}
+
+
+def _result(out: Path, form: Format) -> Path:
+    return out / f"compressed.{form}"
 
 
 def _copy(source: Path, file: Path) -> None:

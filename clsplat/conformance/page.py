@@ -10,7 +10,7 @@ from clsplat.conformance.comparison import Figure
 from clsplat.conformance.host import system
 from clsplat.conformance.report import GIB, DeviceReport, summary
 from clsplat.conformance.supervision import Result
-from clsplat.files import check_result, unwritable, write_text
+from clsplat.files import check_result, told_as, write_text
 from clsplat.pages.page import duration, render
 
 
@@ -34,14 +34,12 @@ class Row:
 def check_place(out: Path) -> None:
     """Raise ConfigError for a file of another kind or of a run, OutputError where a page cannot be written."""
     check_result(out, ".html")
-    try:
+    with told_as(out):
         if out.is_dir():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
         out.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=out.parent):
             pass
-    except OSError as error:
-        raise unwritable(out, error) from error
 
 
 def write_page(report: DeviceReport, out: Path) -> None:

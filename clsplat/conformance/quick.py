@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Literal
 
 from clsplat import __version__, resource_dir
-from clsplat.caches import cache_folder, damaged_kernels
+from clsplat.caches import cache_folder
 from clsplat.conformance import uses
 from clsplat.conformance.checks import BITONIC, ESSENTIAL
 from clsplat.conformance.host import code_variables
@@ -19,6 +19,7 @@ from clsplat.errors import DeviceError, MemoryLimitError, OutputError
 from clsplat.files import write_text
 from clsplat.opencl.device import Device, open_device
 from clsplat.opencl.discovery import DeviceInfo, Schedule, tuning_of
+from clsplat.opencl.kernel_caches import damaged_kernels
 from clsplat.opencl.program import BUILD_OPTIONS
 from clsplat.render.tiles import Sort, known_sort
 

@@ -12,11 +12,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import IO, Any
 
-from clsplat.caches import empty_kernel_caches
 from clsplat.conformance.check import Check, Note
 from clsplat.conformance.comparison import Figure
 from clsplat.errors import shortened
 from clsplat.opencl.discovery import DeviceInfo
+from clsplat.opencl.kernel_caches import empty_kernel_caches
 
 WORKER = ("-P", "-m", "clsplat.conformance.worker")  # -P: nothing of the working folder is imported
 CHECK_SECONDS = 900  # without a word from a check; an interpreter of kernels needs minutes

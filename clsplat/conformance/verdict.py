@@ -4,8 +4,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from clsplat.caches import kernel_caches
 from clsplat.conformance.supervision import Result
+from clsplat.opencl.kernel_caches import kernel_caches
 
 BITONIC = {"count_pairs", "fill_tiles", "sort_tiles"}  # what `rasterizer.sort: radix` does without
 REPORT = "report it with the file of `clsplat doctor --html FILE`"

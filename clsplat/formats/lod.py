@@ -21,7 +21,9 @@ from clsplat.names import fault_of_name, is_inside
 from clsplat.reading import read_json
 
 LOD_META = "lod-meta.json"
+MOST_LEVELS = 64  # writers make about ten
 Run = tuple[int, int]  # offset and count of a leaf's splats in a file
+Runs = dict[int, list[Run]]  # of a level, ascending, by the number of their file
 
 
 def looks_like_lod(data: bytes) -> bool:
@@ -32,7 +34,7 @@ def looks_like_lod(data: bytes) -> bool:
 def read_lod(path: Path) -> SplatFile:
     """Read the finest level of a lod-meta.json, and its environment.  Raises DataError when it is damaged."""
     meta = _meta(path)
-    runs = _runs(path, meta, 0)
+    runs = _runs(path, meta)[0]
     if not runs:
         raise DataError(f"{path}: its leaves name no file of level 0; export it again")
     parts = [_part(path, meta["filenames"][file], runs[file]) for file in sorted(runs)]
@@ -48,11 +50,10 @@ def read_lod(path: Path) -> SplatFile:
 def faults_of_levels(path: Path) -> list[str]:
     """Return a sentence for each file of the coarser levels that is missing or damaged; `read_lod` reads the others."""
     meta, faults = _meta(path), []
-    spare = {file: list[Run]() for file in range(len(meta["filenames"]))}  # of those that no leaf names, too
-    for level in range(len(meta["counts"])):
+    levels = _runs(path, meta)
+    spare: Runs = {file: [] for file in {*range(len(meta["filenames"]))}.difference(*levels)}
+    for level, runs in enumerate(levels):
         try:
-            runs = _runs(path, meta, level)
-            spare = {file: none for file, none in spare.items() if file not in runs}
             faults += _faults(path, meta, runs) if level else []
             _require_count(path, meta, level, runs)
         except DataError as error:
@@ -60,7 +61,7 @@ def faults_of_levels(path: Path) -> list[str]:
     return faults + _faults(path, meta, spare)
 
 
-def _faults(path: Path, meta: dict[str, Any], runs: dict[int, list[Run]]) -> list[str]:
+def _faults(path: Path, meta: dict[str, Any], runs: Runs) -> list[str]:
     """A sentence for each of some files that is missing or damaged."""
     faults = []
     for file, own in sorted(runs.items()):
@@ -87,8 +88,15 @@ def _meta(path: Path) -> dict[str, Any]:
     names, counts = meta.get("filenames"), meta.get("counts")
     if not isinstance(names, list) or len({_inside(path, name) for name in names}) < len(names):
         raise DataError(f"{path}: filenames is {quoted(names)}; expected names of files, each once: export it again")
-    if not isinstance(counts, list) or not counts:
-        raise DataError(f"{path}: counts is {quoted(counts)}; expected a number for each level: export it again")
+    if not isinstance(counts, list) or not 1 <= len(counts) <= MOST_LEVELS:
+        raise DataError(
+            f"{path}: counts is {quoted(counts)}; expected a number for each of 1 to {MOST_LEVELS} levels: export it "
+            "again"
+        )
+    if (levels := meta.get("lodLevels")) != len(counts):
+        raise DataError(
+            f"{path}: lodLevels is {quoted(levels)}; expected {len(counts)}, as it has counts: export it again"
+        )
     return meta
 
 
@@ -104,19 +112,25 @@ def _is_meta_below(name: str) -> bool:
     return is_inside(name) and path.name == META and "\\" not in name and not any(map(fault_of_name, path.parts))
 
 
-def _runs(path: Path, meta: dict[str, Any], level: int) -> dict[int, list[Run]]:
-    """The runs of a level, ascending, by the number of their file."""
-    runs: dict[int, list[Run]] = {}
+def _runs(path: Path, meta: dict[str, Any]) -> list[Runs]:
+    """The runs of each level."""
+    levels: list[Runs] = [{} for _ in meta["counts"]]
+    numbers = {str(level): level for level in range(len(levels))}
     for leaf in _leaves(path, meta.get("tree")):
-        if str(level) in leaf:
-            file, offset, count = (_whole(path, key, leaf[str(level)]) for key in ("file", "offset", "count"))
-            runs.setdefault(file, []).append((offset, count))
-    if max(runs, default=-1) >= len(meta["filenames"]):
-        raise DataError(f"{path}: its leaves name a file of level {level} that it has not; export it again")
-    return {file: sorted(one) for file, one in runs.items()}
+        for name, run in leaf.items():
+            if name not in numbers:
+                raise DataError(
+                    f"{path}: a leaf names level {quoted(name)}; expected 0 to {len(levels) - 1}: export it again"
+                )
+            file, offset, count = (_whole(path, key, run) for key in ("file", "offset", "count"))
+            levels[numbers[name]].setdefault(file, []).append((offset, count))
+    for level, runs in enumerate(levels):
+        if max(runs, default=-1) >= len(meta["filenames"]):
+            raise DataError(f"{path}: its leaves name a file of level {level} that it has not; export it again")
+    return [{file: sorted(one) for file, one in runs.items()} for runs in levels]
 
 
-def _require_count(path: Path, meta: dict[str, Any], level: int, runs: dict[int, list[Run]]) -> None:
+def _require_count(path: Path, meta: dict[str, Any], level: int, runs: Runs) -> None:
     found, declared = sum(count for one in runs.values() for _, count in one), meta["counts"][level]
     if found != declared:
         raise DataError(

@@ -62,6 +62,7 @@ class Reading:
 
     axes: Literal["spz", "ply"] = "spz"  # of an SPZ file: as its specification says, or those of a PLY, unturned
     not_finite: Literal["refuse", "drop", "keep"] = "refuse"  # Gaussians with NaN or infinity
+    quiet: bool = False  # no line about the axes of an SPZ file: whoever reads it wrote it
 
 
 @dataclass(frozen=True)
@@ -73,6 +74,7 @@ class Writing:
     spz_version: Literal[3, 4] = 3
     quality: Literal["small", "balanced", "high"] = "balanced"  # SPZ and SOG
     clustering: Clustering = HostClusters  # SOG: who computes its palette; the bytes do not depend on it
+    quiet: bool = False  # no line about what the format does not keep: it was said
 
 
 def sh_coefficients(degree: int) -> int:
@@ -148,19 +150,21 @@ def not_finite(parameters: Parameters) -> NDArray[np.bool_]:
 
 def too_large(parameters: Parameters) -> NDArray[np.bool_]:
     """Return which Gaussians hold finite logarithms of scales or coefficients beyond LARGEST, [N]."""
-    found = np.zeros(len(parameters["means"]), np.bool_)
-    for name in LIMITED:
-        size = np.abs(parameters[name])
-        found |= ((size > LARGEST) & (size < np.inf)).any(axis=1)
-    return found
+    return np.asarray(np.any([_beyond(parameters[name]) for name in LIMITED], axis=0))
 
 
 def told_too_large(parameters: Parameters) -> str:
     """Say how many Gaussians hold values that are too large, and of which tables; '' of none."""
     if not (count := int(too_large(parameters).sum())):
         return ""
-    names = [name for name in LIMITED if (np.abs(parameters[name]) > LARGEST).any()]
-    return f"{count} of {len(parameters['means'])} Gaussians hold {', '.join(names)} beyond {LARGEST:g}"
+    names = ", ".join(name for name in LIMITED if _beyond(parameters[name]).any())
+    return f"{count:,} of {len(parameters['means']):,} Gaussians hold {names} beyond {LARGEST:g}"
+
+
+def _beyond(table: Floats) -> NDArray[np.bool_]:
+    """Which rows hold finite values beyond LARGEST, [N]."""
+    size = np.abs(table)
+    return np.asarray(((size > LARGEST) & (size < np.inf)).any(axis=1))
 
 
 def settled(path: Path, splats: SplatFile, options: Reading) -> SplatFile:

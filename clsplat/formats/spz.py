@@ -30,7 +30,6 @@ HEADER4 = 32  # bytes, of version 4
 GZIP_RATIO, ZSTD_RATIO = 1032, 1 << 17  # most bytes that one byte of a stream can stand for
 ADOBE_AXES = 0xADBE0003  # an extension that changes the axes
 EXPECTED = "an SPZ file"
-_own: set[Path] = set()  # files that this process wrote with these axes
 
 
 def read_spz(path: Path, options: Reading) -> SplatFile:
@@ -42,7 +41,7 @@ def read_spz(path: Path, options: Reading) -> SplatFile:
         LOG.warning("%s: dropped the bands of SH degree 4", path)
     if options.axes == "spz":
         parameters = flipped(parameters)
-    if options.axes == "spz" and path.absolute() not in _own:
+    if options.axes == "spz" and not options.quiet:
         LOG.info("%s: axes as the format says (up, back); if it stands on its head, `clsplat convert --axes ply`", path)
     return SplatFile(parameters, {}, "mip" if header.flags & MIP else "default")
 
@@ -64,7 +63,6 @@ def write_spz(path: Path, splats: SplatFile, options: Writing) -> str:
         content = start + struct.pack("<BI12x", len(streams), HEADER4) + table + b"".join(frames)
     with written(path) as file:
         file.write(content)
-    (_own.add if options.axes == "spz" else _own.discard)(path.absolute())
     return file.sha256
 
 

@@ -24,7 +24,6 @@ from clsplat.ply_header import MAX_HEADER
 from clsplat.reading import opened
 
 LOG = logging.getLogger("clsplat")
-_told: set[tuple[Path, str, str]] = set()  # what was said to be lost of the files in a folder
 
 
 def _is_ply(start: Start) -> bool:
@@ -207,11 +206,9 @@ def for_writing(path: Path) -> Codec:
 
 
 def write(path: Path, splats: SplatFile, options: Writing | None = None) -> str:
-    """Write a model file in the format that its name stands for; log in a line what the format does not hold,
-    numbers of the renderer once for a folder.
+    """Write a model file in the format that its name stands for; `tell_losses`, unless the options say not to.
 
     Returns the SHA-256 of what was written, of a folder of SOG that of its meta.json.
-
     Raises ConfigError for a name of no format, DataError for a model that the format cannot hold, OutputError where
     the file cannot be written, and ValueError for a world filter that is not part of the scales and opacities already:
     a PLY alone holds one.
@@ -225,18 +222,25 @@ def write(path: Path, splats: SplatFile, options: Writing | None = None) -> str:
             f"{path}: {bad:,} Gaussians hold values that are not finite, which {codec.name} cannot hold; drop them, "
             "or write a PLY"
         )
+    options = options or Writing()
+    if not options.quiet:
+        tell_losses(path, splats)
+    if codec.keeps_numbers:
+        checked_numbers(path, splats.rendering)  # its reader would refuse them
+    return codec.write(path, splats, options)
+
+
+def tell_losses(path: Path, splats: SplatFile) -> None:
+    """Log in a line what the format that a name stands for does not hold of a mark and of numbers."""
+    codec = for_writing(path)
     if not codec.keeps_mode and splats.mode == "mip":
         LOG.warning(
             "%s: %s has no mark for a mip model, which viewers then show as plain 3DGS; PLY, SPZ, SOG and GLB have one",
             path,
             codec.name,
         )
-    if not codec.keeps_numbers and (lost := _unusual(splats)) and (path.parent, codec.name, lost) not in _told:
-        _told.add((path.parent, codec.name, lost))
+    if not codec.keeps_numbers and (lost := _unusual(splats)):
         LOG.warning("%s: %s does not keep %s; PLY, SOG and GLB do", path, codec.name, lost)
-    if codec.keeps_numbers:
-        checked_numbers(path, splats.rendering)  # its reader would refuse them
-    return codec.write(path, splats, options or Writing())
 
 
 def _unusual(splats: SplatFile) -> str:

@@ -55,29 +55,37 @@ def levels_of_detail(
 
 def _opened(model: Path, scene: Path | None, plan: Plan, device: Any) -> tuple[ModelFile | None, Model]:
     """The model with its photographs, or alone where there are none, and its Gaussians."""
-    if scene is None and run_of(model) is None:
-        alone = load(model).baked()
-        given = {"--steps": plan.steps, "--downscale": plan.downscale, "--device": device}
-        if names := ", ".join(name for name, value in given.items() if value):
-            raise ConfigError(f"{model}: no photographs are known, needed for {names}; give --scene, or leave that out")
+    run = run_of(model) if scene is None else None
+    if scene is None and run is None:
+        alone = _alone(model, plan, device, "no photographs are known")
         LOG.info("%s: no photographs: merged alone", model)
         return None, alone
     try:
         opened = ModelFile(model, scene, device)
     except DataError as error:
-        if scene is not None or (fault := _fault_of_photographs(model)) is None:
+        if run is None or (fault := _fault_of_photographs(run)) is None:
             raise
         if plan.steps != 0:
             raise DataError(f"{fault} (--scene DIR names another; --steps 0 needs none)") from error
+        alone = _alone(model, plan, device, "its photographs cannot be read")
         LOG.warning("%s; levels are merged alone, and not measured", fault)
-        return None, load(model).baked()
+        return None, alone
     return opened, opened.loaded.baked()
 
 
-def _fault_of_photographs(model: Path) -> DataError | None:
-    """Why those of the model's run cannot be read."""
+def _alone(model: Path, plan: Plan, device: Any, why: str) -> Model:
+    """The Gaussians of a model without photographs.  Raises ConfigError for what needs them."""
+    alone = load(model).baked()
+    given = {"--steps": plan.steps, "--downscale": plan.downscale, "--device": device}
+    if names := ", ".join(name for name, value in given.items() if value):
+        raise ConfigError(f"{model}: {why}, needed for {names}; give --scene, or leave that out")
+    return alone
+
+
+def _fault_of_photographs(run: Path) -> DataError | None:
+    """Why those of a run cannot be read."""
     try:
-        read_scene(photographs_of(run_of(model) or model))
+        read_scene(photographs_of(run))
     except DataError as error:
         return error
     return None

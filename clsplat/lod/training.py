@@ -58,22 +58,19 @@ class Training:
     """Trains and measures levels."""
 
     def __init__(self, opened: ModelFile, place: Path, plan: Plan) -> None:
-        self.place, self.plan = place, plan
+        self.place, self.plan, self.source = place, plan, opened.source
         self.steps = STEPS if plan.steps is None else plan.steps
         self.measurer = Measurer(opened)
         self.tuning = Tuning("lod", opened.source, opened.loaded, self.steps, opened.device)
-        self.question: dict[str, Any] = {
-            "sha256": sha256(located(opened.source.file)),
-            "scene": str(opened.source.folder),
-        }
-        self.question |= {"keep": plan.keep, "steps": self.steps, "downscale": plan.downscale}
 
     def held(self) -> AbstractContextManager[None]:
         """Hold the folder of the training in a block, where anything is trained."""
         if not self.steps or self.plan.levels == 1:
             return nullcontext()
-        self.question["photographs"] = self.measurer.identity()
-        return claimed(self.place, self.question, RECORD, "the training of levels", "the name of another folder")
+        question: dict[str, Any] = {"sha256": sha256(located(self.source.file)), "scene": str(self.source.folder)}
+        question |= {"keep": self.plan.keep, "steps": self.steps, "downscale": self.plan.downscale}
+        question["photographs"] = self.measurer.identity()
+        return claimed(self.place, question, RECORD, "the training of levels", "the name of another folder")
 
     def measured(self, model: Model) -> Level:
         """Return a level that is not trained."""

@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from clsplat.caches import remove_cut_kernels
 from clsplat.errors import ConfigError, KernelError, MemoryLimitError
 from clsplat.opencl import runtimes
 from clsplat.opencl.discovery import DeviceInfo, Schedule, choose, platforms, resolve_schedule, tuning_of
+from clsplat.opencl.kernel_caches import remove_cut_kernels
 from clsplat.opencl.refusals import refusals
 from clsplat.opencl.timings import Timings
 

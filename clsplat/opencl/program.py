@@ -16,10 +16,10 @@ import numpy as np
 import pyopencl as cl
 
 from clsplat import resource_dir
-from clsplat.caches import kernel_caches
 from clsplat.errors import KernelError
 from clsplat.opencl.device import Array
 from clsplat.opencl.discovery import DeviceInfo
+from clsplat.opencl.kernel_caches import kernel_caches
 
 if TYPE_CHECKING:
     from clsplat.opencl.device import Device

@@ -14,7 +14,7 @@ from typing import Any
 
 from clsplat import lock
 from clsplat.errors import DataError
-from clsplat.files import make_folder, sweep, sync_below, sync_folder, unwritable, write_text
+from clsplat.files import make_folder, sweep, sync_below, sync_folder, told_as, unwritable, write_text
 from clsplat.names import NOTE
 from clsplat.prepare.steps import Step
 from clsplat.progress import Count
@@ -84,10 +84,8 @@ def prepare(
 @contextmanager
 def _only_one_making(one: Planned) -> Iterator[None]:
     """Hold a result: what an interrupted call left is gone on with by one process alone."""
-    try:
+    with told_as(one.folder.parent):
         make_folder(one.folder.parent)
-    except OSError as error:
-        raise unwritable(one.folder.parent, error) from error
     with lock.held(one.folder, one.folder.with_name(f".{one.folder.name}.lock")):
         yield
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from clsplat import lock
 from clsplat.errors import DataError
-from clsplat.files import make_folder, sync_below, sync_folder, unwritable
+from clsplat.files import make_folder, sync_below, sync_folder, told_as
 from clsplat.names import LOCK
 from clsplat.prepare.cache import RECORD, plan, prepare
 from clsplat.prepare.steps import FindFeatures, MapCameras, MatchFeatures, Step
@@ -36,10 +36,8 @@ def place_photographs(
         MatchFeatures(matching=matching),
         MapCameras(mapper=mapper),
     ]
-    try:
+    with told_as(out):
         make_folder(out / STEPS)
-    except OSError as error:
-        raise unwritable(out, error) from error
     with lock.held(out, out / STEPS / LOCK):
         _require_free(out)  # again: another call may have ended since
         result = prepare(plan(steps, source, out / STEPS), source, out / STEPS)
@@ -58,7 +56,7 @@ def _require_free(out: Path) -> None:
 
 def _show(result: Path, out: Path) -> None:
     """Let `out` be a COLMAP folder: link the images of the last step, copy its model.  Raises OutputError."""
-    try:
+    with told_as(out):
         (out / IMAGES).unlink(missing_ok=True)
         link(result / IMAGES, out / IMAGES)
         half = out / STEPS / f".{MODEL}"
@@ -67,5 +65,3 @@ def _show(result: Path, out: Path) -> None:
         sync_below(half)
         half.rename(out / MODEL)
         sync_folder(out)
-    except OSError as error:
-        raise unwritable(out, error) from error

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from clsplat.cameras.table import write_cameras
 from clsplat.errors import ConfigError
-from clsplat.names import PIPELINE
+from clsplat.runs.found import has_pipeline
 from clsplat.runs.source import Source
 from clsplat.scene.detect import read_scene
 from clsplat.scene.scene import HOLDOUT, Scene
@@ -21,7 +21,7 @@ def write(scene: Path | Scene, out: Path, format_: str, images: str = "none") ->
 
 
 def _read(folder: Path) -> Scene:
-    if not (folder / PIPELINE).is_file():
+    if not has_pipeline(folder):
         return read_scene(folder, HOLDOUT)
     source = Source.of(folder, None)
     return read_scene(source.folder, source.settings.holdout)

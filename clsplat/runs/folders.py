@@ -8,7 +8,7 @@ from typing import Any, Literal, get_args
 
 from clsplat import lock
 from clsplat.errors import ClsplatError, ConfigError, InternalError, OutputError, as_clsplat_error
-from clsplat.files import make_folder, sweep, unwritable
+from clsplat.files import make_folder, sweep, told_as
 from clsplat.names import (
     BEFORE_A_RUN,
     CHECKPOINTS,
@@ -24,7 +24,7 @@ from clsplat.names import (
 )
 from clsplat.pipeline.matrix import load_experiment
 from clsplat.reading import read_text
-from clsplat.runs.found import has_begun
+from clsplat.runs.found import has_begun, has_pipeline
 from clsplat.training import checkpoint
 from clsplat.training.status import StatusFile, read_status
 
@@ -42,10 +42,8 @@ def opened(out: Path, start: Start, **values: Any) -> Iterator[StatusFile]:
     check_run_folder(out, start)
     made = [folder for folder in (out, *out.parents) if not folder.exists()]
     is_new = not (out / PIPELINE).exists()
-    try:
+    with told_as(out):
         make_folder(out)
-    except OSError as error:
-        raise unwritable(out, error) from error
     try:
         with lock.held(out) as require_held:
             check_run_folder(out, start)  # again: another run may have ended since
@@ -92,15 +90,13 @@ def clear(status: StatusFile) -> None:
     files = [*checkpoint.saved(out), *checkpoints.glob("failed_*.npz"), *checkpoints.glob("damaged_*.npz")]
     files += [out / name for name in (CHECKSUMS, METRICS, RECORDS, INPUTS, NOTE)]
     for file in files:
-        try:
+        with told_as(file):
             file.unlink(missing_ok=True)
-        except OSError as error:
-            raise unwritable(file, error) from error
 
 
 def _is_of_a_run(out: Path) -> bool:
     """Whether a folder's pipeline.yaml, where there is one, was written by a run, or by that of a matrix."""
-    if not (out / PIPELINE).is_file() or (out / STATUS).exists() or checkpoint.saved(out):
+    if not has_pipeline(out) or (out / STATUS).exists() or checkpoint.saved(out):
         return True
     with suppress(ClsplatError):
         if read_text(out / PIPELINE).startswith(RESOLVED):
@@ -122,7 +118,7 @@ def check_run_folder(out: Path, start: Start) -> None:
         raise ConfigError(
             f"{out / PIPELINE}: is not that of a run, which would write its own in its place; give another folder"
         )
-    if start == "new" and (has_begun(out)):
+    if start == "new" and has_begun(out):
         raise ConfigError(f"{out}: already holds a run; give another folder, --resume or --restart")
     status = read_status(out) if start == "resume" else {}
     if status.get("state") == "done" and not ({"cells", "checkpoint"} & status.keys() or checkpoint.saved(out)):

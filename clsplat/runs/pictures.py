@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.errors import ConfigError, DataError
-from clsplat.files import atomic, is_there, unwritable, write_text
+from clsplat.files import atomic, is_there, told_as, write_text
 from clsplat.progress import counted
 from clsplat.reading import read_json
 from clsplat.scene.images import write_image
@@ -63,11 +63,9 @@ def write_pictures(
 
 def _remove(out: Path, frames: set[str]) -> None:
     """Remove frames of an earlier film from a folder and its record."""
-    try:
+    with told_as(out):
         for name in frames:
             (out / name).unlink(missing_ok=True)
-    except OSError as error:
-        raise unwritable(out, error) from error
     _note(out, {name: framed for name, framed in _rendered(out).items() if name not in frames})
     if frames:
         LOG.info("%s: removed %d pictures of an earlier film", out, len(frames))

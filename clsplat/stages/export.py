@@ -8,7 +8,7 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import model_validator
 
 from clsplat.errors import DataError, OutputError
-from clsplat.formats.splats import Writing
+from clsplat.formats.splats import Reading, Writing
 from clsplat.formats.table import endings, for_writing
 from clsplat.gaussians.clusters import DeviceClusters
 from clsplat.gaussians.model import load
@@ -59,7 +59,7 @@ class Export(Scheduled):
             run.written[_name(file, run)] = one.save(file, options)
             try:
                 if for_writing(file).read:
-                    load(file)
+                    load(file, Reading(quiet=True))
             except DataError as error:
                 raise OutputError(f"{error}; it was written just now: check the disk and its space") from error
             LOG.info("%s Gaussians written to %s", f"{len(one):,}", file)

@@ -8,7 +8,7 @@ from typing import Any
 
 from clsplat import lock
 from clsplat.errors import ConfigError, DataError
-from clsplat.files import is_there, make_folder, sweep, unwritable, write_text
+from clsplat.files import is_there, make_folder, sweep, told_as, write_text
 from clsplat.names import LOCK, PIPELINE
 from clsplat.reading import read_json
 
@@ -23,10 +23,8 @@ def claimed(out: Path, question: dict[str, Any], record: str, what: str, remedy:
     Raises ConfigError where it holds something else, OutputError where another process uses it.
     """
     _require_own(out, question, record, what, remedy)
-    try:
+    with told_as(out):
         make_folder(out)
-    except OSError as error:
-        raise unwritable(out, error) from error
     with lock.held(out):
         _require_own(out, question, record, what, remedy)  # again: another may have begun since
         sweep(out, border=PIPELINE)

@@ -187,6 +187,15 @@ def test_gaussians_that_no_codebook_holds_are_refused_and_convert_drops_them(tab
     assert clsplat.convert(tmp_path / "a.ply", tmp_path / "b.ply", keep_nan=True)["gaussians"] == 20
 
 
+def test_tables_that_are_not_finite_are_not_called_too_large(tmp_path, rng, caplog):
+    large = splats(rng, 1200)
+    large.parameters["sh_base"][:1100, 1] = 1e20
+    large.parameters["log_scales"][7] = np.inf
+    write_ply(tmp_path / "a.ply", large.parameters, {})
+    assert clsplat.convert(tmp_path / "a.ply", tmp_path / "b.ply")["gaussians"] == 100
+    assert "1,100 of 1,200 Gaussians hold sh_base beyond 1e+15; they are dropped" in caplog.text
+
+
 @pytest.mark.parametrize("name", ["b.ply", "b.compressed.ply", "b.sog", "b.glb"])
 def test_a_number_that_no_reader_takes_is_not_written(name, source, tmp_path):
     with pytest.raises(DataError, match=r"says near = .*; expected a number from 0 to 1e\+15"):
@@ -303,12 +312,14 @@ stages:
 
 
 @pytest.mark.parametrize("name", ["a.spz", "a.sog"])
-def test_a_run_starts_from_any_format_and_exports_any(name, tiny_scene, tmp_path, rng):
+def test_a_run_starts_from_any_format_and_exports_any(name, tiny_scene, tmp_path, rng, caplog):
+    caplog.set_level("INFO")
     out = tmp_path / "run"
     write(tmp_path / name, splats(rng, 40, 1))
     text = PIPELINE.replace("SCENE", str(tiny_scene)).replace("FILE", name)
     (tmp_path / "p.yaml").write_text(text.replace("INIT", f"{{source: model, file: '{tmp_path / name}'}}"))
     clsplat.run(tmp_path / "p.yaml", out=out)
+    assert f"{out / name}: axes" not in caplog.text  # which it wrote itself
     found = load(out / name)
     assert len(found) == 40
     assert detect(out / name).name == detect(tmp_path / name).name

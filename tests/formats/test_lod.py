@@ -11,6 +11,7 @@ import pytest
 
 from clsplat.errors import ConfigError, DataError, OutputError
 from clsplat.files import new_folder
+from clsplat.formats import lod
 from clsplat.formats.lod_tree import Limits, half_boxes, tree
 from clsplat.formats.lod_writing import write_lod
 from clsplat.formats.packing import morton_order
@@ -254,7 +255,17 @@ WRONG = {
         "_9/meta.json: cannot be read (No such file",
     ),
     "too few names": ({"filenames": []}, "name a file of level 0 that it has not"),
-    "no counts": ({"counts": []}, "expected a number for each level"),
+    "no counts": ({"counts": []}, "expected a number for each of 1 to 64 levels"),
+    "more levels than are declared": ({"lodLevels": 2}, "lodLevels is 2; expected 3, as it has counts"),
+    "more levels than there can be": (
+        {"counts": [0] * 65, "lodLevels": 65},
+        "expected a number for each of 1 to 64 levels",
+    ),
+    "no number of levels": ({"lodLevels": None}, "lodLevels is None; expected 3"),
+    "a level beyond": (
+        {"counts": [700, 300], "lodLevels": 2},
+        "a leaf names level '2'; expected 0 to 1",
+    ),
     "another count": ({"counts": [701, 0, 0]}, "declares 701 splats of level 0; its leaves have 700"),
     "no tree": ({"tree": 7}, "a node of its tree is 7"),
     "an empty tree": ({"tree": {"children": []}}, "name no file of level 0"),
@@ -276,6 +287,14 @@ def test_a_damaged_one_is_refused_in_a_line(written, name):
     assert message in str(error.value)
     assert "\n" not in str(error.value)
     assert len(str(error.value)) < len(str(folder)) + 300
+
+
+def test_the_tree_is_walked_once_whatever_the_number_of_levels(written, monkeypatch):
+    folder, _ = written
+    walks, real = [], lod._leaves
+    monkeypatch.setattr(lod, "_leaves", lambda path, tree: walks.append(path) or real(path, tree))
+    assert lod.faults_of_levels(folder / "lod-meta.json") == []
+    assert len(walks) == 1
 
 
 def renamed(folder: Path, file: int, name: str) -> Path:

@@ -137,24 +137,19 @@ def test_older_versions_are_read(version, tmp_path):
     np.testing.assert_array_equal(found["log_scales"], np.full((2, 3), -5))
 
 
-def test_the_axes_of_files_that_this_process_wrote_are_known(tmp_path, rng, caplog):
+def test_axes_and_what_is_lost_are_said_for_every_file_unless_a_caller_knows(tmp_path, rng, caplog):
     caplog.set_level("INFO")
-    write(tmp_path / "a.spz", splats(rng, 20))
-    read(tmp_path / "a.spz")
-    assert "axes as the format says" not in caplog.text
-    (tmp_path / "b.spz").write_bytes((tmp_path / "a.spz").read_bytes())
-    read(tmp_path / "b.spz")
-    assert "b.spz: axes as the format says" in caplog.text
-
-
-def test_what_a_format_loses_is_said_once_for_a_folder(tmp_path, rng, caplog):
     one = replace(splats(rng, 20), rendering={"background": "white"})
     for name in ("a.spz", "b.spz"):
         write(tmp_path / name, one)
-    (tmp_path / "other").mkdir()
-    write(tmp_path / "other" / "c.spz", one)
-    told = [text.split(":")[0] for text in caplog.messages if "does not keep" in text]
-    assert told == [str(tmp_path / "a.spz"), str(tmp_path / "other" / "c.spz")]
+        read(tmp_path / name)
+    assert [(text.split(":")[0], "does not keep" in text, "axes as" in text) for text in caplog.messages] == [
+        (str(tmp_path / name), writes, not writes) for name in ("a.spz", "b.spz") for writes in (True, False)
+    ]
+    caplog.clear()
+    write(tmp_path / "a.spz", one, Writing(quiet=True))
+    read(tmp_path / "a.spz", Reading(quiet=True))
+    assert not caplog.messages
 
 
 def test_an_extension_that_turns_the_axes_is_refused_and_others_are_skipped(tmp_path):
