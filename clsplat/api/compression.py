@@ -24,7 +24,8 @@ def compress_model(
     """Look for the smallest file of a model that loses no more than `target`, or the best one of that size.
 
     model, scene: as for `render_views`; target: "-0.1dB" or "5MB"; out: a folder, which holds the file, a page and all
-    that was tried; keep: shares of the Gaussians to try; steps: of training after each pruning, default 1000.  Returns
+    that was tried; keep: shares of the Gaussians to try; steps: of training after each pruning,
+    default 1000; with each palette it is a fifth of them.  Returns
     what compress.json holds, `file` and `page`.  Raises ConfigError for a target that no file meets.
     """
     from clsplat.compress import search

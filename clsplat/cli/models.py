@@ -173,7 +173,10 @@ def compress(
         str | None, typer.Option(metavar="SHARE,…", help="Of the Gaussians; default: 1,0.7,0.5,0.35,0.25,0.18.")
     ] = None,
     steps: Annotated[
-        int | None, typer.Option(min=1, metavar="N", help="Of training after each pruning; default: 1000.")
+        int | None,
+        typer.Option(
+            min=1, metavar="N", help="Of training after each pruning, and a fifth with each palette; default: 1000."
+        ),
     ] = None,
     device: DeviceOption = None,
 ) -> None:

@@ -2,7 +2,7 @@
 
 import json
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -24,10 +24,10 @@ from clsplat.tuning.tuning import Tuning
 
 LOG = logging.getLogger("clsplat")
 Format = Literal["sog", "spz"]
-Quality = Literal["small", "balanced"]
+Quality = Literal["small", "balanced", "high"]
 KEEPS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18)  # shares of the Gaussians
 SETTINGS: dict[Format, tuple[tuple[int, Quality], ...]] = {  # of the harmonics: degree, quality
-    "sog": ((3, "balanced"), (3, "small"), (0, "small")),  # a palette of degree 2 or 1 is hardly smaller
+    "sog": ((3, "high"), (3, "balanced"), (3, "small")),  # a palette of a lower degree is hardly smaller
     "spz": ((3, "balanced"), (3, "small"), (2, "small"), (1, "small"), (0, "small")),
 }
 RECORD, PAGE, TRIALS = "compress.json", "compress.html", "trials"
@@ -111,23 +111,25 @@ def compress(
 
 def _measured(ladder: Ladder, source: Path, keep: float, form: Format, measurer: Measurer) -> list[Point]:
     """Write a rung with each setting of its harmonics, and measure the files as they are read back."""
-    points, degrees, model = [], set[tuple[int, str]](), load(source)
-    for degree, quality in SETTINGS[form]:
-        setting = min(degree, model.sh_degree), quality
-        if setting in degrees:
-            continue
-        degrees.add(setting)
-        name = f"keep_{round(100 * keep):02d}_degree_{setting[0]}_{quality}"
+    points, model = [], load(source)
+    for degree, quality in _settings(form, model.sh_degree):
+        name = f"keep_{round(100 * keep):02d}_degree_{degree}_{quality}"
         file = ladder.out / TRIALS / f"{name}.{form}"
         if form == "sog":
-            _copy(ladder.fitted(source, name, *setting), file)
+            _copy(ladder.fitted(source, name, degree, quality), file)
         else:
-            of_degree(model, setting[0]).save(file, Writing(quality=quality, quiet=True))
+            of_degree(model, degree).save(file, Writing(quality=quality, quiet=True))
         size, figures = file.stat().st_size, measurer.figures(load(file, Reading(quiet=True)))
-        point = Point(f"{TRIALS}/{file.name}", keep, *setting, len(model), size, *figures)
+        point = Point(f"{TRIALS}/{file.name}", keep, degree, quality, len(model), size, *figures)
         LOG.info("%s: %.3g MB, %.2f dB", file.name, size / 1e6, point.psnr)
         points.append(point)
     return points
+
+
+def _settings(form: Format, degree: int) -> Iterable[tuple[int, Quality]]:
+    """Those of a model of this degree that differ: without harmonics there is one."""
+    lower = ((min(most, degree), quality) for most, quality in SETTINGS[form])
+    return dict.fromkeys((most, quality if most else "balanced") for most, quality in lower)
 
 
 def _finished(search: Search, form: Format) -> dict[str, Any]:

@@ -131,18 +131,22 @@ class HostClusters:
 
 
 def palette(
-    points: NDArray[np.float32], entries: int, clustering: Clustering = HostClusters
+    points: NDArray[np.float32],
+    entries: int,
+    clustering: Clustering = HostClusters,
+    weights: NDArray[np.float64] | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Return vectors [entries, c] that stand for points [N, c], and for each point the index of its vector.
 
     Lloyd's iteration on a share of the points, from evenly spaced ones; a vector without points gets one that is far
     from its own.  At most 45 components.  `clustering` makes the clusters of points: the host's, or those of a device.
-    Points that are at most `entries` different ones are kept; the last is then repeated.
+    `weights`, [N], say how much errors count: a point is in that share as often as its weight says.  Points that are at
+    most `entries` different ones are kept; the last is then repeated.
     """
     if (kept := _different(points, entries)) is not None:
         return kept
     whole = _whole_numbers(points)
-    chosen = np.linspace(0, len(points) - 1, min(len(points), SAMPLE * entries)).astype(np.int64)
+    chosen = _drawn(len(points), SAMPLE * entries, weights)
     sample, sample_whole = points[chosen].astype(np.float64), whole[chosen]
     starts = np.linspace(0, len(sample) - 1, entries).astype(np.int64)
     vectors, moved = sample[starts], sample_whole[starts]
@@ -158,6 +162,14 @@ def palette(
         vectors[:, column] = np.bincount(labels, sample[:, column], minlength=entries) / np.maximum(held, 1)
     vectors[empty] = sample[farthest]
     return vectors, clustering(whole).nearest(moved)[0]
+
+
+def _drawn(count: int, most: int, weights: NDArray[np.float64] | None) -> NDArray[np.int64]:
+    """The places, ascending, of points that train a palette: evenly spaced ones, by number or by weight."""
+    if weights is None or not weights.any():
+        return np.linspace(0, count - 1, min(count, most)).astype(np.int64)
+    passed = np.cumsum(weights)
+    return np.asarray(np.searchsorted(passed, (np.arange(most) + 0.5) / most * passed[-1]))
 
 
 def _different(points: NDArray[np.float32], most: int) -> tuple[NDArray[np.float64], NDArray[np.int64]] | None:

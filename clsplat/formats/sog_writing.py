@@ -115,10 +115,10 @@ class Harmonics:
     labels: NDArray[np.int64]
 
     @classmethod
-    def of(cls, rest: NDArray[np.float32], options: Writing) -> "Harmonics":
-        """Quantise harmonics [N, c].  Those of `values` come out as they are."""
+    def of(cls, rest: NDArray[np.float32], options: Writing, weights: NDArray[np.float64] | None = None) -> "Harmonics":
+        """Quantise harmonics [N, c]; errors count by `weights` [N].  Those of `values` come out as they are."""
         entries = min(PALETTES[options.quality], max(1, int(SMALLEST * 2.0 ** np.floor(np.log2(len(rest) / SMALLEST)))))
-        vectors, labels = palette(rest, entries, options.clustering)
+        vectors, labels = palette(rest, entries, options.clustering, weights)
         numbers = np.array([_short(number) for number in codebook(vectors)])
         return cls(numbers, nearest(vectors, numbers), labels)
 

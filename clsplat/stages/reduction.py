@@ -108,10 +108,10 @@ class ReduceSh(Scheduled):
 
 
 class PaletteSh(Scheduled):
-    """Give each Gaussian the harmonics that a SOG would hold for it: one of the vectors of a palette.
+    """Give each Gaussian one of the vectors of a palette of harmonics, as a SOG holds them.
 
-    Training that follows with a rate of 0 for `sh_rest` adapts the other tables to them, and the SOG then loses nothing
-    of its harmonics.
+    Errors count by what a Gaussian contributes to the training views.  Training that follows with a rate of 0 for
+    `sh_rest` adapts the other tables to them, and the SOG then loses nothing of its harmonics.
     """
 
     stage: Literal["palette_sh"] = "palette_sh"
@@ -130,7 +130,7 @@ class PaletteSh(Scheduled):
         if not gaussians.sh_degree:
             return
         options = Writing(quality=self.quality, clustering=partial(DeviceClusters, run.device))
-        found = Harmonics.of(gaussians.get("sh_rest"), options)
+        found = Harmonics.of(gaussians.get("sh_rest"), options, scores(run))
         gaussians.set("sh_rest", found.values)
         if run.adam is not None:
             run.adam.forget("sh_rest")

@@ -151,6 +151,19 @@ def test_every_point_has_the_nearest_vector_in_whole_numbers(rng):
     assert len(np.unique(labels)) > 28
 
 
+def test_a_palette_is_nearer_to_points_that_count_more(rng):
+    points = rng.normal(size=(4000, 9)).astype(np.float32)
+    weights = np.where(np.arange(4000) % 10 == 0, 50.0, 0.1)
+
+    def error(found):
+        return (weights * np.square(found[0][found[1]] - points).sum(axis=1)).sum()
+
+    evenly, weighted = palette(points, 64), palette(points, 64, weights=weights)
+    assert error(weighted) < 0.8 * error(evenly)
+    for others in (np.zeros(4000), None):
+        np.testing.assert_array_equal(palette(points, 64, weights=others)[1], evenly[1])
+
+
 def test_a_palette_does_not_depend_on_the_number_of_threads(rng):
     """Sums of whole numbers below 2^24: any order of a product gives the same."""
     from clsplat.formats import palette as module
