@@ -8,12 +8,15 @@ from pathlib import Path
 import pytest
 
 import clsplat
+from clsplat.errors import InternalError, Interrupted
 from clsplat.gaussians.model import load as load_model
 from clsplat.opencl.device import Device
 from clsplat.pipeline.matrix import load_experiment
 from clsplat.runs import found
 from clsplat.runs.experiment import run_matrix
 from clsplat.runs.source import Source
+from clsplat.stages.report import Report
+from clsplat.training.status import read_status
 from clsplat.tuning.tuning import Tuning
 from tests.test_cli import clsplat as command
 
@@ -44,6 +47,24 @@ stages:
 """
 
 
+TWO_MODELS = """
+name: models
+scene: {{path: '{scene}'}}
+stages:
+  - init: {{count: 50}}
+  - optimize: {{steps: 2, losses: [l1]}}
+  - export: {{file: a.ply}}
+  - optimize: {{steps: 2, losses: [l1]}}
+  - evaluate
+  - export: {{file: b.ply}}
+  - checkpoint
+"""
+
+
+def damaged(out: Path) -> list[str]:
+    return [one["file"] for one in clsplat.check(out)["objects"] if not one["whole"]]
+
+
 @pytest.fixture(scope="module")
 def saved_late(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished run whose checkpoint is behind all that it has written."""
@@ -66,13 +87,74 @@ def test_a_file_whose_bytes_changed_is_written_again(name, saved_late, tmp_path)
     assert b"x" * 20 not in (out / name).read_bytes()
 
 
-def test_what_cannot_be_made_again_is_named(saved_late, tmp_path):
+def test_what_cannot_be_made_again_is_named_until_it_is_there_again(saved_late, tmp_path):
     out = tmp_path / "run"
     shutil.copytree(saved_late, out)
     records = out / "metrics.jsonl"
     records.write_text(records.read_text().replace('"step": 4', '"step": 3'))
-    assert f"{records}: is missing or was changed since it was written, and cannot" in command("resume", out).stderr
+    for _ in range(2):
+        assert f"{records}: is missing or was changed since it was written, and cannot" in command("resume", out).stderr
+        assert damaged(out) == ["metrics.jsonl"]
+        assert read_status(out)["state"] == "done"
+    assert f"`clsplat run {out}/pipeline.yaml --out {out} --restart`" in command("check", out, expect=7).stderr
+    shutil.copy(saved_late / "metrics.jsonl", records)
+    assert damaged(out) == []
     assert "cannot be made again" not in command("resume", out).stderr
+
+
+@pytest.mark.parametrize("raised", [KeyboardInterrupt, ZeroDivisionError])
+def test_a_resume_that_is_stopped_takes_no_damaged_file_for_a_whole_one(raised, saved_late, tmp_path, monkeypatch):
+    out = tmp_path / "run"
+    shutil.copytree(saved_late, out)
+    for name in ("viewer.html", "report.html"):
+        (out / name).write_bytes((out / name).read_bytes().replace(b"a", b"b", 20))
+
+    def stop(*arguments):
+        raise raised
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Report, "run", stop)
+        with pytest.raises((Interrupted, InternalError)):
+            clsplat.resume(out)
+    assert read_status(out)["state"] in ("interrupted", "failed")
+    assert damaged(out) == ["report.html"], "the other was written again"
+    clsplat.resume(out)
+    assert damaged(out) == []
+    assert (out / "report.html").read_bytes().count(b"b") < (saved_late / "report.html").read_bytes().count(b"b") + 20
+
+
+def test_a_model_of_an_earlier_stage_that_is_lost_leaves_the_run_done(tiny_scene, tmp_path):
+    (tmp_path / "two.yaml").write_text(TWO_MODELS.format(scene=tiny_scene))
+    out = clsplat.run(tmp_path / "two.yaml", out=tmp_path / "run")
+    (out / "a.ply").unlink()
+    (out / "b.ply").unlink()
+    advice = f"begin again: `clsplat run {out}/pipeline.yaml --out {out} --restart`"
+    said = command("check", out, expect=7).stderr
+    assert said.endswith(f"{advice}; `clsplat resume {out}` makes them again but for {out}/a.ply\n")
+    for _ in range(2):
+        assert (
+            f"{out}/a.ply: is missing or was changed since it was written, and cannot" in command("resume", out).stderr
+        )
+        assert read_status(out)["state"] == "done"
+        assert damaged(out) == ["a.ply"]
+        assert command("check", out, expect=7).stderr.endswith(f"{advice}\n")
+    (out / "checksums.json").unlink()
+    clsplat.resume(out)
+    assert damaged(out) == ["a.ply"], "the checkpoint knows it too"
+
+
+def test_the_remedy_of_a_run_without_a_checkpoint_is_to_begin_again(saved_late, tmp_path):
+    out = tmp_path / "run"
+    shutil.copytree(saved_late, out)
+    shutil.rmtree(out / "checkpoints")
+    status = read_status(out)
+    del status["checkpoint"]
+    (out / "status.json").write_text(json.dumps(status))
+    (out / "point_cloud.ply").unlink()
+    said = command("check", out, expect=7).stderr
+    assert said.endswith(f"begin again: `clsplat run {out}/pipeline.yaml --out {out} --restart`\n")
+    (out / "pipeline.yaml").unlink()
+    assert f"give its `clsplat run … --out {out}` again, with --restart" in command("check", out, expect=7).stderr
 
 
 def test_a_cell_without_a_checkpoint_that_lost_a_file_is_kept(tiny_scene, tmp_path, caplog):
