@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import clsplat
-from clsplat.errors import InternalError, Interrupted
+from clsplat.errors import ConfigError, DeviceError, InternalError, Interrupted, OutputError
 from clsplat.gaussians.model import load as load_model
 from clsplat.opencl.device import Device
 from clsplat.pipeline.matrix import load_experiment
@@ -141,6 +141,34 @@ def test_a_model_of_an_earlier_stage_that_is_lost_leaves_the_run_done(tiny_scene
     (out / "checksums.json").unlink()
     clsplat.resume(out)
     assert damaged(out) == ["a.ply"], "the checkpoint knows it too"
+
+
+REFUSALS = {
+    "no checkpoint": (
+        ConfigError,
+        {},
+        r"has no checkpoint to go on from; `clsplat run \S+ --out \S+ --restart` trains",
+    ),
+    "a damaged checkpoint": (OutputError, {}, "no checkpoint is whole"),
+    "another setting": (ConfigError, {"init.count": 51}, "was made with other settings"),
+    "no such device": (DeviceError, {}, "nowhere"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSALS)
+def test_a_refused_resume_leaves_a_run_done(name, saved_late, tmp_path):
+    kind, changes, words = REFUSALS[name]
+    out = tmp_path / "run"
+    shutil.copytree(saved_late, out)
+    (checkpoint,) = (out / "checkpoints").iterdir()
+    if name == "no checkpoint":
+        checkpoint.unlink()
+    if name == "a damaged checkpoint":
+        checkpoint.write_bytes(b"")
+    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file() and path.name != "log.txt"}
+    with pytest.raises(kind, match=words):
+        clsplat.resume(out, set=changes, device="nowhere" if name == "no such device" else None)
+    assert {path: path.read_bytes() for path in before} == before
 
 
 def test_the_remedy_of_a_run_without_a_checkpoint_is_to_begin_again(saved_late, tmp_path):
