@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import clsplat
-from clsplat.errors import ConfigError, DeviceError, InternalError, Interrupted, OutputError
+from clsplat.errors import ClsplatError, ConfigError, DeviceError, InternalError, Interrupted, OutputError
 from clsplat.gaussians.model import load as load_model
 from clsplat.opencl.device import Device
 from clsplat.pipeline.matrix import load_experiment
@@ -185,6 +185,39 @@ def test_the_remedy_of_a_run_without_a_checkpoint_is_to_begin_again(saved_late, 
     assert f"give its `clsplat run … --out {out}` again, with --restart" in command("check", out, expect=7).stderr
 
 
+@pytest.mark.parametrize("name", ["metrics.json", "pipeline.yaml"])
+def test_a_cell_that_lost_its_result_does_not_stop_the_comparison(name, tiny_scene, tmp_path):
+    (tmp_path / "two.yaml").write_text(MATRIX.format(scene=tiny_scene))
+    out = clsplat.run(tmp_path / "two.yaml", out=tmp_path / "run")
+    cell = out / "seed=1"
+    (cell / name).write_text("")
+    (out / "compare.html").unlink()
+    for _ in range(2):
+        with pytest.raises(ClsplatError, match=f"1 of 2 cells failed; the first, seed=1: .*--out {cell} --restart`"):
+            clsplat.resume(out)
+    assert "seed=2" in (out / "compare.html").read_text()
+    clsplat.run(tmp_path / "two.yaml", out=tmp_path / "other", set={"init.count": 50})
+    shutil.copy(tmp_path / "other" / "seed=1" / "pipeline.yaml", cell)
+    clsplat.run(cell / "pipeline.yaml", out=cell, start="restart")
+    clsplat.resume(out)
+    assert damaged(out) == []
+
+
+def test_a_cell_with_a_checkpoint_writes_its_result_again(tiny_scene, tmp_path):
+    (tmp_path / "two.yaml").write_text(MATRIX.format(scene=tiny_scene) + "  - checkpoint\n")
+    out = clsplat.run(tmp_path / "two.yaml", out=tmp_path / "run")
+    (out / "seed=1" / "pipeline.yaml").write_text("")
+    (out / "seed=2" / "metrics.json").unlink()
+    clsplat.resume(out)
+    assert damaged(out) == []
+    records = out / "seed=1" / "metrics.jsonl"
+    records.write_text(records.read_text() + "x")
+    written = [path.stat().st_mtime_ns for path in out.glob("*/metrics.json")]
+    clsplat.resume(out)
+    assert [path.stat().st_mtime_ns for path in out.glob("*/metrics.json")] == written, "nothing would come back"
+    assert damaged(out) == ["seed=1/metrics.jsonl"]
+
+
 def test_a_cell_without_a_checkpoint_that_lost_a_file_is_kept(tiny_scene, tmp_path, caplog):
     (tmp_path / "two.yaml").write_text(MATRIX.format(scene=tiny_scene))
     matrix = load_experiment(str(tmp_path / "two.yaml"))
@@ -215,6 +248,9 @@ def test_a_rung_that_lost_its_model_is_trained_again(content, few_steps, info, t
     written = file.stat().st_mtime_ns
     tuning.trained(pipeline, tmp_path / "rung")
     assert file.stat().st_mtime_ns == written
+    shutil.rmtree(tmp_path / "rung" / "checkpoints")
+    (tmp_path / "rung" / "status.json").unlink()  # no command of theirs has --restart
+    assert tuning.trained(pipeline, tmp_path / "rung").read_bytes() == whole
 
 
 def test_a_run_that_was_killed_before_it_began_is_told_how_to_begin(tmp_path):
