@@ -1,6 +1,7 @@
 """Damaged checkpoints are passed over, and a run goes on from a whole one."""
 
 import errno
+import json
 import re
 import shutil
 import zipfile
@@ -116,6 +117,8 @@ def test_the_one_before_a_checkpoint_on_a_bad_part_of_the_disk_is_used(
 def test_a_run_whose_checkpoints_are_gone_does_not_begin_again(killed_run, tiny_scene, few_steps):
     before = (killed_run / "metrics.jsonl").read_bytes()
     shutil.rmtree(killed_run / "checkpoints")
+    status = json.loads((killed_run / "status.json").read_text())
+    (killed_run / "status.json").write_text(json.dumps({**status, "state": "running"}))
     with pytest.raises(OutputError, match=r"is empty, but step_000012.npz was saved there; .*--restart` starts"):
         train(tiny_scene, killed_run, *FEW, resume=True)
     assert (killed_run / "metrics.jsonl").read_bytes() == before

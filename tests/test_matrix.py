@@ -170,6 +170,6 @@ def test_the_same_name_twice_is_refused(write, tmp_path):
 
 def test_schema_knows_the_matrix():
     schema = json_schema()
-    assert set(schema["$defs"]["Matrix"]["properties"]) == {"pipelines", "scenes", "seeds", "set"}
+    assert set(schema["$defs"]["Matrix"]["properties"]) == {"pipelines", "scenes", "seeds", "set", "options"}
     assert schema["properties"]["matrix"] == {"$ref": "#/$defs/Matrix"}
     assert "stages" not in schema["required"]

@@ -96,6 +96,19 @@ def test_resume_runs_what_is_missing_only(finished, tmp_path):
     assert {path.parent.name: path.read_bytes() for path in out.glob("*/point_cloud.ply")} == bits
 
 
+def test_a_resumed_matrix_has_the_options_of_its_run(tiny_scene, tmp_path):
+    """Of --set and --scene, which its file does not name."""
+    (tmp_path / "x.yaml").write_text(f"name: sweep\nmatrix: {{seeds: [0, 1]}}\n{STAGES}")
+    out = tmp_path / "run"
+    experiment.Job.open(str(tmp_path / "x.yaml"), tiny_scene, out, ["optimize.steps=5", "optimize.steps=3"]).run()
+    shutil.rmtree(out / "seed=1")
+    experiment.Job.resume(out).run()
+    assert json.loads((out / "status.json").read_text())["state"] == "done"
+    assert json.loads((out / "seed=1" / "metrics.json").read_text())["steps"] == 3
+    options = load_experiment(str(out / "pipeline.yaml"), ["init.count=9"]).text.partition("options:")[2]
+    assert options.count("optimize.steps") == options.count("init.count") == options.count("scene.path") == 1
+
+
 def test_a_matrix_that_has_lost_its_status_goes_on(finished, tmp_path):
     out = tmp_path / "run"
     shutil.copytree(finished[1], out)

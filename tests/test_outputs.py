@@ -18,8 +18,8 @@ from clsplat.training.run import Run
 
 READ = {  # text that is read, or compared, and never the name of something that is written
     "SceneSettings.path", "Init.file", "Evaluate.file", "Evaluate.lpips", "Matrix.pipelines", "Matrix.scenes",
-    "Matrix.set", "PipelineFile.plugins", "Snapshot.view", "Snapshot.size", "Timelapse.folder", "Video.path",
-    "Video.size",
+    "Matrix.set", "Matrix.options", "PipelineFile.plugins", "Snapshot.view", "Snapshot.size", "Timelapse.folder",
+    "Video.path", "Video.size",
 }  # fmt: skip
 NAMES = {"PipelineFile.name", "MatrixFile.name"}  # of folders
 OUTSIDE = [

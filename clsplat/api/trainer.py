@@ -16,7 +16,7 @@ from clsplat.errors import ClsplatError, ConfigError, DataError, Interrupted, Ou
 from clsplat.gaussians.model import Model
 from clsplat.losses.base import HostFunction, HostLoss, ViewGradients
 from clsplat.metrics.views import mean, measure
-from clsplat.names import END_STATES
+from clsplat.names import CHECKSUMS, END_STATES
 from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import Pipeline, load
 from clsplat.runs import folders, opening, outputs, runner
@@ -102,6 +102,7 @@ class Trainer:
                 scene_of_run = RunScene.of(self.pipeline.settings.scene, self.scene)
                 self._run = opening.make_run(self.pipeline, scene_of_run, opened, self.out, status)
                 runner.begin(self.pipeline, self._run, start)
+                (self.out / CHECKSUMS).unlink(missing_ok=True)  # it lists what the stages of a whole run write
                 with saved_on_failure(self._run):
                     run_until_training(self.pipeline, self._run)
             holding.callback(_left, status)

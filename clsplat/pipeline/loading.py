@@ -1,14 +1,12 @@
 """From a pipeline file to checked stages, and back to the resolved file that a run folder holds."""
 
 import copy
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from pydantic import ValidationError
-from ruamel.yaml import YAML
 
 from clsplat import plugins
 from clsplat.density.edit import Rule
@@ -21,7 +19,7 @@ from clsplat.pipeline.files import find
 from clsplat.pipeline.overrides import NoSuchKey, apply, split, suggestion
 from clsplat.pipeline.renamed import with_new_names
 from clsplat.pipeline.settable import CADENCE, settable
-from clsplat.pipeline.yaml_file import Document, read_yaml
+from clsplat.pipeline.yaml_file import Document, read_yaml, yaml_text
 from clsplat.prepare.cache import Planned, plan
 from clsplat.settings import Settings, variants
 from clsplat.stages.base import Scheduled, Stage, written_twice
@@ -57,13 +55,7 @@ class Pipeline:
 
     def text(self) -> str:
         """Return the text of the resolved file."""
-        stream = io.StringIO()
-        yaml = YAML(typ="safe")
-        yaml.default_flow_style = None
-        yaml.sort_base_mapping_type_on_output = False  # type: ignore[assignment]
-        yaml.width = 120
-        yaml.dump(self.resolved(), stream)
-        return stream.getvalue()
+        return yaml_text(self.resolved())
 
 
 def prepared_folder(out: Path) -> Path:

@@ -28,7 +28,7 @@ from clsplat.pipeline.explanation import explain, place_text
 from clsplat.pipeline.file import Name
 from clsplat.pipeline.files import find
 from clsplat.pipeline.loading import Pipeline, checked
-from clsplat.pipeline.yaml_file import Document, Place, read_pipeline, read_yaml
+from clsplat.pipeline.yaml_file import Document, Place, read_pipeline, read_yaml, yaml_text
 from clsplat.settings import ReadPath, Settings
 
 MAX_CELLS = 1000
@@ -45,6 +45,8 @@ class Matrix(Settings):
     """Seeds; without them, the seed of the pipeline."""
     set: dict[str, Annotated[list[JsonValue], Field(min_length=1)]] = Field({})
     """Settings by place, as of --set, each with the list of its values."""
+    options: list[str] = Field([])
+    """Settings of every cell, as place=value: those of --set and --scene, which a run notes in its folder."""
 
     @model_validator(mode="after")
     def _has_cells(self) -> "Matrix":
@@ -80,7 +82,7 @@ class Experiment:
 
     path: Path
     name: str
-    text: str  # of the file
+    text: str  # of the file, with the options that it was opened with
     cells: list[Cell]
 
 
@@ -108,6 +110,7 @@ def load_experiment(name: str, overrides: Sequence[str] = ()) -> Experiment | No
         file = MatrixFile.model_validate(own)
     except ValidationError as error:
         raise ConfigError(explain(error, MatrixFile, path, document)) from error
+    given, overrides = bool(overrides), _last_of_each([*file.matrix.options, *overrides])
     axes = _axes(file.matrix)
     _check_overrides(path, axes, overrides)
     bases = _bases(path, document, file.matrix)
@@ -117,7 +120,8 @@ def load_experiment(name: str, overrides: Sequence[str] = ()) -> Experiment | No
         _check_choices(path, document, base, axes, overrides)
     cells = [_cell(base, choices, overrides) for base in bases for choices in itertools.product(*axes)]
     _check_names(path, cells)
-    return Experiment(path, file.name, read_pipeline(path), cells)
+    data = {**document.data, "matrix": {**document.data["matrix"], "options": overrides}}
+    return Experiment(path, file.name, yaml_text(data) if given else read_pipeline(path), cells)
 
 
 @dataclass(frozen=True)
@@ -206,6 +210,12 @@ def _check_names(path: Path, cells: Sequence[Cell]) -> None:
     names = [cell.name.casefold() for cell in cells]  # some file systems ignore case
     if twice := next((cell.name for cell in cells if names.count(cell.name.casefold()) > 1), None):
         raise ConfigError(f"{path}: two cells of the matrix would be named '{twice}'; rename a pipeline or a folder")
+
+
+def _last_of_each(overrides: Sequence[str]) -> list[str]:
+    """Without those that a later one of the same place takes back."""
+    places = [override.partition("=")[0] for override in overrides]
+    return [override for i, override in enumerate(overrides) if places[i] not in places[i + 1 :]]
 
 
 def _distinct(paths: Sequence[tuple[str, ...]]) -> list[str]:

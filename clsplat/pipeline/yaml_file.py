@@ -4,6 +4,7 @@ Allowed are text, numbers, true, false, null, lists, and maps whose keys are tex
 (`<<`) work; every other tag is an error.
 """
 
+import io
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -86,6 +87,17 @@ def parse_value(text: str) -> Any:
     Raises ConfigError.
     """
     return _parse(text, "").data
+
+
+def yaml_text(data: Any) -> str:
+    """Return plain data as the text of a document."""
+    stream = io.StringIO()
+    yaml = YAML(typ="safe")
+    yaml.default_flow_style = None
+    yaml.sort_base_mapping_type_on_output = False  # type: ignore[assignment]
+    yaml.width = 120
+    yaml.dump(data, stream)
+    return stream.getvalue()
 
 
 def _parse(text: str, name: str) -> Document:

@@ -9,7 +9,7 @@ from clsplat.names import LOCK, PIPELINE
 from clsplat.pipeline.loading import Pipeline
 from clsplat.prepare.cache import Planned, note, noted
 from clsplat.runs.folders import Start
-from clsplat.runs.found import is_done_with
+from clsplat.runs.found import is_complete, is_done_with
 
 
 def free_folder(folder: Path, pipeline: Pipeline | None, start: Start) -> Path:
@@ -30,6 +30,13 @@ def free_folder(folder: Path, pipeline: Pipeline | None, start: Start) -> Path:
         number += 1
         free = folder.with_name(f"{folder.name}-{number}")
     return free
+
+
+def start_of(pipeline: Pipeline, planned: Sequence[Planned], out: Path, start: Start) -> Start | None:
+    """How a run begins in `out`; None: it is up to date.  One that is done goes on where files of it were lost."""
+    if start == "restart" or not is_same(pipeline, planned, out):
+        return start
+    return None if is_complete(out) else "resume"
 
 
 def is_same(pipeline: Pipeline, planned: Sequence[Planned], out: Path) -> bool:

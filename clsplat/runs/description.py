@@ -6,9 +6,8 @@ from pathlib import Path
 from clsplat import lock
 from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import Pipeline
-from clsplat.runs.default_folder import is_same
+from clsplat.runs.default_folder import start_of
 from clsplat.runs.folders import Start, check_run_folder
-from clsplat.runs.found import is_complete
 from clsplat.runs.opening import check_start, open_run
 from clsplat.runs.outputs import check_places
 from clsplat.runs.runner import restore
@@ -29,10 +28,10 @@ def describe(
     Raises what the run would raise before its first stage; of its photographs only where nothing must be prepared.
     """
     planned = pipeline.preparation(out)
-    if start != "restart" and is_same(pipeline, planned, out):
-        if is_complete(out):
-            return f"{out}: up to date"
-        start = "resume"
+    begun = start_of(pipeline, planned, out, start)
+    if begun is None:
+        return f"{out}: up to date"
+    start = begun
     check_places(pipeline, out)
     check_run_folder(out, start)
     tell_of_waiting(out)

@@ -16,18 +16,17 @@ from clsplat.live.live import Live
 from clsplat.names import COMPARISON, LOG_FILE, OF_A_MATRIX, PIPELINE, STATUS
 from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import Pipeline, load
-from clsplat.pipeline.matrix import Cell, Experiment, load_experiment
+from clsplat.pipeline.matrix import Experiment, load_experiment
 from clsplat.pipeline.yaml_file import read_yaml
 from clsplat.runs import description, folders, opening, outputs, runner
-from clsplat.runs.default_folder import free_folder, is_same
+from clsplat.runs.default_folder import free_folder, start_of
 from clsplat.runs.failures import failures_recorded
 from clsplat.runs.folders import Start
-from clsplat.runs.found import has_pipeline, is_complete, is_done
+from clsplat.runs.found import is_finished
 from clsplat.runs.scenes import read_run_scene
 from clsplat.runs.source import photographs_of
 from clsplat.runs.summary import summary
 from clsplat.signals import stop_at_once, stop_if_signalled, stopping_on_signals
-from clsplat.training.changes import first_difference
 from clsplat.training.status import StatusFile
 
 LOG = logging.getLogger("clsplat")
@@ -90,11 +89,12 @@ class Job:
         if isinstance(self.work, Experiment):
             run_matrix(self.work, self.out, device, self.start, live)
             return
-        same = self.start != "restart" and is_same(self.work, self.work.preparation(self.out), self.out)
-        if same and is_complete(self.out):
+        planned = [] if self.start == "restart" else self.work.preparation(self.out)
+        start = start_of(self.work, planned, self.out, self.start)
+        if start is None:
             LOG.info("%s: up to date; change a setting, or give another folder, to run again", self.out)
         else:
-            run_pipeline(self.work, self.out, device, "resume" if same else self.start, live)
+            run_pipeline(self.work, self.out, device, start, live)
 
 
 @contextmanager
@@ -163,7 +163,7 @@ def _run_cells(
         title, folder = f"cell {number} of {len(experiment.cells)}: {cell.name}", status.out / cell.name
         status.note(stage=cell.name)
         try:
-            if start == "resume" and _finished(cell, folder):
+            if start == "resume" and is_finished(cell.pipeline, folder):
                 LOG.info("%s is done", title)
             else:
                 LOG.info("%s", title)
@@ -199,7 +199,7 @@ def describe_matrix(experiment: Experiment, out: Path, device: str | Device | No
         folder = out / cell.name
         state = "unfinished" if folder.exists() else ""
         try:
-            if start == "resume" and _finished(cell, folder):
+            if start == "resume" and is_finished(cell.pipeline, folder):
                 state = "done"
             else:
                 description.describe(cell.pipeline, folder, device, start, read)
@@ -219,16 +219,6 @@ def as_setting(folder: Path) -> str:
     except UnicodeEncodeError:
         raise ConfigError(f"--scene {path!r}: expected a path of UTF-8 text; rename the folder") from None
     return json.dumps(path)
-
-
-def _finished(cell: Cell, folder: Path) -> bool:
-    """Whether the cell was run to its end, and has its files.  Raises ConfigError when that was with other settings."""
-    if not is_done(folder) or not has_pipeline(folder):
-        return False
-    before = load(str(folder / PIPELINE)).resolved()
-    if difference := first_difference(before, cell.pipeline.resolved()):
-        raise ConfigError(f"{folder}: was run with other settings: {difference}; use another folder, or those settings")
-    return is_complete(folder)
 
 
 def _compare(experiment: Experiment, out: Path, failures: dict[str, ClsplatError]) -> None:

@@ -8,7 +8,7 @@ from typing import Any, Literal, get_args
 
 from clsplat import lock
 from clsplat.errors import ClsplatError, ConfigError, InternalError, OutputError, as_clsplat_error
-from clsplat.files import make_folder, sweep, told_as
+from clsplat.files import make_folder, sweep, told_as, write_text
 from clsplat.names import (
     BEFORE_A_RUN,
     CHECKPOINTS,
@@ -24,7 +24,7 @@ from clsplat.names import (
 )
 from clsplat.pipeline.matrix import load_experiment
 from clsplat.reading import read_text
-from clsplat.runs.found import has_begun, has_pipeline
+from clsplat.runs.found import has_begun, has_pipeline, is_done, restart
 from clsplat.training import checkpoint
 from clsplat.training.status import StatusFile, read_status
 
@@ -36,7 +36,8 @@ Start = Literal["new", "resume", "restart"]
 def opened(out: Path, start: Start, **values: Any) -> Iterator[StatusFile]:
     """Make the run folder, swept of what killed runs have left, and its status with `values`; hold it in the block.
 
-    A run that ends before its first step, without a checkpoint, leaves no new folder and no run in one that was there.
+    A run that ends before its first step, without a checkpoint, leaves no new folder and no run in one that was there;
+    one that was done before, and is refused before it goes on, stays done.
     Raises ConfigError when it holds another run, OutputError when it is in use or cannot be written.
     """
     check_run_folder(out, start)
@@ -48,12 +49,17 @@ def opened(out: Path, start: Start, **values: Any) -> Iterator[StatusFile]:
         with lock.held(out) as require_held:
             check_run_folder(out, start)  # again: another run may have ended since
             sweep(out, border=PIPELINE)
+            before = read_text(out / STATUS) if start == "resume" and is_done(out) else None
             status = StatusFile(out, require_held, **values)
             status.begin()
             try:
                 with closing(status):  # the next holder writes its own
                     yield status
             except BaseException as error:
+                if before is not None and not status.has_run:
+                    with suppress(OutputError):
+                        status.require_held()
+                        write_text(out / STATUS, before)
                 is_defect = isinstance(as_clsplat_error(error), InternalError)  # its log has the traceback
                 if is_new and not status.now.step and not is_defect:
                     written = BEFORE_A_RUN if status.now.cells else OF_A_RUN - {CHECKPOINTS}
@@ -121,10 +127,10 @@ def check_run_folder(out: Path, start: Start) -> None:
     if start == "new" and has_begun(out):
         raise ConfigError(f"{out}: already holds a run; give another folder, --resume or --restart")
     status = read_status(out) if start == "resume" else {}
-    if status.get("state") == "done" and not ({"cells", "checkpoint"} & status.keys() or checkpoint.saved(out)):
-        raise ConfigError(f"{out}: is done, and has no checkpoint to go on from; --restart trains it again")
+    if status.get("state") == "done" and "cells" not in status and not checkpoint.saved(out):
+        raise ConfigError(f"{out}: is done, and has no checkpoint to go on from; {restart(out)} trains it again")
     if start == "resume" and not status and (out / INPUTS).exists() and not checkpoint.saved(out):
         raise OutputError(
             f"{out}: has neither a readable {STATUS} nor a checkpoint, though a run has begun there; put them back, or "
-            "give --restart, which begins it again"
+            f"give {restart(out)}, which begins it again"
         )

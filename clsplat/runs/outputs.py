@@ -1,7 +1,8 @@
 """The files that a run has at its end."""
 
 import json
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from clsplat.compare.run_folder import read_metrics
@@ -11,7 +12,7 @@ from clsplat.names import BEFORE_A_RUN, CHECKSUMS, LOCK, LOG_FILE, METRICS, OF_A
 from clsplat.pipeline.loading import Pipeline, load
 from clsplat.processes import Owner
 from clsplat.reading import read_file, read_json, sha256
-from clsplat.runs.found import has_begun
+from clsplat.runs.found import Course, has_begun, is_below, not_whole, read_sums, sum_of
 from clsplat.stages.base import Stage
 from clsplat.stages.optimize import Optimize
 from clsplat.training.run import Run
@@ -39,17 +40,66 @@ def write_metrics(pipeline: Pipeline, run: Run) -> None:
     write_text(run.out / METRICS, json.dumps(metrics, indent=1) + "\n")
 
 
-def write_checksums(pipeline: Pipeline, run: Run) -> None:
-    """Write the SHA-256 of every file that the run has at its end, by its path in the run folder."""
+@dataclass(frozen=True)
+class Lost:
+    """Files of an earlier end of a run that are missing or changed."""
+
+    repeatable: list[Path] = field(default_factory=list)  # that a stage which has ended can write again
+    gone: dict[Path, tuple[str, str | None]] = field(default_factory=dict)
+    """Those that no stage writes again, each with the SHA-256 of what was written, and of what is there."""
+
+
+def keep_checksums(course: Course, run: Run) -> Lost:
+    """Leave in the list what holds while the run goes on: the files that it does not write.  Return what is lost.
+
+    What cannot be made again stays in the list, so that it is not taken for whole at the end.
+    """
+    sums = read_sums(run.out)
+    if sums is None:
+        sums = run.written if run.status.was_done else {}
+    sums = {name: value for name, value in sums.items() if not course.writes(run.out / name)}
+    lost = not_whole(run.out, sums)
+    gone = {file: (sums[_name(file, run)], sum_of(file)) for file in lost if not course.mends(file)}
+    _write_sums(run, {
+        name: value
+        for name, value in sums.items()
+        if run.out / name in lost or not course.may_write(run.out / name)
+    })  # fmt: skip
+    return Lost([file for file in lost if file not in gone], gone)
+
+
+def renew_checksums(stage: Stage, run: Run) -> None:
+    """Put what a stage has written again into the list that the run goes on with."""
+    sums = read_sums(run.out) or {}
+    for name in [name for name in sums if is_below(run.out / name, stage.outputs(run.out))]:
+        sums[name] = sum_of(run.out / name) or sums[name]
+    _write_sums(run, sums)
+
+
+def write_checksums(pipeline: Pipeline, run: Run, gone: Mapping[Path, tuple[str, str | None]]) -> None:
+    """Write the SHA-256 of every file that the run has at its end, by its path in the run folder.
+
+    Files that are `gone` keep that of what was written, unless they were made anew after all.
+    """
     found = [run.out / name for name in (PIPELINE, METRICS, RECORDS)]
     for place in (path for stage in pipeline.stages for path in stage.outputs(run.out)):
         found += sorted(place.rglob("*")) if place.is_dir() else [place]
-    sums = {
-        path.relative_to(run.out).as_posix(): sha256(path, kind=OutputError)
-        for path in dict.fromkeys(found)
-        if path.is_file()
-    }
-    write_text(run.out / CHECKSUMS, json.dumps(sums, indent=1) + "\n")
+    sums = {_name(path, run): sha256(path, kind=OutputError) for path in dict.fromkeys(found) if path.is_file()}
+    for file, (written, damaged) in gone.items():
+        if file == run.out / RECORDS or sums.get(_name(file, run)) == damaged:
+            sums[_name(file, run)] = written
+    _write_sums(run, sums)
+
+
+def _write_sums(run: Run, sums: Mapping[str, str]) -> None:
+    if sums:
+        write_text(run.out / CHECKSUMS, json.dumps(sums, indent=1) + "\n")
+    else:
+        (run.out / CHECKSUMS).unlink(missing_ok=True)
+
+
+def _name(path: Path, run: Run) -> str:
+    return path.relative_to(run.out).as_posix()
 
 
 def check_places(pipeline: Pipeline, out: Path) -> None:
@@ -107,13 +157,17 @@ def _require_free(files: Iterable[Path]) -> None:
             raise ConfigError(f"{path}: exists, and is not of this run; give another folder for the run")
 
 
-def check_outputs(pipeline: Pipeline, run: Run) -> None:
-    """Read back the files of a run.  Raises OutputError where one is missing or damaged."""
+def check_outputs(pipeline: Pipeline, run: Run, gone: Collection[Path] = ()) -> None:
+    """Read back the files of a run, but of the stages whose files are `gone`, which a warning has named.
+
+    Raises OutputError where one is missing or damaged.
+    """
     try:
         read_metrics(run.out / METRICS)
         load(str(run.out / PIPELINE))
         for stage in acting(pipeline):
-            stage.verify(run)
+            if not any(is_below(file, stage.outputs(run.out)) for file in gone):
+                stage.verify(run)
     except (ConfigError, DataError) as error:
         raise OutputError(f"{error}, at the end of the run; see {run.out / LOG_FILE}") from error
 

@@ -2,19 +2,18 @@
 
 import json
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
-from itertools import takewhile
 from pathlib import Path
 
 from clsplat.errors import ConfigError, DataError, Interrupted
 from clsplat.files import write_text
-from clsplat.names import CHECKSUMS, METRICS, NOTE, PIPELINE
+from clsplat.names import NOTE, PIPELINE
 from clsplat.pipeline.loading import Pipeline
 from clsplat.runs.folders import RESOLVED, Start, clear
-from clsplat.runs.found import changed
+from clsplat.runs.found import Course, is_below
 from clsplat.runs.inputs import require_same_inputs, write_inputs
-from clsplat.runs.outputs import check_outputs, write_checksums, write_metrics
+from clsplat.runs.outputs import Lost, check_outputs, keep_checksums, renew_checksums, write_checksums, write_metrics
 from clsplat.runs.signals import finishing_on_interrupt
 from clsplat.stages.optimize import Optimize
 from clsplat.training import checkpoint
@@ -30,33 +29,37 @@ def execute(pipeline: Pipeline, run: Run, start: Start, show: Callable[[Progress
     The caller records a failure.
     """
     run.show = show
-    lost = changed(run.out) if start == "resume" else []  # before the list of checksums goes
-    begin(pipeline, run, start)
+    lost = begin(pipeline, run, start)
     with finishing_on_interrupt(run), saved_on_failure(run):
         _write_again(pipeline, run, lost)
         _run_stages(pipeline, run)
     run.status.require_held()
     write_metrics(pipeline, run)
-    check_outputs(pipeline, run)
-    write_checksums(pipeline, run)
+    check_outputs(pipeline, run, lost.gone)
+    write_checksums(pipeline, run, lost.gone)
     run.status.end("done", exit_code=0)
 
 
-def begin(pipeline: Pipeline, run: Run, start: Start) -> None:
-    """Take the newest checkpoint, or clear the folder, and write what a run folder holds from the beginning on."""
+def begin(pipeline: Pipeline, run: Run, start: Start) -> Lost:
+    """Take the newest checkpoint, or clear the folder, and write what a run folder holds from the beginning on.
+
+    Return which files of an earlier end are lost.
+    """
+    taken = None
     if start == "restart":
         clear(run.status)
     if start == "resume":
         taken = restore(pipeline, run)
         LOG.info("resumed at step %d" if taken else "nothing to resume; starting from the beginning%.0s", run.step)
-        checkpoint.drop_later(run.out, taken)
-    (run.out / CHECKSUMS).unlink(missing_ok=True)
+    run.status.enter("running", step=run.step)  # a refusal leaves all as it was; from here on files change
+    lost = keep_checksums(Course(pipeline, run.out, run), run)
+    checkpoint.drop_later(run.out, taken)
     write_text(run.out / PIPELINE, f"{RESOLVED}{pipeline.path.name}\n{pipeline.text()}")
     write_inputs(run)
     if run.prepared:
         write_text(run.out / NOTE, json.dumps(run.prepared) + "\n")
     run.records.start()
-    run.status.enter("running", step=run.step)
+    return lost
 
 
 def restore(pipeline: Pipeline, run: Run) -> Path | None:
@@ -79,16 +82,13 @@ def restore(pipeline: Pipeline, run: Run) -> Path | None:
     return taken
 
 
-def _write_again(pipeline: Pipeline, run: Run, lost: Sequence[Path]) -> None:
-    """Repeat the stages whose files are `lost` or damaged, of those that ended since the model changed last.
+def _write_again(pipeline: Pipeline, run: Run, lost: Lost) -> None:
+    """Repeat the stages whose files are lost or damaged, of those that ended since the model changed last.
 
     Files that are lost and that no stage writes again are named in a warning.
     """
-    ended = pipeline.stages[: 0 if run.stage_step else run.cursor]
-    unchanged = list(takewhile(lambda stage: not (stage.edits or isinstance(stage, Optimize)), reversed(ended)))
-    left = [file for file in lost if file.name not in (CHECKSUMS, PIPELINE, METRICS)]
-    for stage in reversed(unchanged):
-        own = [file for file in left if any(file.is_relative_to(place) for place in stage.outputs(run.out))]
+    for stage in reversed(Course(pipeline, run.out, run).repeatable):
+        own = [file for file in lost.repeatable if is_below(file, stage.outputs(run.out))]
         try:
             stage.verify(run)
             if own:
@@ -96,11 +96,9 @@ def _write_again(pipeline: Pipeline, run: Run, lost: Sequence[Path]) -> None:
         except DataError as error:
             LOG.warning("%s; it is written again", error)
             stage.act(run)
-        left = [file for file in left if file not in own]
-    coming = [place for stage in pipeline.stages[run.cursor :] for place in stage.outputs(run.out)]
-    for file in left:
-        if not any(file.is_relative_to(place) for place in coming):
-            LOG.warning("%s: is missing or was changed since it was written, and cannot be made again", file)
+            renew_checksums(stage, run)
+    for file in lost.gone:
+        LOG.warning("%s: is missing or was changed since it was written, and cannot be made again", file)
 
 
 def _run_stages(pipeline: Pipeline, run: Run) -> None:

@@ -3,8 +3,8 @@
 from pathlib import Path
 from typing import Any
 
-from clsplat.names import CHECKPOINTS, PIPELINE
-from clsplat.runs.found import has_state
+from clsplat.names import PIPELINE
+from clsplat.runs.found import beyond_repair, has_state, restart
 from clsplat.runs.verify import NO_SUMS
 
 
@@ -27,14 +27,18 @@ def _remedy(found: dict[str, Any], file: str) -> str:
     out = Path(found["run"])
     cell = next((one for one in (out / file).parents if one != out and out in one.parents and has_state(one)), out)
     prefix = "" if cell == out else f"{cell.relative_to(out).as_posix()}/"
-    whole = {one["file"].removeprefix(prefix): one["whole"] for one in found["objects"]}
-    checkpoints = [good for name, good in whole.items() if name.startswith(f"{CHECKPOINTS}/step_")]
+    whole = {
+        one["file"].removeprefix(prefix): one["whole"] for one in found["objects"] if one["file"].startswith(prefix)
+    }
+    damaged = [cell / name for name, good in whole.items() if not good]
+    left = beyond_repair(cell, damaged)
     if not whole.get(PIPELINE):
-        start = "--restart" if checkpoints and not any(checkpoints) else "--resume"
-        return f"give its `clsplat run … --out {cell}` again, with {start}"
-    if checkpoints and not any(checkpoints):
-        return f"begin again: `clsplat run {cell / PIPELINE} --out {cell} --restart`"
-    return f"`clsplat resume {cell}` makes them again"
+        return f"give its `clsplat run … --out {cell}` again, with {'--restart' if left else '--resume'}"
+    resume = f"`clsplat resume {cell}` makes them again"
+    if not left:
+        return resume
+    others = "" if len(left) == len(damaged) else f"; {resume} but for {', '.join(map(str, left))}"
+    return f"begin again: {restart(cell)}{others}"
 
 
 def lines(found: dict[str, Any]) -> str:

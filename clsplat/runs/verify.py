@@ -24,9 +24,8 @@ from clsplat.names import (
 )
 from clsplat.pipeline.loading import load
 from clsplat.pipeline.matrix import load_experiment
-from clsplat.reading import read_json
 from clsplat.runs import file_checks
-from clsplat.runs.found import has_state
+from clsplat.runs.found import has_state, read_sums
 from clsplat.runs.outputs import acting
 from clsplat.runs.status import state_of
 from clsplat.training import checkpoint
@@ -60,8 +59,9 @@ def _objects(out: Path, whole: bool = False) -> Iterator[dict[str, Any]]:
         settings.update(read_settings(out))
         return file_checks.settings_file(path, settings, sums.get(PIPELINE))
 
-    status, sums = read_status(out), _sums(out)
-    done = whole or status.get("state") == "done" or (not status and (out / CHECKSUMS).exists())
+    status, sums = read_status(out), read_sums(out) or {}
+    ended = is_there(out / CHECKSUMS) and (PIPELINE in sums or not sums)  # while a run goes on it lists other files
+    done = whole or status.get("state") == "done" or (not status and ended)
     one = partial(_one, out)
     yield one(PIPELINE, pipeline)
     yield one(STATUS, file_checks.status_file)
@@ -73,14 +73,14 @@ def _objects(out: Path, whole: bool = False) -> Iterator[dict[str, Any]]:
         return
     written: dict[str, str] = {}  # models of a run that is not done
     yield from (one(name, partial(file_checks.checkpoint_file, written)) for name in _checkpoints(out, status))
-    expected = sums or {name: value for name, value in written.items() if is_inside(name)}
+    expected = {**{name: value for name, value in written.items() if is_inside(name)}, **sums}
     for path in sorted((out / CHECKPOINTS).glob("failed_*.npz")):
         yield one(f"{CHECKPOINTS}/{path.name}", file_checks.failed_state)
     files, folders = _declared(out, sums) if done else ([], [])
     if done and not is_there(out / CHECKSUMS):
         yield {"file": CHECKSUMS, "whole": False, "detail": NO_SUMS}
     elif is_there(out / CHECKSUMS):
-        yield one(CHECKSUMS, partial(file_checks.sums_file, [PIPELINE, *files]))
+        yield one(CHECKSUMS, partial(file_checks.sums_file, [PIPELINE, *files] if done else []))
     if done or is_there(out / INPUTS):
         yield one(INPUTS, file_checks.inputs_file)
     if (done and settings.get("prepare")) or is_there(out / NOTE):
@@ -118,15 +118,6 @@ def _cells(out: Path, done: bool) -> list[str]:
         found = load_experiment(str(out / PIPELINE)) if done else None
         cells |= {cell.name for cell in found.cells} if found else set()
     return sorted(cells)
-
-
-def _sums(out: Path) -> dict[str, str]:
-    """The checksums that are listed; none where the list is missing or damaged."""
-    try:
-        sums = read_json(out / CHECKSUMS)
-    except DataError:
-        return {}
-    return {name: str(value) for name, value in sums.items() if is_inside(name)} if isinstance(sums, dict) else {}
 
 
 def _declared(out: Path, sums: dict[str, str]) -> tuple[list[str], list[str]]:

@@ -38,7 +38,10 @@ class StatusFile:
         self.lost: OutputError | None = None  # what it has raised
         self._require_held = require_held
         now = time.time()
-        checkpoint = read_status(out).get("checkpoint")
+        before = read_status(out)
+        checkpoint = before.get("checkpoint")
+        self.was_done = before.get("state") == "done"  # the run that was in the folder before
+        self.has_run = False  # so that the folder is no longer as that run has left it
         self.now = Status(
             format=FORMAT,
             state="starting",
@@ -82,6 +85,7 @@ class StatusFile:
     def enter(self, state: Literal["preparing", "running"], **values: Any) -> None:
         """Change the state, and write it at once."""
         self.note(state=state, stage=None, progress=None, seconds_left=None, **values)
+        self.has_run |= state == "running"
         self.refresh()
         self._beat()
 

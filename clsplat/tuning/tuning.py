@@ -16,7 +16,7 @@ from clsplat.pipeline.loading import Pipeline, checked
 from clsplat.pipeline.yaml_file import Document, read_yaml
 from clsplat.runs.experiment import run_pipeline
 from clsplat.runs.folders import Start
-from clsplat.runs.found import changed, is_done, is_done_with
+from clsplat.runs.found import changed, is_done_with
 from clsplat.runs.source import Source
 from clsplat.training import checkpoint
 
@@ -53,8 +53,8 @@ class Tuning:
         What an earlier call has finished is left alone, what it has begun goes on, and what was lost is made again.
         """
         if not is_done_with(pipeline, folder) or changed(folder):
-            is_lost = is_done(folder) and not checkpoint.saved(folder)
-            start: Start = "restart" if is_lost else "resume" if is_there(folder) else "new"
+            begun: Start = "resume" if checkpoint.saved(folder) else "restart"
+            start: Start = begun if is_there(folder) else "new"
             try:
                 run_pipeline(pipeline, folder, self.device, start)
             except Interrupted as error:
