@@ -60,11 +60,8 @@ def keep_checksums(course: Course, run: Run) -> Lost:
     sums = {name: value for name, value in sums.items() if not course.writes(run.out / name)}
     lost = not_whole(run.out, sums)
     gone = {file: (sums[_name(file, run)], sum_of(file)) for file in lost if not course.mends(file)}
-    _write_sums(run, {
-        name: value
-        for name, value in sums.items()
-        if run.out / name in lost or not course.may_write(run.out / name)
-    })  # fmt: skip
+    going_on = {name for name in sums if run.out / name not in lost and course.may_write(run.out / name)}
+    _write_sums(run, {name: value for name, value in sums.items() if name not in going_on})
     return Lost([file for file in lost if file not in gone], gone)
 
 
