@@ -102,6 +102,29 @@ def test_what_cannot_be_made_again_is_named_until_it_is_there_again(saved_late, 
     assert "cannot be made again" not in command("resume", out).stderr
 
 
+def test_without_a_list_of_checksums_all_that_can_be_is_written_again(saved_late, tmp_path):
+    out = tmp_path / "run"
+    shutil.copytree(saved_late, out)
+    (out / "checksums.json").unlink()
+    viewer = (out / "viewer.html").read_bytes()
+    (out / "viewer.html").write_bytes(viewer[:40] + b"x" * 20 + viewer[60:])
+    assert "what can be is written again, the rest is not verified" in command("resume", out).stderr
+    assert (out / "viewer.html").read_bytes() == viewer
+    assert damaged(out) == []
+
+
+def test_a_run_without_status_and_checkpoint_is_told_to_begin_again(saved_late, tmp_path):
+    out = tmp_path / "run"
+    shutil.copytree(saved_late, out)
+    shutil.rmtree(out / "checkpoints")
+    (out / "status.json").unlink()
+    assert (
+        f"begin again: `clsplat run {out}/pipeline.yaml --out {out} --restart`"
+        in command("check", out, expect=7).stderr
+    )
+    command("resume", out, expect=7)
+
+
 @pytest.mark.parametrize("raised", [KeyboardInterrupt, ZeroDivisionError])
 def test_a_resume_that_is_stopped_takes_no_damaged_file_for_a_whole_one(raised, saved_late, tmp_path, monkeypatch):
     out = tmp_path / "run"
@@ -185,20 +208,22 @@ def test_the_remedy_of_a_run_without_a_checkpoint_is_to_begin_again(saved_late, 
     assert f"give its `clsplat run … --out {out}` again, with --restart" in command("check", out, expect=7).stderr
 
 
-@pytest.mark.parametrize("name", ["metrics.json", "pipeline.yaml"])
-def test_a_cell_that_lost_its_result_does_not_stop_the_comparison(name, tiny_scene, tmp_path):
+@pytest.mark.parametrize(("name", "content"), [("metrics.json", ""), ("pipeline.yaml", ""), ("pipeline.yaml", None)])
+def test_a_cell_that_lost_its_result_does_not_stop_the_comparison(name, content, tiny_scene, tmp_path):
     (tmp_path / "two.yaml").write_text(MATRIX.format(scene=tiny_scene))
     out = clsplat.run(tmp_path / "two.yaml", out=tmp_path / "run")
     cell = out / "seed=1"
-    (cell / name).write_text("")
+    (cell / name).unlink()
+    if content is not None:
+        (cell / name).write_text(content)
     (out / "compare.html").unlink()
     for _ in range(2):
-        with pytest.raises(ClsplatError, match=f"1 of 2 cells failed; the first, seed=1: .*--out {cell} --restart`"):
+        named = "…" if name == "pipeline.yaml" else cell / "pipeline.yaml"
+        with pytest.raises(ClsplatError, match=f"1 of 2 cells failed; .* `clsplat run {named} --out {cell} --restart`"):
             clsplat.resume(out)
     assert "seed=2" in (out / "compare.html").read_text()
     clsplat.run(tmp_path / "two.yaml", out=tmp_path / "other", set={"init.count": 50})
-    shutil.copy(tmp_path / "other" / "seed=1" / "pipeline.yaml", cell)
-    clsplat.run(cell / "pipeline.yaml", out=cell, start="restart")
+    clsplat.run(tmp_path / "other" / "seed=1" / "pipeline.yaml", out=cell, start="restart")
     clsplat.resume(out)
     assert damaged(out) == []
 

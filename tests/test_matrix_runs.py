@@ -105,6 +105,12 @@ def test_a_resumed_matrix_has_the_options_of_its_run(tiny_scene, tmp_path):
     experiment.Job.resume(out).run()
     assert json.loads((out / "status.json").read_text())["state"] == "done"
     assert json.loads((out / "seed=1" / "metrics.json").read_text())["steps"] == 3
+    before = [(out / name).read_bytes() for name in ("pipeline.yaml", "status.json")]
+    with pytest.raises(ConfigError, match=r"was run with other settings: .*steps was 3, is 4"):
+        experiment.Job.resume(out, ["optimize.steps=4"]).run()
+    assert [(out / name).read_bytes() for name in ("pipeline.yaml", "status.json")] == before, (
+        "plain resume still works"
+    )
     options = load_experiment(str(out / "pipeline.yaml"), ["init.count=9"]).text.partition("options:")[2]
     assert options.count("optimize.steps") == options.count("init.count") == options.count("scene.path") == 1
 
@@ -175,9 +181,10 @@ def test_cells_run_with_other_settings_are_not_taken_for_done(finished, tmp_path
     shutil.copytree(finished[1], tmp_path / "run")
     changed = tmp_path / "changed.yaml"
     changed.write_text(Path(finished[0]).read_text().replace("count: 300", "count: 301"))
-    with pytest.raises(ClsplatError, match=r"4 of 4 cells failed.*stages\[0\].init.count was 300, is 301") as error:
+    with pytest.raises(
+        ConfigError, match=r"seed=0: was run with other settings: stages\[0\].init.count was 300, is 301"
+    ):
         experiment.run_matrix(load_experiment(str(changed)), tmp_path / "run", None, "resume")
-    assert error.value.exit_code == 2
 
 
 def test_folders_are_not_mixed(finished, tiny_scene, tmp_path):

@@ -22,7 +22,7 @@ from clsplat.runs import description, folders, opening, outputs, runner
 from clsplat.runs.default_folder import free_folder, start_of
 from clsplat.runs.failures import failures_recorded
 from clsplat.runs.folders import Start
-from clsplat.runs.found import is_finished
+from clsplat.runs.found import has_ended, is_finished
 from clsplat.runs.scenes import read_run_scene
 from clsplat.runs.source import photographs_of
 from clsplat.runs.summary import summary
@@ -139,6 +139,9 @@ def run_matrix(
     Interrupted stops the whole.
     """
     check_matrix_folder(out)
+    if start == "resume":  # other settings change nothing in the folder
+        for cell in experiment.cells:
+            has_ended(cell.pipeline, out / cell.name)
     count = len(experiment.cells)
     with (
         folders.opened(out, start, cells=count, done=0, failed={}) as status,

@@ -30,7 +30,8 @@ def has_pipeline(folder: Path) -> bool:
 
 def has_begun(out: Path) -> bool:
     """Whether a run has begun in a folder, whatever is left of it."""
-    return (out / PIPELINE).exists() or bool(checkpoint.saved(out))
+    is_listed = bool(read_status(out)) and read_sums(out) is not None
+    return (out / PIPELINE).exists() or bool(checkpoint.saved(out)) or is_listed
 
 
 def has_state(folder: Path) -> bool:
@@ -55,6 +56,11 @@ def is_finished(pipeline: Pipeline, out: Path) -> bool:
 
     Raises ConfigError when that was with other settings.
     """
+    return has_ended(pipeline, out) and is_complete(out)
+
+
+def has_ended(pipeline: Pipeline, out: Path) -> bool:
+    """Whether a run of this pipeline has come to its end.  Raises ConfigError when that was with other settings."""
     if not is_done(out) or not has_pipeline(out):
         return False
     try:
@@ -65,12 +71,15 @@ def is_finished(pipeline: Pipeline, out: Path) -> bool:
         raise
     if difference := first_difference(before, pipeline.resolved()):
         raise ConfigError(f"{out}: was run with other settings: {difference}; use another folder, or those settings")
-    return is_complete(out)
+    return True
 
 
 def restart(out: Path) -> str:
     """The command that begins a run again."""
-    pipeline = str(out / PIPELINE) if has_pipeline(out) else "…"
+    pipeline = "…"
+    with suppress(ConfigError):  # where it is lost
+        load(str(out / PIPELINE))
+        pipeline = str(out / PIPELINE)
     return f"`clsplat run {pipeline} --out {out} --restart`"
 
 
@@ -180,7 +189,8 @@ def beyond_repair(out: Path, lost: Sequence[Path]) -> list[Path]:
         return []
     files = checkpoint.saved(out)
     taken, at = _newest_whole(files)
-    if not taken and (files or status.get("checkpoint") or status.get("state") == "done"):
+    is_unknown = not status and (out / INPUTS).exists()
+    if not taken and (files or is_unknown or status.get("checkpoint") or status.get("state") == "done"):
         return list(lost)
     try:
         course = Course(load(str(out / PIPELINE)), out, at)

@@ -47,6 +47,8 @@ class Lost:
     repeatable: list[Path] = field(default_factory=list)  # that a stage which has ended can write again
     gone: dict[Path, tuple[str, str | None]] = field(default_factory=dict)
     """Those that no stage writes again, each with the SHA-256 of what was written, and of what is there."""
+    is_unlisted: bool = False
+    """Whether the list of what a run that was done had written is lost itself."""
 
 
 def keep_checksums(course: Course, run: Run) -> Lost:
@@ -55,14 +57,15 @@ def keep_checksums(course: Course, run: Run) -> Lost:
     What cannot be made again stays in the list, so that it is not taken for whole at the end.
     """
     sums = read_sums(run.out)
+    is_unlisted = sums is None and run.status.was_done
     if sums is None:
-        sums = run.written if run.status.was_done else {}
+        sums = run.written if is_unlisted else {}
     sums = {name: value for name, value in sums.items() if not course.writes(run.out / name)}
     lost = not_whole(run.out, sums)
     gone = {file: (sums[_name(file, run)], sum_of(file)) for file in lost if not course.mends(file)}
     going_on = {name for name in sums if run.out / name not in lost and course.may_write(run.out / name)}
     _write_sums(run, {name: value for name, value in sums.items() if name not in going_on})
-    return Lost([file for file in lost if file not in gone], gone)
+    return Lost([file for file in lost if file not in gone], gone, is_unlisted)
 
 
 def renew_checksums(stage: Stage, run: Run) -> None:

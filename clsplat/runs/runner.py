@@ -8,7 +8,7 @@ from pathlib import Path
 
 from clsplat.errors import ConfigError, DataError, Interrupted
 from clsplat.files import write_text
-from clsplat.names import NOTE, PIPELINE
+from clsplat.names import CHECKSUMS, NOTE, PIPELINE
 from clsplat.pipeline.loading import Pipeline
 from clsplat.runs.folders import RESOLVED, Start, clear
 from clsplat.runs.found import Course, is_below
@@ -87,7 +87,10 @@ def _write_again(pipeline: Pipeline, run: Run, lost: Lost) -> None:
 
     Files that are lost and that no stage writes again are named in a warning.
     """
-    for stage in reversed(Course(pipeline, run.out, run).repeatable):
+    stages = Course(pipeline, run.out, run).repeatable
+    if stages and lost.is_unlisted:
+        LOG.warning("%s: is missing or damaged; what can be is written again, the rest is not verified", CHECKSUMS)
+    for stage in reversed(stages):
         own = [file for file in lost.repeatable if is_below(file, stage.outputs(run.out))]
         try:
             stage.verify(run)
@@ -95,8 +98,11 @@ def _write_again(pipeline: Pipeline, run: Run, lost: Lost) -> None:
                 raise DataError(f"{own[0]}: is missing or was changed")
         except DataError as error:
             LOG.warning("%s; it is written again", error)
-            stage.act(run)
-            renew_checksums(stage, run)
+        else:
+            if not (lost.is_unlisted and stage.outputs(run.out)):
+                continue
+        stage.act(run)
+        renew_checksums(stage, run)
     for file in lost.gone:
         LOG.warning("%s: is missing or was changed since it was written, and cannot be made again", file)
 
