@@ -11,7 +11,7 @@ from clsplat.live.pictures import Pictures
 from clsplat.scene.view import View
 from clsplat.training.status import StatusFile
 
-SHARE = 0.05  # of the time, for pictures
+SHARE = 0.025  # of the time, for pictures; the lead that the host loses by each, and answers, cost about as much again
 SAVED = 1.0  # s of it that are kept for a motion
 RESERVE = 0.3  # s of those that pictures of a camera at rest leave alone
 
