@@ -8,8 +8,9 @@ from clsplat.errors import OutputError
 from clsplat.names import LOCK, PIPELINE
 from clsplat.pipeline.loading import Pipeline
 from clsplat.prepare.cache import Planned, note, noted
+from clsplat.runs.course import is_complete
 from clsplat.runs.folders import Start
-from clsplat.runs.found import is_complete, is_done_with
+from clsplat.runs.found import is_done_with
 
 
 def free_folder(folder: Path, pipeline: Pipeline | None, start: Start) -> Path:

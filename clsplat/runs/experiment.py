@@ -19,10 +19,11 @@ from clsplat.pipeline.loading import Pipeline, load
 from clsplat.pipeline.matrix import Experiment, load_experiment
 from clsplat.pipeline.yaml_file import read_yaml
 from clsplat.runs import description, folders, opening, outputs, runner
+from clsplat.runs.course import is_finished
 from clsplat.runs.default_folder import free_folder, start_of
 from clsplat.runs.failures import failures_recorded
 from clsplat.runs.folders import Start
-from clsplat.runs.found import has_ended, is_finished
+from clsplat.runs.found import has_ended
 from clsplat.runs.scenes import read_run_scene
 from clsplat.runs.source import photographs_of
 from clsplat.runs.summary import summary

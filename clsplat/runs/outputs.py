@@ -12,7 +12,8 @@ from clsplat.names import BEFORE_A_RUN, CHECKSUMS, LOCK, LOG_FILE, METRICS, OF_A
 from clsplat.pipeline.loading import Pipeline, load
 from clsplat.processes import Owner
 from clsplat.reading import read_file, read_json, sha256
-from clsplat.runs.found import Course, has_begun, is_below, not_whole, read_sums, sum_of
+from clsplat.runs.course import Course, is_below
+from clsplat.runs.found import has_begun, not_whole, read_sums, sum_of
 from clsplat.stages.base import Stage
 from clsplat.stages.optimize import Optimize
 from clsplat.training.run import Run

@@ -10,8 +10,8 @@ from clsplat.errors import ConfigError, DataError, Interrupted
 from clsplat.files import write_text
 from clsplat.names import CHECKSUMS, NOTE, PIPELINE
 from clsplat.pipeline.loading import Pipeline
+from clsplat.runs.course import Course, is_below
 from clsplat.runs.folders import RESOLVED, Start, clear
-from clsplat.runs.found import Course, is_below
 from clsplat.runs.inputs import require_same_inputs, write_inputs
 from clsplat.runs.outputs import Lost, check_outputs, keep_checksums, renew_checksums, write_checksums, write_metrics
 from clsplat.runs.signals import finishing_on_interrupt

@@ -4,7 +4,8 @@ from pathlib import Path
 from typing import Any
 
 from clsplat.names import PIPELINE
-from clsplat.runs.found import beyond_repair, has_state, restart
+from clsplat.runs.course import beyond_repair
+from clsplat.runs.found import has_state, restart
 from clsplat.runs.verify import NO_SUMS
 
 
