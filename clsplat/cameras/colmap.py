@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from clsplat.cameras.posed import Posed
+from clsplat.errors import DataError, quoted
 from clsplat.files import write_text
 from clsplat.scene.lens import Lens
 from clsplat.scene.quaternion import unit_quaternions
@@ -25,6 +26,15 @@ def write(out: Path, views: list[Posed], points: PointCloud | None) -> list[Path
     for name, lines in files.items():
         write_text(out / MODEL / name, "\n".join(lines) + "\n")
     return [out / MODEL / name for name in files]
+
+
+def check(views: list[Posed]) -> None:
+    """Raise DataError for a name that COLMAP reads another way."""
+    for one in views:
+        if " " in one.name:
+            raise DataError(
+                f"{quoted(one.name)}: COLMAP reads a name up to its first blank; rename the photographs, or write nerfstudio"
+            )
 
 
 def _camera(lens: Lens, number: int) -> str:

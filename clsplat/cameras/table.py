@@ -19,6 +19,11 @@ WRITERS: dict[str, Callable[[Path, list[Posed], PointCloud | None], list[Path]]]
     "nerfstudio": nerfstudio.write,
     "inria": inria.write,
 }
+CHECKS: dict[str, Callable[[list[Posed]], None]] = {  # what a format cannot hold
+    "colmap": colmap.check,
+    "nerfstudio": nerfstudio.check,
+    "inria": lambda views: None,
+}
 PLACES = {  # that each writes
     "colmap": [colmap.MODEL / name for name in ("cameras.txt", "images.txt", "points3D.txt")],
     "nerfstudio": [Path(nerfstudio.FILE), Path(nerfstudio.POINTS)],
@@ -26,6 +31,13 @@ PLACES = {  # that each writes
 }
 COPIES = ("none", "copy")  # of the photographs
 SPLIT = "nerfstudio"  # what keeps it
+
+
+def checked(scene: Scene, format_: str) -> list[Posed]:
+    """Return the views as a format names them.  Raises DataError for what it cannot hold."""
+    views = posed(scene)
+    CHECKS[format_](views)
+    return views
 
 
 def write_cameras(scene: Scene, out: Path, format_: str, images: str = "none", over: bool = False) -> list[Path]:
@@ -37,7 +49,7 @@ def write_cameras(scene: Scene, out: Path, format_: str, images: str = "none", o
     for what, value, known in (("format", format_, tuple(WRITERS)), ("images", images, COPIES)):
         if value not in known:
             raise ConfigError(f"no {what} {quoted(value)}; there are {', '.join(known)}")
-    views = posed(scene)
+    views = checked(scene, format_)
     copies = image_files(views, out / IMAGES) if images == "copy" else {}
     for path in () if over else (*(out / place for place in PLACES[format_]), *copies):
         if is_there(path):

@@ -5,7 +5,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from clsplat.cameras.table import PLACES, write_cameras
+from clsplat.cameras.table import PLACES, checked, write_cameras
 from clsplat.errors import DataError
 from clsplat.stages.base import Stage, path_in_run
 from clsplat.training.run import Run
@@ -23,6 +23,10 @@ class Cameras(Stage):
     """Files that are written: a COLMAP model as text, transforms.json, cameras.json."""
     folder: Annotated[str, path_in_run()] = "cameras"
     """Path inside the run folder."""
+
+    def check_in(self, run: Run) -> None:
+        for name in self.formats:
+            checked(run.original, name)
 
     def run(self, run: Run) -> None:
         for name in self.formats:

@@ -3,6 +3,8 @@
 import json
 import logging
 import shutil
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,6 +19,7 @@ from clsplat.scene.lens import MODELS, Lens
 from clsplat.scene.quaternion import rotation_matrix
 from clsplat.scene.scene import PointCloud, make_scene
 from clsplat.scene.view import View
+from clsplat.stages.cameras import Cameras
 from tests.data_sets import data_set
 from tests.test_cli import clsplat as command
 
@@ -52,7 +55,7 @@ def scene_of(rng, tmp_path):
             rotation = rotation_matrix(*(quaternion / np.linalg.norm(quaternion)))
             pose = np.column_stack([rotation, rng.normal(size=3) * 3])
             lens = lens_of(model, i % lenses)
-            name = f"left/ä {i}.png" if i < 3 else f"right/{i}.png"
+            name = f"left/ä_{i}.png" if i < 3 else f"right/{i}.png"
             file = tmp_path / "photographs" / name
             file.parent.mkdir(parents=True, exist_ok=True)
             file.write_bytes(f"photograph {i}".encode())
@@ -106,6 +109,37 @@ def test_a_lens_that_nerfstudio_does_not_know_is_refused(model, scene_of, tmp_pa
     with pytest.raises(DataError, match=f"no camera model {model}; write colmap, or `clsplat data undistort` first"):
         clsplat.write_cameras(scene_of(model), tmp_path / "out", "nerfstudio")
     assert not (tmp_path / "out").exists()
+
+
+def test_nerfstudio_finds_its_validation_views_and_one_camera_model(scene_of, tmp_path):
+    """It reads `camera_model` from the top alone, and asks for the views of `val_filenames` as it trains."""
+    clsplat.write_cameras(scene_of("OPENCV_FISHEYE", 3), tmp_path / "a", "nerfstudio")
+    table = json.loads((tmp_path / "a/transforms.json").read_text())
+    assert table["camera_model"] == "OPENCV_FISHEYE"
+    assert not any("camera_model" in frame for frame in table["frames"])
+    assert all({"k1", "fl_x", "cx"} <= frame.keys() for frame in table["frames"]), "all of a lens, or nothing"
+    assert table["val_filenames"] == table["test_filenames"] == ["images/left/ä_0.png", "images/right/3.png"]
+    scene = scene_of("PINHOLE")
+    clsplat.write_cameras(make_scene(scene.path, scene.views, set(), None), tmp_path / "b", "nerfstudio")
+    assert not [key for key in json.loads((tmp_path / "b/transforms.json").read_text()) if "filenames" in key]
+
+
+def test_two_kinds_of_lenses_are_refused_for_nerfstudio(scene_of, tmp_path):
+    views = [scene_of("OPENCV").views[0], scene_of("OPENCV_FISHEYE").views[4]]
+    with pytest.raises(DataError, match=r"right/4\.png: OPENCV_FISHEYE, and others are OPENCV; nerfstudio takes one"):
+        clsplat.write_cameras(make_scene(tmp_path, views, set(), None), tmp_path / "out", "nerfstudio")
+
+
+def test_a_name_with_a_blank_is_refused_for_colmap_before_a_run_trains(tiny_scene, scene_of, tmp_path):
+    scene = scene_of("PINHOLE")
+    views = [replace(scene.views[0], name="IMG 1.png"), *scene.views[1:]]
+    blank = make_scene(scene.path, views, {0}, scene.points)
+    with pytest.raises(DataError, match=r"'IMG 1\.png': COLMAP reads a name up to its first blank; rename"):
+        clsplat.write_cameras(blank, tmp_path / "out", "colmap")
+    stage = SimpleNamespace(original=blank)
+    with pytest.raises(DataError, match="first blank"):
+        Cameras(formats=["colmap"]).check_in(stage)
+    Cameras(formats=["inria", "nerfstudio"]).check_in(stage)
 
 
 @pytest.mark.parametrize("model", ["PINHOLE", "OPENCV"])
