@@ -32,9 +32,8 @@ def check(views: list[Posed]) -> None:
     """Raise DataError for a name that COLMAP reads another way."""
     for one in views:
         if " " in one.name:
-            raise DataError(
-                f"{quoted(one.name)}: COLMAP reads a name up to its first blank; rename the photographs, or write nerfstudio"
-            )
+            remedy = "rename the photographs, or write nerfstudio"
+            raise DataError(f"{quoted(one.name)}: COLMAP reads a name up to its first blank; {remedy}")
 
 
 def _camera(lens: Lens, number: int) -> str:
