@@ -179,3 +179,8 @@ def test_errors_are_those_of_the_commands(call, error, message):
         call()
     assert message in str(raised.value)
     assert "\n" not in str(raised.value)
+
+
+def test_a_picture_of_no_size_is_refused(few_steps, tmp_path):
+    with pytest.raises(DataError, match="raise the downscale to 1"):
+        clsplat.render_views(few_steps, out=tmp_path / "out", downscale=0)

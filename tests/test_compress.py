@@ -89,6 +89,11 @@ def test_the_search_goes_down_until_it_cannot_be_better():
     assert Target.of("0dB").ends(rung, 31), "none is good enough"
 
 
+def test_a_format_that_is_not_searched_is_refused_before_anything_is_opened():
+    with pytest.raises(ConfigError, match="--format 'glb': expected one of sog, spz"):
+        clsplat.compress_model("model.ply", "scene", format="glb")
+
+
 @pytest.mark.parametrize("keeps", [[], [0.0], [1.2], [-0.5], [float("nan")], [0.501, 0.5]])
 def test_what_are_no_shares_is_refused(keeps):
     with pytest.raises(ConfigError, match="--keep: expected shares"):

@@ -38,7 +38,6 @@ def render_views(
     from clsplat.runs import model_file
 
     load_plugins()
-    layers = ("colour", *(name for name, wanted in (("depth", depth), ("alpha", alpha)) if wanted))
     return model_file.render(
         Path(model),
         path_of(scene),
@@ -46,7 +45,7 @@ def render_views(
         split=split,
         downscale=downscale,
         kind=kind,
-        layers=layers,
+        layers=layer_names(depth, alpha),
         device=device,
     )
 

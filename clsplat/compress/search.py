@@ -5,12 +5,12 @@ import logging
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from clsplat.compress.page import page
 from clsplat.compress.rungs import Ladder, checked_keeps, of_degree
 from clsplat.compress.target import Point, Target
-from clsplat.errors import ConfigError
+from clsplat.errors import ConfigError, quoted
 from clsplat.files import write_text
 from clsplat.formats.output import written
 from clsplat.formats.splats import Reading, Writing
@@ -88,6 +88,8 @@ def compress(
     wanted, shares = Target.of(target), checked_keeps(keeps)
     if steps is not None and steps < 1:
         raise ConfigError(f"--steps {steps}: expected a number of at least 1")
+    if form not in get_args(Format):
+        raise ConfigError(f"--format {quoted(form)}: expected one of {', '.join(get_args(Format))}")
     opened = ModelFile(model, scene, device)
     source, first, measurer = opened.source, opened.loaded, Measurer(opened)
     question: dict[str, Any] = {"model": str(source.file), "sha256": sha256(located(source.file))}

@@ -105,7 +105,8 @@ def _activated(model: Model) -> list[str]:
     logit = model.logit_opacity
     if ((logit >= 0) & (logit <= 1)).mean() > NEARLY_ALL:
         found.append("its opacities look like opacities, not logits of them")
-    if (model.sh_base >= 0).mean() > NEARLY_ALL and np.ptp(model.sh_base) > 0:
+    base = model.sh_base
+    if ((base >= 0) & (base <= 1)).mean() > NEARLY_ALL and np.ptp(base) > 0:
         found.append("its base colours look like colours, not coefficients around grey")
     return found
 

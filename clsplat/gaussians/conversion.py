@@ -17,6 +17,7 @@ from clsplat.gaussians.run_model import model_at
 
 LOG = logging.getLogger("clsplat")
 WORDS = ("scale", "rotate", "translate")
+AXES, QUALITIES = ("spz", "ply"), ("small", "balanced", "high")
 
 
 @dataclass(frozen=True)
@@ -58,6 +59,9 @@ class Options:
         """Return them for these files.  Raises ConfigError where one has no meaning there."""
         codec, from_spz = for_writing(out), _reads_spz(sources)
         to_spz = codec.name == "SPZ"
+        for name, value, known in (("axes", self.axes, AXES), ("quality", self.quality, QUALITIES)):
+            if value not in known:
+                raise ConfigError(f"--{name} {quoted(value)}: expected one of {', '.join(known)}")
         if self.spz_version not in (3, 4):
             raise ConfigError(f"--spz-version {self.spz_version}: expected 3 or 4")
         if not to_spz and (self.sh_bits is not None or self.spz_version != 3):

@@ -12,9 +12,10 @@ import cv2
 import numpy as np
 
 from clsplat.live.budget import Budget
+from clsplat.pages.page import shrunk
 from clsplat.scene.photographs import load_photograph
 from clsplat.scene.view import View
-from clsplat.viewer.photographs import LARGEST, THUMBNAIL, shrunk
+from clsplat.viewer.photographs import LARGEST, THUMBNAIL
 
 Kind = Literal["thumbnail", "photograph"]
 SIDES: dict[Kind, int] = {"thumbnail": THUMBNAIL, "photograph": LARGEST}

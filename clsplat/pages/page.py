@@ -87,3 +87,13 @@ def embedded(image: NDArray[np.uint8], suffix: str = ".jpg") -> str:
     _, data = cv2.imencode(suffix, image[..., ::-1], options)
     kind = "jpeg" if suffix == ".jpg" else "png"
     return f"data:image/{kind};base64,{base64.b64encode(data.tobytes()).decode()}"
+
+
+def shrunk(image: NDArray[np.uint8], longest: int) -> NDArray[np.uint8]:
+    """Return an image whose longer side is at most `longest` px, with its aspect."""
+    height, width = image.shape[:2]
+    factor = longest / max(width, height)
+    if factor >= 1:
+        return image
+    size = max(1, round(width * factor)), max(1, round(height * factor))
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)

@@ -99,7 +99,7 @@ def _scene(model: Path, scene: Path | None, loaded: Model, downscale: float | No
     if not needed and scene is None and not has_pipeline(model):
         return None
     source = Source.of(model, scene)
-    return source.scene(loaded).downscaled(downscale or source.settings.downscale)
+    return source.scene(loaded).downscaled(source.settings.downscale if downscale is None else downscale)
 
 
 def _canvas(model: Model, device: Device, background: Background) -> Canvas:

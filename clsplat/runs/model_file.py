@@ -38,7 +38,7 @@ class ModelFile:
         self.loaded = load(self.source.file)
         self.device = open_correct(device)
         self.photographs = self.source.scene(self.loaded)
-        self.downscale = downscale or self.source.settings.downscale
+        self.downscale = self.source.settings.downscale if downscale is None else downscale
         self.scene = self.photographs.downscaled(self.downscale)
         self.background = self.loaded.rendering.background or self.scene.background
         self.rasterizer = Rasterizer(self.device)

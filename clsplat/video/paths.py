@@ -19,7 +19,7 @@ from clsplat.video.walk import order, smooth
 LOG = logging.getLogger("clsplat")
 WIDEST_GAP = math.radians(100)  # between neighbours on a ring about the focus: a wider one was never photographed
 SHARE = 90  # percentile of the cameras' distances that an ellipse and a spiral reach (Barron et al. 2022)
-NEARNESS = 0.75  # of the focus of a spiral, between far (0) and near (1), by inverse depth (Mildenhall et al. 2019)
+FARNESS = 0.75  # of the focus of a spiral, between near (0) and far (1), by inverse depth (Mildenhall et al. 2019)
 TURNS = 2  # of a spiral
 SWAY = 0.3  # of its distance from what it looks at, at most: cameras that surround a scene give no front
 KEPT = 0.85  # of an arc that was photographed: at its ends half of what is seen was not
@@ -68,7 +68,7 @@ def spiral(rig: Rig, frames: int, size: Size) -> list[View]:
     right = unit(np.cross(forward, rig.up))
     axes = np.stack([right, np.cross(forward, right), forward])
     near, far = rig.depths
-    target = middle + forward / ((1 - NEARNESS) / near + NEARNESS / far)
+    target = middle + forward / ((1 - FARNESS) / near + FARNESS / far)
     radii = np.percentile(np.abs((rig.positions - middle) @ axes.T), SHARE, axis=0)
     radii *= min(1.0, SWAY * float(np.linalg.norm(target - middle)) / max(float(radii.max()), 1e-30))
     turn = 2 * np.pi * TURNS * np.arange(frames) / frames

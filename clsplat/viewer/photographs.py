@@ -3,11 +3,10 @@
 from collections.abc import Callable, Iterable
 from typing import Any, Literal
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.pages.page import embedded
+from clsplat.pages.page import embedded, shrunk
 from clsplat.scene.scene import Scene
 from clsplat.scene.view import View
 from clsplat.viewer.cameras import camera_data
@@ -51,13 +50,3 @@ def left_out(sizes: list[int], budget: int) -> set[int]:
     every = next((n for n in range(1, len(sizes) + 1) if sum(sizes[::n]) <= budget), len(sizes) + 1)
     kept = set(range(0, len(sizes), every)) if every <= len(sizes) else set()
     return set(range(len(sizes))) - kept
-
-
-def shrunk(image: Image, longest: int) -> Image:
-    """Return an image whose longer side is at most `longest` px, with its aspect."""
-    height, width = image.shape[:2]
-    factor = longest / max(width, height)
-    if factor >= 1:
-        return image
-    size = max(1, round(width * factor)), max(1, round(height * factor))
-    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)

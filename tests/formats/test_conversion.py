@@ -106,6 +106,8 @@ def test_a_wrong_option_is_refused_before_anything_is_written(option, text, sour
         ("b.spz", {"keep_nan": True}, r"b\.spz: --keep-nan is of PLY; expected a name that ends in \.ply"),
         ("b.xyz", {}, r"no format has the name 'b.xyz'; expected a name that ends in \.ply, "),
         ("b.ply", {"sh_degree": 4}, "expected 0 to 3"),
+        ("b.spz", {"quality": "best"}, "--quality 'best': expected one of small, balanced, high"),
+        ("b.spz", {"axes": "x"}, "--axes 'x': expected one of spz, ply"),
     ],
 )
 def test_an_option_without_meaning_is_refused(name, options, words, source, tmp_path):
@@ -295,6 +297,13 @@ def test_check_sees_activations_that_were_applied_already(table, values, words, 
     assert not [text for text in checked(tmp_path, model)["findings"] if words in text]
     model.parameters[table][:] = rng.uniform(*values, model.parameters[table].shape)
     assert [text for text in checked(tmp_path, model)["findings"] if words in text]
+
+
+def test_bright_colours_are_coefficients(tmp_path, rng):
+    """All above grey, but beyond what a colour can be."""
+    model = splats(rng, 60)
+    model.parameters["sh_base"][:] = rng.uniform(0.02, 1.7, (60, 3))
+    assert not [text for text in checked(tmp_path, model)["findings"] if "colours" in text]
 
 
 def checked(tmp_path, model):

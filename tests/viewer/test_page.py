@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from clsplat.errors import OutputError
-from clsplat.pages.page import inline
+from clsplat.pages.page import inline, shrunk
 from clsplat.scene.stand import Stand
 from clsplat.viewer import page as module
 from clsplat.viewer.cameras import camera_data
 from clsplat.viewer.packing import pack
 from clsplat.viewer.page import FOLDER, SCRIPTS, Page, script
-from clsplat.viewer.photographs import described, left_out, shrunk
+from clsplat.viewer.photographs import described, left_out
 from tests.html_page import HOSTILE
 from tests.html_page import Page as Parsed
 from tests.viewer.scenes import cloud, scene, views
