@@ -11,8 +11,9 @@ import clsplat
 from clsplat.conformance import reference as ref
 from clsplat.conformance.scenes import random_case
 from clsplat.density.control import densify
-from clsplat.density.edit import Edit, Rule, SceneScale
+from clsplat.density.edit import Edit, Rule
 from clsplat.density.statistics import SplatStats
+from clsplat.density.thresholds import SceneScale
 from clsplat.gaussians.tables import PARAMETERS, Gaussians, moment_tables
 from clsplat.pipeline.loading import load
 from clsplat.render.rasterizer import Rasterizer

@@ -21,8 +21,9 @@ from typer.testing import CliRunner
 import clsplat
 from clsplat import cli
 from clsplat.conformance.scenes import random_case
-from clsplat.density.edit import Edit, SceneScale
+from clsplat.density.edit import Edit
 from clsplat.density.statistics import SplatStats
+from clsplat.density.thresholds import SceneScale
 from clsplat.pipeline.loading import load
 from tests.html_page import Page
 

@@ -98,7 +98,7 @@ TWIN = {"steps", "rates.means.over", "evaluate.every", *ENDS}
 MATCHING = {
     f"densify.rules.{rule}~2{key}"
     for rule, size in (("clone", (".size_below",)), ("split", (".size_above", ".children", ".shrink")))
-    for key in ("", ".start", ".statistic", ".as_many_as", ".gradient_above", *size)
+    for key in ("", ".start", ".statistic", ".as_many_as", ".gradient_above", ".opacity", *size)
 }
 SUBDIVIDE = (".start", ".at_most", ".beta", ".children", ".radius_above")
 THINNING = {

@@ -37,6 +37,7 @@ FAULTS = {  # kernel -> file, text, wrong text
     "mark_chosen": ("density.cl", "copies[i] = outcome[i] - 1", "copies[i] = outcome[i]"),
     "list_rows": ("density.cl", "copy >= kept[i] ? 1", "copy > kept[i] ? 1"),
     "spawn_children": ("density.cl", "2.0f * (y * z - w * x) * ez", "2.0f * (y * z + w * x) * ez"),
+    "share_opacity": ("density.cl", "/ (float)copies[source[i]]", "/ (float)(copies[source[i]] + 1)"),
     "cap_opacity": ("density.cl", "limit / sqrt(energy2)", "limit / energy2"),
     "paint_depth": ("depth.cl", "row[2] * means[2 * stride + i]", "row[2] * means[stride + i]"),
     "fill_words": ("fill.cl", "(uint16)(word)", "(uint16)(word & 0xfffffffeu | 2u)"),

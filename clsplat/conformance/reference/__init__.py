@@ -33,6 +33,7 @@ from clsplat.conformance.reference.density import (
     mean_gradient,
     reset_logit,
     screen_gradient,
+    shared_logit,
     split_children,
 )
 from clsplat.conformance.reference.harmonics import (
@@ -123,6 +124,7 @@ __all__ = [
     "screen_gradient",
     "sh_basis",
     "sh_basis_gradient",
+    "shared_logit",
     "split_children",
     "ssim_map",
     "ssim_taps",
