@@ -12,7 +12,7 @@ from clsplat.conformance.checks.images import comparison_of, magnitude_of
 from clsplat.conformance.comparison import SUM, Figure, by_element, by_norm, equal
 from clsplat.conformance.scenes import random_case, with_world_filter
 from clsplat.density.basic import Clone, PruneFaint, PruneLarge, Split
-from clsplat.density.control import cap_opacity, densify
+from clsplat.density.control import add_noise, cap_opacity, densify
 from clsplat.density.edit import Edit
 from clsplat.density.statistics import ABS_X, SEEN, WEIGHT, SplatStats
 from clsplat.density.thresholds import SceneScale
@@ -152,3 +152,21 @@ def opacity_reset(device: Device, rng: np.random.Generator) -> Iterator[Figure |
             expected[capped] = ref.reset_logit(expected[capped], ratio[capped], 0.3)
             found = gaussians.get("logit_opacity")[:, 0]
             yield by_element("cap_opacity", f"opacities of {count} Gaussians", found, expected, 2e-5, floor=1)
+
+
+@CHECKS.add("add_noise")
+def noise(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    rate, below = 40.0, 0.3
+    for count in COUNTS:
+        case = random_case(rng, count)
+        case.parameters["logit_opacity"][:] = rng.uniform(-3, 1, (count, 1))
+        gaussians, p = case.model(device).gaussians, {k: v.astype(np.float64) for k, v in case.parameters.items()}
+        add_noise(gaussians, rate, below, SEED, STEP)
+        opacity = 1 / (1 + np.exp(-p["logit_opacity"][:, 0]))
+        gate = np.where(opacity > below + 0.1, 0, rate / (1 + np.exp(-100 * (below - opacity))))
+        moved = np.zeros((count, 3))
+        for i in range(count):
+            axes = ref.rotation_matrix(p["quats"][i]) * np.exp(p["log_scales"][i])
+            moved[i] = gate[i] * axes @ axes.T @ ref.normal3((i, STEP, 1, 0), (SEED, 0))
+        found = gaussians.get("means").astype(np.float64)
+        yield by_norm("add_noise", f"means of {count} Gaussians", found, p["means"] + moved, SUM)

@@ -59,6 +59,8 @@ from clsplat.conformance.reference.losses import (
 from clsplat.conformance.reference.penalties import (
     anisotropy,
     covariance_trace,
+    mean_opacity,
+    mean_scale,
 )
 from clsplat.conformance.reference.projection import (
     clamped_ray,
@@ -106,6 +108,8 @@ __all__ = [
     "l2",
     "margin",
     "mean_gradient",
+    "mean_opacity",
+    "mean_scale",
     "member_sums",
     "ms_ssim",
     "nearest_vectors",
