@@ -2,8 +2,9 @@
  *
  * Kerbl et al. 2023, section 5.  A rule is a box in (statistic, size, opacity) with an outcome of three numbers: the
  * rows that a Gaussian becomes (`copies`), how many of them are its old row (`kept`), and the factor of the scales of
- * its fresh rows (`shrink`).  Clone = (2, 1, 1), split in n = (n, 0, 1/1.6), prune = (0, 0, 1).  One item = one
- * Gaussian or one row.  No local memory.  Deterministic. */
+ * its fresh rows (`shrink`).  Clone = (2, 1, 1), split in n = (n, 0, 1/1.6), prune = (0, 0, 1).  Where `shared` is set,
+ * the rows together are as opaque as the Gaussian was.  One item = one Gaussian or one row.  No local memory.
+ * Deterministic. */
 #include "random.h"
 #include "splat.h"
 
@@ -90,6 +91,7 @@ void start_edit(
     __global uint *restrict copies,   // [N]
     __global uint *restrict kept,     // [N]
     __global float *restrict shrink,  // [N]
+    __global uint *restrict shared,   // [N] 0 or 1
     const uint count)
 {
     const uint i = get_global_id(0);
@@ -98,6 +100,7 @@ void start_edit(
     copies[i] = 1;
     kept[i] = 1;
     shrink[i] = 1.0f;
+    shared[i] = 0;
 }
 
 /* Apply one rule.  The first growing rule whose box holds a Gaussian decides; pruning overrides growth and compares the
@@ -111,6 +114,7 @@ void mark_rule(
     __global uint *restrict copies,                // [N]
     __global uint *restrict kept,                  // [N]
     __global float *restrict shrink,               // [N]
+    __global uint *restrict shared,                // [N] 0 or 1
     const float gradient_above,                    // mean of the statistic, at least
     const float size_above,                        // scene units, more than
     const float size_below,                        // scene units, at most
@@ -118,6 +122,7 @@ void mark_rule(
     const float new_shrink,
     const uint new_copies,
     const uint new_kept,
+    const uint new_shared,
     const uint stride,
     const uint count)
 {
@@ -130,6 +135,7 @@ void mark_rule(
     if (gradient >= gradient_above && size > size_above && size <= size_below && opacity < opacity_below) {
         copies[i] = new_copies;
         kept[i] = new_kept;
+        shared[i] = new_shared;
         shrink[i] = new_copies == 0 ? shrink[i] : new_shrink;
     }
 }
@@ -202,6 +208,25 @@ void spawn_children(
     means[2 * stride + i] += 2.0f * (x * z - w * y) * ex + 2.0f * (y * z + w * x) * ey + (1.0f - xx - yy) * ez;
     for (uint k = 0; k < 3; k++)
         log_scales[k * stride + i] += log(shrink[source[i]]);
+}
+
+/* Opacities of rows that together let through as much as their Gaussian did: 1 - o' = (1 - o)^(1/n) (Rota Bulo et al.
+ * 2024, "Revising Densification in Gaussian Splatting", section 3.3).  In logits, with x = log(1 + e^l) / n:
+ * l' = log(e^x - 1). */
+__kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
+void share_opacity(
+    __global const uint *restrict source,    // [M] row before the edit
+    __global const uint *restrict copies,    // [N] before the edit
+    __global const uint *restrict shared,    // [N] before the edit, 0 or 1
+    __global float *restrict logit_opacity,  // [S]
+    const uint count)
+{
+    const uint i = get_global_id(0);
+    if (i >= count || shared[source[i]] == 0)
+        return;
+    const float logit = logit_opacity[i];
+    const float x = (fmax(logit, 0.0f) + log1p(exp(-fabs(logit)))) / (float)copies[source[i]];
+    logit_opacity[i] = x + log(-expm1(-x));
 }
 
 /* Lower opacities to the limit, which holds for the opacity after the world filter (the opacity reset of 3DGS and

@@ -1,7 +1,8 @@
-/* Penalties on the scales s of Gaussians, in scene units: value and gradient.
+/* Penalties on the scales s, in scene units, and the opacities o of Gaussians: value and gradient.
  *
  *   covariance trace   P = max(sum_j s_j^2 - tau, 0): bounds the size, and only through it the shape
  *   anisotropy         A = max(s_max / s_min - r, 0): bounds the shape, whatever the size
+ *   scale, opacity     sum_j s_j, and o: a pressure on all, against which only what the images need stays
  *
  * One item = LANES Gaussians; each adds to the gradient and writes one sum.  No local memory.  Deterministic. */
 #include "lanes.h"
@@ -62,4 +63,46 @@ void anisotropy(
         VSTORE(VLOAD(grad_log_scales + k * stride + i) + (up - down), grad_log_scales + k * stride + i);
     }
     sums[get_global_id(0)] = sum_lanes(penalised ? ratio - above : zero);
+}
+
+/* grad_log_scales += weight s. */
+__kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
+void mean_scale(
+    __global const float *restrict log_scales,  // [3,S] log of scene units
+    __global float *restrict grad_log_scales,   // [3,S]
+    __global float *restrict sums,              // [items] scene units
+    const float weight,                         // scene units^-1
+    const uint stride,
+    const uint count)
+{
+    const uint i = get_global_id(0) * LANES;
+    if (i >= count)
+        return;
+    const VI inside = (LANE_INDEX + (int)i) < (int)count;
+    VF total = (VF)(0.0f);
+    for (uint k = 0; k < 3; k++) {
+        const VF scale = inside ? exp_clamped(VLOAD(log_scales + k * stride + i)) : (VF)(0.0f);
+        VSTORE(VLOAD(grad_log_scales + k * stride + i) + weight * scale, grad_log_scales + k * stride + i);
+        total += scale;
+    }
+    sums[get_global_id(0)] = sum_lanes(total);
+}
+
+/* grad_logit_opacity += weight o (1 - o). */
+__kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
+void mean_opacity(
+    __global const float *restrict logit_opacity,  // [S]
+    __global float *restrict grad_logit_opacity,   // [S]
+    __global float *restrict sums,                 // [items]
+    const float weight,
+    const uint count)
+{
+    const uint i = get_global_id(0) * LANES;
+    if (i >= count)
+        return;
+    const VF zero = (VF)(0.0f);
+    const VI inside = (LANE_INDEX + (int)i) < (int)count;
+    const VF opacity = inside ? sigmoid(VLOAD(logit_opacity + i)) : zero;
+    VSTORE(VLOAD(grad_logit_opacity + i) + weight * opacity * (1.0f - opacity), grad_logit_opacity + i);
+    sums[get_global_id(0)] = sum_lanes(opacity);
 }

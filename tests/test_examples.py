@@ -21,8 +21,9 @@ from typer.testing import CliRunner
 import clsplat
 from clsplat import cli
 from clsplat.conformance.scenes import random_case
-from clsplat.density.edit import Edit, SceneScale
+from clsplat.density.edit import Edit
 from clsplat.density.statistics import SplatStats
+from clsplat.density.thresholds import SceneScale
 from clsplat.pipeline.loading import load
 from tests.html_page import Page
 
@@ -31,7 +32,7 @@ pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[1]
 EXAMPLES = ROOT / "examples"
 TESTED = {  # where
-    **dict.fromkeys(("box_blur.py", "opacity_entropy.py", "relocation.py"), "test_plugins.py"),
+    **dict.fromkeys(("box_blur.py", "opacity_entropy.py"), "test_plugins.py"),
     "csv_reader.py": "test_csv_reader.py",
     "test_opacity_entropy.py": "test_docs.py",
 }
@@ -169,9 +170,7 @@ def test_growing_resolution_trains_at_the_sizes_that_it_names(tiny_scene, tmp_pa
     assert written["own"] != written["full"]
 
 
-@pytest.mark.parametrize(
-    ("name", "limit"), [("relocation", 60), ("opacity_entropy", 25), ("box_blur", 40), ("csv_reader", 35)]
-)
+@pytest.mark.parametrize(("name", "limit"), [("opacity_entropy", 25), ("box_blur", 40), ("csv_reader", 35)])
 def test_an_example_is_short(name, limit):
     assert len((EXAMPLES / f"{name}.py").read_text().splitlines()) <= limit
 
@@ -195,11 +194,3 @@ def test_the_verbs_of_an_edit_are_those_of_the_table():
             known = inspect.signature(verb).parameters
             named = [part for part in re.findall(r"[a-z_]+", arguments) if name in ("mark", "choose", "set_rows")]
             assert set(named) <= set(known), f"edit.{name}"
-
-
-@pytest.mark.usefixtures("without_plugins")
-def test_relocation_is_a_pipeline_with_its_plugin():
-    clsplat.load_plugin(EXAMPLES / "relocation.py")
-    found = clsplat.check(EXAMPLES / "relocation.yaml")
-    assert found["stages"][:2] == ["init", "optimize"]
-    assert load(str(EXAMPLES / "relocation.yaml")).resolved()["plugins"].keys() == {"relocation"}

@@ -98,7 +98,7 @@ TWIN = {"steps", "rates.means.over", "evaluate.every", *ENDS}
 MATCHING = {
     f"densify.rules.{rule}~2{key}"
     for rule, size in (("clone", (".size_below",)), ("split", (".size_above", ".children", ".shrink")))
-    for key in ("", ".start", ".statistic", ".as_many_as", ".gradient_above", *size)
+    for key in ("", ".start", ".statistic", ".as_many_as", ".gradient_above", ".opacity", *size)
 }
 SUBDIVIDE = (".start", ".at_most", ".beta", ".children", ".radius_above")
 THINNING = {
@@ -106,6 +106,7 @@ THINNING = {
     *(f"densify~2.rules.prune_unimportant{key}" for key in ("", ".start", ".share")),
     *(f"densify~3.rules.merge_neighbours{key}" for key in ("", ".start", ".colour_below", ".distance_below")),
 }
+MEAN_FILTER = {f"views.transforms.mean_filter{key}" for key in ("", ".width.between", ".width.points")}
 DIFFERENCES = {
     ("splat", "splat_7k"): TWIN,
     ("splat", "mip_splatting"): SMOOTHING | MIP | REFRESH,
@@ -120,6 +121,8 @@ DIFFERENCES = {
         *("reset_opacity~2.when_background", "reset_opacity~3.every", "reset_opacity~3.start"),
         *("reset_opacity~3.stop", "reset_opacity~3.to", "reset_opacity~3.when_background"),
     },
+    ("splat", "opti3dgs"): MEAN_FILTER,
+    ("splat_7k", "opti3dgs_7k"): MEAN_FILTER,
     ("splat", "micro_splatting"): {
         *(f"densify.rules.split_textured{key}" for key in ("", *SUBDIVIDE, ".texture", ".gradient_above")),
         *(f"densify.rules.split_textured.texture_above.{key}" for key in ("of", "quantile")),

@@ -32,11 +32,6 @@ class Nothing(Rule):
 """
 TRIALS = {
     "opacity_entropy": ("optimize.losses=[l1, {type: opacity_entropy, weight: 0.02}]",),
-    "relocation": (
-        "densify.rules=[relocate]",
-        "densify.every=20",
-        "densify.start=10",
-    ),
     "box_blur": ("optimize.views={transforms: [{type: box_blur, reach: [[0, 3], [40, 0]]}]}",),
 }
 
@@ -341,7 +336,7 @@ def test_the_bits_are_those_of_the_same_code_inside_the_package(name, tiny_scene
     shutil.copytree(EXAMPLES.parent / "clsplat", inside / "clsplat", ignore=shutil.ignore_patterns("__pycache__"))
     for folder in ("cl_kernels", "pipelines", "data_tools"):
         shutil.copytree(EXAMPLES.parent / folder, inside / folder, ignore=shutil.ignore_patterns("__pycache__"))
-    room = {"opacity_entropy": "losses", "relocation": "stages", "box_blur": "views"}[name]
+    room = {"opacity_entropy": "losses", "box_blur": "views"}[name]
     shutil.copy(EXAMPLES / f"{name}.py", inside / "clsplat" / room)
     shutil.copy(EXAMPLES / f"{name}.cl", inside / "clsplat" / room)
     code = f"import sys; sys.path.insert(0, {str(inside)!r}); from clsplat.cli import main; main()"

@@ -12,8 +12,9 @@ from clsplat.bench.floors import Work, floors
 from clsplat.bench.peaks import Peaks
 from clsplat.density.basic import PruneLarge
 from clsplat.density.control import densify
-from clsplat.density.edit import Edit, SceneScale
+from clsplat.density.edit import Edit
 from clsplat.density.statistics import SplatStats
+from clsplat.density.thresholds import SceneScale
 from clsplat.formats.splats import Parameters
 from clsplat.gaussians.tables import PARAMETERS, Gaussians
 from clsplat.opencl.device import Device

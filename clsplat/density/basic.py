@@ -10,13 +10,13 @@ from clsplat.schedule import Positive
 
 
 class Grow(Rule):
-    """Base of rules for Gaussians whose mean of a statistic is large.
+    """Base of rules that make several Gaussians of one whose mean of a statistic is large.
 
     With `as_many_as`, the rule chooses as many Gaussians by `statistic` as reach `gradient_above` in that other
     statistic (Gaussian Opacity Fields, Yu et al. 2024).
     """
 
-    training_keys: ClassVar[frozenset[str]] = frozenset({"gradient_above"})
+    training_keys: ClassVar[frozenset[str]] = frozenset({"gradient_above", "opacity"})
 
     statistic: StatisticName = "screen_grad"
     """Column whose mean is compared."""
@@ -25,16 +25,19 @@ class Grow(Rule):
     as_many_as: StatisticName | None = None
     """Column in which Gaussians are counted at `gradient_above`; that number sets the threshold of `statistic`."""
 
+    opacity: Literal["copied", "shared"] = "copied"
+    """`shared`: what one becomes is together as opaque as it was, 1 − (1 − o)^(1/n) each (Rota Bulò et al. 2024)."""
+
     @property
     def statistics(self) -> set[str]:
         return {self.statistic, self.as_many_as or self.statistic}
 
     def condition(self, edit: Edit) -> dict[str, Any]:
-        """Return the arguments of Edit.mark that hold the rule's condition."""
+        """Return the arguments of Edit.mark that hold the rule's condition, and whether opacity is shared."""
         above = edit.at(self.gradient_above)
         if self.as_many_as:
             above = edit.matching(self.statistic, self.as_many_as, above)
-        return {"statistic": self.statistic, "gradient_above": above}
+        return {"statistic": self.statistic, "gradient_above": above, "shared": self.opacity == "shared"}
 
 
 class Clone(Grow):

@@ -1,4 +1,4 @@
-"""Apply density rules, as one edit, and reset opacities (Kerbl et al. 2023, section 5)."""
+"""Apply density rules, as one edit; reset opacities (Kerbl et al. 2023, section 5); move means at random."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -58,6 +58,25 @@ def cap_opacity(gaussians: Gaussians, limit: float) -> None:
         filter_variance=gaussians["filter_variance"],
         logit_opacity=gaussians["logit_opacity"],
         limit=limit,
+        stride=gaussians.capacity,
+        count=gaussians.count,
+    )
+
+
+def add_noise(gaussians: Gaussians, rate: float, opacity_below: float, seed: int, step: int) -> None:
+    """Move each mean by rate / (1 + exp(-100 (opacity_below - opacity))) Σ n, n three normal numbers (Kheradmand et
+    al. 2024, eq. 7).  rate: scene units⁻¹.
+    """
+    gaussians.device.program("noise.cl").add_noise(
+        items=gaussians.count,
+        means=gaussians["means"],
+        quats=gaussians["quats"],
+        log_scales=gaussians["log_scales"],
+        logit_opacity=gaussians["logit_opacity"],
+        rate=rate,
+        opacity_below=opacity_below,
+        seed=seed,
+        step=step,
         stride=gaussians.capacity,
         count=gaussians.count,
     )

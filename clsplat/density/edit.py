@@ -8,17 +8,16 @@ growth and compare the size of the children after a split.
 
 import math
 from abc import abstractmethod
-from collections.abc import Callable, Collection
-from dataclasses import dataclass
-from typing import Annotated, ClassVar
+from collections.abc import Collection
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
 from clsplat.density.statistics import SEEN, SplatStats
-from clsplat.density.thresholds import PixelQuantile, Quantile, Threshold
-from clsplat.errors import ConfigError, MemoryLimitError
+from clsplat.density.thresholds import PixelQuantile, Quantile, SceneScale, Threshold
+from clsplat.errors import MemoryLimitError
 from clsplat.gaussians.tables import PARAMETERS, Gaussians, moment_tables
 from clsplat.render.tiles import Tiler
 from clsplat.schedule import Schedule, at_step
@@ -36,20 +35,8 @@ def _require_rows(copies: int, kept: int) -> None:
             raise ValueError(f"{name}: expected a number of rows, {bound}, got {number}")
 
 
-def _no_photographs(share: float) -> float:
-    raise ConfigError("a quantile of pixels needs training photographs")
-
-
-@dataclass(frozen=True)
-class SceneScale:
-    """Units of rules: the scene's extent, scene units, and quantiles of the photographs' texture, per px."""
-
-    extent: float
-    texture_quantile: Callable[[float], float] = _no_photographs
-
-
 class Edit:
-    """The outcome of each Gaussian: its number of rows, how many of them are its old row, the factor of fresh scales.
+    """The outcome of each Gaussian: its rows, those that are the old one, the factor of fresh scales, a shared opacity.
 
     Random numbers depend on `seed`, `step` and the rule alone.
     """
@@ -61,10 +48,15 @@ class Edit:
         self.copies = device.empty(count, np.uint32)
         self.kept = device.empty(count, np.uint32)
         self.shrink = device.empty(count)
+        self.shared = device.empty(count, np.uint32)
         self.rule = 0  # number of the rule that acts
         self.max_rows: int | None = None  # rows at which growth stops; None: no limit
         self._program = device.program("density.cl")
-        self._program.start_edit(items=count, copies=self.copies, kept=self.kept, shrink=self.shrink, count=count)
+        self._program.start_edit(items=count, **self._outcome, count=count)
+
+    @property
+    def _outcome(self) -> dict[str, Any]:
+        return {"copies": self.copies, "kept": self.kept, "shrink": self.shrink, "shared": self.shared}
 
     def at(self, schedule: Schedule) -> float:
         """Return the value of a schedule at the step of the edit."""
@@ -84,10 +76,11 @@ class Edit:
         size_above: float = 0.0,
         size_below: float | None = None,
         opacity_below: float = math.inf,
+        shared: bool = False,
     ) -> None:
         """Give an outcome to every Gaussian in the box; sizes are shares of the extent.
 
-        Raises ValueError for negative copies or kept, and beyond MAX_ROWS.
+        shared: its rows are together as opaque as it was.  Raises ValueError for numbers of rows that cannot be.
         """
         _require_rows(copies, kept)
         gaussians = self.gaussians
@@ -97,9 +90,7 @@ class Edit:
             logit_opacity=gaussians["logit_opacity"],
             statistic=self.stats.total(statistic) if statistic else self.stats.seen,
             divisor=self.stats.divisor(statistic) if statistic else self.stats.seen,
-            copies=self.copies,
-            kept=self.kept,
-            shrink=self.shrink,
+            **self._outcome,
             gradient_above=gradient_above,
             size_above=size_above * self.scene_scale.extent,
             size_below=MAX_BOUND if size_below is None else size_below * self.scene_scale.extent,
@@ -107,6 +98,7 @@ class Edit:
             new_shrink=shrink,
             new_copies=copies,
             new_kept=kept,
+            new_shared=int(shared),
             stride=gaussians.capacity,
             count=gaussians.count,
         )
@@ -201,15 +193,14 @@ class Edit:
                 "rules that make fewer copies"
             )
         source, fresh = device.empty(rows, np.uint32), device.empty(rows, np.uint32)
-        self._program.list_rows(
-            items=count,
-            copies=self.copies,
-            kept=self.kept,
-            row_offset=row_offset,
-            source=source,
-            fresh=fresh,
-            count=count,
-        )
+        places: dict[str, Any] = {
+            "copies": self.copies,
+            "kept": self.kept,
+            "row_offset": row_offset,
+            "source": source,
+            "fresh": fresh,
+        }
+        self._program.list_rows(items=count, **places, count=count)
         gaussians.rearrange(source, fresh, rows)
         self._program.spawn_children(
             items=rows,
@@ -224,6 +215,8 @@ class Edit:
             stride=gaussians.capacity,
             count=rows,
         )
+        sharing: dict[str, Any] = {"source": source, "copies": self.copies, "shared": self.shared}
+        self._program.share_opacity(items=rows, **sharing, logit_opacity=gaussians["logit_opacity"], count=rows)
 
 
 class Rule(Settings):

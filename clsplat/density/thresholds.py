@@ -1,9 +1,12 @@
-"""Thresholds of density rules: a number by step, or a quantile of the scene's own values."""
+"""Thresholds of density rules, a number by step or a quantile of the scene's own values, and their units."""
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from pydantic import Field
 
+from clsplat.errors import ConfigError
 from clsplat.schedule import NonNegative, explained
 from clsplat.settings import Settings
 
@@ -29,3 +32,15 @@ class PixelQuantile(Settings):
 
 
 Threshold = Annotated[Quantile | PixelQuantile | NonNegative, explained(", or {quantile, of}")]
+
+
+def _no_photographs(share: float) -> float:
+    raise ConfigError("a quantile of pixels needs training photographs")
+
+
+@dataclass(frozen=True)
+class SceneScale:
+    """Units of rules: the scene's extent, scene units, and quantiles of the photographs' texture, per px."""
+
+    extent: float
+    texture_quantile: Callable[[float], float] = _no_photographs

@@ -1,4 +1,4 @@
-"""Penalties on the sizes and shapes of Gaussians: each adds to the gradient of `log_scales`.
+"""Penalties on the sizes, shapes and opacities of Gaussians: each adds to the gradient of its parameter.
 
 The trace of the covariance bounds the size of a Gaussian, not its anisotropy, which has a penalty of its own.
 """
@@ -59,3 +59,29 @@ class Anisotropy(Penalty):
             **inputs.arguments("log_scales"), sums=sums, above=self.above, weight=weight
         )
         return LossValue("anisotropy", lambda: weight * float(sums.get().sum(dtype=np.float64)))
+
+
+class MeanScale(Penalty):
+    """Mean of all scales, in extents (3DGS-MCMC, Kheradmand et al. 2024, in scene units there)."""
+
+    type: Literal["mean_scale"] = "mean_scale"
+
+    def add(self, inputs: PenaltyInputs) -> LossValue:
+        gaussians, sums = inputs.gaussians, inputs.sums("mean_scale")
+        weight = at_step(self.weight, inputs.step) / max(1, 3 * gaussians.count) / inputs.extent
+        gaussians.device.program("penalty.cl").mean_scale(**inputs.arguments("log_scales"), sums=sums, weight=weight)
+        return LossValue("mean_scale", lambda: weight * float(sums.get().sum(dtype=np.float64)))
+
+
+class MeanOpacity(Penalty):
+    """Mean of all opacities (3DGS-MCMC, Kheradmand et al. 2024)."""
+
+    type: Literal["mean_opacity"] = "mean_opacity"
+
+    def add(self, inputs: PenaltyInputs) -> LossValue:
+        gaussians, sums = inputs.gaussians, inputs.sums("mean_opacity")
+        weight = at_step(self.weight, inputs.step) / max(1, gaussians.count)
+        arguments = inputs.arguments("logit_opacity")
+        del arguments["stride"]  # of one plane
+        gaussians.device.program("penalty.cl").mean_opacity(**arguments, sums=sums, weight=weight)
+        return LossValue("mean_opacity", lambda: weight * float(sums.get().sum(dtype=np.float64)))

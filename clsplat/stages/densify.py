@@ -6,7 +6,8 @@ from dataclasses import asdict
 from typing import ClassVar, Literal
 
 from clsplat.density.control import densify
-from clsplat.density.edit import Edit, Rule, SceneScale
+from clsplat.density.edit import Edit, Rule
+from clsplat.density.thresholds import SceneScale
 from clsplat.errors import NumericError
 from clsplat.gaussians.tables import PARAMETERS
 from clsplat.schedule import AtLeastOne

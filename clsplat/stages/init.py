@@ -46,6 +46,8 @@ class Init(Stage):
     """Source of the first Gaussians; `ply` is an older name of `model`."""
     opacity: Annotated[float, Field(gt=0, lt=1)] = 0.1
     """Opacity of the first Gaussians."""
+    scale: Annotated[float, Field(gt=0)] = 1.0
+    """Factor of the first sizes."""
     count: Annotated[int, Field(gt=0)] = 100_000
     """Number of random points."""
     swept: Annotated[int, Field(gt=0)] = 20_000
@@ -98,7 +100,7 @@ class Init(Stage):
         else:
             points = self._points(run.scene)
         self._require_memory(run, len(points))
-        return from_points(points, self.opacity, degree)
+        return from_points(points, self.opacity, degree, self.scale)
 
     def _read(self) -> Parameters:
         assert self.file is not None  # as `check` requires
@@ -144,10 +146,10 @@ def require_ahead(points: PointCloud, scene: Scene) -> None:
         )
 
 
-def from_points(points: PointCloud, opacity: float, degree: int) -> Parameters:
-    """Return one Gaussian for each point."""
+def from_points(points: PointCloud, opacity: float, degree: int, scale: float = 1.0) -> Parameters:
+    """Return one Gaussian for each point, `scale` times as large as the distance to its neighbours."""
     count = len(points)
-    log_scales = 0.5 * np.log(neighbour_distance2(points.positions))
+    log_scales = 0.5 * np.log(neighbour_distance2(points.positions)) + math.log(scale)
     quats = np.zeros((count, 4))
     quats[:, 0] = 1
     return {

@@ -40,22 +40,38 @@ class Blur(PhotographTransform):
     """Standard deviation in px of the photograph at its training size; by step."""
 
     def apply(self, planes: Planes, step: int) -> Planes:
-        camera, sigma = planes.camera, at_step(self.sigma, step)
-        reach = math.ceil(REACH * sigma)
-        if reach == 0:
-            return planes
-        device, reach = planes.workspace.device, min(reach, max(camera.width, camera.height))
-        sums = planes.workspace.array("blur", (4, camera.rows, camera.stride))
-        items, size = (camera.width, camera.height), {"reach": reach, **camera.plane_arguments()}
-        program, masked = device.program("blur.cl"), planes.mask is not None
-        program.blur_rows(
-            items=items,
-            image=planes.colours,
-            mask=planes.mask or sums,
-            sums=sums,
-            masked=int(masked),
-            falloff=0.5 / sigma**2,
-            **size,
-        )
-        program.blur_columns(items=items, sums=sums, image=planes.colours, falloff=0.5 / sigma**2, **size)
+        sigma = at_step(self.sigma, step)
+        return planes if sigma == 0 else _averaged(planes, math.ceil(REACH * sigma), 0.5 / sigma**2)
+
+
+class MeanFilter(PhotographTransform):
+    """Replace a pixel by the mean of a square about it (Opti3DGS, Farooq et al. 2025); masked pixels do not count."""
+
+    type: Literal["mean_filter"] = "mean_filter"
+    width: NonNegative
+    """Side of the square as a share of the photograph's width; the nearest odd number of px is taken; by step."""
+
+    def apply(self, planes: Planes, step: int) -> Planes:
+        return _averaged(planes, math.floor(at_step(self.width, step) * planes.camera.width / 2), 0.0)
+
+
+def _averaged(planes: Planes, reach: int, falloff: float) -> Planes:
+    """Average the pixels within `reach` px in x and in y, by weights exp(-falloff distance²); falloff: px⁻²."""
+    if reach == 0:
         return planes
+    camera, device = planes.camera, planes.workspace.device
+    reach = min(reach, max(camera.width, camera.height))
+    sums = planes.workspace.array("blur", (4, camera.rows, camera.stride))
+    items, size = (camera.width, camera.height), {"reach": reach, **camera.plane_arguments()}
+    program, mask = device.program("blur.cl"), planes.mask
+    program.blur_rows(
+        items=items,
+        image=planes.colours,
+        mask=mask or sums,
+        sums=sums,
+        masked=int(mask is not None),
+        falloff=falloff,
+        **size,
+    )
+    program.blur_columns(items=items, sums=sums, image=planes.colours, falloff=falloff, **size)
+    return planes

@@ -7,8 +7,9 @@ from clsplat.conformance import reference as ref
 from clsplat.conformance.scenes import random_case, with_world_filter
 from clsplat.density.basic import Clone, PruneFaint, PruneLarge, Split
 from clsplat.density.control import cap_opacity, densify
-from clsplat.density.edit import Edit, SceneScale
+from clsplat.density.edit import Edit
 from clsplat.density.statistics import SEEN, SplatStats
+from clsplat.density.thresholds import SceneScale
 from clsplat.gaussians.tables import PARAMETERS, Gaussians, moment_tables
 from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import Rasterizer
@@ -24,7 +25,7 @@ EXTENT = 5.0
 SCREEN_GRAD = "stats/screen_grad"
 
 
-def edited(device: Device, rng, count: int, step: int, rules=RULES):
+def edited(device: Device, rng, count: int, step: int, rules=RULES, limit: int | None = None):
     """Random Gaussians on both sides of every threshold, before and after densify."""
     case = random_case(rng, count)
     p = case.parameters
@@ -45,7 +46,7 @@ def edited(device: Device, rng, count: int, step: int, rules=RULES):
     gaussians.set(SEEN, seen)
     before = {name: gaussians.get(name) for name in gaussians.tables}
     tiler = Rasterizer(device, "radix").tiler
-    change = densify(Edit(gaussians, stats, SceneScale(EXTENT), step, seed=3), rules, tiler)
+    change = densify(Edit(gaussians, stats, SceneScale(EXTENT), step, seed=3), rules, tiler, limit)
     return before, gaussians, change
 
 
@@ -80,6 +81,33 @@ def test_adaptive_density_control(device, rng, count, step):
     offsets = after["means"][split] - before["means"][source][split]
     sizes = size[source][split]
     assert (np.linalg.norm(offsets, axis=1) < 6 * sizes).all()
+
+
+@pytest.mark.parametrize("count", [0, 1, 63, 64, 65, 300])
+@pytest.mark.parametrize("children", [2, 3, 8])
+def test_rows_that_share_an_opacity_let_through_as_much_as_one_did(device, rng, count, children):
+    case = random_case(rng, count)
+    logits = np.resize([-30.0, -5.0, 0.0, 2.0, 9.0, 40.0, 90.0], (count, 1)) + rng.normal(0, 0.1, (count, 1))
+    case.parameters["logit_opacity"][:] = logits
+    gaussians = case.model(device).gaussians
+    stats = SplatStats(gaussians)
+    for name in (SCREEN_GRAD, SEEN):
+        gaussians.set(name, np.ones((count, 1)))
+    large = np.exp(gaussians.get("log_scales")).max(axis=1) > 0.05
+    rules = [Clone(size_below=0.05, opacity="shared"), Split(size_above=0.05, children=children, opacity="shared")]
+    edit = Edit(gaussians, stats, SceneScale(1.0), step=700, seed=1)
+    densify(edit, rules, Rasterizer(device, "radix").tiler)
+    rows = np.where(large, children, 2)
+    expected = [ref.shared_logit(np.float64(np.float32(one[0])), n) for one, n in zip(logits, rows, strict=True)]
+    np.testing.assert_allclose(gaussians.get("logit_opacity")[:, 0], np.repeat(expected, rows), rtol=1e-5, atol=1e-5)
+
+
+def test_growth_that_is_undone_shares_nothing(device, rng):
+    before, gaussians, change = edited(device, rng, 64, 600, rules=[Clone(opacity="shared")])
+    assert change.after > 64
+    before, gaussians, change = edited(device, rng, 64, 600, rules=[Clone(opacity="shared")], limit=64)
+    assert change.after == 64
+    np.testing.assert_array_equal(gaussians.get("logit_opacity"), before["logit_opacity"])
 
 
 @pytest.mark.large

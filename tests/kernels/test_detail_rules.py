@@ -8,11 +8,11 @@ from clsplat.conformance.scenes import random_case
 from clsplat.density.basic import Clone, PruneFaint
 from clsplat.density.control import densify
 from clsplat.density.detail import SplitOversized, SplitTextured, largest
-from clsplat.density.edit import Edit, SceneScale
+from clsplat.density.edit import Edit
 from clsplat.density.mixture import covariance_of, mass_of, merged
 from clsplat.density.statistics import SEEN, SplatStats
 from clsplat.density.thinning import MergeNeighbours, PruneUnimportant
-from clsplat.density.thresholds import PixelQuantile, Quantile
+from clsplat.density.thresholds import PixelQuantile, Quantile, SceneScale
 from clsplat.gaussians.tables import INTERVAL2
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.training.adam import Adam

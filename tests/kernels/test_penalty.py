@@ -7,7 +7,7 @@ from clsplat.conformance import reference as ref
 from clsplat.conformance.scenes import random_case
 from clsplat.gaussians.tables import INTERVAL2, Gradients
 from clsplat.losses.base import LossValue, PenaltyInputs
-from clsplat.losses.penalties import Anisotropy, CovarianceTrace
+from clsplat.losses.penalties import Anisotropy, CovarianceTrace, MeanOpacity, MeanScale
 from clsplat.render.workspace import Workspace
 
 COUNTS = (1, 7, 8, 15, 16, 17, 64, 65, 200)
@@ -20,16 +20,19 @@ def inputs_of(device, rng, count: int) -> tuple[PenaltyInputs, np.ndarray]:
     case.parameters["log_scales"][:] = rng.normal(-2, 1.5, (count, 3))
     gaussians = case.model(device).gaussians
     gradients = Gradients(gaussians)
-    planes = np.zeros((3, gaussians.capacity), np.float32)
-    planes[:, :count] = 0.25
-    gradients["log_scales"].set(planes)
+    for name in ("log_scales", "logit_opacity"):
+        planes = np.zeros((gaussians.tables[name].components, gaussians.capacity), np.float32)
+        planes[:, :count] = 0.25
+        gradients[name].set(planes)
     inputs = PenaltyInputs(Workspace(device), gaussians, gradients, EXTENT, step=1)
     return inputs, case.parameters["log_scales"].astype(np.float64)
 
 
-def check(inputs: PenaltyInputs, found: LossValue, value: float, gradient: np.ndarray) -> None:
+def check(
+    inputs: PenaltyInputs, found: LossValue, value: float, gradient: np.ndarray, parameter: str = "log_scales"
+) -> None:
     assert found.value() == pytest.approx(value, rel=1e-5, abs=1e-12)
-    planes, count = inputs.gradients["log_scales"].get(), inputs.gaussians.count
+    planes, count = inputs.gradients[parameter].get(), inputs.gaussians.count
     added = planes[:, :count].T.astype(np.float64) - 0.25
     np.testing.assert_allclose(added, gradient, rtol=1e-4, atol=1e-6 * max(1, np.abs(gradient).max()))
     assert (planes[:, count:] == 0).all()
@@ -74,7 +77,31 @@ def test_anisotropy(device, rng, count):
     check(inputs, found, 0.1 * value, 0.1 * gradient)
 
 
-@pytest.mark.parametrize("penalty", [lambda x: ref.covariance_trace(x, 0.1, EXTENT), lambda x: ref.anisotropy(x, 5.0)])
+@pytest.mark.parametrize("count", COUNTS)
+def test_mean_scale(device, rng, count):
+    inputs, log_scales = inputs_of(device, rng, count)
+    value, gradient = ref.mean_scale(log_scales, EXTENT)
+    check(inputs, MeanScale(weight=3.0).add(inputs), 3 * value, 3 * gradient)
+
+
+@pytest.mark.parametrize("count", COUNTS)
+def test_mean_opacity(device, rng, count):
+    inputs, _ = inputs_of(device, rng, count)
+    logits = rng.choice([-90.0, -6.0, 0.0, 3.0, 90.0], (count, 1)) + rng.normal(0, 1, (count, 1))
+    inputs.gaussians.set("logit_opacity", logits)
+    value, gradient = ref.mean_opacity(np.float32(logits).astype(np.float64))
+    check(inputs, MeanOpacity(weight=3.0).add(inputs), 3 * value, 3 * gradient, "logit_opacity")
+
+
+@pytest.mark.parametrize(
+    "penalty",
+    [
+        lambda x: ref.covariance_trace(x, 0.1, EXTENT),
+        lambda x: ref.anisotropy(x, 5.0),
+        lambda x: ref.mean_scale(x, EXTENT),
+        ref.mean_opacity,
+    ],
+)
 def test_oracle_against_finite_differences(rng, penalty):
     log_scales, step = rng.normal(-1, 1, (30, 3)), 1e-6
     _, gradient = penalty(log_scales)

@@ -5,8 +5,9 @@ import pytest
 
 from clsplat.conformance.scenes import random_case
 from clsplat.density.control import densify
-from clsplat.density.edit import Edit, Rule, SceneScale
+from clsplat.density.edit import Edit, Rule
 from clsplat.density.statistics import SplatStats
+from clsplat.density.thresholds import SceneScale
 from clsplat.errors import MemoryLimitError
 from clsplat.gaussians.tables import PARAMETERS, Gaussians, moment_tables
 from clsplat.render.rasterizer import Rasterizer

@@ -12,9 +12,10 @@ from clsplat.conformance.checks.images import comparison_of, magnitude_of
 from clsplat.conformance.comparison import SUM, Figure, by_element, by_norm, equal
 from clsplat.conformance.scenes import random_case, with_world_filter
 from clsplat.density.basic import Clone, PruneFaint, PruneLarge, Split
-from clsplat.density.control import cap_opacity, densify
-from clsplat.density.edit import Edit, SceneScale
+from clsplat.density.control import add_noise, cap_opacity, densify
+from clsplat.density.edit import Edit
 from clsplat.density.statistics import ABS_X, SEEN, WEIGHT, SplatStats
+from clsplat.density.thresholds import SceneScale
 from clsplat.gaussians.tables import Gaussians
 from clsplat.losses.base import ViewGradients
 from clsplat.opencl.device import Device
@@ -23,7 +24,8 @@ from clsplat.training.adam import Adam
 
 CHECKS = Checks()
 COUNTS = (1, 15, 17, 65, 200)
-RULES = (Clone(size_below=0.01), Split(size_above=0.01), PruneFaint(opacity_below=0.005), PruneLarge(size_above=0.1))
+GROWTH = (Clone(size_below=0.01, opacity="shared"), Split(size_above=0.01))
+RULES = (*GROWTH, PruneFaint(opacity_below=0.005), PruneLarge(size_above=0.1))
 EXTENT = 5.0
 SEED, STEP = 3, 3100
 COLUMNS = ("screen_grad", "screen_grad_abs_sum", "rendered_texture", "screen_radius", "blend_weight")
@@ -86,7 +88,7 @@ def _edited(device: Device, rng: np.random.Generator, count: int) -> tuple[dict[
     return before, gaussians
 
 
-@CHECKS.add("start_edit", "mark_rule", "list_rows", "spawn_children", "gather_rows")
+@CHECKS.add("start_edit", "mark_rule", "list_rows", "spawn_children", "share_opacity", "gather_rows")
 def edits(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
     for count in COUNTS:
         before, gaussians = _edited(device, rng, count)
@@ -108,6 +110,10 @@ def edits(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
         expected = np.where(fresh[:, None], 0, before[moment][source])
         yield equal("list_rows", f"moments after {what}", after[moment], expected)
         means, scales = before["means"].astype(np.float64)[source], before["log_scales"].astype(np.float64)[source]
+        logits = before["logit_opacity"].astype(np.float64)[source]
+        cloned = action[source] == ref.CLONE
+        logits[cloned] = ref.shared_logit(logits[cloned], 2)
+        yield by_element("share_opacity", f"opacities after {what}", after["logit_opacity"], logits, SUM, floor=1)
         for i in np.flatnonzero(split):
             noise = ref.normal3((int(i), STEP, 0, 0), (SEED, 0))
             rotation = ref.rotation_matrix(before["quats"][source[i]].astype(np.float64))
@@ -146,3 +152,21 @@ def opacity_reset(device: Device, rng: np.random.Generator) -> Iterator[Figure |
             expected[capped] = ref.reset_logit(expected[capped], ratio[capped], 0.3)
             found = gaussians.get("logit_opacity")[:, 0]
             yield by_element("cap_opacity", f"opacities of {count} Gaussians", found, expected, 2e-5, floor=1)
+
+
+@CHECKS.add("add_noise")
+def noise(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    rate, below = 40.0, 0.3
+    for count in COUNTS:
+        case = random_case(rng, count)
+        case.parameters["logit_opacity"][:] = rng.uniform(-3, 1, (count, 1))
+        gaussians, p = case.model(device).gaussians, {k: v.astype(np.float64) for k, v in case.parameters.items()}
+        add_noise(gaussians, rate, below, SEED, STEP)
+        opacity = 1 / (1 + np.exp(-p["logit_opacity"][:, 0]))
+        gate = np.where(opacity > below + 0.1, 0, rate / (1 + np.exp(-100 * (below - opacity))))
+        moved = np.zeros((count, 3))
+        for i in range(count):
+            axes = ref.rotation_matrix(p["quats"][i]) * np.exp(p["log_scales"][i])
+            moved[i] = gate[i] * axes @ axes.T @ ref.normal3((i, STEP, 1, 0), (SEED, 0))
+        found = gaussians.get("means").astype(np.float64)
+        yield by_norm("add_noise", f"means of {count} Gaussians", found, p["means"] + moved, SUM)

@@ -1,4 +1,4 @@
-"""Adam, penalties on shapes, and the rows of tables."""
+"""Adam, penalties, noise on means, and the rows of tables."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -14,7 +14,7 @@ from clsplat.conformance.comparison import CONIC, SUM, Figure, by_element, by_no
 from clsplat.conformance.scenes import Case, random_case, with_world_filter
 from clsplat.gaussians.tables import INTERVAL2, PARAMETERS, Gaussians, Gradients, moment_tables
 from clsplat.losses.base import Penalty, PenaltyInputs
-from clsplat.losses.penalties import Anisotropy, CovarianceTrace
+from clsplat.losses.penalties import Anisotropy, CovarianceTrace, MeanOpacity, MeanScale
 from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.render.workspace import Workspace
@@ -99,7 +99,13 @@ def update_from_sums_over_pixels(device: Device, rng: np.random.Generator) -> It
 
 
 def penalty_figures(
-    device: Device, rng: np.random.Generator, count: int, penalty: Penalty, oracle: Any, interval: NDArray[Any] | None
+    device: Device,
+    rng: np.random.Generator,
+    count: int,
+    penalty: Penalty,
+    oracle: Any,
+    interval: NDArray[Any] | None = None,
+    parameter: str = "log_scales",
 ) -> Iterator[Figure]:
     """Compare value and gradient of a penalty of weight 3, for Gaussians of many sizes and forms."""
     case = random_case(rng, count)
@@ -109,24 +115,24 @@ def penalty_figures(
         gaussians.add(INTERVAL2, 1)
         gaussians.set(INTERVAL2, interval[:, None] ** 2)
     gradients = Gradients(gaussians)
-    gradients["log_scales"].fill(0.25)
+    gradients[parameter].fill(0.25)
     inputs = PenaltyInputs(Workspace(device), gaussians, gradients, EXTENT, step=1)
     found = penalty.add(inputs).value()
-    value, gradient = oracle(case.parameters["log_scales"].astype(np.float64))
+    value, gradient = oracle(case.parameters[parameter].astype(np.float64))
     kernel, what = str(getattr(penalty, "type", "penalty")), f"{count} Gaussians"
     yield by_element(kernel, f"value, {what}", np.array([found]), np.array([3 * value]), SUM, floor=1e-7)
-    added = gradients["log_scales"].get()[:, :count].T.astype(np.float64) - 0.25
+    added = gradients[parameter].get()[:, :count].T.astype(np.float64) - 0.25
     floor = 1e-2 * max(1.0, float(np.abs(3 * gradient).max()))
     yield by_element(kernel, f"gradient, {what}", added, 3 * gradient, 1e-4, floor)
 
 
-@CHECKS.add("covariance_trace", "anisotropy")
+@CHECKS.add("covariance_trace", "anisotropy", "mean_scale", "mean_opacity")
 def penalties(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
     for count in COUNTS:
         interval = rng.uniform(0.01, 0.05, count).astype(np.float32)
         trace = CovarianceTrace(weight=3.0, above=0.02)
         yield from penalty_figures(
-            device, rng, count, trace, lambda s: ref.covariance_trace(s, 0.02 * EXTENT**2, EXTENT), None
+            device, rng, count, trace, lambda s: ref.covariance_trace(s, 0.02 * EXTENT**2, EXTENT)
         )
         in_pixels = CovarianceTrace(weight=3.0, above=9.0, pixels=4.0)
         bound = 3 * (4.0 * interval) ** 2
@@ -134,7 +140,10 @@ def penalties(device: Device, rng: np.random.Generator) -> Iterator[Figure | Not
             device, rng, count, in_pixels, lambda s, bound=bound: ref.covariance_trace(s, bound, EXTENT), interval
         )
         shape = Anisotropy(weight=3.0, above=8.0)
-        yield from penalty_figures(device, rng, count, shape, lambda s: ref.anisotropy(s, 8.0), None)
+        yield from penalty_figures(device, rng, count, shape, lambda s: ref.anisotropy(s, 8.0))
+        yield from penalty_figures(device, rng, count, MeanScale(weight=3.0), lambda s: ref.mean_scale(s, EXTENT))
+        opacity = MeanOpacity(weight=3.0)
+        yield from penalty_figures(device, rng, count, opacity, ref.mean_opacity, parameter="logit_opacity")
 
 
 def _tables(gaussians: Gaussians) -> dict[str, NDArray[Any]]:

@@ -17,8 +17,9 @@ from clsplat.conformance.host import available_memory
 from clsplat.conformance.scenes import Case, random_case
 from clsplat.density.basic import Clone, PruneFaint, Split
 from clsplat.density.control import densify
-from clsplat.density.edit import Edit, SceneScale
+from clsplat.density.edit import Edit
 from clsplat.density.statistics import SplatStats
+from clsplat.density.thresholds import SceneScale
 from clsplat.errors import MemoryLimitError
 from clsplat.losses.image import L1, Dssim
 from clsplat.opencl.device import Array, Device

@@ -33,6 +33,7 @@ from clsplat.conformance.reference.density import (
     mean_gradient,
     reset_logit,
     screen_gradient,
+    shared_logit,
     split_children,
 )
 from clsplat.conformance.reference.harmonics import (
@@ -58,6 +59,8 @@ from clsplat.conformance.reference.losses import (
 from clsplat.conformance.reference.penalties import (
     anisotropy,
     covariance_trace,
+    mean_opacity,
+    mean_scale,
 )
 from clsplat.conformance.reference.projection import (
     clamped_ray,
@@ -105,6 +108,8 @@ __all__ = [
     "l2",
     "margin",
     "mean_gradient",
+    "mean_opacity",
+    "mean_scale",
     "member_sums",
     "ms_ssim",
     "nearest_vectors",
@@ -123,6 +128,7 @@ __all__ = [
     "screen_gradient",
     "sh_basis",
     "sh_basis_gradient",
+    "shared_logit",
     "split_children",
     "ssim_map",
     "ssim_taps",

@@ -79,6 +79,12 @@ def split_children(
     return means, np.array([log_scale - np.log(factor) for _ in noise])
 
 
+def shared_logit(logit: NDArray[Any], rows: int) -> NDArray[Any]:
+    """Logits of `rows` Gaussians in one place that together let through as much as one did: 1 - o' = (1 - o)^(1/n)."""
+    log_transmittance = -np.log1p(np.exp(logit)) / rows
+    return np.log(-np.expm1(log_transmittance)) - log_transmittance
+
+
 def reset_logit(logit: NDArray[Any], filter_ratio: NDArray[Any] | float = 1.0, ceiling: float = 0.01) -> NDArray[Any]:
     """Opacity reset (6; 8.3 with `filter_ratio` = ρ): the filtered opacity becomes at most `ceiling`: [N]."""
     opacity = np.minimum(filter_ratio / (1 + np.exp(-logit)), ceiling) / filter_ratio

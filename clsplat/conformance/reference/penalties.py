@@ -1,4 +1,4 @@
-"""Penalties on the shapes of Gaussians, with their gradients by log_scales."""
+"""Penalties on scales and opacities, with their gradients by log_scales and logit_opacity."""
 
 from typing import Any
 
@@ -26,3 +26,15 @@ def anisotropy(log_scales: NDArray[Any], above: float) -> tuple[float, NDArray[A
     gradient[rows, longest] += slope
     gradient[rows, shortest] -= slope
     return np.maximum(ratio - above, 0).mean(), gradient
+
+
+def mean_scale(log_scales: NDArray[Any], extent: float) -> tuple[float, NDArray[Any]]:
+    """Mean of the scales by extent.  log_scales: [N, 3]."""
+    scales = np.exp(log_scales)
+    return scales.mean() / extent, scales / scales.size / extent
+
+
+def mean_opacity(logit_opacity: NDArray[Any]) -> tuple[float, NDArray[Any]]:
+    """Mean of the opacities.  logit_opacity: [N, 1]."""
+    opacities = 1 / (1 + np.exp(-logit_opacity))
+    return opacities.mean(), opacities * (1 - opacities) / opacities.size
