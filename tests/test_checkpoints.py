@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from clsplat.errors import ConfigError, MemoryLimitError, OutputError, as_clsplat_error
+import clsplat
+from clsplat.errors import ConfigError, DataError, MemoryLimitError, OutputError, as_clsplat_error
 from clsplat.names import CHECKSUMS
 from clsplat.runs import folders
 from clsplat.training import archive
@@ -150,3 +151,13 @@ def test_restoring_reads_no_other_run(tiny_scene, tmp_path):
     with pytest.raises(ConfigError, match="already holds a run; give another folder, --resume or --restart"):
         folders.check_run_folder(tmp_path, "new")
     assert CHECKSUMS in {path.name for path in tmp_path.iterdir()}
+
+
+def test_a_run_whose_scene_has_moved_goes_on_where_it_is_now(killed_run, few_steps, tiny_scene, tmp_path):
+    pipeline, moved = killed_run / "pipeline.yaml", shutil.copytree(tiny_scene, tmp_path / "moved" / tiny_scene.name)
+    pipeline.write_text(pipeline.read_text().replace(str(tiny_scene), str(tmp_path / "gone")))
+    remedy = rf"photographs, {tmp_path / 'gone'}, is missing; `clsplat resume {killed_run} --scene DIR` says where"
+    with pytest.raises(DataError, match=remedy):
+        clsplat.resume(killed_run)
+    clsplat.resume(killed_run, moved)
+    assert (killed_run / "point_cloud.ply").read_bytes() == (few_steps / "point_cloud.ply").read_bytes()

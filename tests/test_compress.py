@@ -63,7 +63,7 @@ def test_targets(text, most, change):
 
 
 @pytest.mark.parametrize(
-    "text", ["", "5", "MB", "-5MB", "0MB", "0.1dB", "1e3MB", "5 apples", "-0.1 dB\n5MB", "٥MB", "nandB"]
+    "text", ["", "5", "MB", "-5MB", "0MB", "0.5B", "0.1dB", "1e3MB", "5 apples", "-0.1 dB\n5MB", "٥MB", "nandB"]
 )
 def test_what_is_no_target_is_refused(text):
     with pytest.raises(ConfigError, match="expected a size such as 5MB"):
@@ -228,6 +228,15 @@ def test_a_target_that_no_file_meets_leaves_page_and_nearest_file(few_steps, tmp
     assert not (tmp_path / "out" / "compressed.spz").exists()
     assert "No file meets" in (tmp_path / "out" / "compress.html").read_text()
     assert detect(tmp_path / "out" / "trials" / "keep_100_degree_0_balanced.spz").name == "SPZ"
+
+
+def test_the_file_of_an_earlier_target_goes_where_none_meets_the_new_one(few_steps, tmp_path):
+    ask = {"out": tmp_path / "out", "format": "spz", "keep": [1.0]}
+    clsplat.compress_model(few_steps, target="1MB", **ask)
+    assert (tmp_path / "out" / "compressed.spz").is_file()
+    with pytest.raises(ConfigError, match=r"no file meets it; the nearest, .*_degree_0_balanced\.spz"):
+        clsplat.compress_model(few_steps, target="2B", **ask)
+    assert not (tmp_path / "out" / "compressed.spz").exists()
 
 
 def test_what_spz_loses_is_said_once_for_a_search(few_steps, tiny_scene, tmp_path, caplog):

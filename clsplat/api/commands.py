@@ -54,16 +54,21 @@ def describe_run(
 
 
 def resume(
-    folder: PathLike, *, set: Overrides = (), device: "str | Device | None" = None, live: int | None = None
+    folder: PathLike,
+    scene: PathLike | None = None,
+    *,
+    set: Overrides = (),
+    device: "str | Device | None" = None,
+    live: int | None = None,
 ) -> Path:
     """Go on with a run, or a matrix, from its newest checkpoint, as `clsplat resume` does; return the run folder.
 
-    live: as for `run`.
+    scene: where its photographs are, if they have moved; live: as for `run`.
     """
     from clsplat.runs.experiment import Job
 
     load_plugins()
-    job = Job.resume(Path(folder), overrides(set))
+    job = Job.resume(Path(folder), path_of(scene), overrides(set))
     job.run(device, live)
     return job.out
 

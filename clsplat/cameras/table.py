@@ -7,7 +7,7 @@ from pathlib import Path
 
 from clsplat.cameras import colmap, inria, nerfstudio
 from clsplat.cameras.posed import IMAGES, Posed, image_files, posed
-from clsplat.errors import ConfigError, quoted
+from clsplat.errors import ConfigError, DataError, quoted
 from clsplat.files import atomic, is_there
 from clsplat.progress import counted
 from clsplat.reading import opened
@@ -29,6 +29,7 @@ PLACES = {  # that each writes
     "nerfstudio": [Path(nerfstudio.FILE), Path(nerfstudio.POINTS)],
     "inria": [Path(inria.FILE)],
 }
+UNDISTORTED = ("inria",)  # formats of cameras without lenses
 COPIES = ("none", "copy")  # of the photographs
 SPLIT = "nerfstudio"  # what keeps it
 
@@ -50,6 +51,11 @@ def write_cameras(scene: Scene, out: Path, format_: str, images: str = "none", o
         if value not in known:
             raise ConfigError(f"no {what} {quoted(value)}; there are {', '.join(known)}")
     views = checked(scene, format_)
+    if images == "copy" and format_ in UNDISTORTED and any(one.view.lens is not None for one in views):
+        raise DataError(
+            f"{scene.path}: {format_} holds cameras of undistorted photographs, and these are distorted; "
+            "`clsplat data undistort` first, or write the cameras alone"
+        )
     copies = image_files(views, out / IMAGES) if images == "copy" else {}
     for path in () if over else (*(out / place for place in PLACES[format_]), *copies):
         if is_there(path):

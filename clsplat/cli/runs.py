@@ -41,9 +41,17 @@ def run(
         _show_summary(found)
 
 
-@command("resume", "clsplat resume runs/splat_7k", "clsplat resume runs/splat_7k --steps 14000")
+@command(
+    "resume",
+    "clsplat resume runs/splat_7k",
+    "clsplat resume runs/splat_7k --steps 14000",
+    "clsplat resume runs/splat_7k --scene moved/my_scene",
+)
 def resume(
     folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run folder, or that of a matrix.")],
+    scene: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Where its photographs are now; default: where they were.")
+    ] = None,
     device: DeviceOption = None,
     steps: Annotated[
         int | None,
@@ -57,9 +65,9 @@ def resume(
     changes = [*(set_ or ()), *([f"optimize.steps={steps}"] if steps is not None else [])]
     if dry_run:
         file = folder / "pipeline.yaml"
-        terminal.show(commands.describe_run(file, out=folder, set=changes, device=device, start="resume"))
+        terminal.show(commands.describe_run(file, scene, folder, set=changes, device=device, start="resume"))
     else:
-        _show_summary(commands.resume(folder, set=changes, device=device, live=live))
+        _show_summary(commands.resume(folder, scene, set=changes, device=device, live=live))
 
 
 def _show_summary(folder: Path) -> None:

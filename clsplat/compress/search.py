@@ -137,13 +137,14 @@ def _settings(form: Format, degree: int) -> Iterable[tuple[int, Quality]]:
 def _finished(search: Search, form: Format) -> dict[str, Any]:
     """Write the chosen file under its own name.  Raises ConfigError where there is none."""
     chosen, psnr = search.chosen, search.source.psnr
+    file = _result(search.out, form)
     if chosen is None:
+        file.unlink(missing_ok=True)  # of another target
         near = search.target.nearest(search.points)
         raise ConfigError(
             f"--target {search.target.text}: no file meets it; the nearest, {search.out / near.file}, has "
             f"{near.bytes / 1e6:.3g} MB and {near.psnr - psnr:+z.2f} dB; ask for less, or train for longer with --steps"
         )
-    file = _result(search.out, form)
     _copy(search.out / chosen.file, file)
     return {**search.data(), "file": str(file), "page": str(search.out / PAGE)}
 

@@ -44,7 +44,7 @@ class Target:
             if value > 0:
                 raise ConfigError(f"--target {quoted(text)}: a gain; {EXPECTED}")
             return cls(text.strip(), change=value)
-        if value <= 0:
+        if value * UNITS[unit] < 1:
             raise ConfigError(f"--target {quoted(text)}: {EXPECTED}")
         return cls(text.strip(), most=int(value * UNITS[unit]))
 
@@ -63,7 +63,8 @@ class Target:
 
     def nearest(self, points: Sequence[Point]) -> Point:
         """Return the file that misses the target least."""
-        return min(points, key=lambda point: point.bytes) if self.most else max(points, key=lambda point: point.psnr)
+        smallest, best = min(points, key=lambda point: point.bytes), max(points, key=lambda point: point.psnr)
+        return best if self.most is None else smallest
 
     def ends(self, rung: Sequence[Point], psnr: float) -> bool:
         """Return whether files of fewer Gaussians cannot be better: all of these fit, or none is good enough."""

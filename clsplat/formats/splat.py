@@ -14,7 +14,18 @@ import numpy as np
 from clsplat.errors import DataError
 from clsplat.formats.output import written
 from clsplat.formats.packing import beyond_bytes, tell_cut
-from clsplat.formats.splats import MAX_FILE, SH_C0, Parameters, SplatFile, Writing, logits, logs, opacities, unit
+from clsplat.formats.splats import (
+    MAX_FILE,
+    SH_C0,
+    Parameters,
+    SplatFile,
+    Writing,
+    logits,
+    logs,
+    opacities,
+    require_some,
+    unit,
+)
 from clsplat.reading import read_file
 
 LOG = logging.getLogger("clsplat")
@@ -56,7 +67,8 @@ def read_splat(path: Path) -> SplatFile:
 
 
 def write_splat(path: Path, splats: SplatFile, options: Writing) -> str:
-    """Write a `.splat` file.  Raises OutputError."""
+    """Write a `.splat` file.  Raises DataError for a model without Gaussians, OutputError."""
+    require_some(path, splats)
     p = splats.parameters
     alpha = opacities(p["logit_opacity"])
     volume = p["log_scales"].astype(np.float64).sum(axis=1)

@@ -204,4 +204,4 @@ def require_held(path: Path, held: int, expected: int, what: str) -> None:
 def require_some(path: Path, splats: SplatFile) -> None:
     """Raise DataError for a model without Gaussians, which most formats do not know."""
     if not len(splats):
-        raise DataError(f"{path}: the model holds no Gaussians; a PLY alone can hold none")
+        raise DataError(f"{path}: the model holds no Gaussians; a PLY can hold none")

@@ -56,7 +56,7 @@ def write_usda(path: Path, splats: SplatFile, options: Writing) -> str:
 def _array(file: Output, name: str, table: NDArray[np.floating]) -> None:
     """One attribute, with as many digits as float32 has."""
     width = table.shape[1]
-    row = ", ".join(["%.8g"] * width) if width == 1 else f"({', '.join(['%.8g'] * width)})"
+    row = ", ".join(["%.9g"] * width) if width == 1 else f"({', '.join(['%.9g'] * width)})"
     file.write(f"    {name} = [".encode())
     for start in range(0, len(table), BLOCK):
         block = table[start : start + BLOCK].astype(np.float32)

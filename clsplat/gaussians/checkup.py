@@ -87,6 +87,8 @@ def verdict(found: dict[str, Any]) -> str:
     """Return a sentence about what `examine` found."""
     if found["valid"]:
         return f"{found['model']}: valid"
+    if not found["gaussians"]:
+        return f"{found['model']}: it holds no Gaussians; export it again"
     remedy = (
         "write it again" if found["format"] == "streamed SOG" else "export it again, or mend it with `clsplat convert`"
     )

@@ -18,7 +18,8 @@ LOG = logging.getLogger("clsplat")
 LOOPBACK = "127.0.0.1"
 PORT, TRIED = 8710, 20  # the first port that is tried where none is given, and how many
 CONNECTIONS = 32  # at a time; browsers keep six
-IDLE = 15.0  # seconds until a connection that says nothing is closed
+IDLE = 15.0  # seconds until a connection that asks for nothing more is closed
+HEAD = 2.0  # seconds that the beginning of a request, and each line of it, may take
 RATE, BURST = 30.0, 120.0  # answers a second, and at once after a rest: a page opens with many small pictures
 POLL = 0.1  # seconds until the server sees that it is to stop
 
@@ -105,7 +106,7 @@ class _Connection(socketserver.StreamRequestHandler):
     """One connection: requests one after the other."""
 
     server: Server
-    timeout = IDLE
+    timeout = HEAD
     disable_nagle_algorithm = True
 
     def handle(self) -> None:
@@ -114,6 +115,7 @@ class _Connection(socketserver.StreamRequestHandler):
                 self.server.paced()
                 answer = self._answer(head)
                 self.wfile.write(answer.bytes())
+                self.connection.settimeout(IDLE)
                 if answer.status in (400, 405, 431):  # what follows may be a body
                     return
         except OSError:  # it was closed, or says nothing
@@ -129,6 +131,8 @@ class _Connection(socketserver.StreamRequestHandler):
 
     def _head(self) -> bytes | None:
         """The lines up to the empty one, or more than LONGEST bytes; None at the end."""
+        self.rfile.peek(1)  # type: ignore[attr-defined]
+        self.connection.settimeout(HEAD)
         head = b""
         while len(head) <= LONGEST:
             line = self.rfile.readline(LONGEST + 1 - len(head) + 1)

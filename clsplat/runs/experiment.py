@@ -64,13 +64,16 @@ class Job:
         return cls(checked, out or free_folder(Path("runs") / checked.settings.name, checked, start), start)
 
     @classmethod
-    def resume(cls, out: Path, overrides: Sequence[str] = ()) -> "Job":
-        """Take the pipeline that a run folder holds, to go on with it there.  Raises ConfigError or DataError."""
+    def resume(cls, out: Path, scene: Path | None = None, overrides: Sequence[str] = ()) -> "Job":
+        """Take the pipeline that a run folder holds, to go on with it there.  Raises ConfigError or DataError.
+
+        scene: where its photographs are; default: where they were.
+        """
         file = out / PIPELINE
         if not file.is_file():
             again = f"; give its `clsplat run … --out {out} --resume` again" if (out / STATUS).is_file() else ""
             raise DataError(f"{out}: has no pipeline.yaml; expected the folder of a run that has begun{again}")
-        return cls.open(str(file), None, out, overrides, "resume")
+        return cls.open(str(file), scene, out, overrides, "resume")
 
     def describe(self, device: str | Device | None = None) -> str:
         """What would run, as lines of text.  Raises what `run` raises before it begins."""
@@ -94,6 +97,9 @@ class Job:
         start = start_of(self.work, planned, self.out, self.start)
         if start is None:
             LOG.info("%s: up to date; change a setting, or give another folder, to run again", self.out)
+        elif start == "resume" and not (folder := self.work.settings.scene.folder).exists():
+            remedy = f"`clsplat resume {self.out} --scene DIR` says where they are now"
+            raise DataError(f"{self.out}: the folder of its photographs, {folder}, is missing; {remedy}")
         else:
             run_pipeline(self.work, self.out, device, start, live)
 

@@ -1,5 +1,6 @@
 """Films of models: along a path, beside photographs or another model."""
 
+import logging
 import time
 from dataclasses import dataclass
 from functools import lru_cache
@@ -7,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from clsplat.conformance.quick import open_correct
-from clsplat.errors import ConfigError
+from clsplat.errors import ConfigError, DataError
 from clsplat.gaussians.model import Model, load
 from clsplat.opencl.device import Device
 from clsplat.progress import counted
@@ -24,6 +25,7 @@ from clsplat.video.paths import nearest
 from clsplat.video.pictures import Canvas, Image, letterboxed
 from clsplat.views.photographs import BACKGROUNDS, Photographs
 
+LOG = logging.getLogger("clsplat")
 PHOTOGRAPH = "photograph"  # what can stand beside a picture; else a model
 
 
@@ -98,7 +100,13 @@ def _scene(model: Path, scene: Path | None, loaded: Model, downscale: float | No
     """The scene of a model at the size of its run; None where none is known and none is needed."""
     if not needed and scene is None and not has_pipeline(model):
         return None
-    source = Source.of(model, scene)
+    try:
+        source = Source.of(model, scene)
+    except DataError as error:
+        if needed or scene is not None:
+            raise
+        LOG.warning("%s; without it: the background and the size are those of the model and the path", error)
+        return None
     return source.scene(loaded).downscaled(source.settings.downscale if downscale is None else downscale)
 
 

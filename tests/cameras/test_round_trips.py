@@ -157,6 +157,14 @@ def test_cameras_json_holds_the_undistorted_cameras(model, scene_of, tmp_path, c
     np.testing.assert_allclose(np.array(first["rotation"])[:, 2], scene.views[0].world_to_camera[2, :3])
 
 
+def test_distorted_photographs_are_not_copied_beside_undistorted_cameras(scene_of, tmp_path):
+    with pytest.raises(DataError, match=r"inria holds cameras of undistorted photographs, .*`clsplat data undistort`"):
+        clsplat.write_cameras(scene_of("OPENCV"), tmp_path / "a", "inria", images="copy")
+    assert not (tmp_path / "a").exists()
+    clsplat.write_cameras(scene_of("PINHOLE"), tmp_path / "b", "inria", images="copy")
+    assert (tmp_path / "b/images/right/4.png").is_file()
+
+
 FAULTS = {
     "a table": (lambda d: {"frames": d}, "expected a list of 1 to"),
     "nothing": (lambda d: [], "expected a list of 1 to"),

@@ -299,6 +299,14 @@ def test_check_sees_activations_that_were_applied_already(table, values, words, 
     assert [text for text in checked(tmp_path, model)["findings"] if words in text]
 
 
+@pytest.mark.parametrize("name", ["a.splat", "a.spz", "a.sog", "a.glb", "a.usda"])
+def test_a_format_that_knows_no_empty_model_refuses_one(name, tmp_path, rng):
+    with pytest.raises(DataError, match="the model holds no Gaussians; a PLY can hold none"):
+        write(tmp_path / name, splats(rng, 0))
+    write(tmp_path / "a.ply", splats(rng, 0))
+    assert verdict(clsplat.check(tmp_path / "a.ply")).endswith("it holds no Gaussians; export it again")
+
+
 def test_bright_colours_are_coefficients(tmp_path, rng):
     """All above grey, but beyond what a colour can be."""
     model = splats(rng, 60)

@@ -207,7 +207,7 @@ def test_a_cut_glb_is_refused(tmp_path, rng):
 
 def test_openusd_holds_every_number(tmp_path, rng):
     """Read back by splitting: a viewer of OpenUSD sees these values."""
-    source = splats(rng, 7, 1)
+    source = splats(rng, 700, 1)
     write(tmp_path / "a.usda", source)
     lines = (tmp_path / "a.usda").read_text().splitlines()
     assert lines[0] == "#usda 1.0"
@@ -223,9 +223,9 @@ def test_openusd_holds_every_number(tmp_path, rng):
     np.testing.assert_allclose(tables["scales"], np.exp(p["log_scales"]), rtol=1e-6)
     np.testing.assert_allclose(tables["opacities"], opacities(p["logit_opacity"])[:, 0], rtol=1e-6)
     np.testing.assert_allclose(tables["orientations"], unit(p["quats"]) * [1, 1, -1, -1], atol=1e-6)
-    harmonics = tables["radiance:sphericalHarmonicsCoefficients"].reshape(7, 4, 3)
+    harmonics = tables["radiance:sphericalHarmonicsCoefficients"].reshape(700, 4, 3)
     np.testing.assert_array_equal(harmonics[:, 0], p["sh_base"])
-    np.testing.assert_array_equal(harmonics[:, 1:], p["sh_rest"].reshape(7, 3, 3) * np.float32([[-1], [-1], [1]]))
+    np.testing.assert_array_equal(harmonics[:, 1:], p["sh_rest"].reshape(700, 3, 3) * np.float32([[-1], [-1], [1]]))
     assert (tables["extent"][0] < tables["positions"].min(axis=0)).all()
     with pytest.raises(DataError, match="OpenUSD is written, not read"):
         read(tmp_path / "a.usda")

@@ -52,6 +52,20 @@ def test_a_path_of_a_file_needs_no_scene(few_steps, tmp_path):
         clsplat.render_path(model, video=tmp_path / "a.webm")
 
 
+def test_a_path_of_a_file_needs_no_photographs_of_the_run(few_steps, tiny_scene, tmp_path, caplog):
+    clsplat.render_path(few_steps, video=None, out=tmp_path / "o", frames=2, save_path=tmp_path / "p.json")
+    shutil.copytree(few_steps, tmp_path / "run")
+    pipeline = tmp_path / "run" / "pipeline.yaml"
+    pipeline.write_text(pipeline.read_text().replace(str(tiny_scene), str(tmp_path / "gone")))
+    told = clsplat.render_path(
+        tmp_path / "run", video=None, out=tmp_path / "a", path=str(tmp_path / "p.json"), size="32x32"
+    )
+    assert told["frames"] == 2
+    assert f"the folder of its photographs, {tmp_path / 'gone'}, is missing" in caplog.text
+    with pytest.raises(DataError, match="is missing; give the folder of a scene"):
+        clsplat.render_path(tmp_path / "run", video=None, out=tmp_path / "b")
+
+
 def test_the_pictures_of_a_film_stand_alone(few_steps, tiny_scene, tmp_path):
     out, options = tmp_path / "out", {"video": None, "out": tmp_path / "out", "size": (16, 16)}
     clsplat.render_path(few_steps, **options, frames=5, depth=True)
