@@ -1,6 +1,7 @@
 """Models, of files or run folders, on one page to walk through."""
 
 import logging
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -43,6 +44,8 @@ def view(
         raise ConfigError(f"--splats {splats}: expected a number of at least 1")
     if photographs not in ("none", "test", "all"):
         raise ConfigError(f"no photographs '{photographs}'; there are none, test and all")
+    if not 0 <= photograph_budget < math.inf:
+        raise ConfigError(f"--photograph-budget {photograph_budget:g}: expected MB, a finite number of at least 0")
     source = next((Source.of(path, scene) for path in models if scene is not None or run_of(path)), None)
     if photographs == "all" and source is None:
         raise ConfigError("--photographs all needs the photographs of a scene; give --scene, or a run folder")

@@ -163,6 +163,9 @@ def test_errors_of_the_function(run, tmp_path, monkeypatch):
         clsplat.view()
     with pytest.raises(ConfigError, match="no photographs 'some'; there are none, test and all"):
         clsplat.view(run, out=tmp_path / "a.html", photographs="some")
+    for budget in (float("inf"), float("nan"), -1.0):
+        with pytest.raises(ConfigError, match=rf"--photograph-budget {budget:g}: expected MB, a finite number"):
+            clsplat.view(run, out=tmp_path / "a.html", photograph_budget=budget)
     alone = shutil.copy(run / "point_cloud.ply", tmp_path)
     with pytest.raises(ConfigError, match="--photographs all needs the photographs of a scene; give --scene"):
         clsplat.view(alone, out=tmp_path / "a.html", photographs="all")

@@ -54,6 +54,10 @@ def test_names_are_escaped(page):
     assert re.fullmatch(r"[\w.-]+", info["file"])
 
 
+def test_the_help_names_the_gestures_of_fingers_too(page):
+    assert "double click it · double tap it" in page.text()
+
+
 def test_only_the_script_and_style_of_the_package_may_run(page):
     text = page.text()
     policy = re.search(r'Content-Security-Policy" content="([^"]*)"', text).group(1)
