@@ -60,7 +60,7 @@ def view(
     views = described(found, read, photographs, photograph_budget) if found else []
     start = (found.split("test") or found.views)[0] if found else None
     stand = Stand.of(first.means, found.views if found else (), start)
-    title = " and ".join(loaded) + (f" · {found.path.name}" if found else "")
+    title = " and ".join(loaded) + (f" · {source.scene_name}" if source else "")
     if found is None:
         LOG.info("without a scene up is -y; give --scene where the picture stands on its head")
     Page(title, {name: pack(model, splats) for name, model in loaded.items()}, stand, background, views).write(out)

@@ -1,5 +1,6 @@
 """The stage of pipelines, the command and the function: the same pages, errors in one line."""
 
+import json
 import re
 import shutil
 from pathlib import Path
@@ -13,6 +14,7 @@ from clsplat.errors import ConfigError, DataError, OutputError
 from clsplat.pipeline.files import shipped
 from clsplat.pipeline.loading import load
 from clsplat.runs.viewing import names
+from clsplat.scene.detect import read_scene
 from clsplat.stages.viewer import Viewer
 from clsplat.viewer import page as module
 from tests.html_page import Page
@@ -41,6 +43,31 @@ def test_a_run_writes_a_viewer_and_its_report_leads_to_it(run):
     assert viewer.count('"photograph":null') == 8, "training views have a thumbnail alone"
     assert '<a class="viewer" href="viewer.html">' in report
     assert Page(report).elements["a"] == 2, "the viewer and the model"
+
+
+def test_titles_name_the_folder_that_the_user_gave(run, tiny_scene, tmp_path, monkeypatch):
+    """Not that of the prepared photographs, whose name is a hash."""
+    prepared = shutil.copytree(tiny_scene, tmp_path / "undistort-f22e16004ac0")
+    copy = shutil.copytree(run, tmp_path / "castle_run")
+    (copy / "prepared.json").write_text(json.dumps({"inputs": "f22e", "folder": str(prepared)}))
+    assert f"<title>castle_run · {tiny_scene.name}</title>" in clsplat.view(copy, out=tmp_path / "a.html").read_text()
+    given = clsplat.view(copy, scene=prepared, out=tmp_path / "b.html").read_text()
+    assert f"<title>castle_run · {prepared.name}</title>" in given, "what is given is what is named"
+    monkeypatch.setattr("clsplat.runs.scenes.read_scene", lambda folder, holdout: read_scene(prepared, holdout))
+    out = clsplat.run("smoke", tiny_scene, tmp_path / "run", set=SHORT)
+    assert f"<title>smoke · {tiny_scene.name}</title>" in (out / "viewer.html").read_text()
+    assert f"<title>{tiny_scene.name}</title>" in (out / "report.html").read_text()
+
+
+def test_the_report_leads_to_files_of_one_name_in_several_folders(tiny_scene, tmp_path):
+    steps = [stage for stage in load("smoke").resolved()["stages"] if "render" not in stage]
+    at = next(i for i, stage in enumerate(steps) if "export" in stage)
+    steps[at : at + 1] = [{"export": {"file": f"{folder}/model.ply"}} for folder in ("a", "b")]
+    (tmp_path / "two.yaml").write_text(json.dumps({"name": "two", "stages": steps}))
+    report = (clsplat.run(tmp_path / "two.yaml", tiny_scene, tmp_path / "run", set=SHORT) / "report.html").read_text()
+    assert re.findall(r'<a href="([^"]*)">([^<]*)</a>', report) == [
+        (f"{at}/model.ply", f"{at}/model.ply") for at in "ab"
+    ]
 
 
 def test_the_stage_and_the_command_show_the_same(run, tmp_path):
