@@ -95,7 +95,7 @@ def test_lines_of_runs_with_one_seed_are_told_apart_by_their_folders(make_run, t
     alike = page_of(tmp_path, tmp_path / "first", tmp_path / "again" / "first")
     assert f">A {tmp_path}/first</tspan>" in alike
     assert f">A {tmp_path}/again/first (dashed)</tspan>" in alike
-    assert "PSNR of training views, mean of the last 5, over steps, dB" in alike
+    assert "training PSNR over steps, mean of 5 views, dB" in alike
 
 
 def test_another_scene_or_size_is_another_table(make_run, tiny_scene, tmp_path):

@@ -130,7 +130,7 @@ def _curves(rows: Sequence[Row]) -> list[Markup]:
     drawings = [
         curve("test PSNR over steps, dB", lines("evaluate", "psnr", split="test", downscale=downscale)),
         curve(
-            f"PSNR of training views, mean of the last {VIEWS}, over steps, dB",
+            f"training PSNR over steps, mean of {VIEWS} views, dB",
             [over_all_views(line) for line in lines("train", "psnr")],
         ),
         curve("Gaussians over steps", lines("train", "gaussians")),
