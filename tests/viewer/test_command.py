@@ -148,6 +148,33 @@ def test_a_page_over_an_earlier_one_says_so(run, tmp_path):
     assert "a.html: replaced; 0." in command(*words)
 
 
+def test_models_of_different_scenes_are_told(run, tiny_scene, tmp_path):
+    other, same = (shutil.copytree(run, tmp_path / name) for name in ("other", "same"))
+    text = (other / "pipeline.yaml").read_text()
+    (other / "pipeline.yaml").write_text(text.replace(str(tiny_scene), str(tmp_path / "kitchen")))
+    for_all = ["--out", tmp_path / "a.html"]
+    done = CliRunner().invoke(app, [str(word) for word in ("view", run, other, *for_all)])
+    warning = (
+        f"run is of {tiny_scene}, other of {tmp_path / 'kitchen'}: both stand before the cameras of {tiny_scene.name}"
+    )
+    assert warning in done.output.replace("\n", ""), done.output
+    for models in ([run, same], [run]):
+        assert "both stand" not in CliRunner().invoke(app, [str(word) for word in ("view", *models, *for_all)]).output
+
+
+def test_no_page_takes_the_place_of_another_file_of_a_run(run, tmp_path):
+    copy = shutil.copytree(run, tmp_path / "copy")
+    before = (copy / "report.html").read_bytes()
+    (copy / "own.html").write_text("<html></html>")
+    for name in ("report.html", "own.html"):
+        with pytest.raises(ConfigError, match=rf"{name}: is a file of a run; give another name"):
+            clsplat.view(copy, out=copy / name)
+    assert (copy / "report.html").read_bytes() == before
+    for name in ("viewer.html", "new.html", "new.html"):
+        clsplat.view(copy, out=copy / name, photographs="none")
+    assert (copy / "viewer.html").read_bytes() != (run / "viewer.html").read_bytes()
+
+
 def test_which_way_is_up_is_said_where_no_view_tells(run, tmp_path):
     for_all = ["--out", tmp_path / "a.html"]
     assert "up is -y; give --scene" in command("view", shutil.copy(run / "point_cloud.ply", tmp_path), *for_all)
