@@ -211,9 +211,15 @@ def check_result(path: Path, suffix: str) -> None:
     """Raise ConfigError where a command would write a file of another kind, or over a file of a run."""
     if path.suffix.lower() != suffix:
         raise ConfigError(f"{path}: expected the name of a file that ends in {suffix}")
+    if path.name != COMPARISON:
+        check_no_file_of_a_run(path)
+
+
+def check_no_file_of_a_run(path: Path) -> None:
+    """Raise ConfigError where a command would write over a file of a run."""
     folder = path.absolute().parent
     run = next((one for one in (folder, *folder.parents) if any((one / n).is_file() for n in (PIPELINE, STATUS))), None)
-    if run and is_there(path) and path.name != COMPARISON:
+    if run and is_there(path):
         raise ConfigError(f"{path}: is a file of a run; give another name")
 
 

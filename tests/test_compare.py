@@ -85,6 +85,19 @@ def test_seeds_are_one_row_with_mean_and_deviation(make_run, tmp_path):
     assert "LPIPS" not in page, "it was not measured"
 
 
+def test_lines_of_runs_with_one_seed_are_told_apart_by_their_folders(make_run, tmp_path):
+    names = re.findall(r">(A [^<]+)</tspan>", page_of(tmp_path, make_run("first"), make_run("second")))
+    assert set(names) == {"A first", "A second (dashed)"}
+    seeds = re.findall(r">(A [^<]+)</tspan>", page_of(tmp_path, make_run("third", "seed=1"), tmp_path / "first"))
+    assert set(seeds) == {"A seed 0", "A seed 1 (dashed)"}
+    (tmp_path / "again").mkdir()
+    shutil.copytree(tmp_path / "first", tmp_path / "again" / "first")
+    alike = page_of(tmp_path, tmp_path / "first", tmp_path / "again" / "first")
+    assert f">A {tmp_path}/first</tspan>" in alike
+    assert f">A {tmp_path}/again/first (dashed)</tspan>" in alike
+    assert "training PSNR over steps, mean of 5 views, dB" in alike
+
+
 def test_another_scene_or_size_is_another_table(make_run, tiny_scene, tmp_path):
     shutil.copytree(tiny_scene, tmp_path / "second")
     one, two = make_run("one", psnr=20), make_run("two", f"scene.path='{tmp_path / 'second'}'", psnr=30)

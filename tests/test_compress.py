@@ -1,6 +1,7 @@
 """`clsplat compress`: what a target is, how far the search goes, and what it leaves."""
 
 import json
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -128,12 +129,22 @@ def test_the_page_shows_every_file_and_the_curve(searched):
     Page(text)
 
 
+def test_the_page_names_the_scene_and_leads_to_the_file(searched, few_steps, tiny_scene):
+    text = (searched / "compress.html").read_text()
+    assert f"<title>{tiny_scene.name} · point_cloud.ply, compressed to " in text
+    assert str(few_steps / "point_cloud.ply") in text
+    assert '<a href="compressed.sog">compressed.sog</a>' in text
+    before = page(Target.of("-1dB"), point(2000, 31), [point(900, 30.5)], None, "test", "fox", "a.ply")
+    assert "<a" not in before, "as long as none is written"
+
+
 def test_names_of_files_are_escaped():
     source = point(2000, 31)
-    text = page(Target.of("-1dB"), source, [point(900, 30.5)], None, "test")
+    text = page(Target.of("-1dB"), source, [point(900, 30.5)], None, "test", "a<b>", "a<b>.ply")
     assert "a<b>" not in text
     assert "a&lt;b&gt;" in text
     assert "No file meets the target" in text
+    assert re.findall(r'<polyline[^>]* stroke="([^"]+)"[^>]*dasharray', text) == ["var(--target)"]
 
 
 def test_the_same_search_again_trains_nothing_and_gives_the_same_bytes(searched, few_steps):

@@ -21,6 +21,10 @@ SOURCES = sorted(Path(package.__file__).parent.rglob("*.py"))
 PAGES = ("report", "compare", "compress", "inspect", "notebook", "doctor", "viewer", "live")
 FOLDER = Path(package.__file__).parent / "pages" / "templates"
 DRAWINGS = {"clsplat/pages/svg.py", "clsplat/pages/plan.py", "clsplat/bench/table.py"}  # SVG, escaped there
+STATES = ("good", "warn", "bad", "note")  # colours of text with papers of their own
+WITHOUT_TEXT = {  # a background, or text on one that another rule or the page's data fix
+    *("td.bar i", "button.grown", ".slider::after", ".space canvas", ".space button:hover", ".space output", ".chip"),
+}
 TAG = re.compile(r"</?(html|head|body|p|div|span|table|t[rdh]|h\d|ul|li|a|b|i|br|img|pre|figure|svg|style|script)[\s>]")
 
 
@@ -39,6 +43,43 @@ def test_html_stands_in_templates_only(path):
     for line, text in strings(path):
         assert not TAG.search(text), f"{name}:{line}: HTML belongs into clsplat/pages/templates"
     assert "html.escape" not in path.read_text(), f"{name}: templates escape what they show"
+
+
+def luminance(colour: str) -> float:
+    """Of #rgb or #rrggbb, as WCAG has it."""
+    digits = colour[1:] if len(colour) == 7 else "".join(2 * digit for digit in colour[1:])
+    parts = [int(digits[i : i + 2], 16) / 255 for i in (0, 2, 4)]
+    linear = [part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in parts]
+    return sum(weight * part for weight, part in zip((0.2126, 0.7152, 0.0722), linear, strict=True))
+
+
+@pytest.mark.parametrize("mode", ["light", "dark"])
+def test_text_can_be_read_on_its_paper(mode):
+    light, dark = re.findall(r":root \{(.*?)\}", (FOLDER / "base.css").read_text(), re.DOTALL)
+    found = [dict(re.findall(r"--([\w-]+): (#\w+)", text)) for text in (light, dark)]
+    assert found[0].keys() == found[1].keys(), "a colour of one mode alone"
+    colours = found[mode == "dark"]
+    on_paper = [(text, "paper") for text in ("ink", "soft", "link", "good", "warn", "bad")]
+    for text, paper in [
+        *on_paper,
+        ("ink", "card"),
+        *((name, f"{name}-paper") for name in STATES),
+        ("ink", "note-paper"),
+    ]:
+        dark, light = sorted((luminance(colours[text]), luminance(colours[paper])))
+        assert (light + 0.05) / (dark + 0.05) >= 4.5, f"{text} on {paper}"
+
+
+@pytest.mark.parametrize(
+    "path", [path for path in FOLDER.iterdir() if path.suffix in (".css", ".j2")], ids=lambda p: p.name
+)
+def test_colours_of_text_and_paper_follow_the_mode(path):
+    """Where one of both is fixed, so is the other: the page's own is dark or light."""
+    text = path.read_text()
+    style = text if path.suffix == ".css" else "".join(re.findall(r"block style %\}(.*?)\{% endblock", text, re.DOTALL))
+    for names, rule in re.findall(r"([^{}]+)\{([^{}]*)\}", style):
+        fixed = {key for key in ("color", "background") if re.search(rf"(?<![-\w]){key}:[^;]*#\w", rule)}
+        assert len(fixed) != 1 or names.strip() in WITHOUT_TEXT, f"{names.strip()}: one fixed colour"
 
 
 def test_one_place_marks_text_as_safe():

@@ -14,6 +14,7 @@ from clsplat.compare.differences import differing, flat
 from clsplat.compare.run_folder import RunFolder, read_settings
 from clsplat.errors import ConfigError, DataError
 from clsplat.names import PIPELINE
+from clsplat.pages.page import scene_name
 from clsplat.pages.svg import COLOURS
 
 MAX_SETTINGS = 3  # differing ones in a variant's name
@@ -135,7 +136,7 @@ def _scene_names(runs: Sequence[RunFolder]) -> list[str]:
     names = []
     for run in runs:
         size = f" at 1/{run.scene.downscale:g}" if run.scene.downscale != 1 else ""
-        names.append(f"{Path(run.scene.path or 'scene').name}{size}")
+        names.append(f"{scene_name(run.scene.path or 'scene')}{size}")
     return [
         name if names.count(name) == 1 else f"{name} {json.dumps(run.scene.model_dump(exclude_defaults=True))}"
         for name, run in zip(names, runs, strict=True)

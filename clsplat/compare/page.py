@@ -3,7 +3,7 @@
 import logging
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean
 from urllib.parse import quote
@@ -18,6 +18,7 @@ from clsplat.errors import ConfigError, DataError
 from clsplat.files import write_text
 from clsplat.pages.page import charts, counted, embedded, render
 from clsplat.pages.svg import Line, curve
+from clsplat.training.forecast import VIEWS, over_views
 
 LOG = logging.getLogger("clsplat")
 MAX_NAMES = 4  # of pipelines, in the title
@@ -114,21 +115,41 @@ def _curves(rows: Sequence[Row]) -> list[Markup]:
     """PSNR and Gaussians over steps, a line for each run; then quality over image sizes."""
 
     def lines(kind: str, figure: str, **where: object) -> list[Line]:
-        found = [(row, run, run.points(kind, figure, **where)) for row in rows for run in row.runs]
-        return [Line(points, _seed(row, run), row.variant.colour) for row, run, points in found if len(points) > 1]
+        return [
+            Line(points, name, row.variant.colour, i)
+            for row in rows
+            for i, (run, name) in enumerate(zip(row.runs, _names(row), strict=True))
+            if len(points := run.points(kind, figure, **where)) > 1
+        ]
+
+    def over_all_views(line: Line) -> Line:
+        steps, psnrs = zip(*line.points, strict=True)
+        return replace(line, points=list(zip(steps, over_views(psnrs), strict=True)))
 
     downscale = rows[0].runs[0].scene.downscale
     drawings = [
         curve("test PSNR over steps, dB", lines("evaluate", "psnr", split="test", downscale=downscale)),
-        curve("PSNR of single training views over steps, dB", lines("train", "psnr")),
+        curve(
+            f"training PSNR over steps, mean of {VIEWS} views, dB",
+            [over_all_views(line) for line in lines("train", "psnr")],
+        ),
         curve("Gaussians over steps", lines("train", "gaussians")),
     ]
     return charts(drawings + _size_charts(rows, "test") + _size_charts(rows, "train"))
 
 
-def _seed(row: Row, run: RunFolder) -> str:
-    """The name of a line where its variant has several seeds."""
-    return f"{row.variant.letter} seed {run.metrics.seed}" if len(row.runs) > 1 else ""
+def _names(row: Row) -> list[str]:
+    """The names of a row's lines where it has several runs: their seeds, or the folders of runs with one seed."""
+    runs = row.runs
+    if len(runs) == 1:
+        return [""]
+    choices = (
+        [f"seed {run.metrics.seed}" for run in runs],
+        [run.path.resolve().name for run in runs],
+        [str(run.path) for run in runs],
+    )
+    names = next((names for names in choices if len(set(names)) == len(runs)), choices[-1])
+    return [f"{row.variant.letter} {name}" for name in names]
 
 
 def _size_charts(rows: Sequence[Row], split: str) -> list[str]:

@@ -35,12 +35,22 @@ def table(found: dict[str, Any]) -> str:
     return columns([[mark, *row] for mark, row in zip(marks, rows, strict=True)])
 
 
-def page(target: Target, source: Point, points: Sequence[Point], chosen: Point | None, split: str) -> str:
-    """Return the page."""
+def page(
+    target: Target,
+    source: Point,
+    points: Sequence[Point],
+    chosen: Point | None,
+    split: str,
+    scene: str,
+    model: str,
+    result: str = "",
+) -> str:
+    """Return the page on a search for a model's file; `result`: the name of the one that it wrote."""
     return render(
         "compress.html.j2",
-        title=f"{source.file}, compressed to {target.text}",
-        subtitle=f"PSNR and SSIM of {split} views, of every file as it is read back",
+        title=f"{scene} · {source.file}, compressed to {target.text}",
+        subtitle=f"{model}; PSNR and SSIM of {split} views, of every file as it is read back",
+        result=result,
         verdict=_verdict(target, source, chosen),
         curves=charts([curve("PSNR, dB, over the file's size, MB", _lines(target, source, points))]),
         headings=HEADINGS,
@@ -67,5 +77,5 @@ def _lines(target: Target, source: Point, points: Sequence[Point]) -> list[Line]
     largest = max((point.bytes for point in points), default=0) / 1e6
     if target.change is not None and points:
         level = source.psnr + target.change
-        lines.append(Line([(0, level), (largest, level)], f"target {target.text}", "#a0aec0"))
+        lines.append(Line([(0, level), (largest, level)], f"target {target.text}", "var(--target)", dash=1))
     return lines

@@ -42,6 +42,7 @@ class Search:
     question: dict[str, Any]  # what is compressed, and how
     source: Point  # the model itself
     split: str  # views that are measured
+    scene: str  # its name on pages
     points: list[Point] = field(default_factory=list)
 
     @property
@@ -60,10 +61,11 @@ class Search:
             "chosen": chosen and asdict(chosen),
         }
 
-    def write(self) -> None:
-        """Write what was measured, as JSON and as a page."""
+    def write(self, result: str = "") -> None:
+        """Write what was measured, as JSON and as a page, which leads to the file of the result."""
         write_text(self.out / RECORD, json.dumps(self.data(), indent=1) + "\n")
-        write_text(self.out / PAGE, page(self.target, self.source, self.points, self.chosen, self.split))
+        measured = self.target, self.source, self.points, self.chosen, self.split
+        write_text(self.out / PAGE, page(*measured, self.scene, self.question["model"], result))
 
 
 def compress(
@@ -98,7 +100,7 @@ def compress(
     with claimed(out, question, RECORD, "a search", "another --out"):
         tell_losses(_result(out, form), first.as_file())
         whole = Point(source.file.name, 1, first.sh_degree, "", len(first), size, *measurer.figures(first))
-        search = Search(out, wanted, question, whole, measurer.split)
+        search = Search(out, wanted, question, whole, measurer.split, source.scene_name)
         ladder = Ladder(out, Tuning("compress", source, first, steps, opened.device))
         before = 1.0
         for keep in shares:
@@ -146,6 +148,7 @@ def _finished(search: Search, form: Format) -> dict[str, Any]:
             f"{near.bytes / 1e6:.3g} MB and {near.psnr - psnr:+z.2f} dB; ask for less, or train for longer with --steps"
         )
     _copy(search.out / chosen.file, file)
+    search.write(file.name)
     return {**search.data(), "file": str(file), "page": str(search.out / PAGE)}
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.errors import ConfigError, DataError, quoted
+from clsplat.files import check_no_file_of_a_run
 from clsplat.formats.splats import MAX_DEGREE, Reading, Writing, with_degree
 from clsplat.formats.table import bytes_of, detect, for_writing
 from clsplat.gaussians.model import Model, load
@@ -90,6 +91,7 @@ def convert(
     codec = for_writing(out)
     if any(_is_same(out, model_at(source)) for source in sources):
         raise ConfigError(f"{out}: is one of the files that are read; give another name")
+    check_no_file_of_a_run(out)
     reading, writing = (options or Options()).of(sources, out)
     models = [load(source, reading) for source in sources]
     model = (changes or Changes()).of(merged(models, [str(source) for source in sources]))

@@ -48,12 +48,13 @@ class Answers:
 
     def _state(self, request: Request) -> Answer:
         desk, shown = self.desk, self.desk.shown
+        ended = desk.ended  # at one time, before the rest: who hears of the end hears how it was
         status = desk.status.now.model_dump(include=STATUS_KEYS, exclude_none=True) if desk.status else {}
         state: dict[str, Any] = {**status, "scene": shown.number if shown else 0, "drawn": desk.step}
-        state |= {"paused": desk.paused, "ended": desk.ended, "fault": desk.fault}
+        state |= {"paused": desk.paused, "ended": ended, "fault": desk.fault}
         if shown:
             state["points"] = shown.curves.after(request.number("after", 0, 1 << 40))
-        desk.told = desk.told or desk.ended
+        desk.told = desk.told or ended
         return Answer.json(state)
 
     def _scene(self, request: Request) -> Answer:

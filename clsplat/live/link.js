@@ -43,10 +43,12 @@ class Link {
     this.waiting = order;
     try {
       const answer = await fetch(`frame.jpg?page=${PAGE}&pace=${order.pace}&${order.key}`);
-      if (answer.status === 200 && order.number > this.shown) {
+      if (answer.status === 200) {
         const bitmap = await createImageBitmap(await answer.blob());
-        [this.shown, this.arrived] = [order.number, performance.now()];
-        this.live.show({...order, bitmap, step: +answer.headers.get("X-Step")});
+        if (order.number > this.shown) { // a newer one may have come while this one was decoded
+          [this.shown, this.arrived] = [order.number, performance.now()];
+          this.live.show({...order, bitmap, step: +answer.headers.get("X-Step")});
+        } else bitmap.close();
       } else if (!answer.ok) this.rest = performance.now() + AGAIN;
     } catch { this.rest = performance.now() + AGAIN; }
     if (this.waiting === order) this.waiting = null;

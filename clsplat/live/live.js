@@ -132,6 +132,7 @@ class Watch {
     find("state").textContent = this.text(state);
     find("bar").value = state.steps ? Math.min(1, state.step / state.steps) : 0;
     find("pause").disabled = !state.drawn || state.ended;
+    find("pause").hidden = state.ended;
     find("pause").textContent = state.paused ? "Resume" : "Pause";
     find("pause").classList.toggle("paused", state.paused);
     if (state.host) find("tunnel").textContent = find("tunnel").textContent.replace(/\S+$/, state.host);
@@ -149,10 +150,12 @@ class Watch {
     this.live = new Live(info, this.curves);
   }
 
-  text({state, stage, progress, step, steps, seconds_left: left, paused}) {
-    if (!state) return "Waiting for the run …";
-    const parts = [paused ? "paused" : stage && stage !== "optimize" ? stage.replaceAll("_", " ") : state];
-    if (progress && progress.unit !== "steps") {
+  text({state, stage, progress, step, steps, seconds_left: left, paused, ended}) {
+    if (!state) return ended ? "ended" : "Waiting for the run …";
+    const end = {done: "finished", failed: "failed", interrupted: "interrupted"}[state] ?? (ended && "ended");
+    const doing = paused ? "paused" : stage && stage !== "optimize" ? stage.replaceAll("_", " ") : state;
+    const parts = [end || doing];
+    if (!end && progress && progress.unit !== "steps") {
       parts.push(`${thousands(progress.done)} of ${thousands(progress.total)} ${progress.unit}`);
     }
     if (step && steps) parts.push(`step ${thousands(step)} of ${thousands(steps)}`);

@@ -98,7 +98,7 @@ class Live:
     def _enter(self, run: Run) -> None:
         desk, scene = self.desk, run.scene.downscaled(run.downscale)
         number = desk.shown.number + 1 if desk.shown else 1
-        title, test = f"{run.name} · {run.original.path.name}", scene.split("test")
+        title, test = f"{run.name} · {run.scene_name}", scene.split("test")
         points = run.original.points.positions if run.original.points else np.zeros((0, 3), np.float32)
         stand = Stand.of(points, scene.views, (test or scene.views)[0])
         data = scene_data(number, title, scene.views, {view.name for view in test}, stand)

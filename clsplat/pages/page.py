@@ -68,6 +68,11 @@ def _safe(text: str) -> Markup:
     return Markup(text)
 
 
+def scene_name(folder: str | Path) -> str:
+    """Return what pages call a scene: the user's folder, not that of what was prepared of it, which is a hash."""
+    return Path(folder).resolve().name
+
+
 def counted(count: int, word: str) -> str:
     """Return a number with its noun: `1 view`, `2 views`."""
     return f"{count:,} {word}{'s' if count != 1 else ''}"

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 WIDTH, HEIGHT = 460, 220  # px
 LEFT, BOTTOM, TOP, RIGHT = 56, 30, 26, 12
 COLOURS = ("#2b6cb0", "#c05621", "#2f855a", "#805ad5", "#b83280", "#0f8a9d", "#8a6d1b", "#4a5568")
+DASHES = (("", ""), ("7 4", "dashed"), ("2 3", "dotted"), ("9 3 2 3", "dash-dotted"))  # of a stroke, and in words
 MAX_MARKED_POINTS = 12  # of a line; a longer one shows no circles
 LEGEND_ROW, LEGEND_LETTERS = 14, 66  # px of a row; letters that fit in one, about
 
@@ -19,6 +20,7 @@ class Line:
     points: Sequence[tuple[float, float]]
     name: str = ""  # in the legend
     colour: str = ""  # by default the next one
+    dash: int = 0  # place in DASHES, for lines of one colour
 
 
 def curve(
@@ -50,20 +52,23 @@ def curve(
     parts.append(f'<text x="{LEFT}" y="15" class="title">{html.escape(title)}</text>')
     for i, row in enumerate(legend, 1):
         parts.append(f'<text x="{LEFT}" y="{15 + LEGEND_ROW * i}">{row}</text>')
-    rows = _decade_ticks(y_low, y_high) if logarithmic else _ticks(y_low, y_high)
-    for tick, label in zip(rows, _numbers([10**row if logarithmic else row for row in rows]), strict=True):
+    counts = not logarithmic and _are_whole(ys)
+    rows = _decade_ticks(y_low, y_high) if logarithmic else _ticks(y_low, y_high, counts)
+    for tick, label in zip(rows, _numbers([10**row if logarithmic else row for row in rows], counts), strict=True):
         _, y = place(x_low, tick)
         parts.append(f'<line x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{y:.1f}" y2="{y:.1f}" class="grid"/>')
         parts.append(f'<text x="{LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">{label}</text>')
-    columns = _ticks(x_low, x_high)
-    for tick, label in (ticks or dict(zip(columns, _numbers(columns), strict=True))).items():
+    steps = _are_whole(xs)
+    columns = _ticks(x_low, x_high, steps)
+    for tick, label in (ticks or dict(zip(columns, _numbers(columns, steps), strict=True))).items():
         x, _ = place(tick, y_low)
         parts.append(f'<text x="{x:.1f}" y="{HEIGHT - 10}" text-anchor="middle">{html.escape(label)}</text>')
     for i, line in enumerate(drawn):
-        colour = _colour(line, i)
+        colour, (dash, _) = _colour(line, i), _dash(line)
+        dashed = f' stroke-dasharray="{dash}"' if dash else ""
         places = [place(*point) for point in line.points]
         path = " ".join(f"{x:.1f},{y:.1f}" for x, y in places)
-        parts.append(f'<polyline points="{path}" fill="none" stroke="{colour}" stroke-width="1.8"/>')
+        parts.append(f'<polyline points="{path}" fill="none" stroke="{colour}" stroke-width="1.8"{dashed}/>')
         if len(places) <= MAX_MARKED_POINTS:
             parts += [f'<circle cx="{x:.1f}" cy="{y:.1f}" r="2.6" fill="{colour}"/>' for x, y in places]
     return "".join([*parts, "</svg>"])
@@ -80,8 +85,8 @@ def histogram(title: str, values: Sequence[float], bins: int = 24) -> str:
     width, height = WIDTH - LEFT - RIGHT, HEIGHT - BOTTOM - TOP
     parts = [f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{html.escape(title)}">']
     parts.append(f'<text x="{LEFT}" y="15" class="title">{html.escape(title)}</text>')
-    rows = [tick for tick in _ticks(0, max(counts)) if tick % 1 == 0]
-    for tick, label in zip(rows, _numbers(rows), strict=True):
+    rows = _ticks(0, max(counts), whole=True)
+    for tick, label in zip(rows, _numbers(rows, whole=True), strict=True):
         y = HEIGHT - BOTTOM - tick / max(counts) * height
         parts.append(f'<line x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{y:.1f}" y2="{y:.1f}" class="grid"/>')
         parts.append(f'<text x="{LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">{label}</text>')
@@ -108,6 +113,10 @@ def _colour(line: Line, index: int) -> str:
     return line.colour or COLOURS[index % len(COLOURS)]
 
 
+def _dash(line: Line) -> tuple[str, str]:
+    return DASHES[line.dash % len(DASHES)]
+
+
 def _legend(lines: Sequence[Line]) -> list[str]:
     """Rows of names in their lines' colours; none for a single line."""
     rows: list[str] = []
@@ -115,18 +124,23 @@ def _legend(lines: Sequence[Line]) -> list[str]:
     for i, line in enumerate(lines if len(lines) > 1 else []):
         if not line.name:
             continue
-        if len(line.name) > room:
+        name = line.name + (f" ({word})" if (word := _dash(line)[1]) else "")
+        if len(name) > room:
             rows.append("")
             room = LEGEND_LETTERS
         gap = ' dx="12"' if rows[-1] else ""
-        rows[-1] += f'<tspan{gap} style="fill:{_colour(line, i)}">{html.escape(line.name)}</tspan>'
-        room -= len(line.name) + 2
+        rows[-1] += f'<tspan{gap} style="fill:{_colour(line, i)}">{html.escape(name)}</tspan>'
+        room -= len(name) + 2
     return rows
 
 
-def _ticks(low: float, high: float) -> list[float]:
-    """Three to six round numbers between low and high."""
-    rough = (high - low) / 4
+def _are_whole(values: Sequence[float]) -> bool:
+    return all(float(value).is_integer() for value in values)
+
+
+def _ticks(low: float, high: float, whole: bool = False) -> list[float]:
+    """Three to six round numbers between low and high; fewer where there are fewer whole ones."""
+    rough = max((high - low) / 4, 1.0 if whole else 0.0)
     power = 10 ** math.floor(math.log10(rough))
     step = next(power * m for m in (1, 2, 5, 10) if power * m >= rough)
     first = math.ceil(low / step - 1e-9)
@@ -140,8 +154,10 @@ def _decade_ticks(low: float, high: float) -> list[float]:
     return ticks if len(ticks) > 1 else [math.log10(tick) for tick in _ticks(10**low, 10**high)]
 
 
-def _numbers(values: Sequence[float]) -> list[str]:
-    """Labels of ticks, with the digits that tell them apart: 100k, 100.2k, not 100k twice."""
+def _numbers(values: Sequence[float], whole: bool = False) -> list[str]:
+    """Labels of ticks, with the digits that tell them apart: 100k, 100.2k, not 100k twice; whole: 8,040, not 8.04k."""
+    if whole and any(value % 100 for value in values):
+        return [f"{value:,.0f}" for value in values]
     found = [[_number(value, digits) for value in values] for digits in range(3, 10)]
     return next((labels for labels in found if len(set(labels)) == len(set(values))), found[-1])
 

@@ -8,13 +8,15 @@ from markupsafe import Markup
 from clsplat.metrics.distribution import SHARES
 from clsplat.pages.page import charts
 from clsplat.pages.svg import Line, curve
+from clsplat.training.forecast import VIEWS, over_views
 from clsplat.training.run import Run
 
 
 def training_charts(run: Run) -> list[Markup]:
     """Draw PSNR, loss, Gaussians and times over the steps."""
     train, tests = run.records.read("train"), run.records.read("evaluate")
-    line = {key: [(r["step"], r[key]) for r in train] for key in ("loss", "psnr", "gaussians", "ms")}
+    psnr = list(zip([r["step"] for r in train], over_views([r["psnr"] for r in train]), strict=True))
+    line = {key: [(r["step"], r[key]) for r in train] for key in ("loss", "gaussians", "ms")}
     measured = [
         Line(
             [(r["step"], r["psnr"]) for r in tests if r["split"] == split and r["downscale"] == run.downscale],
@@ -24,7 +26,7 @@ def training_charts(run: Run) -> list[Markup]:
     ]
     return charts(
         [
-            curve("PSNR, dB", [Line(line["psnr"], "single training views"), *measured]),
+            curve("PSNR, dB", [Line(psnr, f"training views, mean of the last {VIEWS}"), *measured]),
             curve("loss", [Line(line["loss"])], logarithmic=True),
             curve("Gaussians", [Line(line["gaussians"])]),
             curve("milliseconds per step", [Line(line["ms"])]),

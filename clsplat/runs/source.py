@@ -9,6 +9,7 @@ from clsplat.formats.table import located
 from clsplat.gaussians.model import Model
 from clsplat.gaussians.run_model import model_of_run
 from clsplat.names import PIPELINE
+from clsplat.pages.page import scene_name
 from clsplat.pipeline.file import SceneSettings
 from clsplat.pipeline.loading import Pipeline, load
 from clsplat.prepare.cache import noted
@@ -25,6 +26,7 @@ class Source:
     file: Path
     folder: Path  # of the photographs
     settings: SceneSettings  # how they are read
+    scene_name: str  # on pages
     alpha: Alpha | None = None  # None: as the model file says
 
     @classmethod
@@ -46,8 +48,10 @@ class Source:
         file = model_of_run(model) if run == model else model
         if run == model and not file.is_file():
             raise DataError(f"{model}: has no {file.name}; finish the run with `clsplat resume {model}`")
-        folder = photographs_of(scene if scene is not None else run or model)
-        return cls(file, folder, settings, settings.alpha)
+        given = scene if scene is not None else run or model
+        folder = photographs_of(given)
+        name = scene_name(settings.path if settings.path and has_pipeline(given) else folder)
+        return cls(file, folder, settings, name, settings.alpha)
 
     def scene(self, model: Model) -> Scene:
         """Read the photographs as the model was trained on, at their full size."""

@@ -1,20 +1,25 @@
 """Models, of files or run folders, on one page to walk through."""
 
 import logging
+import math
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.errors import ConfigError
+from clsplat.files import check_no_file_of_a_run
 from clsplat.gaussians.model import load
+from clsplat.names import PIPELINE
+from clsplat.pipeline.loading import load as load_pipeline
 from clsplat.runs.source import Source, run_of
 from clsplat.scene.photographs import load_photograph
 from clsplat.scene.scene import View
 from clsplat.scene.stand import Stand
 from clsplat.viewer.packing import pack
-from clsplat.viewer.page import Page
+from clsplat.viewer.page import Page, is_viewer
 from clsplat.viewer.photographs import BUDGET, Which, described
 from clsplat.views.photographs import BACKGROUNDS
 
@@ -39,13 +44,18 @@ def view(
         raise ConfigError(f"view: expected one model or two, got {len(models)}")
     if out.suffix.lower() not in (".html", ".htm"):
         raise ConfigError(f"{out}: expected a name that ends in .html, as browsers open it")
+    if not (out.is_file() and is_viewer(out)):
+        check_no_file_of_a_run(out)
     if splats is not None and splats < 1:
         raise ConfigError(f"--splats {splats}: expected a number of at least 1")
     if photographs not in ("none", "test", "all"):
         raise ConfigError(f"no photographs '{photographs}'; there are none, test and all")
+    if not 0 <= photograph_budget < math.inf:
+        raise ConfigError(f"--photograph-budget {photograph_budget:g}: expected MB, a finite number of at least 0")
     source = next((Source.of(path, scene) for path in models if scene is not None or run_of(path)), None)
     if photographs == "all" and source is None:
         raise ConfigError("--photographs all needs the photographs of a scene; give --scene, or a run folder")
+    _tell_of_scenes(models, source)
     loaded = {name: load(path) for name, path in zip(names(models), models, strict=True)}
     first = next(iter(loaded.values()))
     found = source.scene(first).downscaled(source.settings.downscale) if source else None
@@ -57,11 +67,23 @@ def view(
     views = described(found, read, photographs, photograph_budget) if found else []
     start = (found.split("test") or found.views)[0] if found else None
     stand = Stand.of(first.means, found.views if found else (), start)
-    title = " and ".join(loaded) + (f" · {found.path.name}" if found else "")
+    title = " and ".join(loaded) + (f" · {source.scene_name}" if source else "")
     if found is None:
         LOG.info("without a scene up is -y; give --scene where the picture stands on its head")
     Page(title, {name: pack(model, splats) for name, model in loaded.items()}, stand, background, views).write(out)
     return out
+
+
+def _tell_of_scenes(models: Sequence[Path], source: Source | None) -> None:
+    """Warn where models are of different scenes: the page has the cameras of one."""
+    scenes = {}
+    for name, run in zip(names(models), map(run_of, models), strict=True):
+        with suppress(ConfigError):  # of a plug-in that is missing: the model can be shown
+            if run and (path := load_pipeline(str(run / PIPELINE)).settings.scene.path):
+                scenes[name] = Path(path).resolve()
+    if source and len(set(scenes.values())) > 1:
+        told = [part for one in scenes.items() for part in one]
+        LOG.warning("%s is of %s, %s of %s: both stand before the cameras of %s", *told, source.scene_name)
 
 
 def names(models: Sequence[Path]) -> list[str]:

@@ -34,7 +34,7 @@ class Report(Stage):
     def run(self, run: Run) -> None:
         page = render(
             "report.html.j2",
-            title=Path(run.pipeline["scene"]["path"] or run.scene.path).resolve().name,
+            title=run.scene_name,
             subtitle=f"{run.name} · {run.device.text}",
             main=_main(run),
             photographs=photographs_text(run.found) or f"{counted(len(run.original.views), 'photograph')}",
@@ -56,9 +56,9 @@ class Report(Stage):
 
 
 def _addresses(run: Run, stage: str, page: Path) -> dict[str, str]:
-    """The files that stages of this name write, with their addresses beside the page."""
-    files = [run.out / one[stage]["file"] for one in run.pipeline["stages"] if stage in one]
-    return {file.name: quote(Path(os.path.relpath(file, page.parent)).as_posix()) for file in files}
+    """The files that stages of this name write, by their paths in the run, with their addresses beside the page."""
+    files = [Path(one[stage]["file"]) for one in run.pipeline["stages"] if stage in one]
+    return {file.as_posix(): quote(Path(os.path.relpath(run.out / file, page.parent)).as_posix()) for file in files}
 
 
 def _main(run: Run) -> str:

@@ -48,7 +48,7 @@ class Viewer(Stage):
 
         views = described(scene, read, self.photographs, self.photograph_budget, through)
         stand = Stand.of(model.means, scene.views, (scene.split("test") or scene.views)[0])
-        page = Page(f"{run.name} · {run.scene.path.name}", {run.name: pack(model)}, stand, name, views)
+        page = Page(f"{run.name} · {run.scene_name}", {run.name: pack(model)}, stand, name, views)
         if page.size > MAX_SIZE and page.fitting:  # else the photographs are the fault, which the page says
             LOG.warning(
                 "%s: shows the %s most important of %s Gaussians, so that browsers can open it; "

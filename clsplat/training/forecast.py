@@ -1,13 +1,12 @@
 """What reports of a training say about its course: PSNR over several views, and the time that is left."""
 
-from collections import deque
 from collections.abc import Callable, Sequence
 from statistics import fmean
 
 import numpy as np
 from numpy.typing import NDArray
 
-VIEWS = 5  # reports whose PSNR is averaged: each is of one view, and views differ by many dB
+VIEWS = 5  # reports whose PSNR is averaged
 LATEST = 3  # reports whose step time is averaged
 TREND = 4  # reports that tell how fast the number of Gaussians grows
 WIDE = 2.0  # of the number of Gaussians, largest by smallest: from there on the times tell what a Gaussian costs
@@ -15,12 +14,20 @@ USUAL = 0.6  # of the mean time by Gaussian is what one more costs, where they d
 LEAST = 0.4  # of it, whatever they tell: on a busy machine they tell little
 
 
+def over_views(psnrs: Sequence[float]) -> list[float]:
+    """Return the mean of each PSNR and those of the reports before it: one is of one view, and views differ by many dB.
+
+    Terminal, live page and reports show it.
+    """
+    return [fmean(psnrs[max(0, end - VIEWS) : end]) for end in range(1, len(psnrs) + 1)]
+
+
 class Forecast:
     """The course of one training, up to `last_step`.  Rules that grow the model act until the step `growth_end`."""
 
     def __init__(self, last_step: int, growth_end: int) -> None:
         self.last_step, self.growth_end = last_step, growth_end
-        self._psnr: deque[float] = deque(maxlen=VIEWS)  # dB
+        self._psnrs: list[float] = []  # dB
         self._reports: list[tuple[int, int, float]] = []  # step, Gaussians, s a step
 
     @classmethod
@@ -31,13 +38,13 @@ class Forecast:
 
     def add(self, step: int, psnr: float, gaussians: int, seconds: float) -> None:
         """Take a report; seconds: the mean time of a step since the last one."""
-        self._psnr.append(psnr)
+        self._psnrs.append(psnr)
         self._reports.append((step, gaussians, seconds))
 
     @property
     def psnr(self) -> float:
         """dB, the mean over the views of the last reports."""
-        return fmean(self._psnr)
+        return over_views(self._psnrs[-VIEWS:])[-1]
 
     @property
     def growth_known(self) -> bool:

@@ -15,6 +15,7 @@ from clsplat.gaussians.model import Model, Rendering
 from clsplat.gaussians.tables import INTERVAL2, PARAMETERS, DeviceModel
 from clsplat.losses.base import Loss
 from clsplat.opencl.device import Device
+from clsplat.pages.page import scene_name
 from clsplat.render.rasterizer import PIXEL_SUMS, Rasterizer
 from clsplat.scene.identity import Identity
 from clsplat.scene.scene import Scene
@@ -112,6 +113,11 @@ class Run:
         before, self.whole = self.whole, False
         yield
         self.whole = before
+
+    @property
+    def scene_name(self) -> str:
+        """What pages call the scene."""
+        return scene_name(self.pipeline["scene"]["path"] or self.scene.path)
 
     @property
     def inputs(self) -> str:

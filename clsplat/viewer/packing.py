@@ -57,6 +57,7 @@ def pack(model: Model, limit: int | None = None) -> Packed:
     limit: the number of splats, the most important ones; None: all.
     """
     model = model.baked()
+    faint = int((model.opacities <= MIN_OPACITY).sum()) if limit is None or limit >= len(model) else 0
     model = model[_order(model, limit)]
     frame = _frame(model.means.astype(np.float64))
     count = len(model)
@@ -70,6 +71,7 @@ def pack(model: Model, limit: int | None = None) -> Packed:
     planes += [_codes(table, column) for table, values in columns for column in values.T]
     header = {
         "count": count,
+        "faint": faint,  # too faint to draw: all that is left out of a model without faults, if there is no limit
         "degree": model.sh_degree,
         "near": model.rendering.near,
         "variance": model.rendering.screen_variance,

@@ -10,6 +10,7 @@ from typing import Any
 from clsplat.errors import OutputError
 from clsplat.files import write_text
 from clsplat.pages.page import inline, render
+from clsplat.reading import read_file
 from clsplat.scene.stand import Stand
 from clsplat.viewer.cameras import stand_data
 from clsplat.viewer.packing import Packed
@@ -21,6 +22,7 @@ SCRIPTS = (
 )
 MAX_SIZE = 200.0  # MB: browsers need several times as much memory
 MARGIN = 0.97  # of that size, for splats that pack worse than the average
+MARK = b'<canvas id="frustums"'  # of viewer.html.j2
 COLOURS = {"black": [0, 0, 0], "white": [1, 1, 1]}
 
 
@@ -86,11 +88,17 @@ class Page:
         facts = {}
         for name, packed in self.models.items():
             header, of = packed.header, f" of {name}" if len(self.models) > 1 else ""
-            facts[f"splats{of}"] = f"{packed.count:,}, SH degree {header['degree']}"
+            faint = f" + {header['faint']:,} too faint to draw" if header["faint"] else ""
+            facts[f"splats{of}"] = f"{packed.count:,}{faint}, SH degree {header['degree']}"
             kept = ", keeps the energy" if header["compensate"] else ""
             facts[f"screen filter{of}"] = f"{header['variance']:g} px²{kept}"
             facts[f"size{of}"] = f"{len(packed.data) / 1e6:.2f} MB"
         return facts | ({"views": f"{len(self.views):,}"} if self.views else {})
+
+
+def is_viewer(path: Path) -> bool:
+    """Return whether a file is such a page.  Raises DataError where it cannot be read."""
+    return MARK in read_file(path)
 
 
 def script() -> str:

@@ -39,8 +39,9 @@ class Settings extends Panel {
 
   // drawn: splats; ms: of a frame while moving, null when not measured; scale: of the picture's resolution
   statistics(drawn, ms, scale) {
-    const whole = this.viewer.layers.reduce((sum, layer) => sum + layer.header.count, 0);
-    const parts = [`${thousands(drawn)} of ${thousands(whole)} splats`];
+    const sum = key => this.viewer.layers.reduce((whole, layer) => whole + layer.header[key], 0), faint = sum("faint");
+    const parts = [`${thousands(drawn)} of ${thousands(sum("count"))} splats`];
+    if (faint) parts[0] += ` + ${thousands(faint)} too faint to draw`;
     if (ms !== null) parts.push(`${ms < 10 ? ms.toFixed(1) : Math.round(ms)} ms a frame`);
     if (scale < 1) parts.push(`${Math.round(100 * scale)} % resolution`);
     find("statistics").textContent = parts.join(" · ");

@@ -39,6 +39,17 @@ def test_a_model_is_written_as_its_name_says(name, source, tmp_path):
         assert detect(tmp_path / name).name == done["format"]
 
 
+def test_no_file_of_a_run_is_replaced(source, tmp_path):
+    run = tmp_path / "run"
+    run.mkdir()
+    (run / "pipeline.yaml").write_text("name: a")
+    (run / "point_cloud.ply").write_text("trained")
+    with pytest.raises(ConfigError, match=r"point_cloud\.ply: is a file of a run; give another name"):
+        clsplat.convert(source, run / "point_cloud.ply")
+    assert (run / "point_cloud.ply").read_text() == "trained"
+    assert clsplat.convert(source, run / "new.spz")["gaussians"] == 100
+
+
 def test_models_are_merged_with_the_most_harmonics_of_them(source, tmp_path, rng):
     write(tmp_path / "b.glb", splats(rng, 30, 1))
     done = clsplat.convert([source, tmp_path / "b.glb"], tmp_path / "c.ply")

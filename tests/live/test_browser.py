@@ -24,6 +24,29 @@ def test_the_page_is_whole_and_its_scripts_short():
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium: apt-get install chromium")
+def test_a_picture_that_was_decoded_late_does_not_replace_a_newer_one(tmp_path):
+    script = (LIVE / "link.js").read_text()
+    race = """(async () => {
+      const shown = [], closed = [], decoded = {};
+      const answer = number => ({status: 200, ok: true, blob: async () => number, headers: {get: () => number}});
+      const fetch = async url => answer(+url.split("view=")[1]);
+      const createImageBitmap = number => new Promise(ready => {
+        decoded[number] = () => ready({close: () => closed.push(number)});
+      });
+      %s
+      Link.prototype.poll = () => {};
+      const link = new Link({wish: () => null, show: ({number}) => shown.push(number)}), pause = () =>
+        new Promise(later => setTimeout(later, 10));
+      const asked = [1, 2].map(number => link.ask({number, key: `view=${number}`, pace: "still"}));
+      for (const number of [2, 1]) { await pause(); decoded[number](); }
+      await Promise.all(asked);
+      return [shown, closed];
+    })()"""
+    with Browser(tmp_path, 300, 200) as browser:
+        assert browser.run(race % script) == [[2], [1]]
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium: apt-get install chromium")
 def test_a_visit_from_the_first_step_to_the_end(tiny_scene, tmp_path):
     with Live() as live, Browser(tmp_path / "browser", 700, 620) as browser:
         live.desk.pause(True)
@@ -47,7 +70,8 @@ def test_a_visit_from_the_first_step_to_the_end(tiny_scene, tmp_path):
             assert browser.run("document.getElementById('notice').textContent").startswith("The run is done; ")
             assert browser.run("document.querySelector('#loss polyline').getAttribute('points').split(' ').length") == 3
             assert browser.run("document.querySelector('#gaussians b').textContent") != "–"
-            assert browser.run("document.getElementById('pause').disabled")
+            assert browser.run("document.getElementById('pause').hidden")
+            assert browser.run("document.getElementById('state').textContent") == "finished · step 12 of 12"
 
         with beside(visit):
             trained(live, tiny_scene, tmp_path / "run")

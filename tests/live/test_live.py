@@ -3,6 +3,7 @@
 import http.client
 import json
 import os
+import shutil
 import signal
 import threading
 import time
@@ -136,6 +137,15 @@ def test_a_run_that_is_looked_at_has_the_bits_of_one_that_is_not(live, few_steps
     assert len({int(step) for step, status in seen.items() if step not in ("end", None) and status == 200}) >= 6, seen
     assert seen["end"]["state"] == "done"
     assert [point[0] for point in seen["end"]["points"]] == [10, 12]
+
+
+def test_the_title_names_the_folder_that_the_user_gave(live, tiny_scene, tmp_path, monkeypatch):
+    """Not that of the prepared photographs, whose name is a hash."""
+    prepared = tmp_path / "undistort-f22e16004ac0"
+    shutil.copytree(tiny_scene, prepared)
+    monkeypatch.setattr("clsplat.runs.scenes.read_scene", lambda folder, holdout: read_scene(prepared, holdout))
+    trained(live, tiny_scene, tmp_path / "run")
+    assert live.desk.shown.title == f"smoke · {tiny_scene.name}"
 
 
 def test_nothing_is_drawn_while_nobody_looks(live, tiny_scene, tmp_path, monkeypatch):

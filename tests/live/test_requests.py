@@ -1,9 +1,12 @@
 """Who may ask, and for what: before any answer is computed."""
 
+import json
+
 import pytest
 
-from clsplat.live.answers import camera
-from clsplat.live.requests import Answer, Refused, host_name, read
+from clsplat.live.answers import Answers, camera
+from clsplat.live.desk import Desk
+from clsplat.live.requests import Answer, Refused, Request, host_name, read
 
 TOKEN = "secret-token"
 
@@ -115,3 +118,20 @@ def test_a_camera_is_what_the_page_has_written():
 def test_an_impossible_camera_is_refused(text):
     with pytest.raises(Refused, match="camera: expected"):
         camera(text)
+
+
+def test_a_page_that_was_not_told_of_the_end_does_not_count_as_told():
+    class Ending(Desk):
+        looks = 0
+
+        @property
+        def ended(self) -> bool:  # it ends while the answer is made
+            self.looks += 1
+            return self.looks > 1
+
+        @ended.setter
+        def ended(self, _: bool) -> None: ...
+
+    desk = Ending()
+    state = json.loads(Answers(desk)(Request("state.json", {})).body)
+    assert desk.told == state["ended"]

@@ -1,5 +1,6 @@
 """The stage of pipelines, the command and the function: the same pages, errors in one line."""
 
+import json
 import re
 import shutil
 from pathlib import Path
@@ -13,6 +14,7 @@ from clsplat.errors import ConfigError, DataError, OutputError
 from clsplat.pipeline.files import shipped
 from clsplat.pipeline.loading import load
 from clsplat.runs.viewing import names
+from clsplat.scene.detect import read_scene
 from clsplat.stages.viewer import Viewer
 from clsplat.viewer import page as module
 from tests.html_page import Page
@@ -41,6 +43,31 @@ def test_a_run_writes_a_viewer_and_its_report_leads_to_it(run):
     assert viewer.count('"photograph":null') == 8, "training views have a thumbnail alone"
     assert '<a class="viewer" href="viewer.html">' in report
     assert Page(report).elements["a"] == 2, "the viewer and the model"
+
+
+def test_titles_name_the_folder_that_the_user_gave(run, tiny_scene, tmp_path, monkeypatch):
+    """Not that of the prepared photographs, whose name is a hash."""
+    prepared = shutil.copytree(tiny_scene, tmp_path / "undistort-f22e16004ac0")
+    copy = shutil.copytree(run, tmp_path / "castle_run")
+    (copy / "prepared.json").write_text(json.dumps({"inputs": "f22e", "folder": str(prepared)}))
+    assert f"<title>castle_run · {tiny_scene.name}</title>" in clsplat.view(copy, out=tmp_path / "a.html").read_text()
+    given = clsplat.view(copy, scene=prepared, out=tmp_path / "b.html").read_text()
+    assert f"<title>castle_run · {prepared.name}</title>" in given, "what is given is what is named"
+    monkeypatch.setattr("clsplat.runs.scenes.read_scene", lambda folder, holdout: read_scene(prepared, holdout))
+    out = clsplat.run("smoke", tiny_scene, tmp_path / "run", set=SHORT)
+    assert f"<title>smoke · {tiny_scene.name}</title>" in (out / "viewer.html").read_text()
+    assert f"<title>{tiny_scene.name}</title>" in (out / "report.html").read_text()
+
+
+def test_the_report_leads_to_files_of_one_name_in_several_folders(tiny_scene, tmp_path):
+    steps = [stage for stage in load("smoke").resolved()["stages"] if "render" not in stage]
+    at = next(i for i, stage in enumerate(steps) if "export" in stage)
+    steps[at : at + 1] = [{"export": {"file": f"{folder}/model.ply"}} for folder in ("a", "b")]
+    (tmp_path / "two.yaml").write_text(json.dumps({"name": "two", "stages": steps}))
+    report = (clsplat.run(tmp_path / "two.yaml", tiny_scene, tmp_path / "run", set=SHORT) / "report.html").read_text()
+    assert re.findall(r'<a href="([^"]*)">([^<]*)</a>', report) == [
+        (f"{at}/model.ply", f"{at}/model.ply") for at in "ab"
+    ]
 
 
 def test_the_stage_and_the_command_show_the_same(run, tmp_path):
@@ -121,6 +148,33 @@ def test_a_page_over_an_earlier_one_says_so(run, tmp_path):
     assert "a.html: replaced; 0." in command(*words)
 
 
+def test_models_of_different_scenes_are_told(run, tiny_scene, tmp_path):
+    other, same = (shutil.copytree(run, tmp_path / name) for name in ("other", "same"))
+    text = (other / "pipeline.yaml").read_text()
+    (other / "pipeline.yaml").write_text(text.replace(str(tiny_scene), str(tmp_path / "kitchen")))
+    for_all = ["--out", tmp_path / "a.html"]
+    done = CliRunner().invoke(app, [str(word) for word in ("view", run, other, *for_all)])
+    warning = (
+        f"run is of {tiny_scene}, other of {tmp_path / 'kitchen'}: both stand before the cameras of {tiny_scene.name}"
+    )
+    assert warning in done.output.replace("\n", ""), done.output
+    for models in ([run, same], [run]):
+        assert "both stand" not in CliRunner().invoke(app, [str(word) for word in ("view", *models, *for_all)]).output
+
+
+def test_no_page_takes_the_place_of_another_file_of_a_run(run, tmp_path):
+    copy = shutil.copytree(run, tmp_path / "copy")
+    before = (copy / "report.html").read_bytes()
+    (copy / "own.html").write_text("<html></html>")
+    for name in ("report.html", "own.html"):
+        with pytest.raises(ConfigError, match=rf"{name}: is a file of a run; give another name"):
+            clsplat.view(copy, out=copy / name)
+    assert (copy / "report.html").read_bytes() == before
+    for name in ("viewer.html", "new.html", "new.html"):
+        clsplat.view(copy, out=copy / name, photographs="none")
+    assert (copy / "viewer.html").read_bytes() != (run / "viewer.html").read_bytes()
+
+
 def test_which_way_is_up_is_said_where_no_view_tells(run, tmp_path):
     for_all = ["--out", tmp_path / "a.html"]
     assert "up is -y; give --scene" in command("view", shutil.copy(run / "point_cloud.ply", tmp_path), *for_all)
@@ -163,6 +217,9 @@ def test_errors_of_the_function(run, tmp_path, monkeypatch):
         clsplat.view()
     with pytest.raises(ConfigError, match="no photographs 'some'; there are none, test and all"):
         clsplat.view(run, out=tmp_path / "a.html", photographs="some")
+    for budget in (float("inf"), float("nan"), -1.0):
+        with pytest.raises(ConfigError, match=rf"--photograph-budget {budget:g}: expected MB, a finite number"):
+            clsplat.view(run, out=tmp_path / "a.html", photograph_budget=budget)
     alone = shutil.copy(run / "point_cloud.ply", tmp_path)
     with pytest.raises(ConfigError, match="--photographs all needs the photographs of a scene; give --scene"):
         clsplat.view(alone, out=tmp_path / "a.html", photographs="all")

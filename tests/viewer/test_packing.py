@@ -94,6 +94,8 @@ def test_what_no_view_shows_is_left_out():
     tables["log_scales"][4] = -np.inf
     packed = pack(replace(model, **tables))
     assert packed.count == 5
+    assert packed.header["faint"] == 1, "the page says so"
+    assert pack(replace(model, **tables), 2).header["faint"] == 0, "others are left out too"
     np.testing.assert_allclose(np.sort(unpacked(packed).means[:, 0]), np.sort(model.means[5:, 0]), atol=1e-3)
 
 

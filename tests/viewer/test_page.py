@@ -54,6 +54,20 @@ def test_names_are_escaped(page):
     assert re.fullmatch(r"[\w.-]+", info["file"])
 
 
+def test_splats_too_faint_to_draw_are_told(page):
+    model = cloud(60)
+    model.logit_opacity[:] = 0
+    model.logit_opacity[:7] = -6
+    faint = replace(page, models={"model": pack(model)})
+    assert "<dd>53 + 7 too faint to draw, SH degree" in faint.text()
+    model.logit_opacity[:] = 0
+    assert "too faint to draw, SH" not in replace(page, models={"model": pack(model)}).text()
+
+
+def test_the_help_names_the_gestures_of_fingers_too(page):
+    assert "double click it · double tap it" in page.text()
+
+
 def test_only_the_script_and_style_of_the_package_may_run(page):
     text = page.text()
     policy = re.search(r'Content-Security-Policy" content="([^"]*)"', text).group(1)
