@@ -124,13 +124,20 @@ def unit(quats: Floats) -> NDArray[np.float64]:
 
 def flipped(parameters: Parameters) -> Parameters:
     """Return the Gaussians in axes whose y and z point the other way: up and back for down and ahead, or back again."""
-    signs = np.repeat(np.array(FLIP_SH, np.float32), 3)[: parameters["sh_rest"].shape[1]]
-    return {
-        **parameters,
-        "means": parameters["means"] * np.array([1, -1, -1], np.float32),
-        "quats": parameters["quats"] * np.array([1, 1, -1, -1], np.float32),
-        "sh_rest": parameters["sh_rest"] * signs,
-    }
+    signs = _signs(parameters)
+    return {name: table * signs[name] if name in signs else table for name, table in parameters.items()}
+
+
+def flip(parameters: Parameters) -> None:
+    """Turn the Gaussians as `flipped` does, in place."""
+    for name, signs in _signs(parameters).items():
+        parameters[name] *= signs
+
+
+def _signs(parameters: Parameters) -> Parameters:
+    rest = np.repeat(FLIP_SH, 3)[: parameters["sh_rest"].shape[1]]
+    signs = {"means": (1, -1, -1), "quats": (1, 1, -1, -1), "sh_rest": rest}
+    return {name: np.array(values, np.float32) for name, values in signs.items()}
 
 
 def swapped(table: NDArray[np.float32], outer: int, inner: int) -> NDArray[np.float32]:
