@@ -146,6 +146,16 @@ def test_a_codebook_is_better_than_equal_steps(rng):
     np.testing.assert_array_equal(codebook(few)[nearest(few, codebook(few))], few)
 
 
+@pytest.mark.parametrize("far", [[-1e5] * 50, [-1e5 - step for step in range(50)], [1e8], [-1e15], [1e15, -1e15, 3e8]])
+def test_a_few_far_values_cost_the_others_little(far, rng):
+    values = rng.normal(-5, 1.2, 60_000)
+
+    def error(entries):
+        return np.square(entries[nearest(values, entries)] - values).mean()
+
+    assert error(codebook(np.append(values, far))) < 2 * error(codebook(values))
+
+
 def test_every_point_has_the_nearest_vector_in_whole_numbers(rng):
     points = rng.integers(-511, 512, (400, 45)).astype(np.float32)
     points[0, 0] = 511
