@@ -19,7 +19,16 @@ from clsplat.formats.packing import morton_order, smallest_three
 from clsplat.formats.palette import codebook, nearest, palette
 from clsplat.formats.sog import PER_ROW, ROTATED
 from clsplat.formats.sog_files import META, with_images
-from clsplat.formats.splats import Parameters, SplatFile, Writing, opacities, require_moderate, require_some, unit
+from clsplat.formats.splats import (
+    Parameters,
+    SplatFile,
+    Writing,
+    degree_of,
+    opacities,
+    require_moderate,
+    require_some,
+    unit,
+)
 
 PALETTES = {"small": 1024, "balanced": 4096, "high": 16384}  # entries at most
 SMALLEST = 1024  # entries for so many splats, and twice as many for twice as many
@@ -132,10 +141,14 @@ class Harmonics:
 
 def _harmonics(rest: NDArray[np.float32], options: Writing, image: Any) -> dict[str, Any]:
     found, size = Harmonics.of(rest, options), rest.shape[1] // 3
-    degree = round((size + 1) ** 0.5) - 1
     files = [image("shN_centroids", *found.palette.reshape(-1, 3).T, across=PER_ROW * size)]
     files.append(image("shN_labels", found.labels & 255, found.labels >> 8, np.zeros_like(found.labels)))
-    return {"count": len(found.palette), "bands": degree, "codebook": found.numbers.tolist(), "files": files}
+    return {
+        "count": len(found.palette),
+        "bands": degree_of(rest.shape[1]),
+        "codebook": found.numbers.tolist(),
+        "files": files,
+    }
 
 
 def _short(number: float, rounding: str = ROUND_HALF_EVEN) -> float:

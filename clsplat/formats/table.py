@@ -67,6 +67,8 @@ CODECS = (
         read_spz,
         write_spz,
         has_quality=True,
+        has_axes=True,
+        has_bits=True,
     ),
     Codec(
         "SOG",

@@ -16,6 +16,7 @@ from clsplat.gaussians.model import Model, load
 from clsplat.gaussians.run_model import model_at
 
 LOG = logging.getLogger("clsplat")
+KEPT = ("near", "screen_variance", "background", "alpha")  # of the first model that is merged
 WORDS = ("scale", "rotate", "translate")
 
 
@@ -38,7 +39,7 @@ class Changes:
             low, high = np.array(self.crop, np.float64).reshape(2, 3)
             kept = kept[((kept.means >= low) & (kept.means <= high)).all(axis=1)]
         if self.sh_degree is not None and self.sh_degree < kept.sh_degree:
-            kept = replace(kept, **with_degree(kept.tables(), self.sh_degree))  # type: ignore[arg-type]
+            kept = replace(kept, sh_rest=with_degree(kept.tables(), self.sh_degree)["sh_rest"])
         if not len(kept) and len(model):
             raise DataError(f"none of {len(model):,} Gaussians is left; expected some inside of the crop and as opaque")
         return kept
@@ -56,13 +57,12 @@ class Options:
 
     def of(self, sources: Sequence[Path], out: Path) -> tuple[Reading, Writing]:
         """Return them for these files.  Raises ConfigError where one has no meaning there."""
-        codec, from_spz = for_writing(out), _reads_spz(sources)
-        to_spz = codec.name == "SPZ"
+        codec, reads_axes = for_writing(out), _reads_axes(sources)
         if self.spz_version not in (3, 4):
             raise ConfigError(f"--spz-version {self.spz_version}: expected 3 or 4")
-        if not to_spz and (self.sh_bits is not None or self.spz_version != 3):
+        if not codec.has_bits and (self.sh_bits is not None or self.spz_version != 3):
             raise ConfigError(f"{out}: --sh-bits and --spz-version are of SPZ; expected a name that ends in .spz")
-        if self.axes != "spz" and not to_spz and not from_spz:
+        if self.axes != "spz" and not codec.has_axes and not reads_axes:
             raise ConfigError("--axes is of SPZ; expected an SPZ file to read or to write")
         if self.quality != "balanced" and not codec.has_quality:
             raise ConfigError(f"{out}: --quality is of SPZ and SOG; expected a name that ends in .spz or .sog")
@@ -70,7 +70,7 @@ class Options:
             raise ConfigError(f"{out}: --keep-nan is of PLY; expected a name that ends in .ply")
         bits = None if self.sh_bits is None else sh_bits_of(self.sh_bits)
         version: Literal[3, 4] = 4 if self.spz_version == 4 else 3
-        written = Writing(bits, "spz" if from_spz else self.axes, version, self.quality)
+        written = Writing(bits, "spz" if reads_axes else self.axes, version, self.quality)
         return Reading(self.axes, "keep" if self.keep_nan else "drop"), written
 
 
@@ -107,8 +107,9 @@ def merged(models: Sequence[Model], names: Sequence[str]) -> Model:
         if bool(model.rendering.compensate) != bool(first.rendering.compensate):
             kinds = [("a mip model" if m.rendering.compensate else "none") for m in (first, model)]
             raise DataError(f"{name}: is {kinds[1]}, {names[0]} is {kinds[0]}; expected the same: one filter draws all")
-        if model.rendering.screen_variance != first.rendering.screen_variance:
-            LOG.warning("%s: its screen_variance is another; that of %s is kept", name, names[0])
+        own, kept = model.rendering.comment(), first.rendering.comment()
+        if other := [f"{one} = {own.get(one, 'not given')}" for one in KEPT if own.get(one) != kept.get(one)]:
+            LOG.warning("%s: has %s; what %s says is kept", name, ", ".join(other), names[0])
     if any(model.filter_variance is None for model in models):
         models = [model.baked() for model in models]
     degree = max(model.sh_degree for model in models)
@@ -192,10 +193,10 @@ def checked_degree(degree: int | None) -> int | None:
     return degree
 
 
-def _reads_spz(sources: Sequence[Path]) -> bool:
-    """Whether one of the files is an SPZ file."""
+def _reads_axes(sources: Sequence[Path]) -> bool:
+    """Whether one of the files is of a format that does not tell its axes."""
     found = [detect(place) for place in map(model_at, sources) if place.is_file()]
-    return any(codec is not None and codec.name == "SPZ" for codec in found)
+    return any(codec is not None and codec.has_axes for codec in found)
 
 
 def _is_same(one: Path, other: Path) -> bool:

@@ -19,6 +19,8 @@ from clsplat.formats.splats import (
     Reading,
     SplatFile,
     Writing,
+    degree_of,
+    opacities,
     sh_coefficients,
 )
 from clsplat.formats.table import for_writing, read, write
@@ -112,8 +114,7 @@ class Model:
     @property
     def sh_degree(self) -> int:
         """Highest degree of the spherical harmonics."""
-        degree: int = round((1 + self.sh_rest.shape[1] / 3) ** 0.5) - 1
-        return degree
+        return degree_of(self.sh_rest.shape[1])
 
     @property
     def scales(self) -> Floats:
@@ -123,7 +124,7 @@ class Model:
     @property
     def opacities(self) -> Floats:
         """Opacities in (0, 1), [N]."""
-        return np.asarray(1 / (1 + np.exp(-self.logit_opacity[:, 0].astype(np.float64))), np.float32)
+        return opacities(self.logit_opacity[:, 0]).astype(np.float32)
 
     @property
     def colours(self) -> Floats:

@@ -48,6 +48,30 @@ def test_models_are_merged_with_the_most_harmonics_of_them(source, tmp_path, rng
     np.testing.assert_array_equal(found.means[:100], load(source).means)
 
 
+def test_every_number_of_a_merged_model_that_is_not_kept_is_said(tmp_path, rng, caplog):
+    said = [{"near": 0.2}, {"near": 5.0, "background": "white", "screen_variance": 0.1, "alpha": "mask"}, {"near": 0.2}]
+    for name, numbers in zip("abc", said, strict=True):
+        write(tmp_path / f"{name}.ply", replace(splats(rng, 10), rendering=numbers))
+    a, b, c = (tmp_path / f"{name}.ply" for name in "abc")
+    clsplat.convert([a, b, c], tmp_path / "d.ply")
+    assert caplog.messages == [
+        f"{b}: has near = 5.0, screen_variance = 0.1, background = white, alpha = mask; what {a} says is kept"
+    ]
+    caplog.clear()
+    clsplat.convert([b, a], tmp_path / "d.ply")
+    assert "has near = 0.2, screen_variance = 0.3, background = not given, alpha = transparency; what" in caplog.text
+
+
+def test_options_of_one_format_are_fields_of_the_table(source, tmp_path, monkeypatch):
+    """So that a format that has them is asked nowhere by its name."""
+    found = {field: [codec.name for codec in CODECS if getattr(codec, field)] for field in ("has_axes", "has_bits")}
+    assert found == {"has_axes": ["SPZ"], "has_bits": ["SPZ"]}
+    renamed = [replace(codec, name="SPZ of Niantic" if codec.name == "SPZ" else codec.name) for codec in CODECS]
+    monkeypatch.setattr("clsplat.formats.table.CODECS", renamed)
+    clsplat.convert(source, tmp_path / "b.spz", sh_bits="5/4", axes="ply")
+    clsplat.convert(tmp_path / "b.spz", tmp_path / "c.ply", axes="ply")
+
+
 def test_a_mip_model_is_not_merged_with_another(source, tmp_path, rng):
     write(tmp_path / "b.ply", splats(rng, 30, 1, "mip"))
     with pytest.raises(DataError, match=r"b\.ply: is a mip model, .*a\.ply is none; expected the same"):
