@@ -27,6 +27,8 @@ MAX_FILE = 1 << 33  # bytes
 LARGEST = 1e15  # of LIMITED: beyond it neither viewers nor codebooks hold anything
 LIMITED = ("log_scales", "sh_base", "sh_rest")
 MIN_ALPHA = 1e-6  # opacities of 0 and 1 have no logit
+MAX_EXPONENT = 700.0  # of e in float64
+MAX_LOG = 88.7  # of a scale in float32
 FLAT_LOG_SCALE = -13.815511  # log 1e-6: of the third axis of a disc
 FLIP_SH = (-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1)  # y and z change sign: bands 1 to 3
 Parameters = dict[str, NDArray[np.float32]]  # by the names of PARAMETERS, each [N, components]
@@ -103,8 +105,13 @@ def logits(alpha: Floats) -> NDArray[np.float32]:
 
 
 def opacities(logit: Floats) -> NDArray[np.float64]:
-    """Return opacities in [0, 1] of logits."""
+    """Return opacities in [0, 1] of logits, to 1e-16."""
     return np.asarray(0.5 + 0.5 * np.tanh(0.5 * logit.astype(np.float64)))
+
+
+def inverse_opacities(logit: Floats) -> NDArray[np.float64]:
+    """Return 1 / opacity of logits, in which faint ones keep their digits; finite for all that are."""
+    return np.asarray(1 + np.exp(np.minimum(-logit.astype(np.float64), MAX_EXPONENT)))
 
 
 def logs(scales: Floats) -> NDArray[np.float32]:

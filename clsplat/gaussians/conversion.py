@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.errors import ConfigError, DataError, quoted
+from clsplat.formats.ply import MAX_NUMBER
 from clsplat.formats.splats import MAX_DEGREE, Reading, Writing, with_degree
 from clsplat.formats.table import bytes_of, detect, for_writing
 from clsplat.gaussians.model import Model, load
@@ -30,11 +31,14 @@ class Changes:
     sh_degree: int | None = None  # at most
 
     def of(self, model: Model) -> Model:
-        """Return the changed model.  Raises DataError where nothing is left."""
+        """Return the changed model.  Raises DataError where nothing is left, ConfigError for a transform too far."""
         kept = model[model.opacities >= self.drop_below] if self.drop_below else model
         if self.transform is not None:
             scale = float(np.cbrt(np.linalg.det(self.transform[:3, :3])))
-            kept = kept.transformed(scale, self.transform[:3, :3] / scale, self.transform[:3, 3])
+            try:
+                kept = kept.transformed(scale, self.transform[:3, :3] / scale, self.transform[:3, 3])
+            except ValueError as error:
+                raise ConfigError(f"--transform: {error}") from error
         if self.crop is not None:
             low, high = np.array(self.crop, np.float64).reshape(2, 3)
             kept = kept[((kept.means >= low) & (kept.means <= high)).all(axis=1)]
@@ -136,14 +140,19 @@ def transform_of(text: str) -> NDArray[np.float64]:
             matrix = np.eye(4)
             for part in text.split():
                 word, _, values = part.partition("=")
-                matrix = _step(word, [float(value) for value in values.split(",")]) @ matrix
+                with np.errstate(over="ignore", invalid="ignore"):  # told below
+                    matrix = _step(word, [float(value) for value in values.split(",")]) @ matrix
     except ValueError as error:
         raise ConfigError(expected) from error
     turned = matrix[:3, :3]
+    if not np.abs(matrix).max() < MAX_NUMBER or not (np.abs(turned).max() or 1) > 1 / MAX_NUMBER:
+        raise ConfigError(
+            f"--transform {quoted(text)}: expected a scale from {1 / MAX_NUMBER:g} to {MAX_NUMBER:g}, and a "
+            "translation below that"
+        )
     scale2 = turned @ turned.T
     if (
-        not np.isfinite(matrix).all()
-        or not np.allclose(matrix[3], [0, 0, 0, 1])
+        not np.allclose(matrix[3], [0, 0, 0, 1])
         or np.linalg.det(turned) <= 0
         or not np.allclose(scale2, scale2[0, 0] * np.eye(3), atol=1e-5 * scale2[0, 0])
     ):
