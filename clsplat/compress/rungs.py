@@ -1,11 +1,10 @@
 """The rungs of the ladder: a model with fewer and fewer Gaussians, each trained from the one before."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from clsplat.errors import ConfigError
-from clsplat.gaussians.model import Model
 from clsplat.gaussians.run_model import MODEL
 from clsplat.pipeline.loading import Pipeline
 from clsplat.tuning.tuning import Tuning
@@ -55,8 +54,3 @@ def checked_keeps(keeps: Sequence[float]) -> list[float]:
     if len({round(100 * keep) for keep in ordered}) < len(ordered):
         raise ConfigError("--keep: expected shares that differ by a hundredth")
     return ordered
-
-
-def of_degree(model: Model, degree: int) -> Model:
-    """Return a model with harmonics up to a degree."""
-    return replace(model, sh_rest=model.sh_rest[:, : 3 * ((degree + 1) ** 2 - 1)])

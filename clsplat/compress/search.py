@@ -3,17 +3,17 @@
 import json
 import logging
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 from clsplat.compress.page import page
-from clsplat.compress.rungs import Ladder, checked_keeps, of_degree
+from clsplat.compress.rungs import Ladder, checked_keeps
 from clsplat.compress.target import Point, Target
 from clsplat.errors import ConfigError, quoted
 from clsplat.files import write_text
 from clsplat.formats.output import written
-from clsplat.formats.splats import Reading, Writing
+from clsplat.formats.splats import Reading, Writing, with_degree
 from clsplat.formats.table import bytes_of, located, tell_losses
 from clsplat.gaussians.model import load
 from clsplat.reading import read_file, sha256
@@ -122,7 +122,8 @@ def _measured(ladder: Ladder, source: Path, keep: float, form: Format, measurer:
         if form == "sog":
             _copy(ladder.fitted(source, name, degree, quality), file)
         else:
-            of_degree(model, degree).save(file, Writing(quality=quality, quiet=True))
+            lower = replace(model, sh_rest=with_degree(model.tables(), degree)["sh_rest"])
+            lower.save(file, Writing(quality=quality, quiet=True))
         size, figures = file.stat().st_size, measurer.figures(load(file, Reading(quiet=True)))
         point = Point(f"{TRIALS}/{file.name}", keep, degree, quality, len(model), size, *figures)
         LOG.info("%s: %.3g MB, %.2f dB", file.name, size / 1e6, point.psnr)

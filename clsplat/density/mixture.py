@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.formats.splats import inverse_opacities
 from clsplat.scene.quaternion import rotation_matrix, unit_quaternions
 
 Floats = NDArray[np.float64]
@@ -30,7 +31,7 @@ def surface(log_scales: Floats) -> Floats:
 
 def mass_of(tables: dict[str, Floats], size: Size = volume) -> Floats:
     """Return opacity times size, [N]."""
-    mass: Floats = size(tables["log_scales"]) / (1 + np.exp(-tables["logit_opacity"][:, 0]))
+    mass: Floats = size(tables["log_scales"]) / inverse_opacities(tables["logit_opacity"][:, 0])
     return mass
 
 

@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 from clsplat.density.edit import Edit, Rule
 from clsplat.density.mixture import mass_of, merged
 from clsplat.density.thresholds import Share
+from clsplat.formats.splats import inverse_opacities
 from clsplat.gaussians.tables import SH_C0
 from clsplat.schedule import Positive
 
@@ -27,7 +28,7 @@ class PruneUnimportant(Rule):
 
     def mark(self, edit: Edit) -> None:
         gaussians = edit.gaussians
-        opacity = 1 / (1 + np.exp(-gaussians.get("logit_opacity")[:, 0].astype(np.float64)))
+        opacity = 1 / inverse_opacities(gaussians.get("logit_opacity")[:, 0])
         score = opacity * np.exp(gaussians.get("log_scales").astype(np.float64).mean(axis=1))
         chosen = np.zeros(len(score), bool)
         chosen[np.argsort(score, kind="stable")[: int(self.share * len(score))]] = True

@@ -44,3 +44,5 @@ class Codec:
     keeps_numbers: bool = False  # of the rasterizer
     keeps_nan: bool = False
     has_quality: bool = False  # writing heeds Writing.quality
+    has_axes: bool = False  # reading and writing heed axes, of which nothing in the file tells
+    has_bits: bool = False  # writing heeds Writing.sh_bits and Writing.spz_version

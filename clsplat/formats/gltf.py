@@ -85,7 +85,7 @@ class Gltf:
             if number in seen:
                 raise DataError(f"{self.path}: its nodes are no tree, node {number} occurs twice; export it again")
             seen.add(number)
-            matrix = above @ _matrix(nodes[number])
+            matrix = above @ self._matrix(number)
             if not np.isfinite(matrix).all():
                 raise DataError(
                     f"{self.path}: node {number} has no finite place; expected finite numbers: export it again"
@@ -94,6 +94,29 @@ class Gltf:
                 found.append((_index(nodes[number]["mesh"]), matrix))
             waiting += [(_index(child), matrix) for child in nodes[number].get("children", [])]
         return found
+
+    def _matrix(self, number: int) -> NDArray[np.float64]:
+        """Where a node stands in the one above, [4, 4].  Raises DataError for a quaternion without a direction."""
+        node = self.tree["nodes"][number]
+        if "matrix" in node:
+            return np.array(node["matrix"], np.float64).reshape(4, 4).T
+        quaternion = np.array(node.get("rotation", [0, 0, 0, 1]), np.float64)
+        length = np.linalg.norm(quaternion)
+        if not 0 < length < np.inf:
+            raise DataError(
+                f"{self.path}: the rotation of node {number} is a quaternion of length {length:g}; expected 1: export "
+                "it again"
+            )
+        x, y, z, w = quaternion / length
+        matrix = np.eye(4)
+        matrix[:3, :3] = [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+        matrix[:3, :3] *= np.array(node.get("scale", [1, 1, 1]), np.float64)
+        matrix[:3, 3] = np.array(node.get("translation", [0, 0, 0]), np.float64)
+        return matrix
 
     def _roots(self) -> list[int]:
         """The nodes of the scene; without one, those that are nobody's child."""
@@ -108,19 +131,3 @@ def _index(value: Any) -> int:
     if not isinstance(value, int) or not 0 <= value < 1 << 40:
         raise ValueError(f"expected a whole number, got {quoted(value)}")
     return value
-
-
-def _matrix(node: dict[str, Any]) -> NDArray[np.float64]:
-    """Where a node stands in the one above, [4, 4]."""
-    if "matrix" in node:
-        return np.array(node["matrix"], np.float64).reshape(4, 4).T
-    x, y, z, w = np.array(node.get("rotation", [0, 0, 0, 1]), np.float64)
-    matrix = np.eye(4)
-    matrix[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    matrix[:3, :3] *= np.array(node.get("scale", [1, 1, 1]), np.float64)
-    matrix[:3, 3] = np.array(node.get("translation", [0, 0, 0]), np.float64)
-    return matrix

@@ -32,7 +32,7 @@ def codebook(values: NDArray[np.floating]) -> NDArray[np.float64]:
     cuts = _first_cuts(ordered)
     for _ in range(CODEBOOK_ROUNDS):
         for _ in range(LLOYD_STEPS):
-            means = cells.means(cuts)
+            means = np.sort(cells.means(cuts))
             cuts[1:-1] = np.searchsorted(ordered, (means[1:] + means[:-1]) / 2)
         cuts = cells.exchanged(cuts)
     return np.sort(cells.means(cuts))
@@ -42,10 +42,9 @@ class _Cells:
     """Sorted values in consecutive cells, which are divided by the places `cuts`, [ENTRIES + 1]."""
 
     def __init__(self, ordered: NDArray[np.float64]) -> None:
-        self.ordered, self.centre = ordered, ordered.mean()
+        self.ordered, self.centre = ordered, ordered[len(ordered) // 2]
         around = ordered - self.centre
-        self.sums = np.concatenate([[0.0], np.cumsum(around)])
-        self.squares = np.concatenate([[0.0], np.cumsum(np.square(around))])
+        self.sums, self.squares = _sums(around), _sums(np.square(around))
 
     def means(self, cuts: NDArray[np.int64]) -> NDArray[np.float64]:
         """The mean of each cell; of an empty one the value before it."""
@@ -63,7 +62,7 @@ class _Cells:
         for _ in range(ENTRIES):
             own = self.errors(cuts[:-1], cuts[1:])
             joined = self.errors(cuts[:-2], cuts[2:]) - own[:-1] - own[1:]
-            middle = np.searchsorted(self.ordered, self.means(cuts))
+            middle = np.clip(np.searchsorted(self.ordered, self.means(cuts)), cuts[:-1], cuts[1:])  # of empty cells too
             gain = own - self.errors(cuts[:-1], middle) - self.errors(middle, cuts[1:])
             worst = int(gain.argmax())
             joined[max(worst - 1, 0) : worst + 1] = np.inf  # of cells beside it
@@ -72,6 +71,13 @@ class _Cells:
                 break
             cuts = np.sort(np.append(np.delete(cuts, cheap + 1), middle[worst]))
         return cuts
+
+
+def _sums(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Sums of the values before each place, [N + 1], from the middle on: far ones cost no digits there."""
+    middle = len(values) // 2
+    before, after = np.cumsum(values[:middle][::-1])[::-1], np.cumsum(values[middle:])
+    return np.concatenate([-before, [0.0], after])
 
 
 def _first_cuts(ordered: NDArray[np.float64]) -> NDArray[np.int64]:

@@ -5,6 +5,7 @@ import json
 import zipfile
 from contextlib import suppress
 from dataclasses import dataclass
+from decimal import ROUND_CEILING, ROUND_FLOOR, ROUND_HALF_EVEN, Context
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,16 @@ from clsplat.formats.packing import morton_order, smallest_three
 from clsplat.formats.palette import codebook, nearest, palette
 from clsplat.formats.sog import PER_ROW, ROTATED
 from clsplat.formats.sog_files import META, with_images
-from clsplat.formats.splats import Parameters, SplatFile, Writing, opacities, require_moderate, require_some, unit
+from clsplat.formats.splats import (
+    Parameters,
+    SplatFile,
+    Writing,
+    degree_of,
+    opacities,
+    require_moderate,
+    require_some,
+    unit,
+)
 
 PALETTES = {"small": 1024, "balanced": 4096, "high": 16384}  # entries at most
 SMALLEST = 1024  # entries for so many splats, and twice as many for twice as many
@@ -94,7 +104,8 @@ def _write(path: Path, data: bytes) -> str:
 def _means(p: Parameters, image: Any) -> dict[str, Any]:
     wide = p["means"].astype(np.float64)
     t = np.sign(wide) * np.log1p(np.abs(wide))
-    lows, highs = t.min(axis=0), t.max(axis=0)
+    ends = zip((t.min(axis=0), t.max(axis=0)), (ROUND_FLOOR, ROUND_CEILING), strict=True)
+    lows, highs = (np.array([_short(end, way) for end in row]) for row, way in ends)
     span = np.where(highs > lows, highs - lows, 1)
     levels = np.rint(65535 * (t - lows) / span).astype(np.uint16)
     files = [image("means_l", *(levels & 255).T), image("means_u", *(levels >> 8).T)]
@@ -130,15 +141,19 @@ class Harmonics:
 
 def _harmonics(rest: NDArray[np.float32], options: Writing, image: Any) -> dict[str, Any]:
     found, size = Harmonics.of(rest, options), rest.shape[1] // 3
-    degree = round((size + 1) ** 0.5) - 1
     files = [image("shN_centroids", *found.palette.reshape(-1, 3).T, across=PER_ROW * size)]
     files.append(image("shN_labels", found.labels & 255, found.labels >> 8, np.zeros_like(found.labels)))
-    return {"count": len(found.palette), "bands": degree, "codebook": found.numbers.tolist(), "files": files}
+    return {
+        "count": len(found.palette),
+        "bands": degree_of(rest.shape[1]),
+        "codebook": found.numbers.tolist(),
+        "files": files,
+    }
 
 
-def _short(number: float) -> float:
-    """A number as float32 has it, in few digits."""
-    return float(f"{number:.8g}")
+def _short(number: float, rounding: str = ROUND_HALF_EVEN) -> float:
+    """A number in few digits, as float32 has it: the last bit of logarithms and means is the processor's."""
+    return float(Context(8, rounding).create_decimal(float(number)))
 
 
 def _zipped(images: dict[str, bytes]) -> bytes:

@@ -27,6 +27,8 @@ MAX_FILE = 1 << 33  # bytes
 LARGEST = 1e15  # of LIMITED: beyond it neither viewers nor codebooks hold anything
 LIMITED = ("log_scales", "sh_base", "sh_rest")
 MIN_ALPHA = 1e-6  # opacities of 0 and 1 have no logit
+MAX_EXPONENT = 700.0  # of e in float64
+MAX_LOG = 88.7  # of a scale in float32
 FLAT_LOG_SCALE = -13.815511  # log 1e-6: of the third axis of a disc
 FLIP_SH = (-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1)  # y and z change sign: bands 1 to 3
 Parameters = dict[str, NDArray[np.float32]]  # by the names of PARAMETERS, each [N, components]
@@ -103,8 +105,13 @@ def logits(alpha: Floats) -> NDArray[np.float32]:
 
 
 def opacities(logit: Floats) -> NDArray[np.float64]:
-    """Return opacities in [0, 1] of logits."""
+    """Return opacities in [0, 1] of logits, to 1e-16."""
     return np.asarray(0.5 + 0.5 * np.tanh(0.5 * logit.astype(np.float64)))
+
+
+def inverse_opacities(logit: Floats) -> NDArray[np.float64]:
+    """Return 1 / opacity of logits, in which faint ones keep their digits; finite for all that are."""
+    return np.asarray(1 + np.exp(np.minimum(-logit.astype(np.float64), MAX_EXPONENT)))
 
 
 def logs(scales: Floats) -> NDArray[np.float32]:
@@ -124,13 +131,20 @@ def unit(quats: Floats) -> NDArray[np.float64]:
 
 def flipped(parameters: Parameters) -> Parameters:
     """Return the Gaussians in axes whose y and z point the other way: up and back for down and ahead, or back again."""
-    signs = np.repeat(np.array(FLIP_SH, np.float32), 3)[: parameters["sh_rest"].shape[1]]
-    return {
-        **parameters,
-        "means": parameters["means"] * np.array([1, -1, -1], np.float32),
-        "quats": parameters["quats"] * np.array([1, 1, -1, -1], np.float32),
-        "sh_rest": parameters["sh_rest"] * signs,
-    }
+    signs = _signs(parameters)
+    return {name: table * signs[name] if name in signs else table for name, table in parameters.items()}
+
+
+def flip(parameters: Parameters) -> None:
+    """Turn the Gaussians as `flipped` does, in place."""
+    for name, signs in _signs(parameters).items():
+        parameters[name] *= signs
+
+
+def _signs(parameters: Parameters) -> Parameters:
+    rest = np.repeat(FLIP_SH, 3)[: parameters["sh_rest"].shape[1]]
+    signs = {"means": (1, -1, -1), "quats": (1, 1, -1, -1), "sh_rest": rest}
+    return {name: np.array(values, np.float32) for name, values in signs.items()}
 
 
 def swapped(table: NDArray[np.float32], outer: int, inner: int) -> NDArray[np.float32]:

@@ -11,23 +11,36 @@ Axes are x right, y up, z back.  Some programs leave those of the PLY, and nothi
 """
 
 import gzip
-import itertools
+import io
 import logging
 import struct
 import zlib
+from collections.abc import Callable
 from pathlib import Path
 
 from clsplat.errors import DataError
 from clsplat.formats import zstd
 from clsplat.formats.output import written
 from clsplat.formats.packing import morton_order
-from clsplat.formats.splats import MAX_DEGREE, MAX_FILE, Reading, SplatFile, Writing, flipped, require_some
+from clsplat.formats.splats import (
+    MAX_DEGREE,
+    MAX_FILE,
+    Parameters,
+    Reading,
+    SplatFile,
+    Writing,
+    flip,
+    flipped,
+    require_some,
+)
 from clsplat.formats.spz_planes import EXTENSIONS, HEADER, MAGIC, MIP, Header, fraction_of, packed, unpacked
 from clsplat.reading import read_file
 
 LOG = logging.getLogger("clsplat")
 HEADER4 = 32  # bytes, of version 4
-GZIP_RATIO, ZSTD_RATIO = 1032, 1 << 17  # most bytes that one byte of a stream can stand for
+GZIP_RATIO = 1032  # most bytes that one byte of deflate can stand for
+RATIO4 = 1024  # most bytes of positions that one byte of version 4 may stand for, as in Niantic's library
+BLOCK = 1 << 16  # bytes at once
 ADOBE_AXES = 0xADBE0003  # an extension that changes the axes
 EXPECTED = "an SPZ file"
 
@@ -35,12 +48,11 @@ EXPECTED = "an SPZ file"
 def read_spz(path: Path, options: Reading) -> SplatFile:
     """Read an SPZ file.  Raises DataError when it is missing or damaged, or where its axes are not known."""
     data = read_file(path, EXPECTED, limit=MAX_FILE)
-    header, planes = _unpacked_4(path, data) if data[:4] == MAGIC else _unpacked(path, data)
-    parameters = unpacked(header, planes)
+    header, parameters = _unpacked_4(path, data) if data[:4] == MAGIC else _unpacked(path, data)
     if header.degree > MAX_DEGREE:
         LOG.warning("%s: dropped the bands of SH degree 4", path)
     if options.axes == "spz":
-        parameters = flipped(parameters)
+        flip(parameters)
     if options.axes == "spz" and not options.quiet:
         LOG.info("%s: axes as the format says (up, back); if it stands on its head, `clsplat convert --axes ply`", path)
     return SplatFile(parameters, {}, "mip" if header.flags & MIP else "default")
@@ -61,35 +73,68 @@ def write_spz(path: Path, splats: SplatFile, options: Writing) -> str:
         frames = [zstd.compress(plane) for plane in streams]
         table = b"".join(struct.pack("<2Q", len(f), len(s)) for f, s in zip(frames, streams, strict=True))
         content = start + struct.pack("<BI12x", len(streams), HEADER4) + table + b"".join(frames)
+        if len(planes[0]) > len(content) * RATIO4:
+            raise DataError(f"{path}: so many equal splats are refused by readers of version 4; use version 3")
     with written(path) as file:
         file.write(content)
     return file.sha256
 
 
-def _unpacked(path: Path, data: bytes) -> tuple[Header, list[bytes]]:
-    """Header and planes of versions 1 to 3."""
-    try:
-        header = Header.of(path, zlib.decompressobj(31).decompress(data, HEADER))
-        expected = HEADER + sum(header.sizes)
-        _check_size(path, header, len(data) * GZIP_RATIO)
-        stream = zlib.decompressobj(31)
-        body = stream.decompress(data, expected + 1)
-        rest = stream.decompress(stream.unconsumed_tail, MAX_DEGREE * 1024) if header.flags & EXTENSIONS else b""
-    except zlib.error as error:
-        raise DataError(f"{path}: {error}; expected {EXPECTED} in gzip: copy or export it again") from error
+def _unpacked(path: Path, data: bytes) -> tuple[Header, Parameters]:
+    """Header and parameters of versions 1 to 3."""
+    stream = _Gzip(path, data)
+    header = Header.of(path, stream.read(HEADER))
     if header.version > 3:
         raise DataError(f"{path}: SPZ of version 4 in gzip; expected Zstandard: export it again")
-    if len(body) < expected:
-        raise DataError(f"{path}: ends early: {header.count} splats take {expected} bytes; copy or export it again")
+    _check_size(path, header, sum(header.sizes), len(data) * GZIP_RATIO)
+
+    def read(size: int) -> bytes:
+        if len(found := stream.read(size)) < size:
+            expected = HEADER + sum(header.sizes)
+            raise DataError(f"{path}: ends early: {header.count} splats take {expected} bytes; copy or export it again")
+        return found
+
+    parameters = unpacked(header, [read] * len(header.sizes))
     if header.flags & EXTENSIONS:
-        _check_extensions(path, body[expected:] + rest)
-    elif len(body) > expected:
+        _check_extensions(path, stream.read)
+    if stream.read(1):
         raise DataError(f"{path}: goes on after {header.count} splats; copy or export it again")
-    return header, _cut(body[HEADER:expected], header.sizes)
+    stream.require_end()
+    return header, parameters
 
 
-def _unpacked_4(path: Path, data: bytes) -> tuple[Header, list[bytes]]:
-    """Header and planes of version 4."""
+class _Gzip:
+    """A member of gzip, a part at a time.  Raises DataError where it is damaged."""
+
+    def __init__(self, path: Path, data: bytes) -> None:
+        self.path, self.file, self.stream = path, io.BytesIO(data), zlib.decompressobj(31)
+
+    def read(self, size: int) -> bytes:
+        """Return so many bytes, or fewer at the end."""
+        found = bytearray()
+        while len(found) < size and not self.stream.eof:
+            fed = self.stream.unconsumed_tail or self.file.read(BLOCK)
+            try:
+                part = self.stream.decompress(fed, size - len(found))
+            except zlib.error as error:
+                raise DataError(
+                    f"{self.path}: {error}; expected {EXPECTED} in gzip: copy or export it again"
+                ) from error
+            if not fed and not part:
+                break
+            found += part
+        return bytes(found)
+
+    def require_end(self) -> None:
+        """Raise DataError where the member, which is read, is not whole, or something follows it."""
+        if not self.stream.eof:
+            raise DataError(f"{self.path}: ends early, before the checksum of its gzip; copy or export it again")
+        if rest := len(self.stream.unused_data) + len(self.file.read()):
+            raise DataError(f"{self.path}: goes on for {rest} bytes after its gzip; copy or export it again")
+
+
+def _unpacked_4(path: Path, data: bytes) -> tuple[Header, Parameters]:
+    """Header and parameters of version 4."""
     header = Header.of(path, data)
     if header.version != 4 or len(data) < HEADER4:
         raise DataError(f"{path}: SPZ of version {header.version} without gzip; expected version 4: export it again")
@@ -100,10 +145,10 @@ def _unpacked_4(path: Path, data: bytes) -> tuple[Header, list[bytes]]:
             f"{path}: has {streams} streams, their table at byte {table}; expected {len(present)}, inside of its "
             f"{len(data)} bytes: copy or export it again"
         )
-    _check_size(path, header, len(data) * ZSTD_RATIO)
+    _check_size(path, header, header.sizes[0], len(data) * RATIO4)
     if header.flags & EXTENSIONS:
-        _check_extensions(path, data[HEADER4:table])
-    start, planes = table + 16 * streams, []
+        _check_extensions(path, io.BytesIO(data[HEADER4:table]).read)
+    start, frames = table + 16 * streams, []
     for number, size in enumerate(present):
         held, declared = struct.unpack_from("<2Q", data, table + 16 * number)
         if declared != size or held > len(data) - start:
@@ -111,32 +156,27 @@ def _unpacked_4(path: Path, data: bytes) -> tuple[Header, list[bytes]]:
                 f"{path}: stream {number} declares {held} bytes for {declared}; expected {size} for {header.count} "
                 "splats, inside of the file: copy or export it again"
             )
-        planes.append(zstd.decompress(path, data[start : start + held], size))
+        frames.append(zstd.Frame(path, data[start : start + held], size))
         start += held
     if start != len(data):
         raise DataError(f"{path}: goes on after its last stream, at byte {start}; copy or export it again")
-    return header, planes + [b""] * (len(header.sizes) - len(planes))
+    return header, unpacked(header, [frame.read for frame in frames])
 
 
-def _check_size(path: Path, header: Header, most: int) -> None:
-    """Raise DataError where a file cannot hold so many splats, before any is made."""
-    if sum(header.sizes) > most:
+def _check_size(path: Path, header: Header, size: int, most: int) -> None:
+    """Raise DataError where a file cannot hold so many splats, of this size, before any is made."""
+    if size > most:
         raise DataError(
-            f"{path}: declares {header.count} splats, {sum(header.sizes)} bytes, more than it can hold; "
+            f"{path}: declares {header.count} splats, {size} bytes, more than it can hold ({most}); "
             "the file is truncated or damaged: copy or export it again"
         )
 
 
-def _check_extensions(path: Path, data: bytes) -> None:
+def _check_extensions(path: Path, read: Callable[[int], bytes]) -> None:
     """Raise DataError for a record that changes the axes; others are skipped, as the library does."""
-    start = 0
-    while start + 8 <= len(data):
-        kind, length = struct.unpack_from("<2I", data, start)
+    while len(record := read(8)) == 8:
+        kind, length = struct.unpack("<2I", record)
         if kind == ADOBE_AXES:
             raise DataError(f"{path}: has axes of its own, in the record {kind:#x}; expected none: export it without")
-        start += 8 + length
-
-
-def _cut(data: bytes, sizes: list[int]) -> list[bytes]:
-    """Divide bytes into parts of these sizes."""
-    return [data[end - size : end] for size, end in zip(sizes, itertools.accumulate(sizes), strict=True)]
+        while length and (part := read(min(length, BLOCK))):
+            length -= len(part)

@@ -3,6 +3,7 @@
 import logging
 import math
 import struct
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from clsplat.errors import DataError
 from clsplat.formats.packing import beyond_bytes, from_smallest_three, smallest_three, tell_cut
-from clsplat.formats.splats import MAX_DEGREE, Parameters, Writing, logits, opacities, sh_coefficients, unit
+from clsplat.formats.splats import MAX_DEGREE, PARAMETERS, Parameters, Writing, logits, opacities, sh_coefficients, unit
 
 LOG = logging.getLogger("clsplat")
 MAGIC = b"NGSP"
@@ -21,6 +22,7 @@ STORED_DEGREE = 4  # which the format knows; bands beyond MAX_DEGREE are dropped
 COLOUR = 0.15
 MAX_INT24 = 2**23 - 1
 FRACTION, FINE_FRACTION = 12, 20  # bits of positions; the second for quality high
+ROWS = 1 << 13  # that are decoded at once: what that takes beside the result is little
 QUALITY = {"small": (6, 5), "balanced": (8, 8), "high": (8, 8)}  # bits of band 1 and of the others
 
 
@@ -54,36 +56,48 @@ class Header:
         return [self.count * width for width in (*widths, 3 * (sh_coefficients(self.degree) - 1))]
 
 
-def unpacked(header: Header, planes: list[bytes]) -> Parameters:
-    """Return the parameters that the bytes of the planes stand for."""
-    positions, alphas, colours, scales, rotations, harmonics = (np.frombuffer(plane, np.uint8) for plane in planes)
-    count, columns = header.count, 3 * (sh_coefficients(min(header.degree, MAX_DEGREE)) - 1)
-    if header.version == 1:
-        means = positions.view("<f2").astype(np.float32)
-    else:
-        low, middle, high = positions.reshape(-1, 3).astype(np.int32).T
-        means = ((low | middle << 8 | (high ^ 128) << 16) - (1 << 23)).astype(np.float32) / np.float32(
-            2**header.fraction
-        )
-    rest = harmonics.reshape(count, -1)[:, :columns] if count else np.zeros((0, columns), np.uint8)
-    return {
-        "means": means.reshape(count, 3),
-        "quats": _three_bytes(rotations) if header.version < 3 else _four_bytes(rotations),
-        "log_scales": scales.reshape(count, 3).astype(np.float32) / np.float32(16) - np.float32(10),
-        "logit_opacity": logits(alphas.reshape(count, 1) / 255.0),
-        "sh_base": ((colours.reshape(count, 3) / 255.0 - 0.5) / COLOUR).astype(np.float32),
-        "sh_rest": (rest.astype(np.float32) - np.float32(128)) / np.float32(128),
+def unpacked(header: Header, planes: Sequence[Callable[[int], bytes]]) -> Parameters:
+    """Return the parameters that the bytes of the planes stand for: of each, what returns the next so many bytes."""
+    byte = np.arange(256, dtype=np.float32)
+    levels = {
+        "logit_opacity": logits(np.arange(256) / 255.0),
+        "sh_base": ((np.arange(256) / 255.0 - 0.5) / COLOUR).astype(np.float32),
+        "log_scales": byte / np.float32(16) - np.float32(10),
+        "sh_rest": (byte - np.float32(128)) / np.float32(128),
     }
+    columns = 3 * (sh_coefficients(min(header.degree, MAX_DEGREE)) - 1)
+    widths = {"means": 3, "quats": 4, "log_scales": 3, "logit_opacity": 1, "sh_base": 3, "sh_rest": columns}
+    found = {name: np.empty((header.count, widths[name]), np.float32) for name in PARAMETERS}
+    order = ("means", "logit_opacity", "sh_base", "log_scales", "quats", "sh_rest")
+    for name, size, plane in zip(order, header.sizes, planes, strict=False):  # of degree 0 there may be no last one
+        for start in range(0, header.count if size else 0, ROWS):
+            part = found[name][start : start + ROWS]
+            data = np.frombuffer(plane(size // header.count * len(part)), np.uint8).reshape(len(part), -1)
+            if name == "means":
+                part[:] = _positions(header, data)
+            elif name == "quats":
+                part[:] = _three_bytes(data) if header.version < 3 else _four_bytes(data)
+            else:
+                part[:] = levels[name][data[:, : widths[name]]]
+    return found
+
+
+def _positions(header: Header, data: NDArray[np.uint8]) -> NDArray[np.float32]:
+    if header.version == 1:
+        return data.view("<f2").astype(np.float32)
+    low, middle, high = data.reshape(-1, 3).astype(np.int32).T
+    whole = (low | middle << 8 | (high ^ 128) << 16) - (1 << 23)
+    return (whole.astype(np.float32) / np.float32(2**header.fraction)).reshape(-1, 3)
 
 
 def _three_bytes(packed: NDArray[np.uint8]) -> NDArray[np.float32]:
-    xyz = packed.reshape(-1, 3) / 127.5 - 1
+    xyz = packed / 127.5 - 1
     w = np.sqrt(np.maximum(1 - np.square(xyz).sum(axis=1, keepdims=True), 0))
     return np.concatenate([w, xyz], axis=1).astype(np.float32)
 
 
 def _four_bytes(packed: NDArray[np.uint8]) -> NDArray[np.float32]:
-    bits = packed.view("<u4")
+    bits = packed.view("<u4")[:, 0]
     parts = [bits >> np.uint32(shift) & np.uint32(1023) for shift in (20, 10, 0)]
     others = np.stack([(part & 511) / 511 * 0.5**0.5 * np.where(part & 512, -1, 1) for part in parts], axis=1)
     xyzw = from_smallest_three((bits >> np.uint32(30)).astype(np.intp), others)

@@ -26,10 +26,6 @@ from clsplat.reading import opened
 LOG = logging.getLogger("clsplat")
 
 
-def _is_ply(start: Start) -> bool:
-    return "f_dc_0" in (((header := start.ply()) and header.dtype.names) or ())
-
-
 CODECS = (
     Codec(
         "PLY",
@@ -37,7 +33,7 @@ CODECS = (
         "any order and number types, little or big endian, discs of 2DGS, other elements around the vertices",
         "the order of 3DGS",
         "nothing",
-        _is_ply,
+        lambda start: (header := start.ply()) is not None and "f_dc_0" in (header.dtype.names or ()),
         lambda path, options: read_ply(path),
         lambda path, splats, options: write_ply(path, splats.parameters, splats.rendering),
         keeps_filter=True,
@@ -67,6 +63,8 @@ CODECS = (
         read_spz,
         write_spz,
         has_quality=True,
+        has_axes=True,
+        has_bits=True,
     ),
     Codec(
         "SOG",

@@ -18,16 +18,29 @@ def compress(data: bytes) -> bytes:
     return packed
 
 
-def decompress(path: Path, data: bytes, size: int) -> bytes:
-    """Return the `size` bytes of a frame; nothing larger is made.  Raises DataError for another size or a bad frame."""
-    module, builtin = _module()
-    try:
-        found: bytes = _stream(module, builtin, data).read(size + 1)
-    except (module.ZstdError, EOFError) as error:
-        raise DataError(f"{path}: a stream is damaged ({error}); copy or export the file again") from error
-    if len(found) != size:
-        raise DataError(f"{path}: a stream holds {len(found)} bytes or more; expected {size}: export the file again")
-    return found
+class Frame:
+    """A frame that holds `size` bytes, read a part at a time.  Raises DataError for another size or a bad frame."""
+
+    def __init__(self, path: Path, data: bytes, size: int) -> None:
+        module, builtin = _module()
+        self.path, self.size, self.left, self.error = path, size, size, module.ZstdError
+        self.stream = _stream(module, builtin, data)
+
+    def read(self, size: int) -> bytes:
+        """Return the next bytes, so many."""
+        found = self._some(size)
+        self.left -= size
+        if len(found) != size or (not self.left and self._some(1)):
+            end = "ends early" if len(found) != size else "goes on"
+            raise DataError(f"{self.path}: a stream {end}; expected {self.size} bytes: copy or export the file again")
+        return found
+
+    def _some(self, size: int) -> bytes:
+        try:
+            found: bytes = self.stream.read(size)
+        except (self.error, EOFError) as error:
+            raise DataError(f"{self.path}: a stream is damaged ({error}); copy or export the file again") from error
+        return found
 
 
 def _stream(module: ModuleType, builtin: bool, data: bytes) -> Any:

@@ -11,12 +11,14 @@ from numpy.typing import NDArray
 
 from clsplat.errors import ConfigError, DataError, quoted
 from clsplat.files import check_no_file_of_a_run
+from clsplat.formats.ply import MAX_NUMBER
 from clsplat.formats.splats import MAX_DEGREE, Reading, Writing, with_degree
 from clsplat.formats.table import bytes_of, detect, for_writing
 from clsplat.gaussians.model import Model, load
 from clsplat.gaussians.run_model import model_at
 
 LOG = logging.getLogger("clsplat")
+KEPT = ("near", "screen_variance", "background", "alpha")  # of the first model that is merged
 WORDS = ("scale", "rotate", "translate")
 AXES, QUALITIES = ("spz", "ply"), ("small", "balanced", "high")
 
@@ -31,16 +33,19 @@ class Changes:
     sh_degree: int | None = None  # at most
 
     def of(self, model: Model) -> Model:
-        """Return the changed model.  Raises DataError where nothing is left."""
+        """Return the changed model.  Raises DataError where nothing is left, ConfigError for a transform too far."""
         kept = model[model.opacities >= self.drop_below] if self.drop_below else model
         if self.transform is not None:
             scale = float(np.cbrt(np.linalg.det(self.transform[:3, :3])))
-            kept = kept.transformed(scale, self.transform[:3, :3] / scale, self.transform[:3, 3])
+            try:
+                kept = kept.transformed(scale, self.transform[:3, :3] / scale, self.transform[:3, 3])
+            except ValueError as error:
+                raise ConfigError(f"--transform: {error}") from error
         if self.crop is not None:
             low, high = np.array(self.crop, np.float64).reshape(2, 3)
             kept = kept[((kept.means >= low) & (kept.means <= high)).all(axis=1)]
         if self.sh_degree is not None and self.sh_degree < kept.sh_degree:
-            kept = replace(kept, **with_degree(kept.tables(), self.sh_degree))  # type: ignore[arg-type]
+            kept = replace(kept, sh_rest=with_degree(kept.tables(), self.sh_degree)["sh_rest"])
         if not len(kept) and len(model):
             raise DataError(f"none of {len(model):,} Gaussians is left; expected some inside of the crop and as opaque")
         return kept
@@ -58,16 +63,15 @@ class Options:
 
     def of(self, sources: Sequence[Path], out: Path) -> tuple[Reading, Writing]:
         """Return them for these files.  Raises ConfigError where one has no meaning there."""
-        codec, from_spz = for_writing(out), _reads_spz(sources)
-        to_spz = codec.name == "SPZ"
+        codec, reads_axes = for_writing(out), _reads_axes(sources)
         for name, value, known in (("axes", self.axes, AXES), ("quality", self.quality, QUALITIES)):
             if value not in known:
                 raise ConfigError(f"--{name} {quoted(value)}: expected one of {', '.join(known)}")
         if self.spz_version not in (3, 4):
             raise ConfigError(f"--spz-version {self.spz_version}: expected 3 or 4")
-        if not to_spz and (self.sh_bits is not None or self.spz_version != 3):
+        if not codec.has_bits and (self.sh_bits is not None or self.spz_version != 3):
             raise ConfigError(f"{out}: --sh-bits and --spz-version are of SPZ; expected a name that ends in .spz")
-        if self.axes != "spz" and not to_spz and not from_spz:
+        if self.axes != "spz" and not codec.has_axes and not reads_axes:
             raise ConfigError("--axes is of SPZ; expected an SPZ file to read or to write")
         if self.quality != "balanced" and not codec.has_quality:
             raise ConfigError(f"{out}: --quality is of SPZ and SOG; expected a name that ends in .spz or .sog")
@@ -75,7 +79,7 @@ class Options:
             raise ConfigError(f"{out}: --keep-nan is of PLY; expected a name that ends in .ply")
         bits = None if self.sh_bits is None else sh_bits_of(self.sh_bits)
         version: Literal[3, 4] = 4 if self.spz_version == 4 else 3
-        written = Writing(bits, "spz" if from_spz else self.axes, version, self.quality)
+        written = Writing(bits, "spz" if reads_axes else self.axes, version, self.quality)
         return Reading(self.axes, "keep" if self.keep_nan else "drop"), written
 
 
@@ -113,8 +117,9 @@ def merged(models: Sequence[Model], names: Sequence[str]) -> Model:
         if bool(model.rendering.compensate) != bool(first.rendering.compensate):
             kinds = [("a mip model" if m.rendering.compensate else "none") for m in (first, model)]
             raise DataError(f"{name}: is {kinds[1]}, {names[0]} is {kinds[0]}; expected the same: one filter draws all")
-        if model.rendering.screen_variance != first.rendering.screen_variance:
-            LOG.warning("%s: its screen_variance is another; that of %s is kept", name, names[0])
+        own, kept = model.rendering.comment(), first.rendering.comment()
+        if other := [f"{one} = {own.get(one, 'not given')}" for one in KEPT if own.get(one) != kept.get(one)]:
+            LOG.warning("%s: has %s; what %s says is kept", name, ", ".join(other), names[0])
     if any(model.filter_variance is None for model in models):
         models = [model.baked() for model in models]
     degree = max(model.sh_degree for model in models)
@@ -141,14 +146,19 @@ def transform_of(text: str) -> NDArray[np.float64]:
             matrix = np.eye(4)
             for part in text.split():
                 word, _, values = part.partition("=")
-                matrix = _step(word, [float(value) for value in values.split(",")]) @ matrix
+                with np.errstate(over="ignore", invalid="ignore"):  # told below
+                    matrix = _step(word, [float(value) for value in values.split(",")]) @ matrix
     except ValueError as error:
         raise ConfigError(expected) from error
     turned = matrix[:3, :3]
+    if not np.abs(matrix).max() < MAX_NUMBER or not (np.abs(turned).max() or 1) > 1 / MAX_NUMBER:
+        raise ConfigError(
+            f"--transform {quoted(text)}: expected a scale from {1 / MAX_NUMBER:g} to {MAX_NUMBER:g}, and a "
+            "translation below that"
+        )
     scale2 = turned @ turned.T
     if (
-        not np.isfinite(matrix).all()
-        or not np.allclose(matrix[3], [0, 0, 0, 1])
+        not np.allclose(matrix[3], [0, 0, 0, 1])
         or np.linalg.det(turned) <= 0
         or not np.allclose(scale2, scale2[0, 0] * np.eye(3), atol=1e-5 * scale2[0, 0])
     ):
@@ -198,10 +208,10 @@ def checked_degree(degree: int | None) -> int | None:
     return degree
 
 
-def _reads_spz(sources: Sequence[Path]) -> bool:
-    """Whether one of the files is an SPZ file."""
+def _reads_axes(sources: Sequence[Path]) -> bool:
+    """Whether one of the files is of a format that does not tell its axes."""
     found = [detect(place) for place in map(model_at, sources) if place.is_file()]
-    return any(codec is not None and codec.name == "SPZ" for codec in found)
+    return any(codec is not None and codec.has_axes for codec in found)
 
 
 def _is_same(one: Path, other: Path) -> bool:

@@ -9,8 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.errors import DataError
+from clsplat.formats.ply import MAX_NUMBER
 from clsplat.formats.splats import (
     MAX_DEGREE,
+    MAX_EXPONENT,
+    MAX_LOG,
     MIP_VARIANCE,
     NEAR,
     PARAMETERS,
@@ -19,9 +22,14 @@ from clsplat.formats.splats import (
     Reading,
     SplatFile,
     Writing,
+    degree_of,
+    inverse_opacities,
+    not_finite,
+    opacities,
     sh_coefficients,
 )
 from clsplat.formats.table import for_writing, read, write
+from clsplat.gaussians.quaternions import product, quaternion_of
 from clsplat.gaussians.run_model import model_at
 from clsplat.gaussians.sh import rotated_sh
 from clsplat.gaussians.tables import DeviceModel, Gaussians
@@ -112,18 +120,17 @@ class Model:
     @property
     def sh_degree(self) -> int:
         """Highest degree of the spherical harmonics."""
-        degree: int = round((1 + self.sh_rest.shape[1] / 3) ** 0.5) - 1
-        return degree
+        return degree_of(self.sh_rest.shape[1])
 
     @property
     def scales(self) -> Floats:
         """Standard deviations along the axes, [N, 3] scene units."""
-        return np.exp(self.log_scales)
+        return np.exp(np.minimum(self.log_scales, MAX_LOG))
 
     @property
     def opacities(self) -> Floats:
         """Opacities in (0, 1), [N]."""
-        return np.asarray(1 / (1 + np.exp(-self.logit_opacity[:, 0].astype(np.float64))), np.float32)
+        return opacities(self.logit_opacity[:, 0]).astype(np.float32)
 
     @property
     def colours(self) -> Floats:
@@ -140,7 +147,8 @@ class Model:
     ) -> "Model":
         """Return the model after x -> scale · rotation x + translation; colours turn with it.
 
-        rotation: [3, 3]; translation: [3] scene units.  Raises ValueError for a matrix that is not a rotation.
+        rotation: [3, 3]; translation: [3] scene units.  Raises ValueError for a matrix that is not a rotation, and
+        where the result is more than a model file holds.
         """
         turn = np.eye(3) if rotation is None else np.asarray(rotation, np.float64)
         if np.shape(translation) != (3,):
@@ -149,16 +157,20 @@ class Model:
             raise ValueError("expected a positive scale and a rotation matrix [3, 3]")
         if np.linalg.det(turn) < 0:
             raise ValueError("expected a rotation; this matrix mirrors")
-        changed: dict[str, Any] = {
-            "means": scale * self.means.astype(np.float64) @ turn.T + np.asarray(translation, np.float64),
-            "quats": _product(_quaternion(turn), self.quats.astype(np.float64)),
-            "log_scales": self.log_scales + np.log(scale),
-            "sh_rest": rotated_sh(self.sh_rest, turn),
-        }
-        if self.filter_variance is not None:
-            changed["filter_variance"] = self.filter_variance * scale**2
-        rendering = replace(self.rendering, near=self.rendering.near * scale)
-        return replace(self, **{k: v.astype(np.float32) for k, v in changed.items()}, rendering=rendering)
+        with np.errstate(over="ignore", invalid="ignore"):
+            changed: dict[str, Any] = {
+                "means": scale * self.means.astype(np.float64) @ turn.T + np.asarray(translation, np.float64),
+                "quats": product(quaternion_of(turn), self.quats.astype(np.float64)),
+                "log_scales": self.log_scales + np.log(scale),
+                "sh_rest": rotated_sh(self.sh_rest, turn),
+            }
+            if self.filter_variance is not None:
+                changed["filter_variance"] = self.filter_variance * scale**2
+            tables = {name: table.astype(np.float32) for name, table in changed.items()}
+        near = self.rendering.near * scale
+        if near >= MAX_NUMBER or (not_finite({**self.tables(), **tables}) & ~not_finite(self.tables())).any():
+            raise ValueError("expected a smaller scale and translation: no model file holds so large numbers")
+        return replace(self, **tables, rendering=replace(self.rendering, near=near))
 
     def baked(self) -> "Model":
         """Return the model with the world filter as part of its scales and opacities (Yu et al. 2024, eq. 9).
@@ -167,14 +179,14 @@ class Model:
         """
         if self.filter_variance is None:
             return self
-        scale2 = np.exp(2 * self.log_scales.astype(np.float64))
+        scale2 = np.exp(np.clip(2 * self.log_scales.astype(np.float64), -MAX_EXPONENT, MAX_EXPONENT))
         filtered2 = scale2 + self.filter_variance.astype(np.float64)
         opacity = np.sqrt(np.prod(scale2 / filtered2, axis=1, keepdims=True))
-        opacity /= 1 + np.exp(-self.logit_opacity.astype(np.float64))
+        opacity /= inverse_opacities(self.logit_opacity)
         with np.errstate(divide="ignore"):
             logit = np.log(opacity) - np.log1p(-opacity)
         log_scales = (0.5 * np.log(filtered2)).astype(np.float32)
-        logits = np.maximum(logit, MIN_LOGIT).astype(np.float32)
+        logits = np.clip(logit, MIN_LOGIT, -MIN_LOGIT).astype(np.float32)
         return replace(self, log_scales=log_scales, logit_opacity=logits, filter_variance=None)
 
     def save(self, path: str | Path, options: Writing | None = None) -> str:
@@ -223,24 +235,4 @@ def load(path: str | Path, options: Reading | None = None) -> Model:
     try:
         return model.transformed(scale, file.placement[:3, :3] / (scale or 1), file.placement[:3, 3])
     except ValueError as error:
-        raise DataError(f"{path}: a node stretches or mirrors its Gaussians; export it again") from error
-
-
-def _quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(w, x, y, z) of a rotation matrix."""
-    from scipy.spatial.transform import Rotation
-
-    return np.roll(Rotation.from_matrix(rotation).as_quat(), 1)
-
-
-def _product(left: NDArray[np.float64], right: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Products of a quaternion, [4], and many, [N, 4]."""
-    w, x, y, z = left
-    a, b, c, d = right.T
-    parts = [
-        w * a - x * b - y * c - z * d,
-        w * b + x * a + y * d - z * c,
-        w * c - x * d + y * a + z * b,
-        w * d + x * c - y * b + z * a,
-    ]
-    return np.stack(parts, axis=1)
+        raise DataError(f"{path}: a node stretches or mirrors its Gaussians, or moves them too far: {error}") from error

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from clsplat.formats.splats import PARAMETERS as PARAMETERS
 from clsplat.formats.splats import SH_C0 as SH_C0
+from clsplat.formats.splats import degree_of
 from clsplat.formats.splats import sh_coefficients as sh_coefficients
 from clsplat.opencl.device import Array, Device
 
@@ -42,7 +43,7 @@ class Gaussians:
         self.device = device
         self.count = len(parameters["means"])
         self.capacity = _aligned(self.count)
-        self.sh_degree = round((1 + parameters["sh_rest"].shape[1] / 3) ** 0.5) - 1
+        self.sh_degree = degree_of(parameters["sh_rest"].shape[1])
         self.tables: dict[str, Table] = {}
         for name in PARAMETERS:
             self.add(name, parameters[name].shape[1])

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from clsplat.formats.splats import inverse_opacities
 from clsplat.gaussians.tables import Gaussians
 
 SHARES = (0.05, 0.25, 0.5, 0.75, 0.95)
@@ -13,6 +14,6 @@ def distribution(gaussians: Gaussians) -> dict[str, list[float]]:
     columns = {
         "size": np.sqrt(np.exp(2 * log_scales).mean(axis=1)),
         "anisotropy": np.exp(log_scales.max(axis=1) - log_scales.min(axis=1)),
-        "opacity": 1 / (1 + np.exp(-gaussians.get("logit_opacity")[:, 0].astype(np.float64))),
+        "opacity": 1 / inverse_opacities(gaussians.get("logit_opacity")[:, 0]),
     }
     return {name: [float(value) for value in np.quantile(column, SHARES)] for name, column in columns.items()}

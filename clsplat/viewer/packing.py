@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.formats.packing import morton_order, smallest_three
+from clsplat.formats.splats import MAX_LOG
 from clsplat.gaussians.model import Model
 
 BLOCK = 256  # splats
@@ -65,7 +66,7 @@ def pack(model: Model, limit: int | None = None) -> Packed:
     logs = np.maximum(logs, logs.max(axis=1, keepdims=True) - FLATTEST)
     scales, opacity, base = (_table(values) for values in (logs, model.opacities, model.sh_base))
     rest = _even_table(float(max(model.sh_rest.max(initial=0.0), -model.sh_rest.min(initial=0.0))))
-    tables = np.stack([np.exp(scales), opacity, base, rest]).astype("<f4")
+    tables = np.stack([np.exp(np.minimum(scales, MAX_LOG)), opacity, base, rest]).astype("<f4")
     planes: list[NDArray[Any]] = [tables, *_positions(_logarithmic(model.means, *frame)), _quaternions(model.quats)]
     columns = (scales, logs), (opacity, model.opacities[:, None]), (base, model.sh_base), (rest, model.sh_rest)
     planes += [_codes(table, column) for table, values in columns for column in values.T]

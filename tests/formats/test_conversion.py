@@ -12,13 +12,16 @@ from typer.testing import CliRunner
 
 import clsplat
 from clsplat.cli import app
+from clsplat.density.mixture import mass_of
 from clsplat.errors import ConfigError, DataError
 from clsplat.formats.ply import write_ply
+from clsplat.formats.splats import inverse_opacities, opacities
 from clsplat.formats.table import CODECS, bytes_of, detect, read, write
-from clsplat.gaussians.checkup import lines, verdict
+from clsplat.gaussians.checkup import examine, lines, verdict
 from clsplat.gaussians.conversion import transform_of
-from clsplat.gaussians.model import load
+from clsplat.gaussians.model import Rendering, load
 from clsplat.gaussians.sh import basis
+from clsplat.viewer.packing import pack
 from tests.formats.models import splats
 
 
@@ -57,6 +60,83 @@ def test_models_are_merged_with_the_most_harmonics_of_them(source, tmp_path, rng
     assert (done["gaussians"], found.sh_degree) == (130, 3)
     assert not found.sh_rest[100:, 9:].any()
     np.testing.assert_array_equal(found.means[:100], load(source).means)
+
+
+def test_every_number_of_a_merged_model_that_is_not_kept_is_said(tmp_path, rng, caplog):
+    said = [{"near": 0.2}, {"near": 5.0, "background": "white", "screen_variance": 0.1, "alpha": "mask"}, {"near": 0.2}]
+    for name, numbers in zip("abc", said, strict=True):
+        write(tmp_path / f"{name}.ply", replace(splats(rng, 10), rendering=numbers))
+    a, b, c = (tmp_path / f"{name}.ply" for name in "abc")
+    clsplat.convert([a, b, c], tmp_path / "d.ply")
+    assert caplog.messages == [
+        f"{b}: has near = 5.0, screen_variance = 0.1, background = white, alpha = mask; what {a} says is kept"
+    ]
+    caplog.clear()
+    clsplat.convert([b, a], tmp_path / "d.ply")
+    assert "has near = 0.2, screen_variance = 0.3, background = not given, alpha = transparency; what" in caplog.text
+
+
+def test_options_of_one_format_are_fields_of_the_table(source, tmp_path, monkeypatch):
+    """So that a format that has them is asked nowhere by its name."""
+    found = {field: [codec.name for codec in CODECS if getattr(codec, field)] for field in ("has_axes", "has_bits")}
+    assert found == {"has_axes": ["SPZ"], "has_bits": ["SPZ"]}
+    renamed = [replace(codec, name="SPZ of Niantic" if codec.name == "SPZ" else codec.name) for codec in CODECS]
+    monkeypatch.setattr("clsplat.formats.table.CODECS", renamed)
+    clsplat.convert(source, tmp_path / "b.spz", sh_bits="5/4", axes="ply")
+    clsplat.convert(tmp_path / "b.spz", tmp_path / "c.ply", axes="ply")
+
+
+EXTREME = {
+    "logits": {"logit_opacity": 800},
+    "logits and a world filter": {"logit_opacity": 800, "filter_variance": 0.01},
+    "scales and a world filter": {"log_scales": 500, "filter_variance": 0.01},
+    "scales": {"log_scales": 120},
+    "large scales": {"log_scales": 9e14},
+}
+
+
+@pytest.mark.parametrize("name", EXTREME)
+@pytest.mark.filterwarnings("error")
+def test_extreme_values_raise_no_warnings_of_numpy(name, tmp_path, rng):
+    one = splats(rng, 40, 1)
+    for table, value in EXTREME[name].items():
+        if table == "filter_variance":
+            one.parameters[table] = np.full((40, 1), value, np.float32)
+        else:
+            one.parameters[table][:10], one.parameters[table][10:20] = value, -value
+    write(tmp_path / "a.ply", one)
+    assert examine(tmp_path / "a.ply")["gaussians"] == 40
+    for file in ("b.spz", "b.sog", "b.glb", "b.compressed.ply"):
+        assert clsplat.convert(tmp_path / "a.ply", tmp_path / file)["gaussians"] == 40
+    model = load(tmp_path / "a.ply")
+    clsplat.convert(tmp_path / "a.ply", tmp_path / "b.ply", drop_below=0.1)
+    assert np.isfinite(model.scales).all()
+    assert model.opacities.min() >= 0
+    assert pack(model).count > 0
+    assert np.isfinite(
+        mass_of({n: t.astype(np.float64) for n, t in one.parameters.items()}, lambda logs: logs[:, 0])
+    ).all()
+
+
+@pytest.mark.parametrize("text", ["scale=1e39", "scale=1e200", "scale=1e-200", "translate=0,1e300,0 rotate=0,20,1"])
+@pytest.mark.filterwarnings("error")
+def test_a_transform_too_far_is_named_as_such(text, source, tmp_path):
+    with pytest.raises(ConfigError, match=rf"--transform '{text}': expected a scale from 1e-15 to 1e\+15"):
+        clsplat.convert(source, tmp_path / "b.ply", transform=text)
+    far = load(source)
+    far.means[0] = 3e38
+    for model in (far, replace(load(source), rendering=Rendering(near=5e14))):
+        model.save(tmp_path / "far.ply")
+        with pytest.raises(ConfigError, match="--transform: expected a smaller scale and translation: no model file"):
+            clsplat.convert(tmp_path / "far.ply", tmp_path / "b.ply", transform="scale=1e10")
+    assert not (tmp_path / "b.ply").exists()
+
+
+def test_faint_opacities_keep_their_digits():
+    logit = np.array([-800, -80, -40, 0, 40, 800], np.float32)
+    expected = [0, np.exp(-80.0), np.exp(-40.0), 0.5, 1, 1]
+    np.testing.assert_allclose(1 / inverse_opacities(logit), expected, rtol=1e-12, atol=1e-300)
+    np.testing.assert_allclose(opacities(logit), expected, atol=1e-16)
 
 
 def test_a_mip_model_is_not_merged_with_another(source, tmp_path, rng):
@@ -212,7 +292,7 @@ def test_tables_that_are_not_finite_are_not_called_too_large(tmp_path, rng, capl
 @pytest.mark.parametrize("name", ["b.ply", "b.compressed.ply", "b.sog", "b.glb"])
 def test_a_number_that_no_reader_takes_is_not_written(name, source, tmp_path):
     with pytest.raises(DataError, match=r"says near = .*; expected a number from 0 to 1e\+15"):
-        clsplat.convert(source, tmp_path / name, transform="scale=1e17")
+        write(tmp_path / name, replace(read(source), rendering={"near": 2e16}))
     assert not (tmp_path / name).exists()
 
 

@@ -124,6 +124,21 @@ def test_a_node_that_is_moved_turned_and_scaled_moves_its_gaussians(tmp_path, rn
     np.testing.assert_allclose(np.abs((unit(found.quats) * unit(expected.quats)).sum(axis=1)), 1, atol=1e-6)
 
 
+def test_a_rotation_in_few_digits_is_one(tmp_path, rng):
+    plain, other = moved(tmp_path, rng, rotation=[0, 0.70710, 0, 0.70710])
+    turned = load(plain).transformed(1.0, np.array([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]]), (0, -1, 0))
+    np.testing.assert_allclose(load(other).means, turned.means, atol=2e-6)
+
+
+@pytest.mark.parametrize("rotation", [[0, 0, 0, 0], [0, float("nan"), 0, 1], [0, 1e400, 0, 1]])
+def test_a_rotation_without_a_direction_is_refused(rotation, tmp_path, rng):
+    _, other = moved(tmp_path, rng, rotation=rotation)
+    with pytest.raises(
+        DataError, match=r"b\.glb: the rotation of node 1 .* of length (0|nan|inf); expected .*: export"
+    ):
+        load(other)
+
+
 @pytest.mark.parametrize("scale", [[1, 2, 1], [-1, 1, 1], [0, 0, 0]])
 def test_a_node_that_stretches_or_mirrors_is_refused(scale, tmp_path, rng):
     _, other = moved(tmp_path, rng, scale=scale)

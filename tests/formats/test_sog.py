@@ -5,8 +5,12 @@ import io
 import json
 import os
 import shutil
+import subprocess
+import sys
 import tracemalloc
 import zipfile
+from hashlib import sha256
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -140,6 +144,16 @@ def test_a_codebook_is_better_than_equal_steps(rng):
     assert error < 0.2 * np.square(equal[nearest(values, equal)] - values).mean()
     few = np.float32([3, 1, 2, 2])
     np.testing.assert_array_equal(codebook(few)[nearest(few, codebook(few))], few)
+
+
+@pytest.mark.parametrize("far", [[-1e5] * 50, [-1e5 - step for step in range(50)], [1e8], [-1e15], [1e15, -1e15, 3e8]])
+def test_a_few_far_values_cost_the_others_little(far, rng):
+    values = rng.normal(-5, 1.2, 60_000)
+
+    def error(entries):
+        return np.square(entries[nearest(values, entries)] - values).mean()
+
+    assert error(codebook(np.append(values, far))) < 2 * error(codebook(values))
 
 
 def test_every_point_has_the_nearest_vector_in_whole_numbers(rng):
@@ -317,3 +331,43 @@ def test_files_of_a_bundle_may_lie_in_a_folder_of_it(tmp_path, rng):
     shutil.move(tmp_path / "a.zip", tmp_path / "a.sog")
     for name, table in read(tmp_path / "a.sog").parameters.items():
         np.testing.assert_array_equal(table, read(tmp_path / "s").parameters[name])
+
+
+def sums(folder: Path, count: int = 24) -> list[str]:
+    """The SHA-256 of so many models as SOG."""
+    found = []
+    for seed in range(count):
+        write(folder / "a.sog", splats(np.random.default_rng(seed), 60, 0), Writing(quiet=True))
+        found.append(sha256((folder / "a.sog").read_bytes()).hexdigest())
+    return found
+
+
+def test_processors_with_and_without_avx_512_write_the_same_bytes(tmp_path):
+    """NumPy computes logarithms in other ways with it, whose last bit differs."""
+    core = pytest.importorskip("numpy._core._multiarray_umath")
+    wide = [
+        name for name in core.__cpu_dispatch__ if core.__cpu_features__[name] and name.startswith(("AVX512", "X86_V4"))
+    ]
+    if not wide:
+        pytest.skip("this processor has no AVX-512")
+    code = (
+        "import sys; from pathlib import Path; from tests.formats.test_sog import sums; print(*sums(Path(sys.argv[1])))"
+    )
+    narrow = {**os.environ, "NPY_DISABLE_CPU_FEATURES": " ".join(wide)}
+    args = [sys.executable, "-c", code, str(tmp_path)]
+    done = subprocess.run(args, env=narrow, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == sums(tmp_path)
+
+
+@pytest.mark.parametrize("place", [0.0, -7.3, 5e5])
+def test_positions_are_as_fine_as_their_range_wherever_it_lies(place, tmp_path, rng):
+    source = splats(rng, 400, 0)
+    source.parameters["means"][:] += place
+    found = there_and_back(tmp_path / "a.sog", source).parameters["means"]
+    expected = source.rows(morton_order(source.parameters["means"])).parameters["means"]
+    assert np.abs(found - expected).max() < (0.05 if place == 5e5 else 1e-3)  # float32 holds steps of 0.03 there
+    with zipfile.ZipFile(tmp_path / "a.sog") as archive:
+        means = json.loads(archive.read("meta.json"))["means"]
+    ends = np.sign(expected) * np.log1p(np.abs(expected.astype(np.float64)))
+    assert (means["mins"] <= ends.min(axis=0)).all()
+    assert (means["maxs"] >= ends.max(axis=0)).all()

@@ -3,6 +3,7 @@
 import gzip
 import struct
 import sys
+import tracemalloc
 import zlib
 from dataclasses import replace
 
@@ -157,6 +158,10 @@ def test_an_extension_that_turns_the_axes_is_refused_and_others_are_skipped(tmp_
     other = struct.pack("<2I4s", 7, 4, b"abcd")
     path.write_bytes(gzip.compress(legacy(2, flags=2, rest=other)))
     assert len(read(path)) == 2
+    long = struct.pack("<2I", 7, 200_000) + bytes(200_000)
+    path.write_bytes(gzip.compress(legacy(2, flags=2, rest=long + struct.pack("<2II", 0xADBE0003, 4, 1))))
+    with pytest.raises(DataError, match="axes of its own"):
+        read(path)
     damaged = bytearray(gzip.compress(legacy(2, flags=2, rest=other)))
     damaged[-5] ^= 1  # of the checksum, which is read with the records
     path.write_bytes(damaged)
@@ -180,6 +185,11 @@ REFUSED = {
     "short": (gzip.compress(legacy(2)[:-1]), "ends early"),
     "long": (gzip.compress(legacy(2) + b"a"), "goes on after 2 splats"),
     "gzip": (gzip.compress(legacy(2))[:20], "not an SPZ|ends early"),
+    "cut by its trailer": (gzip.compress(legacy(2))[:-8], "ends early, before the checksum of its gzip; copy"),
+    "cut by three bytes": (gzip.compress(legacy(2))[:-3], "ends early, before the checksum of its gzip; copy"),
+    "cut with records": (gzip.compress(legacy(2, flags=2))[:-3], "ends early, before the checksum"),
+    "rubbish": (gzip.compress(legacy(2)) + b"rubbish", "goes on for 7 bytes after its gzip; copy"),
+    "two members": (gzip.compress(legacy(2)) * 2, "goes on for [0-9]+ bytes after its gzip"),
     "checksum of bytes": (b"\x1f\x8b\x08\0\0\0\0\0\0\xff\xff\xff\xff", "in gzip"),
     "version 3 without gzip": (legacy(3), "without gzip"),
     "header": (b"NGSP\4\0\0\0", "its header of 16 bytes"),
@@ -221,7 +231,7 @@ def test_a_bomb_is_refused_before_it_grows(tmp_path):
     header = struct.pack("<4s2I4BI12x", b"NGSP", 4, 2, 0, 12, 0, 5, 32)
     assert len(header) == 32
     (tmp_path / "a.spz").write_bytes(header + table + frame)
-    with pytest.raises(DataError, match="expected 18"):
+    with pytest.raises(DataError, match="a stream goes on; expected 18"):
         read(tmp_path / "a.spz")
     (tmp_path / "a.spz").write_bytes(zlib.compress(legacy(2) + bytes(1 << 26), wbits=31))
     with pytest.raises(DataError, match="goes on after 2 splats"):
@@ -234,3 +244,43 @@ def test_version_4_without_zstandard_says_what_to_install(tmp_path, rng, monkeyp
     with pytest.raises(ConfigError, match=r"pip install 'clsplat\[spz\]', or use version 3"):
         write(tmp_path / "a.spz", splats(rng, 3), Writing(spz_version=4))
     assert not (tmp_path / "a.spz").exists()
+
+
+@pytest.mark.parametrize("version", [3, 4])
+def test_a_model_takes_little_more_memory_than_it_has(version, tmp_path, rng):
+    """All planes but the positions of a file of version 4 are of equal bytes, so that the file is small."""
+    zstandard = pytest.importorskip("zstandard") if version == 4 else None
+    count = 200_000
+    planes = [bytes(count * width) for width in (9, 1, 3, 3, 4, 45)]
+    header = struct.pack("<4s2I4B", b"NGSP", version, count, 3, 12, 0, 0)
+    if zstandard:
+        planes[0] = rng.bytes(count // 100).ljust(9 * count, b"\0")
+        frames = [zstandard.ZstdCompressor(1).compress(plane) for plane in planes]
+        sizes = b"".join(struct.pack("<2Q", len(f), len(p)) for f, p in zip(frames, planes, strict=True))
+        content = header[:-1] + struct.pack("<BI12x", 6, 32) + sizes + b"".join(frames)
+    else:
+        content = gzip.compress(header + b"".join(planes))
+    path = tmp_path / "a.spz"
+    path.write_bytes(content)
+    tracemalloc.start()
+    try:
+        found = read(path)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert len(content) < 70_000
+    assert len(found) == count
+    assert peak / count < 1.3 * 59 * 4, f"{peak / count:.0f} bytes a splat; the model has {59 * 4}"
+
+
+def test_more_splats_than_a_file_of_version_4_may_stand_for_are_refused(tmp_path, rng):
+    """Zstandard itself has no such bound: a file of 40 kB could stand for 20 million splats."""
+    pytest.importorskip("zstandard")
+    count, path = 20_000_000, tmp_path / "a.spz"
+    table = b"".join(struct.pack("<2Q", 8000, count * width) for width in (9, 1, 3, 3, 4))
+    path.write_bytes(struct.pack("<4s2I4BI12x", b"NGSP", 4, count, 0, 12, 0, 5, 32) + table + bytes(5 * 8000))
+    with pytest.raises(DataError, match=r"20000000 splats, 180000000 bytes, more than it can hold \([0-9]+\); .*copy"):
+        read(path)
+    source = splats(rng, 1, 0).rows([0] * 200_000)
+    with pytest.raises(DataError, match="refused by readers of version 4; use version 3"):
+        write(path, source, Writing(spz_version=4))
