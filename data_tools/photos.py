@@ -12,7 +12,7 @@ run in one thread by default.
 
 import logging
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
@@ -53,7 +53,10 @@ def find_features(
     size and focal length share a camera.  Raises DataError when fewer than three can be read.
     """
     pycolmap = require_pycolmap()
-    names = gather(photographs, out / IMAGES, list_photographs(photographs, without))
+    names, damaged = gather(photographs, out / IMAGES, list_photographs(photographs, without))
+    figures = {"photographs": len(names), "damaged": damaged}
+    for text in left_out(figures):
+        LOG.warning("%s", text)
     database, mode = str(out / DATABASE), {"auto": "AUTO", "one": "SINGLE"}.get(cameras, cameras.upper())
     reader, extraction = pycolmap.ImageReaderOptions(), pycolmap.FeatureExtractionOptions()
     reader.camera_model = camera_model
@@ -79,7 +82,7 @@ def find_features(
                 device=pycolmap.Device.cpu,
             )
         count.reach(len(names))
-    return {"photographs": len(names)}
+    return figures
 
 
 def match_features(
@@ -172,26 +175,37 @@ def map_cameras(source: Path, out: Path, mapper: Mapper = "incremental", threads
     (out / "sparse" / "0").mkdir(parents=True)
     best.write(str(out / "sparse" / "0"))
     registered = {best.images[number].name for number in best.reg_image_ids()}
-    missing = [name for name in names if name not in registered]
-    if missing:
-        LOG.warning(
-            "%d of %d photographs could not be placed: %s; the scene is made of the others: for more, add photographs "
-            "from places between, or raise match_features.neighbours",
-            *(len(missing), len(names), first_few(missing)),
-        )
-    others = [model.num_reg_images() for model in models[1:]]
-    if others:
-        LOG.warning(
-            "%d smaller models, of %s photographs, are left out: add photographs that join them to the largest",
-            *(len(others), ", ".join(map(str, others))),
-        )
-    return {
+    figures = {
         "registered": len(registered),
-        "not_registered": missing,
-        "other_models": others,
+        "not_registered": [name for name in names if name not in registered],
+        "other_models": [model.num_reg_images() for model in models[1:]],
         "points": best.num_points3D(),
         "error_px": round(best.compute_mean_reprojection_error(), 3),
     }
+    for text in left_out(figures):
+        LOG.warning("%s", text)
+    return figures
+
+
+def left_out(figures: Mapping[str, Any]) -> list[str]:
+    """Return warnings of the photographs that a step has left out, by what it returned."""
+    texts = []
+    if damaged := figures.get("damaged"):
+        names = [f"{name} ({reason})" for name, reason in damaged.items()]
+        count = figures["photographs"] + len(names)
+        texts.append(f"{len(names)} of {count} photographs cannot be read: {first_few(names)}; export them again")
+    if missing := figures.get("not_registered"):
+        texts.append(
+            f"{len(missing)} of {figures['registered'] + len(missing)} photographs could not be placed: "
+            f"{first_few(missing)}; the scene is made of the others: for more, add photographs from places between, or "
+            "raise match_features.neighbours"
+        )
+    if others := figures.get("other_models"):
+        texts.append(
+            f"{len(others)} smaller models, of {', '.join(map(str, others))} photographs, are left out: add "
+            "photographs that join them to the largest"
+        )
+    return texts
 
 
 def _alike_pairs(pycolmap: ModuleType, database: Path, neighbours: int) -> list[tuple[str, str]]:

@@ -277,8 +277,9 @@ def test_damaged_photographs_are_left_out_and_turned_ones_turned(tmp_path, caplo
     (tmp_path / "out").mkdir()
     summary = find_features(photos, tmp_path / "out")
     images = tmp_path / "out" / "images"
-    assert summary["photographs"] == 4
-    assert "broken.jpg" in caplog.text
+    assert summary == {"photographs": 4, "damaged": {"broken.jpg": "not an image, or a damaged one"}}
+    warned = "1 of 5 photographs cannot be read: broken.jpg (not an image, or a damaged one); export them again"
+    assert [record.getMessage() for record in caplog.records] == [warned]
     assert sorted(path.name for path in images.iterdir()) == ["0.png", "1.png", "2.png", "turned.jpg"]
     assert (images / "0.png").is_symlink()
     assert cv2.imread(str(images / "turned.jpg"), cv2.IMREAD_UNCHANGED).shape == (48, 32, 3)

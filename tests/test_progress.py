@@ -7,6 +7,7 @@ import pytest
 from clsplat import progress, terminal
 from clsplat.prepare.steps import FindFeatures, MapCameras
 from clsplat.progress import Count, clock, heard_by, watched
+from clsplat.training.found import photographs_text
 from clsplat.training.status import StatusFile
 
 
@@ -95,6 +96,15 @@ def test_what_was_placed_is_told_in_words():
     many = step.told({**figures, "not_registered": [f"{i}.jpg" for i in range(20)]})
     assert many.endswith("6.jpg, 7.jpg, and 12 more")
     assert FindFeatures(stage="find_features").told({"photographs": 5, "none": ""}) == "photographs 5"
+
+
+def test_photographs_that_cannot_be_read_are_counted():
+    features = {"photographs": 4, "damaged": {"b.jpg": "not an image"}}
+    assert FindFeatures(stage="find_features").told(features) == "photographs 4, damaged b.jpg"
+    cameras = {"registered": 3, "not_registered": ["c.jpg"], "error_px": 0.5}
+    text = photographs_text({"find_features": features, "map_cameras": cameras})
+    assert text == "3 of 5 photographs placed, 0.50 px; left out: b.jpg (not an image), c.jpg"
+    assert photographs_text({"find_features": "damaged", "map_cameras": cameras}) == ""
 
 
 def test_times_are_read_as_on_a_clock():

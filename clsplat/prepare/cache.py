@@ -77,6 +77,8 @@ def prepare(
                     _do(one, source, root)
             else:
                 LOG.info("%s: exists in %s", one.step.stage, one.folder)
+                for text in one.step.warnings(record_of(one.folder)):
+                    LOG.warning("%s", text)
         source = one.folder
     return source
 
