@@ -22,6 +22,7 @@ class Listener(Protocol):
 
 
 _listener: ContextVar[Listener | None] = ContextVar("listener", default=None)
+_level: ContextVar[int] = ContextVar("level", default=logging.INFO)  # of the lines of counts
 
 
 @contextmanager
@@ -41,6 +42,16 @@ def heard_by(listener: Listener) -> Iterator[None]:
         yield
     finally:
         _listener.reset(token)
+
+
+@contextmanager
+def counts_shown() -> Iterator[None]:
+    """Log the counts of the block as details: something else shows them."""
+    token = _level.set(logging.DEBUG)
+    try:
+        yield
+    finally:
+        _level.reset(token)
 
 
 class Count:
@@ -70,7 +81,8 @@ class Count:
             listener(self.what, done, self.total, seconds_left=left)
         if done and time.monotonic() - self._logged >= INTERVAL:
             self._logged = time.monotonic()
-            LOG.info("%s: %d of %d%s", self.what, done, self.total, f", {clock(left)} left" if left else "")
+            told = f", {clock(left)} left" if left else ""
+            LOG.log(_level.get(), "%s: %d of %d%s", self.what, done, self.total, told)
 
 
 def counted(items: Iterable[Item], what: str, total: int) -> Iterator[Item]:

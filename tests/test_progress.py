@@ -1,6 +1,8 @@
 """How far work on the host is: who hears it, and the time that is left."""
 
+import io
 import threading
+from collections.abc import Iterator
 
 import pytest
 
@@ -8,6 +10,7 @@ from clsplat import progress, terminal
 from clsplat.prepare.steps import FindFeatures, MapCameras
 from clsplat.progress import Count, clock, heard_by, watched
 from clsplat.training.found import photographs_text
+from clsplat.training.run import Progress
 from clsplat.training.status import StatusFile
 
 
@@ -86,6 +89,71 @@ def test_a_terminal_shows_a_bar_and_a_pipe_does_not(monkeypatch, capsys):
     with console.capture() as shown, terminal.counted():
         Count("pairs matched", 4).reach(2)
     assert "pairs matched: 2 of 4" in shown.get()
+
+
+@pytest.fixture
+def screen(monkeypatch) -> io.StringIO:
+    """What a terminal shows, of stdout and of stderr."""
+    shown = io.StringIO()
+    for name in ("CONSOLE", "ERRORS"):
+        console = terminal.Console(file=shown, force_terminal=True, width=120, highlight=False)
+        monkeypatch.setattr(terminal, name, console)
+    return shown
+
+
+@pytest.fixture
+def log_shown(screen) -> Iterator[None]:
+    before = progress.LOG.handlers[:], progress.LOG.level
+    terminal.start_logging(debug=False, remarks=terminal.CONSOLE)
+    yield
+    progress.LOG.handlers[:] = before[0]
+    progress.LOG.setLevel(before[1])
+
+
+def text_of(bar: "terminal._RunBar") -> str:
+    return bar.__rich__().tasks[0].description
+
+
+def test_the_bar_of_a_run_moves_between_reports(tmp_path, monkeypatch):
+    status, now = StatusFile(tmp_path), [100.0]
+    monkeypatch.setattr(terminal.time, "monotonic", lambda: now[0])
+    bar = terminal._RunBar(status)
+    status.note(stage="optimize")
+    assert text_of(bar) == "optimize"
+    status.count("steps", 1, 90, step=1, steps=90)
+    assert text_of(bar) == "step 1/90"
+    now[0] += 10
+    status.count("steps", 3, 90, step=3, steps=90)
+    assert text_of(bar) == "step 3/90  about 7:15 left"
+    bar.report(Progress(10, 90, 0.1, 20.0, 1000, 5.0, 80.0))
+    now[0] += 20
+    status.count("steps", 30, 90, step=30, steps=90)
+    assert text_of(bar) == "step 30/90  loss 0.1000  psnr 20.0  gaussians 1,000  5.0 ms/step  1:00 left"
+    assert (bar.bar.tasks[0].completed, bar.bar.tasks[0].total) == (30, 90)
+    status.note(stage="evaluate")
+    status.count("views", 2, 8)
+    assert text_of(bar) == "evaluate: 2 of 8 views"
+
+
+def test_warnings_stand_above_the_bar(screen, log_shown):
+    with terminal.counted():
+        Count("pairs matched", 4)
+        terminal.LOG.warning("cannot be renamed")
+        text = screen.getvalue()
+    before = text[: text.index("warning: cannot be renamed")]
+    assert before.endswith("\x1b[2K"), (before, text)
+
+
+def test_counts_are_not_said_above_a_bar(now, screen, log_shown):
+    with terminal.counted():
+        count = Count("pairs matched", 4)
+        now[0] += 9
+        count.reach(2)
+    assert "pairs matched: 2 of 4, 0:09 left" not in screen.getvalue()
+    count = Count("pairs matched", 4)
+    now[0] += 9
+    count.reach(2)
+    assert "pairs matched: 2 of 4, 0:09 left" in screen.getvalue()
 
 
 def test_what_was_placed_is_told_in_words():

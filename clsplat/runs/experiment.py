@@ -125,7 +125,7 @@ def run_pipeline(
         with terminal.counted():
             run = opening.open_run(pipeline, out, device, start, status)
             stop_if_signalled()
-        with terminal.progress_bar() as show, live.showing(run) if live else nullcontext():
+        with terminal.progress_bar(status) as show, live.showing(run) if live else nullcontext():
             runner.execute(pipeline, run, start, live.reporting(show) if live else show)
         for line in summary(out):
             LOG.debug("%s", line)  # who asked for the run shows it
