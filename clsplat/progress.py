@@ -57,8 +57,9 @@ def counts_shown() -> Iterator[None]:
 class Count:
     """Counts the pieces of some work: `what` is what is done, such as 'photographs decoded'."""
 
-    def __init__(self, what: str, total: int) -> None:
-        self.what, self.total, self.done = what, total, 0
+    def __init__(self, what: str, total: int, is_even: bool = True) -> None:
+        """is_even: whether pieces take about the same time, so that the time left follows from those done."""
+        self.what, self.total, self.done, self.is_even = what, total, 0, is_even
         self._began: tuple[float, int] | None = None  # when, and with how many done by an earlier call
         self._logged = time.monotonic()
         self.reach(0)
@@ -66,14 +67,16 @@ class Count:
     @property
     def seconds_left(self) -> float | None:
         """The time that the other pieces take at the speed of those done so far; None before the first."""
-        if self._began is None or self.done <= self._began[1]:
+        if not self.is_even or self._began is None or self.done <= self._began[1]:
             return None
         began, before = self._began
         return (time.monotonic() - began) / (self.done - before) * (self.total - self.done)
 
     def reach(self, done: int) -> None:
-        """Note how many pieces are done."""
+        """Note how many pieces are done; nobody hears of nothing."""
         self.done = done
+        if not self.total:
+            return
         if self._began is None or self.done < self._began[1]:
             self._began = time.monotonic(), done
         left = self.seconds_left

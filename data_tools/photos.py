@@ -23,7 +23,7 @@ import numpy as np
 from clsplat.errors import DataError, first_few
 from clsplat.files import write_text
 from clsplat.progress import Count, watched
-from data_tools.database import image_names, matched_pairs, pairs_done, remove, without_features
+from data_tools.database import features_done, image_names, matched_pairs, pairs_done, remove, without_features
 from data_tools.gather import MIN_PHOTOGRAPHS, gather, link, list_photographs
 from data_tools.pycolmap_import import require_pycolmap
 from data_tools.vocabulary import alike
@@ -34,7 +34,7 @@ Mapper = Literal["incremental", "global"]
 Cameras = Literal["auto", "one", "per_folder", "per_image"]
 CameraModel = Literal["SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "PINHOLE", "SIMPLE_PINHOLE"]
 MAX_EXHAUSTIVE = 200  # photographs whose pairs are all matched: the time grows with the square of their number
-CHUNK = 10  # photographs between two counts
+CHUNK = 10  # photographs in a call of pycolmap, which no signal ends
 DATABASE, IMAGES, PAIRS = "database.db", "images", "pairs.txt"
 
 
@@ -71,16 +71,17 @@ def find_features(
                 database, str(out / IMAGES), getattr(pycolmap.CameraMode, mode), image_names=names, options=reader
             )
         missing, count = without_features(pycolmap, out / DATABASE), Count("photographs with features", len(names))
-        for start in range(0, len(missing), CHUNK):
-            count.reach(len(names) - len(missing) + start)
-            pycolmap.extract_features(
-                database,
-                str(out / IMAGES),
-                missing[start : start + CHUNK],
-                extraction_options=extraction,
-                reader_options=reader,
-                device=pycolmap.Device.cpu,
-            )
+        count.reach(len(names) - len(missing))
+        with watched(count, lambda: features_done(out / DATABASE)):
+            for start in range(0, len(missing), CHUNK):
+                pycolmap.extract_features(
+                    database,
+                    str(out / IMAGES),
+                    missing[start : start + CHUNK],
+                    extraction_options=extraction,
+                    reader_options=reader,
+                    device=pycolmap.Device.cpu,
+                )
         count.reach(len(names))
     return figures
 

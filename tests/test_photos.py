@@ -2,7 +2,7 @@
 
 import shutil
 import sqlite3
-from contextlib import closing
+from contextlib import closing, nullcontext
 from pathlib import Path
 
 import cv2
@@ -208,6 +208,25 @@ def test_counting_pairs_loses_none(placed, tmp_path, monkeypatch):
     assert max(heard) == 14 * 13 // 2
     assert len(heard) > 2, "counts between none and all of them"
     assert rows(tmp_path / "database.db") == rows(placed.parent / "matches" / "database.db")
+
+
+def test_features_are_counted_while_they_are_found(photos, tmp_path, monkeypatch):
+    monkeypatch.setattr(progress, "WATCH", 0.01)
+    heard: set[int] = set()
+
+    def hear(what: str, done: int, total: int, /, *, seconds_left: float | None) -> None:
+        if what == "photographs with features":
+            heard.add(done)
+
+    for name in ("counted", "alone"):
+        (tmp_path / name).mkdir()
+    with heard_by(hear):
+        find_features(photos, tmp_path / "counted", long_side=480, features=2048)
+    assert max(heard) == 14
+    assert heard - {0, 10, 14}, "counts inside of a call"
+    monkeypatch.setattr(photos_tool, "watched", lambda *_: nullcontext())
+    find_features(photos, tmp_path / "alone", long_side=480, features=2048)
+    assert rows(tmp_path / "counted" / "database.db") == rows(tmp_path / "alone" / "database.db")
 
 
 @pytest.mark.parametrize("blank", ["crop", "mask"])

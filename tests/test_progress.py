@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import pytest
 
 from clsplat import progress, terminal
+from clsplat.prepare.cache import Planned, prepare
 from clsplat.prepare.steps import FindFeatures, MapCameras
 from clsplat.progress import Count, clock, heard_by, watched
 from clsplat.training.found import photographs_text
@@ -39,6 +40,24 @@ def test_what_an_earlier_call_has_done_took_no_time(now, monkeypatch):
     now[0] += 5
     began.reach(25)
     assert began.seconds_left == pytest.approx(5, rel=0.9)
+
+
+def test_pieces_that_differ_much_tell_no_time(now):
+    count = Count("steps of the preparation", 4, is_even=False)
+    now[0] += 10
+    count.reach(1)
+    assert count.seconds_left is None
+
+
+def test_nothing_to_count_is_not_heard(tmp_path):
+    heard = []
+    with heard_by(lambda *what, seconds_left: heard.append((*what, seconds_left))):
+        prepare([], tmp_path, tmp_path)
+        Count("photographs", 0).reach(0)
+        assert heard == []
+        planned = [Planned(MapCameras(), "", "", tmp_path, "")] * 2
+        prepare(planned, tmp_path, tmp_path)
+    assert heard == [("steps of the preparation", done, 2, None) for done in (0, 0, 1)]
 
 
 def test_everyone_around_hears(now):
