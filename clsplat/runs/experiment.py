@@ -172,8 +172,8 @@ def _run_cells(
             else:
                 LOG.info("%s", title)
                 run_pipeline(cell.pipeline, folder, device, start, live)
-        except Interrupted:
-            raise
+        except Interrupted as stopped:
+            raise Interrupted(f"stopped in {title}; `clsplat resume {status.out}` goes on with it") from stopped
         except Exception as error:
             failures[cell.name] = as_clsplat_error(error)
             LOG.warning("cell %s failed: %s", cell.name, one_line(failures[cell.name]))
