@@ -131,6 +131,11 @@ def first_few(names: Sequence[str]) -> str:
     return ", ".join(names[:NAMES_SHOWN]) + more
 
 
+def amount(count: int, word: str) -> str:
+    """Return a number with its noun: `1 view`, `2,000 views`."""
+    return f"{count:,} {word}{'s' if count != 1 else ''}"
+
+
 def shortened(text: str, limit: int = QUOTE_LIMIT) -> str:
     """Return the text, cut in the middle where it is longer than `limit` characters."""
     kept = limit - 3

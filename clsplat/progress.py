@@ -22,6 +22,7 @@ class Listener(Protocol):
 
 
 _listener: ContextVar[Listener | None] = ContextVar("listener", default=None)
+_level: ContextVar[int] = ContextVar("level", default=logging.INFO)  # of the lines of counts
 
 
 @contextmanager
@@ -43,11 +44,22 @@ def heard_by(listener: Listener) -> Iterator[None]:
         _listener.reset(token)
 
 
+@contextmanager
+def counts_shown() -> Iterator[None]:
+    """Log the counts of the block as details: something else shows them."""
+    token = _level.set(logging.DEBUG)
+    try:
+        yield
+    finally:
+        _level.reset(token)
+
+
 class Count:
     """Counts the pieces of some work: `what` is what is done, such as 'photographs decoded'."""
 
-    def __init__(self, what: str, total: int) -> None:
-        self.what, self.total, self.done = what, total, 0
+    def __init__(self, what: str, total: int, is_even: bool = True) -> None:
+        """is_even: whether pieces take about the same time, so that the time left follows from those done."""
+        self.what, self.total, self.done, self.is_even = what, total, 0, is_even
         self._began: tuple[float, int] | None = None  # when, and with how many done by an earlier call
         self._logged = time.monotonic()
         self.reach(0)
@@ -55,14 +67,16 @@ class Count:
     @property
     def seconds_left(self) -> float | None:
         """The time that the other pieces take at the speed of those done so far; None before the first."""
-        if self._began is None or self.done <= self._began[1]:
+        if not self.is_even or self._began is None or self.done <= self._began[1]:
             return None
         began, before = self._began
         return (time.monotonic() - began) / (self.done - before) * (self.total - self.done)
 
     def reach(self, done: int) -> None:
-        """Note how many pieces are done."""
+        """Note how many pieces are done; nobody hears of nothing."""
         self.done = done
+        if not self.total:
+            return
         if self._began is None or self.done < self._began[1]:
             self._began = time.monotonic(), done
         left = self.seconds_left
@@ -70,7 +84,8 @@ class Count:
             listener(self.what, done, self.total, seconds_left=left)
         if done and time.monotonic() - self._logged >= INTERVAL:
             self._logged = time.monotonic()
-            LOG.info("%s: %d of %d%s", self.what, done, self.total, f", {clock(left)} left" if left else "")
+            told = f", {clock(left)} left" if left else ""
+            LOG.log(_level.get(), "%s: %d of %d%s", self.what, done, self.total, told)
 
 
 def counted(items: Iterable[Item], what: str, total: int) -> Iterator[Item]:

@@ -3,8 +3,10 @@
 import json
 import logging
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,20 +17,22 @@ from rich.progress import BarColumn, Progress, TextColumn
 from clsplat import __version__, streams
 from clsplat.errors import OutputError
 from clsplat.files import told_as
-from clsplat.progress import clock, heard_by
+from clsplat.progress import clock, counts_shown, heard_by
 
 if TYPE_CHECKING:  # the command line starts without OpenCL
     from clsplat.training import run as training
+    from clsplat.training.status import StatusFile
 
 LOG = logging.getLogger("clsplat")
 
 
 CONSOLE = Console(file=streams.STDOUT, highlight=False, soft_wrap=True)  # type: ignore[arg-type]
 ERRORS = Console(file=streams.STDERR, highlight=False, soft_wrap=True)  # type: ignore[arg-type]
+_bars: list[Live] = []  # that are drawn
 
 
 class _TerminalHandler(logging.Handler):
-    """A handler that prints log lines above the progress bar: remarks to `remarks`, warnings to stderr."""
+    """A handler that prints remarks to `remarks`, warnings to stderr; above a progress bar where both are terminals."""
 
     def __init__(self, remarks: Console) -> None:
         super().__init__()
@@ -36,9 +40,10 @@ class _TerminalHandler(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         warning = record.levelno >= logging.WARNING
-        (ERRORS if warning else self.remarks).print(
-            ("warning: " if warning else "") + record.getMessage(), markup=False
-        )
+        console = ERRORS if warning else self.remarks
+        if _bars and console.is_terminal:  # past the bar's console a line would be glued to it
+            console = CONSOLE
+        console.print(("warning: " if warning else "") + record.getMessage(), markup=False)
 
 
 def start_logging(debug: bool, remarks: Console = CONSOLE) -> None:
@@ -151,20 +156,14 @@ def device_text(device: dict[str, Any]) -> str:
 
 
 @contextmanager
-def progress_bar() -> Iterator[Callable[["training.Progress"], None]]:
-    """Yield a function that shows progress."""
+def progress_bar(status: "StatusFile") -> Iterator[Callable[["training.Progress"], None]]:
+    """Yield a function that shows reports; between them a terminal shows what `status` counts."""
     if not CONSOLE.is_terminal:
         yield lambda progress: LOG.info(line(progress))
         return
-    bar = Progress(BarColumn(bar_width=24), TextColumn("{task.description}"), console=CONSOLE)
-    task = bar.add_task("", total=None)
-    with Live(bar, console=CONSOLE, refresh_per_second=8, transient=True):
-
-        def update(progress: "training.Progress") -> None:
-            bar.update(task, total=progress.steps, completed=progress.step, description=line(progress))
-            LOG.debug(line(progress))
-
-        yield update
+    bar = _RunBar(status)
+    with _drawn(bar):
+        yield bar.report
 
 
 @contextmanager
@@ -173,12 +172,65 @@ def counted() -> Iterator[None]:
     if not CONSOLE.is_terminal:
         yield
         return
-    bar = Progress(BarColumn(bar_width=24), TextColumn("{task.description}"), console=CONSOLE)
+    bar = _new_bar()
     task = bar.add_task("", total=None, visible=False)
 
     def update(what: str, done: int, total: int, /, *, seconds_left: float | None) -> None:
         left = "" if seconds_left is None or done == total else f"  {clock(seconds_left)} left"
         bar.update(task, total=total, completed=done, description=f"{what}: {done} of {total}{left}", visible=True)
 
-    with Live(bar, console=CONSOLE, refresh_per_second=8, transient=True), heard_by(update):
+    with _drawn(bar), heard_by(update):
         yield
+
+
+class _RunBar:
+    """The bar of a run, made of its status as often as it is drawn: the training waits for nothing."""
+
+    def __init__(self, status: "StatusFile") -> None:
+        self.status, self.bar = status, _new_bar()
+        self.task = self.bar.add_task("", total=None)
+        self.last: tuple[float, training.Progress] | None = None  # report, and when
+        self.first: tuple[float, int, int] | None = None  # when, step and last step of a training, as first seen
+
+    def report(self, progress: "training.Progress") -> None:
+        self.last = time.monotonic(), progress
+        LOG.debug(line(progress))
+
+    def __rich__(self) -> Progress:
+        now = self.status.now
+        stage, amount, done, total = now.stage or "", now.progress, now.step or 0, now.steps
+        if amount is None:
+            self.bar.update(self.task, total=None, completed=0, description=stage)
+        elif amount.unit == "steps" and total:
+            self.bar.update(self.task, total=total, completed=done, description=self._training(done, total))
+        else:
+            text = f"{stage}: {amount.done} of {amount.total} {amount.unit}"
+            self.bar.update(self.task, total=amount.total, completed=amount.done, description=text)
+        return self.bar
+
+    def _training(self, step: int, steps: int) -> str:
+        time_now = time.monotonic()
+        if self.last and self.last[1].steps == steps:
+            since, report = self.last
+            left = max(0.0, report.seconds_left - (time_now - since))
+            return line(replace(report, step=step, seconds_left=left))
+        if self.first is None or self.first[2] != steps:
+            self.first = time_now, step, steps
+        since, before, _ = self.first
+        seconds = (time_now - since) / (step - before) * (steps - step) if step > before else None
+        return f"step {step}/{steps}" + ("" if seconds is None else f"  about {clock(seconds)} left")
+
+
+def _new_bar() -> Progress:
+    return Progress(BarColumn(bar_width=24), TextColumn("{task.description}"), console=CONSOLE)
+
+
+@contextmanager
+def _drawn(bar: "Progress | _RunBar") -> Iterator[None]:
+    """Draw a bar in the block, several times a second; lines of the log stand above it."""
+    with Live(bar, console=CONSOLE, refresh_per_second=4, transient=True) as live, counts_shown():
+        _bars.append(live)
+        try:
+            yield
+        finally:
+            _bars.remove(live)

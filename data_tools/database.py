@@ -7,10 +7,10 @@ from types import ModuleType
 
 import numpy as np
 
-COUNT_PAIRS = """
+COUNT_ROWS = """
 import sqlite3, sys
 with sqlite3.connect(sys.argv[1], uri=True, timeout=0.1) as opened:
-    print(opened.execute("SELECT COUNT(*) FROM two_view_geometries").fetchone()[0])
+    print(opened.execute(f"SELECT COUNT(*) FROM {sys.argv[2]}").fetchone()[0])
 """
 
 
@@ -47,16 +47,25 @@ def matched_pairs(pycolmap: ModuleType, database: Path) -> int:
 
 
 def pairs_done(database: Path) -> int:
-    """Return the number of pairs that were looked at, while pycolmap writes; 0 where that cannot be read just now.
+    """Return the number of pairs that were looked at, while pycolmap writes; 0 where that cannot be read just now."""
+    return _rows(database, "two_view_geometries")
+
+
+def features_done(database: Path) -> int:
+    """Return the number of images with features, while pycolmap writes; 0 where that cannot be read just now."""
+    return _rows(database, "descriptors")
+
+
+def _rows(database: Path, table: str) -> int:
+    """The number of rows of a table.
 
     A process of its own reads it: a second SQLite library in pycolmap's process would release the locks of the first
     (https://www.sqlite.org/howtocorrupt.html, 2.2.1), and matches would be lost.
     """
     address = f"{database.resolve().as_uri()}?mode=ro"
     try:
-        return int(
-            subprocess.check_output([sys.executable, "-I", "-S", "-c", COUNT_PAIRS, address], stderr=subprocess.DEVNULL)
-        )
+        command = [sys.executable, "-I", "-S", "-c", COUNT_ROWS, address, table]
+        return int(subprocess.check_output(command, stderr=subprocess.DEVNULL))
     except (OSError, subprocess.CalledProcessError):
         return 0
 

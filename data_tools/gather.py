@@ -56,12 +56,12 @@ def _found(folder: Path, without: Path | None) -> tuple[list[str], list[str]]:
     return sorted(names), unreadable
 
 
-def gather(photographs: Path, images: Path, names: list[str]) -> list[str]:
-    """Link photographs into a folder, or copy them upright; return the names of those that can be read.
+def gather(photographs: Path, images: Path, names: list[str]) -> tuple[list[str], dict[str, str]]:
+    """Link photographs into a folder, or copy them upright.
 
-    What an interrupted call has put there stays.
+    Return the names of those that can be read, and why the others cannot; what an interrupted call has put there stays.
     """
-    kept, count = [], Count("photographs read", len(names))
+    kept, damaged, count = [], dict[str, str](), Count("photographs read", len(names))
     for number, name in enumerate(names, 1):
         count.reach(number)
         if _is_there(photographs / name, images / name):
@@ -70,7 +70,7 @@ def gather(photographs: Path, images: Path, names: list[str]) -> list[str]:
         try:
             stored, upright = read_image(photographs / name), read_image(photographs / name, upright=True)
         except DataError as error:
-            LOG.warning("%s; left out", error)
+            damaged[name] = str(error).removeprefix(f"{photographs / name}: ").partition(";")[0]
             continue
         (images / name).parent.mkdir(parents=True, exist_ok=True)
         if stored.shape[:2] == upright.shape[:2] and (stored[:, :, :3] == upright[:, :, :3]).all():
@@ -82,7 +82,7 @@ def gather(photographs: Path, images: Path, names: list[str]) -> list[str]:
         kept.append(name)
     if len(kept) < MIN_PHOTOGRAPHS:
         raise DataError(f"{photographs}: only {len(kept)} of {len(names)} photographs can be read; export them again")
-    return kept
+    return kept, damaged
 
 
 def link(source: Path, target: Path) -> None:

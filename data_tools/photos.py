@@ -12,7 +12,7 @@ run in one thread by default.
 
 import logging
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
@@ -23,7 +23,7 @@ import numpy as np
 from clsplat.errors import DataError, first_few
 from clsplat.files import write_text
 from clsplat.progress import Count, watched
-from data_tools.database import image_names, matched_pairs, pairs_done, remove, without_features
+from data_tools.database import features_done, image_names, matched_pairs, pairs_done, remove, without_features
 from data_tools.gather import MIN_PHOTOGRAPHS, gather, link, list_photographs
 from data_tools.pycolmap_import import require_pycolmap
 from data_tools.vocabulary import alike
@@ -34,7 +34,7 @@ Mapper = Literal["incremental", "global"]
 Cameras = Literal["auto", "one", "per_folder", "per_image"]
 CameraModel = Literal["SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "PINHOLE", "SIMPLE_PINHOLE"]
 MAX_EXHAUSTIVE = 200  # photographs whose pairs are all matched: the time grows with the square of their number
-CHUNK = 10  # photographs between two counts
+CHUNK = 10  # photographs in a call of pycolmap, which no signal ends
 DATABASE, IMAGES, PAIRS = "database.db", "images", "pairs.txt"
 
 
@@ -53,7 +53,10 @@ def find_features(
     size and focal length share a camera.  Raises DataError when fewer than three can be read.
     """
     pycolmap = require_pycolmap()
-    names = gather(photographs, out / IMAGES, list_photographs(photographs, without))
+    names, damaged = gather(photographs, out / IMAGES, list_photographs(photographs, without))
+    figures = {"photographs": len(names), "damaged": damaged}
+    for text in left_out(figures):
+        LOG.warning("%s", text)
     database, mode = str(out / DATABASE), {"auto": "AUTO", "one": "SINGLE"}.get(cameras, cameras.upper())
     reader, extraction = pycolmap.ImageReaderOptions(), pycolmap.FeatureExtractionOptions()
     reader.camera_model = camera_model
@@ -68,18 +71,19 @@ def find_features(
                 database, str(out / IMAGES), getattr(pycolmap.CameraMode, mode), image_names=names, options=reader
             )
         missing, count = without_features(pycolmap, out / DATABASE), Count("photographs with features", len(names))
-        for start in range(0, len(missing), CHUNK):
-            count.reach(len(names) - len(missing) + start)
-            pycolmap.extract_features(
-                database,
-                str(out / IMAGES),
-                missing[start : start + CHUNK],
-                extraction_options=extraction,
-                reader_options=reader,
-                device=pycolmap.Device.cpu,
-            )
+        count.reach(len(names) - len(missing))
+        with watched(count, lambda: features_done(out / DATABASE)):
+            for start in range(0, len(missing), CHUNK):
+                pycolmap.extract_features(
+                    database,
+                    str(out / IMAGES),
+                    missing[start : start + CHUNK],
+                    extraction_options=extraction,
+                    reader_options=reader,
+                    device=pycolmap.Device.cpu,
+                )
         count.reach(len(names))
-    return {"photographs": len(names)}
+    return figures
 
 
 def match_features(
@@ -172,26 +176,37 @@ def map_cameras(source: Path, out: Path, mapper: Mapper = "incremental", threads
     (out / "sparse" / "0").mkdir(parents=True)
     best.write(str(out / "sparse" / "0"))
     registered = {best.images[number].name for number in best.reg_image_ids()}
-    missing = [name for name in names if name not in registered]
-    if missing:
-        LOG.warning(
-            "%d of %d photographs could not be placed: %s; the scene is made of the others: for more, add photographs "
-            "from places between, or raise match_features.neighbours",
-            *(len(missing), len(names), first_few(missing)),
-        )
-    others = [model.num_reg_images() for model in models[1:]]
-    if others:
-        LOG.warning(
-            "%d smaller models, of %s photographs, are left out: add photographs that join them to the largest",
-            *(len(others), ", ".join(map(str, others))),
-        )
-    return {
+    figures = {
         "registered": len(registered),
-        "not_registered": missing,
-        "other_models": others,
+        "not_registered": [name for name in names if name not in registered],
+        "other_models": [model.num_reg_images() for model in models[1:]],
         "points": best.num_points3D(),
         "error_px": round(best.compute_mean_reprojection_error(), 3),
     }
+    for text in left_out(figures):
+        LOG.warning("%s", text)
+    return figures
+
+
+def left_out(figures: Mapping[str, Any]) -> list[str]:
+    """Return warnings of the photographs that a step has left out, by what it returned."""
+    texts = []
+    if damaged := figures.get("damaged"):
+        names = [f"{name} ({reason})" for name, reason in damaged.items()]
+        count = figures["photographs"] + len(names)
+        texts.append(f"{len(names)} of {count} photographs cannot be read: {first_few(names)}; export them again")
+    if missing := figures.get("not_registered"):
+        texts.append(
+            f"{len(missing)} of {figures['registered'] + len(missing)} photographs could not be placed: "
+            f"{first_few(missing)}; the scene is made of the others: for more, add photographs from places between, or "
+            "raise match_features.neighbours"
+        )
+    if others := figures.get("other_models"):
+        texts.append(
+            f"{len(others)} smaller models, of {', '.join(map(str, others))} photographs, are left out: add "
+            "photographs that join them to the largest"
+        )
+    return texts
 
 
 def _alike_pairs(pycolmap: ModuleType, database: Path, neighbours: int) -> list[tuple[str, str]]:

@@ -56,6 +56,12 @@ def test_help_fits_a_terminal_of_80_columns_and_shows_examples(command, monkeypa
     assert all(line.startswith(f"clsplat {command}") for line in examples), "one wraps"
 
 
+def test_help_names_all_that_a_scene_may_be():
+    texts = {name: " ".join(clsplat(name, "--help").stdout.replace("│", " ").split()) for name in ("run", "inspect")}
+    assert all("nerfstudio folder, or a run's" in text for text in texts.values())
+    assert "for `photos`, photographs" in texts["run"]
+
+
 def test_completion_knows_commands_and_pipelines_without_opencl():
     def completed(words: str, number: int) -> list[str]:
         variables = {"_CLSPLAT_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": str(number)}

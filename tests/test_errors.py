@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from clsplat import cli
-from clsplat.errors import MESSAGE_LIMIT, QUOTE_LIMIT, DataError, OverrideError, one_line, quoted, shortened
+from clsplat.errors import MESSAGE_LIMIT, QUOTE_LIMIT, DataError, OverrideError, amount, one_line, quoted, shortened
 from tests.test_cli import clsplat
 
 VALUES = [
@@ -26,6 +26,10 @@ VALUES = [
 def test_a_value_in_a_message_is_one_line_of_limited_length(value):
     assert 1 <= len(quoted(value)) <= QUOTE_LIMIT
     assert "\n" not in quoted(value)
+
+
+def test_one_is_no_plural():
+    assert [amount(count, "view") for count in (0, 1, 2000)] == ["0 views", "1 view", "2,000 views"]
 
 
 def test_a_short_value_in_a_message_is_whole():

@@ -19,6 +19,8 @@ from clsplat.formats.table import write as write_splats
 from clsplat.inspect.inspection import Inspection
 from clsplat.inspect.page import MAX_NAMES, inspection_page
 from clsplat.inspect.survey import distortion
+from clsplat.pipeline.file import SceneSettings
+from clsplat.runs.scenes import RunScene
 from clsplat.scene.detect import read_scene
 from clsplat.scene.lens import Lens
 from clsplat.scene.view import load_image, load_mask
@@ -470,3 +472,12 @@ def test_a_model_is_no_dataset(tmp_path, rng):
     (tmp_path / "b.txt").write_text("text")
     done = clsplat("inspect", tmp_path / "b.txt", expect=3)
     assert "b.txt: is a file; expected the folder of a dataset" in done.stderr
+
+
+def test_a_run_warns_of_few_views_as_inspect_does(tiny_scene, caplog):
+    scene = read_scene(tiny_scene)
+    warned = [finding.text for finding in Inspection.of(tiny_scene).findings if "training views" in finding.fault]
+    caplog.clear()
+    RunScene.of(SceneSettings(), scene)
+    assert [record.getMessage() for record in caplog.records if record.levelname == "WARNING"] == warned
+    assert warned[0].startswith("there are only 8 training views: expect floaters")

@@ -12,6 +12,7 @@ import clsplat
 from clsplat.cli import app
 from clsplat.errors import ConfigError, DataError, Interrupted, OutputError
 from clsplat.formats.table import bytes_of, read
+from clsplat.lod import levels
 from clsplat.lod.decimation import decimated
 from clsplat.lod.table import table
 from clsplat.lod.training import Plan
@@ -50,6 +51,13 @@ def test_levels_are_trained_and_measured(trained, few_steps, tiny_scene):
         assert "\nname: lod\n" in (training / f"level_{number}" / "pipeline.yaml").read_text()
     first = found["levels"][0]
     assert first["psnr"] == first["merged_psnr"] == evaluate(few_steps)["test"]["1"]["psnr"]
+
+
+def test_numbers_are_told_as_elsewhere(monkeypatch, caplog):
+    caplog.set_level("INFO")
+    monkeypatch.setattr(levels, "decimated", lambda model, keep: range(1200))
+    levels._levels(range(2400), Plan(levels=2), None)
+    assert "level 1: 1,200 Gaussians" in caplog.text
 
 
 def test_each_level_is_merged_from_the_trained_one_before(trained):

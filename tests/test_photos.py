@@ -2,7 +2,7 @@
 
 import shutil
 import sqlite3
-from contextlib import closing
+from contextlib import closing, nullcontext
 from pathlib import Path
 
 import cv2
@@ -210,6 +210,25 @@ def test_counting_pairs_loses_none(placed, tmp_path, monkeypatch):
     assert rows(tmp_path / "database.db") == rows(placed.parent / "matches" / "database.db")
 
 
+def test_features_are_counted_while_they_are_found(photos, tmp_path, monkeypatch):
+    monkeypatch.setattr(progress, "WATCH", 0.01)
+    heard: set[int] = set()
+
+    def hear(what: str, done: int, total: int, /, *, seconds_left: float | None) -> None:
+        if what == "photographs with features":
+            heard.add(done)
+
+    for name in ("counted", "alone"):
+        (tmp_path / name).mkdir()
+    with heard_by(hear):
+        find_features(photos, tmp_path / "counted", long_side=480, features=2048)
+    assert max(heard) == 14
+    assert heard - {0, 10, 14}, "counts inside of a call"
+    monkeypatch.setattr(photos_tool, "watched", lambda *_: nullcontext())
+    find_features(photos, tmp_path / "alone", long_side=480, features=2048)
+    assert rows(tmp_path / "counted" / "database.db") == rows(tmp_path / "alone" / "database.db")
+
+
 @pytest.mark.parametrize("blank", ["crop", "mask"])
 def test_undistortion_goes_on(tmp_path, monkeypatch, blank):
     source, written = shutil.copytree(data_set("fox_opencv"), tmp_path / "source"), []
@@ -277,8 +296,9 @@ def test_damaged_photographs_are_left_out_and_turned_ones_turned(tmp_path, caplo
     (tmp_path / "out").mkdir()
     summary = find_features(photos, tmp_path / "out")
     images = tmp_path / "out" / "images"
-    assert summary["photographs"] == 4
-    assert "broken.jpg" in caplog.text
+    assert summary == {"photographs": 4, "damaged": {"broken.jpg": "not an image, or a damaged one"}}
+    warned = "1 of 5 photographs cannot be read: broken.jpg (not an image, or a damaged one); export them again"
+    assert [record.getMessage() for record in caplog.records] == [warned]
     assert sorted(path.name for path in images.iterdir()) == ["0.png", "1.png", "2.png", "turned.jpg"]
     assert (images / "0.png").is_symlink()
     assert cv2.imread(str(images / "turned.jpg"), cv2.IMREAD_UNCHANGED).shape == (48, 32, 3)

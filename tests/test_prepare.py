@@ -63,6 +63,19 @@ def test_the_second_time_nothing_is_done(photos, tmp_path):
     assert do(steps, photos, root) == ("pab", [])
 
 
+def test_what_was_left_out_is_told_again(photos, tmp_path, monkeypatch, caplog):
+    figures = {"photographs": 4, "damaged": {"b.jpg": "not an image"}, "registered": 3, "not_registered": ["c.jpg"]}
+    for step in (prepare_steps.FindFeatures, prepare_steps.MapCameras):
+        monkeypatch.setattr(step, "make", lambda *_: figures)
+        monkeypatch.setattr(step, "told", lambda *_: "")
+    steps = [prepare_steps.FindFeatures(), prepare_steps.MapCameras()]
+    prepare(plan(steps, photos, tmp_path / "prepared"), photos, tmp_path / "prepared")
+    caplog.clear()
+    prepare(plan(steps, photos, tmp_path / "prepared"), photos, tmp_path / "prepared")
+    assert "1 of 5 photographs cannot be read: b.jpg (not an image)" in caplog.text
+    assert "1 of 4 photographs could not be placed: c.jpg" in caplog.text
+
+
 def test_what_depends_on_a_change_is_redone(photos, tmp_path):
     root, a, b, c = tmp_path / "runs" / "prepared", Copy(letter="a"), Copy(letter="b"), Copy(letter="c")
     do([a, b, c], photos, root)

@@ -1,12 +1,17 @@
 """How far work on the host is: who hears it, and the time that is left."""
 
+import io
 import threading
+from collections.abc import Iterator
 
 import pytest
 
 from clsplat import progress, terminal
+from clsplat.prepare.cache import Planned, prepare
 from clsplat.prepare.steps import FindFeatures, MapCameras
 from clsplat.progress import Count, clock, heard_by, watched
+from clsplat.training.found import photographs_text
+from clsplat.training.run import Progress
 from clsplat.training.status import StatusFile
 
 
@@ -35,6 +40,24 @@ def test_what_an_earlier_call_has_done_took_no_time(now, monkeypatch):
     now[0] += 5
     began.reach(25)
     assert began.seconds_left == pytest.approx(5, rel=0.9)
+
+
+def test_pieces_that_differ_much_tell_no_time(now):
+    count = Count("steps of the preparation", 4, is_even=False)
+    now[0] += 10
+    count.reach(1)
+    assert count.seconds_left is None
+
+
+def test_nothing_to_count_is_not_heard(tmp_path):
+    heard = []
+    with heard_by(lambda *what, seconds_left: heard.append((*what, seconds_left))):
+        prepare([], tmp_path, tmp_path)
+        Count("photographs", 0).reach(0)
+        assert heard == []
+        planned = [Planned(MapCameras(), "", "", tmp_path, "")] * 2
+        prepare(planned, tmp_path, tmp_path)
+    assert heard == [("steps of the preparation", done, 2, None) for done in (0, 0, 1)]
 
 
 def test_everyone_around_hears(now):
@@ -87,6 +110,71 @@ def test_a_terminal_shows_a_bar_and_a_pipe_does_not(monkeypatch, capsys):
     assert "pairs matched: 2 of 4" in shown.get()
 
 
+@pytest.fixture
+def screen(monkeypatch) -> io.StringIO:
+    """What a terminal shows, of stdout and of stderr."""
+    shown = io.StringIO()
+    for name in ("CONSOLE", "ERRORS"):
+        console = terminal.Console(file=shown, force_terminal=True, width=120, highlight=False)
+        monkeypatch.setattr(terminal, name, console)
+    return shown
+
+
+@pytest.fixture
+def log_shown(screen) -> Iterator[None]:
+    before = progress.LOG.handlers[:], progress.LOG.level
+    terminal.start_logging(debug=False, remarks=terminal.CONSOLE)
+    yield
+    progress.LOG.handlers[:] = before[0]
+    progress.LOG.setLevel(before[1])
+
+
+def text_of(bar: "terminal._RunBar") -> str:
+    return bar.__rich__().tasks[0].description
+
+
+def test_the_bar_of_a_run_moves_between_reports(tmp_path, monkeypatch):
+    status, now = StatusFile(tmp_path), [100.0]
+    monkeypatch.setattr(terminal.time, "monotonic", lambda: now[0])
+    bar = terminal._RunBar(status)
+    status.note(stage="optimize")
+    assert text_of(bar) == "optimize"
+    status.count("steps", 1, 90, step=1, steps=90)
+    assert text_of(bar) == "step 1/90"
+    now[0] += 10
+    status.count("steps", 3, 90, step=3, steps=90)
+    assert text_of(bar) == "step 3/90  about 7:15 left"
+    bar.report(Progress(10, 90, 0.1, 20.0, 1000, 5.0, 80.0))
+    now[0] += 20
+    status.count("steps", 30, 90, step=30, steps=90)
+    assert text_of(bar) == "step 30/90  loss 0.1000  psnr 20.0  gaussians 1,000  5.0 ms/step  1:00 left"
+    assert (bar.bar.tasks[0].completed, bar.bar.tasks[0].total) == (30, 90)
+    status.note(stage="evaluate")
+    status.count("views", 2, 8)
+    assert text_of(bar) == "evaluate: 2 of 8 views"
+
+
+def test_warnings_stand_above_the_bar(screen, log_shown):
+    with terminal.counted():
+        Count("pairs matched", 4)
+        terminal.LOG.warning("cannot be renamed")
+        text = screen.getvalue()
+    before = text[: text.index("warning: cannot be renamed")]
+    assert before.endswith("\x1b[2K"), (before, text)
+
+
+def test_counts_are_not_said_above_a_bar(now, screen, log_shown):
+    with terminal.counted():
+        count = Count("pairs matched", 4)
+        now[0] += 9
+        count.reach(2)
+    assert "pairs matched: 2 of 4, 0:09 left" not in screen.getvalue()
+    count = Count("pairs matched", 4)
+    now[0] += 9
+    count.reach(2)
+    assert "pairs matched: 2 of 4, 0:09 left" in screen.getvalue()
+
+
 def test_what_was_placed_is_told_in_words():
     figures = {"registered": 32, "not_registered": ["IMG_0034.jpg"], "points": 9, "error_px": 1.268}
     step = MapCameras(stage="map_cameras")
@@ -95,6 +183,15 @@ def test_what_was_placed_is_told_in_words():
     many = step.told({**figures, "not_registered": [f"{i}.jpg" for i in range(20)]})
     assert many.endswith("6.jpg, 7.jpg, and 12 more")
     assert FindFeatures(stage="find_features").told({"photographs": 5, "none": ""}) == "photographs 5"
+
+
+def test_photographs_that_cannot_be_read_are_counted():
+    features = {"photographs": 4, "damaged": {"b.jpg": "not an image"}}
+    assert FindFeatures(stage="find_features").told(features) == "photographs 4, damaged b.jpg"
+    cameras = {"registered": 3, "not_registered": ["c.jpg"], "error_px": 0.5}
+    text = photographs_text({"find_features": features, "map_cameras": cameras})
+    assert text == "3 of 5 photographs placed, 0.50 px; left out: b.jpg (not an image), c.jpg"
+    assert photographs_text({"find_features": "damaged", "map_cameras": cameras}) == ""
 
 
 def test_times_are_read_as_on_a_clock():

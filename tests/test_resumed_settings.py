@@ -6,6 +6,7 @@ import shutil
 import pytest
 
 from clsplat.errors import ConfigError
+from clsplat.runs.experiment import Job
 from clsplat.training import archive
 from tests.few_steps import FEW, steps_saved
 from tests.test_checkpoints import crafted
@@ -44,6 +45,19 @@ def test_a_run_that_has_trained_for_longer_is_refused(killed_run, tiny_scene, ca
         train(tiny_scene, killed_run, *FEW, "optimize.steps=6", resume=True)
     assert "bits" not in caplog.text, "nothing goes on"
     assert (killed_run / "pipeline.yaml").read_text() == before
+
+
+def test_a_training_without_a_step_left_takes_no_other_numbers(few_steps, tiny_scene, tmp_path):
+    out = shutil.copytree(few_steps, tmp_path / "run")
+    before = {file: file.read_bytes() for file in out.rglob("*") if file.is_file()}
+    words = rf"no step is left to train, at step 12: .*rates.quats was .*; `clsplat resume {out} --steps 24` with that"
+    with pytest.raises(ConfigError, match=words):
+        Job.resume(out, ["optimize.rates.quats=1e-5"]).run()
+    assert {file: file.read_bytes() for file in before if file.name != "log.txt"} == {
+        file: content for file, content in before.items() if file.name != "log.txt"
+    }
+    Job.resume(out, ["optimize.rates.quats=1e-5", "optimize.steps=14"]).run()
+    assert len(json.loads((out / "metrics.json").read_text())["changes"]) == 2
 
 
 def test_a_stage_that_is_over_keeps_its_settings(killed_run, tiny_scene):

@@ -39,7 +39,7 @@ ENDINGS = {
     "a defect without words": (AssertionError(), InternalError, f"internal error (a defect): AssertionError; {HINT}"),
     "several lines": (RuntimeError("a\n  b"), InternalError, "RuntimeError: a b; "),
     "no memory": (MemoryError(), MemoryLimitError, "out of memory"),
-    "a second Ctrl-C": (KeyboardInterrupt(), Interrupted, "stopped at once; to go on, run it again, with --resume"),
+    "a second Ctrl-C": (KeyboardInterrupt(), Interrupted, "stopped at once; to go on, run the same command again"),
     "the end of a file": (EOFError(), InternalError, "EOFError"),
     "a full disk": (OSError(28, "No space left on device", "/x/y"), OutputError, "/x/y: No space left on device"),
     "bad data": (DataError("no photograph"), DataError, "no photograph"),

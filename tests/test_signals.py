@@ -1,6 +1,7 @@
 """A signal in a stage other than training: the state is saved, and the run goes on to the same bits."""
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -95,7 +96,8 @@ def test_a_long_stage_ends_early_with_its_state_saved_and_is_repeated(
 
 def test_the_second_signal_stops_at_once(pipeline, tiny_scene, tmp_path, monkeypatch):
     monkeypatch.setattr(render, "render_view", signalled(render.render_view, 1, times=2))
-    with pytest.raises(Interrupted, match="stopped at once"):
+    words = f"stopped at once, and no checkpoint was saved; `clsplat resume {tmp_path}` begins it again"
+    with pytest.raises(Interrupted, match=re.escape(words)):
         Job.open(pipeline, tiny_scene, tmp_path).run()
     assert read_status(tmp_path)["state"] == "interrupted"
     assert not list((tmp_path / "renders").rglob("*.png"))

@@ -172,7 +172,7 @@ PipelineArgument = Annotated[
 ModelArgument = Annotated[Path, typer.Argument(metavar="MODEL|RUN", help="A model file with --scene, or a run folder.")]
 SceneOption = Annotated[
     Path | None,
-    typer.Option(metavar="DIR", help="A COLMAP, Blender or nerfstudio folder; default: that of the run."),
+    typer.Option(metavar="DIR", help="A COLMAP, Blender or nerfstudio folder, or a run's; default: that of the run."),
 ]
 SetOption = Annotated[
     list[str] | None,

@@ -9,7 +9,7 @@ import typer
 from clsplat import terminal
 from clsplat.api import pictures
 from clsplat.cli.app import DeviceOption, ModelArgument, SceneOption, command
-from clsplat.errors import ConfigError
+from clsplat.errors import ConfigError, amount
 
 ScaleOption = Annotated[
     float | None,
@@ -83,7 +83,7 @@ def render(
         alpha=alpha,
         device=device,
     )
-    terminal.remark(f"{count} images written to {out}")
+    terminal.remark(f"{amount(count, 'image')} written to {out}")
 
 
 def _told(found: dict[str, Any], pictures_wide: int) -> str:

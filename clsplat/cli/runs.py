@@ -19,7 +19,12 @@ from clsplat.errors import ConfigError, DataError, OutputError
 )
 def run(
     pipeline: PipelineArgument,
-    scene: Annotated[Path | None, typer.Option(metavar="DIR", help="A COLMAP, Blender or nerfstudio folder.")] = None,
+    scene: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR", help="A COLMAP, Blender or nerfstudio folder, or a run's; for `photos`, photographs."
+        ),
+    ] = None,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="The run folder; default: runs/NAME.")] = None,
     device: DeviceOption = None,
     set_: SetOption = None,

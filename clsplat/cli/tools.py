@@ -52,7 +52,7 @@ def doctor(
 
 @command("inspect", "clsplat inspect my_scene", "clsplat inspect my_scene --html scene.html")
 def inspect(
-    scene: Annotated[Path, typer.Argument(metavar="SCENE", help="A COLMAP, Blender or nerfstudio folder.")],
+    scene: Annotated[Path, typer.Argument(metavar="SCENE", help="A COLMAP, Blender or nerfstudio folder, or a run's.")],
     as_json: JsonOption = False,
     page: Annotated[
         Path | None, typer.Option("--html", metavar="FILE", help="Write a page with the cameras and points in 3D.")

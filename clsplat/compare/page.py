@@ -14,9 +14,9 @@ from clsplat.compare import tables
 from clsplat.compare.comparison import Comparison, Row, Variant
 from clsplat.compare.crops import Crop, find_crops
 from clsplat.compare.run_folder import RunFolder
-from clsplat.errors import ConfigError, DataError
+from clsplat.errors import ConfigError, DataError, amount
 from clsplat.files import write_text
-from clsplat.pages.page import charts, counted, embedded, render
+from clsplat.pages.page import charts, embedded, render
 from clsplat.pages.svg import Line, curve
 from clsplat.training.forecast import VIEWS, over_views
 
@@ -72,8 +72,8 @@ def comparison_page(comparison: Comparison, title: str, remarks: Sequence[str], 
     device = f"device: {devices.pop()}" if len(devices) == 1 else "several devices"
     return render(
         "compare.html.j2",
-        title=f"{title}: {counted(len(runs), 'run')}",
-        subtitle=f"{counted(len(variants), 'variant')} on {counted(len(scenes), 'scene')}; {device}",
+        title=f"{title}: {amount(len(runs), 'run')}",
+        subtitle=f"{amount(len(variants), 'variant')} on {amount(len(scenes), 'scene')}; {device}",
         remarks=remarks,
         means=tables.means_over_scenes(comparison) if len(scenes) > 1 else None,
         scenes=[_section(name, rows) for name, rows in scenes.items()],

@@ -8,9 +8,9 @@ from clsplat.conformance.checks import KERNELS, SPEED
 from clsplat.conformance.quick import forget, remember
 from clsplat.conformance.report import DeviceReport
 from clsplat.conformance.supervision import Result, supervised
+from clsplat.errors import amount
 from clsplat.opencl.device import Device
 from clsplat.opencl.discovery import choose, resolve_schedule
-from clsplat.pages.page import counted
 
 LOG = logging.getLogger("clsplat")
 SCHEDULES: tuple[Literal["simt", "wide"], ...] = ("simt", "wide")
@@ -60,4 +60,4 @@ def progress(schedule: str, result: Result) -> str:
 def _hold(figures: int) -> str:
     if figures == 0:
         return "measured"
-    return f"{counted(figures, 'figure')} hold{'s' if figures == 1 else ''}"
+    return f"{amount(figures, 'figure')} hold{'s' if figures == 1 else ''}"

@@ -2,6 +2,7 @@
 
 from statistics import median
 
+from clsplat.errors import amount
 from clsplat.inspect.survey import CameraFacts, Facts
 
 MAX_CAMERAS = 4  # cameras, by the number of their views
@@ -13,7 +14,7 @@ def figures(facts: Facts) -> dict[str, str]:
     if facts.train is not None:
         lines["views"] = f"{facts.train} for training, {facts.test} for testing"
     if len(facts.submodels) > 1:
-        lines["models"] = ", ".join(f"{name} ({count} images)" for name, count in facts.submodels.items())
+        lines["models"] = ", ".join(f"{name} ({amount(count, 'image')})" for name, count in facts.submodels.items())
     for i, camera in enumerate(facts.cameras[:MAX_CAMERAS]):
         lines["camera" if len(facts.cameras) == 1 else f"camera {i + 1} of {len(facts.cameras)}"] = camera_line(camera)
     if facts.extent is not None:
@@ -38,9 +39,11 @@ def camera_line(camera: CameraFacts) -> str:
     """Return a camera on one line."""
     fx, fy = camera.focal
     focal = f"{fx:.1f}" if abs(fx - fy) < 0.05 else f"{fx:.1f}, {fy:.1f}"
-    amount = "without bounds" if camera.distortion is None else f"up to {camera.distortion:.1f} px"
-    lens = f", distortion {amount}, {100 * camera.kept:.0f} % kept" if camera.distortion != 0 else ""
-    return f"{camera.model} {camera.width}x{camera.height}, focal length {focal} px{lens}; {camera.views} views"
+    bent = "without bounds" if camera.distortion is None else f"up to {camera.distortion:.1f} px"
+    lens = f", distortion {bent}, {100 * camera.kept:.0f} % kept" if camera.distortion != 0 else ""
+    return (
+        f"{camera.model} {camera.width}x{camera.height}, focal length {focal} px{lens}; {amount(camera.views, 'view')}"
+    )
 
 
 def _images(facts: Facts) -> str:

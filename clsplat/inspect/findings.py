@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from clsplat.errors import shortened
+from clsplat.errors import amount, shortened
 from clsplat.inspect.survey import MAX_DISTANCE, MIN_SEEN, CameraFacts, Facts, PointFacts
 
 Level = Literal["error", "warning", "note"]
@@ -42,6 +42,13 @@ def findings(facts: Facts) -> list[Finding]:
     return sorted(found, key=lambda finding: LEVELS.index(finding.level))
 
 
+def few_views(train: int) -> Iterator[Finding]:
+    """Yield a warning where a scene has few training views."""
+    if train < MIN_VIEWS:
+        fault = f"there {_are(train, 'training view', 'only ')}"
+        yield Finding("warning", fault, "expect floaters and blur far from the photographs; take 30 or more")
+
+
 def trainable(found: Sequence[Finding]) -> bool:
     """Return whether no finding is an error."""
     return all(finding.level != "error" for finding in found)
@@ -53,18 +60,18 @@ def verdict(found: Sequence[Finding]) -> str:
     worst, start = (errors, "cannot train: ") if errors else (warnings, "trains, but ")
     if not worst:
         return "ready to train"
-    more = f" (and {_counted(len(worst) - 1, 'more ' + ('error' if errors else 'warning'))})" if len(worst) > 1 else ""
+    more = f" (and {amount(len(worst) - 1, 'more ' + ('error' if errors else 'warning'))})" if len(worst) > 1 else ""
     return f"{start}{worst[0]}{more}"
 
 
 def _unreadable(facts: Facts) -> Iterator[Finding]:
     if facts.kind == "none" and facts.on_disk:
         folder = os.path.dirname(os.path.join(facts.path, facts.unregistered[0]))
-        fault = f"{facts.path} holds {_counted(facts.on_disk, 'photograph')} but no camera poses"
+        fault = f"{facts.path} holds {amount(facts.on_disk, 'photograph')} but no camera poses"
         yield Finding("error", fault, f"`clsplat run photos --scene {folder}` finds the cameras")
     yield from (Finding("error", fault) for fault in facts.faults[:MAX_NAMES])
     if len(facts.faults) > MAX_NAMES:
-        more = f"{_counted(len(facts.faults) - MAX_NAMES, 'more part')} of the dataset cannot be read"
+        more = f"{amount(len(facts.faults) - MAX_NAMES, 'more part')} of the dataset cannot be read"
         yield Finding("error", more, "fix the first ones and inspect again")
 
 
@@ -77,10 +84,10 @@ def _photographs(facts: Facts) -> Iterator[Finding]:
         )
     if photographs.unreadable:
         unreadable, reason = _listed(list(photographs.unreadable)), next(iter(photographs.unreadable.values()))
-        fault = f"{_counted(len(photographs.unreadable), 'image file')} cannot be decoded ({unreadable})"
+        fault = f"{amount(len(photographs.unreadable), 'image file')} cannot be decoded ({unreadable})"
         yield Finding("error", fault, f"{reason.partition(';')[0]}; copy or export them again")
     if photographs.cut:
-        fault = f"the end is missing from {_counted(len(photographs.cut), 'image file')} ({_listed(photographs.cut)})"
+        fault = f"the end is missing from {amount(len(photographs.cut), 'image file')} ({_listed(photographs.cut)})"
         yield Finding("error", fault, "copy them again")
     if photographs.misfits:
         sizes = [f"{name} is {size}" for name, size in photographs.misfits.items()]
@@ -122,7 +129,7 @@ def _cameras(facts: Facts) -> Iterator[Finding]:
         remedy = "this is allowed; a larger view takes more time in a step"
         yield Finding("note", f"the photographs have {len(sizes)} sizes", remedy)
     for camera in facts.cameras:
-        name = f"the {_camera_name(camera)} of {_counted(camera.views, 'view')}"
+        name = f"the {_camera_name(camera)} of {amount(camera.views, 'view')}"
         if not FOCAL_RANGE[0] < camera.focal[0] / camera.width < FOCAL_RANGE[1]:
             fault = f"{name} has a focal length of {camera.focal[0]:.4g} px, which is not plausible"
             yield Finding("warning", fault, "calibrate it again, or find the poses with the right focal length")
@@ -141,9 +148,8 @@ def _poses(facts: Facts) -> Iterator[Finding]:
         fault = f"COLMAP made {len(facts.submodels)} models and only {used} ({facts.submodels[used]} images) is used"
         remedy = f"left out is {parts}; colmap model_merger may join them where they share images"
         yield Finding("warning" if large else "note", fault, remedy)
-    if facts.train is not None and facts.train < MIN_VIEWS:
-        fault = f"there {_are(facts.train, 'training view', 'only ')}"
-        yield Finding("warning", fault, "expect floaters and blur far from the photographs; take 30 or more")
+    if facts.train is not None:
+        yield from few_views(facts.train)
     if facts.test == 0:
         yield Finding("note", "there are no test views", "clsplat measures quality on training views only")
     if facts.one_place:
@@ -159,7 +165,7 @@ def _poses(facts: Facts) -> Iterator[Finding]:
         yield Finding("note", fault, "training counts copies of a photograph twice; keep one of them")
     if facts.few_seen:
         counted = [f"{name}: {facts.seen[name]}" for name in facts.few_seen]
-        fault = f"fewer than {MIN_SEEN} points are seen by {_counted(len(counted), 'view')} ({_listed(counted)})"
+        fault = f"fewer than {MIN_SEEN} points are seen by {amount(len(counted), 'view')} ({_listed(counted)})"
         yield Finding("warning", fault, "their poses are unreliable; look at their renders, or remove these images")
 
 
@@ -200,14 +206,10 @@ def _camera_name(camera: CameraFacts) -> str:
     return f"{camera.model} camera {camera.width}x{camera.height}"
 
 
-def _counted(count: int, word: str) -> str:
-    return f"{count:,} {word}{'s' if count != 1 else ''}"
-
-
 def _are(count: int, word: str, before: str = "") -> str:
     """Return a count with its verb: `3 views are`, or with words before the count `are only 3 views`."""
     verb = "is" if count == 1 else "are"
-    return f"{verb} {before}{_counted(count, word)}" if before else f"{_counted(count, word)} {verb}"
+    return f"{verb} {before}{amount(count, word)}" if before else f"{amount(count, word)} {verb}"
 
 
 def _listed(names: Sequence[str], limit: int = MAX_NAMES) -> str:

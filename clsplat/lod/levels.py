@@ -6,7 +6,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from clsplat.errors import ConfigError, DataError
+from clsplat.errors import ConfigError, DataError, amount
 from clsplat.files import new_folder, require_free
 from clsplat.formats.lod_writing import write_lod
 from clsplat.formats.splats import Writing, require_moderate
@@ -38,7 +38,8 @@ def levels_of_detail(
         raise DataError(f"{model}: the model holds no Gaussians; expected some to merge")
     require_moderate(model, first.as_file(), "SOG")
     if len(first) < FEW:
-        LOG.warning("%s: has %d Gaussians; below a million one SOG is better: `clsplat convert`", model, len(first))
+        told = amount(len(first), "Gaussian")
+        LOG.warning("%s: has %s; below a million one SOG is better: `clsplat convert`", model, told)
     training = Training(opened, folder.with_name(f"{folder.name}.training"), plan) if opened else None
     writing = Writing(clustering=partial(DeviceClusters, opened.device)) if opened else Writing()
     with new_folder(folder) as place:
@@ -95,7 +96,7 @@ def _levels(first: Model, plan: Plan, training: Training | None) -> list[Level]:
     levels = [training.measured(first) if training else Level(first)]
     for number in range(1, plan.levels):
         fewer = decimated(levels[-1].model, plan.keep)
-        LOG.info("level %d: %d Gaussians", number, len(fewer))
+        LOG.info("level %d: %s", number, amount(len(fewer), "Gaussian"))
         levels.append(training.trained(number, fewer) if training else Level(fewer))
     return levels
 

@@ -73,11 +73,6 @@ def scene_name(folder: str | Path) -> str:
     return Path(folder).resolve().name
 
 
-def counted(count: int, word: str) -> str:
-    """Return a number with its noun: `1 view`, `2 views`."""
-    return f"{count:,} {word}{'s' if count != 1 else ''}"
-
-
 def duration(seconds: float) -> str:
     """Return a time in words: `1 h 2 min`, `3 min 4 s`, `5 s`."""
     minutes, rest = divmod(round(seconds), 60)

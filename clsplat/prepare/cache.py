@@ -68,7 +68,7 @@ def prepare(
 
     Raises OutputError where another process makes one of the results, and the errors of the steps.
     """
-    count = Count("steps of the preparation", len(planned))
+    count = Count("steps of the preparation", len(planned), is_even=False)
     for number, one in enumerate(planned):
         count.reach(number)
         with _only_one_making(one) if one.why else nullcontext():
@@ -77,6 +77,8 @@ def prepare(
                     _do(one, source, root)
             else:
                 LOG.info("%s: exists in %s", one.step.stage, one.folder)
+                for text in one.step.warnings(record_of(one.folder)):
+                    LOG.warning("%s", text)
         source = one.folder
     return source
 

@@ -17,6 +17,7 @@ from data_tools.photos import (
     Mapper,
     Matching,
     find_features,
+    left_out,
     map_cameras,
     match_features,
 )
@@ -50,7 +51,11 @@ class Step(Settings):
 
     def told(self, figures: dict[str, Any]) -> str:
         """Return what `make` returned in words."""
-        return ", ".join(f"{name} {value}" for name, value in figures.items() if value not in ([], ""))
+        return ", ".join(f"{name} {value}" for name, value in figures.items() if value not in ([], {}, ""))
+
+    def warnings(self, figures: dict[str, Any]) -> list[str]:
+        """Return what `make` has warned of when it returned these figures, for calls that find its result."""
+        return []
 
 
 class FindFeatures(Step):
@@ -83,6 +88,12 @@ class FindFeatures(Step):
         return find_features(
             source, out, self.long_side, self.features, self.camera_model, self.cameras, without.resolve()
         )
+
+    def told(self, figures: dict[str, Any]) -> str:
+        return super().told({**figures, "damaged": ", ".join(figures.get("damaged", ()))})
+
+    def warnings(self, figures: dict[str, Any]) -> list[str]:
+        return left_out(figures)
 
 
 class MatchFeatures(Step):
@@ -118,6 +129,9 @@ class MapCameras(Step):
 
     def told(self, figures: dict[str, Any]) -> str:
         return photographs_text({self.stage: figures})
+
+    def warnings(self, figures: dict[str, Any]) -> list[str]:
+        return left_out(figures)
 
 
 class Undistort(Step):

@@ -131,7 +131,7 @@ def run_pipeline(
         with terminal.counted():
             run = opening.open_run(pipeline, out, device, start, status)
             stop_if_signalled()
-        with terminal.progress_bar() as show, live.showing(run) if live else nullcontext():
+        with terminal.progress_bar(status) as show, live.showing(run) if live else nullcontext():
             runner.execute(pipeline, run, start, live.reporting(show) if live else show)
         for line in summary(out):
             LOG.debug("%s", line)  # who asked for the run shows it
@@ -178,8 +178,8 @@ def _run_cells(
             else:
                 LOG.info("%s", title)
                 run_pipeline(cell.pipeline, folder, device, start, live)
-        except Interrupted:
-            raise
+        except Interrupted as stopped:
+            raise Interrupted(f"stopped in {title}; `clsplat resume {status.out}` goes on with it") from stopped
         except Exception as error:
             failures[cell.name] = as_clsplat_error(error)
             LOG.warning("cell %s failed: %s", cell.name, one_line(failures[cell.name]))

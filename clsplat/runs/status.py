@@ -10,6 +10,7 @@ from clsplat.errors import DataError, one_line
 from clsplat.names import END_STATES, METRICS, PIPELINE, SILENT, STATUS
 from clsplat.processes import Owner
 from clsplat.training import checkpoint
+from clsplat.training.found import photographs_text
 from clsplat.training.records import Records
 from clsplat.training.status import read_status
 from clsplat.training.status_schema import status_of
@@ -76,6 +77,8 @@ def status_text(status: dict[str, Any]) -> str:
         lines.append(advice)
     if status["last"] and status["metrics"] is None:
         lines.append("last report: " + _figures(status["last"], ("step", "loss", "psnr", "gaussians")))
+    if placed := photographs_text((status["metrics"] or {}).get("preparation", {})):
+        lines.append(placed)
     for split in ("test", "train"):
         for downscale, figures in ((status["metrics"] or {}).get(split) or {}).items():
             lines.append(f"{split} 1/{downscale}: {_figures(figures, ('psnr', 'ssim', 'lpips', 'views'))}")

@@ -8,7 +8,7 @@ from typing import ClassVar, Literal
 from clsplat.density.control import densify
 from clsplat.density.edit import Edit, Rule
 from clsplat.density.thresholds import SceneScale
-from clsplat.errors import NumericError
+from clsplat.errors import NumericError, amount
 from clsplat.gaussians.tables import PARAMETERS
 from clsplat.schedule import AtLeastOne
 from clsplat.settings import OneOf
@@ -57,6 +57,6 @@ class Densify(Scheduled):
             most = f"{fits:,} Gaussians, the most that fit in the device's memory; with smaller photographs more do"
             LOG.warning("step %d: growth stops at %s", run.step, most)
         run.records.add(run.step, "densify", **asdict(change))
-        LOG.debug("step %d: %d -> %d Gaussians", run.step, change.before, change.after)
+        LOG.debug("step %d: %s -> %s", run.step, f"{change.before:,}", amount(change.after, "Gaussian"))
         if change.after == 0:
             raise NumericError(f"step {run.step}: every Gaussian was pruned; weaken the prune rules or lower the rates")

@@ -5,6 +5,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import AfterValidator, Field, field_validator
 
+from clsplat.errors import amount
 from clsplat.gaussians.model import load
 from clsplat.gaussians.tables import DeviceModel
 from clsplat.metrics.lpips import InputRange
@@ -85,7 +86,7 @@ class Evaluate(Scheduled):
             run.records.add(run.step, "evaluate", split=self.split, downscale=downscale, **averages)
             run.metrics.setdefault(self.split, {})[f"{downscale:g}"] = averages
             LOG.info(
-                "step %d  %s%s views at 1/%g: PSNR %.2f dB  SSIM %.4f  (%d views)",
+                "step %d  %s%s views at 1/%g: PSNR %.2f dB  SSIM %.4f  (%s)",
                 *(run.step, f"{self.file}, " if self.file else "", self.split, downscale),
-                *(averages["psnr"], averages["ssim"], len(results)),
+                *(averages["psnr"], averages["ssim"], amount(len(results), "view")),
             )

@@ -12,6 +12,7 @@ from pydantic import Field, model_validator
 
 from clsplat.density.contribution import contributions
 from clsplat.density.thresholds import Share
+from clsplat.errors import amount
 from clsplat.formats.sog_writing import Harmonics
 from clsplat.formats.splats import MAX_DEGREE, Writing, sh_coefficients
 from clsplat.gaussians.clusters import DeviceClusters
@@ -134,7 +135,7 @@ class PaletteSh(Scheduled):
         gaussians.set("sh_rest", found.values)
         if run.adam is not None:
             run.adam.forget("sh_rest")
-        LOG.info("%d harmonics of %d Gaussians", len(found.palette), gaussians.count)
+        LOG.info("%s of %s", amount(len(found.palette), "harmonic"), amount(gaussians.count, "Gaussian"))
 
 
 def best(score: NDArray[np.float64], count: int) -> NDArray[np.int64]:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 from typing import Annotated, ClassVar, Literal
 
-from clsplat.errors import DataError
+from clsplat.errors import DataError, amount
 from clsplat.metrics.views import render_view
 from clsplat.scene.images import image_size, is_image, write_image
 from clsplat.scene.view import View
@@ -39,7 +39,7 @@ class Render(Stage):
         for path, view in counted:
             camera = run.photographs.camera(view)
             write_image(path, render_view(run.rasterizer, run.model, camera, run.photographs.background))
-        LOG.info("%d images written to %s", len(views), run.out / self.folder)
+        LOG.info("%s written to %s", amount(len(views), "image"), run.out / self.folder)
 
     def verify(self, run: Run) -> None:
         for path, view in self._views(run).items():

@@ -6,9 +6,10 @@ from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 from urllib.parse import quote
 
+from clsplat.errors import amount
 from clsplat.files import write_text
 from clsplat.names import PIPELINE
-from clsplat.pages.page import counted, duration, render, require_end
+from clsplat.pages.page import duration, render, require_end
 from clsplat.reading import read_text
 from clsplat.report.cameras import cameras
 from clsplat.report.charts import gaussians_charts, training_charts
@@ -37,7 +38,7 @@ class Report(Stage):
             title=run.scene_name,
             subtitle=f"{run.name} · {run.device.text}",
             main=_main(run),
-            photographs=photographs_text(run.found) or f"{counted(len(run.original.views), 'photograph')}",
+            photographs=photographs_text(run.found) or f"{amount(len(run.original.views), 'photograph')}",
             viewers=_addresses(run, "viewer", run.out / self.file),
             models=_addresses(run, "export", run.out / self.file),
             views=views(run),
@@ -74,7 +75,7 @@ def _figures(run: Run) -> dict[str, str]:
     for split, by_downscale in run.metrics.items():
         for downscale, averages in by_downscale.items():
             suffix = "" if downscale == f"{run.downscale:g}" else f" at 1/{downscale}"
-            values[f"{split} PSNR{suffix} ({counted(averages['views'], 'view')})"] = f"{averages['psnr']:.2f} dB"
+            values[f"{split} PSNR{suffix} ({amount(averages['views'], 'view')})"] = f"{averages['psnr']:.2f} dB"
             values[f"{split} SSIM{suffix}"] = f"{averages['ssim']:.4f}"
     values["Gaussians"] = f"{run.model.gaussians.count:,}"
     values["steps"] = f"{run.step:,}"

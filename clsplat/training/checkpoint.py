@@ -215,6 +215,9 @@ def _take_changes(run: Run, path: Path, state: State) -> list[str]:
             raise ConfigError(f"{path} was made with other settings: {difference}; {remedy}")
         if difference.stage is not None and difference.stage < state.cursor:
             raise ConfigError(f"{path} was saved after that stage, at step {state.step}: {difference}; {remedy}")
+        if difference.stage == state.cursor and state.is_trained(run.pipeline):
+            more = f"`clsplat resume {run.out} --steps {2 * state.stage_step}` with that setting trains on"
+            raise ConfigError(f"{path}: no step is left to train, at step {state.step}: {difference}; {more}")
         changed.append(f"step {state.step}: {difference}")
     run.changes = [*state.changes, *changed]
     return changed

@@ -13,8 +13,9 @@ def photographs_text(found: Mapping[str, Mapping[str, Any]]) -> str:
     """
     cameras = found.get("map_cameras", {})
     try:
-        placed, lost = int(cameras["registered"]), [str(name) for name in cameras["not_registered"]]
+        damaged = [f"{name} ({reason})" for name, reason in found.get("find_features", {}).get("damaged", {}).items()]
+        placed, lost = int(cameras["registered"]), [*damaged, *map(str, cameras["not_registered"])]
         text = f"{placed} of {placed + len(lost)} photographs placed, {float(cameras['error_px']):.2f} px"
-    except (KeyError, TypeError, ValueError):
+    except (AttributeError, KeyError, TypeError, ValueError):
         return ""
     return text + (f"; left out: {first_few(lost)}" if lost else "")

@@ -30,3 +30,8 @@ class State(BaseModel):
     device: str
     inputs: str  # identity of the scene
     pipeline: dict[str, Any]
+
+    def is_trained(self, pipeline: dict[str, Any]) -> bool:
+        """Whether all the steps that a resolved pipeline gives the training in progress are done."""
+        (stage,) = pipeline["stages"][self.cursor].values()
+        return bool(stage.get("steps") == self.stage_step)
