@@ -19,8 +19,6 @@ from clsplat.formats.table import write as write_splats
 from clsplat.inspect.inspection import Inspection
 from clsplat.inspect.page import MAX_NAMES, inspection_page
 from clsplat.inspect.survey import distortion
-from clsplat.pipeline.file import SceneSettings
-from clsplat.runs.scenes import RunScene
 from clsplat.scene.detect import read_scene
 from clsplat.scene.lens import Lens
 from clsplat.scene.view import load_image, load_mask
@@ -31,6 +29,7 @@ from tests.formats.models import splats
 from tests.html_page import HOSTILE, Page
 from tests.test_cli import clsplat
 from tests.test_image_headers import with_exif
+from tests.test_training import train
 
 COUNT = 24  # cameras on a circle of radius 4 that look at points in a ball of radius 1
 SIZE = (64, 48)
@@ -474,10 +473,9 @@ def test_a_model_is_no_dataset(tmp_path, rng):
     assert "b.txt: is a file; expected the folder of a dataset" in done.stderr
 
 
-def test_a_run_warns_of_few_views_as_inspect_does(tiny_scene, caplog):
-    scene = read_scene(tiny_scene)
+def test_a_run_warns_of_few_views_as_inspect_does(tiny_scene, tmp_path, caplog):
     warned = [finding.text for finding in Inspection.of(tiny_scene).findings if "training views" in finding.fault]
     caplog.clear()
-    RunScene.of(SceneSettings(), scene)
+    train(tiny_scene, tmp_path / "run", "optimize.steps=2", "optimize.during=[]")
     assert [record.getMessage() for record in caplog.records if record.levelname == "WARNING"] == warned
     assert warned[0].startswith("there are only 8 training views: expect floaters")

@@ -141,7 +141,7 @@ def test_a_run_continues_when_its_output_is_not_read(tiny_scene, tmp_path):
     process.stdout.readline()
     process.stdout.close()
     assert process.wait(60) == 0, process.stderr.read()
-    assert process.stderr.read() == ""
+    assert [line for line in process.stderr.read().splitlines() if "training views" not in line] == []
     assert json.loads((tmp_path / "status.json").read_text())["state"] == "done"
 
 

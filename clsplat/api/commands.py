@@ -68,7 +68,7 @@ def resume(
     from clsplat.runs.experiment import Job
 
     load_plugins()
-    job = Job.resume(Path(folder), path_of(scene), overrides(set))
+    job = Job.resume(Path(folder), overrides(set), path_of(scene))
     job.run(device, live)
     return job.out
 

@@ -64,7 +64,7 @@ class Job:
         return cls(checked, out or free_folder(Path("runs") / checked.settings.name, checked, start), start)
 
     @classmethod
-    def resume(cls, out: Path, scene: Path | None = None, overrides: Sequence[str] = ()) -> "Job":
+    def resume(cls, out: Path, overrides: Sequence[str] = (), scene: Path | None = None) -> "Job":
         """Take the pipeline that a run folder holds, to go on with it there.  Raises ConfigError or DataError.
 
         scene: where its photographs are; default: where they were.

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from clsplat.errors import ConfigError, DataError, Interrupted
 from clsplat.files import write_text
+from clsplat.inspect.findings import few_views
 from clsplat.names import CHECKSUMS, NOTE, PIPELINE
 from clsplat.pipeline.loading import Pipeline
 from clsplat.runs.course import Course, is_below
@@ -33,6 +34,8 @@ def execute(pipeline: Pipeline, run: Run, start: Start, show: Callable[[Progress
     with finishing_on_interrupt(run), saved_on_failure(run):
         _write_again(pipeline, run, lost)
         _run_stages(pipeline, run)
+    for finding in few_views(len(run.original.train)):
+        LOG.warning("%s", finding.text)
     run.status.require_held()
     write_metrics(pipeline, run)
     check_outputs(pipeline, run, lost.gone)

@@ -5,7 +5,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from clsplat.inspect.findings import few_views
 from clsplat.pipeline.file import SceneSettings
 from clsplat.scene.decoding import decode_all, require_whole
 from clsplat.scene.detect import read_scene
@@ -45,8 +44,6 @@ class RunScene:
                 downscaled.extent,
             ),
         )
-        for finding in few_views(len(original.train)):
-            LOG.warning("%s", finding.text)
         files = decode_all(
             view for one in (original, downscaled) for split in ("train", "test") for view in one.split(split)
         )
