@@ -2,6 +2,7 @@
 
 import errno
 import itertools
+import json
 import logging
 import os
 import re
@@ -13,7 +14,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from clsplat.errors import ConfigError, OutputError
-from clsplat.names import COMPARISON, PIPELINE, STATUS
+from clsplat.names import CHECKSUMS, COMPARISON, RESERVED, STATUS
 from clsplat.processes import is_alive
 
 LOG = logging.getLogger("clsplat")
@@ -218,9 +219,21 @@ def check_result(path: Path, suffix: str) -> None:
 def check_no_file_of_a_run(path: Path) -> None:
     """Raise ConfigError where a command would write over a file of a run."""
     folder = path.absolute().parent
-    run = next((one for one in (folder, *folder.parents) if any((one / n).is_file() for n in (PIPELINE, STATUS))), None)
-    if run and is_there(path):
+    run = next(
+        (one for one in (folder, *folder.parents) if any((one / n).is_file() for n in (CHECKSUMS, STATUS))), None
+    )
+    if run and is_there(path) and _is_of(run, path):
         raise ConfigError(f"{path}: is a file of a run; give another name")
+
+
+def _is_of(run: Path, path: Path) -> bool:
+    """Whether a run has written a file of its folder: all but what its list of checksums does not know."""
+    name = path.absolute().relative_to(run).as_posix()
+    try:
+        listed = json.loads((run / CHECKSUMS).read_text(encoding="utf-8"))
+    except (OSError, ValueError):  # it has not ended, or is a matrix
+        return True
+    return not isinstance(listed, dict) or name in listed or name in RESERVED
 
 
 def unwritable(path: Path, error: OSError) -> OutputError:

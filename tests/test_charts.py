@@ -20,6 +20,12 @@ def columns(chart: str) -> list[str]:
     return re.findall(rf'y="{HEIGHT - 10}" text-anchor="middle">([^<]+)<', chart)
 
 
+def test_points_that_are_not_finite_are_left_out():
+    odd = [(1, float("nan")), (2, float("inf")), (3, 5.0), (4, 6.0)]
+    assert rows(curve("a", [Line(odd)])) == rows(curve("a", [Line(odd[2:])]))
+    assert curve("a", [Line(odd[:2])], logarithmic=True) == ""
+
+
 @pytest.mark.parametrize(("counts", "labels"), [
     ((8040, 8040), ["8,040"]),
     ((8040, 8041), ["8,040", "8,041"]),

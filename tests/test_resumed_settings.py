@@ -8,6 +8,7 @@ import pytest
 from clsplat.errors import ConfigError
 from clsplat.runs.experiment import Job
 from clsplat.training import archive
+from clsplat.training.status import read_status
 from tests.few_steps import FEW, steps_saved
 from tests.test_checkpoints import crafted
 from tests.test_training import digest, train
@@ -58,6 +59,12 @@ def test_a_training_without_a_step_left_takes_no_other_numbers(few_steps, tiny_s
     }
     Job.resume(out, ["optimize.rates.quats=1e-5", "optimize.steps=14"]).run()
     assert len(json.loads((out / "metrics.json").read_text())["changes"]) == 2
+
+
+def test_a_training_ends_at_the_step_where_it_stopped_if_that_is_asked(killed_run):
+    Job.resume(killed_run, ["optimize.steps=8"]).run()
+    assert read_status(killed_run)["state"] == "done"
+    assert (killed_run / "point_cloud.ply").is_file()
 
 
 def test_a_stage_that_is_over_keeps_its_settings(killed_run, tiny_scene):

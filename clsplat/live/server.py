@@ -106,16 +106,16 @@ class _Connection(socketserver.StreamRequestHandler):
     """One connection: requests one after the other."""
 
     server: Server
-    timeout = HEAD
+    timeout = IDLE
     disable_nagle_algorithm = True
 
     def handle(self) -> None:
         try:
             while (head := self._head()) is not None and not self.server.ended:
+                self.connection.settimeout(IDLE)
                 self.server.paced()
                 answer = self._answer(head)
                 self.wfile.write(answer.bytes())
-                self.connection.settimeout(IDLE)
                 if answer.status in (400, 405, 431):  # what follows may be a body
                     return
         except OSError:  # it was closed, or says nothing

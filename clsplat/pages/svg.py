@@ -103,10 +103,9 @@ def histogram(title: str, values: Sequence[float], bins: int = 24) -> str:
 
 
 def _drawn(line: Line, logarithmic: bool) -> Line:
-    """The line in the coordinates of the axes."""
-    if not logarithmic:
-        return line
-    return replace(line, points=[(x, math.log10(y)) for x, y in line.points if y > 0])
+    """The line in the coordinates of the axes: its points that are finite."""
+    points = [(x, y) for x, y in line.points if math.isfinite(x) and math.isfinite(y)]
+    return replace(line, points=[(x, math.log10(y)) for x, y in points if y > 0] if logarithmic else points)
 
 
 def _colour(line: Line, index: int) -> str:

@@ -215,7 +215,8 @@ def _take_changes(run: Run, path: Path, state: State) -> list[str]:
             raise ConfigError(f"{path} was made with other settings: {difference}; {remedy}")
         if difference.stage is not None and difference.stage < state.cursor:
             raise ConfigError(f"{path} was saved after that stage, at step {state.step}: {difference}; {remedy}")
-        if difference.stage == state.cursor and state.is_trained(run.pipeline):
+        is_end = difference.place.endswith(".steps")  # an end before the one that was planned
+        if difference.stage == state.cursor and state.is_trained(run.pipeline) and not is_end:
             more = f"`clsplat resume {run.out} --steps {2 * state.stage_step}` with that setting trains on"
             raise ConfigError(f"{path}: no step is left to train, at step {state.step}: {difference}; {more}")
         changed.append(f"step {state.step}: {difference}")

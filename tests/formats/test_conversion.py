@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +15,7 @@ import clsplat
 from clsplat.cli import app
 from clsplat.density.mixture import mass_of
 from clsplat.errors import ConfigError, DataError
+from clsplat.files import check_no_file_of_a_run
 from clsplat.formats.ply import write_ply
 from clsplat.formats.splats import inverse_opacities, opacities
 from clsplat.formats.table import CODECS, bytes_of, detect, read, write
@@ -42,10 +44,22 @@ def test_a_model_is_written_as_its_name_says(name, source, tmp_path):
         assert detect(tmp_path / name).name == done["format"]
 
 
+def test_a_file_that_no_run_has_written_is_replaced(few_steps, tmp_path):
+    run = shutil.copytree(few_steps, tmp_path / "run")
+    (tmp_path / "pipeline.yaml").write_text("of a project")
+    for place in (run / "web.spz", tmp_path / "out" / "web.spz"):
+        for _ in range(2):
+            clsplat.convert(run, place)
+    for name in ("report.html", "metrics.json"):
+        assert (run / name).is_file()
+        with pytest.raises(ConfigError, match="is a file of a run; give another name"):
+            check_no_file_of_a_run(run / name)
+
+
 def test_no_file_of_a_run_is_replaced(source, tmp_path):
     run = tmp_path / "run"
     run.mkdir()
-    (run / "pipeline.yaml").write_text("name: a")
+    (run / "status.json").write_text("{}")
     (run / "point_cloud.ply").write_text("trained")
     with pytest.raises(ConfigError, match=r"point_cloud\.ply: is a file of a run; give another name"):
         clsplat.convert(source, run / "point_cloud.ply")
