@@ -2,7 +2,6 @@
 
 import errno
 import itertools
-import json
 import logging
 import os
 import re
@@ -13,9 +12,10 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
-from clsplat.errors import ConfigError, OutputError
+from clsplat.errors import ConfigError, DataError, OutputError
 from clsplat.names import CHECKSUMS, COMPARISON, RESERVED, STATUS
 from clsplat.processes import is_alive
+from clsplat.reading import read_json
 
 LOG = logging.getLogger("clsplat")
 # what a process that was killed leaves: .NAME.PROCESS-NUMBER.partial
@@ -230,8 +230,8 @@ def _is_of(run: Path, path: Path) -> bool:
     """Whether a run has written a file of its folder: all but what its list of checksums does not know."""
     name = path.absolute().relative_to(run).as_posix()
     try:
-        listed = json.loads((run / CHECKSUMS).read_text(encoding="utf-8"))
-    except (OSError, ValueError):  # it has not ended, or is a matrix
+        listed = read_json(run / CHECKSUMS)
+    except DataError:  # it has not ended, or is a matrix
         return True
     return not isinstance(listed, dict) or name in listed or name in RESERVED
 
