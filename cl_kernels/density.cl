@@ -211,7 +211,7 @@ void spawn_children(
 }
 
 /* Opacities of rows that together let through as much as their Gaussian did: 1 - o' = (1 - o)^(1/n) (Rota Bulo et al.
- * 2024, "Revising Densification in Gaussian Splatting", section 3.3).  In logits, with x = log(1 + e^l) / n:
+ * 2024, "Revising Densification in Gaussian Splatting").  In logits, with x = log(1 + e^l) / n:
  * l' = log(e^x - 1). */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void share_opacity(

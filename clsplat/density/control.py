@@ -65,7 +65,7 @@ def cap_opacity(gaussians: Gaussians, limit: float) -> None:
 
 def add_noise(gaussians: Gaussians, rate: float, opacity_below: float, seed: int, step: int) -> None:
     """Move each mean by rate / (1 + exp(-100 (opacity_below - opacity))) Σ n, n three normal numbers (Kheradmand et
-    al. 2024, eq. 7).  rate: scene units⁻¹.
+    al. 2024).  rate: scene units⁻¹.
     """
     gaussians.device.program("noise.cl").add_noise(
         items=gaussians.count,

@@ -1,4 +1,4 @@
-"""Relocation: faint Gaussians move to places that are opaque (3DGS-MCMC, Kheradmand et al. 2024, section 4)."""
+"""Relocation: faint Gaussians move to places that are opaque (3DGS-MCMC, Kheradmand et al. 2024)."""
 
 from typing import Annotated, ClassVar, Literal
 

@@ -1,4 +1,4 @@
-"""density.cl: statistics of views, rules, and the rows that an edit makes."""
+"""density.cl and noise.cl: statistics of views, rules, the rows that an edit makes, and means that move at random."""
 
 from collections.abc import Iterator
 from typing import Any

@@ -1,4 +1,4 @@
-"""Adam, penalties, noise on means, and the rows of tables."""
+"""Adam, penalties, and the rows of tables."""
 
 from collections.abc import Iterator
 from typing import Any
