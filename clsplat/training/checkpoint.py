@@ -164,6 +164,7 @@ def _write(run: Run, kind: str) -> Path:
         degree=run.model.degree,
         zero_fresh=[name for name, table in run.model.gaussians.tables.items() if table.zero_fresh],
         updates=run.adam.updates if run.adam else {},
+        numbers=run.numbers,
         train_seconds=run.train_seconds,
         metrics=run.metrics,
         records=run.records.lines,
@@ -239,7 +240,7 @@ def _restore(run: Run, state: State, tables: Arrays) -> None:
         gaussians.set(name, table)
     run.step, run.cursor, run.stage_step = state.step, state.cursor, state.stage_step
     run.acted, run.edited, run.whole = state.acted, state.edited, True
-    run.train_seconds, run.metrics = state.train_seconds, state.metrics
+    run.numbers, run.train_seconds, run.metrics = state.numbers, state.train_seconds, state.metrics
     run.records.lines, run.inputs_before, run.written = state.records, state.inputs, state.written
 
 

@@ -79,6 +79,7 @@ class Run:
     whole: bool = True  # False after a failure in the middle of a change of the tables
     changes: list[str] = field(default_factory=list)  # of settings, with which the run went on
     inputs_before: str = ""  # `inputs` of the checkpoint that the run goes on from
+    numbers: dict[str, float] = field(default_factory=dict)  # that parts of it keep from step to step, by name
     train_seconds: float = 0.0
     written: dict[str, str] = field(default_factory=dict)  # models: path in the run folder -> SHA-256
     metrics: dict[str, dict[str, Any]] = field(default_factory=dict)  # split -> downscale -> averages

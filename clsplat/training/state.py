@@ -22,6 +22,7 @@ class State(BaseModel):
     degree: Annotated[int, Field(ge=0, le=3)]
     zero_fresh: list[str]
     updates: dict[str, Count]
+    numbers: dict[str, float] = {}  # that parts of the run keep; older files have none
     train_seconds: float
     metrics: dict[str, dict[str, Any]]
     records: Count  # lines of metrics.jsonl
