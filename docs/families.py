@@ -43,6 +43,7 @@ FAMILIES = {  # by the name of the base; any other family gets a page of its own
     "Grow": Family("rules", "growing rule", "rules"),
     "Subdivide": Family("rules", "dividing rule", "rules"),
     "Statistic": Family("statistics", "statistic", "statistic", listed=False),
+    "Budget": Family("rules", "budget of Gaussians", "budget", listed=False),
     "Order": Family("views", "order", "order", listed=False),
     "PhotographTransform": Family("views", "transform", "transforms"),
     "WorldFilter": Family("filters", "world filter", "world_filter", listed=False),

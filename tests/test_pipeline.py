@@ -102,11 +102,18 @@ MATCHING = {
 }
 SUBDIVIDE = (".start", ".at_most", ".beta", ".children", ".radius_above")
 THINNING = {
-    *(f"densify~{n}.{key}" for n in (2, 3) for key in ("every", "max_gaussians", "start", "stop")),
+    *(f"densify~{n}.{key}" for n in (2, 3) for key in ("budget", "every", "max_gaussians", "start", "stop")),
     *(f"densify~2.rules.prune_unimportant{key}" for key in ("", ".start", ".share")),
     *(f"densify~3.rules.merge_neighbours{key}" for key in ("", ".start", ".colour_below", ".distance_below")),
 }
 MEAN_FILTER = {f"views.transforms.mean_filter{key}" for key in ("", ".width.between", ".width.points")}
+DASH = {
+    *(f"densify.budget{key}" for key in ("", ".begin", ".gaussians", ".gradient_above", ".growth", ".keep", ".most")),
+    *(f"views.resolution{key}" for key in ("", ".every", ".follows", ".largest", ".start", ".until")),
+    *(f"rates.means.{key}" for key in ("over", "start", "until")),
+    *(f"densify.rules.prune_large{key}" for key in ("", ".size_above", ".start")),
+    "densify.stop",
+}
 DIFFERENCES = {
     ("splat", "splat_7k"): TWIN,
     ("splat", "mip_splatting"): SMOOTHING | MIP | REFRESH,
@@ -123,6 +130,9 @@ DIFFERENCES = {
     },
     ("splat", "opti3dgs"): MEAN_FILTER,
     ("splat_7k", "opti3dgs_7k"): MEAN_FILTER,
+    ("splat", "dash"): DASH | {"reset_opacity.stop", "rates.logit_opacity"},
+    ("splat_7k", "dash_7k"): DASH,
+    ("mip_splatting", "dash_mip"): DASH | {"reset_opacity.stop", "rates.logit_opacity", "refresh_filter.start"},
     ("splat", "micro_splatting"): {
         *(f"densify.rules.split_textured{key}" for key in ("", *SUBDIVIDE, ".texture", ".gradient_above")),
         *(f"densify.rules.split_textured.texture_above.{key}" for key in ("of", "quantile")),

@@ -1,10 +1,13 @@
 """Density control at a cadence."""
 
 import logging
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from dataclasses import asdict
 from typing import ClassVar, Literal
 
+from pydantic import model_validator
+
+from clsplat.density.budget import Budget, Moment
 from clsplat.density.control import densify
 from clsplat.density.edit import Edit, Rule
 from clsplat.density.thresholds import SceneScale
@@ -30,16 +33,24 @@ class Densify(Scheduled):
     """Which Gaussians grow or are removed; the first growing rule decides, pruning rules override growth."""
     max_gaussians: AtLeastOne | None = None
     """Number of Gaussians at which growth stops, by step; without it, as many as fit in memory.  Pruning continues."""
+    budget: OneOf[Budget] | None = None
+    """Number of Gaussians at which the growth of an edit stops, from the course of the training; needs `stop`."""
 
     @property
     def statistics(self) -> set[str]:
         """Columns of statistics that the rules read."""
-        return {name for rule in self.rules for name in rule.statistics}
+        return {name for part in (*self.rules, self.budget) if part for name in part.statistics}
 
     @property
     def tables(self) -> set[str]:
         """Tables of the Gaussians that the rules read beside the parameters."""
         return {name for rule in self.rules for name in rule.tables}
+
+    @model_validator(mode="after")
+    def _with_an_end(self) -> "Densify":
+        if self.budget and self.stop is None:
+            raise ValueError("'budget' needs 'stop', the step at which it is reached")
+        return self
 
     def stale(self, run: Run) -> Collection[str]:
         return PARAMETERS
@@ -50,7 +61,7 @@ class Densify(Scheduled):
         scale = SceneScale(run.scene.extent, run.texture_quantile)
         edit = Edit(run.model.gaussians, run.stats, scale, run.step, run.seed)
         fits = run.memory_plan().limit
-        limit = fits if self.max_gaussians is None else min(fits, int(edit.at(self.max_gaussians)))
+        limit = min([fits, *self._limits(run, edit)])
         change = densify(edit, self.rules, run.rasterizer.tiler, limit)
         run.refresh_filter()
         if change.after == fits:
@@ -60,3 +71,11 @@ class Densify(Scheduled):
         LOG.debug("step %d: %s -> %s", run.step, f"{change.before:,}", amount(change.after, "Gaussian"))
         if change.after == 0:
             raise NumericError(f"step {run.step}: every Gaussian was pruned; weaken the prune rules or lower the rates")
+
+    def _limits(self, run: Run, edit: Edit) -> Iterator[int]:
+        """The numbers of Gaussians at which the settings stop growth."""
+        if self.max_gaussians is not None:
+            yield int(edit.at(self.max_gaussians))
+        if self.budget and self.every and self.stop:
+            moment = Moment(run.step / self.stop, run.step + self.every >= self.stop, run.divisor)
+            yield self.budget.limit(edit, moment, run.numbers)

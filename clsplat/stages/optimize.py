@@ -12,10 +12,11 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field, field_validator
 
 from clsplat.density.statistics import SplatStats
-from clsplat.errors import DataError, Interrupted, NotFiniteError
+from clsplat.errors import Interrupted, NotFiniteError
 from clsplat.losses.base import ImageLoss, Loss, Penalty, ViewGradients
 from clsplat.losses.image import pixel_loss
 from clsplat.metrics.distribution import distribution
+from clsplat.schedule import Points
 from clsplat.settings import OneOf
 from clsplat.stages.base import Scheduled, Stage
 from clsplat.stages.densify import Densify
@@ -25,8 +26,8 @@ from clsplat.training.forecast import Forecast
 from clsplat.training.profile import stage_milliseconds
 from clsplat.training.run import Progress, Run, Stopped
 from clsplat.training.trainer import Trainer
-from clsplat.views.photographs import Photograph
-from clsplat.views.sampling import Sample, Sampler, ViewSettings
+from clsplat.views.detail import course
+from clsplat.views.sampling import Sampler, ViewSettings
 
 LOG = logging.getLogger("clsplat")
 DISTRIBUTION_INTERVAL = 5  # reports
@@ -97,7 +98,8 @@ class Optimize(Stage):
 
     def iterate(self, run: Run) -> Iterator[ViewGradients]:
         """Train step by step; the gradients that a step yields are valid until the next."""
-        trainer, sampler = self._trainer(run), Sampler(run.scene.split("train"), self.views, run.seed)
+        views = self._views(run)
+        trainer, sampler = self._trainer(run, views), Sampler(run.scene.split("train"), views, run.seed)
         memory, count = run.memory_plan(), run.model.gaussians.count
         LOG.info(memory.text(count))
         memory.check(count)
@@ -107,7 +109,7 @@ class Optimize(Stage):
         self._act(run)
         while run.stage_step < self.steps:
             start = time.perf_counter()
-            self._edit(run)
+            self._edit(run, views)
             view = self._step(run, trainer, sampler)
             run.status.count("steps", run.stage_step, self.steps, step=run.step, steps=last_step)
             report = run.step % self.log_every == 0 or run.stage_step == self.steps or run.interrupted
@@ -142,7 +144,14 @@ class Optimize(Stage):
     def _density(self) -> list[Densify]:
         return [stage for stage in self.during if isinstance(stage, Densify)]
 
-    def _trainer(self, run: Run) -> Trainer:
+    def _views(self, run: Run) -> ViewSettings:
+        """The settings of the samples, with what follows from the photographs."""
+        views = self.views.settled(run.training_images)
+        if isinstance(views.resolution, Points) and views is not self.views:
+            LOG.info(course(views.resolution))
+        return views
+
+    def _trainer(self, run: Run, views: ViewSettings) -> Trainer:
         """Attach moments, statistics and tables to the run's Gaussians; a resumed run has them."""
         gaussians, photographs = run.model.gaussians, run.photographs
         run.adam = run.adam or Adam(gaussians)
@@ -151,7 +160,8 @@ class Optimize(Stage):
             gaussians.add(name, 1)
             run.refresh_filter()
         parts = run.rasterizer, run.model, run.adam, run.stats, photographs.background
-        return Trainer(*parts, self.losses, self.rates, run.scene.extent)
+        full_size = views.full_size(run.step - run.stage_step + self.steps)
+        return Trainer(*parts, self.losses, self.rates.settled(full_size), run.scene.extent)
 
     def _act(self, run: Run) -> None:
         """Run the stages that are due and do not edit; those that fail run again when the run goes on."""
@@ -166,10 +176,11 @@ class Optimize(Stage):
                 run.acted = place
                 raise
 
-    def _edit(self, run: Run) -> None:
+    def _edit(self, run: Run, views: ViewSettings) -> None:
         """Run the edits that were due at the step before."""
         if run.stage_step == 0 or run.edited:
             return
+        run.divisor = views.divisor(run.step)
         with run.changing():
             for stage in self.during:
                 if stage.edits and stage.due(run.step):
@@ -200,29 +211,13 @@ class Optimize(Stage):
         """
         run.device.timings.sampling = run.step % self.log_every == self.log_every // 2
         sample = sampler.at(run.step)
-        photograph = self._photograph(run, sample)
+        photograph = run.photographs.of_sizes(sample.view, sample.original)
         ahead = range(1, min(READ_AHEAD, self.steps - run.stage_step) + 1)
         run.photographs.announce(sampler.at(run.step + number).view for number in ahead)
         stale = {name for stage in self.during if stage.due(run.step) for name in stage.stale(run)}
         trainer.losses = [*self.losses, *run.losses]
         gradients = trainer.differentiate(photograph, run.step, sample.transforms)
         return gradients, set() if run.stage_step == self.steps else stale
-
-    def _photograph(self, run: Run, sample: Sample) -> Photograph:
-        """The photograph of a step; at its full size where a mask leaves nothing of the smaller one.
-
-        Raises DataError when the mask leaves out every pixel at that size too.
-        """
-        photograph = run.photographs.get(sample.view)
-        if photograph.empty and sample.view is not sample.original:
-            photograph = run.photographs.get(sample.original)
-        if photograph.empty:
-            view = sample.original
-            raise DataError(
-                f"{view.mask_path or view.image_path}: the mask leaves out every pixel of '{view.name}'; expected some "
-                "that count: remove the photograph from the dataset, or fix its mask"
-            )
-        return photograph
 
     def _values(self, run: Run, view: ViewGradients, sampler: Sampler) -> tuple[float, float]:
         """Read the step's loss and PSNR.  Raises NotFiniteError, with the state set aside, when not finite."""

@@ -1,20 +1,45 @@
 """Adam on the tables of a Gaussians struct, with a learning rate for each."""
 
 from collections.abc import Collection
-from typing import Any
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
 
 from clsplat.gaussians.tables import PARAMETERS, DeviceModel, Gaussians, Gradients, moment_tables, sh_coefficients
 from clsplat.opencl.device import Array
 from clsplat.opencl.program import constants
 from clsplat.render.rasterizer import Frame, shape_arguments
-from clsplat.schedule import Decay, NonNegative, at_step
+from clsplat.schedule import Decay, NonNegative, at_step, explained
 from clsplat.settings import Settings
+
+Positive = Annotated[float, Field(gt=0)]
+
+
+class FullSizeDecay(Settings):
+    """The initial value as long as photographs have less than their full size, then an exponential decay (DashGaussian,
+    Chen et al. 2025)."""
+
+    start: Literal["full_size"]
+    """`full_size`: the first step at the full size of the photographs."""
+    until: Annotated[int, Field(gt=0)]
+    """Global step from which the value is the final one."""
+    initial: Positive
+    """The value before the decay."""
+    final: Positive
+    """The value after it."""
+
+    def from_step(self, step: int) -> Decay:
+        """Return the decay that begins at a global step."""
+        start = min(step, self.until - 1)
+        return Decay(initial=self.initial, final=self.final, start=start, over=self.until - start)
 
 
 class Rates(Settings):
     """Learning rates by parameter, each by step.  Those of `means` are multiplied by the scene's extent."""
 
-    means: NonNegative = Decay(initial=1.6e-4, final=1.6e-6, over=30_000)
+    means: Annotated[FullSizeDecay | NonNegative, explained(", or {initial, final, until, start: full_size}")] = Decay(
+        initial=1.6e-4, final=1.6e-6, over=30_000
+    )
     """Of the means, as shares of the scene's extent."""
     quats: NonNegative = 1.0e-3
     """Of the quaternions."""
@@ -27,9 +52,16 @@ class Rates(Settings):
     sh_rest: NonNegative = 1.25e-4
     """Of the other bands."""
 
+    def settled(self, full_size: int) -> "Rates":
+        """Return rates by step alone; full_size: the first step at the full size of the photographs."""
+        if not isinstance(self.means, FullSizeDecay):
+            return self
+        return self.model_copy(update={"means": self.means.from_step(full_size)})
+
     def at(self, step: int, extent: float) -> dict[str, float]:
-        """Return the rates of a global step, by the names of PARAMETERS."""
-        rates = {name: at_step(getattr(self, name), step) for name in PARAMETERS}
+        """Return the rates of a global step, by the names of PARAMETERS; sizes of photographs play no part."""
+        settled = self.settled(0)
+        rates = {name: at_step(getattr(settled, name), step) for name in PARAMETERS}
         return {**rates, "means": rates["means"] * extent}
 
 

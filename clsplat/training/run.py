@@ -7,6 +7,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
+
 from clsplat import __version__
 from clsplat.density.statistics import SplatStats
 from clsplat.errors import ConfigError, Interrupted
@@ -78,6 +81,7 @@ class Run:
     edited: bool = False  # whether those that edit the model have too
     whole: bool = True  # False after a failure in the middle of a change of the tables
     changes: list[str] = field(default_factory=list)  # of settings, with which the run went on
+    divisor: float = 1.0  # of the photographs' size at the step before an edit
     inputs_before: str = ""  # `inputs` of the checkpoint that the run goes on from
     numbers: dict[str, float] = field(default_factory=dict)  # that parts of it keep from step to step, by name
     train_seconds: float = 0.0
@@ -168,6 +172,12 @@ class Run:
             photographs = (self.photographs.get(view) for view in self.scene.split("train"))
             self._texture_quantiles[share] = texture_quantile(self.rasterizer.workspace, photographs, share)
         return self._texture_quantiles[share]
+
+    def training_images(self) -> Iterator[NDArray[np.uint8]]:
+        """Yield the photographs of the training views, each [height, width, 3]."""
+        views = self.scene.split("train")
+        for view in self.status.counted(views, "photographs", len(views)):
+            yield self.photographs.get(view).image()
 
     def host_model(self) -> Model:
         """Copy the model to the host, as it is trained: with a world filter that is not part of its scales."""

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.errors import DataError
 from clsplat.opencl.device import Array, Device
 from clsplat.render.camera import DeviceCamera, upload_camera
 from clsplat.render.workspace import Workspace
@@ -98,6 +99,21 @@ class Photographs:
             mask_on_device, empty = (self.device.upload(mask), not mask.any()) if len(mask) else (None, False)
             photograph = Photograph(self.camera(view), self.device.upload(colours), mask_on_device, empty)
         self._held[key] = photograph
+        return photograph
+
+    def of_sizes(self, view: View, original: View) -> Photograph:
+        """Return the photograph of a view, or of the larger `original` where a mask leaves nothing of the smaller one.
+
+        Raises DataError when the mask leaves out every pixel at that size too.
+        """
+        photograph = self.get(view)
+        if photograph.empty and view is not original:
+            photograph = self.get(original)
+        if photograph.empty:
+            raise DataError(
+                f"{original.mask_path or original.image_path}: the mask leaves out every pixel of '{original.name}'; "
+                "expected some that count: remove the photograph from the dataset, or fix its mask"
+            )
         return photograph
 
     def announce(self, views: Iterable[View]) -> None:

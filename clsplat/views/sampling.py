@@ -1,13 +1,18 @@
 """The sample of a training step: a view, at a size, with transforms of its photograph."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
+from clsplat.errors import ConfigError
 from clsplat.scene.scene import View
-from clsplat.schedule import AtLeastOne, at_step
+from clsplat.schedule import AtLeastOne, at_step, explained
 from clsplat.settings import OneOf, Settings
+from clsplat.views.detail import DetailDivisor
 from clsplat.views.order import Order, Uniform, ViewPool
 from clsplat.views.transforms import PhotographTransform
 
@@ -17,10 +22,27 @@ class ViewSettings(Settings):
 
     order: OneOf[Order] = Uniform()
     """Which view a step trains on."""
-    resolution: AtLeastOne = 1.0
-    """Divisor of the photographs' size beside `scene.downscale`, at least 1; by step."""
+    resolution: Annotated[DetailDivisor | AtLeastOne, explained(", or {follows: detail, until, …}")] = 1.0
+    """Divisor of the photographs' size beside `scene.downscale`, at least 1: by step, or from their detail."""
     transforms: list[OneOf[PhotographTransform]] = Field(default=[])
     """Transforms of the photograph, in order."""
+
+    def settled(self, photographs: Callable[[], Iterable[NDArray[np.uint8]]]) -> "ViewSettings":
+        """Return settings in which what follows from the training photographs, each [height, width, 3], is a number by
+        step."""
+        if not isinstance(self.resolution, DetailDivisor):
+            return self
+        return self.model_copy(update={"resolution": self.resolution.of(photographs())})
+
+    def divisor(self, step: int) -> float:
+        """Return the divisor of the photographs' size at a global step.  Raises ConfigError before it is settled."""
+        if isinstance(self.resolution, DetailDivisor):
+            raise ConfigError("a resolution that follows detail needs photographs: expected what `settled` returns")
+        return at_step(self.resolution, step)
+
+    def full_size(self, last: int) -> int:
+        """Return the first step up to `last` whose photographs are larger than 1/2 of their size."""
+        return next((step for step in range(1, last + 1) if self.divisor(step) < 2), last)
 
 
 @dataclass(frozen=True)
@@ -41,5 +63,5 @@ class Sampler:
 
     def at(self, step: int) -> Sample:
         """Return the sample of a global step, counted from 1."""
-        view, divisor = self.settings.order.at(self._pool, step), at_step(self.settings.resolution, step)
+        view, divisor = self.settings.order.at(self._pool, step), self.settings.divisor(step)
         return Sample(view.resized(view.downscale * divisor), view, self.settings.transforms, step)
