@@ -92,6 +92,7 @@ void update_gaussians(
     const float sh_base_correction2,
     const float sh_rest_correction2,
     const uint degree,
+    const uint sh_rest_degree,                       // up to which bands are updated: 0 or `degree`
     const uint stride,
     const uint count)
 {
@@ -120,7 +121,7 @@ void update_gaussians(
     UPDATE(logit_opacity, 0, logit_opacity);
     for (uint channel = 0; channel < 3; channel++)
         UPDATE(sh_base, channel, basis[0] * g[v].colour[channel]);
-    for (uint k = 1; k < (degree + 1) * (degree + 1); k++)
+    for (uint k = 1; k < (sh_rest_degree + 1) * (sh_rest_degree + 1); k++)
         for (uint channel = 0; channel < 3; channel++)
             UPDATE(sh_rest, (k - 1) * 3 + channel, basis[k] * g[v].colour[channel]);
 }

@@ -4,6 +4,7 @@
 [[0, 4.0], [1000, 1.0]]                                 points (global step, value), straight lines between
 {points: [[0, 4.0], [1000, 1.0]], between: steps}       each value from its step on, until the next
 {initial: 1.6e-4, final: 1.6e-6, over: 30000, start: 0} exponential decay over a number of steps from a step on
+{every: 4, value: 5.0e-4}                               at every so many steps, else 0
 """
 
 import inspect
@@ -99,9 +100,25 @@ class Decay(Curve):
         return [self.initial, self.final]
 
 
+class Every(Curve):
+    """A value at every so many steps, and 0 at the others (such as the rate of what may change rarely)."""
+
+    every: Annotated[int, Field(gt=0)]
+    """Steps from one value to the next."""
+    value: float
+    """The value at global steps that are multiples of `every`."""
+
+    def at(self, step: int) -> float:
+        return self.value if step % self.every == 0 else 0.0
+
+    @property
+    def values(self) -> list[float]:
+        return [self.value, 0.0]
+
+
 NOTATIONS = (
-    "expected a number, points [[step, value], …] with growing steps, {points, between} or "
-    "{initial, final, over, start}"
+    "expected a number, points [[step, value], …] with growing steps, {points, between}, {initial, final, over, start} "
+    "or {every, value}"
 )
 
 

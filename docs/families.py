@@ -16,12 +16,12 @@ from pydantic.fields import FieldInfo
 import clsplat.pipeline.schema  # noqa: F401  (it imports all that a pipeline can name)
 from clsplat.pipeline.file import PipelineFile
 from clsplat.pipeline.matrix import Matrix
-from clsplat.schedule import Curve, Decay, Points
+from clsplat.schedule import Curve, Decay, Every, Points
 from clsplat.settings import Settings
 
 ROOT = Path(__file__).resolve().parents[1]
 Kind = type[Settings]
-NOTATIONS = (Points, Decay)  # of a number that changes: on a page of their own
+NOTATIONS = (Points, Decay, Every)  # of a number that changes: on a page of their own
 
 
 class Family(NamedTuple):

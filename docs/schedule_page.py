@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 from families import NOTATIONS, Kind, families, family, models, tag, unnamed
 
-from clsplat.schedule import Curve, Decay, Points
+from clsplat.schedule import Curve, Decay, Every, Points
 
 EXAMPLES = {  # notation: what it means, and how a file writes it
     "A constant": ("The same at every step.", "weight: 0.8"),
@@ -16,9 +16,10 @@ EXAMPLES = {  # notation: what it means, and how a file writes it
 }
 SAMPLES = {
     Points: "resolution: {points: [[0, 4.0], [500, 2.0], [1000, 1.0]], between: steps}",
+    Every: "sh_rest: {every: 4, value: 5.0e-4}",
     Decay: "means: {initial: 1.6e-4, final: 1.6e-6, over: 30000}",
 }
-TITLES = {Points: "Points with keys", Decay: "Exponential decay"}
+TITLES = {Points: "Points with keys", Decay: "Exponential decay", Every: "Every so many steps"}
 
 
 def schedule_page(key_table: Callable[[Kind], str]) -> str:

@@ -8,7 +8,7 @@ import pytest
 from clsplat.errors import ConfigError
 from clsplat.losses.image import L1
 from clsplat.pipeline.loading import load
-from clsplat.schedule import at_step
+from clsplat.schedule import Every, at_step
 
 POINTS = [[100, 0.8], [200, 0.4], [300, 4.0]]
 STEPS = {"points": POINTS, "between": "steps"}
@@ -56,6 +56,12 @@ def test_a_decay_is_exponential_between_its_start_and_its_end(step, share):
     assert value_of(DECAY, step) == pytest.approx(10 ** (-2 - 2 * share), rel=1e-12)
 
 
+def test_a_value_at_every_so_many_steps_is_0_at_the_others():
+    curve = Every(every=4, value=0.5)
+    assert [curve.at(step) for step in (1, 3, 4, 5, 8, 4000)] == [0, 0, 0.5, 0, 0.5, 0.5]
+    assert min(curve.values) == 0
+
+
 def test_a_decay_begins_at_once_and_may_grow():
     growing = {"initial": 1.0, "final": 100.0, "over": 4}
     assert [value_of(growing, step) for step in range(6)] == pytest.approx(
@@ -63,7 +69,7 @@ def test_a_decay_begins_at_once_and_may_grow():
     )
 
 
-NOTATION = r"expected a number, points [[step, value], …] with growing steps, {points, between} or {initial, final, over, start}"  # noqa: E501
+NOTATION = r"expected a number, points [[step, value], …] with growing steps, {points, between}, {initial, final, over, start} or {every, value}"  # noqa: E501
 ORDER = "expected points [step, value] with growing steps"
 
 
@@ -190,9 +196,9 @@ def test_bounds_hold_for_every_value_of_a_schedule(recipe, places, refused, acce
 @pytest.mark.parametrize(
     ("place", "value", "more"),
     [
-        ("texture_above", "{quantile: 2.0, of: pixels}", " or {initial, final, over, start}, or {quantile, of}"),
+        ("texture_above", "{quantile: 2.0, of: pixels}", " or {every, value}, or {quantile, of}"),
         ("texture_above", "{quantile: 0.5, of: photographs}", ", or {quantile, of}"),
-        ("rms_above", "{quantile: 0.5, of: pixels}", " or {initial, final, over, start}, or {quantile}"),
+        ("rms_above", "{quantile: 0.5, of: pixels}", " or {every, value}, or {quantile}"),
         ("rms_above", "many", ", or {quantile}"),
     ],
 )

@@ -50,7 +50,7 @@ class Rates(Settings):
     sh_base: NonNegative = 2.5e-3
     """Of band 0 of the spherical harmonics."""
     sh_rest: NonNegative = 1.25e-4
-    """Of the other bands."""
+    """Of the other bands, which cost most; where it is 0 they are left alone, with their moments."""
 
     def settled(self, full_size: int) -> "Rates":
         """Return rates by step alone; full_size: the first step at the full size of the photographs."""
@@ -96,6 +96,7 @@ class Adam:
             items=-(-gaussians.count // (self._lanes * self._vectors)),
             **shape_arguments(model, frame.camera),
             **arguments,
+            sh_rest_degree=model.degree if rates["sh_rest"] else 0,
             splats=frame.splats,
             pixel_sums=pixel_sums,
             grad_mean2d=grad_mean2d,
@@ -111,7 +112,7 @@ class Adam:
         """
         gaussians = self.gaussians
         for name in PARAMETERS:
-            if name in without:
+            if name in without or (name == "sh_rest" and not rates[name]):
                 continue
             components = gaussians.tables[name].components
             if name == "sh_rest":
@@ -132,8 +133,8 @@ class Adam:
 
     def _factors(self, name: str, rates: dict[str, float]) -> tuple[float, float]:
         """Rate and second factor of a parameter's next update, with the bias correction of the moments."""
-        self.updates[name] += 1
-        updates = self.updates[name]
+        self.updates[name] += name != "sh_rest" or rates[name] != 0  # see Rates.sh_rest
+        updates = max(self.updates[name], 1)
         return rates[name] / (1 - self._beta1**updates), 1 / (1 - self._beta2**updates)
 
     def forget(self, name: str) -> None:

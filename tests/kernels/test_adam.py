@@ -5,7 +5,7 @@ import pytest
 
 from clsplat.conformance.checks.update import step_figures
 from clsplat.conformance.scenes import random_case, with_world_filter
-from clsplat.gaussians.tables import Gradients
+from clsplat.gaussians.tables import Gradients, moment_tables
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.training.adam import Adam, Rates
 from tests.kernels.figures import hold
@@ -17,8 +17,8 @@ def test_steps(device, rng, count):
 
 
 @pytest.mark.parametrize("count", [1, 17, 64, 150])
-@pytest.mark.parametrize("degree", [0, 2, 3])
-def test_update_on_the_way_equals_gradients_in_memory(device, rng, count, degree):
+@pytest.mark.parametrize(("degree", "sh_rest"), [(0, 1e-4), (2, 1e-4), (3, 1e-4), (3, {"every": 2, "value": 1e-4})])
+def test_update_on_the_way_equals_gradients_in_memory(device, rng, count, degree, sh_rest):
     """update_gaussians against project_backward and adam_step, bit for bit, moments and screen gradients too."""
     case = with_world_filter(random_case(rng, count, degree=degree, compensate=1.0), rng)
     case.parameters["means"][1::5] -= 20 * case.view.world_to_camera[2, :3]  # behind the camera
@@ -28,8 +28,9 @@ def test_update_on_the_way_equals_gradients_in_memory(device, rng, count, degree
     for fused in (False, True):
         rasterizer, model = Rasterizer(device, "radix"), case.model(device)
         camera = case.device_camera(device)
-        adam, rates = Adam(model.gaussians), Rates().at(3, extent=2.0)
-        for _ in range(2):
+        adam = Adam(model.gaussians)
+        for step in (2, 3, 4):
+            rates = Rates(sh_rest=sh_rest).at(step, extent=2.0)
             frame = rasterizer.forward(model, camera, device.zeros(3))
             pixel_sums = rasterizer.pixel_sums(
                 model, frame, device.upload(weights[:, : camera.rows, : camera.stride].copy())
@@ -56,6 +57,30 @@ def test_bands_above_the_active_degree_stay(device, rng):
     moved = model.gaussians.get("sh_rest") != case.parameters["sh_rest"]
     assert moved[:, :9].all()
     assert not moved[:, 9:].any()
+
+
+@pytest.mark.parametrize("count", [1, 17, 150])
+def test_bands_whose_rate_is_0_stay_with_their_moments(device, rng, count):
+    """Their number of updates too, so that the next one is corrected as it must be; all else is as with a rate."""
+    case = random_case(rng, count)
+    tables, updates = [], []
+    for rate in (1e-4, 0.0):
+        rasterizer, model = Rasterizer(device, "radix"), case.model(device)
+        camera = case.device_camera(device)
+        adam = Adam(model.gaussians)
+        frame = rasterizer.forward(model, camera, device.zeros(3))
+        ones = device.upload(np.ones((3, camera.rows, camera.stride), np.float32))
+        adam.update(model, frame, rasterizer.pixel_sums(model, frame, ones), Rates(sh_rest=rate).at(3, extent=2.0))
+        tables.append({name: model.gaussians.get(name) for name in model.gaussians.tables})
+        updates.append(adam.updates)
+    np.testing.assert_array_equal(tables[1]["sh_rest"], case.parameters["sh_rest"])
+    assert (updates[0]["sh_rest"], updates[1]["sh_rest"]) == (1, 0)
+    for name, table in tables[1].items():
+        if name in moment_tables("sh_rest"):
+            assert not table.any(), name
+            assert tables[0][name].any(), name
+        elif name != "sh_rest":
+            np.testing.assert_array_equal(table, tables[0][name], err_msg=name)
 
 
 def test_parameters_left_out_stay(device, rng):
