@@ -11,7 +11,7 @@ import inspect
 import math
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, Field, GetCoreSchemaHandler, ValidationError, WrapValidator
 from pydantic_core import CoreSchema, core_schema
@@ -81,6 +81,8 @@ class Points(Curve):
 
 class Decay(Curve):
     """A value that falls or grows exponentially (Kerbl et al. 2023)."""
+
+    step_keys: ClassVar[frozenset[str]] = frozenset({"over", "start"})
 
     initial: Annotated[float, Field(gt=0)]
     """The value up to `start`."""

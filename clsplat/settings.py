@@ -28,6 +28,7 @@ class Settings(BaseModel):
     defined: ClassVar[list[type["Settings"]]] = []  # every subclass, in the order of definition
     output_keys: ClassVar[frozenset[str]] = frozenset()  # the model does not depend on them: they may change on resume
     training_keys: ClassVar[frozenset[str]] = frozenset()  # they may change on resume; bits then no longer compare
+    step_keys: ClassVar[frozenset[str]] = frozenset()  # steps that grow with the length of the training
 
     @classmethod
     def __pydantic_init_subclass__(cls, **options: Any) -> None:

@@ -223,6 +223,7 @@ class Rule(Settings):
     """A condition on Gaussians, and the outcome of those that meet it."""
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"start"})
+    step_keys: ClassVar[frozenset[str]] = frozenset({"start"})
 
     start: Annotated[int, Field(ge=0)] = 0
     """Global step after which the rule acts."""

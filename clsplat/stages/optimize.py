@@ -47,6 +47,7 @@ class Optimize(Stage):
     makes: ClassVar[frozenset[str]] = frozenset({"adam", "stats"})
     output_keys: ClassVar[frozenset[str]] = frozenset({"log_every"})
     training_keys: ClassVar[frozenset[str]] = frozenset({"steps", "rates"})
+    step_keys: ClassVar[frozenset[str]] = frozenset({"steps"})
 
     steps: Annotated[int, Field(gt=0)]
     """Number of training steps."""

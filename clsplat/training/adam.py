@@ -1,7 +1,7 @@
 """Adam on the tables of a Gaussians struct, with a learning rate for each."""
 
 from collections.abc import Collection
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
@@ -18,6 +18,8 @@ Positive = Annotated[float, Field(gt=0)]
 class FullSizeDecay(Settings):
     """The initial value as long as photographs have less than their full size, then an exponential decay (DashGaussian,
     Chen et al. 2025)."""
+
+    step_keys: ClassVar[frozenset[str]] = frozenset({"until"})
 
     start: Literal["full_size"]
     """`full_size`: the first step at the full size of the photographs."""

@@ -4,7 +4,7 @@ After DashGaussian (Chen et al. 2025).
 """
 
 from collections.abc import Iterable, Sequence
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,6 +79,8 @@ class DetailDivisor(Settings):
     Small photographs first: those that show a quarter of the amplitudes of their spectrum.  The time that a share of
     the amplitudes is waited for falls as their sum grows.  The divisor is a whole number, which changes with edits.
     """
+
+    step_keys: ClassVar[frozenset[str]] = frozenset({"until", "start"})
 
     follows: Literal["detail"]
     """`detail`: the mean spectrum of the training photographs."""

@@ -1,0 +1,62 @@
+"""A recipe in another number of steps."""
+
+import pytest
+
+from clsplat.pipeline.files import shipped
+from clsplat.pipeline.loading import load
+from clsplat.pipeline.stretching import stretched
+from clsplat.settings import Settings
+from clsplat.stages.optimize import Optimize
+from tests.test_pipeline import flat
+
+STEPS = ("steps", "start", "stop", "over", "until", "raise_sh.every", "reset_opacity.every", "reset_opacity~2.every")
+TRAINING = [name for name in shipped() if any(isinstance(stage, Optimize) for stage in load(name).stages)]
+
+
+def changes(name: str, factor: float) -> dict[str, tuple[object, object]]:
+    settings = load(name).settings
+    old, new = (flat(one.model_dump(mode="json")) for one in (settings, stretched(settings, factor)))
+    assert old.keys() == new.keys()
+    return {place: (old[place], new[place]) for place in old if old[place] != new[place]}
+
+
+def test_the_long_recipe_in_fewer_steps_is_the_short_one():
+    """But for the end of growth, which splat_7k.yaml chooses."""
+    new = stretched(load("splat").settings, 7000 / 30000).training
+    assert (new.steps, new.rates.means.over) == (7000, 7000)
+    raise_sh, densify, reset, white = new.during[:4]
+    assert (raise_sh.every, densify.every, densify.start, densify.stop) == (233, 100, 116, 3500)
+    assert [rule.start for rule in densify.rules] == [0, 0, 0, 700]
+    assert (reset.every, reset.stop) == (700, 3500)
+    assert [step for step in range(1, 7000) if white.due(step)] == [116]
+
+
+@pytest.mark.parametrize("name", TRAINING)
+def test_only_steps_change_and_all_of_them(name):
+    found = changes(name, 2.0)
+    for place, (old, new) in found.items():
+        assert place.endswith(STEPS) or "points" in place, place
+        if not isinstance(old, list):
+            assert new == 2 * old
+    stretchable = [
+        place
+        for place, value in flat(load(name).settings.model_dump(mode="json")).items()
+        if place.endswith((".steps", ".start", ".stop", ".over", ".until")) and isinstance(value, int) and value
+    ]
+    assert set(stretchable) <= found.keys()
+
+
+@pytest.mark.parametrize("factor", [0.01, 0.13, 0.5, 1.0, 3.7])
+@pytest.mark.parametrize("name", TRAINING)
+def test_every_stretched_recipe_is_valid(name, factor):
+    settings = load(name).settings
+    new = stretched(settings, factor)
+    assert type(settings).model_validate(new.model_dump()) == new
+    assert factor != 1 or new == settings
+
+
+def test_points_that_fall_together_become_one():
+    class Holder(Settings):
+        values: list[list[float]]
+
+    assert stretched(Holder(values=[[0, 1.0], [10, 2.0], [14, 3.0]]), 0.1).values == [[0, 1.0], [1, 3.0]]
