@@ -1,0 +1,96 @@
+"""Every shipped recipe, in few steps: the same bits again, after a stop, and with one thread in the place of two."""
+
+import hashlib
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from clsplat.pipeline.files import shipped
+from clsplat.pipeline.loading import Pipeline, load
+from clsplat.pipeline.stretching import stretched
+from clsplat.runs.experiment import run_pipeline
+from clsplat.stages.base import Scheduled
+from clsplat.stages.evaluate import Evaluate
+from clsplat.stages.optimize import Optimize
+from clsplat.training import checkpoint
+from clsplat.training.state import State
+
+STEPS = 24
+RECIPES = [
+    name
+    for name, file in shipped().items()
+    if name != "compress"
+    and not load(name).settings.prepare
+    and any(isinstance(s, Optimize) for s in load(name).stages)
+]
+ONE_THREAD = {"POCL_MAX_PTHREAD_COUNT": "1", "POCL_CPU_MAX_CU_COUNT": "1", "CL_CONFIG_CPU_TBB_NUM_WORKERS": "1"}
+ALONE = """
+import sys
+from pathlib import Path
+from tests.test_every_recipe import short, train
+for name in sys.argv[3:]:
+    train(short(name, Path(sys.argv[1])), Path(sys.argv[2]) / name)
+"""
+
+
+def short(name: str, scene: Path) -> Pipeline:
+    """A recipe in STEPS steps, with edits every 4, without pictures and pages."""
+    pipeline = load(name, [f"scene.path='{scene}'"])
+    settings = stretched(pipeline.settings, STEPS / pipeline.settings.training.steps)
+    stages = [often(stage) if isinstance(stage, Optimize) else stage for stage in settings.stages]
+    kept = [stage for stage in stages if stage.stage in ("init", "optimize", "export")]
+    return Pipeline(pipeline.path, settings.model_copy(update={"stages": kept}))
+
+
+def often(loop: Optimize) -> Optimize:
+    during = [stage for stage in loop.during if not isinstance(stage, Evaluate)]
+    return loop.model_copy(update={"during": [acting(stage) for stage in during]})
+
+
+def acting(stage: Scheduled) -> Scheduled:
+    return stage.model_copy(update={"every": 4}) if stage.every and stage.every > STEPS else stage
+
+
+def train(pipeline: Pipeline, out: Path, resume: bool = False) -> str:
+    """Run it; return the hash of its model."""
+    run_pipeline(pipeline, out, os.environ.get("CLSPLAT_DEVICE"), "resume" if resume else "new")
+    return digest(out)
+
+
+def digest(out: Path) -> str:
+    return hashlib.sha256(next(out.glob("point_cloud.ply")).read_bytes()).hexdigest()
+
+
+def newest(out: Path) -> State:
+    return checkpoint.load(checkpoint.saved(out)[-1])[0]
+
+
+@pytest.fixture(scope="module")
+def with_one_thread(tiny_scene, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("alone")
+    command = [sys.executable, "-c", ALONE, tiny_scene, folder, *RECIPES]
+    environment = {**os.environ, **ONE_THREAD}
+    done = subprocess.run(command, cwd=Path(__file__).parents[1], env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_a_recipe_gives_the_same_bits_after_a_stop_and_with_one_thread(name, tiny_scene, tmp_path, with_one_thread):
+    pipeline = short(name, tiny_scene)
+    expected = train(pipeline, tmp_path / "run")
+    assert digest(with_one_thread / name) == expected
+    numbers = newest(tmp_path / "run").numbers
+    stopped = tmp_path / "stopped"
+    shutil.copytree(tmp_path / "run", stopped)
+    *_, last = sorted((stopped / "checkpoints").iterdir())
+    last.unlink()
+    for file in ("point_cloud.ply", "metrics.json", "checksums.json", "status.json"):
+        (stopped / file).unlink()
+    assert len(list((stopped / "checkpoints").iterdir())) > 0
+    assert train(pipeline, stopped, resume=True) == expected
+    assert newest(stopped).numbers == numbers
