@@ -3,11 +3,12 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from clsplat.scene.scene import View
 from clsplat.schedule import AtLeastOne, at_step
 from clsplat.settings import OneOf, Settings
+from clsplat.views.learned import learned_of
 from clsplat.views.order import Order, Uniform, ViewPool
 from clsplat.views.transforms import PhotographTransform
 
@@ -20,7 +21,13 @@ class ViewSettings(Settings):
     resolution: AtLeastOne = 1.0
     """Divisor of the photographs' size beside `scene.downscale`, at least 1; by step."""
     transforms: list[OneOf[PhotographTransform]] = Field(default=[])
-    """Transforms of the photograph, in order."""
+    """Transforms of the photograph, in order; one that learns stands last."""
+
+    @field_validator("transforms")
+    @classmethod
+    def _learning_at_the_end(cls, transforms: list[PhotographTransform]) -> list[PhotographTransform]:
+        learned_of(transforms)
+        return transforms
 
 
 @dataclass(frozen=True)
