@@ -107,6 +107,7 @@ THINNING = {
     *(f"densify~3.rules.merge_neighbours{key}" for key in ("", ".start", ".colour_below", ".distance_below")),
 }
 MEAN_FILTER = {f"views.transforms.mean_filter{key}" for key in ("", ".width.between", ".width.points")}
+HAAR = {f"views.transforms.haar{key}" for key in ("", ".learn", ".rate", ".weight")}
 DIFFERENCES = {
     ("splat", "splat_7k"): TWIN,
     ("splat", "mip_splatting"): SMOOTHING | MIP | REFRESH,
@@ -123,6 +124,8 @@ DIFFERENCES = {
     },
     ("splat", "opti3dgs"): MEAN_FILTER,
     ("splat_7k", "opti3dgs_7k"): MEAN_FILTER,
+    ("splat", "auto_opti3dgs"): HAAR,
+    ("splat_7k", "auto_opti3dgs_7k"): HAAR,
     ("splat", "micro_splatting"): {
         *(f"densify.rules.split_textured{key}" for key in ("", *SUBDIVIDE, ".texture", ".gradient_above")),
         *(f"densify.rules.split_textured.texture_above.{key}" for key in ("of", "quantile")),
