@@ -140,7 +140,7 @@ def haar_figures(
     for name in ("haar", "haar sums"):
         workspace.array(name, (3, camera.rows, camera.stride)).fill(np.nan)
     counted = None if mask is None else planes_of(device, camera, mask[None])
-    numbers = dict(zip(Haar().first(), taps.tolist(), strict=True))
+    numbers = {"haar/scale": (taps[0] - taps[1]) / np.sqrt(2), "haar/leak": taps.sum() / np.sqrt(2)}
     planes = Planes(workspace, camera, planes_of(device, camera, image), counted, numbers)
     changed = Haar().apply(planes, step=1)
     found, exact = changed.colours.get(), image.astype(np.float64)
@@ -148,8 +148,10 @@ def haar_figures(
     yield by_element("haar_forward", what, found[:, :height, :width], expected, 2e-6, floor=1.0)
     yield equal("haar_forward", f"pixels outside the image, {what}", outside(camera, found), 0.0)
     derivatives = Haar().backward(changed, planes_of(device, camera, gradient))()
-    expected, size = ref.haar_gradient(exact, gradient, taps, mask), np.sqrt(gradient.size)
-    yield by_element("haar_backward", what, np.array([*derivatives.values()]), expected, SUM, floor=float(size))
+    by_taps = ref.haar_gradient(exact, gradient, taps, mask)
+    by_both = np.array([by_taps[0] - by_taps[1], by_taps.sum()]) / np.sqrt(2)
+    found, size = np.array([*derivatives.values()]), float(np.sqrt(gradient.size))
+    yield by_element("haar_backward", what, found, by_both, SUM, floor=size)
 
 
 @CHECKS.add("haar_forward", "haar_backward")
