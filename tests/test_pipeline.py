@@ -114,6 +114,7 @@ DASH = {
     *(f"densify.rules.prune_large{key}" for key in ("", ".size_above", ".start")),
     "densify.stop",
 }
+HAAR = {f"views.transforms.haar{key}" for key in ("", ".learn", ".rate", ".weight")}
 DIFFERENCES = {
     ("splat", "splat_7k"): TWIN,
     ("splat", "mip_splatting"): SMOOTHING | MIP | REFRESH,
@@ -133,6 +134,8 @@ DIFFERENCES = {
     ("splat", "dash"): DASH | {"reset_opacity.stop", "rates.logit_opacity"},
     ("splat_7k", "dash_7k"): DASH,
     ("mip_splatting", "dash_mip"): DASH | {"reset_opacity.stop", "rates.logit_opacity", "refresh_filter.start"},
+    ("splat", "auto_opti3dgs"): HAAR,
+    ("splat_7k", "auto_opti3dgs_7k"): HAAR,
     ("splat", "micro_splatting"): {
         *(f"densify.rules.split_textured{key}" for key in ("", *SUBDIVIDE, ".texture", ".gradient_above")),
         *(f"densify.rules.split_textured.texture_above.{key}" for key in ("of", "quantile")),

@@ -44,6 +44,8 @@ FAULTS = {  # kernel -> file, text, wrong text
     "sampling_interval": ("filter.cl", "z * (1.0f / focal[view])", "z * (1.0f / focal[0])"),
     "filter_variance": ("filter.cl", "variance * taken * taken", "variance * taken"),
     "sum_records": ("gather.cl", "pair < first + pairs", "pair + 1 < first + pairs"),
+    "haar_forward": ("haar.cl", "u * block.xz + v", "u * block.xz - v"),
+    "haar_backward": ("haar.cl", "const float2 before = low + u * high", "const float2 before = low - u * high"),
     "gather_rows": ("gather.cl", "zero_fresh && fresh[i]", "zero_fresh || fresh[i]"),
     "set_rows": ("gather.cl", "values[i * components + plane]", "values[i * components]"),
     "zero_rows": ("gather.cl", "rows[i]] = 0.0f", "rows[i]] = 1.0f"),

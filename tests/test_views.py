@@ -22,6 +22,7 @@ pytestmark = pytest.mark.slow
 
 RESOLUTION = "optimize.views.resolution={points: [[0, 2], [20, 1]], between: steps}"
 BLUR = "optimize.views.transforms=[{type: blur, sigma: [[0, 3.0], [30, 0.5], [45, 0.0]]}]"
+HAAR = "optimize.views.transforms=[{type: haar, rate: 0.02}]"
 FRACTIONS = "optimize.views.resolution=[[1, 3.0], [40, 1.0]]"
 
 
@@ -44,7 +45,9 @@ def test_transforms_come_with_every_sample(tiny_scene):
     assert list(sampler.at(7).transforms) == transforms
 
 
-@pytest.mark.parametrize("setting", [RESOLUTION, BLUR, FRACTIONS], ids=["resolution", "blur", "fractions"])
+@pytest.mark.parametrize(
+    "setting", [RESOLUTION, BLUR, FRACTIONS, HAAR], ids=["resolution", "blur", "fractions", "haar"]
+)
 def test_a_run_with_changing_views_is_the_same_after_an_interruption(tiny_scene, tmp_path, setting):
     whole = train(tiny_scene, tmp_path / "whole", setting)
     assert load(str(whole.out / "pipeline.yaml")).resolved() == whole.pipeline
@@ -58,8 +61,9 @@ def test_a_run_with_changing_views_is_the_same_after_an_interruption(tiny_scene,
 
         with pytest.raises(Interrupted):
             runner.execute(checked, run, "resume", stop)
-    train(tiny_scene, out, setting, resume=True)
+    resumed = train(tiny_scene, out, setting, resume=True)
     assert digest(out) == digest(tmp_path / "whole")
+    assert resumed.numbers == whole.numbers
 
 
 def test_views_change_what_is_trained_and_their_defaults_do_not(tiny_scene, tmp_path):

@@ -2,8 +2,8 @@
 
 import math
 from abc import abstractmethod
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -18,6 +18,8 @@ from clsplat.render.rasterizer import Frame
 from clsplat.render.workspace import Workspace
 from clsplat.schedule import NonNegative, Schedule, at_step
 from clsplat.settings import Settings
+from clsplat.views.learned import learned_of, name_of
+from clsplat.views.transforms import PhotographTransform
 
 
 @dataclass
@@ -72,6 +74,7 @@ class ViewGradients:
     comparison: Comparison
     losses: list[LossValue]
     pixel_sums: Array  # [PIXEL_SUMS or more, S]
+    learning: Callable[[], None] | None = None  # changes the numbers of the transform that learns
 
     @property
     def loss(self) -> float:
@@ -91,9 +94,39 @@ class Loss(Settings):
 class ImageLoss(Loss):
     """A loss that compares the rendered image with the photograph."""
 
+    symmetric: ClassVar[bool] = False
+    """Whether it has the same value with image and photograph exchanged; a transform that learns needs that."""
+
     @abstractmethod
     def add(self, comparison: Comparison) -> LossValue:
         """Add weight · d(loss)/d(image) to the gradient."""
+
+
+def require_symmetric(losses: Iterable[Loss], transforms: Sequence[PhotographTransform]) -> None:
+    """Raise ConfigError where a transform learns, and a loss has no gradient by the photograph."""
+    if not learned_of(transforms):
+        return
+    for loss in losses:
+        if isinstance(loss, ImageLoss) and not loss.symmetric:
+            name = getattr(loss, "type", getattr(loss, "name", type(loss).__name__))
+            raise ConfigError(
+                f"the loss '{name}', where '{name_of(transforms[-1])}' learns: expected losses that are the same with "
+                "image and photograph exchanged, such as l1, l2 and dssim; the class of one says `symmetric = True`"
+            )
+
+
+def gradient_by_photograph(losses: Iterable[Loss], comparison: Comparison) -> Array:
+    """Return the gradient of symmetric losses by the photograph, [3, rows, stride]; the image's is left as it is.
+
+    It comes before that of the image: a loss keeps the sums of its last call, which its value is read from.
+    """
+    gradient = comparison.workspace.array("grad_photograph", comparison.gradient.shape)
+    image, photograph = comparison.photograph, comparison.image
+    exchanged = replace(comparison, image=image, photograph=photograph, gradient=gradient, accumulate=False)
+    for loss in losses:
+        if isinstance(loss, ImageLoss):
+            loss.add(exchanged)
+    return gradient
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """Photometric losses: L1, L2 and D-SSIM of the rendered image and the photograph."""
 
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 
@@ -17,6 +17,8 @@ SSIM_PIXELS_MAX = 2**32 // 9  # the kernels index nine planes in 32 bits
 class L1(ImageLoss):
     """Mean absolute difference of all values."""
 
+    symmetric: ClassVar[bool] = True
+
     type: Literal["l1"] = "l1"
 
     def add(self, comparison: Comparison) -> LossValue:
@@ -28,6 +30,8 @@ class L1(ImageLoss):
 class L2(ImageLoss):
     """Mean squared difference of all values."""
 
+    symmetric: ClassVar[bool] = True
+
     type: Literal["l2"] = "l2"
 
     def add(self, comparison: Comparison) -> LossValue:
@@ -38,6 +42,8 @@ class L2(ImageLoss):
 
 class Dssim(ImageLoss):
     """1 - SSIM (Wang et al. 2004): 11 x 11 Gaussian window, sigma 1.5, zero padding, mean over pixels and channels."""
+
+    symmetric: ClassVar[bool] = True
 
     type: Literal["dssim"] = "dssim"
 

@@ -8,6 +8,7 @@ import math
 import threading
 import warnings
 import weakref
+from collections.abc import Callable
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -57,6 +58,22 @@ class Array:
             with self.device.refusals("a copy to the host"):
                 cl.enqueue_copy(self.device.queue, host, self.buffer)
         return host
+
+    def get_later(self) -> Callable[[], NDArray[Any]]:
+        """Begin a copy to the host of what the array holds after all that is enqueued so far.
+
+        The result waits for that alone, not for what is enqueued later.  Raises MemoryLimitError, DeviceError.
+        """
+        host = np.empty(self.shape, self.dtype)
+        with self.device.refusals("a copy to the host"):
+            copied = cl.enqueue_copy(self.device.queue, host, self.buffer, is_blocking=False)
+
+        def waited() -> NDArray[Any]:
+            with self.device.refusals("a copy to the host"):
+                copied.wait()
+            return host
+
+        return waited
 
     def get_item(self, index: int) -> Any:
         """Copy one value of a one-dimensional array to the host.  As `get`."""

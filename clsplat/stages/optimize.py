@@ -13,7 +13,7 @@ from pydantic import Field, field_validator
 
 from clsplat.density.statistics import SplatStats
 from clsplat.errors import Interrupted, NotFiniteError
-from clsplat.losses.base import ImageLoss, Loss, Penalty, ViewGradients
+from clsplat.losses.base import ImageLoss, Loss, Penalty, ViewGradients, require_symmetric
 from clsplat.losses.image import pixel_loss
 from clsplat.metrics.distribution import distribution
 from clsplat.schedule import Points
@@ -78,6 +78,7 @@ class Optimize(Stage):
         return during
 
     def check(self) -> None:
+        require_symmetric(self.losses, self.views.transforms)
         for stage in self.during:
             stage.check()
 
@@ -162,7 +163,7 @@ class Optimize(Stage):
             run.refresh_filter()
         parts = run.rasterizer, run.model, run.adam, run.stats, photographs.background
         full_size = views.full_size(run.step - run.stage_step + self.steps)
-        return Trainer(*parts, self.losses, self.rates.settled(full_size), run.scene.extent)
+        return Trainer(*parts, self.losses, self.rates.settled(full_size), run.scene.extent, run.numbers)
 
     def _act(self, run: Run) -> None:
         """Run the stages that are due and do not edit; those that fail run again when the run goes on."""

@@ -1,19 +1,31 @@
 """One training step: render a view, compare it with its photograph, differentiate, update, count."""
 
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, field
 
 from clsplat.density.statistics import SplatStats
 from clsplat.errors import ConfigError
 from clsplat.gaussians.tables import DeviceModel
-from clsplat.losses.base import Comparison, ImageLoss, Loss, Penalty, PenaltyInputs, ViewGradients, returned
+from clsplat.losses.base import (
+    Comparison,
+    ImageLoss,
+    Loss,
+    LossValue,
+    Penalty,
+    PenaltyInputs,
+    ViewGradients,
+    gradient_by_photograph,
+    require_symmetric,
+    returned,
+)
 from clsplat.opencl.device import Array
 from clsplat.opencl.program import constants
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.training.adam import Adam, Rates
+from clsplat.views.learned import LearnedTransform, learned_of, name_of
 from clsplat.views.photographs import Photograph, apply_mask
 from clsplat.views.texture import known_gradient
-from clsplat.views.transforms import PhotographTransform
+from clsplat.views.transforms import PhotographTransform, Planes
 
 TEXTURE = int(constants("splat.h")["SUM_TEXTURE"])
 
@@ -52,6 +64,7 @@ class Trainer:
     losses: Sequence[Loss]
     rates: Rates
     extent: float = 1.0  # scene units
+    numbers: dict[str, float] = field(default_factory=dict)  # of a transform that learns, by name; a step changes them
 
     def step(
         self,
@@ -73,32 +86,57 @@ class Trainer:
     ) -> ViewGradients:
         """Return the derivative of the losses at one view, as sums over pixels; nothing is updated.
 
-        Raises ConfigError for a loss that is neither an ImageLoss nor a Penalty.
+        Raises ConfigError for a loss that is neither an ImageLoss nor a Penalty, and, where a transform learns, for one
+        that is not symmetric in image and photograph.
         """
         for loss in self.losses:
             if not isinstance(loss, ImageLoss | Penalty):
                 raise ConfigError(f"the loss {type(loss).__name__}: expected a subclass of ImageLoss or of Penalty")
+        require_symmetric(self.losses, transforms)
         workspace, camera, timings = self.rasterizer.workspace, photograph.camera, self.rasterizer.device.timings
         frame = self.rasterizer.forward(self.model, camera, self.background)
         timings.section = "loss"
-        planes = photograph.planes(workspace, transforms, step)
+        planes = photograph.planes(workspace, transforms, step, self.numbers)
         gradient = workspace.array("grad_image", (3, camera.rows, camera.stride))
         comparison = Comparison(workspace, camera, frame.image, planes.colours, gradient, planes.mask, step)
         if planes.mask is not None:  # pixels that do not count are black in both images and have no gradient
             apply_mask(workspace, camera, frame.image, planes.mask)
             apply_mask(workspace, camera, planes.colours, planes.mask)
-        values = [returned(loss, loss.add(comparison)) for loss in self.losses if isinstance(loss, ImageLoss)]
+        learned = learned_of(transforms)
+        own, learning = self._learn(learned, planes, comparison) if learned else ([], None)
+        values = [returned(loss, loss.add(comparison)) for loss in self.losses if isinstance(loss, ImageLoss)] + own
         if planes.mask is not None:
             apply_mask(workspace, camera, gradient, planes.mask)
         count = self.stats.pixel_sums
         timings.section = "statistics"
         texture = known_gradient(workspace, camera, planes.colours, planes.mask) if count > TEXTURE else None
         pixel_sums = self.rasterizer.pixel_sums(self.model, frame, gradient, count, texture)
-        return ViewGradients(frame, comparison, values, pixel_sums)
+        return ViewGradients(frame, comparison, values, pixel_sums, learning)
+
+    def _learn(
+        self, transform: LearnedTransform, planes: Planes, comparison: Comparison
+    ) -> tuple[list[LossValue], Callable[[], None]]:
+        """Begin the derivatives by the transform's numbers; return its own loss, and what changes the numbers.
+
+        The host waits for them after all of the step is enqueued, so that the device does not wait for the host.
+        """
+        gradient = gradient_by_photograph(self.losses, comparison)
+        if planes.mask is not None:
+            apply_mask(planes.workspace, planes.camera, gradient, planes.mask)
+        of_images = transform.backward(planes, gradient)
+        value, of_numbers = transform.penalty(transform.now(self.numbers), comparison.step)
+
+        def learn() -> None:
+            gradients = {name: derivative + of_numbers[name] for name, derivative in of_images().items()}
+            transform.update(self.numbers, gradients, comparison.step)
+
+        return [LossValue(name_of(transform), lambda: value)], learn
 
     def update(self, view: ViewGradients, stale: Collection[str] = ()) -> None:
         """Apply what `differentiate` returned: change parameters, moments and statistics."""
         grad_mean2d = self._update(view, stale)
+        if view.learning:
+            view.learning()
         self.rasterizer.device.timings.section = "statistics"
         self.stats.add(view, grad_mean2d)
 

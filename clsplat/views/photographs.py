@@ -1,6 +1,6 @@
 """Photographs on the device, 8 bits a channel, and the float planes that losses compare with."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -43,11 +43,20 @@ class Photograph:
         """Return which pixels count, [height, width], or None when all do."""
         return np.asarray(self.mask.get()[0] > 0) if self.mask else None
 
-    def planes(self, workspace: Workspace, transforms: Sequence[PhotographTransform] = (), step: int = 0) -> Planes:
-        """Return the photograph as float planes of whole tiles, after the transforms of a global step."""
+    def planes(
+        self,
+        workspace: Workspace,
+        transforms: Sequence[PhotographTransform] = (),
+        step: int = 0,
+        numbers: Mapping[str, float] | None = None,
+    ) -> Planes:
+        """Return the photograph as float planes of whole tiles, after the transforms of a global step.
+
+        numbers: those of a transform that learns; without them it has its first ones.
+        """
         colours = unpack(workspace, self.camera, self.colours, 1 / 255, "photograph")
         mask = unpack(workspace, self.camera, self.mask, 1.0, "mask") if self.mask else None
-        planes = Planes(workspace, self.camera, colours, mask)
+        planes = Planes(workspace, self.camera, colours, mask, numbers or {})
         for transform in transforms:
             planes = transform.apply(planes, step)
         return planes

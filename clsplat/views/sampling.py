@@ -6,13 +6,14 @@ from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from clsplat.errors import ConfigError
 from clsplat.scene.scene import View
 from clsplat.schedule import AtLeastOne, at_step, explained
 from clsplat.settings import OneOf, Settings
 from clsplat.views.detail import DetailDivisor
+from clsplat.views.learned import learned_of
 from clsplat.views.order import Order, Uniform, ViewPool
 from clsplat.views.transforms import PhotographTransform
 
@@ -25,7 +26,13 @@ class ViewSettings(Settings):
     resolution: Annotated[DetailDivisor | AtLeastOne, explained(", or {follows: detail, until, …}")] = 1.0
     """Divisor of the photographs' size beside `scene.downscale`, at least 1: by step, or from their detail."""
     transforms: list[OneOf[PhotographTransform]] = Field(default=[])
-    """Transforms of the photograph, in order."""
+    """Transforms of the photograph, in order; one that learns stands last."""
+
+    @field_validator("transforms")
+    @classmethod
+    def _learning_at_the_end(cls, transforms: list[PhotographTransform]) -> list[PhotographTransform]:
+        learned_of(transforms)
+        return transforms
 
     def settled(self, photographs: Callable[[], Iterable[NDArray[np.uint8]]]) -> "ViewSettings":
         """Return settings in which what follows from the training photographs, each [height, width, 3], is a number by

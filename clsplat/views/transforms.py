@@ -2,7 +2,8 @@
 
 import math
 from abc import abstractmethod
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Literal
 
 from clsplat.opencl.device import Array
@@ -22,6 +23,8 @@ class Planes:
     camera: DeviceCamera
     colours: Array  # [3, rows, stride] in [0, 1]
     mask: Array | None  # [1, rows, stride], 1 in pixels that count, else 0; None: all count
+    numbers: Mapping[str, float] = field(default_factory=dict)  # of the transform that learns, by name
+    source: Array | None = None  # the colours that it was given
 
 
 class PhotographTransform(Settings):

@@ -15,6 +15,7 @@ from clsplat.losses.image import L1, L2, Dssim
 from clsplat.opencl.device import Array, Device
 from clsplat.render.camera import DeviceCamera
 from clsplat.render.workspace import Workspace
+from clsplat.views.haar import Haar
 from clsplat.views.photographs import apply_mask, unpack
 from clsplat.views.texture import known_gradient
 from clsplat.views.transforms import Blur, Planes
@@ -127,6 +128,37 @@ def blur(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
             what = f"sigma {sigma:g}, {width} x {height} px"
             yield by_element("blur_columns", what, found[:, :height, :width], expected, 2e-5, floor=0.05)
             yield equal("blur_columns", f"pixels outside the image, {what}", outside(camera, found), 0.0)
+
+
+def haar_figures(
+    device: Device, rng: np.random.Generator, width: int, height: int, share: float | None, taps: NDArray[Any]
+) -> Iterator[Figure]:
+    """Compare a photograph that passed the Haar transform, and the derivatives by its filter."""
+    image, gradient = rng.uniform(0, 1, (3, height, width)).astype(np.float32), rng.normal(size=(3, height, width))
+    mask = None if share is None else rng.random((height, width)) < share
+    camera, workspace, what = camera_of(device, width, height), Workspace(device), f"{width} x {height} px, h = {taps}"
+    for name in ("haar", "haar sums"):
+        workspace.array(name, (3, camera.rows, camera.stride)).fill(np.nan)
+    counted = None if mask is None else planes_of(device, camera, mask[None])
+    numbers = {"haar/scale": (taps[0] - taps[1]) / np.sqrt(2), "haar/leak": taps.sum() / np.sqrt(2)}
+    planes = Planes(workspace, camera, planes_of(device, camera, image), counted, numbers)
+    changed = Haar().apply(planes, step=1)
+    found, exact = changed.colours.get(), image.astype(np.float64)
+    expected = ref.haar_filtered(exact, taps, mask)
+    yield by_element("haar_forward", what, found[:, :height, :width], expected, 2e-6, floor=1.0)
+    yield equal("haar_forward", f"pixels outside the image, {what}", outside(camera, found), 0.0)
+    derivatives = Haar().backward(changed, planes_of(device, camera, gradient))()
+    by_taps = ref.haar_gradient(exact, gradient, taps, mask)
+    by_both = np.array([by_taps[0] - by_taps[1], by_taps.sum()]) / np.sqrt(2)
+    found, size = np.array([*derivatives.values()]), float(np.sqrt(gradient.size))
+    yield by_element("haar_backward", what, found, by_both, SUM, floor=size)
+
+
+@CHECKS.add("haar_forward", "haar_backward")
+def haar(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    for width, height in ((1, 1), (2, 2), (16, 5), (17, 33), (129, 66)):
+        for share in (None, 0.6):
+            yield from haar_figures(device, rng, width, height, share, rng.normal(size=2).round(2))
 
 
 def magnitude_of(image: NDArray[Any]) -> NDArray[Any]:

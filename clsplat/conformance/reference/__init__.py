@@ -36,6 +36,10 @@ from clsplat.conformance.reference.density import (
     shared_logit,
     split_children,
 )
+from clsplat.conformance.reference.haar import (
+    haar_filtered,
+    haar_gradient,
+)
 from clsplat.conformance.reference.harmonics import (
     sh_basis,
     sh_basis_gradient,
@@ -104,6 +108,8 @@ __all__ = [
     "dssim",
     "filtered",
     "footprint",
+    "haar_filtered",
+    "haar_gradient",
     "l1",
     "l2",
     "margin",
