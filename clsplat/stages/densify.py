@@ -48,7 +48,7 @@ class Densify(Scheduled):
         if run.stats is None:
             return
         scale = SceneScale(run.scene.extent, run.texture_quantile)
-        edit = Edit(run.model.gaussians, run.stats, scale, run.step, run.seed)
+        edit = Edit(run.model.gaussians, run.stats, scale, run.step, run.seed, run.survey())
         fits = run.memory_plan().limit
         limit = fits if self.max_gaussians is None else min(fits, int(edit.at(self.max_gaussians)))
         change = densify(edit, self.rules, run.rasterizer.tiler, limit)
