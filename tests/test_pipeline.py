@@ -106,6 +106,34 @@ THINNING = {
     *(f"densify~2.rules.prune_unimportant{key}" for key in ("", ".start", ".share")),
     *(f"densify~3.rules.merge_neighbours{key}" for key in ("", ".start", ".colour_below", ".distance_below")),
 }
+LIMITED = {  # a limit of the opacity, in front of the resets
+    *("reset_opacity.every", "reset_opacity.to", "reset_opacity~2.every", "reset_opacity~2.stop"),
+    *("reset_opacity~2.when_background", "reset_opacity~3.every", "reset_opacity~3.start"),
+    *("reset_opacity~3.stop", "reset_opacity~3.to", "reset_opacity~3.when_background"),
+}
+STAGE = ("every", "max_gaussians", "start", "stop")
+
+
+def rules(stage: str, **keys: str) -> set[str]:
+    """The places of rules that a recipe has more, or less, by their keys."""
+    return {
+        f"{stage}.rules.{rule}{key}"
+        for rule, named in keys.items()
+        for key in ("", *(f".{one}" for one in named.split()))
+    }
+
+
+WRONG = " views error_above start"
+FASTGS = {
+    *rules("densify", prune_faint="opacity_below start", prune_large="size_above start"),
+    *rules("densify", ungrow_accurate="pixels_above" + WRONG),
+    *rules("densify", prune_sampled="opacity_below share size_above.between size_above.points" + WRONG),
+    *rules("densify~2", prune_faint="opacity_below start", prune_inaccurate="score_above" + WRONG),
+    *(f"densify~2.{key}" for key in STAGE),
+    *("densify.every", "densify.rules.clone.size_below", "reset_opacity.start"),
+    *(f"densify.rules.split.{key}" for key in ("gradient_above", "size_above", "statistic")),
+    *LIMITED,
+}
 MEAN_FILTER = {f"views.transforms.mean_filter{key}" for key in ("", ".width.between", ".width.points")}
 DIFFERENCES = {
     ("splat", "splat_7k"): TWIN,
@@ -117,10 +145,10 @@ DIFFERENCES = {
     ("splat", "absgs"): {
         *("densify.rules.clone.size_below", "densify.rules.split.size_above"),
         *("densify.rules.split.statistic", "densify.rules.split.gradient_above"),
-        *("reset_opacity.every", "reset_opacity.to", "reset_opacity~2.every", "reset_opacity~2.stop"),
-        *("reset_opacity~2.when_background", "reset_opacity~3.every", "reset_opacity~3.start"),
-        *("reset_opacity~3.stop", "reset_opacity~3.to", "reset_opacity~3.when_background"),
+        *LIMITED,
     },
+    ("splat", "fastgs"): FASTGS,
+    ("fastgs", "fastgs_7k"): TWIN | {"densify~2.every", "densify~2.start", "reset_opacity~2.stop"},
     ("splat", "opti3dgs"): MEAN_FILTER,
     ("splat_7k", "opti3dgs_7k"): MEAN_FILTER,
     ("splat", "micro_splatting"): {

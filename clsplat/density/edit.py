@@ -64,7 +64,7 @@ class Edit:
     def survey(self) -> Survey:
         """The training views, in which the rules see the Gaussians before the edit.  Raises ConfigError without any."""
         if self._survey is None:
-            raise ConfigError("the rule needs training photographs")
+            raise ConfigError("a rule needs training photographs; expected an edit with a survey of them")
         return self._survey
 
     def at(self, schedule: Schedule) -> float:

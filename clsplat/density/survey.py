@@ -95,10 +95,17 @@ class Survey:
     """The training views for the rules of one edit, which see the Gaussians as they are before it."""
 
     def __init__(
-        self, rasterizer: Rasterizer, model: DeviceModel, photographs: Photographs, views: Sequence[View]
+        self,
+        rasterizer: Rasterizer,
+        model: DeviceModel,
+        photographs: Photographs,
+        views: Sequence[View],
+        seed: int,
+        step: int,
     ) -> None:
         self.views = views
         self._rasterizer, self._model, self._photographs = rasterizer, model, photographs
+        self._seed, self._step = seed, step
         self._found: dict[Any, Any] = {}
 
     def looks(self, views: Sequence[View]) -> Iterator[Look]:
@@ -107,10 +114,15 @@ class Survey:
             photograph = self._photographs.get(view)
             yield Look.at(self._rasterizer, self._model, photograph, self._photographs.background)
 
-    def drawn(self, number: int, seed: int, step: int) -> list[View]:
+    @property
+    def count(self) -> int:
+        """Number of Gaussians, N."""
+        return self._model.gaussians.count
+
+    def drawn(self, number: int) -> list[View]:
         """Return that many of the views, drawn by seed and step, in their order; all where there are no more."""
         count = len(self.views)
-        places = np.random.default_rng([seed, step, count, number]).permutation(count)[:number]
+        places = np.random.default_rng([self._seed, self._step, count, number]).permutation(count)[:number]
         return [self.views[place] for place in np.sort(places)]
 
     def once(self, function: Callable[..., Found], *arguments: Any) -> Found:

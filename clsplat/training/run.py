@@ -164,7 +164,7 @@ class Run:
 
     def survey(self) -> Survey:
         """Return the training views for the rules of an edit."""
-        return Survey(self.rasterizer, self.model, self.photographs, self.scene.split("train"))
+        return Survey(self.rasterizer, self.model, self.photographs, self.scene.split("train"), self.seed, self.step)
 
     def texture_quantile(self, share: float) -> float:
         """Return the gradient magnitude, per px, that `share` of the training photographs' pixels stay below."""

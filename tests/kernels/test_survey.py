@@ -1,7 +1,6 @@
 """What Gaussians do in the pixels of training views (survey.py), at the edges of tiles and groups."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -139,21 +138,24 @@ def test_errors_and_losses_are_those_of_the_pixels_that_count(device, rng, maske
     np.testing.assert_array_equal(look.sum(WEIGHT), before)
 
 
-def test_views_are_drawn_by_seed_and_step(device):
+def test_views_are_drawn_by_seed_and_step():
     views = list(range(25))
-    survey = Survey(SimpleNamespace(), None, None, views)
-    drawn = survey.drawn(10, seed=1, step=600)
-    assert len(set(drawn)) == 10
-    assert drawn == sorted(drawn) == survey.drawn(10, seed=1, step=600)
-    assert drawn not in (survey.drawn(10, seed=2, step=600), survey.drawn(10, seed=1, step=700))
-    assert survey.drawn(25, seed=1, step=600) == survey.drawn(99, seed=1, step=600) == views
-    counts = np.bincount(np.concatenate([survey.drawn(10, 1, step) for step in range(500)]), minlength=25)
+
+    def drawn(number: int, seed: int, step: int) -> list[int]:
+        return Survey(None, None, None, views, seed, step).drawn(number)
+
+    one = drawn(10, seed=1, step=600)
+    assert len(set(one)) == 10
+    assert one == sorted(one) == drawn(10, seed=1, step=600)
+    assert one not in (drawn(10, seed=2, step=600), drawn(10, seed=1, step=700))
+    assert drawn(25, seed=1, step=600) == drawn(99, seed=1, step=600) == views
+    counts = np.bincount(np.concatenate([drawn(10, 1, step) for step in range(500)]), minlength=25)
     assert counts.min() > 140, "200 expected"
     assert counts.max() < 260
 
 
 def test_rules_share_what_they_ask_for():
-    survey, asked = Survey(SimpleNamespace(), None, None, []), []
+    survey, asked = Survey(None, None, None, [], 0, 0), []
 
     def found(given: Survey, number: int) -> int:
         asked.append((given, number))
