@@ -134,6 +134,7 @@ FASTGS = {
     *(f"densify.rules.split.{key}" for key in ("gradient_above", "size_above", "statistic")),
     *LIMITED,
 }
+LEAST = ("prune_least", "prune_least~2")
 MEAN_FILTER = {f"views.transforms.mean_filter{key}" for key in ("", ".width.between", ".width.points")}
 DIFFERENCES = {
     ("splat", "splat_7k"): TWIN,
@@ -149,6 +150,12 @@ DIFFERENCES = {
     },
     ("splat", "fastgs"): FASTGS,
     ("fastgs", "fastgs_7k"): TWIN | {"densify~2.every", "densify~2.start", "reset_opacity~2.stop"},
+    ("splat", "speedy"): {
+        f"{stage}.{key}" for stage in LEAST for key in ("every", "keep", "remove", "score", "start", "stop")
+    },
+    ("speedy", "speedy_7k"): TWIN
+    | {f"{stage}.{key}" for stage in LEAST for key in ("every", "start")}
+    | {"prune_least.stop"},
     ("splat", "opti3dgs"): MEAN_FILTER,
     ("splat_7k", "opti3dgs_7k"): MEAN_FILTER,
     ("splat", "micro_splatting"): {
