@@ -14,7 +14,7 @@ from tests.test_training import digest, train
 
 pytestmark = pytest.mark.slow
 
-RECIPES = ("fastgs_7k", "speedy_7k")
+RECIPES = ("fastgs_7k", "speedy_7k", "mini_7k")
 SHARE = 250  # of the steps
 STEPS = frozenset({"steps", "every", "start", "stop", "over"})
 

@@ -134,6 +134,18 @@ FASTGS = {
     *(f"densify.rules.split.{key}" for key in ("gradient_above", "size_above", "statistic")),
     *LIMITED,
 }
+MINI = {
+    *rules("densify", prune_large="size_above start"),
+    *(
+        place
+        for n in ("", "~2", "~3")
+        for place in rules(f"densify{n}", prune_useless="of_all of_view start views_below")
+    ),
+    *(f"densify~{n}.{key}" for n in (2, 3) for key in STAGE),
+    *("densify.every", "densify.start", "densify.stop"),
+    *(f"reset_opacity.{key}" for key in ("every", "stop", "when_background")),
+    *(f"reset_opacity~2.{key}" for key in ("every", "start", "stop", "to", "when_background")),
+}
 LEAST = ("prune_least", "prune_least~2")
 MEAN_FILTER = {f"views.transforms.mean_filter{key}" for key in ("", ".width.between", ".width.points")}
 DIFFERENCES = {
@@ -150,6 +162,8 @@ DIFFERENCES = {
     },
     ("splat", "fastgs"): FASTGS,
     ("fastgs", "fastgs_7k"): TWIN | {"densify~2.every", "densify~2.start", "reset_opacity~2.stop"},
+    ("splat", "mini"): MINI,
+    ("mini", "mini_7k"): TWIN - ENDS | {"densify~3.every", "densify~3.stop"},
     ("splat", "speedy"): {
         f"{stage}.{key}" for stage in LEAST for key in ("every", "keep", "remove", "score", "start", "stop")
     },
