@@ -162,6 +162,12 @@ DIFFERENCES = {
     },
     ("splat", "fastgs"): FASTGS,
     ("fastgs", "fastgs_7k"): TWIN | {"densify~2.every", "densify~2.start", "reset_opacity~2.stop"},
+    ("splat", "taming"): {
+        *rules("densify", grow_scored="start views", prune_faint="opacity_below start", prune_large="size_above start"),
+        *rules("densify", prune_scored="opacity_below share size_above.between size_above.points start views"),
+        *("densify.every", "densify.max_gaussians", "densify.max_gaussians.reach"),
+    },
+    ("taming", "taming_7k"): TWIN | {"densify.every", "densify.max_gaussians.reach"},
     ("splat", "mini"): MINI,
     ("mini", "mini_7k"): TWIN - ENDS | {"densify~3.every", "densify~3.stop"},
     ("splat", "speedy"): {
@@ -237,6 +243,14 @@ REFUSED = {
     "fraction for a whole": (replaced("steps: 10", "steps: 10.5"), "expected a whole number, got 10.5"),
     "negative": (replaced("steps: 10", "steps: -1"), "greater than 0, got -1"),
     "infinite": (replaced("weight: 0.8", "weight: .inf"), "finite"),
+    "a number to reach without an end": (
+        replaced("every: 100\n", "every: 100\n            max_gaussians: {reach: 10}\n"),
+        r"'max_gaussians: \{reach\}' needs 'stop'",
+    ),
+    "no number to reach": (
+        replaced("every: 100\n", "every: 100\n            max_gaussians: {reach: 0}\n"),
+        r"max_gaussians.*\{initial, final, over, start\}, or \{reach\}",
+    ),
     "missing steps": (replaced("      steps: 10\n", ""), "'steps' is missing"),
     "a start outside": (replaced("- evaluate", "- evaluate: {start: 3}"), r"'start' belongs inside optimize.during"),
     "a stop outside": (replaced("- evaluate", "- evaluate: {stop: 3}"), r"'stop' belongs inside optimize.during"),

@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from clsplat.density.edit import Edit, Rule
-from clsplat.density.sampling import faint_or_large, sampled
+from clsplat.density.sampling import SampledPruning
 from clsplat.density.survey import BLENDED, Survey
 from clsplat.density.thresholds import Share
 from clsplat.losses.image import L1, Dssim
-from clsplat.schedule import NonNegative, Positive
+from clsplat.schedule import NonNegative
 
 LOSSES = L1(weight=0.8), Dssim(weight=0.2)
 Floats = NDArray[np.float64]
@@ -76,28 +76,17 @@ class UngrowAccurate(ByWrongPixels):
         edit.undo_growth(self.wrong(edit).pixels <= edit.at(self.pixels_above))
 
 
-class PruneSampled(ByWrongPixels):
+class PruneSampled(SampledPruning, ByWrongPixels):
     """Remove a share of the faint and the large Gaussians, drawn by 1 / (1 - score).
 
     The score is the number of wrong pixels times the loss of their view, summed over the views, and scaled to [0, 1].
     """
 
     type: Literal["prune_sampled"] = "prune_sampled"
-    training_keys: ClassVar[frozenset[str]] = frozenset({"share", "opacity_below", "size_above"})
 
-    share: Share = 0.5
-    """Share of the faint and large ones that is removed."""
-    opacity_below: Positive = 0.005
-    """Opacity of faint Gaussians; by step."""
-    size_above: Positive = 0.1
-    """Size of large Gaussians, largest standard deviation as a share of the extent; by step."""
-
-    def mark(self, edit: Edit) -> None:
-        candidates = faint_or_large(edit, edit.at(self.opacity_below), edit.at(self.size_above))
+    def weights(self, edit: Edit) -> Floats:
         with np.errstate(divide="ignore"):
-            weights = 1 / (1 - self.wrong(edit).score)
-        chosen = sampled(candidates, weights, int(self.share * candidates.sum()), edit.random())
-        edit.choose(chosen, copies=0, kept=0)
+            return np.asarray(1 / (1 - self.wrong(edit).score))
 
 
 class PruneInaccurate(ByWrongPixels):

@@ -58,6 +58,10 @@ class Look:
         comparison = Comparison(workspace, camera, self.frame.image, planes.colours, self._gradient(), planes.mask)
         return sum(loss.add(comparison).value() for loss in losses)
 
+    def radius(self) -> Floats:
+        """Return the radius of each splat, three standard deviations, [N] px; 0: not seen."""
+        return np.asarray(self.frame.radius.get()[: self.model.gaussians.count])
+
     def sum(self, number: int, plane: NDArray[Any] | None = None, channel: int | None = None) -> Floats:
         """Return one of the sums over pixels of cl_kernels/splat.h for each Gaussian, [N]; 0 where it is not seen.
 

@@ -3,14 +3,18 @@
 import logging
 from collections.abc import Collection
 from dataclasses import asdict
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
+from pydantic import model_validator
+
+from clsplat.density.budget import Reach
 from clsplat.density.control import densify
 from clsplat.density.edit import Edit, Rule
+from clsplat.density.outcomes import MAX_ROWS
 from clsplat.density.thresholds import SceneScale
 from clsplat.errors import NumericError, amount
 from clsplat.gaussians.tables import PARAMETERS
-from clsplat.schedule import AtLeastOne
+from clsplat.schedule import AtLeastOne, explained
 from clsplat.settings import OneOf
 from clsplat.stages.base import Scheduled
 from clsplat.training.run import Run
@@ -28,8 +32,15 @@ class Densify(Scheduled):
 
     rules: list[OneOf[Rule]]
     """Which Gaussians grow or are removed; the first growing rule decides, pruning rules override growth."""
-    max_gaussians: AtLeastOne | None = None
-    """Number of Gaussians at which growth stops, by step; without it, as many as fit in memory.  Pruning continues."""
+    max_gaussians: Annotated[Reach | AtLeastOne, explained(", or {reach}")] | None = None
+    """Number of Gaussians at which growth stops, by step; without it, as many as fit in memory.  Pruning continues.
+    `{reach: B}`: growth comes to B at the last edit before `stop`, quickly at first."""
+
+    @model_validator(mode="after")
+    def _with_an_end(self) -> "Densify":
+        if isinstance(self.max_gaussians, Reach) and self.stop is None:
+            raise ValueError("'max_gaussians: {reach}' needs 'stop', the step before which it is reached")
+        return self
 
     @property
     def statistics(self) -> set[str]:
@@ -41,6 +52,15 @@ class Densify(Scheduled):
         """Tables of the Gaussians that the rules read beside the parameters."""
         return {name for rule in self.rules for name in rule.tables}
 
+    def _limit(self, edit: Edit) -> int:
+        """The number to which the rules may grow the Gaussians of an edit."""
+        if self.max_gaussians is None:
+            return MAX_ROWS
+        if not isinstance(self.max_gaussians, Reach):
+            return int(edit.at(self.max_gaussians))
+        left = len(range(edit.step, self.stop or edit.step + 1, self.every or 1))
+        return self.max_gaussians.limit(edit.gaussians.count, left)
+
     def stale(self, run: Run) -> Collection[str]:
         return PARAMETERS
 
@@ -50,7 +70,7 @@ class Densify(Scheduled):
         scale = SceneScale(run.scene.extent, run.texture_quantile)
         edit = Edit(run.model.gaussians, run.stats, scale, run.step, run.seed, run.survey())
         fits = run.memory_plan().limit
-        limit = fits if self.max_gaussians is None else min(fits, int(edit.at(self.max_gaussians)))
+        limit = min(fits, self._limit(edit))
         change = densify(edit, self.rules, run.rasterizer.tiler, limit)
         run.refresh_filter()
         if change.after == fits:
