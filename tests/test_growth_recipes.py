@@ -1,5 +1,8 @@
-"""Recipes whose edits look at training views: a short form of each repeats its bits, also after an interruption."""
+"""Recipes whose edits look at training views: a short form repeats its bits, interrupted and with one core too."""
 
+import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +13,7 @@ from clsplat.errors import Interrupted
 from clsplat.pipeline.loading import load
 from clsplat.runs import opening, runner
 from clsplat.training.run import Progress, Run
-from tests.test_training import digest, train
+from tests.test_training import ONE_CORE, digest, train
 
 pytestmark = pytest.mark.slow
 
@@ -82,3 +85,17 @@ def test_a_recipe_repeats_and_goes_on_with_the_same_bits(recipe, tiny_scene, tmp
             runner.execute(checked, run, "resume", stop)
     train(tiny_scene, tmp_path / "parts", *overrides, pipeline=recipe, resume=True)
     assert digest(tmp_path / "parts") == digest(whole.out)
+    command = [
+        sys.executable,
+        "-m",
+        "clsplat",
+        "run",
+        recipe,
+        "--scene",
+        str(tiny_scene),
+        "--out",
+        str(tmp_path / "one"),
+    ]
+    environment = {**os.environ, **ONE_CORE, "OPENBLAS_NUM_THREADS": "1"}
+    subprocess.run([*command, "--set", *overrides], check=True, env=environment, capture_output=True)
+    assert digest(tmp_path / "one") == digest(whole.out)
