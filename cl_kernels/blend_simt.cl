@@ -127,7 +127,7 @@ void blend_backward(
         const bool owns = begin + item < end, active = begin + item < last;
         const uint pair = owns ? tile_pairs[begin + item] : 0;
         float splat[RECORD] = {0.0f};
-        pixel_sums_t m = {0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f};
+        pixel_sums_t m = {0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f};
         if (active) {
             float4 quads[QUADS];
             load_quads(splats, pair_splat[pair], quads);
@@ -147,7 +147,7 @@ void blend_backward(
             }
         if (owns) {
             const float sums[RECORD] = {m.power, m.x, m.y, m.xx, m.xy, m.yy, m.red, m.green, m.blue,
-                                        m.abs_x, m.abs_y, m.weight, m.texture, 0.0f, 0.0f, 0.0f};
+                                        m.abs_x, m.abs_y, m.weight, m.texture, m.blended, m.square, 0.0f};
             __global sums_part_t *record = (__global sums_part_t *)pair_sums + (size_t)pair * (RECORD / 4);
             for (uint k = 0; k < SUMS_PARTS; k++)
                 record[k] = vload4(k, sums);

@@ -100,7 +100,7 @@ static inline void store_record(const pixel_sums_t m, __global float *record)
     const float16 sums = (float16)(
         sum_lanes(m.power), sum_lanes(m.x), sum_lanes(m.y), sum_lanes(m.xx), sum_lanes(m.xy), sum_lanes(m.yy),
         sum_lanes(m.red), sum_lanes(m.green), sum_lanes(m.blue), sum_lanes(m.abs_x), sum_lanes(m.abs_y),
-        sum_lanes(m.weight), sum_lanes(m.texture), 0.0f, 0.0f, 0.0f);
+        sum_lanes(m.weight), sum_lanes(m.texture), sum_lanes(m.blended), sum_lanes(m.square), 0.0f);
     vstore16(sums, 0, record);
 }
 
@@ -109,7 +109,8 @@ static inline void pixel_sums_of(const float *splat, const uint tile_x, const ui
                                  grad_pixels_t (*pixels)[COLUMNS], pixel_sums_t *sums)
 {
     const VF zero = (VF)(0.0f);
-    pixel_sums_t pixel_sums = {zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero};
+    pixel_sums_t pixel_sums = {zero, zero, zero, zero, zero, zero, zero, zero,
+                               zero, zero, zero, zero, zero, zero, zero};
     const float top = tile_y * TILE + 0.5f;
     const float low = splat[SPLAT_Y_MIN] - top, high = splat[SPLAT_Y_MAX] - top;
     const uint y_first = low > 0.0f ? (uint)low : 0u;

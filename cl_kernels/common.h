@@ -34,7 +34,7 @@
 #define SPLAT_GROUP 32  // splats per batch of the simt backward pass
 #endif
 #ifndef PIXEL_SUMS
-#define PIXEL_SUMS 9  // sums in a gradient record (splat.h): 11 or 13 where a density statistic needs more
+#define PIXEL_SUMS 9  // sums in a gradient record (splat.h): 11, 13 or 15 where a density statistic needs more
 #endif
 
 /* ---- constants of the method (Kerbl et al. 2023); tests change the first three to make blending smooth ---- */

@@ -36,6 +36,8 @@
 #define SUM_ABS_Y 10
 #define SUM_WEIGHT 11  // w, where the texture is known: not below 0
 #define SUM_TEXTURE 12 // w times the texture at the pixel, there
+#define SUM_BLENDED 13 // the texture of the pixels that the splat is blended in, there: with ones, their number
+#define SUM_SQUARE 14  // (dL/dG)^2 with G = e^power, so that alpha = opacity G
 
 /* A gradient record is written and read in aligned parts: quads where an item computes one Gaussian, and only those
  * with sums; else whole. */
@@ -49,7 +51,7 @@ typedef float16 sums_part_t;
 
 /* Partial sums, one set per lane. */
 typedef struct {
-    VF power, x, y, xx, xy, yy, red, green, blue, abs_x, abs_y, weight, texture;
+    VF power, x, y, xx, xy, yy, red, green, blue, abs_x, abs_y, weight, texture, blended, square;
 } pixel_sums_t;
 
 /* A splat seen from one row of pixels. */
@@ -160,6 +162,11 @@ static inline void blend_backward_step(grad_pixels_t *p, const row_splat_t s, co
     const VF known = p->texture >= zero ? k.weight : zero;
     m->weight += known;
     m->texture += known * p->texture;
+#endif
+#if PIXEL_SUMS > SUM_BLENDED
+    m->blended += k.blended ? larger(p->texture, zero) : zero;
+    const VF grad_falloff = passes ? s.opacity * grad_alpha : zero;
+    m->square += grad_falloff * grad_falloff;
 #endif
 }
 

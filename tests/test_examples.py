@@ -23,6 +23,7 @@ from clsplat import cli
 from clsplat.conformance.scenes import random_case
 from clsplat.density.edit import Edit
 from clsplat.density.statistics import SplatStats
+from clsplat.density.survey import Survey
 from clsplat.density.thresholds import SceneScale
 from clsplat.pipeline.loading import load
 from tests.html_page import Page
@@ -184,7 +185,7 @@ def test_a_blur_is_short_with_its_kernel():
 def test_the_verbs_of_an_edit_are_those_of_the_table():
     """Each `edit.name` of the page exists, and so do the arguments that the table gives to it."""
     gaussians = random_case(np.random.default_rng(0), 3).model(clsplat.Device()).gaussians
-    edit = Edit(gaussians, SplatStats(gaussians), SceneScale(1.0), step=1, seed=0)
+    edit = Edit(gaussians, SplatStats(gaussians), SceneScale(1.0), 1, 0, Survey(None, None, None, [], 0, 1))
     page = (ROOT / "docs" / "extending.md").read_text()
     found = re.findall(r"`edit\.([\w.]+)(?:\(([^)`]*)\))?", page)
     assert {name for name, _ in found} >= {"mark", "choose", "set_rows", "room", "scene_scale.extent"}

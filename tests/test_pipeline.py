@@ -106,6 +106,47 @@ THINNING = {
     *(f"densify~2.rules.prune_unimportant{key}" for key in ("", ".start", ".share")),
     *(f"densify~3.rules.merge_neighbours{key}" for key in ("", ".start", ".colour_below", ".distance_below")),
 }
+LIMITED = {  # a limit of the opacity, in front of the resets
+    *("reset_opacity.every", "reset_opacity.to", "reset_opacity~2.every", "reset_opacity~2.stop"),
+    *("reset_opacity~2.when_background", "reset_opacity~3.every", "reset_opacity~3.start"),
+    *("reset_opacity~3.stop", "reset_opacity~3.to", "reset_opacity~3.when_background"),
+}
+STAGE = ("budget", "every", "max_gaussians", "start", "stop")
+
+
+def rules(stage: str, **keys: str) -> set[str]:
+    """The places of rules that a recipe has more, or less, by their keys."""
+    return {
+        f"{stage}.rules.{rule}{key}"
+        for rule, named in keys.items()
+        for key in ("", *(f".{one}" for one in named.split()))
+    }
+
+
+WRONG = " views error_above start"
+FASTGS = {
+    *rules("densify", prune_faint="opacity_below start", prune_large="size_above start"),
+    *rules("densify", ungrow_accurate="pixels_above" + WRONG),
+    *rules("densify", prune_sampled="opacity_below share size_above.between size_above.points" + WRONG),
+    *rules("densify~2", prune_faint="opacity_below start", prune_inaccurate="score_above" + WRONG),
+    *(f"densify~2.{key}" for key in STAGE),
+    *("densify.every", "densify.rules.clone.size_below", "reset_opacity.start"),
+    *(f"densify.rules.split.{key}" for key in ("gradient_above", "size_above", "statistic")),
+    *LIMITED,
+}
+MINI = {
+    *rules("densify", prune_large="size_above start"),
+    *(
+        place
+        for n in ("", "~2", "~3")
+        for place in rules(f"densify{n}", prune_useless="of_all of_view start views_below")
+    ),
+    *(f"densify~{n}.{key}" for n in (2, 3) for key in STAGE),
+    *("densify.every", "densify.start", "densify.stop"),
+    *(f"reset_opacity.{key}" for key in ("every", "stop", "when_background")),
+    *(f"reset_opacity~2.{key}" for key in ("every", "start", "stop", "to", "when_background")),
+}
+LEAST = ("prune_least", "prune_least~2")
 MEAN_FILTER = {f"views.transforms.mean_filter{key}" for key in ("", ".width.between", ".width.points")}
 DASH = {
     *(f"densify.budget{key}" for key in ("", ".begin", ".gaussians", ".gradient_above", ".growth", ".keep", ".most")),
@@ -125,10 +166,24 @@ DIFFERENCES = {
     ("splat", "absgs"): {
         *("densify.rules.clone.size_below", "densify.rules.split.size_above"),
         *("densify.rules.split.statistic", "densify.rules.split.gradient_above"),
-        *("reset_opacity.every", "reset_opacity.to", "reset_opacity~2.every", "reset_opacity~2.stop"),
-        *("reset_opacity~2.when_background", "reset_opacity~3.every", "reset_opacity~3.start"),
-        *("reset_opacity~3.stop", "reset_opacity~3.to", "reset_opacity~3.when_background"),
+        *LIMITED,
     },
+    ("splat", "fastgs"): FASTGS,
+    ("fastgs", "fastgs_7k"): TWIN | {"densify~2.every", "densify~2.start", "reset_opacity~2.stop"},
+    ("splat", "taming"): {
+        *rules("densify", grow_scored="start views", prune_faint="opacity_below start", prune_large="size_above start"),
+        *rules("densify", prune_scored="opacity_below share size_above.between size_above.points start views"),
+        *("densify.every", "densify.budget", "densify.budget.gaussians"),
+    },
+    ("taming", "taming_7k"): TWIN | {"densify.every", "densify.budget.gaussians"},
+    ("splat", "mini"): MINI,
+    ("mini", "mini_7k"): TWIN - ENDS | {"densify~3.every", "densify~3.stop"},
+    ("splat", "speedy"): {
+        f"{stage}.{key}" for stage in LEAST for key in ("every", "keep", "remove", "score", "start", "stop")
+    },
+    ("speedy", "speedy_7k"): TWIN
+    | {f"{stage}.{key}" for stage in LEAST for key in ("every", "start")}
+    | {"prune_least.stop"},
     ("splat", "opti3dgs"): MEAN_FILTER,
     ("splat_7k", "opti3dgs_7k"): MEAN_FILTER,
     ("splat", "dash"): DASH | {"reset_opacity.stop", "rates.logit_opacity"},
@@ -201,6 +256,14 @@ REFUSED = {
     "fraction for a whole": (replaced("steps: 10", "steps: 10.5"), "expected a whole number, got 10.5"),
     "negative": (replaced("steps: 10", "steps: -1"), "greater than 0, got -1"),
     "infinite": (replaced("weight: 0.8", "weight: .inf"), "finite"),
+    "a number to reach without an end": (
+        replaced("every: 100\n", "every: 100\n            budget: {type: parabola, gaussians: 10}\n"),
+        r"'budget' needs 'stop'",
+    ),
+    "no number to reach": (
+        replaced("every: 100\n", "every: 100\n            budget: {type: parabola, gaussians: 0}\n"),
+        r"budget.gaussians: expected a value of at least 1",
+    ),
     "missing steps": (replaced("      steps: 10\n", ""), "'steps' is missing"),
     "a start outside": (replaced("- evaluate", "- evaluate: {start: 3}"), r"'start' belongs inside optimize.during"),
     "a stop outside": (replaced("- evaluate", "- evaluate: {stop: 3}"), r"'stop' belongs inside optimize.during"),

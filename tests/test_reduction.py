@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 
 from clsplat.conformance import reference as ref
+from clsplat.density.contribution import sensitivities
 from clsplat.errors import ConfigError, Interrupted
 from clsplat.formats.table import read
 from clsplat.gaussians.model import Model, load
 from clsplat.pipeline.loading import load as load_pipeline
 from clsplat.runs import opening, runner
-from clsplat.stages.reduction import band_energy, best, columns_of, scores
+from clsplat.stages.reduction import PruneLeast, band_energy, best, columns_of, scores
 from clsplat.training.run import Progress, Run
 from tests.test_training import train
 
@@ -76,6 +77,18 @@ def test_the_least_gaussians_go(tiny_scene, pipeline, tmp_path):
     order = np.argsort(-score, kind="stable")[: len(kept)]
     np.testing.assert_array_equal(kept, before[np.sort(order)])
     assert scores(run).sum() > 0.8 * score.sum(), "the others had little weight"
+
+
+def test_the_score_may_be_the_change_of_the_image(tiny_scene, pipeline, tmp_path):
+    run = opened(tiny_scene, pipeline, tmp_path)
+    by_weight = scores(run)
+    photographs = [run.photographs.get(view) for view in run.scene.split("train")]
+    score = sensitivities(run.rasterizer, run.model, photographs, run.photographs.background)
+    before = run.model.gaussians.get("means")
+    PruneLeast(stage="prune_least", remove=0.8, score="sensitivity").act(run)
+    kept = np.sort(np.argsort(-score, kind="stable")[: round(0.2 * len(before))])
+    np.testing.assert_array_equal(run.model.gaussians.get("means"), before[kept])
+    assert not np.array_equal(kept, np.sort(np.argsort(-by_weight, kind="stable")[: len(kept)]))
 
 
 def test_of_equal_scores_the_first_stay():
@@ -157,6 +170,7 @@ def test_an_interruption_between_edits_changes_no_bit(finished, tiny_scene, pipe
         ("{keep: 0.5, remove: 0.5}", "expected one of 'keep' and 'remove'"),
         ("{keep: 0.0}", "greater than 0"),
         ("{remove: 1.0}", "less than 1"),
+        ("{remove: 0.5, score: weights}", "expected 'weight' or 'sensitivity'"),
     ],
 )
 def test_what_is_no_share_is_refused(tmp_path, fields, complaint):

@@ -36,6 +36,9 @@ def train(scene: Path, out: Path, *overrides: str, pipeline: str = "smoke", resu
     return run
 
 
+ONE_CORE = {"POCL_MAX_PTHREAD_COUNT": "1", "POCL_CPU_MAX_CU_COUNT": "1", "CL_CONFIG_CPU_TBB_NUM_WORKERS": "1"}
+
+
 def digest(out: Path) -> str:
     return hashlib.sha256((out / "point_cloud.ply").read_bytes()).hexdigest()
 
@@ -76,7 +79,6 @@ def test_the_loss_falls_and_density_changes(finished):
 def test_the_same_bits_twice_and_with_one_core(finished, tiny_scene, tmp_path):
     train(tiny_scene, tmp_path / "again")
     assert digest(tmp_path / "again") == digest(finished)
-    one_core = {"POCL_MAX_PTHREAD_COUNT": "1", "POCL_CPU_MAX_CU_COUNT": "1", "CL_CONFIG_CPU_TBB_NUM_WORKERS": "1"}
     command = [
         sys.executable,
         "-m",
@@ -88,7 +90,7 @@ def test_the_same_bits_twice_and_with_one_core(finished, tiny_scene, tmp_path):
         "--out",
         str(tmp_path / "one"),
     ]
-    subprocess.run(command, check=True, env={**os.environ, **one_core}, capture_output=True)
+    subprocess.run(command, check=True, env={**os.environ, **ONE_CORE}, capture_output=True)
     assert digest(tmp_path / "one") == digest(finished)
 
 

@@ -16,7 +16,7 @@ class Moment:
     """The time of an edit."""
 
     share: float  # of the steps up to the end of edits
-    is_last: bool  # none follows
+    edits: int  # that are left, with this one
     divisor: float  # of the photographs' size
 
 
@@ -68,7 +68,27 @@ class Momentum(Budget):
         begin = numbers.setdefault("momentum.start", count)
         momentum = numbers.setdefault("momentum.sum", self.begin * begin)
         end = self.gaussians or begin + momentum
-        target = end if moment.is_last else begin + (end - begin) / moment.divisor ** (2 - moment.share)
+        target = end if moment.edits == 1 else begin + (end - begin) / moment.divisor ** (2 - moment.share)
         eager = int((edit.stats.mean("screen_grad") >= edit.at(self.gradient_above)).sum())
         numbers["momentum.sum"] = max(momentum, float(int(self.keep * momentum + min(self.most, eager))))
         return min(max(count, int(target)), int(count * (1 + self.growth)))
+
+
+class Parabola(Budget):
+    """Growth to a number, steep at first: P0 + (B - P0) (2x/S - x²/S²) after x of S edits (Taming 3DGS, Mallick et al.
+    2024).
+
+    It is planned anew at every edit from the number that there is, so that it needs no P0 and makes up for what was
+    pruned.
+    """
+
+    type: Literal["parabola"] = "parabola"
+    training_keys: ClassVar[frozenset[str]] = frozenset({"gaussians"})
+
+    gaussians: Annotated[int, Field(ge=1)]
+    """The number B, to which the last edit may grow."""
+
+    def limit(self, edit: Edit, moment: Moment, numbers: dict[str, float]) -> int:
+        missing = self.gaussians - edit.gaussians.count
+        left = (moment.edits - 1) / moment.edits
+        return self.gaussians - int(missing * left**2) if missing > 0 else self.gaussians

@@ -15,9 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from clsplat.density.outcomes import MAX_ROWS, outcomes_of, require_rows
 from clsplat.density.statistics import SEEN, SplatStats
+from clsplat.density.survey import Survey
 from clsplat.density.thresholds import PixelQuantile, Quantile, SceneScale, Threshold
-from clsplat.errors import MemoryLimitError
+from clsplat.errors import ConfigError, MemoryLimitError
 from clsplat.gaussians.tables import PARAMETERS, Gaussians, moment_tables
 from clsplat.render.tiles import Tiler
 from clsplat.schedule import Schedule, at_step
@@ -25,14 +27,6 @@ from clsplat.settings import Settings
 
 MAX_BOUND = 3.0e38  # a bound above all values
 MIN_BOUND = 1.2e-38  # the smallest normal float: a bound that all values but zero reach
-MAX_ROWS = 2**32 - 2  # sums of 32 bits stay at one more, whatever more there is (cl_kernels/scan.cl)
-
-
-def _require_rows(copies: int, kept: int) -> None:
-    for name, number in (("copies", copies), ("kept", kept)):
-        if not 0 <= number <= MAX_ROWS:
-            bound = "0 or more" if number < 0 else f"at most {MAX_ROWS}"
-            raise ValueError(f"{name}: expected a number of rows, {bound}, got {number}")
 
 
 class Edit:
@@ -41,10 +35,18 @@ class Edit:
     Random numbers depend on `seed`, `step` and the rule alone.
     """
 
-    def __init__(self, gaussians: Gaussians, stats: SplatStats, scene_scale: SceneScale, step: int, seed: int) -> None:
+    def __init__(
+        self,
+        gaussians: Gaussians,
+        stats: SplatStats,
+        scene_scale: SceneScale,
+        step: int,
+        seed: int,
+        survey: Survey | None = None,
+    ) -> None:
         device, count = gaussians.device, gaussians.count
         self.gaussians, self.stats, self.scene_scale = gaussians, stats, scene_scale
-        self.step, self.seed = step, seed
+        self.step, self.seed, self._survey = step, seed, survey
         self.copies = device.empty(count, np.uint32)
         self.kept = device.empty(count, np.uint32)
         self.shrink = device.empty(count)
@@ -57,6 +59,13 @@ class Edit:
     @property
     def _outcome(self) -> dict[str, Any]:
         return {"copies": self.copies, "kept": self.kept, "shrink": self.shrink, "shared": self.shared}
+
+    @property
+    def survey(self) -> Survey:
+        """The training views, in which the rules see the Gaussians before the edit.  Raises ConfigError without any."""
+        if self._survey is None:
+            raise ConfigError("a rule needs training photographs; expected an edit with a survey of them")
+        return self._survey
 
     def at(self, schedule: Schedule) -> float:
         """Return the value of a schedule at the step of the edit."""
@@ -82,7 +91,7 @@ class Edit:
 
         shared: its rows are together as opaque as it was.  Raises ValueError for numbers of rows that cannot be.
         """
-        _require_rows(copies, kept)
+        require_rows(copies, kept)
         gaussians = self.gaussians
         self._program.mark_rule(
             items=gaussians.count,
@@ -128,19 +137,10 @@ class Edit:
         statistics; the others are fresh.  Raises ValueError for another shape or type, and for numbers of rows below 0
         or beyond MAX_ROWS.
         """
-        count, numbers = self.gaussians.count, np.asarray(copies)
-        if chosen.dtype != np.bool_ or chosen.shape != (count,):
-            raise ValueError(f"chosen: expected a mask, bool [{count}], got {chosen.dtype} {list(chosen.shape)}")
-        if not np.issubdtype(numbers.dtype, np.integer) or numbers.shape not in ((), (count,)):
-            raise ValueError(
-                f"copies: expected an integer or integers [{count}], got {numbers.dtype} {list(numbers.shape)}"
-            )
-        _require_rows(int(numbers.min(initial=0)), kept)
-        _require_rows(int(numbers.max(initial=0)), kept)
-        outcome = np.where(chosen, numbers.astype(np.int64) + 1, 0)
+        count = self.gaussians.count
         self._program.mark_chosen(
             items=count,
-            outcome=self.gaussians.device.upload(outcome.astype(np.uint32)),
+            outcome=self.gaussians.device.upload(outcomes_of(chosen, copies, kept, count)),
             copies=self.copies,
             kept=self.kept,
             shrink=self.shrink,
@@ -167,17 +167,22 @@ class Edit:
         """Rows that may still be added to the outcomes so far; negative: too many already; None: no limit."""
         return None if self.max_rows is None else self.max_rows - int(self.rows().sum(dtype=np.int64))
 
+    def undo_growth(self, refused: NDArray[np.bool_]) -> None:
+        """Let the Gaussians of a mask, [N], that were to become several stay as they are."""
+        refused = refused & (self.rows() > 1)
+        for array, alone in zip(self._outcome.values(), (1, 1, 1, 0), strict=True):
+            array.set(np.where(refused, alone, array.get()))
+
     def limit(self, limit: int) -> None:
         """Undo growth until at most `limit` rows remain; the smallest means of the first column come first."""
-        rows, kept = self.rows().astype(np.int64), self.kept.get()
+        rows = self.rows().astype(np.int64)
         growing = np.flatnonzero(rows > 1)
         score = self.stats.mean(self.stats.names[0]) if self.stats.names else np.zeros(len(rows), np.float32)
         order = growing[np.argsort(-score[growing], kind="stable")]
         total = int(np.minimum(rows, 1).sum()) + np.cumsum(rows[order] - 1)
-        refused = order[total > limit]
-        rows[refused], kept[refused] = 1, 1
-        self.copies.set(rows.astype(np.uint32))
-        self.kept.set(kept)
+        refused = np.zeros(len(rows), bool)
+        refused[order[total > limit]] = True
+        self.undo_growth(refused)
 
     def apply(self, tiler: Tiler) -> None:
         """Rearrange all tables and place the children of split Gaussians.

@@ -151,8 +151,8 @@ class Rasterizer:
     ) -> Array:
         """Return the sums over each Gaussian's pixels that give its gradients, [count, S]; see cl_kernels/splat.h.
 
-        grad_image: [3, rows, stride], zero outside the image.  A `count` above PIXEL_SUMS takes more time; the last two
-        sums need `texture`, [rows, stride] per px.  Memory as in `forward`.
+        grad_image: [3, rows, stride], zero outside the image.  A `count` above PIXEL_SUMS takes more time; those of
+        the texture need `texture`, [rows, stride], below 0 where it is not known.  Memory as in `forward`.
         """
         bands = frame.bands
         while True:

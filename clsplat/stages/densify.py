@@ -59,7 +59,7 @@ class Densify(Scheduled):
         if run.stats is None:
             return
         scale = SceneScale(run.scene.extent, run.texture_quantile)
-        edit = Edit(run.model.gaussians, run.stats, scale, run.step, run.seed)
+        edit = Edit(run.model.gaussians, run.stats, scale, run.step, run.seed, run.survey())
         fits = run.memory_plan().limit
         limit = min([fits, *self._limits(run, edit)])
         change = densify(edit, self.rules, run.rasterizer.tiler, limit)
@@ -77,5 +77,6 @@ class Densify(Scheduled):
         if self.max_gaussians is not None:
             yield int(edit.at(self.max_gaussians))
         if self.budget and self.every and self.stop:
-            moment = Moment(run.step / self.stop, run.step + self.every >= self.stop, run.divisor)
+            left = len(range(run.step, self.stop, self.every))
+            moment = Moment(run.step / self.stop, left, run.divisor)
             yield self.budget.limit(edit, moment, run.numbers)

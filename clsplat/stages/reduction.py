@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from clsplat.density.contribution import contributions
+from clsplat.density.contribution import contributions, sensitivities
 from clsplat.density.thresholds import Share
 from clsplat.errors import amount
 from clsplat.formats.sog_writing import Harmonics
@@ -24,29 +24,36 @@ LOG = logging.getLogger("clsplat")
 Part = Annotated[float, Field(gt=0, lt=1)]
 
 
-def scores(run: Run) -> NDArray[np.float64]:
-    """Return what each Gaussian contributes to the training views, [N]: its blend weight summed over their pixels."""
+Score = Literal["weight", "sensitivity"]
+
+
+def scores(run: Run, score: Score = "weight") -> NDArray[np.float64]:
+    """Return what each Gaussian does to the training views, [N], summed over their pixels: its blend weight, or the
+    squares of the image's derivatives by its value."""
     views = run.scene.split("train")
     photographs = (run.photographs.get(view) for view in run.status.counted(views, "views", len(views)))
-    return contributions(run.rasterizer, run.model, photographs).astype(np.float64)
+    if score == "weight":
+        return contributions(run.rasterizer, run.model, photographs).astype(np.float64)
+    return sensitivities(run.rasterizer, run.model, photographs, run.photographs.background).astype(np.float64)
 
 
 class PruneLeast(Scheduled):
     """Remove the Gaussians that contribute least to the training views.
 
-    The score of a Gaussian is its weight in the image, summed over all pixels of all training views; pixels that a mask
-    leaves out do not count.
+    The score of a Gaussian is a sum over all pixels of all training views; pixels that a mask leaves out do not count.
     """
 
     stage: Literal["prune_least"] = "prune_least"
     needs: ClassVar[frozenset[str]] = frozenset({"model"})
     edits: ClassVar[bool] = True
-    training_keys: ClassVar[frozenset[str]] = frozenset({"keep", "remove"})
+    training_keys: ClassVar[frozenset[str]] = frozenset({"keep", "remove", "score"})
 
     keep: Part | None = None
     """Share of the Gaussians that stays; this or `remove`."""
     remove: Part | None = None
     """Share of the Gaussians that is removed; this or `keep`."""
+    score: Score = "weight"
+    """Of its weights in the image, or of the squared derivatives of the image by its value (Hanson et al. 2025)."""
 
     @model_validator(mode="after")
     def _one_share(self) -> "PruneLeast":
@@ -58,7 +65,7 @@ class PruneLeast(Scheduled):
         return PARAMETERS
 
     def run(self, run: Run) -> None:
-        gaussians, score = run.model.gaussians, scores(run)
+        gaussians, score = run.model.gaussians, scores(run, self.score)
         share = 1 - (self.remove or 0) if self.keep is None else self.keep
         kept = best(score, max(1, round(share * len(score))))
         before = gaussians.count
@@ -68,7 +75,9 @@ class PruneLeast(Scheduled):
         causes = {self.stage: before - len(kept)}
         run.records.add(run.step, "densify", before=before, after=len(kept), causes=causes, grown={})
         lost = 100 * (1 - score[kept].sum() / (score.sum() or 1))
-        LOG.info("%s Gaussians kept; the others had %.2g %% of the weight", f"{len(kept):,} of {before:,}", lost)
+        LOG.info(
+            "%s Gaussians kept; the others had %.2g %% of the %s", f"{len(kept):,} of {before:,}", lost, self.score
+        )
 
 
 class ReduceSh(Scheduled):

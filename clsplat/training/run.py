@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from clsplat import __version__
 from clsplat.density.statistics import SplatStats
+from clsplat.density.survey import Survey
 from clsplat.errors import ConfigError, Interrupted
 from clsplat.filters import FilterViews, ModelSettings, measure_intervals
 from clsplat.gaussians.model import Model, Rendering
@@ -165,6 +166,10 @@ class Run:
         self.model_settings.world_filter.refresh(model.gaussians, views, model.near)
         if INTERVAL2 in model.gaussians.tables:
             measure_intervals(model.gaussians, views, views.focal, model.near, 1.0, model.gaussians[INTERVAL2])
+
+    def survey(self) -> Survey:
+        """Return the training views for the rules of an edit."""
+        return Survey(self.rasterizer, self.model, self.photographs, self.scene.split("train"), self.seed, self.step)
 
     def texture_quantile(self, share: float) -> float:
         """Return the gradient magnitude, per px, that `share` of the training photographs' pixels stay below."""

@@ -10,7 +10,8 @@ from clsplat.conformance import reference as ref
 from clsplat.conformance.check import Checks, Note
 from clsplat.conformance.comparison import GRADIENT, SUM, Figure, by_norm, equal, image_figures
 from clsplat.conformance.scenes import Case, random_case, safe_case
-from clsplat.density.statistics import ABS_X, WEIGHT
+from clsplat.density.statistics import ABS_X
+from clsplat.density.survey import BLENDED, SQUARE, WEIGHT
 from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import PIXEL_SUMS, RECORD, Budget, Frame, Rasterizer
 from clsplat.render.tiles import Sort
@@ -18,7 +19,7 @@ from clsplat.render.tiles import Sort
 CHECKS = Checks()
 BACKGROUND = np.array([0.2, 0.5, 0.9], np.float32)
 MARGIN = 1e-5  # of alpha and transmittance: float32 is off by about 3e-6 there
-ALL_SUMS = WEIGHT + 2
+ALL_SUMS = SQUARE + 1
 Sums = tuple[NDArray[Any], Frame, Rasterizer]
 
 
@@ -127,6 +128,14 @@ def statistics_of_blending(device: Device, rng: np.random.Generator) -> Iterator
     yield by_norm("blend_backward", "sums of weights", m[:, WEIGHT], blended.sum(axis=(1, 2)), GRADIENT)
     expected = (blended * texture).sum(axis=(1, 2))
     yield by_norm("blend_backward", "sums of texture", m[:, WEIGHT + 1], expected, GRADIENT)
+    squares = ref.falloff_squares(case.project(), width, height, BACKGROUND.astype(np.float64), weights)
+    yield by_norm("blend_backward", "sums of squares", m[:, SQUARE], squares, GRADIENT)
+    flags = np.where(texture < 0, -1, texture > 0.3).astype(np.float32)
+    for one in (case, safe_case(rng, 300, width, height, 2e-6, _opaque)):  # finished pixels
+        counts = pixel_sums_of(device, one, weights, ALL_SUMS, texture=flags)[:, BLENDED]
+        expected = (ref.blend_weights(one.project(), width, height) > 0) * (flags > 0)
+        yield equal("blend_backward", "numbers of pixels", counts, expected.sum(axis=(1, 2)))
+    yield from sum_figures(case, pixel_sums_of(device, case, weights, WEIGHT + 2, texture=flags), weights, "fewer sums")
 
 
 @CHECKS.add("sum_records")

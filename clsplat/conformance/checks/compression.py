@@ -1,15 +1,17 @@
 """What compression of a model computes on the device: each Gaussian's contribution, and clusters for a palette."""
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from clsplat.conformance import reference as ref
 from clsplat.conformance.check import Checks, Note
 from clsplat.conformance.checks.blending import MARGIN
-from clsplat.conformance.comparison import SUM, Figure, by_element, equal
+from clsplat.conformance.comparison import GRADIENT, SUM, Figure, by_element, by_norm, equal
 from clsplat.conformance.scenes import Case, safe_case
-from clsplat.density.contribution import contributions
+from clsplat.density.contribution import contributions, sensitivities
 from clsplat.formats.palette import LEVELS
 from clsplat.gaussians.clusters import DeviceClusters
 from clsplat.opencl.device import Device
@@ -27,7 +29,7 @@ def photograph_of(device: Device, case: Case, mask: Mask | None = None) -> Photo
     return Photograph(camera, colours, None if mask is None else device.upload(mask[None].astype(np.uint8)))
 
 
-@CHECKS.add("accumulate_pixel_sum", "blend_backward")
+@CHECKS.add("blend_backward")
 def contribution(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
     for count, width, height in SIZES:
         case = safe_case(rng, count, width, height, MARGIN)
@@ -36,8 +38,22 @@ def contribution(device: Device, rng: np.random.Generator) -> Iterator[Figure | 
         expected = sum(ref.contribution(case.project(), width, height, mask) for mask in masks)
         found, again = (contributions(Rasterizer(device, "radix"), case.model(device), photographs) for _ in range(2))
         what = f"blend weights of {count} Gaussians"
-        yield by_element("accumulate_pixel_sum", what, found, np.asarray(expected), SUM, floor=0.1)
-        yield equal("accumulate_pixel_sum", f"{what}, a second time", again, found)
+        yield by_element("blend_backward", what, found, np.asarray(expected), SUM, floor=0.1)
+        yield equal("blend_backward", f"{what}, a second time", again, found)
+        background = rng.random(3).astype(np.float32)
+        found = sensitivities(Rasterizer(device, "radix"), case.model(device), photographs, device.upload(background))
+        squares = np.sum([_squares(case, background, mask) for mask in masks], axis=0)
+        yield by_norm("blend_backward", f"squared changes of the image by {count} Gaussians", found, squares, GRADIENT)
+
+
+def _squares(case: Case, background: NDArray[Any], mask: Mask | None) -> NDArray[Any]:
+    """(dI/dG)² summed over the pixels of a mask and the channels, [N]."""
+    width, height = case.size
+    counted, total = np.ones((height, width)) if mask is None else mask, np.zeros(len(case.project().opacity))
+    for channel in range(3):
+        gradient = counted * (np.arange(3) == channel)[:, None, None]
+        total += ref.falloff_squares(case.project(), width, height, background.astype(np.float64), gradient)
+    return total
 
 
 @CHECKS.add("nearest_vectors", "sum_members")

@@ -96,19 +96,9 @@ def blend_backward(
     """Gradients of the splats, in the prefix form.  Where alpha is capped its derivative is zero."""
     n = len(splats.opacity)
     grad = SplatGradients(np.zeros((n, 2)), np.zeros((n, 3)), np.zeros(n), np.zeros((n, 3)), np.zeros((n, 2)))
-    image, final, _ = blend(splats, width, height, background, thresholds)
-    through_background = np.einsum("c,chw->hw", background, grad_image)
-    behind = image - np.asarray(background)[:, None, None] * final  # S_N - S_i, once splat i has been taken off
-    for step in blend_steps(splats, width, height, thresholds):
-        i, alpha, before = step.splat, step.alpha, step.before
-        colour = splats.colour[i][:, None, None]
-        behind = behind - colour * np.where(step.blended, alpha * before, 0)
-        grad.colour[i] = np.sum(grad_image * np.where(step.blended, alpha * before, 0), axis=(1, 2))
-        grad_alpha = np.sum((colour * before - behind / (1 - alpha)) * grad_image, axis=0)
-        grad_alpha -= final / (1 - alpha) * through_background
-        capped = splats.opacity[i] * step.falloff > thresholds.alpha_max
-        grad_alpha = np.where(step.blended & ~capped, grad_alpha, 0)
-
+    for step, grad_alpha in _alpha_gradients(splats, width, height, background, grad_image, thresholds):
+        i = step.splat
+        grad.colour[i] = np.sum(grad_image * np.where(step.blended, step.alpha * step.before, 0), axis=(1, 2))
         grad.opacity[i] = np.sum(step.falloff * grad_alpha)
         grad_sigma = -splats.opacity[i] * step.falloff * grad_alpha
         a, b, c = splats.conic[i]
@@ -119,6 +109,42 @@ def blend_backward(
         products = 0.5 * step.dx**2, step.dx * step.dy, 0.5 * step.dy**2
         grad.conic[i] = [np.sum(grad_sigma * product) for product in products]
     return grad
+
+
+def falloff_squares(
+    splats: Splats,
+    width: int,
+    height: int,
+    background: NDArray[Any],
+    grad_image: NDArray[Any],
+    thresholds: Thresholds = Thresholds(),
+) -> NDArray[Any]:
+    """(dL/dG)² summed over pixels, [N], where alpha is the opacity times G."""
+    squares = np.zeros(len(splats.opacity))
+    for step, grad_alpha in _alpha_gradients(splats, width, height, background, grad_image, thresholds):
+        squares[step.splat] = np.sum((splats.opacity[step.splat] * grad_alpha) ** 2)
+    return squares
+
+
+def _alpha_gradients(
+    splats: Splats,
+    width: int,
+    height: int,
+    background: NDArray[Any],
+    grad_image: NDArray[Any],
+    thresholds: Thresholds,
+) -> Iterator[tuple[BlendStep, NDArray[Any]]]:
+    """Walk through the splats front to back, each with dL/dalpha, [H,W]: 0 where alpha is capped."""
+    image, final, _ = blend(splats, width, height, background, thresholds)
+    through_background = np.einsum("c,chw->hw", background, grad_image)
+    behind = image - np.asarray(background)[:, None, None] * final  # S_N - S_i, once splat i has been taken off
+    for step in blend_steps(splats, width, height, thresholds):
+        colour = splats.colour[step.splat][:, None, None]
+        behind = behind - colour * np.where(step.blended, step.alpha * step.before, 0)
+        grad_alpha = np.sum((colour * step.before - behind / (1 - step.alpha)) * grad_image, axis=0)
+        grad_alpha -= final / (1 - step.alpha) * through_background
+        capped = splats.opacity[step.splat] * step.falloff > thresholds.alpha_max
+        yield step, np.where(step.blended & ~capped, grad_alpha, 0)
 
 
 class Margin(NamedTuple):

@@ -1,0 +1,64 @@
+"""Importance by blend weights in several views (importance.py), against the reference."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from clsplat.conformance import reference as ref
+from clsplat.conformance.checks.blending import MARGIN
+from clsplat.conformance.checks.compression import photograph_of
+from clsplat.conformance.scenes import random_case, safe_case
+from clsplat.density.edit import Edit
+from clsplat.density.importance import PruneUseless, Weights, largest_of, weights
+from clsplat.density.statistics import SplatStats
+from clsplat.density.survey import Survey
+from clsplat.density.thresholds import SceneScale
+from clsplat.render.rasterizer import Rasterizer
+
+
+@pytest.mark.parametrize(("count", "width", "height"), [(0, 16, 16), (1, 16, 16), (17, 33, 31), (40, 24, 24)])
+def test_weights_are_those_of_the_reference(device, rng, count, width, height):
+    """Two views that differ by their masks; the useful ones by adding weights one after another."""
+    case = safe_case(rng, count, width, height, MARGIN)
+    masks = [rng.random((height, width)) < share for share in (0.9, 0.2)]
+    held = [photograph_of(device, case, mask) for mask in masks]
+    source = SimpleNamespace(get=lambda view: held[view], background=device.zeros(3))
+    found = weights(Survey(Rasterizer(device, "radix"), case.model(device), source, range(2), 0, 0), 0.9)
+    expected = [ref.contribution(case.project(), width, height, mask) for mask in masks]
+    np.testing.assert_allclose(found.total, sum(expected), rtol=1e-4, atol=1e-5)
+    views = np.zeros(count, int)
+    for weight in expected:
+        made = 0.0
+        for i in sorted(range(count), key=lambda i: -weight[i]):
+            if made >= 0.9 * weight.sum() or weight[i] == 0:
+                break
+            made += weight[i]
+            views[i] += 1
+    np.testing.assert_array_equal(found.views, views)
+
+
+@pytest.mark.parametrize(
+    ("weight", "share", "expected"),
+    [
+        ([1, 2, 3, 4], 0.7, [0, 0, 1, 1]),
+        ([1, 2, 3, 4], 0.71, [0, 1, 1, 1]),
+        ([1, 2, 3, 4], 1.0, [1, 1, 1, 1]),
+        ([0, 2, 0, 4], 1.0, [0, 1, 0, 1]),
+        ([1, 1, 1, 1], 0.5, [1, 1, 0, 0]),
+        ([0, 0], 0.99, [0, 0]),
+        ([], 0.99, []),
+    ],
+)
+def test_the_fewest_that_make_a_share(weight, share, expected):
+    assert largest_of(np.array(weight, float), share).tolist() == expected
+
+
+def test_what_few_views_need_and_what_has_little_weight_goes(device, rng):
+    gaussians = random_case(rng, 5).model(device).gaussians
+    found = Weights(np.array([500.0, 300, 200, 0.5, 0.4]), np.array([3, 1, 2, 3, 4]))
+    survey = SimpleNamespace(once=lambda function, *arguments: found)
+    edit = Edit(gaussians, SplatStats(gaussians), SceneScale(1.0), step=600, seed=3, survey=survey)
+    edit.mark(copies=2, kept=1)
+    PruneUseless(views_below=2, of_all=0.999).mark(edit)
+    assert edit.rows().tolist() == [2, 0, 2, 0, 0]
