@@ -107,8 +107,18 @@ THINNING = {
     *(f"densify~3.rules.merge_neighbours{key}" for key in ("", ".start", ".colour_below", ".distance_below")),
 }
 MEAN_FILTER = {f"views.transforms.mean_filter{key}" for key in ("", ".width.between", ".width.points")}
+SADDLE = {
+    *(f"densify.rules.{rule}{key}" for rule in ("clone", "split") for key in ("", ".start", ".statistic", ".opacity")),
+    *(f"densify.rules.{rule}{key}" for rule in ("clone", "split") for key in (".as_many_as", ".gradient_above")),
+    *("densify.rules.clone.size_below", "densify.rules.split.size_above"),
+    *("densify.rules.split.children", "densify.rules.split.shrink"),
+    *(f"densify.rules.split_saddle{key}" for key in ("", ".start", ".eigenvalue_below", ".gradient_above")),
+    *(f"densify.rules.split_saddle{key}" for key in (".distance", ".shrink", ".opacity")),
+}
 DIFFERENCES = {
     ("splat", "splat_7k"): TWIN,
+    ("splat", "steep"): SADDLE,
+    ("steep", "steep_7k"): TWIN,
     ("splat", "mip_splatting"): SMOOTHING | MIP | REFRESH,
     ("splat", "mip_splatting_no_3d"): MIP,
     ("mip_splatting", "mip_splatting_no_2d"): {"model.screen_filter.variance"},

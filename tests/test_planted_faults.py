@@ -66,6 +66,7 @@ FAULTS = {  # kernel -> file, text, wrong text
     "add_noise": ("noise.cl", "scale * scale * turned", "scale * turned"),
     "project_forward": ("gaussian.h", "2.0f * (x * y - w * z)", "2.0f * (x * y + w * z)"),
     "project_backward": ("backward.h", "energy2 = larger(1.0f + compensate", "energy2 = larger(1.0f - compensate"),
+    "accumulate_splitting": ("saddle.cl", "c * c * yy - power * c", "c * c * yy - power * a"),
     "scan_blocks": ("scan.cl", "total = added(total, sums[i])", "total = sums[i] + 1"),
     "scan_offsets": ("scan.cl", "offset[count] = sum", "offset[count] = sum - 1"),
     "permute": ("scan.cl", "values[order[place]]", "values[order[place]] + 1"),
@@ -95,8 +96,6 @@ MORE = {  # that smaller pictures do not show
     "project_forward wide, a bit too few": ("tiles.h", "(float)BOX_TILES_MAX;", "(float)(BOX_TILES_MAX + 1);"),
     "project_forward simt, a bit too few": ("tiles.h", "(float)BOX_TILES_MAX;", "(float)(BOX_TILES_MAX + 1);"),
 }
-
-
 CHECKS = {"doctor": [*KERNELS, *SPEED], "a run": [*ESSENTIAL, *BITONIC]}
 
 

@@ -36,6 +36,7 @@ STAGES = {
     "accumulate_sum": "statistics",
     "accumulate_pixel_sum": "statistics",
     "accumulate_radius": "statistics",
+    "accumulate_splitting": "statistics",
     "sample_magnitude": "statistics",
     "image_gradient": "statistics",
     "hide_masked": "statistics",

@@ -85,6 +85,28 @@ def contribution(
     return np.sum(weights if mask is None else weights * mask, axis=(1, 2))
 
 
+def alpha_gradients(
+    splats: Splats,
+    width: int,
+    height: int,
+    background: NDArray[Any],
+    grad_image: NDArray[Any],
+    thresholds: Thresholds = Thresholds(),
+) -> Iterator[tuple[BlendStep, NDArray[Any]]]:
+    """Each splat front to back with dL/dalpha, [H,W], in the prefix form; where alpha is capped it is zero."""
+    image, final, _ = blend(splats, width, height, background, thresholds)
+    through_background = np.einsum("c,chw->hw", background, grad_image)
+    behind = image - np.asarray(background)[:, None, None] * final  # S_N - S_i, once splat i has been taken off
+    for step in blend_steps(splats, width, height, thresholds):
+        i, alpha, before = step.splat, step.alpha, step.before
+        colour = splats.colour[i][:, None, None]
+        behind = behind - colour * np.where(step.blended, alpha * before, 0)
+        grad_alpha = np.sum((colour * before - behind / (1 - alpha)) * grad_image, axis=0)
+        grad_alpha -= final / (1 - alpha) * through_background
+        capped = splats.opacity[i] * step.falloff > thresholds.alpha_max
+        yield step, np.where(step.blended & ~capped, grad_alpha, 0)
+
+
 def blend_backward(
     splats: Splats,
     width: int,
@@ -93,22 +115,12 @@ def blend_backward(
     grad_image: NDArray[Any],
     thresholds: Thresholds = Thresholds(),
 ) -> SplatGradients:
-    """Gradients of the splats, in the prefix form.  Where alpha is capped its derivative is zero."""
+    """Gradients of the splats."""
     n = len(splats.opacity)
     grad = SplatGradients(np.zeros((n, 2)), np.zeros((n, 3)), np.zeros(n), np.zeros((n, 3)), np.zeros((n, 2)))
-    image, final, _ = blend(splats, width, height, background, thresholds)
-    through_background = np.einsum("c,chw->hw", background, grad_image)
-    behind = image - np.asarray(background)[:, None, None] * final  # S_N - S_i, once splat i has been taken off
-    for step in blend_steps(splats, width, height, thresholds):
-        i, alpha, before = step.splat, step.alpha, step.before
-        colour = splats.colour[i][:, None, None]
-        behind = behind - colour * np.where(step.blended, alpha * before, 0)
-        grad.colour[i] = np.sum(grad_image * np.where(step.blended, alpha * before, 0), axis=(1, 2))
-        grad_alpha = np.sum((colour * before - behind / (1 - alpha)) * grad_image, axis=0)
-        grad_alpha -= final / (1 - alpha) * through_background
-        capped = splats.opacity[i] * step.falloff > thresholds.alpha_max
-        grad_alpha = np.where(step.blended & ~capped, grad_alpha, 0)
-
+    for step, grad_alpha in alpha_gradients(splats, width, height, background, grad_image, thresholds):
+        i = step.splat
+        grad.colour[i] = np.sum(grad_image * np.where(step.blended, step.alpha * step.before, 0), axis=(1, 2))
         grad.opacity[i] = np.sum(step.falloff * grad_alpha)
         grad_sigma = -splats.opacity[i] * step.falloff * grad_alpha
         a, b, c = splats.conic[i]
