@@ -10,8 +10,10 @@ pytestmark = pytest.mark.slow
 
 PRUNE = "{type: prune_faint, opacity_below: 0.005}"
 SADDLE = "{type: split_saddle, gradient_above: 1.0e-5, distance: 0.5, shrink: 1.6}"
+CROWDED = "{type: clone_crowded, gradient_above: 1.0e-5, size_below: 0.1, ratio_above: 2.0, cells: 3, extremes: 8}"
 CASES = {  # what acts -> settings
     "split_saddle": (f"densify.rules=[{SADDLE}, {PRUNE}]",),
+    "clone_crowded": (f"densify.rules=[{CROWDED}, {{type: clone}}, {PRUNE}]",),
 }
 
 

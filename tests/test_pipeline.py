@@ -115,10 +115,16 @@ SADDLE = {
     *(f"densify.rules.split_saddle{key}" for key in ("", ".start", ".eigenvalue_below", ".gradient_above")),
     *(f"densify.rules.split_saddle{key}" for key in (".distance", ".shrink", ".opacity")),
 }
+CROWDED = {
+    *(f"densify.rules.clone_crowded{key}" for key in ("", ".start", ".gradient_above", ".size_below")),
+    *(f"densify.rules.clone_crowded{key}" for key in (".ratio_above", ".jitter", ".cells", ".extremes")),
+}
 DIFFERENCES = {
     ("splat", "splat_7k"): TWIN,
     ("splat", "steep"): SADDLE,
     ("steep", "steep_7k"): TWIN,
+    ("splat", "gdgs"): CROWDED,
+    ("gdgs", "gdgs_7k"): TWIN | {"densify.rules.clone_crowded.start"},
     ("splat", "mip_splatting"): SMOOTHING | MIP | REFRESH,
     ("splat", "mip_splatting_no_3d"): MIP,
     ("mip_splatting", "mip_splatting_no_2d"): {"model.screen_filter.variance"},
