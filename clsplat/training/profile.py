@@ -23,6 +23,7 @@ STAGES = {
     "pixel_loss": "loss",
     "ssim_maps": "loss",
     "ssim_gradient": "loss",
+    "weight_entropy": "loss",
     "apply_mask": "loss",
     "covariance_trace": "loss",
     "anisotropy": "loss",

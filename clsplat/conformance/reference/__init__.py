@@ -18,6 +18,7 @@ from clsplat.conformance.reference.blending import (
     margin,
     render,
     render_backward,
+    weight_entropy,
 )
 from clsplat.conformance.reference.blur import (
     blurred,
@@ -136,4 +137,5 @@ __all__ = [
     "splitting",
     "ssim_map",
     "ssim_taps",
+    "weight_entropy",
 ]
