@@ -72,18 +72,21 @@ class SplitSaddle(Rule):
 
     def mark(self, edit: Edit) -> None:
         gaussians, extent = edit.gaussians, edit.scene_scale.extent
-        least, axes = least_axes(edit.stats.means("splitting").astype(np.float64) * extent**2)
-        candidates = (edit.rows() == 1) & (least < edit.at(self.eigenvalue_below))
-        candidates &= edit.stats.mean("screen_grad") >= edit.at(self.gradient_above)
-        chosen = largest(candidates, -least, len(least) if edit.room is None else max(edit.room, 0))
-        rows = np.flatnonzero(chosen)
+        steep = edit.stats.mean("screen_grad") >= edit.at(self.gradient_above)
+        rows = np.flatnonzero(steep & (edit.rows() == 1))
+        least, axes = least_axes(edit.stats.means("splitting")[rows].astype(np.float64) * extent**2)
+        room = len(rows) if edit.room is None else max(edit.room, 0)
+        lowest = largest(least < edit.at(self.eigenvalue_below), -least, room)
+        rows, axes = rows[lowest], axes[lowest]
         tables = {
             name: gaussians.get(name)[rows].astype(np.float64)
             for name in ("means", "quats", "log_scales", "logit_opacity")
         }
         covariance = covariance_of(tables["quats"], tables["log_scales"])
-        deviation = np.sqrt(np.einsum("ni,nij,nj->n", axes[rows], covariance, axes[rows]))
-        way = edit.at(self.distance) * deviation[:, None] * axes[rows]
+        deviation = np.sqrt(np.einsum("ni,nij,nj->n", axes, covariance, axes))
+        way = edit.at(self.distance) * deviation[:, None] * axes
+        chosen = np.zeros(gaussians.count, bool)
+        chosen[rows] = True
         edit.choose(chosen, copies=2, kept=0, shrink=1 / self.shrink)
         edit.set_children("means", rows, np.stack([tables["means"] + way, tables["means"] - way], axis=1))
         logits = divided_logits(tables["logit_opacity"], self.opacity)

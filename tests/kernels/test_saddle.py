@@ -264,6 +264,10 @@ def test_children_lie_along_the_axis_and_share_the_opacity(device, rng):
                 assert (after[table] == 0).all(), table
 
 
+def test_without_gaussians_nothing_happens(device, rng):
+    assert Edited(device, rng, np.zeros((0, 6))).apply(SplitSaddle()).after == 0
+
+
 def test_candidates_also_reach_the_gradient_and_belong_to_no_earlier_rule(device, rng):
     case = Edited(device, rng, diagonal(np.full((40, 3), -1.0)), screen_grad=np.tile([1e-4, 3e-4], 20))
     case.apply(SplitSaddle(gradient_above=2e-4))
