@@ -32,7 +32,7 @@ void blend_forward(
     __global const float *restrict splats,      // [N,RECORD]
     __constant float *restrict background,      // [3]
     __constant camera_t *restrict camera,       // [1]
-    __global float *restrict image,             // [3,tiles_y*TILE,tiles_x*TILE]
+    __global float *restrict image,             // [3 + WEIGHT_ENTROPY,tiles_y*TILE,tiles_x*TILE]
     __global float *restrict transmittance,     // [tiles_y*TILE,tiles_x*TILE]
     __global uint *restrict tile_last,          // [T] pairs of the tile up to the last that any pixel blends
     const uint first_tile)                      // of this launch
@@ -85,11 +85,15 @@ void blend_forward(
     image[plane + at] = inside ? p.green + t * background[1] : 0.0f;
     image[2 * plane + at] = inside ? p.blue + t * background[2] : 0.0f;
     transmittance[at] = inside ? t : 0.0f;
+#if WEIGHT_ENTROPY
+    image[3 * plane + at] = inside ? p.entropy - t * log_weight(t) : 0.0f;
+#endif
 }
 
 /* One item owns one splat of a batch and adds the tile's pixels one after another: at step s, item i computes pixel
  * s - i, which item i - 1 computed at the step before, so every pixel blends its splats front to back.  No atomics, no
- * sums across items.  Local memory: PIXELS * 20 bytes, 24 with a texture.  Deterministic. */
+ * sums across items.  Local memory: PIXELS * 20 bytes, * 24 with a texture or the entropy, * 28 with both.
+ * Deterministic. */
 __kernel __attribute__((reqd_work_group_size(SPLAT_GROUP, 1, 1)))
 void blend_backward(
     __global const uint *restrict tile_offset,  // [T+1]
@@ -97,8 +101,8 @@ void blend_backward(
     __global const uint *restrict pair_splat,   // [P]
     __global const float *restrict splats,      // [N,RECORD]
     __constant camera_t *restrict camera,       // [1]
-    __global const float *restrict image,       // [3,tiles_y*TILE,tiles_x*TILE]
-    __global const float *restrict grad_image,  // [3,tiles_y*TILE,tiles_x*TILE]
+    __global const float *restrict image,       // [3 + WEIGHT_ENTROPY,tiles_y*TILE,tiles_x*TILE]
+    __global const float *restrict grad_image,  // [3 + WEIGHT_ENTROPY,tiles_y*TILE,tiles_x*TILE]
     __global const float *restrict texture,     // [tiles_y*TILE,tiles_x*TILE] read where PIXEL_SUMS > SUM_WEIGHT
     __global const uint *restrict tile_last,    // [T]
     __global float *restrict pair_sums,         // [P,RECORD] in emission order
@@ -118,6 +122,10 @@ void blend_backward(
         p.rest = p.red * image[at] + p.green * image[plane + at] + p.blue * image[2 * plane + at];
 #if PIXEL_SUMS > SUM_WEIGHT
         p.texture = texture[at];
+#endif
+#if WEIGHT_ENTROPY
+        p.entropy = grad_image[3 * plane + at];
+        p.rest = p.rest - p.entropy * (1.0f - image[3 * plane + at]);
 #endif
         pixels[i] = p;
     }

@@ -5,7 +5,10 @@
  *
  * A splat contributes to a pixel when the pixel's row lies in its extent, power_min <= power <= 0 (power_min is where
  * alpha falls to 1/255) and blending it leaves transmittance >= 1e-4; the first splat that would leave less finishes
- * the pixel and is not blended (Kerbl et al. 2023).  A finished pixel stores its transmittance with a negative sign. */
+ * the pixel and is not blended (Kerbl et al. 2023).  A finished pixel stores its transmittance with a negative sign.
+ *
+ * With WEIGHT_ENTROPY the image and its gradient have a fourth plane, H = -sum_i w_i ln w_i - T ln T with w = alpha T
+ * and the last T: how far a pixel is from showing one splat alone. */
 #ifndef CLSPLAT_SPLAT_H
 #define CLSPLAT_SPLAT_H
 #include "lanes.h"
@@ -110,7 +113,13 @@ static inline contribution_t contribution_of(const row_splat_t s, const VF pixel
 /* State of LANES pixels going front to back: transmittance and colour. */
 typedef struct {
     VF t, red, green, blue;
+#if WEIGHT_ENTROPY
+    VF entropy;
+#endif
 } pixels_t;
+
+/* ln w; finite for the weight 0 of what is not blended. */
+static inline VF log_weight(const VF w) { return log_positive(larger(w, (VF)(1.0e-30f))); }
 
 static inline void blend(pixels_t *p, const row_splat_t s, const VF pixel, const float *colour)
 {
@@ -118,6 +127,9 @@ static inline void blend(pixels_t *p, const row_splat_t s, const VF pixel, const
     p->red += k.weight * colour[0];
     p->green += k.weight * colour[1];
     p->blue += k.weight * colour[2];
+#if WEIGHT_ENTROPY
+    p->entropy -= k.weight * log_weight(k.weight);
+#endif
     p->t = k.next;
 }
 
@@ -125,11 +137,17 @@ static inline VF magnitude(VF t) { return as_VF(as_VI(t) & 0x7fffffff); }
 
 /* State of LANES pixels for gradients: g = dL/dcolour of the pixel; rest = g . (colour that is blended after this
  * splat, background included), which starts as g . final colour.  Then dL/dalpha = t (c . g) - rest_after / (1 -
- * alpha): front to back, without dividing the transmittance. */
+ * alpha): front to back, without dividing the transmittance.
+ *
+ * The entropy adds -(ln w + 1) dL/dH to what a splat of weight w shows of g, c . g: the sum over all splats and the
+ * background starts as -(1 - H) dL/dH, since their weights have the sum 1. */
 typedef struct {
     VF t, rest, red, green, blue;
 #if PIXEL_SUMS > SUM_WEIGHT
     VF texture;
+#endif
+#if WEIGHT_ENTROPY
+    VF entropy;  // dL/dH
 #endif
 } grad_pixels_t;
 
@@ -138,7 +156,10 @@ static inline void blend_backward_step(grad_pixels_t *p, const row_splat_t s, co
 {
     const VF zero = (VF)(0.0f);
     const contribution_t k = contribution_of(s, pixel, p->t);
-    const VF shade = colour[0] * p->red + colour[1] * p->green + colour[2] * p->blue;
+    VF shade = colour[0] * p->red + colour[1] * p->green + colour[2] * p->blue;
+#if WEIGHT_ENTROPY
+    shade = shade - p->entropy * (log_weight(k.weight) + 1.0f);
+#endif
     p->rest = p->rest - k.weight * shade;
     const VF grad_alpha = p->t * shade - p->rest / k.remain;
     const VI passes = k.blended & (k.uncapped <= ALPHA_MAX);  // the cap passes no gradient

@@ -7,7 +7,7 @@ name it as soon as its class is defined, in the package or in a plug-in; there i
 import importlib
 import pkgutil
 import typing
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, GetCoreSchemaHandler, GetJsonSchemaHandler
@@ -123,13 +123,13 @@ ReadPath = Annotated[str, AfterValidator(_readable)]  # a file or folder that is
 
 
 class VariantName:
-    """Marks a field that accepts the name of one of the variants of a base."""
+    """Marks a field that accepts the name of one of the variants of a base, or of those that `accepts` is true of."""
 
-    def __init__(self, base: type[Settings]) -> None:
-        self.base = base
+    def __init__(self, base: type[Base], accepts: Callable[[type[Base]], bool] = lambda kind: True) -> None:
+        self.base, self._accepts = base, accepts
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        return core_schema.literal_schema(list(variants(self.base)))
+        return core_schema.literal_schema([name for name, kind in variants(self.base).items() if self._accepts(kind)])
 
 
 if TYPE_CHECKING:

@@ -32,6 +32,7 @@ pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = ROOT / "examples"
+VERBS = ("mark", "choose", "set_rows", "set_children")
 TESTED = {  # where
     **dict.fromkeys(("box_blur.py", "opacity_entropy.py"), "test_plugins.py"),
     "csv_reader.py": "test_csv_reader.py",
@@ -193,5 +194,5 @@ def test_the_verbs_of_an_edit_are_those_of_the_table():
         verb = operator.attrgetter(name)(edit)
         if arguments:
             known = inspect.signature(verb).parameters
-            named = [part for part in re.findall(r"[a-z_]+", arguments) if name in ("mark", "choose", "set_rows")]
+            named = [part for part in re.findall(r"[a-z_]+", arguments) if name in VERBS]
             assert set(named) <= set(known), f"edit.{name}"

@@ -156,8 +156,24 @@ DASH = {
     "densify.stop",
 }
 HAAR = {f"views.transforms.haar{key}" for key in ("", ".learn", ".rate", ".weight")}
+SADDLE = {
+    *(f"densify.rules.{rule}{key}" for rule in ("clone", "split") for key in ("", ".start", ".statistic", ".opacity")),
+    *(f"densify.rules.{rule}{key}" for rule in ("clone", "split") for key in (".as_many_as", ".gradient_above")),
+    *("densify.rules.clone.size_below", "densify.rules.split.size_above"),
+    *("densify.rules.split.children", "densify.rules.split.shrink"),
+    *(f"densify.rules.split_saddle{key}" for key in ("", ".start", ".eigenvalue_below", ".gradient_above")),
+    *(f"densify.rules.split_saddle{key}" for key in (".distance", ".shrink", ".opacity")),
+}
+CROWDED = {
+    *(f"densify.rules.clone_crowded{key}" for key in ("", ".start", ".gradient_above", ".size_below")),
+    *(f"densify.rules.clone_crowded{key}" for key in (".ratio_above", ".jitter", ".cells", ".extremes")),
+}
 DIFFERENCES = {
     ("splat", "splat_7k"): TWIN,
+    ("splat", "steep"): SADDLE,
+    ("steep", "steep_7k"): TWIN,
+    ("splat", "gdgs"): CROWDED,
+    ("gdgs", "gdgs_7k"): TWIN | {"densify.rules.clone_crowded.start"},
     ("splat", "mip_splatting"): SMOOTHING | MIP | REFRESH,
     ("splat", "mip_splatting_no_3d"): MIP,
     ("mip_splatting", "mip_splatting_no_2d"): {"model.screen_filter.variance"},

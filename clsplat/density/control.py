@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from clsplat.density.edit import Edit, Rule
+from clsplat.density.rows import apply_edit
 from clsplat.gaussians.tables import Gaussians
 from clsplat.render.tiles import Tiler
 
@@ -45,7 +46,7 @@ def densify(edit: Edit, rules: Sequence[Rule], tiler: Tiler, limit: int | None =
         name = getattr(rule, "type", "rule")
         causes[name] = causes.get(name, 0) + int((decided_by == number).sum())
         grown[name] = grown.get(name, 0) + int(((decided_by == number) & (rows > 1)).sum())
-    edit.apply(tiler)
+    apply_edit(edit, tiler)
     edit.stats.clear()
     return Change(before, gaussians.count, causes, grown)
 

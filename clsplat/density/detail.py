@@ -43,7 +43,7 @@ class Subdivide(Rule):
         edit.choose(chosen, copies=self.children, kept=0, shrink=self.beta**0.5)
 
 
-def largest(candidates: NDArray[np.bool_], score: NDArray[np.float32], limit: int) -> NDArray[np.bool_]:
+def largest(candidates: NDArray[np.bool_], score: NDArray[np.floating], limit: int) -> NDArray[np.bool_]:
     """Return which candidates, [N], have the largest scores: at most `limit` of them, ties by index."""
     places = np.flatnonzero(candidates)
     order = np.argsort(-score[places], kind="stable")

@@ -15,13 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from clsplat.density.outcomes import MAX_ROWS, outcomes_of, require_rows
+from clsplat.density.outcomes import outcomes_of, require_rows
 from clsplat.density.statistics import SEEN, SplatStats
 from clsplat.density.survey import Survey
 from clsplat.density.thresholds import PixelQuantile, Quantile, SceneScale, Threshold
-from clsplat.errors import ConfigError, MemoryLimitError
-from clsplat.gaussians.tables import PARAMETERS, Gaussians, moment_tables
-from clsplat.render.tiles import Tiler
+from clsplat.errors import ConfigError
+from clsplat.gaussians.tables import PARAMETERS, Gaussians, checked_rows, moment_tables
 from clsplat.schedule import Schedule, at_step
 from clsplat.settings import Settings
 
@@ -53,6 +52,7 @@ class Edit:
         self.shared = device.empty(count, np.uint32)
         self.rule = 0  # number of the rule that acts
         self.max_rows: int | None = None  # rows at which growth stops; None: no limit
+        self.children: list[tuple[str, NDArray[np.integer], NDArray[np.floating]]] = []  # what set_children was given
         self._program = device.program("density.cl")
         self._program.start_edit(items=count, **self._outcome, count=count)
 
@@ -153,6 +153,17 @@ class Edit:
         """Write values [n, components] into different rows, [n], of a table; fresh rows copy them."""
         self.gaussians.set_rows(name, rows, values)
 
+    def set_children(self, name: str, rows: NDArray[np.integer], values: NDArray[np.floating]) -> None:
+        """Write values [n, copies, components] into the rows that different Gaussians, [n], become, of a table.
+
+        Rows of Gaussians that become another number of them in the end, as where growth is undone, stay as they are.
+        Raises ValueError for other rows than in `checked_rows` and for values of another shape.
+        """
+        components = self.gaussians.tables[name].components
+        if values.ndim != 3 or len(values) != len(rows) or values.shape[2] != components:
+            raise ValueError(f"{name}: expected [{len(rows)}, copies, {components}], got {list(values.shape)}")
+        self.children.append((name, checked_rows(rows, self.gaussians.count), values))
+
     def zero_moments(self, rows: NDArray[np.integer], parameters: Collection[str] = PARAMETERS) -> None:
         """Set Adam's moments of different rows, [n], to zero."""
         names = [table for parameter in parameters for table in moment_tables(parameter)]
@@ -174,54 +185,16 @@ class Edit:
             array.set(np.where(refused, alone, array.get()))
 
     def limit(self, limit: int) -> None:
-        """Undo growth until at most `limit` rows remain; the smallest means of the first column come first."""
+        """Undo growth until at most `limit` rows remain; the smallest means of the first single column come first."""
         rows = self.rows().astype(np.int64)
         growing = np.flatnonzero(rows > 1)
-        score = self.stats.mean(self.stats.names[0]) if self.stats.names else np.zeros(len(rows), np.float32)
+        single = [name for name, column in self.stats.columns.items() if column.components == 1]
+        score = self.stats.mean(single[0]) if single else np.zeros(len(rows), np.float32)
         order = growing[np.argsort(-score[growing], kind="stable")]
         total = int(np.minimum(rows, 1).sum()) + np.cumsum(rows[order] - 1)
         refused = np.zeros(len(rows), bool)
         refused[order[total > limit]] = True
         self.undo_growth(refused)
-
-    def apply(self, tiler: Tiler) -> None:
-        """Rearrange all tables and place the children of split Gaussians.
-
-        Raises MemoryLimitError where these are more rows than memory holds; all tables stay as they are.
-        """
-        gaussians, device, count = self.gaussians, self.gaussians.device, self.gaussians.count
-        row_offset = tiler.scan(self.copies, count, "row_offset")
-        rows = int(row_offset.get_item(count))
-        if rows > MAX_ROWS:
-            raise MemoryLimitError(
-                f"step {self.step}: the rules ask for more than {MAX_ROWS:,} Gaussians; use densify.max_gaussians, or "
-                "rules that make fewer copies"
-            )
-        source, fresh = device.empty(rows, np.uint32), device.empty(rows, np.uint32)
-        places: dict[str, Any] = {
-            "copies": self.copies,
-            "kept": self.kept,
-            "row_offset": row_offset,
-            "source": source,
-            "fresh": fresh,
-        }
-        self._program.list_rows(items=count, **places, count=count)
-        gaussians.rearrange(source, fresh, rows)
-        self._program.spawn_children(
-            items=rows,
-            source=source,
-            kept=self.kept,
-            shrink=self.shrink,
-            quats=gaussians["quats"],
-            means=gaussians["means"],
-            log_scales=gaussians["log_scales"],
-            seed=self.seed,
-            step=self.step,
-            stride=gaussians.capacity,
-            count=rows,
-        )
-        sharing: dict[str, Any] = {"source": source, "copies": self.copies, "shared": self.shared}
-        self._program.share_opacity(items=rows, **sharing, logit_opacity=gaussians["logit_opacity"], count=rows)
 
 
 class Rule(Settings):

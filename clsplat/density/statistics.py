@@ -1,7 +1,8 @@
 """Statistics of each Gaussian over the views since the last edit, in named columns that density rules read.
 
-A column is a table `stats/<name>`: the sum of one number per view, over the views that see the Gaussian.  Its mean is
-the sum divided by the number of those views, or by another column.  Only columns that a rule reads are summed.
+A column is a table `stats/<name>`: the sum of one number per view, or of several, over the views that see the
+Gaussian.  Its mean is the sum divided by the number of those views, or by another column.  Only columns that a rule
+reads are summed.
 """
 
 from abc import abstractmethod
@@ -29,12 +30,13 @@ TEXTURE = int(constants("splat.h")["SUM_TEXTURE"])
 class Statistic(Settings):
     """A column, and how a view adds to it."""
 
+    components: ClassVar[int] = 1  # numbers of each Gaussian; rules that compare a mean with a threshold need 1
     pixel_sums: ClassVar[int] = PIXEL_SUMS  # number of sums over pixels that the backward pass must compute
     divisor: ClassVar[str] = "seen"  # column that divides the sum: views that see the Gaussian, or another column
 
     @abstractmethod
     def add(self, gaussians: Gaussians, view: ViewGradients, grad_mean2d: Array, total: Array) -> None:
-        """Add a view to `total`, [S].  grad_mean2d: [2, S] px⁻¹."""
+        """Add a view to `total`, [components, S].  grad_mean2d: [2, S] px⁻¹."""
 
 
 class ScreenGrad(Statistic):
@@ -130,7 +132,7 @@ class BlendWeight(Statistic):
         _add_pixel_sum(gaussians, view, WEIGHT, total)
 
 
-StatisticName = Annotated[str, VariantName(Statistic)]
+StatisticName = Annotated[str, VariantName(Statistic, lambda kind: kind.components == 1)]
 
 
 class SplatStats:
@@ -142,12 +144,12 @@ class SplatStats:
         known = variants(Statistic)
         needed = {*names, *(known[name].divisor for name in names)}
         self.columns = {name: kind() for name, kind in known.items() if name in needed}
-        tables = [*(FOLDER + name for name in self.columns), SEEN]
+        tables = {SEEN: 1} | {FOLDER + name: column.components for name, column in self.columns.items()}
         for name in [name for name in gaussians.tables if name.startswith(FOLDER) and name not in tables]:
             del gaussians.tables[name]
-        for name in tables:
+        for name, components in tables.items():
             if name not in gaussians.tables:
-                gaussians.add(name, 1, zero_fresh=True)
+                gaussians.add(name, components, zero_fresh=True)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -160,7 +162,7 @@ class SplatStats:
         return max((column.pixel_sums for column in self.columns.values()), default=PIXEL_SUMS)
 
     def total(self, name: str) -> Array:
-        """Return a column's sums over views, [S]."""
+        """Return a column's sums over views, [components, S]."""
         return self.gaussians[FOLDER + name]
 
     def divisor(self, name: str) -> Array:
@@ -183,7 +185,11 @@ class SplatStats:
 
     def mean(self, name: str) -> NDArray[np.float32]:
         """Return a column's mean for each Gaussian, on the host, [N]; 0 where the divisor is 0."""
-        total, divisor = (self.gaussians.get(FOLDER + table)[:, 0] for table in (name, self.columns[name].divisor))
+        return self.means(name)[:, 0]
+
+    def means(self, name: str) -> NDArray[np.float32]:
+        """Return the means of a column of several components, as `mean` does, [N, components]."""
+        total, divisor = (self.gaussians.get(FOLDER + table) for table in (name, self.columns[name].divisor))
         return np.divide(total, divisor, out=np.zeros_like(total), where=divisor > 0)
 
     def clear(self) -> None:

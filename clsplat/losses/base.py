@@ -26,6 +26,8 @@ from clsplat.views.transforms import PhotographTransform
 class Comparison:
     """A rendered image beside its photograph, float planes [3, rows, stride], and the gradient that losses add to.
 
+    Image and gradient have a fourth plane, the entropy of blend weights, where a loss reads it.
+
     Losses are means over the whole image, masked or not, so that a threshold means the same with and without a mask.
     """
 
@@ -96,6 +98,7 @@ class ImageLoss(Loss):
 
     symmetric: ClassVar[bool] = False
     """Whether it has the same value with image and photograph exchanged; a transform that learns needs that."""
+    reads_entropy: ClassVar[bool] = False  # the fourth plane of image and gradient, which then exists
 
     @abstractmethod
     def add(self, comparison: Comparison) -> LossValue:
@@ -212,7 +215,7 @@ class HostLoss(ImageLoss):
                 "expected finite numbers: look for a division, root or logarithm of 0 in it"
             )
         planes = comparison.gradient.get() if comparison.accumulate else np.zeros(comparison.gradient.shape, np.float32)
-        planes[:, :height, :width] += np.float32(weight) * derivative.transpose(2, 0, 1)
+        planes[:3, :height, :width] += np.float32(weight) * derivative.transpose(2, 0, 1)
         comparison.gradient.set(planes)
         comparison.accumulate = True
         return LossValue(self.name, lambda: weight * value)

@@ -9,7 +9,7 @@ import numpy as np
 from clsplat.errors import MemoryLimitError
 from clsplat.gaussians.tables import DeviceModel, Gradients
 from clsplat.opencl.device import Array, Device
-from clsplat.opencl.program import constants
+from clsplat.opencl.program import Program, constants
 from clsplat.render.camera import DeviceCamera
 from clsplat.render.tiles import Band, Footprints, Sort, TileLists, Tiler, TooManyPairs
 from clsplat.render.workspace import Workspace
@@ -17,7 +17,9 @@ from clsplat.render.workspace import Workspace
 RECORD = int(constants()["RECORD"])
 PIXEL_SUMS = int(constants()["PIXEL_SUMS"])
 MAX_PAIRS = 2**31  # more than fit in memory, and few enough for sums of 32 bits: no other limit
-Content = Literal["colour", "depth"]  # channels of the splats: colour, or (depth of the mean in scene units, 1, 0)
+Content = Literal["colour", "depth", "entropy"]
+# channels of the splats: colour, or (depth of the mean in scene units, 1, 0); or colour with a fourth plane of the
+# image, the entropy of a pixel's blend weights
 
 
 @dataclass(frozen=True)
@@ -29,7 +31,7 @@ class Frame:
     radius: Array  # [S] px, 3 standard deviations; 0: not seen
     lists: TileLists
     tile_last: Array  # [T] pairs of each tile up to the last that any pixel blends
-    image: Array  # [3, rows, stride], zero outside the image
+    image: Array  # [3, rows, stride], zero outside the image; with the entropy [4, rows, stride]
     transmittance: Array  # [rows, stride]
     bands: list[Band]  # `lists` belongs to the last one
     content: Content  # what was blended
@@ -55,7 +57,7 @@ class Rasterizer:
         self.workspace = Workspace(device)
         self.tiler = Tiler(device, self.workspace, sort)
         self._project = device.program("project.cl")
-        self._blend = device.program(f"blend_{device.schedule}.cl")
+        self._blend("colour")  # built at once, as the others
         self._lanes = int(device.tuning["LANES"])
         self._gradients: Gradients | None = None  # allocated at first use
 
@@ -90,14 +92,14 @@ class Rasterizer:
         array = self.workspace.array
         splats = array("splats", (model.gaussians.count, RECORD))
         radius = array("radius", model.gaussians.capacity)
-        image = array("image", (3, camera.rows, camera.stride))
+        image = array("image", (4 if content == "entropy" else 3, camera.rows, camera.stride))
         transmittance = array("transmittance", (camera.rows, camera.stride))
         tile_last = array("tile_last", camera.tiles, np.uint32)
         bands = self._split(camera)
         for band in bands:
             lists = self._project_band(model, camera, band, splats, radius, content)
             for first_tile, groups in self._launches(band):
-                self._blend.blend_forward(
+                self._blend(content).blend_forward(
                     groups=groups,
                     tile_offset=lists.tile_offset,
                     tile_pairs=lists.tile_pairs,
@@ -111,6 +113,12 @@ class Rasterizer:
                     first_tile=first_tile,
                 )
         return Frame(camera, splats, radius, lists, tile_last, image, transmittance, bands, content)
+
+    def _blend(self, content: Content, **defines: int) -> Program:
+        """The kernels of blending; without sums and entropy that nobody reads."""
+        if content == "entropy":
+            defines["WEIGHT_ENTROPY"] = 1
+        return self.device.program(f"blend_{self.device.schedule}.cl", **defines)
 
     def _split(self, camera: DeviceCamera) -> list[Band]:
         rows = np.linspace(0, camera.tiles_y, min(self._bands.get(camera.tiles_y, 1), camera.tiles_y) + 1).astype(int)
@@ -151,7 +159,7 @@ class Rasterizer:
     ) -> Array:
         """Return the sums over each Gaussian's pixels that give its gradients, [count, S]; see cl_kernels/splat.h.
 
-        grad_image: [3, rows, stride], zero outside the image.  A `count` above PIXEL_SUMS takes more time; those of
+        grad_image: as the frame's image, zero outside it.  A `count` above PIXEL_SUMS takes more time; those of
         the texture need `texture`, [rows, stride], below 0 where it is not known.  Memory as in `forward`.
         """
         bands = frame.bands
@@ -175,7 +183,7 @@ class Rasterizer:
                 lists = self._project_band(model, frame.camera, band, frame.splats, frame.radius, frame.content)
             pair_sums = self.workspace.array("pair_sums", (lists.pairs, RECORD))
             for first_tile, groups in self._launches(band):
-                self.device.program(f"blend_{self.device.schedule}.cl", **defines).blend_backward(
+                self._blend(frame.content, **defines).blend_backward(
                     groups=groups,
                     tile_offset=lists.tile_offset,
                     tile_pairs=lists.tile_pairs,

@@ -20,7 +20,7 @@ from clsplat.losses.base import (
 )
 from clsplat.opencl.device import Array
 from clsplat.opencl.program import constants
-from clsplat.render.rasterizer import Rasterizer
+from clsplat.render.rasterizer import Content, Rasterizer
 from clsplat.training.adam import Adam, Rates
 from clsplat.views.learned import LearnedTransform, learned_of, name_of
 from clsplat.views.photographs import Photograph, apply_mask
@@ -94,11 +94,16 @@ class Trainer:
                 raise ConfigError(f"the loss {type(loss).__name__}: expected a subclass of ImageLoss or of Penalty")
         require_symmetric(self.losses, transforms)
         workspace, camera, timings = self.rasterizer.workspace, photograph.camera, self.rasterizer.device.timings
-        frame = self.rasterizer.forward(self.model, camera, self.background)
+        reads_entropy = any(isinstance(loss, ImageLoss) and loss.reads_entropy for loss in self.losses)
+        content: Content = "entropy" if reads_entropy else "colour"
+        frame = self.rasterizer.forward(self.model, camera, self.background, content)
         timings.section = "loss"
         planes = photograph.planes(workspace, transforms, step, self.numbers)
-        gradient = workspace.array("grad_image", (3, camera.rows, camera.stride))
+        gradient = workspace.array("grad_image", frame.image.shape)
         comparison = Comparison(workspace, camera, frame.image, planes.colours, gradient, planes.mask, step)
+        if reads_entropy:  # losses of colours overwrite three planes alone
+            gradient.fill(0)
+            comparison.accumulate = True
         if planes.mask is not None:  # pixels that do not count are black in both images and have no gradient
             apply_mask(workspace, camera, frame.image, planes.mask)
             apply_mask(workspace, camera, planes.colours, planes.mask)

@@ -161,7 +161,8 @@ def unpack(workspace: Workspace, camera: DeviceCamera, pixels: Array, factor: fl
 
 
 def apply_mask(workspace: Workspace, camera: DeviceCamera, planes: Array, mask: Array) -> None:
-    """Set `planes` [3, rows, stride] to zero where the mask [1, rows, stride] is zero."""
+    """Set `planes` [channels, rows, stride] to zero where the mask [1, rows, stride] is zero."""
+    pixels = camera.rows * camera.stride
     workspace.device.program("loss.cl").apply_mask(
-        items=(camera.rows * camera.stride, 3), planes=planes, mask=mask, pixels=camera.rows * camera.stride
+        items=(pixels, planes.shape[0]), planes=planes, mask=mask, pixels=pixels
     )

@@ -6,6 +6,7 @@ import pytest
 from clsplat.conformance.scenes import random_case
 from clsplat.density.control import densify
 from clsplat.density.edit import Edit, Rule
+from clsplat.density.rows import apply_edit
 from clsplat.density.statistics import SplatStats
 from clsplat.density.thresholds import SceneScale
 from clsplat.errors import MemoryLimitError
@@ -123,7 +124,7 @@ def test_an_edit_with_more_rows_than_32_bits_count_is_refused_and_changes_nothin
     edit = edit_of(gaussians)
     edit.choose(np.ones(COUNT, bool), 2**32 // COUNT + 1, 1)
     with pytest.raises(MemoryLimitError, match="step 600: the rules ask for more than 4,294,967,294 Gaussians; use"):
-        edit.apply(Tiler(device, Workspace(device)))
+        apply_edit(edit, Tiler(device, Workspace(device)))
     assert gaussians.count == COUNT
     for table, planes in before.items():
         np.testing.assert_array_equal(gaussians[table].get(), planes, err_msg=table)

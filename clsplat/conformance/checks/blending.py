@@ -138,6 +138,24 @@ def statistics_of_blending(device: Device, rng: np.random.Generator) -> Iterator
     yield from sum_figures(case, pixel_sums_of(device, case, weights, WEIGHT + 2, texture=flags), weights, "fewer sums")
 
 
+@CHECKS.add("blend_forward", "blend_backward")
+def entropy_of_weights(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    for count, width, height in ((1, 16, 16), (17, 33, 15), (65, 24, 24)):
+        case, what = safe_case(rng, count, width, height, MARGIN), f"{count} Gaussians, {width} x {height} px"
+        rasterizer, model, camera = Rasterizer(device, "radix"), case.model(device), case.device_camera(device)
+        frame = rasterizer.forward(model, camera, device.upload(BACKGROUND), "entropy")
+        planes = frame.image.get()
+        yield equal(
+            "blend_forward", f"colours beside the entropy, {what}", planes[:3], render(device, case).image.get()
+        )
+        expected = ref.weight_entropy(case.project(), width, height)
+        yield from image_figures("blend_forward", f"entropy, {what}", planes[3:, :height, :width], expected[None])
+        weights = np.zeros((4, camera.rows, camera.stride), np.float32)
+        weights[:, :height, :width] = rng.normal(size=(4, height, width))
+        m = rasterizer.pixel_sums(model, frame, device.upload(weights)).get()[:, :count].T.astype(np.float64)
+        yield from sum_figures(case, m, weights[:, :height, :width], f"with the entropy, {what}")
+
+
 @CHECKS.add("sum_records")
 def sums_of_records(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
     lanes = int(device.tuning["LANES"])

@@ -1,4 +1,4 @@
-"""density.cl and noise.cl: statistics of views, rules, the rows that an edit makes, and means that move at random."""
+"""density.cl, saddle.cl and noise.cl: statistics of views, rules, the rows of an edit, and means moved at random."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -8,16 +8,17 @@ from numpy.typing import NDArray
 
 from clsplat.conformance import reference as ref
 from clsplat.conformance.check import Checks, Note
-from clsplat.conformance.checks.images import comparison_of, magnitude_of
-from clsplat.conformance.comparison import SUM, Figure, by_element, by_norm, equal
-from clsplat.conformance.scenes import random_case, with_world_filter
+from clsplat.conformance.checks.blending import BACKGROUND, MARGIN
+from clsplat.conformance.checks.images import comparison_of, magnitude_of, planes_of
+from clsplat.conformance.comparison import GRADIENT, SUM, Figure, by_element, by_norm, equal
+from clsplat.conformance.scenes import random_case, safe_case, with_world_filter
 from clsplat.density.basic import Clone, PruneFaint, PruneLarge, Split
 from clsplat.density.control import add_noise, cap_opacity, densify
 from clsplat.density.edit import Edit
 from clsplat.density.statistics import ABS_X, SEEN, WEIGHT, SplatStats
 from clsplat.density.thresholds import SceneScale
 from clsplat.gaussians.tables import Gaussians
-from clsplat.losses.base import ViewGradients
+from clsplat.losses.base import Comparison, ViewGradients
 from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.training.adam import Adam
@@ -64,6 +65,25 @@ def statistics(device: Device, rng: np.random.Generator) -> Iterator[Figure | No
         for (name, kernel), values in expected.items():
             found = gaussians.get(f"stats/{name}")[:, 0]
             yield by_element(kernel, f"{name} of {count} Gaussians", found, 2 * values * seen, SUM, floor=0.1)
+
+
+@CHECKS.add("accumulate_splitting")
+def splitting_matrices(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    for count in COUNTS:
+        case = safe_case(rng, count, 33, 31, MARGIN)
+        case.parameters["means"][1::4] -= 20 * case.view.world_to_camera[2, :3]  # behind the camera
+        model, camera = case.model(device), case.device_camera(device)
+        rasterizer, weights = Rasterizer(device, "radix"), rng.normal(size=(3, 31, 33)).astype(np.float32)
+        frame = rasterizer.forward(model, camera, device.upload(BACKGROUND))
+        pixel_sums = rasterizer.pixel_sums(model, frame, planes_of(device, camera, weights))
+        stats = SplatStats(model.gaussians, ("splitting",))
+        comparison = Comparison(rasterizer.workspace, camera, frame.image, frame.image, frame.image)
+        for _ in range(2):
+            stats.add(ViewGradients(frame, comparison, [], pixel_sums), pixel_sums)
+        on_screen = ref.screen_splitting(case.project(), 33, 31, BACKGROUND.astype(np.float64), weights)
+        expected = 2 * ref.splitting(case.gaussians(), case.camera(), on_screen)[:, *np.triu_indices(3)]
+        found = model.gaussians.get("stats/splitting")
+        yield by_norm("accumulate_splitting", f"matrices of {count} Gaussians", found, expected, GRADIENT)
 
 
 def _edited(device: Device, rng: np.random.Generator, count: int) -> tuple[dict[str, NDArray[Any]], Gaussians]:

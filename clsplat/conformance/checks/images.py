@@ -11,6 +11,7 @@ from clsplat.conformance import reference as ref
 from clsplat.conformance.check import Checks, Note
 from clsplat.conformance.comparison import LOSS_GRADIENT, SUM, Figure, by_element, equal
 from clsplat.losses.base import Comparison, ImageLoss
+from clsplat.losses.entropy import WeightEntropy
 from clsplat.losses.image import L1, L2, Dssim
 from clsplat.opencl.device import Array, Device
 from clsplat.render.camera import DeviceCamera
@@ -95,6 +96,20 @@ def losses_that_add_up(device: Device, rng: np.random.Generator) -> Iterator[Fig
         expected += weight * oracle(x.astype(np.float64), y.astype(np.float64))[1]
     error = np.abs(comparison.gradient.get()[:, :20, :50] - expected).max() / np.abs(expected).max()
     yield Figure("ssim_gradient", "sum of the gradients of three losses", float(error), LOSS_GRADIENT)
+
+
+@CHECKS.add("weight_entropy")
+def entropies(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    for width, height in SIZES:
+        x, what = rng.uniform(0, 1, (4, height, width)).astype(np.float32), f"{width} x {height} px"
+        comparison = comparison_of(device, x, x[:3])
+        comparison.gradient = device.zeros((4, comparison.camera.rows, comparison.camera.stride))
+        value = WeightEntropy(weight=0.7).add(comparison).value()
+        expected = np.array([0.7 * x[3].mean(dtype=np.float64)])
+        yield by_element("weight_entropy", f"value, {what}", np.array([value]), expected, SUM)
+        found, truth = comparison.gradient.get(), np.zeros(comparison.gradient.shape)
+        truth[3, :height, :width] = 0.7 / (width * height)
+        yield by_element("weight_entropy", f"gradient, {what}", found, truth, SUM, floor=1e-9)
 
 
 @CHECKS.add("unpack_pixels", "apply_mask")

@@ -19,6 +19,7 @@ from clsplat.conformance.reference.blending import (
     margin,
     render,
     render_backward,
+    weight_entropy,
 )
 from clsplat.conformance.reference.blur import (
     blurred,
@@ -79,6 +80,7 @@ from clsplat.conformance.reference.projection_backward import (
     ratio_gradient,
 )
 from clsplat.conformance.reference.random import normal3, philox
+from clsplat.conformance.reference.splitting import mean_jacobian, screen_splitting, splitting
 from clsplat.conformance.reference.world_filter import (
     filtered,
     sampling_interval,
@@ -116,6 +118,7 @@ __all__ = [
     "l2",
     "margin",
     "mean_gradient",
+    "mean_jacobian",
     "mean_opacity",
     "mean_scale",
     "member_sums",
@@ -134,10 +137,13 @@ __all__ = [
     "rotation_matrix",
     "sampling_interval",
     "screen_gradient",
+    "screen_splitting",
     "sh_basis",
     "sh_basis_gradient",
     "shared_logit",
     "split_children",
+    "splitting",
     "ssim_map",
     "ssim_taps",
+    "weight_entropy",
 ]

@@ -77,12 +77,59 @@ def blend_weights(splats: Splats, width: int, height: int, thresholds: Threshold
     return weights
 
 
+def weight_entropy(splats: Splats, width: int, height: int, thresholds: Thresholds = Thresholds()) -> NDArray[Any]:
+    """-Σ w ln w of the weights of all splats and of what they leave, [H,W]."""
+    weights = blend_weights(splats, width, height, thresholds)
+    weights = np.concatenate([weights, 1 - weights.sum(axis=0, keepdims=True)])
+    return -np.sum(weights * np.log(np.where(weights > 0, weights, 1)), axis=0)
+
+
+def entropy_gradients(splats: Splats, width: int, height: int, thresholds: Thresholds) -> Iterator[NDArray[Any]]:
+    """d(entropy)/d(alpha) of each splat front to back, [H,W]: -(ln w + 1) T + Σ_behind (ln w + 1) w / (1 - alpha)."""
+    steps = list(blend_steps(splats, width, height, thresholds))
+    weights = [np.where(step.blended, step.alpha * step.before, 0) for step in steps]
+    weights.append(1 - np.sum(weights, axis=0))
+    terms = [(np.log(np.where(weight > 0, weight, 1)) + 1) * weight for weight in weights]
+    for n, step in enumerate(steps):
+        own = (np.log(np.where(weights[n] > 0, weights[n], 1)) + 1) * step.before
+        yield -own + np.sum(terms[n + 1 :], axis=0) / (1 - step.alpha)
+
+
 def contribution(
     splats: Splats, width: int, height: int, mask: NDArray[Any] | None = None, thresholds: Thresholds = Thresholds()
 ) -> NDArray[Any]:
     """Blend weights summed over the pixels of a view that count, [N]; `mask`: [H,W], None: all count."""
     weights = blend_weights(splats, width, height, thresholds)
     return np.sum(weights if mask is None else weights * mask, axis=(1, 2))
+
+
+def alpha_gradients(
+    splats: Splats,
+    width: int,
+    height: int,
+    background: NDArray[Any],
+    grad_image: NDArray[Any],
+    thresholds: Thresholds = Thresholds(),
+) -> Iterator[tuple[BlendStep, NDArray[Any]]]:
+    """Each splat front to back with dL/dalpha, [H,W], in the prefix form; where alpha is capped it is zero.
+
+    grad_image: [3,H,W], or [4,H,W] with the derivative by the entropy of weights.
+    """
+    grad_image, grad_entropy = grad_image[:3], grad_image[3:]
+    entropy = entropy_gradients(splats, width, height, thresholds) if len(grad_entropy) else iter(())
+    image, final, _ = blend(splats, width, height, background, thresholds)
+    through_background = np.einsum("c,chw->hw", background, grad_image)
+    behind = image - np.asarray(background)[:, None, None] * final  # S_N - S_i, once splat i has been taken off
+    for step in blend_steps(splats, width, height, thresholds):
+        i, alpha, before = step.splat, step.alpha, step.before
+        colour = splats.colour[i][:, None, None]
+        behind = behind - colour * np.where(step.blended, alpha * before, 0)
+        grad_alpha = np.sum((colour * before - behind / (1 - alpha)) * grad_image, axis=0)
+        grad_alpha -= final / (1 - alpha) * through_background
+        if len(grad_entropy):
+            grad_alpha += grad_entropy[0] * next(entropy)
+        capped = splats.opacity[i] * step.falloff > thresholds.alpha_max
+        yield step, np.where(step.blended & ~capped, grad_alpha, 0)
 
 
 def blend_backward(
@@ -93,12 +140,12 @@ def blend_backward(
     grad_image: NDArray[Any],
     thresholds: Thresholds = Thresholds(),
 ) -> SplatGradients:
-    """Gradients of the splats, in the prefix form.  Where alpha is capped its derivative is zero."""
+    """Gradients of the splats; grad_image: as in `alpha_gradients`."""
     n = len(splats.opacity)
     grad = SplatGradients(np.zeros((n, 2)), np.zeros((n, 3)), np.zeros(n), np.zeros((n, 3)), np.zeros((n, 2)))
-    for step, grad_alpha in _alpha_gradients(splats, width, height, background, grad_image, thresholds):
+    for step, grad_alpha in alpha_gradients(splats, width, height, background, grad_image, thresholds):
         i = step.splat
-        grad.colour[i] = np.sum(grad_image * np.where(step.blended, step.alpha * step.before, 0), axis=(1, 2))
+        grad.colour[i] = np.sum(grad_image[:3] * np.where(step.blended, step.alpha * step.before, 0), axis=(1, 2))
         grad.opacity[i] = np.sum(step.falloff * grad_alpha)
         grad_sigma = -splats.opacity[i] * step.falloff * grad_alpha
         a, b, c = splats.conic[i]

@@ -1,0 +1,53 @@
+"""Whole runs with rules and losses of shipped recipes: what they decide, and that runs resume and repeat to the bit."""
+
+import json
+
+import numpy as np
+import pytest
+
+from clsplat.formats.table import read as read_ply
+from tests.test_training import train
+
+pytestmark = pytest.mark.slow
+
+PRUNE = "{type: prune_faint, opacity_below: 0.005}"
+SADDLE = "{type: split_saddle, gradient_above: 1.0e-5, distance: 0.5, shrink: 1.6}"
+CROWDED = "{type: clone_crowded, gradient_above: 1.0e-5, size_below: 0.1, ratio_above: 2.0, cells: 3, extremes: 8}"
+ENTROPY = "optimize.losses=[{type: l1, weight: 0.8}, {type: dssim, weight: 0.2}, {type: weight_entropy, weight: 0.05}]"
+CASES = {  # what acts -> settings
+    "split_saddle": (f"densify.rules=[{SADDLE}, {PRUNE}]",),
+    "clone_crowded": (f"densify.rules=[{CROWDED}, {{type: clone}}, {PRUNE}]",),
+    "weight_entropy": (ENTROPY,),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_runs_resume_and_repeat_to_the_bit(tiny_scene, tmp_path, name):
+    settings = (*CASES[name], "optimize.checkpoint.keep=9", "optimize.log_every=5")
+    first = train(tiny_scene, tmp_path / "first", *settings)
+    whole = (first.out / "point_cloud.ply").read_bytes()
+    lines = [json.loads(line) for line in (first.out / "metrics.jsonl").read_text().splitlines()]
+    edits = [line for line in lines if line["kind"] == "densify"]
+    assert name == "weight_entropy" or sum(edit["grown"][name] for edit in edits) > 20
+    again = train(tiny_scene, tmp_path / "again", *settings)
+    assert (again.out / "point_cloud.ply").read_bytes() == whole
+    for step in (30, 40, 50):
+        (again.out / "checkpoints" / f"step_{step:06d}.npz").unlink()
+    (again.out / "point_cloud.ply").unlink()
+    resumed = train(tiny_scene, tmp_path / "again", *settings, resume=True)
+    assert (resumed.out / "point_cloud.ply").read_bytes() == whole
+    assert resumed.records.read("densify") == first.records.read("densify")
+
+
+def test_the_entropy_makes_opacities_sharper_and_without_weight_changes_little(tiny_scene, tmp_path):
+    middling, losses = {}, "optimize.losses=[{type: l1, weight: 0.8}, {type: dssim, weight: 0.2}%s]"
+    for name, extra in (
+        ("none", ""),
+        ("zero", ", {type: weight_entropy, weight: 0.0}"),
+        ("heavy", ", {type: weight_entropy, weight: 1.0}"),
+    ):
+        run = train(tiny_scene, tmp_path / name, losses % extra, f"densify.rules=[{PRUNE}]")
+        opacity = 1 / (1 + np.exp(-read_ply(run.out / "point_cloud.ply").parameters["logit_opacity"].astype(float)))
+        middling[name] = np.mean(opacity * (1 - opacity))
+    assert middling["zero"] == pytest.approx(middling["none"], rel=1e-3)
+    assert middling["heavy"] < 0.8 * middling["none"]
