@@ -168,30 +168,9 @@ def falloff_squares(
 ) -> NDArray[Any]:
     """(dL/dG)² summed over pixels, [N], where alpha is the opacity times G."""
     squares = np.zeros(len(splats.opacity))
-    for step, grad_alpha in _alpha_gradients(splats, width, height, background, grad_image, thresholds):
+    for step, grad_alpha in alpha_gradients(splats, width, height, background, grad_image, thresholds):
         squares[step.splat] = np.sum((splats.opacity[step.splat] * grad_alpha) ** 2)
     return squares
-
-
-def _alpha_gradients(
-    splats: Splats,
-    width: int,
-    height: int,
-    background: NDArray[Any],
-    grad_image: NDArray[Any],
-    thresholds: Thresholds,
-) -> Iterator[tuple[BlendStep, NDArray[Any]]]:
-    """Walk through the splats front to back, each with dL/dalpha, [H,W]: 0 where alpha is capped."""
-    image, final, _ = blend(splats, width, height, background, thresholds)
-    through_background = np.einsum("c,chw->hw", background, grad_image)
-    behind = image - np.asarray(background)[:, None, None] * final  # S_N - S_i, once splat i has been taken off
-    for step in blend_steps(splats, width, height, thresholds):
-        colour = splats.colour[step.splat][:, None, None]
-        behind = behind - colour * np.where(step.blended, step.alpha * step.before, 0)
-        grad_alpha = np.sum((colour * step.before - behind / (1 - step.alpha)) * grad_image, axis=0)
-        grad_alpha -= final / (1 - step.alpha) * through_background
-        capped = splats.opacity[step.splat] * step.falloff > thresholds.alpha_max
-        yield step, np.where(step.blended & ~capped, grad_alpha, 0)
 
 
 class Margin(NamedTuple):
