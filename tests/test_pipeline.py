@@ -148,8 +148,9 @@ MINI = {
 }
 LEAST = ("prune_least", "prune_least~2")
 MEAN_FILTER = {f"views.transforms.mean_filter{key}" for key in ("", ".width.between", ".width.points")}
+MOMENTUM = (".gradient_above", ".growth", ".keep", ".most")
 DASH = {
-    *(f"densify.budget{key}" for key in ("", ".begin", ".gaussians", ".gradient_above", ".growth", ".keep", ".most")),
+    *(f"densify.budget{key}" for key in ("", ".begin", ".gaussians", ".per_pixel", *MOMENTUM)),
     *(f"views.resolution{key}" for key in ("", ".every", ".follows", ".largest", ".start", ".until")),
     *(f"rates.means.{key}" for key in ("over", "start", "until")),
     *(f"densify.rules.prune_large{key}" for key in ("", ".size_above", ".start")),
@@ -204,6 +205,7 @@ DIFFERENCES = {
     ("splat_7k", "opti3dgs_7k"): MEAN_FILTER,
     ("splat", "dash"): DASH | {"reset_opacity.stop", "rates.logit_opacity"},
     ("splat_7k", "dash_7k"): DASH,
+    ("dash_7k", "fast"): {"densify.budget.per_pixel"},
     ("mip_splatting", "dash_mip"): DASH | {"reset_opacity.stop", "rates.logit_opacity", "refresh_filter.start"},
     ("splat", "auto_opti3dgs"): HAAR,
     ("splat_7k", "auto_opti3dgs_7k"): HAAR,

@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Collection, Iterator
 from dataclasses import asdict
+from statistics import fmean
 from typing import ClassVar, Literal
 
 from pydantic import model_validator
@@ -78,5 +79,6 @@ class Densify(Scheduled):
             yield int(edit.at(self.max_gaussians))
         if self.budget and self.every and self.stop:
             left = len(range(run.step, self.stop, self.every))
-            moment = Moment(run.step / self.stop, left, run.divisor)
+            pixels = fmean(view.camera.width * view.camera.height for view in run.scene.split("train"))
+            moment = Moment(run.step / self.stop, left, run.divisor, pixels)
             yield self.budget.limit(edit, moment, run.numbers)
