@@ -26,6 +26,7 @@ from clsplat.density.statistics import SplatStats
 from clsplat.density.survey import Survey
 from clsplat.density.thresholds import SceneScale
 from clsplat.pipeline.loading import load
+from clsplat.pipeline.matrix import load_experiment
 from tests.html_page import Page
 
 pytestmark = pytest.mark.slow
@@ -149,6 +150,16 @@ def test_python_lines_of_the_documentation_run(page, code, tiny_scene, folder):
     assert steps == code.count("optimize.steps")
     exec(compile(code, page, "exec"), {})
     assert len(list(folder.glob("*.ply"))) == code.count(".save(")
+
+
+def test_the_methods_of_growth_are_compared_at_equal_length_and_seeds():
+    experiment = load_experiment(str(EXAMPLES / "growth.yaml"))
+    assert {cell.pipeline.settings.training.steps for cell in experiment.cells} == {7000}
+    names = [cell.pipeline.settings.name for cell in experiment.cells]
+    assert {"splat_7k", "dash_7k", "mcmc_7k", "steep_7k", "fast"} <= set(names)
+    assert {names.count(name) for name in names} == {3}
+    page = (EXAMPLES.parent / "docs" / "growth.md").read_text()
+    assert all(f"`{name}`" in page or f"`{name.removesuffix('_7k')}`" in page for name in names)
 
 
 def test_growing_resolution_is_a_pipeline():

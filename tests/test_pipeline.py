@@ -205,7 +205,7 @@ DIFFERENCES = {
     ("splat_7k", "opti3dgs_7k"): MEAN_FILTER,
     ("splat", "dash"): DASH | {"reset_opacity.stop", "rates.logit_opacity"},
     ("splat_7k", "dash_7k"): DASH,
-    ("dash_7k", "fast"): {"densify.budget.per_pixel"},
+    ("dash_7k", "fast"): {"densify.budget.per_pixel", "stages.init.count"},
     ("mip_splatting", "dash_mip"): DASH | {"reset_opacity.stop", "rates.logit_opacity", "refresh_filter.start"},
     ("splat", "auto_opti3dgs"): HAAR,
     ("splat_7k", "auto_opti3dgs_7k"): HAAR,
