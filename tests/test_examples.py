@@ -156,7 +156,7 @@ def test_the_methods_of_growth_are_compared_at_equal_length_and_seeds():
     experiment = load_experiment(str(EXAMPLES / "growth.yaml"))
     assert {cell.pipeline.settings.training.steps for cell in experiment.cells} == {7000}
     names = [cell.pipeline.settings.name for cell in experiment.cells]
-    assert {"splat_7k", "dash_7k", "mcmc_7k", "steep_7k", "fast"} <= set(names)
+    assert {"splat_7k", "dash_7k", "mcmc_7k", "steep_7k"} <= set(names)
     assert {names.count(name) for name in names} == {3}
     page = (EXAMPLES.parent / "docs" / "growth.md").read_text()
     assert all(f"`{name}`" in page or f"`{name.removesuffix('_7k')}`" in page for name in names)

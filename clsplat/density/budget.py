@@ -4,7 +4,7 @@ from abc import abstractmethod
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from clsplat.density.edit import Edit
 from clsplat.schedule import Positive
@@ -18,7 +18,6 @@ class Moment:
     share: float  # of the steps up to the end of edits
     edits: int  # that are left, with this one
     divisor: float  # of the photographs' size
-    pixels: float  # of a photograph in its full size, the mean
 
 
 class Budget(Settings):
@@ -46,13 +45,11 @@ class Momentum(Budget):
 
     type: Literal["momentum"] = "momentum"
     training_keys: ClassVar[frozenset[str]] = frozenset(
-        {"gaussians", "per_pixel", "begin", "keep", "gradient_above", "most", "growth"}
+        {"gaussians", "begin", "keep", "gradient_above", "most", "growth"}
     )
 
     gaussians: Annotated[int, Field(gt=0)] | None = None
-    """Number at the end; without it and `per_pixel`, the one that growth finds."""
-    per_pixel: Annotated[float, Field(gt=0)] | None = None
-    """Number at the end by the pixels of a training photograph, in the place of `gaussians`."""
+    """Number at the end; without it, the one that growth finds."""
     begin: Annotated[float, Field(gt=0)] = 5.0
     """First value of the sum, as a multiple of the Gaussians at the start."""
     keep: Annotated[float, Field(ge=0, lt=1)] = 0.98
@@ -64,12 +61,6 @@ class Momentum(Budget):
     growth: Annotated[float, Field(gt=0)] = 0.2
     """Largest share of the Gaussians that one edit adds."""
 
-    @model_validator(mode="after")
-    def _one_number(self) -> "Momentum":
-        if self.gaussians and self.per_pixel:
-            raise ValueError("expected one of 'gaussians' and 'per_pixel'")
-        return self
-
     @property
     def statistics(self) -> set[str]:
         return {"screen_grad"}
@@ -78,8 +69,7 @@ class Momentum(Budget):
         count = edit.gaussians.count
         begin = numbers.setdefault("momentum.start", count)
         momentum = numbers.setdefault("momentum.sum", self.begin * begin)
-        given = self.gaussians or (self.per_pixel and self.per_pixel * moment.pixels)
-        end = given or begin + momentum
+        end = self.gaussians or begin + momentum
         target = end if moment.edits == 1 else begin + (end - begin) / moment.divisor ** (2 - moment.share)
         eager = int((edit.stats.mean("screen_grad") >= edit.at(self.gradient_above)).sum())
         numbers["momentum.sum"] = max(momentum, float(int(self.keep * momentum + min(self.most, eager))))

@@ -3,7 +3,6 @@
 import logging
 from collections.abc import Collection, Iterator
 from dataclasses import asdict
-from statistics import fmean
 from typing import ClassVar, Literal
 
 from pydantic import model_validator
@@ -79,6 +78,5 @@ class Densify(Scheduled):
             yield int(edit.at(self.max_gaussians))
         if self.budget and self.every and self.stop:
             left = len(range(run.step, self.stop, self.every))
-            pixels = fmean(view.camera.width * view.camera.height for view in run.scene.split("train"))
-            moment = Moment(run.step / self.stop, left, run.divisor, pixels)
+            moment = Moment(run.step / self.stop, left, run.divisor)
             yield self.budget.limit(edit, moment, run.numbers)
