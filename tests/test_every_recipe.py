@@ -39,7 +39,7 @@ for name in sys.argv[3:]:
 
 def short(name: str, scene: Path) -> Pipeline:
     """A recipe in STEPS steps, with edits every 4, without pictures and pages."""
-    pipeline = load(name, [f"scene.path='{scene}'"])
+    pipeline = load(name, [f"scene.path='{scene}'", "init.opacity=0.3"])  # faint ones have no time to become opaque
     settings = stretched(pipeline.settings, STEPS / pipeline.settings.training.steps)
     stages = [often(stage) if isinstance(stage, Optimize) else stage for stage in settings.stages]
     kept = [stage for stage in stages if stage.stage in ("init", "optimize", "export")]
@@ -47,7 +47,8 @@ def short(name: str, scene: Path) -> Pipeline:
 
 
 def often(loop: Optimize) -> Optimize:
-    during = [stage for stage in loop.during if not isinstance(stage, Evaluate)]
+    """Edits every few steps; without resets to faint, from which so few steps do not recover."""
+    during = [stage for stage in loop.during if not isinstance(stage, Evaluate) and getattr(stage, "to", 1) > 0.01]
     return loop.model_copy(update={"during": [acting(stage) for stage in during]})
 
 

@@ -6,6 +6,7 @@ import re
 
 import pytest
 
+from clsplat.density import control
 from clsplat.density.statistics import SplatStats
 from clsplat.errors import DataError, DeviceError, InternalError, OutputError, as_clsplat_error
 from clsplat.opencl.program import Kernel
@@ -123,19 +124,18 @@ def test_a_report_that_fails_is_written_when_the_run_goes_on(tiny_scene, tmp_pat
     assert digest(tmp_path) == digest(few_steps)
 
 
-@pytest.mark.parametrize("place", ["SplatStats.add", "Edit.apply"])
+@pytest.mark.parametrize("place", ["SplatStats.add", "density edit"])
 def test_a_step_that_is_half_done_is_not_saved(place, tiny_scene, tmp_path, monkeypatch, few_steps, caplog):
-    name, method = place.split(".")
-    kind = {"SplatStats": SplatStats, "Edit": __import__("clsplat.density.edit", fromlist=["Edit"]).Edit}[name]
-    before, calls = getattr(kind, method), []
+    of, name, at = (SplatStats, "add", 7) if place == "SplatStats.add" else (control, "apply_edit", 2)
+    before, calls = getattr(of, name), []
 
     def fail(*arguments):
         calls.append(1)
-        if len(calls) == (7 if name == "SplatStats" else 2):
+        if len(calls) == at:
             raise MemoryError
         return before(*arguments)
 
-    monkeypatch.setattr(kind, method, fail)
+    monkeypatch.setattr(of, name, fail)
     with pytest.raises(Exception, match="out of memory"):
         train(tiny_scene, tmp_path, *FEW)
     monkeypatch.undo()
