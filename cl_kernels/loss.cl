@@ -22,6 +22,14 @@ static inline VF inside_row(const uint column, const uint width)
     return (LANE_INDEX + (int)column) < (int)width ? (VF)(1.0f) : (VF)(0.0f);
 }
 
+static inline float sum_items(__local const float *sums)  // [TEAM]
+{
+    float sum = 0.0f;
+    for (uint i = 0; i < TEAM; i++)
+        sum += sums[i];
+    return sum;
+}
+
 /* 8-bit pixels times a factor to float planes.  One item = one pixel of one channel; dimensions x, y, channel. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void unpack_pixels(
@@ -163,12 +171,8 @@ void ssim_maps(
     }
     sums[item] = sum_lanes(total);
     barrier(CLK_LOCAL_MEM_FENCE);
-    if (item == 0) {
-        float sum = 0.0f;
-        for (uint i = 0; i < TEAM; i++)
-            sum += sums[i];
-        block_sums[(channel * height + y) * get_num_groups(0) + get_group_id(0)] = sum;
-    }
+    if (item == 0)
+        block_sums[(channel * height + y) * get_num_groups(0) + get_group_id(0)] = sum_items(sums);
 }
 
 /* gradient (+)= scale (W * d_mean + 2 x (W * d_variance) + y (W * d_covariance)), W * the window.
@@ -246,10 +250,6 @@ void weight_entropy(
     }
     sums[item] = sum_lanes(total);
     barrier(CLK_LOCAL_MEM_FENCE);
-    if (item == 0) {
-        float sum = 0.0f;
-        for (uint i = 0; i < TEAM; i++)
-            sum += sums[i];
-        row_sums[y] = sum;
-    }
+    if (item == 0)
+        row_sums[y] = sum_items(sums);
 }

@@ -51,3 +51,21 @@ def test_the_entropy_makes_opacities_sharper_and_without_weight_changes_little(t
         middling[name] = np.mean(opacity * (1 - opacity))
     assert middling["zero"] == pytest.approx(middling["none"], rel=1e-3)
     assert middling["heavy"] < 0.8 * middling["none"]
+
+
+def test_growth_along_the_parabola_ends_at_the_number_and_not_above(tiny_scene, tmp_path):
+    """Every Gaussian may grow at each of the five edits, 10 to 30, of which the draws take as many as the curve has."""
+    settings = [
+        *(
+            "optimize.steps=40",
+            "init.source=random",
+            "init.count=100",
+            "densify.every=5",
+            "densify.start=5",
+            "densify.stop=31",
+        ),
+        *("densify.budget={type: parabola, gaussians: 300}", "optimize.evaluate.every=100", "reset_opacity.every=1000"),
+        "densify.rules=[{type: clone, gradient_above: 1.0e-12, size_below: 100.0}, {type: grow_scored, views: 3}]",
+    ]
+    edits = train(tiny_scene, tmp_path / "run", *settings).records.read("densify")
+    assert [edit["after"] for edit in edits] == [172, 228, 268, 292, 300]

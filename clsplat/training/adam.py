@@ -12,8 +12,6 @@ from clsplat.render.rasterizer import Frame, shape_arguments
 from clsplat.schedule import Decay, NonNegative, at_step, explained
 from clsplat.settings import Settings
 
-Positive = Annotated[float, Field(gt=0)]
-
 
 class FullSizeDecay(Settings):
     """The initial value as long as photographs have less than their full size, then an exponential decay (DashGaussian,
@@ -25,9 +23,9 @@ class FullSizeDecay(Settings):
     """`full_size`: the first step at the full size of the photographs."""
     until: Annotated[int, Field(gt=0)]
     """Global step from which the value is the final one."""
-    initial: Positive
+    initial: Annotated[float, Field(gt=0)]
     """The value before the decay."""
-    final: Positive
+    final: Annotated[float, Field(gt=0)]
     """The value after it."""
 
     def from_step(self, step: int) -> Decay:
