@@ -12,8 +12,8 @@ import pytest
 from clsplat.pipeline.files import shipped
 from clsplat.pipeline.loading import Pipeline, load
 from clsplat.pipeline.stretching import stretched
-from clsplat.runs.experiment import run_pipeline
-from clsplat.stages.base import Scheduled
+from clsplat.runs.single import run_pipeline
+from clsplat.stages.base import Stage
 from clsplat.stages.evaluate import Evaluate
 from clsplat.stages.optimize import Optimize
 from clsplat.training import checkpoint, records
@@ -42,19 +42,21 @@ def short(name: str, scene: Path) -> Pipeline:
     """A recipe in STEPS steps, with edits every 4, without pictures and pages."""
     pipeline = load(name, [f"scene.path='{scene}'", "init.opacity=0.3"])  # faint ones have no time to become opaque
     settings = stretched(pipeline.settings, STEPS / pipeline.settings.training.steps)
-    stages = [often(stage) if isinstance(stage, Optimize) else stage for stage in settings.stages]
+    pairs = zip(pipeline.stages, settings.stages, strict=True)
+    stages = [often(old, stage) if isinstance(stage, Optimize) else stage for old, stage in pairs]
     kept = [stage for stage in stages if stage.stage in ("init", "optimize", "export")]
     return Pipeline(pipeline.path, settings.model_copy(update={"stages": kept}))
 
 
-def often(loop: Optimize) -> Optimize:
+def often(old: Stage, loop: Optimize) -> Optimize:
     """Edits every few steps; without resets to faint, from which so few steps do not recover."""
-    during = [stage for stage in loop.during if not isinstance(stage, Evaluate) and getattr(stage, "to", 1) > 0.01]
-    return loop.model_copy(update={"during": [acting(stage) for stage in during]})
-
-
-def acting(stage: Scheduled) -> Scheduled:
-    return stage.model_copy(update={"every": 4}) if stage.every and stage.every > STEPS else stage
+    assert isinstance(old, Optimize)
+    during = [
+        stage.model_copy(update={"every": 4}) if before.every != 1 and stage.stage != "raise_sh" else stage
+        for before, stage in zip(old.during, loop.during, strict=True)
+        if not isinstance(stage, Evaluate) and getattr(stage, "to", 1) > 0.01
+    ]
+    return loop.model_copy(update={"during": during})
 
 
 def train(pipeline: Pipeline, out: Path, resume: bool = False) -> str:

@@ -8,7 +8,7 @@ import pytest
 
 import clsplat
 from clsplat.errors import ConfigError
-from clsplat.runs import experiment
+from clsplat.runs import single
 from tests.test_cli import clsplat as command
 
 pytestmark = pytest.mark.slow
@@ -52,7 +52,7 @@ def test_a_folder_with_files_of_others_stays(tiny_scene, tmp_path, monkeypatch):
         (out / "notes.txt").write_text("mine")
         raise ConfigError("refused")
 
-    monkeypatch.setattr(experiment.opening, "open_run", open_run)
+    monkeypatch.setattr(single.opening, "open_run", open_run)
     with pytest.raises(ConfigError, match="refused"):
         clsplat.run("smoke", tiny_scene, tmp_path / "run")
     assert (tmp_path / "run" / "notes.txt").read_text() == "mine"

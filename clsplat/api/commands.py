@@ -27,16 +27,18 @@ def run(
     device: "str | Device | None" = None,
     start: Literal["new", "resume", "restart"] = "new",
     live: int | None = None,
+    minutes: float | None = None,
 ) -> Path:
     """Run a pipeline or a matrix, as `clsplat run` does; return the run folder.
 
     pipeline: a file, or the name of a shipped one; scene: default that of the pipeline; out: default runs/NAME; set:
     settings by place, such as {"optimize.steps": 3000}; start: "resume" goes on from the newest checkpoint in `out`, if
     there is one, "restart" begins again where `out` holds a run, and removes its checkpoints and metrics; live: the
-    port of a page on this machine that shows the model while it trains, 0 for the usual one.
+    port of a page on this machine that shows the model while it trains, 0 for the usual one; minutes: the time that the
+    run takes once its photographs are read, in as many steps as fit: they are chosen before it starts.
     """
     job = _job(pipeline, scene, out, set, start)
-    job.run(device, live)
+    job.run(device, live, minutes)
     return job.out
 
 

@@ -16,6 +16,7 @@ from clsplat.errors import ConfigError, DataError, OutputError
     "clsplat run splat_7k --scene my_scene",
     "clsplat run splat_7k --scene my_scene --out runs/a --set optimize.steps=3000",
     "clsplat run splat_7k --scene my_scene --live",
+    "clsplat run splat_7k --scene my_scene --minutes 5",
 )
 def run(
     pipeline: PipelineArgument,
@@ -34,15 +35,23 @@ def run(
     ] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Check everything and say what would run.")] = False,
     live: LiveOption = None,
+    minutes: Annotated[
+        float | None,
+        typer.Option(metavar="M", help="The time that it takes: trains in as many steps as fit, which it says before."),
+    ] = None,
 ) -> None:
     """Run a pipeline, or all cells of a matrix."""
+    if minutes is not None and dry_run:
+        raise ConfigError("--minutes rehearses the pipeline on the device, which --dry-run does not; give one of them")
     if resume and restart:
         raise ConfigError("--resume goes on with a run and --restart begins it again; give one of them")
     start: Literal["new", "resume", "restart"] = "resume" if resume else "restart" if restart else "new"
     if dry_run:
         terminal.show(commands.describe_run(pipeline, scene, out, set=set_ or (), device=device, start=start))
     else:
-        found = commands.run(pipeline, scene, out, set=set_ or (), device=device, start=start, live=live)
+        found = commands.run(
+            pipeline, scene, out, set=set_ or (), device=device, start=start, live=live, minutes=minutes
+        )
         _show_summary(found)
 
 

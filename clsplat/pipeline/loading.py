@@ -32,6 +32,8 @@ class Pipeline:
 
     path: Path
     settings: PipelineFile
+    reason: str = ""
+    """Why settings are others than those of the file, in one line."""
 
     @property
     def names(self) -> list[str]:

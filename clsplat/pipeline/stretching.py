@@ -1,4 +1,7 @@
-"""A pipeline in another number of steps: what is a place or a length in its training is multiplied, cadences stay."""
+"""A pipeline in another number of steps: places, lengths and cadences of its training are multiplied.
+
+So as many edits are made, each at the same share of the training.
+"""
 
 import math
 from typing import Any, TypeVar
@@ -29,8 +32,9 @@ def _stretched(value: Any, factor: float) -> Any:
 
 
 def _steps(name: str, steps: Any, factor: float) -> Any:
-    """A number of steps; what ends before a step ends after the last of the steps before it."""
-    if not isinstance(steps, int) or steps == 0:
+    """A number of steps; what ends before a step ends after the last of the steps before it, what acts at each step
+    acts at each."""
+    if not isinstance(steps, int) or steps == 0 or (name == "every" and steps == 1):
         return steps
     return math.ceil(steps * factor) if name == "stop" else max(1, math.floor(steps * factor))
 

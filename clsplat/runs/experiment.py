@@ -2,8 +2,9 @@
 
 import json
 import logging
+import math
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -13,21 +14,20 @@ from clsplat.compare.page import write_comparison
 from clsplat.errors import ClsplatError, ConfigError, DataError, Interrupted, as_clsplat_error, one_line
 from clsplat.files import is_there, write_text
 from clsplat.live.live import Live
-from clsplat.names import COMPARISON, LOG_FILE, OF_A_MATRIX, PIPELINE, STATUS
+from clsplat.names import COMPARISON, OF_A_MATRIX, PIPELINE, STATUS
 from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import Pipeline, load
 from clsplat.pipeline.matrix import Experiment, load_experiment
 from clsplat.pipeline.yaml_file import read_yaml
-from clsplat.runs import description, folders, opening, outputs, runner
+from clsplat.runs import description, folders, outputs
 from clsplat.runs.course import is_finished
 from clsplat.runs.default_folder import free_folder, start_of
 from clsplat.runs.failures import failures_recorded
 from clsplat.runs.folders import Start
 from clsplat.runs.found import has_ended
 from clsplat.runs.scenes import read_run_scene
+from clsplat.runs.single import run_pipeline
 from clsplat.runs.source import photographs_of
-from clsplat.runs.summary import summary
-from clsplat.signals import stop_at_once, stop_if_signalled, stopping_on_signals
 from clsplat.training.status import StatusFile
 
 LOG = logging.getLogger("clsplat")
@@ -81,15 +81,24 @@ class Job:
             return describe_matrix(self.work, self.out, device, self.start)
         return description.describe(self.work, self.out, device, self.start)
 
-    def run(self, device: str | Device | None = None, live: int | None = None) -> None:
+    def run(self, device: str | Device | None = None, live: int | None = None, minutes: float | None = None) -> None:
         """Run it; what is up to date is left alone.  Raises ClsplatError; status.json tells why.
 
-        live: the port of a live preview, 0 for any; None: there is none.
+        live: the port of a live preview, 0 for any; None: there is none.  minutes: that it takes, from when its
+        photographs are read, in as many steps as fit.
         """
+        if minutes is not None and not 0 < minutes < math.inf:
+            raise ConfigError(f"--minutes {minutes:g}: expected a number of minutes above 0")
+        if minutes is not None and isinstance(self.work, Experiment):
+            raise ConfigError(
+                "--minutes: expected a single run; a matrix has several: give optimize.steps in its cells"
+            )
+        if minutes is not None and self.start == "resume":
+            raise ConfigError("--minutes is for a new run, whose steps it chooses; leave it out to go on with this one")
         with previewed(live) as preview:
-            self._run(device, preview)
+            self._run(device, preview, minutes)
 
-    def _run(self, device: str | Device | None, live: Live | None) -> None:
+    def _run(self, device: str | Device | None, live: Live | None, minutes: float | None) -> None:
         if isinstance(self.work, Experiment):
             run_matrix(self.work, self.out, device, self.start, live)
             return
@@ -101,7 +110,7 @@ class Job:
             remedy = f"`clsplat resume {self.out} --scene DIR` says where they are now"
             raise DataError(f"{self.out}: the folder of its photographs, {folder}, is missing; {remedy}")
         else:
-            run_pipeline(self.work, self.out, device, start, live)
+            run_pipeline(self.work, self.out, device, start, live, minutes)
 
 
 @contextmanager
@@ -113,28 +122,6 @@ def previewed(port: int | None) -> Iterator[Live | None]:
     with Live(port) as live:
         terminal.remark(live.text)  # not in the log, which others may read: its address is a secret
         yield live
-
-
-def run_pipeline(
-    pipeline: Pipeline, out: Path, device: str | Device | None, start: Start, live: Live | None = None
-) -> None:
-    """Run one pipeline in its folder, with a log and a progress bar.  Raises ClsplatError; status.json tells why."""
-    outputs.check_places(pipeline, out)
-    with (
-        folders.opened(out, start, step=0) as status,
-        stopping_on_signals(stop_at_once),
-        failures_recorded(status),
-        terminal.logging_to(out / LOG_FILE),
-    ):
-        if live:
-            live.follow(status)
-        with terminal.counted():
-            run = opening.open_run(pipeline, out, device, start, status)
-            stop_if_signalled()
-        with terminal.progress_bar(status) as show, live.showing(run) if live else nullcontext():
-            runner.execute(pipeline, run, start, live.reporting(show) if live else show)
-        for line in summary(out):
-            LOG.debug("%s", line)  # who asked for the run shows it
 
 
 def run_matrix(

@@ -33,7 +33,7 @@ def execute(pipeline: Pipeline, run: Run, start: Start, show: Callable[[Progress
     lost = begin(pipeline, run, start)
     with finishing_on_interrupt(run), saved_on_failure(run):
         _write_again(pipeline, run, lost)
-        _run_stages(pipeline, run)
+        run_stages(pipeline, run)
     for finding in few_views(len(run.original.train)):
         LOG.warning("%s", finding.text)
     run.status.require_held()
@@ -57,7 +57,8 @@ def begin(pipeline: Pipeline, run: Run, start: Start) -> Lost:
     run.status.enter("running", step=run.step)  # a refusal leaves all as it was; from here on files change
     lost = keep_checksums(Course(pipeline, run.out, run), run)
     checkpoint.drop_later(run.out, taken)
-    write_text(run.out / PIPELINE, f"{RESOLVED}{pipeline.path.name}\n{pipeline.text()}")
+    reason = f"# {pipeline.reason}\n" if pipeline.reason else ""
+    write_text(run.out / PIPELINE, f"{RESOLVED}{pipeline.path.name}\n{reason}{pipeline.text()}")
     write_inputs(run)
     if run.prepared:
         write_text(run.out / NOTE, json.dumps(run.prepared) + "\n")
@@ -110,7 +111,8 @@ def _write_again(pipeline: Pipeline, run: Run, lost: Lost) -> None:
         LOG.warning("%s: is missing or was changed since it was written, and cannot be made again", file)
 
 
-def _run_stages(pipeline: Pipeline, run: Run) -> None:
+def run_stages(pipeline: Pipeline, run: Run) -> None:
+    """Run the stages from where the run stands on."""
     for cursor, stage in enumerate(pipeline.stages):
         if cursor < run.cursor:
             continue

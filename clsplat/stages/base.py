@@ -93,7 +93,7 @@ class Scheduled(Stage):
     """
 
     training_keys: ClassVar[frozenset[str]] = CADENCE
-    step_keys: ClassVar[frozenset[str]] = frozenset({"start", "stop"})
+    step_keys: ClassVar[frozenset[str]] = CADENCE
     ends: ClassVar[bool] = False  # whether it runs after the last step of the training too
 
     every: Annotated[int, Field(gt=0)] | None = None

@@ -16,7 +16,6 @@ class RaiseSh(Scheduled):
     stage: Literal["raise_sh"] = "raise_sh"
     needs: ClassVar[frozenset[str]] = frozenset({"model"})
     edits: ClassVar[bool] = True
-    step_keys: ClassVar[frozenset[str]] = frozenset({"every"})
 
     def run(self, run: Run) -> None:
         model = run.model
@@ -33,7 +32,6 @@ class ResetOpacity(Scheduled):
     needs: ClassVar[frozenset[str]] = frozenset({"model"})
     edits: ClassVar[bool] = True
     training_keys: ClassVar[frozenset[str]] = frozenset({"to"})
-    step_keys: ClassVar[frozenset[str]] = frozenset({"every"})
 
     to: Annotated[float, Field(gt=0, lt=1)] = 0.01
     """Largest opacity after the reset."""

@@ -14,9 +14,9 @@ from clsplat.opencl.device import Device
 from clsplat.pipeline.files import find
 from clsplat.pipeline.loading import Pipeline, checked
 from clsplat.pipeline.yaml_file import Document, read_yaml
-from clsplat.runs.experiment import run_pipeline
 from clsplat.runs.folders import Start
 from clsplat.runs.found import changed, is_done_with
+from clsplat.runs.single import run_pipeline
 from clsplat.runs.source import Source
 from clsplat.training import checkpoint
 

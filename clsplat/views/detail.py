@@ -80,7 +80,7 @@ class DetailDivisor(Settings):
     the amplitudes is waited for falls as their sum grows.  The divisor is a whole number, which changes with edits.
     """
 
-    step_keys: ClassVar[frozenset[str]] = frozenset({"until", "start"})
+    step_keys: ClassVar[frozenset[str]] = frozenset({"until", "every", "start"})
 
     follows: Literal["detail"]
     """`detail`: the mean spectrum of the training photographs."""

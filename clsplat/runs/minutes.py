@@ -1,0 +1,217 @@
+"""The number of steps that fit into a time.
+
+The pipeline is rehearsed in few steps, and what that took is continued.  How many Gaussians grow is only known when
+they have grown; then the number is corrected, once.  It is written into the run's pipeline, so that its bits repeat.
+"""
+
+import logging
+import math
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from statistics import fmean
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from clsplat.errors import ConfigError, Interrupted
+from clsplat.pipeline.file import PipelineFile
+from clsplat.pipeline.loading import Pipeline
+from clsplat.pipeline.stretching import stretched
+from clsplat.runs.folders import Start
+from clsplat.runs.runner import run_stages
+from clsplat.stages.optimize import Optimize
+from clsplat.training.run import Progress, Run
+from clsplat.training.status import StatusFile
+
+LOG = logging.getLogger("clsplat")
+FIRST = 200  # steps of the first rehearsal
+LONGER = 3  # times the steps of one before
+SHARE = 0.03  # of the time: rehearsals that took less are followed by a longer one
+REPORTS = 20  # of a rehearsal; each gives the median time of its steps, without what is done once
+TREND = 0.5  # steepest power of the number of steps that the time of one is taken to follow
+KNOWN = 0.25, 0.6  # shares of the training between which it is corrected, where growth ends or else does not
+
+Show = Callable[[Progress], None]
+Execute = Callable[[Pipeline, Run, Start, Show], None]
+
+
+@dataclass(frozen=True)
+class Rehearsal:
+    """What a pipeline took in few steps."""
+
+    steps: int
+    step: float  # s, a training step
+    during: float  # s, of edits and measurements of the training: the same in any number of steps
+    after: float  # s, of what follows the training
+    growth: float  # the share of the steps after which no Gaussian grew
+
+
+def execute_within(minutes: float, pipeline: Pipeline, run: Run, start: Start, show: Show, execute: Execute) -> None:
+    """Execute the pipeline in as many steps as take `minutes`, with their rehearsal.
+
+    Raises ConfigError where not exactly one stage trains, or FIRST steps take longer, and what `execute` raises.
+    """
+    until = time.perf_counter() + 60 * minutes
+    rehearsals = rehearsed(pipeline, run, minutes)
+    fitting = fitted(pipeline, rehearsals, until - time.perf_counter(), minutes)
+    trained, last = fitting.settings.training.steps, rehearsals[-1]
+
+    def corrected(report: Progress) -> Pipeline:
+        rest = last.after + last.during * (1 - report.step / trained)
+        each = report.seconds_left / (trained - report.step)
+        steps = report.step + max(1, int((until - time.perf_counter() - rest) / each))
+        reason = f"--minutes {minutes:g}: {steps:,} steps, of which {report.step:,} had shown what one takes"
+        LOG.info("%s: %.0f ms", reason, 1e3 * each)
+        return replace(fitting, settings=lasting(fitting.settings, steps), reason=reason)
+
+    pause = Pause(fresh(run, fitting), round(trained * min(max(KNOWN[0], last.growth), KNOWN[1])), corrected)
+    try:
+        execute(fitting, pause.run, start, pause.showing(show))
+    except Interrupted:
+        if pause.corrected is None:
+            raise
+    if pause.corrected is not None:
+        del pause.run  # and its tables on the device
+        execute(pause.corrected, fresh(run, pause.corrected), "resume", show)
+
+
+@dataclass
+class Pause:
+    """Interrupts a run at the first report from a step on, which corrects its pipeline: the checkpoint is of the new
+    one."""
+
+    run: Run
+    at: int
+    correct: Callable[[Progress], Pipeline]
+    corrected: Pipeline | None = None
+
+    def showing(self, show: Show) -> Show:
+        """Return a function that shows reports, and interrupts the run."""
+
+        def shown(progress: Progress) -> None:
+            show(progress)
+            if self.at <= progress.step < progress.steps and not self.run.interrupted:
+                self.corrected = self.correct(progress)
+                self.run.settings, self.run.pipeline = self.corrected.settings, self.corrected.resolved()
+                self.run.interrupted = True
+
+        return shown
+
+
+def rehearsed(pipeline: Pipeline, run: Run, minutes: float) -> list[Rehearsal]:
+    """Return rehearsals in growing numbers of steps; the longest takes a small part of the time, or is the first.
+
+    Raises ConfigError where not exactly one stage trains.
+    """
+    number_of = sum(isinstance(stage, Optimize) for stage in pipeline.stages)
+    if number_of != 1:
+        raise ConfigError(
+            f"{pipeline.path}: --minutes: expected one stage that trains, found {number_of}; leave it out"
+        )
+    steps = pipeline.settings.training.steps
+    found, took = list[Rehearsal](), 0.0
+    with run.status.stage("rehearse"):
+        while took < SHARE * 60 * minutes:
+            number, began = FIRST * LONGER ** len(found), time.perf_counter()
+            LOG.info("--minutes %g: %s is rehearsed in %d steps", minutes, pipeline.settings.name, number)
+            found.append(rehearse(pipeline, run, number / steps))
+            took = time.perf_counter() - began
+    return found
+
+
+def rehearse(pipeline: Pipeline, run: Run, factor: float) -> Rehearsal:
+    """Run all stages of the pipeline in `factor` times its steps; the run is left as it is."""
+    short = replace(pipeline, settings=_reporting(stretched(pipeline.settings, factor)))
+    with TemporaryDirectory(prefix="clsplat-") as folder, _only_warnings():
+        out, trained = Path(folder), 0.0
+
+        def show(progress: Progress) -> None:
+            nonlocal trained
+            trained = time.perf_counter()
+
+        one = fresh(run, short, out=out, status=StatusFile(out), show=show)
+        one.records.start()
+        start = time.perf_counter()
+        run_stages(short, one)
+        end = time.perf_counter()
+        during = trained - start - one.status.seconds["optimize"]
+        step = fmean(line["ms"] for line in one.records.read("train")) / 1e3
+        growth = [line["step"] for line in one.records.read("densify") if any(line["grown"].values())]
+        return Rehearsal(one.step, step, max(0.0, during), end - trained, max(growth, default=0) / one.step)
+
+
+def fitted(pipeline: Pipeline, rehearsals: Sequence[Rehearsal], seconds: float, minutes: float) -> Pipeline:
+    """Return the pipeline in as many steps as are predicted to take so many seconds.
+
+    Raises ConfigError where those are fewer than FIRST.
+    """
+    steps = pipeline.settings.training.steps
+    chosen = most_steps(rehearsals, seconds)
+    if chosen < FIRST:
+        least = minutes + (predicted(rehearsals, FIRST) - seconds) / 60
+        expected = f"expected {math.ceil(10 * least) / 10:g} or more for this scene on this device"
+        raise ConfigError(f"--minutes {minutes:g}: {expected}, or a pipeline that does less")
+    told = f"{chosen:,} steps in the place of {steps:,}, which take about {seconds / 60:.1f} minutes more"
+    reason = f"--minutes {minutes:g}: {told}, by a rehearsal in {rehearsals[-1].steps:,} steps"
+    LOG.info("%s", reason)
+    return replace(pipeline, settings=stretched(pipeline.settings, chosen / steps), reason=reason)
+
+
+def predicted(rehearsals: Sequence[Rehearsal], steps: int) -> float:
+    """Return the time of a number of steps, in s, from rehearsals in growing numbers of steps.
+
+    The time of a step is a power of their number, as the last two rehearsals have it: a model that trains longer has
+    more Gaussians, and smaller ones.
+    """
+    *_, last = rehearsals
+    power = 0.0
+    if len(rehearsals) > 1:
+        before = rehearsals[-2]
+        power = math.log(last.step / before.step) / math.log(last.steps / before.steps)
+        power = min(max(power, -TREND), TREND)
+    return last.during + last.after + steps * last.step * math.pow(steps / last.steps, power)
+
+
+def most_steps(rehearsals: Sequence[Rehearsal], seconds: float) -> int:
+    """Return the largest number of steps that are predicted to take no longer than `seconds`; 0 where none is."""
+    low, high = 0, FIRST
+    while predicted(rehearsals, high) <= seconds:
+        low, high = high, 2 * high
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (middle, high) if predicted(rehearsals, middle) <= seconds else (low, middle)
+    return low
+
+
+def fresh(run: Run, pipeline: Pipeline, **changes: Any) -> Run:
+    """Return a run of the pipeline as this one was before its first step, with its device, scene and photographs."""
+    own: dict[str, Any] = {"numbers": {}, "written": {}, "metrics": {}, "changes": []}
+    return replace(run, settings=pipeline.settings, pipeline=pipeline.resolved(), **own, **changes)
+
+
+def lasting(settings: PipelineFile, steps: int) -> PipelineFile:
+    """Return settings whose training has so many steps, of which those that have been done are the same."""
+    return _each(settings, lambda training: training.model_copy(update={"steps": steps}))
+
+
+def _reporting(settings: PipelineFile) -> PipelineFile:
+    """With REPORTS reports of each training."""
+    return _each(settings, lambda training: training.model_copy(update={"log_every": -(-training.steps // REPORTS)}))
+
+
+def _each(settings: PipelineFile, changed: Callable[[Optimize], Optimize]) -> PipelineFile:
+    stages = [changed(stage) if isinstance(stage, Optimize) else stage for stage in settings.stages]
+    return settings.model_copy(update={"stages": stages})
+
+
+@contextmanager
+def _only_warnings() -> Iterator[None]:
+    """Leave out what a rehearsal tells of itself."""
+    level = LOG.level
+    LOG.setLevel(logging.WARNING)
+    try:
+        yield
+    finally:
+        LOG.setLevel(level)

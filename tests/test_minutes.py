@@ -1,0 +1,109 @@
+"""A run in a given time: how many steps are chosen, and that the bits are those of its pipeline."""
+
+import hashlib
+import math
+import re
+from pathlib import Path
+
+import pytest
+
+import clsplat
+from clsplat.errors import ConfigError
+from clsplat.pipeline.loading import load
+from clsplat.runs import minutes
+from clsplat.runs.minutes import Rehearsal, fitted, most_steps, predicted
+
+
+def rehearsal(steps: int, step: float) -> Rehearsal:
+    return Rehearsal(steps, step, during=3.0, after=2.0, growth=0.5)
+
+
+def digest(out: Path) -> str:
+    return hashlib.sha256((out / "point_cloud.ply").read_bytes()).hexdigest()
+
+
+def test_one_rehearsal_is_continued_evenly():
+    assert predicted([rehearsal(200, 0.02)], 3000) == pytest.approx(5 + 3000 * 0.02)
+
+
+def test_two_rehearsals_tell_how_the_time_of_a_step_grows():
+    found = [rehearsal(200, 0.02), rehearsal(600, 0.02 * 3**0.25)]
+    assert predicted(found, 1800) == pytest.approx(5 + 1800 * 0.02 * 9**0.25)
+
+
+@pytest.mark.parametrize(("later", "power"), [(0.2, minutes.TREND), (0.002, -minutes.TREND)])
+def test_a_rehearsal_that_was_disturbed_does_not_tell_more_than_it_can(later, power):
+    found = [rehearsal(200, 0.02), rehearsal(600, later)]
+    assert predicted(found, 1200) == pytest.approx(5 + 1200 * later * 2**power)
+
+
+@pytest.mark.parametrize("seconds", [9.0, 60.0, 1234.5])
+def test_as_many_steps_are_chosen_as_fit(seconds):
+    found = [rehearsal(200, 0.02), rehearsal(600, 0.023)]
+    steps = most_steps(found, seconds)
+    assert predicted(found, steps) <= seconds < predicted(found, steps + 1)
+
+
+def test_too_little_time_is_refused_with_what_would_do():
+    """200 steps take 5 + 4 s, and 60 have gone."""
+    with pytest.raises(ConfigError, match=r"expected 1\.2 or more"):
+        fitted(load("splat_7k"), [rehearsal(200, 0.02)], seconds=0.0, minutes=1.0)
+
+
+def test_the_choice_stretches_every_schedule_and_gives_its_reason():
+    found = fitted(load("splat_7k"), [rehearsal(200, 0.01)], seconds=40.0, minutes=1.0)
+    training = found.settings.training
+    assert training.steps == 3500
+    assert [stage.every for stage in training.during[:2]] == [500, 50]
+    assert found.reason == (
+        "--minutes 1: 3,500 steps in the place of 7,000, which take about 0.7 minutes more, by a rehearsal in 200 steps"
+    )
+
+
+@pytest.fixture
+def short_rehearsals(monkeypatch):
+    monkeypatch.setattr(minutes, "FIRST", 10)
+    monkeypatch.setattr(minutes, "SHARE", 0.0)
+    monkeypatch.setattr(minutes, "rehearsed", lambda *given: [minutes.rehearse(*given[:2], 0.2)])
+
+
+@pytest.mark.slow
+def test_a_run_in_minutes_has_the_bits_of_the_pipeline_that_it_writes(
+    tiny_scene, tmp_path, monkeypatch, short_rehearsals
+):
+    """The steps are corrected while it trains, wherever the clock stands; files of the rehearsal are gone."""
+    monkeypatch.setattr(minutes, "most_steps", lambda *given: 40)
+    out = clsplat.run("smoke", tiny_scene, tmp_path / "run", minutes=0.2)
+    text = (out / "pipeline.yaml").read_text()
+    steps, known = re.search(r"# --minutes 0.2: (.+) steps, of which (\d+) had shown what one takes", text).groups()
+    assert int(known) < 40
+    assert int(steps.replace(",", "")) == load(str(out / "pipeline.yaml")).settings.training.steps
+    assert "from here on the bits" not in (out / "log.txt").read_text()
+    again = clsplat.run(out / "pipeline.yaml", out=tmp_path / "again")
+    assert digest(out) == digest(again)
+    assert clsplat.check(out)["whole"]
+
+
+@pytest.mark.slow
+def test_a_rehearsal_leaves_no_trace_in_the_run(tiny_scene, tmp_path, monkeypatch, short_rehearsals):
+    """Of a training that ends before it can be corrected: the same bits as without a rehearsal."""
+    monkeypatch.setattr(minutes, "most_steps", lambda *given: 50)
+    monkeypatch.setattr(minutes, "KNOWN", (1.0, 1.0))
+    out = clsplat.run("smoke", tiny_scene, tmp_path / "run", minutes=0.2)
+    plain = clsplat.run("smoke", tiny_scene, tmp_path / "plain")
+    assert digest(out) == digest(plain)
+    names = ({file.name for file in folder.iterdir()} for folder in (out, plain))
+    assert next(names) == next(names)
+
+
+def test_what_cannot_be_fitted_is_refused(tiny_scene, tmp_path, few_steps):
+    with pytest.raises(ConfigError, match="leave it out to go on"):
+        clsplat.run(few_steps / "pipeline.yaml", out=few_steps, start="resume", minutes=1)
+    with pytest.raises(ConfigError, match="a matrix has several"):
+        clsplat.run(Path("examples/growth.yaml").absolute(), tiny_scene, tmp_path / "m", minutes=1)
+    with pytest.raises(ConfigError, match="found 2"):
+        clsplat.run("compress", tiny_scene, tmp_path / "c", set={"init.file": few_steps / "point_cloud.ply"}, minutes=1)
+    for wrong in (0, -1, math.nan, math.inf):
+        with pytest.raises(ConfigError, match="--minutes"):
+            clsplat.run("smoke", tiny_scene, tmp_path / "w", minutes=wrong)
+    assert not list(tmp_path.iterdir())
