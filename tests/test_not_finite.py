@@ -1,7 +1,6 @@
 """A state that is not finite is never a checkpoint, and what the message advises works."""
 
 import json
-import math
 import re
 from types import SimpleNamespace
 
@@ -62,8 +61,8 @@ def test_a_state_that_is_not_finite_is_never_a_checkpoint(
 
 
 def test_a_loss_that_is_not_finite_leaves_no_newer_checkpoint(tiny_scene, tmp_path, monkeypatch):
-    numbers = SimpleNamespace(isfinite=lambda value: False, log10=math.log10)
-    monkeypatch.setattr("clsplat.stages.optimize.math", numbers)
+    numbers = SimpleNamespace(isfinite=lambda value: False)
+    monkeypatch.setattr("clsplat.training.rescue.math", numbers)
     with pytest.raises(NumericError, match=r"parameters not finite: none; .*goes on from step_000004.npz"):
         train(tiny_scene, tmp_path, *FEW)
     assert steps_saved(tmp_path) == ["failed_000005.npz", "step_000004.npz"]

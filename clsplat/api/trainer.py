@@ -14,7 +14,7 @@ from clsplat.api.arguments import PathLike, load_plugins, overrides
 from clsplat.api.device import proved
 from clsplat.errors import ClsplatError, ConfigError, DataError, Interrupted, OutputError
 from clsplat.gaussians.model import Model
-from clsplat.losses.base import HostFunction, HostLoss, ViewGradients
+from clsplat.losses.base import HostFunction, HostLoss, ViewLosses
 from clsplat.metrics.views import mean, measure
 from clsplat.names import CHECKSUMS, END_STATES
 from clsplat.opencl.device import Device
@@ -42,7 +42,7 @@ class Report:
 
     step: int  # global, counted from 1
     gaussians: int
-    view: ViewGradients  # of this step; valid until the next
+    view: ViewLosses  # of this step, ViewGradients unless it was skipped; valid until the next
 
     @property
     def loss(self) -> float:

@@ -3,7 +3,7 @@
 import math
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -69,19 +69,25 @@ def returned(loss: "Loss", value: object) -> LossValue:
 
 
 @dataclass(frozen=True)
-class ViewGradients:
-    """A view's frame, its losses and the sums over pixels that give the gradients; valid until the next view."""
+class ViewLosses:
+    """A view's frame and its losses; valid until the next view."""
 
     frame: Frame
     comparison: Comparison
     losses: list[LossValue]
-    pixel_sums: Array  # [PIXEL_SUMS or more, S]
-    learning: Callable[[], None] | None = None  # changes the numbers of the transform that learns
+    learning: Callable[[], None] | None = field(default=None, kw_only=True)  # changes what a transform learns
 
     @property
     def loss(self) -> float:
-        """The sum of the losses, penalties included; waits for the device."""
+        """The sum of the losses; waits for the device.  Those of penalties are among them after an update."""
         return sum(loss.value() for loss in self.losses)
+
+
+@dataclass(frozen=True)
+class ViewGradients(ViewLosses):
+    """A view's frame, its losses and the sums over pixels that give the gradients; valid until the next view."""
+
+    pixel_sums: Array  # [PIXEL_SUMS or more, S]
 
 
 class Loss(Settings):

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 
-from clsplat.losses.base import ViewGradients
+from clsplat.losses.base import ViewLosses
 from clsplat.pipeline.loading import Pipeline
 from clsplat.stages.optimize import Optimize
 from clsplat.training.run import Run
@@ -18,7 +18,7 @@ def run_until_training(pipeline: Pipeline, run: Run) -> None:
             stage.act(run)
 
 
-def train(pipeline: Pipeline, run: Run) -> Iterator[ViewGradients]:
+def train(pipeline: Pipeline, run: Run) -> Iterator[ViewLosses]:
     """Run all stages that train, and those between them; yield after each step."""
     first, last = _training_stages(pipeline)
     for cursor in range(max(first, run.cursor), last + 1):

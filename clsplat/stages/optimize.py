@@ -1,7 +1,6 @@
 """The training loop: render, compare, differentiate, update."""
 
 import logging
-import math
 import time
 from collections.abc import Iterator
 from contextlib import suppress
@@ -12,9 +11,9 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field, field_validator
 
 from clsplat.density.statistics import SplatStats
-from clsplat.errors import Interrupted, NotFiniteError
-from clsplat.losses.base import ImageLoss, Loss, Penalty, ViewGradients, require_symmetric
-from clsplat.losses.image import pixel_loss
+from clsplat.errors import Interrupted
+from clsplat.losses.base import ImageLoss, Loss, Penalty, ViewGradients, ViewLosses, require_symmetric
+from clsplat.losses.image import psnr
 from clsplat.metrics.distribution import distribution
 from clsplat.schedule import Points
 from clsplat.settings import OneOf
@@ -24,7 +23,9 @@ from clsplat.training import checkpoint
 from clsplat.training.adam import Adam, Rates
 from clsplat.training.forecast import Forecast
 from clsplat.training.profile import stage_milliseconds
+from clsplat.training.rescue import require_finite
 from clsplat.training.run import Progress, Run, Stopped
+from clsplat.training.skipping import Skip, Visit
 from clsplat.training.trainer import Trainer
 from clsplat.views.detail import course
 from clsplat.views.sampling import Sampler, ViewSettings
@@ -46,7 +47,7 @@ class Optimize(Stage):
     needs: ClassVar[frozenset[str]] = frozenset({"model"})
     makes: ClassVar[frozenset[str]] = frozenset({"adam", "stats"})
     output_keys: ClassVar[frozenset[str]] = frozenset({"log_every"})
-    training_keys: ClassVar[frozenset[str]] = frozenset({"steps", "rates"})
+    training_keys: ClassVar[frozenset[str]] = frozenset({"steps", "rates", "skip"})
     step_keys: ClassVar[frozenset[str]] = frozenset({"steps"})
 
     steps: Annotated[int, Field(gt=0)]
@@ -57,6 +58,8 @@ class Optimize(Stage):
     """View, size and photograph of each step."""
     losses: list[OneOf[Loss]]
     """Losses and penalties; training minimises their sum."""
+    skip: Skip | None = None
+    """Steps that skip the backward pass, where a view has converged; without it, none."""
     during: list[OneOf[Scheduled]] = Field([])
     """Stages that run every so many steps."""
     log_every: Annotated[int, Field(gt=0)] = 100
@@ -98,8 +101,8 @@ class Optimize(Stage):
         with run.status.stage(self.stage):  # it goes on in its middle, so that its records stay
             self.run(run)
 
-    def iterate(self, run: Run) -> Iterator[ViewGradients]:
-        """Train step by step; the gradients that a step yields are valid until the next."""
+    def iterate(self, run: Run) -> Iterator[ViewLosses]:
+        """Train step by step; what a step yields, ViewGradients unless it is skipped, is valid until the next."""
         views = self._views(run)
         trainer, sampler = self._trainer(run, views), Sampler(run.scene.split("train"), views, run.seed)
         memory, count = run.memory_plan(), run.model.gaussians.count
@@ -189,25 +192,27 @@ class Optimize(Stage):
                     stage.act(run)
             run.edited = True
 
-    def _step(self, run: Run, trainer: Trainer, sampler: Sampler) -> ViewGradients:
+    def _step(self, run: Run, trainer: Trainer, sampler: Sampler) -> ViewLosses:
         """Do one step; a failure before its update leaves the run at the step before."""
         run.step += 1
         run.stage_step += 1
         try:
-            view, stale = self._differentiate(run, trainer, sampler)
+            view, stale, visit = self._differentiate(run, trainer, sampler)
         except BaseException:  # a second Ctrl-C too
             run.step, run.stage_step = run.step - 1, run.stage_step - 1
             run.device.timings.sampling = False
             raise
         with run.changing():
-            trainer.update(view, stale)
+            run.numbers.update(visit.numbers)
+            if isinstance(view, ViewGradients):
+                trainer.update(view, stale)
             run.acted, run.edited = 0, False
         run.device.timings.sampling = False
         run.status.note(step=run.step)
         return view
 
-    def _differentiate(self, run: Run, trainer: Trainer, sampler: Sampler) -> tuple[ViewGradients, set[str]]:
-        """The gradients of one view, and the parameters that they do not update.
+    def _differentiate(self, run: Run, trainer: Trainer, sampler: Sampler) -> tuple[ViewLosses, set[str], Visit]:
+        """The losses of one view, with gradients unless it is skipped, and the parameters that they do not update.
 
         The kernels are timed halfway between reports, away from density edits.
         """
@@ -218,19 +223,17 @@ class Optimize(Stage):
         run.photographs.announce(sampler.at(run.step + number).view for number in ahead)
         stale = {name for stage in self.during if stage.due(run.step) for name in stage.stale(run)}
         trainer.losses = [*self.losses, *run.losses]
-        gradients = trainer.differentiate(photograph, run.step, sample.transforms)
-        return gradients, set() if run.stage_step == self.steps else stale
+        view = trainer.compare(photograph, run.step, sample.transforms)
+        visit = self.skip.visit(sample.original, view, run.numbers) if self.skip else Visit()
+        if not visit.skipped:
+            view = trainer.backward(view)
+        return view, set() if run.stage_step == self.steps else stale, visit
 
-    def _values(self, run: Run, view: ViewGradients, sampler: Sampler) -> tuple[float, float]:
+    def _values(self, run: Run, view: ViewLosses, sampler: Sampler) -> tuple[float, float]:
         """Read the step's loss and PSNR.  Raises NotFiniteError, with the state set aside, when not finite."""
-        loss = view.loss
-        squares = pixel_loss(view.comparison, l1=0.0, l2=0.0).get()[..., 1]
-        error = float(squares.sum(dtype="float64")) / view.comparison.counted
-        broken = run.model.gaussians.not_finite()
-        if broken or not math.isfinite(loss):
-            name, told = sampler.at(run.step).view.name, checkpoint.set_aside(run, broken)
-            raise NotFiniteError(f"step {run.step}, view '{name}': the loss is {loss}; {told}")
-        return loss, -10 * math.log10(max(error, 1e-10))
+        values = view.loss, psnr(view.comparison)
+        require_finite(run, sampler.at(run.step).view.name, values[0])
+        return values
 
     def _report(self, run: Run, forecast: Forecast, loss: float, psnr: float, seconds: list[float]) -> None:
         count = run.model.gaussians.count
@@ -238,6 +241,8 @@ class Optimize(Stage):
         run.records.add(run.step, "train", loss=loss, psnr=psnr, gaussians=count, ms=ms, stages=stages)
         if run.step % (DISTRIBUTION_INTERVAL * self.log_every) == 0 or run.step == forecast.last_step:
             run.records.add(run.step, "distribution", gaussians=count, **distribution(run.model.gaussians))
+        if self.skip and run.step == forecast.last_step:
+            self.skip.tell(run)
         run.records.write()
         forecast.add(run.step, psnr, count, fmean(seconds))
         left, known = forecast.seconds_left, forecast.growth_known

@@ -1,6 +1,7 @@
 """Save the state of a run that fails."""
 
 import logging
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -22,6 +23,14 @@ def saved_on_failure(run: Run) -> Iterator[None]:
         if run.step > 0 and not run.status.lost:
             LOG.warning(_rescue(run))
         raise
+
+
+def require_finite(run: Run, view: str, loss: float) -> None:
+    """Raise NotFiniteError, with the state set aside, where the loss of a view or the model is not finite."""
+    broken = run.model.gaussians.not_finite()
+    if broken or not math.isfinite(loss):
+        told = checkpoint.set_aside(run, broken)
+        raise NotFiniteError(f"step {run.step}, view '{view}': the loss is {loss}; {told}")
 
 
 def _rescue(run: Run) -> str:

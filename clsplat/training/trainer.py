@@ -14,6 +14,7 @@ from clsplat.losses.base import (
     Penalty,
     PenaltyInputs,
     ViewGradients,
+    ViewLosses,
     gradient_by_photograph,
     require_symmetric,
     returned,
@@ -53,7 +54,7 @@ class Trainer:
             print(gradients.loss)
 
     Between two steps the Gaussians may be changed (`model.gaussians.set`) or moved (`clsplat.density.edit`).  In a loop
-    that applies its own update, `differentiate` is the step without Adam.
+    that applies its own update, `differentiate` is the step without Adam; `compare` and `backward` are its two parts.
     """
 
     rasterizer: Rasterizer
@@ -86,6 +87,13 @@ class Trainer:
     ) -> ViewGradients:
         """Return the derivative of the losses at one view, as sums over pixels; nothing is updated.
 
+        Raises ConfigError as `compare` does.
+        """
+        return self.backward(self.compare(photograph, step, transforms))
+
+    def compare(self, photograph: Photograph, step: int, transforms: Sequence[PhotographTransform] = ()) -> ViewLosses:
+        """Render one view and compare it with its photograph; nothing is updated.
+
         Raises ConfigError for a loss that is neither an ImageLoss nor a Penalty, and, where a transform learns, for one
         that is not symmetric in image and photograph.
         """
@@ -110,13 +118,19 @@ class Trainer:
         learned = learned_of(transforms)
         own, learning = self._learn(learned, planes, comparison) if learned else ([], None)
         values = [returned(loss, loss.add(comparison)) for loss in self.losses if isinstance(loss, ImageLoss)] + own
-        if planes.mask is not None:
-            apply_mask(workspace, camera, gradient, planes.mask)
+        return ViewLosses(frame, comparison, values, learning=learning)
+
+    def backward(self, view: ViewLosses) -> ViewGradients:
+        """Return the derivative of the losses that `compare` returned, as sums over pixels."""
+        comparison, workspace, camera = view.comparison, self.rasterizer.workspace, view.comparison.camera
+        photograph, gradient, mask = comparison.photograph, comparison.gradient, comparison.mask
+        if mask is not None:
+            apply_mask(workspace, camera, gradient, mask)
         count = self.stats.pixel_sums
-        timings.section = "statistics"
-        texture = known_gradient(workspace, camera, planes.colours, planes.mask) if count > TEXTURE else None
-        pixel_sums = self.rasterizer.pixel_sums(self.model, frame, gradient, count, texture)
-        return ViewGradients(frame, comparison, values, pixel_sums, learning)
+        self.rasterizer.device.timings.section = "statistics"
+        texture = known_gradient(workspace, camera, photograph, mask) if count > TEXTURE else None
+        pixel_sums = self.rasterizer.pixel_sums(self.model, view.frame, gradient, count, texture)
+        return ViewGradients(view.frame, comparison, view.losses, pixel_sums, learning=view.learning)
 
     def _learn(
         self, transform: LearnedTransform, planes: Planes, comparison: Comparison
