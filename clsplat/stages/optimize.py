@@ -21,7 +21,7 @@ from clsplat.settings import OneOf
 from clsplat.stages.base import Scheduled, Stage
 from clsplat.stages.densify import Densify
 from clsplat.training import checkpoint
-from clsplat.training.adam import Adam, Rates
+from clsplat.training.adam import Adam, Rates, Rows
 from clsplat.training.forecast import Forecast
 from clsplat.training.profile import stage_milliseconds
 from clsplat.training.run import Progress, Run, Stopped
@@ -46,13 +46,16 @@ class Optimize(Stage):
     needs: ClassVar[frozenset[str]] = frozenset({"model"})
     makes: ClassVar[frozenset[str]] = frozenset({"adam", "stats"})
     output_keys: ClassVar[frozenset[str]] = frozenset({"log_every"})
-    training_keys: ClassVar[frozenset[str]] = frozenset({"steps", "rates"})
+    training_keys: ClassVar[frozenset[str]] = frozenset({"steps", "rates", "update"})
     step_keys: ClassVar[frozenset[str]] = frozenset({"steps"})
 
     steps: Annotated[int, Field(gt=0)]
     """Number of training steps."""
     rates: Rates = Rates()
     """Learning rates."""
+    update: Rows = "all"
+    """Gaussians that a step changes: `all`, or `seen`, which saves the time of those that the view culls: they keep
+    their parameters and Adam's moments, whatever penalties give them."""
     views: ViewSettings = ViewSettings()
     """View, size and photograph of each step."""
     losses: list[OneOf[Loss]]
@@ -163,7 +166,7 @@ class Optimize(Stage):
             run.refresh_filter()
         parts = run.rasterizer, run.model, run.adam, run.stats, photographs.background
         full_size = views.full_size(run.step - run.stage_step + self.steps)
-        return Trainer(*parts, self.losses, self.rates.settled(full_size), run.scene.extent, run.numbers)
+        return Trainer(*parts, self.losses, self.rates.settled(full_size), run.scene.extent, run.numbers, self.update)
 
     def _act(self, run: Run) -> None:
         """Run the stages that are due and do not edit; those that fail run again when the run goes on."""
