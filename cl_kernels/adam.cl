@@ -3,6 +3,8 @@
  * adam_step reads gradients from memory.  update_gaussians computes the gradients of projection itself, which saves
  * writing and reading 59 values for each Gaussian; it gives the same bits as project_backward and adam_step.
  *
+ * `every` is all ones where each Gaussian is updated, and 0 where those that were culled keep values and moments.
+ *
  * One item = LANES Gaussians.  No local memory.  Deterministic: each value has one writer. */
 #include "adam.h"
 #include "backward.h"
@@ -14,43 +16,49 @@ void adam_step(
     __global const float *restrict gradient,  // [components,S]
     __global float *restrict moment1,         // [components,S]
     __global float *restrict moment2,         // [components,S]
+    __global const uint *restrict depth_key,  // [S] of the view: all ones when culled
     const float rate,                         // learning rate / (1 - BETA1^t)
     const float correction2,                  // 1 / (1 - BETA2^t)
+    const uint every,
     const uint stride,
     const uint count)
 {
     const uint i = get_global_id(0) * LANES;
     if (i >= count)
         return;
+    /* where each is updated, all items read the first keys, which costs nothing */
+    const VI updated = (VLOAD(depth_key + (i & ~every)) != ~0u) | (VI)((int)every);
+    if (!ANY(updated))
+        return;
     const uint at = get_global_id(1) * stride + i;
-    adam_update(values + at, moment1 + at, moment2 + at, VLOAD(gradient + at), rate, correction2);
+    adam_update(values + at, moment1 + at, moment2 + at, VLOAD(gradient + at), updated, rate, correction2);
 }
 
-/* Update one plane of a block.  gradient: [VECTORS]. */
+/* Update one plane of a block.  first, gradient, g, updated: [VECTORS]. */
 static inline void update_plane(__global float *values, __global float *moment1, __global float *moment2,
-                                const VF *gradient, const gradient_t *g, const uint vectors, const float rate,
-                                const float correction2)
+                                const uint *first, const VF *gradient, const gradient_t *g, const VI *updated,
+                                const uint vectors, const float rate, const float correction2)
 {
     for (uint v = 0; v < vectors; v++)
-        adam_update(values + v * LANES, moment1 + v * LANES, moment2 + v * LANES,
-                    g[v].touched ? gradient[v] : (VF)(0.0f), rate, correction2);
+        adam_update(values + first[v], moment1 + first[v], moment2 + first[v],
+                    g[v].touched ? gradient[v] : (VF)(0.0f), updated[v], rate, correction2);
 }
 
 /* Update plane `plane` of a table, with the member `member` of the block's gradients. */
 #define UPDATE(table, plane, member)                                                                          \
     do {                                                                                                      \
-        const uint at = (plane) * stride + i;                                                                 \
+        const uint at = (plane) * stride;                                                                     \
         VF gradient[VECTORS];                                                                                 \
         for (uint v = 0; v < vectors; v++)                                                                    \
             gradient[v] = g[v].member;                                                                        \
-        update_plane(table + at, table##_moment1 + at, table##_moment2 + at, gradient, g, vectors,            \
-                     table##_rate, table##_correction2);                                                      \
+        update_plane(table + at, table##_moment1 + at, table##_moment2 + at, first, gradient, g, updated,     \
+                     vectors, table##_rate, table##_correction2);                                             \
     } while (0)
 
 /* The update of all tables from the sums over pixels.  Rates are divided by 1 - BETA1^t.
  *
- * One item = VECTORS vectors of Gaussians, plane by plane, so that memory is read in runs.  Private memory:
- * VECTORS * LANES * 200 bytes. */
+ * One item = VECTORS vectors of Gaussians, plane by plane, so that memory is read in runs; those in which none is
+ * updated are left out.  Private memory: VECTORS * LANES * 204 bytes. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void update_gaussians(
     __global float *restrict means,                  // [3,S] scene units
@@ -93,20 +101,35 @@ void update_gaussians(
     const float sh_rest_correction2,
     const uint degree,
     const uint sh_rest_degree,                       // up to which bands are updated: 0 or `degree`
+    const uint every,
     const uint stride,
     const uint count)
 {
     const uint i = get_global_id(0) * LANES * VECTORS;
     if (i >= count)
         return;
-    const uint left = (count - i + LANES - 1) / LANES, vectors = left < VECTORS ? left : VECTORS;
+    uint first[VECTORS], kept = 0;
     gradient_t g[VECTORS];
+    VI updated[VECTORS];
     VF weights[VECTORS][16];
-    for (uint v = 0; v < vectors; v++)
-        colour_backward(splats, pixel_sums, stride, count, i + v * LANES, g + v);
-    weigh_harmonics(sh_rest, g, vectors, degree, stride, i, weights);
-    for (uint v = 0; v < vectors; v++) {
+    for (uint v = 0; v < VECTORS && i + v * LANES < count; v++) {
         const uint at = i + v * LANES;
+        colour_backward(splats, pixel_sums, stride, count, at, g + kept);
+        first[kept] = at;
+        updated[kept] = g[kept].touched | (VI)((int)every);
+        if (ANY(updated[kept])) {
+            kept++;
+        } else {
+            for (uint k = 0; k < 2; k++)
+                VSTORE((VF)(0.0f), grad_mean2d + k * stride + at);
+        }
+    }
+    if (kept == 0)
+        return;
+    const uint vectors = kept < VECTORS ? kept : VECTORS;  // where VECTORS is 1, compilers see that it is 1 here
+    weigh_harmonics(sh_rest, g, vectors, degree, stride, first, weights);
+    for (uint v = 0; v < vectors; v++) {
+        const uint at = first[v];
         gradient_of(means, quats, log_scales, logit_opacity, filter_variance, camera, pixel_sums, weights[v],
                     near_plane, screen_variance, compensate, degree, stride, at, g + v);
         for (uint k = 0; k < 2; k++)

@@ -106,19 +106,18 @@ static inline void colour_backward(
                                  ? VLOAD(pixel_sums + (SUM_RED + channel) * stride + i) : (VF)(0.0f);
 }
 
-/* The weight of each basis function in the derivative by direction, c_k . g, for a block of vectors: plane by plane, so
- * that memory is read in runs. */
+/* The weight of each basis function in the derivative by direction, c_k . g, for the vectors from each of `first` on:
+ * plane by plane, so that memory is read in runs. */
 static inline void weigh_harmonics(
     __global const float *sh_rest,  // [(K-1)*3,S] coefficient-major
-    const gradient_t *g, const uint vectors, const uint degree, const uint stride, const uint i, VF (*weights)[16])
+    const gradient_t *g, const uint vectors, const uint degree, const uint stride, const uint *first, VF (*weights)[16])
 {
     for (uint k = 1; k < (degree + 1) * (degree + 1); k++) {
         for (uint v = 0; v < vectors; v++)
             weights[v][k] = (VF)(0.0f);
         for (uint channel = 0; channel < 3; channel++)
             for (uint v = 0; v < vectors; v++)
-                weights[v][k] += VLOAD(sh_rest + ((k - 1) * 3 + channel) * stride + i + v * LANES) *
-                                 g[v].colour[channel];
+                weights[v][k] += VLOAD(sh_rest + ((k - 1) * 3 + channel) * stride + first[v]) * g[v].colour[channel];
     }
 }
 

@@ -108,6 +108,9 @@ OPTIONAL = {  # in what few runs compute: doctor notices them, the check before 
             ("squares", "passes ? s.opacity * grad_alpha", "passes ? k.uncapped * grad_alpha"),
         )
     },
+    "adam_step, rows not seen": ("adam.cl", "!= ~0u) | (VI)((int)every)", "!= 0u) | (VI)((int)every)"),
+    "update_gaussians, rows not seen": ("adam.cl", "].touched | (VI)((int)every)", "].touched | (VI)(-1)"),
+    "update_gaussians, moments not seen": ("adam.h", "(updated ? v : v_before)", "v"),
     "blend_forward wide, entropy": ("blend_wide.cl", "(p.entropy - t * log", "(p.entropy + t * log"),
     "blend_forward simt, entropy": ("blend_simt.cl", "? p.entropy - t * log", "? p.entropy + t * log"),
     "blend_forward, weights in the entropy": ("splat.h", "p->entropy -= k.weight *", "p->entropy -= p->t *"),

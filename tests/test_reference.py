@@ -605,6 +605,20 @@ def test_adam_is_the_sum_it_stands_for(rng):
         np.testing.assert_allclose(parameter, expected, rtol=1e-12)
 
 
+def test_adam_of_seen_rows_leaves_the_others(rng):
+    state, seen = rng.normal(1, 0.1, (4, 3, 2)), np.array([True, False, True])
+    parameter, gradient, moment1, moment2 = state
+    whole = ref.adam_step(parameter, gradient, moment1, moment2, 3, 0.01)
+    for after, updated, before in zip(
+        ref.adam_step(parameter, gradient, moment1, moment2, 3, 0.01, seen=seen),
+        whole,
+        (parameter, moment1, moment2),
+        strict=True,
+    ):
+        np.testing.assert_array_equal(after[seen], updated[seen])
+        np.testing.assert_array_equal(after[1], before[1])
+
+
 def test_adam_epsilon_is_outside_the_root():
     """The first step is rate · g / (|g| + ε): half the rate at g = ε, the whole of it at g = 1."""
     parameter, _, _ = ref.adam_step(np.zeros(2), np.array([1e-15, -1.0]), np.zeros(2), np.zeros(2), 1, 0.01)

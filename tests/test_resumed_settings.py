@@ -24,7 +24,9 @@ def test_what_no_table_depends_on_may_change(killed_run, tiny_scene, few_steps, 
     assert steps_saved(killed_run) == ["step_000012.npz"]
 
 
-@pytest.mark.parametrize("change", ["optimize.steps=14", "densify.stop=6", "optimize.losses.0.weight=0.7"])
+@pytest.mark.parametrize(
+    "change", ["optimize.steps=14", "densify.stop=6", "optimize.losses.0.weight=0.7", "optimize.update=seen"]
+)
 def test_numbers_of_the_training_may_change(change, killed_run, tiny_scene, caplog):
     run = train(tiny_scene, killed_run, *FEW, change, resume=True)
     assert run.step == (14 if "steps" in change else 12)

@@ -135,6 +135,25 @@ def test_stale_parameters_stay(device, rng):
     assert (trainer.model.gaussians.get("log_scales") != before["log_scales"]).any()
 
 
+@pytest.mark.parametrize("losses", [[L1()], [L1(), Anisotropy(above=1.0)]], ids=["losses", "a penalty"])
+def test_rows_that_no_view_sees_stay(device, rng, losses):
+    """Their moments too; penalties give gradients to all rows, and change no other ones than losses do."""
+    trainer, photograph = trainer_of(device, rng, losses)
+    gaussians = trainer.model.gaussians
+    means = gaussians.get("means")
+    means[::4] += [0, 0, -50]
+    gaussians.set("means", means)
+    trainer.step(photograph, 1)  # moments for all that a penalty gives some
+    trainer.rows = "seen"
+    before = {name: gaussians.get(name) for name in gaussians.tables}
+    seen = trainer.step(photograph, 2).frame.depth_key.get()[:60] != 0xFFFFFFFF
+    assert 20 < seen.sum() <= 45
+    for name in ("means", "log_scales", "adam/log_scales/moment1", "adam/log_scales/moment2"):
+        changed = (gaussians.get(name) != before[name]).any(axis=1)
+        assert not changed[~seen].any(), name
+        assert changed[seen].sum() > 15, name
+
+
 def test_what_a_mask_leaves_out_has_no_gradient(device, rng):
     trainer, photograph = trainer_of(device, rng, [Dssim(), L2()])
     comparison = trainer.differentiate(photograph, 1).comparison

@@ -71,6 +71,7 @@ class Case:
             colour,
             optimize.losses,
             zero_rates,
+            rows=optimize.update,
         )
         self.clock: list[float] = []
         self.stages: dict[str, list[float]] = defaultdict(list)

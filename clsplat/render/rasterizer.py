@@ -28,6 +28,7 @@ class Frame:
 
     camera: DeviceCamera
     splats: Array  # [N, RECORD]
+    depth_key: Array  # [S] bits of the depth; all ones where the splat was culled
     radius: Array  # [S] px, 3 standard deviations; 0: not seen
     lists: TileLists
     tile_last: Array  # [T] pairs of each tile up to the last that any pixel blends
@@ -112,7 +113,8 @@ class Rasterizer:
                     tile_last=tile_last,
                     first_tile=first_tile,
                 )
-        return Frame(camera, splats, radius, lists, tile_last, image, transmittance, bands, content)
+        depth_key = array("depth_key", model.gaussians.capacity, np.uint32)
+        return Frame(camera, splats, depth_key, radius, lists, tile_last, image, transmittance, bands, content)
 
     def _blend(self, content: Content, **defines: int) -> Program:
         """The kernels of blending; without sums and entropy that nobody reads."""

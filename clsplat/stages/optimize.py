@@ -20,7 +20,7 @@ from clsplat.settings import OneOf
 from clsplat.stages.base import Scheduled, Stage
 from clsplat.stages.densify import Densify
 from clsplat.training import checkpoint
-from clsplat.training.adam import Adam, Rates
+from clsplat.training.adam import Adam, Rates, Rows
 from clsplat.training.forecast import Forecast
 from clsplat.training.profile import stage_milliseconds
 from clsplat.training.rescue import require_finite
@@ -47,13 +47,16 @@ class Optimize(Stage):
     needs: ClassVar[frozenset[str]] = frozenset({"model"})
     makes: ClassVar[frozenset[str]] = frozenset({"adam", "stats"})
     output_keys: ClassVar[frozenset[str]] = frozenset({"log_every"})
-    training_keys: ClassVar[frozenset[str]] = frozenset({"steps", "rates", "skip"})
+    training_keys: ClassVar[frozenset[str]] = frozenset({"steps", "rates", "update", "skip"})
     step_keys: ClassVar[frozenset[str]] = frozenset({"steps"})
 
     steps: Annotated[int, Field(gt=0)]
     """Number of training steps."""
     rates: Rates = Rates()
     """Learning rates."""
+    update: Rows = "all"
+    """Gaussians that a step changes: `all`, or `seen`, which saves the time of those that the view culls: they keep
+    their parameters and Adam's moments, whatever penalties give them."""
     views: ViewSettings = ViewSettings()
     """View, size and photograph of each step."""
     losses: list[OneOf[Loss]]
@@ -129,9 +132,8 @@ class Optimize(Stage):
             run.between()
             if run.interrupted:
                 path = checkpoint.save(run)
-                raise Interrupted(
-                    f"stopped at step {run.step}, saved in {path}; `clsplat resume {run.out}` goes on from it"
-                )
+                told = f"saved in {path}; `clsplat resume {run.out}` goes on from it"
+                raise Interrupted(f"stopped at step {run.step}, {told}")
             yield view
 
     @property
@@ -165,8 +167,8 @@ class Optimize(Stage):
             gaussians.add(name, 1)
             run.refresh_filter()
         parts = run.rasterizer, run.model, run.adam, run.stats, photographs.background
-        full_size = views.full_size(run.step - run.stage_step + self.steps)
-        return Trainer(*parts, self.losses, self.rates.settled(full_size), run.scene.extent, run.numbers)
+        rates = self.rates.settled(views.full_size(run.step - run.stage_step + self.steps))
+        return Trainer(*parts, self.losses, rates, run.scene.extent, run.numbers, self.update)
 
     def _act(self, run: Run) -> None:
         """Run the stages that are due and do not edit; those that fail run again when the run goes on."""
@@ -225,15 +227,13 @@ class Optimize(Stage):
         trainer.losses = [*self.losses, *run.losses]
         view = trainer.compare(photograph, run.step, sample.transforms)
         visit = self.skip.visit(sample.original, view, run.numbers) if self.skip else Visit()
-        if not visit.skipped:
-            view = trainer.backward(view)
-        return view, set() if run.stage_step == self.steps else stale, visit
+        stale = set() if run.stage_step == self.steps else stale
+        return view if visit.skipped else trainer.backward(view), stale, visit
 
     def _values(self, run: Run, view: ViewLosses, sampler: Sampler) -> tuple[float, float]:
         """Read the step's loss and PSNR.  Raises NotFiniteError, with the state set aside, when not finite."""
-        values = view.loss, psnr(view.comparison)
-        require_finite(run, sampler.at(run.step).view.name, values[0])
-        return values
+        require_finite(run, sampler.at(run.step).view.name, view.loss)
+        return view.loss, psnr(view.comparison)
 
     def _report(self, run: Run, forecast: Forecast, loss: float, psnr: float, seconds: list[float]) -> None:
         count = run.model.gaussians.count

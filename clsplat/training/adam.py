@@ -65,8 +65,18 @@ class Rates(Settings):
         return {**rates, "means": rates["means"] * extent}
 
 
+Rows = Literal["all", "seen"]  # Gaussians that an update changes
+_EVERY = {"all": 0xFFFFFFFF, "seen": 0}
+
+
 class Adam:
-    """Adam, with its moments in tables beside the parameters, and a number of updates for each parameter."""
+    """Adam, with its moments in tables beside the parameters, and a number of updates for each parameter.
+
+    Of the rows `seen`, one whose splat was culled in the view (it has no pixel within the photograph where it is not
+    fainter than 1/255) keeps its parameters and both moments, whatever penalties give it.  The correction of the
+    moments' bias counts the updates of a parameter, in `seen` too, where a row may have had fewer; published kernels
+    (Taming 3DGS) leave the correction out.
+    """
 
     def __init__(self, gaussians: Gaussians) -> None:
         self.gaussians = gaussians
@@ -79,7 +89,9 @@ class Adam:
             for moment in moment_tables(name):
                 gaussians.add(moment, gaussians.tables[name].components, zero_fresh=True)
 
-    def update(self, model: DeviceModel, frame: Frame, pixel_sums: Array, rates: dict[str, float]) -> Array:
+    def update(
+        self, model: DeviceModel, frame: Frame, pixel_sums: Array, rates: dict[str, float], rows: Rows = "all"
+    ) -> Array:
         """Update every parameter from the frame's sums over pixels, [PIXEL_SUMS, S].
 
         Returns the gradient of the projected means, [2, S] px⁻¹.
@@ -97,6 +109,7 @@ class Adam:
             **shape_arguments(model, frame.camera),
             **arguments,
             sh_rest_degree=model.degree if rates["sh_rest"] else 0,
+            every=_EVERY[rows],
             splats=frame.splats,
             pixel_sums=pixel_sums,
             grad_mean2d=grad_mean2d,
@@ -104,9 +117,15 @@ class Adam:
         return grad_mean2d
 
     def step(
-        self, model: DeviceModel, gradients: Gradients, rates: dict[str, float], without: Collection[str] = ()
+        self,
+        model: DeviceModel,
+        frame: Frame,
+        gradients: Gradients,
+        rates: dict[str, float],
+        without: Collection[str] = (),
+        rows: Rows = "all",
     ) -> None:
-        """Update every parameter but those named in `without` from gradients in memory.
+        """Update every parameter but those named in `without` from gradients in memory; `frame`: of the view.
 
         Bands above the active SH degree are left out: their gradients and moments are zero.
         """
@@ -125,8 +144,10 @@ class Adam:
                 gradient=gradients[name],
                 moment1=gaussians[moment1],
                 moment2=gaussians[moment2],
+                depth_key=frame.depth_key,
                 rate=rate,
                 correction2=correction2,
+                every=_EVERY[rows],
                 stride=gaussians.capacity,
                 count=gaussians.count,
             )

@@ -22,7 +22,7 @@ from clsplat.losses.base import (
 from clsplat.opencl.device import Array
 from clsplat.opencl.program import constants
 from clsplat.render.rasterizer import Content, Rasterizer
-from clsplat.training.adam import Adam, Rates
+from clsplat.training.adam import Adam, Rates, Rows
 from clsplat.views.learned import LearnedTransform, learned_of, name_of
 from clsplat.views.photographs import Photograph, apply_mask
 from clsplat.views.texture import known_gradient
@@ -66,6 +66,7 @@ class Trainer:
     rates: Rates
     extent: float = 1.0  # scene units
     numbers: dict[str, float] = field(default_factory=dict)  # of a transform that learns, by name; a step changes them
+    rows: Rows = "all"  # Gaussians that a step changes
 
     def step(
         self,
@@ -169,10 +170,10 @@ class Trainer:
         step = view.comparison.step
         rates = self.rates.at(step, self.extent)
         if not (penalties or stale):
-            return self.adam.update(self.model, view.frame, view.pixel_sums, rates)
+            return self.adam.update(self.model, view.frame, view.pixel_sums, rates, self.rows)
         gradients = self.rasterizer.gradients(self.model, view.frame, view.pixel_sums)
         inputs = PenaltyInputs(self.rasterizer.workspace, self.model.gaussians, gradients, self.extent, step)
         self.rasterizer.device.timings.section = "loss"
         view.losses.extend(returned(penalty, penalty.add(inputs)) for penalty in penalties)
-        self.adam.step(self.model, gradients, rates, stale)
+        self.adam.step(self.model, view.frame, gradients, rates, stale, self.rows)
         return gradients.mean2d

@@ -12,17 +12,19 @@ from clsplat.conformance.checks.blending import BACKGROUND
 from clsplat.conformance.checks.projection import expected_gradients
 from clsplat.conformance.comparison import CONIC, SUM, Figure, by_element, by_norm, equal
 from clsplat.conformance.scenes import Case, random_case, with_world_filter
-from clsplat.gaussians.tables import INTERVAL2, PARAMETERS, Gaussians, Gradients, moment_tables
+from clsplat.gaussians.tables import INTERVAL2, PARAMETERS, DeviceModel, Gaussians, Gradients, moment_tables
 from clsplat.losses.base import Penalty, PenaltyInputs
 from clsplat.losses.penalties import Anisotropy, CovarianceTrace, MeanOpacity, MeanScale
-from clsplat.opencl.device import Device
-from clsplat.render.rasterizer import Rasterizer
+from clsplat.opencl.device import Array, Device
+from clsplat.opencl.program import constants
+from clsplat.render.rasterizer import RECORD, Frame, Rasterizer
 from clsplat.render.workspace import Workspace
 from clsplat.training.adam import Adam, Rates
 
 CHECKS = Checks()
 COUNTS = (1, 15, 17, 65)
 EXTENT = 2.5
+SPLAT_OPACITY = int(constants("splat.h")["SPLAT_OPACITY"])
 
 
 def step_figures(device: Device, rng: np.random.Generator, count: int) -> Iterator[Figure]:
@@ -30,6 +32,7 @@ def step_figures(device: Device, rng: np.random.Generator, count: int) -> Iterat
     case = random_case(rng, count)
     model = case.model(device)
     adam, rates = Adam(model.gaussians), Rates().at(3, extent=2.0)
+    frame = Rasterizer(device, "radix").forward(model, case.device_camera(device), device.upload(BACKGROUND))
     values = {name: case.parameters[name].astype(np.float64) for name in PARAMETERS}
     moments = {name: [np.zeros_like(v), np.zeros_like(v)] for name, v in values.items()}
     for step in range(1, 4):
@@ -44,7 +47,7 @@ def step_figures(device: Device, rng: np.random.Generator, count: int) -> Iterat
             values[name], *moments[name] = ref.adam_step(
                 values[name], gradient.astype(np.float64), moments[name][0], moments[name][1], step, rates[name]
             )
-        adam.step(model, gradients, rates)
+        adam.step(model, frame, gradients, rates)
     for name in PARAMETERS:
         moved, what = float(np.abs(values[name] - case.parameters[name]).max()), f"{name}, {count} Gaussians"
         found = model.gaussians.get(name)
@@ -57,15 +60,23 @@ def step_figures(device: Device, rng: np.random.Generator, count: int) -> Iterat
             yield by_element("adam_step", f"moments of {what}", found, expected, bound, floor=0.1 * largest)
 
 
-def fused_figures(device: Device, rng: np.random.Generator, case: Case, what: str) -> Iterator[Figure]:
-    """One update on the way: moments against the reference's gradients, values against the device's own moments."""
-    kernel, count = "update_gaussians", len(case.parameters["means"])
-    rasterizer, model, camera = Rasterizer(device, "radix"), case.model(device), case.device_camera(device)
-    gaussians, adam, rates = model.gaussians, Adam(model.gaussians), Rates().at(3, extent=2.0)
+def _sums_of(
+    device: Device, rng: np.random.Generator, case: Case, rasterizer: Rasterizer, model: DeviceModel
+) -> tuple[Frame, Array]:
+    """The frame of a case, and its sums over pixels for a random gradient of the image."""
+    camera = case.device_camera(device)
     frame = rasterizer.forward(model, camera, device.upload(BACKGROUND))
     weights = np.zeros((3, camera.rows, camera.stride), np.float32)
     weights[:, : camera.height, : camera.width] = rng.normal(size=(3, camera.height, camera.width))
-    pixel_sums = rasterizer.pixel_sums(model, frame, device.upload(weights))
+    return frame, rasterizer.pixel_sums(model, frame, device.upload(weights))
+
+
+def fused_figures(device: Device, rng: np.random.Generator, case: Case, what: str) -> Iterator[Figure]:
+    """One update on the way: moments against the reference's gradients, values against the device's own moments."""
+    kernel, count = "update_gaussians", len(case.parameters["means"])
+    rasterizer, model = Rasterizer(device, "radix"), case.model(device)
+    gaussians, adam, rates = model.gaussians, Adam(model.gaussians), Rates().at(3, extent=2.0)
+    frame, pixel_sums = _sums_of(device, rng, case, rasterizer, model)
     grad_mean2d = adam.update(model, frame, pixel_sums, rates).get()[:, :count].T
     expected = expected_gradients(case, case.project(), pixel_sums.get()[:, :count].T.astype(np.float64))
     yield by_norm(kernel, f"gradients of the projected means, {what}", grad_mean2d, expected["mean2d"], CONIC)
@@ -79,7 +90,42 @@ def fused_figures(device: Device, rng: np.random.Generator, case: Case, what: st
         yield by_element(kernel, f"{name}, {what}", gaussians.get(name), before - step, 3e-7, floor)
 
 
-def _behind_each_fifth(case: Case) -> Case:
+def seen_figures(device: Device, rng: np.random.Generator, case: Case, what: str) -> Iterator[Figure]:
+    """The fifth update, of seen rows alone, with moments from before, by each kernel from the same gradients."""
+    count, rates, parameters = len(case.parameters["means"]), Rates().at(3, extent=2.0), case.parameters
+    moments = {
+        name: (rng.normal(size=values.shape), rng.uniform(0.5, 2, values.shape))
+        for name, values in parameters.items()
+        if name in PARAMETERS
+    }
+    for kernel in ("update_gaussians", "adam_step"):
+        rasterizer, model = Rasterizer(device, "radix"), case.model(device)
+        gaussians, adam = model.gaussians, Adam(model.gaussians)
+        frame, pixel_sums = _sums_of(device, rng, case, rasterizer, model)
+        gradients = rasterizer.gradients(model, frame, pixel_sums)
+        seen = frame.splats.get().reshape(-1, RECORD)[:count, SPLAT_OPACITY] > 0
+        adam.updates = dict.fromkeys(PARAMETERS, 4)
+        expected: dict[str, NDArray[Any]] = {}
+        for name in PARAMETERS:
+            for table, values in zip(moment_tables(name), moments[name], strict=True):
+                gaussians.set(table, values)
+            tables = name, *moment_tables(name)
+            before, moment1, moment2 = (gaussians.get(table).astype(np.float64) for table in tables)
+            gradient = gradients[name].get()[:, :count].T.astype(np.float64)
+            after = ref.adam_step(before, gradient, moment1, moment2, 5, rates[name], seen=seen)
+            expected |= dict(zip(tables, after, strict=True))
+        if kernel == "adam_step":
+            adam.step(model, frame, gradients, rates, rows="seen")
+        else:
+            adam.update(model, frame, pixel_sums, rates, rows="seen")
+        for table, truth in expected.items():
+            found = gaussians.get(table)
+            yield equal(kernel, f"{table} of rows not seen, {what}", found[~seen], truth[~seen])
+            yield by_element(kernel, f"{table} of rows seen, {what}", found[seen], truth[seen], 3 * SUM, floor=0.1)
+
+
+def behind_each_fifth(case: Case) -> Case:
+    """Return the case with each fifth Gaussian behind the camera."""
     case.parameters["means"][1::5] -= 20 * case.view.world_to_camera[2, :3]
     return case
 
@@ -90,12 +136,18 @@ def adam(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
         yield from step_figures(device, rng, count)
 
 
+@CHECKS.add("adam_step", "update_gaussians")
+def adam_of_seen_rows(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    for count in COUNTS:
+        yield from seen_figures(device, rng, behind_each_fifth(random_case(rng, count)), f"{count} Gaussians")
+
+
 @CHECKS.add("update_gaussians")
 def update_from_sums_over_pixels(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
     for count, degree in ((1, 3), (17, 0), (40, 2), (150, 3)):
         case = with_world_filter(random_case(rng, count, degree=degree, compensate=1.0), rng)
         what = f"{count} Gaussians, degree {degree}"
-        yield from fused_figures(device, rng, _behind_each_fifth(case), what)
+        yield from fused_figures(device, rng, behind_each_fifth(case), what)
 
 
 def penalty_figures(
