@@ -1,11 +1,14 @@
 """Whole runs with rules and losses of shipped recipes: what they decide, and that runs resume and repeat to the bit."""
 
 import json
+import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from clsplat.formats.table import read as read_ply
+from clsplat.scene.points import read_points_ply, write_points_ply
 from tests.test_training import train
 
 pytestmark = pytest.mark.slow
@@ -69,3 +72,33 @@ def test_growth_along_the_parabola_ends_at_the_number_and_not_above(tiny_scene, 
     ]
     edits = train(tiny_scene, tmp_path / "run", *settings).records.read("densify")
     assert [edit["after"] for edit in edits] == [172, 228, 268, 292, 300]
+
+
+def times(scene, factor, folder):
+    """A copy of a scene in other units of length, beside the same photographs."""
+    shutil.copytree(scene, folder)
+    for file in folder.glob("transforms_*.json"):
+        data = json.loads(file.read_text())
+        for frame in data["frames"]:
+            matrix = np.array(frame["transform_matrix"])
+            matrix[:3, 3] *= factor
+            frame["transform_matrix"] = matrix.tolist()
+        file.write_text(json.dumps(data))
+    points = read_points_ply(folder / "points3d.ply")
+    write_points_ply(folder / "points3d.ply", replace(points, positions=points.positions * np.float32(factor)))
+    return folder
+
+
+def test_mcmc_does_not_depend_on_the_unit_of_length(tiny_scene, tmp_path):
+    """Within 0.02 dB, in ten times the units: rates, noise, penalties and sizes are shares of the scene's extent."""
+    found = []
+    for factor in (1, 10):
+        scene = times(tiny_scene, factor, tmp_path / f"scene{factor}")
+        settings = (
+            *(f"model.near={0.2 * factor}", "optimize.steps=160", "densify.start=20", "densify.every=20"),
+            *("densify.stop=120", "add_noise.stop=120", "optimize.evaluate.every=1000", "densify.max_gaussians=4000"),
+        )
+        run = train(scene, tmp_path / f"run{factor}", *settings, pipeline="mcmc_7k")
+        found.append(json.loads((run.out / "metrics.json").read_text())["test"]["1"]["psnr"])
+    assert found[0] > 15
+    assert found[1] == pytest.approx(found[0], abs=0.02)
