@@ -25,7 +25,7 @@ def test_the_long_recipe_in_fewer_steps_is_the_short_one():
     new = stretched(load("splat").settings, 7000 / 30000).training
     assert (new.steps, new.rates.means.over) == (7000, 7000)
     raise_sh, densify, reset, white = new.during[:4]
-    assert (raise_sh.every, densify.every, densify.start, densify.stop) == (233, 23, 116, 3500)
+    assert (raise_sh.every, densify.every, densify.start, densify.stop) == (233, 23, 115, 3450)
     assert [rule.start for rule in densify.rules] == [0, 0, 0, 700]
     assert (reset.every, reset.stop) == (700, 3500)
     assert [step for step in range(1, 7000) if white.due(step)] == [116]
@@ -44,6 +44,21 @@ def test_only_steps_change_and_all_of_them(name):
         if place.endswith((".steps", ".start", ".stop", ".over", ".until")) and isinstance(value, int) and value
     ]
     assert set(stretchable) <= found.keys()
+
+
+@pytest.mark.parametrize("factor", [0.0371, 0.176, 0.617, 1.9])
+@pytest.mark.parametrize("name", sorted({*TRAINING} - {"smoke"}))  # which has few steps as it is
+def test_what_ends_acts_as_often(name, factor):
+    settings = load(name).settings
+    old, new = settings.training, stretched(settings, factor).training
+    for before, after in zip(old.during, new.during, strict=True):
+        if before.stop is None or before.every == 1:
+            continue
+        counts = [
+            sum(stage.due(step) for step in range(1, training.steps))
+            for stage, training in ((before, old), (after, new))
+        ]
+        assert counts[0] == counts[1], before
 
 
 @pytest.mark.parametrize("factor", [0.01, 0.13, 0.5, 1.0, 3.7])

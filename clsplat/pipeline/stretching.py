@@ -1,6 +1,7 @@
 """A pipeline in another number of steps: places, lengths and cadences of its training are multiplied.
 
-So as many edits are made, each at the same share of the training.
+So each edit that has an end is made as often, at about the same share of the training.  What follows from the number of
+updates, such as a filter that is learned, does not change.
 """
 
 import math
@@ -24,19 +25,31 @@ def _stretched(value: Any, factor: float) -> Any:
         return value
     fields = {name: getattr(value, name) for name in type(value).model_fields}
     keys = {key for base in type(value).__mro__ if issubclass(base, Settings) for key in base.step_keys}
+    every = fields["every"] if "every" in keys else None
     changed = {
-        name: _steps(name, field, factor) if name in keys else _stretched(field, factor)
+        name: _steps(name, field, factor, every) if name in keys else _stretched(field, factor)
         for name, field in fields.items()
     }
     return value.model_copy(update={name: new for name, new in changed.items() if new is not fields[name]})
 
 
-def _steps(name: str, steps: Any, factor: float) -> Any:
-    """A number of steps; what ends before a step ends after the last of the steps before it, what acts at each step
-    acts at each."""
-    if not isinstance(steps, int) or steps == 0 or (name == "every" and steps == 1):
+def _steps(name: str, steps: Any, factor: float, every: Any = None) -> Any:
+    """A number of steps; one that begins or ends what acts at multiples of `every` does so at the same of them."""
+    if not isinstance(steps, int) or steps == 0:
         return steps
-    return math.ceil(steps * factor) if name == "stop" else max(1, math.floor(steps * factor))
+    if name == "every":
+        return _cadence(steps, factor)
+    if name not in ("start", "stop") or not isinstance(every, int):
+        return max(1, math.floor(steps * factor))
+    after = name == "stop"  # what acts at a step before it is what acts up to the step before it
+    number, rest = divmod(steps - after, every)
+    cadence = _cadence(every, factor)
+    return number * cadence + min(math.floor(rest * factor), cadence - 1) + after
+
+
+def _cadence(every: int, factor: float) -> int:
+    """What acts at each step acts at each."""
+    return every if every == 1 else max(1, math.floor(every * factor))
 
 
 def _points(points: list[list[float]], factor: float) -> list[list[float]]:
