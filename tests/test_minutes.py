@@ -3,15 +3,18 @@
 import hashlib
 import math
 import re
+from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 import clsplat
-from clsplat.errors import ConfigError
-from clsplat.pipeline.loading import load
+from clsplat.errors import ConfigError, Interrupted
+from clsplat.pipeline.loading import Pipeline, load
 from clsplat.runs import minutes
-from clsplat.runs.minutes import Rehearsal, fitted, most_steps, predicted
+from clsplat.runs.minutes import Rehearsal, most_steps, pipeline_for, predicted
+from clsplat.training.run import Progress, Run
 
 
 def rehearsal(steps: int, step: float) -> Rehearsal:
@@ -47,11 +50,11 @@ def test_as_many_steps_are_chosen_as_fit(seconds):
 def test_too_little_time_is_refused_with_what_would_do():
     """200 steps take 5 + 4 s, and 60 have gone."""
     with pytest.raises(ConfigError, match=r"expected 1\.2 or more"):
-        fitted(load("splat_7k"), [rehearsal(200, 0.02)], seconds=0.0, minutes=1.0)
+        pipeline_for(load("splat_7k"), [rehearsal(200, 0.02)], seconds=0.0, minutes=1.0)
 
 
 def test_the_choice_stretches_every_schedule_and_gives_its_reason():
-    found = fitted(load("splat_7k"), [rehearsal(200, 0.01)], seconds=40.0, minutes=1.0)
+    found = pipeline_for(load("splat_7k"), [rehearsal(200, 0.01)], seconds=40.0, minutes=1.0)
     training = found.settings.training
     assert training.steps == 3500
     assert [stage.every for stage in training.during[:2]] == [500, 50]
@@ -60,11 +63,50 @@ def test_the_choice_stretches_every_schedule_and_gives_its_reason():
     )
 
 
+@pytest.mark.parametrize("growth", [0.0, 3.0, 30.0])
+@pytest.mark.parametrize("given", [2.0, 10.0, 60.0])
+def test_it_takes_the_time_that_was_given(monkeypatch, given, growth):
+    """By a made-up clock: steps take longer as Gaussians grow, in long trainings more than in a rehearsal."""
+    clock, done = [0.0], [0]
+
+    def cost(step: int, planned: int) -> float:
+        return 0.01 * (1 + growth * (planned / 7000) ** 0.4 * min(1, 2 * step / planned))
+
+    def rehearse(pipeline: Pipeline, run: Run, factor: float) -> Rehearsal:
+        steps = round(7000 * factor)
+        each = sum(cost(step, steps) for step in range(steps)) / steps
+        clock[0] += 3 + 2 + steps * each
+        return Rehearsal(steps, each, during=3.0, after=2.0, growth=0.5)
+
+    def execute(pipeline: Pipeline, run: Run, start: str, show: minutes.Show) -> None:
+        steps = pipeline.settings.training.steps
+        planned.append(steps)
+        while done[0] < steps:
+            done[0] += 1
+            now = cost(done[0], planned[0])
+            clock[0] += now + 3 / planned[0]
+            if done[0] % 100 == 0 or done[0] == steps:
+                show(Progress(done[0], steps, 0.0, 0.0, 0, 0.0, seconds_left=now * (steps - done[0])))
+            if run.interrupted:
+                raise Interrupted("")
+        clock[0] += 2
+
+    planned: list[int] = []
+    monkeypatch.setattr(minutes, "time", SimpleNamespace(perf_counter=lambda: clock[0]))
+    monkeypatch.setattr(minutes, "rehearse", rehearse)
+    monkeypatch.setattr(minutes, "new_run", lambda *given: SimpleNamespace(interrupted=False))
+    run = SimpleNamespace(status=SimpleNamespace(stage=lambda name: nullcontext()))
+    minutes.execute_within(given, load("splat_7k"), run, "new", lambda progress: None, execute)
+    assert clock[0] == pytest.approx(60 * given, rel=0.05)
+    assert len(planned) == 2
+    assert done[0] == planned[1]
+
+
 @pytest.fixture
 def short_rehearsals(monkeypatch):
     monkeypatch.setattr(minutes, "FIRST", 10)
     monkeypatch.setattr(minutes, "SHARE", 0.0)
-    monkeypatch.setattr(minutes, "rehearsed", lambda *given: [minutes.rehearse(*given[:2], 0.2)])
+    monkeypatch.setattr(minutes, "rehearsals_of", lambda *given: [minutes.rehearse(*given[:2], 0.2)])
 
 
 @pytest.mark.slow

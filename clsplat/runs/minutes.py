@@ -54,33 +54,33 @@ def execute_within(minutes: float, pipeline: Pipeline, run: Run, start: Start, s
     Raises ConfigError where not exactly one stage trains, or FIRST steps take longer, and what `execute` raises.
     """
     until = time.perf_counter() + 60 * minutes
-    rehearsals = rehearsed(pipeline, run, minutes)
-    fitting = fitted(pipeline, rehearsals, until - time.perf_counter(), minutes)
-    trained, last = fitting.settings.training.steps, rehearsals[-1]
+    rehearsals = rehearsals_of(pipeline, run, minutes)
+    chosen = pipeline_for(pipeline, rehearsals, until - time.perf_counter(), minutes)
+    planned, last = chosen.settings.training.steps, rehearsals[-1]
 
-    def corrected(report: Progress) -> Pipeline:
-        rest = last.after + last.during * (1 - report.step / trained)
-        each = report.seconds_left / (trained - report.step)
+    def correct(report: Progress) -> Pipeline:
+        rest = last.after + last.during * (1 - report.step / planned)
+        each = report.seconds_left / (planned - report.step)
         steps = report.step + max(1, int((until - time.perf_counter() - rest) / each))
         reason = f"--minutes {minutes:g}: {steps:,} steps, of which {report.step:,} had shown what one takes"
         LOG.info("%s: %.0f ms", reason, 1e3 * each)
-        return replace(fitting, settings=lasting(fitting.settings, steps), reason=reason)
+        return replace(chosen, settings=with_steps(chosen.settings, steps), reason=reason)
 
-    pause = Pause(fresh(run, fitting), round(trained * min(max(KNOWN[0], last.growth), KNOWN[1])), corrected)
+    pause = Pause(new_run(run, chosen), round(planned * min(max(KNOWN[0], last.growth), KNOWN[1])), correct)
     try:
-        execute(fitting, pause.run, start, pause.showing(show))
+        execute(chosen, pause.run, start, pause.showing(show))
     except Interrupted:
         if pause.corrected is None:
             raise
     if pause.corrected is not None:
         del pause.run  # and its tables on the device
-        execute(pause.corrected, fresh(run, pause.corrected), "resume", show)
+        execute(pause.corrected, new_run(run, pause.corrected), "resume", show)
 
 
 @dataclass
 class Pause:
-    """Interrupts a run at the first report from a step on, which corrects its pipeline: the checkpoint is of the new
-    one."""
+    """Corrects the pipeline of a run at the first report from a step on, and interrupts it: its checkpoint is of the
+    corrected one."""
 
     run: Run
     at: int
@@ -100,7 +100,7 @@ class Pause:
         return shown
 
 
-def rehearsed(pipeline: Pipeline, run: Run, minutes: float) -> list[Rehearsal]:
+def rehearsals_of(pipeline: Pipeline, run: Run, minutes: float) -> list[Rehearsal]:
     """Return rehearsals in growing numbers of steps; the longest takes a small part of the time, or is the first.
 
     Raises ConfigError where not exactly one stage trains.
@@ -131,7 +131,7 @@ def rehearse(pipeline: Pipeline, run: Run, factor: float) -> Rehearsal:
             nonlocal trained
             trained = time.perf_counter()
 
-        one = fresh(run, short, out=out, status=StatusFile(out), show=show)
+        one = new_run(run, short, out=out, status=StatusFile(out), show=show)
         one.records.start()
         start = time.perf_counter()
         run_stages(short, one)
@@ -142,21 +142,21 @@ def rehearse(pipeline: Pipeline, run: Run, factor: float) -> Rehearsal:
         return Rehearsal(one.step, step, max(0.0, during), end - trained, max(growth, default=0) / one.step)
 
 
-def fitted(pipeline: Pipeline, rehearsals: Sequence[Rehearsal], seconds: float, minutes: float) -> Pipeline:
+def pipeline_for(pipeline: Pipeline, rehearsals: Sequence[Rehearsal], seconds: float, minutes: float) -> Pipeline:
     """Return the pipeline in as many steps as are predicted to take so many seconds.
 
     Raises ConfigError where those are fewer than FIRST.
     """
     steps = pipeline.settings.training.steps
-    chosen = most_steps(rehearsals, seconds)
-    if chosen < FIRST:
+    number = most_steps(rehearsals, seconds)
+    if number < FIRST:
         least = minutes + (predicted(rehearsals, FIRST) - seconds) / 60
         expected = f"expected {math.ceil(10 * least) / 10:g} or more for this scene on this device"
         raise ConfigError(f"--minutes {minutes:g}: {expected}, or a pipeline that does less")
-    told = f"{chosen:,} steps in the place of {steps:,}, which take about {seconds / 60:.1f} minutes more"
+    told = f"{number:,} steps in the place of {steps:,}, which take about {seconds / 60:.1f} minutes more"
     reason = f"--minutes {minutes:g}: {told}, by a rehearsal in {rehearsals[-1].steps:,} steps"
     LOG.info("%s", reason)
-    return replace(pipeline, settings=stretched(pipeline.settings, chosen / steps), reason=reason)
+    return replace(pipeline, settings=stretched(pipeline.settings, number / steps), reason=reason)
 
 
 def predicted(rehearsals: Sequence[Rehearsal], steps: int) -> float:
@@ -185,13 +185,13 @@ def most_steps(rehearsals: Sequence[Rehearsal], seconds: float) -> int:
     return low
 
 
-def fresh(run: Run, pipeline: Pipeline, **changes: Any) -> Run:
+def new_run(run: Run, pipeline: Pipeline, **changes: Any) -> Run:
     """Return a run of the pipeline as this one was before its first step, with its device, scene and photographs."""
     own: dict[str, Any] = {"numbers": {}, "written": {}, "metrics": {}, "changes": []}
     return replace(run, settings=pipeline.settings, pipeline=pipeline.resolved(), **own, **changes)
 
 
-def lasting(settings: PipelineFile, steps: int) -> PipelineFile:
+def with_steps(settings: PipelineFile, steps: int) -> PipelineFile:
     """Return settings whose training has so many steps, of which those that have been done are the same."""
     return _each(settings, lambda training: training.model_copy(update={"steps": steps}))
 
