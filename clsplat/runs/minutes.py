@@ -21,6 +21,7 @@ from clsplat.pipeline.loading import Pipeline
 from clsplat.pipeline.stretching import stretched
 from clsplat.runs.folders import Start
 from clsplat.runs.runner import run_stages
+from clsplat.signals import stop_if_signalled
 from clsplat.stages.optimize import Optimize
 from clsplat.training.run import Progress, Run
 from clsplat.training.status import StatusFile
@@ -72,6 +73,7 @@ def execute_within(minutes: float, pipeline: Pipeline, run: Run, start: Start, s
     except Interrupted:
         if pause.corrected is None:
             raise
+        stop_if_signalled()
     if pause.corrected is not None:
         del pause.run  # and its tables on the device
         execute(pause.corrected, new_run(run, pause.corrected), "resume", show)
