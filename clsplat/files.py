@@ -71,6 +71,21 @@ def new_folder(folder: Path) -> Iterator[Path]:
     Raises ConfigError where `folder` is in use, OutputError, before the block too, where it cannot be made.
     """
     require_free(folder)
+    with scratch_folder(folder) as temporary:
+        yield temporary
+        with told_as(folder):
+            if folder.exists():
+                folder.rmdir()  # it is empty; Windows replaces no folder
+            _replace(temporary, folder)
+            sync_folder(folder.parent)
+
+
+@contextmanager
+def scratch_folder(folder: Path) -> Iterator[Path]:
+    """Yield a hidden folder beside `folder`, which is removed at the end of the block.
+
+    Those that killed processes left there are removed.  Raises OutputError, before the block, where it cannot be made.
+    """
     temporary = _temporary(folder)
     try:
         with told_as(folder):
@@ -78,11 +93,6 @@ def new_folder(folder: Path) -> Iterator[Path]:
             temporary.mkdir()
             _sweep_beside(folder)
         yield temporary
-        with told_as(folder):
-            if folder.exists():
-                folder.rmdir()  # it is empty; Windows replaces no folder
-            _replace(temporary, folder)
-            sync_folder(folder.parent)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
         _open.discard(temporary.name)

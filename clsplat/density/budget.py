@@ -50,7 +50,7 @@ class Momentum(Budget):
 
     gaussians: Annotated[int, Field(gt=0)] | None = None
     """Number at the end; without it, the one that growth finds."""
-    begin: Annotated[float, Field(gt=0)] = 5.0
+    begin: Annotated[float, Field(gt=0, le=1e6)] = 5.0
     """First value of the sum, as a multiple of the Gaussians at the start."""
     keep: Annotated[float, Field(ge=0, lt=1)] = 0.98
     """Share of the sum that stays from edit to edit."""
@@ -67,12 +67,12 @@ class Momentum(Budget):
 
     def limit(self, edit: Edit, moment: Moment, numbers: dict[str, float]) -> int:
         count = edit.gaussians.count
-        begin = numbers.setdefault("momentum.start", count)
-        momentum = numbers.setdefault("momentum.sum", self.begin * begin)
+        begin = numbers.setdefault("momentum/start", count)
+        momentum = numbers.setdefault("momentum/sum", self.begin * begin)
         end = self.gaussians or begin + momentum
         target = end if moment.edits == 1 else begin + (end - begin) / moment.divisor ** (2 - moment.share)
         eager = int((edit.stats.mean("screen_grad") >= edit.at(self.gradient_above)).sum())
-        numbers["momentum.sum"] = max(momentum, float(int(self.keep * momentum + min(self.most, eager))))
+        numbers["momentum/sum"] = max(momentum, float(int(self.keep * momentum + min(self.most, eager))))
         return min(max(count, int(target)), int(count * (1 + self.growth)))
 
 

@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 from clsplat.settings import Settings
 
 Value = TypeVar("Value")
+MOST = 2**63 - 1  # that a file can hold
 
 
 def stretched(value: Value, factor: float) -> Value:
@@ -40,11 +41,11 @@ def _steps(name: str, steps: Any, factor: float, every: Any = None) -> Any:
     if name == "every":
         return _cadence(steps, factor)
     if name not in ("start", "stop") or not isinstance(every, int):
-        return max(1, math.floor(steps * factor))
+        return max(1, min(math.floor(steps * factor), MOST))
     after = name == "stop"  # what acts at a step before it is what acts up to the step before it
     number, rest = divmod(steps - after, every)
     cadence = _cadence(every, factor)
-    return number * cadence + min(math.floor(rest * factor), cadence - 1) + after
+    return min(number * cadence + min(math.floor(rest * factor), cadence - 1) + after, MOST)
 
 
 def _cadence(every: int, factor: float) -> int:

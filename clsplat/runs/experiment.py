@@ -24,7 +24,7 @@ from clsplat.runs.course import is_finished
 from clsplat.runs.default_folder import free_folder, start_of
 from clsplat.runs.failures import failures_recorded
 from clsplat.runs.folders import Start
-from clsplat.runs.found import has_ended
+from clsplat.runs.found import has_begun, has_ended
 from clsplat.runs.scenes import read_run_scene
 from clsplat.runs.single import run_pipeline
 from clsplat.runs.source import photographs_of
@@ -93,7 +93,7 @@ class Job:
             raise ConfigError(
                 "--minutes: expected a single run; a matrix has several: give optimize.steps in its cells"
             )
-        if minutes is not None and self.start == "resume":
+        if minutes is not None and self.start == "resume" and has_begun(self.out):
             raise ConfigError("--minutes is for a new run, whose steps it chooses; leave it out to go on with this one")
         with previewed(live) as preview:
             self._run(device, preview, minutes)

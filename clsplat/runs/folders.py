@@ -49,7 +49,7 @@ def opened(out: Path, start: Start, **values: Any) -> Iterator[StatusFile]:
         with lock.held(out) as require_held:
             check_run_folder(out, start)  # again: another run may have ended since
             sweep(out, border=PIPELINE)
-            before = read_text(out / STATUS) if start == "resume" and is_done(out) else None
+            before = read_text(out / STATUS) if start != "new" and is_done(out) else None
             status = StatusFile(out, require_held, **values)
             status.begin()
             try:

@@ -10,17 +10,16 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from pathlib import Path
 from statistics import fmean
-from tempfile import TemporaryDirectory
 from typing import Any
 
 from clsplat.errors import ConfigError, Interrupted
+from clsplat.files import scratch_folder
 from clsplat.pipeline.file import PipelineFile
 from clsplat.pipeline.loading import Pipeline
 from clsplat.pipeline.stretching import stretched
 from clsplat.runs.folders import Start
-from clsplat.runs.runner import run_stages
+from clsplat.runs.runner import run_stages, write_pipeline
 from clsplat.signals import stop_if_signalled
 from clsplat.stages.optimize import Optimize
 from clsplat.training.run import Progress, Run
@@ -61,13 +60,14 @@ def execute_within(minutes: float, pipeline: Pipeline, run: Run, start: Start, s
 
     def correct(report: Progress) -> Pipeline:
         rest = last.after + last.during * (1 - report.step / planned)
-        each = report.seconds_left / (planned - report.step)
+        each = report.milliseconds / 1e3  # of the steps since the last edit
         steps = report.step + max(1, int((until - time.perf_counter() - rest) / each))
         reason = f"--minutes {minutes:g}: {steps:,} steps, of which {report.step:,} had shown what one takes"
-        LOG.info("%s: %.0f ms", reason, 1e3 * each)
+        LOG.info("%s: %.0f ms", reason, report.milliseconds)
         return replace(chosen, settings=with_steps(chosen.settings, steps), reason=reason)
 
-    pause = Pause(new_run(run, chosen), round(planned * min(max(KNOWN[0], last.growth), KNOWN[1])), correct)
+    known = planned * min(max(KNOWN[0], last.growth), KNOWN[1]) + chosen.settings.training.log_every
+    pause = Pause(new_run(run, chosen), round(known), correct)
     try:
         execute(chosen, pause.run, start, pause.showing(show))
     except Interrupted:
@@ -96,6 +96,7 @@ class Pause:
             show(progress)
             if self.at <= progress.step < progress.steps and not self.run.interrupted:
                 self.corrected = self.correct(progress)
+                write_pipeline(self.corrected, self.run)  # before the checkpoint: whoever resumes takes it
                 self.run.settings, self.run.pipeline = self.corrected.settings, self.corrected.resolved()
                 self.run.interrupted = True
 
@@ -114,24 +115,33 @@ def rehearsals_of(pipeline: Pipeline, run: Run, minutes: float) -> list[Rehearsa
         )
     steps = pipeline.settings.training.steps
     found, took = list[Rehearsal](), 0.0
+    until = time.perf_counter() + 60 * minutes
+    run.status.note(seconds_left=None)
     with run.status.stage("rehearse"):
         while took < SHARE * 60 * minutes:
             number, began = FIRST * LONGER ** len(found), time.perf_counter()
             LOG.info("--minutes %g: %s is rehearsed in %d steps", minutes, pipeline.settings.name, number)
-            found.append(rehearse(pipeline, run, number / steps))
+            found.append(rehearse(pipeline, run, number / steps, until))
             took = time.perf_counter() - began
     return found
 
 
-def rehearse(pipeline: Pipeline, run: Run, factor: float) -> Rehearsal:
-    """Run all stages of the pipeline in `factor` times its steps; the run is left as it is."""
+def rehearse(pipeline: Pipeline, run: Run, factor: float, until: float) -> Rehearsal:
+    """Run all stages of the pipeline in `factor` times its steps; the run is left as it is.
+
+    Raises ConfigError where the clock comes to `until` meanwhile.
+    """
     short = replace(pipeline, settings=_reporting(stretched(pipeline.settings, factor)))
-    with TemporaryDirectory(prefix="clsplat-") as folder, _only_warnings():
-        out, trained = Path(folder), 0.0
+    with scratch_folder(run.out / "rehearsal") as out, _only_warnings():
+        trained = 0.0
 
         def show(progress: Progress) -> None:
             nonlocal trained
             trained = time.perf_counter()
+            run.status.count("steps", progress.step, progress.steps)
+            if trained > until:
+                alone = f"a rehearsal in {progress.steps} steps alone takes longer on this device"
+                raise ConfigError(f"--minutes: expected more: {alone}; or a pipeline that does less")
 
         one = new_run(run, short, out=out, status=StatusFile(out), show=show)
         one.records.start()

@@ -57,13 +57,18 @@ def begin(pipeline: Pipeline, run: Run, start: Start) -> Lost:
     run.status.enter("running", step=run.step)  # a refusal leaves all as it was; from here on files change
     lost = keep_checksums(Course(pipeline, run.out, run), run)
     checkpoint.drop_later(run.out, taken)
-    reason = f"# {pipeline.reason}\n" if pipeline.reason else ""
-    write_text(run.out / PIPELINE, f"{RESOLVED}{pipeline.path.name}\n{reason}{pipeline.text()}")
+    write_pipeline(pipeline, run)
     write_inputs(run)
     if run.prepared:
         write_text(run.out / NOTE, json.dumps(run.prepared) + "\n")
     run.records.start()
     return lost
+
+
+def write_pipeline(pipeline: Pipeline, run: Run) -> None:
+    """Write every setting of the run, with the reason where some are not those of the file."""
+    reason = f"# {pipeline.reason}\n" if pipeline.reason else ""
+    write_text(run.out / PIPELINE, f"{RESOLVED}{pipeline.path.name}\n{reason}{pipeline.text()}")
 
 
 def restore(pipeline: Pipeline, run: Run) -> Path | None:

@@ -84,8 +84,8 @@ class DetailDivisor(Settings):
 
     follows: Literal["detail"]
     """`detail`: the mean spectrum of the training photographs."""
-    until: Annotated[int, Field(gt=0)]
-    """Global step at which the photographs have their full size, at the latest."""
+    until: Annotated[int, Field(gt=0, le=10**6)]
+    """Global step at which the photographs have their full size, at the latest; up to a million."""
     largest: Annotated[float, Field(ge=1)] = 8
     """Largest divisor."""
     every: Annotated[int, Field(gt=0)] = 100
@@ -97,15 +97,16 @@ class DetailDivisor(Settings):
         """Return the divisors of training photographs, each [height, width, 3], by step."""
         steps, divisors = knots([Spectrum.of(image) for image in photographs], self.until, self.largest)
 
-        def at(step: int) -> float:
+        def at(places: Floats) -> Floats:
             """Linear in the number of pixels."""
-            pixels = float(np.interp(step, steps, divisors**-2.0))
-            return float(np.floor(pixels**-0.5 + 1e-9)) if step < self.until else 1.0
+            pixels = np.interp(places, steps, divisors**-2.0)
+            return np.where(places < self.until, np.floor(pixels**-0.5 + 1e-9), 1.0)
 
-        points = [[0.0, at(1)]]
-        for step in range(self.every * (self.start // self.every + 1), self.until + self.every, self.every):
-            if at(step) != points[-1][1]:
-                points.append([float(step + 1), at(step)])
+        changes = range(self.every * (self.start // self.every + 1), self.until + self.every, self.every)
+        places = np.array([1.0, *changes])
+        sizes = at(places)
+        differs = np.flatnonzero(np.diff(sizes)) + 1
+        points = [[0.0, float(sizes[0])], *([float(places[i]) + 1, float(sizes[i])] for i in differs)]
         return Points(points=points, between="steps")
 
 
