@@ -83,8 +83,11 @@ class GrowScored(ByScore):
         if edit.room is None or edit.room >= 0:
             return
         rows, kept = edit.rows().astype(np.int64), edit.kept.get() > 0
+        refused = rows > 1
+        if not refused.any():
+            return
         room = edit.room + int(np.maximum(rows - 1, 0).sum())
-        score, random, refused = self.score(edit), edit.random(), rows > 1
+        score, random = self.score(edit), edit.random()
         for kind, part in ((kept, (refused & kept).sum() / refused.sum()), (~kept, 1.0)):
             order = drawn_order((rows > 1) & kind, score, random)
             added = np.cumsum(rows[order] - 1)
