@@ -226,7 +226,7 @@ class Optimize(Stage):
         stale = {name for stage in self.during if stage.due(run.step) for name in stage.stale(run)}
         trainer.losses = [*self.losses, *run.losses]
         view = trainer.compare(photograph, run.step, sample.transforms)
-        visit = self.skip.visit(sample.original, view, run.numbers) if self.skip else Visit()
+        visit = self.skip.visit(sample.view.name, view, run.numbers) if self.skip else Visit()
         stale = set() if run.stage_step == self.steps else stale
         return view if visit.skipped else trainer.backward(view), stale, visit
 
