@@ -47,7 +47,8 @@ class SplitSaddle(Rule):
     """Replace a Gaussian by two, moved apart in the direction in which that lowers the loss most.
 
     It is split where the least eigenvalue of its splitting matrix, the mean over views, is low enough; the children
-    move along its eigenvector.  Those with the lowest eigenvalues come first below `max_gaussians`.
+    move along its eigenvector.  Those with the lowest eigenvalues come first below the limit of the edit
+    (`max_gaussians`, `budget`, memory).
     """
 
     type: Literal["split_saddle"] = "split_saddle"

@@ -72,7 +72,8 @@ class ByScore(Rule):
 
 
 class GrowScored(ByScore):
-    """Of the Gaussians that the rules before this one make several of, grow those that `max_gaussians` allows.
+    """Of the Gaussians that the rules before this one make several of, grow as many as the limit of the edit allows
+    (`max_gaussians`, `budget`, memory).
 
     They are drawn by score; those that are kept and those that are replaced have shares of the room by their numbers.
     """
