@@ -71,7 +71,7 @@ class Optimize(Stage):
     @field_validator("losses")
     @classmethod
     def _of_an_image(cls, losses: list[Loss]) -> list[Loss]:
-        if not any(isinstance(loss, ImageLoss) and not loss.reads_entropy for loss in losses):
+        if not any(isinstance(loss, ImageLoss) and loss.reads_photograph for loss in losses):
             raise ValueError("expected at least one loss that compares images, such as l1")
         return losses
 
