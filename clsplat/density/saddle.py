@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from clsplat.density.detail import largest
 from clsplat.density.edit import Edit, Rule
 from clsplat.density.mixture import covariance_of
+from clsplat.density.sampling import largest
 from clsplat.density.statistics import Statistic
 from clsplat.gaussians.tables import Gaussians
 from clsplat.losses.base import ViewGradients

@@ -8,10 +8,9 @@ from numpy.typing import NDArray
 from pydantic import Field
 from scipy.ndimage import laplace
 
-from clsplat.density.accuracy import LOSSES, scaled
 from clsplat.density.edit import Edit, Rule
 from clsplat.density.sampling import SampledPruning, drawn_order
-from clsplat.density.survey import BLENDED, WEIGHT, Look, Survey
+from clsplat.density.survey import BLENDED, LOSSES, WEIGHT, Look, Survey, scaled
 from clsplat.formats.splats import inverse_opacities
 
 Floats = NDArray[np.float64]
