@@ -8,6 +8,7 @@ import pytest
 
 from clsplat.density.budget import Moment, Momentum
 from clsplat.errors import ConfigError
+from clsplat.pipeline.loading import load
 from clsplat.schedule import Decay
 from clsplat.training.adam import Rates
 from clsplat.views.detail import KNOTS, LEVELS, DetailDivisor, Spectrum, course, knots
@@ -97,6 +98,13 @@ def test_the_rate_of_the_means_is_constant_up_to_the_full_size():
     means = [rates.settled(600).at(step, 2.0)["means"] for step in (1, 600, 800, 1000, 2000)]
     assert means == pytest.approx([2e-2, 2e-2, 2e-3, 2e-4, 2e-4], rel=1e-9)
     assert rates.settled(5000).means.over == 1
+
+
+def test_rates_that_wait_for_the_full_size_are_settled_before_they_are_used():
+    rates = load("dash").settings.training.rates
+    with pytest.raises(ConfigError, match=r"start: full_size.* expected what `settled\(step\)` returns"):
+        rates.at(1, 1.0)
+    assert rates.settled(1).at(1, 1.0)["means"] == pytest.approx(rates.means.initial, rel=1e-3)
 
 
 def edit_of(count: int, eager: int, step: int = 100) -> SimpleNamespace:

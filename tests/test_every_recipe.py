@@ -19,6 +19,8 @@ from clsplat.stages.optimize import Optimize
 from clsplat.training import checkpoint, records
 from clsplat.training.state import State
 
+pytestmark = pytest.mark.slow
+
 STEPS = 24
 RECIPES = [
     name
@@ -28,6 +30,7 @@ RECIPES = [
     and any(isinstance(s, Optimize) for s in load(name).stages)
 ]
 LOOKS_AT_VIEWS = {"fastgs_7k", "speedy_7k", "mini_7k", "taming_7k"}
+LEARNS = {"auto_opti3dgs", "auto_opti3dgs_7k"}
 ONE_THREAD = {"POCL_MAX_PTHREAD_COUNT": "1", "POCL_CPU_MAX_CU_COUNT": "1", "CL_CONFIG_CPU_TBB_NUM_WORKERS": "1"}
 ALONE = """
 import sys
@@ -94,6 +97,8 @@ def test_a_recipe_gives_the_same_bits_after_a_stop_and_with_one_thread(name, tin
         assert removed > 0 or "taming" in name, "none is faint, so soon"
     assert digest(with_one_thread / name) == expected
     numbers = newest(tmp_path / "run").numbers
+    assert newest(with_one_thread / name).numbers == numbers
+    assert name not in LEARNS or numbers["haar/scale"] != 0
     stopped = tmp_path / "stopped"
     shutil.copytree(tmp_path / "run", stopped)
     *_, last = sorted((stopped / "checkpoints").iterdir())

@@ -69,6 +69,9 @@ REFUSED = {
     "plugins={}": "'plugins' cannot be set",
     "optimize.during=[{every: 3}, {to: 1, every: 3}]": "expected a 'stage', the name of the stage",
     "optimize.losses=[{weight: 3}]": "expected a 'type', the name of the loss",
+    "densify.budget={gaussians: 1}": "expected a 'type', the name of the budget",
+    "densify.budget.gaussians=40000": "expected a 'type', the name of the budget",
+    "densify.budget={type: parabol}": "no budget named 'parabol'; did you mean 'parabola'?",
     "model.world_filter={type: none, variance: 1}": "unknown key 'variance'; there are no other keys here, remove it",
     "stages=3": "expected a list, got 3",
 }

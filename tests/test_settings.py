@@ -26,15 +26,15 @@ stages:
       views: {views}
       losses: {losses}
       during:
-        - densify: {{every: 5, rules: {rules}}}
+        - densify: {{every: 5, rules: {rules}, budget: {budget}}}
 """
 
 
 @pytest.fixture
 def loaded(tmp_path: Path):
-    def loaded(views: str = "{}", losses: str = "[l1]", rules: str = "[clone]") -> Pipeline:
+    def loaded(views: str = "{}", losses: str = "[l1]", rules: str = "[clone]", budget: str = "null") -> Pipeline:
         path = tmp_path / "small.yaml"
-        path.write_text(PIPELINE.format(views=views, losses=losses, rules=rules))
+        path.write_text(PIPELINE.format(views=views, losses=losses, rules=rules, budget=budget))
         return load(str(path))
 
     return loaded
@@ -139,6 +139,9 @@ def test_a_word_means_the_variant_with_its_defaults(loaded):
         ({"views": "{order: 3}"}, "stages[1].optimize.views.order: "),
         ({"views": "{order: {}}"}, "stages[1].optimize.views.order: expected a 'type', the name of the order"),
         ({"views": "{order: {type: paper, share: 1}}"}, "optimize.views.order.share: unknown key 'share'"),
+        ({"budget": "{gaussians: 1}"}, "small.yaml:9: stages[1].optimize.during[0].densify.budget: expected a "
+         "'type', the name of the budget"),
+        ({"budget": "parabol"}, "no budget named 'parabol'; did you mean 'parabola'?"),
         ({"views": "{oder: paper}"}, "unknown key 'oder'; did you mean 'order'?"),
         ({"views": "{transforms: [blur]}"}, "'sigma' is missing"),
         ({"rules": "[{type: clone, statistic: screen_grat}]"}, "rules[0].statistic: expected "),

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from clsplat.errors import ConfigError
+from clsplat.gaussians.tables import moment_tables
 from clsplat.losses.base import ViewGradients, ViewLosses
 from clsplat.opencl.device import Array
 from clsplat.pipeline.loading import load
@@ -108,12 +109,13 @@ def test_a_loss_that_is_not_finite_changes_nothing():
 def test_a_view_has_an_average_at_each_size_and_none_up_to_the_start():
     skip = Skip(start=8)
     numbers: dict[str, float] = {}
-    for step, downscale in ((8, 1), (9, 1), (10, 2), (11, 1)):
-        view = SimpleNamespace(name="a.png", downscale=downscale)
-        losses = SimpleNamespace(comparison=SimpleNamespace(step=step), loss=float(step))
-        numbers.update(skip.visit(view, losses, numbers).numbers)
+    for step, width in ((8, 40), (9, 40), (10, 20), (11, 40)):
+        camera = SimpleNamespace(width=width, height=30)
+        losses = SimpleNamespace(comparison=SimpleNamespace(step=step, camera=camera), loss=float(step))
+        numbers.update(skip.visit("a.png", losses, numbers).numbers)
     averages = {name: value for name, value in numbers.items() if name.startswith("skip/loss/")}
-    assert averages == pytest.approx({"skip/loss/1/a.png": 0.95 * 9 + 0.05 * 11, "skip/loss/2/a.png": 10.0})
+    expected = {"skip/loss/40x30/a.png": 0.95 * 9 + 0.05 * 11, "skip/loss/20x30/a.png": 10.0}
+    assert averages == pytest.approx(expected)
 
 
 # ---- the setting
@@ -162,12 +164,23 @@ def test_a_skipped_step_leaves_all_as_it_was(tiny_scene, tmp_path, more):
             assert "anisotropy" not in [loss.name for loss in view.losses]
         else:
             changed = {name for name in after if after[name] != before.get(name)}
-            assert changed >= {"means", "means/moment1", "stats/seen", "stats/screen_grad", "updates"} & after.keys()
+            assert changed >= {"means", *moment_tables("means"), "stats/seen", "stats/screen_grad", "updates"}
             assert "haar/scale" in changed or not more or more[0] != HAAR
         before = after
     assert not any(skipped[: 5 + 12])
     assert 8 < sum(skipped) <= 0.75 * 45
     assert run.adam.updates["means"] == run.step - sum(skipped) == 50 - sum(skipped)
+
+
+def test_each_size_of_a_resolution_by_step_has_averages_of_its_own(tiny_scene, tmp_path):
+    """Photographs are half as large up to step 19."""
+    sizes = "optimize.views.resolution={points: [[0, 2], [20, 1]], between: steps}"
+    run, steps = begun(tiny_scene, tmp_path, "optimize.skip={start: 2, warm_up: 40}", sizes, *NO_EDITS)
+    for _ in range(36):
+        next(steps)
+    averages = [name.split("/")[2] for name in run.numbers if name.startswith("skip/loss/")]
+    assert set(averages) == {"20x20", "40x40"}
+    assert len(averages) > 8, "photographs"
 
 
 def test_a_failure_after_the_decision_leaves_the_step_before(tiny_scene, tmp_path, monkeypatch):

@@ -10,12 +10,10 @@ from pydantic import Field
 
 from clsplat.density.edit import Edit, Rule
 from clsplat.density.sampling import SampledPruning
-from clsplat.density.survey import BLENDED, Survey
+from clsplat.density.survey import BLENDED, LOSSES, Survey, scaled
 from clsplat.density.thresholds import Share
-from clsplat.losses.image import L1, Dssim
 from clsplat.schedule import NonNegative
 
-LOSSES = L1(weight=0.8), Dssim(weight=0.2)
 Floats = NDArray[np.float64]
 
 
@@ -38,14 +36,6 @@ def wrong_pixels(survey: Survey, views: int, error_above: float) -> Wrong:
         total += pixels
         weighted += look.loss(LOSSES) * pixels
     return Wrong(total // max(len(drawn), 1), scaled(weighted, np.ones(len(weighted), bool)))
-
-
-def scaled(values: Floats, counted: NDArray[np.bool_]) -> Floats:
-    """Return values between 0 for the least of those that count and 1 for the largest; all 0 where these are equal."""
-    least, most = (
-        float(bound(values[counted], initial=start)) for bound, start in ((np.min, np.inf), (np.max, -np.inf))
-    )
-    return (values - least) / (most - least) if most > least else np.zeros_like(values)
 
 
 class ByWrongPixels(Rule):

@@ -4,7 +4,8 @@ The contribution is the global significance of LightGaussian (Fan et al. 2024) w
 leaves out do not count, nor do those beyond the image's edge in its last tiles.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,10 +16,18 @@ from clsplat.opencl.device import Array
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.views.photographs import Photograph
 
+Score = Literal["weight", "sensitivity"]
+Scoring = Callable[[Rasterizer, DeviceModel, Iterable[Photograph], Array], NDArray[np.float32]]
 
-def contributions(rasterizer: Rasterizer, model: DeviceModel, photographs: Iterable[Photograph]) -> NDArray[np.float32]:
-    """Return the blend weights, alpha T, summed over photographs, [N]; 0 where a Gaussian is seen nowhere."""
-    total, background = np.zeros(model.gaussians.count, np.float32), rasterizer.device.zeros(3)
+
+def contributions(
+    rasterizer: Rasterizer, model: DeviceModel, photographs: Iterable[Photograph], background: Array
+) -> NDArray[np.float32]:
+    """Return the blend weights, alpha T, summed over photographs, [N]; 0 where a Gaussian is seen nowhere.
+
+    background: [3]; the weights do not depend on it.
+    """
+    total = np.zeros(model.gaussians.count, np.float32)
     for photograph in photographs:
         total += Look.at(rasterizer, model, photograph, background).sum(WEIGHT)
     return total
@@ -36,3 +45,6 @@ def sensitivities(
         for channel in range(3):
             total += look.sum(SQUARE, channel=channel)
     return total
+
+
+SCORES: dict[Score, Scoring] = {"weight": contributions, "sensitivity": sensitivities}

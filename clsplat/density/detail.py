@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from clsplat.density.edit import Edit, Rule
+from clsplat.density.sampling import largest
 from clsplat.density.statistics import SEEN, StatisticName
 from clsplat.density.thresholds import PixelQuantile, Quantile, Share, Threshold
 from clsplat.gaussians.tables import INTERVAL2
@@ -41,15 +42,6 @@ class Subdivide(Rule):
         candidates = candidates & (edit.rows() == 1) & (edit.stats.mean("screen_radius") >= self.radius_above)
         chosen = largest(candidates, score, int(self.at_most * len(candidates)))
         edit.choose(chosen, copies=self.children, kept=0, shrink=self.beta**0.5)
-
-
-def largest(candidates: NDArray[np.bool_], score: NDArray[np.floating], limit: int) -> NDArray[np.bool_]:
-    """Return which candidates, [N], have the largest scores: at most `limit` of them, ties by index."""
-    places = np.flatnonzero(candidates)
-    order = np.argsort(-score[places], kind="stable")
-    chosen = np.zeros_like(candidates)
-    chosen[places[order[:limit]]] = True
-    return chosen
 
 
 class SplitTextured(Subdivide):

@@ -17,7 +17,7 @@ WEIGHTS = 2**24  # steps of an opacity as a weight: whole numbers, whose sums ar
 class Relocate(Rule):
     """Move faint Gaussians to opaque ones, drawn by opacity; those that share a place keep its opacity (eqs. 8 and 9).
 
-    As many more are drawn as the growth asks for.  `max_gaussians` limits it.
+    As many more are drawn as the growth asks for, up to the limit of the edit (`max_gaussians`, `budget`, memory).
     """
 
     type: Literal["relocate"] = "relocate"

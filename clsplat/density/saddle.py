@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from clsplat.density.detail import largest
 from clsplat.density.edit import Edit, Rule
 from clsplat.density.mixture import covariance_of
+from clsplat.density.sampling import largest
 from clsplat.density.statistics import Statistic
 from clsplat.gaussians.tables import Gaussians
 from clsplat.losses.base import ViewGradients
@@ -47,7 +47,8 @@ class SplitSaddle(Rule):
     """Replace a Gaussian by two, moved apart in the direction in which that lowers the loss most.
 
     It is split where the least eigenvalue of its splitting matrix, the mean over views, is low enough; the children
-    move along its eigenvector.  Those with the lowest eigenvalues come first below `max_gaussians`.
+    move along its eigenvector.  Those with the lowest eigenvalues come first below the limit of the edit
+    (`max_gaussians`, `budget`, memory).
     """
 
     type: Literal["split_saddle"] = "split_saddle"

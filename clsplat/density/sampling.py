@@ -1,4 +1,4 @@
-"""Draws of Gaussians without replacement, and the removal of some of those that are faint or large."""
+"""Choices of Gaussians: the largest scores, draws without replacement, the removal of some that are faint or large."""
 
 from abc import abstractmethod
 from typing import ClassVar
@@ -21,6 +21,15 @@ def drawn_order(candidates: Mask, weights: NDArray[np.float64], random: np.rando
         keys = np.log1p(-random.random(len(weights))) / weights
     places = np.flatnonzero(candidates)
     return places[np.argsort(-keys[places], kind="stable")]
+
+
+def largest(candidates: Mask, score: NDArray[np.floating], limit: int) -> Mask:
+    """Return which candidates, [N], have the largest scores: at most `limit` of them, ties by index."""
+    places = np.flatnonzero(candidates)
+    order = np.argsort(-score[places], kind="stable")
+    chosen = np.zeros_like(candidates)
+    chosen[places[order[:limit]]] = True
+    return chosen
 
 
 class SampledPruning(Rule):

@@ -8,10 +8,9 @@ from numpy.typing import NDArray
 from pydantic import Field
 from scipy.ndimage import laplace
 
-from clsplat.density.accuracy import LOSSES, scaled
 from clsplat.density.edit import Edit, Rule
 from clsplat.density.sampling import SampledPruning, drawn_order
-from clsplat.density.survey import BLENDED, WEIGHT, Look, Survey
+from clsplat.density.survey import BLENDED, LOSSES, WEIGHT, Look, Survey, scaled
 from clsplat.formats.splats import inverse_opacities
 
 Floats = NDArray[np.float64]
@@ -72,7 +71,8 @@ class ByScore(Rule):
 
 
 class GrowScored(ByScore):
-    """Of the Gaussians that the rules before this one make several of, grow those that `max_gaussians` allows.
+    """Of the Gaussians that the rules before this one make several of, grow as many as the limit of the edit allows
+    (`max_gaussians`, `budget`, memory).
 
     They are drawn by score; those that are kept and those that are replaced have shares of the room by their numbers.
     """
@@ -83,8 +83,11 @@ class GrowScored(ByScore):
         if edit.room is None or edit.room >= 0:
             return
         rows, kept = edit.rows().astype(np.int64), edit.kept.get() > 0
+        refused = rows > 1
+        if not refused.any():
+            return
         room = edit.room + int(np.maximum(rows - 1, 0).sum())
-        score, random, refused = self.score(edit), edit.random(), rows > 1
+        score, random = self.score(edit), edit.random()
         for kind, part in ((kept, (refused & kept).sum() / refused.sum()), (~kept, 1.0)):
             order = drawn_order((rows > 1) & kind, score, random)
             added = np.cumsum(rows[order] - 1)

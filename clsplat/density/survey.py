@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from clsplat.gaussians.tables import DeviceModel
 from clsplat.losses.base import Comparison, ImageLoss
+from clsplat.losses.image import L1, Dssim
 from clsplat.opencl.device import Array
 from clsplat.opencl.program import constants
 from clsplat.render.pictures import inside
@@ -20,6 +21,7 @@ from clsplat.scene.scene import View
 from clsplat.views.photographs import Photograph, Photographs, apply_mask
 
 WEIGHT, BLENDED, SQUARE = (int(constants("splat.h")[f"SUM_{name}"]) for name in ("WEIGHT", "BLENDED", "SQUARE"))
+LOSSES = L1(weight=0.8), Dssim(weight=0.2)  # of a view in published scores
 Floats = NDArray[np.float32]
 Found = TypeVar("Found")
 
@@ -136,3 +138,11 @@ class Survey:
             self._found[key] = function(self, *arguments)
         found: Found = self._found[key]
         return found
+
+
+def scaled(values: NDArray[np.float64], counted: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Return values between 0 for the least of those that count and 1 for the largest; all 0 where these are equal."""
+    least, most = (
+        float(bound(values[counted], initial=start)) for bound, start in ((np.min, np.inf), (np.max, -np.inf))
+    )
+    return (values - least) / (most - least) if most > least else np.zeros_like(values)

@@ -105,6 +105,8 @@ class ImageLoss(Loss):
     symmetric: ClassVar[bool] = False
     """Whether it has the same value with image and photograph exchanged; a transform that learns needs that."""
     reads_entropy: ClassVar[bool] = False  # the fourth plane of image and gradient, which then exists
+    reads_photograph: ClassVar[bool] = True
+    """Whether it compares; one that does not needs no symmetry, and is no loss to train on alone."""
 
     @abstractmethod
     def add(self, comparison: Comparison) -> LossValue:
@@ -116,7 +118,7 @@ def require_symmetric(losses: Iterable[Loss], transforms: Sequence[PhotographTra
     if not learned_of(transforms):
         return
     for loss in losses:
-        if isinstance(loss, ImageLoss) and not loss.symmetric:
+        if isinstance(loss, ImageLoss) and loss.reads_photograph and not loss.symmetric:
             name = getattr(loss, "type", getattr(loss, "name", type(loss).__name__))
             raise ConfigError(
                 f"the loss '{name}', where '{name_of(transforms[-1])}' learns: expected losses that are the same with "
@@ -129,12 +131,14 @@ def gradient_by_photograph(losses: Iterable[Loss], comparison: Comparison) -> Ar
 
     It comes before that of the image: a loss keeps the sums of its last call, which its value is read from.
     """
-    gradient = comparison.workspace.array("grad_photograph", comparison.gradient.shape)
+    gradient = comparison.workspace.array("grad_photograph", comparison.photograph.shape)
     image, photograph = comparison.photograph, comparison.image
     exchanged = replace(comparison, image=image, photograph=photograph, gradient=gradient, accumulate=False)
-    for loss in losses:
-        if isinstance(loss, ImageLoss):
-            loss.add(exchanged)
+    compared = [loss for loss in losses if isinstance(loss, ImageLoss) and loss.reads_photograph]
+    if not compared:
+        gradient.fill(0)
+    for loss in compared:
+        loss.add(exchanged)
     return gradient
 
 

@@ -12,12 +12,13 @@ from clsplat.schedule import at_step
 class WeightEntropy(ImageLoss):
     """Mean over pixels of -Σ w ln w - T ln T, w = alpha T the weights of a pixel's splats and T what they leave.
 
-    It makes lists of splats shorter, and opacities sharper; published weights are from 0.005 to 0.015.  Pixels that a
+    It makes lists of splats shorter (Liu and Han 2026, with the weight 0.015), and opacities sharper.  Pixels that a
     mask leaves out do not count.
     """
 
     type: Literal["weight_entropy"] = "weight_entropy"
     reads_entropy: ClassVar[bool] = True
+    reads_photograph: ClassVar[bool] = False
 
     def add(self, comparison: Comparison) -> LossValue:
         camera, weight = comparison.camera, at_step(self.weight, comparison.step)

@@ -23,7 +23,10 @@ def models(annotation: Any) -> list[type[BaseModel]]:
 
 
 def bases(annotation: Any) -> list[type[Settings]]:
-    """Return the base of the variants that a field accepts, in a list; without variants the list is empty."""
+    """Return the base of the variants that a field accepts, also of one that may be null, in a list; without variants
+    the list is empty."""
+    if typing.get_origin(annotation) in (typing.Union, types.UnionType):
+        return [base for argument in typing.get_args(annotation) for base in bases(argument)]
     if typing.get_origin(annotation) is not typing.Annotated:
         return []
     return [mark.base for mark in typing.get_args(annotation)[1:] if isinstance(mark, Variants)]
@@ -59,7 +62,7 @@ def with_tags(data: Any, annotation: Any) -> Any:
     """Return plain data with every bare name of a variant as {type: name}, and a stage as {stage: name, …}."""
     if isinstance(data, list):
         return [with_tags(item, inside_list(annotation)) for item in data]
-    for mark in _marks(annotation):
+    for mark in map(Variants, bases(annotation)):
         if isinstance(data, str):
             data = {mark.tag: data}
         elif mark.tag == "stage" and isinstance(data, dict) and len(data) == 1:
@@ -70,10 +73,3 @@ def with_tags(data: Any, annotation: Any) -> Any:
         known = {key: annotation_of(field) for key, field in model.model_fields.items()}
         return {key: with_tags(value, known.get(key)) for key, value in data.items()}
     return data
-
-
-def _marks(annotation: Any) -> list[Variants]:
-    """The marks of the variants that a field accepts, also of one that may be null."""
-    if typing.get_origin(annotation) in (typing.Union, types.UnionType):
-        return [mark for argument in typing.get_args(annotation) for mark in _marks(argument)]
-    return [Variants(base) for base in bases(annotation)]

@@ -71,7 +71,7 @@ class Optimize(Stage):
     @field_validator("losses")
     @classmethod
     def _of_an_image(cls, losses: list[Loss]) -> list[Loss]:
-        if not any(isinstance(loss, ImageLoss) and not loss.reads_entropy for loss in losses):
+        if not any(isinstance(loss, ImageLoss) and loss.reads_photograph for loss in losses):
             raise ValueError("expected at least one loss that compares images, such as l1")
         return losses
 
@@ -226,7 +226,7 @@ class Optimize(Stage):
         stale = {name for stage in self.during if stage.due(run.step) for name in stage.stale(run)}
         trainer.losses = [*self.losses, *run.losses]
         view = trainer.compare(photograph, run.step, sample.transforms)
-        visit = self.skip.visit(sample.original, view, run.numbers) if self.skip else Visit()
+        visit = self.skip.visit(sample.view.name, view, run.numbers) if self.skip else Visit()
         stale = set() if run.stage_step == self.steps else stale
         return view if visit.skipped else trainer.backward(view), stale, visit
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from clsplat.density.contribution import contributions, sensitivities
+from clsplat.density.contribution import SCORES, Score
 from clsplat.density.thresholds import Share
 from clsplat.errors import amount
 from clsplat.formats.sog_writing import Harmonics
@@ -24,17 +24,12 @@ LOG = logging.getLogger("clsplat")
 Part = Annotated[float, Field(gt=0, lt=1)]
 
 
-Score = Literal["weight", "sensitivity"]
-
-
 def scores(run: Run, score: Score = "weight") -> NDArray[np.float64]:
     """Return what each Gaussian does to the training views, [N], summed over their pixels: its blend weight, or the
     squares of the image's derivatives by its value."""
     views = run.scene.split("train")
     photographs = (run.photographs.get(view) for view in run.status.counted(views, "views", len(views)))
-    if score == "weight":
-        return contributions(run.rasterizer, run.model, photographs).astype(np.float64)
-    return sensitivities(run.rasterizer, run.model, photographs, run.photographs.background).astype(np.float64)
+    return SCORES[score](run.rasterizer, run.model, photographs, run.photographs.background).astype(np.float64)
 
 
 class PruneLeast(Scheduled):

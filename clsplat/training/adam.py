@@ -5,6 +5,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
+from clsplat.errors import ConfigError
 from clsplat.gaussians.tables import PARAMETERS, DeviceModel, Gaussians, Gradients, moment_tables, sh_coefficients
 from clsplat.opencl.device import Array
 from clsplat.opencl.program import constants
@@ -59,9 +60,16 @@ class Rates(Settings):
         return self.model_copy(update={"means": self.means.from_step(full_size)})
 
     def at(self, step: int, extent: float) -> dict[str, float]:
-        """Return the rates of a global step, by the names of PARAMETERS; sizes of photographs play no part."""
-        settled = self.settled(0)
-        rates = {name: at_step(getattr(settled, name), step) for name in PARAMETERS}
+        """Return the rates of a global step, by the names of PARAMETERS.
+
+        Raises ConfigError before they are settled.
+        """
+        if isinstance(self.means, FullSizeDecay):
+            raise ConfigError(
+                "a rate with `start: full_size` needs the step of the photographs' full size: expected what "
+                "`settled(step)` returns"
+            )
+        rates = {name: at_step(getattr(self, name), step) for name in PARAMETERS}
         return {**rates, "means": rates["means"] * extent}
 
 

@@ -9,7 +9,6 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import Field, ValidationError, WrapValidator
 
 from clsplat.losses.base import ViewLosses
-from clsplat.scene.view import View
 from clsplat.settings import Settings
 from clsplat.training.run import Run
 
@@ -60,14 +59,15 @@ class Skip(Settings):
     """Least share of steps that do the whole work; `auto`: the share of the warm-up that would not have been
     skipped."""
 
-    def visit(self, view: View, losses: ViewLosses, numbers: Mapping[str, float]) -> Visit:
+    def visit(self, view: str, losses: ViewLosses, numbers: Mapping[str, float]) -> Visit:
         """Decide on a step from `numbers`, which it leaves as they are; up to `start` the loss is not read.
 
-        view: at the size that is trained on.  A loss that is not finite is not skipped, and no part of an average.
+        view: its name.  A loss that is not finite is not skipped, and no part of an average.
         """
         if losses.comparison.step <= self.start:
             return Visit()
-        return self.decide(f"skip/loss/{view.downscale:g}/{view.name}", losses.loss, numbers)
+        camera = losses.comparison.camera
+        return self.decide(f"skip/loss/{camera.width}x{camera.height}/{view}", losses.loss, numbers)
 
     def decide(self, name: str, loss: float, numbers: Mapping[str, float]) -> Visit:
         """Decide on a step after `start`; name: of the view's average."""
@@ -78,8 +78,7 @@ class Skip(Settings):
         converged = average is not None and loss <= average
         if warming := warm_up < self.warm_up:
             warm_up, above = warm_up + 1, above + (not converged)
-        least = above / warm_up if self.least == "auto" else self.least
-        skipped = converged and not warming and whole >= least * steps
+        skipped = converged and not warming and whole >= self._share(above, warm_up) * steps
         counts = steps, whole + (not skipped), warm_up, above
         after = loss if average is None else self.decay * average + (1 - self.decay) * loss
         return Visit(skipped, {name: after, **dict(zip((f"skip/{count}" for count in COUNTS), counts, strict=True))})
@@ -87,8 +86,11 @@ class Skip(Settings):
     def tell(self, run: Run) -> None:
         """Say and record how many steps of a run were skipped."""
         steps, whole, warm_up, above = (run.numbers.get(f"skip/{count}", 0.0) for count in COUNTS)
-        least = above / max(warm_up, 1) if self.least == "auto" else self.least
-        skipped = steps - whole
+        least, skipped = self._share(above, warm_up), steps - whole
         run.records.add(run.step, "skip", steps=int(steps), skipped=int(skipped), least=least)
         whole_at_least = f"at least {least:.1%} were to do the whole work"
         LOG.info(f"{skipped:,.0f} of {steps:,.0f} steps after step {self.start:,} were skipped; {whole_at_least}")
+
+    def _share(self, above: float, warm_up: float) -> float:
+        """The least share of whole steps; warm_up: its steps so far, of which so many were `above` the average."""
+        return above / max(warm_up, 1) if self.least == "auto" else self.least

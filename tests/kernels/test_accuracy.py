@@ -8,13 +8,13 @@ import pytest
 from clsplat.conformance import reference as ref
 from clsplat.conformance.checks.blending import MARGIN
 from clsplat.conformance.scenes import Case, random_case, safe_case
-from clsplat.density.accuracy import PruneInaccurate, PruneSampled, UngrowAccurate, Wrong, scaled, wrong_pixels
+from clsplat.density.accuracy import PruneInaccurate, PruneSampled, UngrowAccurate, Wrong, wrong_pixels
 from clsplat.density.basic import Clone, Split
 from clsplat.density.control import densify
 from clsplat.density.edit import Edit, Rule
 from clsplat.density.sampling import drawn_order
 from clsplat.density.statistics import SplatStats
-from clsplat.density.survey import Survey
+from clsplat.density.survey import Survey, scaled
 from clsplat.density.thresholds import SceneScale
 from clsplat.errors import ConfigError
 from clsplat.opencl.device import Device

@@ -7,9 +7,10 @@ from scipy.spatial.transform import Rotation
 from clsplat.conformance.scenes import random_case
 from clsplat.density.basic import Clone, PruneFaint
 from clsplat.density.control import densify
-from clsplat.density.detail import SplitOversized, SplitTextured, largest
+from clsplat.density.detail import SplitOversized, SplitTextured
 from clsplat.density.edit import Edit
 from clsplat.density.mixture import covariance_of, mass_of, merged
+from clsplat.density.sampling import largest
 from clsplat.density.statistics import SEEN, SplatStats
 from clsplat.density.thinning import MergeNeighbours, PruneUnimportant
 from clsplat.density.thresholds import PixelQuantile, Quantile, SceneScale

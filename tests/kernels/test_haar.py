@@ -11,6 +11,7 @@ from clsplat.conformance.scenes import random_case
 from clsplat.density.statistics import SplatStats
 from clsplat.errors import ConfigError
 from clsplat.losses.base import HostLoss
+from clsplat.losses.entropy import WeightEntropy
 from clsplat.losses.image import L1, L2, Dssim
 from clsplat.losses.penalties import Anisotropy
 from clsplat.render.rasterizer import Rasterizer
@@ -173,6 +174,24 @@ def test_differentiating_changes_no_number(device, rng):
     assert trainer.numbers == {}
     trainer.step(photograph, 1, [Haar()])
     assert trainer.numbers.keys() > Haar().first().keys()
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_a_loss_that_reads_no_photograph_combines_with_it(device, rng, masked):
+    """The filter's derivatives are those without it, and it adds to the gradient as elsewhere."""
+    of_colours, moments = [L1(weight=0.8), Dssim(weight=0.2)], []
+    for losses in (of_colours, [WeightEntropy(weight=0.3), *of_colours]):
+        trainer, photograph = trainer_of(device, np.random.default_rng(5), losses, masked)
+        view = trainer.step(photograph, 1, [Haar()])
+        moments.append({name: value for name, value in trainer.numbers.items() if name.endswith("moment1")})
+    assert moments[0] == pytest.approx(moments[1], rel=1e-6)
+    assert all(moments[0].values())
+    entropy = next(loss.value() for loss in view.losses if loss.name == "weight_entropy")
+    sums = view.comparison.image.get()[3].sum(dtype=np.float64)
+    assert entropy == pytest.approx(0.3 * sums / (30 * 41), rel=1e-5)
+    trainer.losses, trainer.numbers = [WeightEntropy()], {}
+    trainer.step(photograph, 2, [Haar(weight=0.05)])
+    assert trainer.numbers["haar/scale/moment1"] / 0.1 == pytest.approx(-0.2), "its own loss alone"
 
 
 def test_a_loss_that_is_not_symmetric_is_refused(device, rng):

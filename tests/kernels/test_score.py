@@ -94,6 +94,13 @@ def test_growth_keeps_to_the_budget_and_to_the_shares(device, rng, limit):
     assert change.causes["clone"] + change.causes["split"] == room
 
 
+@pytest.mark.parametrize("limit", [200, 99, 40])
+def test_where_nothing_grows_nothing_is_drawn(device, rng, limit):
+    edit = edit_of(device, rng, np.full(100, 0.005), gradient=0.0)
+    rules = [Clone(size_below=0.01), GrowScored()]
+    assert densify(edit, rules, Rasterizer(device, "radix").tiler, limit).after == 100
+
+
 def test_growth_is_drawn_by_score(device, rng):
     """Score of one in ten is (25 * 39 + 125) / (25 + 125) times that of the others; half of the weight grows most."""
     gradient = np.where(np.arange(200) < 20, 39.0, 1.0)

@@ -36,7 +36,10 @@ def contribution(device: Device, rng: np.random.Generator) -> Iterator[Figure | 
         masks = (None, rng.random((height, width)) < 0.6)
         photographs = [photograph_of(device, case, mask) for mask in masks]
         expected = sum(ref.contribution(case.project(), width, height, mask) for mask in masks)
-        found, again = (contributions(Rasterizer(device, "radix"), case.model(device), photographs) for _ in range(2))
+        found, again = (
+            contributions(Rasterizer(device, "radix"), case.model(device), photographs, device.zeros(3))
+            for _ in range(2)
+        )
         what = f"blend weights of {count} Gaussians"
         yield by_element("blend_backward", what, found, np.asarray(expected), SUM, floor=0.1)
         yield equal("blend_backward", f"{what}, a second time", again, found)
