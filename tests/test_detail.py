@@ -117,12 +117,12 @@ def test_momentum_follows_its_formulas():
     budget, numbers = Momentum(), {}
     begin = 1000
     assert budget.limit(edit_of(begin, 300), Moment(0.1, 5, 4.0), numbers) == 1200  # at most a fifth more
-    assert numbers == {"momentum.start": begin, "momentum.sum": 5200}  # .98 * 5000 + 300
+    assert numbers == {"momentum/start": begin, "momentum/sum": 5200}  # .98 * 5000 + 300
     target = begin + 5200 / 4**1.7
     assert budget.limit(edit_of(1200, 0), Moment(0.3, 5, 4.0), numbers) == int(1200 * (1 + min(0.2, target / 1200 - 1)))
-    assert numbers["momentum.sum"] == 5200  # it does not fall
+    assert numbers["momentum/sum"] == 5200  # it does not fall
     assert budget.limit(edit_of(6000, 900), Moment(0.9, 5, 1.0), numbers) == 6200
-    assert numbers["momentum.sum"] == 5996
+    assert numbers["momentum/sum"] == 5996
     assert budget.limit(edit_of(6900, 0), Moment(0.95, 1, 2.0), numbers) == 6996  # the last edit reaches it
     assert budget.limit(edit_of(7400, 0), Moment(0.95, 1, 1.0), numbers) == 7400  # pruned ones are replaced
 

@@ -41,6 +41,7 @@ ROWS = (  # from the top down; a module imports only from lower rows, or from it
         "processes",
         "progress",
         "reading",
+        "results",
     }
     | {"schedule", "settings", "signals", "streams", ""},
 )
@@ -66,7 +67,7 @@ TEXTS = {  # what turns results into lines of text
     "clsplat.runs.verdict": {"lines", "verdict"},
     "clsplat.pipeline.files": {"shipped"},  # for completion, which must be fast
 }
-BELOW_COMMANDS = {"api", "cli", "terminal", "errors", "files", "signals", "streams", ""}
+BELOW_COMMANDS = {"api", "cli", "terminal", "errors", "files", "results", "signals", "streams", ""}
 
 
 def imports(path: Path) -> list[tuple[int, str]]:

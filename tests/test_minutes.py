@@ -1,6 +1,7 @@
 """A run in a given time: how many steps are chosen, and that the bits are those of its pipeline."""
 
 import hashlib
+import json
 import math
 import re
 from contextlib import nullcontext
@@ -12,7 +13,7 @@ import pytest
 import clsplat
 from clsplat.errors import ConfigError, Interrupted
 from clsplat.pipeline.loading import Pipeline, load
-from clsplat.runs import minutes
+from clsplat.runs import minutes, single
 from clsplat.runs.minutes import Rehearsal, most_steps, pipeline_for, predicted
 from clsplat.training.run import Progress, Run
 
@@ -72,7 +73,7 @@ def test_it_takes_the_time_that_was_given(monkeypatch, given, growth):
     def cost(step: int, planned: int) -> float:
         return 0.01 * (1 + growth * (planned / 7000) ** 0.4 * min(1, 2 * step / planned))
 
-    def rehearse(pipeline: Pipeline, run: Run, factor: float) -> Rehearsal:
+    def rehearse(pipeline: Pipeline, run: Run, factor: float, until: float) -> Rehearsal:
         steps = round(7000 * factor)
         each = sum(cost(step, steps) for step in range(steps)) / steps
         clock[0] += 3 + 2 + steps * each
@@ -86,7 +87,7 @@ def test_it_takes_the_time_that_was_given(monkeypatch, given, growth):
             now = cost(done[0], planned[0])
             clock[0] += now + 3 / planned[0]
             if done[0] % 100 == 0 or done[0] == steps:
-                show(Progress(done[0], steps, 0.0, 0.0, 0, 0.0, seconds_left=now * (steps - done[0])))
+                show(Progress(done[0], steps, 0.0, 0.0, 0, 1e3 * now, seconds_left=2 * now * steps))
             if run.interrupted:
                 raise Interrupted("")
         clock[0] += 2
@@ -95,7 +96,8 @@ def test_it_takes_the_time_that_was_given(monkeypatch, given, growth):
     monkeypatch.setattr(minutes, "time", SimpleNamespace(perf_counter=lambda: clock[0]))
     monkeypatch.setattr(minutes, "rehearse", rehearse)
     monkeypatch.setattr(minutes, "new_run", lambda *given: SimpleNamespace(interrupted=False))
-    run = SimpleNamespace(status=SimpleNamespace(stage=lambda name: nullcontext()))
+    monkeypatch.setattr(minutes, "write_pipeline", lambda *given: None)
+    run = SimpleNamespace(status=SimpleNamespace(stage=lambda name: nullcontext(), note=lambda **values: None))
     minutes.execute_within(given, load("splat_7k"), run, "new", lambda progress: None, execute)
     assert clock[0] == pytest.approx(60 * given, rel=0.05)
     assert len(planned) == 2
@@ -106,7 +108,7 @@ def test_it_takes_the_time_that_was_given(monkeypatch, given, growth):
 def short_rehearsals(monkeypatch):
     monkeypatch.setattr(minutes, "FIRST", 10)
     monkeypatch.setattr(minutes, "SHARE", 0.0)
-    monkeypatch.setattr(minutes, "rehearsals_of", lambda *given: [minutes.rehearse(*given[:2], 0.2)])
+    monkeypatch.setattr(minutes, "rehearsals_of", lambda *given: [minutes.rehearse(*given[:2], 0.2, math.inf)])
 
 
 @pytest.mark.slow
@@ -114,15 +116,56 @@ def test_a_run_in_minutes_has_the_bits_of_the_pipeline_that_it_writes(
     tiny_scene, tmp_path, monkeypatch, short_rehearsals
 ):
     """The steps are corrected while it trains, wherever the clock stands; files of the rehearsal are gone."""
-    monkeypatch.setattr(minutes, "most_steps", lambda *given: 40)
+    monkeypatch.setattr(minutes, "most_steps", lambda *given: 60)
     out = clsplat.run("smoke", tiny_scene, tmp_path / "run", minutes=0.2)
     text = (out / "pipeline.yaml").read_text()
     steps, known = re.search(r"# --minutes 0.2: (.+) steps, of which (\d+) had shown what one takes", text).groups()
-    assert int(known) < 40
+    assert int(known) == 50
     assert int(steps.replace(",", "")) == load(str(out / "pipeline.yaml")).settings.training.steps
     assert "from here on the bits" not in (out / "log.txt").read_text()
     again = clsplat.run(out / "pipeline.yaml", out=tmp_path / "again")
     assert digest(out) == digest(again)
+    assert clsplat.check(out)["whole"]
+
+
+@pytest.mark.slow
+def test_a_run_that_dies_at_the_correction_goes_on_with_what_was_chosen(
+    tiny_scene, tmp_path, monkeypatch, short_rehearsals
+):
+    """The pipeline is written before the checkpoint, which is of the corrected one."""
+    monkeypatch.setattr(minutes, "most_steps", lambda *given: 50)
+
+    def die(checked: Pipeline, run: Run, start: str, show: minutes.Show) -> None:
+        if start == "resume":
+            raise KeyboardInterrupt
+        execute(checked, run, start, show)
+
+    execute = single.runner.execute
+    monkeypatch.setattr(single.runner, "execute", die)
+    with pytest.raises(Interrupted):
+        clsplat.run("smoke", tiny_scene, tmp_path / "run", minutes=0.2)
+    monkeypatch.undo()
+    out = tmp_path / "run"
+    steps = load(str(out / "pipeline.yaml")).settings.training.steps
+    assert "had shown what one takes" in (out / "pipeline.yaml").read_text()
+    clsplat.resume(out)
+    assert "from here on the bits" not in (out / "log.txt").read_text()
+    assert json.loads((out / "metrics.json").read_text())["steps"] == steps
+
+
+@pytest.mark.slow
+def test_a_rehearsal_that_takes_longer_than_the_time_is_ended(tiny_scene, tmp_path):
+    with pytest.raises(ConfigError, match="a rehearsal in 200 steps alone takes longer"):
+        clsplat.run("smoke", tiny_scene, tmp_path / "run", minutes=1e-6)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+def test_a_refused_beginning_leaves_a_run_that_is_done_done(tiny_scene, tmp_path):
+    out = clsplat.run("smoke", tiny_scene, tmp_path / "run")
+    with pytest.raises(ConfigError, match="takes longer"):
+        clsplat.run("smoke", tiny_scene, out, start="restart", minutes=1e-6)
+    assert clsplat.status(out)["state"] == "done"
     assert clsplat.check(out)["whole"]
 
 

@@ -70,6 +70,11 @@ def test_every_stretched_recipe_is_valid(name, factor):
     assert factor != 1 or new == settings
 
 
+def test_never_stays_a_number_that_a_file_holds():
+    never = load("splat_7k", [f"densify.stop={2**63 - 1}"]).settings
+    assert stretched(never, 3.0).training.during[1].stop == 2**63 - 1
+
+
 def test_points_that_fall_together_become_one():
     class Holder(Settings):
         values: list[list[float]]

@@ -195,7 +195,7 @@ def convert(
 def compare_runs(runs: Sequence[PathLike], out: PathLike = "compare.html") -> int:
     """Write the page that shows runs side by side; return their number.  The folder of a matrix stands for its runs."""
     from clsplat.compare.page import write_comparison
-    from clsplat.files import check_result
+    from clsplat.results import check_result
 
     check_result(Path(out), ".html")
     return write_comparison([Path(folder) for folder in runs], Path(out))

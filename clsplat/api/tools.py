@@ -53,9 +53,9 @@ def inspect_scene(scene: PathLike, page: PathLike | None = None) -> "Inspection"
     scene: a folder, or that of a run, which stands for the one it was trained on; page: a file to write, with the
     cameras and points in 3D.  Raises DataError only where there is no such folder.
     """
-    from clsplat.files import check_result
     from clsplat.inspect.inspection import Inspection
     from clsplat.inspect.page import write_page
+    from clsplat.results import check_result
     from clsplat.runs.source import photographs_of
 
     load_plugins()

@@ -43,7 +43,8 @@ def evaluate(
     device: DeviceOption = None,
 ) -> None:
     """Measure a model on a scene's test and training views."""
-    from clsplat.files import check_result, write_text
+    from clsplat.files import write_text
+    from clsplat.results import check_result
 
     if out is None:
         terminal.keep_stdout_for_json()

@@ -10,8 +10,9 @@ from clsplat.conformance.comparison import Figure
 from clsplat.conformance.host import system
 from clsplat.conformance.report import GIB, DeviceReport, summary
 from clsplat.conformance.supervision import Result
-from clsplat.files import check_result, told_as, write_text
+from clsplat.files import told_as, write_text
 from clsplat.pages.page import duration, render
+from clsplat.results import check_result
 
 
 @dataclass(frozen=True)

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.errors import ConfigError
-from clsplat.files import check_no_file_of_a_run
 from clsplat.gaussians.model import load
 from clsplat.names import PIPELINE
 from clsplat.pipeline.loading import load as load_pipeline
+from clsplat.results import check_no_file_of_a_run
 from clsplat.runs.source import Source, run_of
 from clsplat.scene.photographs import load_photograph
 from clsplat.scene.scene import View

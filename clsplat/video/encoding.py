@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.errors import ConfigError, OutputError
-from clsplat.files import atomic_name, check_result
+from clsplat.files import atomic_name
 from clsplat.metrics.images import to_8_bits
+from clsplat.results import check_result
 from clsplat.video.lenses import Size, checked_rate, checked_size
 from clsplat.video.webm import without_chance
 

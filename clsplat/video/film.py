@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from clsplat.errors import ConfigError, quoted
-from clsplat.files import check_result
+from clsplat.results import check_result
 from clsplat.scene.scene import Scene
 from clsplat.scene.view import View
 from clsplat.video import camera_path, encoding

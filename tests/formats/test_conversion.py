@@ -15,7 +15,6 @@ import clsplat
 from clsplat.cli import app
 from clsplat.density.mixture import mass_of
 from clsplat.errors import ConfigError, DataError
-from clsplat.files import check_no_file_of_a_run
 from clsplat.formats.ply import write_ply
 from clsplat.formats.splats import inverse_opacities, opacities
 from clsplat.formats.table import CODECS, bytes_of, detect, read, write
@@ -23,6 +22,7 @@ from clsplat.gaussians.checkup import examine, lines, verdict
 from clsplat.gaussians.conversion import transform_of
 from clsplat.gaussians.model import Rendering, load
 from clsplat.gaussians.sh import basis
+from clsplat.results import check_no_file_of_a_run
 from clsplat.viewer.packing import pack
 from tests.formats.models import splats
 
