@@ -19,7 +19,7 @@ from clsplat.training.run import Progress, Run
 
 
 def rehearsal(steps: int, step: float) -> Rehearsal:
-    return Rehearsal(steps, step, during=3.0, after=2.0, growth=0.5)
+    return Rehearsal(steps, [step], during=3.0, after=2.0, growth=0.5)
 
 
 def digest(out: Path) -> str:
@@ -66,22 +66,24 @@ def test_the_choice_stretches_every_schedule_and_gives_its_reason():
 
 @pytest.mark.parametrize("growth", [0.0, 3.0, 30.0])
 @pytest.mark.parametrize("given", [2.0, 10.0, 60.0])
-def test_it_takes_the_time_that_was_given(monkeypatch, given, growth):
+@pytest.mark.parametrize("until_share", [0.5, 0.9])
+def test_it_takes_the_time_that_was_given(monkeypatch, given, growth, until_share):
     """By a made-up clock: steps take longer as Gaussians grow, in long trainings more than in a rehearsal."""
     clock, done = [0.0], [0]
 
     def cost(step: int, planned: int) -> float:
-        return 0.01 * (1 + growth * (planned / 7000) ** 0.4 * min(1, 2 * step / planned))
+        return 0.01 * (1 + growth * (planned / 7000) ** 0.4 * min(1, step / planned / until_share))
 
     def rehearse(pipeline: Pipeline, run: Run, factor: float, until: float) -> Rehearsal:
         steps = round(7000 * factor)
-        each = sum(cost(step, steps) for step in range(steps)) / steps
-        clock[0] += 3 + 2 + steps * each
-        return Rehearsal(steps, each, during=3.0, after=2.0, growth=0.5)
+        course = [cost(step, steps) for step in range(0, steps, steps // 20)]
+        clock[0] += 3 + 2 + steps * sum(course) / len(course)
+        return Rehearsal(steps, course, during=3.0, after=2.0, growth=until_share)
 
     def execute(pipeline: Pipeline, run: Run, start: str, show: minutes.Show) -> None:
         steps = pipeline.settings.training.steps
         planned.append(steps)
+        assert start == ("new" if len(planned) == 1 else "resume")
         while done[0] < steps:
             done[0] += 1
             now = cost(done[0], planned[0])
@@ -100,8 +102,8 @@ def test_it_takes_the_time_that_was_given(monkeypatch, given, growth):
     run = SimpleNamespace(status=SimpleNamespace(stage=lambda name: nullcontext(), note=lambda **values: None))
     minutes.execute_within(given, load("splat_7k"), run, "new", lambda progress: None, execute)
     assert clock[0] == pytest.approx(60 * given, rel=0.05)
-    assert len(planned) == 2
-    assert done[0] == planned[1]
+    assert len(planned) == (2 if until_share == 0.5 else 3)
+    assert done[0] == planned[-1]
 
 
 @pytest.fixture
@@ -119,9 +121,9 @@ def test_a_run_in_minutes_has_the_bits_of_the_pipeline_that_it_writes(
     monkeypatch.setattr(minutes, "most_steps", lambda *given: 60)
     out = clsplat.run("smoke", tiny_scene, tmp_path / "run", minutes=0.2)
     text = (out / "pipeline.yaml").read_text()
-    steps, known = re.search(r"# --minutes 0.2: (.+) steps, of which (\d+) had shown what one takes", text).groups()
-    assert int(known) == 50
-    assert int(steps.replace(",", "")) == load(str(out / "pipeline.yaml")).settings.training.steps
+    steps, known = re.search(r"# --minutes 0.2: (.+) steps, of which ([\d,]+) had shown what one takes", text).groups()
+    steps, known = (int(number.replace(",", "")) for number in (steps, known))
+    assert known < steps == load(str(out / "pipeline.yaml")).settings.training.steps
     assert "from here on the bits" not in (out / "log.txt").read_text()
     again = clsplat.run(out / "pipeline.yaml", out=tmp_path / "again")
     assert digest(out) == digest(again)
@@ -173,7 +175,8 @@ def test_a_refused_beginning_leaves_a_run_that_is_done_done(tiny_scene, tmp_path
 def test_a_rehearsal_leaves_no_trace_in_the_run(tiny_scene, tmp_path, monkeypatch, short_rehearsals):
     """Of a training that ends before it can be corrected: the same bits as without a rehearsal."""
     monkeypatch.setattr(minutes, "most_steps", lambda *given: 50)
-    monkeypatch.setattr(minutes, "KNOWN", (1.0, 1.0))
+    monkeypatch.setattr(minutes, "EARLY", 1.0)
+    monkeypatch.setattr(minutes, "SOON", 1.0)
     out = clsplat.run("smoke", tiny_scene, tmp_path / "run", minutes=0.2)
     plain = clsplat.run("smoke", tiny_scene, tmp_path / "plain")
     assert digest(out) == digest(plain)

@@ -1,7 +1,7 @@
 """The number of steps that fit into a time.
 
 The pipeline is rehearsed in few steps, and what that took is continued.  How many Gaussians grow is only known when
-they have grown; then the number is corrected, once.  It is written into the run's pipeline, so that its bits repeat.
+they have grown; then the number is corrected.  It is written into the run's pipeline, so that its bits repeat.
 """
 
 import logging
@@ -31,7 +31,8 @@ LONGER = 3  # times the steps of one before
 SHARE = 0.03  # of the time: rehearsals that took less are followed by a longer one
 REPORTS = 20  # of a rehearsal; each gives the median time of its steps, without what is done once
 TREND = 0.5  # steepest power of the number of steps that the time of one is taken to follow
-KNOWN = 0.25, 0.6  # shares of the training between which it is corrected, where growth ends or else does not
+EARLY, SOON = 0.25, 0.6  # shares of the training between which it is corrected, where growth ends
+TWICE = 0.4, 0.8  # where growth ends later
 
 Show = Callable[[Progress], None]
 Execute = Callable[[Pipeline, Run, Start, Show], None]
@@ -42,10 +43,26 @@ class Rehearsal:
     """What a pipeline took in few steps."""
 
     steps: int
-    step: float  # s, a training step
+    course: Sequence[float]  # s, a training step, in each of equal parts of the training
     during: float  # s, of edits and measurements of the training: the same in any number of steps
     after: float  # s, of what follows the training
     growth: float  # the share of the steps after which no Gaussian grew
+
+    @property
+    def known(self) -> Sequence[float]:
+        """The shares of the training at which the number of steps is corrected: where growth ends, if that is soon."""
+        return [max(EARLY, self.growth)] if self.growth <= SOON else TWICE
+
+    @property
+    def step(self) -> float:
+        """The mean time of a step, s."""
+        return fmean(self.course)
+
+    def later(self, share: float) -> tuple[float, float]:
+        """How many times as long as at a share of the training steps take after it, in the mean and at the end."""
+        place = min(int(share * len(self.course)), len(self.course) - 1)
+        after = self.course[place + 1 :] or self.course[-1:]
+        return fmean(after) / self.course[place], self.course[-1] / self.course[place]
 
 
 def execute_within(minutes: float, pipeline: Pipeline, run: Run, start: Start, show: Show, execute: Execute) -> None:
@@ -56,27 +73,32 @@ def execute_within(minutes: float, pipeline: Pipeline, run: Run, start: Start, s
     until = time.perf_counter() + 60 * minutes
     rehearsals = rehearsals_of(pipeline, run, minutes)
     chosen = pipeline_for(pipeline, rehearsals, until - time.perf_counter(), minutes)
-    planned, last = chosen.settings.training.steps, rehearsals[-1]
+    last, plan = rehearsals[-1], chosen
 
     def correct(report: Progress) -> Pipeline:
-        rest = last.after + last.during * (1 - report.step / planned)
-        each = report.milliseconds / 1e3  # of the steps since the last edit
-        steps = report.step + max(1, int((until - time.perf_counter() - rest) / each))
+        planned = plan.settings.training.steps
+        share, each = report.step / planned, report.milliseconds / 1e3  # of the steps since the last edit
+        mean, end = (ratio * each for ratio in last.later(share))
+        rest = last.after + last.during * (1 - share) + mean * (planned - report.step)
+        steps = max(report.step + 1, planned + math.floor((until - time.perf_counter() - rest) / end))
         reason = f"--minutes {minutes:g}: {steps:,} steps, of which {report.step:,} had shown what one takes"
         LOG.info("%s: %.0f ms", reason, report.milliseconds)
-        return replace(chosen, settings=with_steps(chosen.settings, steps), reason=reason)
+        return replace(plan, settings=with_steps(plan.settings, steps), reason=reason)
 
-    known = planned * min(max(KNOWN[0], last.growth), KNOWN[1]) + chosen.settings.training.log_every
-    pause = Pause(new_run(run, chosen), round(known), correct)
-    try:
-        execute(chosen, pause.run, start, pause.showing(show))
-    except Interrupted:
+    for share in last.known:
+        training = plan.settings.training
+        pause = Pause(new_run(run, plan), round(share * training.steps) + training.log_every, correct)
+        try:
+            execute(plan, pause.run, start, pause.showing(show))
+        except Interrupted:
+            if pause.corrected is None:
+                raise
+            stop_if_signalled()
         if pause.corrected is None:
-            raise
-        stop_if_signalled()
-    if pause.corrected is not None:
-        del pause.run  # and its tables on the device
-        execute(pause.corrected, new_run(run, pause.corrected), "resume", show)
+            return
+        plan, start = pause.corrected, "resume"
+        del pause  # and the tables of its run on the device
+    execute(plan, new_run(run, plan), start, show)
 
 
 @dataclass
@@ -108,11 +130,9 @@ def rehearsals_of(pipeline: Pipeline, run: Run, minutes: float) -> list[Rehearsa
 
     Raises ConfigError where not exactly one stage trains.
     """
-    number_of = sum(isinstance(stage, Optimize) for stage in pipeline.stages)
-    if number_of != 1:
-        raise ConfigError(
-            f"{pipeline.path}: --minutes: expected one stage that trains, found {number_of}; leave it out"
-        )
+    trains = sum(isinstance(stage, Optimize) for stage in pipeline.stages)
+    if trains != 1:
+        raise ConfigError(f"{pipeline.path}: --minutes: expected one stage that trains, found {trains}; leave it out")
     steps = pipeline.settings.training.steps
     found, took = list[Rehearsal](), 0.0
     until = time.perf_counter() + 60 * minutes
@@ -149,9 +169,9 @@ def rehearse(pipeline: Pipeline, run: Run, factor: float, until: float) -> Rehea
         run_stages(short, one)
         end = time.perf_counter()
         during = trained - start - one.status.seconds["optimize"]
-        step = fmean(line["ms"] for line in one.records.read("train")) / 1e3
+        course = [line["ms"] / 1e3 for line in one.records.read("train")]
         growth = [line["step"] for line in one.records.read("densify") if any(line["grown"].values())]
-        return Rehearsal(one.step, step, max(0.0, during), end - trained, max(growth, default=0) / one.step)
+        return Rehearsal(one.step, course, max(0.0, during), end - trained, max(growth, default=0) / one.step)
 
 
 def pipeline_for(pipeline: Pipeline, rehearsals: Sequence[Rehearsal], seconds: float, minutes: float) -> Pipeline:
