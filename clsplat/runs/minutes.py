@@ -80,7 +80,9 @@ def execute_within(minutes: float, pipeline: Pipeline, run: Run, start: Start, s
         share, each = report.step / planned, report.milliseconds / 1e3  # of the steps since the last edit
         mean, end = (ratio * each for ratio in last.later(share))
         rest = last.after + last.during * (1 - share) + mean * (planned - report.step)
-        steps = max(report.step + 1, planned + math.floor((until - time.perf_counter() - rest) / end))
+        more = math.floor((until - time.perf_counter() - rest) / end)
+        is_known = share >= last.known[-1]  # before, steps become slower still, by nobody knows how much
+        steps = max(report.step + 1, planned + (more if is_known else min(more, 0)))
         reason = f"--minutes {minutes:g}: {steps:,} steps, of which {report.step:,} had shown what one takes"
         LOG.info("%s: %.0f ms", reason, report.milliseconds)
         return replace(plan, settings=with_steps(plan.settings, steps), reason=reason)
@@ -103,8 +105,7 @@ def execute_within(minutes: float, pipeline: Pipeline, run: Run, start: Start, s
 
 @dataclass
 class Pause:
-    """Corrects the pipeline of a run at the first report from a step on, and interrupts it: its checkpoint is of the
-    corrected one."""
+    """Corrects the pipeline of a run at a report, and interrupts it, so that its checkpoint is of the corrected one."""
 
     run: Run
     at: int
