@@ -176,12 +176,12 @@ def test_a_search_that_is_interrupted_goes_on_when_it_is_asked_again(few_steps, 
         run.interrupted = True
         run_stages(pipeline, run)
 
-    run_stages = runner._run_stages
-    monkeypatch.setattr(runner, "_run_stages", interrupted)
+    run_stages = runner.run_stages
+    monkeypatch.setattr(runner, "run_stages", interrupted)
     search = {"target": "1MB", "out": tmp_path / "out", "keep": [0.5], "steps": STEPS}
     with pytest.raises(Interrupted, match=r"^stopped in keep_50; the same command goes on$"):
         clsplat.compress_model(few_steps, **search)
-    monkeypatch.setattr(runner, "_run_stages", run_stages)
+    monkeypatch.setattr(runner, "run_stages", run_stages)
     assert Path(clsplat.compress_model(few_steps, **search)["file"]).is_file()
     assert "resumed at step 0" in (tmp_path / "out" / "keep_50" / "log.txt").read_text()
 

@@ -189,12 +189,12 @@ def test_a_training_that_is_interrupted_goes_on(few_steps, tmp_path, monkeypatch
         run.interrupted = True
         run_stages(pipeline, run)
 
-    run_stages = runner._run_stages
-    monkeypatch.setattr(runner, "_run_stages", interrupted)
+    run_stages = runner.run_stages
+    monkeypatch.setattr(runner, "run_stages", interrupted)
     with pytest.raises(Interrupted, match=r"^stopped in level_1; the same command goes on$"):
         clsplat.write_levels(few_steps, tmp_path / "site", levels=3, steps=STEPS)
     assert not (tmp_path / "site").exists()
-    monkeypatch.setattr(runner, "_run_stages", run_stages)
+    monkeypatch.setattr(runner, "run_stages", run_stages)
     with pytest.raises(ConfigError, match=r"site\.training: holds the training of levels that differs in steps"):
         clsplat.write_levels(few_steps, tmp_path / "site", levels=3, steps=STEPS + 1)
     clsplat.write_levels(few_steps, tmp_path / "site", levels=3, steps=STEPS)
