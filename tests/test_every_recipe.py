@@ -47,7 +47,7 @@ def short(name: str, scene: Path) -> Pipeline:
     settings = stretched(pipeline.settings, STEPS / pipeline.settings.training.steps)
     pairs = zip(pipeline.stages, settings.stages, strict=True)
     stages = [often(old, stage) if isinstance(stage, Optimize) else stage for old, stage in pairs]
-    kept = [stage for stage in stages if stage.stage in ("init", "optimize", "export")]
+    kept = [stage for stage in stages if stage.stage in ("init", "optimize", "take_average", "export")]
     return Pipeline(pipeline.path, settings.model_copy(update={"stages": kept}))
 
 
@@ -55,7 +55,9 @@ def often(old: Stage, loop: Optimize) -> Optimize:
     """Edits every few steps; without resets to faint, from which so few steps do not recover."""
     assert isinstance(old, Optimize)
     during = [
-        stage.model_copy(update={"every": 4}) if before.every != 1 and stage.stage != "raise_sh" else stage
+        stage.model_copy(update={"every": 4, **({"start": 0} if stage.stage == "add_to_average" else {})})
+        if before.every != 1 and stage.stage != "raise_sh"
+        else stage
         for before, stage in zip(old.during, loop.during, strict=True)
         if not isinstance(stage, Evaluate) and getattr(stage, "to", 1) > 0.01
     ]

@@ -56,8 +56,9 @@ class Report:
 class Trainer:
     """Trains a scene as a pipeline says: a trainer and `clsplat run` give the same bits.
 
-    Stages before the training are run at once; those after it, such as `evaluate` and `export`, are not run at all: use
-    `evaluate` and `model`.  Ctrl-C lets a step finish, and training can go on; a trainer serves one thread.
+    Stages before the training are run at once, and those that change the model right behind it with its last step; the
+    others, such as `evaluate` and `export`, are not run at all: use `evaluate` and `model`.  Ctrl-C lets a step finish,
+    and training can go on; a trainer serves one thread.
     """
 
     def __init__(

@@ -173,6 +173,16 @@ def _untagged(stage: dict[str, Any]) -> dict[str, Any]:
     return {stage["stage"]: fields}
 
 
+def _late(stages: Sequence[Stage], need: str) -> str:
+    """Say of a part what should make it during a training, but does not act; "" where there is none."""
+    for training in stages:
+        for inner in training.during if isinstance(training, Optimize) else ():
+            if need in inner.makes:
+                cadence = f"{inner.stage} makes at every {inner.every} steps after step {inner.start}"
+                return f"{cadence}; the training ends before: set its start and its every"
+    return ""
+
+
 def _check_order(path: Path, settings: PipelineFile) -> None:
     """Raise ConfigError where a stage needs a part of the run that no earlier stage makes."""
     made, step = {"scene"}, 0
@@ -181,11 +191,13 @@ def _check_order(path: Path, settings: PipelineFile) -> None:
             if getattr(stage, key) != type(stage).model_fields[key].default:
                 raise ConfigError(f"{path}: stages[{i}] {stage.stage}: '{key}' belongs inside optimize.during")
         for need in sorted(stage.needs - made):
+            if late := _late(settings.stages[:i], need):
+                raise ConfigError(f"{path}: stages[{i}] {stage.stage} needs '{need}', which {late}")
             makers = ", ".join(name for name, kind in variants(Stage).items() if need in kind.makes)
             raise ConfigError(
                 f"{path}: stages[{i}] {stage.stage} needs '{need}', which no earlier stage makes ({makers} makes it)"
             )
-        made |= stage.makes
+        made = (made - stage.takes) | stage.makes
         if isinstance(stage, Optimize):
             made.update(part for inner in stage.acting(step) for part in inner.makes)
             step += stage.steps

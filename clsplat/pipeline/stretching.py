@@ -5,12 +5,41 @@ updates, such as a filter that is learned, does not change.
 """
 
 import math
+from collections.abc import Callable
 from typing import Any, TypeVar
 
+from clsplat.pipeline.file import PipelineFile
 from clsplat.settings import Settings
+from clsplat.stages.base import Scheduled
+from clsplat.stages.optimize import Optimize
 
 Value = TypeVar("Value")
 MOST = 2**63 - 1  # that a file can hold
+
+
+def with_steps(settings: PipelineFile, steps: int, done: int) -> PipelineFile:
+    """Return settings whose training has so many steps, of which those that are done are the same; stages that have not
+    begun do so at the same share of the others."""
+
+    def changed(training: Optimize) -> Optimize:
+        left = (steps - done) / (training.steps - done)
+        during = [_moved(stage, done, left) for stage in training.during]
+        return training.model_copy(update={"steps": steps, "during": during})
+
+    return of_trainings(settings, changed)
+
+
+def _moved(stage: Scheduled, done: int, left: float) -> Scheduled:
+    if stage.start <= done:
+        return stage
+    every, start = max(1, math.floor((stage.every or 1) * left)), done + math.floor((stage.start - done) * left)
+    return stage.model_copy(update={"every": every, "start": start})
+
+
+def of_trainings(settings: PipelineFile, changed: Callable[[Optimize], Optimize]) -> PipelineFile:
+    """Return settings with other trainings."""
+    stages = [changed(stage) if isinstance(stage, Optimize) else stage for stage in settings.stages]
+    return settings.model_copy(update={"stages": stages})
 
 
 def stretched(value: Value, factor: float) -> Value:

@@ -17,7 +17,7 @@ from clsplat.errors import ConfigError, Interrupted
 from clsplat.files import scratch_folder
 from clsplat.pipeline.file import PipelineFile
 from clsplat.pipeline.loading import Pipeline
-from clsplat.pipeline.stretching import stretched
+from clsplat.pipeline.stretching import of_trainings, stretched, with_steps
 from clsplat.runs.folders import Start
 from clsplat.runs.runner import run_stages, write_pipeline
 from clsplat.signals import stop_if_signalled
@@ -82,10 +82,10 @@ def execute_within(minutes: float, pipeline: Pipeline, run: Run, start: Start, s
         rest = last.after + last.during * (1 - share) + mean * (planned - report.step)
         more = math.floor((until - time.perf_counter() - rest) / end)
         is_known = share >= last.known[-1]  # before, steps become slower still, by nobody knows how much
-        steps = max(report.step + 1, planned + (more if is_known else min(more, 0)))
+        steps = max(report.step + 2, planned + (more if is_known else min(more, 0)))
         reason = f"--minutes {minutes:g}: {steps:,} steps, of which {report.step:,} had shown what one takes"
         LOG.info("%s: %.0f ms", reason, report.milliseconds)
-        return replace(plan, settings=with_steps(plan.settings, steps), reason=reason)
+        return replace(plan, settings=with_steps(plan.settings, steps, report.step), reason=reason)
 
     for share in last.known:
         training = plan.settings.training
@@ -105,7 +105,7 @@ def execute_within(minutes: float, pipeline: Pipeline, run: Run, start: Start, s
 
 @dataclass
 class Pause:
-    """Corrects the pipeline of a run at a report, and interrupts it, so that its checkpoint is of the corrected one."""
+    """Corrects the pipeline of a run at a report, and interrupts it: its checkpoint is of the corrected one."""
 
     run: Run
     at: int
@@ -224,19 +224,11 @@ def new_run(run: Run, pipeline: Pipeline, **changes: Any) -> Run:
     return replace(run, settings=pipeline.settings, pipeline=pipeline.resolved(), **own, **changes)
 
 
-def with_steps(settings: PipelineFile, steps: int) -> PipelineFile:
-    """Return settings whose training has so many steps, of which those that have been done are the same."""
-    return _each(settings, lambda training: training.model_copy(update={"steps": steps}))
-
-
 def _reporting(settings: PipelineFile) -> PipelineFile:
     """With REPORTS reports of each training."""
-    return _each(settings, lambda training: training.model_copy(update={"log_every": -(-training.steps // REPORTS)}))
-
-
-def _each(settings: PipelineFile, changed: Callable[[Optimize], Optimize]) -> PipelineFile:
-    stages = [changed(stage) if isinstance(stage, Optimize) else stage for stage in settings.stages]
-    return settings.model_copy(update={"stages": stages})
+    return of_trainings(
+        settings, lambda training: training.model_copy(update={"log_every": -(-training.steps // REPORTS)})
+    )
 
 
 @contextmanager

@@ -1,6 +1,7 @@
 """The stages of a pipeline that train, one step at a time."""
 
 from collections.abc import Iterator
+from itertools import takewhile
 
 from clsplat.losses.base import ViewLosses
 from clsplat.pipeline.loading import Pipeline
@@ -19,7 +20,7 @@ def run_until_training(pipeline: Pipeline, run: Run) -> None:
 
 
 def train(pipeline: Pipeline, run: Run) -> Iterator[ViewLosses]:
-    """Run all stages that train, and those between them; yield after each step."""
+    """Run all stages that train, those between them, and the edits right behind them; yield after each step."""
     first, last = _training_stages(pipeline)
     for cursor in range(max(first, run.cursor), last + 1):
         if cursor > run.cursor:
@@ -27,9 +28,21 @@ def train(pipeline: Pipeline, run: Run) -> Iterator[ViewLosses]:
         stage = pipeline.stages[cursor]
         if isinstance(stage, Optimize):
             run.status.note(stage=stage.stage, progress=None)
-            yield from stage.iterate(run)
+            for view in stage.iterate(run):
+                if cursor == last and run.stage_step == stage.steps:
+                    _edit_behind(pipeline, run)
+                    yield view
+                    return
+                yield view
         else:
             stage.act(run)
+
+
+def _edit_behind(pipeline: Pipeline, run: Run) -> None:
+    """Run the stages that change the model right behind the training, as part of its last step."""
+    for stage in takewhile(lambda stage: stage.edits, pipeline.stages[run.cursor + 1 :]):
+        run.next_stage(run.cursor + 1)
+        stage.act(run)
 
 
 def is_trained(pipeline: Pipeline, run: Run) -> bool:

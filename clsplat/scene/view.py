@@ -144,6 +144,20 @@ def load_image(view: View, background: tuple[float, float, float] | Floats = BLA
     return np.asarray(composite * 255 + slack, np.uint8)  # truncated, as in the reference (Kerbl et al. 2023)
 
 
+def load_rgba(view: View) -> NDArray[np.uint8] | None:
+    """Return the photograph of `view` at its camera's size with its alpha, [H, W, 4], not premultiplied; None where it
+    has no transparency, or pixels that do not count.
+
+    Raises DataError as load_image does.
+    """
+    pixels = _as_taken(view, view.image_path)
+    if pixels.shape[2] == 3 or load_mask(view) is not None:
+        return None
+    size = view.camera.width, view.camera.height
+    values = cv2.resize(pixels.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    return np.asarray(np.rint(values * (255 / np.iinfo(pixels.dtype).max)), np.uint8)
+
+
 def load_mask(view: View) -> NDArray[np.bool_] | None:
     """Return which pixels of `load_image` count, [H, W], or None when all do.
 

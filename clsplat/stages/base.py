@@ -48,6 +48,7 @@ class Stage(Settings):
 
     needs: ClassVar[frozenset[str]] = frozenset()  # parts of the run that must exist
     makes: ClassVar[frozenset[str]] = frozenset()  # parts that exist afterwards
+    takes: ClassVar[frozenset[str]] = frozenset()  # parts that do not exist afterwards
     edits: ClassVar[bool] = False  # changes the model; inside `during` it acts between two steps
 
     stage: str
@@ -102,6 +103,9 @@ class Scheduled(Stage):
     """Global step after which the stage runs."""
     stop: Annotated[int, Field(gt=0)] | None = None
     """Global step before which the stage runs."""
+
+    def attach(self, run: Run) -> None:
+        """Add tables that the stage keeps beside the parameters, before the first step; a resumed run has them."""
 
     def due(self, step: int, is_last: bool = False) -> bool:
         """Return whether the stage runs at a global step, counted from 1; `is_last` of the training."""

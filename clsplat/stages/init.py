@@ -15,10 +15,11 @@ from clsplat.errors import ConfigError, DataError
 from clsplat.formats.splats import Parameters, with_degree
 from clsplat.gaussians.model import load
 from clsplat.gaussians.tables import SH_C0, Gaussians, sh_coefficients
+from clsplat.scene.hull import hull_points
 from clsplat.scene.images import read_image
 from clsplat.scene.plane_sweep import swept_points
 from clsplat.scene.scene import PointCloud, Scene, View
-from clsplat.scene.view import load_image
+from clsplat.scene.view import load_image, load_rgba
 from clsplat.settings import ReadPath
 from clsplat.stages.base import Stage
 from clsplat.training.memory import first_tables
@@ -26,7 +27,7 @@ from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
 MIN_DISTANCE2 = 1.0e-7  # scene units²: coincident points still get a size
-MIN_SWEPT_POINTS = 100  # with fewer points from a sweep, random ones are used
+MIN_POINTS = 100  # with fewer from a sweep or a hull, random ones are used
 MODEL_SOURCES = ("model", "ply")
 RANDOM_BOX = 1.3 / 4.03  # half side of the box by camera distance: the value of 3DGS for the Blender scenes
 
@@ -35,21 +36,25 @@ class Init(Stage):
     """Make Gaussians: isotropic, as large as the mean distance to the three nearest neighbours (Kerbl et al. 2023).
 
     `source: auto` uses the scene's points if it has points.  Without points it uses a plane sweep over the photographs,
-    or, when the photographs have alpha, random points in a box around the point that the cameras look at.
+    or, where they have alpha, what `transparent` says: random points in a box around the point that the cameras look
+    at, as published, or points on the hull of the silhouettes in that box.
     """
 
     stage: Literal["init"] = "init"
     makes: ClassVar[frozenset[str]] = frozenset({"model"})
+    takes: ClassVar[frozenset[str]] = frozenset({"average"})
     edits: ClassVar[bool] = True
 
-    source: Literal["auto", "points", "sweep", "random", "model", "ply"] = "auto"
+    source: Literal["auto", "points", "sweep", "hull", "random", "model", "ply"] = "auto"
     """Source of the first Gaussians; `ply` is an older name of `model`."""
+    transparent: Literal["random", "hull"] = "random"
+    """Source of `auto` for a scene without points whose photographs have alpha."""
     opacity: Annotated[float, Field(gt=0, lt=1)] = 0.1
     """Opacity of the first Gaussians."""
     scale: Annotated[float, Field(gt=0)] = 1.0
     """Factor of the first sizes."""
     count: Annotated[int, Field(gt=0)] = 100_000
-    """Number of random points."""
+    """Number of random points; largest number of points on a hull."""
     swept: Annotated[int, Field(gt=0)] = 20_000
     """Largest number of points of a plane sweep."""
     file: ReadPath | None = None
@@ -63,44 +68,47 @@ class Init(Stage):
         source = self._source(run.scene)
         if source in MODEL_SOURCES:
             self._read()
-        elif source == "random":
+        elif source in ("random", "hull"):
             self._require_memory(run, self.count)
         elif source == "points":
-            self._require_memory(run, len(self._points(run.scene)))
+            self._require_memory(run, len(self._points(run)))
 
     def run(self, run: Run) -> None:
         degree = run.model_settings.sh_degree
-        gaussians = Gaussians(run.device, self._parameters(run, degree))
+        parameters, source = self._parameters(run, degree)
+        gaussians = Gaussians(run.device, parameters)
         run.model = run.model_settings.model(gaussians, degree if self.source in MODEL_SOURCES else 0)
         run.refresh_filter()
-        LOG.info("%s Gaussians from %s", f"{run.model.gaussians.count:,}", self._origin(run.scene))
+        LOG.info("%s Gaussians from %s", f"{run.model.gaussians.count:,}", self._origin(source, run.scene))
 
-    def _origin(self, scene: Scene) -> str:
-        names = {"points": "the scene's points", "random": "random points", "sweep": "a sweep over the photographs"}
-        source = self._source(scene)
-        return names.get(source, source) + (
-            "" if scene.points is not None or source in MODEL_SOURCES else ": the scene has none"
-        )
+    def _origin(self, source: str, scene: Scene) -> str:
+        names = {
+            "points": "the scene's points",
+            "random": "random points",
+            "sweep": "a sweep over the photographs",
+            "hull": "the hull of the silhouettes",
+        }
+        has_own = scene.points is not None or source in MODEL_SOURCES
+        return names.get(source, source) + ("" if has_own else ": the scene has no points")
 
     def _source(self, scene: Scene) -> str:
         if self.source != "auto":
             return self.source
         if scene.points is not None:
             return "points"
-        return "random" if read_image(scene.views[0].image_path).shape[2] == 4 else "sweep"
+        return self.transparent if read_image(scene.views[0].image_path).shape[2] == 4 else "sweep"
 
-    def _parameters(self, run: Run, degree: int) -> Parameters:
-        if self.source in MODEL_SOURCES:
-            return with_degree(self._read(), degree)
+    def _parameters(self, run: Run, degree: int) -> tuple[Parameters, str]:
+        """The parameters and their source: random points too where photographs agree on too few."""
         source = self._source(run.scene)
-        if source == "random":
-            points = self._random(run)
-        elif source == "sweep":
-            points = self._swept(run)
-        else:
-            points = self._points(run.scene)
+        if source in MODEL_SOURCES:
+            return with_degree(self._read(), degree), source
+        found = {"sweep": self._swept, "hull": self._on_hull, "points": self._points}
+        points = found[source](run) if source in found else None
+        if points is None:
+            points, source = self._random(run), "random"
         self._require_memory(run, len(points))
-        return from_points(points, self.opacity, degree, self.scale)
+        return from_points(points, self.opacity, degree, self.scale), source
 
     def _read(self) -> Parameters:
         assert self.file is not None  # as `check` requires
@@ -110,7 +118,8 @@ class Init(Stage):
         return parameters
 
     @staticmethod
-    def _points(scene: Scene) -> PointCloud:
+    def _points(run: Run) -> PointCloud:
+        scene = run.scene
         if scene.points is None:
             raise DataError(f"{scene.path}: has no points to start from; use init: {{source: sweep}}")
         require_ahead(scene.points, scene)
@@ -126,13 +135,24 @@ class Init(Stage):
         self._require_memory(run, self.count)
         return random_points(run.scene, self.count, run.seed)
 
-    def _swept(self, run: Run) -> PointCloud:
+    def _swept(self, run: Run) -> PointCloud | None:
         views = [view for view in run.scene.split("train") if view.downscale == run.downscale]
         points = swept_points(views, centre_of(views), load_image, self.swept, run.seed)
-        if len(points) < MIN_SWEPT_POINTS:
+        if len(points) < MIN_POINTS:
             remedy = "photographs from places that lie closer together agree on more"
             LOG.warning("the photographs agree on %d points only; starting from random ones; %s", len(points), remedy)
-            return self._random(run)
+            return None
+        return points
+
+    def _on_hull(self, run: Run) -> PointCloud | None:
+        views = [view for view in run.scene.split("train") if view.downscale == run.downscale]
+        points = hull_points(views, *looked_at_box(run.scene), load_rgba, self.count, run.seed)
+        if len(points) < MIN_POINTS:
+            remedy = "they need transparency around what they show, and no masks; or use init: {source: sweep}"
+            LOG.warning(
+                "the photographs' silhouettes give %d points only; starting from random ones; %s", len(points), remedy
+            )
+            return None
         return points
 
 
@@ -174,12 +194,17 @@ def neighbour_distance2(positions: NDArray[np.floating]) -> NDArray[np.float64]:
 
 def random_points(scene: Scene, count: int, seed: int) -> PointCloud:
     """Return grey points, uniform in a box around the point that the training cameras look at."""
-    views = scene.split("train")
-    positions, centre = np.stack([view.position for view in views]), centre_of(views)
-    half_side = RANDOM_BOX * float(np.median(np.linalg.norm(positions - centre, axis=1)))
+    centre, half_side = looked_at_box(scene)
     rng = np.random.default_rng([seed, count])
     spread = rng.uniform(-half_side, half_side, (count, 3))
     return PointCloud((centre + spread).astype(np.float32), np.full((count, 3), 127 / 255, np.float32))
+
+
+def looked_at_box(scene: Scene) -> tuple[NDArray[np.floating], float]:
+    """Return the centre, [3], and half the side of a box around the point that the training cameras look at."""
+    views = scene.split("train")
+    positions, centre = np.stack([view.position for view in views]), centre_of(views)
+    return centre, RANDOM_BOX * float(np.median(np.linalg.norm(positions - centre, axis=1)))
 
 
 def centre_of(views: Sequence[View]) -> NDArray[np.floating]:

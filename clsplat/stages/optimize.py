@@ -94,7 +94,8 @@ class Optimize(Stage):
     def acting(self, step: int) -> list[Scheduled]:
         """Return the stages of `during` that run when the training begins after a global step."""
         last = step + self.steps
-        return [stage for stage in self.during if any(stage.due(i, i == last) for i in range(step + 1, last + 1))]
+        before = range(step + 1, last)  # no edit follows the last
+        return [s for s in self.during if any(map(s.due, before)) or (not s.edits and s.due(last, True))]
 
     def run(self, run: Run) -> None:
         for _ in self.iterate(run):
@@ -108,9 +109,8 @@ class Optimize(Stage):
         """Train step by step; what a step yields, ViewGradients unless it is skipped, is valid until the next."""
         views = self._views(run)
         trainer, sampler = self._trainer(run, views), Sampler(run.scene.split("train"), views, run.seed)
-        memory, count = run.memory_plan(), run.model.gaussians.count
+        (memory := run.memory_plan()).check(count := run.model.gaussians.count)
         LOG.info(memory.text(count))
-        memory.check(count)
         last_step = run.step - run.stage_step + self.steps
         forecast = Forecast.of(run.step, last_step, [stage.due for stage in self._density])
         seconds: list[float] = []  # of the steps since the last report
@@ -131,8 +131,7 @@ class Optimize(Stage):
                 self._act(run)
             run.between()
             if run.interrupted:
-                path = checkpoint.save(run)
-                told = f"saved in {path}; `clsplat resume {run.out}` goes on from it"
+                told = f"saved in {checkpoint.save(run)}; `clsplat resume {run.out}` goes on from it"
                 raise Interrupted(f"stopped at step {run.step}, {told}")
             yield view
 
@@ -166,6 +165,8 @@ class Optimize(Stage):
         for name in sorted(self.tables - gaussians.tables.keys()):
             gaussians.add(name, 1)
             run.refresh_filter()
+        for stage in self.during:
+            stage.attach(run)
         parts = run.rasterizer, run.model, run.adam, run.stats, photographs.background
         rates = self.rates.settled(views.full_size(run.step - run.stage_step + self.steps))
         return Trainer(*parts, self.losses, rates, run.scene.extent, run.numbers, self.update)
@@ -189,9 +190,8 @@ class Optimize(Stage):
             return
         run.divisor = views.divisor(run.step)
         with run.changing():
-            for stage in self.during:
-                if stage.edits and stage.due(run.step):
-                    stage.act(run)
+            for stage in (stage for stage in self.during if stage.edits and stage.due(run.step)):
+                stage.act(run)
             run.edited = True
 
     def _step(self, run: Run, trainer: Trainer, sampler: Sampler) -> ViewLosses:

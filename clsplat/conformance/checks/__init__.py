@@ -2,6 +2,7 @@
 
 from clsplat.conformance.check import Check
 from clsplat.conformance.checks import (
+    averages,
     blending,
     compression,
     density,
@@ -21,6 +22,7 @@ KERNELS: list[Check] = [
     *blending.CHECKS.listed,
     *images.CHECKS.listed,
     *update.CHECKS.listed,
+    *averages.CHECKS.listed,
     *density.CHECKS.listed,
     *compression.CHECKS.listed,
     *whole.CHECKS.listed,
