@@ -47,6 +47,7 @@ void project_forward(
     __global const float *restrict sh_base,          // [3,S]
     __global const float *restrict sh_rest,          // [(K-1)*3,S] coefficient-major
     __global const float *restrict filter_variance,  // [S] scene units^2
+    __global const float *restrict hidden,           // [planes,S] whole numbers: bits of the views that leave it out
     __constant camera_t *restrict camera,            // [1]
     __global float *restrict splats,                 // [N,RECORD] see splat.h
     __global uint *restrict depth_key,               // [S] bits of z, all ones when culled
@@ -59,6 +60,8 @@ void project_forward(
     const float compensate,                          // 0 or 1
     const uint row_begin,                            // of the band of tiles whose pairs are listed
     const uint row_end,
+    const uint hidden_plane,                         // that has the view
+    const uint hidden_bit,                           // of the view; 0: no Gaussian is left out
     const uint degree,
     const uint stride,
     const uint count)
@@ -68,7 +71,8 @@ void project_forward(
         return;
     shape_t s;
     shape_of(means, quats, log_scales, filter_variance, camera, near_plane, screen_variance, compensate, stride, i, &s);
-    const VI inside = (LANE_INDEX + (int)i) < (int)count;
+    const VI left_out = to_VI(VLOAD(hidden + hidden_plane * stride + i)) & (VI)((int)hidden_bit);
+    const VI inside = ((LANE_INDEX + (int)i) < (int)count) & (left_out == 0);
     const VF u = camera->fx * s.x * s.inverse_z + camera->cx;
     const VF v = camera->fy * s.y * s.inverse_z + camera->cy;
 

@@ -21,6 +21,8 @@ from clsplat.formats.splats import degree_of
 from clsplat.formats.splats import sh_coefficients as sh_coefficients
 from clsplat.opencl.device import Array, Device
 
+HIDDEN = "hidden"  # bit v % HIDDEN_VIEWS of component v // HIDDEN_VIEWS: training view v leaves the Gaussian out
+HIDDEN_VIEWS = 22  # to a component, a whole number that to_VI of lanes.h converts
 INTERVAL2 = "sampling_interval2"  # scene units², the smallest over training views; exists only where it is read
 ALIGNMENT = 64  # capacity is a multiple of this: wide kernels need no tail
 GROWTH = 1.5
@@ -124,6 +126,13 @@ class Gaussians:
             kept = self.get(name)[:, :components]
             self.add(name, components, self.tables[name].zero_fresh)
             self.set(name, kept)
+
+    def hidden_arguments(self, view: int | None) -> dict[str, Any]:
+        """Return the arguments of project_forward that leave out what is hidden in a training view, by its number."""
+        if view is None or HIDDEN not in self.tables:
+            return {"hidden": self["filter_variance"], "hidden_plane": 0, "hidden_bit": 0}  # any table: no bit counts
+        plane, bit = divmod(view, HIDDEN_VIEWS)
+        return {"hidden": self[HIDDEN], "hidden_plane": plane, "hidden_bit": 1 << bit}
 
     def not_finite(self) -> list[str]:
         """Return the names of the parameters that hold NaN or infinity, or whose moments do."""

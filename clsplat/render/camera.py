@@ -37,6 +37,7 @@ class DeviceCamera:
     tiles_x: int
     tiles_y: int
     tile: int
+    view: int | None = None  # its number in the table HIDDEN; without one every Gaussian is drawn
 
     @property
     def tiles(self) -> int:

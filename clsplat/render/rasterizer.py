@@ -143,6 +143,7 @@ class Rasterizer:
             items=-(-count // self._lanes),
             **shape_arguments(model, camera),
             sh_base=gaussians["sh_base"],
+            **gaussians.hidden_arguments(camera.view),
             splats=splats,
             **vars(footprints),
             radius=radius,

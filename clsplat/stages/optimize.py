@@ -220,7 +220,7 @@ class Optimize(Stage):
         """
         run.device.timings.sampling = run.step % self.log_every == self.log_every // 2
         sample = sampler.at(run.step)
-        photograph = run.photographs.of_sizes(sample.view, sample.original)
+        photograph = run.photographs.of_sizes(sample.view, sample.original, sample.number)
         ahead = range(1, min(READ_AHEAD, self.steps - run.stage_step) + 1)
         run.photographs.announce(sampler.at(run.step + number).view for number in ahead)
         stale = {name for stage in self.during if stage.due(run.step) for name in stage.stale(run)}

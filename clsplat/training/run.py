@@ -16,7 +16,7 @@ from clsplat.density.survey import Survey
 from clsplat.errors import ConfigError, Interrupted
 from clsplat.filters import FilterViews, ModelSettings, measure_intervals
 from clsplat.gaussians.model import Model, Rendering
-from clsplat.gaussians.tables import INTERVAL2, PARAMETERS, DeviceModel
+from clsplat.gaussians.tables import HIDDEN, INTERVAL2, PARAMETERS, DeviceModel
 from clsplat.losses.base import Loss
 from clsplat.opencl.device import Device
 from clsplat.pages.page import scene_name
@@ -112,6 +112,8 @@ class Run:
     def next_stage(self, cursor: int) -> None:
         """Come to the beginning of a stage."""
         self.cursor, self.stage_step, self.acted, self.edited = cursor, 0, 0, False
+        if self.has_model:
+            self.model.gaussians.tables.pop(HIDDEN, None)  # which a training has for itself
 
     @contextmanager
     def changing(self) -> Iterator[None]:

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -110,10 +110,10 @@ class Photographs:
         self._held[key] = photograph
         return photograph
 
-    def of_sizes(self, view: View, original: View) -> Photograph:
+    def of_sizes(self, view: View, original: View, number: int | None = None) -> Photograph:
         """Return the photograph of a view, or of the larger `original` where a mask leaves nothing of the smaller one.
 
-        Raises DataError when the mask leaves out every pixel at that size too.
+        number: of the view, see DeviceCamera.  Raises DataError when the mask leaves out every pixel at that size too.
         """
         photograph = self.get(view)
         if photograph.empty and view is not original:
@@ -123,7 +123,7 @@ class Photographs:
                 f"{original.mask_path or original.image_path}: the mask leaves out every pixel of '{original.name}'; "
                 "expected some that count: remove the photograph from the dataset, or fix its mask"
             )
-        return photograph
+        return replace(photograph, camera=replace(photograph.camera, view=number))
 
     def announce(self, views: Iterable[View]) -> None:
         """Start to read the photographs of views that are used next, unless they are on the device."""

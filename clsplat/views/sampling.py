@@ -58,6 +58,7 @@ class Sample:
 
     view: View  # at the size of the step
     original: View  # at the size that is trained on
+    number: int  # of it among the training views
     transforms: Sequence[PhotographTransform]
     step: int  # global
 
@@ -67,8 +68,10 @@ class Sampler:
 
     def __init__(self, views: Sequence[View], settings: ViewSettings, seed: int) -> None:
         self.settings, self._pool = settings, ViewPool(views, seed)
+        self._numbers = {id(view): number for number, view in enumerate(views)}
 
     def at(self, step: int) -> Sample:
         """Return the sample of a global step, counted from 1."""
         view, divisor = self.settings.order.at(self._pool, step), self.settings.divisor(step)
-        return Sample(view.resized(view.downscale * divisor), view, self.settings.transforms, step)
+        small = view.resized(view.downscale * divisor)
+        return Sample(small, view, self._numbers[id(view)], self.settings.transforms, step)
