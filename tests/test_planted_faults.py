@@ -111,6 +111,8 @@ OPTIONAL = {  # in what few runs compute: doctor notices them, the check before 
             ("squares", "passes ? s.opacity * grad_alpha", "passes ? k.uncapped * grad_alpha"),
         )
     },
+    "project_forward, what a view leaves out": ("project.cl", " & (left_out == 0)", ""),
+    "project_forward, the views of another plane": ("project.cl", "hidden_plane * stride + i", "i"),
     "adam_step, rows not seen": ("adam.cl", "!= ~0u) | (VI)((int)every)", "!= 0u) | (VI)((int)every)"),
     "update_gaussians, rows not seen": ("adam.cl", "].touched | (VI)((int)every)", "].touched | (VI)(-1)"),
     "update_gaussians, moments not seen": ("adam.h", "(updated ? v : v_before)", "v"),

@@ -10,7 +10,6 @@ from pydantic import Field
 from clsplat.density.edit import Edit, Rule
 from clsplat.density.survey import WEIGHT, Survey
 from clsplat.density.thresholds import Share
-from clsplat.gaussians.tables import HIDDEN_VIEWS
 
 
 @dataclass(frozen=True)
@@ -40,15 +39,13 @@ def largest_of(weight: NDArray[np.float64], share: float) -> NDArray[np.bool_]:
     return found
 
 
-def hidden(survey: Survey, of_view: float) -> NDArray[np.float32]:
-    """Return what each view leaves out, [N, components] as the table HIDDEN: Gaussians that it sees, and that are not
-    of the largest that make `of_view` of its weight."""
-    bits = np.zeros((survey.count, -(-len(survey.views) // HIDDEN_VIEWS)), np.int64)
-    for number, look in enumerate(survey.looks(survey.views)):
-        plane, bit = divmod(number, HIDDEN_VIEWS)
-        useless = ~largest_of(look.sum(WEIGHT).astype(np.float64), of_view)
-        bits[:, plane] += (useless & (look.radius() > 0)).astype(np.int64) << bit
-    return bits.astype(np.float32)
+def useless(survey: Survey, of_view: float) -> NDArray[np.bool_]:
+    """Return for each view, [V, N], which Gaussians it sees that are not of the largest that make `of_view` of its
+    weight."""
+    found = np.zeros((len(survey.views), survey.count), bool)
+    for here, look in zip(found, survey.looks(survey.views), strict=True):
+        here[:] = (look.radius() > 0) & ~largest_of(look.sum(WEIGHT).astype(np.float64), of_view)
+    return found
 
 
 class PruneUseless(Rule):

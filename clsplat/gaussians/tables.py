@@ -205,6 +205,18 @@ class DeviceModel:
     compensate: float = 0.0  # 1: the opacity falls as the screen filter enlarges the splat
 
 
+def hide(gaussians: Gaussians, left_out: NDArray[np.bool_]) -> None:
+    """Write which Gaussians each training view leaves out, [V, N], into the table HIDDEN."""
+    views, count = left_out.shape
+    bits = np.zeros((count, -(-views // HIDDEN_VIEWS)), np.float32)  # whole numbers
+    for view in range(views):
+        plane, bit = divmod(view, HIDDEN_VIEWS)
+        bits[:, plane] += left_out[view] * np.float32(1 << bit)
+    if HIDDEN not in gaussians.tables:
+        gaussians.add(HIDDEN, bits.shape[1])
+    gaussians.set(HIDDEN, bits)
+
+
 def checked_rows(rows: NDArray[np.integer], count: int) -> NDArray[np.uint32]:
     """Return rows, [n], as a kernel takes them; raise ValueError unless they are different integers in [0, count)."""
     if rows.ndim != 1 or not np.issubdtype(rows.dtype, np.integer):

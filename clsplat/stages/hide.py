@@ -2,9 +2,9 @@
 
 from typing import ClassVar, Literal
 
-from clsplat.density.importance import hidden
+from clsplat.density.importance import useless
 from clsplat.density.thresholds import Share
-from clsplat.gaussians.tables import HIDDEN, HIDDEN_VIEWS
+from clsplat.gaussians.tables import HIDDEN, HIDDEN_VIEWS, hide
 from clsplat.stages.base import Scheduled
 from clsplat.training.run import Run
 
@@ -30,5 +30,4 @@ class HideUseless(Scheduled):
             run.model.gaussians.add(HIDDEN, -(-len(run.scene.split("train")) // HIDDEN_VIEWS))
 
     def run(self, run: Run) -> None:
-        self.attach(run)
-        run.model.gaussians.set(HIDDEN, hidden(run.survey(), self.of_view))
+        hide(run.model.gaussians, useless(run.survey(), self.of_view))

@@ -10,7 +10,7 @@ from clsplat.conformance.checks.blending import MARGIN
 from clsplat.conformance.checks.compression import photograph_of
 from clsplat.conformance.scenes import random_case, safe_case
 from clsplat.density.edit import Edit
-from clsplat.density.importance import PruneUseless, Weights, largest_of, weights
+from clsplat.density.importance import PruneUseless, Weights, largest_of, useless, weights
 from clsplat.density.statistics import SplatStats
 from clsplat.density.survey import Survey
 from clsplat.density.thresholds import SceneScale
@@ -36,6 +36,23 @@ def test_weights_are_those_of_the_reference(device, rng, count, width, height):
             made += weight[i]
             views[i] += 1
     np.testing.assert_array_equal(found.views, views)
+
+
+@pytest.mark.parametrize(("count", "width", "height"), [(0, 16, 16), (1, 16, 16), (17, 33, 31), (40, 24, 24)])
+def test_a_view_has_no_use_for_the_rest_of_what_it_sees(device, rng, count, width, height):
+    case = safe_case(rng, count, width, height, MARGIN)
+    case.parameters["means"][::7] += 100.0  # out of sight
+    masks = [rng.random((height, width)) < share for share in (0.9, 0.2)]
+    held = [photograph_of(device, case, mask) for mask in masks]
+    source = SimpleNamespace(get=lambda view: held[view], background=device.zeros(3))
+    survey = Survey(Rasterizer(device, "radix"), case.model(device), source, range(2), 0, 0)
+    for share in (0.0, 0.9, 1.0):
+        found = useless(survey, share)
+        for here, mask in zip(found, masks, strict=True):
+            splats = case.project()
+            weight = ref.contribution(splats, width, height, mask)
+            expected = (splats.radius > 0) & ~largest_of(weight, share)
+            np.testing.assert_array_equal(here, expected)
 
 
 @pytest.mark.parametrize(

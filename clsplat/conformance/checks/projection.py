@@ -12,6 +12,7 @@ from clsplat.conformance.check import Checks, Note
 from clsplat.conformance.comparison import CONIC, DEPTH, PROJECTION, SUM, Figure, by_element, by_norm, equal, wrong
 from clsplat.conformance.scenes import Case, random_case, with_world_filter
 from clsplat.filters import FilterViews, Smoothing
+from clsplat.gaussians.tables import HIDDEN_VIEWS, hide
 from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import PIXEL_SUMS, Rasterizer
 
@@ -156,6 +157,30 @@ def projection_of_what_cannot_be_drawn(device: Device, rng: np.random.Generator)
     yield equal("project_forward", "depths of Gaussians behind, faint or not finite", keys[culled], CULLED)
     yield equal("project_forward", "radii of Gaussians behind or not finite", radius[:6], 0.0)
     yield wrong("project_forward", "records that are not numbers", np.isnan(records))
+
+
+def hidden_figures(device: Device, case: Case, rng: np.random.Generator, views: int) -> Iterator[Figure]:
+    """Hide Gaussians in training views; compare each view's picture with that of the others alone."""
+    model, camera, count = case.model(device), case.device_camera(device), len(case.parameters["means"])
+    left_out = rng.random((views, count)) < 0.5
+    hide(model.gaussians, left_out)
+    rasterizer, background = Rasterizer(device, "radix"), device.upload(np.full(3, 0.25, np.float32))
+    for view in sorted({0, min(HIDDEN_VIEWS, views) - 1, views - 1}):
+        what = f"what view {view} of {views} leaves out of {count} Gaussians"
+        frame = rasterizer.forward(model, replace(camera, view=view), background)
+        found, hidden = frame.image.get().copy(), left_out[view]
+        yield equal("project_forward", f"records of {what}", frame.splats.get()[hidden], 0.0)
+        yield equal("project_forward", f"depths of {what}", frame.depth_key.get()[:count][hidden], CULLED)
+        yield equal("project_forward", f"radii of {what}", frame.radius.get()[:count][hidden], 0.0)
+        others = Case({name: values[~hidden] for name, values in case.parameters.items()}, case.view)
+        expected = rasterizer.forward(others.model(device), camera, background).image.get()
+        yield equal("project_forward", f"a picture without {what}", found, expected)
+
+
+@CHECKS.add("project_forward")
+def gaussians_that_views_leave_out(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    for count, views in ((17, 2), (65, HIDDEN_VIEWS + 1)):
+        yield from hidden_figures(device, random_case(rng, count), rng, views)
 
 
 @CHECKS.add("project_backward")
