@@ -143,6 +143,7 @@ MINI = {
         for place in rules(f"densify{n}", prune_useless="of_all of_view start views_below")
     ),
     *(f"densify~{n}.{key}" for n in (2, 3) for key in STAGE),
+    *(f"hide_useless{n}.{key}" for n in ("", "~2") for key in ("every", "of_view", "start", "stop")),
     *("densify.every", "densify.start", "densify.stop"),
     *(f"reset_opacity.{key}" for key in ("every", "stop", "when_background")),
     *(f"reset_opacity~2.{key}" for key in ("every", "start", "stop", "to", "when_background")),
@@ -195,7 +196,8 @@ DIFFERENCES = {
     },
     ("taming", "taming_7k"): TWIN | {"densify.every", "densify.budget.gaussians"},
     ("splat", "mini"): MINI,
-    ("mini", "mini_7k"): TWIN - ENDS | {"densify~3.every", "densify~3.stop"},
+    ("mini", "mini_7k"): TWIN - ENDS
+    | {f"{stage}.{key}" for stage in ("densify~3", "hide_useless~2") for key in ("every", "stop")},
     ("splat", "speedy"): {
         f"{stage}.{key}" for stage in LEAST for key in ("every", "keep", "remove", "score", "start", "stop")
     },
