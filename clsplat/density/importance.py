@@ -20,10 +20,13 @@ class Weights:
     views: NDArray[np.int64]  # [N] in which it is useful
 
 
-def weights(survey: Survey, of_view: float) -> Weights:
-    """Return the weights, and the views in which a Gaussian is one of the largest that make `of_view` of the weight."""
+def weights(survey: Survey, of_view: float, drawn: int | None = None) -> Weights:
+    """Return the weights, and the views in which a Gaussian is one of the largest that make `of_view` of the weight.
+
+    drawn: the number of views; None: all.
+    """
     total, views = np.zeros(survey.count), np.zeros(survey.count, np.int64)
-    for look in survey.looks(survey.views):
+    for look in survey.looks(survey.views if drawn is None else survey.drawn(drawn)):
         weight = look.sum(WEIGHT).astype(np.float64)
         total += weight
         views += largest_of(weight, of_view)
@@ -55,16 +58,18 @@ class PruneUseless(Rule):
     """
 
     type: Literal["prune_useless"] = "prune_useless"
-    training_keys: ClassVar[frozenset[str]] = frozenset({"of_view", "of_all", "views_below"})
+    training_keys: ClassVar[frozenset[str]] = frozenset({"of_view", "of_all", "views", "views_below"})
 
     of_view: Share = 0.99
     """Share of a view's weight that is made by what is useful in it."""
+    views: Annotated[int, Field(ge=1)] | None = None
+    """Number of training views, drawn by seed and step; all of them without a number, or where there are no more."""
     views_below: Annotated[int, Field(ge=0)] = 2
     """Number of views below which a Gaussian is removed."""
     of_all: Share = 0.999
     """Share of the weight in all views that stays; the smallest weights go."""
 
     def mark(self, edit: Edit) -> None:
-        found = edit.survey.once(weights, self.of_view)
+        found = edit.survey.once(weights, self.of_view, self.views)
         kept = largest_of(found.total, self.of_all) & (found.views >= self.views_below)
         edit.choose(~kept, copies=0, kept=0)

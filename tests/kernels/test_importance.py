@@ -38,6 +38,20 @@ def test_weights_are_those_of_the_reference(device, rng, count, width, height):
     np.testing.assert_array_equal(found.views, views)
 
 
+def test_some_views_are_drawn(device, rng):
+    case = safe_case(rng, 17, 33, 31, MARGIN)
+    held = [photograph_of(device, case, rng.random((31, 33)) < 0.8) for _ in range(5)]
+    source = SimpleNamespace(get=lambda view: held[view], background=device.zeros(3))
+    survey = Survey(Rasterizer(device, "radix"), case.model(device), source, range(5), 3, 600)
+    places = survey.drawn(2)
+    of_two = weights(survey, 0.9, 2)
+    alone = Survey(Rasterizer(device, "radix"), case.model(device), source, places, 3, 600)
+    expected = weights(alone, 0.9)
+    np.testing.assert_array_equal(of_two.total, expected.total)
+    np.testing.assert_array_equal(of_two.views, expected.views)
+    np.testing.assert_array_equal(weights(survey, 0.9, 9).total, weights(survey, 0.9).total)
+
+
 @pytest.mark.parametrize(("count", "width", "height"), [(0, 16, 16), (1, 16, 16), (17, 33, 31), (40, 24, 24)])
 def test_a_view_has_no_use_for_the_rest_of_what_it_sees(device, rng, count, width, height):
     case = safe_case(rng, count, width, height, MARGIN)
