@@ -140,7 +140,7 @@ MINI = {
     *(
         place
         for n in ("", "~2", "~3")
-        for place in rules(f"densify{n}", prune_useless="of_all of_view start views_below")
+        for place in rules(f"densify{n}", prune_useless="of_all of_view start views views_below")
     ),
     *(f"densify~{n}.{key}" for n in (2, 3) for key in STAGE),
     *(f"hide_useless{n}.{key}" for n in ("", "~2") for key in ("every", "of_view", "start", "stop")),
@@ -209,7 +209,7 @@ DIFFERENCES = {
     ("splat", "dash"): DASH | {"reset_opacity.stop", "rates.logit_opacity"},
     ("splat_7k", "dash_7k"): DASH,
     ("splat_7k", "fast"): {
-        *rules("densify~2", prune_useless="of_all of_view start views_below"),
+        *rules("densify~2", prune_useless="of_all of_view start views views_below"),
         *(f"densify~2.{key}" for key in STAGE),
         *(f"densify.rules.prune_large{key}" for key in ("", ".size_above", ".start")),
         *(f"rates.{key}" for key in ("log_scales", "logit_opacity", "quats", "sh_base", "sh_rest")),
@@ -218,7 +218,7 @@ DIFFERENCES = {
         *(f"{stage}.{key}" for stage in ("add_to_average", "reset_opacity~2") for key in ("every", "start", "stop")),
         *(f"reset_opacity{key}" for key in (".every", ".start", ".stop", ".to", ".when_background")),
         *("reset_opacity~2.to", "reset_opacity~2.when_background", "raise_sh.every", "evaluate.every", "steps"),
-        *("densify.start", "densify.stop", "stages.init.count", "stages.init.transparent"),
+        *("densify.start", "densify.stop", "stages.init.count", "stages.init.fewest", "stages.init.transparent"),
     },
     ("mip_splatting", "dash_mip"): DASH | {"reset_opacity.stop", "rates.logit_opacity", "refresh_filter.start"},
     ("splat", "auto_opti3dgs"): HAAR,

@@ -9,10 +9,11 @@ from scipy.spatial import cKDTree
 
 from clsplat.scene.detect import read_scene
 from clsplat.scene.plane_sweep import swept_points
-from clsplat.scene.scene import Camera, View
+from clsplat.scene.scene import Camera, PointCloud, View
 from clsplat.scene.view import load_image
 from clsplat.stages.init import centre_of
 from tests.data_sets import data_set
+from tests.test_training import train
 
 DEPTH = 4.0
 
@@ -70,3 +71,23 @@ def test_real_surfaces():
     distance = np.median([np.linalg.norm(view.position - centre) for view in views])
     gaps, _ = cKDTree(points.positions).query(scene.points.positions)
     assert np.quantile(gaps, 0.9) < 0.03 * distance
+
+
+@pytest.mark.parametrize(
+    ("fewest", "found", "alpha", "swept"),
+    [(1, 1, False, True), (1, 0, False, False), (0, 1, False, False), (1, 1, True, False)],
+)
+def test_a_scene_with_few_points_is_swept(tiny_scene, tmp_path, monkeypatch, caplog, fewest, found, alpha, swept):
+    """fewest, found: beyond the number of the scene's points."""
+    own, file = len(read_scene(tiny_scene).points), tmp_path / "start.yaml"
+    cloud = PointCloud(np.random.default_rng(0).random((own + found, 3), np.float32), np.zeros((own + found, 3)))
+    monkeypatch.setattr("clsplat.stages.init.swept_points", lambda *arguments: cloud)
+    monkeypatch.setattr("clsplat.stages.init.has_alpha", lambda scene: alpha)
+    stages = f"[{{init: {{fewest: {own + fewest}}}}}, {{optimize: {{steps: 1, losses: [l1]}}}}, export]"
+    file.write_text(f"name: start\nstages: {stages}\n")
+    caplog.set_level("INFO", "clsplat")
+    run = train(tiny_scene, tmp_path / "run", pipeline=str(file))
+    log = caplog.text
+    assert (f"from a sweep over the photographs: the scene has {own:,} points" in log) == swept
+    assert ("from the scene's points" in log) != swept
+    assert run.model.gaussians.count == (len(cloud) if swept else own)

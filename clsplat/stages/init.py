@@ -37,7 +37,8 @@ class Init(Stage):
 
     `source: auto` uses the scene's points if it has points.  Without points it uses a plane sweep over the photographs,
     or, where they have alpha, what `transparent` says: random points in a box around the point that the cameras look
-    at, as published, or points on the hull of the silhouettes in that box.
+    at, as published, or points on the hull of the silhouettes in that box.  Photographs without alpha are swept too
+    where the scene has fewer points than `fewest`, and the sweep finds more.
     """
 
     stage: Literal["init"] = "init"
@@ -49,6 +50,8 @@ class Init(Stage):
     """Source of the first Gaussians; `ply` is an older name of `model`."""
     transparent: Literal["random", "hull"] = "random"
     """Source of `auto` for a scene without points whose photographs have alpha."""
+    fewest: Annotated[int, Field(ge=0)] = 0
+    """Number of the scene's points below which `auto` prefers a plane sweep."""
     opacity: Annotated[float, Field(gt=0, lt=1)] = 0.1
     """Opacity of the first Gaussians."""
     scale: Annotated[float, Field(gt=0)] = 1.0
@@ -88,15 +91,17 @@ class Init(Stage):
             "sweep": "a sweep over the photographs",
             "hull": "the hull of the silhouettes",
         }
-        has_own = scene.points is not None or source in MODEL_SOURCES
-        return names.get(source, source) + ("" if has_own else ": the scene has no points")
+        if source in MODEL_SOURCES or (source != "sweep" and scene.points is not None):
+            return names.get(source, source)
+        own = "no points" if scene.points is None else f"{len(scene.points):,} points"
+        return f"{names.get(source, source)}: the scene has {own}"
 
     def _source(self, scene: Scene) -> str:
         if self.source != "auto":
             return self.source
         if scene.points is not None:
             return "points"
-        return self.transparent if read_image(scene.views[0].image_path).shape[2] == 4 else "sweep"
+        return self.transparent if has_alpha(scene) else "sweep"
 
     def _parameters(self, run: Run, degree: int) -> tuple[Parameters, str]:
         """The parameters and their source: random points too where photographs agree on too few."""
@@ -107,6 +112,9 @@ class Init(Stage):
         points = found[source](run) if source in found else None
         if points is None:
             points, source = self._random(run), "random"
+        if source == "points" and self.source == "auto" and len(points) < self.fewest and not has_alpha(run.scene):
+            swept = self._sweep(run)
+            points, source = (swept, "sweep") if len(swept) > len(points) else (points, source)
         self._require_memory(run, len(points))
         return from_points(points, self.opacity, degree, self.scale), source
 
@@ -135,9 +143,12 @@ class Init(Stage):
         self._require_memory(run, self.count)
         return random_points(run.scene, self.count, run.seed)
 
-    def _swept(self, run: Run) -> PointCloud | None:
+    def _sweep(self, run: Run) -> PointCloud:
         views = [view for view in run.scene.split("train") if view.downscale == run.downscale]
-        points = swept_points(views, centre_of(views), load_image, self.swept, run.seed)
+        return swept_points(views, centre_of(views), load_image, self.swept, run.seed)
+
+    def _swept(self, run: Run) -> PointCloud | None:
+        points = self._sweep(run)
         if len(points) < MIN_POINTS:
             remedy = "photographs from places that lie closer together agree on more"
             LOG.warning("the photographs agree on %d points only; starting from random ones; %s", len(points), remedy)
@@ -154,6 +165,11 @@ class Init(Stage):
             )
             return None
         return points
+
+
+def has_alpha(scene: Scene) -> bool:
+    """Return whether the photographs have alpha, by the first one."""
+    return bool(read_image(scene.views[0].image_path).shape[2] == 4)
 
 
 def require_ahead(points: PointCloud, scene: Scene) -> None:
