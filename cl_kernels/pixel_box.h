@@ -42,7 +42,7 @@ typedef struct {
 /* With a, d = (P(z + h) +- P(z - h)) / 2 it is sinh d / (cosh d + cosh a): nothing cancels where h is small. */
 static inline rise_t rise_of(const VF place, const VF h)
 {
-    const VF one = (VF)(1.0f), reach = (VF)(CDF_REACH), size = place < 0.0f ? -place : place;
+    const VF one = (VF)(1.0f), reach = (VF)(CDF_REACH), size = as_VF(as_VI(place) & 0x7fffffff);
     const VF end = smaller(size + h, reach), begin = smaller(larger(size - h, -reach), reach);
     const VI clipped = size + h > reach;
     rise_t f;
@@ -157,9 +157,9 @@ static inline void line_of(const float *splat, const VF centre, line_t *line, sl
         y = wide_within(dy, s);
     else
         y = sharp_within(dy, s, f);
-    const float k2 = 12.0f * k * k;
+    const float k2 = 12.0f * k * k, t2 = t * t;  // t2 apart: a sum of two products may be joined either way
     const VF r = k2 * y.variance, w2 = sqrt(1.0f + r * r), w = sqrt(w2);
-    const VF inverse = 1.0f / sqrt(t * t + (1.0f + r - w2) * (1.0f / 12.0f));
+    const VF e = sqrt(t2 + (1.0f + r - w2) * (1.0f / 12.0f)), inverse = 1.0f / e;
     line->scale = splat[SPLAT_OPACITY] * (TWO_PI * s * t) * f.value / w;
     line->shift = splat[turned ? SPLAT_Y : SPLAT_X] - k * y.mean;
     line->inverse = inverse;
@@ -177,7 +177,7 @@ static inline void line_of(const float *splat, const VF centre, line_t *line, sl
     slopes->fixed = -by_w / w;
     slopes->wide = 0.5f * by_w * inverse;
     slopes->narrow = -(1.0f - r / w2) * (1.0f / 24.0f) * inverse * inverse;
-    slopes->share = t * t * inverse * inverse;
+    slopes->share = t2 * inverse * inverse;
 }
 
 /* d ln alpha at a pixel. */

@@ -6,9 +6,7 @@ that order and sort stably by tile alone.  Bitonic: emit in order of index, writ
 """
 
 import time
-from collections.abc import Mapping
 from dataclasses import dataclass
-from types import MappingProxyType
 from typing import Any, Literal
 
 import numpy as np
@@ -17,9 +15,9 @@ from clsplat.opencl.device import Array, Device
 from clsplat.render.workspace import Workspace
 
 Sort = Literal["auto", "radix", "bitonic"]
+Defines = dict[str, int] | None  # with which the records were made
 TRIALS = 3  # of each sort when `auto` measures
 ONE_GROUP = 32  # values of an item, at most, where one group scans them all
-NO_DEFINES: Mapping[str, int] = MappingProxyType({})
 BLOCKS_MAX = 1024  # of a scan: each adds the sums of all before it
 
 
@@ -85,31 +83,23 @@ class Tiler:
         self._team = int(device.tuning["TEAM"])
         self.sort: Sort = known_sort(device, sort)
         self._pairs = device.program("pairs.cl")
-        device.program("large.cl")
         self._scan = device.program("scan.cl")
         self._radix = device.program("sort_radix.cl")
         self._digit_bits = int(device.tuning["DIGIT_BITS"])
         self._zero = device.zeros(1, np.uint32)
 
     def build(
-        self,
-        splats: Array,
-        footprints: Footprints,
-        band: Band,
-        count: int,
-        limit: int,
-        defines: Mapping[str, int] = NO_DEFINES,
+        self, splats: Array, footprints: Footprints, band: Band, count: int, limit: int, defines: Defines = None
     ) -> TileLists:
         """Make the tile lists of `count` splat records in a band.  Reads the number of pairs back: the only wait.
 
-        defines: with which the records were made.
         Raises TooManyPairs when there are more than `limit`.
         """
         if self.sort == "auto":
             self.sort = self._faster(splats, footprints, band, count, limit, defines)
         depth_key, tile_count = footprints.depth_key, footprints.tile_count
         large = self._large_arguments(splats, footprints, band, count)
-        program = self.device.program("large.cl", **defines)
+        program = self.device.program("large.cl", **(defines or {}))
         program.count_large(**large)
         order = self._depth_order(depth_key, count) if self.sort == "radix" else self._index_order(count)
         ordered_count = self.workspace.array("ordered_count", count, np.uint32)
@@ -245,13 +235,7 @@ class Tiler:
         return tile_offset, tile_pairs
 
     def _faster(
-        self,
-        splats: Array,
-        footprints: Footprints,
-        band: Band,
-        count: int,
-        limit: int,
-        defines: Mapping[str, int],
+        self, splats: Array, footprints: Footprints, band: Band, count: int, limit: int, defines: Defines
     ) -> Sort:
         seconds: dict[Sort, float] = {}
         for sort in ("radix", "bitonic"):

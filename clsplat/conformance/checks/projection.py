@@ -81,7 +81,7 @@ def _wrong_extents(record: NDArray[Any], truth: ref.Splats, drawn: NDArray[Any])
     for low, high, centre, half in ((11, 12, 0, half_x), (9, 10, 1, half_y)):
         mean = truth.mean2d[drawn, centre]
         right &= (record[:, high] >= mean + half - 1e-3) & (record[:, low] <= mean - half + 1e-3)
-        right &= record[:, high] - record[:, low] <= 2.4 * half + 1
+        right &= record[:, high] - record[:, low] <= 2.4 * half + (3 if truth.pixel_box else 1)
     return ~right
 
 

@@ -43,10 +43,8 @@ def blend_steps(splats: Splats, width: int, height: int, thresholds: Thresholds)
     for i in depth_order(splats):
         a, b, c = splats.conic[i]
         dx, dy = splats.mean2d[i, 0] - pixel_x, splats.mean2d[i, 1] - pixel_y
-        sigma = 0.5 * (a * dx**2 + c * dy**2) + b * dx * dy
-        falloff = np.exp(-sigma)
-        if splats.pixel_box:
-            falloff, sigma = box_response(splats.conic[i], dx, dy), np.zeros_like(dx)
+        sigma = 0.5 * (a * dx**2 + c * dy**2) + b * dx * dy  # with the pixel's box only its sign counts
+        falloff = box_response(splats.conic[i], dx, dy) if splats.pixel_box else np.exp(-sigma)
         alpha = np.minimum(thresholds.alpha_max, splats.opacity[i] * falloff)
         after = transmittance * (1 - alpha)
         candidate = running & (sigma >= 0) & (alpha >= thresholds.alpha_min)
@@ -151,9 +149,9 @@ def blend_backward(
         grad.colour[i] = np.sum(grad_image[:3] * np.where(step.blended, step.alpha * step.before, 0), axis=(1, 2))
         grad.opacity[i] = np.sum(step.falloff * grad_alpha)
         if splats.pixel_box:
-            by = [splats.opacity[i] * grad_alpha * by for by in box_derivatives(splats.conic[i], step.dx, step.dy)]
-            grad.mean2d[i], grad.conic[i] = [t.sum() for t in by[:2]], [t.sum() for t in by[2:]]
-            grad.mean2d_abs[i] = [np.abs(t).sum() for t in by[:2]]
+            by = splats.opacity[i] * grad_alpha * np.array(box_derivatives(splats.conic[i], step.dx, step.dy))
+            grad.mean2d[i], grad.conic[i] = by[:2].sum(axis=(1, 2)), by[2:].sum(axis=(1, 2))
+            grad.mean2d_abs[i] = np.abs(by[:2]).sum(axis=(1, 2))
             continue
         grad_sigma = -splats.opacity[i] * step.falloff * grad_alpha
         a, b, c = splats.conic[i]
@@ -206,9 +204,6 @@ def margin(splats: Splats, width: int, height: int, thresholds: Thresholds = Thr
 
 def _relative_gap(values: NDArray[Any], threshold: float) -> float:
     return float(np.min(np.abs(values / threshold - 1), initial=np.inf)) if threshold > 0 else np.inf
-
-
-# ---- Both together -------------------------------------------------------------------------------------------------
 
 
 class Frame(NamedTuple):

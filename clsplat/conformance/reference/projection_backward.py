@@ -83,7 +83,8 @@ def project_backward(
         grad["logit_opacity"][n] = grad_opacity[n] * rho * kappa * sigmoid * (1 - sigmoid)
         grad_kappa = grad_opacity[n] * sigmoid * rho
 
-        # Conic -> 2D covariance: G_V = -K G_K K (with the pixel's box the gradient is that of V already); then κ = sqrt(1 + compensate (det V / det V1 - 1))
+        # Conic -> 2D covariance: G_V = -K G_K K (that of V itself for the pixel's box)
+        # then κ = sqrt(1 + compensate (det V / det V1 - 1))
         a, b, c = splats.conic[n]
         conic = np.array([[a, b], [b, c]])
         ga, gb, gc = grad_conic[n]
