@@ -10,7 +10,7 @@ from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from clsplat.formats.ply import MAX_NUMBER
 from clsplat.gaussians.tables import DeviceModel, Gaussians
@@ -128,6 +128,12 @@ class Mip(ScreenFilter):
     """1: the opacity falls as the area grows, so that a splat keeps its energy."""
 
 
+def _of_a_box(variance: float) -> float:
+    if variance != BOX_VARIANCE:
+        raise ValueError(f"expected no variance beside the type 'box', or {BOX_VARIANCE}: write `screen_filter: box`")
+    return variance
+
+
 class Box(ScreenFilter):
     """Integrate every splat over the box of each pixel, instead of taking its value at the pixel's centre.
 
@@ -137,7 +143,7 @@ class Box(ScreenFilter):
 
     pixel_box: ClassVar[bool] = True
     type: Literal["box"] = "box"
-    variance: Annotated[float, Field(ge=BOX_VARIANCE, le=BOX_VARIANCE)] = BOX_VARIANCE
+    variance: Annotated[float, AfterValidator(_of_a_box)] = BOX_VARIANCE
     """Of the box, px²: for programs that draw a Gaussian blur instead.  Only this value."""
     compensate: Literal[1] = 1
     """As `variance`: a box keeps the energy of a splat."""

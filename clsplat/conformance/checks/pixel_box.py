@@ -27,7 +27,7 @@ from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import Budget
 
 CHECKS = Checks()
-BOX = {"variance": 0.0, "pixel_box": 1.0}
+BOX: dict[str, Any] = {"variance": 0.0, "pixel_box": 1.0}
 SIZES = {"of pixels": 0.0, "far below a pixel": -2.5, "of many pixels": 2.0}  # added to the logarithms of scales
 
 
