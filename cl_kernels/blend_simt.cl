@@ -29,7 +29,7 @@ static inline void unpack_quads(const float4 *quads, float *splat)
 
 static inline row_splat_t splat_on_line(const float *splat, const float row, const float pixel)
 {
-    row_splat_t s = splat_at_pixels(splat, row, pixel);
+    row_splat_t s = splat_at_pixels(splat, splat[BOX_TURNED] > 0.0f, row, pixel);
     line_of(splat, s.turned ? pixel : row, &s.line, &s.slopes);
     return s;
 }

@@ -24,7 +24,7 @@ static inline VF inside_image(__constant camera_t *camera, const VF pixel, const
 #if PIXEL_BOX
 #define LINE_FIELDS (sizeof(line_t) / sizeof(VF))
 #define SLOPE_FIELDS (sizeof(slopes_t) / sizeof(VF))
-#define SPLAT_AT(splat, lines, row, y) splat_on_lines(splat, lines, row, y, column, pixel)
+#define SPLAT_AT(splat, lines, row, y) splat_on_lines(splat, lines, splat[BOX_TURNED] > 0.0f, row, y, column, pixel)
 
 /* The lines of a splat through a tile, rows or columns, each field of all lines together. */
 static inline void lines_of(const float *splat, const uint tile_x, const uint tile_y, float (*lines)[TILE],
@@ -47,12 +47,12 @@ static inline VF field_at(const float *field, const bool turned, const uint y, c
     return turned ? VLOAD(field + column * LANES) : (VF)(field[y]);
 }
 
-static inline row_splat_t splat_on_lines(const float *splat, const float (*lines)[TILE], const float row,
-                                         const uint y, const uint column, const VF pixel)
+static inline row_splat_t splat_on_lines(const float *splat, const float (*lines)[TILE], const bool turned,
+                                         const float row, const uint y, const uint column, const VF pixel)
 {
-    row_splat_t s = splat_at_pixels(splat, row, pixel);
+    row_splat_t s = splat_at_pixels(splat, turned, row, pixel);
     for (uint k = 0; k < LINE_FIELDS; k++)
-        ((VF *)&s.line)[k] = field_at(lines[k], s.turned, y, column);
+        ((VF *)&s.line)[k] = field_at(lines[k], turned, y, column);
     return s;
 }
 #else
@@ -157,6 +157,22 @@ static inline void store_record(const pixel_sums_t m, __global float *record)
     vstore16(sums, 0, record);
 }
 
+#if PIXEL_BOX
+/* Add a row of pixels. */
+static inline void add_row(const float *splat, const float (*lines)[TILE], const float (*slopes)[TILE],
+                           const bool turned, const float row, const uint y, const uint tile_x,
+                           grad_pixels_t *pixels, pixel_sums_t *sums)
+{
+    for (uint column = 0; column < COLUMNS; column++) {
+        const VF pixel = pixel_centres(tile_x, column);
+        row_splat_t s = splat_on_lines(splat, lines, turned, row, y, column, pixel);
+        for (uint k = 0; k < SLOPE_FIELDS; k++)
+            ((VF *)&s.slopes)[k] = field_at(slopes[k], turned, y, column);
+        blend_backward_step(pixels + column, s, pixel, splat + SPLAT_RED, sums);
+    }
+}
+#endif
+
 /* Sum one splat over the rows of its tile that it reaches, whole pairs of rows. */
 static inline void pixel_sums_of(const float *splat, const uint tile_x, const uint tile_y,
                                  grad_pixels_t (*pixels)[COLUMNS], pixel_sums_t *sums)
@@ -172,24 +188,24 @@ static inline void pixel_sums_of(const float *splat, const uint tile_x, const ui
     const float low = splat[SPLAT_Y_MIN] - top, high = splat[SPLAT_Y_MAX] - top;
     const uint y_first = low > 0.0f ? (uint)low : 0u;
     const uint y_end = high < TILE - 1.0f ? (uint)(high + 1.0f) : TILE;
+#if PIXEL_BOX
+    if (splat[BOX_TURNED] > 0.0f)  // apart, so that both loops know where their fields lie
+        for (uint y = y_first; y < y_end; y++)
+            add_row(splat, lines, slopes, true, top + y, y, tile_x, pixels[y], &pixel_sums);
+    else
+        for (uint y = y_first; y < y_end; y++)
+            add_row(splat, lines, slopes, false, top + y, y, tile_x, pixels[y], &pixel_sums);
+#else
     const uint y_begin = y_first - (y_end == TILE ? (y_end - y_first) & 1u : 0u);
     for (uint y = y_begin; y < y_end; y += 2) {
-#if !PIXEL_BOX
         const row_splat_t upper = splat_at_row(splat, top + y), lower = splat_at_row(splat, top + y + 1.0f);
-#endif
         for (uint column = 0; column < COLUMNS; column++) {
             const VF pixel = pixel_centres(tile_x, column);
-#if PIXEL_BOX
-            row_splat_t upper = SPLAT_AT(splat, lines, top + y, y), lower = SPLAT_AT(splat, lines, top + y + 1.0f, y + 1);
-            for (uint k = 0; k < SLOPE_FIELDS; k++) {
-                ((VF *)&upper.slopes)[k] = field_at(slopes[k], upper.turned, y, column);
-                ((VF *)&lower.slopes)[k] = field_at(slopes[k], lower.turned, y + 1, column);
-            }
-#endif
             blend_backward_step(&pixels[y][column], upper, pixel, splat + SPLAT_RED, &pixel_sums);
             blend_backward_step(&pixels[y + 1][column], lower, pixel, splat + SPLAT_RED, &pixel_sums);
         }
     }
+#endif
     *sums = pixel_sums;
 }
 

@@ -56,12 +56,13 @@ static inline rise_t rise_of(const VF place, const VF h)
     const VF ea = exp_power(-a), ed = exp_power(-d), ea2 = ea * ea, ed2 = ed * ed, t = 2.0f * d;
     const VF series = t * (1.0f - t * (1.0f / 2.0f) * (1.0f - t * (1.0f / 3.0f) * (1.0f - t * (1.0f / 4.0f) *
                       (1.0f - t * (1.0f / 5.0f) * (1.0f - t * (1.0f / 6.0f))))));
-    const VF gap = t < 0.35f ? series : one - ed2;
+    const VF gap = larger(t < 0.35f ? series : one - ed2, (VF)(1.0e-10f));  // 1 - ed2; the bound changes no pixel
     const VF below = ea * (1.0f + ed2) + ed * (1.0f + ea2);
-    f.value = ea * gap / below;
+    const VF inverse = 1.0f / (gap * below), inverse_below = gap * inverse;
+    f.value = ea * gap * inverse_below;
 
-    const VF by_a = -ed * (1.0f - ea2) / below;
-    const VF by_d = (4.0f * ea * ed + (1.0f + ea2) * (1.0f + ed2)) * ed / (larger(gap, (VF)(1.0e-10f)) * below);
+    const VF by_a = -ed * (1.0f - ea2) * inverse_below;
+    const VF by_d = (4.0f * ea * ed + (1.0f + ea2) * (1.0f + ed2)) * ed * inverse;
     const VF even = CDF_SLOPE + 3.0f * CDF_CUBIC * (z2 + h2) + 5.0f * CDF_QUINTIC * ((z2 + 6.0f * h2) * z2 + h2 * h2);
     const VF odd = 2.0f * f.z * f.h * (3.0f * CDF_CUBIC + 10.0f * CDF_QUINTIC * (z2 + h2));
     const VF by_z = by_a * even + by_d * odd;

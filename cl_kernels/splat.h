@@ -76,12 +76,12 @@ typedef struct {
 } row_splat_t;
 
 /* The splat at a row; line and slopes are added by the schedules. */
-static inline row_splat_t splat_at_pixels(const float *splat, const float row, const VF pixel)
+static inline row_splat_t splat_at_pixels(const float *splat, const bool turned, const float row, const VF pixel)
 {
     const bool inside = (row >= splat[SPLAT_Y_MIN]) & (row <= splat[SPLAT_Y_MAX]);
     row_splat_t s;
-    s.turned = splat[BOX_TURNED] > 0.0f;
-    s.place = s.turned ? (VF)(row) : pixel;
+    s.turned = turned;
+    s.place = turned ? (VF)(row) : pixel;
     s.opacity = splat[SPLAT_OPACITY];
     s.alpha_min = inside ? ALPHA_MIN : 2.0f;
     return s;
