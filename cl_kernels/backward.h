@@ -27,6 +27,16 @@ static inline void shape_backward(const shape_t *s, __constant camera_t *camera,
                                   const float compensate, VF *grad_mean2d, VF *grad_mean, VF *grad_quat, VF *grad_scale)
 {
     __constant const float *w = camera->world_to_camera;
+#if PIXEL_BOX
+    /* k = xy / longer, s^2 = longer, t^2 = determinant / longer -> covariance */
+    const VF gu = m[SUM_X], gv = m[SUM_Y];
+    const VI turned = s->xx > s->yy;
+    const VF longer = turned ? s->xx : s->yy, inverse_longer = 1.0f / longer, slope = s->xy * inverse_longer;
+    const VF g_short = 0.5f * m[SUM_YY] * longer / s->determinant;
+    const VF g_long = (0.5f * m[SUM_XY] - slope * m[SUM_XX]) * inverse_longer + g_short * slope * slope;
+    const VF g00 = turned ? g_long : g_short, g11 = turned ? g_short : g_long;
+    const VF g01 = 0.5f * m[SUM_XX] * inverse_longer - g_short * slope;
+#else
     const VF a = s->conic_xx, b = s->conic_xy, c = s->conic_yy;
     const VF gu = -(a * m[SUM_X] + b * m[SUM_Y]);
     const VF gv = -(b * m[SUM_X] + c * m[SUM_Y]);
@@ -40,6 +50,7 @@ static inline void shape_backward(const shape_t *s, __constant camera_t *camera,
     const VF g00 = g_ratio * (s->yy / s->determinant - s->ratio * a) - (k00 * a + k01 * b);
     const VF g01 = g_ratio * (-s->xy / s->determinant - s->ratio * b) - (k00 * b + k01 * c);
     const VF g11 = g_ratio * (s->xx / s->determinant - s->ratio * c) - (k10 * b + k11 * c);
+#endif
 
     /* covariance -> V = T M -> T, rotation, scales */
     VF gt[6] = {0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f}, gr[9];

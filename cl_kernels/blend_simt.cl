@@ -6,7 +6,8 @@
 #define BATCH PIXELS  // splats in local memory: each item loads one
 #define QUADS 3       // of four floats: what blending reads of a splat record
 
-/* Load a record in aligned quads; the last field is SPLAT_POWER_MIN instead of SPLAT_X_MIN, which blending does not
+/* Load a record in aligned quads; the last field is SPLAT_POWER_MIN (or BOX_TURNED, in its
+ * place) instead of SPLAT_X_MIN, which blending does not
  * read. */
 static inline void load_quads(__global const float *splats, const uint splat, float4 *quads)
 {
@@ -22,6 +23,19 @@ static inline void unpack_quads(const float4 *quads, float *splat)
         vstore4(quads[k], k, splat);
     splat[SPLAT_POWER_MIN] = quads[QUADS - 1].w;
 }
+
+#if PIXEL_BOX
+#define SPLAT_AT(splat, row, pixel) splat_on_line(splat, row, pixel)
+
+static inline row_splat_t splat_on_line(const float *splat, const float row, const float pixel)
+{
+    row_splat_t s = splat_at_pixels(splat, splat[BOX_TURNED] > 0.0f, row, pixel);
+    line_of(splat, s.turned ? pixel : row, &s.line, &s.slopes);
+    return s;
+}
+#else
+#define SPLAT_AT(splat, row, pixel) splat_at_row(splat, row)
+#endif
 
 /* One work-group = one tile, one item = one pixel.  Local memory: BATCH * 48 + 4 bytes.  Deterministic. */
 __kernel __attribute__((reqd_work_group_size(PIXELS, 1, 1)))
@@ -67,7 +81,7 @@ void blend_forward(
                 quads[k] = batch[j][k];
             float splat[RECORD];
             unpack_quads(quads, splat);
-            blend(&p, splat_at_row(splat, row), pixel, splat + SPLAT_RED);
+            blend(&p, SPLAT_AT(splat, row, pixel), pixel, splat + SPLAT_RED);
         }
         if (p.t > 0.0f)
             atomic_inc(&open);
@@ -148,7 +162,7 @@ void blend_backward(
                 if (active && i < PIXELS) {
                     const float pixel = tile_x * TILE + i % TILE + 0.5f, row = tile_y * TILE + i / TILE + 0.5f;
                     grad_pixels_t p = pixels[i];
-                    blend_backward_step(&p, splat_at_row(splat, row), pixel, splat + SPLAT_RED, &m);
+                    blend_backward_step(&p, SPLAT_AT(splat, row, pixel), pixel, splat + SPLAT_RED, &m);
                     pixels[i] = p;
                 }
                 barrier(CLK_LOCAL_MEM_FENCE);

@@ -3,7 +3,11 @@
 #include "splat.h"
 
 #define COLUMNS (TILE / LANES)  // vectors per tile row
+#if PIXEL_BOX
+#define SEGMENT 64              // with the lines of each, TILE * 16 bytes
+#else
 #define SEGMENT 128             // splats of a tile loaded together: one wait for memory, then rows read the cache
+#endif
 
 static inline VF pixel_centres(const uint tile_x, const uint column)
 {
@@ -17,7 +21,46 @@ static inline VF inside_image(__constant camera_t *camera, const VF pixel, const
     return row < camera->height ? (pixel < (float)camera->width ? one : zero) : zero;
 }
 
-/* Private memory: SEGMENT * 68 bytes of splats and TILE * TILE * 16 of pixels.  Deterministic. */
+#if PIXEL_BOX
+#define LINE_FIELDS (sizeof(line_t) / sizeof(VF))
+#define SLOPE_FIELDS (sizeof(slopes_t) / sizeof(VF))
+#define SPLAT_AT(splat, lines, row, y) splat_on_lines(splat, lines, splat[BOX_TURNED] > 0.0f, row, y, column, pixel)
+
+/* The lines of a splat through a tile, rows or columns, each field of all lines together. */
+static inline void lines_of(const float *splat, const uint tile_x, const uint tile_y, float (*lines)[TILE],
+                            float (*slopes)[TILE])
+{
+    for (uint column = 0; column < COLUMNS; column++) {
+        line_t line;
+        slopes_t slope;
+        line_of(splat, pixel_centres(splat[BOX_TURNED] > 0.0f ? tile_x : tile_y, column), &line, &slope);
+        for (uint k = 0; k < LINE_FIELDS; k++)
+            VSTORE(((const VF *)&line)[k], lines[k] + column * LANES);
+        for (uint k = 0; slopes && k < SLOPE_FIELDS; k++)
+            VSTORE(((const VF *)&slope)[k], slopes[k] + column * LANES);
+    }
+}
+
+/* A field at LANES pixels of row y of a tile: of their columns, or of the row alone. */
+static inline VF field_at(const float *field, const bool turned, const uint y, const uint column)
+{
+    return turned ? VLOAD(field + column * LANES) : (VF)(field[y]);
+}
+
+static inline row_splat_t splat_on_lines(const float *splat, const float (*lines)[TILE], const bool turned,
+                                         const float row, const uint y, const uint column, const VF pixel)
+{
+    row_splat_t s = splat_at_pixels(splat, turned, row, pixel);
+    for (uint k = 0; k < LINE_FIELDS; k++)
+        ((VF *)&s.line)[k] = field_at(lines[k], turned, y, column);
+    return s;
+}
+#else
+#define SPLAT_AT(splat, lines, row, y) splat_at_row(splat, row)
+#endif
+
+/* Private memory: SEGMENT * 68 bytes of splats and TILE * TILE * 16 of pixels; with PIXEL_BOX also
+ * SEGMENT * TILE * 16 of lines.  Deterministic. */
 __kernel __attribute__((reqd_work_group_size(1, 1, 1)))
 void blend_forward(
     __global const uint *restrict tile_offset,  // [T+1]
@@ -36,6 +79,9 @@ void blend_forward(
     const uint first = tile_offset[tile], end = tile_offset[tile + 1];
     const uint width = camera->tiles_x * TILE, plane = width * camera->tiles_y * TILE;
     float segment[SEGMENT][RECORD];
+#if PIXEL_BOX
+    float lines[SEGMENT][LINE_FIELDS][TILE];
+#endif
     uint list[SEGMENT];
     pixels_t pixels[TILE][COLUMNS];
     for (uint y = 0; y < TILE; y++)
@@ -50,6 +96,10 @@ void blend_forward(
         const uint length = end - begin < SEGMENT ? end - begin : SEGMENT;
         for (uint j = 0; j < length; j++)
             vstore16(vload16(pair_splat[tile_pairs[begin + j]], splats), 0, segment[j]);
+#if PIXEL_BOX
+        for (uint j = 0; j < length; j++)
+            lines_of(segment[j], tile_x, tile_y, lines[j], 0);
+#endif
         unfinished = false;
         for (uint y = 0; y < TILE; y += 2) {
             const float row = tile_y * TILE + y + 0.5f;
@@ -64,8 +114,8 @@ void blend_forward(
                 bool open = ANY((upper.t > 0.0f) | (lower.t > 0.0f));
                 for (uint k = 0; k < listed && open; k++) {
                     const float *splat = segment[list[k]];
-                    blend(&upper, splat_at_row(splat, row), pixel, splat + SPLAT_RED);
-                    blend(&lower, splat_at_row(splat, row + 1.0f), pixel, splat + SPLAT_RED);
+                    blend(&upper, SPLAT_AT(splat, lines[list[k]], row, y), pixel, splat + SPLAT_RED);
+                    blend(&lower, SPLAT_AT(splat, lines[list[k]], row + 1.0f, y + 1), pixel, splat + SPLAT_RED);
                     if ((k & 15) == 15 || k + 1 == listed) {
                         open = ANY((upper.t > 0.0f) | (lower.t > 0.0f));
                         const uint reached = begin + list[k] + 1;
@@ -107,6 +157,22 @@ static inline void store_record(const pixel_sums_t m, __global float *record)
     vstore16(sums, 0, record);
 }
 
+#if PIXEL_BOX
+/* Add a row of pixels. */
+static inline void add_row(const float *splat, const float (*lines)[TILE], const float (*slopes)[TILE],
+                           const bool turned, const float row, const uint y, const uint tile_x,
+                           grad_pixels_t *pixels, pixel_sums_t *sums)
+{
+    for (uint column = 0; column < COLUMNS; column++) {
+        const VF pixel = pixel_centres(tile_x, column);
+        row_splat_t s = splat_on_lines(splat, lines, turned, row, y, column, pixel);
+        for (uint k = 0; k < SLOPE_FIELDS; k++)
+            ((VF *)&s.slopes)[k] = field_at(slopes[k], turned, y, column);
+        blend_backward_step(pixels + column, s, pixel, splat + SPLAT_RED, sums);
+    }
+}
+#endif
+
 /* Sum one splat over the rows of its tile that it reaches, whole pairs of rows. */
 static inline void pixel_sums_of(const float *splat, const uint tile_x, const uint tile_y,
                                  grad_pixels_t (*pixels)[COLUMNS], pixel_sums_t *sums)
@@ -114,10 +180,22 @@ static inline void pixel_sums_of(const float *splat, const uint tile_x, const ui
     const VF zero = (VF)(0.0f);
     pixel_sums_t pixel_sums = {zero, zero, zero, zero, zero, zero, zero, zero,
                                zero, zero, zero, zero, zero, zero, zero};
+#if PIXEL_BOX
+    float lines[LINE_FIELDS][TILE], slopes[SLOPE_FIELDS][TILE];
+    lines_of(splat, tile_x, tile_y, lines, slopes);
+#endif
     const float top = tile_y * TILE + 0.5f;
     const float low = splat[SPLAT_Y_MIN] - top, high = splat[SPLAT_Y_MAX] - top;
     const uint y_first = low > 0.0f ? (uint)low : 0u;
     const uint y_end = high < TILE - 1.0f ? (uint)(high + 1.0f) : TILE;
+#if PIXEL_BOX
+    if (splat[BOX_TURNED] > 0.0f)  // apart, so that both loops know where their fields lie
+        for (uint y = y_first; y < y_end; y++)
+            add_row(splat, lines, slopes, true, top + y, y, tile_x, pixels[y], &pixel_sums);
+    else
+        for (uint y = y_first; y < y_end; y++)
+            add_row(splat, lines, slopes, false, top + y, y, tile_x, pixels[y], &pixel_sums);
+#else
     const uint y_begin = y_first - (y_end == TILE ? (y_end - y_first) & 1u : 0u);
     for (uint y = y_begin; y < y_end; y += 2) {
         const row_splat_t upper = splat_at_row(splat, top + y), lower = splat_at_row(splat, top + y + 1.0f);
@@ -127,6 +205,7 @@ static inline void pixel_sums_of(const float *splat, const uint tile_x, const ui
             blend_backward_step(&pixels[y + 1][column], lower, pixel, splat + SPLAT_RED, &pixel_sums);
         }
     }
+#endif
     *sums = pixel_sums;
 }
 

@@ -36,6 +36,9 @@
 #ifndef PIXEL_SUMS
 #define PIXEL_SUMS 9  // sums in a gradient record (splat.h): 11, 13 or 15 where a density statistic needs more
 #endif
+#ifndef PIXEL_BOX
+#define PIXEL_BOX 0  // 1: a splat is integrated over the box of each pixel (pixel_box.h)
+#endif
 #ifndef WEIGHT_ENTROPY
 #define WEIGHT_ENTROPY 0  // 1: the image has a fourth plane, the entropy of the blend weights (splat.h)
 #endif

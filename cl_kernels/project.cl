@@ -3,7 +3,7 @@
  * Kerbl et al. 2023, section 4, with the linearised perspective of Zwicker et al. 2001.  Both filters are numbers:
  * `filter_variance`, scene units^2, is added to the squared scales, `screen_variance`, px^2, to the screen covariance.
  * The opacity is multiplied by the energy factor of the first, and with `compensate` = 1 also by that of the second
- * (Mip-Splatting, Yu et al. 2024, eq. 9 and 11).
+ * (Mip-Splatting, Yu et al. 2024, eq. 9 and 11).  With PIXEL_BOX `screen_variance` and `compensate` are 0.
  *
  * One item = LANES Gaussians.  No local memory.  Deterministic: no item writes what another reads. */
 #include "backward.h"
@@ -86,10 +86,18 @@ void project_forward(
     VSTORE((seen ? r : (VF)(0.0f)), radius + i);
 
     const VF opacity = sigmoid(VLOAD(logit_opacity + i)) * s.energy;
+#if PIXEL_BOX  // no pixel shows more of it than its whole area
+    const VI opaque = opacity * smaller(TWO_PI * sqrt(s.determinant), (VF)(1.0f)) > ALPHA_MIN;
+#else
     const VI opaque = opacity > ALPHA_MIN;
+#endif
     const VF power_min = larger(log_positive(ALPHA_MIN / (opaque ? opacity : (VF)(1.0f))), (VF)(POWER_MIN));
     const VF size2 = EXTENT_SLACK - 2.0f * power_min;
+#if PIXEL_BOX
+    const VF half_x = 0.5f + sqrt(size2 * (s.xx + BOX_FOOTPRINT)), half_y = 0.5f + sqrt(size2 * (s.yy + BOX_FOOTPRINT));
+#else
     const VF half_x = sqrt(size2 * (s.xx + screen_variance)), half_y = sqrt(size2 * (s.yy + screen_variance));
+#endif
     const VI visible = inside & s.valid & opaque & (u + half_x >= 0.0f) & (u - half_x <= (float)camera->width) &
                        (v + half_y >= 0.0f) & (v - half_y <= (float)camera->height);
 
@@ -109,10 +117,19 @@ void project_forward(
     }
 
     const VF zero = (VF)(0.0f);
+#if PIXEL_BOX
+    const VI turned = s.xx > s.yy;
+    const VF longer = turned ? s.xx : s.yy;
+    const VF fields[RECORD] = {
+        u, v, s.xy / longer, sqrt(longer), sqrt(s.determinant / longer), opacity,
+        larger(colour[0], zero), larger(colour[1], zero), larger(colour[2], zero),
+        v - half_y, v + half_y, u - half_x, u + half_x, turned ? (VF)(1.0f) : zero, zero, zero};
+#else
     const VF fields[RECORD] = {
         u, v, s.conic_xx, s.conic_xy, s.conic_yy, opacity,
         larger(colour[0], zero), larger(colour[1], zero), larger(colour[2], zero),
         v - half_y, v + half_y, u - half_x, u + half_x, power_min, zero, zero};
+#endif
     const footprint_t footprint = footprint_of(fields, visible, camera->tiles_x, row_begin, row_end);
     VI mask;
     VSTORE(count_tiles(&footprint, &mask), (__global int *)tile_count + i);

@@ -7,6 +7,8 @@
  * alpha falls to 1/255) and blending it leaves transmittance >= 1e-4; the first splat that would leave less finishes
  * the pixel and is not blended (Kerbl et al. 2023).  A finished pixel stores its transmittance with a negative sign.
  *
+ * With PIXEL_BOX alpha is the mean of that Gaussian over the pixel instead (pixel_box.h), and has to be >= 1/255.
+ *
  * With WEIGHT_ENTROPY the image and its gradient have a fourth plane, H = -sum_i w_i ln w_i - T ln T with w = alpha T
  * and the last T: how far a pixel is from showing one splat alone. */
 #ifndef CLSPLAT_SPLAT_H
@@ -42,6 +44,9 @@
 #define SUM_BLENDED 13 // the texture of the pixels that the splat is blended in, there: with ones, their number
 #define SUM_SQUARE 14  // (dL/dG)^2 with G = e^power, so that alpha = opacity G
 
+/* With PIXEL_BOX p = dL/dln(alpha), and SUM_X to SUM_YY are p times the derivatives of ln(alpha), by x and y of the
+ * mean and by k, ln s and ln t of pixel_box.h. */
+
 /* A gradient record is written and read in aligned parts: quads where an item computes one Gaussian, and only those
  * with sums; else whole. */
 #if LANES == 1
@@ -57,6 +62,31 @@ typedef struct {
     VF power, x, y, xx, xy, yy, red, green, blue, abs_x, abs_y, weight, texture, blended, square;
 } pixel_sums_t;
 
+#if PIXEL_BOX
+#include "pixel_box.h"
+
+/* A splat seen from LANES pixels of a row. */
+typedef struct {
+    line_t line;
+    slopes_t slopes;  // known in the backward pass
+    VF place;         // of the pixels across the lines, px
+    bool turned;
+    float opacity;
+    float alpha_min;  // above 1, so that no pixel is hit, when the row is outside the splat's extent
+} row_splat_t;
+
+/* The splat at a row; line and slopes are added by the schedules. */
+static inline row_splat_t splat_at_pixels(const float *splat, const bool turned, const float row, const VF pixel)
+{
+    const bool inside = (row >= splat[SPLAT_Y_MIN]) & (row <= splat[SPLAT_Y_MAX]);
+    row_splat_t s;
+    s.turned = turned;
+    s.place = turned ? (VF)(row) : pixel;
+    s.opacity = splat[SPLAT_OPACITY];
+    s.alpha_min = inside ? ALPHA_MIN : 2.0f;
+    return s;
+}
+#else
 /* A splat seen from one row of pixels. */
 typedef struct {
     float x;           // mean, px
@@ -79,12 +109,17 @@ static inline row_splat_t splat_at_row(const float *splat, const float row)
         inside ? splat[SPLAT_POWER_MIN] : 1.0f};
     return s;
 }
+#endif
 
 /* Contribution of a splat to LANES pixels whose transmittance before it is t. */
 typedef struct {
     VI hit;       // the splat reaches the pixel ...
     VI blended;   // ... and does not finish the pixel
+#if PIXEL_BOX
+    rise_t rise;  // across the lines
+#else
     VF dx;        // px
+#endif
     VF uncapped;  // alpha before the cap
     VF remain;    // 1 - alpha
     VF weight;    // alpha t where blended, else 0
@@ -94,12 +129,19 @@ typedef struct {
 static inline contribution_t contribution_of(const row_splat_t s, const VF pixel, const VF t)
 {
     contribution_t k;
+#if PIXEL_BOX
+    k.rise = rise_of((s.line.shift - s.place) * s.line.inverse, s.line.spread);
+    k.uncapped = s.line.scale * k.rise.value;
+    const VF alpha = smaller(k.uncapped, (VF)(ALPHA_MAX));
+    k.hit = (k.uncapped >= s.alpha_min) & (k.uncapped > 0.0f);
+#else
     k.dx = s.x - pixel;
     const VF power = (k.dx * s.a - s.b) * k.dx - s.c;
     /* the bound changes no pixel that is hit; without it, distant pixels have subnormal numbers, which are slow */
     k.uncapped = s.opacity * exp_power(larger(power, (VF)(POWER_MIN)));
     const VF alpha = smaller(k.uncapped, (VF)(ALPHA_MAX));
     k.hit = (power >= s.power_min) & (power <= 0.0f);
+#endif
     k.remain = 1.0f - alpha;
     const VF left = t * k.remain;
     const VI passes = left >= TRANSMITTANCE_MIN;
@@ -164,6 +206,17 @@ static inline void blend_backward_step(grad_pixels_t *p, const row_splat_t s, co
     const VF grad_alpha = p->t * shade - p->rest / k.remain;
     const VI passes = k.blended & (k.uncapped <= ALPHA_MAX);  // the cap passes no gradient
     const VF power = passes ? k.uncapped * grad_alpha : zero;
+#if PIXEL_BOX
+    const log_slopes_t l = log_slopes_of(s.slopes, s.line, k.rise);
+    const VF power_x = power * (s.turned ? l.along : l.across), power_y = power * (s.turned ? l.across : l.along);
+    p->t = k.next;
+    m->power += power;
+    m->x += power_x;
+    m->y += power_y;
+    m->xx += power * l.slope;
+    m->xy += power * l.longer;
+    m->yy += power * l.shorter;
+#else
     const VF power_x = power * k.dx;
     p->t = k.next;
     m->power += power;
@@ -172,10 +225,14 @@ static inline void blend_backward_step(grad_pixels_t *p, const row_splat_t s, co
     m->xx += power_x * k.dx;
     m->xy += power_x * s.dy;
     m->yy += power * (s.dy * s.dy);
+#endif
     m->red += k.weight * p->red;
     m->green += k.weight * p->green;
     m->blue += k.weight * p->blue;
-#if PIXEL_SUMS > SUM_ABS_X
+#if PIXEL_SUMS > SUM_ABS_X && PIXEL_BOX
+    m->abs_x += magnitude(power_x);
+    m->abs_y += magnitude(power_y);
+#elif PIXEL_SUMS > SUM_ABS_X
     m->abs_x += magnitude(power * (s.b - 2.0f * s.a * k.dx));
     m->abs_y += magnitude(power * (s.xy * k.dx + s.slope));
 #endif

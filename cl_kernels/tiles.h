@@ -20,6 +20,14 @@ typedef struct {
     VF columns, rows;      // its size, tiles; none when the splat is not visible
 } footprint_t;
 
+#if PIXEL_BOX  // a splat reaches a pixel where it reaches its edge
+#define FIRST_PLACE 0.0f
+#define PLACES TILE
+#else
+#define FIRST_PLACE 0.5f
+#define PLACES (TILE - 1.0f)
+#endif
+
 static inline VF clamp_to(const VF x, const VF low, const VF high) { return smaller(larger(x, low), high); }
 
 /* First and one past the last tile of `begin` to `end` along one axis whose pixel centres reach into [low, high] px. */
@@ -42,12 +50,26 @@ static inline footprint_t footprint_of(const VF *splat, const VI visible, const 
     footprint_t f;
     f.x = splat[SPLAT_X];
     f.y = splat[SPLAT_Y];
+#if PIXEL_BOX
+    const VF k = splat[BOX_SLOPE], longer = splat[BOX_LONG] * splat[BOX_LONG];
+    const VF left = splat[BOX_SHORT] * splat[BOX_SHORT], shorter = left + k * k * longer;
+    const VI turned = splat[BOX_TURNED] > 0.0f;
+    const VF inverse = 1.0f / (longer * left + BOX_FOOTPRINT * (longer + shorter + BOX_FOOTPRINT));
+    f.xx = ((turned ? shorter : longer) + BOX_FOOTPRINT) * inverse;
+    f.xy = -k * longer * inverse;
+    f.yy = ((turned ? longer : shorter) + BOX_FOOTPRINT) * inverse;
+#else
     f.xx = splat[SPLAT_XX];
     f.xy = splat[SPLAT_XY];
     f.yy = splat[SPLAT_YY];
+#endif
     f.along_x = -f.xy / f.yy;
     f.along_y = -f.xy / f.xx;
+#if PIXEL_BOX
+    f.reach = 0.5f * EXTENT_SLACK + log_positive(larger(splat[SPLAT_OPACITY], (VF)(ALPHA_MIN)) / ALPHA_MIN);
+#else
     f.reach = 0.5f * EXTENT_SLACK - splat[SPLAT_POWER_MIN];
+#endif
     f.first_x = first_tile(splat[SPLAT_X_MIN], 0, tiles_x);
     f.first_y = first_tile(splat[SPLAT_Y_MIN], row_begin, row_end);
     f.columns = visible ? larger(end_tile(splat[SPLAT_X_MAX], 0, tiles_x) - f.first_x, zero) : zero;
@@ -60,8 +82,8 @@ static inline footprint_t footprint_of(const VF *splat, const VI visible, const 
  * StopThePop, Radl et al. 2024). */
 static inline VI touches_tile(const footprint_t *f, const VF column, const VF row)
 {
-    const VF x0 = (f->first_x + column) * TILE + 0.5f - f->x, x1 = x0 + (TILE - 1.0f);
-    const VF y0 = (f->first_y + row) * TILE + 0.5f - f->y, y1 = y0 + (TILE - 1.0f);
+    const VF x0 = (f->first_x + column) * TILE + FIRST_PLACE - f->x, x1 = x0 + PLACES;
+    const VF y0 = (f->first_y + row) * TILE + FIRST_PLACE - f->y, y1 = y0 + PLACES;
     const VF x = clamp_to((VF)(0.0f), x0, x1), y = clamp_to((VF)(0.0f), y0, y1);
     const VF best_y = clamp_to(f->along_x * x, y0, y1);
     const VF best_x = clamp_to(f->along_y * y, x0, x1);

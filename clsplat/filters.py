@@ -1,16 +1,16 @@
 """The settings of `model:`: the degree of the colours and the two low-pass filters, as numbers.
 
 A world filter writes `filter_variance`, scene units², which is added to the squared scales of each Gaussian.  A screen
-filter is two numbers of the model.  Rendering reads these numbers and has no case for a filter.
+filter is three numbers of the model.  Rendering reads these numbers and has no case for a filter.
 """
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from clsplat.formats.ply import MAX_NUMBER
 from clsplat.gaussians.tables import DeviceModel, Gaussians
@@ -18,6 +18,8 @@ from clsplat.opencl.device import Array, Device
 from clsplat.render.camera import camera_values
 from clsplat.scene.scene import View
 from clsplat.settings import OneOf, Settings
+
+BOX_VARIANCE = 1 / 12  # px²
 
 
 class FilterViews:
@@ -89,6 +91,7 @@ def measure_intervals(
 class ScreenFilter(Settings):
     """A blur of splats in the image."""
 
+    pixel_box: ClassVar[bool] = False  # splats are integrated over the pixel's box; the two numbers are for viewers
     variance: Annotated[float, Field(ge=0, lt=MAX_NUMBER)]
     """Added to the variance of every splat, px²."""
     compensate: Literal[0, 1]
@@ -125,6 +128,27 @@ class Mip(ScreenFilter):
     """1: the opacity falls as the area grows, so that a splat keeps its energy."""
 
 
+def _of_a_box(variance: float) -> float:
+    if variance != BOX_VARIANCE:
+        raise ValueError(f"expected no variance beside the type 'box', or {BOX_VARIANCE}: write `screen_filter: box`")
+    return variance
+
+
+class Box(ScreenFilter):
+    """Integrate every splat over the box of each pixel, instead of taking its value at the pixel's centre.
+
+    Where a splat is larger than a pixel this differs little from a Gaussian blur of the box's variance, 1/12 px², which
+    programs that know no box draw instead.  The integral is that of `cl_kernels/pixel_box.h`.
+    """
+
+    pixel_box: ClassVar[bool] = True
+    type: Literal["box"] = "box"
+    variance: Annotated[float, AfterValidator(_of_a_box)] = BOX_VARIANCE
+    """Of the box, px²: for programs that draw a Gaussian blur instead.  Only this value."""
+    compensate: Literal[1] = 1
+    """As `variance`: a box keeps the energy of a splat."""
+
+
 class ModelSettings(Settings):
     """How Gaussians are rendered."""
 
@@ -140,4 +164,5 @@ class ModelSettings(Settings):
     def model(self, gaussians: Gaussians, degree: int) -> DeviceModel:
         """Return the Gaussians with the numbers of these settings; `degree` is the active one."""
         screen = self.screen_filter
-        return DeviceModel(gaussians, degree, self.near, screen.variance, float(screen.compensate))
+        numbers = screen.variance, float(screen.compensate), float(screen.pixel_box)
+        return DeviceModel(gaussians, degree, self.near, *numbers)

@@ -178,6 +178,7 @@ DIFFERENCES = {
     ("splat", "gdgs"): CROWDED,
     ("gdgs", "gdgs_7k"): TWIN | {"densify.rules.clone_crowded.start"},
     ("splat", "mip_splatting"): SMOOTHING | MIP | REFRESH,
+    ("mip_splatting", "box"): {"model.screen_filter", "model.screen_filter.variance"},
     ("splat", "mip_splatting_no_3d"): MIP,
     ("mip_splatting", "mip_splatting_no_2d"): {"model.screen_filter.variance"},
     ("splat", "splat_ewa"): {"model.screen_filter", "model.screen_filter.compensate"},
@@ -239,6 +240,7 @@ DIFFERENCES = {
         (name, f"{name}_7k"): TWIN | ({"refresh_filter.start", "refresh_filter.stop"} if refreshes else set())
         for name, refreshes in (
             ("mip_splatting", True),
+            ("box", True),
             ("mip_splatting_no_3d", False),
             ("mip_splatting_no_2d", True),
             ("splat_ewa", False),

@@ -121,6 +121,22 @@ OPTIONAL = {  # in what few runs compute: doctor notices them, the check before 
     "blend_forward, weights in the entropy": ("splat.h", "p->entropy -= k.weight *", "p->entropy -= p->t *"),
     "blend_backward wide, entropy": ("blend_wide.cl", "(1.0f - VLOAD(image + 3", "(1.0f + VLOAD(image + 3"),
     "blend_backward simt, entropy": ("blend_simt.cl", "(1.0f - image[3", "(1.0f + image[3"),
+    **{
+        f"{kernel} {schedule}, {what} of the pixel's box": (file, text, wrong)
+        for schedule in ("wide", "simt")
+        for kernel, what, file, text, wrong in (
+            ("blend_forward", "normal distribution", "pixel_box.h", "QUINTIC (-5.9", "QUINTIC (-6.5"),
+            ("blend_forward", "width", "pixel_box.h", "(1.0f + r - w2)", "(1.0f + r)"),
+            ("blend_forward", "variance", "pixel_box.h", "variance = c - tilt2", "variance = c + tilt2"),
+            ("blend_backward", "slope", "pixel_box.h", "= 24.0f * k * y.variance", "= 12.0f * k * y.variance"),
+            ("blend_backward", "blur", "pixel_box.h", "-(1.0f - r / w2) *", "-(1.0f + r / w2) *"),
+            ("blend_backward", "shift", "pixel_box.h", "? -mean_s : mean_s", "? mean_s : mean_s"),
+            ("blend_backward", "variance by size", "pixel_box.h", "s * s * (2.0f * part", "s * s * (part"),
+            ("project_forward", "turned splats", "project.cl", "turned ? (VF)(1.0f)", "!turned ? (VF)(1.0f)"),
+            ("project_backward", "covariance", "backward.h", "+ g_short * slope * slope", "- g_short * slope * slope"),
+            ("emit_large", "tiles", "tiles.h", "-k * longer * inverse", "k * longer * inverse"),
+        )
+    },
     "blend_backward, entropy": ("splat.h", "(log_weight(k.weight) + 1.0f)", "log_weight(k.weight)"),
 }
 

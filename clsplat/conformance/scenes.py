@@ -28,6 +28,7 @@ class Case:
     near: float = 0.2
     variance: float = 0.3
     compensate: float = 0.0
+    pixel_box: float = 0.0  # 1: with a variance of 0
 
     @property
     def size(self) -> tuple[int, int]:
@@ -35,7 +36,7 @@ class Case:
 
     def model(self, device: Device) -> DeviceModel:
         gaussians = Gaussians(device, self.parameters)
-        return DeviceModel(gaussians, self.degree, self.near, self.variance, self.compensate)
+        return DeviceModel(gaussians, self.degree, self.near, self.variance, self.compensate, self.pixel_box)
 
     def device_camera(self, device: Device) -> DeviceCamera:
         return upload_camera(device, self.view)
@@ -60,7 +61,8 @@ class Case:
         return ref.Camera(pose, fx, fy, cx, cy, c.width, c.height)
 
     def numbers(self) -> dict[str, float]:
-        return {"near": self.near, "variance": self.variance, "compensate": self.compensate}
+        numbers = {"near": self.near, "variance": self.variance, "compensate": self.compensate}
+        return numbers | {"pixel_box": self.pixel_box}
 
     def project(self, thresholds: ref.Thresholds = SHARP) -> ref.Splats:
         return ref.project(self.gaussians(), self.camera(), self.degree, **self.numbers(), thresholds=thresholds)

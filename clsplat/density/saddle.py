@@ -29,6 +29,7 @@ class Splitting(Statistic):
 
     type: Literal["splitting"] = "splitting"
     components = 6
+    reads_conics = True
 
     def add(self, gaussians: Gaussians, view: ViewGradients, grad_mean2d: Array, total: Array) -> None:
         gaussians.device.program("saddle.cl").accumulate_splitting(

@@ -32,6 +32,7 @@ class Statistic(Settings):
 
     components: ClassVar[int] = 1  # numbers of each Gaussian; rules that compare a mean with a threshold need 1
     pixel_sums: ClassVar[int] = PIXEL_SUMS  # number of sums over pixels that the backward pass must compute
+    reads_conics: ClassVar[bool] = False  # from records and sums, where the pixel's box has others (cl_kernels/splat.h)
     divisor: ClassVar[str] = "seen"  # column that divides the sum: views that see the Gaussian, or another column
 
     @abstractmethod

@@ -35,7 +35,7 @@ from clsplat.reading import opened
 RENDERING, MODE = "clsplat ", "SplatRenderMode: "  # comments
 MIP = re.compile(r"SplatRenderMode\s*:\s*mip|postshot\.anti_aliasing\s*=\s*1", re.IGNORECASE)  # of all programs
 FILTER = "filter_3D"
-NUMBERS = ("near", "screen_variance", "compensate")  # of the comment
+NUMBERS = ("near", "screen_variance", "compensate", "pixel_box")  # of the comment
 MAX_NUMBER = 1e15  # as of any number in a dataset
 _COLUMNS = {
     "means": ("x", "y", "z"),

@@ -244,5 +244,6 @@ def tell_losses(path: Path, splats: SplatFile) -> None:
 def _unusual(splats: SplatFile) -> str:
     """The numbers of the renderer that a reader would not take for a file without them, in words."""
     usual = {"near": NEAR, "screen_variance": MIP_VARIANCE if splats.mode == "mip" else VARIANCE, "background": None}
+    usual["pixel_box"] = 0
     given = {name: splats.rendering.get(name, value) for name, value in usual.items()}
     return ", ".join(f"{name} = {value}" for name, value in given.items() if value != usual[name])

@@ -52,7 +52,7 @@ def examine(path: Path) -> dict[str, Any]:
         "format": codec.name if codec else "",
         "gaussians": len(model),
         "sh_degree": model.sh_degree,
-        "mode": "mip" if model.rendering.compensate else "default",
+        "mode": "box" if model.rendering.pixel_box else "mip" if model.rendering.compensate else "default",
         "world_filter": model.filter_variance is not None,
         "ranges": _ranges(whole),
         "bounds": [whole.means.min(axis=0).tolist(), whole.means.max(axis=0).tolist()] if len(whole) else [],

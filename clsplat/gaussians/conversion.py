@@ -108,14 +108,14 @@ def merged(models: Sequence[Model], names: Sequence[str]) -> Model:
     """Return one model of all Gaussians, with the numbers of the first for rendering and the largest SH degree.
 
     Where one has a world filter and another has none, it is baked.  Raises DataError where some are mip models and
-    others are not, for one filter serves all.
+    others are not, or of the pixel's box, for one filter serves all.
     """
     first = models[0]
     if len(models) == 1:
         return first
     for model, name in zip(models, names, strict=True):
-        if bool(model.rendering.compensate) != bool(first.rendering.compensate):
-            kinds = [("a mip model" if m.rendering.compensate else "none") for m in (first, model)]
+        kinds = [_kind(m) for m in (first, model)]
+        if kinds[0] != kinds[1]:
             raise DataError(f"{name}: is {kinds[1]}, {names[0]} is {kinds[0]}; expected the same: one filter draws all")
         own, kept = model.rendering.comment(), first.rendering.comment()
         if other := [f"{one} = {own.get(one, 'not given')}" for one in KEPT if own.get(one) != kept.get(one)]:
@@ -125,6 +125,13 @@ def merged(models: Sequence[Model], names: Sequence[str]) -> Model:
     degree = max(model.sh_degree for model in models)
     tables = [with_degree(model.tables(), degree) for model in models]
     return Model(**{n: np.concatenate([t[n] for t in tables]) for n in tables[0]}, rendering=first.rendering)
+
+
+def _kind(model: Model) -> str:
+    """Say whether a model is a mip model."""
+    if model.rendering.pixel_box:
+        return "one of the pixel's box"
+    return "a mip model" if model.rendering.compensate else "none"
 
 
 def transform_of(text: str) -> NDArray[np.float64]:

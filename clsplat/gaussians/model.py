@@ -51,6 +51,7 @@ class Rendering:
     near: float = NEAR  # scene units; nearer Gaussians are not drawn
     screen_variance: float = VARIANCE  # px², added to every splat
     compensate: float = 0.0  # 1: the opacity falls as that variance spreads a splat out
+    pixel_box: float = 0.0  # 1: splats are integrated over the pixel's box instead; the two numbers are for viewers
     background: Literal["black", "white"] | None = None  # None: what the scene says
     alpha: Literal["transparency", "mask"] = "transparency"  # what the fourth channel of its photographs was
     notes: Mapping[str, Any] = field(default_factory=dict)  # what else the file says
@@ -59,7 +60,7 @@ class Rendering:
     def of(cls, comment: Mapping[str, Any], mode: str) -> "Rendering":
         """Take the numbers from a file's comment; files of other programs get those of 3DGS or Mip-Splatting."""
         mip = {"screen_variance": MIP_VARIANCE, "compensate": 1.0} if mode == "mip" else {}
-        names = ("near", "screen_variance", "compensate")
+        names = ("near", "screen_variance", "compensate", "pixel_box")
         given = {name: float(comment[name]) for name in names if isinstance(comment.get(name), int | float)}
         return cls(
             **{**mip, **given},
@@ -71,7 +72,9 @@ class Rendering:
     def comment(self) -> dict[str, Any]:
         """What a model file says about rendering."""
         numbers = {"near": self.near, "screen_variance": self.screen_variance, "compensate": self.compensate}
-        known = {"background": self.background} if self.background else {}
+        known: dict[str, Any] = {"background": self.background} if self.background else {}
+        if self.pixel_box or "pixel_box" in self.notes:  # files of other models stay as they are
+            known["pixel_box"] = self.pixel_box
         return {**self.notes, **numbers, **known, "alpha": self.alpha}
 
 
@@ -110,7 +113,8 @@ class Model:
         """Copy the model to a device, for the rasterizer."""
         numbers = self.rendering
         gaussians = Gaussians(device, self.tables())
-        return DeviceModel(gaussians, self.sh_degree, numbers.near, numbers.screen_variance, numbers.compensate)
+        screen = numbers.screen_variance, numbers.compensate, numbers.pixel_box
+        return DeviceModel(gaussians, self.sh_degree, numbers.near, *screen)
 
     def tables(self) -> dict[str, Floats]:
         """The arrays by name; filter_variance where there is one."""

@@ -203,6 +203,12 @@ class DeviceModel:
     near: float = 0.2  # scene units
     screen_variance: float = 0.3  # px²
     compensate: float = 0.0  # 1: the opacity falls as the screen filter enlarges the splat
+    pixel_box: float = 0.0  # 1: splats are integrated over the box of each pixel instead
+
+    @property
+    def defines(self) -> dict[str, int]:
+        """What chooses the programs that project, list and blend these splats."""
+        return {"PIXEL_BOX": 1} if self.pixel_box else {}
 
 
 def hide(gaussians: Gaussians, left_out: NDArray[np.bool_]) -> None:

@@ -98,6 +98,7 @@ def _validated(data: dict[str, Any], path: Path, document: Document) -> Pipeline
     except ValidationError as error:
         raise ConfigError(explain(error, PipelineFile, path, document)) from error
     _check_order(path, settings)
+    _check_screen_filter(path, settings)
     return settings.model_copy(update={"plugins": plugins.used_by(_kinds(settings))})
 
 
@@ -181,6 +182,21 @@ def _late(stages: Sequence[Stage], need: str) -> str:
                 cadence = f"{inner.stage} makes at every {inner.every} steps after step {inner.start}"
                 return f"{cadence}; the training ends before: set its start and its every"
     return ""
+
+
+def _check_screen_filter(path: Path, settings: PipelineFile) -> None:
+    """Raise ConfigError where a rule reads what the screen filter does not compute."""
+    if not settings.model.screen_filter.pixel_box:
+        return
+    for i, stage in enumerate(settings.stages):
+        for rule in [rule for inner in getattr(stage, "during", ()) for rule in getattr(inner, "rules", ())]:
+            for kind in _kinds(rule):
+                if issubclass(kind, Statistic) and kind.reads_conics:
+                    raise ConfigError(
+                        f"{path}: stages[{i}] {stage.stage}: the rule '{rule.type}' reads the inverse covariance of "
+                        "splats, which model.screen_filter.type 'box' does not have; expected another screen filter "
+                        "(mip is the nearest), or another rule"
+                    )
 
 
 def _check_order(path: Path, settings: PipelineFile) -> None:

@@ -57,8 +57,8 @@ class Rasterizer:
         self._bands: dict[int, int] = {}  # rows of tiles of a frame -> number of bands
         self.workspace = Workspace(device)
         self.tiler = Tiler(device, self.workspace, sort)
-        self._project = device.program("project.cl")
-        self._blend("colour")  # built at once, as the others
+        device.program("project.cl")  # built at once, as the others
+        self._blend("colour")
         self._lanes = int(device.tuning["LANES"])
         self._gradients: Gradients | None = None  # allocated at first use
 
@@ -100,7 +100,7 @@ class Rasterizer:
         for band in bands:
             lists = self._project_band(model, camera, band, splats, radius, content)
             for first_tile, groups in self._launches(band):
-                self._blend(content).blend_forward(
+                self._blend(content, **model.defines).blend_forward(
                     groups=groups,
                     tile_offset=lists.tile_offset,
                     tile_pairs=lists.tile_pairs,
@@ -139,7 +139,7 @@ class Rasterizer:
         count, stride = gaussians.count, gaussians.capacity
         arrays = (self.workspace.array(field.name, stride, np.uint32) for field in fields(Footprints))
         footprints = Footprints(*arrays)
-        self._project.project_forward(
+        self.device.program("project.cl", **model.defines).project_forward(
             items=-(-count // self._lanes),
             **shape_arguments(model, camera),
             sh_base=gaussians["sh_base"],
@@ -155,7 +155,8 @@ class Rasterizer:
                 items=count, means=gaussians["means"], camera=camera.array, splats=splats, stride=stride, count=count
             )
         single = band.row_end - band.row_begin == 1  # cannot be split further
-        return self.tiler.build(splats, footprints, band, count, MAX_PAIRS if single else self._limit)
+        limit = MAX_PAIRS if single else self._limit
+        return self.tiler.build(splats, footprints, band, count, limit, model.defines)
 
     def pixel_sums(
         self, model: DeviceModel, frame: Frame, grad_image: Array, count: int = PIXEL_SUMS, texture: Array | None = None
@@ -186,7 +187,7 @@ class Rasterizer:
                 lists = self._project_band(model, frame.camera, band, frame.splats, frame.radius, frame.content)
             pair_sums = self.workspace.array("pair_sums", (lists.pairs, RECORD))
             for first_tile, groups in self._launches(band):
-                self._blend(frame.content, **defines).blend_backward(
+                self._blend(frame.content, **defines, **model.defines).blend_backward(
                     groups=groups,
                     tile_offset=lists.tile_offset,
                     tile_pairs=lists.tile_pairs,
@@ -217,7 +218,7 @@ class Rasterizer:
         if self._gradients is None or self._gradients.size != (model.gaussians.capacity, model.gaussians.sh_degree):
             self._gradients = Gradients(model.gaussians)
         gradients = self._gradients
-        self._project.project_backward(
+        self.device.program("project.cl", **model.defines).project_backward(
             items=-(-model.gaussians.count // self._lanes),
             **shape_arguments(model, frame.camera),
             splats=frame.splats,
@@ -235,8 +236,8 @@ def shape_arguments(model: DeviceModel, camera: DeviceCamera) -> dict[str, Any]:
         **{name: gaussians[name] for name in names},
         "camera": camera.array,
         "near_plane": model.near,
-        "screen_variance": model.screen_variance,
-        "compensate": model.compensate,
+        "screen_variance": 0.0 if model.pixel_box else model.screen_variance,
+        "compensate": 0.0 if model.pixel_box else model.compensate,
         "degree": model.degree,
         "stride": gaussians.capacity,
         "count": gaussians.count,

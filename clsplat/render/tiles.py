@@ -15,6 +15,7 @@ from clsplat.opencl.device import Array, Device
 from clsplat.render.workspace import Workspace
 
 Sort = Literal["auto", "radix", "bitonic"]
+Defines = dict[str, int] | None  # with which the records were made
 TRIALS = 3  # of each sort when `auto` measures
 ONE_GROUP = 32  # values of an item, at most, where one group scans them all
 BLOCKS_MAX = 1024  # of a scan: each adds the sums of all before it
@@ -82,22 +83,24 @@ class Tiler:
         self._team = int(device.tuning["TEAM"])
         self.sort: Sort = known_sort(device, sort)
         self._pairs = device.program("pairs.cl")
-        self._large = device.program("large.cl")
         self._scan = device.program("scan.cl")
         self._radix = device.program("sort_radix.cl")
         self._digit_bits = int(device.tuning["DIGIT_BITS"])
         self._zero = device.zeros(1, np.uint32)
 
-    def build(self, splats: Array, footprints: Footprints, band: Band, count: int, limit: int) -> TileLists:
+    def build(
+        self, splats: Array, footprints: Footprints, band: Band, count: int, limit: int, defines: Defines = None
+    ) -> TileLists:
         """Make the tile lists of `count` splat records in a band.  Reads the number of pairs back: the only wait.
 
         Raises TooManyPairs when there are more than `limit`.
         """
         if self.sort == "auto":
-            self.sort = self._faster(splats, footprints, band, count, limit)
+            self.sort = self._faster(splats, footprints, band, count, limit, defines)
         depth_key, tile_count = footprints.depth_key, footprints.tile_count
         large = self._large_arguments(splats, footprints, band, count)
-        self._large.count_large(**large)
+        program = self.device.program("large.cl", **(defines or {}))
+        program.count_large(**large)
         order = self._depth_order(depth_key, count) if self.sort == "radix" else self._index_order(count)
         ordered_count = self.workspace.array("ordered_count", count, np.uint32)
         self._scan.permute(items=count, values=tile_count, order=order, permuted=ordered_count, count=count)
@@ -121,7 +124,7 @@ class Tiler:
             tiles_x=band.tiles_x,
             count=count,
         )
-        self._large.emit_large(**large, first_pair=first_pair, pair_tile=pair_tile, pair_splat=pair_splat)
+        program.emit_large(**large, first_pair=first_pair, pair_tile=pair_tile, pair_splat=pair_splat)
         tiles = band.tiles
         if self.sort == "radix":
             tile_offset, tile_pairs = self._sort_by_tile(pair_tile, pairs, tiles)
@@ -231,14 +234,16 @@ class Tiler:
         bitonic.sort_tiles(groups=tiles, tile_offset=tile_offset, tile_depth=tile_depth, tile_pairs=tile_pairs)
         return tile_offset, tile_pairs
 
-    def _faster(self, splats: Array, footprints: Footprints, band: Band, count: int, limit: int) -> Sort:
+    def _faster(
+        self, splats: Array, footprints: Footprints, band: Band, count: int, limit: int, defines: Defines
+    ) -> Sort:
         seconds: dict[Sort, float] = {}
         for sort in ("radix", "bitonic"):
             tiler = Tiler(self.device, self.workspace, sort)
             times = []
             for _ in range(1 + TRIALS):  # the first one compiles
                 start = time.perf_counter()
-                tiler.build(splats, footprints, band, count, limit)
+                tiler.build(splats, footprints, band, count, limit, defines)
                 self.device.finish()
                 times.append(time.perf_counter() - start)
             seconds[sort] = min(times[1:])

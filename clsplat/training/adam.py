@@ -89,7 +89,7 @@ class Adam:
     def __init__(self, gaussians: Gaussians) -> None:
         self.gaussians = gaussians
         self.updates = dict.fromkeys(PARAMETERS, 0)
-        self._program = gaussians.device.program("adam.cl")
+        gaussians.device.program("adam.cl")  # built before the first step
         self._lanes = int(gaussians.device.tuning["LANES"])
         self._vectors = int(gaussians.device.tuning["VECTORS"])
         self._beta1, self._beta2 = constants("adam.h")["BETA1"], constants("adam.h")["BETA2"]
@@ -112,7 +112,8 @@ class Adam:
             rate, correction2 = self._factors(name, rates)
             arguments |= {f"{name}_moment1": gaussians[moment1], f"{name}_moment2": gaussians[moment2]}
             arguments |= {f"{name}_rate": rate, f"{name}_correction2": correction2}
-        self._program.update_gaussians(
+        program = gaussians.device.program("adam.cl", **model.defines)
+        program.update_gaussians(
             items=-(-gaussians.count // (self._lanes * self._vectors)),
             **shape_arguments(model, frame.camera),
             **arguments,
@@ -146,7 +147,7 @@ class Adam:
                 components = 3 * (sh_coefficients(model.degree) - 1)
             moment1, moment2 = moment_tables(name)
             rate, correction2 = self._factors(name, rates)
-            self._program.adam_step(
+            gaussians.device.program("adam.cl").adam_step(
                 items=(-(-gaussians.count // self._lanes), components),
                 values=gaussians[name],
                 gradient=gradients[name],

@@ -200,6 +200,7 @@ class Run:
             "near": model.near,
             "screen_variance": model.screen_variance,
             "compensate": model.compensate,
+            **({"pixel_box": model.pixel_box} if model.pixel_box else {}),
             "background": self.photographs.background_name,
             "alpha": self.original.views[0].alpha,
         }

@@ -74,6 +74,8 @@ class Tuning:
     def _rendering(self) -> dict[str, Any]:
         numbers = self.model.rendering
         screen = {"type": "dilation", "variance": numbers.screen_variance, "compensate": int(numbers.compensate)}
+        if numbers.pixel_box:
+            screen = {"type": "box"}
         return {"model.sh_degree": self.model.sh_degree, "model.near": numbers.near, "model.screen_filter": screen}
 
 

@@ -77,6 +77,7 @@ def pack(model: Model, limit: int | None = None) -> Packed:
         "near": model.rendering.near,
         "variance": model.rendering.screen_variance,
         "compensate": model.rendering.compensate,
+        **({"box": 1} if model.rendering.pixel_box else {}),
         "origin": frame[0].tolist(),
         "unit": frame[1],
         "levels": [count * (level + 1) // LEVELS for level in range(LEVELS)],

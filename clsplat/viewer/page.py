@@ -91,7 +91,10 @@ class Page:
             faint = f" + {header['faint']:,} too faint to draw" if header["faint"] else ""
             facts[f"splats{of}"] = f"{packed.count:,}{faint}, SH degree {header['degree']}"
             kept = ", keeps the energy" if header["compensate"] else ""
-            facts[f"screen filter{of}"] = f"{header['variance']:g} px²{kept}"
+            blur = f"{header['variance']:g} px²{kept}"
+            if "box" in header:
+                blur = f"the pixel's box, drawn here as a blur of {blur}"
+            facts[f"screen filter{of}"] = blur
             facts[f"size{of}"] = f"{len(packed.data) / 1e6:.2f} MB"
         return facts | ({"views": f"{len(self.views):,}"} if self.views else {})
 

@@ -150,10 +150,10 @@ def test_a_frame_with_more_pairs_than_32_bits_count_is_rendered_in_bands(device,
     image, pixel_sums, _ = results(device, case, weights)
     build = Tiler.build
 
-    def crowded(tiler, splats, footprints, band, count, limit):
+    def crowded(tiler, splats, footprints, band, count, limit, defines=None):
         if band.row_end - band.row_begin > 1:
             footprints = replace(footprints, tile_count=device.upload(np.full(count, 2**32 // count + 1, np.uint32)))
-        return build(tiler, splats, footprints, band, count, limit)
+        return build(tiler, splats, footprints, band, count, limit, defines)
 
     monkeypatch.setattr(Tiler, "build", crowded)
     banded_image, banded_sums, banded = results(device, case, weights)

@@ -170,7 +170,7 @@ def test_a_large_splat_that_was_counted_wrongly_is_blended_once(device, rng, mon
     image, pairs = expected.image.get(), expected.lists.pairs
     sums = rasterizer.pixel_sums(model, expected, gradient).get()[:, :12]
 
-    kernels = rasterizer.tiler._large.kernels
+    kernels = device.program("large.cl").kernels
     correct = kernels["count_large"]
 
     def miscount(**values):

@@ -25,9 +25,14 @@ DEVICES = {"simt": [GPU, replace(GPU, group=64)], "wide": [GPU]}  # wide where s
 FITTED: tuple[dict[str, int | str], ...] = ({}, {"SPLAT_GROUP": 64})  # once it is open, by its waves
 SCHEDULES: tuple[Schedule, ...] = ("simt", "wide")
 SUMS = sorted({kind.pixel_sums for kind in variants(Statistic).values()} - {PIXEL_SUMS})
+BOX = {"PIXEL_BOX": 1}
+BLEND: list[dict[str, int]] = [*({"PIXEL_SUMS": count} for count in SUMS), BOX, {**BOX, "PIXEL_SUMS": SUMS[-1]}]
 PASSED = {  # what call sites of Device.program add to the tuning; a test holds it against them
-    "blend_simt.cl": [{"PIXEL_SUMS": count} for count in SUMS],
-    "blend_wide.cl": [{"PIXEL_SUMS": count} for count in SUMS],
+    "adam.cl": [BOX],
+    "large.cl": [BOX],
+    "project.cl": [BOX],
+    "blend_simt.cl": BLEND,
+    "blend_wide.cl": BLEND,
     "gather.cl": [{"PIXEL_SUMS": count} for count in SUMS],
 }
 

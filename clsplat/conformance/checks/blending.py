@@ -10,6 +10,7 @@ from clsplat.conformance import reference as ref
 from clsplat.conformance.check import Checks, Note
 from clsplat.conformance.comparison import GRADIENT, SUM, Figure, by_norm, equal, image_figures
 from clsplat.conformance.scenes import Case, random_case, safe_case
+from clsplat.conformance.sums import gradients_of_sums
 from clsplat.density.statistics import ABS_X
 from clsplat.density.survey import BLENDED, SQUARE, WEIGHT
 from clsplat.opencl.device import Device
@@ -65,10 +66,8 @@ def sum_figures(case: Case, m: NDArray[Any], weights: NDArray[Any], what: str) -
     """Compare sums over pixels, [N, PIXEL_SUMS or more], as the gradients of splats."""
     kernel, splats = "blend_backward", case.project()
     truth = ref.blend_backward(splats, *case.size, BACKGROUND.astype(np.float64), weights)
-    a, b, c = splats.conic.T
-    mean2d = -np.stack([a * m[:, 1] + b * m[:, 2], b * m[:, 1] + c * m[:, 2]], axis=1)
+    mean2d, conic = gradients_of_sums(splats, m)
     yield by_norm(kernel, f"gradients of splat means, {what}", mean2d, truth.mean2d, GRADIENT)
-    conic = np.stack([-0.5 * m[:, 3], -m[:, 4], -0.5 * m[:, 5]], axis=1)
     yield by_norm(kernel, f"gradients of conics, {what}", conic, truth.conic, GRADIENT)
     yield by_norm(kernel, f"gradients of opacities, {what}", m[:, 0], truth.opacity * splats.opacity, GRADIENT)
     yield by_norm(kernel, f"gradients of colours, {what}", m[:, 6:9], truth.colour, GRADIENT)

@@ -11,6 +11,7 @@ from clsplat.conformance import reference as ref
 from clsplat.conformance.check import Checks, Note
 from clsplat.conformance.comparison import CONIC, DEPTH, PROJECTION, SUM, Figure, by_element, by_norm, equal, wrong
 from clsplat.conformance.scenes import Case, random_case, with_world_filter
+from clsplat.conformance.sums import gradients_of_sums
 from clsplat.filters import FilterViews, Smoothing
 from clsplat.gaussians.tables import HIDDEN_VIEWS, hide
 from clsplat.opencl.device import Device
@@ -45,14 +46,16 @@ def record_figures(device: Device, case: Case, what: str) -> Iterator[Figure]:
     drawn &= truth.visible
     record = records[drawn]
     yield by_element(kernel, f"means, {what}", record[:, :2], truth.mean2d[drawn], PROJECTION, floor=50)
+    conic = covariances_of(record) if case.pixel_box else record[:, 2:5]
     size = np.maximum(np.linalg.norm(truth.conic[drawn], axis=1), 1e-30)
-    error = np.linalg.norm(record[:, 2:5] - truth.conic[drawn], axis=1) / size
+    error = np.linalg.norm(conic - truth.conic[drawn], axis=1) / size
     yield Figure(kernel, f"conics, {what}", float(error.max(initial=0)), CONIC)
     yield by_element(kernel, f"opacities, {what}", record[:, 5], truth.opacity[drawn], PROJECTION)
     yield by_element(kernel, f"colours, {what}", record[:, 6:9], truth.colour[drawn], PROJECTION, floor=1)
     yield by_element(kernel, f"depths, {what}", keys[drawn].view(np.float32), truth.depth[drawn], DEPTH)
-    power_min = -np.log(255 * truth.opacity[drawn])
-    yield by_element(kernel, f"reaches, {what}", record[:, 13], power_min, PROJECTION, floor=1)
+    if not case.pixel_box:
+        power_min = -np.log(255 * truth.opacity[drawn])
+        yield by_element(kernel, f"reaches, {what}", record[:, 13], power_min, PROJECTION, floor=1)
     hidden = records[:, 5] <= 0
     yield wrong(kernel, f"culled splats, {what}", (keys[hidden] != CULLED) | (records[hidden] != 0).any(axis=1))
     # ceil() may jump by a pixel where the radius is almost whole
@@ -61,16 +64,25 @@ def record_figures(device: Device, case: Case, what: str) -> Iterator[Figure]:
     yield wrong(kernel, f"extents, {what}", _wrong_extents(record, truth, drawn))
 
 
+def covariances_of(record: NDArray[Any]) -> NDArray[Any]:
+    """V, [N, 3], from the fields of records for the pixel's box."""
+    k, s, t, turned = (record[:, field].astype(np.float64) for field in (2, 3, 4, 13))
+    xx, xy, yy = t**2 + k**2 * s**2, k * s**2, s**2
+    return np.stack([np.where(turned > 0, yy, xx), xy, np.where(turned > 0, xx, yy)], axis=1)
+
+
 def _wrong_extents(record: NDArray[Any], truth: ref.Splats, drawn: NDArray[Any]) -> NDArray[Any]:
     """Extents that do not hold the pixels where alpha falls to 1/255, or much more than those."""
     reach2 = 2 * np.log(255 * truth.opacity[drawn])
     a, b, c = truth.conic[drawn].T
     half_x, half_y = np.sqrt(reach2 * c / (a * c - b * b)), np.sqrt(reach2 * a / (a * c - b * b))
+    if truth.pixel_box:  # of the covariance, a pixel wider
+        half_x, half_y = 0.5 + np.sqrt(reach2 * a), 0.5 + np.sqrt(reach2 * c)
     right = np.ones(len(record), bool)
     for low, high, centre, half in ((11, 12, 0, half_x), (9, 10, 1, half_y)):
         mean = truth.mean2d[drawn, centre]
         right &= (record[:, high] >= mean + half - 1e-3) & (record[:, low] <= mean - half + 1e-3)
-        right &= record[:, high] - record[:, low] <= 2.4 * half + 1
+        right &= record[:, high] - record[:, low] <= 2.4 * half + (3 if truth.pixel_box else 1)
     return ~right
 
 
@@ -94,9 +106,7 @@ def gradient_figures(device: Device, case: Case, rng: np.random.Generator, what:
 
 def expected_gradients(case: Case, truth: ref.Splats, m: NDArray[Any]) -> dict[str, NDArray[Any]]:
     """Gradients of all parameters, and of the projected means, from the sums over pixels, [N, PIXEL_SUMS]."""
-    a, b, c = truth.conic.T
-    grad_mean2d = -np.stack([a * m[:, 1] + b * m[:, 2], b * m[:, 1] + c * m[:, 2]], axis=1)
-    grad_conic = np.stack([-0.5 * m[:, 3], -m[:, 4], -0.5 * m[:, 5]], axis=1)
+    grad_mean2d, grad_conic = gradients_of_sums(truth, m)
     grad_opacity = np.where(truth.visible, m[:, 0] / np.where(truth.visible, truth.opacity, 1), 0)
     upstream = grad_mean2d, grad_conic, grad_opacity, m[:, 6:9]
     reference, camera = case.gaussians(), case.camera()

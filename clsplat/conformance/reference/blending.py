@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.conformance.reference.kinds import Camera, Gaussians, SplatGradients, Splats, Thresholds
+from clsplat.conformance.reference.pixel_box import box_derivatives, box_response
 from clsplat.conformance.reference.projection import project
 from clsplat.conformance.reference.projection_backward import project_backward
 
@@ -42,8 +43,8 @@ def blend_steps(splats: Splats, width: int, height: int, thresholds: Thresholds)
     for i in depth_order(splats):
         a, b, c = splats.conic[i]
         dx, dy = splats.mean2d[i, 0] - pixel_x, splats.mean2d[i, 1] - pixel_y
-        sigma = 0.5 * (a * dx**2 + c * dy**2) + b * dx * dy
-        falloff = np.exp(-sigma)
+        sigma = 0.5 * (a * dx**2 + c * dy**2) + b * dx * dy  # with the pixel's box only its sign counts
+        falloff = box_response(splats.conic[i], dx, dy) if splats.pixel_box else np.exp(-sigma)
         alpha = np.minimum(thresholds.alpha_max, splats.opacity[i] * falloff)
         after = transmittance * (1 - alpha)
         candidate = running & (sigma >= 0) & (alpha >= thresholds.alpha_min)
@@ -147,6 +148,11 @@ def blend_backward(
         i = step.splat
         grad.colour[i] = np.sum(grad_image[:3] * np.where(step.blended, step.alpha * step.before, 0), axis=(1, 2))
         grad.opacity[i] = np.sum(step.falloff * grad_alpha)
+        if splats.pixel_box:
+            by = splats.opacity[i] * grad_alpha * np.array(box_derivatives(splats.conic[i], step.dx, step.dy))
+            grad.mean2d[i], grad.conic[i] = by[:2].sum(axis=(1, 2)), by[2:].sum(axis=(1, 2))
+            grad.mean2d_abs[i] = np.abs(by[:2]).sum(axis=(1, 2))
+            continue
         grad_sigma = -splats.opacity[i] * step.falloff * grad_alpha
         a, b, c = splats.conic[i]
         grad_u = grad_sigma * (a * step.dx + b * step.dy)
@@ -200,9 +206,6 @@ def _relative_gap(values: NDArray[Any], threshold: float) -> float:
     return float(np.min(np.abs(values / threshold - 1), initial=np.inf)) if threshold > 0 else np.inf
 
 
-# ---- Both together -------------------------------------------------------------------------------------------------
-
-
 class Frame(NamedTuple):
     """What `render` returns."""
 
@@ -221,9 +224,10 @@ def render(
     variance: float = 0.3,
     compensate: float = 0.0,
     thresholds: Thresholds = Thresholds(),
+    pixel_box: float = 0.0,
 ) -> Frame:
     """Project and blend."""
-    splats = project(gaussians, camera, degree, near, variance, compensate, thresholds)
+    splats = project(gaussians, camera, degree, near, variance, compensate, thresholds, pixel_box)
     return Frame(*blend(splats, camera.width, camera.height, background, thresholds), splats)
 
 

@@ -70,19 +70,20 @@ class Splats:
     """Projected Gaussians.  Rows that are not visible are zero, except for their radius."""
 
     mean2d: NDArray[Any]  # [N,2] px
-    conic: NDArray[Any]  # [N,3] A, B, C = xx, xy, yy of the inverse covariance
+    conic: NDArray[Any]  # [N,3] A, B, C = xx, xy, yy of the inverse covariance; with the pixel's box the covariance
     opacity: NDArray[Any]  # [N] after both filters
     colour: NDArray[Any]  # [N,3]
     depth: NDArray[Any]  # [N] z
     radius: NDArray[Any]  # [N] px, whole; 0 = not visible to density control; independent of opacity
     visible: NDArray[Any]  # [N] bool: blended
+    pixel_box: bool = False  # integrated over the box of each pixel (pixel_box.py)
 
 
 class SplatGradients(NamedTuple):
     """What `blend_backward` returns."""
 
     mean2d: NDArray[Any]  # [N,2]
-    conic: NDArray[Any]  # [N,3] with respect to the scalars A, B, C
+    conic: NDArray[Any]  # [N,3] with respect to the scalars of Splats.conic
     opacity: NDArray[Any]  # [N]
     colour: NDArray[Any]  # [N,3]
     mean2d_abs: NDArray[Any]  # [N,2] sum over pixels of |dL/du|, |dL/dv|

@@ -118,8 +118,12 @@ def project(
     variance: float = 0.3,
     compensate: float = 0.0,
     thresholds: Thresholds = Thresholds(),
+    pixel_box: float = 0.0,
 ) -> Splats:
-    """Project Gaussians; `degree` is the active one, `variance` (px²) and `compensate` (0 or 1) the screen filter."""
+    """Project Gaussians; `degree` is the active one, `variance` (px²) and `compensate` (0 or 1) the screen filter.
+
+    pixel_box: 1, with neither of them, where splats are integrated over the pixel's box.
+    """
     count = len(gaussians.means)
     splats = Splats(
         mean2d=np.zeros((count, 2)),
@@ -129,6 +133,7 @@ def project(
         depth=np.zeros(count),
         radius=np.zeros(count),
         visible=np.zeros(count, bool),
+        pixel_box=bool(pixel_box),
     )
     for n in range(count):
         z = camera.rotation[2] @ gaussians.means[n] + camera.translation[2]
@@ -142,11 +147,14 @@ def project(
         mean2d = np.array([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy])
         splats.radius[n] = vanilla_radius(mean2d, foot.dilated, camera.width, camera.height)
         opacity = np.prod(opacity_factors(gaussians.logit_opacity[n], foot, compensate))
-        if not opacity > thresholds.alpha_min:
+        brightest = opacity * min(1, 2 * np.pi * np.sqrt(det)) if pixel_box else opacity
+        if not brightest > thresholds.alpha_min:
             continue
         splats.visible[n] = True
         splats.mean2d[n] = mean2d
         splats.conic[n] = np.array([foot.dilated[1, 1], -foot.dilated[0, 1], foot.dilated[0, 0]]) / det
+        if pixel_box:
+            splats.conic[n] = foot.sharp[0, 0], foot.sharp[0, 1], foot.sharp[1, 1]
         splats.opacity[n] = opacity
         splats.colour[n] = np.maximum(0, unclamped_colour(gaussians, n, camera, degree))
         splats.depth[n] = z

@@ -83,11 +83,14 @@ def project_backward(
         grad["logit_opacity"][n] = grad_opacity[n] * rho * kappa * sigmoid * (1 - sigmoid)
         grad_kappa = grad_opacity[n] * sigmoid * rho
 
-        # Conic -> 2D covariance: G_V = -K G_K K; then κ = sqrt(1 + compensate (det V / det V1 - 1))
+        # Conic -> 2D covariance: G_V = -K G_K K (that of V itself for the pixel's box)
+        # then κ = sqrt(1 + compensate (det V / det V1 - 1))
         a, b, c = splats.conic[n]
         conic = np.array([[a, b], [b, c]])
         ga, gb, gc = grad_conic[n]
-        grad_v = -conic @ np.array([[ga, gb / 2], [gb / 2, gc]]) @ conic
+        grad_v = np.array([[ga, gb / 2], [gb / 2, gc]])
+        if not splats.pixel_box:
+            grad_v = -conic @ grad_v @ conic
         if compensate != 0:
             grad_v += grad_kappa * compensate / (2 * kappa) * ratio_gradient(foot)
 

@@ -1,0 +1,83 @@
+"""Splats that are integrated over the box of each pixel: records, images, sums over pixels, gradients, updates."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.conformance import reference as ref
+from clsplat.conformance.check import Checks, Note
+from clsplat.conformance.checks.blending import (
+    ALL_SUMS,
+    BACKGROUND,
+    MARGIN,
+    blend_figures,
+    dim,
+    pixel_sums_of,
+    render,
+    sum_figures,
+)
+from clsplat.conformance.checks.projection import gradient_figures, record_figures
+from clsplat.conformance.checks.update import fused_figures
+from clsplat.conformance.comparison import GRADIENT, Figure, by_norm, equal
+from clsplat.conformance.scenes import Case, random_case, safe_case, with_world_filter
+from clsplat.density.survey import SQUARE
+from clsplat.opencl.device import Device
+from clsplat.render.rasterizer import Budget
+
+CHECKS = Checks()
+BOX: dict[str, Any] = {"variance": 0.0, "pixel_box": 1.0}
+SIZES = {"of pixels": 0.0, "far below a pixel": -2.5, "of many pixels": 2.0}  # added to the logarithms of scales
+
+
+def of_size(size: float, rng: np.random.Generator, count: int, width: int, height: int) -> Case:
+    def change(parameters: dict[str, NDArray[Any]]) -> None:
+        parameters["log_scales"] += np.float32(size)
+        parameters["logit_opacity"] += np.float32(max(0, -size))
+
+    return safe_case(rng, count, width, height, MARGIN, change, **BOX)
+
+
+@CHECKS.add("project_forward", "project_backward", "update_gaussians")
+def projection_for_the_pixel_box(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    for count in (1, 17, 65):
+        case, what = random_case(rng, count, **BOX), f"{count} Gaussians for the pixel's box"
+        yield from record_figures(device, case, what)
+        yield from gradient_figures(device, case, rng, what)
+    filtered = with_world_filter(random_case(rng, 30, **BOX), rng)
+    yield from record_figures(device, filtered, "filtered Gaussians for the pixel's box")
+    yield from gradient_figures(device, filtered, rng, "filtered Gaussians for the pixel's box")
+    yield from fused_figures(device, rng, random_case(rng, 40, **BOX), "40 Gaussians for the pixel's box")
+
+
+@CHECKS.add("blend_forward", "blend_backward", "count_large", "emit_large")
+def blending_over_the_pixel_box(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    for count, width, height in ((0, 20, 20), (1, 16, 16), (17, 33, 15), (65, 40, 30)):
+        case = of_size(0.0, rng, count, width, height)
+        yield from blend_figures(device, case, f"{count} Gaussians over the pixel's box, {width} x {height} px")
+    yield from blend_figures(device, safe_case(rng, 300, 14, 14, 2e-6, dim, **BOX), "long tiles over the pixel's box")
+    for what, size in SIZES.items():
+        case = of_size(size, rng, 25, 40, 30)
+        yield from blend_figures(device, case, f"splats {what} over the pixel's box")
+        weights = rng.normal(size=(3, 30, 40)).astype(np.float32)
+        sums = pixel_sums_of(device, case, weights, ALL_SUMS, texture=np.ones((30, 40), np.float32))
+        yield from sum_figures(case, sums, weights, f"splats {what} over the pixel's box")
+        squares = ref.falloff_squares(case.project(), 40, 30, BACKGROUND.astype(np.float64), weights)
+        yield by_norm("blend_backward", f"sums of squares, {what}", sums[:, SQUARE], squares, GRADIENT)
+    few = pixel_sums_of(device, case, weights)
+    yield from sum_figures(case, few, weights, "without more sums over the pixel's box")
+
+
+@CHECKS.add("blend_forward", "blend_backward", "emit_large")
+def the_pixel_box_in_bands(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    case = random_case(rng, 60, 150, 130, **BOX)
+    case.parameters["log_scales"][:10] += 1.5
+    weights = rng.normal(size=(3, 130, 150)).astype(np.float32)
+    image = render(device, case).image.get()
+    yield equal(
+        "sort_tiles", "pixels over their box, by the other sort", render(device, case, "bitonic").image.get(), image
+    )
+    sums = pixel_sums_of(device, case, weights)
+    banded = pixel_sums_of(device, case, weights, budget=Budget(250, 3))
+    yield equal("blend_backward", "sums over pixels over their box, against bands of tiles", banded, sums)
