@@ -74,20 +74,19 @@ def test_real_surfaces():
 
 
 @pytest.mark.parametrize(
-    ("fewest", "found", "alpha", "swept"),
-    [(1, 1, False, True), (1, 0, False, False), (0, 1, False, False), (1, 1, True, False)],
+    ("more", "found", "alpha", "joined"), [(1, 70, False, 70), (1, 0, False, 0), (0, 70, False, 0), (1, 70, True, 0)]
 )
-def test_a_scene_with_few_points_is_swept(tiny_scene, tmp_path, monkeypatch, caplog, fewest, found, alpha, swept):
-    """fewest, found: beyond the number of the scene's points."""
+def test_a_scene_with_few_points_is_swept(tiny_scene, tmp_path, monkeypatch, caplog, more, found, alpha, joined):
+    """more: than the scene's points are enough."""
     own, file = len(read_scene(tiny_scene).points), tmp_path / "start.yaml"
-    cloud = PointCloud(np.random.default_rng(0).random((own + found, 3), np.float32), np.zeros((own + found, 3)))
+    cloud = PointCloud(np.random.default_rng(0).random((found, 3), np.float32), np.zeros((found, 3), np.float32))
     monkeypatch.setattr("clsplat.stages.init.swept_points", lambda *arguments: cloud)
     monkeypatch.setattr("clsplat.stages.init.has_alpha", lambda scene: alpha)
-    stages = f"[{{init: {{fewest: {own + fewest}}}}}, {{optimize: {{steps: 1, losses: [l1]}}}}, export]"
+    stages = f"[{{init: {{fewest: {own + more}}}}}, {{optimize: {{steps: 1, losses: [l1]}}}}, export]"
     file.write_text(f"name: start\nstages: {stages}\n")
     caplog.set_level("INFO", "clsplat")
     run = train(tiny_scene, tmp_path / "run", pipeline=str(file))
     log = caplog.text
-    assert (f"from a sweep over the photographs: the scene has {own:,} points" in log) == swept
-    assert ("from the scene's points" in log) != swept
-    assert run.model.gaussians.count == (len(cloud) if swept else own)
+    swept = bool(more) and not alpha
+    assert f"{own + joined:,} Gaussians from the scene's points{' and a sweep' if swept else ''}" in log
+    assert run.model.gaussians.count == own + joined

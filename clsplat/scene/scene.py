@@ -41,6 +41,11 @@ class PointCloud:
     def __len__(self) -> int:
         return len(self.positions)
 
+    def joined(self, other: "PointCloud") -> "PointCloud":
+        """Return these points, then those of another cloud."""
+        pairs = (self.positions, other.positions), (self.colours, other.colours)
+        return PointCloud(*(np.concatenate(pair).astype(np.float32) for pair in pairs))
+
 
 @dataclass(frozen=True)
 class Scene:

@@ -37,8 +37,8 @@ class Init(Stage):
 
     `source: auto` uses the scene's points if it has points.  Without points it uses a plane sweep over the photographs,
     or, where they have alpha, what `transparent` says: random points in a box around the point that the cameras look
-    at, as published, or points on the hull of the silhouettes in that box.  Photographs without alpha are swept too
-    where the scene has fewer points than `fewest`, and the sweep finds more.
+    at, as published, or points on the hull of the silhouettes in that box.  Where a
+    scene has fewer points than `fewest`, and its photographs have no alpha, those of a sweep join them.
     """
 
     stage: Literal["init"] = "init"
@@ -51,7 +51,7 @@ class Init(Stage):
     transparent: Literal["random", "hull"] = "random"
     """Source of `auto` for a scene without points whose photographs have alpha."""
     fewest: Annotated[int, Field(ge=0)] = 0
-    """Number of the scene's points below which `auto` prefers a plane sweep."""
+    """Number of the scene's points below which `auto` adds those of a plane sweep."""
     opacity: Annotated[float, Field(gt=0, lt=1)] = 0.1
     """Opacity of the first Gaussians."""
     scale: Annotated[float, Field(gt=0)] = 1.0
@@ -90,11 +90,10 @@ class Init(Stage):
             "random": "random points",
             "sweep": "a sweep over the photographs",
             "hull": "the hull of the silhouettes",
+            "both": "the scene's points and a sweep over the photographs",
         }
-        if source in MODEL_SOURCES or (source != "sweep" and scene.points is not None):
-            return names.get(source, source)
-        own = "no points" if scene.points is None else f"{len(scene.points):,} points"
-        return f"{names.get(source, source)}: the scene has {own}"
+        has_own = scene.points is not None or source in MODEL_SOURCES
+        return names.get(source, source) + ("" if has_own else ": the scene has no points")
 
     def _source(self, scene: Scene) -> str:
         if self.source != "auto":
@@ -113,8 +112,7 @@ class Init(Stage):
         if points is None:
             points, source = self._random(run), "random"
         if source == "points" and self.source == "auto" and len(points) < self.fewest and not has_alpha(run.scene):
-            swept = self._sweep(run)
-            points, source = (swept, "sweep") if len(swept) > len(points) else (points, source)
+            points, source = points.joined(self._sweep(run)), "both"
         self._require_memory(run, len(points))
         return from_points(points, self.opacity, degree, self.scale), source
 
