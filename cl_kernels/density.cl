@@ -73,6 +73,40 @@ void accumulate_pixel_sum(
         total[i] += pixel_sums[pixel_sum * stride + i];
 }
 
+/* Add by how much a shift by one standard deviation changes this view's loss at most, sqrt(g^T C g) with the splat's
+ * covariance C, times a number. */
+__kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
+void accumulate_gain(
+    __global const float *restrict grad_mean2d,  // [2,S] px^-1
+    __global const float *restrict splats,       // [N,RECORD] see splat.h
+    __global const float *restrict radius,       // [S] px, 0 = not seen
+    __global float *restrict total,              // [S] over views
+    const float factor,
+    const uint stride,
+    const uint count)
+{
+    const uint i = get_global_id(0);
+    if (i >= count || !(radius[i] > 0.0f))
+        return;
+    __global const float *splat = splats + (size_t)i * RECORD;
+    const float xx = splat[SPLAT_XX], xy = splat[SPLAT_XY], yy = splat[SPLAT_YY];
+    const float x = grad_mean2d[i], y = grad_mean2d[stride + i];
+    const float square = yy * x * x - 2.0f * xy * x * y + xx * y * y, determinant = xx * yy - xy * xy;
+    total[i] += square > 0.0f && determinant > 0.0f ? factor * sqrt(square / determinant) : 0.0f;
+}
+
+/* Add this view's error, whether it sees the Gaussian or not. */
+__kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
+void accumulate_error(
+    __global const float *restrict error,  // [1]
+    __global float *restrict total,        // [S] over views
+    const uint count)
+{
+    const uint i = get_global_id(0);
+    if (i < count)
+        total[i] += error[0];
+}
+
 /* Add this view's radius. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void accumulate_radius(

@@ -228,6 +228,46 @@ void ssim_gradient(
     }
 }
 
+/* How far the view is from its photograph in the loss's own measure: sums of |gradient (x - y)|, by row.
+ * Local memory: TEAM * 4. */
+__kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
+void view_error(
+    __global const float *restrict image,       // [3,H',stride]
+    __global const float *restrict photograph,  // [3,H',stride]
+    __global const float *restrict gradient,    // [3,H',stride] of the loss, by the image
+    __global float *restrict row_errors,        // [3,H']
+    const uint width,
+    const uint height,
+    const uint rows,                            // H'
+    const uint stride)
+{
+    __local float sums[TEAM];
+    const uint item = get_local_id(0), y = get_group_id(1), channel = get_group_id(2);
+    const uint row = (channel * rows + y) * stride, columns = y < height ? width : 0;
+    VF error = (VF)(0.0f);
+    for (uint x = item * LANES; x < stride; x += TEAM * LANES) {
+        const VF difference = VLOAD(image + row + x) - VLOAD(photograph + row + x);
+        error += fabs(VLOAD(gradient + row + x) * difference) * inside_row(x, columns);
+    }
+    sums[item] = sum_lanes(error);
+    barrier(CLK_LOCAL_MEM_FENCE);
+    if (item == 0)
+        row_errors[channel * rows + y] = sum_items(sums);
+}
+
+/* Add the errors of a view's rows up, in their order.  One item. */
+__kernel __attribute__((reqd_work_group_size(1, 1, 1)))
+void sum_errors(
+    __global const float *restrict row_errors,  // [count]
+    __global float *restrict error,             // [1]
+    const uint count)
+{
+    float total = 0.0f;
+    for (uint i = 0; i < count; i++)
+        total += row_errors[i];
+    error[0] = total;
+}
+
 /* gradient += scale, in the fourth plane: the mean entropy of the blend weights (splat.h).  Local memory: TEAM * 4. */
 __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
 void weight_entropy(

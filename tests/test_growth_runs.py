@@ -16,10 +16,14 @@ pytestmark = pytest.mark.slow
 PRUNE = "{type: prune_faint, opacity_below: 0.005}"
 SADDLE = "{type: split_saddle, gradient_above: 1.0e-5, distance: 0.5, shrink: 1.6}"
 CROWDED = "{type: clone_crowded, gradient_above: 1.0e-5, size_below: 0.1, ratio_above: 2.0, cells: 3, extremes: 8}"
+GAINFUL = "{type: clone, statistic: gain, gradient_above: 0.1, size_below: 0.1}"
+SPARE = "{type: prune_spare, error_rise: 0.1, views: 3}"
 ENTROPY = "optimize.losses=[{type: l1, weight: 0.8}, {type: dssim, weight: 0.2}, {type: weight_entropy, weight: 0.05}]"
 CASES = {  # what acts -> settings
     "split_saddle": (f"densify.rules=[{SADDLE}, {PRUNE}]",),
     "clone_crowded": (f"densify.rules=[{CROWDED}, {{type: clone}}, {PRUNE}]",),
+    "clone": (f"densify.rules=[{GAINFUL}, {PRUNE}]",),
+    "prune_spare": (f"densify.rules=[{GAINFUL}, {SPARE}]",),
     "weight_entropy": (ENTROPY,),
 }
 
@@ -31,7 +35,7 @@ def test_runs_resume_and_repeat_to_the_bit(tiny_scene, tmp_path, name):
     whole = (first.out / "point_cloud.ply").read_bytes()
     lines = [json.loads(line) for line in (first.out / "metrics.jsonl").read_text().splitlines()]
     edits = [line for line in lines if line["kind"] == "densify"]
-    assert name == "weight_entropy" or sum(edit["grown"][name] for edit in edits) > 20
+    assert name == "weight_entropy" or sum(edit["causes"][name] for edit in edits) > 20
     again = train(tiny_scene, tmp_path / "again", *settings)
     assert (again.out / "point_cloud.ply").read_bytes() == whole
     for step in (30, 40, 50):

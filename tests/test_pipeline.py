@@ -173,6 +173,10 @@ CROWDED = {
 }
 DIFFERENCES = {
     ("splat", "splat_7k"): TWIN,
+    ("splat", "auto"): {
+        f"densify.rules.{rule}.{key}" for rule in ("clone", "split") for key in ("gradient_above", "statistic")
+    },
+    ("auto", "auto_7k"): TWIN,
     ("splat", "steep"): SADDLE,
     ("steep", "steep_7k"): TWIN,
     ("splat", "gdgs"): CROWDED,

@@ -100,7 +100,7 @@ class Edit:
             statistic=self.stats.total(statistic) if statistic else self.stats.seen,
             divisor=self.stats.divisor(statistic) if statistic else self.stats.seen,
             **self._outcome,
-            gradient_above=gradient_above,
+            gradient_above=gradient_above / self.stats.factor(statistic) if statistic else gradient_above,
             size_above=size_above * self.scene_scale.extent,
             size_below=MAX_BOUND if size_below is None else size_below * self.scene_scale.extent,
             opacity_below=min(opacity_below, MAX_BOUND),

@@ -34,6 +34,7 @@ class Statistic(Settings):
     pixel_sums: ClassVar[int] = PIXEL_SUMS  # number of sums over pixels that the backward pass must compute
     reads_conics: ClassVar[bool] = False  # from records and sums, where the pixel's box has others (cl_kernels/splat.h)
     divisor: ClassVar[str] = "seen"  # column that divides the sum: views that see the Gaussian, or another column
+    of_all_views: ClassVar[bool] = False  # the mean is multiplied by the number of training views
 
     @abstractmethod
     def add(self, gaussians: Gaussians, view: ViewGradients, grad_mean2d: Array, total: Array) -> None:
@@ -139,9 +140,11 @@ StatisticName = Annotated[str, VariantName(Statistic, lambda kind: kind.componen
 class SplatStats:
     """The columns of a model, and the number of views that see each Gaussian."""
 
-    def __init__(self, gaussians: Gaussians, names: Collection[str] = ("screen_grad",)) -> None:
+    def __init__(
+        self, gaussians: Gaussians, names: Collection[str] = ("screen_grad",), training_views: int = 1
+    ) -> None:
         """Attach the columns `names` and their divisors, drop all others; existing columns keep their sums."""
-        self.gaussians = gaussians
+        self.gaussians, self.training_views = gaussians, training_views
         known = variants(Statistic)
         needed = {*names, *(known[name].divisor for name in names)}
         self.columns = {name: kind() for name, kind in known.items() if name in needed}
@@ -170,6 +173,10 @@ class SplatStats:
         """Return the sums that divide a column, [S]."""
         return self.gaussians[FOLDER + self.columns[name].divisor]
 
+    def factor(self, name: str) -> int:
+        """Return what a column's sum by its divisor is multiplied by."""
+        return self.training_views if self.columns[name].of_all_views else 1
+
     @property
     def seen(self) -> Array:
         """Number of views that see each Gaussian, [S]."""
@@ -191,7 +198,7 @@ class SplatStats:
     def means(self, name: str) -> NDArray[np.float32]:
         """Return the means of a column of several components, as `mean` does, [N, components]."""
         total, divisor = (self.gaussians.get(FOLDER + table) for table in (name, self.columns[name].divisor))
-        return np.divide(total, divisor, out=np.zeros_like(total), where=divisor > 0)
+        return np.divide(total, divisor, out=np.zeros_like(total), where=divisor > 0) * np.float32(self.factor(name))
 
     def clear(self) -> None:
         """Set all columns to zero."""

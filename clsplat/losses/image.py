@@ -91,6 +91,27 @@ def psnr(comparison: Comparison) -> float:
     return -10 * math.log10(max(error, 1e-10))
 
 
+def view_error(comparison: Comparison) -> Array:
+    """Return the sum over pixels of |gradient (x - y)|, [1]: how far the image is from the photograph, as the
+    losses see it.
+
+    The gradient is that of all image losses, by the image.
+    """
+    camera, workspace = comparison.camera, comparison.workspace
+    rows, error = workspace.array("row_errors", (3, camera.rows)), workspace.array("view_error", 1)
+    program = workspace.device.program("loss.cl")
+    program.view_error(
+        groups=(1, camera.rows, 3),
+        image=comparison.image,
+        photograph=comparison.photograph,
+        gradient=comparison.gradient,
+        row_errors=rows,
+        **camera.plane_arguments(),
+    )
+    program.sum_errors(groups=(1,), row_errors=rows, error=error, count=3 * camera.rows)
+    return error
+
+
 def ssim_maps(comparison: Comparison) -> tuple[Array, Array]:
     """Return the derivatives of the SSIM map [3, 3, rows, stride] and the map's sums [3, height, blocks].
 

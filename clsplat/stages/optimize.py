@@ -161,7 +161,7 @@ class Optimize(Stage):
         """Attach moments, statistics and tables to the run's Gaussians; a resumed run has them."""
         gaussians, photographs = run.model.gaussians, run.photographs
         run.adam = run.adam or Adam(gaussians)
-        run.stats = SplatStats(gaussians, self.statistics)
+        run.stats = SplatStats(gaussians, self.statistics, len(run.scene.split("train")))
         for name in sorted(self.tables - gaussians.tables.keys()):
             gaussians.add(name, 1)
             run.refresh_filter()

@@ -20,6 +20,7 @@ from clsplat.density.thresholds import SceneScale
 from clsplat.gaussians.tables import Gaussians
 from clsplat.losses.base import Comparison, ViewGradients
 from clsplat.opencl.device import Device
+from clsplat.opencl.program import constants
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.training.adam import Adam
 
@@ -29,12 +30,13 @@ GROWTH = (Clone(size_below=0.01, opacity="shared"), Split(size_above=0.01))
 RULES = (*GROWTH, PruneFaint(opacity_below=0.005), PruneLarge(size_above=0.1))
 EXTENT = 5.0
 SEED, STEP = 3, 3100
-COLUMNS = ("screen_grad", "screen_grad_abs_sum", "rendered_texture", "screen_radius", "blend_weight")
+SPLAT_XX = int(constants("splat.h")["SPLAT_XX"])
+COLUMNS = ("screen_grad", "screen_grad_abs_sum", "rendered_texture", "screen_radius", "blend_weight", "gain")
 
 
 @CHECKS.add(
     *("count_seen", "accumulate_norm", "accumulate_sum", "accumulate_pixel_sum", "accumulate_radius"),
-    "sample_magnitude",
+    *("sample_magnitude", "accumulate_error", "accumulate_gain"),
 )
 def statistics(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
     for count in COUNTS:
@@ -46,25 +48,32 @@ def statistics(device: Device, rng: np.random.Generator) -> Iterator[Figure | No
         planes = rng.normal(size=(stats.pixel_sums, gaussians.capacity)).astype(np.float32)
         planes[ABS_X:] = np.abs(planes[ABS_X:])
         image = frame.image.get()[:, :height, :width]
-        comparison = comparison_of(device, image, image)
+        photograph = image + rng.normal(size=image.shape).astype(np.float32)
+        comparison = comparison_of(device, image, photograph)  # with a gradient of 7
+        error = ref.view_error(np.full(image.shape, 7.0), image.astype(np.float64), photograph)
         view = ViewGradients(frame, comparison, [], device.upload(planes))
         for _ in range(2):
             stats.add(view, device.upload(planes[:2]))
         radius, half = frame.radius.get()[:count], np.array([width / 2, height / 2])
         seen, sums = radius > 0, planes[:, :count].T.astype(np.float64)
-        x, y = frame.splats.get()[:count, :2].T
+        splats = frame.splats.get()[:count].astype(np.float64)
+        (x, y), conic = splats[:, :2].T, splats[:, SPLAT_XX : SPLAT_XX + 3]
         column, row = np.clip(x, 0, width - 1).astype(int), np.clip(y, 0, height - 1).astype(int)
-        expected = {
+        columns = {
             ("screen_grad", "accumulate_norm"): ref.screen_gradient(sums[:, :2], width, height),
             ("screen_grad_abs_sum", "accumulate_sum"): sums[:, ABS_X : ABS_X + 2] @ half,
             ("rendered_texture", "sample_magnitude"): magnitude_of(image)[row, column],
             ("screen_radius", "accumulate_radius"): radius,
             ("blend_weight", "accumulate_pixel_sum"): sums[:, WEIGHT],
+            ("gain", "accumulate_gain"): width * height * ref.screen_gain(sums[:, :2], conic),
+            ("view_error", "accumulate_error"): np.full(count, error),
         }
         yield equal("count_seen", f"views of {count} Gaussians", gaussians.get(SEEN)[:, 0], 2.0 * seen)
-        for (name, kernel), values in expected.items():
+        for (name, kernel), values in columns.items():
             found = gaussians.get(f"stats/{name}")[:, 0]
-            yield by_element(kernel, f"{name} of {count} Gaussians", found, 2 * values * seen, SUM, floor=0.1)
+            of_all = name == "view_error"  # counts for those that the view does not see too
+            expected = 2 * values * (seen | of_all)
+            yield by_element(kernel, f"{name} of {count} Gaussians", found, expected, SUM, floor=0.1)
 
 
 @CHECKS.add("accumulate_splitting")

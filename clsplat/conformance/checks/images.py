@@ -12,7 +12,7 @@ from clsplat.conformance.check import Checks, Note
 from clsplat.conformance.comparison import LOSS_GRADIENT, SUM, Figure, by_element, equal
 from clsplat.losses.base import Comparison, ImageLoss
 from clsplat.losses.entropy import WeightEntropy
-from clsplat.losses.image import L1, L2, Dssim
+from clsplat.losses.image import L1, L2, Dssim, view_error
 from clsplat.opencl.device import Array, Device
 from clsplat.render.camera import DeviceCamera
 from clsplat.render.workspace import Workspace
@@ -96,6 +96,21 @@ def losses_that_add_up(device: Device, rng: np.random.Generator) -> Iterator[Fig
         expected += weight * oracle(x.astype(np.float64), y.astype(np.float64))[1]
     error = np.abs(comparison.gradient.get()[:, :20, :50] - expected).max() / np.abs(expected).max()
     yield Figure("ssim_gradient", "sum of the gradients of three losses", float(error), LOSS_GRADIENT)
+
+
+@CHECKS.add("view_error", "sum_errors")
+def errors_of_views(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    for width, height in SIZES:
+        (x, y), what = pictures(rng, width, height), f"{width} x {height} px"
+        gradient, comparison = rng.normal(size=x.shape).astype(np.float32), comparison_of(device, x, y)
+        comparison.gradient = planes_of(device, comparison.camera, gradient)
+        found = view_error(comparison).get()
+        rows = comparison.workspace.array("row_errors", (3, comparison.camera.rows)).get()
+        values = [table.astype(np.float64) for table in (gradient, x, y)]
+        expected = np.array([[ref.view_error(*(v[c, row] for v in values)) for row in range(height)] for c in range(3)])
+        yield by_element("view_error", f"errors of rows, {what}", rows[:, :height], expected, SUM, floor=1e-2)
+        yield equal("view_error", f"errors of rows outside the image, {what}", rows[:, height:], 0.0)
+        yield by_element("sum_errors", f"error of {what}", found, np.array([expected.sum()]), SUM)
 
 
 @CHECKS.add("weight_entropy")

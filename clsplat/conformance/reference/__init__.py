@@ -34,6 +34,7 @@ from clsplat.conformance.reference.density import (
     adc_actions,
     mean_gradient,
     reset_logit,
+    screen_gain,
     screen_gradient,
     shared_logit,
     split_children,
@@ -61,6 +62,7 @@ from clsplat.conformance.reference.losses import (
     psnr,
     ssim_map,
     ssim_taps,
+    view_error,
 )
 from clsplat.conformance.reference.penalties import (
     anisotropy,
@@ -136,6 +138,7 @@ __all__ = [
     "reset_logit",
     "rotation_matrix",
     "sampling_interval",
+    "screen_gain",
     "screen_gradient",
     "screen_splitting",
     "sh_basis",
@@ -145,5 +148,6 @@ __all__ = [
     "splitting",
     "ssim_map",
     "ssim_taps",
+    "view_error",
     "weight_entropy",
 ]

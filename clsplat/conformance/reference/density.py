@@ -32,6 +32,19 @@ def screen_gradient(grad_mean2d: NDArray[Any], width: int, height: int) -> NDArr
     return np.hypot(width / 2 * grad_mean2d[:, 0], height / 2 * grad_mean2d[:, 1])
 
 
+def screen_gain(grad_mean2d: NDArray[Any], conic: NDArray[Any]) -> NDArray[Any]:
+    """Largest change of the loss by a shift of one standard deviation, to first order: [N]; 0 for a culled splat.
+
+    grad_mean2d: [N,2] px^-1; conic: [N,3] px^-2.  It is the length of L^T g, with L L^T the covariance.
+    """
+    found = np.zeros(len(conic))
+    for i, (xx, xy, yy) in enumerate(conic):
+        if xx > 0:
+            lower = np.linalg.cholesky(np.linalg.inv([[xx, xy], [xy, yy]]))
+            found[i] = np.linalg.norm(lower.T @ grad_mean2d[i])
+    return found
+
+
 def mean_gradient(total: NDArray[Any], count: NDArray[Any]) -> NDArray[Any]:
     """ḡ: [N]; 0 where the Gaussian was never visible."""
     return np.where(count > 0, total / np.maximum(count, 1), 0)

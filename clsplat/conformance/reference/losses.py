@@ -19,6 +19,11 @@ def l1(x: NDArray[Any], y: NDArray[Any]) -> tuple[float, NDArray[Any]]:
     return np.mean(np.abs(x - y)), np.sign(x - y) / x.size
 
 
+def view_error(gradient: NDArray[Any], x: NDArray[Any], y: NDArray[Any]) -> float:
+    """Sum of |gradient (x - y)|, the gradient by x of any losses."""
+    return float(np.abs(gradient * (x - y)).sum())
+
+
 def l2(x: NDArray[Any], y: NDArray[Any]) -> tuple[float, NDArray[Any]]:
     """Mean squared difference, and its gradient."""
     return np.mean((x - y) ** 2), 2 * (x - y) / x.size
