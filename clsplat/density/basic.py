@@ -2,11 +2,12 @@
 
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from clsplat.density.edit import Edit, Rule
-from clsplat.density.statistics import StatisticName
+from clsplat.density.statistics import Statistic, StatisticName
 from clsplat.schedule import Positive
+from clsplat.settings import variants
 
 
 class Grow(Rule):
@@ -21,12 +22,19 @@ class Grow(Rule):
     statistic: StatisticName = "screen_grad"
     """Column whose mean is compared."""
     gradient_above: Positive = 2.0e-4
-    """Lowest mean of the statistic; by step."""
+    """Lowest mean of the statistic, in its unit; by step."""
     as_many_as: StatisticName | None = None
     """Column in which Gaussians are counted at `gradient_above`; that number sets the threshold of `statistic`."""
 
     opacity: Literal["copied", "shared"] = "copied"
     """`shared`: what one becomes is together as opaque as it was, 1 − (1 − o)^(1/n) each (Rota Bulò et al. 2024)."""
+
+    @model_validator(mode="after")
+    def _with_a_threshold_of_its_unit(self) -> "Grow":
+        name = self.as_many_as or self.statistic
+        if variants(Statistic)[name].of_all_views and "gradient_above" not in self.model_fields_set:
+            raise ValueError(f"'gradient_above' is needed with '{name}', whose unit is another; try 200")
+        return self
 
     @property
     def statistics(self) -> set[str]:

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from clsplat.conformance import reference as ref
 from clsplat.conformance.checks.images import comparison_of, pictures
@@ -141,3 +142,12 @@ def test_few_gaussians(device, count):
     stats = stats_of(device, count, 1.0, [L1()])
     assert len(stats.mean("gain")) == count
     assert rows_of(stats, "gain", 1e-30) == [1, 2][:count]  # the first one is behind the camera
+
+
+def test_a_threshold_for_another_unit_is_not_taken():
+    """The default belongs to the gradient: with it, everything would grow."""
+    for keys in ({"statistic": "gain"}, {"statistic": "screen_grad", "as_many_as": "gain"}):
+        with pytest.raises(ValidationError, match="'gradient_above' is needed with 'gain', whose unit is another"):
+            Clone(**keys)
+        assert Clone(gradient_above=200, **keys).gradient_above == 200
+    assert Clone(statistic="gain", as_many_as="screen_grad").gradient_above == 2e-4
