@@ -22,7 +22,7 @@ BOX = "model.screen_filter=box"
 
 
 def boxed(rng: np.random.Generator, count: int = 50) -> Model:
-    return Model(**splats(rng, count).parameters, rendering=Rendering(0.05, 1 / 12, 1.0, 1.0, "white"))
+    return Model(**splats(rng, count).parameters, rendering=Rendering(0.05, 1 / 12, 1.0, "white", pixel_box=1.0))
 
 
 def test_it_has_no_number_that_could_be_changed():

@@ -51,10 +51,10 @@ class Rendering:
     near: float = NEAR  # scene units; nearer Gaussians are not drawn
     screen_variance: float = VARIANCE  # px², added to every splat
     compensate: float = 0.0  # 1: the opacity falls as that variance spreads a splat out
-    pixel_box: float = 0.0  # 1: splats are integrated over the pixel's box instead; the two numbers are for viewers
     background: Literal["black", "white"] | None = None  # None: what the scene says
     alpha: Literal["transparency", "mask"] = "transparency"  # what the fourth channel of its photographs was
     notes: Mapping[str, Any] = field(default_factory=dict)  # what else the file says
+    pixel_box: float = 0.0  # 1: splats are integrated over the pixel's box instead; the two numbers above are for viewers
 
     @classmethod
     def of(cls, comment: Mapping[str, Any], mode: str) -> "Rendering":
