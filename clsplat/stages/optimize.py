@@ -12,7 +12,6 @@ from pydantic import Field, field_validator
 from clsplat.density.statistics import SplatStats
 from clsplat.errors import Interrupted
 from clsplat.losses.base import ImageLoss, Loss, Penalty, ViewGradients, ViewLosses, require_symmetric
-from clsplat.losses.image import psnr
 from clsplat.metrics.distribution import distribution
 from clsplat.schedule import Points
 from clsplat.settings import OneOf
@@ -20,12 +19,14 @@ from clsplat.stages.base import Scheduled, Stage
 from clsplat.stages.densify import Densify
 from clsplat.training import checkpoint
 from clsplat.training.adam import Adam, Rates, Rows
+from clsplat.training.colours import photograph_colours
 from clsplat.training.forecast import Forecast
 from clsplat.training.profile import stage_milliseconds
-from clsplat.training.rescue import require_finite
+from clsplat.training.rescue import finite_values
 from clsplat.training.run import Progress, Run, Stopped, clocks
 from clsplat.training.skipping import Skip, Visit
 from clsplat.training.trainer import Trainer
+from clsplat.views.colours import Colours
 from clsplat.views.detail import course
 from clsplat.views.sampling import Sampler, ViewSettings
 
@@ -60,6 +61,9 @@ class Optimize(Stage):
     """View, size and photograph of each step."""
     losses: list[OneOf[Loss]]
     """Losses and penalties; training minimises their sum."""
+    colours: OneOf[Colours] | None = None
+    """Colours of each photograph, where exposure or white balance differ: `gain`, `affine`, or `auto`, by what the
+    photographs show; without it, all have those of the scene."""
     skip: Skip | None = None
     """Steps that skip the backward pass, where a view has converged; without it, none."""
     during: list[OneOf[Scheduled]] = Field([])
@@ -120,7 +124,7 @@ class Optimize(Stage):
             view = self._step(run, trainer, sampler)
             run.status.count("steps", run.stage_step, self.steps, step=run.step, steps=last_step)
             report = run.step % self.log_every == 0 or run.stage_step == self.steps or run.interrupted
-            loss, psnr = self._values(run, view, sampler) if report else (0.0, 0.0)
+            loss, psnr = finite_values(run, sampler.at(run.step).view.name, view) if report else (0.0, 0.0)
             seconds.append(run.add_training_time(start))
             if report:
                 self._report(run, forecast, loss, psnr, seconds)
@@ -166,8 +170,9 @@ class Optimize(Stage):
         for stage in self.during:
             stage.attach(run)
         parts = run.rasterizer, run.model, run.adam, run.stats, photographs.background
-        rates = self.rates.settled(views.full_size(run.step - run.stage_step + self.steps))
-        return Trainer(*parts, self.losses, rates, run.scene.extent, run.numbers, self.update)
+        last = run.step - run.stage_step + self.steps
+        rates, colours = self.rates.settled(views.full_size(last)), photograph_colours(self.colours, run, last)
+        return Trainer(*parts, self.losses, rates, run.scene.extent, run.numbers, self.update, colours)
 
     def _act(self, run: Run) -> None:
         """Run the stages that are due and do not edit; those that fail run again when the run goes on."""
@@ -227,11 +232,6 @@ class Optimize(Stage):
         visit = self.skip.visit(sample.view.name, view, run.numbers) if self.skip else Visit()
         stale = set() if run.stage_step == self.steps else stale
         return view if visit.skipped else trainer.backward(view), stale, visit
-
-    def _values(self, run: Run, view: ViewLosses, sampler: Sampler) -> tuple[float, float]:
-        """Read the step's loss and PSNR.  Raises NotFiniteError, with the state set aside, when not finite."""
-        require_finite(run, sampler.at(run.step).view.name, view.loss)
-        return view.loss, psnr(view.comparison)
 
     def _report(self, run: Run, forecast: Forecast, loss: float, psnr: float, seconds: list[float]) -> None:
         count = run.model.gaussians.count
