@@ -42,7 +42,10 @@ def undistort_scene(source: Path, out: Path, long_side: int | None = None, blank
             write_image(image, load_image(pinhole_view))
         views.append(replace(pinhole_view, name=name))
         count.reach(number)
-    write_model(out / "sparse" / "0", views, scene.points)
+    tracks = scene.tracks and replace(
+        scene.tracks, seen={name: scene.tracks.seen[view.name] for view, name in zip(scene.views, names, strict=True)}
+    )
+    write_model(out / "sparse" / "0", views, scene.points, tracks)
     return len(views)
 
 

@@ -13,13 +13,14 @@ from clsplat.density.statistics import SplatStats
 from clsplat.errors import Interrupted
 from clsplat.losses.base import ImageLoss, Loss, Penalty, ViewGradients, ViewLosses, require_symmetric
 from clsplat.metrics.distribution import distribution
+from clsplat.names import VIEW_COLOURS
 from clsplat.schedule import Points
 from clsplat.settings import OneOf
 from clsplat.stages.base import Scheduled, Stage
 from clsplat.stages.densify import Densify
 from clsplat.training import checkpoint
 from clsplat.training.adam import Adam, Rates, Rows
-from clsplat.training.colours import photograph_colours
+from clsplat.training.colours import photograph_colours, write_view_colours
 from clsplat.training.forecast import Forecast
 from clsplat.training.profile import stage_milliseconds
 from clsplat.training.rescue import finite_values
@@ -39,8 +40,7 @@ class Optimize(Stage):
     """Train for a number of steps, one view each (Kerbl et al. 2023).
 
     Stages in `during` that edit the model act between two steps, so that other stages see the model before the edit.
-    No edit follows the last step.  As in the reference, the gradient of a parameter is not applied at the step before
-    its edit.
+    No edit follows the last step.  As in the reference, a parameter is not updated at the step before its edit.
     """
 
     stage: Literal["optimize"] = "optimize"
@@ -62,8 +62,7 @@ class Optimize(Stage):
     losses: list[OneOf[Loss]]
     """Losses and penalties; training minimises their sum."""
     colours: OneOf[Colours] | None = None
-    """Colours of each photograph, where exposure or white balance differ: `gain`, `affine`, or `auto`, by what the
-    photographs show; without it, all have those of the scene."""
+    """Colours of each photograph, where exposures differ: `gain`, `affine`, `auto`; without it, those of the scene."""
     skip: Skip | None = None
     """Steps that skip the backward pass, where a view has converged; without it, none."""
     during: list[OneOf[Scheduled]] = Field([])
@@ -92,7 +91,8 @@ class Optimize(Stage):
             stage.check()
 
     def outputs(self, out: Path) -> list[Path]:
-        return [path for stage in self.during for path in stage.outputs(out)]
+        own = [out / VIEW_COLOURS] if self.colours else []
+        return [*(path for stage in self.during for path in stage.outputs(out)), *own]
 
     def acting(self, step: int) -> list[Scheduled]:
         """Return the stages of `during` that run when the training begins after a global step."""
@@ -111,10 +111,10 @@ class Optimize(Stage):
     def iterate(self, run: Run) -> Iterator[ViewLosses]:
         """Train step by step; what a step yields, ViewGradients unless it is skipped, is valid until the next."""
         views = self._views(run)
-        trainer, sampler = self._trainer(run, views), Sampler(run.scene.split("train"), views, run.seed)
+        last_step = run.step - run.stage_step + self.steps
+        trainer, sampler = self._trainer(run, views, last_step), Sampler(run.scene.split("train"), views, run.seed)
         (memory := run.memory_plan()).check(count := run.model.gaussians.count)
         LOG.info(memory.text(count))
-        last_step = run.step - run.stage_step + self.steps
         forecast = Forecast.of(run.step, last_step, [stage.due for stage in self._density])
         seconds: list[float] = []  # of the steps since the last report
         self._act(run)
@@ -136,6 +136,7 @@ class Optimize(Stage):
                 told = f"saved in {checkpoint.save(run)}; `clsplat resume {run.out}` goes on from it"
                 raise Interrupted(f"stopped at step {run.step}, {told}")
             yield view
+        write_view_colours(run, trainer.colours)
 
     @property
     def statistics(self) -> set[str]:
@@ -159,7 +160,7 @@ class Optimize(Stage):
             LOG.info(course(views.resolution))
         return views
 
-    def _trainer(self, run: Run, views: ViewSettings) -> Trainer:
+    def _trainer(self, run: Run, views: ViewSettings, last: int) -> Trainer:
         """Attach moments, statistics and tables to the run's Gaussians; a resumed run has them."""
         gaussians, photographs = run.model.gaussians, run.photographs
         run.adam = run.adam or Adam(gaussians)
@@ -170,7 +171,6 @@ class Optimize(Stage):
         for stage in self.during:
             stage.attach(run)
         parts = run.rasterizer, run.model, run.adam, run.stats, photographs.background
-        last = run.step - run.stage_step + self.steps
         rates, colours = self.rates.settled(views.full_size(last)), photograph_colours(self.colours, run, last)
         return Trainer(*parts, self.losses, rates, run.scene.extent, run.numbers, self.update, colours)
 

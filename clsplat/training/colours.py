@@ -1,8 +1,17 @@
-"""The colours of the photographs at the beginning of a training."""
+"""The colours of the photographs in a run: where a training begins and ends, and where it is measured."""
 
+import json
+import logging
+from typing import Any
+
+from clsplat.files import write_text
+from clsplat.names import VIEW_COLOURS
 from clsplat.training.run import Run
-from clsplat.views.colours import ColourModel, Colours
-from clsplat.views.photograph_colours import PhotographColours
+from clsplat.views.colours import Auto, ColourModel, Colours
+from clsplat.views.photograph_colours import TABLE, PhotographColours
+
+LOG = logging.getLogger("clsplat")
+GUESSED = 1.0  # dB by which figures in the photographs' colours are better, from which on a warning tells of it
 
 
 def photograph_colours(colours: Colours | None, run: Run, last: int) -> PhotographColours | None:
@@ -10,10 +19,69 @@ def photograph_colours(colours: Colours | None, run: Run, last: int) -> Photogra
 
     The numbers of a run that begins are set; a resumed run has them.
     """
+    if isinstance(colours, Auto):
+        colours = settled(colours, run).in_use
     if not isinstance(colours, ColourModel):
         return None
     views = [view.name for view in run.scene.split("train")]
     found = PhotographColours(colours, views, colours.rate_of(last, len(set(views))))
     if not found.table.begun(run.numbers):
-        found.begin(run.numbers, {})
+        exposures = run.exposures()
+        found.begin(run.numbers, exposures.log_gains)
+        LOG.info("colours of photographs: %s", exposures.text)
     return found
+
+
+def settled(colours: Auto, run: Run) -> Auto:
+    """Return it with the choice that follows from the exposures of a run's photographs; one that is made stays."""
+    if colours.chosen is not None:
+        return colours
+    exposures = run.exposures()
+    if not exposures.log_gains:
+        return colours.choose("off", exposures.text)
+    differ = exposures.spread > colours.above and exposures.explained > colours.explained
+    bounds = f"more than {colours.above:.1%} and {colours.explained:.0%}"
+    return colours.choose("on" if differ else "off", f"{exposures.text}; {'' if differ else 'not '}{bounds}")
+
+
+def colours_of(run: Run) -> ColourModel | None:
+    """Return what photographs have been given in training, or None."""
+    if not any(name.startswith(f"{TABLE}/") for name in run.numbers):
+        return None
+    found = [getattr(stage, "colours", None) for stage in getattr(run.settings, "stages", ())]
+    models = [one.model if isinstance(one, Auto) else one for one in found]
+    return next((model for model in reversed(models) if isinstance(model, ColourModel)), None)
+
+
+def write_view_colours(run: Run, colours: PhotographColours | None) -> None:
+    """Write the numbers of each training photograph, and the matrix that they make, into the run folder; log a line."""
+    if colours is None:
+        return
+    rows = {view: colours.table.row(run.numbers, view) for view in colours.table.views}
+    data: dict[str, Any] = {
+        "meaning": "a colour c of the model, red, green and blue, is min(1, E c + b) in the photograph; "
+        "matrix: the rows of [E | b]",
+        "type": getattr(colours.model, "type", type(colours.model).__name__),
+        "photographs": {
+            view: {
+                **dict(zip(colours.model.columns, map(float, row), strict=True)),
+                "matrix": colours.model.matrix(row).tolist(),
+            }
+            for view, row in rows.items()
+        },
+    }
+    write_text(run.out / VIEW_COLOURS, json.dumps(data, indent=1) + "\n")
+    brightness = [colours.model.matrix(row)[1, 1] for row in rows.values()]
+    LOG.info(
+        "colours of %d photographs in %s: green is multiplied by %.2f to %.2f",
+        *(len(rows), VIEW_COLOURS, min(brightness), max(brightness)),
+    )
+
+
+def tell_of_colours(averages: dict[str, Any]) -> None:
+    """Log the figures of a split in the photographs' colours, where there are any."""
+    if "psnr_colour" not in averages:
+        return
+    LOG.info("in the photographs' colours: PSNR %(psnr_colour).2f dB, affine %(psnr_affine).2f dB", averages)
+    if averages["psnr_colour"] - averages["psnr"] > GUESSED:
+        LOG.warning("exposures of these photographs differ: PSNR, in the colours of the model, is low for that alone")

@@ -23,12 +23,13 @@ from clsplat.opencl.device import Device
 from clsplat.pages.page import scene_name
 from clsplat.render.rasterizer import PIXEL_SUMS, Rasterizer
 from clsplat.scene.identity import Identity
-from clsplat.scene.scene import Scene
+from clsplat.scene.scene import Scene, View
 from clsplat.settings import Settings
 from clsplat.training.adam import Adam
 from clsplat.training.memory import MemoryPlan, plan
 from clsplat.training.records import Records
 from clsplat.training.status import StatusFile
+from clsplat.views.exposures import Exposures, measured
 from clsplat.views.photographs import Photographs
 from clsplat.views.texture import texture_quantile
 
@@ -104,6 +105,7 @@ class Run:
         self._model: DeviceModel | None = None
         self._filter_views: FilterViews | None = None
         self._texture_quantiles: dict[float, float] = {}
+        self._exposures: Exposures | None = None
 
     @property
     def model(self) -> DeviceModel:
@@ -186,6 +188,19 @@ class Run:
     def survey(self) -> Survey:
         """Return the training views for the rules of an edit."""
         return Survey(self.rasterizer, self.model, self.photographs, self.scene.split("train"), self.seed, self.step)
+
+    def exposures(self) -> Exposures:
+        """Return what the training photographs show of their exposures, by the tracks of the dataset; measured once."""
+        if self._exposures is None:
+
+            def read(view: View) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
+                photograph = self.photographs.get(view)
+                return photograph.image(), photograph.counted()
+
+            views = self.scene.split("train")
+            counted = self.status.counted(views, "photographs", len(views))
+            self._exposures = measured(self.scene.tracks, counted, read) if self.scene.tracks else Exposures({}, 0, 0.0)
+        return self._exposures
 
     def texture_quantile(self, share: float) -> float:
         """Return the gradient magnitude, per px, that `share` of the training photographs' pixels stay below."""
