@@ -1,10 +1,16 @@
 """Whole runs in which photographs have colours of their own."""
 
+import json
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from clsplat.pipeline.choices import without_choices
+from clsplat.pipeline.loading import load
+from clsplat.runs.found import has_ended
+from clsplat.runs.single import run_pipeline
 from tests.few_steps import FEW
 from tests.test_training import digest, train
 
@@ -43,3 +49,37 @@ def test_each_visit_counts_for_its_photograph_and_the_mean_stays(tiny_scene, tmp
         assert sum(values) == pytest.approx(0, abs=1e-12)
         assert max(map(abs, values)) > 1e-3
     assert digest(tmp_path / "run") != digest(few_steps)
+
+
+def test_the_table_lies_beside_the_model_and_figures_beside_psnr(with_gains, few_steps):
+    data = json.loads((with_gains / "view_colours.json").read_text())
+    assert data["type"] == "gain"
+    assert len(data["photographs"]) == 8
+    for row in data["photographs"].values():
+        luminance = np.log(np.diag(row["matrix"])) @ [0.299, 0.587, 0.114]
+        assert luminance == pytest.approx(row["exposure"])
+    measured = json.loads((with_gains / "metrics.json").read_text())["test"]["1"]
+    assert {"psnr_colour", "psnr_affine"} < measured.keys()
+    assert "view_colours.json" in json.loads((with_gains / "checksums.json").read_text())
+    assert not (few_steps / "view_colours.json").exists()
+    assert "psnr_colour" not in json.loads((few_steps / "metrics.json").read_text())["test"]["1"]
+
+
+def test_a_choice_is_written_with_its_reason_and_off_leaves_the_bits(tiny_scene, tmp_path, few_steps):
+    """The synthetic scene has points without tracks."""
+    asked = load("smoke", [f"scene.path='{tiny_scene}'", *FEW, "optimize.colours=auto"])
+    run_pipeline(asked, tmp_path / "run", None, "new")
+    found = load(str(tmp_path / "run" / "pipeline.yaml")).settings.training.colours
+    assert found.chosen == "off"
+    assert found.reason == "the dataset does not tell which points its photographs show"
+    assert f"optimize.colours: off, since {found.reason}" in (tmp_path / "run" / "log.txt").read_text()
+    assert digest(tmp_path / "run") == digest(few_steps)
+    assert has_ended(asked, tmp_path / "run"), "the same command finds it up to date"
+
+
+def test_what_a_run_chose_is_no_setting_of_its_pipeline():
+    asked = load("smoke", ["optimize.colours=auto"]).resolved()
+    chosen = load("smoke", ["optimize.colours={type: auto, chosen: on, reason: they differ}"]).resolved()
+    assert asked != chosen
+    assert without_choices(asked) == without_choices(chosen)
+    assert without_choices(asked) != without_choices(load("smoke").resolved())

@@ -24,9 +24,10 @@ def photograph_colours(colours: Colours | None, run: Run, last: int) -> Photogra
     if not isinstance(colours, ColourModel):
         return None
     views = [view.name for view in run.scene.split("train")]
-    found = PhotographColours(colours, views, colours.rate_of(last, len(set(views))))
+    exposures = run.exposures()
+    rate = colours.rate_of(last, len(set(views)), bool(exposures.log_gains))
+    found = PhotographColours(colours, views, rate)
     if not found.table.begun(run.numbers):
-        exposures = run.exposures()
         found.begin(run.numbers, exposures.log_gains)
         LOG.info("colours of photographs: %s", exposures.text)
     return found

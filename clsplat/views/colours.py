@@ -4,6 +4,7 @@ A photograph has its numbers, all 0 where its colours are the scene's.  They mak
 rendered image becomes min(1, E c + b) before every loss (cl_kernels/colours.cl).
 """
 
+import math
 from abc import abstractmethod
 from typing import Annotated, ClassVar, Literal
 
@@ -18,6 +19,7 @@ Floats = NDArray[np.float64]
 LUMINANCE = np.array([0.299, 0.587, 0.114])  # BT.601
 IDENTITY = np.eye(3, 4)
 FEW_VISITS = 400  # of a photograph: with fewer, Adam at 2e-3 cannot reach a gain of 1.5
+MOST = 5e-2  # learning rate
 SPREAD = 0.03  # of the exposures: smaller ones are within what tracks measure
 EXPLAINED = (
     1 / 3
@@ -40,13 +42,20 @@ class ColourModel(Colours):
 
     rate: Annotated[Literal["auto"] | NonNegative, explained(", or auto")] = "auto"
     """Learning rate of the numbers, by Adam, by step; auto: 1e-2 to 1e-3, where each photograph is visited 400 times or
-    more 2e-3 to 2e-5."""
+    more 2e-3 to 2e-5; where no tracks tell the exposures, as large as a gain of 2.7 needs, up to 5e-2."""
 
-    def rate_of(self, steps: int, photographs: int) -> Schedule:
-        """Return the learning rate by step of a training with so many steps and photographs."""
+    def rate_of(self, steps: int, photographs: int, known: bool = True) -> Schedule:
+        """Return the learning rate by step of a training with so many steps and photographs.
+
+        known: whether the numbers begin near those of the photographs.
+        """
         if self.rate != "auto":
             return self.rate
-        initial, final = (1e-2, 1e-3) if steps < FEW_VISITS * photographs else (2e-3, 2e-5)
+        visits = steps / photographs
+        initial, final = (1e-2, 1e-3) if visits < FEW_VISITS else (2e-3, 2e-5)
+        if not known:
+            needed = min(math.log(10) / (0.9 * visits), MOST)  # the sum of rates that fall to a tenth is 1
+            initial, final = max(initial, needed), max(final, needed / 10)
         return Decay(initial=initial, final=final, over=steps)
 
     @abstractmethod
