@@ -71,7 +71,7 @@ def test_a_choice_is_written_with_its_reason_and_off_leaves_the_bits(tiny_scene,
     run_pipeline(asked, tmp_path / "run", None, "new")
     found = load(str(tmp_path / "run" / "pipeline.yaml")).settings.training.colours
     assert found.chosen == "off"
-    assert found.reason == "the dataset does not tell which points its photographs show"
+    assert found.reason == "neither tracks of points nor cameras tell the exposures"
     assert f"optimize.colours: off, since {found.reason}" in (tmp_path / "run" / "log.txt").read_text()
     assert digest(tmp_path / "run") == digest(few_steps)
     assert has_ended(asked, tmp_path / "run"), "the same command finds it up to date"

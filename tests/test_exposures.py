@@ -58,7 +58,6 @@ def test_gains_are_found_again(rng):
     found = wall.measured()
     assert table(found) == pytest.approx(wall.log_gains, abs=2e-3)
     assert found.spread == pytest.approx(np.std(wall.log_gains @ [0.299, 0.587, 0.114]), abs=2e-3)
-    assert found.points == POINTS
     assert found.explained > 0.95
     assert f"exposures of 8 photographs differ by {found.spread:.1%} at 400 points" in found.text
 

@@ -11,7 +11,7 @@ from clsplat.views.colours import Auto, ColourModel, Colours
 from clsplat.views.photograph_colours import TABLE, PhotographColours
 
 LOG = logging.getLogger("clsplat")
-GUESSED = 1.0  # dB by which figures in the photographs' colours are better, from which on a warning tells of it
+GUESSED = 1.0  # dB by which figures in the photographs' colours are better, from which on the log says why
 
 
 def photograph_colours(colours: Colours | None, run: Run, last: int) -> PhotographColours | None:
@@ -83,6 +83,6 @@ def tell_of_colours(averages: dict[str, Any]) -> None:
     """Log the figures of a split in the photographs' colours, where there are any."""
     if "psnr_colour" not in averages:
         return
-    LOG.info("in the photographs' colours: PSNR %(psnr_colour).2f dB, affine %(psnr_affine).2f dB", averages)
-    if averages["psnr_colour"] - averages["psnr"] > GUESSED:
-        LOG.warning("exposures of these photographs differ: PSNR, in the colours of the model, is low for that alone")
+    differ = averages["psnr_colour"] - averages["psnr"] > GUESSED
+    why = "; exposures of these photographs differ, which PSNR counts as errors" if differ else ""
+    LOG.info("in the photographs' colours: PSNR %.2f dB%s", averages["psnr_colour"], why)

@@ -29,7 +29,7 @@ from clsplat.training.adam import Adam
 from clsplat.training.memory import MemoryPlan, plan
 from clsplat.training.records import Records
 from clsplat.training.status import StatusFile
-from clsplat.views.exposures import Exposures, measured
+from clsplat.views.exposures import UNKNOWN, Exposures, measured, noted
 from clsplat.views.photographs import Photographs
 from clsplat.views.texture import texture_quantile
 
@@ -190,7 +190,7 @@ class Run:
         return Survey(self.rasterizer, self.model, self.photographs, self.scene.split("train"), self.seed, self.step)
 
     def exposures(self) -> Exposures:
-        """Return what the training photographs show of their exposures, by the tracks of the dataset; measured once."""
+        """Return what the training photographs show of their exposures, or else what cameras noted; measured once."""
         if self._exposures is None:
 
             def read(view: View) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
@@ -199,7 +199,8 @@ class Run:
 
             views = self.scene.split("train")
             counted = self.status.counted(views, "photographs", len(views))
-            self._exposures = measured(self.scene.tracks, counted, read) if self.scene.tracks else Exposures({}, 0, 0.0)
+            shown = measured(self.scene.tracks, counted, read) if self.scene.tracks else UNKNOWN
+            self._exposures = shown if shown.log_gains else noted(views)
         return self._exposures
 
     def texture_quantile(self, share: float) -> float:

@@ -6,13 +6,15 @@ much as it is in the image, where haze on a dark point is little.  They are foun
 1 / |ln y - e - a|, by conjugate gradients on sums in a fixed order.
 """
 
-from collections.abc import Callable, Iterable
+import math
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.scene.exposures import camera_exposures
 from clsplat.scene.scene import View
 from clsplat.scene.tracks import Tracks
 from clsplat.views.colours import LUMINANCE, Floats
@@ -20,6 +22,7 @@ from clsplat.views.photographs import Mask
 
 DARKEST, BRIGHTEST = 0.05, 0.95  # of values that count: beyond them noise and clipping decide
 SIDE = 3  # px, of the square about a point whose mean is its value
+GAMMA = 2.2  # of the values of images
 FEWEST = 20  # values of a photograph whose exposure is measured
 ROUNDS = 10
 EXACT = 0.01  # of a logarithm: smaller differences weigh no more
@@ -33,8 +36,8 @@ class Exposures:
     """Logarithms of gains by the name of a view, of red, green and blue, [3]; their mean is 0."""
 
     log_gains: dict[str, Floats]
-    points: int  # that photographs share
-    explained: float  # share of the differences between photographs of one point that the gains take away
+    source: str  # in words
+    explained: float = 1.0  # share of the differences between photographs of one point that the gains take away
 
     @property
     def spread(self) -> float:
@@ -43,12 +46,26 @@ class Exposures:
 
     @property
     def text(self) -> str:
-        """What was measured, in words."""
+        """What was found, in words."""
         if not self.log_gains:
-            return "the dataset does not tell which points its photographs show"
-        count = len(self.log_gains)
-        share = f"which is {self.explained:.0%} of the differences between photographs of one point"
-        return f"exposures of {count} photographs differ by {self.spread:.1%} at {self.points:,} points, {share}"
+            return self.source
+        return f"exposures of {len(self.log_gains)} photographs differ by {self.spread:.1%} {self.source}"
+
+
+UNKNOWN = Exposures({}, "neither tracks of points nor cameras tell the exposures")
+
+
+def noted(views: Sequence[View]) -> Exposures:
+    """Return what cameras noted: EV = log2(t ISO / N²), from light to the values of images by a power of 1 / 2.2.
+
+    Tone curves differ from that, so that it is where to begin.
+    """
+    values = {view.name: one.value for view, one in zip(views, camera_exposures(views), strict=True) if one}
+    if not values:
+        return UNKNOWN
+    mean = math.fsum(values.values()) / len(values)
+    gains = {name: np.full(3, math.log(2) * (value - mean) / GAMMA) for name, value in values.items()}
+    return Exposures(gains, "as their cameras noted")
 
 
 def measured(tracks: Tracks, views: Iterable[View], read: Read) -> Exposures:
@@ -74,7 +91,8 @@ def measured(tracks: Tracks, views: Iterable[View], read: Read) -> Exposures:
     known = np.isfinite(log_gains).all(axis=1)
     log_gains -= log_gains[known].mean(axis=0) if known.any() else 0
     explained = float(1 - left[0] / left[1]) if left[1] > 0 else 0.0
-    return Exposures({name: log_gains[i] for i, name in enumerate(by_name) if known[i]}, shared, explained)
+    source = f"at {shared:,} points, which is {explained:.0%} of what differs between photographs of one point"
+    return Exposures({name: log_gains[i] for i, name in enumerate(by_name) if known[i]}, source, explained)
 
 
 def samples(tracks: Tracks, view: View, image: NDArray[np.uint8], mask: Mask | None) -> tuple[Integers, Floats]:
