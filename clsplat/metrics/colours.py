@@ -40,7 +40,7 @@ def in_colours_of(
     left, right = np.s_[:, :middle], np.s_[:, middle:]
     for half, other in ((left, right), (right, left)):
         matrix = model.fitted(image[other][usable[other]], truth[other][usable[other]])
-        changed[half] = np.minimum(image[half] @ matrix[:, :3].T + matrix[:, 3], 1)
+        changed[half] = np.minimum(np.einsum("hwc,ac->hwa", image[half], matrix[:, :3]) + matrix[:, 3], 1)
     return changed
 
 

@@ -142,7 +142,9 @@ class Affine(ColourModel):
         if len(image) == 0:
             return IDENTITY
         with_one = np.column_stack([image, np.ones(len(image))])
-        return np.asarray(np.linalg.lstsq(with_one, photograph, rcond=None)[0].T, np.float64)
+        squares = np.einsum("mi,mj->ij", with_one, with_one)  # no sum depends on threads
+        products = np.einsum("mi,mj->ij", with_one, photograph)
+        return np.asarray(np.linalg.lstsq(squares, products, rcond=None)[0].T, np.float64)
 
 
 class Auto(Colours):

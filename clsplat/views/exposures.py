@@ -99,7 +99,8 @@ def samples(tracks: Tracks, view: View, image: NDArray[np.uint8], mask: Mask | N
     """Return the points that a photograph shows, rows [S], and their values there, [S, 3] in [0, 1]."""
     rows = tracks.seen.get(view.name, np.empty(0, np.int64))
     camera, (height, width) = view.camera, image.shape[:2]
-    x, y, z = (tracks.positions[rows] @ view.world_to_camera[:, :3].T + view.world_to_camera[:, 3]).T
+    turned = np.einsum("ij,nj->in", view.world_to_camera[:, :3], tracks.positions[rows])  # no sum depends on threads
+    x, y, z = turned + view.world_to_camera[:, 3:]
     in_front = z > 0
     depth = np.where(in_front, z, 1)
     places = [camera.fx * x / depth + camera.cx, camera.fy * y / depth + camera.cy]
@@ -107,8 +108,8 @@ def samples(tracks: Tracks, view: View, image: NDArray[np.uint8], mask: Mask | N
     column, row = (np.floor(np.where(inside, place, 0)).astype(np.intp) for place in places)
     if mask is not None:
         inside &= mask[row, column]
-    means = cv2.blur(image.astype(np.float32) / np.float32(255), (SIDE, SIDE))
-    return rows[inside], means[row[inside], column[inside]].astype(np.float64)
+    sums = cv2.boxFilter(image, cv2.CV_32S, (SIDE, SIDE), normalize=False)
+    return rows[inside], sums[row[inside], column[inside]] / (255.0 * SIDE**2)
 
 
 def _fitted(
