@@ -9,9 +9,11 @@ import pytest
 
 from clsplat.pipeline.choices import without_choices
 from clsplat.pipeline.loading import load
+from clsplat.runs import folders, opening
 from clsplat.runs.found import has_ended
 from clsplat.runs.single import run_pipeline
 from tests.few_steps import FEW
+from tests.test_exposures import Wall
 from tests.test_training import digest, train
 
 pytestmark = pytest.mark.slow
@@ -75,6 +77,22 @@ def test_a_choice_is_written_with_its_reason_and_off_leaves_the_bits(tiny_scene,
     assert f"optimize.colours: off, since {found.reason}" in (tmp_path / "run" / "log.txt").read_text()
     assert digest(tmp_path / "run") == digest(few_steps)
     assert has_ended(asked, tmp_path / "run"), "the same command finds it up to date"
+
+
+def test_a_run_chooses_colours_where_exposures_differ_and_begins_with_them(rng, tmp_path):
+    wall = Wall(rng)
+    wall.write(tmp_path / "scene")
+    settings = [f"scene.path='{tmp_path / 'scene'}'", "scene.holdout=0", *FEW, "optimize.colours=auto"]
+    run_pipeline(load("smoke", settings), tmp_path / "run", None, "new")
+    found = load(str(tmp_path / "run" / "pipeline.yaml")).settings.training.colours
+    assert found.chosen == "on"
+    assert "exposures of 8 photographs differ by" in found.reason
+    photographs = json.loads((tmp_path / "run" / "view_colours.json").read_text())["photographs"]
+    gains = np.log([np.diag(photographs[view.name]["matrix"]) for view in wall.views])
+    assert gains == pytest.approx(wall.log_gains, abs=0.06), "twelve steps do not move them far"
+    with folders.opened(tmp_path / "run", "resume", step=0) as status:
+        run = opening.open_run(load(str(tmp_path / "run" / "pipeline.yaml")), tmp_path / "run", None, "resume", status)
+    assert run.settings.training.colours == found, "who goes on takes the choice"
 
 
 def test_what_a_run_chose_is_no_setting_of_its_pipeline():

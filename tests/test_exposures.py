@@ -1,6 +1,7 @@
 """Exposures of photographs, from the pixels in which they show the same points."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -44,6 +45,13 @@ class Wall:
         for (x, y), colour in zip(self.at, self.colours, strict=True):
             image[y : y + 3, x : x + 3] = colour
         return np.rint(np.minimum(image * np.exp(self.log_gains[self.views.index(view)]), 1) * 255).astype(np.uint8)
+
+    def write(self, folder: Path) -> None:
+        """Write a COLMAP scene."""
+        points = PointCloud(self.tracks.positions.astype(np.float32), self.colours.astype(np.float32))
+        write_model(folder / "sparse" / "0", self.views, points, self.tracks)
+        for view in self.views:
+            write_image(folder / "images" / view.name, self.photograph(view))
 
     def measured(self) -> Exposures:
         return measured(self.tracks, self.views, lambda view: (self.photograph(view), None))
@@ -142,10 +150,7 @@ def test_tracks_of_text_are_those_of_its_ids(tmp_path):
 
 def test_tracks_stay_with_undistorted_photographs(rng, tmp_path):
     wall = Wall(rng, photographs=3)
-    points = PointCloud(wall.tracks.positions.astype(np.float32), wall.colours.astype(np.float32))
-    write_model(tmp_path / "scene" / "sparse" / "0", wall.views, points, wall.tracks)
-    for view in wall.views:
-        write_image(tmp_path / "scene" / "images" / view.name, wall.photograph(view))
+    wall.write(tmp_path / "scene")
     assert undistort_scene(tmp_path / "scene", tmp_path / "out", long_side=32) == 3
     scene = read_scene(tmp_path / "out", holdout=0)
     found = measured(scene.tracks, scene.views, lambda view: (load_image(view), None))
