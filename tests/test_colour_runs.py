@@ -7,11 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from clsplat.errors import DataError
 from clsplat.pipeline.choices import without_choices
 from clsplat.pipeline.loading import load
 from clsplat.runs import folders, opening
 from clsplat.runs.found import has_ended
+from clsplat.runs.model_file import evaluate
 from clsplat.runs.single import run_pipeline
+from clsplat.training.colours import colours_beside
 from tests.few_steps import FEW
 from tests.test_exposures import Wall
 from tests.test_training import digest, train
@@ -65,6 +68,17 @@ def test_the_table_lies_beside_the_model_and_figures_beside_psnr(with_gains, few
     assert "view_colours.json" in json.loads((with_gains / "checksums.json").read_text())
     assert not (few_steps / "view_colours.json").exists()
     assert "psnr_colour" not in json.loads((few_steps / "metrics.json").read_text())["test"]["1"]
+
+
+def test_a_run_folder_is_measured_in_the_photographs_colours_too(with_gains, few_steps, tmp_path):
+    measured = json.loads((with_gains / "metrics.json").read_text())["test"]["1"]
+    again = evaluate(with_gains)["test"]["1"]
+    assert again["psnr_colour"] == pytest.approx(measured["psnr_colour"], abs=1e-6)
+    assert "psnr_colour" not in evaluate(few_steps)["test"]["1"]
+    for damage in ("[]", '{"type": "lens"}'):
+        (tmp_path / "view_colours.json").write_text(damage)
+        with pytest.raises(DataError, match=r"the type of colours is .* expected one of \w+, \w+"):
+            colours_beside(tmp_path / "point_cloud.ply")
 
 
 def test_a_choice_is_written_with_its_reason_and_off_leaves_the_bits(tiny_scene, tmp_path, few_steps):

@@ -2,10 +2,14 @@
 
 import json
 import logging
+from pathlib import Path
 from typing import Any
 
+from clsplat.errors import DataError, quoted
 from clsplat.files import write_text
 from clsplat.names import VIEW_COLOURS
+from clsplat.reading import read_json
+from clsplat.settings import variants
 from clsplat.training.run import Run
 from clsplat.views.colours import Auto, ColourModel, Colours
 from clsplat.views.photograph_colours import TABLE, PhotographColours
@@ -77,6 +81,22 @@ def write_view_colours(run: Run, colours: PhotographColours | None) -> None:
         "colours of %d photographs in %s: green is multiplied by %.2f to %.2f",
         *(len(rows), VIEW_COLOURS, min(brightness), max(brightness)),
     )
+
+
+def colours_beside(model: Path) -> ColourModel | None:
+    """Return what photographs were given where a model was trained, by the table beside its file; None without one.
+
+    Raises DataError where the table is damaged.
+    """
+    path = model.with_name(VIEW_COLOURS)
+    if not path.is_file():
+        return None
+    data, known = read_json(path, "colours of photographs"), variants(ColourModel)
+    name = data.get("type") if isinstance(data, dict) else None
+    if not isinstance(name, str) or name not in known:
+        names = ", ".join(known)
+        raise DataError(f"{path}: the type of colours is {quoted(name)}; expected one of {names}: write it again")
+    return known[name]()
 
 
 def tell_of_colours(averages: dict[str, Any]) -> None:
