@@ -1,12 +1,12 @@
-/* Rows that share one vector: each gets the weighted mean of the members of its cluster.
+/* Rows that share one vector: each gets the weighted mean of the rows of its cluster.
  *
- * x_i <- x_0 + sum_j w_j (x_j - x_0) / sum_j w_j over the members j of its cluster, of which x_0 is the first: rows that
- * are equal stay as they are, to the bit.  Where all weights are zero it is x_0.
+ * x_i <- x_0 + sum_j w_j (x_j - x_0) / sum_j w_j over the members j of its cluster, of which x_0 is the first: rows
+ * that are equal stay as they are, to the bit.  Where all weights are zero it is x_0.
  *
- * One item = one cluster of one plane; dimension 1 is the plane.  No local memory.  Deterministic: the members are
- * summed in the order of their rows, and each value has one writer. */
+ * No local memory.  Deterministic: the members are summed in the order of their rows, and each value has one writer. */
 #include "common.h"
 
+/* Share the mean.  One item = one cluster of one plane; dimension 1 is the plane. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void share_mean(
     __global float *restrict values,        // [components,S]
