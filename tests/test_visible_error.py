@@ -40,7 +40,9 @@ def test_the_form_is_the_error_that_the_views_show(seen, rng, coefficients):
     forms = (found.gradient(errors) * errors).sum(axis=1)
     everywhere = UNSEEN / (4 * np.pi) * (found.weights + FAINT * found.weights.mean())
     expected = [shown(seen, i, errors[i]) for i in range(59)]
-    np.testing.assert_allclose((forms - everywhere * np.square(errors).sum(axis=1))[:59], expected, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(
+        (forms - everywhere * np.square(errors).sum(axis=1))[:59], expected, rtol=1e-6, atol=1e-9
+    )
     assert forms[59] > 0, "a Gaussian that no view shows has a form"
 
 

@@ -31,7 +31,9 @@ class VisibleError:
     form: Floats  # [N,K(K+1)/2] upper triangle of A, plus the share of all directions
 
     @classmethod
-    def of(cls, looks: Iterable[tuple[Look, NDArray[np.floating]]], means: NDArray[np.floating], coefficients: int) -> "VisibleError":
+    def of(
+        cls, looks: Iterable[tuple[Look, NDArray[np.floating]]], means: NDArray[np.floating], coefficients: int
+    ) -> "VisibleError":
         """Sum over views, each with the centre of its camera, [3].  means: [N,3] scene units."""
         i, j = np.triu_indices(coefficients)
         weights, first = np.zeros(len(means)), np.zeros((coefficients, len(means)))
