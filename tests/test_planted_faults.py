@@ -28,6 +28,7 @@ FAULTS = {  # kernel -> file, text, wrong text
     "sum_members": ("clusters.cl", "components + k, (int)p)", "components + k, (int)p / 2)"),
     "colours_forward": ("colours.cl", "br * r + bg * g + bb * b + b1, one", "br * r + bg * g + bb * b, one"),
     "colours_backward": ("colours.cl", "rg * passed_r + gg * passed_g", "rg * passed_r + gr * passed_g"),
+    "share_mean": ("members.cl", "start + sum / total", "sum / total"),
     "count_not_finite": ("check.cl", "<= FLT_MAX", "<= INFINITY"),
     "count_seen": ("density.cl", "seen[i] += 1.0f", "seen[i] += 1.001f"),
     "accumulate_norm": ("density.cl", "sqrt(x * x + y * y)", "sqrt(x * x - y * y * 0.5f)"),
