@@ -14,19 +14,14 @@ from clsplat.training.run import Run
 
 def training_charts(run: Run) -> list[Markup]:
     """Draw PSNR, loss, Gaussians and times over the steps."""
-    train, tests = run.records.read("train"), run.records.read("evaluate")
+    train = run.records.read("train")
     psnr = list(zip([r["step"] for r in train], over_views([r["psnr"] for r in train]), strict=True))
     line = {key: [(r["step"], r[key]) for r in train] for key in ("loss", "gaussians", "ms")}
-    measured = [
-        Line(
-            [(r["step"], r["psnr"]) for r in tests if r["split"] == split and r["downscale"] == run.downscale],
-            f"{split} views",
-        )
-        for split in ("test", "train")
-    ]
+    trial = _measured(run, trial=True)
     return charts(
         [
-            curve("PSNR, dB", [Line(psnr, f"training views, mean of the last {VIEWS}"), *measured]),
+            curve("PSNR, dB", [Line(psnr, f"training views, mean of the last {VIEWS}"), *_measured(run)]),
+            *([curve("PSNR before validation views were trained on, dB", trial)] if trial else []),
             curve("loss", [Line(line["loss"])], logarithmic=True),
             curve("Gaussians", [Line(line["gaussians"])]),
             curve("milliseconds per step", [Line(line["ms"])]),
@@ -34,6 +29,17 @@ def training_charts(run: Run) -> list[Markup]:
         if train
         else []
     )
+
+
+def _measured(run: Run, trial: bool = False) -> list[Line]:
+    """PSNR of each split over the steps whose model was measured, by the last measurement of each; `trial`: before a
+    refit."""
+    names = {"test": "test views", "validation": "validation views", "train": "training views"}
+    points: dict[str, dict[int, float]] = {split: {} for split in names}
+    for line in run.records.read("evaluate", trial):
+        if line["downscale"] == run.downscale:
+            points[line["split"]][line["step"]] = line["psnr"]
+    return [Line(sorted(one.items()), names[split]) for split, one in points.items() if one]
 
 
 def gaussians_charts(run: Run) -> list[Markup]:

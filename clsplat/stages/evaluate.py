@@ -101,12 +101,12 @@ class Evaluate(Scheduled):
             if not results:
                 continue
             for result in results:
-                run.records.add(run.step, "view", split=self.split, downscale=downscale, **result.line())
+                run.records.add(run.model_step, "view", split=self.split, downscale=downscale, **result.line())
             averages = mean(results, perceptual)
-            run.records.add(run.step, "evaluate", split=self.split, downscale=downscale, **averages)
+            run.records.add(run.model_step, "evaluate", split=self.split, downscale=downscale, **averages)
             run.metrics.setdefault(self.split, {})[f"{downscale:g}"] = averages
             LOG.info(
                 "step %d  %s%s views at 1/%g: PSNR %.2f dB  SSIM %.4f  (%s)",
-                *(run.step, f"{self.file}, " if self.file else "", self.split, downscale),
+                *(run.model_step, f"{self.file}, " if self.file else "", self.split, downscale),
                 *(averages["psnr"], averages["ssim"], amount(len(results), "view")),
             )
