@@ -41,9 +41,11 @@ for name in sys.argv[3:]:
 """
 
 
-def short(name: str, scene: Path) -> Pipeline:
+def short(name: str, scene: Path, *overrides: str) -> Pipeline:
     """A recipe in STEPS steps, with edits every 4, without pictures and pages."""
-    pipeline = load(name, [f"scene.path='{scene}'", "init.opacity=0.3"])  # faint ones have no time to become opaque
+    pipeline = load(
+        name, [f"scene.path='{scene}'", "init.opacity=0.3", *overrides]
+    )  # faint ones have no time to become opaque
     settings = stretched(pipeline.settings, STEPS / pipeline.settings.training.steps)
     pairs = zip(pipeline.stages, settings.stages, strict=True)
     stages = [often(old, stage) if isinstance(stage, Optimize) else stage for old, stage in pairs]

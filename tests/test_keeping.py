@@ -49,7 +49,7 @@ stages:
 """
 PATIENT = ("optimize.patience=3",)
 REFIT = (*PATIENT, "optimize.refit=true")
-TIMES = {"ms", "stages", "train_seconds", "seconds", "scene"}
+TIMES = {"ms", "stages", "train_seconds", "cpu_seconds", "device_memory", "seconds", "scene"}
 
 
 @pytest.fixture(scope="module")

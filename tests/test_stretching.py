@@ -8,7 +8,7 @@ import pytest
 from clsplat.pipeline.file import PipelineFile
 from clsplat.pipeline.files import shipped
 from clsplat.pipeline.loading import Pipeline, load
-from clsplat.pipeline.stretching import stretched, with_steps
+from clsplat.pipeline.stretching import in_steps, stretched, with_steps
 from clsplat.settings import Settings
 from clsplat.stages.optimize import Optimize
 from tests.test_pipeline import flat
@@ -63,6 +63,18 @@ def test_what_ends_acts_as_often(name, factor):
             for stage, training in ((before, old), (after, new))
         ]
         assert counts[0] == counts[1], before
+
+
+def test_what_acts_at_each_step_ends_at_the_same_share_of_the_training():
+    new = in_steps(load("mcmc_7k").settings, 2000).training
+    (noise,) = [stage for stage in new.during if stage.stage == "add_noise"]
+    assert (noise.every, noise.stop) == (1, 5000 * 2000 // 7000)
+
+
+@pytest.mark.parametrize("steps", [1, 999, 2000, 3500, 7001])
+@pytest.mark.parametrize("name", TRAINING)
+def test_a_recipe_has_the_steps_that_were_asked_for(name, steps):
+    assert in_steps(load(name).settings, steps).training.steps == steps
 
 
 @pytest.mark.parametrize("factor", [0.01, 0.13, 0.5, 1.0, 3.7])

@@ -6,6 +6,7 @@ updates, such as a filter that is learned, does not change.
 
 import math
 from collections.abc import Callable
+from fractions import Fraction
 from typing import Any, TypeVar
 
 from clsplat.pipeline.file import PipelineFile
@@ -29,6 +30,11 @@ def with_steps(settings: PipelineFile, steps: int, done: int) -> PipelineFile:
     return of_trainings(settings, changed)
 
 
+def in_steps(settings: PipelineFile, steps: int) -> PipelineFile:
+    """Return settings stretched so that the first training has so many steps.  Raises ConfigError when none trains."""
+    return stretched(settings, Fraction(steps, settings.training.steps))
+
+
 def _moved(stage: Scheduled, done: int, left: float) -> Scheduled:
     if stage.start <= done:
         return stage
@@ -42,12 +48,12 @@ def of_trainings(settings: PipelineFile, changed: Callable[[Optimize], Optimize]
     return settings.model_copy(update={"stages": stages})
 
 
-def stretched(value: Value, factor: float) -> Value:
+def stretched(value: Value, factor: float | Fraction) -> Value:
     """Return settings for `factor` times as many steps; each class names in `step_keys` what that changes."""
     return _stretched(value, factor)  # type: ignore[no-any-return]
 
 
-def _stretched(value: Any, factor: float) -> Any:
+def _stretched(value: Any, factor: float | Fraction) -> Any:
     if isinstance(value, list):
         is_points = bool(value) and all(isinstance(item, list) for item in value)
         return _points(value, factor) if is_points else [_stretched(item, factor) for item in value]
@@ -63,13 +69,13 @@ def _stretched(value: Any, factor: float) -> Any:
     return value.model_copy(update={name: new for name, new in changed.items() if new is not fields[name]})
 
 
-def _steps(name: str, steps: Any, factor: float, every: Any = None) -> Any:
+def _steps(name: str, steps: Any, factor: float | Fraction, every: Any = None) -> Any:
     """A number of steps; one that begins or ends what acts at multiples of `every` does so at the same of them."""
     if not isinstance(steps, int) or steps == 0:
         return steps
     if name == "every":
         return _cadence(steps, factor)
-    if name not in ("start", "stop") or not isinstance(every, int):
+    if name not in ("start", "stop") or not isinstance(every, int) or every == 1:
         return max(1, min(math.floor(steps * factor), MOST))
     after = name == "stop"  # what acts at a step before it is what acts up to the step before it
     number, rest = divmod(steps - after, every)
@@ -77,11 +83,11 @@ def _steps(name: str, steps: Any, factor: float, every: Any = None) -> Any:
     return min(number * cadence + min(math.floor(rest * factor), cadence - 1) + after, MOST)
 
 
-def _cadence(every: int, factor: float) -> int:
+def _cadence(every: int, factor: float | Fraction) -> int:
     """What acts at each step acts at each."""
     return every if every == 1 else max(1, math.floor(every * factor))
 
 
-def _points(points: list[list[float]], factor: float) -> list[list[float]]:
+def _points(points: list[list[float]], factor: float | Fraction) -> list[list[float]]:
     """Points of a schedule; of two that fall together the later one stays."""
     return [list(point) for point in {math.floor(step * factor): value for step, value in points}.items()]

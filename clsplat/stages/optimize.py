@@ -1,7 +1,6 @@
 """The training loop: render, compare, differentiate, update."""
 
 import logging
-import time
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -23,7 +22,7 @@ from clsplat.training import checkpoint
 from clsplat.training.adam import Adam, Rates, Rows
 from clsplat.training.forecast import Forecast
 from clsplat.training.rescue import require_finite
-from clsplat.training.run import Run, Stopped
+from clsplat.training.run import Run, Stopped, clocks
 from clsplat.training.skipping import Skip, Visit
 from clsplat.training.trainer import Trainer
 from clsplat.views.detail import course
@@ -118,14 +117,13 @@ class Optimize(Keeping):
         seconds: list[float] = []  # of the steps since the last report
         self._act(run)
         while not self.has_ended(run):
-            start = time.perf_counter()
+            start = clocks()
             self._edit(run, views)
             view = self._step(run, trainer, sampler)
             run.status.count("steps", run.stage_step, self.steps, step=run.step, steps=last_step)
             is_reported = run.step % self.log_every == 0 or run.stage_step == self.steps or run.interrupted
             loss, psnr = self._values(run, view, sampler) if is_reported else (0.0, 0.0)
-            seconds.append(time.perf_counter() - start)
-            run.train_seconds += seconds[-1]
+            seconds.append(run.add_training_time(start))
             if is_reported:
                 if self.skip and run.step == last_step:
                     self.skip.tell(run)

@@ -19,7 +19,8 @@ def report(
     """
     count, (loss, psnr) = run.model.gaussians.count, values
     stages, ms = stage_milliseconds(run.device.timings), 1e3 * median(seconds)  # the first step may load much
-    run.records.add(run.step, "train", loss=loss, psnr=psnr, gaussians=count, ms=ms, stages=stages)
+    cost = {"ms": ms, "cpu_seconds": round(run.cpu_seconds, 3), "stages": stages}
+    run.records.add(run.step, "train", loss=loss, psnr=psnr, gaussians=count, **cost)
     if run.step % distribution_every == 0 or run.step == forecast.last_step:
         run.records.add(run.step, "distribution", gaussians=count, **distribution(run.model.gaussians))
     run.records.write()

@@ -168,6 +168,7 @@ def _write(run: Run, kind: str) -> Path:
         numbers=run.numbers,
         best=run.best,
         train_seconds=run.train_seconds,
+        cpu_seconds=run.cpu_seconds,
         metrics=run.metrics,
         records=run.records.lines,
         written=run.written,
@@ -223,11 +224,11 @@ def _restore(run: Run, state: State, tables: Arrays) -> None:
             gaussians.add(name, table.shape[1], zero_fresh=name in state.zero_fresh)
         gaussians.set(name, table)
     run.step, run.cursor, run.stage_step = state.step, state.cursor, state.stage_step
-    run.acted, run.edited, run.whole = state.acted, state.edited, True
+    run.acted, run.edited, run.whole, run.numbers = state.acted, state.edited, True, state.numbers
     run.best = state.best
     if run.is_refit:
         run.train_on_all()
-    run.numbers, run.train_seconds, run.metrics = state.numbers, state.train_seconds, state.metrics
+    run.train_seconds, run.cpu_seconds, run.metrics = state.train_seconds, state.cpu_seconds, state.metrics
     run.records.lines, run.inputs_before, run.written = state.records, state.inputs, state.written
 
 
