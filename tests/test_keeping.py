@@ -13,6 +13,7 @@ from clsplat.errors import ConfigError, DataError
 from clsplat.formats.splats import PARAMETERS
 from clsplat.formats.table import read as read_ply
 from clsplat.pipeline.loading import load
+from clsplat.report.charts import NAMES
 from clsplat.report.parting import parting
 from clsplat.runs.experiment import Job
 from clsplat.runs.summary import summary
@@ -119,7 +120,7 @@ def test_its_metrics_are_those_of_that_model(best):
 
 def test_its_page_shows_the_three_splits_and_the_best_step(best):
     page = (best / "report.html").read_text()
-    for text in ("validation views", "training views", "test views", f"is that of step {BEST}, whose model is kept"):
+    for text in (*NAMES.values(), f"the model of step {BEST} is the best", "That model is kept"):
         assert text in page
 
 
@@ -180,7 +181,7 @@ def test_a_refit_has_the_bits_of_a_run_of_so_many_steps_without_validation(tiny_
     assert psnr_of(refit, "validation", "trial.jsonl") == {
         step: psnr for step, psnr in psnr_of(best, "validation").items() if step <= BEST + 12
     }
-    assert "all training photographs, those too, were trained on again" in (refit / "report.html").read_text()
+    assert f"All training photographs are then trained on for {BEST} steps" in (refit / "report.html").read_text()
 
 
 @pytest.mark.parametrize("names", ["step_000006", "step_000024", "refit_000002", "refit_000012"])
@@ -304,7 +305,7 @@ def test_a_checkpoint_without_its_best_model_is_damaged(best):
     ("train_", "validation", "expected"),
     [
         (26.0, 20.0, "At step 8 the model has 26.0 dB at training views and 20.0 dB at validation views."),
-        (26.1, 20.0, "20.0 dB at validation views, more than 6 dB less: it has learnt its photographs by heart."),
+        (26.1, 20.0, "20.0 dB at validation views, more than 6 dB apart: the photographs are learnt by heart."),
     ],
 )
 def test_six_decibels_apart_are_learnt_by_heart(train_, validation, expected):
@@ -318,5 +319,5 @@ def test_a_run_without_validation_is_told_when_it_has_learnt_by_heart(tiny_scene
     run.records.add(8, "evaluate", split="train", downscale=1, psnr=40.0, ssim=1.0)
     run.records.write()
     assert "40.0 dB at training views" in parting(run)
-    assert "dB at test views, more than 6 dB less: it has learnt its photographs by heart" in parting(run)
+    assert "dB at test views, more than 6 dB apart: the photographs are learnt by heart" in parting(run)
     assert "`scene.validation: auto` with `optimize.keep: best`" in parting(run)

@@ -47,4 +47,5 @@ def _lines(folder: Path, metrics: dict[str, Any]) -> Iterator[str]:
         yield f"  time     {', '.join(told)}"
     page = next((files[stage] for stage in ("report", "viewer") if stage in files and files[stage].exists()), None)
     if page:
-        yield f"next: open {page} in a browser; `clsplat resume {folder} --steps {2 * metrics['steps']}` trains longer"
+        longer = f"; `clsplat resume {folder} --steps {2 * metrics['steps']}` trains longer"
+        yield f"next: open {page} in a browser{'' if kept and kept['refit'] else longer}"

@@ -81,6 +81,10 @@ def _figures(run: Run) -> dict[str, str]:
             suffix = "" if downscale == f"{run.downscale:g}" else f" at 1/{downscale}"
             values[f"{split} PSNR{suffix} ({amount(averages['views'], 'view')})"] = f"{averages['psnr']:.2f} dB"
             values[f"{split} SSIM{suffix}"] = f"{averages['ssim']:.4f}"
+    if run.is_refit and run.best:
+        found = run.best.found
+        values["validation PSNR before the refit"] = f"{found.validation:.2f} dB"
+        values["training PSNR before the refit"] = f"{found.train:.2f} dB"
     values["Gaussians"] = f"{run.model.gaussians.count:,}"
     values["steps"] = f"{run.step:,}"
     values["training"] = duration(run.train_seconds)

@@ -30,12 +30,15 @@ class Measured(BaseModel):
         """Whether the model has learnt its photographs by heart."""
         return self.train - self.validation > APART
 
-    def told(self, views: str, apart: "Measured | None" = None) -> str:
-        """Return it in words; views: what it calls those that were not trained on.  apart: the first that was."""
-        text = f"At step {self.step:,} the model has {self.train:.1f} dB at training views and {self.validation:.1f} dB"
-        since = f" since step {apart.step:,}" if apart and apart.step < self.step else ""
-        heart = f", more than {APART:g} dB less{since}: it has learnt its photographs by heart" if self.is_apart else ""
-        return f"{text} at {views} views{heart}."
+    def told(self, views: str) -> str:
+        """Return it in words; views: what it calls those that were not trained on."""
+        figures = f"{self.train:.1f} dB at training views and {self.validation:.1f} dB at {views} views"
+        return f"At step {self.step:,} the model has {figures}{self.heart()}."
+
+    def heart(self, first: "Measured | None" = None) -> str:
+        """Return how far apart they are, in words; "" where that is little.  first: the first model that had more."""
+        since = f" since step {first.step:,}" if first and first.step < self.step else ""
+        return f", more than {APART:g} dB apart{since}: the photographs are learnt by heart" if self.is_apart else ""
 
 
 class Best(BaseModel):
@@ -74,12 +77,15 @@ class Best(BaseModel):
 
     def told(self) -> str:
         """Return what happened, in words."""
-        end = f"The best PSNR at validation views, {self.found.validation:.2f} dB, is that of step {self.found.step:,}"
+        found, last = self.found, self.last
+        both = f"{found.train:.1f} dB at training views and {found.validation:.1f} dB at validation views"
+        text = f"By the validation views the model of step {found.step:,} is the best: {both}{found.heart()}."
+        if last.step != found.step:
+            apart = last.heart(self.apart)
+            text += f" At step {last.step:,} it is {last.train:.1f} and {last.validation:.1f} dB{apart}."
         if self.refit != "none":
-            end += ": all training photographs, those too, were trained on again for so many steps"
-        elif self.taken is not None:
-            end += ", whose model is kept"
-        return f"{self.last.told('validation', self.apart)} {end}."
+            return f"{text} All training photographs are then trained on for {found.step:,} steps."
+        return f"{text} That model is kept." if self.taken is not None else text
 
 
 def tables_of(model: DeviceModel) -> Tables:
