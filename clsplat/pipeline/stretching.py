@@ -1,7 +1,7 @@
 """A pipeline in another number of steps: places, lengths and cadences of its training are multiplied.
 
-So each edit that has an end is made as often, at about the same share of the training.  What follows from the number of
-updates, such as a filter that is learned, does not change.
+So each edit that has an end is made as often, at about the same share of the training.  What is learned in so many
+updates, such as a filter, has a rate that falls as much as their number grows.
 """
 
 import math
@@ -10,8 +10,10 @@ from fractions import Fraction
 from typing import Any, TypeVar
 
 from clsplat.pipeline.file import PipelineFile
+from clsplat.schedule import divided
 from clsplat.settings import Settings
 from clsplat.stages.base import Scheduled
+from clsplat.stages.densify import Densify
 from clsplat.stages.optimize import Optimize
 
 Value = TypeVar("Value")
@@ -30,6 +32,15 @@ def with_steps(settings: PipelineFile, steps: int, done: int) -> PipelineFile:
     return of_trainings(settings, changed)
 
 
+def last_edit(training: Optimize) -> int:
+    """Return the step up to which Gaussians grow and the photographs' size changes; 0 where that is not said.
+
+    One that is cut before would end with small photographs, or before its last pruning.
+    """
+    stops = [stage.stop for stage in training.during if isinstance(stage, Densify) and stage.stop is not None]
+    return max([*stops, int(training.views.last_change)])
+
+
 def in_steps(settings: PipelineFile, steps: int) -> PipelineFile:
     """Return settings stretched so that the first training has so many steps.  Raises ConfigError when none trains."""
     return stretched(settings, Fraction(steps, settings.training.steps))
@@ -38,8 +49,11 @@ def in_steps(settings: PipelineFile, steps: int) -> PipelineFile:
 def _moved(stage: Scheduled, done: int, left: float) -> Scheduled:
     if stage.start <= done:
         return stage
-    every, start = max(1, math.floor((stage.every or 1) * left)), done + math.floor((stage.start - done) * left)
-    return stage.model_copy(update={"every": every, "start": start})
+    every = max(1, math.floor((stage.every or 1) * left))
+    start, stop = (
+        place if place is None else done + math.floor((place - done) * left) for place in (stage.start, stage.stop)
+    )
+    return stage.model_copy(update={"every": every, "start": start, "stop": stop})
 
 
 def of_trainings(settings: PipelineFile, changed: Callable[[Optimize], Optimize]) -> PipelineFile:
@@ -66,6 +80,7 @@ def _stretched(value: Any, factor: float | Fraction) -> Any:
         name: _steps(name, field, factor, every) if name in keys else _stretched(field, factor)
         for name, field in fields.items()
     }
+    changed |= {name: divided(changed[name], float(factor)) for name in type(value).rate_keys if factor != 1}
     return value.model_copy(update={name: new for name, new in changed.items() if new is not fields[name]})
 
 
