@@ -7,6 +7,7 @@ from pathlib import PureWindowsPath
 PIPELINE = "pipeline.yaml"
 METRICS = "metrics.json"
 RECORDS = "metrics.jsonl"
+TRIAL = "trial.jsonl"
 STATUS = "status.json"
 LOG_FILE = "log.txt"
 NOTE = "prepared.json"
@@ -20,12 +21,12 @@ COMPARISON = "compare.html"
 VIEW_COLOURS = "view_colours.json"
 RESERVED = frozenset(
     {
-        *(PIPELINE, METRICS, RECORDS, STATUS, LOG_FILE, NOTE, INPUTS, CHECKSUMS, LOCK),
+        *(PIPELINE, METRICS, RECORDS, TRIAL, STATUS, LOG_FILE, NOTE, INPUTS, CHECKSUMS, LOCK),
         *(CHECKPOINTS, UNDISTORTED, PREPARED, COMPARISON, "cameras.json", VIEW_COLOURS),
     }
 )
 BEFORE_A_RUN = frozenset({STATUS, LOG_FILE, LOCK, UNDISTORTED})  # written before pipeline.yaml
-OF_A_RUN = BEFORE_A_RUN | {PIPELINE, METRICS, RECORDS, NOTE, INPUTS, CHECKSUMS, CHECKPOINTS}
+OF_A_RUN = BEFORE_A_RUN | {PIPELINE, METRICS, RECORDS, TRIAL, NOTE, INPUTS, CHECKSUMS, CHECKPOINTS}
 OF_A_MATRIX = frozenset({STATUS, LOCK, PIPELINE, COMPARISON})
 END_STATES = ("done", "failed", "interrupted")  # of status.json
 SILENT = 60  # seconds without a heartbeat there after which a run may have ended

@@ -63,7 +63,7 @@ def test_the_psnr_of_the_report_is_that_of_the_terminal():
         seen.append(forecast.psnr)
     assert over_views(psnrs) == pytest.approx(seen)
     train = [{"step": i, "psnr": psnr, "loss": 0.1, "gaussians": 9, "ms": 1.0} for i, psnr in enumerate(psnrs, 1)]
-    records = SimpleNamespace(read=lambda kind: train if kind == "train" else [
+    records = SimpleNamespace(read=lambda kind, trial=False: [] if trial else train if kind == "train" else [
         {"step": step, "split": "test", "downscale": 1.0, "psnr": psnr} for step, psnr in ((1, 20.0), (7, 31.0))
     ])  # fmt: skip
     chart = str(training_charts(SimpleNamespace(records=records, downscale=1.0))[0])

@@ -14,6 +14,7 @@ from clsplat.runs import folders, opening
 from clsplat.runs.found import has_ended
 from clsplat.runs.model_file import evaluate
 from clsplat.runs.single import run_pipeline
+from clsplat.training import checkpoint
 from clsplat.training.colours import colours_beside
 from tests.few_steps import FEW
 from tests.test_exposures import Wall
@@ -79,6 +80,22 @@ def test_a_run_folder_is_measured_in_the_photographs_colours_too(with_gains, few
         (tmp_path / "view_colours.json").write_text(damage)
         with pytest.raises(DataError, match=r"the type of colours is .* expected one of \w+, \w+"):
             colours_beside(tmp_path / "point_cloud.ply")
+
+
+def test_the_best_model_is_left_with_the_colours_of_its_step(tiny_scene, tmp_path):
+    wild = "optimize.colours={type: gain, rate: {points: [[0, 0.01], [9, 3.0]], between: steps}}"
+    kept = (
+        "scene.validation=2",
+        "optimize.keep=best",
+        "optimize.evaluate.split=validation",
+        "optimize.evaluate.every=4",
+    )
+    run = train(tiny_scene, tmp_path / "run", *FEW, *kept, wild)
+    assert run.best.found.step == 8, "the last steps ruin it"
+    then, _ = checkpoint.load(tmp_path / "run" / "checkpoints" / "step_000008.npz")
+    assert {name: run.numbers[name] for name in then.numbers} == then.numbers
+    (row, *_) = json.loads((tmp_path / "run" / "view_colours.json").read_text())["photographs"].items()
+    assert row[1]["exposure"] == then.numbers[f"colours/{row[0]}/exposure"]
 
 
 def test_a_choice_is_written_with_its_reason_and_off_leaves_the_bits(tiny_scene, tmp_path, few_steps):

@@ -19,7 +19,7 @@ from clsplat.training.run import Run
 READ = {  # text that is read, or compared, and never the name of something that is written
     "SceneSettings.path", "Init.file", "Evaluate.file", "Evaluate.lpips", "Matrix.pipelines", "Matrix.scenes",
     "Matrix.set", "Matrix.options", "PipelineFile.plugins", "Snapshot.view", "Snapshot.size", "Timelapse.folder",
-    "Video.path", "Video.size",
+    "Video.path", "Video.size", "Choice.names", "Choice.file",
 }  # fmt: skip
 NAMES = {"PipelineFile.name", "MatrixFile.name"}  # of folders
 OUTSIDE = [
@@ -30,7 +30,7 @@ OUTSIDE = [
     "con", "NUL", "a/Aux.png", "com1", "LPT9.x", "COM¹", "CONOUT$", "a.", "a ", "a/b. /c", "CHECKP~1",
     "a:b", "a*", "a?", "a|b", "a<b", 'a"b', ".hidden", "a/.git/hooks", "checkpoints", "Checkpoints/x", "CHECKPOINTS",
     "undistorted", "prepared", "status.json", "status.json/x", "Pipeline.YAML", "metrics.json", "metrics.jsonl",
-    "log.txt", "LOG.TXT", "run.lock", "inputs.json", "checksums.json", "prepared.json",
+    "trial.jsonl", "log.txt", "LOG.TXT", "run.lock", "inputs.json", "checksums.json", "prepared.json",
 ]  # fmt: skip
 INSIDE = ["renders", "a/b", "a b", "a.b", "réndérs", "x" * 180, "console", "a~b", "status", "b/status.json", "a..b"]
 

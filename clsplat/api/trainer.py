@@ -86,7 +86,7 @@ class Trainer:
         place = [f"scene.path={as_setting(folder)}"] if folder.is_dir() else []
         self.pipeline = load(str(pipeline), [*place, *overrides(set or {})])
         _check(self.pipeline)
-        self.scene = scene if isinstance(scene, Scene) else read_scene(folder, self.pipeline.settings.scene.holdout)
+        self.scene = scene if isinstance(scene, Scene) else read_scene(folder, self.pipeline.settings.scene.split)
         if without := [view.name for view in self.scene.split("train") if view.image_path == NO_FILE]:
             raise DataError(f"{self.scene.path}: the view '{without[0]}' has no photograph; training needs one of each")
         if start != "new" and out is None:

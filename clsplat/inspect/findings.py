@@ -79,9 +79,8 @@ def _photographs(facts: Facts) -> Iterator[Finding]:
     photographs, colmap = facts.photos, facts.kind == "COLMAP"
     if facts.missing:
         fault = f"{len(facts.missing)} of {facts.registered} registered images are missing on disk"
-        yield Finding(
-            "error", f"{fault} ({_listed(facts.missing)})", "put the files back, or remove them from the dataset"
-        )
+        remedy = "put the files back, or do without: --set scene.missing=skip"
+        yield Finding("error", f"{fault} ({_listed(facts.missing)})", remedy)
     if photographs.unreadable:
         unreadable, reason = _listed(list(photographs.unreadable)), next(iter(photographs.unreadable.values()))
         fault = f"{amount(len(photographs.unreadable), 'image file')} cannot be decoded ({unreadable})"

@@ -18,8 +18,11 @@ from clsplat.opencl.discovery import Schedule
 from clsplat.prepare.steps import Step
 from clsplat.render.rasterizer import MAX_PAIRS, RECORD, Budget
 from clsplat.render.tiles import Sort
+from clsplat.scene.choice import Choice, Chosen, ChosenOrAuto
 from clsplat.scene.detect import read_scene
+from clsplat.scene.images import Missing
 from clsplat.scene.scene import HOLDOUT, Alpha, Background, Scene
+from clsplat.scene.split import Split
 from clsplat.settings import OneOf, ReadPath, Settings
 from clsplat.stages.base import Stage
 from clsplat.stages.optimize import Optimize
@@ -42,8 +45,16 @@ class SceneSettings(Settings):
     """Colour behind the scene; auto: white for Blender scenes, else black."""
     image_budget: Annotated[int, Field(gt=0)] | None = None
     """MiB of photographs on the device; without it, a quarter of its memory."""
-    holdout: Annotated[int, Field(ge=0)] = HOLDOUT
-    """Every n-th image, by name, is a test view; 0: none."""
+    holdout: Chosen = HOLDOUT
+    """Test views: every n-th image by name, from the first on; 0: none; or {every, offset}, {names} or {file}.  Names
+    replace the split of a dataset that has one."""
+    train: Choice | None = None
+    """Training views that are used, such as {every: 4}, and no others; without it, all."""
+    validation: ChosenOrAuto = 0
+    """Training views that are kept out to choose by (`optimize.keep`), as in `holdout`; auto: every 8th, from the
+    fifth on, and two at least."""
+    missing: Missing = "refuse"
+    """Photographs that the dataset names and does not have: an error, or `skip`: the scene is read without them."""
 
     @property
     def downscales(self) -> tuple[float, ...]:
@@ -57,9 +68,15 @@ class SceneSettings(Settings):
             raise ConfigError("no scene given; use --scene DIR, or scene: {path: DIR} in the pipeline file")
         return Path(self.path)
 
+    @property
+    def split(self) -> Split:
+        """What of the dataset is for training, validation and testing."""
+        lists = None if self.path is None else Path(self.path)
+        return Split(self.holdout, self.train, self.validation, self.missing, lists)
+
     def read(self, folder: Path) -> tuple[Scene, Background]:
         """Return the scene of a folder with these settings, and its background.  Raises DataError."""
-        return self.applied(read_scene(folder, self.holdout))
+        return self.applied(read_scene(folder, self.split))
 
     def applied(self, scene: Scene) -> tuple[Scene, Background]:
         """Return a scene with these settings for alpha, and its background."""

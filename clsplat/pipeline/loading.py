@@ -99,6 +99,7 @@ def _validated(data: dict[str, Any], path: Path, document: Document) -> Pipeline
         raise ConfigError(explain(error, PipelineFile, path, document)) from error
     _check_order(path, settings)
     _check_screen_filter(path, settings)
+    _check_keeping(path, settings)
     return settings.model_copy(update={"plugins": plugins.used_by(_kinds(settings))})
 
 
@@ -197,6 +198,15 @@ def _check_screen_filter(path: Path, settings: PipelineFile) -> None:
                         "splats, which model.screen_filter.type 'box' does not have; expected another screen filter "
                         "(mip is the nearest), or another rule"
                     )
+
+
+def _check_keeping(path: Path, settings: PipelineFile) -> None:
+    """Raise ConfigError where a training has nothing to choose its model by, or one of several is a refit."""
+    trainings = [stage for stage in settings.stages if isinstance(stage, Optimize)]
+    if any(stage.keep == "best" for stage in trainings) and settings.scene.validation == 0:
+        raise ConfigError(f"{path}: optimize.keep: best chooses by validation views; expected scene.validation: auto")
+    if any(stage.refit for stage in trainings) and len(trainings) > 1:
+        raise ConfigError(f"{path}: optimize.refit: expected one stage that trains, found {len(trainings)}")
 
 
 def _check_order(path: Path, settings: PipelineFile) -> None:

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from clsplat.pages.page import charts
 from clsplat.pages.plan import Marks, plan
+from clsplat.scene.scene import SPLITS
 from clsplat.scene.stand import upward
 from clsplat.scene.view import View
 from clsplat.training.run import Run
@@ -27,7 +28,7 @@ def cameras(run: Run) -> list[Markup]:
         return np.stack([points @ across, points @ ahead], axis=-1)
 
     marks = []
-    for split in ("train", "test"):
+    for split in SPLITS:
         views = scene.split(split)
         if views:
             directions = np.stack([view.world_to_camera[2, :3] for view in views])

@@ -7,26 +7,26 @@ from markupsafe import Markup
 
 from clsplat.metrics.distribution import SHARES
 from clsplat.pages.page import charts
-from clsplat.pages.svg import Line, curve
+from clsplat.pages.svg import COLOURS, Line, curve
 from clsplat.training.forecast import VIEWS, over_views
 from clsplat.training.run import Run
+
+NAMES = {"train": "training views", "test": "test views", "validation": "validation views"}
+DOTTED = 2  # place in DASHES
 
 
 def training_charts(run: Run) -> list[Markup]:
     """Draw PSNR, loss, Gaussians and times over the steps."""
-    train, tests = run.records.read("train"), run.records.read("evaluate")
+    train = run.records.read("train")
+    measured, trial = _measured(run), _measured(run, trial=True)
+    running = DOTTED if any(line.name == NAMES["train"] for line in measured) else 0
     psnr = list(zip([r["step"] for r in train], over_views([r["psnr"] for r in train]), strict=True))
     line = {key: [(r["step"], r[key]) for r in train] for key in ("loss", "gaussians", "ms")}
-    measured = [
-        Line(
-            [(r["step"], r["psnr"]) for r in tests if r["split"] == split and r["downscale"] == run.downscale],
-            f"{split} views",
-        )
-        for split in ("test", "train")
-    ]
+    seen = Line(psnr, f"training views, mean of the last {VIEWS}", COLOURS[0], running)
     return charts(
         [
-            curve("PSNR, dB", [Line(psnr, f"training views, mean of the last {VIEWS}"), *measured]),
+            curve("PSNR, dB", [seen, *measured]),
+            *([curve("PSNR before the refit, dB", trial)] if trial else []),
             curve("loss", [Line(line["loss"])], logarithmic=True),
             curve("Gaussians", [Line(line["gaussians"])]),
             curve("milliseconds per step", [Line(line["ms"])]),
@@ -34,6 +34,17 @@ def training_charts(run: Run) -> list[Markup]:
         if train
         else []
     )
+
+
+def _measured(run: Run, trial: bool = False) -> list[Line]:
+    """PSNR of each split over the steps whose model was measured, by the last measurement of each; `trial`: before a
+    refit."""
+    points: dict[str, dict[int, float]] = {split: {} for split in NAMES}
+    for line in run.records.read("evaluate", trial):
+        if line["downscale"] == run.downscale:
+            points[line["split"]][line["step"]] = line["psnr"]
+    colours = dict(zip(NAMES, COLOURS, strict=False))
+    return [Line(sorted(one.items()), NAMES[split], colours[split]) for split, one in points.items() if one]
 
 
 def gaussians_charts(run: Run) -> list[Markup]:

@@ -24,7 +24,7 @@ class ViewFigure:
 def views(run: Run) -> dict[str, list[ViewFigure]]:
     """Return the best and the worst views of the last evaluation, by heading."""
     by_name = {view.name: view for view in run.scene.downscaled(run.downscale).views}
-    lines = [r for r in run.records.read("view") if r["downscale"] == run.downscale and r["step"] == run.step]
+    lines = [r for r in run.records.read("view") if r["downscale"] == run.downscale and r["step"] == run.model_step]
     last = {r["view"]: r for r in lines if r["view"] in by_name}  # a view may be measured twice after the same step
     ranked = sorted(last.values(), key=lambda r: r["psnr"])
     worst = ranked[:MAX_VIEWS]

@@ -24,4 +24,4 @@ def _read(folder: Path) -> Scene:
     if not has_pipeline(folder):
         return read_scene(folder, HOLDOUT)
     source = Source.of(folder, None)
-    return read_scene(source.folder, source.settings.holdout)
+    return read_scene(source.folder, source.settings.split)

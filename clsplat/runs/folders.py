@@ -21,6 +21,7 @@ from clsplat.names import (
     PIPELINE,
     RECORDS,
     STATUS,
+    TRIAL,
 )
 from clsplat.pipeline.matrix import load_experiment
 from clsplat.reading import read_text
@@ -94,7 +95,7 @@ def clear(status: StatusFile) -> None:
     out = status.out
     checkpoints = out / CHECKPOINTS
     files = [*checkpoint.saved(out), *checkpoints.glob("failed_*.npz"), *checkpoints.glob("damaged_*.npz")]
-    files += [out / name for name in (CHECKSUMS, METRICS, RECORDS, INPUTS, NOTE)]
+    files += [out / name for name in (CHECKSUMS, METRICS, RECORDS, TRIAL, INPUTS, NOTE)]
     for file in files:
         with told_as(file):
             file.unlink(missing_ok=True)

@@ -135,6 +135,8 @@ def rehearsals_of(pipeline: Pipeline, run: Run, minutes: float) -> list[Rehearsa
     trains = sum(isinstance(stage, Optimize) for stage in pipeline.stages)
     if trains != 1:
         raise ConfigError(f"{pipeline.path}: --minutes: expected one stage that trains, found {trains}; leave it out")
+    if pipeline.settings.training.refit:
+        raise ConfigError(f"{pipeline.path}: --minutes: a refit trains twice, for nobody knows how long; leave one out")
     steps = pipeline.settings.training.steps
     found, took = list[Rehearsal](), 0.0
     until = time.perf_counter() + 60 * minutes
@@ -221,7 +223,7 @@ def most_steps(rehearsals: Sequence[Rehearsal], seconds: float) -> int:
 
 def new_run(run: Run, pipeline: Pipeline, **changes: Any) -> Run:
     """Return a run of the pipeline as this one was before its first step, with its device, scene and photographs."""
-    own: dict[str, Any] = {"numbers": {}, "written": {}, "metrics": {}, "changes": []}
+    own: dict[str, Any] = {"best": None, "best_tables": {}, "numbers": {}, "written": {}, "metrics": {}, "changes": []}
     return replace(run, settings=pipeline.settings, pipeline=pipeline.resolved(), **own, **changes)
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from clsplat.compare.run_folder import read_metrics
 from clsplat.errors import ConfigError, DataError, OutputError
 from clsplat.files import is_there, write_text
-from clsplat.names import BEFORE_A_RUN, CHECKSUMS, LOCK, LOG_FILE, METRICS, OF_A_RUN, PIPELINE, RECORDS, STATUS
+from clsplat.names import BEFORE_A_RUN, CHECKSUMS, LOCK, LOG_FILE, METRICS, OF_A_RUN, PIPELINE, RECORDS, STATUS, TRIAL
 from clsplat.pipeline.loading import Pipeline, load
 from clsplat.processes import Owner
 from clsplat.reading import read_file, read_json, sha256
@@ -26,6 +26,8 @@ def write_metrics(pipeline: Pipeline, run: Run) -> None:
     metrics = {
         "test": run.metrics.get("test", {}),
         "train": run.metrics.get("train", {}),
+        **({"validation": run.metrics["validation"]} if "validation" in run.metrics else {}),
+        **({"kept": run.best.figures()} if run.best else {}),
         "gaussians": run.model.gaussians.count,
         "steps": run.step,
         "train_seconds": round(run.train_seconds, 3),
@@ -84,7 +86,7 @@ def write_checksums(pipeline: Pipeline, run: Run, gone: Mapping[Path, tuple[str,
 
     Files that are `gone` keep that of what was written, unless they were made anew after all.
     """
-    found = [run.out / name for name in (PIPELINE, METRICS, RECORDS)]
+    found = [run.out / name for name in (PIPELINE, METRICS, RECORDS, TRIAL)]
     for place in (path for stage in pipeline.stages for path in stage.outputs(run.out)):
         found += sorted(place.rglob("*")) if place.is_dir() else [place]
     sums = {_name(path, run): sha256(path, kind=OutputError) for path in dict.fromkeys(found) if path.is_file()}

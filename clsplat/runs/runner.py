@@ -11,10 +11,12 @@ from clsplat.files import write_text
 from clsplat.inspect.findings import few_views
 from clsplat.names import CHECKSUMS, NOTE, PIPELINE
 from clsplat.pipeline.loading import Pipeline
+from clsplat.report.parting import parting
 from clsplat.runs.course import Course, is_below
 from clsplat.runs.folders import RESOLVED, Start, clear
 from clsplat.runs.inputs import require_same_inputs, write_inputs
 from clsplat.runs.outputs import Lost, check_outputs, keep_checksums, renew_checksums, write_checksums, write_metrics
+from clsplat.runs.refitting import as_trained, begin_if_due, is_due
 from clsplat.runs.signals import finishing_on_interrupt
 from clsplat.stages.optimize import Optimize
 from clsplat.training import checkpoint
@@ -36,9 +38,11 @@ def execute(pipeline: Pipeline, run: Run, start: Start, show: Callable[[Progress
         run_stages(pipeline, run)
     for finding in few_views(len(run.original.train)):
         LOG.warning("%s", finding.text)
+    if run.best is None and (text := parting(run)):
+        LOG.info("%s", text)
     run.status.require_held()
     write_metrics(pipeline, run)
-    check_outputs(pipeline, run, lost.gone)
+    check_outputs(as_trained(pipeline, run), run, lost.gone)
     write_checksums(pipeline, run, lost.gone)
     run.status.end("done", exit_code=0)
 
@@ -61,7 +65,7 @@ def begin(pipeline: Pipeline, run: Run, start: Start) -> Lost:
     write_inputs(run)
     if run.prepared:
         write_text(run.out / NOTE, json.dumps(run.prepared) + "\n")
-    run.records.start()
+    run.records.start(run.is_refit)
     return lost
 
 
@@ -117,8 +121,9 @@ def _write_again(pipeline: Pipeline, run: Run, lost: Lost) -> None:
 
 
 def run_stages(pipeline: Pipeline, run: Run) -> None:
-    """Run the stages from where the run stands on."""
-    for cursor, stage in enumerate(pipeline.stages):
+    """Run the stages from where the run stands on, and again from the beginning for a refit."""
+    begin_if_due(run)
+    for cursor, stage in enumerate(as_trained(pipeline, run).stages if run.is_refit else pipeline.stages):
         if cursor < run.cursor:
             continue
         with suppress(Stopped):
@@ -127,3 +132,6 @@ def run_stages(pipeline: Pipeline, run: Run) -> None:
         if run.interrupted:
             path = checkpoint.save(run)
             raise Interrupted(f"stopped in {stage.stage}, saved in {path}; `clsplat resume {run.out}` goes on from it")
+        if is_due(run):
+            run_stages(pipeline, run)
+            return

@@ -9,7 +9,7 @@ from clsplat.pipeline.file import SceneSettings
 from clsplat.scene.decoding import decode_all, require_whole
 from clsplat.scene.detect import read_scene
 from clsplat.scene.identity import Identity
-from clsplat.scene.scene import Background, Scene
+from clsplat.scene.scene import SPLITS, Background, Scene
 
 LOG = logging.getLogger("clsplat")
 
@@ -33,10 +33,11 @@ class RunScene:
         downscaled = original.downscaled(*settings.downscales)
         camera = downscaled.views[0].camera
         LOG.info(
-            "scene: %s, %d training and %d test views, %d x %d px, %s background, extent %.3g",
+            "scene: %s, %d training%s and %d test views, %d x %d px, %s background, extent %.3g",
             *(
                 scene.path,
                 len(downscaled.train),
+                f", {len(downscaled.validation)} validation" if downscaled.validation else "",
                 len(downscaled.test),
                 camera.width,
                 camera.height,
@@ -44,9 +45,7 @@ class RunScene:
                 downscaled.extent,
             ),
         )
-        files = decode_all(
-            view for one in (original, downscaled) for split in ("train", "test") for view in one.split(split)
-        )
+        files = decode_all(view for one in (original, downscaled) for split in SPLITS for view in one.split(split))
         require_whole(scene.path, files)
         return cls(original, downscaled, background, Identity.of(original, files))
 
@@ -56,4 +55,4 @@ ReadScene = Callable[[SceneSettings, Path], RunScene]
 
 def read_run_scene(settings: SceneSettings, folder: Path) -> RunScene:
     """Read the scene in a folder with these settings.  Raises DataError."""
-    return RunScene.of(settings, read_scene(folder, settings.holdout))
+    return RunScene.of(settings, read_scene(folder, settings.split))

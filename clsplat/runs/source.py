@@ -55,7 +55,7 @@ class Source:
 
     def scene(self, model: Model) -> Scene:
         """Read the photographs as the model was trained on, at their full size."""
-        return read_scene(self.folder, self.settings.holdout).with_alpha(self.alpha or model.rendering.alpha)
+        return read_scene(self.folder, self.settings.split).with_alpha(self.alpha or model.rendering.alpha)
 
 
 def run_of(model: Path) -> Path | None:

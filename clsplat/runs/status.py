@@ -79,7 +79,7 @@ def status_text(status: dict[str, Any]) -> str:
         lines.append("last report: " + _figures(status["last"], ("step", "loss", "psnr", "gaussians")))
     if placed := photographs_text((status["metrics"] or {}).get("preparation", {})):
         lines.append(placed)
-    for split in ("test", "train"):
+    for split in ("test", "validation", "train"):
         for downscale, figures in ((status["metrics"] or {}).get(split) or {}).items():
             lines.append(f"{split} 1/{downscale}: {_figures(figures, ('psnr', 'ssim', 'lpips', 'views'))}")
     return "\n  ".join(map(one_line, lines))

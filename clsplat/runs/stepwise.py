@@ -5,6 +5,7 @@ from itertools import takewhile
 
 from clsplat.losses.base import ViewLosses
 from clsplat.pipeline.loading import Pipeline
+from clsplat.runs.refitting import as_trained, begin_if_due, is_due
 from clsplat.stages.optimize import Optimize
 from clsplat.training.run import Run
 
@@ -20,7 +21,15 @@ def run_until_training(pipeline: Pipeline, run: Run) -> None:
 
 
 def train(pipeline: Pipeline, run: Run) -> Iterator[ViewLosses]:
-    """Run all stages that train, those between them, and the edits right behind them; yield after each step."""
+    """Run all stages that train, those between them, and the edits right behind them; yield after each step.
+
+    A refit runs the stages from the beginning on.
+    """
+    whole, begins = pipeline, is_due(run)
+    begin_if_due(run)
+    pipeline = as_trained(whole, run) if run.is_refit else whole
+    if begins:
+        run_until_training(pipeline, run)
     first, last = _training_stages(pipeline)
     for cursor in range(max(first, run.cursor), last + 1):
         if cursor > run.cursor:
@@ -29,11 +38,14 @@ def train(pipeline: Pipeline, run: Run) -> Iterator[ViewLosses]:
         if isinstance(stage, Optimize):
             run.status.note(stage=stage.stage, progress=None)
             for view in stage.iterate(run):
-                if cursor == last and run.stage_step == stage.steps:
+                if cursor == last and stage.has_ended(run) and not is_due(run):
                     _edit_behind(pipeline, run)
                     yield view
                     return
                 yield view
+            if is_due(run):
+                yield from train(whole, run)
+                return
         else:
             stage.act(run)
 
@@ -48,9 +60,9 @@ def _edit_behind(pipeline: Pipeline, run: Run) -> None:
 def is_trained(pipeline: Pipeline, run: Run) -> bool:
     """Return whether no step of the training is left."""
     _, last = _training_stages(pipeline)
-    stage = pipeline.stages[last]
-    in_its_end = isinstance(stage, Optimize) and run.cursor == last and run.stage_step >= stage.steps
-    return run.cursor > last or in_its_end
+    stage = (as_trained(pipeline, run) if run.is_refit else pipeline).stages[last]
+    in_its_end = isinstance(stage, Optimize) and run.cursor == last and stage.has_ended(run)
+    return (run.cursor > last or in_its_end) and not is_due(run)
 
 
 def _training_stages(pipeline: Pipeline) -> tuple[int, int]:

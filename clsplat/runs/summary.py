@@ -30,6 +30,11 @@ def _lines(folder: Path, metrics: dict[str, Any]) -> Iterator[str]:
     quality = f"test PSNR {test['psnr']:.2f} dB, SSIM {test['ssim']:.4f}; " if test else ""
     yield f"{quality}{metrics['gaussians']:,} Gaussians; {metrics['train_seconds']:.0f} s of training"
     placed = photographs_text(metrics.get("preparation", {}))
+    if kept := metrics.get("kept"):
+        name, what = (
+            ("refit", "steps on all of its photographs") if kept["refit"] else ("kept", "steps, the best model")
+        )
+        yield f"  {name:<8} {kept['step']:,} {what}, by a validation PSNR of {kept['validation']:.2f} dB"
     if scene := metrics.get("scene"):
         yield f"  scene    {scene}" + (f"; {placed}" if placed else "")
     files = {stage: folder / name for stage, name in metrics.get("files", BEFORE_FILES).items()}
@@ -42,4 +47,5 @@ def _lines(folder: Path, metrics: dict[str, Any]) -> Iterator[str]:
         yield f"  time     {', '.join(told)}"
     page = next((files[stage] for stage in ("report", "viewer") if stage in files and files[stage].exists()), None)
     if page:
-        yield f"next: open {page} in a browser; `clsplat resume {folder} --steps {2 * metrics['steps']}` trains longer"
+        longer = f"; `clsplat resume {folder} --steps {2 * metrics['steps']}` trains longer"
+        yield f"next: open {page} in a browser{'' if kept and kept['refit'] else longer}"

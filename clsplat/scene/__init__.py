@@ -2,6 +2,7 @@
 
 from clsplat.reading import read_file as read_file
 from clsplat.scene.camera import Camera as Camera
+from clsplat.scene.choice import Choice as Choice
 from clsplat.scene.detect import read_scene as read_scene
 from clsplat.scene.images import inside as inside
 from clsplat.scene.images import require_files as require_files
@@ -13,3 +14,4 @@ from clsplat.scene.scene import Scene as Scene
 from clsplat.scene.scene import View as View
 from clsplat.scene.scene import every_nth as every_nth
 from clsplat.scene.scene import make_scene as make_scene
+from clsplat.scene.split import Split as Split

@@ -21,8 +21,8 @@ class BlenderReader(Reader):
 
     def read(self, path: Path, holdout: int) -> Scene:
         transforms = Transforms(path / TRAIN_FILE)
-        train = transforms.views()
-        test = Transforms(path / TEST_FILE).views() if (path / TEST_FILE).is_file() else []
+        train = transforms.views(self.missing)
+        test = Transforms(path / TEST_FILE).views(self.missing) if (path / TEST_FILE).is_file() else []
         held_out = set(range(len(train), len(train) + len(test)))
         # NeRF and later papers render these scenes on white.
         return make_scene(path, train + test, held_out, transforms.points(), background="white")

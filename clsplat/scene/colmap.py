@@ -12,7 +12,7 @@ from clsplat.errors import DataError, quoted
 from clsplat.scene.camera import MAX_SIDE, MIN_FOCAL
 from clsplat.scene.colmap_files import find_file, read_cameras, read_images, read_point_table
 from clsplat.scene.colmap_records import REMEDY, CameraRecord, ImageRecord
-from clsplat.scene.images import inside, require_files
+from clsplat.scene.images import inside, present
 from clsplat.scene.lens import MODELS, Lens, shared
 from clsplat.scene.parts import Parts
 from clsplat.scene.points import MAX_VALUE, PointTable
@@ -43,7 +43,8 @@ class ColmapReader(Reader):
         cameras = read_cameras(model)
         folder = image_folder(path)
         views = sorted((view_of(image, cameras, folder) for image in images), key=lambda view: view.name)
-        require_files(path, (view.image_path for view in views))
+        there = present(path, [view.image_path for view in views], self.missing)
+        views = [view for view, found in zip(views, there, strict=True) if found]
         table = read_point_table(model)
         points, tracks = (table.cloud(), tracks_of(images, table)) if table else (None, None)
         scene = make_scene(path, views, every_nth([view.name for view in views], holdout), points)

@@ -11,6 +11,7 @@ from clsplat.scene.multiscale import MultiscaleReader
 from clsplat.scene.nerfstudio import NerfstudioReader
 from clsplat.scene.readers import Reader, reader_classes
 from clsplat.scene.scene import HOLDOUT, Scene
+from clsplat.scene.split import Split
 
 PRECEDENCE = (ColmapReader, BlenderReader, MultiscaleReader, NerfstudioReader)
 
@@ -51,9 +52,10 @@ def holds_scene(path: Path) -> bool:
     return reader_of(path) is not None
 
 
-def read_scene(path: str | Path, holdout: int = HOLDOUT) -> Scene:
+def read_scene(path: str | Path, holdout: int | Split = HOLDOUT) -> Scene:
     """Read the dataset in a folder; every `holdout`-th view is for testing where the dataset has no split.
 
+    A Split says more: test views by name, a validation fold, training views that are left out.
     Raises DataError when its format is unknown or its files are damaged.
     """
     path = Path(path)
@@ -63,8 +65,10 @@ def read_scene(path: str | Path, holdout: int = HOLDOUT) -> Scene:
             model = model_format(path)
             found = f"is a model ({model.name}), which `clsplat check` reads" if model else "is a file"
         raise DataError(f"{path}: {found}; expected the folder of a dataset")
+    split = holdout if isinstance(holdout, Split) else Split(holdout)
     if reader := reader_of(path):
-        return reader.read(path, holdout)
+        reader.missing = split.missing
+        return split.applied(reader.read(path, split.of_reader))
     if any(is_image(file) for file in path.iterdir()):
         raise DataError(f"{path}: photographs without cameras; `clsplat run photos --scene {path}` finds the cameras")
     known = ", ".join(f"{reader.name} ({reader.expects})" for reader in readers())

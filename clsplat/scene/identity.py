@@ -3,7 +3,7 @@
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from clsplat.scene.decoding import ImageFile
-from clsplat.scene.scene import Scene
+from clsplat.scene.scene import SPLITS, Scene
 from clsplat.scene.view import View
 
 MAX_NAMES = 3  # in a message
@@ -28,27 +28,29 @@ class Identity:
     train: dict[str, Row]
     test: dict[str, Row]
     points: str
+    validation: dict[str, Row] = field(default_factory=dict)
 
     @classmethod
     def of(cls, scene: Scene, files: Mapping[Path, ImageFile]) -> "Identity":
         """Return the identity of a scene whose image files were decoded."""
-        train, test = ({view.name: _row(view, files) for view in scene.split(name)} for name in ("train", "test"))
-        return cls(train, test, _hash(scene.points.positions, scene.points.colours) if scene.points else "")
+        train, test, fold = ({view.name: _row(view, files) for view in scene.split(name)} for name in SPLITS)
+        return cls(train, test, _hash(scene.points.positions, scene.points.colours) if scene.points else "", fold)
 
     @property
     def digest(self) -> str:
         """One hash of all that decides over the bits of a run: the order of the test views does not."""
         parts = [list(self.train.items()), sorted(self.test.items()), self.points]
+        parts += [list(self.validation.items())] if self.validation else []
         return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
 
     def changes(self, before: "Identity") -> list[str]:
         """Return what is another than it was, with counts and the first few names: 'the photographs of 2 views (…)'."""
         found = []
-        old, new = before.train | before.test, self.train | self.test
+        old, new = before._rows, self._rows
         for part in ("photograph", "mask", "camera"):
             names = [name for name in old if name in new and old[name][part] != new[name][part]]
             found += [f"the {part} of {_named(names)}"] if names else []
-        moved = [name for name in old if name in new and (name in before.train) != (name in self.train)]
+        moved = [name for name in old if name in new and before._split_of(name) != self._split_of(name)]
         gone, fresh = [name for name in old if name not in new], [name for name in new if name not in old]
         found += [f"the split of {_named(moved)}"] if moved else []
         found += [f"{_named(gone)}, gone"] if gone else []
@@ -56,6 +58,13 @@ class Identity:
         if not (moved or gone or fresh) and list(self.train) != list(before.train):
             found.append("the order of the training views")
         return found + (["the points"] if self.points != before.points else [])
+
+    @property
+    def _rows(self) -> dict[str, Row]:
+        return self.train | self.test | self.validation
+
+    def _split_of(self, name: str) -> tuple[bool, bool]:
+        return name in self.train, name in self.validation
 
     def data(self) -> dict[str, Any]:
         """Return the identity as plain data for JSON."""
@@ -65,7 +74,8 @@ class Identity:
     def from_data(cls, data: Any) -> "Identity":
         """Return what `data` returned.  Raises ValueError where it is damaged."""
         try:
-            found = cls(dict(data["train"]), dict(data["test"]), str(data["points"]))
+            train, test, points = dict(data["train"]), dict(data["test"]), str(data["points"])
+            found = cls(train, test, points, dict(data.get("validation", {})))
             if found.digest == data["digest"]:
                 return found
         except (KeyError, TypeError, ValueError):

@@ -1,9 +1,10 @@
 """The files of a dataset: allowed paths, bytes and images."""
 
+import logging
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePath, PureWindowsPath
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -16,6 +17,8 @@ from clsplat.scene.image_headers import HEAD_SIZE, TAIL_SIZE, Header, is_cut, pa
 from clsplat.scene.png import pixels_only
 
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # its lines name no file; errors here do
+logger = logging.getLogger("clsplat")
+Missing = Literal["refuse", "skip"]  # what to do about photographs that a dataset names and does not have
 MAX_BYTES = (1 << 31) - 1  # of an image file: OpenCV decodes no longer ones
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"})  # in lower case
 
@@ -50,11 +53,25 @@ def inside(folder: Path, name: str, where: str) -> Path:
 
 def require_files(path: Path, files: Iterable[Path]) -> None:
     """Raise DataError, naming the first few, when some of the `files` of the dataset at `path` do not exist."""
-    expected = list(files)
-    missing = [str(file) for file in expected if not os.path.exists(file)]  # unlike Path.exists, never raises
-    if missing:
-        names = ", ".join(map(shortened, missing[:3])) + (", ..." if len(missing) > 3 else "")
-        raise DataError(f"{path}: {len(missing)} of {len(expected)} image files are missing: {names}; put them back")
+    present(path, list(files), "refuse", "")
+
+
+def present(
+    path: Path, files: Sequence[Path], missing: Missing, remedy: str = ", or --set scene.missing=skip to do without"
+) -> list[bool]:
+    """Return which of the photographs of the dataset at `path` exist.
+
+    Raises DataError, naming the first few, where some do not, unless those are to be skipped; where none does, always.
+    """
+    found = [os.path.exists(file) for file in files]  # unlike Path.exists, never raises
+    lost = [str(file) for file, there in zip(files, found, strict=True) if not there]
+    if lost:
+        names = ", ".join(map(shortened, lost[:3])) + (", ..." if len(lost) > 3 else "")
+        fault = f"{path}: {len(lost)} of {len(files)} image files are missing: {names}"
+        if missing == "refuse" or len(lost) == len(files):
+            raise DataError(f"{fault}; put them back{remedy if len(lost) < len(files) else ''}")
+        logger.warning("%s; the scene is read without them", fault)
+    return found
 
 
 def read_header(path: Path) -> Header:

@@ -5,7 +5,7 @@ from typing import Any
 
 from clsplat.errors import DataError, quoted
 from clsplat.reading import read_json
-from clsplat.scene.images import require_files
+from clsplat.scene.images import present
 from clsplat.scene.parts import Parts
 from clsplat.scene.points import read_ply_table, read_points_ply
 from clsplat.scene.readers import Reader
@@ -28,7 +28,9 @@ class MultiscaleReader(Reader):
     def read(self, path: Path, holdout: int) -> Scene:
         splits = read_json(path / FILE, limit=MAX_BYTES)
         train, test = (_views(path / FILE, splits, name) for name in ("train", "test"))
-        require_files(path, (view.image_path for view in train + test))
+        there = present(path, [view.image_path for view in train + test], self.missing)
+        test = [view for view, found in zip(test, there[len(train) :], strict=True) if found]
+        train = [view for view, found in zip(train, there[: len(train)], strict=True) if found]
         points = path / POINTS
         held_out = set(range(len(train), len(train) + len(test)))
         cloud = read_points_ply(points) if points.is_file() else None

@@ -6,7 +6,7 @@ from pathlib import Path
 from clsplat.errors import DataError, quoted
 from clsplat.scene.parts import Parts
 from clsplat.scene.readers import Reader
-from clsplat.scene.scene import Scene, View, every_nth, make_scene
+from clsplat.scene.scene import Scene, every_nth, make_scene
 from clsplat.scene.transforms import Transforms, list_frames, view_name
 
 FILE = "transforms.json"
@@ -28,8 +28,8 @@ class NerfstudioReader(Reader):
 
     def read(self, path: Path, holdout: int) -> Scene:
         transforms = Transforms(path / FILE)
-        views = sorted(transforms.views(), key=lambda view: view.name)
-        train, test = _listed(transforms, "train_filenames", views), _listed(transforms, "test_filenames", views)
+        views = sorted(transforms.views(self.missing), key=lambda view: view.name)
+        train, test = (_listed(transforms, key) for key in ("train_filenames", "test_filenames"))
         if train is None and test is None:
             return make_scene(path, views, every_nth([view.name for view in views], holdout), transforms.points())
         test = test or set()
@@ -43,7 +43,7 @@ class NerfstudioReader(Reader):
         list_frames(parts, FILE)
 
 
-def _listed(transforms: Transforms, key: str, views: list[View]) -> set[str] | None:
+def _listed(transforms: Transforms, key: str) -> set[str] | None:
     """Return the view names of a list of file paths, or None where there is none.  Raises DataError."""
     entries = transforms.table.get(key)
     if entries is None:
@@ -51,7 +51,7 @@ def _listed(transforms: Transforms, key: str, views: list[View]) -> set[str] | N
     if not isinstance(entries, list) or not all(isinstance(entry, str) for entry in entries):
         raise DataError(f"{transforms.path}: {key} is not a list of file paths; export the file again")
     names = {view_name(entry) for entry in entries}
-    unknown = sorted(names - {view.name for view in views})
+    unknown = sorted(names - {view_name(path) for frame in transforms.frames if (path := frame.value("file_path"))})
     if unknown:
         raise DataError(
             f"{transforms.path}: {key} lists {quoted(unknown[0])}, which no frame has; remove it from the list"

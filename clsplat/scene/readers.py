@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from clsplat.errors import ConfigError
+from clsplat.scene.images import Missing
 from clsplat.scene.parts import Parts
 from clsplat.scene.points import PointTable
 from clsplat.scene.scene import Scene
@@ -22,6 +23,7 @@ class Reader(ABC):
 
     name: ClassVar[str]  # of the format
     expects: ClassVar[str]  # the files that mark the format, in a few words
+    missing: Missing = "refuse"  # what to do about photographs that the dataset names and does not have
     defined: ClassVar[list[type["Reader"]]] = []  # every subclass, in the order of definition
 
     def __init_subclass__(cls, **options: Any) -> None:

@@ -30,6 +30,7 @@ HOLDOUT = 8  # every 8th view is for testing where the dataset has no split: the
 MAX_DISTANCE = 10.0  # median distances: evenly spaced cameras on a line reach 2, an orbit 1, a close-up about 4
 MAX_STRAYED_SHARE = 0.2  # of the cameras
 MAX_THUMBNAILS = 4
+SPLITS = ("train", "test", "validation")
 
 
 @dataclass(frozen=True)
@@ -59,15 +60,25 @@ class Scene:
     points: PointCloud | None
     extent: float  # radius of the training cameras, scene units
     background: Background = "black"  # on which papers show the photographs
+    validation: tuple[int, ...] = ()  # kept out of the training, to choose by
     tracks: Tracks | None = None  # which points the photographs show, where the dataset has that
 
     def split(self, name: str) -> tuple[View, ...]:
-        """Return the views of `train`, `test` or `all`.  Raises ValueError for another name."""
+        """Return the views of `train`, `test`, `validation` or `all`.  Raises ValueError for another name."""
         if name == "all":
             return self.views
-        if name not in ("train", "test"):
-            raise ValueError(f"no split '{name}'; there are train, test and all")
-        return tuple(self.views[i] for i in (self.train if name == "train" else self.test))
+        if name not in SPLITS:
+            raise ValueError(f"no split '{name}'; there are {', '.join(SPLITS)} and all")
+        return tuple(self.views[i] for i in self.indices[name])
+
+    @property
+    def indices(self) -> dict[str, tuple[int, ...]]:
+        """The indices of the views of each split."""
+        return {"train": self.train, "test": self.test, "validation": self.validation}
+
+    def with_fold(self) -> "Scene":
+        """Return the scene with the validation views among those that are trained on."""
+        return replace(self, train=tuple(sorted(self.train + self.validation)), validation=())
 
     def with_alpha(self, alpha: Alpha) -> "Scene":
         """Return the scene with the fourth channel of its photographs taken as transparency or as mask."""
@@ -87,7 +98,7 @@ class Scene:
         if downscales == self.downscales:
             return self
         views: list[View] = []
-        splits: dict[str, list[int]] = {"train": [], "test": []}
+        splits: dict[str, list[int]] = {name: [] for name in SPLITS}
         smallest = min(self.downscales)
         for downscale in downscales:
             if downscale < smallest:
@@ -100,10 +111,12 @@ class Scene:
                 found = [view for view in self.split(name) if view.downscale == source]
                 indices += range(len(views), len(views) + len(found))
                 views += [view.resized(downscale) for view in found]
-        return replace(self, views=tuple(views), train=tuple(splits["train"]), test=tuple(splits["test"]))
+        train, test, validation = (tuple(splits[name]) for name in SPLITS)
+        return replace(self, views=tuple(views), train=train, test=test, validation=validation)
 
     def __repr__(self) -> str:
-        return f"Scene({self.path.name}: {len(self.train)} training and {len(self.test)} test views)"
+        fold = f", {len(self.validation)} for validation" if self.validation else ""
+        return f"Scene({self.path.name}: {len(self.train)} training and {len(self.test)} test views{fold})"
 
     def _repr_html_(self) -> str:
         from clsplat.pages.notebook import summary
@@ -172,9 +185,9 @@ def strayed(views: Sequence[View]) -> NDArray[np.bool_]:
     return far if np.median(distance) > 0 and far.mean() <= MAX_STRAYED_SHARE else np.zeros(len(views), bool)
 
 
-def every_nth(names: list[str], holdout: int) -> set[int]:
-    """Return the indices of the names that are held out: every `holdout`-th by name, from the first on."""
+def every_nth(names: Sequence[str], holdout: int, offset: int = 0) -> set[int]:
+    """Return the indices of the names that are held out: every `holdout`-th by name, from the place `offset` on."""
     if holdout <= 0:
         return set()
     order = sorted(range(len(names)), key=lambda i: names[i])
-    return set(order[::holdout])
+    return set(order[offset::holdout])

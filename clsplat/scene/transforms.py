@@ -10,7 +10,7 @@ import numpy as np
 from clsplat.errors import DataError, quoted
 from clsplat.reading import read_json
 from clsplat.scene.camera import MAX_SIDE, MIN_FOCAL
-from clsplat.scene.images import image_size, inside, read_header, require_files
+from clsplat.scene.images import Missing, image_size, inside, present, read_header, require_files
 from clsplat.scene.lens import Lens, shared
 from clsplat.scene.parts import Parts
 from clsplat.scene.points import MAX_VALUE, read_ply_table, read_points_ply
@@ -71,19 +71,20 @@ class Transforms:
             raise DataError(f"{path}: has {len(frames)} frames; expected at most {MAX_FRAMES}: divide the scene")
         self.frames = [Frame(path.parent, f"{path}: frames[{i}]", own, self.table) for i, own in enumerate(frames)]
 
-    def views(self) -> list[View]:
-        """Return one view per frame, in the order of the file.
+    def views(self, missing: Missing = "refuse") -> list[View]:
+        """Return one view per frame, in the order of the file; of those whose image is missing as `missing` says.
 
         An image without a size in the file has the size of the first one.  Photographs of lenses with distortion are
         undistorted when they are read.
         Raises DataError for damaged numbers, missing files and paths that leave the folder.
         """
         images = [image_path_of(frame) for frame in self.frames]
-        masks = [frame.file("mask_path") for frame in self.frames]
-        require_files(self.path, [*images, *(mask for mask in masks if mask)])
-        has_sizes = all(frame.number("w") and frame.number("h") for frame in self.frames)
-        size = None if has_sizes else image_size(images[0])
-        return [view_of(frame, size) for frame in self.frames]
+        there = present(self.path, images, missing)
+        frames = [frame for frame, found in zip(self.frames, there, strict=True) if found]
+        require_files(self.path, filter(None, (frame.file("mask_path") for frame in frames)))
+        has_sizes = all(frame.number("w") and frame.number("h") for frame in frames)
+        size = None if has_sizes else image_size(images[there.index(True)])
+        return [view_of(frame, size) for frame in frames]
 
     def points(self) -> PointCloud | None:
         """Read the points; None when there are none."""

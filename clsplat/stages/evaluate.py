@@ -1,6 +1,7 @@
 """Metrics of a split."""
 
 import logging
+from collections.abc import Sequence
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import AfterValidator, Field, field_validator
@@ -12,6 +13,7 @@ from clsplat.metrics.lpips import InputRange
 from clsplat.metrics.perceptual import Metric, Perceptual
 from clsplat.metrics.views import mean, measure
 from clsplat.names import fault_of_output
+from clsplat.scene.scene import View
 from clsplat.settings import ReadPath
 from clsplat.stages.base import CADENCE, Scheduled
 from clsplat.training.colours import colours_of, tell_of_colours
@@ -38,10 +40,20 @@ class Evaluate(Scheduled):
     stage: Literal["evaluate"] = "evaluate"
     needs: ClassVar[frozenset[str]] = frozenset({"model"})
     makes: ClassVar[frozenset[str]] = frozenset({"metrics"})
-    output_keys: ClassVar[frozenset[str]] = CADENCE | {"split", "downscales", "metrics", "lpips", "lpips_input", "file"}
+    output_keys: ClassVar[frozenset[str]] = CADENCE | {
+        "split",
+        "most",
+        "downscales",
+        "metrics",
+        "lpips",
+        "lpips_input",
+        "file",
+    }
 
-    split: Literal["test", "train"] = "test"
+    split: Literal["test", "train", "validation"] = "test"
     """Views that are measured."""
+    most: Annotated[int, Field(gt=0)] | None = None
+    """Number of views that are measured at most, evenly spaced; without it, all."""
     downscales: Annotated[list[Downscale], Field(min_length=1)] | None = None
     """Divisors of the photographs' size; without it, the smallest in training."""
     metrics: list[Metric] = Field(["psnr", "ssim"])
@@ -69,26 +81,34 @@ class Evaluate(Scheduled):
     def _model(self, run: Run) -> DeviceModel:
         return run.model if self.file is None else load(run.out / self.file).upload(run.device)
 
+    def _chosen(self, views: Sequence[View]) -> Sequence[View]:
+        """At most so many, from the middles of as many equal parts."""
+        if self.most is None or len(views) <= self.most:
+            return views
+        return [views[(2 * i + 1) * len(views) // (2 * self.most)] for i in range(self.most)]
+
     def run(self, run: Run) -> None:
         if not run.scene.split(self.split):
-            LOG.warning("no %s views: nothing to evaluate (scene.holdout chooses them)", self.split)
+            if self.split != "test" or run.pipeline["scene"]["holdout"] != 0:  # who wants none need not be told
+                key = "holdout" if self.split == "test" else "validation"
+                LOG.warning("no %s views: nothing to evaluate (scene.%s chooses them)", self.split, key)
             return
         perceptual, model = self._perceptual(), self._model(run)
         for downscale in self.downscales or [run.downscale]:
-            views = run.original.downscaled(downscale).split(self.split)
+            views = self._chosen(run.original.downscaled(downscale).split(self.split))
             photographs = run.photographs if downscale in run.scene.downscales else run.photographs.fresh()
             counted = run.status.counted(run.until_interrupted(views), "views", len(views))
             results = measure(run.rasterizer, model, counted, photographs, perceptual, colours=colours_of(run))
             if not results:
                 continue
             for result in results:
-                run.records.add(run.step, "view", split=self.split, downscale=downscale, **result.line())
+                run.records.add(run.model_step, "view", split=self.split, downscale=downscale, **result.line())
             averages = mean(results, perceptual)
-            run.records.add(run.step, "evaluate", split=self.split, downscale=downscale, **averages)
+            run.records.add(run.model_step, "evaluate", split=self.split, downscale=downscale, **averages)
             run.metrics.setdefault(self.split, {})[f"{downscale:g}"] = averages
             LOG.info(
                 "step %d  %s%s views at 1/%g: PSNR %.2f dB  SSIM %.4f  (%s)",
-                *(run.step, f"{self.file}, " if self.file else "", self.split, downscale),
+                *(run.model_step, f"{self.file}, " if self.file else "", self.split, downscale),
                 *(averages["psnr"], averages["ssim"], amount(len(results), "view")),
             )
             tell_of_colours(averages)

@@ -4,7 +4,6 @@ import logging
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
-from statistics import fmean, median
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, field_validator
@@ -12,19 +11,19 @@ from pydantic import Field, field_validator
 from clsplat.density.statistics import SplatStats
 from clsplat.errors import Interrupted
 from clsplat.losses.base import ImageLoss, Loss, Penalty, ViewGradients, ViewLosses, require_symmetric
-from clsplat.metrics.distribution import distribution
 from clsplat.names import VIEW_COLOURS
 from clsplat.schedule import Points
 from clsplat.settings import OneOf
-from clsplat.stages.base import Scheduled, Stage
+from clsplat.stages.base import Scheduled
 from clsplat.stages.densify import Densify
+from clsplat.stages.keeping import Keeping
+from clsplat.stages.progress import report
 from clsplat.training import checkpoint
 from clsplat.training.adam import Adam, Rates, Rows
 from clsplat.training.colours import photograph_colours, write_view_colours
 from clsplat.training.forecast import Forecast
-from clsplat.training.profile import stage_milliseconds
 from clsplat.training.rescue import finite_values
-from clsplat.training.run import Progress, Run, Stopped, clocks
+from clsplat.training.run import Run, Stopped, clocks
 from clsplat.training.skipping import Skip, Visit
 from clsplat.training.trainer import Trainer
 from clsplat.views.colours import Colours
@@ -36,7 +35,7 @@ DISTRIBUTION_INTERVAL = 5  # reports
 READ_AHEAD = 4  # photographs
 
 
-class Optimize(Stage):
+class Optimize(Keeping):
     """Train for a number of steps, one view each (Kerbl et al. 2023).
 
     Stages in `during` that edit the model act between two steps, so that other stages see the model before the edit.
@@ -47,11 +46,8 @@ class Optimize(Stage):
     needs: ClassVar[frozenset[str]] = frozenset({"model"})
     makes: ClassVar[frozenset[str]] = frozenset({"adam", "stats"})
     output_keys: ClassVar[frozenset[str]] = frozenset({"log_every"})
-    training_keys: ClassVar[frozenset[str]] = frozenset({"steps", "rates", "update", "skip"})
-    step_keys: ClassVar[frozenset[str]] = frozenset({"steps"})
+    training_keys: ClassVar[frozenset[str]] = frozenset({"rates", "update", "skip"})
 
-    steps: Annotated[int, Field(gt=0)]
-    """Number of training steps."""
     rates: Rates = Rates()
     """Learning rates."""
     update: Rows = "all"
@@ -98,7 +94,12 @@ class Optimize(Stage):
         """Return the stages of `during` that run when the training begins after a global step."""
         last = step + self.steps
         before = range(step + 1, last)  # no edit follows the last
-        return [s for s in self.during if any(map(s.due, before)) or (not s.edits and s.due(last, True))]
+        return [s for s in self.inner if any(map(s.due, before)) or (not s.edits and s.due(last, True))]
+
+    @property
+    def inner(self) -> list[Scheduled]:
+        """The stages that act between two steps."""
+        return [*self.measuring(self.during), *self.during]
 
     def run(self, run: Run) -> None:
         for _ in self.iterate(run):
@@ -110,6 +111,7 @@ class Optimize(Stage):
 
     def iterate(self, run: Run) -> Iterator[ViewLosses]:
         """Train step by step; what a step yields, ViewGradients unless it is skipped, is valid until the next."""
+        self.begin_to_keep(run)
         views = self._views(run)
         last_step = run.step - run.stage_step + self.steps
         trainer, sampler = self._trainer(run, views, last_step), Sampler(run.scene.split("train"), views, run.seed)
@@ -118,16 +120,18 @@ class Optimize(Stage):
         forecast = Forecast.of(run.step, last_step, [stage.due for stage in self._density])
         seconds: list[float] = []  # of the steps since the last report
         self._act(run)
-        while run.stage_step < self.steps:
+        while not self.has_ended(run):
             start = clocks()
             self._edit(run, views)
             view = self._step(run, trainer, sampler)
             run.status.count("steps", run.stage_step, self.steps, step=run.step, steps=last_step)
-            report = run.step % self.log_every == 0 or run.stage_step == self.steps or run.interrupted
-            loss, psnr = finite_values(run, sampler.at(run.step).view.name, view) if report else (0.0, 0.0)
+            is_reported = run.step % self.log_every == 0 or run.stage_step == self.steps or run.interrupted
+            loss, psnr = finite_values(run, sampler.at(run.step).view.name, view) if is_reported else (0.0, 0.0)
             seconds.append(run.add_training_time(start))
-            if report:
-                self._report(run, forecast, loss, psnr, seconds)
+            if is_reported:
+                if self.skip and run.step == last_step:
+                    self.skip.tell(run)
+                report(run, forecast, (loss, psnr), seconds, DISTRIBUTION_INTERVAL * self.log_every)
                 seconds.clear()
             with suppress(Stopped):
                 self._act(run)
@@ -135,7 +139,10 @@ class Optimize(Stage):
             if run.interrupted:
                 told = f"saved in {checkpoint.save(run)}; `clsplat resume {run.out}` goes on from it"
                 raise Interrupted(f"stopped at step {run.step}, {told}")
+            if self.has_ended(run):
+                self.leave(run)
             yield view
+        self.leave(run)  # a resumed run may have no step left
         write_view_colours(run, trainer.colours)
 
     @property
@@ -176,13 +183,14 @@ class Optimize(Stage):
 
     def _act(self, run: Run) -> None:
         """Run the stages that are due and do not edit; those that fail run again when the run goes on."""
-        for place, stage in enumerate(self.during):
-            due = run.stage_step > 0 and stage.due(run.step, run.stage_step == self.steps)
+        for place, stage in enumerate(self.inner):
+            due = run.stage_step > 0 and stage.due(run.step, self.has_ended(run))
             if place < run.acted or stage.edits or not due:
                 continue
             run.acted = place + 1  # a checkpoint is of the state after it
             try:
                 stage.act(run)
+                self.judge(run, stage)
             except BaseException:
                 run.acted = place
                 raise
@@ -232,18 +240,3 @@ class Optimize(Stage):
         visit = self.skip.visit(sample.view.name, view, run.numbers) if self.skip else Visit()
         stale = set() if run.stage_step == self.steps else stale
         return view if visit.skipped else trainer.backward(view), stale, visit
-
-    def _report(self, run: Run, forecast: Forecast, loss: float, psnr: float, seconds: list[float]) -> None:
-        count = run.model.gaussians.count
-        stages, ms = stage_milliseconds(run.device.timings), 1e3 * median(seconds)  # the first step may load much
-        cost = {"ms": ms, "cpu_seconds": round(run.cpu_seconds, 3), "stages": stages}
-        run.records.add(run.step, "train", loss=loss, psnr=psnr, gaussians=count, **cost)
-        if run.step % (DISTRIBUTION_INTERVAL * self.log_every) == 0 or run.step == forecast.last_step:
-            run.records.add(run.step, "distribution", gaussians=count, **distribution(run.model.gaussians))
-        if self.skip and run.step == forecast.last_step:
-            self.skip.tell(run)
-        run.records.write()
-        forecast.add(run.step, psnr, count, fmean(seconds))
-        left, known = forecast.seconds_left, forecast.growth_known
-        run.status.note(gaussians=count, seconds_left=round(left, 1))
-        run.show(Progress(run.step, forecast.last_step, loss, forecast.psnr, count, ms, left, known))

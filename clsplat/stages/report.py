@@ -13,8 +13,10 @@ from clsplat.pages.page import duration, render, require_end
 from clsplat.reading import read_text
 from clsplat.report.cameras import cameras
 from clsplat.report.charts import gaussians_charts, training_charts
+from clsplat.report.parting import parting
 from clsplat.report.times import times
 from clsplat.report.views import views
+from clsplat.scene.scene import SPLITS
 from clsplat.stages.base import Stage, path_in_run
 from clsplat.training.found import photographs_text
 from clsplat.training.run import Run
@@ -38,6 +40,7 @@ class Report(Stage):
             title=run.scene_name,
             subtitle=f"{run.name} · {run.device.text}",
             main=_main(run),
+            parting=parting(run),
             photographs=photographs_text(run.found) or f"{amount(len(run.original.views), 'photograph')}",
             viewers=_addresses(run, "viewer", run.out / self.file),
             models=_addresses(run, "export", run.out / self.file),
@@ -66,17 +69,22 @@ def _main(run: Run) -> str:
     """The figures that are looked for first."""
     test = run.metrics.get("test", {}).get(f"{run.downscale:g}")
     quality = [f"test PSNR {test['psnr']:.2f} dB, SSIM {test['ssim']:.4f}"] if test else []
+    quality += [f"the model of step {run.model_step:,}"] if run.model_step != run.step else []
     others = f"{run.model.gaussians.count:,} Gaussians", f"trained for {duration(run.train_seconds)}"
     return " · ".join([*quality, *others])
 
 
 def _figures(run: Run) -> dict[str, str]:
     values = {}
-    for split, by_downscale in run.metrics.items():
+    for split, by_downscale in sorted(run.metrics.items(), key=lambda item: SPLITS.index(item[0])):
         for downscale, averages in by_downscale.items():
             suffix = "" if downscale == f"{run.downscale:g}" else f" at 1/{downscale}"
             values[f"{split} PSNR{suffix} ({amount(averages['views'], 'view')})"] = f"{averages['psnr']:.2f} dB"
             values[f"{split} SSIM{suffix}"] = f"{averages['ssim']:.4f}"
+    if run.is_refit and run.best:
+        found = run.best.found
+        values["validation PSNR before the refit"] = f"{found.validation:.2f} dB"
+        values["training PSNR before the refit"] = f"{found.train:.2f} dB"
     values["Gaussians"] = f"{run.model.gaussians.count:,}"
     values["steps"] = f"{run.step:,}"
     values["training"] = duration(run.train_seconds)

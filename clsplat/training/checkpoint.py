@@ -5,13 +5,12 @@ finite is no checkpoint: it lies beside them as failed_N.npz, and a run goes on 
 """
 
 import logging
-import math
 import re
 from collections.abc import Iterable
 from functools import cache
+from itertools import chain
 from pathlib import Path
 
-import numpy as np
 from pydantic import ValidationError
 
 from clsplat import __version__
@@ -19,16 +18,15 @@ from clsplat.density.statistics import FOLDER as STATS_FOLDER
 from clsplat.density.statistics import SEEN, SplatStats
 from clsplat.errors import ClsplatError, ConfigError, DataError, NotFiniteError, OutputError
 from clsplat.files import atomic
-from clsplat.gaussians.model import WIDTHS
-from clsplat.gaussians.tables import PARAMETERS, Gaussians, moment_tables
+from clsplat.gaussians.tables import Gaussians
 from clsplat.names import CHECKPOINTS, PIPELINE
-from clsplat.training import archive
+from clsplat.training import archive, kept
 from clsplat.training.adam import Adam
 from clsplat.training.advice import lower_rate
 from clsplat.training.archive import Arrays
 from clsplat.training.changes import differences
 from clsplat.training.run import Run
-from clsplat.training.state import State
+from clsplat.training.state import State, check_tables
 
 FORMAT = 4
 LOG = logging.getLogger("clsplat")
@@ -44,11 +42,12 @@ def save(run: Run, keep: int | None = None) -> Path:
         raise ClsplatError(f"{run.out}: step {run.step} is half done, so it is not saved; resume the run to go on")
     if broken := run.model.gaussians.not_finite():
         raise NotFiniteError(f"step {run.step}: {set_aside(run, broken)}")
-    path = _write(run, "step")
+    path = _write(run, "refit" if run.is_refit else "step")
     run.status.note(checkpoint=path.name)
     run.status.refresh()
     if keep is not None:
-        _remove(saved(run.out, run.step)[:-keep])  # a later one is damaged, and could not be renamed
+        files = saved(run.out)
+        _remove(files[: files.index(path) + 1][:-keep])  # a later one is damaged, and could not be renamed
     return path
 
 
@@ -68,14 +67,14 @@ def set_aside(run: Run, broken: list[str]) -> str:
     )
 
 
-def saved(out: Path, last: float = math.inf) -> list[Path]:
-    """Return the checkpoints of a run folder from old to new, up to the step `last`."""
-    steps = {
-        int(found[1]): path
-        for path in (out / CHECKPOINTS).glob("step_*.npz")
-        if (found := re.fullmatch(r"step_(\d+)\.npz", path.name))
+def saved(out: Path) -> list[Path]:
+    """Return the checkpoints of a run folder from old to new; those of a refit come after those before it."""
+    places = {
+        (found[1] == "refit", int(found[2])): path
+        for path in (out / CHECKPOINTS).glob("*.npz")
+        if (found := re.fullmatch(r"(step|refit)_(\d+)\.npz", path.name))
     }
-    return [steps[step] for step in sorted(steps) if step <= last]
+    return [places[place] for place in sorted(places)]
 
 
 def load(path: Path) -> tuple[State, Arrays]:
@@ -93,7 +92,9 @@ def load(path: Path) -> tuple[State, Arrays]:
         raise DataError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from error
     if state.cursor > len(state.pipeline.get("stages", ())):  # equal to it: all stages have ended
         raise DataError(f"it has no stage {state.cursor}")
-    _check(state, {name.removeprefix("gaussians/"): table for name, table in tables.items()})
+    own, best = kept.split_tables(tables)
+    kept.check(state.best, best)
+    check_tables(state, {name.removeprefix("gaussians/"): table for name, table in own.items()})
     return state, tables
 
 
@@ -131,7 +132,7 @@ def drop_later(out: Path, taken: Path | None) -> None:
     files = saved(out)
     for damaged in files[files.index(taken) + 1 :] if taken else ():
         try:
-            damaged.rename(damaged.with_name(damaged.name.replace("step", "damaged")))
+            damaged.rename(damaged.with_name(re.sub("^(step|refit)", "damaged", damaged.name)))
         except OSError as error:
             LOG.warning("%s: cannot be renamed (%s); remove it", damaged, error.strerror)
 
@@ -165,6 +166,7 @@ def _write(run: Run, kind: str) -> Path:
         zero_fresh=[name for name, table in run.model.gaussians.tables.items() if table.zero_fresh],
         updates=run.adam.updates if run.adam else {},
         numbers=run.numbers,
+        best=run.best,
         train_seconds=run.train_seconds,
         cpu_seconds=run.cpu_seconds,
         metrics=run.metrics,
@@ -178,30 +180,9 @@ def _write(run: Run, kind: str) -> Path:
     path = run.out / CHECKPOINTS / f"{kind}_{run.step:06d}.npz"
     with atomic(path) as file:
         tables = ((_key(name), run.model.gaussians.get(name)) for name in run.model.gaussians.tables)
-        archive.write(file, state.model_dump(), tables)
+        best = ((kept.FOLDER + name, table) for name, table in run.best_tables.items())
+        archive.write(file, state.model_dump(), chain(tables, best))
     return path
-
-
-def _check(state: State, tables: Arrays) -> None:
-    """Raise DataError for tables that are not those of a run."""
-    if missing := [name for name in PARAMETERS if name not in tables]:
-        raise DataError(f"lacks {', '.join(missing)}")
-    count = len(tables["means"])
-    for name, table in tables.items():
-        if table.dtype != np.float32 or table.ndim != 2 or len(table) != count:
-            raise DataError(f"{name} is not [{count}, components] of float32")
-    if count == 0:
-        raise DataError("it holds no Gaussians")
-    for name in PARAMETERS:
-        if tables[name].shape[1] not in WIDTHS[name]:
-            raise DataError(f"{name} has {tables[name].shape[1]} components")
-        moments = [moment for moment in moment_tables(name) if moment in tables]
-        if broken := [key for key in (name, *moments) if not np.isfinite(tables[key]).all()]:
-            raise DataError(f"{broken[0]} holds values that are not finite")
-        if [tables[moment].shape for moment in moments] != [tables[name].shape] * (2 if state.updates else 0):
-            raise DataError(f"the moments of {name} are not like it")
-    if state.updates and state.updates.keys() != set(PARAMETERS):
-        raise DataError("it counts updates of other parameters")
 
 
 def _take_changes(run: Run, path: Path, state: State) -> list[str]:
@@ -217,6 +198,8 @@ def _take_changes(run: Run, path: Path, state: State) -> list[str]:
             raise ConfigError(f"{path} was made with other settings: {difference}; {remedy}")
         if difference.stage is not None and difference.stage < state.cursor:
             raise ConfigError(f"{path} was saved after that stage, at step {state.step}: {difference}; {remedy}")
+        if state.best and state.best.refit == "begun" and difference.place.endswith((".steps", ".patience")):
+            raise ConfigError(f"{path} is of a refit, whose steps validation has found: {difference}; {remedy}")
         is_end = difference.place.endswith(".steps")  # an end before the one that was planned
         if difference.stage == state.cursor and state.is_trained(run.pipeline) and not is_end:
             more = f"`clsplat resume {run.out} --steps {2 * state.stage_step}` with that setting trains on"
@@ -227,6 +210,7 @@ def _take_changes(run: Run, path: Path, state: State) -> list[str]:
 
 
 def _restore(run: Run, state: State, tables: Arrays) -> None:
+    tables, run.best_tables = kept.split_tables(tables)
     gaussians = Gaussians(run.device, {name.removeprefix("gaussians/"): table for name, table in tables.items()})
     run.model = run.model_settings.model(gaussians, state.degree)
     if state.updates:
@@ -241,6 +225,9 @@ def _restore(run: Run, state: State, tables: Arrays) -> None:
         gaussians.set(name, table)
     run.step, run.cursor, run.stage_step = state.step, state.cursor, state.stage_step
     run.acted, run.edited, run.whole, run.numbers = state.acted, state.edited, True, state.numbers
+    run.best = state.best
+    if run.is_refit:
+        run.train_on_all()
     run.train_seconds, run.cpu_seconds, run.metrics = state.train_seconds, state.cpu_seconds, state.metrics
     run.records.lines, run.inputs_before, run.written = state.records, state.inputs, state.written
 

@@ -5,14 +5,20 @@ import logging
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from clsplat.errors import DataError, quoted
 from clsplat.files import write_text
 from clsplat.names import VIEW_COLOURS
 from clsplat.reading import read_json
+from clsplat.scene.view import View
 from clsplat.settings import variants
 from clsplat.training.run import Run
 from clsplat.views.colours import Auto, ColourModel, Colours
+from clsplat.views.exposures import UNKNOWN, Exposures, measured, noted
 from clsplat.views.photograph_colours import TABLE, PhotographColours
+from clsplat.views.photographs import Mask
 
 LOG = logging.getLogger("clsplat")
 GUESSED = 1.0  # dB by which figures in the photographs' colours are better, from which on the log says why
@@ -28,7 +34,7 @@ def photograph_colours(colours: Colours | None, run: Run, last: int) -> Photogra
     if not isinstance(colours, ColourModel):
         return None
     views = [view.name for view in run.scene.split("train")]
-    exposures = run.exposures()
+    exposures = exposures_of(run)
     rate = colours.rate_of(last, len(set(views)), bool(exposures.log_gains))
     found = PhotographColours(colours, views, rate)
     if not found.table.begun(run.numbers):
@@ -37,11 +43,27 @@ def photograph_colours(colours: Colours | None, run: Run, last: int) -> Photogra
     return found
 
 
+def exposures_of(run: Run) -> Exposures:
+    """Return what the training photographs show of their exposures, or else what cameras noted; measured once."""
+    views = run.scene.split("train")
+    names = tuple(view.name for view in views)
+    if names not in run.exposures:
+
+        def read(view: View) -> tuple[NDArray[np.uint8], Mask | None]:
+            photograph = run.photographs.get(view)
+            return photograph.image(), photograph.counted()
+
+        counted = run.status.counted(views, "photographs", len(views))
+        shown = measured(run.scene.tracks, counted, read) if run.scene.tracks else UNKNOWN
+        run.exposures[names] = shown if shown.log_gains else noted(views)
+    return run.exposures[names]
+
+
 def settled(colours: Auto, run: Run) -> Auto:
     """Return it with the choice that follows from the exposures of a run's photographs; one that is made stays."""
     if colours.chosen is not None:
         return colours
-    exposures = run.exposures()
+    exposures = exposures_of(run)
     if not exposures.log_gains:
         return colours.choose("off", exposures.text)
     differ = exposures.spread > colours.above and exposures.explained > colours.explained

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from clsplat.errors import DataError
-from clsplat.files import append, write_text
-from clsplat.names import RECORDS
+from clsplat.files import append, told_as, write_text
+from clsplat.names import RECORDS, TRIAL
 from clsplat.reading import read_file
 
 LOG = logging.getLogger("clsplat")
@@ -26,19 +26,31 @@ class Records:
         """`require_held` raises OutputError when the folder is no longer held."""
         self.out = out
         self._require_held = require_held
-        self.path = out / RECORDS
+        self.path, self.trial = out / RECORDS, out / TRIAL
         self.lines = 0  # of metrics.jsonl that belong to the state of the run, with those that wait
         self._waiting: list[str] = []
 
-    def start(self) -> None:
+    def set_aside(self) -> None:
+        """Begin anew, for a refit; the lines so far are in trial.jsonl then.  Raises OutputError."""
+        self.write()
+        self._require_held()
+        with told_as(self.trial):
+            self.path.replace(self.trial)
+        self.lines = 0
+
+    def start(self, is_refit: bool = False) -> None:
         """Drop the lines after those of the state, which a resumed run writes again.
 
+        Where that is before a refit, lines that were set aside for one come back.
         Those of the state that cannot be read are lost, with all behind them, and a warning says so.
         """
+        if not is_refit and self.trial.exists():
+            with told_as(self.trial):
+                self.trial.replace(self.path)
         kept: list[dict[str, Any]] = []
         fault = "it ends before"
         try:
-            for line in islice(self._each(), self.lines):
+            for line in islice(self._each(self.path), self.lines):
                 kept.append(line)
         except DataError as error:
             fault = str(error)
@@ -75,17 +87,20 @@ class Records:
             self.lines = lines
             raise
 
-    def read(self, kind: str | None = None) -> list[dict[str, Any]]:
+    def read(self, kind: str | None = None, trial: bool = False) -> list[dict[str, Any]]:
         """Return the lines, of one kind or all; a line cut short by a crash is left out.
+
+        trial: those before a refit, none where there was none.
 
         Raises DataError with file and line when the file is damaged in another way.
         """
-        return [line for line in self._each() if kind in (None, line["kind"])]
+        lines = self._each(self.trial if trial else self.path)
+        return [line for line in lines if kind in (None, line["kind"])]
 
-    def _each(self) -> Iterator[dict[str, Any]]:
-        if not self.path.exists():
+    def _each(self, path: Path) -> Iterator[dict[str, Any]]:
+        if not path.exists():
             return
-        texts = read_file(self.path).decode(errors="replace").split("\n")
+        texts = read_file(path).decode(errors="replace").split("\n")
         for number, text in enumerate(texts, 1):
             try:
                 line = json.loads(text)
@@ -95,7 +110,7 @@ class Records:
                 line = None
             if not isinstance(line, dict) or type(line.get("step")) is not int or not isinstance(line.get("kind"), str):
                 raise DataError(
-                    f"{self.path}:{number}: damaged; expected keys and values with 'step' and 'kind'; remove this line"
+                    f"{path}:{number}: damaged; expected keys and values with 'step' and 'kind'; remove this line"
                 )
             if "scale" in line:  # its name in older runs
                 line["downscale"] = line.pop("scale")

@@ -23,13 +23,14 @@ from clsplat.opencl.device import Device
 from clsplat.pages.page import scene_name
 from clsplat.render.rasterizer import PIXEL_SUMS, Rasterizer
 from clsplat.scene.identity import Identity
-from clsplat.scene.scene import Scene, View
+from clsplat.scene.scene import Scene
 from clsplat.settings import Settings
 from clsplat.training.adam import Adam
+from clsplat.training.kept import Best, Tables
 from clsplat.training.memory import MemoryPlan, plan
 from clsplat.training.records import Records
 from clsplat.training.status import StatusFile
-from clsplat.views.exposures import UNKNOWN, Exposures, measured, noted
+from clsplat.views.exposures import Exposures
 from clsplat.views.photographs import Photographs
 from clsplat.views.texture import texture_quantile
 
@@ -92,6 +93,9 @@ class Run:
     divisor: float = 1.0  # of the photographs' size at the step before an edit
     inputs_before: str = ""  # `inputs` of the checkpoint that the run goes on from
     numbers: dict[str, float] = field(default_factory=dict)  # that parts of it keep from step to step, by name
+    best: Best | None = None  # what validation has found in the training
+    best_tables: Tables = field(default_factory=dict)  # of that model, on the host, as long as the training goes on
+    exposures: dict[tuple[str, ...], Exposures] = field(default_factory=dict)  # measured, by the names of photographs
     train_seconds: float = 0.0
     cpu_seconds: float = 0.0  # of all threads of the process, in the same time
     written: dict[str, str] = field(default_factory=dict)  # models: path in the run folder -> SHA-256
@@ -105,7 +109,6 @@ class Run:
         self._model: DeviceModel | None = None
         self._filter_views: FilterViews | None = None
         self._texture_quantiles: dict[float, float] = {}
-        self._exposures: Exposures | None = None
 
     @property
     def model(self) -> DeviceModel:
@@ -123,6 +126,31 @@ class Run:
         self.cursor, self.stage_step, self.acted, self.edited = cursor, 0, 0, False
         if self.has_model:
             self.model.gaussians.tables.pop(HIDDEN, None)  # which a training has for itself
+
+    @property
+    def model_step(self) -> int:
+        """The global step whose model this is."""
+        is_kept = self.best is not None and self.best.taken == self.step and self.best.refit != "begun"
+        return self.best.found.step if self.best and is_kept else self.step
+
+    @property
+    def is_refit(self) -> bool:
+        """Whether all training photographs are trained on, those for validation too, for the steps that were best."""
+        return self.best is not None and self.best.refit == "begun"
+
+    def begin_again(self, best: Best) -> None:
+        """Come to the beginning of the pipeline, to train again for the steps of the best model."""
+        self._model, self.adam, self.stats, self.step, self.divisor = None, None, None, 0, 1.0
+        self.numbers, self.metrics, self.written, self.whole = {}, {}, {}, True
+        self.best, self.best_tables = best, {}
+        self.next_stage(0)
+        self.train_on_all()
+
+    def train_on_all(self) -> None:
+        """Put the validation views among those that are trained on."""
+        self.original, downscales = self.original.with_fold(), self.scene.downscales
+        self.scene = self.original.downscaled(*downscales)
+        self._filter_views, self._texture_quantiles = None, {}
 
     @contextmanager
     def changing(self) -> Iterator[None]:
@@ -188,20 +216,6 @@ class Run:
     def survey(self) -> Survey:
         """Return the training views for the rules of an edit."""
         return Survey(self.rasterizer, self.model, self.photographs, self.scene.split("train"), self.seed, self.step)
-
-    def exposures(self) -> Exposures:
-        """Return what the training photographs show of their exposures, or else what cameras noted; measured once."""
-        if self._exposures is None:
-
-            def read(view: View) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
-                photograph = self.photographs.get(view)
-                return photograph.image(), photograph.counted()
-
-            views = self.scene.split("train")
-            counted = self.status.counted(views, "photographs", len(views))
-            shown = measured(self.scene.tracks, counted, read) if self.scene.tracks else UNKNOWN
-            self._exposures = shown if shown.log_gains else noted(views)
-        return self._exposures
 
     def texture_quantile(self, share: float) -> float:
         """Return the gradient magnitude, per px, that `share` of the training photographs' pixels stay below."""

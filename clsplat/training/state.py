@@ -2,7 +2,14 @@
 
 from typing import Annotated, Any
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
+
+from clsplat.errors import DataError
+from clsplat.gaussians.model import WIDTHS
+from clsplat.gaussians.tables import PARAMETERS, moment_tables
+from clsplat.training.archive import Arrays
+from clsplat.training.kept import Best
 
 Count = Annotated[int, Field(ge=0)]
 
@@ -23,6 +30,7 @@ class State(BaseModel):
     zero_fresh: list[str]
     updates: dict[str, Count]
     numbers: dict[str, float] = {}  # that parts of the run keep; older files have none
+    best: Best | None = None  # what validation has found; older files have none
     train_seconds: float
     cpu_seconds: float = 0.0  # in the same time; older files have none
     metrics: dict[str, dict[str, Any]]
@@ -37,3 +45,25 @@ class State(BaseModel):
         """Whether all the steps that a resolved pipeline gives the training in progress are done."""
         (stage,) = pipeline["stages"][self.cursor].values()
         return bool(stage.get("steps") == self.stage_step)
+
+
+def check_tables(state: State, tables: Arrays) -> None:
+    """Raise DataError for tables that are not those of a run."""
+    if missing := [name for name in PARAMETERS if name not in tables]:
+        raise DataError(f"lacks {', '.join(missing)}")
+    count = len(tables["means"])
+    for name, table in tables.items():
+        if table.dtype != np.float32 or table.ndim != 2 or len(table) != count:
+            raise DataError(f"{name} is not [{count}, components] of float32")
+    if count == 0:
+        raise DataError("it holds no Gaussians")
+    for name in PARAMETERS:
+        if tables[name].shape[1] not in WIDTHS[name]:
+            raise DataError(f"{name} has {tables[name].shape[1]} components")
+        moments = [moment for moment in moment_tables(name) if moment in tables]
+        if broken := [key for key in (name, *moments) if not np.isfinite(tables[key]).all()]:
+            raise DataError(f"{broken[0]} holds values that are not finite")
+        if [tables[moment].shape for moment in moments] != [tables[name].shape] * (2 if state.updates else 0):
+            raise DataError(f"the moments of {name} are not like it")
+    if state.updates and state.updates.keys() != set(PARAMETERS):
+        raise DataError("it counts updates of other parameters")

@@ -1,0 +1,108 @@
+"""A choice of a scene's views by their names: every n-th, a list, or the lines of a file."""
+
+from collections.abc import Callable, Sequence
+from difflib import get_close_matches
+from pathlib import Path, PurePosixPath
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, ValidationError, WrapValidator, model_validator
+
+from clsplat.errors import DataError, quoted
+from clsplat.reading import read_text
+from clsplat.scene.scene import every_nth
+from clsplat.settings import ReadPath, Settings
+
+LARGEST = 1 << 24  # bytes of a list of names
+NOTATIONS = "expected a number, {every, offset}, {names: […]} or {file: …}"
+
+
+class Choice(Settings):
+    """Views by name: every n-th from one on, or those of a list, or of a file with a name a line.
+
+    A listed name is that of the view, or its end: `0042`, `0042.jpg` and `images/0042.jpg` name the same photograph.
+    """
+
+    every: Annotated[int, Field(gt=0)] | None = None
+    """Every n-th view, in order of name."""
+    offset: Annotated[int, Field(ge=0)] = 0
+    """Place of the first of them, counted from 0."""
+    names: Annotated[list[str], Field(min_length=1)] | None = None
+    """Names of the views."""
+    file: ReadPath | None = None
+    """Text file with a name a line; a relative path is one in the folder of the dataset."""
+
+    @model_validator(mode="after")
+    def _of_one_kind(self) -> "Choice":
+        given = [self.every, self.names, self.file]
+        if sum(value is not None for value in given) != 1 or (self.offset and self.every is None):
+            raise ValueError(NOTATIONS)
+        if self.every is not None and self.offset >= self.every:
+            raise ValueError(f"expected an offset below every, {self.every}")
+        return self
+
+    def of(self, names: Sequence[str], folders: Sequence[Path]) -> set[int]:
+        """Return the indices of the chosen ones of `names`.
+
+        folders: where a relative file is looked for, in order.  Raises DataError for a name that no view has, or
+        several have.
+        """
+        if self.every is not None:
+            return every_nth(names, self.every, self.offset)
+        place, listed = "the list of names", self.names or []
+        if self.file is not None:
+            files = [folder / self.file for folder in folders]
+            found = next((file for file in files if file.is_file()), files[0])
+            place = str(found)
+            lines = (line.strip() for line in read_text(found, limit=LARGEST).splitlines())
+            listed = [line for line in lines if line and not line.startswith("#")]
+            if not listed:
+                raise DataError(f"{place}: is empty; expected the name of a photograph in each line")
+        return {_index_of(name, names, place) for name in listed}
+
+
+def _explained(notations: str) -> WrapValidator:
+    """Make one sentence of the errors of all notations."""
+
+    def validated(value: Any, validate: Callable[[Any], Any]) -> Any:
+        try:
+            return validate(value)
+        except ValidationError as error:
+            own = [one["msg"].removeprefix("Value error, ") for one in error.errors() if one["type"] == "value_error"]
+            raise ValueError(next(iter(own), notations)) from None
+
+    return WrapValidator(validated)
+
+
+Number = Annotated[int, Field(ge=0)]
+Chosen = Annotated[Number | Choice, _explained(NOTATIONS)]
+ChosenOrAuto = Annotated[Number | Choice | Literal["auto"], _explained(f"{NOTATIONS}, or auto")]
+
+
+def choose(choice: int | Choice, names: Sequence[str], folders: Sequence[Path]) -> set[int]:
+    """Return the indices of the chosen names; a number chooses every n-th from the first on, 0 none.
+
+    Raises DataError as Choice.of does.
+    """
+    return choice.of(names, folders) if isinstance(choice, Choice) else every_nth(names, choice)
+
+
+def _index_of(listed: str, names: Sequence[str], place: str) -> int:
+    """The index of the only name that a listed one means, whole or as an end, with or without its suffix."""
+    if listed in names:
+        return names.index(listed)
+    wanted = PurePosixPath(listed.replace("\\", "/"))
+    found = [
+        i
+        for i, path in enumerate(map(PurePosixPath, names))
+        if any(one.parts[-len(wanted.parts) :] == wanted.parts for one in (path, path.with_suffix("")))
+    ]
+    if len(found) == 1:
+        return found[0]
+    if found:
+        both = " and ".join(quoted(names[i]) for i in found[:2])
+        raise DataError(f"{place}: {quoted(listed)} means {both}; give more of the path")
+    near = get_close_matches(listed, [*names, *(PurePosixPath(name).name for name in names)], 1)
+    more = (
+        f"did you mean {quoted(near[0])}?" if near else f"the first is {quoted(names[0])}: correct or remove the name"
+    )
+    raise DataError(f"{place}: no photograph is called {quoted(listed)}; {more}")

@@ -1,0 +1,83 @@
+"""Which views of a scene are for training, for validation and for testing, and which are left out."""
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+from clsplat.errors import DataError, amount
+from clsplat.scene.choice import Choice, choose
+from clsplat.scene.images import Missing
+from clsplat.scene.scene import HOLDOUT, Scene, make_scene
+
+LOG = logging.getLogger("clsplat")
+FOLD, FOLD_OFFSET = 8, 4  # of the training views, in order of name: not the first, the end of many a path
+LEAST = 4  # training views that can be divided
+
+
+@dataclass(frozen=True)
+class Split:
+    """What of a dataset a run trains on, chooses by and is tested on; fields as in the table `scene` of a pipeline."""
+
+    holdout: int | Choice = HOLDOUT
+    train: Choice | None = None
+    validation: int | Choice | Literal["auto"] = 0
+    missing: Missing = "refuse"
+    folder: Path | None = None  # where lists of names are that the dataset's own folder does not have
+
+    @property
+    def of_reader(self) -> int:
+        """The holdout that a reader is asked for, where the dataset has no split."""
+        return self.holdout if isinstance(self.holdout, int) else 0
+
+    def applied(self, scene: Scene) -> Scene:
+        """Return the scene, read with `of_reader`, with this split.
+
+        Raises DataError where names are wrong, or a split takes every view.
+        """
+        folders = [scene.path, *([self.folder] if self.folder else [])]
+        if isinstance(self.holdout, Choice) and not (self.holdout.every and scene.test):  # the dataset says which
+            names = [view.name for view in scene.views]
+            scene = _with_test(scene, self.holdout.of(names, folders))
+        if self.train is not None:
+            kept = _of(scene, self.train, folders) | set(scene.test)
+            LOG.info("scene.train leaves out %s", amount(len(scene.views) - len(kept), "photograph"))
+            views = [view for i, view in enumerate(scene.views) if i in kept]
+            test = {scene.views[i].name for i in scene.test}
+            smaller = replace(scene, views=tuple(views))
+            scene = _with_test(smaller, {i for i, view in enumerate(views) if view.name in test})
+        if self.validation == 0:
+            return scene
+        fold = _auto(scene) if self.validation == "auto" else _of(scene, self.validation, folders)
+        train = tuple(i for i in scene.train if i not in fold)
+        if not fold or not train:
+            raise DataError(
+                f"{scene.path}: scene.validation takes {len(fold)} of {len(scene.train)} training photographs; "
+                "expected some of them, not all"
+            )
+        return replace(scene, train=train, validation=tuple(sorted(fold)))
+
+
+def _with_test(scene: Scene, test: set[int]) -> Scene:
+    """The views of a scene, with its extent, where these are for testing."""
+    return make_scene(scene.path, list(scene.views), test, scene.points, scene.background)
+
+
+def _of(scene: Scene, choice: int | Choice, folders: Sequence[Path]) -> set[int]:
+    """The indices of the chosen ones of the training views."""
+    chosen = choose(choice, [scene.views[i].name for i in scene.train], folders)
+    return {scene.train[i] for i in chosen}
+
+
+def _auto(scene: Scene) -> set[int]:
+    """Every 8th of the training views, and at least two of them."""
+    count = len(scene.train)
+    if count < LEAST:
+        raise DataError(
+            f"{scene.path}: has {amount(count, 'training photograph')}; expected {LEAST} or more to keep some for "
+            "validation: take more, or set scene.validation to 0"
+        )
+    order = sorted(scene.train, key=lambda i: scene.views[i].name)
+    fold = order[FOLD_OFFSET::FOLD]
+    return set(fold if len(fold) > 1 else [order[count // 4], order[3 * count // 4]])

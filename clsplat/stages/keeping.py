@@ -1,0 +1,122 @@
+"""Which model a training leaves: that of its last step, or the best one by photographs that it did not see."""
+
+import logging
+from collections.abc import Sequence
+from typing import Annotated, ClassVar, Literal
+
+from pydantic import Field, model_validator
+
+from clsplat.errors import ConfigError
+from clsplat.gaussians.tables import Gaussians
+from clsplat.stages.base import Scheduled, Stage
+from clsplat.stages.evaluate import Evaluate
+from clsplat.training.kept import Best, Measured, tables_of
+from clsplat.training.run import Run
+
+LOG = logging.getLogger("clsplat")
+EVALUATIONS, SHORTEST = 20, 100  # of a training at most; steps from one to the next at least
+PSNR_AND_SSIM = ("psnr", "ssim")
+SHOWN = 8  # training views that are measured beside the validation views, at most
+
+
+class Keeping(Stage):
+    """A training with a number of steps, and the model that it leaves.
+
+    With `keep: best` the validation views (`scene.validation`) are measured as often as an `evaluate` of them in
+    `during` says, or else every 20th part of the steps, 100 at least; some training views beside them.
+    """
+
+    training_keys: ClassVar[frozenset[str]] = frozenset({"steps", "patience"})
+    step_keys: ClassVar[frozenset[str]] = frozenset({"steps"})
+
+    steps: Annotated[int, Field(gt=0)]
+    """Number of training steps."""
+    keep: Literal["last", "best"] = "last"
+    """Model that the training leaves: that of its last step, or the one with the best PSNR at the validation views."""
+    patience: Annotated[int, Field(gt=0)] | None = None
+    """Measurements of the validation views without a better one after which the training ends; without it, none."""
+    refit: bool = False
+    """With `keep: best`: train again from the beginning on all training photographs, those for validation too, for the
+    number of steps that was best."""
+
+    @model_validator(mode="after")
+    def _by_validation(self) -> "Keeping":
+        if self.keep != "best" and (self.patience or self.refit):
+            raise ValueError(f"'{'patience' if self.patience else 'refit'}' is for 'keep: best'; give both or neither")
+        inner = getattr(self, "during", ())
+        if self.keep == "best" and any("average" in stage.makes for stage in inner):
+            raise ValueError("'keep: best' leaves the model of one step, and not the average of several; choose one")
+        return self
+
+    def measuring(self, during: Sequence[Scheduled]) -> list[Evaluate]:
+        """Return the measurements that `keep: best` adds to `during`: of training views, then of validation views."""
+        if self.keep == "last":
+            return []
+        own = next((stage for stage in during if _validates(stage)), None)
+        every = own.every if own else min(max(SHORTEST, self.steps // EVALUATIONS), self.steps)
+        start, stop = (own.start, own.stop) if own else (0, None)
+        facts = {"metrics": [*PSNR_AND_SSIM], "every": every}
+        train = Evaluate.model_validate({**facts, "split": "train", "most": SHOWN, "start": start, "stop": stop})
+        return [train] if own else [train, Evaluate.model_validate({**facts, "split": "validation"})]
+
+    def begin_to_keep(self, run: Run) -> None:
+        """Forget the best of an earlier training.  Raises ConfigError where there is nothing to choose by."""
+        if self.keep == "best" and not run.scene.split("validation"):
+            raise ConfigError(
+                "optimize.keep: best chooses by validation views; expected some: set scene.validation=auto"
+            )
+        if self.keep == "best" and run.stage_step == 0:
+            run.best, run.best_tables = None, {}
+
+    def judge(self, run: Run, stage: Scheduled) -> None:
+        """After a measurement of the validation views, keep the model where it is the best so far."""
+        if self.keep == "last" or not _validates(stage):
+            return
+        averages = {split: run.metrics.get(split, {}) for split in ("train", "validation")}
+        train, validation = (one.get(f"{run.downscale:g}", {}).get("psnr") for one in averages.values())
+        if train is None or validation is None:  # at another size, or masks leave out all
+            return
+        best, now = run.best, Measured(step=run.step, train=train, validation=validation)
+        if best is not None and not validation > best.found.validation:
+            run.best = best.after(now)
+            return
+        apart = (best and best.apart) or (now if now.is_apart else None)
+        tables, evaluations = tables_of(run.model), best.evaluations + 1 if best else 1
+        copied = {split: dict(one) for split, one in averages.items()}
+        run.best = Best(
+            found=now,
+            degree=run.model.degree,
+            metrics=copied,
+            numbers=dict(run.numbers),
+            evaluations=evaluations,
+            since=0,
+            apart=apart,
+            last=now,
+        )
+        run.best_tables = tables
+
+    def has_ended(self, run: Run) -> bool:
+        """Whether no step of the training is left."""
+        best = run.best if self.keep == "best" and run.stage_step else None
+        ended = best is not None and self.patience is not None and best.since >= self.patience
+        return ended or run.stage_step >= self.steps
+
+    def leave(self, run: Run) -> None:
+        """At the end of the training, put the best model into the place of the last one."""
+        best = run.best
+        if self.keep == "last" or best is None or best.taken is not None:
+            return
+        with run.changing():
+            if best.found.step != run.step:
+                gaussians = Gaussians(run.device, run.best_tables)
+                run.model = run.model_settings.model(gaussians, best.degree)
+                run.adam = run.stats = None
+                run.numbers.update(best.numbers)
+            run.metrics.update(best.metrics)
+            run.best = best.model_copy(update={"taken": run.step, "refit": "due" if self.refit else "none"})
+            run.best_tables = {}
+        LOG.info("%s", run.best.told())
+
+
+def _validates(stage: Scheduled) -> bool:
+    return isinstance(stage, Evaluate) and stage.split == "validation" and stage.file is None
