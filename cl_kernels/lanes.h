@@ -1,5 +1,5 @@
-/* VF and VI: a float and an int in each of LANES lanes.  One source serves CPUs, where an item computes 16 or 8
- * Gaussians or pixels, as many as the vector unit has lanes, and GPUs, where an item computes one.
+/* VF, VI and VB: a float, an int and a byte in each of LANES lanes.  One source serves CPUs, where an item computes 16
+ * or 8 Gaussians or pixels, as many as the vector unit has lanes, and GPUs, where an item computes one.
  *
  * Comparisons give -1 in vectors and 1 in scalars, so masks are combined with & and | only and used as m ? a : b.
  * Loops that matter use operators only: some CPU runtimes call built-in functions out of line. */
@@ -10,6 +10,7 @@
 #if LANES == 16
 typedef float16 VF;
 typedef int16 VI;
+typedef uchar16 VB;
 #define as_VF as_float16
 #define as_VI as_int16
 #define LANE_INDEX ((VI)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15))
@@ -17,6 +18,7 @@ typedef int16 VI;
 #elif LANES == 8
 typedef float8 VF;
 typedef int8 VI;
+typedef uchar8 VB;
 #define as_VF as_float8
 #define as_VI as_int8
 #define LANE_INDEX ((VI)(0, 1, 2, 3, 4, 5, 6, 7))
@@ -24,6 +26,7 @@ typedef int8 VI;
 #else
 typedef float VF;
 typedef int VI;
+typedef uchar VB;
 #define as_VF as_float
 #define as_VI as_int
 #define LANE_INDEX 0
@@ -34,10 +37,12 @@ typedef int VI;
  * vstore, which some CPU runtimes call out of line or compose of four parts. */
 typedef VF __attribute__((aligned(4))) VF_in_memory;
 typedef VI __attribute__((aligned(4))) VI_in_memory;
+typedef VB __attribute__((aligned(1))) VB_in_memory;
 #define VLOAD(pointer) (*(__global const VF_in_memory *)(pointer))
 #define VSTORE(value, pointer) (*(__global VF_in_memory *)(pointer) = (value))
 #define VLOAD_INT(pointer) (*(__global const VI_in_memory *)(pointer))
 #define VSTORE_INT(value, pointer) (*(__global VI_in_memory *)(pointer) = (value))
+#define VLOAD_BYTES(pointer) (*(__global const VB_in_memory *)(pointer))
 #define VLOAD_LOCAL(pointer) (*(__local const VF_in_memory *)(pointer))
 #define VSTORE_LOCAL(value, pointer) (*(__local VF_in_memory *)(pointer) = (value))
 #define VLOAD_PRIVATE(pointer) (*(const VF_in_memory *)(pointer))

@@ -30,7 +30,7 @@ static inline float sum_items(__local const float *sums)  // [TEAM]
     return sum;
 }
 
-/* 8-bit pixels times a factor to float planes.  One item = one pixel of one channel; dimensions x, y, channel. */
+/* 8-bit pixels times a factor to float planes.  One item = LANES pixels of one channel; dimensions x, y, channel. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void unpack_pixels(
     __global const uchar *restrict pixels,  // [channels,height,width]
@@ -40,12 +40,16 @@ void unpack_pixels(
     const uint height,
     const uint stride)
 {
-    const uint x = get_global_id(0), y = get_global_id(1), channel = get_global_id(2);
-    if (x < width)
-        planes[(channel * get_global_size(1) + y) * stride + x] =
-            y < height ? pixels[(channel * height + y) * width + x] * factor : 0.0f;
-    else if (x < stride)
-        planes[(channel * get_global_size(1) + y) * stride + x] = 0.0f;
+    const uint x = get_global_id(0) * LANES, y = get_global_id(1), channel = get_global_id(2);
+    if (x >= stride)
+        return;
+    __global const uchar *first = pixels + (channel * height + y) * width + x;
+    __global float *values = planes + (channel * get_global_size(1) + y) * stride + x;
+    if (y < height && x + LANES <= width)
+        VSTORE(to_VF(VLOAD_BYTES(first)) * factor, values);
+    else
+        for (uint lane = 0; lane < LANES; lane++)
+            values[lane] = y < height && x + lane < width ? first[lane] * factor : 0.0f;
 }
 
 /* Set pixels that the mask leaves out to zero.  One item = one pixel of one channel; dimensions pixel, channel. */
