@@ -16,6 +16,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import AfterValidator, Field, GetCoreSchemaHandler, ValidationError, WrapValidator
 from pydantic_core import CoreSchema, core_schema
 
+from clsplat.errors import ConfigError
 from clsplat.settings import Settings
 
 Point = Annotated[list[float], Field(min_length=2, max_length=2)]  # global step, value
@@ -54,6 +55,10 @@ class Curve(Settings):
     def values(self) -> list[float]:
         """The values that bounds are checked on: the smallest must be among them."""
 
+    def divided(self, factor: float) -> "Curve":
+        """Return the curve with its values divided by a factor.  Raises ConfigError where it has no such values."""
+        raise ConfigError(f"{type(self).__name__}: cannot follow the number of steps; expected a number or points")
+
 
 class _Curves:
     """Marks a field that takes any curve, told apart by its keys."""
@@ -78,6 +83,9 @@ class Points(Curve):
     def values(self) -> list[float]:
         return [value for _, value in self.points]
 
+    def divided(self, factor: float) -> "Points":
+        return self.model_copy(update={"points": [[step, value / factor] for step, value in self.points]})
+
 
 class Decay(Curve):
     """A value that falls or grows exponentially (Kerbl et al. 2023)."""
@@ -101,6 +109,9 @@ class Decay(Curve):
     def values(self) -> list[float]:
         return [self.initial, self.final]
 
+    def divided(self, factor: float) -> "Decay":
+        return self.model_copy(update={"initial": self.initial / factor, "final": self.final / factor})
+
 
 class Every(Curve):
     """A value at every so many steps, and 0 at the others (such as the rate of what may change rarely)."""
@@ -116,6 +127,9 @@ class Every(Curve):
     @property
     def values(self) -> list[float]:
         return [self.value, 0.0]
+
+    def divided(self, factor: float) -> "Every":
+        return self.model_copy(update={"value": self.value / factor})
 
 
 NOTATIONS = (
@@ -146,6 +160,13 @@ def values_of(schedule: Schedule) -> list[float]:
     if isinstance(schedule, list):
         return [value for _, value in schedule]
     return schedule.values if isinstance(schedule, Curve) else [schedule]
+
+
+def divided(schedule: Schedule, factor: float) -> Schedule:
+    """Return a schedule with its values divided by a factor."""
+    if isinstance(schedule, list):
+        return [[step, value / factor] for step, value in schedule]
+    return schedule.divided(factor) if isinstance(schedule, Curve) else schedule / factor
 
 
 class Bounded:

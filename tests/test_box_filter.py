@@ -1,18 +1,23 @@
 """The screen filter `box`: settings, model files, what refuses it, and a run."""
 
 import json
+import re
 from dataclasses import replace
+from inspect import getsource
 
 import numpy as np
 import pytest
 
 import clsplat
+from clsplat import resource_dir
+from clsplat.density.statistics import Statistic
 from clsplat.errors import ConfigError, DataError
 from clsplat.formats.table import read, write
 from clsplat.gaussians.checkup import examine
 from clsplat.gaussians.model import Model, Rendering, load
 from clsplat.pipeline.loading import load as load_pipeline
 from clsplat.scene.stand import Stand
+from clsplat.settings import variants
 from clsplat.viewer.packing import pack
 from clsplat.viewer.page import Page
 from tests.formats.models import splats
@@ -39,10 +44,24 @@ def test_the_resolved_file_says_it_again(tmp_path):
     assert load_pipeline(tmp_path / "again.yaml").settings.model == pipeline.settings.model
 
 
-def test_a_rule_that_reads_conics_is_refused():
-    words = r"stages\[1\] optimize: the rule 'split_saddle' .* model.screen_filter.type 'box' .*expected another"
+@pytest.mark.parametrize(("name", "rule"), [("steep_7k", "split_saddle"), ("auto_7k", "clone")])
+def test_a_rule_that_reads_conics_is_refused(name, rule):
+    words = rf"stages\[1\] optimize: the rule '{rule}' .* model.screen_filter.type 'box' .*expected another"
     with pytest.raises(ConfigError, match=words):
-        load_pipeline("steep_7k", [BOX])
+        load_pipeline(name, [BOX])
+
+
+def test_every_statistic_whose_kernel_reads_conics_says_so():
+    reading = {
+        name
+        for path in resource_dir("cl_kernels").glob("*.cl")
+        for name, body in re.findall(r"\nvoid (accumulate_\w+)\((.*?)\n}", path.read_text(), re.S)
+        if "SPLAT_XX" in body
+    }
+    assert reading == {"accumulate_gain", "accumulate_splitting"}
+    kinds = [kind for kind in variants(Statistic).values() if any(name in getsource(kind) for name in reading)]
+    assert len(kinds) == 2
+    assert all(kind.reads_conics for kind in kinds)
 
 
 @pytest.mark.parametrize("name", ["a.ply", "a.compressed.ply", "a.sog", "a.glb"])

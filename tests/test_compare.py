@@ -85,6 +85,28 @@ def test_seeds_are_one_row_with_mean_and_deviation(make_run, tmp_path):
     assert "LPIPS" not in page, "it was not measured"
 
 
+def test_costs_are_shown_where_runs_have_noted_them(make_run, tmp_path):
+    def with_records(folder: Path, *lines: dict[str, object]) -> Path:
+        (folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+        return folder
+
+    trained = [{"step": s, "kind": "train", "psnr": 9.0, "gaussians": 9, "cpu_seconds": s / 5} for s in (10, 50)]
+    tested = [{"step": s, "kind": "evaluate", "split": "test", "downscale": 1.0, "psnr": 20.0 + s} for s in (30, 50)]
+    new = with_records(make_run("new", cpu_seconds=1234.4, device_memory=56_700_000), *trained, *tested)
+    old = with_records(make_run("old", "seed=1"), *({**line, "cpu_seconds": None} for line in trained), *tested)
+    page = page_of(tmp_path, new)
+    assert "CPU seconds</th>" in page
+    assert "<td>1,234</td>" in page
+    assert "<td>57</td>" in page
+    assert "test PSNR over CPU seconds of training, dB" in page
+    run = RunFolder.read(new)
+    assert run.by_cpu_seconds(run.points("evaluate", "psnr")) == [(6.0, 50.0), (10.0, 70.0)], "between two reports"
+    alone = page_of(tmp_path, old)
+    assert "CPU seconds" not in alone
+    assert "device memory" not in alone
+    assert "<td>1,234</td>" in page_of(tmp_path, new, old), "the mean of those that have noted it"
+
+
 def test_lines_of_runs_with_one_seed_are_told_apart_by_their_folders(make_run, tmp_path):
     names = re.findall(r">(A [^<]+)</tspan>", page_of(tmp_path, make_run("first"), make_run("second")))
     assert set(names) == {"A first", "A second (dashed)"}

@@ -154,7 +154,7 @@ def test_python_lines_of_the_documentation_run(page, code, tiny_scene, folder):
 
 def test_the_methods_of_growth_are_compared_at_equal_length_and_seeds():
     experiment = load_experiment(str(EXAMPLES / "growth.yaml"))
-    assert {cell.pipeline.settings.training.steps for cell in experiment.cells} == {7000}
+    assert {cell.pipeline.settings.training.steps for cell in experiment.cells} == {2000}
     names = [cell.pipeline.settings.name for cell in experiment.cells]
     assert {"splat_7k", "dash_7k", "mcmc_7k", "steep_7k"} <= set(names)
     assert {names.count(name) for name in names} == {3}

@@ -73,6 +73,18 @@ def test_cells_of_pipelines_and_scenes(write, tmp_path):
     assert [cell.pipeline.settings.name for cell in found.cells] == ["smoke", "smoke", "other", "other"]
 
 
+def test_cells_in_another_number_of_steps(write):
+    (cell,) = load_experiment(write("name: s\nmatrix: {pipelines: [splat_7k], seeds: [3], steps: 700}\n")).cells
+    training = cell.pipeline.settings.training
+    assert (training.steps, training.during[1].every, training.during[1].stop) == (700, 10, 400)
+
+
+def test_steps_need_a_stage_that_trains(write):
+    text = "name: s\nmatrix: {seeds: [3], steps: 700}\nstages:\n  - init: {count: 300}\n  - export\n"
+    with pytest.raises(ConfigError, match="expected a stage 'optimize'"):
+        load_experiment(write(text))
+
+
 def test_cells_do_not_see_each_others_values(write):
     """Values inside nested lists and dicts of the file are not shared."""
     text = (
@@ -170,6 +182,6 @@ def test_the_same_name_twice_is_refused(write, tmp_path):
 
 def test_schema_knows_the_matrix():
     schema = json_schema()
-    assert set(schema["$defs"]["Matrix"]["properties"]) == {"pipelines", "scenes", "seeds", "set", "options"}
+    assert set(schema["$defs"]["Matrix"]["properties"]) == {"pipelines", "scenes", "seeds", "set", "steps", "options"}
     assert schema["properties"]["matrix"] == {"$ref": "#/$defs/Matrix"}
     assert "stages" not in schema["required"]

@@ -54,6 +54,12 @@ def test_too_little_time_is_refused_with_what_would_do():
         pipeline_for(load("splat_7k"), [rehearsal(200, 0.02)], seconds=0.0, minutes=1.0)
 
 
+def test_a_short_training_is_reported_often_enough_to_be_corrected():
+    training = pipeline_for(load("splat_7k"), [rehearsal(200, 0.01)], seconds=8.0, minutes=1.0).settings.training
+    assert training.steps < 400
+    assert training.log_every <= 0.05 * training.steps + 1
+
+
 def test_the_choice_stretches_every_schedule_and_gives_its_reason():
     found = pipeline_for(load("splat_7k"), [rehearsal(200, 0.01)], seconds=40.0, minutes=1.0)
     training = found.settings.training

@@ -226,6 +226,7 @@ DIFFERENCES = {
         *("densify.start", "densify.stop", "stages.init.count", "stages.init.fewest", "stages.init.transparent"),
     },
     ("mip_splatting", "dash_mip"): DASH | {"reset_opacity.stop", "rates.logit_opacity", "refresh_filter.start"},
+    ("mip_splatting_7k", "dash_mip_7k"): DASH | {"refresh_filter.start"},
     ("splat", "auto_opti3dgs"): HAAR,
     ("splat_7k", "auto_opti3dgs_7k"): HAAR,
     ("splat", "micro_splatting"): {

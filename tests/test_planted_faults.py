@@ -26,6 +26,7 @@ FAULTS = {  # kernel -> file, text, wrong text
     "blur_columns": ("blur.cl", "row <= last", "row < last"),
     "nearest_vectors": ("clusters.cl", "difference < nearest", "difference <= nearest"),
     "sum_members": ("clusters.cl", "components + k, (int)p)", "components + k, (int)p / 2)"),
+    "share_mean": ("members.cl", "start + sum / total", "sum / total"),
     "count_not_finite": ("check.cl", "<= FLT_MAX", "<= INFINITY"),
     "count_seen": ("density.cl", "seen[i] += 1.0f", "seen[i] += 1.001f"),
     "accumulate_norm": ("density.cl", "sqrt(x * x + y * y)", "sqrt(x * x - y * y * 0.5f)"),

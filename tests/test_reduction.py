@@ -229,6 +229,70 @@ def test_a_sog_holds_the_harmonics_that_a_model_was_trained_with(many, tiny_scen
     np.testing.assert_array_equal(ours[1], theirs[1])
 
 
+LEARNED = PALETTE.replace(
+    "  - optimize: {steps: 4, rates: {sh_rest: 0, sh_base: 0.01}, losses: [l1]}\n",
+    """\
+  - export: {file: before.ply}
+  - optimize:
+      steps: 6
+      rates: {sh_rest: 0.01}
+      losses: [l1]
+      during: [share_palette: {every: 2}, checkpoint: {every: 3}]
+  - share_palette
+  - export: {file: after.ply}
+  - palette_sh: {quality: small}
+""",
+)
+
+
+@pytest.fixture(scope="module")
+def learned(many: Path, tiny_scene: Path, tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("learned")
+    (out / "palette.yaml").write_text(LEARNED.replace("MODEL", json.dumps(str(many))))
+    return train(tiny_scene, out / "run", pipeline=str(out / "palette.yaml")).out
+
+
+def test_gaussians_that_share_a_vector_train_it_together(learned):
+    before, after = (load(learned / f"{name}.ply").sh_rest for name in ("before", "after"))
+    vectors, labels = np.unique(before, axis=0, return_inverse=True)
+    assert len(vectors) <= 1024 < len(before)
+    pairs = np.unique(np.concatenate([labels.reshape(-1, 1), after], axis=1), axis=0)
+    assert len(pairs) == len(vectors), "each vector became one vector"
+    assert not np.array_equal(before, after)
+
+
+def test_a_trained_palette_is_rounded_to_what_a_sog_holds(learned):
+    after, model, back = (load(learned / name) for name in ("after.ply", "point_cloud.ply", "model.sog"))
+    assert len(np.unique(model.sh_rest)) <= 256 < len(np.unique(after.sh_rest))
+    assert len(np.unique(model.sh_rest, axis=0)) <= 1024
+    np.testing.assert_allclose(model.sh_rest, after.sh_rest, atol=0.01)
+    ours, theirs = (np.unique(one.sh_rest, axis=0, return_counts=True) for one in (model, back))
+    np.testing.assert_array_equal(ours[0], theirs[0])
+    np.testing.assert_array_equal(ours[1], theirs[1])
+
+
+def test_training_of_a_palette_goes_on_with_the_same_bits(learned, many, tiny_scene, tmp_path):
+    (tmp_path / "palette.yaml").write_text(LEARNED.replace("MODEL", json.dumps(str(many))))
+    checked = load_pipeline(str(tmp_path / "palette.yaml"), [f"scene.path='{tiny_scene}'", "optimize.log_every=1"])
+    run = opening.open_run(checked, tmp_path / "run", None)
+
+    def stop(progress: Progress) -> None:
+        run.interrupted = progress.step >= 3
+
+    with pytest.raises(Interrupted):
+        runner.execute(checked, run, "resume", stop)
+    train(tiny_scene, tmp_path / "run", pipeline=str(tmp_path / "palette.yaml"), resume=True)
+    for name in ("point_cloud.ply", "model.sog"):
+        assert (tmp_path / "run" / name).read_bytes() == (learned / name).read_bytes()
+
+
+def test_vectors_are_shared_where_a_palette_is(tmp_path):
+    path = tmp_path / "x.yaml"
+    path.write_text("name: x\nstages:\n  - init\n  - share_palette\n")
+    with pytest.raises(ConfigError, match=r"share_palette needs 'palette', .* \(palette_sh makes it\)"):
+        load_pipeline(str(path))
+
+
 def test_a_palette_of_a_model_without_harmonics_changes_nothing(few_steps, tiny_scene, tmp_path):
     source = few_steps / "point_cloud.ply"
     lines = [line for line in PALETTE.replace("sh_degree: 2", "sh_degree: 0").splitlines() if "optimize" not in line]

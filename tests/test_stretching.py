@@ -8,9 +8,11 @@ import pytest
 from clsplat.pipeline.file import PipelineFile
 from clsplat.pipeline.files import shipped
 from clsplat.pipeline.loading import Pipeline, load
-from clsplat.pipeline.stretching import stretched, with_steps
+from clsplat.pipeline.stretching import in_steps, last_edit, stretched, with_steps
+from clsplat.schedule import at_step
 from clsplat.settings import Settings
 from clsplat.stages.optimize import Optimize
+from clsplat.views.detail import DetailDivisor
 from tests.test_pipeline import flat
 
 STEPS = ("steps", "start", "stop", "over", "until", "every")
@@ -18,8 +20,10 @@ TRAINING = [name for name in shipped() if any(isinstance(stage, Optimize) for st
 
 
 def changes(name: str, factor: float) -> dict[str, tuple[object, object]]:
-    settings = load(name).settings
-    old, new = (flat(one.model_dump(mode="json")) for one in (settings, stretched(settings, factor)))
+    pipeline = load(name)
+    old, new = (
+        flat(one.resolved()) for one in (pipeline, replace(pipeline, settings=stretched(pipeline.settings, factor)))
+    )
     assert old.keys() == new.keys()
     return {place: (old[place], new[place]) for place in old if old[place] != new[place]}
 
@@ -37,14 +41,19 @@ def test_the_long_recipe_in_fewer_steps_is_the_short_one():
 
 @pytest.mark.parametrize("name", TRAINING)
 def test_only_steps_change_and_all_of_them(name):
+    """What acts at multiples of a cadence ends one step after the last; a rate of what is learned falls."""
     found = changes(name, 2.0)
     for place, (old, new) in found.items():
-        assert place.endswith(STEPS) or "points" in place, place
-        if not isinstance(old, list):
-            assert new == 2 * old
+        if isinstance(old, list):
+            assert new == [[2 * step, value] for step, value in old], place
+        elif place.endswith(".haar.rate"):
+            assert new == old / 2
+        else:
+            assert place.endswith(STEPS), place
+            assert new in (2 * old, 2 * old - place.endswith(".stop")), place
     stretchable = [
         place
-        for place, value in flat(load(name).settings.model_dump(mode="json")).items()
+        for place, value in flat(load(name).resolved()).items()
         if place.endswith((".steps", ".start", ".stop", ".over", ".until")) and isinstance(value, int) and value
     ]
     assert set(stretchable) <= found.keys()
@@ -63,6 +72,18 @@ def test_what_ends_acts_as_often(name, factor):
             for stage, training in ((before, old), (after, new))
         ]
         assert counts[0] == counts[1], before
+
+
+def test_what_acts_at_each_step_ends_at_the_same_share_of_the_training():
+    new = in_steps(load("mcmc_7k").settings, 2000).training
+    (noise,) = [stage for stage in new.during if stage.stage == "add_noise"]
+    assert (noise.every, noise.stop) == (1, 5000 * 2000 // 7000)
+
+
+@pytest.mark.parametrize("steps", [1, 999, 2000, 3500, 7001])
+@pytest.mark.parametrize("name", TRAINING)
+def test_a_recipe_has_the_steps_that_were_asked_for(name, steps):
+    assert in_steps(load(name).settings, steps).training.steps == steps
 
 
 @pytest.mark.parametrize("factor", [0.01, 0.13, 0.5, 1.0, 3.7])
@@ -103,6 +124,29 @@ def test_a_number_of_steps_that_is_corrected_keeps_what_comes_later(tmp_path, na
         for step in range(1, done + 1):
             assert before.due(step) == after.due(step)
         assert before.start <= done or done < after.start + 1 < new.steps
+
+
+@pytest.mark.parametrize("name", TRAINING)
+def test_a_number_that_is_corrected_comes_after_growth_and_small_photographs(name):
+    training = load(name).settings.training
+    last, resolution = last_edit(training), training.views.resolution
+    assert last <= training.steps
+    assert last >= resolution.until if isinstance(resolution, DetailDivisor) else at_step(resolution, last) == 1
+    grows = [stage for stage in training.during if stage.stage == "densify" and stage.stop]
+    assert not any(stage.due(step) for stage in grows for step in range(last, training.steps))
+
+
+def test_a_training_that_follows_detail_is_not_cut_before_the_full_size():
+    assert last_edit(load("dash_7k").settings.training) == 6300
+
+
+def test_what_is_learned_in_so_many_updates_has_a_rate_that_falls_as_much():
+    (haar,) = in_steps(load("auto_opti3dgs").settings, 7000).training.views.transforms
+    (short,) = load("auto_opti3dgs_7k").settings.training.views.transforms
+    assert haar.rate == pytest.approx(1e-4 * 30 / 7)
+    assert short.rate == pytest.approx(haar.rate, rel=0.01)
+    (points,) = stretched([haar.model_copy(update={"rate": [[0, 1e-3], [100, 1e-4]]})], 0.5)
+    assert points.rate == [[0, 2e-3], [50, 2e-4]]
 
 
 def test_never_stays_a_number_that_a_file_holds():

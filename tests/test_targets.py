@@ -13,7 +13,7 @@ from ruamel.yaml import YAML
 
 from clsplat.opencl.discovery import tuning_of
 from clsplat.opencl.program import BUILD_OPTIONS, parse_kernels
-from tests.targets import amd, figures, intel, nvidia, page
+from tests.targets import accepted, amd, figures, intel, nvidia, page
 from tests.targets.__main__ import VENDOR_OF, VENDORS, compile_all, compile_one, versions_of
 from tests.targets.builds import GPU, KERNELS, PASSED, Build, builds
 from tests.targets.compilers import CompileError
@@ -297,6 +297,15 @@ def test_figures_of_two_commits_are_compared(tmp_path):
         "gfx900 changed: registers 40 → 32, global loads 0 → 4",
         "gfx900 gone: gone",
     ]
+
+
+def test_accepted_faults_are_no_failures_and_must_still_be_seen():
+    fault, *rest = accepted.ACCEPTED
+    assert accepted.others([*accepted.ACCEPTED, "another"], everything=True) == ["another"]
+    assert accepted.others([fault + "0"], everything=False) == [fault + "0"]
+    gone = accepted.others([fault], everything=True)
+    assert len(gone) == len(rest)
+    assert all("is accepted, and was not seen" in one for one in gone)
 
 
 @vendors

@@ -2,8 +2,8 @@
 
 import logging
 import os
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
 from urllib.parse import quote
@@ -13,7 +13,7 @@ from markupsafe import Markup
 from clsplat.compare import tables
 from clsplat.compare.comparison import Comparison, Row, Variant
 from clsplat.compare.crops import Crop, find_crops
-from clsplat.compare.run_folder import RunFolder
+from clsplat.compare.run_folder import Points, RunFolder
 from clsplat.errors import ConfigError, DataError, amount
 from clsplat.files import write_text
 from clsplat.pages.page import charts, embedded, render
@@ -114,26 +114,28 @@ def _section(name: str, rows: Sequence[Row]) -> SceneSection:
 def _curves(rows: Sequence[Row]) -> list[Markup]:
     """PSNR and Gaussians over steps, a line for each run; then quality over image sizes."""
 
-    def lines(kind: str, figure: str, **where: object) -> list[Line]:
+    downscale = rows[0].runs[0].scene.downscale
+
+    def lines(points_of: Callable[[RunFolder], Points]) -> list[Line]:
         return [
             Line(points, name, row.variant.colour, i)
             for row in rows
             for i, (run, name) in enumerate(zip(row.runs, _names(row), strict=True))
-            if len(points := run.points(kind, figure, **where)) > 1
+            if len(points := points_of(run)) > 1
         ]
 
-    def over_all_views(line: Line) -> Line:
-        steps, psnrs = zip(*line.points, strict=True)
-        return replace(line, points=list(zip(steps, over_views(psnrs), strict=True)))
+    def tested(run: RunFolder) -> Points:
+        return run.points("evaluate", "psnr", split="test", downscale=downscale)
 
-    downscale = rows[0].runs[0].scene.downscale
+    def trained(run: RunFolder) -> Points:
+        points = run.points("train", "psnr")
+        return list(zip([step for step, _ in points], over_views([psnr for _, psnr in points]), strict=True))
+
     drawings = [
-        curve("test PSNR over steps, dB", lines("evaluate", "psnr", split="test", downscale=downscale)),
-        curve(
-            f"training PSNR over steps, mean of {VIEWS} views, dB",
-            [over_all_views(line) for line in lines("train", "psnr")],
-        ),
-        curve("Gaussians over steps", lines("train", "gaussians")),
+        curve("test PSNR over steps, dB", lines(tested)),
+        curve("test PSNR over CPU seconds of training, dB", lines(lambda run: run.by_cpu_seconds(tested(run)))),
+        curve(f"training PSNR over steps, mean of {VIEWS} views, dB", lines(trained)),
+        curve("Gaussians over steps", lines(lambda run: run.points("train", "gaussians"))),
     ]
     return charts(drawings + _size_charts(rows, "test") + _size_charts(rows, "train"))
 

@@ -5,6 +5,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from clsplat import plugins
@@ -17,6 +18,8 @@ from clsplat.pipeline.yaml_file import read_yaml
 from clsplat.prepare.cache import noted
 from clsplat.reading import read_file, read_json
 from clsplat.training.records import Records
+
+Points = list[tuple[float, float]]
 
 
 class Averages(BaseModel):
@@ -48,6 +51,8 @@ class RunMetrics(BaseModel):
     gaussians: int
     steps: int
     train_seconds: float
+    cpu_seconds: float | None = None  # of all threads, in the training; older runs have none
+    device_memory: int | None = None  # bytes, the peak
     seed: int
     device: str
     pipeline: str
@@ -96,11 +101,19 @@ class RunFolder:
         """The lines of metrics.jsonl; none where it is missing.  Raises DataError when it is damaged."""
         return Records(self.path).read()
 
-    def points(self, kind: str, figure: str, **where: Any) -> list[tuple[float, float]]:
+    def points(self, kind: str, figure: str, **where: Any) -> Points:
         """Return (step, figure) of all records of a kind, such as `train`, whose values are those of `where`."""
         lines = (line for line in self.records if line["kind"] == kind)
         chosen = (line for line in lines if all(line.get(key) == value for key, value in where.items()))
         return [(line["step"], line[figure]) for line in chosen if isinstance(line.get(figure), int | float)]
+
+    def by_cpu_seconds(self, points: Points) -> Points:
+        """Return points (step, figure) by the CPU seconds of training at their step; none for an older run."""
+        spent = [(0.0, 0.0), *self.points("train", "cpu_seconds")]
+        if len(spent) == 1:
+            return []
+        steps, seconds = zip(*spent, strict=True)
+        return [(float(np.interp(step, steps, seconds)), figure) for step, figure in points]
 
     @property
     def renders(self) -> Path:

@@ -6,6 +6,7 @@ from statistics import fmean, stdev
 
 from clsplat.compare.comparison import Comparison, Row, Variant
 from clsplat.compare.differences import differing
+from clsplat.compare.run_folder import RunMetrics
 from clsplat.pages.page import duration
 
 METRICS = {  # name -> heading, digits, function that returns the better one
@@ -59,8 +60,17 @@ def main_table(rows: Sequence[Row]) -> Table:
         Column("Gaussians", _cells([[run.metrics.gaussians for run in row.runs] for row in rows], 0)),
         Column("steps", _cells([[run.metrics.steps for run in row.runs] for row in rows], 0)),
         Column("training", [Cell(duration(fmean(run.metrics.train_seconds for run in row.runs))) for row in rows]),
+        *_cost(rows, "CPU seconds", lambda metrics: metrics.cpu_seconds),
+        *_cost(rows, "device memory, MB", lambda metrics: metrics.device_memory and metrics.device_memory / 1e6),
     ]
     return _table(rows, [*_trained_on(rows), Group("", costs)])
+
+
+def _cost(rows: Sequence[Row], heading: str, cost: Callable[[RunMetrics], float | None]) -> list[Column]:
+    """A column of what older runs have not noted; none where no run has."""
+    found = [[cost(run.metrics) for run in row.runs] for row in rows]
+    values = [[value for value in row if value is not None] for row in found]
+    return [Column(heading, _cells(values, 0))] if any(values) else []
 
 
 def other_table(rows: Sequence[Row]) -> Table | None:

@@ -10,7 +10,9 @@ from clsplat.pipeline.loading import Pipeline
 from clsplat.tuning.tuning import Tuning
 
 STAGES = ("init", "prune_least", "optimize")  # of the recipe; what a rung writes is a PLY
-FITTING = ("init", "reduce_sh", "palette_sh", "optimize")  # what is trained with the harmonics that a SOG holds
+PALETTE = "palette_sh"
+# what trains the harmonics that a SOG holds, and then the other tables with them
+FITTING = ("init", "reduce_sh", PALETTE, "optimize", "share_palette", PALETTE, "optimize")
 FITTED, SOG = "fitted", "model.sog"
 
 
@@ -37,7 +39,8 @@ class Ladder:
 
     def fitted(self, file: Path, name: str, degree: int, quality: str) -> Path:
         """Train a rung with the harmonics of a SOG of it; return that SOG."""
-        values = {"init.file": str(file.resolve()), "reduce_sh.degree": degree, "palette_sh.quality": quality}
+        values = {"init.file": str(file.resolve()), "reduce_sh.degree": degree}
+        values |= {f"stages.{place}.quality": quality for place, name in enumerate(FITTING) if name == PALETTE}
         pipeline = self.tuning.pipeline(FITTING, values, file=SOG, quality=quality)
         return self.tuning.trained(pipeline, self.out / FITTED / name, SOG)
 

@@ -25,6 +25,7 @@ class Gain(Statistic):
 
     type: Literal["gain"] = "gain"
     divisor: ClassVar[str] = "view_error"
+    reads_conics: ClassVar[bool] = True
     of_all_views: ClassVar[bool] = True
 
     def add(self, gaussians: Gaussians, view: ViewGradients, grad_mean2d: Array, total: Array) -> None:

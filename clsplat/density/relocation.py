@@ -42,8 +42,14 @@ class Relocate(Rule):
         opacities, factors = divided(
             opacity[sources], np.minimum(drawn[sources] + 1, MOST), edit.at(self.opacity_below)
         )
-        edit.set_rows("logit_opacity", sources, np.log(opacities / (1 - opacities))[:, None])
-        edit.set_rows("log_scales", sources, log_scales[sources] + np.log(factors)[:, None])
+        logits, log_scales = (
+            np.log(opacities / (1 - opacities))[:, None],
+            log_scales[sources] + np.log(factors)[:, None],
+        )
+        for copies in np.unique(drawn[sources] + 1):  # not where a later rule or the limit lets a source stay alone
+            alike = drawn[sources] + 1 == copies
+            for name, values in (("logit_opacity", logits), ("log_scales", log_scales)):
+                edit.set_children(name, sources[alike], np.repeat(values[alike, None], copies, axis=1))
         edit.zero_moments(sources)
         edit.choose(faint | (drawn > 0), copies=np.where(faint, 0, drawn + 1), kept=1)
 

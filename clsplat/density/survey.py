@@ -3,7 +3,7 @@
 The sums are those of the backward pass, in a fixed order: the same bits on the same device.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -114,7 +114,7 @@ class Survey:
         self._seed, self._step = seed, step
         self._found: dict[Any, Any] = {}
 
-    def looks(self, views: Sequence[View]) -> Iterator[Look]:
+    def looks(self, views: Iterable[View]) -> Iterator[Look]:
         """Render views, one after another."""
         for view in views:
             photograph = self._photographs.get(view)

@@ -3,6 +3,7 @@
 import io
 import json
 import zipfile
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from decimal import ROUND_CEILING, ROUND_FLOOR, ROUND_HALF_EVEN, Context
@@ -126,10 +127,21 @@ class Harmonics:
     labels: NDArray[np.int64]
 
     @classmethod
-    def of(cls, rest: NDArray[np.float32], options: Writing, weights: NDArray[np.float64] | None = None) -> "Harmonics":
-        """Quantise harmonics [N, c]; errors count by `weights` [N].  Those of `values` come out as they are."""
+    def of(
+        cls,
+        rest: NDArray[np.float32],
+        options: Writing,
+        weights: NDArray[np.float64] | None = None,
+        better: Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.int64]]] | None = None,
+    ) -> "Harmonics":
+        """Quantise harmonics [N, c]; errors count by `weights` [N].  Those of `values` come out as they are.
+
+        better: makes of a palette [E, c] another one, and the label of each splat.
+        """
         entries = min(PALETTES[options.quality], max(1, int(SMALLEST * 2.0 ** np.floor(np.log2(len(rest) / SMALLEST)))))
         vectors, labels = palette(rest, entries, options.clustering, weights)
+        if better and not np.array_equal(vectors[labels].astype(np.float32), rest):
+            vectors, labels = better(vectors)
         numbers = np.array([_short(number) for number in codebook(vectors)])
         return cls(numbers, nearest(vectors, numbers), labels)
 

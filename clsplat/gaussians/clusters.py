@@ -9,6 +9,7 @@ from clsplat.opencl.program import constants
 
 FILE = "clusters.cl"
 FARTHEST, TOGETHER = constants(FILE)["FARTHEST"], int(constants(FILE)["TOGETHER"])
+BLOCK = 1 << 16  # points on the device at once, where they have many components
 AT_ONCE = 1024  # vectors of a launch: they stay in a core's cache
 
 
@@ -30,11 +31,22 @@ class DeviceClusters:
     def nearest(self, vectors: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
         """Return the nearest of the vectors [E, c] for each point, the first of equally near ones, and half the squared
         distance."""
+        label, apart = self._nearest(vectors, np.square(vectors).sum(axis=1) / 2)
+        return label, apart + self._norms
+
+    def most_alike(self, vectors: NDArray[np.float32]) -> NDArray[np.int64]:
+        """Return the vector with the largest product for each point, the first of equal ones; all are any numbers."""
+        return self._nearest(vectors, np.zeros(len(vectors), np.float32))[0]
+
+    def _nearest(
+        self, vectors: NDArray[np.float32], half_squares: NDArray[np.float32]
+    ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+        """The vector with the least half square minus product for each point, and that difference."""
         entries = -(-len(vectors) // TOGETHER) * TOGETHER
         padded = np.zeros((entries, self.components), np.float32)
         padded[: len(vectors)] = vectors
         norms = np.full(entries, FARTHEST, np.float32)
-        norms[: len(vectors)] = np.square(vectors).sum(axis=1) / 2
+        norms[: len(vectors)] = half_squares
         uploaded, norm = self.device.upload(padded), self.device.upload(norms)
         label, apart = self.device.empty(self._stride), self.device.empty(self._stride)
         for first in range(0, entries, AT_ONCE):
@@ -51,7 +63,7 @@ class DeviceClusters:
                 stride=self._stride,
                 count=self.count,
             )
-        return label.get()[: self.count].astype(np.int64), apart.get()[: self.count] + self._norms
+        return label.get()[: self.count].astype(np.int64), apart.get()[: self.count]
 
     def sums(self, labels: NDArray[np.int64], entries: int) -> NDArray[np.int64]:
         """Return the sums of the points that have each label, [entries, c]."""
@@ -66,3 +78,9 @@ class DeviceClusters:
             count=self.count,
         )
         return sums.get().astype(np.int64)
+
+
+def most_alike(device: Device, points: NDArray[np.float32], vectors: NDArray[np.float32]) -> NDArray[np.int64]:
+    """Return the vector, of [E, c], with the largest product for each point, of [N, c]; memory is for BLOCK points."""
+    blocks = (points[start : start + BLOCK] for start in range(0, len(points), BLOCK))
+    return np.concatenate([DeviceClusters(device, block).most_alike(vectors) for block in blocks])

@@ -54,7 +54,7 @@ class Rendering:
     background: Literal["black", "white"] | None = None  # None: what the scene says
     alpha: Literal["transparency", "mask"] = "transparency"  # what the fourth channel of its photographs was
     notes: Mapping[str, Any] = field(default_factory=dict)  # what else the file says
-    pixel_box: float = 0.0  # 1: splats are integrated over the pixel's box instead; the two numbers above are for viewers
+    pixel_box: float = 0.0  # 1: splats are integrated over the pixel's box instead; screen_variance is for viewers
 
     @classmethod
     def of(cls, comment: Mapping[str, Any], mode: str) -> "Rendering":

@@ -7,6 +7,7 @@
       seeds: [0, 1, 2]
       set:                                     # each key takes every value of its list
         densify.every: [100, 200]
+      steps: 2000                              # of each cell; what happens at a step keeps its share of them
 
 Each cell runs in its own folder below the run folder; its name holds its value on every axis.
 """
@@ -16,7 +17,7 @@ import json
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -28,6 +29,7 @@ from clsplat.pipeline.explanation import explain, place_text
 from clsplat.pipeline.file import Name
 from clsplat.pipeline.files import find
 from clsplat.pipeline.loading import Pipeline, checked
+from clsplat.pipeline.stretching import in_steps
 from clsplat.pipeline.yaml_file import Document, Place, read_pipeline, read_yaml, yaml_text
 from clsplat.settings import ReadPath, Settings
 
@@ -45,6 +47,8 @@ class Matrix(Settings):
     """Seeds; without them, the seed of the pipeline."""
     set: dict[str, Annotated[list[JsonValue], Field(min_length=1)]] = Field({})
     """Settings by place, as of --set, each with the list of its values."""
+    steps: Annotated[int, Field(ge=1)] | None = None
+    """Steps of each cell's training, all that happens at a step keeping its share of them; without it, as they are."""
     options: list[str] = Field([])
     """Settings of every cell, as place=value: those of --set and --scene, which a run notes in its folder."""
 
@@ -119,6 +123,8 @@ def load_experiment(name: str, overrides: Sequence[str] = ()) -> Experiment | No
     for base in bases:
         _check_choices(path, document, base, axes, overrides)
     cells = [_cell(base, choices, overrides) for base in bases for choices in itertools.product(*axes)]
+    if file.matrix.steps is not None:
+        cells = [_in_steps(cell, file.matrix.steps) for cell in cells]
     _check_names(path, cells)
     data = {**document.data, "matrix": {**document.data["matrix"], "options": overrides}}
     return Experiment(path, file.name, yaml_text(data) if given else read_pipeline(path), cells)
@@ -181,6 +187,10 @@ def _cell(base: _Base, choices: Sequence[_Choice], overrides: Sequence[str]) -> 
     except OverrideError as error:
         raise ConfigError(f"{base.path}: cell '{shortened(name)}' of the matrix: {error.reason}") from error
     return Cell(name, pipeline)
+
+
+def _in_steps(cell: Cell, steps: int) -> Cell:
+    return replace(cell, pipeline=replace(cell.pipeline, settings=in_steps(cell.pipeline.settings, steps)))
 
 
 def _check_choices(

@@ -1,16 +1,19 @@
 """A pipeline in another number of steps: places, lengths and cadences of its training are multiplied.
 
-So each edit that has an end is made as often, at about the same share of the training.  What follows from the number of
-updates, such as a filter that is learned, does not change.
+So each edit that has an end is made as often, at about the same share of the training.  What is learned in so many
+updates, such as a filter, has a rate that falls as much as their number grows.
 """
 
 import math
 from collections.abc import Callable
+from fractions import Fraction
 from typing import Any, TypeVar
 
 from clsplat.pipeline.file import PipelineFile
+from clsplat.schedule import divided
 from clsplat.settings import Settings
 from clsplat.stages.base import Scheduled
+from clsplat.stages.densify import Densify
 from clsplat.stages.optimize import Optimize
 
 Value = TypeVar("Value")
@@ -29,11 +32,28 @@ def with_steps(settings: PipelineFile, steps: int, done: int) -> PipelineFile:
     return of_trainings(settings, changed)
 
 
+def last_edit(training: Optimize) -> int:
+    """Return the step up to which Gaussians grow and the photographs' size changes; 0 where that is not said.
+
+    One that is cut before would end with small photographs, or before its last pruning.
+    """
+    stops = [stage.stop for stage in training.during if isinstance(stage, Densify) and stage.stop is not None]
+    return max([*stops, int(training.views.last_change)])
+
+
+def in_steps(settings: PipelineFile, steps: int) -> PipelineFile:
+    """Return settings stretched so that the first training has so many steps.  Raises ConfigError when none trains."""
+    return stretched(settings, Fraction(steps, settings.training.steps))
+
+
 def _moved(stage: Scheduled, done: int, left: float) -> Scheduled:
     if stage.start <= done:
         return stage
-    every, start = max(1, math.floor((stage.every or 1) * left)), done + math.floor((stage.start - done) * left)
-    return stage.model_copy(update={"every": every, "start": start})
+    every = max(1, math.floor((stage.every or 1) * left))
+    start, stop = (
+        place if place is None else done + math.floor((place - done) * left) for place in (stage.start, stage.stop)
+    )
+    return stage.model_copy(update={"every": every, "start": start, "stop": stop})
 
 
 def of_trainings(settings: PipelineFile, changed: Callable[[Optimize], Optimize]) -> PipelineFile:
@@ -42,12 +62,12 @@ def of_trainings(settings: PipelineFile, changed: Callable[[Optimize], Optimize]
     return settings.model_copy(update={"stages": stages})
 
 
-def stretched(value: Value, factor: float) -> Value:
+def stretched(value: Value, factor: float | Fraction) -> Value:
     """Return settings for `factor` times as many steps; each class names in `step_keys` what that changes."""
     return _stretched(value, factor)  # type: ignore[no-any-return]
 
 
-def _stretched(value: Any, factor: float) -> Any:
+def _stretched(value: Any, factor: float | Fraction) -> Any:
     if isinstance(value, list):
         is_points = bool(value) and all(isinstance(item, list) for item in value)
         return _points(value, factor) if is_points else [_stretched(item, factor) for item in value]
@@ -60,16 +80,17 @@ def _stretched(value: Any, factor: float) -> Any:
         name: _steps(name, field, factor, every) if name in keys else _stretched(field, factor)
         for name, field in fields.items()
     }
+    changed |= {name: divided(changed[name], float(factor)) for name in type(value).rate_keys if factor != 1}
     return value.model_copy(update={name: new for name, new in changed.items() if new is not fields[name]})
 
 
-def _steps(name: str, steps: Any, factor: float, every: Any = None) -> Any:
+def _steps(name: str, steps: Any, factor: float | Fraction, every: Any = None) -> Any:
     """A number of steps; one that begins or ends what acts at multiples of `every` does so at the same of them."""
     if not isinstance(steps, int) or steps == 0:
         return steps
     if name == "every":
         return _cadence(steps, factor)
-    if name not in ("start", "stop") or not isinstance(every, int):
+    if name not in ("start", "stop") or not isinstance(every, int) or every == 1:
         return max(1, min(math.floor(steps * factor), MOST))
     after = name == "stop"  # what acts at a step before it is what acts up to the step before it
     number, rest = divmod(steps - after, every)
@@ -77,11 +98,11 @@ def _steps(name: str, steps: Any, factor: float, every: Any = None) -> Any:
     return min(number * cadence + min(math.floor(rest * factor), cadence - 1) + after, MOST)
 
 
-def _cadence(every: int, factor: float) -> int:
+def _cadence(every: int, factor: float | Fraction) -> int:
     """What acts at each step acts at each."""
     return every if every == 1 else max(1, math.floor(every * factor))
 
 
-def _points(points: list[list[float]], factor: float) -> list[list[float]]:
+def _points(points: list[list[float]], factor: float | Fraction) -> list[list[float]]:
     """Points of a schedule; of two that fall together the later one stays."""
     return [list(point) for point in {math.floor(step * factor): value for step, value in points}.items()]

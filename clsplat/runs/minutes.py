@@ -17,7 +17,7 @@ from clsplat.errors import ConfigError, Interrupted
 from clsplat.files import scratch_folder
 from clsplat.pipeline.file import PipelineFile
 from clsplat.pipeline.loading import Pipeline
-from clsplat.pipeline.stretching import of_trainings, stretched, with_steps
+from clsplat.pipeline.stretching import last_edit, of_trainings, stretched, with_steps
 from clsplat.runs.folders import Start
 from clsplat.runs.runner import run_stages, write_pipeline
 from clsplat.signals import stop_if_signalled
@@ -82,7 +82,8 @@ def execute_within(minutes: float, pipeline: Pipeline, run: Run, start: Start, s
         rest = last.after + last.during * (1 - share) + mean * (planned - report.step)
         more = math.floor((until - time.perf_counter() - rest) / end)
         is_known = share >= last.known[-1]  # before, steps become slower still, by nobody knows how much
-        steps = max(report.step + 2, planned + (more if is_known else min(more, 0)))
+        least = min(planned, last_edit(plan.settings.training))
+        steps = max(report.step + 2, least, planned + (more if is_known else min(more, 0)))
         reason = f"--minutes {minutes:g}: {steps:,} steps, of which {report.step:,} had shown what one takes"
         LOG.info("%s: %.0f ms", reason, report.milliseconds)
         return replace(plan, settings=with_steps(plan.settings, steps, report.step), reason=reason)
@@ -189,7 +190,7 @@ def pipeline_for(pipeline: Pipeline, rehearsals: Sequence[Rehearsal], seconds: f
     told = f"{number:,} steps in the place of {steps:,}, which take about {seconds / 60:.1f} minutes more"
     reason = f"--minutes {minutes:g}: {told}, by a rehearsal in {rehearsals[-1].steps:,} steps"
     LOG.info("%s", reason)
-    return replace(pipeline, settings=stretched(pipeline.settings, number / steps), reason=reason)
+    return replace(pipeline, settings=_reporting(stretched(pipeline.settings, number / steps)), reason=reason)
 
 
 def predicted(rehearsals: Sequence[Rehearsal], steps: int) -> float:
@@ -225,10 +226,12 @@ def new_run(run: Run, pipeline: Pipeline, **changes: Any) -> Run:
 
 
 def _reporting(settings: PipelineFile) -> PipelineFile:
-    """With REPORTS reports of each training."""
-    return of_trainings(
-        settings, lambda training: training.model_copy(update={"log_every": -(-training.steps // REPORTS)})
-    )
+    """With REPORTS reports of each training, or more: one is needed soon after each share at which it is corrected."""
+
+    def reporting(training: Optimize) -> Optimize:
+        return training.model_copy(update={"log_every": min(training.log_every, -(-training.steps // REPORTS))})
+
+    return of_trainings(settings, reporting)
 
 
 @contextmanager

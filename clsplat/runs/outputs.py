@@ -29,6 +29,8 @@ def write_metrics(pipeline: Pipeline, run: Run) -> None:
         "gaussians": run.model.gaussians.count,
         "steps": run.step,
         "train_seconds": round(run.train_seconds, 3),
+        "cpu_seconds": round(run.cpu_seconds, 3),
+        "device_memory": run.device.peak,
         "seed": run.seed,
         "device": run.device.text,
         "pipeline": run.name,

@@ -43,7 +43,7 @@ class Init(Stage):
 
     stage: Literal["init"] = "init"
     makes: ClassVar[frozenset[str]] = frozenset({"model"})
-    takes: ClassVar[frozenset[str]] = frozenset({"average"})
+    takes: ClassVar[frozenset[str]] = frozenset({"average", "palette"})
     edits: ClassVar[bool] = True
 
     source: Literal["auto", "points", "sweep", "hull", "random", "model", "ply"] = "auto"

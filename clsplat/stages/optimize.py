@@ -1,7 +1,6 @@
 """The training loop: render, compare, differentiate, update."""
 
 import logging
-import time
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -24,7 +23,7 @@ from clsplat.training.adam import Adam, Rates, Rows
 from clsplat.training.forecast import Forecast
 from clsplat.training.profile import stage_milliseconds
 from clsplat.training.rescue import require_finite
-from clsplat.training.run import Progress, Run, Stopped
+from clsplat.training.run import Progress, Run, Stopped, clocks
 from clsplat.training.skipping import Skip, Visit
 from clsplat.training.trainer import Trainer
 from clsplat.views.detail import course
@@ -116,14 +115,13 @@ class Optimize(Stage):
         seconds: list[float] = []  # of the steps since the last report
         self._act(run)
         while run.stage_step < self.steps:
-            start = time.perf_counter()
+            start = clocks()
             self._edit(run, views)
             view = self._step(run, trainer, sampler)
             run.status.count("steps", run.stage_step, self.steps, step=run.step, steps=last_step)
             report = run.step % self.log_every == 0 or run.stage_step == self.steps or run.interrupted
             loss, psnr = self._values(run, view, sampler) if report else (0.0, 0.0)
-            seconds.append(time.perf_counter() - start)
-            run.train_seconds += seconds[-1]
+            seconds.append(run.add_training_time(start))
             if report:
                 self._report(run, forecast, loss, psnr, seconds)
                 seconds.clear()
@@ -238,7 +236,8 @@ class Optimize(Stage):
     def _report(self, run: Run, forecast: Forecast, loss: float, psnr: float, seconds: list[float]) -> None:
         count = run.model.gaussians.count
         stages, ms = stage_milliseconds(run.device.timings), 1e3 * median(seconds)  # the first step may load much
-        run.records.add(run.step, "train", loss=loss, psnr=psnr, gaussians=count, ms=ms, stages=stages)
+        cost = {"ms": ms, "cpu_seconds": round(run.cpu_seconds, 3), "stages": stages}
+        run.records.add(run.step, "train", loss=loss, psnr=psnr, gaussians=count, **cost)
         if run.step % (DISTRIBUTION_INTERVAL * self.log_every) == 0 or run.step == forecast.last_step:
             run.records.add(run.step, "distribution", gaussians=count, **distribution(run.model.gaussians))
         if self.skip and run.step == forecast.last_step:

@@ -2,7 +2,6 @@
 
 import logging
 from collections.abc import Collection
-from functools import partial
 from itertools import pairwise
 from typing import Annotated, ClassVar, Literal
 
@@ -12,10 +11,7 @@ from pydantic import Field, model_validator
 
 from clsplat.density.contribution import SCORES, Score
 from clsplat.density.thresholds import Share
-from clsplat.errors import amount
-from clsplat.formats.sog_writing import Harmonics
-from clsplat.formats.splats import MAX_DEGREE, Writing, sh_coefficients
-from clsplat.gaussians.clusters import DeviceClusters
+from clsplat.formats.splats import MAX_DEGREE, sh_coefficients
 from clsplat.gaussians.tables import PARAMETERS
 from clsplat.stages.base import Scheduled
 from clsplat.training.run import Run
@@ -110,36 +106,6 @@ class ReduceSh(Scheduled):
         if run.adam is not None:
             run.adam.forget("sh_rest")
         LOG.info("%d of %d bands of harmonics are zero", dropped.sum(), dropped.size)
-
-
-class PaletteSh(Scheduled):
-    """Give each Gaussian one of the vectors of a palette of harmonics, as a SOG holds them.
-
-    Errors count by what a Gaussian contributes to the training views.  Training that follows with a rate of 0 for
-    `sh_rest` adapts the other tables to them, and the SOG then loses nothing of its harmonics.
-    """
-
-    stage: Literal["palette_sh"] = "palette_sh"
-    needs: ClassVar[frozenset[str]] = frozenset({"model"})
-    edits: ClassVar[bool] = True
-    training_keys: ClassVar[frozenset[str]] = frozenset({"quality"})
-
-    quality: Literal["small", "balanced", "high"] = "balanced"
-    """Of the SOG: `small`, `balanced` or `high`, which have 1,024, 4,096 and 16,384 vectors at most."""
-
-    def stale(self, run: Run) -> Collection[str]:
-        return ("sh_rest",)
-
-    def run(self, run: Run) -> None:
-        gaussians = run.model.gaussians
-        if not gaussians.sh_degree:
-            return
-        options = Writing(quality=self.quality, clustering=partial(DeviceClusters, run.device))
-        found = Harmonics.of(gaussians.get("sh_rest"), options, scores(run))
-        gaussians.set("sh_rest", found.values)
-        if run.adam is not None:
-            run.adam.forget("sh_rest")
-        LOG.info("%s of %s", amount(len(found.palette), "harmonic"), amount(gaussians.count, "Gaussian"))
 
 
 def best(score: NDArray[np.float64], count: int) -> NDArray[np.int64]:

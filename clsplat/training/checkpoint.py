@@ -166,6 +166,7 @@ def _write(run: Run, kind: str) -> Path:
         updates=run.adam.updates if run.adam else {},
         numbers=run.numbers,
         train_seconds=run.train_seconds,
+        cpu_seconds=run.cpu_seconds,
         metrics=run.metrics,
         records=run.records.lines,
         written=run.written,
@@ -239,8 +240,8 @@ def _restore(run: Run, state: State, tables: Arrays) -> None:
             gaussians.add(name, table.shape[1], zero_fresh=name in state.zero_fresh)
         gaussians.set(name, table)
     run.step, run.cursor, run.stage_step = state.step, state.cursor, state.stage_step
-    run.acted, run.edited, run.whole = state.acted, state.edited, True
-    run.numbers, run.train_seconds, run.metrics = state.numbers, state.train_seconds, state.metrics
+    run.acted, run.edited, run.whole, run.numbers = state.acted, state.edited, True, state.numbers
+    run.train_seconds, run.cpu_seconds, run.metrics = state.train_seconds, state.cpu_seconds, state.metrics
     run.records.lines, run.inputs_before, run.written = state.records, state.inputs, state.written
 
 

@@ -1,6 +1,7 @@
 """The state of a pipeline while it runs."""
 
 import logging
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -53,6 +54,11 @@ class Progress:
     growth_known: bool = True  # False: rules will make steps slower, and it is not known yet how much
 
 
+def clocks() -> tuple[float, float]:
+    """Return the time, and that of all threads of this process, in s."""
+    return time.perf_counter(), time.process_time()
+
+
 @dataclass
 class Run:
     """The mutable state of a pipeline; stages read and change it."""
@@ -86,6 +92,7 @@ class Run:
     inputs_before: str = ""  # `inputs` of the checkpoint that the run goes on from
     numbers: dict[str, float] = field(default_factory=dict)  # that parts of it keep from step to step, by name
     train_seconds: float = 0.0
+    cpu_seconds: float = 0.0  # of all threads of the process, in the same time
     written: dict[str, str] = field(default_factory=dict)  # models: path in the run folder -> SHA-256
     metrics: dict[str, dict[str, Any]] = field(default_factory=dict)  # split -> downscale -> averages
     interrupted: bool = False  # finish the step, save, stop
@@ -121,6 +128,13 @@ class Run:
         before, self.whole = self.whole, False
         yield
         self.whole = before
+
+    def add_training_time(self, start: tuple[float, float]) -> float:
+        """Count what the clocks show since `start` as training; return the seconds of the first."""
+        spent, cpu = (now - then for now, then in zip(clocks(), start, strict=True))
+        self.train_seconds += spent
+        self.cpu_seconds += cpu
+        return spent
 
     @property
     def scene_name(self) -> str:

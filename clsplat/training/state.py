@@ -24,6 +24,7 @@ class State(BaseModel):
     updates: dict[str, Count]
     numbers: dict[str, float] = {}  # that parts of the run keep; older files have none
     train_seconds: float
+    cpu_seconds: float = 0.0  # in the same time; older files have none
     metrics: dict[str, dict[str, Any]]
     records: Count  # lines of metrics.jsonl
     written: dict[str, str] = {}  # models, by path in the run folder, with their SHA-256; older files have none

@@ -20,7 +20,7 @@ from clsplat.runs.single import run_pipeline
 from clsplat.runs.source import Source
 from clsplat.training import checkpoint
 
-RECIPE = "compress"
+RECIPE, TRAINING = "compress", "optimize"
 
 
 @dataclass(frozen=True)
@@ -38,13 +38,15 @@ class Tuning:
         path = find(RECIPE)
         data = read_yaml(path).data
         left = iter(data["stages"])
-        chosen = [next(stage for stage in left if isinstance(stage, dict) and name in stage) for name in stages]
+        chosen = [next(stage for stage in left if _is(stage, name)) for name in stages]
         document = Document({**data, "name": self.name, "stages": [*chosen, {"export": {"file": MODEL, **export}}]})
         settings = {**self._scene(), **self._rendering(), **values}
         if self.steps is not None:
-            first, own = (_training(part)["steps"] for part in (data["stages"], chosen))
-            steps = max(1, round(self.steps * own / first))
-            settings |= {"optimize.steps": steps, "optimize.rates.means.over": steps}
+            first = next(stage for stage in data["stages"] if _is(stage, TRAINING))[TRAINING]["steps"]
+            for place, stage in enumerate(chosen):
+                if _is(stage, TRAINING):
+                    steps = max(1, round(self.steps * stage[TRAINING]["steps"] / first))
+                    settings |= {f"stages.{place}.steps": steps, f"stages.{place}.rates.means.over": steps}
         return checked(path, document, [f"{place}={json.dumps(value)}" for place, value in settings.items()])
 
     def trained(self, pipeline: Pipeline, folder: Path, file: str = MODEL) -> Path:
@@ -79,6 +81,6 @@ class Tuning:
         return {"model.sh_degree": self.model.sh_degree, "model.near": numbers.near, "model.screen_filter": screen}
 
 
-def _training(stages: Sequence[Any]) -> Any:
-    """The settings of the first stage that trains."""
-    return next(stage["optimize"] for stage in stages if isinstance(stage, dict) and "optimize" in stage)
+def _is(stage: Any, name: str) -> bool:
+    """Whether a stage of a file, which is its name where it has no settings, has this name."""
+    return bool(stage == name or (isinstance(stage, dict) and name in stage))

@@ -24,6 +24,7 @@ class LearnedTransform(PhotographTransform):
     """
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"rate"})
+    rate_keys: ClassVar[frozenset[str]] = frozenset({"rate"})
 
     rate: NonNegative
     """Learning rate of the numbers; by step."""

@@ -10,7 +10,7 @@ from pydantic import Field, field_validator
 
 from clsplat.errors import ConfigError
 from clsplat.scene.scene import View
-from clsplat.schedule import AtLeastOne, at_step, explained
+from clsplat.schedule import AtLeastOne, Points, at_step, explained
 from clsplat.settings import OneOf, Settings
 from clsplat.views.detail import DetailDivisor
 from clsplat.views.learned import learned_of
@@ -46,6 +46,15 @@ class ViewSettings(Settings):
         if isinstance(self.resolution, DetailDivisor):
             raise ConfigError("a resolution that follows detail needs photographs: expected what `settled` returns")
         return at_step(self.resolution, step)
+
+    @property
+    def last_change(self) -> float:
+        """The global step of the last change of the size, at the latest; 0 where it does not change."""
+        resolution = self.resolution
+        if isinstance(resolution, DetailDivisor):
+            return resolution.until
+        points = resolution.points if isinstance(resolution, Points) else resolution
+        return points[-1][0] if isinstance(points, list) else 0.0
 
     def full_size(self, last: int) -> int:
         """Return the first step up to `last` whose photographs are larger than 1/2 of their size."""

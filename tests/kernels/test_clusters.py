@@ -9,7 +9,7 @@ from clsplat.conformance import reference as ref
 from clsplat.formats.palette import LEVELS, HostClusters, palette
 from clsplat.formats.splats import SplatFile, Writing
 from clsplat.formats.table import write
-from clsplat.gaussians.clusters import AT_ONCE, DeviceClusters
+from clsplat.gaussians.clusters import AT_ONCE, DeviceClusters, most_alike
 from tests.formats.models import splats
 
 
@@ -67,6 +67,16 @@ def test_vectors_of_several_launches(device, rng):
     expected, apart = HostClusters(points).nearest(vectors)
     np.testing.assert_array_equal(labels, expected)
     np.testing.assert_array_equal(distance, apart)
+
+
+@pytest.mark.parametrize(("count", "entries"), [(1, 1), (17, 9), (130, 40)])
+def test_the_vector_with_the_largest_product_is_found_in_blocks_too(device, rng, count, entries, monkeypatch):
+    points, vectors = (rng.normal(size=(rows, 165)).astype(np.float32) for rows in (count, entries))
+    products = points.astype(np.float64) @ vectors.T.astype(np.float64)
+    whole = most_alike(device, points, vectors)
+    np.testing.assert_allclose(products[np.arange(count), whole], products.max(axis=1), rtol=1e-5)
+    monkeypatch.setattr("clsplat.gaussians.clusters.BLOCK", 64)
+    np.testing.assert_array_equal(most_alike(device, points, vectors), whole)
 
 
 @pytest.mark.parametrize(("count", "entries"), [(1, 1), (100, 64), (3000, 64)])

@@ -36,11 +36,11 @@ def some_gaussians(device, rng, count: int, faint: int, opacity=(0.2, 0.95)) -> 
     return gaussians
 
 
-def relocated(gaussians: Gaussians, limit: int | None = None, before=(), **settings) -> np.ndarray:
+def relocated(gaussians: Gaussians, limit: int | None = None, before=(), after=(), **settings) -> np.ndarray:
     """Apply the rule; return the old row of each new row, [M]."""
     colours = gaussians.get("sh_rest")
     edit = Edit(gaussians, SplatStats(gaussians), SceneScale(1.0), step=600, seed=3)
-    rules = [*before, Relocate(**settings)]
+    rules = [*before, Relocate(**settings), *after]
     densify(edit, rules, Rasterizer(gaussians.device, "radix").tiler, limit)
     return np.array([int(np.flatnonzero((colours == row).all(axis=1))[0]) for row in gaussians.get("sh_rest")])
 
@@ -84,6 +84,26 @@ def test_relocation_keeps_the_optical_depth_whatever_the_limit(device, rng, limi
     sums = np.bincount(source, -np.log1p(-opacities(gaussians)), minlength=150)
     np.testing.assert_allclose(sums[50:], depth[50:], rtol=1e-5)
     assert (sums[:50] == 0).all()
+
+
+class Alone(Rule):
+    """Let every second Gaussian that was to become several stay as it is."""
+
+    def mark(self, edit: Edit) -> None:
+        edit.undo_growth(np.arange(edit.gaussians.count) % 2 == 0)
+
+
+def test_a_source_that_a_later_rule_leaves_alone_stays_as_it_is(device, rng):
+    gaussians = some_gaussians(device, rng, 60, faint=30)
+    before = {name: gaussians.get(name) for name in ("logit_opacity", "log_scales")}
+    source = relocated(gaussians, after=[Alone()])
+    copies = np.bincount(source, minlength=60)
+    alone = np.flatnonzero(copies[30:] == 1) + 30
+    assert len(alone) > 10
+    assert (copies[30:] > 1).any()
+    rows = [int(np.flatnonzero(source == one)[0]) for one in alone]
+    for name, table in before.items():
+        np.testing.assert_array_equal(gaussians.get(name)[rows], table[alone])
 
 
 def test_sources_and_copies_start_without_moments(device, rng):

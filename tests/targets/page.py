@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Mapping
 from itertools import zip_longest
 
+from tests.targets import accepted
 from tests.targets.builds import KERNELS
 from tests.targets.figures import MAX_GROUP, MAX_LOCAL, Figures, Place, Table
 
@@ -54,7 +55,7 @@ def text(table: Table, versions: Mapping[str, str], vendor_of: Mapping[str, str]
     """Return the figures as Markdown."""
     simt = {place: of for place, of in table.items() if place.schedule == "simt"}
     rows = _rows(simt)
-    parts = [_summary(table, simt)]
+    parts = [_summary(table, simt), accepted.text()]
     for vendor, title in TITLES.items():
         targets = [target for target, whose in vendor_of.items() if whose == vendor]
         cell = f"A cell: {CELLS[vendor]}."
@@ -70,9 +71,9 @@ def _summary(table: Table, simt: Table) -> str:
     scalar = sorted({f"`{p.kernel}` on {p.target}" for p, of in simt.items() if of.counts.get("scalar spills")})
     group, local = max(of.group for of in simt.values()), max(of.local for of in simt.values())
     lines = [
-        f"All {len(kernels)} kernels compile for all {len(targets)} GPUs, in both schedules. In *simt*, that of GPUs,",
-        f"no vector register spills into memory, a group has at most {group} items ({MAX_GROUP} are allowed) and",
-        f"{local} bytes of local memory ({MAX_LOCAL} are allowed).",
+        f"All {len(kernels)} kernels compile for all {len(targets)} GPUs, in both schedules, but for the known faults",
+        "below. In *simt*, the schedule of GPUs, no vector register spills into memory, a group has at most",
+        f"{group} items ({MAX_GROUP} are allowed) and {local} bytes of local memory ({MAX_LOCAL} are allowed).",
         f"*wide*, which no GPU takes by itself, spills in {len(spilling)} of them." if spilling else "",
         f"AMD's scalar registers overflow into vector registers in {', '.join(scalar)}." if scalar else "",
     ]

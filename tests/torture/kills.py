@@ -23,7 +23,7 @@ from clsplat.training.records import Records
 
 ATTEMPTS = 200  # of one run: each has time for a step at least, most for many
 MORE = 1.1  # time for the next, where one has come no further
-TIMES = ("ms", "stages")  # of a record
+TIMES = ("ms", "cpu_seconds", "stages")  # of a record
 SETTINGS = {
     "smoke": {"checkpoint.every": 1, "optimize.steps": 30},
     "mip_splatting_7k": {

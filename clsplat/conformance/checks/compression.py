@@ -10,9 +10,10 @@ from clsplat.conformance import reference as ref
 from clsplat.conformance.check import Checks, Note
 from clsplat.conformance.checks.blending import MARGIN
 from clsplat.conformance.comparison import GRADIENT, SUM, Figure, by_element, by_norm, equal
-from clsplat.conformance.scenes import Case, safe_case
+from clsplat.conformance.scenes import Case, random_case, safe_case
 from clsplat.density.contribution import contributions, sensitivities
 from clsplat.formats.palette import LEVELS
+from clsplat.gaussians import members
 from clsplat.gaussians.clusters import DeviceClusters
 from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import Rasterizer
@@ -75,3 +76,17 @@ def clusters(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note
         yield equal("nearest_vectors", f"distances of {what}", distance, half.astype(np.float32))
         sums = held.sums(expected, entries)
         yield equal("sum_members", f"sums of {what}", sums, ref.member_sums(points, expected, entries))
+
+
+@CHECKS.add("share_mean")
+def shared_means(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    for count, clusters in ((1, 1), (17, 3), (130, 40)):
+        gaussians = random_case(rng, count).model(device).gaussians
+        values, labels = gaussians.get("sh_rest"), rng.integers(0, clusters, count)
+        weights = rng.random(count).astype(np.float32) * (labels != 0)  # of one cluster all are zero
+        members.set_clusters(gaussians, labels, weights)
+        members.share(gaussians, "sh_rest")
+        what, found = f"means of {clusters} clusters of {count} Gaussians", gaussians.get("sh_rest")
+        yield by_element("share_mean", what, found, ref.shared_means(values, labels, weights), SUM, floor=0.1)
+        members.share(gaussians, "sh_rest")
+        yield equal("share_mean", f"{what}, a second time", gaussians.get("sh_rest"), found)

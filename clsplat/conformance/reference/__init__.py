@@ -24,7 +24,7 @@ from clsplat.conformance.reference.blending import (
 from clsplat.conformance.reference.blur import (
     blurred,
 )
-from clsplat.conformance.reference.clusters import member_sums, nearest_vectors
+from clsplat.conformance.reference.clusters import member_sums, nearest_vectors, shared_means
 from clsplat.conformance.reference.density import (
     ABSGS,
     CLONE,
@@ -144,6 +144,7 @@ __all__ = [
     "sh_basis",
     "sh_basis_gradient",
     "shared_logit",
+    "shared_means",
     "split_children",
     "splitting",
     "ssim_map",

@@ -26,3 +26,16 @@ def member_sums(points: NDArray[Any], labels: NDArray[Any], entries: int) -> NDA
     for point, label in zip(points.astype(np.float64), labels, strict=True):
         sums[label] += np.nan_to_num(point, nan=0)
     return sums
+
+
+def shared_means(values: NDArray[Any], labels: NDArray[Any], weights: NDArray[Any]) -> NDArray[Any]:
+    """Each row replaced by the mean of the rows that have its label, by weight, [N,c].
+
+    values: [N,c], labels, weights: [N].  Where all weights of a label are zero it is the first of its rows.
+    """
+    shared = np.empty(values.shape)
+    for label in np.unique(labels):
+        members = np.flatnonzero(labels == label)
+        rows, weight = values[members].astype(np.float64), weights[members].astype(np.float64)
+        shared[members] = weight @ rows / weight.sum() if weight.any() else rows[0]
+    return shared

@@ -1,0 +1,83 @@
+"""A palette of harmonics, as a SOG holds it: drawn, and trained."""
+
+import logging
+from collections.abc import Collection
+from functools import partial
+from typing import ClassVar, Literal
+
+from clsplat.density.visible_error import VisibleError
+from clsplat.errors import amount
+from clsplat.formats.sog_writing import Harmonics
+from clsplat.formats.splats import Writing
+from clsplat.gaussians import members
+from clsplat.gaussians.clusters import DeviceClusters, most_alike
+from clsplat.stages.base import Scheduled
+from clsplat.training.run import Run
+
+LOG = logging.getLogger("clsplat")
+
+
+class PaletteSh(Scheduled):
+    """Give each Gaussian one of the vectors of a palette of harmonics, as a SOG holds them.
+
+    Errors count by how they show in the training views: by what a Gaussian contributes there, in the directions from
+    which it is seen, and without what the base colour takes up, which is changed by it.  Training that follows with a
+    rate of 0 for `sh_rest` adapts the other tables to them, and the SOG then loses nothing of its harmonics.  Harmonics
+    that are vectors of a palette already keep it, and are rounded to the numbers that a SOG has.
+    """
+
+    stage: Literal["palette_sh"] = "palette_sh"
+    needs: ClassVar[frozenset[str]] = frozenset({"model"})
+    makes: ClassVar[frozenset[str]] = frozenset({"palette"})
+    edits: ClassVar[bool] = True
+    training_keys: ClassVar[frozenset[str]] = frozenset({"quality"})
+
+    quality: Literal["small", "balanced", "high"] = "balanced"
+    """Of the SOG: `small`, `balanced` or `high`, which have 1,024, 4,096 and 16,384 vectors at most."""
+
+    def stale(self, run: Run) -> Collection[str]:
+        return "sh_base", "sh_rest"
+
+    def run(self, run: Run) -> None:
+        gaussians = run.model.gaussians
+        if not gaussians.sh_degree:
+            return
+        rest, options = (
+            gaussians.get("sh_rest"),
+            Writing(quality=self.quality, clustering=partial(DeviceClusters, run.device)),
+        )
+        error = visible_error(run)
+        better = partial(error.palette, rest, nearest=partial(most_alike, run.device)) if error.weights.any() else None
+        found = Harmonics.of(rest, options, error.weights, better)
+        gaussians.set("sh_rest", found.values)
+        gaussians.set("sh_base", gaussians.get("sh_base") + error.base_change(rest - found.values))
+        members.set_clusters(gaussians, found.labels, error.weights)
+        if run.adam is not None:
+            run.adam.forget("sh_rest")
+        LOG.info("%s of %s", amount(len(found.palette), "harmonic"), amount(gaussians.count, "Gaussian"))
+
+
+class SharePalette(Scheduled):
+    """Move each vector of the palette to the mean of the harmonics of its Gaussians, which get it again.
+
+    The mean is by what the Gaussians contributed to the training views when `palette_sh` drew the palette.  On a
+    cadence, with a rate for `sh_rest`, the vectors are trained: each Gaussian moves its own, and those that share one
+    agree.  It belongs right behind such a training too, since no edit follows the last step.
+    """
+
+    stage: Literal["share_palette"] = "share_palette"
+    needs: ClassVar[frozenset[str]] = frozenset({"model", "palette"})
+    edits: ClassVar[bool] = True
+
+    def run(self, run: Run) -> None:
+        if run.model.gaussians.sh_degree:
+            members.share(run.model.gaussians, "sh_rest")
+
+
+def visible_error(run: Run) -> VisibleError:
+    """Return how errors of the harmonics show in the training views."""
+    views, gaussians = run.scene.split("train"), run.model.gaussians
+    looks = run.survey().looks(run.status.counted(views, "views", len(views)))
+    positions = (view.position for view in views)
+    coefficients = gaussians.tables["sh_rest"].components // 3
+    return VisibleError.of(zip(looks, positions, strict=False), gaussians.get("means"), coefficients)

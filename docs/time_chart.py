@@ -1,0 +1,51 @@
+"""Draw test PSNR over CPU seconds of training, a chart for each scene: docs/time.svg.
+
+    python docs/time_chart.py NAME=RUN,RUN … > docs/time.svg
+
+NAME is the scene in words; each RUN is a run folder, which need not be finished, with an `evaluate` in its training.
+"""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from clsplat.bench.table import STYLE
+from clsplat.compare.run_folder import read_settings
+from clsplat.pages.svg import HEIGHT, WIDTH, Line, curve
+from clsplat.training.records import Records
+
+LONGEST = 130  # CPU seconds that are shown
+
+
+def line(run: Path) -> Line:
+    """The test PSNR of a run, at the CPU seconds of its steps."""
+    records = Records(run).read()
+    trained = [(0.0, 0.0), *((r["step"], r["cpu_seconds"]) for r in records if r["kind"] == "train")]
+    tested = [(r["step"], r["psnr"]) for r in records if r["kind"] == "evaluate" and r["split"] == "test"]
+    seconds = np.interp([step for step, _ in tested], *zip(*trained, strict=True))
+    points = [(float(x), psnr) for x, (_, psnr) in zip(seconds, tested, strict=True) if x <= LONGEST]
+    return Line(points, read_settings(run)["name"])
+
+
+def drawing(charts: list[str]) -> str:
+    """Charts in two columns, as one SVG."""
+    rows = -(-len(charts) // 2)
+    places = ((WIDTH * (i % 2), HEIGHT * (i // 2)) for i in range(len(charts)))
+    inner = (
+        chart.replace("<svg", f'<svg x="{x}" y="{y}" width="{WIDTH}" height="{HEIGHT}"', 1)
+        for chart, (x, y) in zip(charts, places, strict=True)
+    )
+    size = f'width="{2 * WIDTH}" height="{rows * HEIGHT}" viewBox="0 0 {2 * WIDTH} {rows * HEIGHT}"'
+    return f'<svg xmlns="http://www.w3.org/2000/svg" {size}>{"".join(inner)}{STYLE}</svg>\n'
+
+
+if __name__ == "__main__":
+    scenes = (argument.partition("=") for argument in sys.argv[1:])
+    print(
+        drawing([
+            curve(f"{name}: test PSNR over CPU seconds, dB", [line(Path(run)) for run in runs.split(",")])
+            for name, _, runs in scenes
+        ]),
+        end="",
+    )  # fmt: skip

@@ -1,0 +1,21 @@
+"""Faults that are known and stay: each is said on the page, and one that is not seen any more is a fault itself."""
+
+from collections.abc import Iterable
+
+ACCEPTED = {
+    "tgllp: blend_wide.cl (wide, PIXEL_BOX 1) does not compile: ocloc ended with -6": "no GPU takes *wide* by itself",
+    "pvc project_backward (PIXEL_BOX 1) spills registers (40)": "the recipes `box` and `box_7k` alone",
+    "pvc project_backward (PIXEL_BOX 1, TILE 8) spills registers (40)": "the recipes `box` and `box_7k` alone",
+}
+
+
+def others(failures: Iterable[str], everything: bool) -> list[str]:
+    """Return the failures that are not accepted and, where `everything` was compiled, those that did not occur."""
+    found = list(failures)
+    gone = [f"'{fault}' is accepted, and was not seen: remove it" for fault in ACCEPTED if fault not in found]
+    return [failure for failure in found if failure not in ACCEPTED] + (gone if everything else [])
+
+
+def text() -> str:
+    """Return the accepted faults as Markdown."""
+    return "Known faults:\n\n" + "\n".join(f"- {fault}: {whom}" for fault, whom in ACCEPTED.items())
