@@ -27,7 +27,7 @@ void adam_step(
     if (i >= count)
         return;
     /* where each is updated, all items read the first keys, which costs nothing */
-    const VI updated = (VLOAD(depth_key + (i & ~every)) != ~0u) | (VI)((int)every);
+    const VI updated = (VLOAD_INT(depth_key + (i & ~every)) != -1) | (VI)((int)every);
     if (!ANY(updated))
         return;
     const uint at = get_global_id(1) * stride + i;

@@ -111,9 +111,9 @@ static inline void colour_backward(
     for (uint lane = 0; lane < LANES; lane++)
         for (uint k = 0; k < 4; k++)
             table[k][lane] = i + lane < count ? splats[(size_t)(i + lane) * RECORD + SPLAT_OPACITY + k] : 0.0f;
-    g->touched = VLOAD(table[0]) > 0.0f;  // culled records are all zero
+    g->touched = VLOAD_PRIVATE(table[0]) > 0.0f;  // culled records are all zero
     for (uint channel = 0; channel < 3; channel++)  // max(0, .) passes no gradient where it clamped
-        g->colour[channel] = VLOAD(table[1 + channel]) > 0.0f
+        g->colour[channel] = VLOAD_PRIVATE(table[1 + channel]) > 0.0f
                                  ? VLOAD(pixel_sums + (SUM_RED + channel) * stride + i) : (VF)(0.0f);
 }
 

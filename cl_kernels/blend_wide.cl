@@ -1,18 +1,9 @@
-/* Blending for CPUs: one item = one tile, LANES pixels of a row at a time, two rows together so that their chains of
- * transmittance overlap.  Kerbl et al. 2023, eq. 3; the formulas are in splat.h. */
-#include "splat.h"
+/* Blending for CPUs: one item = one tile, LANES pixels of a row at a time; the forward pass blends two vectors of
+ * pixels together, so that their chains of transmittance overlap.  Kerbl et al. 2023, eq. 3; the formulas are in
+ * splat.h. */
+#include "rows.h"
 
-#define COLUMNS (TILE / LANES)  // vectors per tile row
-#if PIXEL_BOX
-#define SEGMENT 64              // with the lines of each, TILE * 16 bytes
-#else
-#define SEGMENT 128             // splats of a tile loaded together: one wait for memory, then rows read the cache
-#endif
-
-static inline VF pixel_centres(const uint tile_x, const uint column)
-{
-    return to_VF(LANE_INDEX + (int)(tile_x * TILE + column * LANES)) + 0.5f;
-}
+#define TOGETHER (COLUMNS > 1 ? 1 : 2)  // rows of a tile that are blended together
 
 /* 1 where the pixel lies in the image, else 0: losses need planes that are zero outside. */
 static inline VF inside_image(__constant camera_t *camera, const VF pixel, const uint row)
@@ -21,46 +12,8 @@ static inline VF inside_image(__constant camera_t *camera, const VF pixel, const
     return row < camera->height ? (pixel < (float)camera->width ? one : zero) : zero;
 }
 
-#if PIXEL_BOX
-#define LINE_FIELDS (sizeof(line_t) / sizeof(VF))
-#define SLOPE_FIELDS (sizeof(slopes_t) / sizeof(VF))
-#define SPLAT_AT(splat, lines, row, y) splat_on_lines(splat, lines, splat[BOX_TURNED] > 0.0f, row, y, column, pixel)
-
-/* The lines of a splat through a tile, rows or columns, each field of all lines together. */
-static inline void lines_of(const float *splat, const uint tile_x, const uint tile_y, float (*lines)[TILE],
-                            float (*slopes)[TILE])
-{
-    for (uint column = 0; column < COLUMNS; column++) {
-        line_t line;
-        slopes_t slope;
-        line_of(splat, pixel_centres(splat[BOX_TURNED] > 0.0f ? tile_x : tile_y, column), &line, &slope);
-        for (uint k = 0; k < LINE_FIELDS; k++)
-            VSTORE(((const VF *)&line)[k], lines[k] + column * LANES);
-        for (uint k = 0; slopes && k < SLOPE_FIELDS; k++)
-            VSTORE(((const VF *)&slope)[k], slopes[k] + column * LANES);
-    }
-}
-
-/* A field at LANES pixels of row y of a tile: of their columns, or of the row alone. */
-static inline VF field_at(const float *field, const bool turned, const uint y, const uint column)
-{
-    return turned ? VLOAD(field + column * LANES) : (VF)(field[y]);
-}
-
-static inline row_splat_t splat_on_lines(const float *splat, const float (*lines)[TILE], const bool turned,
-                                         const float row, const uint y, const uint column, const VF pixel)
-{
-    row_splat_t s = splat_at_pixels(splat, turned, row, pixel);
-    for (uint k = 0; k < LINE_FIELDS; k++)
-        ((VF *)&s.line)[k] = field_at(lines[k], turned, y, column);
-    return s;
-}
-#else
-#define SPLAT_AT(splat, lines, row, y) splat_at_row(splat, row)
-#endif
-
-/* Private memory: SEGMENT * 68 bytes of splats and TILE * TILE * 16 of pixels; with PIXEL_BOX also
- * SEGMENT * TILE * 16 of lines.  Deterministic. */
+/* Private memory: SEGMENT * 72 bytes of splats, SEGMENT * TILE * LINE_FIELDS * 4 of their lines and TILE * TILE * 16
+ * of pixels.  Deterministic. */
 __kernel __attribute__((reqd_work_group_size(1, 1, 1)))
 void blend_forward(
     __global const uint *restrict tile_offset,  // [T+1]
@@ -78,54 +31,50 @@ void blend_forward(
     const uint tile_y = tile / camera->tiles_x, tile_x = tile - tile_y * camera->tiles_x;
     const uint first = tile_offset[tile], end = tile_offset[tile + 1];
     const uint width = camera->tiles_x * TILE, plane = width * camera->tiles_y * TILE;
-    float segment[SEGMENT][RECORD];
-#if PIXEL_BOX
+    __global const float16 *records = (__global const float16 *)splats;
+    float16 segment[SEGMENT];
     float lines[SEGMENT][LINE_FIELDS][TILE];
-#endif
-    uint list[SEGMENT];
-    pixels_t pixels[TILE][COLUMNS];
-    for (uint y = 0; y < TILE; y++)
-        for (uint column = 0; column < COLUMNS; column++) {
-            const pixels_t clear = {(VF)(1.0f), (VF)(0.0f), (VF)(0.0f), (VF)(0.0f)};
-            pixels[y][column] = clear;
-        }
+    uchar lists[TILE / 2][SEGMENT];
+    uint listed[TILE / 2];
+    VF centres[COLUMNS];
+    for (uint column = 0; column < COLUMNS; column++)
+        centres[column] = pixel_centres(tile_x, column);
+    pixels_t pixels[TILE * COLUMNS];
+    for (uint v = 0; v < TILE * COLUMNS; v++) {
+        const pixels_t clear = {(VF)(1.0f), (VF)(0.0f), (VF)(0.0f), (VF)(0.0f)};
+        pixels[v] = clear;
+    }
 
     uint last = first;
     bool unfinished = true;
     for (uint begin = first; begin < end && unfinished; begin += SEGMENT) {
         const uint length = end - begin < SEGMENT ? end - begin : SEGMENT;
         for (uint j = 0; j < length; j++)
-            vstore16(vload16(pair_splat[tile_pairs[begin + j]], splats), 0, segment[j]);
-#if PIXEL_BOX
+            segment[j] = records[pair_splat[tile_pairs[begin + j]]];
         for (uint j = 0; j < length; j++)
-            lines_of(segment[j], tile_x, tile_y, lines[j], 0);
-#endif
+            lines_of((const float *)(segment + j), tile_x, tile_y, lines[j], 0);
+        list_splats(segment, length, tile_y, lists, listed);
         unfinished = false;
-        for (uint y = 0; y < TILE; y += 2) {
-            const float row = tile_y * TILE + y + 0.5f;
-            uint listed = 0;
-            for (uint j = 0; j < length; j++) {  // branch-free compaction
-                list[listed] = j;
-                listed += (segment[j][SPLAT_Y_MIN] <= row + 1.0f) & (segment[j][SPLAT_Y_MAX] >= row);
-            }
-            for (uint column = 0; column < COLUMNS; column++) {
-                const VF pixel = pixel_centres(tile_x, column);
-                pixels_t upper = pixels[y][column], lower = pixels[y + 1][column];
-                bool open = ANY((upper.t > 0.0f) | (lower.t > 0.0f));
-                for (uint k = 0; k < listed && open; k++) {
-                    const float *splat = segment[list[k]];
-                    blend(&upper, SPLAT_AT(splat, lines[list[k]], row, y), pixel, splat + SPLAT_RED);
-                    blend(&lower, SPLAT_AT(splat, lines[list[k]], row + 1.0f, y + 1), pixel, splat + SPLAT_RED);
-                    if ((k & 15) == 15 || k + 1 == listed) {
-                        open = ANY((upper.t > 0.0f) | (lower.t > 0.0f));
-                        const uint reached = begin + list[k] + 1;
-                        last = reached > last ? reached : last;
-                    }
+        for (uint v = 0; v < TILE * COLUMNS; v += 2) {  // and the next vector
+            const uint y = v / COLUMNS, below = y + TOGETHER - 1, right = (v + 1) % COLUMNS;
+            const uint count = listed[y / 2];
+            const uchar *list = lists[y / 2];
+            pixels_t one = pixels[v], other = pixels[v + 1];
+            bool open = ANY((one.t > 0.0f) | (other.t > 0.0f));
+            for (uint some = 0; some < count && open; some += 16) {
+                const uint stop = some + 16 < count ? some + 16 : count;
+                for (uint k = some; k < stop; k++) {
+                    const float *splat = (const float *)(segment + list[k]);
+                    blend(&one, SPLAT_AT(splat, lines[list[k]], y, 0), centres[0], splat + SPLAT_RED);
+                    blend(&other, SPLAT_AT(splat, lines[list[k]], below, right), centres[right], splat + SPLAT_RED);
                 }
-                pixels[y][column] = upper;
-                pixels[y + 1][column] = lower;
-                unfinished = unfinished || open;
+                open = ANY((one.t > 0.0f) | (other.t > 0.0f));
+                const uint reached = begin + list[stop - 1] + 1;
+                last = reached > last ? reached : last;
             }
+            pixels[v] = one;
+            pixels[v + 1] = other;
+            unfinished = unfinished || open;
         }
     }
 
@@ -134,8 +83,8 @@ void blend_forward(
         for (uint column = 0; column < COLUMNS; column++) {
             const uint row = tile_y * TILE + y;
             const uint at = row * width + tile_x * TILE + column * LANES;
-            const VF inside = inside_image(camera, pixel_centres(tile_x, column), row);
-            const pixels_t p = pixels[y][column];
+            const VF inside = inside_image(camera, centres[column], row);
+            const pixels_t p = pixels[y * COLUMNS + column];
             const VF t = magnitude(p.t);
             VSTORE((p.red + t * background[0]) * inside, image + at);
             VSTORE((p.green + t * background[1]) * inside, image + plane + at);
@@ -147,24 +96,36 @@ void blend_forward(
         }
 }
 
-/* Sum the lanes of each sum over pixels and write one record. */
+/* Two vectors to one: of each part of theirs, the lower lanes plus the upper ones. */
+#define FOLD(a, b, low, high) ((VF)((a).low, (b).low) + (VF)((a).high, (b).high))
+#if LANES == 16
+#define FOLD_TWICE(a, b, c, d) FOLD(FOLD(a, b, lo, hi), FOLD(c, d, lo, hi), s012389ab, s4567cdef)
+#else
+#define FOLD_TWICE(a, b, c, d) FOLD(FOLD(a, b, lo, hi), FOLD(c, d, lo, hi), s0145, s2367)
+#endif
+
+/* Sum the lanes of each sum over pixels, as sum_lanes does, and write one record. */
 static inline void store_record(const pixel_sums_t m, __global float *record)
 {
-    const float16 sums = (float16)(
-        sum_lanes(m.power), sum_lanes(m.x), sum_lanes(m.y), sum_lanes(m.xx), sum_lanes(m.xy), sum_lanes(m.yy),
-        sum_lanes(m.red), sum_lanes(m.green), sum_lanes(m.blue), sum_lanes(m.abs_x), sum_lanes(m.abs_y),
-        sum_lanes(m.weight), sum_lanes(m.texture), sum_lanes(m.blended), sum_lanes(m.square), 0.0f);
-    vstore16(sums, 0, record);
+    const VF a = FOLD_TWICE(m.power, m.x, m.y, m.xx), b = FOLD_TWICE(m.xy, m.yy, m.red, m.green);
+    const VF c = FOLD_TWICE(m.blue, m.abs_x, m.abs_y, m.weight);
+    const VF d = FOLD_TWICE(m.texture, m.blended, m.square, (VF)(0.0f));
+#if LANES == 16
+    const VF low = FOLD(a, b, s014589cd, s2367abef), high = FOLD(c, d, s014589cd, s2367abef);
+    *(__global float16 *)record = FOLD(low, high, even, odd);
+#else
+    *(__global float16 *)record = (float16)(FOLD(a, b, even, odd), FOLD(c, d, even, odd));
+#endif
 }
 
 #if PIXEL_BOX
 /* Add a row of pixels. */
 static inline void add_row(const float *splat, const float (*lines)[TILE], const float (*slopes)[TILE],
-                           const bool turned, const float row, const uint y, const uint tile_x,
+                           const bool turned, const float row, const uint y, const VF *centres,
                            grad_pixels_t *pixels, pixel_sums_t *sums)
 {
     for (uint column = 0; column < COLUMNS; column++) {
-        const VF pixel = pixel_centres(tile_x, column);
+        const VF pixel = centres[column];
         row_splat_t s = splat_on_lines(splat, lines, turned, row, y, column, pixel);
         for (uint k = 0; k < SLOPE_FIELDS; k++)
             ((VF *)&s.slopes)[k] = field_at(slopes[k], turned, y, column);
@@ -173,37 +134,31 @@ static inline void add_row(const float *splat, const float (*lines)[TILE], const
 }
 #endif
 
-/* Sum one splat over the rows of its tile that it reaches, whole pairs of rows. */
-static inline void pixel_sums_of(const float *splat, const uint tile_x, const uint tile_y,
-                                 grad_pixels_t (*pixels)[COLUMNS], pixel_sums_t *sums)
+/* Sum one splat over the rows of its tile that it reaches. */
+static inline void pixel_sums_of(const float *splat, const uint tile_x, const uint tile_y, const VF *centres,
+                                 grad_pixels_t *pixels, pixel_sums_t *sums)
 {
     const VF zero = (VF)(0.0f);
     pixel_sums_t pixel_sums = {zero, zero, zero, zero, zero, zero, zero, zero,
                                zero, zero, zero, zero, zero, zero, zero};
-#if PIXEL_BOX
     float lines[LINE_FIELDS][TILE], slopes[SLOPE_FIELDS][TILE];
     lines_of(splat, tile_x, tile_y, lines, slopes);
-#endif
     const float top = tile_y * TILE + 0.5f;
     const float low = splat[SPLAT_Y_MIN] - top, high = splat[SPLAT_Y_MAX] - top;
-    const uint y_first = low > 0.0f ? (uint)low : 0u;
-    const uint y_end = high < TILE - 1.0f ? (uint)(high + 1.0f) : TILE;
+    const uint y_below = low > 0.0f ? (uint)low : 0u, y_first = y_below + (low > (float)y_below ? 1u : 0u);
+    const uint y_end = high < 0.0f ? 0u : high < TILE - 1.0f ? (uint)(high + 1.0f) : TILE;
 #if PIXEL_BOX
     if (splat[BOX_TURNED] > 0.0f)  // apart, so that both loops know where their fields lie
         for (uint y = y_first; y < y_end; y++)
-            add_row(splat, lines, slopes, true, top + y, y, tile_x, pixels[y], &pixel_sums);
+            add_row(splat, lines, slopes, true, top + y, y, centres, pixels + y * COLUMNS, &pixel_sums);
     else
         for (uint y = y_first; y < y_end; y++)
-            add_row(splat, lines, slopes, false, top + y, y, tile_x, pixels[y], &pixel_sums);
+            add_row(splat, lines, slopes, false, top + y, y, centres, pixels + y * COLUMNS, &pixel_sums);
 #else
-    const uint y_begin = y_first - (y_end == TILE ? (y_end - y_first) & 1u : 0u);
-    for (uint y = y_begin; y < y_end; y += 2) {
-        const row_splat_t upper = splat_at_row(splat, top + y), lower = splat_at_row(splat, top + y + 1.0f);
-        for (uint column = 0; column < COLUMNS; column++) {
-            const VF pixel = pixel_centres(tile_x, column);
-            blend_backward_step(&pixels[y][column], upper, pixel, splat + SPLAT_RED, &pixel_sums);
-            blend_backward_step(&pixels[y + 1][column], lower, pixel, splat + SPLAT_RED, &pixel_sums);
-        }
+    /* One vector after the other, as one loop: two together are too much code for the registers that there are. */
+    for (uint v = y_first * COLUMNS; v < y_end * COLUMNS; v++) {
+        const row_splat_t at_row = splat_on_lines(splat, lines, slopes, v / COLUMNS);
+        blend_backward_step(pixels + v, at_row, centres[v % COLUMNS], splat + SPLAT_RED, &pixel_sums);
     }
 #endif
     *sums = pixel_sums;
@@ -211,7 +166,7 @@ static inline void pixel_sums_of(const float *splat, const uint tile_x, const ui
 
 /* The outer loop runs over splats, the inner one over rows: a splat's record is summed in registers and written once,
  * at the pair's address; the records of pairs that no pixel blends are zero.  Private memory: SEGMENT * 68 bytes of
- * splats and TILE * TILE * 20 of pixels.  Deterministic. */
+ * splats, TILE * (LINE_FIELDS + SLOPE_FIELDS) * 4 of lines and TILE * TILE * 20 of pixels.  Deterministic. */
 __kernel __attribute__((reqd_work_group_size(1, 1, 1)))
 void blend_backward(
     __global const uint *restrict tile_offset,  // [T+1]
@@ -229,7 +184,11 @@ void blend_backward(
     const uint tile = first_tile + get_global_id(0);
     const uint tile_y = tile / camera->tiles_x, tile_x = tile - tile_y * camera->tiles_x;
     const uint width = camera->tiles_x * TILE, plane = width * camera->tiles_y * TILE;
-    grad_pixels_t pixels[TILE][COLUMNS];
+    __global const float16 *records = (__global const float16 *)splats;
+    VF centres[COLUMNS];
+    for (uint column = 0; column < COLUMNS; column++)
+        centres[column] = pixel_centres(tile_x, column);
+    grad_pixels_t pixels[TILE * COLUMNS];
     for (uint y = 0; y < TILE; y++)
         for (uint column = 0; column < COLUMNS; column++) {
             const uint at = (tile_y * TILE + y) * width + tile_x * TILE + column * LANES;
@@ -247,24 +206,24 @@ void blend_backward(
             p.entropy = VLOAD(grad_image + 3 * plane + at);
             p.rest = p.rest - p.entropy * (1.0f - VLOAD(image + 3 * plane + at));
 #endif
-            pixels[y][column] = p;
+            pixels[y * COLUMNS + column] = p;
         }
 
     const uint first = tile_offset[tile], end = tile_offset[tile + 1], last = first + tile_last[tile];
     for (uint begin = first; begin < last; begin += SEGMENT) {
         const uint length = last - begin < SEGMENT ? last - begin : SEGMENT;
-        float segment[SEGMENT][RECORD];
+        float16 segment[SEGMENT];
         uint pairs[SEGMENT];
         for (uint j = 0; j < length; j++) {  // together, so that their waits for memory overlap
             pairs[j] = tile_pairs[begin + j];
-            vstore16(vload16(pair_splat[pairs[j]], splats), 0, segment[j]);
+            segment[j] = records[pair_splat[pairs[j]]];
         }
         for (uint j = 0; j < length; j++) {
             pixel_sums_t pixel_sums;
-            pixel_sums_of(segment[j], tile_x, tile_y, pixels, &pixel_sums);
+            pixel_sums_of((const float *)(segment + j), tile_x, tile_y, centres, pixels, &pixel_sums);
             store_record(pixel_sums, pair_sums + (size_t)pairs[j] * RECORD);
         }
     }
     for (uint j = last; j < end; j++)
-        vstore16((float16)(0.0f), tile_pairs[j], pair_sums);
+        ((__global float16 *)pair_sums)[tile_pairs[j]] = (float16)(0.0f);
 }

@@ -3,7 +3,7 @@
  * White is cut, since a photograph has no more; black is not, or a pixel below it would have no gradient.  What is cut
  * passes no gradient.  A fourth plane of the image is copied.  Planes are [channels,H',W'] with H', W' whole tiles,
  * zero outside the image.  One group of TEAM items = one row; each sum is written once.  Deterministic. */
-#include "rows.h"
+#include "planes.h"
 
 #define SUMS 12  // derivatives by the matrix [E | b], row by row
 

@@ -44,10 +44,10 @@ void sampling_interval(
     }
     const VI seen = (smallest < DEPTH_MAX) & ((LANE_INDEX + (int)i) < (int)count);
     float lanes[LANES], lane_max = 0.0f;
-    VSTORE((seen ? smallest : (VF)(0.0f)), lanes);
+    VSTORE_PRIVATE((seen ? smallest : (VF)(0.0f)), lanes);
     for (uint lane = 0; lane < LANES; lane++)
         lane_max = lanes[lane] > lane_max ? lanes[lane] : lane_max;
-    VSTORE(VLOAD(lanes), interval + i);
+    VSTORE(VLOAD_PRIVATE(lanes), interval + i);
     atomic_max(largest, as_uint(lane_max));  // floats above zero are ordered as their bits
 }
 

@@ -36,7 +36,7 @@ void sum_records(
         float lanes[LANES];
         for (uint lane = 0; lane < LANES; lane++)
             lanes[lane] = ((const float *)table[lane])[k];
-        VSTORE(VLOAD(lanes), pixel_sums + k * stride + i);
+        VSTORE(VLOAD_PRIVATE(lanes), pixel_sums + k * stride + i);
     }
 }
 

@@ -1,5 +1,5 @@
-/* VF and VI: a float and an int in each of LANES lanes.  One source serves CPUs, where an item computes 16 or 8
- * Gaussians or pixels, as many as the vector unit has lanes, and GPUs, where an item computes one.
+/* VF, VI and VB: a float, an int and a byte in each of LANES lanes.  One source serves CPUs, where an item computes 16
+ * or 8 Gaussians or pixels, as many as the vector unit has lanes, and GPUs, where an item computes one.
  *
  * Comparisons give -1 in vectors and 1 in scalars, so masks are combined with & and | only and used as m ? a : b.
  * Loops that matter use operators only: some CPU runtimes call built-in functions out of line. */
@@ -10,43 +10,74 @@
 #if LANES == 16
 typedef float16 VF;
 typedef int16 VI;
+typedef uchar16 VB;
 #define as_VF as_float16
 #define as_VI as_int16
-#define VLOAD(pointer) vload16(0, pointer)
-#define VSTORE(value, pointer) vstore16(value, 0, pointer)
 #define LANE_INDEX ((VI)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15))
 #define to_VF convert_float16
 #elif LANES == 8
 typedef float8 VF;
 typedef int8 VI;
+typedef uchar8 VB;
 #define as_VF as_float8
 #define as_VI as_int8
-#define VLOAD(pointer) vload8(0, pointer)
-#define VSTORE(value, pointer) vstore8(value, 0, pointer)
 #define LANE_INDEX ((VI)(0, 1, 2, 3, 4, 5, 6, 7))
 #define to_VF convert_float8
 #else
 typedef float VF;
 typedef int VI;
+typedef uchar VB;
 #define as_VF as_float
 #define as_VI as_int
-#define VLOAD(pointer) (*(pointer))
-#define VSTORE(value, pointer) (*(pointer) = (value))
 #define LANE_INDEX 0
 #define to_VF convert_float
 #endif
+
+/* Vectors in memory begin at any value.  They are read and written through a type that says so, and not by vload and
+ * vstore, which some CPU runtimes call out of line or compose of four parts. */
+typedef VF __attribute__((aligned(4))) VF_in_memory;
+typedef VI __attribute__((aligned(4))) VI_in_memory;
+typedef VB __attribute__((aligned(1))) VB_in_memory;
+#define VLOAD(pointer) (*(__global const VF_in_memory *)(pointer))
+#define VSTORE(value, pointer) (*(__global VF_in_memory *)(pointer) = (value))
+#define VLOAD_INT(pointer) (*(__global const VI_in_memory *)(pointer))
+#define VSTORE_INT(value, pointer) (*(__global VI_in_memory *)(pointer) = (value))
+#define VLOAD_BYTES(pointer) (*(__global const VB_in_memory *)(pointer))
+#define VLOAD_LOCAL(pointer) (*(__local const VF_in_memory *)(pointer))
+#define VSTORE_LOCAL(value, pointer) (*(__local VF_in_memory *)(pointer) = (value))
+#define VLOAD_PRIVATE(pointer) (*(const VF_in_memory *)(pointer))
+#define VSTORE_PRIVATE(value, pointer) (*(VF_in_memory *)(pointer) = (value))
+#define VSTORE_INT_PRIVATE(value, pointer) (*(VI_in_memory *)(pointer) = (value))
 
 #if LANES == 1
 #define ANY(mask) (mask)
 #define first_lane(v) (v)
 #else
-#define ANY(mask) any(mask)
+#define ANY(mask) any_lane(mask)
 #define first_lane(v) ((v).s0)
 #endif
 
 #define ROUND_MAGIC 12582912.0f  // 1.5 * 2^23: after adding it, the low mantissa bits are the nearest integer
 #define LOG2_E 1.44269504f
 #define LN_2 0.693147181f
+
+/* Whether a mask holds in any lane; the built-in functions may be called out of line. */
+#if LANES == 16
+static inline bool any_lane(const VI mask)
+{
+    const int8 a = mask.lo | mask.hi;
+    const int4 b = a.lo | a.hi;
+    const int2 c = b.lo | b.hi;
+    return (c.x | c.y) < 0;
+}
+#elif LANES == 8
+static inline bool any_lane(const VI mask)
+{
+    const int4 b = mask.lo | mask.hi;
+    const int2 c = b.lo | b.hi;
+    return (c.x | c.y) < 0;
+}
+#endif
 
 /* Sum of the lanes, by halves: one order on every device. */
 #if LANES == 16

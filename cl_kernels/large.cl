@@ -81,7 +81,7 @@ static inline void list_share(const footprint_t *f, const rows_t share, uint pai
     for (uint row = share.begin; row < share.end; row++)
         for (uint column = 0; column < columns; column += LANES) {
             int touched[LANES];
-            VSTORE(touched_from(f, column, row), touched);
+            VSTORE_INT_PRIVATE(touched_from(f, column, row), touched);
             for (uint lane = 0; lane < LANES && column + lane < columns && pair < end; lane++) {
                 if (touched[lane] || end - pair >= left) {
                     pair_tile[pair] = corner + row * tiles_x + column + lane;

@@ -3,7 +3,7 @@
  * SSIM: 11x11 Gaussian window, sigma 1.5, zero padding, C1 = 0.01^2, C2 = 0.03^2 (Wang et al. 2004, as 3DGS uses it).
  * Planes are [channels,H',W'] with H', W' whole tiles, zero outside the image; gradients too.  One group of TEAM items
  * = one row of one channel (SSIM: a block of its columns); each sum is written once.  Deterministic. */
-#include "rows.h"
+#include "planes.h"
 
 #define SSIM_C1 1.0e-4f
 #define SSIM_C2 9.0e-4f
@@ -16,7 +16,7 @@ __constant float WINDOW[2 * REACH + 1] = {
     1.02838008e-03f, 7.59875814e-03f, 3.60007721e-02f, 1.09360690e-01f, 2.13005538e-01f, 2.66011725e-01f,
     2.13005538e-01f, 1.09360690e-01f, 3.60007721e-02f, 7.59875814e-03f, 1.02838008e-03f};
 
-/* 8-bit pixels times a factor to float planes.  One item = one pixel of one channel; dimensions x, y, channel. */
+/* 8-bit pixels times a factor to float planes.  One item = LANES pixels of one channel; dimensions x, y, channel. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void unpack_pixels(
     __global const uchar *restrict pixels,  // [channels,height,width]
@@ -26,12 +26,16 @@ void unpack_pixels(
     const uint height,
     const uint stride)
 {
-    const uint x = get_global_id(0), y = get_global_id(1), channel = get_global_id(2);
-    if (x < width)
-        planes[(channel * get_global_size(1) + y) * stride + x] =
-            y < height ? pixels[(channel * height + y) * width + x] * factor : 0.0f;
-    else if (x < stride)
-        planes[(channel * get_global_size(1) + y) * stride + x] = 0.0f;
+    const uint x = get_global_id(0) * LANES, y = get_global_id(1), channel = get_global_id(2);
+    if (x >= stride)
+        return;
+    __global const uchar *first = pixels + (channel * height + y) * width + x;
+    __global float *values = planes + (channel * get_global_size(1) + y) * stride + x;
+    if (y < height && x + LANES <= width)
+        VSTORE(to_VF(VLOAD_BYTES(first)) * factor, values);
+    else
+        for (uint lane = 0; lane < LANES; lane++)
+            values[lane] = y < height && x + lane < width ? first[lane] * factor : 0.0f;
 }
 
 /* Set pixels that the mask leaves out to zero.  One item = one pixel of one channel; dimensions pixel, channel. */
@@ -125,11 +129,11 @@ void ssim_maps(
                 yy += wb * b;
                 xy += wa * b;
             }
-        VSTORE(mx, vertical[0] + v);
-        VSTORE(my, vertical[1] + v);
-        VSTORE(xx, vertical[2] + v);
-        VSTORE(yy, vertical[3] + v);
-        VSTORE(xy, vertical[4] + v);
+        VSTORE_LOCAL(mx, vertical[0] + v);
+        VSTORE_LOCAL(my, vertical[1] + v);
+        VSTORE_LOCAL(xx, vertical[2] + v);
+        VSTORE_LOCAL(yy, vertical[3] + v);
+        VSTORE_LOCAL(xy, vertical[4] + v);
     }
     barrier(CLK_LOCAL_MEM_FENCE);
 
@@ -138,11 +142,11 @@ void ssim_maps(
         VF mx = zero, my = zero, xx = zero, yy = zero, xy = zero;
         for (uint k = 0; k <= 2 * REACH; k++) {
             const uint at = v + MARGIN - REACH + k;
-            mx += WINDOW[k] * VLOAD(vertical[0] + at);
-            my += WINDOW[k] * VLOAD(vertical[1] + at);
-            xx += WINDOW[k] * VLOAD(vertical[2] + at);
-            yy += WINDOW[k] * VLOAD(vertical[3] + at);
-            xy += WINDOW[k] * VLOAD(vertical[4] + at);
+            mx += WINDOW[k] * VLOAD_LOCAL(vertical[0] + at);
+            my += WINDOW[k] * VLOAD_LOCAL(vertical[1] + at);
+            xx += WINDOW[k] * VLOAD_LOCAL(vertical[2] + at);
+            yy += WINDOW[k] * VLOAD_LOCAL(vertical[3] + at);
+            xy += WINDOW[k] * VLOAD_LOCAL(vertical[4] + at);
         }
         const VF a1 = 2.0f * mx * my + SSIM_C1, a2 = 2.0f * (xy - mx * my) + SSIM_C2;
         const VF b1 = mx * mx + my * my + SSIM_C1, b2 = (xx - mx * mx) + (yy - my * my) + SSIM_C2;
@@ -193,9 +197,9 @@ void ssim_gradient(
                 variance += WINDOW[k] * VLOAD(maps + 3 * plane + at);
                 covariance += WINDOW[k] * VLOAD(maps + 6 * plane + at);
             }
-        VSTORE(mean, vertical[0] + v);
-        VSTORE(variance, vertical[1] + v);
-        VSTORE(covariance, vertical[2] + v);
+        VSTORE_LOCAL(mean, vertical[0] + v);
+        VSTORE_LOCAL(variance, vertical[1] + v);
+        VSTORE_LOCAL(covariance, vertical[2] + v);
     }
     barrier(CLK_LOCAL_MEM_FENCE);
 
@@ -203,9 +207,9 @@ void ssim_gradient(
         VF mean = zero, variance = zero, covariance = zero;
         for (uint k = 0; k <= 2 * REACH; k++) {
             const uint at = v + MARGIN - REACH + k;
-            mean += WINDOW[k] * VLOAD(vertical[0] + at);
-            variance += WINDOW[k] * VLOAD(vertical[1] + at);
-            covariance += WINDOW[k] * VLOAD(vertical[2] + at);
+            mean += WINDOW[k] * VLOAD_LOCAL(vertical[0] + at);
+            variance += WINDOW[k] * VLOAD_LOCAL(vertical[1] + at);
+            covariance += WINDOW[k] * VLOAD_LOCAL(vertical[2] + at);
         }
         const uint at = channel * plane + y * stride + first + v;
         const VF g = (scale * inside_row(first + v, columns)) *

@@ -1,21 +1,99 @@
-/* Rows of planes [channels,H',W'], with H', W' whole tiles and zero outside the image, of which a work-group of TEAM
- * items computes one: which columns lie in the image, and the sum of what the items have found. */
+/* A splat seen from the rows of a tile, for CPUs: what a row of pixels needs is computed for all rows of a tile at
+ * once, LANES of them together, so that the loops over pixels read numbers that are ready, without a branch.  The
+ * formulas are those of splat.h; the bits are those of splat_at_row. */
 #ifndef CLSPLAT_ROWS_H
 #define CLSPLAT_ROWS_H
-#include "lanes.h"
+#include "splat.h"
 
-/* 1 where the column lies in the image, else 0. */
-static inline VF inside_row(const uint column, const uint width)
+#define COLUMNS (TILE / LANES)  // vectors per tile row
+#define SEGMENT 64              // splats of a tile loaded together: one wait for memory, then rows read the cache
+
+static inline VF pixel_centres(const uint tile_x, const uint column)
 {
-    return (LANE_INDEX + (int)column) < (int)width ? (VF)(1.0f) : (VF)(0.0f);
+    return to_VF(LANE_INDEX + (int)(tile_x * TILE + column * LANES)) + 0.5f;
 }
 
-static inline float sum_items(__local const float *sums)  // [TEAM]
+#if PIXEL_BOX
+#define LINE_FIELDS (sizeof(line_t) / sizeof(VF))
+#define SLOPE_FIELDS (sizeof(slopes_t) / sizeof(VF))
+#define SPLAT_AT(splat, lines, y, column) \
+    splat_on_lines(splat, lines, splat[BOX_TURNED] > 0.0f, tile_y * TILE + (y) + 0.5f, y, column, centres[column])
+
+/* The lines of a splat through a tile, rows or columns, each field of all lines together. */
+static inline void lines_of(const float *splat, const uint tile_x, const uint tile_y, float (*lines)[TILE],
+                            float (*slopes)[TILE])
 {
-    float sum = 0.0f;
-    for (uint i = 0; i < TEAM; i++)
-        sum += sums[i];
-    return sum;
+    for (uint column = 0; column < COLUMNS; column++) {
+        line_t line;
+        slopes_t slope;
+        line_of(splat, pixel_centres(splat[BOX_TURNED] > 0.0f ? tile_x : tile_y, column), &line, &slope);
+        for (uint k = 0; k < LINE_FIELDS; k++)
+            VSTORE_PRIVATE(((const VF *)&line)[k], lines[k] + column * LANES);
+        for (uint k = 0; slopes && k < SLOPE_FIELDS; k++)
+            VSTORE_PRIVATE(((const VF *)&slope)[k], slopes[k] + column * LANES);
+    }
+}
+
+/* A field at LANES pixels of row y of a tile: of their columns, or of the row alone. */
+static inline VF field_at(const float *field, const bool turned, const uint y, const uint column)
+{
+    return turned ? VLOAD_PRIVATE(field + column * LANES) : (VF)(field[y]);
+}
+
+static inline row_splat_t splat_on_lines(const float *splat, const float (*lines)[TILE], const bool turned,
+                                         const float row, const uint y, const uint column, const VF pixel)
+{
+    row_splat_t s = splat_at_pixels(splat, turned, row, pixel);
+    for (uint k = 0; k < LINE_FIELDS; k++)
+        ((VF *)&s.line)[k] = field_at(lines[k], turned, y, column);
+    return s;
+}
+#else
+#define LINE_FIELDS 3   // of row_splat_t: b, c, power_min
+#define SLOPE_FIELDS 2  // dy, slope
+#define SPLAT_AT(splat, lines, y, column) splat_on_lines(splat, lines, 0, y)
+
+/* What splat_at_row computes, for all rows of a tile; `slopes` is wanted in the backward pass. */
+static inline void lines_of(const float *splat, const uint tile_x, const uint tile_y, float (*lines)[TILE],
+                            float (*slopes)[TILE])
+{
+    for (uint y = 0; y < TILE; y += LANES) {
+        const VF row = pixel_centres(tile_y, y / LANES), dy = splat[SPLAT_Y] - row;
+        const VI inside = (row >= splat[SPLAT_Y_MIN]) & (row <= splat[SPLAT_Y_MAX]);
+        VSTORE_PRIVATE(splat[SPLAT_XY] * dy, lines[0] + y);
+        VSTORE_PRIVATE(0.5f * splat[SPLAT_YY] * dy * dy, lines[1] + y);
+        VSTORE_PRIVATE((inside ? (VF)(splat[SPLAT_POWER_MIN]) : (VF)(1.0f)), lines[2] + y);
+        if (slopes) {
+            VSTORE_PRIVATE(dy, slopes[0] + y);
+            VSTORE_PRIVATE(splat[SPLAT_YY] * dy, slopes[1] + y);
+        }
+    }
+}
+
+static inline row_splat_t splat_on_lines(const float *splat, const float (*lines)[TILE], const float (*slopes)[TILE],
+                                         const uint y)
+{
+    const row_splat_t s = {
+        splat[SPLAT_X], slopes ? slopes[0][y] : 0.0f, -0.5f * splat[SPLAT_XX], lines[0][y], lines[1][y],
+        splat[SPLAT_XY], slopes ? slopes[1][y] : 0.0f, splat[SPLAT_OPACITY], lines[2][y]};
+    return s;
+}
+#endif
+
+/* List, for each two rows of a tile, the splats of a segment that may reach them. */
+static inline void list_splats(const float16 *segment, const uint length, const uint tile_y,
+                               uchar (*lists)[SEGMENT], uint *listed)
+{
+    const float top = tile_y * TILE + 0.5f;
+    for (uint y = 0; y < TILE; y += 2)
+        listed[y / 2] = 0;
+    for (uint j = 0; j < length; j++) {  // branch-free compaction
+        const float *splat = (const float *)(segment + j);
+        for (uint y = 0; y < TILE; y += 2) {
+            lists[y / 2][listed[y / 2]] = j;
+            listed[y / 2] += (splat[SPLAT_Y_MIN] <= top + y + 1.0f) & (splat[SPLAT_Y_MAX] >= top + y);
+        }
+    }
 }
 
 #endif

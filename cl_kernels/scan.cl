@@ -51,7 +51,7 @@ void scan_offsets(
     const uint item = get_local_id(0);
     const uint first = (get_group_id(0) * TEAM + item) * run;
     uint sum = 0;
-    for (uint i = first; i < first + run && i < count; i++)
+    for (uint i = first; TEAM > 1 && i < first + run && i < count; i++)  // wanted by the items behind
         sum = added(sum, values[i]);
     uint before = 0;
     for (uint block = item; block < get_group_id(0); block += TEAM)

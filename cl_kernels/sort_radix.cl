@@ -57,12 +57,13 @@ void radix_scatter(
     __local uint places[TEAM << DIGIT_BITS];
     const uint item = get_local_id(0), block = get_group_id(0);
     const uint first = (block * TEAM + item) * run;
-    count_digits(keys, places, first, run, shift, digits, count);
+    if (TEAM > 1)  // one item begins where its block does
+        count_digits(keys, places, first, run, shift, digits, count);
     barrier(CLK_LOCAL_MEM_FENCE);
     for (uint digit = item; digit < digits; digit += TEAM) {
         uint place = digit_offset[digit * blocks + block];
         for (uint i = 0; i < TEAM; i++) {
-            const uint here = places[digit * TEAM + i];
+            const uint here = TEAM > 1 ? places[digit * TEAM + i] : 0;
             places[digit * TEAM + i] = place;
             place += here;
         }

@@ -148,7 +148,7 @@ static inline contribution_t contribution_of(const row_splat_t s, const VF pixel
     k.blended = k.hit & passes;
     k.weight = k.blended ? alpha * t : (VF)(0.0f);
     const VF finished = as_VF(as_VI(t) | (VI)(0x80000000));
-    k.next = k.hit ? (passes ? left : finished) : t;
+    k.next = k.blended ? left : (k.hit ? finished : t);
     return k;
 }
 

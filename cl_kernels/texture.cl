@@ -19,7 +19,7 @@ static inline void load_line(__global const float *image, const uint plane, cons
 {
     const float last = luminance_of(image, plane, row + width - 1);
     line[0] = luminance_of(image, plane, row + (x > 0 ? x - 1 : 0));
-    VSTORE(luminance_at(image, plane, row + x), line + 1);
+    VSTORE_PRIVATE(luminance_at(image, plane, row + x), line + 1);
     line[LANES + 1] = x + LANES < width ? luminance_of(image, plane, row + x + LANES) : last;
     for (uint k = width - x; k < LANES; k++)
         line[1 + k] = last;
@@ -46,10 +46,12 @@ void image_gradient(
     load_line(image, plane, (y > 0 ? y - 1 : 0) * stride, x, width, above);
     load_line(image, plane, y * stride, x, width, here);
     load_line(image, plane, (y + 1 < height ? y + 1 : y) * stride, x, width, below);
-    const VF across = (VLOAD(above + 2) - VLOAD(above)) + 2.0f * (VLOAD(here + 2) - VLOAD(here)) +
-                      (VLOAD(below + 2) - VLOAD(below));
-    const VF down = (VLOAD(below) - VLOAD(above)) + 2.0f * (VLOAD(below + 1) - VLOAD(above + 1)) +
-                    (VLOAD(below + 2) - VLOAD(above + 2));
+    const VF above_left = VLOAD_PRIVATE(above), above_right = VLOAD_PRIVATE(above + 2);
+    const VF below_left = VLOAD_PRIVATE(below), below_right = VLOAD_PRIVATE(below + 2);
+    const VF across = (above_right - above_left) + 2.0f * (VLOAD_PRIVATE(here + 2) - VLOAD_PRIVATE(here)) +
+                      (below_right - below_left);
+    const VF down = (below_left - above_left) + 2.0f * (VLOAD_PRIVATE(below + 1) - VLOAD_PRIVATE(above + 1)) +
+                    (below_right - above_right);
     const VF inside = (LANE_INDEX + (int)x) < (int)width ? (VF)(1.0f) : (VF)(0.0f);
     VSTORE(inside * 0.125f * sqrt(across * across + down * down), magnitude + y * stride + x);
 }

@@ -57,7 +57,7 @@ FAULTS = {  # kernel -> file, text, wrong text
     "view_error": ("loss.cl", "fabs(VLOAD(gradient + row + x) * difference)", "VLOAD(gradient + row + x) * difference"),
     "sum_errors": ("loss.cl", "total += row_errors[i]", "total = row_errors[i]"),
     "weight_entropy": ("loss.cl", "row = (3 * rows + y)", "row = (2 * rows + y)"),
-    "unpack_pixels": ("loss.cl", "y < height ? pixels", "y + 1 < height ? pixels"),
+    "unpack_pixels": ("loss.cl", "pixels + (channel * height + y)", "pixels + (channel * height)"),
     "apply_mask": ("loss.cl", "mask[pixel] == 0.0f", "mask[pixel] != 0.0f"),
     "pixel_loss": ("loss.cl", "(2.0f * l2)", "(1.99f * l2)"),
     "ssim_maps": ("loss.cl", "SSIM_C2 9.0e-4f", "SSIM_C2 9.1e-4f"),
@@ -92,7 +92,7 @@ FAULTS = {  # kernel -> file, text, wrong text
     "hide_masked": ("texture.cl", "row <= y + 1", "row <= y"),
     "sample_magnitude": ("texture.cl", "magnitude[row * stride + column]", "magnitude[row * stride]"),
 }  # fmt: skip
-OPEN = "ANY((upper.t > 0.0f) | (lower.t > 0.0f))"
+OPEN = "ANY((one.t > 0.0f) | (other.t > 0.0f))"
 MORE = {  # that smaller pictures do not show
     "colours_backward, what is cut": ("colours.cl", "+ g1 < 1.0f ? inside : zero", "+ g1 < 1.0f ? inside : inside"),
     "colours_backward, a sum of another": ("colours.cl", "total[9] += passed_b * g", "total[9] += passed_b * r"),
@@ -122,7 +122,7 @@ OPTIONAL = {  # in what few runs compute: doctor notices them, the check before 
     },
     "project_forward, what a view leaves out": ("project.cl", " & (left_out == 0)", ""),
     "project_forward, the views of another plane": ("project.cl", "hidden_plane * stride + i", "i"),
-    "adam_step, rows not seen": ("adam.cl", "!= ~0u) | (VI)((int)every)", "!= 0u) | (VI)((int)every)"),
+    "adam_step, rows not seen": ("adam.cl", "!= -1) | (VI)((int)every)", "!= 0) | (VI)((int)every)"),
     "update_gaussians, rows not seen": ("adam.cl", "].touched | (VI)((int)every)", "].touched | (VI)(-1)"),
     "update_gaussians, moments not seen": ("adam.h", "(updated ? v : v_before)", "v"),
     "blend_forward wide, entropy": ("blend_wide.cl", "(p.entropy - t * log", "(p.entropy + t * log"),

@@ -148,8 +148,9 @@ def unpack(workspace: Workspace, camera: DeviceCamera, pixels: Array, factor: fl
     """Return 8-bit pixels [C, height, width] times `factor` as float planes [C, rows, stride], zero outside."""
     channels = pixels.shape[0]
     planes = workspace.array(name, (channels, camera.rows, camera.stride))
+    lanes = int(workspace.device.tuning["LANES"])
     workspace.device.program("loss.cl").unpack_pixels(
-        items=(camera.stride, camera.rows, channels),
+        items=(-(-camera.stride // lanes), camera.rows, channels),
         pixels=pixels,
         planes=planes,
         factor=factor,
