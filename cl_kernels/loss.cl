@@ -3,7 +3,7 @@
  * SSIM: 11x11 Gaussian window, sigma 1.5, zero padding, C1 = 0.01^2, C2 = 0.03^2 (Wang et al. 2004, as 3DGS uses it).
  * Planes are [channels,H',W'] with H', W' whole tiles, zero outside the image; gradients too.  One group of TEAM items
  * = one row of one channel (SSIM: a block of its columns); each sum is written once.  Deterministic. */
-#include "lanes.h"
+#include "planes.h"
 
 #define SSIM_C1 1.0e-4f
 #define SSIM_C2 9.0e-4f
@@ -15,20 +15,6 @@
 __constant float WINDOW[2 * REACH + 1] = {
     1.02838008e-03f, 7.59875814e-03f, 3.60007721e-02f, 1.09360690e-01f, 2.13005538e-01f, 2.66011725e-01f,
     2.13005538e-01f, 1.09360690e-01f, 3.60007721e-02f, 7.59875814e-03f, 1.02838008e-03f};
-
-/* 1 where the column lies in the image, else 0. */
-static inline VF inside_row(const uint column, const uint width)
-{
-    return (LANE_INDEX + (int)column) < (int)width ? (VF)(1.0f) : (VF)(0.0f);
-}
-
-static inline float sum_items(__local const float *sums)  // [TEAM]
-{
-    float sum = 0.0f;
-    for (uint i = 0; i < TEAM; i++)
-        sum += sums[i];
-    return sum;
-}
 
 /* 8-bit pixels times a factor to float planes.  One item = LANES pixels of one channel; dimensions x, y, channel. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))

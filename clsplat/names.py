@@ -18,10 +18,11 @@ CHECKPOINTS = "checkpoints"
 UNDISTORTED = "undistorted"
 PREPARED = "prepared"
 COMPARISON = "compare.html"
+VIEW_COLOURS = "view_colours.json"
 RESERVED = frozenset(
     {
         *(PIPELINE, METRICS, RECORDS, TRIAL, STATUS, LOG_FILE, NOTE, INPUTS, CHECKSUMS, LOCK),
-        *(CHECKPOINTS, UNDISTORTED, PREPARED, COMPARISON, "cameras.json", "view_colours.json"),
+        *(CHECKPOINTS, UNDISTORTED, PREPARED, COMPARISON, "cameras.json", VIEW_COLOURS),
     }
 )
 BEFORE_A_RUN = frozenset({STATUS, LOG_FILE, LOCK, UNDISTORTED})  # written before pipeline.yaml

@@ -5,26 +5,33 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from clsplat.files import atomic
+from clsplat.scene.colmap_binary import POINT2D
 from clsplat.scene.quaternion import unit_quaternions
 from clsplat.scene.scene import Camera, PointCloud, View
+from clsplat.scene.tracks import Tracks
 
 PINHOLE = 1  # COLMAP's number of the model
+NONE = np.empty(0, np.int64)
 
 
-def write_model(folder: Path, views: Sequence[View], points: PointCloud | None) -> None:
+def write_model(folder: Path, views: Sequence[View], points: PointCloud | None, tracks: Tracks | None = None) -> None:
     """Write `views`, whose names are those of their images, and points; cameras that are equal are one.
 
-    The tracks of points are not written: no reader of scenes uses them.  Raises OutputError.
+    tracks: which of the points, in their order, each view shows; their places in an image are where the camera projects
+    them to.  Raises OutputError.
     """
     cameras: dict[Camera, int] = {}
     for view in views:
         cameras.setdefault(view.camera, len(cameras) + 1)
+    seen = {view.name: tracks.seen.get(view.name, NONE) if tracks and points else NONE for view in views}
     rows = [_camera(number, camera) for camera, number in cameras.items()]
     _write(folder / "cameras.bin", rows)
-    _write(folder / "images.bin", [_image(i, view, cameras[view.camera]) for i, view in enumerate(views, 1)])
-    _write(folder / "points3D.bin", [] if points is None else _points(points))
+    images = [_image(i, view, cameras[view.camera], seen[view.name], points) for i, view in enumerate(views, 1)]
+    _write(folder / "images.bin", images)
+    _write(folder / "points3D.bin", [] if points is None else _points(points, list(seen.values())))
 
 
 def _write(path: Path, rows: Sequence[bytes]) -> None:
@@ -37,13 +44,28 @@ def _camera(number: int, camera: Camera) -> bytes:
     return struct.pack("<IiQQ4d", number, PINHOLE, camera.width, camera.height, *params)
 
 
-def _image(number: int, view: View, camera: int) -> bytes:
+def _image(number: int, view: View, camera: int, rows: NDArray[np.int64], points: PointCloud | None) -> bytes:
     quaternion = unit_quaternions(view.world_to_camera[:, :3])
     pose = struct.pack("<I7dI", number, *quaternion, *view.world_to_camera[:, 3], camera)
-    return pose + view.name.encode() + b"\0" + struct.pack("<Q", 0)
+    table = np.zeros(len(rows), POINT2D)
+    if points is not None:
+        table["point"] = rows + 1
+        places = points.positions[rows] @ view.world_to_camera[:, :3].T + view.world_to_camera[:, 3]
+        depth = np.where(places[:, 2] > 0, places[:, 2], 1)
+        focal, centre = (view.camera.fx, view.camera.fy), (view.camera.cx, view.camera.cy)
+        table["xy"] = places[:, :2] / depth[:, None] * focal + centre
+    return pose + view.name.encode() + b"\0" + struct.pack("<Q", len(rows)) + table.tobytes()
 
 
-def _points(points: PointCloud) -> list[bytes]:
+def _points(points: PointCloud, seen: Sequence[NDArray[np.int64]]) -> list[bytes]:
+    """seen: the rows of points that each image shows, by its number less 1."""
+    tracks: list[bytes] = [b""] * len(points)
+    for number, rows in enumerate(seen, 1):
+        for place, row in enumerate(rows):
+            tracks[row] += struct.pack("<II", number, place)
     rgb = np.rint(points.colours * 255).astype(np.uint8)
-    table = zip(points.positions.astype(float), rgb, strict=True)
-    return [struct.pack("<Q3d3BdQ", i, *position, *colour, 0.0, 0) for i, (position, colour) in enumerate(table, 1)]
+    table = zip(points.positions.astype(float), rgb, tracks, strict=True)
+    return [
+        struct.pack("<Q3d3BdQ", i, *position, *colour, 0.0, len(track) // 8) + track
+        for i, (position, colour, track) in enumerate(table, 1)
+    ]

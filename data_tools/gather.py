@@ -11,6 +11,7 @@ import numpy as np
 from clsplat.errors import DataError
 from clsplat.files import atomic
 from clsplat.progress import Count
+from clsplat.scene.exif import exposure_of, write_exposures
 from clsplat.scene.images import IMAGE_SUFFIXES, read_image
 
 LOG = logging.getLogger("clsplat")
@@ -80,6 +81,7 @@ def gather(photographs: Path, images: Path, names: list[str]) -> tuple[list[str]
             with atomic(images / name) as file:
                 file.write(encoded.tobytes())
         kept.append(name)
+    write_exposures(images, {name: exposure_of(photographs / name) for name in kept})  # a copy has none
     if len(kept) < MIN_PHOTOGRAPHS:
         raise DataError(f"{photographs}: only {len(kept)} of {len(names)} photographs can be read; export them again")
     return kept, damaged

@@ -10,6 +10,8 @@ import numpy as np
 from clsplat.errors import DataError
 from clsplat.progress import Count
 from clsplat.scene.detect import read_scene
+from clsplat.scene.exif import write_exposures
+from clsplat.scene.exposures import camera_exposures
 from clsplat.scene.images import write_image
 from clsplat.scene.scene import View
 from clsplat.scene.view import load_image, load_mask
@@ -42,7 +44,11 @@ def undistort_scene(source: Path, out: Path, long_side: int | None = None, blank
             write_image(image, load_image(pinhole_view))
         views.append(replace(pinhole_view, name=name))
         count.reach(number)
-    write_model(out / "sparse" / "0", views, scene.points)
+    write_exposures(out / "images", dict(zip(names, camera_exposures(scene.views), strict=True)))
+    tracks = scene.tracks and replace(
+        scene.tracks, seen={name: scene.tracks.seen[view.name] for view, name in zip(scene.views, names, strict=True)}
+    )
+    write_model(out / "sparse" / "0", views, scene.points, tracks)
     return len(views)
 
 

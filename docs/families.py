@@ -46,6 +46,8 @@ FAMILIES = {  # by the name of the base; any other family gets a page of its own
     "Budget": Family("rules", "budget of Gaussians", "budget", listed=False),
     "Order": Family("views", "order", "order", listed=False),
     "PhotographTransform": Family("views", "transform", "transforms"),
+    "Colours": Family("views", "colours of photographs", "colours", listed=False),
+    "ColourModel": Family("views", "model of colours", "colours", listed=False),
     "WorldFilter": Family("filters", "world filter", "world_filter", listed=False),
     "ScreenFilter": Family("filters", "screen filter", "screen_filter", listed=False),
     "Step": Family("prepare", "prepare step", "prepare"),

@@ -17,7 +17,7 @@ HEADINGS = {
     "losses": "Losses and penalties",
     "rules": "Density rules",
     "prepare": "Prepare steps",
-    "views": "Orders and transforms",
+    "views": "Orders, transforms and colours",
 }
 INTRODUCTIONS = {
     "stages": "A pipeline is a list of stages. Those that can stand in `during` run every so many steps of training.",
@@ -25,7 +25,8 @@ INTRODUCTIONS = {
     "rules": "`densify.rules` is a list. All rules act as one rearrangement of the Gaussians.",
     "statistics": "A [growing rule](rules.md#grow) acts where the mean of its `statistic` is large. Only the "
     "statistics that a rule names are summed and cost time.",
-    "views": "What a training step compares with: the keys `order` and `transforms` of `optimize.views`.",
+    "views": "What a training step compares with: the keys `order` and `transforms` of `optimize.views`, and "
+    "`optimize.colours`.",
     "filters": "The two low-pass filters of `model`: one in the scene, one on the screen.",
     "prepare": "`prepare` is a list: what makes a scene of photographs, once, on the host.",
 }

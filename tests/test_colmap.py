@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 
-from clsplat.scene.colmap_files import read_cameras, read_images, read_points
+from clsplat.scene.colmap_files import read_cameras, read_images, read_point_table
 from clsplat.scene.colmap_records import MODELS, PARAMETERS
 from clsplat.scene.detect import read_scene
 from clsplat.scene.scene import Camera, Scene
@@ -51,7 +51,7 @@ def assert_same_images(folder: Path, reconstruction) -> None:
 
 
 def assert_same_points(folder: Path, reconstruction) -> None:
-    points = read_points(folder)
+    points = read_point_table(folder).cloud()
     assert points is not None
     assert points.positions.dtype == points.colours.dtype == np.float32
     theirs = reconstruction.points3D.values()
@@ -251,7 +251,7 @@ def test_a_hundred_thousand_points_take_less_than_a_second(tmp_path: Path) -> No
     row = struct.pack("<Q3d3BdQ", 1, 1.0, 2.0, 3.0, 10, 20, 30, 0.5, 3) + struct.pack("<6I", *range(6))
     (tmp_path / "points3D.bin").write_bytes(struct.pack("<Q", 100_000) + row * 100_000)
     start = time.perf_counter()
-    points = read_points(tmp_path)
+    points = read_point_table(tmp_path).cloud()
     assert time.perf_counter() - start < 1.0
     assert points is not None
     assert len(points) == 100_000

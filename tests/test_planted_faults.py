@@ -26,6 +26,8 @@ FAULTS = {  # kernel -> file, text, wrong text
     "blur_columns": ("blur.cl", "row <= last", "row < last"),
     "nearest_vectors": ("clusters.cl", "difference < nearest", "difference <= nearest"),
     "sum_members": ("clusters.cl", "components + k, (int)p)", "components + k, (int)p / 2)"),
+    "colours_forward": ("colours.cl", "br * r + bg * g + bb * b + b1, one", "br * r + bg * g + bb * b, one"),
+    "colours_backward": ("colours.cl", "rg * passed_r + gg * passed_g", "rg * passed_r + gr * passed_g"),
     "share_mean": ("members.cl", "start + sum / total", "sum / total"),
     "count_not_finite": ("check.cl", "<= FLT_MAX", "<= INFINITY"),
     "count_seen": ("density.cl", "seen[i] += 1.0f", "seen[i] += 1.001f"),
@@ -92,6 +94,8 @@ FAULTS = {  # kernel -> file, text, wrong text
 }  # fmt: skip
 OPEN = "ANY((one.t > 0.0f) | (other.t > 0.0f))"
 MORE = {  # that smaller pictures do not show
+    "colours_backward, what is cut": ("colours.cl", "+ g1 < 1.0f ? inside : zero", "+ g1 < 1.0f ? inside : inside"),
+    "colours_backward, a sum of another": ("colours.cl", "total[9] += passed_b * g", "total[9] += passed_b * r"),
     "blend_forward wide, dim pixels": (
         "blend_wide.cl",
         f"bool open = {OPEN}",

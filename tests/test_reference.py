@@ -679,3 +679,23 @@ def test_opacity_reset():
     logit = np.array([2.0, -7.0])
     np.testing.assert_allclose(opacity(ref.reset_logit(logit)), [0.01, opacity(-7.0)])
     np.testing.assert_allclose(opacity(ref.reset_logit(logit, 0.5)), [0.02, opacity(-7.0)])
+
+
+def test_gradients_of_the_colours_of_a_photograph(rng):
+    """By the image, by the matrix, and by the exposure and white balance that it is made of; some pixels are cut."""
+    numbers, gradient = rng.normal(0, 0.2, 3), rng.normal(size=(3, 6, 7))
+    image = rng.uniform(-0.2, 1.4, gradient.shape)
+    matrix = np.column_stack([np.eye(3) + rng.normal(0, 0.2, (3, 3)), rng.normal(0, 0.1, 3)])
+    assert 0.1 < np.mean(ref.coloured(image, matrix) == 1) < 0.7
+    by_image, by_matrix = ref.coloured_backward(image, matrix, gradient)
+    for analytic, array in ((by_image, image), (by_matrix, matrix)):
+        numeric = five_point(lambda: (gradient * ref.coloured(image, matrix)).sum(), array)
+        assert relative_error(analytic, numeric) < FD_TOLERANCE
+    _, by_gains = ref.coloured_backward(image, ref.gain_matrix(*numbers), gradient)
+    numeric = five_point(lambda: (gradient * ref.coloured(image, ref.gain_matrix(*numbers))).sum(), numbers)
+    assert relative_error(ref.gain_gradient(*numbers, by_gains), numeric) < FD_TOLERANCE
+
+
+def test_white_balance_keeps_the_luminance_of_its_gains():
+    gains = np.log(np.diag(ref.gain_matrix(0.3, 0.1, -0.2)))
+    assert gains @ [0.299, 0.587, 0.114] == pytest.approx(0.3)

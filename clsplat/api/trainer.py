@@ -20,6 +20,7 @@ from clsplat.names import CHECKSUMS, END_STATES
 from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import Pipeline, load
 from clsplat.runs import folders, opening, outputs, runner
+from clsplat.runs.choices import settle
 from clsplat.runs.experiment import as_setting
 from clsplat.runs.failures import failures_recorded
 from clsplat.runs.folders import Start
@@ -102,6 +103,7 @@ class Trainer:
             with failures_recorded(status, as_raised=True):
                 scene_of_run = RunScene.of(self.pipeline.settings.scene, self.scene)
                 self._run = opening.make_run(self.pipeline, scene_of_run, opened, self.out, status)
+                self.pipeline = settle(self.pipeline, self._run)
                 runner.begin(self.pipeline, self._run, start)
                 (self.out / CHECKSUMS).unlink(missing_ok=True)  # it lists what the stages of a whole run write
                 with saved_on_failure(self._run):

@@ -12,12 +12,14 @@ from clsplat.errors import DataError, NumericError
 from clsplat.gaussians.tables import DeviceModel
 from clsplat.losses.base import Comparison
 from clsplat.losses.image import ssim_maps
+from clsplat.metrics.colours import colour_figures
 from clsplat.metrics.images import psnr, ssim, to_8_bits
 from clsplat.metrics.perceptual import Image, Perceptual
 from clsplat.opencl.device import Array
 from clsplat.render.camera import DeviceCamera
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.scene.scene import View
+from clsplat.views.colours import ColourModel
 from clsplat.views.photographs import Photograph, Photographs, unpack
 
 LOG = logging.getLogger("clsplat")
@@ -32,10 +34,11 @@ class ViewMetrics:
     psnr: float  # dB
     ssim: float
     perceptual: dict[str, float | None] = field(default_factory=dict)
+    colours: dict[str, float] = field(default_factory=dict)  # dB, by name, where photographs have colours of their own
 
     def line(self) -> dict[str, Any]:
         """Return the figures as in a line of metrics.jsonl."""
-        return {"view": self.view, "psnr": self.psnr, "ssim": self.ssim, **self.perceptual}
+        return {"view": self.view, "psnr": self.psnr, "ssim": self.ssim, **self.colours, **self.perceptual}
 
 
 def render_view(rasterizer: Rasterizer, model: DeviceModel, camera: DeviceCamera, background: Array) -> Image:
@@ -77,10 +80,12 @@ def measure(
     photographs: Photographs,
     perceptual: Perceptual = PSNR_AND_SSIM,
     finite: bool = False,
+    colours: ColourModel | None = None,
 ) -> list[ViewMetrics]:
     """Return the metrics of every view.
 
     Masked pixels are black in both images; PSNR and SSIM are means over the other pixels.
+    colours: the photographs' in training, for figures in their colours beside PSNR.
     With `finite`, NumericError is raised for a picture that is not finite, which counts as black otherwise.
     """
     results = []
@@ -94,13 +99,14 @@ def measure(
             require_finite(floats, view)
         rendered = to_8_bits(floats)
         image, mask = photograph.image(), photograph.counted()
+        own = colour_figures(floats, image, mask, colours) if colours else {}
         if mask is None:
             similarity = device_ssim(rasterizer, photograph, rendered)
         else:
             rendered, image = rendered * mask[..., None], image * mask[..., None]
             similarity = ssim(rendered, image, mask)
         more = perceptual.measure(rendered, image)
-        results.append(ViewMetrics(view.name, psnr(rendered, image, mask), similarity, more))
+        results.append(ViewMetrics(view.name, psnr(rendered, image, mask), similarity, more, own))
     return results
 
 
@@ -111,6 +117,7 @@ def mean(results: Sequence[ViewMetrics], perceptual: Perceptual = PSNR_AND_SSIM)
     return {
         "psnr": float(np.mean([r.psnr for r in results])),
         "ssim": float(np.mean([r.ssim for r in results])),
+        **{name: float(np.mean([r.colours[name] for r in results])) for name in results[0].colours},
         **perceptual.mean([r.perceptual for r in results]),
         "views": len(results),
     }

@@ -137,6 +137,7 @@ class MapCameras(Step):
 class Undistort(Step):
     """Undistort photographs, as of a pinhole camera, at the training size."""
 
+    version: ClassVar[int] = 2  # the tracks of points, and the exposures
     resumes: ClassVar[bool] = True
 
     stage: Literal["undistort"] = "undistort"

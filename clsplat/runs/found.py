@@ -3,10 +3,12 @@
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 from clsplat.compare.run_folder import read_metrics
 from clsplat.errors import ConfigError, DataError
 from clsplat.names import CHECKSUMS, METRICS, PIPELINE, STATUS, is_inside
+from clsplat.pipeline.choices import without_choices
 from clsplat.pipeline.loading import Pipeline, load
 from clsplat.reading import read_json, sha256
 from clsplat.training import checkpoint
@@ -38,7 +40,7 @@ def is_done(out: Path) -> bool:
 def is_done_with(pipeline: Pipeline, out: Path) -> bool:
     """Whether that was a run of this pipeline."""
     with suppress(ConfigError):  # a damaged file
-        return is_done(out) and load(str(out / PIPELINE)).resolved() == pipeline.resolved()
+        return is_done(out) and _asked(load(str(out / PIPELINE))) == _asked(pipeline)
     return False
 
 
@@ -47,14 +49,19 @@ def has_ended(pipeline: Pipeline, out: Path) -> bool:
     if not is_done(out) or not has_pipeline(out):
         return False
     try:
-        before = load(str(out / PIPELINE)).resolved()
+        before = _asked(load(str(out / PIPELINE)))
     except ConfigError:
         if out / PIPELINE in changed(out):  # the run writes it again, or says that it cannot go on
             return False
         raise
-    if difference := first_difference(before, pipeline.resolved()):
+    if difference := first_difference(before, _asked(pipeline)):
         raise ConfigError(f"{out}: was run with other settings: {difference}; use another folder, or those settings")
     return True
+
+
+def _asked(pipeline: Pipeline) -> Any:
+    """The resolved pipeline without what a run chose."""
+    return without_choices(pipeline.resolved())
 
 
 def restart(out: Path) -> str:

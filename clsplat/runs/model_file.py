@@ -17,6 +17,7 @@ from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.runs.pictures import KINDS, write_pictures
 from clsplat.runs.source import Source
+from clsplat.training.colours import colours_beside
 from clsplat.video.pictures import LAYERS, Canvas
 from clsplat.views.photographs import Photographs
 
@@ -42,6 +43,7 @@ class ModelFile:
         self.scene = self.photographs.downscaled(self.downscale)
         self.background = self.loaded.rendering.background or self.scene.background
         self.rasterizer = Rasterizer(self.device)
+        self.colours = colours_beside(self.source.file)
 
     @cached_property
     def model(self) -> DeviceModel:
@@ -69,7 +71,8 @@ class ModelFile:
             for split in ("test", "train"):
                 if scene.split(split):
                     views = scene.split(split)
-                    results = measure(self.rasterizer, self.model, views, photographs, perceptual, finite=True)
+                    parts = self.rasterizer, self.model, views, photographs, perceptual
+                    results = measure(*parts, finite=True, colours=self.colours)
                     metrics[split][f"{downscale:g}"] = mean(results, perceptual)
         return {**metrics, "gaussians": self.model.gaussians.count, "device": self.device.text}
 

@@ -10,6 +10,7 @@ from clsplat.names import LOG_FILE
 from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import Pipeline
 from clsplat.runs import folders, opening, outputs, runner
+from clsplat.runs.choices import settle
 from clsplat.runs.failures import failures_recorded
 from clsplat.runs.folders import Start
 from clsplat.runs.minutes import Show, execute_within
@@ -43,6 +44,7 @@ def run_pipeline(
             live.follow(status)
         with terminal.counted():
             run = opening.open_run(pipeline, out, device, start, status)
+            pipeline = settle(pipeline, run)
             stop_if_signalled()
 
         def execute(pipeline: Pipeline, run: Run, start: Start, show: Show) -> None:

@@ -2,19 +2,24 @@
 
 import logging
 import os
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
 
 from clsplat.errors import DataError, quoted
 from clsplat.scene.camera import MAX_SIDE, MIN_FOCAL
-from clsplat.scene.colmap_files import find_file, read_cameras, read_images, read_point_table, read_points
+from clsplat.scene.colmap_files import find_file, read_cameras, read_images, read_point_table
 from clsplat.scene.colmap_records import REMEDY, CameraRecord, ImageRecord
 from clsplat.scene.images import inside, present
 from clsplat.scene.lens import MODELS, Lens, shared
 from clsplat.scene.parts import Parts
-from clsplat.scene.points import MAX_VALUE
+from clsplat.scene.points import MAX_VALUE, PointTable
 from clsplat.scene.quaternion import pose_matrix
 from clsplat.scene.readers import Reader
 from clsplat.scene.scene import Scene, View, every_nth, make_scene
+from clsplat.scene.tracks import Tracks
 
 logger = logging.getLogger("clsplat")
 
@@ -40,7 +45,10 @@ class ColmapReader(Reader):
         views = sorted((view_of(image, cameras, folder) for image in images), key=lambda view: view.name)
         there = present(path, [view.image_path for view in views], self.missing)
         views = [view for view, found in zip(views, there, strict=True) if found]
-        return make_scene(path, views, every_nth([view.name for view in views], holdout), read_points(model))
+        table = read_point_table(model)
+        points, tracks = (table.cloud(), tracks_of(images, table)) if table else (None, None)
+        scene = make_scene(path, views, every_nth([view.name for view in views], holdout), points)
+        return replace(scene, tracks=tracks)
 
     def list_parts(self, parts: Parts) -> None:
         found = [(folder, parts.attempt(read_images, folder) or []) for folder in find_models(parts.path)]
@@ -57,6 +65,18 @@ class ColmapReader(Reader):
                 parts.views.append(view)
                 parts.models[view.name] = cameras[image.camera].model if cameras else ""
                 parts.observed[view.name] = image.observed
+
+
+def tracks_of(images: Sequence[ImageRecord], table: PointTable) -> Tracks | None:
+    """Return which points each image shows, or None where no image names one."""
+    kept = table.kept()
+    positions, ids = table.positions[kept], table.ids[kept]
+    order = np.argsort(ids, kind="stable")
+    seen = {}
+    for image in images:
+        place = np.minimum(np.searchsorted(ids[order], named := np.unique(image.points)), max(len(ids) - 1, 0))
+        seen[image.name] = order[place][ids[order][place] == named] if len(ids) else np.empty(0, np.int64)
+    return Tracks(positions, seen) if any(map(len, seen.values())) else None
 
 
 def find_models(path: Path) -> list[Path]:

@@ -77,8 +77,8 @@ def images_binary(path: Path) -> Iterator[ImageRecord]:
         name = file.text("an image name")
         count = file.count(POINT2D.itemsize, "2D points")
         start = file.skip(POINT2D.itemsize * count, "2D points")
-        observed = int(np.count_nonzero(np.frombuffer(file.data, POINT2D, count, start)["point"] >= 0))
-        yield ImageRecord(where, name, camera, tuple(pose[:4]), tuple(pose[4:]), observed)
+        points = np.frombuffer(file.data, POINT2D, count, start)["point"]
+        yield ImageRecord(where, name, camera, tuple(pose[:4]), tuple(pose[4:]), points[points >= 0])
     file.finish()
 
 
@@ -94,4 +94,4 @@ def points_binary(path: Path) -> PointTable:
         return PointTable(path, np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
     records = np.lib.stride_tricks.sliding_window_view(np.frombuffer(file.data, np.uint8), POINT.itemsize)
     table = records[starts].view(POINT)[:, 0]
-    return PointTable(path, table["position"], table["rgb"], table["error"])
+    return PointTable(path, table["position"], table["rgb"], table["error"], table["id"].astype(np.int64))

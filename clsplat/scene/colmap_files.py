@@ -11,7 +11,6 @@ from clsplat.scene.colmap_binary import cameras_binary, images_binary, points_bi
 from clsplat.scene.colmap_records import REMEDY, CameraRecord, ImageRecord
 from clsplat.scene.colmap_text import cameras_text, images_text, points_text
 from clsplat.scene.points import PointTable
-from clsplat.scene.scene import PointCloud
 
 
 def find_file(folder: Path, stem: str) -> Path | None:
@@ -35,15 +34,6 @@ def read_images(folder: Path) -> list[ImageRecord]:
     """Return the registered images of a model, in the order of the file."""
     file = _require_file(folder, "images")
     return list(images_binary(file) if file.suffix == ".bin" else images_text(file))
-
-
-def read_points(folder: Path) -> PointCloud | None:
-    """Return the points of a model, or None when there are none."""
-    table = read_point_table(folder)
-    if table is None:
-        return None
-    points = table.cloud()
-    return points if len(points) else None
 
 
 def read_point_table(folder: Path) -> PointTable | None:

@@ -2,6 +2,9 @@
 
 from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from clsplat.errors import DataError, quoted
 
 # Camera models in order of their ids, with the number of parameters (COLMAP 4, sensor/models.h).
@@ -28,7 +31,7 @@ class CameraRecord(NamedTuple):
 class ImageRecord(NamedTuple):
     """A line of `images`: quaternion (w, x, y, z) and translation, world to camera.
 
-    `observed` counts its 2D points that show a 3D point.
+    `points` are the ids of the 3D points that its 2D points show.
     """
 
     where: str
@@ -36,7 +39,12 @@ class ImageRecord(NamedTuple):
     camera: int
     quaternion: tuple[float, ...]
     translation: tuple[float, ...]
-    observed: int = 0
+    points: NDArray[np.int64] = np.empty(0, np.int64)
+
+    @property
+    def observed(self) -> int:
+        """The number of its 2D points that show a 3D point."""
+        return len(self.points)
 
 
 def parameter_count(where: str, model: str) -> int:

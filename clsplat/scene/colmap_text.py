@@ -5,11 +5,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from clsplat.errors import DataError, shortened
 from clsplat.reading import read_file
 from clsplat.scene.colmap_records import REMEDY, CameraRecord, ImageRecord, decode, parameter_count
 from clsplat.scene.points import PointTable
+
+LARGEST_ID = 2**63 - 1
 
 
 def cameras_text(path: Path) -> Iterator[tuple[int, CameraRecord]]:
@@ -30,7 +33,7 @@ def images_text(path: Path) -> Iterator[ImageRecord]:
     image: ImageRecord | None = None  # the line of its points may follow
     for where, line in _lines(path):
         if image and _is_points2d(line):
-            yield image._replace(observed=sum(not word.startswith("-") for word in line.split()[2::3]))
+            yield image._replace(points=_ids(line))
             image = None
         elif line:
             if image:
@@ -47,13 +50,19 @@ def _is_points2d(line: str) -> bool:
     return len(words) % 3 == 0 and (not words or words[-1].lstrip("-").isdecimal())
 
 
+def _ids(line: str) -> NDArray[np.int64]:
+    """The ids of the 3D points in a line of 2D points."""
+    return np.array([_id(word) for word in line.split()[2::3] if word.isdecimal()], np.int64)
+
+
 def points_text(path: Path) -> PointTable:
     """Return all points with their errors."""
-    kinds = (int, float, float, float, _byte, _byte, _byte, float)
+    kinds = (_id, float, float, float, _byte, _byte, _byte, float)
     layout = "POINT3D_ID X Y Z R G B ERROR TRACK[]"
-    rows = [_convert(where, line.split(maxsplit=8)[:8], kinds, layout)[1:] for where, line in _lines(path) if line]
-    table = np.array(rows, np.float64).reshape(-1, 7)
-    return PointTable(path, table[:, :3], table[:, 3:6], table[:, 6])
+    rows = [_convert(where, line.split(maxsplit=8)[:8], kinds, layout) for where, line in _lines(path) if line]
+    table = np.array([row[1:] for row in rows], np.float64).reshape(-1, 7)
+    ids = np.array([row[0] for row in rows], np.int64).reshape(-1)
+    return PointTable(path, table[:, :3], table[:, 3:6], table[:, 6], ids)
 
 
 def _lines(path: Path) -> Iterator[tuple[str, str]]:
@@ -74,6 +83,11 @@ def _convert(where: str, words: list[str], kinds: Sequence[Callable[[str], Any]]
         raise DataError(
             f"{where}: {shortened(str(error))}; expected {layout}: remove that entry or {REMEDY}"
         ) from error
+
+
+def _id(word: str) -> int:
+    """The id of a point; those that COLMAP does not give are one."""
+    return min(max(int(word), -1), LARGEST_ID)
 
 
 def _byte(word: str) -> int:

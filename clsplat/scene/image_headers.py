@@ -4,7 +4,7 @@ PNG (W3C, third edition), JPEG (ITU-T T.81, annex B) and Exif 2.3.
 """
 
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 HEAD_SIZE, TAIL_SIZE = 1 << 18, 1 << 16  # bytes that are looked at, at either end
@@ -46,13 +46,8 @@ def is_cut(data: bytes) -> bool:
 
 def _jpeg(head: bytes, tail: bytes, whole: Callable[[], bytes]) -> Header | None:
     """Walk the segments up to the frame header; None when the walk fails."""
-    at, orientation = 2, 1
-    while at + 9 <= len(head) and head[at] == 0xFF:
-        marker = head[at + 1]
-        if marker == 0xFF:  # fill
-            at += 1
-            continue
-        (length,) = struct.unpack_from(">H", head, at + 2)
+    orientation = 1
+    for marker, at, length in segments(head):
         if marker in FRAMES:
             height, width = struct.unpack_from(">HH", head, at + 5)
             # An end marker cannot be part of the pixels; that of a thumbnail lies before them.
@@ -60,8 +55,20 @@ def _jpeg(head: bytes, tail: bytes, whole: Callable[[], bytes]) -> Header | None
             return Header(width, height, orientation, complete)
         if marker == 0xE1 and head[at + 4 : at + 10] == b"Exif\0\0":
             orientation = _orientation(head[at + 10 : at + 2 + length])
-        at += 2 + length
     return None
+
+
+def segments(head: bytes) -> Iterator[tuple[int, int, int]]:
+    """Yield the marker, the place and the length of the segments of a JPEG file; none behind a damaged one."""
+    at = 2
+    while at + 9 <= len(head) and head[at] == 0xFF:
+        marker = head[at + 1]
+        if marker == 0xFF:  # fill
+            at += 1
+            continue
+        (length,) = struct.unpack_from(">H", head, at + 2)
+        yield marker, at, length
+        at += 2 + length
 
 
 def _orientation(exif: bytes) -> int:

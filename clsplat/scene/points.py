@@ -28,10 +28,15 @@ class PointTable(NamedTuple):
     positions: Floats  # [M, 3]
     rgb: NDArray[Any]  # [M, 3], in 0..255
     error: Floats = np.empty(0)  # [M], mean reprojection error in pixels, or [0]; COLMAP writes -1 or 0 for unknown
+    ids: NDArray[np.int64] = np.empty(0, np.int64)  # [M], by which images name them, or [0]
+
+    def kept(self) -> NDArray[np.bool_]:
+        """Return which points are finite, [M]."""
+        return np.asarray((np.abs(self.positions) < MAX_VALUE).all(axis=1))
 
     def cloud(self) -> PointCloud:
         """Return the points that are finite; log the number of the others."""
-        kept = (np.abs(self.positions) < MAX_VALUE).all(axis=1)
+        kept = self.kept()
         if not kept.all():
             logger.warning("%s: dropped %s points that are not finite", self.file, f"{np.count_nonzero(~kept):,}")
         colours = np.asarray(self.rgb[kept], np.float32) / np.float32(255)

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from clsplat.errors import DataError, quoted
 from clsplat.scene.camera import Camera as Camera
+from clsplat.scene.tracks import Tracks as Tracks
 from clsplat.scene.view import Alpha as Alpha
 from clsplat.scene.view import Floats as Floats
 from clsplat.scene.view import View as View
@@ -60,6 +61,7 @@ class Scene:
     extent: float  # radius of the training cameras, scene units
     background: Background = "black"  # on which papers show the photographs
     validation: tuple[int, ...] = ()  # kept out of the training, to choose by
+    tracks: Tracks | None = None  # which points the photographs show, where the dataset has that
 
     def split(self, name: str) -> tuple[View, ...]:
         """Return the views of `train`, `test`, `validation` or `all`.  Raises ValueError for another name."""

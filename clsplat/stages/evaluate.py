@@ -16,6 +16,7 @@ from clsplat.names import fault_of_output
 from clsplat.scene.scene import View
 from clsplat.settings import ReadPath
 from clsplat.stages.base import CADENCE, Scheduled
+from clsplat.training.colours import colours_of, tell_of_colours
 from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
@@ -97,7 +98,7 @@ class Evaluate(Scheduled):
             views = self._chosen(run.original.downscaled(downscale).split(self.split))
             photographs = run.photographs if downscale in run.scene.downscales else run.photographs.fresh()
             counted = run.status.counted(run.until_interrupted(views), "views", len(views))
-            results = measure(run.rasterizer, model, counted, photographs, perceptual)
+            results = measure(run.rasterizer, model, counted, photographs, perceptual, colours=colours_of(run))
             if not results:
                 continue
             for result in results:
@@ -110,3 +111,4 @@ class Evaluate(Scheduled):
                 *(run.model_step, f"{self.file}, " if self.file else "", self.split, downscale),
                 *(averages["psnr"], averages["ssim"], amount(len(results), "view")),
             )
+            tell_of_colours(averages)

@@ -87,6 +87,7 @@ class Keeping(Stage):
             found=now,
             degree=run.model.degree,
             metrics=copied,
+            numbers=dict(run.numbers),
             evaluations=evaluations,
             since=0,
             apart=apart,
@@ -110,6 +111,7 @@ class Keeping(Stage):
                 gaussians = Gaussians(run.device, run.best_tables)
                 run.model = run.model_settings.model(gaussians, best.degree)
                 run.adam = run.stats = None
+                run.numbers.update(best.numbers)
             run.metrics.update(best.metrics)
             run.best = best.model_copy(update={"taken": run.step, "refit": "due" if self.refit else "none"})
             run.best_tables = {}

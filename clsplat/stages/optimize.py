@@ -11,7 +11,7 @@ from pydantic import Field, field_validator
 from clsplat.density.statistics import SplatStats
 from clsplat.errors import Interrupted
 from clsplat.losses.base import ImageLoss, Loss, Penalty, ViewGradients, ViewLosses, require_symmetric
-from clsplat.losses.image import psnr
+from clsplat.names import VIEW_COLOURS
 from clsplat.schedule import Points
 from clsplat.settings import OneOf
 from clsplat.stages.base import Scheduled
@@ -20,11 +20,13 @@ from clsplat.stages.keeping import Keeping
 from clsplat.stages.progress import report
 from clsplat.training import checkpoint
 from clsplat.training.adam import Adam, Rates, Rows
+from clsplat.training.colours import photograph_colours, write_view_colours
 from clsplat.training.forecast import Forecast
-from clsplat.training.rescue import require_finite
+from clsplat.training.rescue import finite_values
 from clsplat.training.run import Run, Stopped, clocks
 from clsplat.training.skipping import Skip, Visit
 from clsplat.training.trainer import Trainer
+from clsplat.views.colours import Colours
 from clsplat.views.detail import course
 from clsplat.views.sampling import Sampler, ViewSettings
 
@@ -37,8 +39,7 @@ class Optimize(Keeping):
     """Train for a number of steps, one view each (Kerbl et al. 2023).
 
     Stages in `during` that edit the model act between two steps, so that other stages see the model before the edit.
-    No edit follows the last step.  As in the reference, the gradient of a parameter is not applied at the step before
-    its edit.
+    No edit follows the last step.  As in the reference, a parameter is not updated at the step before its edit.
     """
 
     stage: Literal["optimize"] = "optimize"
@@ -56,6 +57,8 @@ class Optimize(Keeping):
     """View, size and photograph of each step."""
     losses: list[OneOf[Loss]]
     """Losses and penalties; training minimises their sum."""
+    colours: OneOf[Colours] | None = None
+    """Colours of each photograph, where exposures differ: `gain`, `affine`, `auto`; without it, those of the scene."""
     skip: Skip | None = None
     """Steps that skip the backward pass, where a view has converged; without it, none."""
     during: list[OneOf[Scheduled]] = Field([])
@@ -84,7 +87,8 @@ class Optimize(Keeping):
             stage.check()
 
     def outputs(self, out: Path) -> list[Path]:
-        return [path for stage in self.during for path in stage.outputs(out)]
+        own = [out / VIEW_COLOURS] if self.colours else []
+        return [*(path for stage in self.during for path in stage.outputs(out)), *own]
 
     def acting(self, step: int) -> list[Scheduled]:
         """Return the stages of `during` that run when the training begins after a global step."""
@@ -109,10 +113,10 @@ class Optimize(Keeping):
         """Train step by step; what a step yields, ViewGradients unless it is skipped, is valid until the next."""
         self.begin_to_keep(run)
         views = self._views(run)
-        trainer, sampler = self._trainer(run, views), Sampler(run.scene.split("train"), views, run.seed)
+        last_step = run.step - run.stage_step + self.steps
+        trainer, sampler = self._trainer(run, views, last_step), Sampler(run.scene.split("train"), views, run.seed)
         (memory := run.memory_plan()).check(count := run.model.gaussians.count)
         LOG.info(memory.text(count))
-        last_step = run.step - run.stage_step + self.steps
         forecast = Forecast.of(run.step, last_step, [stage.due for stage in self._density])
         seconds: list[float] = []  # of the steps since the last report
         self._act(run)
@@ -122,7 +126,7 @@ class Optimize(Keeping):
             view = self._step(run, trainer, sampler)
             run.status.count("steps", run.stage_step, self.steps, step=run.step, steps=last_step)
             is_reported = run.step % self.log_every == 0 or run.stage_step == self.steps or run.interrupted
-            loss, psnr = self._values(run, view, sampler) if is_reported else (0.0, 0.0)
+            loss, psnr = finite_values(run, sampler.at(run.step).view.name, view) if is_reported else (0.0, 0.0)
             seconds.append(run.add_training_time(start))
             if is_reported:
                 if self.skip and run.step == last_step:
@@ -139,6 +143,7 @@ class Optimize(Keeping):
                 self.leave(run)
             yield view
         self.leave(run)  # a resumed run may have no step left
+        write_view_colours(run, trainer.colours)
 
     @property
     def statistics(self) -> set[str]:
@@ -162,7 +167,7 @@ class Optimize(Keeping):
             LOG.info(course(views.resolution))
         return views
 
-    def _trainer(self, run: Run, views: ViewSettings) -> Trainer:
+    def _trainer(self, run: Run, views: ViewSettings, last: int) -> Trainer:
         """Attach moments, statistics and tables to the run's Gaussians; a resumed run has them."""
         gaussians, photographs = run.model.gaussians, run.photographs
         run.adam = run.adam or Adam(gaussians)
@@ -173,8 +178,8 @@ class Optimize(Keeping):
         for stage in self.during:
             stage.attach(run)
         parts = run.rasterizer, run.model, run.adam, run.stats, photographs.background
-        rates = self.rates.settled(views.full_size(run.step - run.stage_step + self.steps))
-        return Trainer(*parts, self.losses, rates, run.scene.extent, run.numbers, self.update)
+        rates, colours = self.rates.settled(views.full_size(last)), photograph_colours(self.colours, run, last)
+        return Trainer(*parts, self.losses, rates, run.scene.extent, run.numbers, self.update, colours)
 
     def _act(self, run: Run) -> None:
         """Run the stages that are due and do not edit; those that fail run again when the run goes on."""
@@ -235,8 +240,3 @@ class Optimize(Keeping):
         visit = self.skip.visit(sample.view.name, view, run.numbers) if self.skip else Visit()
         stale = set() if run.stage_step == self.steps else stale
         return view if visit.skipped else trainer.backward(view), stale, visit
-
-    def _values(self, run: Run, view: ViewLosses, sampler: Sampler) -> tuple[float, float]:
-        """Read the step's loss and PSNR.  Raises NotFiniteError, with the state set aside, when not finite."""
-        require_finite(run, sampler.at(run.step).view.name, view.loss)
-        return view.loss, psnr(view.comparison)

@@ -52,6 +52,8 @@ class Best(BaseModel):
     """Active degree of its spherical harmonics."""
     metrics: dict[str, dict[str, Any]]
     """Its averages, by split and downscale."""
+    numbers: dict[str, float] = {}
+    """What parts of the run kept at its step, such as the colours of photographs; older files have none."""
     evaluations: Count
     """Number of measurements so far."""
     since: Count

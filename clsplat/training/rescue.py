@@ -6,6 +6,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from clsplat.errors import Interrupted, NotFiniteError, one_line
+from clsplat.losses.base import ViewLosses
+from clsplat.losses.image import psnr
 from clsplat.training import checkpoint
 from clsplat.training.run import Run
 
@@ -25,12 +27,16 @@ def saved_on_failure(run: Run) -> Iterator[None]:
         raise
 
 
-def require_finite(run: Run, view: str, loss: float) -> None:
-    """Raise NotFiniteError, with the state set aside, where the loss of a view or the model is not finite."""
-    broken = run.model.gaussians.not_finite()
+def finite_values(run: Run, view: str, losses: ViewLosses) -> tuple[float, float]:
+    """Read the loss and the PSNR, dB, of a step at a view.
+
+    Raises NotFiniteError, with the state set aside, where the loss or the model is not finite.
+    """
+    broken, loss = run.model.gaussians.not_finite(), losses.loss
     if broken or not math.isfinite(loss):
         told = checkpoint.set_aside(run, broken)
         raise NotFiniteError(f"step {run.step}, view '{view}': the loss is {loss}; {told}")
+    return loss, psnr(losses.comparison)
 
 
 def _rescue(run: Run) -> str:

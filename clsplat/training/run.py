@@ -30,6 +30,7 @@ from clsplat.training.kept import Best, Tables
 from clsplat.training.memory import MemoryPlan, plan
 from clsplat.training.records import Records
 from clsplat.training.status import StatusFile
+from clsplat.views.exposures import Exposures
 from clsplat.views.photographs import Photographs
 from clsplat.views.texture import texture_quantile
 
@@ -94,6 +95,7 @@ class Run:
     numbers: dict[str, float] = field(default_factory=dict)  # that parts of it keep from step to step, by name
     best: Best | None = None  # what validation has found in the training
     best_tables: Tables = field(default_factory=dict)  # of that model, on the host, as long as the training goes on
+    exposures: dict[tuple[str, ...], Exposures] = field(default_factory=dict)  # measured, by the names of photographs
     train_seconds: float = 0.0
     cpu_seconds: float = 0.0  # of all threads of the process, in the same time
     written: dict[str, str] = field(default_factory=dict)  # models: path in the run folder -> SHA-256

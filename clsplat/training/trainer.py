@@ -21,9 +21,11 @@ from clsplat.losses.base import (
 )
 from clsplat.opencl.device import Array
 from clsplat.opencl.program import constants
+from clsplat.render.camera import DeviceCamera
 from clsplat.render.rasterizer import Content, Rasterizer
 from clsplat.training.adam import Adam, Rates, Rows
 from clsplat.views.learned import LearnedTransform, learned_of, name_of
+from clsplat.views.photograph_colours import PhotographColours, change_back, change_colours
 from clsplat.views.photographs import Photograph, apply_mask
 from clsplat.views.texture import known_gradient
 from clsplat.views.transforms import PhotographTransform, Planes
@@ -67,6 +69,7 @@ class Trainer:
     extent: float = 1.0  # scene units
     numbers: dict[str, float] = field(default_factory=dict)  # of a transform that learns, by name; a step changes them
     rows: Rows = "all"  # Gaussians that a step changes
+    colours: PhotographColours | None = None  # of the photographs, where they have colours of their own
 
     def step(
         self,
@@ -109,17 +112,18 @@ class Trainer:
         timings.section = "loss"
         planes = photograph.planes(workspace, transforms, step, self.numbers)
         gradient = workspace.array("grad_image", frame.image.shape)
-        comparison = Comparison(workspace, camera, frame.image, planes.colours, gradient, planes.mask, step)
+        image, own = self._coloured(camera, frame.image)
+        comparison = Comparison(workspace, camera, image, planes.colours, gradient, planes.mask, step)
         if reads_entropy:  # losses of colours overwrite three planes alone
             gradient.fill(0)
             comparison.accumulate = True
         if planes.mask is not None:  # pixels that do not count are black in both images and have no gradient
-            apply_mask(workspace, camera, frame.image, planes.mask)
+            apply_mask(workspace, camera, image, planes.mask)
             apply_mask(workspace, camera, planes.colours, planes.mask)
         learned = learned_of(transforms)
-        own, learning = self._learn(learned, planes, comparison) if learned else ([], None)
-        values = [returned(loss, loss.add(comparison)) for loss in self.losses if isinstance(loss, ImageLoss)] + own
-        return ViewLosses(frame, comparison, values, learning=learning)
+        of_transform, learning = self._learn(learned, planes, comparison) if learned else ([], None)
+        values = [returned(loss, loss.add(comparison)) for loss in self.losses if isinstance(loss, ImageLoss)]
+        return ViewLosses(frame, comparison, [*values, *of_transform, *own], learning=learning)
 
     def backward(self, view: ViewLosses) -> ViewGradients:
         """Return the derivative of the losses that `compare` returned, as sums over pixels."""
@@ -127,11 +131,38 @@ class Trainer:
         photograph, gradient, mask = comparison.photograph, comparison.gradient, comparison.mask
         if mask is not None:
             apply_mask(workspace, camera, gradient, mask)
+        gradient, learning = self._uncoloured(view, gradient)
         count = self.stats.pixel_sums
         self.rasterizer.device.timings.section = "statistics"
         texture = known_gradient(workspace, camera, photograph, mask) if count > TEXTURE else None
         pixel_sums = self.rasterizer.pixel_sums(self.model, view.frame, gradient, count, texture)
-        return ViewGradients(view.frame, comparison, view.losses, pixel_sums, learning=view.learning)
+        return ViewGradients(view.frame, comparison, view.losses, pixel_sums, learning=learning)
+
+    def _coloured(self, camera: DeviceCamera, image: Array) -> tuple[Array, list[LossValue]]:
+        """The image in the colours of its photograph, where that has its own, and the loss of their numbers."""
+        if self.colours is None or camera.view is None:
+            return image, []
+        penalty = self.colours.penalty(self.numbers, camera.view)
+        matrix = self.colours.matrix(self.numbers, camera.view)
+        changed = change_colours(self.rasterizer.workspace, camera, image, matrix)
+        return changed, [LossValue("colours", lambda: penalty)]
+
+    def _uncoloured(self, view: ViewLosses, gradient: Array) -> tuple[Array, Callable[[], None] | None]:
+        """The gradient by the image as it was rendered, and what changes the numbers of transforms and photographs."""
+        colours, comparison, learning = self.colours, view.comparison, view.learning
+        camera, number = comparison.camera, comparison.camera.view
+        if colours is None or number is None:
+            return gradient, learning
+        matrix = colours.matrix(self.numbers, number)
+        workspace = self.rasterizer.workspace
+        gradient, by_matrix = change_back(workspace, camera, view.frame.image, matrix, gradient)
+
+        def learn() -> None:
+            if learning:
+                learning()
+            colours.learn(self.numbers, number, by_matrix(), comparison.step)
+
+        return gradient, learn
 
     def _learn(
         self, transform: LearnedTransform, planes: Planes, comparison: Comparison

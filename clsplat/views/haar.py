@@ -9,7 +9,8 @@ import numpy as np
 from clsplat.opencl.device import Array
 from clsplat.opencl.program import constants
 from clsplat.schedule import NonNegative, at_step
-from clsplat.views.learned import ByNumber, LearnedTransform
+from clsplat.views.adam import ByNumber
+from clsplat.views.learned import LearnedTransform
 from clsplat.views.transforms import Planes
 
 STRIP = int(constants("haar.cl")["STRIP"])

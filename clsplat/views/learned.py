@@ -3,18 +3,14 @@
 The numbers and Adam's moments lie in one dictionary by name, which a run keeps in its checkpoints.
 """
 
-import math
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from typing import ClassVar
 
 from clsplat.opencl.device import Array
-from clsplat.opencl.program import constants
 from clsplat.schedule import NonNegative, at_step
+from clsplat.views.adam import ByNumber, adam_step
 from clsplat.views.transforms import PhotographTransform, Planes
-
-ADAM = constants("adam.h")
-ByNumber = dict[str, float]
 
 
 class LearnedTransform(PhotographTransform):
@@ -49,17 +45,8 @@ class LearnedTransform(PhotographTransform):
         return {name: numbers.get(name, first) for name, first in self.first().items()}
 
     def update(self, numbers: dict[str, float], gradients: ByNumber, step: int) -> None:
-        """Change the numbers by Adam (Kingma and Ba 2015), as the parameters of the Gaussians are changed."""
-        rate, beta1, beta2 = at_step(self.rate, step), ADAM["BETA1"], ADAM["BETA2"]
-        for name, value in self.now(numbers).items():
-            names = [f"{name}/{kept}" for kept in ("updates", "moment1", "moment2")]
-            updates, moment1, moment2 = (numbers.get(kept, 0.0) for kept in names)
-            updates, gradient = updates + 1, gradients[name]
-            moment1 = beta1 * moment1 + (1 - beta1) * gradient
-            moment2 = beta2 * moment2 + (1 - beta2) * gradient**2
-            root = math.sqrt(moment2 / (1 - beta2**updates)) + ADAM["EPSILON"]
-            numbers[name] = value - rate * moment1 / (1 - beta1**updates) / root
-            numbers |= dict(zip(names, (updates, moment1, moment2), strict=True))
+        """Change the numbers by Adam."""
+        adam_step(numbers, self.now(numbers), gradients, at_step(self.rate, step))
 
 
 def learned_of(transforms: Sequence[PhotographTransform]) -> LearnedTransform | None:

@@ -4,6 +4,7 @@ from clsplat.conformance.check import Check
 from clsplat.conformance.checks import (
     averages,
     blending,
+    colours,
     compression,
     density,
     essential,
@@ -23,6 +24,7 @@ KERNELS: list[Check] = [
     *blending.CHECKS.listed,
     *pixel_box.CHECKS.listed,
     *images.CHECKS.listed,
+    *colours.CHECKS.listed,
     *update.CHECKS.listed,
     *averages.CHECKS.listed,
     *density.CHECKS.listed,

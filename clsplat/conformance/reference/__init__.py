@@ -25,6 +25,7 @@ from clsplat.conformance.reference.blur import (
     blurred,
 )
 from clsplat.conformance.reference.clusters import member_sums, nearest_vectors, shared_means
+from clsplat.conformance.reference.colours import coloured, coloured_backward, gain_gradient, gain_matrix
 from clsplat.conformance.reference.density import (
     ABSGS,
     CLONE,
@@ -108,12 +109,16 @@ __all__ = [
     "blend_weights",
     "blurred",
     "clamped_ray",
+    "coloured",
+    "coloured_backward",
     "contribution",
     "covariance_trace",
     "dssim",
     "falloff_squares",
     "filtered",
     "footprint",
+    "gain_gradient",
+    "gain_matrix",
     "haar_filtered",
     "haar_gradient",
     "l1",

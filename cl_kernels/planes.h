@@ -1,0 +1,21 @@
+/* Rows of planes [channels,H',W'], with H', W' whole tiles and zero outside the image, of which a work-group of TEAM
+ * items computes one: which columns lie in the image, and the sum of what the items have found. */
+#ifndef CLSPLAT_PLANES_H
+#define CLSPLAT_PLANES_H
+#include "lanes.h"
+
+/* 1 where the column lies in the image, else 0. */
+static inline VF inside_row(const uint column, const uint width)
+{
+    return (LANE_INDEX + (int)column) < (int)width ? (VF)(1.0f) : (VF)(0.0f);
+}
+
+static inline float sum_items(__local const float *sums)  // [TEAM]
+{
+    float sum = 0.0f;
+    for (uint i = 0; i < TEAM; i++)
+        sum += sums[i];
+    return sum;
+}
+
+#endif

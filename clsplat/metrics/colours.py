@@ -1,0 +1,61 @@
+"""PSNR of a rendered image in the colours of its photograph, which no training has seen.
+
+Two figures beside PSNR, never in its place.  `psnr_colour`: each half of the image is changed as the other half of the
+photograph asks for, so that no pixel is measured in colours that were fitted to it.  `psnr_affine`: what gsplat calls
+colour-corrected, fitted on the whole photograph, to compare with its figures alone.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.metrics.images import Mask, psnr
+from clsplat.views.colours import ColourModel
+
+LEAST = 1e-3  # slope of a regression, below which there is nothing to divide by
+
+
+def colour_figures(
+    image: NDArray[np.float32], photograph: NDArray[np.uint8], mask: Mask | None, model: ColourModel
+) -> dict[str, float]:
+    """Return `psnr_colour` and `psnr_affine`, dB, of an image as it was rendered and a photograph, [height, width, 3].
+
+    mask: pixels that count, [height, width].
+    """
+    truth = photograph / 255.0
+    counted = np.ones(truth.shape[:2], bool) if mask is None else mask
+    changed = in_colours_of(image.astype(np.float64), photograph, counted, model)
+    corrected = corrected_by_regression(image.astype(np.float64), truth, counted)
+    return {"psnr_colour": psnr(changed, photograph, counted), "psnr_affine": psnr(corrected, photograph, counted)}
+
+
+def in_colours_of(
+    image: NDArray[np.float64], photograph: NDArray[np.uint8], counted: Mask, model: ColourModel
+) -> NDArray[np.float64]:
+    """Return the image with each half, left and right, in the colours that the other half of the photograph asks for.
+
+    Pixels that are black or white in the photograph, or beyond white in the image, say nothing of its colours.
+    """
+    usable = counted & ((photograph > 0) & (photograph < 255) & (image < 1)).all(axis=2)
+    middle, truth, changed = image.shape[1] // 2, photograph / 255.0, image.copy()
+    left, right = np.s_[:, :middle], np.s_[:, middle:]
+    for half, other in ((left, right), (right, left)):
+        matrix = model.fitted(image[other][usable[other]], truth[other][usable[other]])
+        changed[half] = np.minimum(np.einsum("hwc,ac->hwa", image[half], matrix[:, :3]) + matrix[:, 3], 1)
+    return changed
+
+
+def corrected_by_regression(
+    image: NDArray[np.float64], truth: NDArray[np.float64], counted: Mask
+) -> NDArray[np.float64]:
+    """Return (image - b) / a of each channel, where a truth + b is nearest to the image (gsplat).
+
+    Regressing the image on the photograph divides by a slope that noise makes too small: no least-squares correction.
+    """
+    corrected = image.copy()
+    for channel in range(3):
+        x, y = truth[..., channel][counted], image[..., channel][counted]
+        variance = float(np.mean((x - x.mean()) ** 2))
+        slope = float(np.mean((x - x.mean()) * (y - y.mean()))) / variance if variance > 0 else 1.0
+        if abs(slope) > LEAST:
+            corrected[..., channel] = (image[..., channel] - (y.mean() - slope * x.mean())) / slope
+    return np.clip(corrected, 0, 1)

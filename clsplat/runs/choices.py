@@ -1,0 +1,35 @@
+"""Choices that follow from the photographs, made before the first step and written into the run's pipeline."""
+
+import logging
+from dataclasses import replace
+
+from clsplat.pipeline.loading import Pipeline
+from clsplat.pipeline.stretching import of_trainings
+from clsplat.stages.optimize import Optimize
+from clsplat.training.colours import settled
+from clsplat.training.run import Run
+from clsplat.views.colours import Auto
+
+LOG = logging.getLogger("clsplat")
+
+
+def settle(pipeline: Pipeline, run: Run) -> Pipeline:
+    """Return the pipeline with what its keys `auto` choose by the photographs of a run, which takes it; log reasons.
+
+    Choices that are made already stay.
+    """
+    open_ones = [one.colours for one in pipeline.stages if isinstance(one, Optimize) and isinstance(one.colours, Auto)]
+    if all(colours.chosen for colours in open_ones):
+        return pipeline
+
+    def chosen(training: Optimize) -> Optimize:
+        if not isinstance(training.colours, Auto):
+            return training
+        colours = settled(training.colours, run)
+        LOG.info("optimize.colours: %s, since %s", colours.chosen, colours.reason)
+        return training.model_copy(update={"colours": colours})
+
+    with run.status.stage("choose"):
+        found = replace(pipeline, settings=of_trainings(pipeline.settings, chosen))
+    run.settings, run.pipeline = found.settings, found.resolved()
+    return found

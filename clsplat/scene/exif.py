@@ -1,0 +1,109 @@
+"""What a camera noted of a photograph's exposure: Exif 2.3 in JPEG files, or a file beside images that lost it."""
+
+import json
+import math
+import struct
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from clsplat.errors import DataError
+from clsplat.files import write_text
+from clsplat.reading import opened, read_json
+from clsplat.scene.image_headers import HEAD_SIZE, JPEG, segments
+
+BESIDE = "exposures.json"  # in a folder of images
+SUB_FOLDER = 0x8769  # tags: where those of the exposure are
+SECONDS, APERTURE, ISO = 0x829A, 0x829D, 0x8827
+SHORT, LONG, RATIONAL = 3, 4, 5  # kinds of values
+
+
+@dataclass(frozen=True)
+class CameraExposure:
+    """The settings that decide how bright a photograph of the same light is."""
+
+    seconds: float
+    aperture: float  # f-number
+    iso: float
+
+    @property
+    def value(self) -> float:
+        """The logarithm to base 2 of the light that makes a photograph, by its sensitivity."""
+        return math.log2(self.seconds * self.iso / self.aperture**2)
+
+
+def exposure_of(path: Path) -> CameraExposure | None:
+    """Return the exposure that a JPEG file tells; None where it does not.  Raises DataError when it cannot be read."""
+    with opened(path, "an image") as file:
+        return parsed(file.read(HEAD_SIZE))
+
+
+def parsed(head: bytes) -> CameraExposure | None:
+    """Return the exposure in the first bytes of a JPEG file, or None."""
+    if not head.startswith(JPEG):
+        return None
+    for marker, at, length in segments(head):
+        if marker == 0xE1 and head[at + 4 : at + 10] == b"Exif\0\0":
+            try:
+                return _of_block(head[at + 10 : at + 2 + length])
+            except (struct.error, KeyError):
+                return None
+    return None
+
+
+def _of_block(block: bytes) -> CameraExposure | None:
+    """The exposure in a TIFF block.  Raises struct.error where it is cut, KeyError where it has none."""
+    order = {b"II": "<", b"MM": ">"}[block[:2]]
+    (start,) = struct.unpack_from(order + "I", block, 4)
+    inner = _values(block, order, int(start))[SUB_FOLDER]
+    values = _values(block, order, int(inner))
+    return checked(values[SECONDS], values[APERTURE], values[ISO])
+
+
+def _values(block: bytes, order: str, start: int) -> dict[int, float]:
+    """The numbers of a folder of tags; of several that of the first."""
+    found: dict[int, float] = {}
+    (entries,) = struct.unpack_from(order + "H", block, start)
+    for at in range(start + 2, start + 2 + 12 * entries, 12):
+        tag, kind, _, value = struct.unpack_from(order + "HHII", block, at)
+        if kind == RATIONAL:
+            above, below = struct.unpack_from(order + "II", block, value)
+            found[tag] = above / below if below else math.nan
+        elif kind in (SHORT, LONG):
+            (found[tag],) = struct.unpack_from(order + ("H" if kind == SHORT else "I"), block, at + 8)
+    return found
+
+
+def checked(seconds: object, aperture: object, iso: object) -> CameraExposure | None:
+    """Return an exposure, or None where a value is no positive number."""
+    numbers = [float(one) for one in (seconds, aperture, iso) if isinstance(one, int | float)]
+    return CameraExposure(*numbers) if len(numbers) == 3 and all(0 < one < math.inf for one in numbers) else None
+
+
+def write_exposures(folder: Path, exposures: Mapping[str, CameraExposure | None]) -> None:
+    """Write the exposures of the images of a folder, by name, where any is known.  Raises OutputError."""
+    known = {name: asdict(exposure) for name, exposure in exposures.items() if exposure}
+    if known:
+        write_text(folder / BESIDE, json.dumps(known, indent=1) + "\n")
+
+
+def read_exposures(folder: Path) -> dict[str, CameraExposure]:
+    """Return the exposures that lie beside the images of a folder; none where there is no such file.
+
+    Raises DataError where it is damaged.
+    """
+    path = folder / BESIDE
+    if not path.is_file():
+        return {}
+    data, expected = (
+        read_json(path, "exposures of images"),
+        "expected {name: {seconds, aperture, iso}}: remove it",
+    )
+    if not isinstance(data, dict):
+        raise DataError(f"{path}: {expected}")
+    found = {}
+    for name, row in data.items():
+        if not isinstance(row, dict) or not (exposure := checked(*map(row.get, ("seconds", "aperture", "iso")))):
+            raise DataError(f"{path}: the exposure of one image is not three positive numbers; {expected}")
+        found[name] = exposure
+    return found

@@ -1,0 +1,130 @@
+"""The colours of the photographs in a run: where a training begins and ends, and where it is measured."""
+
+import json
+import logging
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.errors import DataError, quoted
+from clsplat.files import write_text
+from clsplat.names import VIEW_COLOURS
+from clsplat.reading import read_json
+from clsplat.scene.view import View
+from clsplat.settings import variants
+from clsplat.training.run import Run
+from clsplat.views.colours import Auto, ColourModel, Colours
+from clsplat.views.exposures import UNKNOWN, Exposures, measured, noted
+from clsplat.views.photograph_colours import TABLE, PhotographColours
+from clsplat.views.photographs import Mask
+
+LOG = logging.getLogger("clsplat")
+GUESSED = 1.0  # dB by which figures in the photographs' colours are better, from which on the log says why
+
+
+def photograph_colours(colours: Colours | None, run: Run, last: int) -> PhotographColours | None:
+    """Return the photographs' colours of a training whose last global step is given, or None where they have none.
+
+    The numbers of a run that begins are set; a resumed run has them.
+    """
+    if isinstance(colours, Auto):
+        colours = settled(colours, run).in_use
+    if not isinstance(colours, ColourModel):
+        return None
+    views = [view.name for view in run.scene.split("train")]
+    exposures = exposures_of(run)
+    rate = colours.rate_of(last, len(set(views)), bool(exposures.log_gains))
+    found = PhotographColours(colours, views, rate)
+    if not found.table.begun(run.numbers):
+        found.begin(run.numbers, exposures.log_gains)
+        LOG.info("colours of photographs: %s", exposures.text)
+    return found
+
+
+def exposures_of(run: Run) -> Exposures:
+    """Return what the training photographs show of their exposures, or else what cameras noted; measured once."""
+    views = run.scene.split("train")
+    names = tuple(view.name for view in views)
+    if names not in run.exposures:
+
+        def read(view: View) -> tuple[NDArray[np.uint8], Mask | None]:
+            photograph = run.photographs.get(view)
+            return photograph.image(), photograph.counted()
+
+        counted = run.status.counted(views, "photographs", len(views))
+        shown = measured(run.scene.tracks, counted, read) if run.scene.tracks else UNKNOWN
+        run.exposures[names] = shown if shown.log_gains else noted(views)
+    return run.exposures[names]
+
+
+def settled(colours: Auto, run: Run) -> Auto:
+    """Return it with the choice that follows from the exposures of a run's photographs; one that is made stays."""
+    if colours.chosen is not None:
+        return colours
+    exposures = exposures_of(run)
+    if not exposures.log_gains:
+        return colours.choose("off", exposures.text)
+    differ = exposures.spread > colours.above and exposures.explained > colours.explained
+    bounds = f"more than {colours.above:.1%} and {colours.explained:.0%}"
+    return colours.choose("on" if differ else "off", f"{exposures.text}; {'' if differ else 'not '}{bounds}")
+
+
+def colours_of(run: Run) -> ColourModel | None:
+    """Return what photographs have been given in training, or None."""
+    if not any(name.startswith(f"{TABLE}/") for name in run.numbers):
+        return None
+    found = [getattr(stage, "colours", None) for stage in getattr(run.settings, "stages", ())]
+    models = [one.model if isinstance(one, Auto) else one for one in found]
+    return next((model for model in reversed(models) if isinstance(model, ColourModel)), None)
+
+
+def write_view_colours(run: Run, colours: PhotographColours | None) -> None:
+    """Write the numbers of each training photograph, and the matrix that they make, into the run folder; log a line."""
+    if colours is None:
+        return
+    rows = {view: colours.table.row(run.numbers, view) for view in colours.table.views}
+    data: dict[str, Any] = {
+        "meaning": "a colour c of the model, red, green and blue, is min(1, E c + b) in the photograph; "
+        "matrix: the rows of [E | b]",
+        "type": getattr(colours.model, "type", type(colours.model).__name__),
+        "photographs": {
+            view: {
+                **dict(zip(colours.model.columns, map(float, row), strict=True)),
+                "matrix": colours.model.matrix(row).tolist(),
+            }
+            for view, row in rows.items()
+        },
+    }
+    write_text(run.out / VIEW_COLOURS, json.dumps(data, indent=1) + "\n")
+    brightness = [colours.model.matrix(row)[1, 1] for row in rows.values()]
+    LOG.info(
+        "colours of %d photographs in %s: green is multiplied by %.2f to %.2f",
+        *(len(rows), VIEW_COLOURS, min(brightness), max(brightness)),
+    )
+
+
+def colours_beside(model: Path) -> ColourModel | None:
+    """Return what photographs were given where a model was trained, by the table beside its file; None without one.
+
+    Raises DataError where the table is damaged.
+    """
+    path = model.with_name(VIEW_COLOURS)
+    if not path.is_file():
+        return None
+    data, known = read_json(path, "colours of photographs"), variants(ColourModel)
+    name = data.get("type") if isinstance(data, dict) else None
+    if not isinstance(name, str) or name not in known:
+        names = ", ".join(known)
+        raise DataError(f"{path}: the type of colours is {quoted(name)}; expected one of {names}: write it again")
+    return known[name]()
+
+
+def tell_of_colours(averages: dict[str, Any]) -> None:
+    """Log the figures of a split in the photographs' colours, where there are any."""
+    if "psnr_colour" not in averages:
+        return
+    differ = averages["psnr_colour"] - averages["psnr"] > GUESSED
+    why = "; exposures of these photographs differ, which PSNR counts as errors" if differ else ""
+    LOG.info("in the photographs' colours: PSNR %.2f dB%s", averages["psnr_colour"], why)

@@ -1,0 +1,134 @@
+"""Whole runs in which photographs have colours of their own."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from clsplat.errors import DataError
+from clsplat.pipeline.choices import without_choices
+from clsplat.pipeline.loading import load
+from clsplat.runs import folders, opening
+from clsplat.runs.found import has_ended
+from clsplat.runs.model_file import evaluate
+from clsplat.runs.single import run_pipeline
+from clsplat.training import checkpoint
+from clsplat.training.colours import colours_beside
+from tests.few_steps import FEW
+from tests.test_exposures import Wall
+from tests.test_training import digest, train
+
+pytestmark = pytest.mark.slow
+GAIN = (*FEW, "optimize.colours=gain")
+
+
+@pytest.fixture(scope="module")
+def with_gains(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run of twelve steps with an exposure of each photograph; nothing is changed in it."""
+    out = tmp_path_factory.mktemp("runs") / "gains"
+    train(tiny_scene, out, *GAIN)
+    return out
+
+
+def test_a_resumed_run_ends_with_the_bits_of_one_that_was_not(with_gains, tiny_scene, tmp_path):
+    out = tmp_path / "run"
+    shutil.copytree(with_gains, out)
+    (out / "checkpoints" / "step_000012.npz").unlink()
+    for name in ("point_cloud.ply", "metrics.json", "checksums.json"):
+        (out / name).unlink()
+    run = train(tiny_scene, out, *GAIN, resume=True)
+    again = train(tiny_scene, tmp_path / "again", *GAIN)
+    assert digest(out) == digest(with_gains) == digest(tmp_path / "again")
+    assert run.numbers == again.numbers
+
+
+def test_each_visit_counts_for_its_photograph_and_the_mean_stays(tiny_scene, tmp_path, few_steps):
+    run = train(tiny_scene, tmp_path / "run", *GAIN)
+    names = [view.name for view in run.scene.split("train")]
+    updates = [run.numbers.get(f"colours/{name}/exposure/updates", 0) for name in names]
+    assert sum(updates) == 12
+    assert len(set(updates)) > 1, "eight photographs, twelve steps"
+    for column in ("exposure", "red", "blue"):
+        values = [run.numbers[f"colours/{name}/{column}"] for name in names]
+        assert sum(values) == pytest.approx(0, abs=1e-12)
+        assert max(map(abs, values)) > 1e-3
+    assert digest(tmp_path / "run") != digest(few_steps)
+
+
+def test_the_table_lies_beside_the_model_and_figures_beside_psnr(with_gains, few_steps):
+    data = json.loads((with_gains / "view_colours.json").read_text())
+    assert data["type"] == "gain"
+    assert len(data["photographs"]) == 8
+    for row in data["photographs"].values():
+        luminance = np.log(np.diag(row["matrix"])) @ [0.299, 0.587, 0.114]
+        assert luminance == pytest.approx(row["exposure"])
+    measured = json.loads((with_gains / "metrics.json").read_text())["test"]["1"]
+    assert {"psnr_colour", "psnr_affine"} < measured.keys()
+    assert "view_colours.json" in json.loads((with_gains / "checksums.json").read_text())
+    assert not (few_steps / "view_colours.json").exists()
+    assert "psnr_colour" not in json.loads((few_steps / "metrics.json").read_text())["test"]["1"]
+
+
+def test_a_run_folder_is_measured_in_the_photographs_colours_too(with_gains, few_steps, tmp_path):
+    measured = json.loads((with_gains / "metrics.json").read_text())["test"]["1"]
+    again = evaluate(with_gains)["test"]["1"]
+    assert again["psnr_colour"] == pytest.approx(measured["psnr_colour"], abs=1e-6)
+    assert "psnr_colour" not in evaluate(few_steps)["test"]["1"]
+    for damage in ("[]", '{"type": "lens"}'):
+        (tmp_path / "view_colours.json").write_text(damage)
+        with pytest.raises(DataError, match=r"the type of colours is .* expected one of \w+, \w+"):
+            colours_beside(tmp_path / "point_cloud.ply")
+
+
+def test_the_best_model_is_left_with_the_colours_of_its_step(tiny_scene, tmp_path):
+    wild = "optimize.colours={type: gain, rate: {points: [[0, 0.01], [9, 3.0]], between: steps}}"
+    kept = (
+        "scene.validation=2",
+        "optimize.keep=best",
+        "optimize.evaluate.split=validation",
+        "optimize.evaluate.every=4",
+    )
+    run = train(tiny_scene, tmp_path / "run", *FEW, *kept, wild)
+    assert run.best.found.step == 8, "the last steps ruin it"
+    then, _ = checkpoint.load(tmp_path / "run" / "checkpoints" / "step_000008.npz")
+    assert {name: run.numbers[name] for name in then.numbers} == then.numbers
+    (row, *_) = json.loads((tmp_path / "run" / "view_colours.json").read_text())["photographs"].items()
+    assert row[1]["exposure"] == then.numbers[f"colours/{row[0]}/exposure"]
+
+
+def test_a_choice_is_written_with_its_reason_and_off_leaves_the_bits(tiny_scene, tmp_path, few_steps):
+    """The synthetic scene has points without tracks."""
+    asked = load("smoke", [f"scene.path='{tiny_scene}'", *FEW, "optimize.colours=auto"])
+    run_pipeline(asked, tmp_path / "run", None, "new")
+    found = load(str(tmp_path / "run" / "pipeline.yaml")).settings.training.colours
+    assert found.chosen == "off"
+    assert found.reason == "neither tracks of points nor cameras tell the exposures"
+    assert f"optimize.colours: off, since {found.reason}" in (tmp_path / "run" / "log.txt").read_text()
+    assert digest(tmp_path / "run") == digest(few_steps)
+    assert has_ended(asked, tmp_path / "run"), "the same command finds it up to date"
+
+
+def test_a_run_chooses_colours_where_exposures_differ_and_begins_with_them(rng, tmp_path):
+    wall = Wall(rng)
+    wall.write(tmp_path / "scene")
+    settings = [f"scene.path='{tmp_path / 'scene'}'", "scene.holdout=0", *FEW, "optimize.colours=auto"]
+    run_pipeline(load("smoke", settings), tmp_path / "run", None, "new")
+    found = load(str(tmp_path / "run" / "pipeline.yaml")).settings.training.colours
+    assert found.chosen == "on"
+    assert "exposures of 8 photographs differ by" in found.reason
+    photographs = json.loads((tmp_path / "run" / "view_colours.json").read_text())["photographs"]
+    gains = np.log([np.diag(photographs[view.name]["matrix"]) for view in wall.views])
+    assert gains == pytest.approx(wall.log_gains, abs=0.06), "twelve steps do not move them far"
+    with folders.opened(tmp_path / "run", "resume", step=0) as status:
+        run = opening.open_run(load(str(tmp_path / "run" / "pipeline.yaml")), tmp_path / "run", None, "resume", status)
+    assert run.settings.training.colours == found, "who goes on takes the choice"
+
+
+def test_what_a_run_chose_is_no_setting_of_its_pipeline():
+    asked = load("smoke", ["optimize.colours=auto"]).resolved()
+    chosen = load("smoke", ["optimize.colours={type: auto, chosen: on, reason: they differ}"]).resolved()
+    assert asked != chosen
+    assert without_choices(asked) == without_choices(chosen)
+    assert without_choices(asked) != without_choices(load("smoke").resolved())

@@ -1,0 +1,158 @@
+"""Exposures of photographs, from the pixels in which they show the same points."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from clsplat.scene.camera import Camera
+from clsplat.scene.colmap import tracks_of
+from clsplat.scene.colmap_files import read_images, read_point_table
+from clsplat.scene.detect import read_scene
+from clsplat.scene.images import write_image
+from clsplat.scene.scene import PointCloud, View
+from clsplat.scene.tracks import Tracks
+from clsplat.scene.view import load_image
+from clsplat.views.exposures import Exposures, measured, samples
+from data_tools.colmap_writer import write_model
+from data_tools.undistort import undistort_scene
+
+SIZE, POINTS = 64, 400
+
+
+class Wall:
+    """Points on a wall, photographed from places beside each other, in squares of one colour each."""
+
+    def __init__(self, rng: np.random.Generator, photographs: int = 8, overlap: int = POINTS) -> None:
+        side = 20
+        self.colours = rng.uniform(0.1, 0.6, (POINTS, 3))
+        at = np.stack(np.meshgrid(np.arange(side), np.arange(side)), axis=-1).reshape(-1, 2)
+        positions = np.column_stack([(3 * at + 2 - SIZE / 2) / SIZE, np.ones(POINTS)])
+        camera = Camera(SIZE, SIZE, SIZE, SIZE, SIZE / 2, SIZE / 2)
+        self.views = [View(f"{i}.png", camera, np.eye(3, 4)) for i in range(photographs)]
+        starts = np.linspace(0, POINTS - overlap, photographs).astype(int)
+        self.tracks = Tracks(
+            positions, {v.name: np.arange(s, s + overlap) for v, s in zip(self.views, starts, strict=True)}
+        )
+        self.log_gains = rng.normal(0, 0.25, (photographs, 3))
+        self.log_gains -= self.log_gains.mean(axis=0)
+        self.at = 3 * at + 1
+
+    def photograph(self, view: View) -> np.ndarray:
+        """Squares of 3 x 3 px, 8 bits."""
+        image = np.zeros((SIZE, SIZE, 3))
+        for (x, y), colour in zip(self.at, self.colours, strict=True):
+            image[y : y + 3, x : x + 3] = colour
+        return np.rint(np.minimum(image * np.exp(self.log_gains[self.views.index(view)]), 1) * 255).astype(np.uint8)
+
+    def write(self, folder: Path) -> None:
+        """Write a COLMAP scene."""
+        points = PointCloud(self.tracks.positions.astype(np.float32), self.colours.astype(np.float32))
+        write_model(folder / "sparse" / "0", self.views, points, self.tracks)
+        for view in self.views:
+            write_image(folder / "images" / view.name, self.photograph(view))
+
+    def measured(self) -> Exposures:
+        return measured(self.tracks, self.views, lambda view: (self.photograph(view), None))
+
+
+def table(exposures: Exposures) -> np.ndarray:
+    return np.array(list(exposures.log_gains.values()))
+
+
+def test_gains_are_found_again(rng):
+    wall = Wall(rng)
+    found = wall.measured()
+    assert table(found) == pytest.approx(wall.log_gains, abs=2e-3)
+    assert found.spread == pytest.approx(np.std(wall.log_gains @ [0.299, 0.587, 0.114]), abs=2e-3)
+    assert found.explained > 0.95
+    assert f"exposures of 8 photographs differ by {found.spread:.1%} at 400 points" in found.text
+
+
+def test_photographs_that_share_points_with_their_neighbours_alone_are_compared(rng):
+    wall = Wall(rng, photographs=20, overlap=60)
+    assert table(wall.measured()) == pytest.approx(wall.log_gains, abs=0.01)
+
+
+def test_a_third_of_the_points_may_be_hidden(rng):
+    wall = Wall(rng)
+    whole = wall.photograph
+
+    def partly(view: View) -> np.ndarray:
+        image = whole(view)
+        image[rng.random((SIZE // 4, SIZE // 4)).repeat(4, 0).repeat(4, 1) < 0.2] = 90
+        return image
+
+    wall.photograph = partly
+    assert table(wall.measured()) == pytest.approx(wall.log_gains, abs=0.06)
+
+
+def test_light_that_changes_with_the_direction_of_view_is_no_exposure(rng):
+    """Each photograph of a point differs for itself."""
+    wall = Wall(rng)
+    wall.log_gains[:] = 0
+    colours = wall.colours
+    glossy = {view.name: colours * np.exp(rng.normal(0, 0.3, (POINTS, 1))) for view in wall.views}
+
+    def photograph(view: View) -> np.ndarray:
+        wall.colours = glossy[view.name]
+        return Wall.photograph(wall, view)
+
+    found = measured(wall.tracks, wall.views, lambda view: (photograph(view), None))
+    assert found.explained < 0.1
+    assert found.spread < 0.05
+
+
+def test_what_cannot_be_known_is_left_out(rng):
+    wall = Wall(rng)
+    seen = {**wall.tracks.seen, "3.png": np.empty(0, np.int64)}
+    wall.tracks = replace(wall.tracks, seen=seen)
+    assert wall.measured().log_gains.keys() == {view.name for view in wall.views} - {"3.png"}
+    nothing = measured(replace(wall.tracks, seen={}), wall.views, lambda view: (wall.photograph(view), None))
+    assert nothing.log_gains == {}
+    assert nothing.spread == 0
+
+
+def test_points_count_where_a_photograph_shows_them(rng):
+    wall, view = Wall(rng), Wall(rng).views[0]
+    image, mask = wall.photograph(wall.views[0]), np.zeros((SIZE, SIZE), bool)
+    rows, values = samples(wall.tracks, view, image, None)
+    assert (rows == np.arange(POINTS)).all()
+    assert values == pytest.approx(wall.colours * np.exp(wall.log_gains[0]), abs=3e-3)
+    mask[:, : SIZE // 2] = True
+    assert len(samples(wall.tracks, view, image, mask)[0]) == pytest.approx(POINTS / 2, abs=20)
+    behind = replace(wall.tracks, positions=-wall.tracks.positions)
+    assert len(samples(behind, view, image, None)[0]) == 0
+
+
+def test_tracks_are_written_and_read(rng, tmp_path):
+    wall = Wall(rng, overlap=60)
+    points = PointCloud(wall.tracks.positions.astype(np.float32), wall.colours.astype(np.float32))
+    write_model(tmp_path, wall.views, points, wall.tracks)
+    images, read = read_images(tmp_path), read_point_table(tmp_path)
+    tracks = tracks_of(images, read)
+    assert tracks.positions == pytest.approx(wall.tracks.positions)
+    assert {name: rows.tolist() for name, rows in tracks.seen.items()} == {
+        name: rows.tolist() for name, rows in wall.tracks.seen.items()
+    }
+    assert [image.observed for image in images] == [60] * len(images)
+    write_model(tmp_path, wall.views, points)
+    assert tracks_of(read_images(tmp_path), read_point_table(tmp_path)) is None
+
+
+def test_tracks_of_text_are_those_of_its_ids(tmp_path):
+    (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 0 1 a.png\n1 1 7 2 2 -1 3 3 5 4 4 5 9 9 77\n")
+    (tmp_path / "points3D.txt").write_text("7 0 0 1 9 9 9 0.5 1 0\n5 1 0 1 9 9 9 0.5 1 2\n")
+    tracks = tracks_of(read_images(tmp_path), read_point_table(tmp_path))
+    assert tracks.seen["a.png"].tolist() == [1, 0], "by id; 77 is no point"
+
+
+def test_tracks_stay_with_undistorted_photographs(rng, tmp_path):
+    wall = Wall(rng, photographs=3)
+    wall.write(tmp_path / "scene")
+    assert undistort_scene(tmp_path / "scene", tmp_path / "out", long_side=32) == 3
+    scene = read_scene(tmp_path / "out", holdout=0)
+    found = measured(scene.tracks, scene.views, lambda view: (load_image(view), None))
+    assert scene.views[0].camera.width == 32
+    assert table(found) == pytest.approx(wall.log_gains, abs=0.1), "squares of 1.5 px"
