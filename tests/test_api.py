@@ -160,7 +160,7 @@ def test_a_scene_made_by_hand_is_for_rendering(device, rng):
 
 
 def test_a_split_that_there_is_not_is_refused():
-    with pytest.raises(ValueError, match="no split 'tset'; there are train, test and all"):
+    with pytest.raises(ValueError, match="no split 'tset'; there are train, test, validation and all"):
         hand_made_scene().split("tset")
 
 

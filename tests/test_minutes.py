@@ -195,7 +195,7 @@ def test_what_cannot_be_fitted_is_refused(tiny_scene, tmp_path, few_steps):
         clsplat.run(few_steps / "pipeline.yaml", out=few_steps, start="resume", minutes=1)
     with pytest.raises(ConfigError, match="a matrix has several"):
         clsplat.run(Path("examples/growth.yaml").absolute(), tiny_scene, tmp_path / "m", minutes=1)
-    with pytest.raises(ConfigError, match="found 2"):
+    with pytest.raises(ConfigError, match="found 3"):
         clsplat.run("compress", tiny_scene, tmp_path / "c", set={"init.file": few_steps / "point_cloud.ply"}, minutes=1)
     for wrong in (0, -1, math.nan, math.inf):
         with pytest.raises(ConfigError, match="--minutes"):

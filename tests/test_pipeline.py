@@ -236,7 +236,10 @@ DIFFERENCES = {
         *(f"losses.covariance_trace{key}" for key in ("", ".above", ".pixels", ".weight")),
         *("losses.l1.weight", "losses.l2", "losses.l2.weight"),
         *("densify.rules.clone.gradient_above", "densify.rules.split.gradient_above"),
-        *(f"stages.evaluate~2.{key}" for key in ("downscales", "file", "lpips", "lpips_input", "metrics", "split")),
+        *(
+            f"stages.evaluate~2.{key}"
+            for key in ("downscales", "file", "lpips", "lpips_input", "metrics", "most", "split")
+        ),
     },
     ("micro_splatting", "micro_splatting_v2"): THINNING,
     ("micro_splatting_7k", "micro_splatting_v2_7k"): THINNING,

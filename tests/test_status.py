@@ -85,7 +85,7 @@ def test_every_status_of_a_run_fits_the_schema(written, tiny_scene, tmp_path):
 def test_a_run_that_ends_early_names_the_stage_and_fits_the_schema(
     failure, state, code, written, tiny_scene, tmp_path, monkeypatch
 ):
-    def fail(*arguments):
+    def fail(*arguments, **settings):
         raise failure
 
     monkeypatch.setattr("clsplat.stages.evaluate.measure", fail)

@@ -181,7 +181,7 @@ def test_intrinsics(tmp_path: Path, values: dict, expected: Camera, per_frame: b
         ({"w": 2**15 + 1}, "the camera is 32769x48"),
         ({"w": 10**14, "h": 10**14, "k1": 0.1}, "the camera is 100000000000000x100000000000000"),
         ({"mask_path": "../a.png"}, "not a path below"),
-        ({"mask_path": "masks/a.png"}, "1 of 3 image files are missing"),
+        ({"mask_path": "masks/a.png"}, "1 of 1 image files are missing"),
     ],
 )
 def test_damaged_frame_is_named(tmp_path: Path, change: dict, message: str) -> None:
