@@ -17,7 +17,7 @@ from clsplat.tuning.tuning import Tuning
 
 MOST = 12  # levels; halves of a million Gaussians are 500 then
 STEPS = 500
-STAGES = ("init", "optimize")  # of the recipe
+STAGES = ("init", "optimize", "take_average")  # of the recipe
 RECORD = "lod.json"
 
 
