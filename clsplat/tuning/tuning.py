@@ -7,7 +7,7 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
-from clsplat.errors import Interrupted
+from clsplat.errors import ConfigError, Interrupted
 from clsplat.files import is_there
 from clsplat.gaussians.model import Model
 from clsplat.gaussians.run_model import MODEL
@@ -23,6 +23,7 @@ from clsplat.runs.source import Source
 from clsplat.training import checkpoint
 
 RECIPE, TRAINING = "compress", "optimize"
+LEAST = 20  # steps: each training of the recipe has some to average then
 
 
 @dataclass(frozen=True)
@@ -78,6 +79,12 @@ class Tuning:
         if numbers.pixel_box:
             screen = {"type": "box"}
         return {"model.sh_degree": self.model.sh_degree, "model.near": numbers.near, "model.screen_filter": screen}
+
+
+def require_steps(steps: int) -> None:
+    """Raise ConfigError for fewer steps than the recipe can be stretched to."""
+    if steps < LEAST:
+        raise ConfigError(f"--steps {steps}: expected a number of at least {LEAST}")
 
 
 def _chosen(stages: Iterable[Any], names: Iterable[str]) -> list[Any]:
