@@ -15,14 +15,14 @@ from clsplat.formats.splats import logits, opacities, unit
 Floats = NDArray[np.floating]
 SMALL = 25  # percentile of the sizes that steps of positions are compared with
 LEVELS = 65535  # of a position, from 0
-# rotations of the axes onto axes, as quaternions: a sign apart they are the same
-_WHOLE = [turn for turn in product((0, 1, -1), repeat=4) if np.count_nonzero(turn) in (1, 2, 4) and turn > (0, 0, 0, 0)]
-_TURNS = np.array([np.divide(turn, np.count_nonzero(turn) ** 0.5) for turn in _WHOLE if next(filter(None, turn)) > 0])
+_SIGNED = [turn for turn in product((0, 1, -1), repeat=4) if np.count_nonzero(turn) in (1, 2, 4)]
+# rotations of the axes onto axes, [24, 4]; a quaternion and its negative are one
+_TURNS = np.array([np.divide(turn, np.linalg.norm(turn)) for turn in _SIGNED if next(filter(None, turn)) > 0])
 
 
 def rounded(values: Floats, step: float) -> NDArray[np.float32]:
     """Return values as multiples of a step."""
-    return (np.rint(values.astype(np.float64) / step) * step).astype(np.float32)
+    return np.asarray(np.rint(values.astype(np.float64) / step) * step, np.float32)
 
 
 def rounded_means(means: Floats, log_scales: Floats, share: float) -> NDArray[np.float32]:
@@ -40,14 +40,14 @@ def rounded_means(means: Floats, log_scales: Floats, share: float) -> NDArray[np
     step = np.exp2(np.minimum(bits, 8))
     levels = np.rint((t - low) / level)
     coarse = low + np.where(levels > 0, np.floor(levels / step) * step + step - 1, 0) * level
-    return (np.sign(coarse) * np.expm1(np.abs(coarse))).astype(np.float32)
+    return np.asarray(np.sign(coarse) * np.expm1(np.abs(coarse)), np.float32)
 
 
 def rounded_quats(quats: Floats, log_scales: Floats, step: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return quaternions [N, 4] on every `step`-th level of a SOG, and the scales [N, 3] that go with them.
 
-    A Gaussian has 24 pairs of a rotation and scales, which differ in the names and signs of its axes.  That of the least
-    angle is taken: the largest component is w then, and the others are small.
+    A Gaussian has 24 pairs of a rotation and scales, which differ in the names and signs of its axes.  That of the
+    least angle is taken: the largest component is w then, and the others are small.
     """
     q, rows = unit(quats), np.arange(len(quats))
     along, taken = np.full(len(q), -1.0), np.zeros(len(q), np.intp)
