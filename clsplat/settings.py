@@ -185,10 +185,9 @@ def import_modules(package: str, path: Iterable[str]) -> None:
 
 def rebuild() -> None:
     """Rebuild all models, so that their fields accept variants defined since, such as those of a plug-in."""
-    complete = [
-        kind for kind in Settings.defined if kind.__pydantic_complete__
-    ]  # the others are built at their first use
+    complete = [kind for kind in Settings.defined if kind.__pydantic_complete__]  # others are built at their first use
     for kind in complete:  # a schema holds those of its variants, and theirs
-        del kind.__pydantic_core_schema__
+        if "__pydantic_core_schema__" in vars(kind):
+            del kind.__pydantic_core_schema__
     for kind in complete:
         kind.model_rebuild(force=True)
