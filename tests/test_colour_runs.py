@@ -3,10 +3,13 @@
 import json
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from clsplat.compare.comparison import Comparison
+from clsplat.compare.tables import main_table
 from clsplat.errors import DataError
 from clsplat.pipeline.choices import without_choices
 from clsplat.pipeline.loading import load
@@ -15,7 +18,9 @@ from clsplat.runs.found import has_ended
 from clsplat.runs.model_file import evaluate
 from clsplat.runs.single import run_pipeline
 from clsplat.training import checkpoint
-from clsplat.training.colours import colours_beside
+from clsplat.training.colours import colours_beside, colours_of
+from clsplat.views.colours import Affine, Auto, Gain
+from clsplat.views.exposures import UNKNOWN
 from tests.few_steps import FEW
 from tests.test_exposures import Wall
 from tests.test_training import digest, train
@@ -66,9 +71,19 @@ def test_the_table_lies_beside_the_model_and_figures_beside_psnr(with_gains, few
         assert luminance == pytest.approx(row["exposure"])
     measured = json.loads((with_gains / "metrics.json").read_text())["test"]["1"]
     assert {"psnr_colour", "psnr_affine"} < measured.keys()
+    pages = [(out / "report.html").read_text() for out in (with_gains, few_steps)]
+    assert [f"{measured['psnr_colour']:.2f} dB" in page and "colours fitted" in page for page in pages] == [True, False]
     assert "view_colours.json" in json.loads((with_gains / "checksums.json").read_text())
     assert not (few_steps / "view_colours.json").exists()
     assert "psnr_colour" not in json.loads((few_steps / "metrics.json").read_text())["test"]["1"]
+
+
+def test_a_comparison_has_a_column_for_them(with_gains, few_steps):
+    tables = [
+        main_table(next(iter(Comparison.read(folders).scenes.values()))) for folders in ([with_gains], [few_steps])
+    ]
+    headings = [[column.heading for group in table.groups for column in group.columns] for table in tables]
+    assert ["PSNR, colours fitted ↑" in found for found in headings] == [True, False]
 
 
 def test_a_run_folder_is_measured_in_the_photographs_colours_too(with_gains, few_steps, tmp_path):
@@ -80,6 +95,35 @@ def test_a_run_folder_is_measured_in_the_photographs_colours_too(with_gains, few
         (tmp_path / "view_colours.json").write_text(damage)
         with pytest.raises(DataError, match=r"the type of colours is .* expected one of \w+, \w+"):
             colours_beside(tmp_path / "point_cloud.ply")
+
+
+def test_where_colours_began_is_kept_with_them(rng, tmp_path):
+    """The rate depends on it, also where the file that told it is gone."""
+    wall = Wall(rng)
+    wall.write(tmp_path / "scene")
+    gain = (*FEW, "scene.holdout=0", "optimize.colours=gain")
+    run = train(tmp_path / "scene", tmp_path / "run", *gain)
+    last = tmp_path / "run" / "checkpoints" / "step_000012.npz"
+    last.unlink()
+    for name in ("point_cloud.ply", "metrics.json", "checksums.json"):
+        (tmp_path / "run" / name).unlink()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("clsplat.training.colours.exposures_of", lambda run: UNKNOWN)
+        again = train(tmp_path / "scene", tmp_path / "run", *gain, resume=True)
+    assert again.numbers == run.numbers
+
+
+def test_figures_are_by_the_colours_of_the_training_that_has_begun():
+    def colours(numbers: dict[str, float], *stages: object) -> object:
+        run = SimpleNamespace(
+            numbers=numbers, settings=SimpleNamespace(stages=[SimpleNamespace(colours=one) for one in stages])
+        )
+        return colours_of(run)
+
+    gain, off = {f"colours/a.png/{column}": 0.0 for column in Gain.columns}, Auto().choose("off", "they are alike")
+    assert colours({}, Gain()) is None
+    assert colours(gain, Gain(), Affine()) == Gain(), "the second has not begun"
+    assert colours(gain, Gain(), off) == Gain()
 
 
 def test_the_best_model_is_left_with_the_colours_of_its_step(tiny_scene, tmp_path):
