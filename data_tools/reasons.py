@@ -82,10 +82,10 @@ def reasons(matched: Matched, models: Sequence[set[str]]) -> dict[str, str]:
 def _reason(matched: Matched, name: str, placed: set[str], sharp: float) -> str:
     matches = matched.matches[name]
     among = {other: count for other, count in matches.items() if other in placed}
+    if matched.features[name] < FEW_FEATURES:
+        return f"only {amount(matched.features[name], 'feature')}: blurred, dark, or of a plain surface"
     if matched.sharpness_of(name) < BLURRED * sharp:
         return "blurred"
-    if matched.features[name] < FEW_FEATURES:
-        return f"only {matched.features[name]} features: dark, or of a plain surface"
     if not matches:
         return "shows nothing that another photograph shows"
     best = max(matches, key=lambda other: (matches[other], other))

@@ -164,7 +164,7 @@ def test_each_photograph_that_is_not_placed_has_a_reason(tmp_path):
     found = reasons(matched(tmp_path), [{"a", "b", "c"}])
     assert found == {
         "blurred": "blurred",
-        "plain": "only 40 features: dark, or of a plain surface",
+        "plain": "only 40 features: blurred, dark, or of a plain surface",
         "alone": "shows nothing that another photograph shows",
         "pair": "matches other alone, which is not placed either",
         "other": "matches pair alone, which is not placed either",
@@ -173,7 +173,7 @@ def test_each_photograph_that_is_not_placed_has_a_reason(tmp_path):
     }
     assert reasons(matched(tmp_path), [{"a", "b", "c"}, {"pair", "other"}])["pair"] == "in another model, with other"
     figures = {"registered": 3, "not_registered": ["plain"], "reasons": found, "other_models": [2]}
-    assert "1 of 4 photographs could not be placed: plain (only 40 features: dark" in left_out(figures)[0]
+    assert "1 of 4 photographs could not be placed: plain (only 40 features: blurred" in left_out(figures)[0]
     assert diagnosis(matched(tmp_path)).startswith("take more sharp ones")
 
 
