@@ -2,8 +2,10 @@
 
 import json
 import logging
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from clsplat.errors import ConfigError, DataError
@@ -13,6 +15,7 @@ from clsplat.scene.detect import read_scene
 from clsplat.scene.identity import Identity
 from clsplat.scene.scene import Scene
 from clsplat.scene.split import Split
+from clsplat.scene.tracks import Tracks
 from tests.test_transforms import LENS, frames, write
 
 LETTERS = "abcdefghijklmnopqrstuvwx"
@@ -34,6 +37,16 @@ def test_every_nth_from_an_offset_on_is_for_testing(folder):
     assert letters(scene, "test") == "emu"
     assert len(scene.train) == 21
     assert scene.extent == pytest.approx(read_scene(folder, 8).extent, rel=1)
+
+
+@pytest.mark.parametrize(
+    "split", [{"holdout": Choice(every=3, offset=1)}, {"train": Choice(every=2)}, {"validation": 2}]
+)
+def test_a_split_leaves_the_rest_of_a_scene_as_it_is(folder, split):
+    scene = replace(read_scene(folder), tracks=Tracks(np.zeros((1, 3)), {}))
+    found = Split(**split).applied(scene)
+    assert (found.tracks, found.points, found.background) == (scene.tracks, scene.points, scene.background)
+    assert {view.name for view in found.views} <= {view.name for view in scene.views}
 
 
 @pytest.mark.parametrize("listed", ["b", "b.png", "images/b.png", "images/b", "images\\b.png"])

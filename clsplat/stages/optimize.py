@@ -29,6 +29,7 @@ from clsplat.training.trainer import Trainer
 from clsplat.views.colours import Colours
 from clsplat.views.detail import course
 from clsplat.views.sampling import Sampler, ViewSettings
+from clsplat.views.transients import Transients
 
 LOG = logging.getLogger("clsplat")
 DISTRIBUTION_INTERVAL = 5  # reports
@@ -59,6 +60,8 @@ class Optimize(Keeping):
     """Losses and penalties; training minimises their sum."""
     colours: OneOf[Colours] | None = None
     """Colours of each photograph, where exposures differ: `gain`, `affine`, `auto`; without it, those of the scene."""
+    transients: Transients | None = None
+    """Pixels that are left out, where photographs show what the scene does not have; without it, none."""
     skip: Skip | None = None
     """Steps that skip the backward pass, where a view has converged; without it, none."""
     during: list[OneOf[Scheduled]] = Field([])
@@ -179,7 +182,7 @@ class Optimize(Keeping):
             stage.attach(run)
         parts = run.rasterizer, run.model, run.adam, run.stats, photographs.background
         rates, colours = self.rates.settled(views.full_size(last)), photograph_colours(self.colours, run, last)
-        return Trainer(*parts, self.losses, rates, run.scene.extent, run.numbers, self.update, colours)
+        return Trainer(*parts, self.losses, rates, run.scene.extent, run.numbers, self.update, colours, self.transients)
 
     def _act(self, run: Run) -> None:
         """Run the stages that are due and do not edit; those that fail run again when the run goes on."""
