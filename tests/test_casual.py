@@ -24,6 +24,18 @@ from tests.refusals import refusal
 # ---- lenses
 
 
+@pytest.mark.parametrize("damage", ["a text for a place", "no focal length", "cut"])
+def test_exif_that_is_damaged_tells_no_lens(tmp_path, damage):
+    segment = bytearray(exif())
+    if damage == "a text for a place":
+        segment[segment.index(struct.pack("<HH", 0x8769, 4)) + 2] = 2
+    if damage == "no focal length":
+        segment[-4:] = bytes(4)  # its divisor
+    path = take(tmp_path / "a.jpg", (16, 16), bytes(segment[:60] if damage == "cut" else segment))
+    assert optics_of(path) is None
+    assert (exposure_of(path) is None) == (damage != "no focal length")
+
+
 def exif(orientation: int = 1, focal: float = 4.2, model: str = "Phone 1") -> bytes:
     """An Exif segment: orientation, make, model, exposure and focal length."""
     texts, rationals = [b"Maker\0", model.encode() + b"\0"], [(1, 50), (18, 10), (round(focal * 100), 100)]

@@ -78,7 +78,7 @@ def _tags(head: bytes) -> dict[int, Value]:
         return tags
     at, length = found
     block = head[at + 10 : at + 2 + length]
-    with suppress(struct.error, KeyError):
+    with suppress(struct.error, KeyError, ValueError):  # cut, without such a folder, or with no number for its place
         order = {b"II": "<", b"MM": ">"}[block[:2]]
         (start,) = struct.unpack_from(order + "I", block, 4)
         tags.update(_values(block, order, int(start)))
@@ -94,7 +94,8 @@ def _values(block: bytes, order: str, start: int) -> dict[int, Value]:
         tag, kind, count, value = struct.unpack_from(order + "HHII", block, at)
         if kind == RATIONAL:
             above, below = struct.unpack_from(order + "II", block, value)
-            found[tag] = above / below if below else math.nan
+            if below:
+                found[tag] = above / below
         elif kind in (SHORT, LONG):
             (found[tag],) = struct.unpack_from(order + ("H" if kind == SHORT else "I"), block, at + 8)
         elif kind == TEXT:
