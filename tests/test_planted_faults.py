@@ -28,6 +28,12 @@ FAULTS = {  # kernel -> file, text, wrong text
     "sum_members": ("clusters.cl", "components + k, (int)p)", "components + k, (int)p / 2)"),
     "colours_forward": ("colours.cl", "br * r + bg * g + bb * b + b1, one", "br * r + bg * g + bb * b, one"),
     "colours_backward": ("colours.cl", "rg * passed_r + gg * passed_g", "rg * passed_r + gr * passed_g"),
+    "sky_forward": ("sky.cl", "+ seen * colour", "- seen * colour"),
+    "sky_matches": ("sky.cl", "apart <= 3.0f * difference", "apart <= difference"),
+    "sky_cover": ("sky.cl", "-scale * (chosen * t)", "-scale * chosen"),
+    "sky_backward": ("sky.cl", "sums[k * 3 + channel] += weights[k]", "sums[k * 3 + channel] += weights[0]"),
+    "sky_gather": ("sky.cl", "run_sums[entries[k] * 3 + channel]", "run_sums[entries[k] * 3]"),
+    "sky_update": ("sky.cl", "sqrt(v / bias2)", "sqrt(v)"),
     "share_mean": ("members.cl", "start + sum / total", "sum / total"),
     "count_not_finite": ("check.cl", "<= FLT_MAX", "<= INFINITY"),
     "count_seen": ("density.cl", "seen[i] += 1.0f", "seen[i] += 1.001f"),
@@ -148,6 +154,14 @@ OPTIONAL = {  # in what few runs compute: doctor notices them, the check before 
             ("emit_large", "tiles", "tiles.h", "-k * longer * inverse", "k * longer * inverse"),
         )
     },
+    "blend_backward wide, what is left": (
+        "blend_wide.cl",
+        "p.rest + VLOAD(behind + at)",
+        "p.rest - VLOAD(behind + at)",
+    ),
+    "blend_backward simt, what is left": ("blend_simt.cl", "p.rest + behind[at]", "p.rest - behind[at]"),
+    "sky_forward, the lower half": ("sky.cl", "a = (x - run->sign_x * below)", "a = (x + run->sign_x * below)"),
+    "sky_cover, most of nine": ("sky.cl", "MOST_OF_BOX 0.6f", "MOST_OF_BOX 0.5f"),
     "blend_backward, entropy": ("splat.h", "(log_weight(k.weight) + 1.0f)", "log_weight(k.weight)"),
 }
 

@@ -19,6 +19,7 @@ from clsplat.formats.splats import PARAMETERS as PARAMETERS
 from clsplat.formats.splats import SH_C0 as SH_C0
 from clsplat.formats.splats import degree_of
 from clsplat.formats.splats import sh_coefficients as sh_coefficients
+from clsplat.gaussians.sky import DeviceSky
 from clsplat.opencl.device import Array, Device
 
 HIDDEN = "hidden"  # bit v % HIDDEN_VIEWS of component v // HIDDEN_VIEWS: training view v leaves the Gaussian out
@@ -204,6 +205,7 @@ class DeviceModel:
     screen_variance: float = 0.3  # px²
     compensate: float = 0.0  # 1: the opacity falls as the screen filter enlarges the splat
     pixel_box: float = 0.0  # 1: splats are integrated over the box of each pixel instead
+    sky: DeviceSky | None = None  # behind them, in place of a background of one colour
 
     @property
     def defines(self) -> dict[str, int]:

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, fields
 from itertools import pairwise
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -10,7 +10,9 @@ from clsplat.errors import MemoryLimitError
 from clsplat.gaussians.tables import DeviceModel, Gradients
 from clsplat.opencl.device import Array, Device
 from clsplat.opencl.program import Program, constants
+from clsplat.render.arguments import shape_arguments
 from clsplat.render.camera import DeviceCamera
+from clsplat.render.sky import Skies
 from clsplat.render.tiles import Band, Footprints, Sort, TileLists, Tiler, TooManyPairs
 from clsplat.render.workspace import Workspace
 
@@ -57,6 +59,8 @@ class Rasterizer:
         self._bands: dict[int, int] = {}  # rows of tiles of a frame -> number of bands
         self.workspace = Workspace(device)
         self.tiler = Tiler(device, self.workspace, sort)
+        self.skies = Skies(device, self.workspace)
+        self._black = device.zeros(3)
         device.program("project.cl")  # built at once, as the others
         self._blend("colour")
         self._lanes = int(device.tuning["LANES"])
@@ -65,14 +69,18 @@ class Rasterizer:
     def forward(
         self, model: DeviceModel, camera: DeviceCamera, background: Array, content: Content = "colour"
     ) -> Frame:
-        """Render the model.  background: [3].
+        """Render the model.  background: [3], where the model has no sky.
 
         Where the pairs of all tiles are more than the budget or the device's memory, the frame is rendered in bands of
         rows: the same bits.  Raises MemoryLimitError where one row at a time does not fit.
         """
+        sky = model.sky if content != "depth" else None
         while True:
             try:
-                return self._forward(model, camera, background, content)
+                frame = self._forward(model, camera, self._black if sky else background, content)
+                if sky:
+                    self.skies.paint(sky, camera, frame.image, frame.transmittance)
+                return frame
             except TooManyPairs as error:
                 if not self._narrow(camera):
                     raise MemoryLimitError(
@@ -159,27 +167,42 @@ class Rasterizer:
         return self.tiler.build(splats, footprints, band, count, limit, model.defines)
 
     def pixel_sums(
-        self, model: DeviceModel, frame: Frame, grad_image: Array, count: int = PIXEL_SUMS, texture: Array | None = None
+        self,
+        model: DeviceModel,
+        frame: Frame,
+        grad_image: Array,
+        count: int = PIXEL_SUMS,
+        texture: Array | None = None,
+        behind: Array | None = None,
     ) -> Array:
         """Return the sums over each Gaussian's pixels that give its gradients, [count, S]; see cl_kernels/splat.h.
 
         grad_image: as the frame's image, zero outside it.  A `count` above PIXEL_SUMS takes more time; those of
-        the texture need `texture`, [rows, stride], below 0 where it is not known.  Memory as in `forward`.
+        the texture need `texture`, [rows, stride], below 0 where it is not known.  behind: [rows, stride] T dL/dT of a
+        loss of what the splats leave, T.  Memory as in `forward`.
         """
         bands = frame.bands
         while True:
             try:
-                return self._pixel_sums(model, frame, bands, grad_image, count, texture)
+                return self._pixel_sums(model, frame, bands, grad_image, count, texture, behind)
             except MemoryLimitError:
                 if not self._narrow(frame.camera):
                     raise
                 bands = self._split(frame.camera)
 
     def _pixel_sums(
-        self, model: DeviceModel, frame: Frame, bands: list[Band], grad_image: Array, count: int, texture: Array | None
+        self,
+        model: DeviceModel,
+        frame: Frame,
+        bands: list[Band],
+        grad_image: Array,
+        count: int,
+        texture: Array | None,
+        behind: Array | None,
     ) -> Array:
         gaussians = model.gaussians
         defines = {} if count == PIXEL_SUMS else {"PIXEL_SUMS": count}
+        of_blend = {**defines, "GRAD_BEHIND": 1} if behind else defines
         pixel_sums = self.workspace.array("pixel_sums", (count, gaussians.capacity))
         for number, band in enumerate(bands):
             lists = frame.lists
@@ -187,7 +210,7 @@ class Rasterizer:
                 lists = self._project_band(model, frame.camera, band, frame.splats, frame.radius, frame.content)
             pair_sums = self.workspace.array("pair_sums", (lists.pairs, RECORD))
             for first_tile, groups in self._launches(band):
-                self._blend(frame.content, **defines, **model.defines).blend_backward(
+                self._blend(frame.content, **of_blend, **model.defines).blend_backward(
                     groups=groups,
                     tile_offset=lists.tile_offset,
                     tile_pairs=lists.tile_pairs,
@@ -197,6 +220,7 @@ class Rasterizer:
                     image=frame.image,
                     grad_image=grad_image,
                     texture=texture or frame.transmittance,  # without a texture the kernel reads none
+                    behind=behind or frame.transmittance,
                     tile_last=frame.tile_last,
                     pair_sums=pair_sums,
                     first_tile=first_tile,
@@ -226,19 +250,3 @@ class Rasterizer:
             **gradients.arguments(),
         )
         return gradients
-
-
-def shape_arguments(model: DeviceModel, camera: DeviceCamera) -> dict[str, Any]:
-    """Return the arguments of every kernel that projects Gaussians, by name."""
-    gaussians = model.gaussians
-    names = ("means", "quats", "log_scales", "logit_opacity", "sh_rest", "filter_variance")
-    return {
-        **{name: gaussians[name] for name in names},
-        "camera": camera.array,
-        "near_plane": model.near,
-        "screen_variance": 0.0 if model.pixel_box else model.screen_variance,
-        "compensate": 0.0 if model.pixel_box else model.compensate,
-        "degree": model.degree,
-        "stride": gaussians.capacity,
-        "count": gaussians.count,
-    }

@@ -3,11 +3,13 @@
 import logging
 from dataclasses import replace
 
+from clsplat.pipeline.file import PipelineFile
 from clsplat.pipeline.loading import Pipeline
 from clsplat.pipeline.stretching import of_trainings
 from clsplat.stages.optimize import Optimize
 from clsplat.training.colours import settled
 from clsplat.training.run import Run
+from clsplat.training.skies import settled as settled_sky
 from clsplat.views.colours import Auto
 
 LOG = logging.getLogger("clsplat")
@@ -19,7 +21,8 @@ def settle(pipeline: Pipeline, run: Run) -> Pipeline:
     Choices that are made already stay.
     """
     open_ones = [one.colours for one in pipeline.stages if isinstance(one, Optimize) and isinstance(one.colours, Auto)]
-    if all(colours.chosen for colours in open_ones):
+    background = pipeline.settings.model.background
+    if all(colours.chosen for colours in open_ones) and (getattr(background, "chosen", "") is not None):
         return pipeline
 
     def chosen(training: Optimize) -> Optimize:
@@ -30,6 +33,14 @@ def settle(pipeline: Pipeline, run: Run) -> Pipeline:
         return training.model_copy(update={"colours": colours})
 
     with run.status.stage("choose"):
-        found = replace(pipeline, settings=of_trainings(pipeline.settings, chosen))
-    run.settings, run.pipeline = found.settings, found.resolved()
+        found = replace(pipeline, settings=_with_sky(of_trainings(pipeline.settings, chosen), run))
+    run.settings, run.pipeline, run.model_settings = found.settings, found.resolved(), found.settings.model
     return found
+
+
+def _with_sky(settings: PipelineFile, run: Run) -> PipelineFile:
+    """Settings with the choice of a sky, where it is open."""
+    background = settled_sky(settings.model.background, run)
+    if background is settings.model.background:
+        return settings
+    return settings.model_copy(update={"model": settings.model.model_copy(update={"background": background})})

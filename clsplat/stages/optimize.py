@@ -22,8 +22,9 @@ from clsplat.training import checkpoint
 from clsplat.training.adam import Adam, Rates, Rows
 from clsplat.training.colours import photograph_colours, write_view_colours
 from clsplat.training.forecast import Forecast
+from clsplat.training.profile import clocks
 from clsplat.training.rescue import finite_values
-from clsplat.training.run import Run, Stopped, clocks
+from clsplat.training.run import Run, Stopped
 from clsplat.training.skipping import Skip, Visit
 from clsplat.training.trainer import Trainer
 from clsplat.views.colours import Colours
@@ -182,7 +183,8 @@ class Optimize(Keeping):
             stage.attach(run)
         parts = run.rasterizer, run.model, run.adam, run.stats, photographs.background
         rates, colours = self.rates.settled(views.full_size(last)), photograph_colours(self.colours, run, last)
-        return Trainer(*parts, self.losses, rates, run.scene.extent, run.numbers, self.update, colours, self.transients)
+        own = colours, self.transients, run.sky
+        return Trainer(*parts, self.losses, rates, run.scene.extent, run.numbers, self.update, *own)
 
     def _act(self, run: Run) -> None:
         """Run the stages that are due and do not edit; those that fail run again when the run goes on."""

@@ -24,6 +24,7 @@ from clsplat.opencl.program import constants
 from clsplat.render.camera import DeviceCamera
 from clsplat.render.rasterizer import Content, Rasterizer
 from clsplat.training.adam import Adam, Rates, Rows
+from clsplat.training.sky import LearnedSky
 from clsplat.views.learned import LearnedTransform, learned_of, name_of
 from clsplat.views.photograph_colours import PhotographColours, change_back, change_colours
 from clsplat.views.photographs import Photograph, apply_mask
@@ -72,6 +73,7 @@ class Trainer:
     rows: Rows = "all"  # Gaussians that a step changes
     colours: PhotographColours | None = None  # of the photographs, where they have colours of their own
     transients: Transients | None = None  # which pixels are left out; None: none
+    sky: LearnedSky | None = None  # of the model, where it has one
 
     def step(
         self,
@@ -126,7 +128,12 @@ class Trainer:
         learned = learned_of(transforms)
         of_transform, learn = self._learn(learned, planes, comparison) if learned else ([], [])
         values = [returned(loss, loss.add(comparison)) for loss in self.losses if isinstance(loss, ImageLoss)]
-        return ViewLosses(frame, comparison, [*values, *of_transform, *own], learning=[*learning, *learn])
+        behind = None
+        if self.sky and (cover := self.sky.cover(self.rasterizer, frame, comparison)):
+            behind, value = cover
+            own.append(value)
+        losses = [*values, *of_transform, *own]
+        return ViewLosses(frame, comparison, losses, learning=[*learning, *learn], behind=behind)
 
     def backward(self, view: ViewLosses) -> ViewGradients:
         """Return the derivative of the losses that `compare` returned, as sums over pixels."""
@@ -135,10 +142,11 @@ class Trainer:
         if mask is not None:
             apply_mask(workspace, camera, gradient, mask)
         gradient, learning = self._uncoloured(view, gradient)
+        learning = [*self._of_sky(view, gradient), *learning]
         count = self.stats.pixel_sums
         self.rasterizer.device.timings.section = "statistics"
         texture = known_gradient(workspace, camera, photograph, mask) if count > TEXTURE else None
-        pixel_sums = self.rasterizer.pixel_sums(self.model, view.frame, gradient, count, texture)
+        pixel_sums = self.rasterizer.pixel_sums(self.model, view.frame, gradient, count, texture, view.behind)
         return ViewGradients(view.frame, comparison, view.losses, pixel_sums, learning=learning)
 
     def _coloured(self, camera: DeviceCamera, image: Array) -> tuple[Array, list[LossValue]]:
@@ -172,6 +180,13 @@ class Trainer:
         gradient, by_matrix = change_back(workspace, camera, view.frame.image, matrix, gradient)
 
         return gradient, [*learning, lambda: colours.learn(self.numbers, number, by_matrix(), comparison.step)]
+
+    def _of_sky(self, view: ViewLosses, gradient: Array) -> list[Callable[[], None]]:
+        """What changes the sky after the Gaussians.  gradient: by the image as it was rendered."""
+        if (sky := self.sky) is None:
+            return []
+        by_texels = sky.by_texels(self.rasterizer, view.frame, gradient)
+        return [lambda: sky.update(self.rasterizer, view.frame, by_texels, view.comparison.step)]
 
     def _learn(
         self, transform: LearnedTransform, planes: Planes, comparison: Comparison

@@ -83,6 +83,7 @@ from clsplat.conformance.reference.projection_backward import (
     ratio_gradient,
 )
 from clsplat.conformance.reference.random import normal3, philox
+from clsplat.conformance.reference.sky import rays, shows_sky, sky_cover, sky_gradient, sky_image, sky_update
 from clsplat.conformance.reference.splitting import mean_jacobian, screen_splitting, splitting
 from clsplat.conformance.reference.transients import residual_numbers, residuals, without_transients
 from clsplat.conformance.reference.world_filter import (
@@ -139,6 +140,7 @@ __all__ = [
     "psnr",
     "ratio_gradient",
     "ray_limits",
+    "rays",
     "render",
     "render_backward",
     "reset_logit",
@@ -153,6 +155,11 @@ __all__ = [
     "sh_basis_gradient",
     "shared_logit",
     "shared_means",
+    "shows_sky",
+    "sky_cover",
+    "sky_gradient",
+    "sky_image",
+    "sky_update",
     "split_children",
     "splitting",
     "ssim_map",
