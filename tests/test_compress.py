@@ -14,7 +14,7 @@ from clsplat import lock
 from clsplat.cli import app
 from clsplat.compress import search
 from clsplat.compress.page import page, table
-from clsplat.compress.rungs import Ladder, checked_keeps
+from clsplat.compress.rungs import FITTING, Ladder, checked_keeps
 from clsplat.compress.target import Point, Target
 from clsplat.errors import ConfigError, DataError, Interrupted, OutputError
 from clsplat.formats.table import detect, read
@@ -30,7 +30,7 @@ from tests.test_left_files import NONE
 
 pytestmark = pytest.mark.slow
 
-KEEP, STEPS = (1.0, 0.5), 3
+KEEP, STEPS = (1.0, 0.5), 20
 
 
 def point(size: int, psnr: float, keep: float = 0.5) -> Point:
@@ -196,7 +196,7 @@ def test_another_search_needs_another_folder(searched, few_steps, tmp_path):
 
 def test_a_search_does_not_go_on_with_other_photographs(few_steps, tiny_scene, tmp_path):
     shutil.copytree(tiny_scene, tmp_path / "scene")
-    ask = {"target": "1MB", "out": tmp_path / "out", "keep": [1.0], "steps": 1}
+    ask = {"target": "1MB", "out": tmp_path / "out", "keep": [1.0], "steps": STEPS}
     clsplat.compress_model(few_steps, tmp_path / "scene", **ask)
     first, second, *_ = sorted((tmp_path / "scene" / "train").iterdir())
     second.write_bytes(first.read_bytes())
@@ -285,13 +285,30 @@ def test_a_rung_is_trained_as_the_model_is_rendered(few_steps, tmp_path):
     """A mip model keeps its filter, and photographs are read as the model's run read them."""
     model = clsplat.load(few_steps / "point_cloud.ply")
     mip = replace(model, rendering=Rendering(near=0.05, screen_variance=0.1, compensate=1.0, background="white"))
-    ladder = Ladder(tmp_path, Tuning("compress", Source.of(few_steps, None), mip, 7, None))
+    ladder = Ladder(tmp_path, Tuning("compress", Source.of(few_steps, None), mip, 20, None))
     settings = ladder.pipeline(few_steps / "point_cloud.ply", 0.7).settings
     screen = settings.model.screen_filter
     assert (settings.model.near, screen.variance, screen.compensate) == (0.05, 0.1, 1)
     assert (settings.scene.background, settings.model.sh_degree) == ("white", model.sh_degree)
-    assert (settings.stages[1].keep, settings.training.steps, settings.training.rates.means.over) == (0.7, 7, 7)
-    assert [stage.stage for stage in settings.stages] == ["init", "prune_least", "optimize", "export"]
+    assert (settings.stages[1].keep, settings.training.steps, settings.training.rates.means.over) == (0.7, 20, 20)
+    assert [stage.stage for stage in settings.stages] == ["init", "prune_least", "optimize", "take_average", "export"]
+
+
+@pytest.mark.parametrize(("steps", "lengths", "starts"), [(None, (400, 200), (200, 500)), (100, (40, 20), (20, 50))])
+def test_averages_of_a_palette_begin_in_the_middle_of_its_trainings(steps, lengths, starts, few_steps, tmp_path):
+    """Their steps count from the first stage that is run, not from that of the recipe."""
+    model = clsplat.load(few_steps / "point_cloud.ply")
+    tuning = Tuning("compress", Source.of(few_steps, None), model, steps, None)
+    settings = tuning.pipeline(FITTING, {"init.file": str(few_steps / "point_cloud.ply")}).settings
+    trainings = [stage for stage in settings.stages if stage.stage == "optimize"]
+    assert tuple(training.steps for training in trainings) == lengths
+    assert tuple(training.during[-1].start for training in trainings) == starts
+
+
+@pytest.mark.parametrize("steps", [19, 1, 0, -5])
+def test_fewer_steps_than_leave_an_average_are_refused(steps, few_steps, tmp_path):
+    with pytest.raises(ConfigError, match=f"--steps {steps}: expected a number of at least 20"):
+        clsplat.compress_model(few_steps, target="1MB", out=tmp_path, steps=steps)
 
 
 def test_a_model_whose_size_cannot_be_told_leaves_no_folder(few_steps, tmp_path, monkeypatch):

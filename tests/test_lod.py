@@ -22,7 +22,7 @@ from tests.test_left_files import NONE
 
 pytestmark = pytest.mark.slow
 
-STEPS = 4
+STEPS = 20
 
 
 @pytest.fixture(scope="module")
@@ -203,7 +203,7 @@ def test_a_training_that_is_interrupted_goes_on(few_steps, tmp_path, monkeypatch
 
 def test_a_training_does_not_go_on_with_other_photographs(few_steps, tiny_scene, tmp_path):
     shutil.copytree(tiny_scene, tmp_path / "scene")
-    ask = {"folder": tmp_path / "site", "scene": tmp_path / "scene", "levels": 2, "steps": 1}
+    ask = {"folder": tmp_path / "site", "scene": tmp_path / "scene", "levels": 2, "steps": STEPS}
     clsplat.write_levels(few_steps, **ask)
     shutil.rmtree(tmp_path / "site")
     first, second, *_ = sorted((tmp_path / "scene" / "train").iterdir())
@@ -237,7 +237,7 @@ def test_without_steps_levels_are_measured_alone(few_steps, tmp_path):
         ({"keep": 0.0}, "--keep 0: expected a share"),
         ({"keep": 1.0}, "--keep 1: expected a share"),
         ({"keep": float("nan")}, "--keep nan: expected a share"),
-        ({"steps": -1}, "--steps -1: expected a number of at least 0"),
+        ({"steps": -1}, "--steps -1: expected a number of at least 20"),
         ({"downscale": 0.5}, "--downscale 0.5: expected a divisor"),
         ({"downscale": 2.0, "steps": 0}, "--downscale 2: belongs to a training; expected --steps above 0"),
     ],

@@ -9,6 +9,7 @@ import pytest
 from clsplat.conformance import reference as ref
 from clsplat.density.contribution import sensitivities
 from clsplat.errors import ConfigError, Interrupted
+from clsplat.formats.packing import morton_order
 from clsplat.formats.table import read
 from clsplat.gaussians.model import Model, load
 from clsplat.pipeline.loading import load as load_pipeline
@@ -227,6 +228,35 @@ def test_a_sog_holds_the_harmonics_that_a_model_was_trained_with(many, tiny_scen
     ours, theirs = (np.unique(one.sh_rest, axis=0, return_counts=True) for one in (model, back))
     np.testing.assert_array_equal(ours[0], theirs[0])
     np.testing.assert_array_equal(ours[1], theirs[1])
+
+
+ROUNDED = PALETTE.replace(
+    "  - optimize: {steps: 4, rates: {sh_rest: 0, sh_base: 0.01}, losses: [l1]}\n",
+    """\
+  - round_tables: {means: 0.25, quats: 2, log_scales: 0.1}
+  - export: {file: before.ply}
+  - optimize:
+      steps: 4
+      rates: {means: 0, quats: 0, log_scales: 0, sh_rest: 0, sh_base: 0.01}
+      losses: [l1]
+      during: [add_to_average: {every: 1}]
+  - take_average
+  - round_tables: {sh_base: 0.04, opacity: 2}
+""",
+).replace("palette_sh: {quality: small}", "palette_sh: {quality: small, step: 0.01}")
+
+
+def test_rounded_tables_are_held_while_the_others_are_trained_and_written_as_they_are(many, tiny_scene, tmp_path):
+    (tmp_path / "rounded.yaml").write_text(ROUNDED.replace("MODEL", json.dumps(str(many))))
+    out = train(tiny_scene, tmp_path / "run", pipeline=str(tmp_path / "rounded.yaml")).out
+    before, after, back = (load(out / name).tables() for name in ("before.ply", "point_cloud.ply", "model.sog"))
+    changed = [name for name in before if not np.array_equal(before[name], after[name])]
+    assert sorted(changed) == ["logit_opacity", "sh_base"]
+    steps = after["sh_rest"] / 0.01
+    np.testing.assert_allclose(steps, np.rint(steps), atol=1e-3)
+    order = morton_order(after["means"])
+    for name, table in after.items():
+        np.testing.assert_allclose(back[name], table[order], rtol=1e-4, atol=1e-5)
 
 
 LEARNED = PALETTE.replace(

@@ -9,10 +9,11 @@ from clsplat.gaussians.run_model import MODEL
 from clsplat.pipeline.loading import Pipeline
 from clsplat.tuning.tuning import Tuning
 
-STAGES = ("init", "prune_least", "optimize")  # of the recipe; what a rung writes is a PLY
+STAGES = ("init", "prune_least", "optimize", "take_average")  # of the recipe; what a rung writes is a PLY
 PALETTE = "palette_sh"
-# what trains the harmonics that a SOG holds, and then the other tables with them
-FITTING = ("init", "reduce_sh", PALETTE, "optimize", "share_palette", PALETTE, "optimize")
+# what trains the harmonics that a SOG holds, rounds them and other tables, and trains the last ones with them
+VECTORS = ("reduce_sh", PALETTE, "optimize", "take_average", "share_palette", PALETTE)
+FITTING = ("init", *VECTORS, "round_tables", "optimize", "take_average", "round_tables")
 FITTED, SOG = "fitted", "model.sog"
 
 

@@ -20,7 +20,7 @@ from clsplat.reading import read_file, sha256
 from clsplat.runs.model_file import ModelFile
 from clsplat.tuning.folder import claimed
 from clsplat.tuning.measuring import Measurer
-from clsplat.tuning.tuning import Tuning
+from clsplat.tuning.tuning import Tuning, require_steps
 
 LOG = logging.getLogger("clsplat")
 Format = Literal["sog", "spz"]
@@ -88,8 +88,8 @@ def compress(
     searches in `out`.
     """
     wanted, shares = Target.of(target), checked_keeps(keeps)
-    if steps is not None and steps < 1:
-        raise ConfigError(f"--steps {steps}: expected a number of at least 1")
+    if steps is not None:
+        require_steps(steps)
     if form not in get_args(Format):
         raise ConfigError(f"--format {quoted(form)}: expected one of {', '.join(get_args(Format))}")
     opened = ModelFile(model, scene, device)

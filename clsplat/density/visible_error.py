@@ -28,7 +28,7 @@ class VisibleError:
 
     weights: Floats  # [N] blend weights over the views' pixels
     mean: Floats  # [N,K] of the harmonics in the directions seen
-    form: Floats  # [N,K(K+1)/2] upper triangle of A, plus the share of all directions
+    form: Floats  # [K(K+1)/2,N] upper triangle of A, plus the share of all directions
 
     @classmethod
     def of(
@@ -47,9 +47,10 @@ class VisibleError:
             for place, (row, column) in enumerate(zip(i, j, strict=True)):
                 second[place] += weighted[row] * harmonics[column]
         mean = first / np.where(weights > 0, weights, 1)
-        second -= mean[i] * first[j]
+        for place, (row, column) in enumerate(zip(i, j, strict=True)):
+            second[place] -= mean[row] * first[column]
         second[i == j] += UNSEEN / (4 * np.pi) * (weights + FAINT * weights.mean())  # |e|^2 / 4 pi over the sphere
-        return cls(weights, np.ascontiguousarray(mean.T), np.ascontiguousarray(second.T))
+        return cls(weights, np.ascontiguousarray(mean.T), second)
 
     def gradient(self, rest: NDArray[np.floating]) -> Floats:
         """Return A x for coefficients, [N, 3 K], of three channels."""
@@ -58,9 +59,9 @@ class VisibleError:
             np.zeros((len(rest), self.mean.shape[1], 3)),
         )
         for place, (row, column) in enumerate(zip(*np.triu_indices(table.shape[1]), strict=True)):
-            products[:, row] += self.form[:, place, None] * table[:, column]
+            products[:, row] += self.form[place, :, None] * table[:, column]
             if row != column:
-                products[:, column] += self.form[:, place, None] * table[:, row]
+                products[:, column] += self.form[place, :, None] * table[:, row]
         return products.reshape(rest.shape)
 
     def base_change(self, error: NDArray[np.floating]) -> Floats:
@@ -76,15 +77,24 @@ class VisibleError:
         Lloyd's iteration with the form of each Gaussian as its distance.  nearest: of points [N, c] and vectors [E, c]
         the one with the largest product.  A vector without Gaussians stays.
         """
-        products, size = self.gradient(rest), self.mean.shape[1]
-        i, j = np.triu_indices(size)
-        scale = 1 / np.maximum(self.weights + FAINT * self.weights.mean(), 1e-30)[:, None]
-        points = np.concatenate([products, self.form * np.where(i == j, -0.5, -1.0)], axis=1) * scale
-        points32 = points.astype(np.float32)
+        products = self.gradient(rest)
+        points = self._points(products)
         for _ in range(ROUNDS):
-            labels = nearest(points32, _with_squares(vectors))
+            labels = nearest(points, _with_squares(vectors))
             vectors = self._minima(products, labels, vectors)
-        return vectors, nearest(points32, _with_squares(vectors))
+        return vectors, nearest(points, _with_squares(vectors))
+
+    def _points(self, products: Floats) -> NDArray[np.float32]:
+        """What a vector with its squares is multiplied by, [N, 3 K + K(K+1)/2], column by column: memory is short."""
+        count, own = products.shape
+        i, j = np.triu_indices(self.mean.shape[1])
+        scale = 1 / np.maximum(self.weights + FAINT * self.weights.mean(), 1e-30)
+        points = np.empty((count, own + len(i)), np.float32)
+        for column in range(own):
+            points[:, column] = products[:, column] * scale
+        for place, factor in enumerate(np.where(i == j, -0.5, -1.0)):
+            points[:, own + place] = self.form[place] * factor * scale
+        return points
 
     def _minima(self, products: Floats, labels: NDArray[np.int64], vectors: Floats) -> Floats:
         """The vector of each label whose error shows least, sums in the order of the Gaussians."""
@@ -92,7 +102,7 @@ class VisibleError:
         i, j = np.triu_indices(size)
         form, right = np.empty((entries, size, size)), np.empty(vectors.shape)
         for place, (row, column) in enumerate(zip(i, j, strict=True)):
-            sums = np.bincount(labels, self.form[:, place], minlength=entries)
+            sums = np.bincount(labels, self.form[place], minlength=entries)
             form[:, row, column] = form[:, column, row] = sums
         for component in range(vectors.shape[1]):
             right[:, component] = np.bincount(labels, products[:, component], minlength=entries)

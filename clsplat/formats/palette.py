@@ -18,16 +18,18 @@ LEVELS = 511  # whole numbers on each side of 0: sums of 45 products are below 2
 TAIL = 1e-4  # share of values that may lie beyond LEVELS
 
 
-def codebook(values: NDArray[np.floating]) -> NDArray[np.float64]:
+def codebook(values: NDArray[np.floating], step: float | None = None) -> NDArray[np.float64]:
     """Return ENTRIES numbers, ascending, that stand for `values` with little squared error.
 
     Lloyd's iteration (1982) in rounds; between them two cells become one where that costs less than what the division
-    of another gains.  Values that are at most ENTRIES different numbers are kept; the last is then repeated.
+    of another gains.  Values that are at most ENTRIES different numbers are kept; the last is then repeated.  So are
+    the multiples of `step` next to them, where the values are more.
     """
     ordered = np.sort(values.astype(np.float64), axis=None)
-    different = np.unique(ordered)
-    if len(different) <= ENTRIES:
-        return np.concatenate([different, np.full(ENTRIES - len(different), different[-1])])
+    for values in [ordered] + ([np.rint(ordered / step) * step] if step else []):
+        different = np.unique(values)
+        if len(different) <= ENTRIES:
+            return np.concatenate([different, np.full(ENTRIES - len(different), different[-1])])
     cells = _Cells(ordered)
     cuts = _first_cuts(ordered)
     for _ in range(CODEBOOK_ROUNDS):
@@ -172,8 +174,9 @@ def palette(
 
 def _drawn(count: int, most: int, weights: NDArray[np.float64] | None) -> NDArray[np.int64]:
     """The places, ascending, of points that train a palette: evenly spaced ones, by number or by weight."""
+    most = min(count, most)
     if weights is None or not weights.any():
-        return np.linspace(0, count - 1, min(count, most)).astype(np.int64)
+        return np.linspace(0, count - 1, most).astype(np.int64)
     passed = np.cumsum(weights)
     return np.asarray(np.searchsorted(passed, (np.arange(most) + 0.5) / most * passed[-1]))
 

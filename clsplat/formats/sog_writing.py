@@ -133,16 +133,18 @@ class Harmonics:
         options: Writing,
         weights: NDArray[np.float64] | None = None,
         better: Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.int64]]] | None = None,
+        step: float | None = None,
     ) -> "Harmonics":
         """Quantise harmonics [N, c]; errors count by `weights` [N].  Those of `values` come out as they are.
 
-        better: makes of a palette [E, c] another one, and the label of each splat.
+        better: makes of a palette [E, c] another one, and the label of each splat.  step: of numbers, where those are
+        few enough.
         """
         entries = min(PALETTES[options.quality], max(1, int(SMALLEST * 2.0 ** np.floor(np.log2(len(rest) / SMALLEST)))))
         vectors, labels = palette(rest, entries, options.clustering, weights)
         if better and not np.array_equal(vectors[labels].astype(np.float32), rest):
             vectors, labels = better(vectors)
-        numbers = np.array([_short(number) for number in codebook(vectors)])
+        numbers = np.array([_short(number) for number in codebook(vectors, step)])
         return cls(numbers, nearest(vectors, numbers), labels)
 
     @property

@@ -13,11 +13,11 @@ from clsplat.reading import sha256
 from clsplat.runs.model_file import ModelFile
 from clsplat.tuning.folder import claimed
 from clsplat.tuning.measuring import Measurer
-from clsplat.tuning.tuning import Tuning
+from clsplat.tuning.tuning import Tuning, require_steps
 
 MOST = 12  # levels; halves of a million Gaussians are 500 then
 STEPS = 500
-STAGES = ("init", "optimize")  # of the recipe
+STAGES = ("init", "optimize", "take_average")  # of the recipe
 RECORD = "lod.json"
 
 
@@ -37,8 +37,8 @@ class Plan:
             raise ConfigError(
                 f"--keep {self.keep:g}: expected a share of the Gaussians from 0.01 to below 1, such as 0.5"
             )
-        if self.steps is not None and self.steps < 0:
-            raise ConfigError(f"--steps {self.steps}: expected a number of at least 0")
+        if self.steps:
+            require_steps(self.steps)
         if self.downscale is not None and not 1 <= self.downscale < math.inf:
             raise ConfigError(f"--downscale {self.downscale:g}: expected a divisor of at least 1")
         if self.downscale is not None and self.steps == 0:

@@ -3,7 +3,9 @@
 import logging
 from collections.abc import Collection
 from functools import partial
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
+
+from pydantic import Field
 
 from clsplat.density.visible_error import VisibleError
 from clsplat.errors import amount
@@ -30,10 +32,13 @@ class PaletteSh(Scheduled):
     needs: ClassVar[frozenset[str]] = frozenset({"model"})
     makes: ClassVar[frozenset[str]] = frozenset({"palette"})
     edits: ClassVar[bool] = True
-    training_keys: ClassVar[frozenset[str]] = frozenset({"quality"})
+    training_keys: ClassVar[frozenset[str]] = frozenset({"quality", "step"})
 
     quality: Literal["small", "balanced", "high"] = "balanced"
     """Of the SOG: `small`, `balanced` or `high`, which have 1,024, 4,096 and 16,384 vectors at most."""
+    step: Annotated[float, Field(gt=0)] | None = None
+    """Step of the coefficients of the vectors, where that makes 256 different ones at most: a larger one makes the
+    file smaller."""
 
     def stale(self, run: Run) -> Collection[str]:
         return "sh_base", "sh_rest"
@@ -48,7 +53,7 @@ class PaletteSh(Scheduled):
         )
         error = visible_error(run)
         better = partial(error.palette, rest, nearest=partial(most_alike, run.device)) if error.weights.any() else None
-        found = Harmonics.of(rest, options, error.weights, better)
+        found = Harmonics.of(rest, options, error.weights, better, self.step)
         gaussians.set("sh_rest", found.values)
         gaussians.set("sh_base", gaussians.get("sh_base") + error.base_change(rest - found.values))
         members.set_clusters(gaussians, found.labels, error.weights)

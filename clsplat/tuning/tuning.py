@@ -1,18 +1,20 @@
 """A model file trained further, from the photographs of its scene: stages of the recipe `compress`, as runs."""
 
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
-from clsplat.errors import Interrupted
+from clsplat.errors import ConfigError, Interrupted
 from clsplat.files import is_there
 from clsplat.gaussians.model import Model
 from clsplat.gaussians.run_model import MODEL
 from clsplat.opencl.device import Device
 from clsplat.pipeline.files import find
 from clsplat.pipeline.loading import Pipeline, checked
+from clsplat.pipeline.stretching import stretched
 from clsplat.pipeline.yaml_file import Document, read_yaml
 from clsplat.runs.folders import Start
 from clsplat.runs.found import changed, is_done_with
@@ -21,6 +23,7 @@ from clsplat.runs.source import Source
 from clsplat.training import checkpoint
 
 RECIPE, TRAINING = "compress", "optimize"
+LEAST = 20  # steps: each training of the recipe has some to average then
 
 
 @dataclass(frozen=True)
@@ -37,17 +40,14 @@ class Tuning:
         """Return stages of the recipe, in its order, and one that writes the model, with other values by place."""
         path = find(RECIPE)
         data = read_yaml(path).data
-        left = iter(data["stages"])
-        chosen = [next(stage for stage in left if _is(stage, name)) for name in stages]
-        document = Document({**data, "name": self.name, "stages": [*chosen, {"export": {"file": MODEL, **export}}]})
+        chosen = [*_chosen(data["stages"], stages), {"export": {"file": MODEL, **export}}]
+        document = Document({**data, "name": self.name, "stages": chosen})
         settings = {**self._scene(), **self._rendering(), **values}
-        if self.steps is not None:
-            first = next(stage for stage in data["stages"] if _is(stage, TRAINING))[TRAINING]["steps"]
-            for place, stage in enumerate(chosen):
-                if _is(stage, TRAINING):
-                    steps = max(1, round(self.steps * stage[TRAINING]["steps"] / first))
-                    settings |= {f"stages.{place}.steps": steps, f"stages.{place}.rates.means.over": steps}
-        return checked(path, document, [f"{place}={json.dumps(value)}" for place, value in settings.items()])
+        pipeline = checked(path, document, [f"{place}={json.dumps(value)}" for place, value in settings.items()])
+        if self.steps is None:
+            return pipeline
+        first = next(stage for stage in data["stages"] if _is(stage, TRAINING))[TRAINING]["steps"]
+        return replace(pipeline, settings=stretched(pipeline.settings, Fraction(self.steps, first)))
 
     def trained(self, pipeline: Pipeline, folder: Path, file: str = MODEL) -> Path:
         """Run a pipeline in a folder; return the file that it writes there.
@@ -85,6 +85,33 @@ class Tuning:
             "model.screen_filter": screen,
             **({"model.background": sky} if sky else {}),
         }
+
+
+def require_steps(steps: int) -> None:
+    """Raise ConfigError for fewer steps than the recipe can be stretched to."""
+    if steps < LEAST:
+        raise ConfigError(f"--steps {steps}: expected a number of at least {LEAST}")
+
+
+def _chosen(stages: Iterable[Any], names: Iterable[str]) -> list[Any]:
+    """The stages of a file that have these names, in order; their steps count from the first of them on."""
+    chosen, left, skipped = [], iter(stages), 0
+    for name in names:
+        while not _is(stage := next(left), name):
+            skipped += stage[TRAINING]["steps"] if _is(stage, TRAINING) else 0
+        chosen.append(_earlier(stage, skipped) if _is(stage, TRAINING) else stage)
+    return chosen
+
+
+def _earlier(training: Any, steps: int) -> Any:
+    """A training of a file so many steps earlier: cadences begin at steps of the whole run."""
+    keys = training[TRAINING]
+    during = [
+        {name: {**inner, **({"start": inner["start"] - steps} if "start" in inner else {})}}
+        for stage in keys.get("during", ())
+        for name, inner in stage.items()
+    ]
+    return {TRAINING: {**keys, "during": during}}
 
 
 def _is(stage: Any, name: str) -> bool:

@@ -1,0 +1,81 @@
+"""Tables in fewer values: the same Gaussians, on levels that a SOG holds, in fewer bytes."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from clsplat.conformance import reference as ref
+from clsplat.formats.packing import morton_order
+from clsplat.formats.palette import ENTRIES, codebook
+from clsplat.formats.sog_steps import LEVELS, rounded, rounded_means, rounded_opacities, rounded_quats
+from clsplat.formats.splats import opacities, unit
+from tests.formats.models import splats, there_and_back
+
+
+def covariances(quats, log_scales):
+    turns = np.stack([ref.rotation_matrix(quat) for quat in unit(quats)])
+    return np.einsum("nij,nj,nkj->nik", turns, np.exp(2.0 * log_scales), turns)
+
+
+def test_axes_of_other_names_are_the_same_gaussian_that_is_turned_less(rng):
+    quats, sizes = rng.normal(size=(2000, 4)), rng.normal(size=(2000, 3))
+    found, renamed = rounded_quats(quats, sizes, 1)
+    assert (np.argmax(np.abs(found), axis=1) == 0).all()
+    assert found[:, 0].min() > 0.84, "the farthest rotation from all that bring axes onto axes has 62.8 degrees"
+    np.testing.assert_array_equal(np.sort(renamed, axis=1), np.sort(sizes.astype(np.float32), axis=1))
+    expected = covariances(quats, sizes)
+    largest = np.abs(expected).max(axis=(1, 2))
+    assert (np.abs(covariances(found, renamed) - expected).max(axis=(1, 2)) < 0.02 * largest).all()
+
+
+def test_positions_stay_within_a_step_and_their_range_stays(rng):
+    means, sizes = rng.normal(size=(3000, 3)).astype(np.float32), rng.normal(-3, 0.5, (3000, 3)).astype(np.float32)
+    found = rounded_means(means, sizes, 0.25)
+    smaller = np.percentile(np.exp(sizes.mean(axis=1)), 25)
+    moved = np.abs(found - means).max()
+    assert smaller / 64 < moved < smaller
+    np.testing.assert_allclose(np.ptp(found, axis=0), np.ptp(means, axis=0), rtol=1e-6)
+    t = np.sign(found) * np.log1p(np.abs(found.astype(np.float64)))
+    levels = np.rint((t - t.min(axis=0)) / np.ptp(t, axis=0) * LEVELS).astype(int)
+    assert all(len(np.unique(column & 255)) <= 64 + 1 for column in levels.T)
+
+
+def test_positions_of_a_scene_without_extent_stay(rng):
+    means = np.full((5, 3), 2.5, np.float32)
+    np.testing.assert_allclose(rounded_means(means, np.zeros((5, 3)), 0.25), means, rtol=1e-6)
+
+
+@pytest.mark.parametrize("step", [1, 2, 16])
+def test_opacities_are_on_levels(step, rng):
+    logit = rng.normal(scale=6, size=(500, 1))
+    levels = 255 * opacities(rounded_opacities(logit, step))
+    np.testing.assert_allclose(levels, np.rint(levels), atol=1e-3)
+    assert set(np.rint(levels).ravel() % step) <= {0, 1, 255 % step}
+    assert np.abs(levels - 255 * opacities(logit)).max() <= max(step / 2, 1) + 1e-3
+
+
+def test_a_codebook_of_steps_where_they_suffice(rng):
+    values = rng.normal(size=5000)
+    entries = codebook(values, 0.1)
+    np.testing.assert_allclose(np.rint(entries / 0.1) * 0.1, entries)
+    np.testing.assert_array_equal(codebook(entries, 0.07), entries)
+    fine = codebook(values, 1e-4)
+    np.testing.assert_array_equal(fine, codebook(values))
+    assert len(fine) == ENTRIES
+
+
+def test_rounded_tables_are_written_as_they_are_in_fewer_bytes(tmp_path: Path, rng):
+    source = splats(rng, 1500, 0)
+    p = source.parameters
+    p["log_scales"] -= 2
+    there_and_back(tmp_path / "before.sog", source)
+    p["means"] = rounded_means(p["means"], p["log_scales"], 0.5)
+    p["quats"], p["log_scales"] = rounded_quats(p["quats"], p["log_scales"], 4)
+    p["log_scales"], p["sh_base"] = rounded(p["log_scales"], 0.1), rounded(p["sh_base"], 0.06)
+    p["logit_opacity"] = rounded_opacities(p["logit_opacity"], 2)
+    found = there_and_back(tmp_path / "after.sog", source)
+    expected = source.rows(morton_order(p["means"]))
+    for name in ("means", "quats", "log_scales", "logit_opacity", "sh_base"):
+        np.testing.assert_allclose(found.parameters[name], expected.parameters[name], rtol=1e-4, atol=1e-5)
+    assert (tmp_path / "after.sog").stat().st_size < 0.85 * (tmp_path / "before.sog").stat().st_size
