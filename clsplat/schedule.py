@@ -170,21 +170,24 @@ def divided(schedule: Schedule, factor: float) -> Schedule:
 
 
 class Bounded:
-    """Requires every value of a schedule to be at least `lowest`, or, where `above`, larger."""
+    """Requires every value of a schedule to be at least `lowest`, or, where `above`, larger; and at most `most`."""
 
-    def __init__(self, lowest: float, above: bool = False) -> None:
-        self.lowest, self.above = lowest, above
+    def __init__(self, lowest: float, above: bool = False, most: float = math.inf) -> None:
+        self.lowest, self.above, self.most = lowest, above, most
 
     def __call__(self, schedule: Any) -> Any:
         lowest = min(values_of(schedule))
         if lowest < self.lowest or (self.above and lowest == self.lowest):
             bound = "larger than" if self.above else "at least"
             raise ValueError(f"expected values {bound} {self.lowest:g}")
+        if max(values_of(schedule)) > self.most:
+            raise ValueError(f"expected values of at most {self.most:g}")
         return schedule
 
 
 NonNegative = Annotated[Schedule, AfterValidator(Bounded(0))]
 Positive = Annotated[Schedule, AfterValidator(Bounded(0, above=True))]
+Probability = Annotated[Schedule, AfterValidator(Bounded(0, most=0.9))]
 AtLeastOne = Annotated[Schedule, AfterValidator(Bounded(1))]
 
 

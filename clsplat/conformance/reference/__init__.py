@@ -33,6 +33,7 @@ from clsplat.conformance.reference.density import (
     PRUNE,
     SPLIT,
     adc_actions,
+    decayed_logit,
     mean_gradient,
     reset_logit,
     screen_gain,
@@ -82,7 +83,7 @@ from clsplat.conformance.reference.projection_backward import (
     project_backward,
     ratio_gradient,
 )
-from clsplat.conformance.reference.random import normal3, philox
+from clsplat.conformance.reference.random import dropped, normal3, philox
 from clsplat.conformance.reference.splitting import mean_jacobian, screen_splitting, splitting
 from clsplat.conformance.reference.world_filter import (
     filtered,
@@ -113,6 +114,8 @@ __all__ = [
     "coloured_backward",
     "contribution",
     "covariance_trace",
+    "decayed_logit",
+    "dropped",
     "dssim",
     "falloff_squares",
     "filtered",
