@@ -61,7 +61,8 @@ class Split:
 
 def _with_test(scene: Scene, test: set[int]) -> Scene:
     """The views of a scene, with its extent, where these are for testing."""
-    return make_scene(scene.path, list(scene.views), test, scene.points, scene.background)
+    divided = make_scene(scene.path, list(scene.views), test, scene.points, scene.background)
+    return replace(divided, tracks=scene.tracks)
 
 
 def _of(scene: Scene, choice: int | Choice, folders: Sequence[Path]) -> set[int]:

@@ -1,0 +1,136 @@
+"""Settings that follow from a measure of the photographs: what is measured, chosen, written, and overridden."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from clsplat.errors import ConfigError
+from clsplat.pipeline.choosing import choose, undone
+from clsplat.pipeline.loading import load
+from clsplat.runs.description import describe
+from clsplat.runs.found import has_ended
+from clsplat.runs.single import run_pipeline
+from clsplat.scene.capture import measured
+from clsplat.scene.detect import read_scene
+from clsplat.scene.scene import Tracks
+from tests.few_steps import FEW
+from tests.test_training import digest, train
+
+pytestmark = pytest.mark.slow
+
+DEGREE = "{key: model.sh_degree, by: photographs, values: [[0, 0], [8, 1], [24, 2]], since: few say little}"
+RESET = "{key: reset_opacity.stop, by: photographs, values: [[0, 1], [9, null]], since: they decay}"
+PATIENCE = "{key: optimize.patience, by: photographs, values: [[0, 4], [8, null]], since: many are enough}"
+KEEP = "{key: optimize.keep, by: photographs, values: [[0, best], [8, last]], since: many are enough}"
+FOLD = "{key: scene.validation, by: photographs, values: [[0, auto], [8, 0]], since: many are enough}"
+BOTH = f"choices=[{DEGREE}, {RESET}]"
+
+
+def test_the_last_row_that_a_measure_reaches_decides():
+    settings = load("smoke", [BOTH]).settings
+    for count, degree, stop in ((1, 0, 1), (7.9, 0, 1), (8, 1, 1), (23, 1, None), (500, 2, None)):
+        chosen = choose(settings, {"photographs": count})
+        reset = next(stage for stage in chosen.training.during if stage.stage == "reset_opacity")
+        assert (chosen.model.sh_degree, reset.stop) == (degree, stop)
+        assert [one.chosen for one in chosen.choices] == [degree, stop]
+        assert chosen.choices[0].instead_of == settings.model.sh_degree
+        assert chosen.choices[0].reason == f"{count:,.4g} training photographs; few say little"
+        assert undone(chosen) == settings
+        assert choose(chosen, {"photographs": 30}) == chosen, "a choice that is made stays"
+
+
+def test_without_the_measure_the_value_of_the_file_stays():
+    settings = load("smoke", [BOTH.replace("photographs", "points")]).settings
+    chosen = choose(settings, {"photographs": 3})
+    assert chosen.model == settings.model
+    assert chosen.choices[0].reason == "the dataset does not tell points"
+
+
+@pytest.mark.parametrize(
+    ("override", "left"),
+    [
+        ("model.sh_degree=2", ["reset_opacity.stop"]),
+        ("model={sh_degree: 2}", ["reset_opacity.stop"]),
+        ("stages.1.during.2.stop=7", ["model.sh_degree"]),
+        ("optimize.during=[checkpoint: {every: 5}, reset_opacity: {every: 9}]", ["model.sh_degree"]),
+        ("optimize.steps=7", ["model.sh_degree", "reset_opacity.stop"]),
+    ],
+)
+def test_an_override_takes_the_place_of_a_choice(tmp_path, override, left):
+    text = load("smoke", [BOTH]).text()
+    (tmp_path / "own.yaml").write_text(text)
+    names = [stage.stage for stage in load("smoke").settings.training.during]
+    override = override.replace("during.2", f"during.{names.index('reset_opacity')}")
+    if override.startswith("optimize.during"):
+        override = "optimize.during=[{stage: reset_opacity, every: 9}]"
+    assert [one.key for one in load(str(tmp_path / "own.yaml"), [override]).settings.choices] == left
+
+
+@pytest.mark.parametrize(
+    ("choices", "complaint"),
+    [
+        (DEGREE.replace("sh_degree", "sh_degre"), "sh_degre"),
+        (DEGREE.replace("[8, 1]", "[8, 9]"), "at 8 photographs: model.sh_degree: "),
+        (DEGREE.replace("[8, 1]", "[8, 1], [8, 2]"), "growing numbers"),
+        (DEGREE.replace("[0, 0]", "[1, 0]"), "the first one from 0"),
+        (DEGREE.replace("photographs", "moons"), "photographs_per_point"),
+        (f"{DEGREE}, {DEGREE}", "chosen twice"),
+        (
+            KEEP.replace("keep", "patience").replace("best", "4").replace("last", "null"),
+            "'patience' is for 'keep: best'",
+        ),
+        (DEGREE.replace("model.sh_degree", "scene.holdout"), "before photographs are measured"),
+    ],
+)
+def test_a_choice_that_cannot_be_made_is_refused_before_a_run(choices, complaint):
+    with pytest.raises(ConfigError, match=complaint):
+        load("smoke", [f"choices=[{choices}]"])
+
+
+def test_what_is_measured_of_a_scene(tiny_scene):
+    scene = read_scene(tiny_scene)
+    train_names = [view.name for view in scene.split("train")]
+    rows = {name: np.arange(i % 2 + 1) for i, name in enumerate(train_names)}  # point 0 in all, point 1 in each second
+    others = {view.name: np.array([0, 1, 2]) for view in scene.split("test")}
+    found = measured(replace(scene, tracks=Tracks(np.zeros((3, 3)), {**rows, **others})))
+    count = len(train_names)
+    assert found["photographs"] == count
+    assert found["pixels"] == 40 * 40
+    assert found["points"] == len(scene.points)
+    assert found["photographs_per_point"] == (count + count // 2) / 2, "of points that training photographs show"
+    sizes = measured(scene.downscaled(1, 2))
+    assert (sizes["photographs"], sizes["pixels"]) == (count, 1600), "each photograph counts once"
+    assert "photographs_per_point" not in sizes
+
+
+def test_a_run_writes_what_it_chose_and_repeats_without_choosing(tiny_scene, tmp_path):
+    asked = load("smoke", [f"scene.path='{tiny_scene}'", *FEW, BOTH])
+    run_pipeline(asked, tmp_path / "run", None, "new")
+    written = load(str(tmp_path / "run" / "pipeline.yaml"))
+    assert written.settings.model.sh_degree == 1
+    assert [one.chosen for one in written.settings.choices] == [1, 1]
+    assert "model.sh_degree: 1, since 8 training photographs; few say little" in (tmp_path / "run/log.txt").read_text()
+    assert has_ended(asked, tmp_path / "run"), "the same command finds it up to date"
+    plain = train(tiny_scene, tmp_path / "plain", *FEW, "model.sh_degree=1", "reset_opacity.stop=1")
+    assert digest(plain.out) == digest(tmp_path / "run")
+    run_pipeline(written, tmp_path / "again", None, "new")
+    assert digest(tmp_path / "again") == digest(tmp_path / "run")
+
+
+def test_a_description_tells_choices_and_reasons(tiny_scene, tmp_path):
+    asked = load("smoke", [f"scene.path='{tiny_scene}'", *FEW, BOTH])
+    text = describe(asked, tmp_path / "run", None, "new")
+    assert "model.sh_degree=1, since 8 training photographs; few say little" in text
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_choice_may_give_the_fold_back_to_the_training(tiny_scene, tmp_path):
+    (tmp_path / "own.yaml").write_text(load("smoke", ["scene.validation=auto", "optimize.keep=best"]).text())
+    settings = [f"scene.path='{tiny_scene}'", *FEW, f"choices=[{KEEP}, {FOLD}]"]
+    run_pipeline(load(str(tmp_path / "own.yaml"), settings), tmp_path / "run", None, "new")
+    assert digest(tmp_path / "run") == digest(train(tiny_scene, tmp_path / "plain", *FEW).out)
+    found = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert "validation" not in found
+    assert "kept" not in found
