@@ -9,6 +9,7 @@ import pytest
 from clsplat.errors import ConfigError
 from clsplat.pipeline.choosing import choose, undone
 from clsplat.pipeline.loading import load
+from clsplat.pipeline.stretching import in_steps
 from clsplat.runs.description import describe
 from clsplat.runs.found import has_ended
 from clsplat.runs.single import run_pipeline
@@ -87,6 +88,14 @@ def test_an_override_takes_the_place_of_a_choice(tmp_path, override, left):
 def test_a_choice_that_cannot_be_made_is_refused_before_a_run(choices, complaint):
     with pytest.raises(ConfigError, match=complaint):
         load("smoke", [f"choices=[{choices}]"])
+
+
+def test_in_fewer_steps_schedules_end_earlier_and_bounds_stay():
+    schedule = "{key: optimize.dropout, by: photographs, values: [[0, [[0, 0.0], [50, 0.2]]], [24, 0]], since: few}"
+    settings = load("smoke", [f"choices=[{schedule}, {RESET}]"]).settings
+    dropout, reset = in_steps(settings, settings.training.steps // 2).choices
+    assert dropout.values == [[0, [[0, 0.0], [25, 0.2]]], [24, 0]]
+    assert reset == settings.choices[1]
 
 
 def test_what_is_measured_of_a_scene(tiny_scene):
