@@ -4,8 +4,13 @@ A variant is a subclass with a name: the literal in its field `type`, or `stage`
 name it as soon as its class is defined, in the package or in a plug-in; there is no other list of variants.
 """
 
+import ast
+import functools
 import importlib
+import inspect
+import itertools
 import pkgutil
+import textwrap
 import typing
 from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeVar
@@ -30,9 +35,7 @@ Base = TypeVar("Base", bound="Settings")
 class Settings(BaseModel):
     """Base of all settings in pipeline files: unknown keys and wrong types are errors."""
 
-    model_config = ConfigDict(
-        frozen=True, extra="forbid", strict=True, allow_inf_nan=False, use_attribute_docstrings=True
-    )
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False, defer_build=True)
     defined: ClassVar[list[type["Settings"]]] = []  # every subclass, in the order of definition
     output_keys: ClassVar[frozenset[str]] = frozenset()  # the model does not depend on them: they may change on resume
     training_keys: ClassVar[frozenset[str]] = frozenset()  # they may change on resume; bits then no longer compare
@@ -42,6 +45,36 @@ class Settings(BaseModel):
     @classmethod
     def __pydantic_init_subclass__(cls, **options: Any) -> None:
         Settings.defined.append(cls)
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        found = handler(schema)
+        properties = handler.resolve_ref_schema(found).get("properties", {})
+        for name, text in descriptions(cls).items():
+            properties.get(name, {}).setdefault("description", text)
+        return found
+
+
+@functools.cache
+def descriptions(kind: type[BaseModel]) -> dict[str, str]:
+    """Return the docstrings of a class's fields, by name; none where its source cannot be read.
+
+    They are read from the source when they are asked for: for all classes at each start it would take a third of it.
+    """
+    found: dict[str, str] = {}
+    for base in reversed(kind.__mro__):
+        if not (issubclass(base, BaseModel) and base.__annotations__):
+            continue
+        try:
+            (tree,) = ast.parse(textwrap.dedent(inspect.getsource(base))).body
+        except (OSError, TypeError, SyntaxError):
+            continue
+        assert isinstance(tree, ast.ClassDef)
+        for field, below in itertools.pairwise(tree.body):
+            match field, below:
+                case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str(text))):
+                    found[name] = inspect.cleandoc(text)
+    return {name: text for name, text in found.items() if name in kind.model_fields}
 
 
 def tag_of(kind: type[Settings]) -> tuple[str, str] | None:
@@ -173,8 +206,9 @@ def import_modules(package: str, path: Iterable[str]) -> None:
 
 def rebuild() -> None:
     """Rebuild all models, so that their fields accept variants defined since, such as those of a plug-in."""
-    for kind in Settings.defined:  # a schema holds those of its variants, and theirs
+    complete = [kind for kind in Settings.defined if kind.__pydantic_complete__]  # others are built at their first use
+    for kind in complete:  # a schema holds those of its variants, and theirs
         if "__pydantic_core_schema__" in vars(kind):
             del kind.__pydantic_core_schema__
-    for kind in Settings.defined:
+    for kind in complete:
         kind.model_rebuild(force=True)

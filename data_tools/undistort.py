@@ -13,6 +13,7 @@ from clsplat.scene.detect import read_scene
 from clsplat.scene.exif import write_exposures
 from clsplat.scene.exposures import camera_exposures
 from clsplat.scene.images import write_image
+from clsplat.scene.lens import shared
 from clsplat.scene.scene import View
 from clsplat.scene.view import load_image, load_mask
 from data_tools.colmap_writer import write_model
@@ -61,7 +62,7 @@ def _source(view: View) -> str:
 def _shown(view: View, blank: Blank) -> View:
     if view.lens is None or blank == "crop":
         return view
-    lens = replace(view.lens, whole=True)
+    lens = shared(replace(view.lens, whole=True))
     return replace(view, lens=lens, camera=lens.pinhole)
 
 

@@ -17,7 +17,7 @@ import clsplat.pipeline.schema  # noqa: F401  (it imports all that a pipeline ca
 from clsplat.pipeline.file import PipelineFile
 from clsplat.pipeline.matrix import Matrix
 from clsplat.schedule import Curve, Decay, Every, Points
-from clsplat.settings import Settings
+from clsplat.settings import Settings, descriptions
 
 ROOT = Path(__file__).resolve().parents[1]
 Kind = type[Settings]
@@ -136,6 +136,6 @@ def undescribed() -> list[str]:
     return [
         f"{kind.__name__}.{name}"
         for kind in kinds
-        for name, field in kind.model_fields.items()
-        if name not in ("type", "stage") and not field.description
+        for name in kind.model_fields
+        if name not in ("type", "stage") and name not in descriptions(kind)
     ]

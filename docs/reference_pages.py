@@ -9,7 +9,7 @@ from yaml_examples import example
 
 from clsplat.scene.detect import readers
 from clsplat.schedule import Bounded
-from clsplat.settings import variants
+from clsplat.settings import descriptions, variants
 
 Node = dict[str, Any]
 HEADINGS = {
@@ -90,7 +90,7 @@ def readers_page() -> str:
 
 def key_table(kind: Kind, without: tuple[str, ...] = ()) -> str:
     """Return a table of the keys of a class, but those named in `without` that it has from its base."""
-    schema, rows = kind.model_json_schema(), ""
+    schema, texts, rows = kind.model_json_schema(), descriptions(kind), ""
     for name, field in kind.model_fields.items():
         if name in ("type", "stage") or (name in without and name not in kind.__annotations__):
             continue
@@ -100,7 +100,7 @@ def key_table(kind: Kind, without: tuple[str, ...] = ()) -> str:
         takes = expected(node)
         if bound:
             takes = takes.replace(BY_STEP, f"{BY_STEP} {'>' if bound.above else '≥'} {bound.lowest:g}")
-        cells = (f"`{name}`", takes, default, field.description or "")
+        cells = (f"`{name}`", takes, default, texts.get(name, ""))
         rows += "| " + " | ".join(" ".join(cell.split()).replace("|", "\\|") for cell in cells) + " |\n"
     return f"{TABLE}{rows}\n" if rows else ""
 

@@ -4,6 +4,7 @@ Kernel tests run on every device named in CLSPLAT_TEST_DEVICES (parts of names, 
 that clsplat would choose), each with the wide schedule at 16 and 8 lanes and with the simt schedule.
 """
 
+import functools
 import os
 import shutil
 import signal
@@ -18,6 +19,8 @@ import pytest
 
 from clsplat import plugins
 from clsplat.conformance import quick
+from clsplat.opencl import device as opencl_device
+from clsplat.opencl import program
 from clsplat.opencl.device import Array, Device
 from clsplat.opencl.discovery import DeviceInfo, choose
 from clsplat.opencl.program import Program
@@ -124,6 +127,15 @@ def held_buffers() -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Device, "empty", empty)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def built_once() -> Iterator[None]:
+    """Every device of a session has one context, with programs that are built once: opening one more costs little."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(opencl_device, "context_of", functools.cache(opencl_device.context_of))
+        patch.setattr(program, "built", functools.cache(program.built))
         yield
 
 

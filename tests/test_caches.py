@@ -205,6 +205,31 @@ def test_kernels_that_are_cut_off_are_removed_and_no_others(machine, caplog):
 
 
 @linux
+def test_kernels_are_looked_at_once_after_each_start_of_the_machine(machine, monkeypatch):
+    """Also where another folder is used than before."""
+    first, second = (machine / folder / kernel("", "empty") for folder in ("first", "second"))
+    start = {"now": "1"}
+    monkeypatch.setattr("clsplat.opencl.kernel_caches._start_of_the_machine", lambda: start["now"])
+
+    def cut(file: Path) -> bool:
+        """Whether a kernel that is cut off is found by a process that starts now."""
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.touch()
+        remove_cut_kernels.cache_clear()
+        remove_cut_kernels()
+        return not file.exists()
+
+    monkeypatch.setenv("POCL_CACHE_DIR", str(machine / "first"))
+    assert [cut(first), cut(first)] == [True, False]
+    monkeypatch.setenv("POCL_CACHE_DIR", str(machine / "second"))
+    assert [cut(second), cut(second)] == [True, False]
+    start["now"] = "2"
+    assert cut(second)
+    start["now"] = ""
+    assert [cut(second), cut(second)] == [True, True], "a system that does not tell its starts apart"
+
+
+@linux
 @pytest.mark.parametrize("page", [512, 65536])
 def test_a_database_that_is_cut_off_is_removed_but_not_one_that_is_written_now(page, machine):
     pytools = machine / "home" / ".cache" / "pytools"

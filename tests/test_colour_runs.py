@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from clsplat.compare.comparison import Comparison
+from clsplat.compare.tables import main_table
 from clsplat.errors import DataError
 from clsplat.pipeline.choices import without_choices
 from clsplat.pipeline.loading import load
@@ -66,9 +68,19 @@ def test_the_table_lies_beside_the_model_and_figures_beside_psnr(with_gains, few
         assert luminance == pytest.approx(row["exposure"])
     measured = json.loads((with_gains / "metrics.json").read_text())["test"]["1"]
     assert {"psnr_colour", "psnr_affine"} < measured.keys()
+    pages = [(out / "report.html").read_text() for out in (with_gains, few_steps)]
+    assert [f"{measured['psnr_colour']:.2f} dB" in page and "colours fitted" in page for page in pages] == [True, False]
     assert "view_colours.json" in json.loads((with_gains / "checksums.json").read_text())
     assert not (few_steps / "view_colours.json").exists()
     assert "psnr_colour" not in json.loads((few_steps / "metrics.json").read_text())["test"]["1"]
+
+
+def test_a_comparison_has_a_column_for_them(with_gains, few_steps):
+    tables = [
+        main_table(next(iter(Comparison.read(folders).scenes.values()))) for folders in ([with_gains], [few_steps])
+    ]
+    headings = [[column.heading for group in table.groups for column in group.columns] for table in tables]
+    assert ["PSNR, colours fitted ↑" in found for found in headings] == [True, False]
 
 
 def test_a_run_folder_is_measured_in_the_photographs_colours_too(with_gains, few_steps, tmp_path):

@@ -3,11 +3,13 @@
 import json
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
 from clsplat.errors import DataError
-from clsplat.scene.lens import MODELS, Lens
+from clsplat.scene import lens as lens_room
+from clsplat.scene.lens import MAX_ROUNDS, MODELS, Lens, shared
 from tests.data_sets import data_set
 
 STRONG = Lens(200, 150, "OPENCV", (160.0, 165.0, 97.0, 80.0, -0.25, 0.06, 0.002, -0.001))
@@ -25,6 +27,37 @@ def test_every_model_projects_as_colmap_does():
         assert error < (0.02 if name == "FOV_fitted" else 1e-9), name
         back = np.stack(lens.undistort(*pixels.T), axis=1)
         np.testing.assert_allclose(back, case["normalized_back"], atol=1e-8, err_msg=name)
+
+
+@pytest.mark.parametrize("lens", [STRONG, FISHEYE])
+def test_pixels_that_settled_have_the_bits_of_all_rounds(lens):
+    """Beyond the photograph some never settle, and some become infinite."""
+    x, y = np.meshgrid(np.linspace(-40, lens.width + 40, 97), np.linspace(-40, lens.height + 40, 71))
+    fx, fy, cx, cy, rest = lens._split
+    goal = np.stack([(x.ravel() - cx) / fx, (y.ravel() - cy) / fy])
+    found = goal
+    with np.errstate(all="ignore"):
+        for _ in range(MAX_ROUNDS):
+            found = lens_room._nearer(MODELS[lens.model][1], rest, found, goal)
+    u, v = (one.ravel() for one in lens.undistort(x, y))
+    good = np.isfinite(u)
+    assert good.mean() > 0.5
+    assert np.stack([u, v])[:, good].tobytes() == found[:, good].tobytes()
+
+
+def test_photographs_of_one_camera_share_one_map(monkeypatch):
+    drawn: list[np.ndarray] = []
+    computed: list[int] = []
+    remap, distort = cv2.remap, Lens.distort
+    monkeypatch.setattr(lens_room.cv2, "remap", lambda *a, **k: (drawn.append(a[1]), remap(*a, **k))[1])
+    monkeypatch.setattr(Lens, "distort", lambda self, u, v: (computed.append(u.size), distort(self, u, v))[1])
+    photograph = np.zeros((STRONG.height, STRONG.width, 3), np.uint8)
+    for _ in range(3):
+        one = shared(replace(STRONG, params=(161.0, *STRONG.params[1:]), whole=True))  # a lens of this test alone
+        one.undistort_image(photograph)
+        assert one.shown.any()
+    assert drawn[0] is drawn[1] is drawn[2]
+    assert len(computed) == 2  # the map, and the pixels that are shown
 
 
 @pytest.mark.parametrize("lens", [STRONG, FISHEYE])

@@ -11,6 +11,8 @@ from clsplat.pages.page import duration
 
 METRICS = {  # name -> heading, digits, function that returns the better one
     "psnr": ("PSNR ↑", 2, max),
+    "psnr_colour": ("PSNR in the photographs' colours ↑", 2, max),
+    "psnr_affine": ("PSNR, colours fitted ↑", 2, max),
     "ssim": ("SSIM ↑", 4, max),
     "ms_ssim": ("MS-SSIM ↑", 4, max),
     "flip": ("FLIP ↓", 4, min),

@@ -3,9 +3,9 @@
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 from pydantic import Field
-from scipy.special import comb
 
 from clsplat.density.edit import Edit, Rule
 from clsplat.schedule import Positive
@@ -75,5 +75,5 @@ def divided(
     Together they have the opacity of one at its centre, and its integral along a line.
     """
     new = np.clip(1 - (1 - opacity) ** (1 / rows), lowest, 1 - 1e-6)
-    series = sum(comb(rows, j) * (-1.0) ** (j - 1) * new**j / np.sqrt(j) for j in range(1, MOST + 1))
+    series = sum(scipy.special.comb(rows, j) * (-1.0) ** (j - 1) * new**j / np.sqrt(j) for j in range(1, MOST + 1))
     return new, opacity / series

@@ -4,9 +4,9 @@ Mallick et al. 2024)."""
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 from pydantic import Field
-from scipy.ndimage import laplace
 
 from clsplat.density.edit import Edit, Rule
 from clsplat.density.sampling import SampledPruning, drawn_order
@@ -25,7 +25,7 @@ def by_median(values: NDArray[np.floating]) -> Floats:
 def pixel_weights(look: Look) -> Floats:
     """Return the error of a view's pixels and the edges of its photograph, each from 0 to 1, added, [height, width]."""
     counted = look.counted()
-    edges = np.abs(laplace(look.photograph.image().mean(axis=2), mode="nearest"))
+    edges = np.abs(scipy.ndimage.laplace(look.photograph.image().mean(axis=2), mode="nearest"))
     return scaled(look.error().astype(np.float64), counted) + scaled(edges, counted)
 
 

@@ -4,8 +4,8 @@
 from typing import ClassVar, Literal
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from clsplat.density.edit import Edit, Rule
 from clsplat.density.mixture import mass_of, merged
@@ -74,7 +74,7 @@ class MergeNeighbours(Rule):
         if len(means) < 2 or not np.isfinite(means).all():  # the next report ends the training
             return np.empty(0, np.int64), np.empty(0, np.int64)
         rows = np.arange(len(means))
-        distances, found = cKDTree(means).query(means, k=2)
+        distances, found = scipy.spatial.cKDTree(means).query(means, k=2)
         other = np.where(found[:, 0] == rows, 1, 0)  # of two in one place, the row itself may come second
         distance, nearest = distances[rows, other], found[rows, other]
         mutual = (nearest[nearest] == rows) & (rows < nearest)

@@ -7,8 +7,8 @@ from types import ModuleType
 from typing import Any, Literal, get_args
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.ndimage import correlate1d
 
 from clsplat.errors import ConfigError
 from clsplat.metrics.lpips import InputRange, Lpips
@@ -130,8 +130,8 @@ def _ssim_factors(x: Floats, y: Floats) -> tuple[Floats, Floats]:
 def _window_mean(image: Floats) -> Floats:
     taps = np.exp(-(np.arange(-RADIUS, RADIUS + 1) ** 2) / (2 * SIGMA**2))
     taps /= taps.sum()
-    rows = correlate1d(image, taps, axis=0)[RADIUS:-RADIUS]
-    return np.asarray(correlate1d(rows, taps, axis=1)[:, RADIUS:-RADIUS])
+    rows = scipy.ndimage.correlate1d(image, taps, axis=0)[RADIUS:-RADIUS]
+    return np.asarray(scipy.ndimage.correlate1d(rows, taps, axis=1)[:, RADIUS:-RADIUS])
 
 
 def flip(image: Image, photograph: Image) -> float:

@@ -111,7 +111,7 @@ class Device:
         remove_cut_kernels()
         timed = cl.command_queue_properties.PROFILING_ENABLE
         with self.refusals("opening it"):
-            self.context = cl.Context([platforms()[platform].get_devices()[number]])
+            self.context = context_of(platforms()[platform].get_devices()[number])
             self._queues = {False: cl.CommandQueue(self.context), True: cl.CommandQueue(self.context, properties=timed)}
         self._sampling = False  # whether the timed queue is in use: it costs the host
         self.schedule = resolve_schedule(info, schedule)
@@ -211,6 +211,11 @@ class Device:
     def refusals(self, what: str) -> AbstractContextManager[None]:
         """Convert what the runtime refuses in a block, in which `what` is done."""
         return refusals(what, self.info.name)
+
+
+def context_of(device: Any) -> Any:
+    """Return a new context of a device of the runtime."""
+    return cl.Context([device])
 
 
 def open_device(device: str | Device | None = None, schedule: Schedule = "auto") -> Device:

@@ -14,8 +14,10 @@ from pathlib import Path
 
 import platformdirs
 
-from clsplat.caches import LIBRARIES, named_by_user
-from clsplat.reading import regular
+from clsplat.caches import LIBRARIES, cache_folder, named_by_user
+from clsplat.errors import DataError, OutputError
+from clsplat.files import write_text
+from clsplat.reading import read_text, regular
 
 LOG = logging.getLogger("clsplat")
 SQLITE, SQLITE_HEADER = b"SQLite format 3\0", 100  # bytes
@@ -39,7 +41,14 @@ def damaged_kernels() -> str:
 
 @cache
 def remove_cut_kernels() -> None:
-    """Remove, once in a process, what a loss of power has cut off: PoCL loads such kernels and ends the process."""
+    """Remove what a loss of power has cut off: PoCL loads such kernels and ends the process.
+
+    Once after each start of the machine, where the system tells one from another; else once in a process.
+    """
+    now, before = f"{_start_of_the_machine()}\n{kernel_caches()}", cache_folder() / "kernels_checked"
+    with suppress(DataError):
+        if not now.startswith("\n") and read_text(before) == now:
+            return
     _, pytools, pocl = _kernel_folders()
     cut = [file for file in _kernels_of_pocl(pocl) if _is_cut(file)]
     cut += [file for file in pytools.glob("pdict-*pyopencl*.sqlite") if not _is_database(file)]
@@ -48,6 +57,15 @@ def remove_cut_kernels() -> None:
             file.unlink()
     if cut:
         LOG.warning("%d files of built kernels are cut off (%s); they are removed, and made again", len(cut), cut[0])
+    with suppress(OutputError):
+        write_text(before, now)
+
+
+def _start_of_the_machine() -> str:
+    """What Linux names each start of the machine by; '' elsewhere."""
+    with suppress(OSError):
+        return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+    return ""
 
 
 def _kernels_of_pocl(folder: Path) -> list[Path]:

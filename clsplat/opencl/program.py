@@ -193,7 +193,7 @@ class Program:
         source = flatten(path)
         options = [*self.options, *(f"-D{name}={value}" for name, value in sorted(defines.items()))]
         try:
-            program = cl.Program(device.context, source).build(options)
+            program = built(device.context, source, tuple(options))
         except cl.Error as error:
             raise KernelError(
                 f"{file} does not build on {device.text} with {' '.join(options)}: {_first_error(error)}"
@@ -221,6 +221,11 @@ class Program:
         if name not in kernels:
             raise AttributeError(f"no kernel named '{name}'")
         return kernels[name]
+
+
+def built(context: Any, source: str, options: tuple[str, ...]) -> Any:
+    """Return a program that is built for a context."""
+    return cl.Program(context, source).build(list(options))
 
 
 def _first_error(error: Exception) -> str:

@@ -10,6 +10,7 @@ from pydantic import BaseModel
 from clsplat.errors import ConfigError
 from clsplat.pipeline.overrides import NOT_SETTABLE
 from clsplat.pipeline.yaml_file import parse_value
+from clsplat.settings import descriptions
 
 CADENCE = ("every", "start", "stop")  # keys of stages inside `during` only
 
@@ -36,7 +37,7 @@ def settable(settings: BaseModel) -> list[Key]:
 def _keys(model: BaseModel, prefix: str, addresses: dict[int, str]) -> Iterator[Key]:
     plain = model.model_dump(mode="json")
     outside = hasattr(model, "every") and model.every is None
-    fields = type(model).model_fields
+    fields, texts = type(model).model_fields, descriptions(type(model))
     for name in sorted(fields, key=lambda name: name != "type"):
         value = getattr(model, name)
         if name in ("stage", *NOT_SETTABLE) or (outside and name in CADENCE):
@@ -48,7 +49,7 @@ def _keys(model: BaseModel, prefix: str, addresses: dict[int, str]) -> Iterator[
             for i, item in enumerate(items):
                 yield from _keys(item, addresses.get(id(item), f"{prefix}{name}.{i}") + ".", addresses)
         else:
-            yield Key(prefix + name, plain[name], fields[name].description or "")
+            yield Key(prefix + name, plain[name], texts.get(name, ""))
 
 
 def _addresses(settings: BaseModel) -> dict[int, str]:

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.ndimage import binary_erosion
 
 from clsplat.scene.scene import PointCloud, View
 
@@ -95,7 +95,9 @@ def hull_points(
             break
     inside, _ = _within(silhouettes, _centres(cells, centre, half_side, number)[0], 0)
     full[tuple(cells[inside].T)] = True
-    points, side = _centres(np.argwhere(full & ~binary_erosion(full, border_value=1)), centre, half_side, number)
+    points, side = _centres(
+        np.argwhere(full & ~scipy.ndimage.binary_erosion(full, border_value=1)), centre, half_side, number
+    )
     colours, seen = _colours(silhouettes, points, side)
     points, colours = points[seen], colours[seen]
     chosen = np.sort(np.random.default_rng([seed, count]).permutation(len(points))[:count])

@@ -123,21 +123,18 @@ class Lens:
         """Return the normalised coordinates of pixels, by Newton's method; NaN where it does not converge."""
         fx, fy, cx, cy, rest = self._split
         distortion = MODELS[self.model][1]
-        goal_u, goal_v = (x - cx) / fx, (y - cy) / fy
-        u, v = goal_u.copy(), goal_v.copy()
-        step = 1e-7
+        goal = np.stack([(x.ravel() - cx) / fx, (y.ravel() - cy) / fy])
+        found, moving = goal.copy(), np.arange(x.size)
         with np.errstate(all="ignore"):
             for _ in range(MAX_ROUNDS):
-                a, b = distortion(u, v, rest)
-                au, bu = distortion(u + step, v, rest)
-                av, bv = distortion(u, v + step, rest)
-                j00, j10, j01, j11 = (au - a) / step, (bu - b) / step, (av - a) / step, (bv - b) / step
-                det = j00 * j11 - j01 * j10
-                da, db = goal_u - a, goal_v - b
-                u, v = u + (j11 * da - j01 * db) / det, v + (j00 * db - j10 * da) / det
-            a, b = distortion(u, v, rest)
-            good = (np.abs(a - goal_u) < MAX_ERROR) & (np.abs(b - goal_v) < MAX_ERROR)
-        return np.where(good, u, np.nan), np.where(good, v, np.nan)
+                before = found[:, moving]
+                found[:, moving] = after = _nearer(distortion, rest, before, goal[:, moving])
+                moving = moving[(before.view(np.int64) != after.view(np.int64)).any(axis=0)]  # the others stay for ever
+                if not moving.size:
+                    break
+            error = np.abs(np.stack(distortion(found[0], found[1], rest)) - goal)
+            u, v = np.where((error < MAX_ERROR).all(axis=0), found, np.nan)
+        return u.reshape(x.shape), v.reshape(x.shape)
 
     @property
     def camera(self) -> Camera:
@@ -178,9 +175,7 @@ class Lens:
     def undistort_image(self, pixels: NDArray[Any]) -> NDArray[Any]:
         """Return the undistorted photograph, as `pinhole` sees it, [H, W, C] of the same type."""
         camera = self.pinhole
-        x, y = self.distort(*_rays(camera))
-        maps = (x - 0.5).astype(np.float32), (y - 0.5).astype(np.float32)  # OpenCV's pixels have whole centres
-        undistorted = cv2.remap(pixels, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        undistorted = cv2.remap(pixels, *_maps(self), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return undistorted.reshape(camera.height, camera.width, -1)
 
     @cached_property
@@ -202,7 +197,26 @@ def _rays(camera: Camera) -> tuple[Floats, Floats]:
     return u, v
 
 
+def _nearer(distortion: Distortion, k: Sequence[float], point: Floats, goal: Floats) -> Floats:
+    """One step of Newton's method towards the points [2, M] that are distorted to `goal`."""
+    step, (u, v) = 1e-7, point
+    a, b = distortion(u, v, k)
+    au, bu = distortion(u + step, v, k)
+    av, bv = distortion(u, v + step, k)
+    j00, j10, j01, j11 = (au - a) / step, (bu - b) / step, (av - a) / step, (bv - b) / step
+    det = j00 * j11 - j01 * j10
+    da, db = goal[0] - a, goal[1] - b
+    return np.stack([u + (j11 * da - j01 * db) / det, v + (j00 * db - j10 * da) / det])
+
+
+@lru_cache(maxsize=2)  # of a phone held upright and across; each has 8 bytes a pixel
+def _maps(lens: Lens) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Where in the photograph the pixels of `pinhole` lie, [H, W] each; OpenCV's pixels have whole centres."""
+    x, y = lens.distort(*_rays(lens.pinhole))
+    return (x - 0.5).astype(np.float32), (y - 0.5).astype(np.float32)
+
+
 @lru_cache(maxsize=64)
 def shared(lens: Lens) -> Lens:
-    """Return the first lens that equals this one, so that views share its `pinhole`, which is slow to compute."""
+    """Return the first lens that equals this one, so that views share what is slow to compute: `pinhole`, `shown`."""
     return lens

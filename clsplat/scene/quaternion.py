@@ -4,8 +4,8 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
 from clsplat.errors import quoted
 from clsplat.scene.points import MAX_VALUE
@@ -26,7 +26,7 @@ def rotation_matrix(w: ArrayLike, x: ArrayLike, y: ArrayLike, z: ArrayLike) -> F
 
 def unit_quaternions(rotations: NDArray[np.floating]) -> Floats:
     """Return the unit quaternions [..., 4] of rotation matrices [..., 3, 3]."""
-    quaternions: Floats = np.roll(Rotation.from_matrix(rotations).as_quat(), 1, axis=-1)
+    quaternions: Floats = np.roll(scipy.spatial.transform.Rotation.from_matrix(rotations).as_quat(), 1, axis=-1)
     return quaternions
 
 

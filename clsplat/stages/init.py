@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 from pydantic import Field
-from scipy.spatial import cKDTree
 
 from clsplat.errors import ConfigError, DataError
 from clsplat.formats.splats import Parameters, with_degree
@@ -201,7 +201,7 @@ def neighbour_distance2(positions: NDArray[np.floating]) -> NDArray[np.float64]:
     neighbours = min(4, len(positions))
     if neighbours < 2:
         return np.full(len(positions), 1.0)
-    distance = cKDTree(positions).query(positions, k=neighbours, workers=-1)[0]
+    distance = scipy.spatial.cKDTree(positions).query(positions, k=neighbours, workers=-1)[0]
     squared: NDArray[np.float64] = np.square(distance[:, 1:]).mean(axis=1)
     return np.maximum(squared, MIN_DISTANCE2)
 

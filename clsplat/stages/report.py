@@ -22,6 +22,7 @@ from clsplat.training.found import photographs_text
 from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
+COLOURS = {"psnr_colour": "in the photographs' colours", "psnr_affine": "with colours fitted"}  # metrics/colours.py
 
 
 class Report(Stage):
@@ -80,6 +81,9 @@ def _figures(run: Run) -> dict[str, str]:
         for downscale, averages in by_downscale.items():
             suffix = "" if downscale == f"{run.downscale:g}" else f" at 1/{downscale}"
             values[f"{split} PSNR{suffix} ({amount(averages['views'], 'view')})"] = f"{averages['psnr']:.2f} dB"
+            for key, name in COLOURS.items():
+                if averages.get(key) is not None:
+                    values[f"{split} PSNR {name}{suffix}"] = f"{averages[key]:.2f} dB"
             values[f"{split} SSIM{suffix}"] = f"{averages['ssim']:.4f}"
     if run.is_refit and run.best:
         found = run.best.found

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
+import scipy
 
 from clsplat.cameras import inria
 from clsplat.cameras.lost import centre_lost, width_lost
@@ -120,7 +120,9 @@ def spread(views: Sequence[View], frames: int) -> list[View]:
         return [View(f"frame_{i:05d}", views[0].camera, views[0].world_to_camera) for i in range(1, frames + 1)]
     places = np.linspace(0, len(views) - 1, frames)
     poses = np.stack([view.world_to_camera for view in views])
-    turns = Slerp(np.arange(len(views)), Rotation.from_matrix(poses[:, :, :3]))(places).as_matrix()
+    turns = scipy.spatial.transform.Slerp(
+        np.arange(len(views)), scipy.spatial.transform.Rotation.from_matrix(poses[:, :, :3])
+    )(places).as_matrix()
     lenses = np.array([[c.fx, c.fy, c.cx, c.cy] for c in (view.camera for view in views)])
     centres, lenses = (
         np.stack([np.interp(places, np.arange(len(views)), column) for column in columns.T], axis=1)

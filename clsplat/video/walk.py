@@ -1,9 +1,8 @@
 """A walk through the views of a scene: their order, and a smooth curve along them."""
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.interpolate import splev, splprep
-from scipy.spatial.distance import cdist
 
 from clsplat.video.rig import Floats, Rig
 
@@ -21,7 +20,7 @@ def order(rig: Rig) -> Indices:
     places = np.hstack([rig.positions / spread, rig.forwards])
     by_name = np.array(sorted(range(len(rig.views)), key=lambda i: rig.views[i].name))
     by_name = by_name[:: -(-len(by_name) // MOST_VIEWS)]
-    between = cdist(places[by_name], places[by_name])
+    between = scipy.spatial.distance.cdist(places[by_name], places[by_name])
     ways = np.arange(len(by_name)), _shortened(_neighbours(between), between)
     return np.asarray(by_name[min(ways, key=lambda way: _length(between, way))])
 
@@ -39,8 +38,10 @@ def smooth(places: Floats, frames: int, distance: float) -> Floats:
     if len(scaled) == 1:
         return np.repeat(places[:1], frames, axis=0)
     loose = len(scaled) * (LOOSENESS * float(np.median(steps[kept[1:]]))) ** 2
-    curve, _ = splprep(scaled.T, k=min(DEGREE, len(scaled) - 1), s=loose if len(scaled) > DEGREE else 0)
-    return np.asarray(np.stack(splev(np.linspace(0, 1, frames), curve), axis=1) / weights)
+    curve, _ = scipy.interpolate.splprep(
+        scaled.T, k=min(DEGREE, len(scaled) - 1), s=loose if len(scaled) > DEGREE else 0
+    )
+    return np.asarray(np.stack(scipy.interpolate.splev(np.linspace(0, 1, frames), curve), axis=1) / weights)
 
 
 def _neighbours(between: Floats) -> Indices:

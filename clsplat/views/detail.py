@@ -7,9 +7,9 @@ from collections.abc import Iterable, Sequence
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 from pydantic import Field
-from scipy import fft
 
 from clsplat.schedule import Points
 from clsplat.settings import Settings
@@ -32,8 +32,8 @@ class Spectrum:
     def of(cls, image: NDArray[np.uint8]) -> "Spectrum":
         """Return the spectrum of an image, [height, width, 3]."""
         height, width = image.shape[:2]
-        amplitudes = np.abs(fft.rfft2(image.astype(np.float32), axes=(1, 0))).sum(axis=2, dtype=np.float64)
-        down, right = (np.abs(fft.fftfreq(size)) * 2 for size in (height, width))
+        amplitudes = np.abs(scipy.fft.rfft2(image.astype(np.float32), axes=(1, 0))).sum(axis=2, dtype=np.float64)
+        down, right = (np.abs(scipy.fft.fftfreq(size)) * 2 for size in (height, width))
         down = down[: height // 2 + 1]
         twice = np.where((down == 0) | (down == 1), 1, 2)  # the transform of a real image has only one of a pair
         bound = np.maximum(down[:, None], right[None, :])

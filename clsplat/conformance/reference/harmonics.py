@@ -36,8 +36,11 @@ def _harmonics(x: NDArray[Any], y: NDArray[Any], z: NDArray[Any]) -> list[tuple[
 def _harmonic_table(directions: NDArray[Any], degree: int) -> NDArray[Any]:
     """Value and gradient of the first (degree+1)² harmonics: [..., K, 4]."""
     x, y, z = np.moveaxis(np.asarray(directions, np.float64), -1, 0)
-    rows = _harmonics(x, y, z)[: (degree + 1) ** 2]
-    return np.stack([np.stack([entry + np.zeros_like(x) for entry in row], axis=-1) for row in rows], axis=-2)
+    table = np.empty((*x.shape, (degree + 1) ** 2, 4))
+    for k, row in enumerate(_harmonics(x, y, z)[: (degree + 1) ** 2]):
+        for i, entry in enumerate(row):
+            table[..., k, i] = entry
+    return table
 
 
 def sh_basis(directions: NDArray[Any], degree: int) -> NDArray[Any]:

@@ -19,12 +19,14 @@ STEP = 1e-5  # of finite differences, px or px², by the size of what changes
 
 def cdf(x: Floats) -> Floats:
     x = np.clip(x, -REACH, REACH)
-    return 1 / (1 + np.exp(-x * (SLOPE + CUBIC * x**2 + QUINTIC * x**4)))
+    square = x * x
+    return 1 / (1 + np.exp(-x * (SLOPE + square * (CUBIC + square * QUINTIC))))
 
 
 def density(x: Floats) -> Floats:
     x = np.clip(x, -REACH, REACH)
-    return cdf(x) * (1 - cdf(x)) * (SLOPE + 3 * CUBIC * x**2 + 5 * QUINTIC * x**4)
+    square, share = x * x, cdf(x)
+    return share * (1 - share) * (SLOPE + square * (3 * CUBIC + square * (5 * QUINTIC)))
 
 
 def moments(dy: Floats, s: float) -> tuple[Floats, Floats, Floats]:
