@@ -16,16 +16,19 @@ from clsplat.runs.single import run_pipeline
 from clsplat.scene.capture import measured
 from clsplat.scene.detect import read_scene
 from clsplat.scene.scene import Tracks
+from clsplat.schedule import at_step
 from tests.few_steps import FEW
 from tests.test_training import digest, train
 
 pytestmark = pytest.mark.slow
 
-DEGREE = "{key: model.sh_degree, by: photographs, values: [[0, 0], [8, 1], [24, 2]], since: few say little}"
-RESET = "{key: reset_opacity.stop, by: photographs, values: [[0, 1], [9, null]], since: they decay}"
-PATIENCE = "{key: optimize.patience, by: photographs, values: [[0, 4], [8, null]], since: many are enough}"
-KEEP = "{key: optimize.keep, by: photographs, values: [[0, best], [8, last]], since: many are enough}"
-FOLD = "{key: scene.validation, by: photographs, values: [[0, auto], [8, 0]], since: many are enough}"
+DEGREE = "{keys: [model.sh_degree], by: photographs, values: [[0, 0], [8, 1], [24, 2]], since: few say little}"
+RESET = "{keys: [reset_opacity.stop], by: photographs, values: [[0, 1], [9, null]], since: they decay}"
+PATIENCE = "{keys: [optimize.patience], by: photographs, values: [[0, 4], [8, null]], since: many are enough}"
+KEEP = (
+    "{keys: [scene.validation, optimize.keep, optimize.patience], by: photographs, "
+    "values: [[0, 0, last, null], [8, auto, best, 2], [9, 0, last, null]], since: few are learnt by heart}"
+)
 BOTH = f"choices=[{DEGREE}, {RESET}]"
 
 
@@ -35,8 +38,8 @@ def test_the_last_row_that_a_measure_reaches_decides():
         chosen = choose(settings, {"photographs": count})
         reset = next(stage for stage in chosen.training.during if stage.stage == "reset_opacity")
         assert (chosen.model.sh_degree, reset.stop) == (degree, stop)
-        assert [one.chosen for one in chosen.choices] == [degree, stop]
-        assert chosen.choices[0].instead_of == settings.model.sh_degree
+        assert [one.chosen for one in chosen.choices] == [[degree], [stop]]
+        assert chosen.choices[0].instead_of == [settings.model.sh_degree]
         assert chosen.choices[0].reason == f"{count:,.4g} training photographs; few say little"
         assert undone(chosen) == settings
         assert choose(chosen, {"photographs": 30}) == chosen, "a choice that is made stays"
@@ -66,7 +69,9 @@ def test_an_override_takes_the_place_of_a_choice(tmp_path, override, left):
     override = override.replace("during.2", f"during.{names.index('reset_opacity')}")
     if override.startswith("optimize.during"):
         override = "optimize.during=[{stage: reset_opacity, every: 9}]"
-    assert [one.key for one in load(str(tmp_path / "own.yaml"), [override]).settings.choices] == left
+    assert [one.keys for one in load(str(tmp_path / "own.yaml"), [override]).settings.choices] == [
+        [key] for key in left
+    ]
 
 
 @pytest.mark.parametrize(
@@ -78,10 +83,7 @@ def test_an_override_takes_the_place_of_a_choice(tmp_path, override, left):
         (DEGREE.replace("[0, 0]", "[1, 0]"), "the first one from 0"),
         (DEGREE.replace("photographs", "moons"), "photographs_per_point"),
         (f"{DEGREE}, {DEGREE}", "chosen twice"),
-        (
-            KEEP.replace("keep", "patience").replace("best", "4").replace("last", "null"),
-            "'patience' is for 'keep: best'",
-        ),
+        (DEGREE.replace("model.sh_degree", "optimize.patience"), "'patience' is for 'keep: best'"),
         (DEGREE.replace("model.sh_degree", "scene.holdout"), "before photographs are measured"),
     ],
 )
@@ -91,7 +93,7 @@ def test_a_choice_that_cannot_be_made_is_refused_before_a_run(choices, complaint
 
 
 def test_in_fewer_steps_schedules_end_earlier_and_bounds_stay():
-    schedule = "{key: optimize.dropout, by: photographs, values: [[0, [[0, 0.0], [50, 0.2]]], [24, 0]], since: few}"
+    schedule = "{keys: [optimize.dropout], by: photographs, values: [[0, [[0, 0.0], [50, 0.2]]], [24, 0]], since: few}"
     settings = load("smoke", [f"choices=[{schedule}, {RESET}]"]).settings
     dropout, reset = in_steps(settings, settings.training.steps // 2).choices
     assert dropout.values == [[0, [[0, 0.0], [25, 0.2]]], [24, 0]]
@@ -119,8 +121,8 @@ def test_a_run_writes_what_it_chose_and_repeats_without_choosing(tiny_scene, tmp
     run_pipeline(asked, tmp_path / "run", None, "new")
     written = load(str(tmp_path / "run" / "pipeline.yaml"))
     assert written.settings.model.sh_degree == 1
-    assert [one.chosen for one in written.settings.choices] == [1, 1]
-    assert "model.sh_degree: 1, since 8 training photographs; few say little" in (tmp_path / "run/log.txt").read_text()
+    assert [one.chosen for one in written.settings.choices] == [[1], [1]]
+    assert "model.sh_degree=1, since 8 training photographs; few say little" in (tmp_path / "run/log.txt").read_text()
     assert has_ended(asked, tmp_path / "run"), "the same command finds it up to date"
     plain = train(tiny_scene, tmp_path / "plain", *FEW, "model.sh_degree=1", "reset_opacity.stop=1")
     assert digest(plain.out) == digest(tmp_path / "run")
@@ -135,11 +137,33 @@ def test_a_description_tells_choices_and_reasons(tiny_scene, tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-def test_a_choice_may_give_the_fold_back_to_the_training(tiny_scene, tmp_path):
-    (tmp_path / "own.yaml").write_text(load("smoke", ["scene.validation=auto", "optimize.keep=best"]).text())
-    settings = [f"scene.path='{tiny_scene}'", *FEW, f"choices=[{KEEP}, {FOLD}]"]
-    run_pipeline(load(str(tmp_path / "own.yaml"), settings), tmp_path / "run", None, "new")
-    assert digest(tmp_path / "run") == digest(train(tiny_scene, tmp_path / "plain", *FEW).out)
-    found = json.loads((tmp_path / "run" / "metrics.json").read_text())
-    assert "validation" not in found
-    assert "kept" not in found
+def test_a_choice_may_keep_photographs_out_to_choose_by(tiny_scene, tmp_path):
+    settings = [f"scene.path='{tiny_scene}'", *FEW]
+    asked = load("smoke", [*settings, f"choices=[{KEEP}]"])
+    run_pipeline(asked, tmp_path / "run", None, "new")
+    plain = "scene.validation=auto", "optimize.keep=best", "optimize.patience=2"
+    train(tiny_scene, tmp_path / "plain", *FEW, *plain)
+    assert digest(tmp_path / "run") == digest(tmp_path / "plain")
+    found = [json.loads((tmp_path / name / "metrics.json").read_text()) for name in ("run", "plain")]
+    assert found[0]["validation"] == found[1]["validation"]
+    assert has_ended(asked, tmp_path / "run")
+    written = load(str(tmp_path / "run" / "pipeline.yaml"))
+    run_pipeline(written, tmp_path / "again", None, "new")
+    assert digest(tmp_path / "again") == digest(tmp_path / "run")
+    removed = load("smoke", [*settings, f"choices=[{KEEP}]", "scene.validation=0"])
+    assert removed.settings.choices == [], "what goes together is not chosen in part"
+
+
+@pytest.mark.parametrize(
+    ("photographs", "degree", "dropout", "keep"),
+    [(4, 0, 0.2, "last"), (11, 1, 0.2, "best"), (25, 3, 0, "best"), (43, 3, 0, "last")],
+)
+def test_the_recipe_for_photographs_chooses_by_their_number(photographs, degree, dropout, keep):
+    settings = load("photos").settings
+    chosen = choose(settings, {"photographs": photographs})
+    training = chosen.training
+    assert (chosen.model.sh_degree, at_step(training.dropout, 7000), training.keep) == (degree, dropout, keep)
+    assert training.refit is (keep == "best")
+    plain = load("splat_7k").settings
+    many = choose(settings, {"photographs": 200})
+    assert (many.training, many.model) == (plain.training, plain.model), "nothing is lost where there are many"

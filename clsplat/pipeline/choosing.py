@@ -24,9 +24,13 @@ def choose(settings: PipelineFile, measures: dict[Measure, float]) -> PipelineFi
     Raises ConfigError where they do not go together.
     """
     data = settings.model_dump(mode="json")
-    made = [one if one.reason else one.of(measures, value_at(data, one.key, PipelineFile)) for one in settings.choices]
+
+    def made(one: CaptureChoice) -> CaptureChoice:
+        return one if one.reason else one.of(measures, [value_at(data, key, PipelineFile) for key in one.keys])
+
+    choices = [made(one) for one in settings.choices]
     try:
-        return _with(settings, made, [(one.key, one.chosen) for one in made])
+        return _with(settings, choices, [pair for one in choices for pair in one.settings])
     except ValidationError as error:
         place, complaint = first_fault(error, PipelineFile)
         measured = ", ".join(f"{value:,.4g} {measure}" for measure, value in measures.items())
@@ -36,7 +40,7 @@ def choose(settings: PipelineFile, measures: dict[Measure, float]) -> PipelineFi
 def undone(settings: PipelineFile) -> PipelineFile:
     """Return the settings as they were before a run chose by `choices`."""
     made = [one for one in settings.choices if one.reason]
-    before = [(one.key, one.instead_of) for one in made]
+    before = [pair for one in made for pair in zip(one.keys, one.instead_of or [], strict=True)]
     return _with(settings, [one.undone() for one in settings.choices], before) if made else settings
 
 
@@ -44,22 +48,27 @@ def without_overridden(data: dict[str, Any], places: Collection[Place]) -> dict[
     """Return a file's data without the choices of what an override has set, around it or inside of it."""
     if not places or not isinstance(choices := data.get("choices"), list):
         return data
-    left = [one for one in choices if not any(_touch(_place(data, one), place) for place in places)]
-    return {**data, "choices": left}
+
+    def is_set(choice: Any) -> bool:
+        keys = choice.get("keys") if isinstance(choice, dict) else None
+        own = [_place(data, key) for key in keys if isinstance(key, str)] if isinstance(keys, list) else []
+        return any(_touch(one, place) for one in own for place in places)
+
+    return {**data, "choices": [one for one in choices if not is_set(one)]}
 
 
 def check_choices(settings: PipelineFile) -> None:
     """Raise ConfigError where a choice has no place, where two have the same, or where values do not go together."""
     data, places = settings.model_dump(mode="json"), list[Place]()
-    for number, one in enumerate(settings.choices):
-        place, what = _set(copy.deepcopy(data), one.key, None), f"choices[{number}]: {one.key}"
+    for number, key in [(number, key) for number, one in enumerate(settings.choices) for key in one.keys]:
+        place, what = _place(data, key), f"choices[{number}]: {key}"
         if place[0] not in LATE and place != ("scene", "validation"):
             raise ConfigError(f"{what} is used before photographs are measured; expected a key of {' or '.join(LATE)}")
         if any(_touch(place, other) for other in places):
             raise ConfigError(f"{what} is chosen twice; expected one choice for each place")
         places.append(place)
     still_open = undone(settings)
-    for by, bound in sorted({(one.by, bound) for one in settings.choices for bound, _ in one.values}):
+    for by, bound in sorted({(one.by, bound) for one in settings.choices for bound, *_ in one.values}):
         choose(still_open, {by: bound})
 
 
@@ -74,10 +83,9 @@ def _set(data: dict[str, Any], key: str, value: Any) -> Place:
     return apply(data, f"{key}={json.dumps(value)}", PipelineFile)
 
 
-def _place(data: dict[str, Any], choice: Any) -> Place:
-    """The place of a choice in a file's data; one without a key, which is refused later, has none."""
-    key = choice.get("key") if isinstance(choice, dict) else None
-    return _set(copy.deepcopy(data), key, None) if isinstance(key, str) else ()
+def _place(data: dict[str, Any], key: str) -> Place:
+    """The place of a key in a file's data.  Raises OverrideError where there is none."""
+    return _set(copy.deepcopy(data), key, None)
 
 
 def _touch(one: Place, other: Place) -> bool:

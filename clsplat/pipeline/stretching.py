@@ -73,7 +73,9 @@ def _stretched(value: Any, factor: float | Fraction) -> Any:
         is_points = bool(value) and all(isinstance(item, list) for item in value)
         return _points(value, factor) if is_points else [_stretched(item, factor) for item in value]
     if isinstance(value, CaptureChoice):  # whose rows begin with what is measured, and not with steps
-        return value.model_copy(update={"values": [[bound, _stretched(one, factor)] for bound, one in value.values]})
+        return value.model_copy(
+            update={"values": [[bound, *(_stretched(one, factor) for one in row)] for bound, *row in value.values]}
+        )
     if not isinstance(value, Settings):
         return value
     fields = {name: getattr(value, name) for name in type(value).model_fields}

@@ -1,6 +1,5 @@
 """Choices that follow from the photographs, made before the first step and written into the run's pipeline."""
 
-import json
 import logging
 from dataclasses import replace
 
@@ -31,16 +30,16 @@ def _by_capture(pipeline: Pipeline, run: Run) -> Pipeline:
     if not any(not one.reason for one in pipeline.settings.choices):
         return pipeline
     chosen = replace(pipeline, settings=choose(pipeline.settings, measured(run.scene)))
+    if chosen.settings.scene.validation != pipeline.settings.scene.validation:
+        run.divide(chosen.settings.scene.split.with_validation(run.original.with_fold()))
     for one in chosen.settings.choices:
-        LOG.info("%s: %s, since %s", one.key, json.dumps(one.chosen), one.reason)
+        LOG.info("%s", one.told)
     return chosen
 
 
 def _taken(pipeline: Pipeline, run: Run) -> Pipeline:
     """The same; the run has its settings."""
     run.settings, run.pipeline, run.model_settings = pipeline.settings, pipeline.resolved(), pipeline.settings.model
-    if pipeline.settings.scene.validation == 0 and run.original.validation:
-        run.train_on_all()
     return pipeline
 
 

@@ -1,12 +1,10 @@
 """What a run would do, before it does it."""
 
-import json
 import logging
 from pathlib import Path
 
 from clsplat import lock
 from clsplat.opencl.device import Device
-from clsplat.pipeline.choices import CaptureChoice
 from clsplat.pipeline.loading import Pipeline
 from clsplat.runs.choices import settle
 from clsplat.runs.default_folder import start_of
@@ -50,7 +48,7 @@ def describe(
             verdict = f"would go on from step {run.step}" if resumed else "nothing to resume; would run"
         for stage in pipeline.stages[run.cursor :]:
             stage.check_in(run)
-    lines += [f"  {_choice(one)}" for one in pipeline.settings.choices]
+    lines += [f"  {one.told}" for one in pipeline.settings.choices]
     lines += [f"  {stage.stage:<14} {_detail(stage, run)}".rstrip() for stage in pipeline.stages]
     return f"{verdict} in {out}:\n" + "\n".join(lines)
 
@@ -69,11 +67,6 @@ def _detail(stage: Stage, run: Run | None) -> str:
         sizes = ", ".join(f"1/{downscale:g}" for downscale in stage.downscales or [run.downscale])
         return f"{len(views)} {stage.split} views at {sizes}"
     return ""
-
-
-def _choice(one: CaptureChoice) -> str:
-    """What a choice has set, and why; before photographs are measured, by what it will."""
-    return f"{one.key}={json.dumps(one.chosen)}, since {one.reason}" if one.reason else f"{one.key}: by {one.by}"
 
 
 def _cadence(stage: Scheduled) -> str:

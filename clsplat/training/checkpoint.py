@@ -227,7 +227,7 @@ def _restore(run: Run, state: State, tables: Arrays) -> None:
     run.acted, run.edited, run.whole, run.numbers = state.acted, state.edited, True, state.numbers
     run.best = state.best
     if run.is_refit:
-        run.train_on_all()
+        run.divide(run.original.with_fold())
     run.train_seconds, run.cpu_seconds, run.metrics = state.train_seconds, state.cpu_seconds, state.metrics
     run.records.lines, run.inputs_before, run.written = state.records, state.inputs, state.written
 
