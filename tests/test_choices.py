@@ -83,7 +83,10 @@ def test_an_override_takes_the_place_of_a_choice(tmp_path, override, left):
         (DEGREE.replace("[0, 0]", "[1, 0]"), "the first one from 0"),
         (DEGREE.replace("photographs", "moons"), "photographs_per_point"),
         (f"{DEGREE}, {DEGREE}", "chosen twice"),
-        (DEGREE.replace("model.sh_degree", "optimize.patience"), "'patience' is for 'keep: best'"),
+        (
+            DEGREE.replace("model.sh_degree", "optimize.patience").replace("[0, 0]", "[0, 4]"),
+            "'patience' is for 'keep: best'",
+        ),
         (DEGREE.replace("model.sh_degree", "scene.holdout"), "before photographs are measured"),
     ],
 )

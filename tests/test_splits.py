@@ -2,8 +2,10 @@
 
 import json
 import logging
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from clsplat.errors import ConfigError, DataError
@@ -13,6 +15,7 @@ from clsplat.scene.detect import read_scene
 from clsplat.scene.identity import Identity
 from clsplat.scene.scene import Scene
 from clsplat.scene.split import Split
+from clsplat.scene.tracks import Tracks
 from tests.test_transforms import LENS, frames, write
 
 LETTERS = "abcdefghijklmnopqrstuvwx"
@@ -159,3 +162,10 @@ def test_a_choice_that_is_wrong_is_explained(setting, fault):
     with pytest.raises(ConfigError) as raised:
         load("splat_7k", [f"scene.{setting}"])
     assert fault in str(raised.value)
+
+
+def test_a_split_by_choice_keeps_the_tracks_of_points(tiny_scene):
+    scene = read_scene(tiny_scene)
+    tracks = Tracks(np.zeros((1, 3)), {scene.views[0].name: np.array([0])})
+    for split in (Split(holdout=Choice(every=3, offset=1)), Split(train=Choice(every=2))):
+        assert split.applied(replace(scene, test=(), tracks=tracks)).tracks is tracks
