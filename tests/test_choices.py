@@ -158,14 +158,13 @@ def test_a_choice_may_keep_photographs_out_to_choose_by(tiny_scene, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("photographs", "degree", "dropout", "keep"),
-    [(4, 0, 0.2, "last"), (11, 1, 0.2, "best"), (25, 3, 0, "best"), (43, 3, 0, "last")],
+    ("photographs", "dropout", "keep"), [(4, 0.2, "last"), (11, 0.2, "best"), (25, 0, "best"), (43, 0, "last")]
 )
-def test_the_recipe_for_photographs_chooses_by_their_number(photographs, degree, dropout, keep):
+def test_the_recipe_for_photographs_chooses_by_their_number(photographs, dropout, keep):
     settings = load("photos").settings
     chosen = choose(settings, {"photographs": photographs})
     training = chosen.training
-    assert (chosen.model.sh_degree, at_step(training.dropout, 7000), training.keep) == (degree, dropout, keep)
+    assert (at_step(training.dropout, 7000), training.keep) == (dropout, keep)
     assert training.refit is (keep == "best")
     plain = load("splat_7k").settings
     many = choose(settings, {"photographs": 200})
