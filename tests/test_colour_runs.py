@@ -3,6 +3,7 @@
 import json
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,7 +18,9 @@ from clsplat.runs.found import has_ended
 from clsplat.runs.model_file import evaluate
 from clsplat.runs.single import run_pipeline
 from clsplat.training import checkpoint
-from clsplat.training.colours import colours_beside
+from clsplat.training.colours import colours_beside, colours_of
+from clsplat.views.colours import Affine, Auto, Gain
+from clsplat.views.exposures import UNKNOWN
 from tests.few_steps import FEW
 from tests.test_exposures import Wall
 from tests.test_training import digest, train
@@ -92,6 +95,35 @@ def test_a_run_folder_is_measured_in_the_photographs_colours_too(with_gains, few
         (tmp_path / "view_colours.json").write_text(damage)
         with pytest.raises(DataError, match=r"the type of colours is .* expected one of \w+, \w+"):
             colours_beside(tmp_path / "point_cloud.ply")
+
+
+def test_where_colours_began_is_kept_with_them(rng, tmp_path):
+    """The rate depends on it, also where the file that told it is gone."""
+    wall = Wall(rng)
+    wall.write(tmp_path / "scene")
+    gain = (*FEW, "scene.holdout=0", "optimize.colours=gain")
+    run = train(tmp_path / "scene", tmp_path / "run", *gain)
+    last = tmp_path / "run" / "checkpoints" / "step_000012.npz"
+    last.unlink()
+    for name in ("point_cloud.ply", "metrics.json", "checksums.json"):
+        (tmp_path / "run" / name).unlink()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("clsplat.training.colours.exposures_of", lambda run: UNKNOWN)
+        again = train(tmp_path / "scene", tmp_path / "run", *gain, resume=True)
+    assert again.numbers == run.numbers
+
+
+def test_figures_are_by_the_colours_of_the_training_that_has_begun():
+    def colours(numbers: dict[str, float], *stages: object) -> object:
+        run = SimpleNamespace(
+            numbers=numbers, settings=SimpleNamespace(stages=[SimpleNamespace(colours=one) for one in stages])
+        )
+        return colours_of(run)
+
+    gain, off = {f"colours/a.png/{column}": 0.0 for column in Gain.columns}, Auto().choose("off", "they are alike")
+    assert colours({}, Gain()) is None
+    assert colours(gain, Gain(), Affine()) == Gain(), "the second has not begun"
+    assert colours(gain, Gain(), off) == Gain()
 
 
 def test_the_best_model_is_left_with_the_colours_of_its_step(tiny_scene, tmp_path):

@@ -14,7 +14,7 @@ from clsplat.scene.images import write_image
 from clsplat.scene.scene import PointCloud, View
 from clsplat.scene.tracks import Tracks
 from clsplat.scene.view import load_image
-from clsplat.views.exposures import Exposures, measured, samples
+from clsplat.views.exposures import Exposures, _fitted, measured, samples
 from data_tools.colmap_writer import write_model
 from data_tools.undistort import undistort_scene
 
@@ -68,6 +68,16 @@ def test_gains_are_found_again(rng):
     assert found.spread == pytest.approx(np.std(wall.log_gains @ [0.299, 0.587, 0.114]), abs=2e-3)
     assert found.explained > 0.95
     assert f"exposures of 8 photographs differ by {found.spread:.1%} at 400 points" in found.text
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.25])
+def test_photographs_that_agree_but_for_their_gains_are_no_fault(rng, spread):
+    """Nothing is left then but rounding, which says nothing."""
+    wall = Wall(rng)
+    log_gains = wall.log_gains[:, 0] * (spread / 0.25)
+    photograph, point = (part.ravel() for part in np.indices((8, POINTS)))
+    values = wall.colours[point, 0] * np.exp(log_gains[photograph])
+    assert _fitted(photograph, point, values, 8)[0] == pytest.approx(log_gains - log_gains.mean(), abs=1e-6)
 
 
 def test_photographs_that_share_points_with_their_neighbours_alone_are_compared(rng):

@@ -39,6 +39,16 @@ def test_every_nth_from_an_offset_on_is_for_testing(folder):
     assert scene.extent == pytest.approx(read_scene(folder, 8).extent, rel=1)
 
 
+@pytest.mark.parametrize(
+    "split", [{"holdout": Choice(every=3, offset=1)}, {"train": Choice(every=2)}, {"validation": 2}]
+)
+def test_a_split_leaves_the_rest_of_a_scene_as_it_is(folder, split):
+    scene = replace(read_scene(folder), tracks=Tracks(np.zeros((1, 3)), {}))
+    found = Split(**split).applied(scene)
+    assert (found.tracks, found.points, found.background) == (scene.tracks, scene.points, scene.background)
+    assert {view.name for view in found.views} <= {view.name for view in scene.views}
+
+
 @pytest.mark.parametrize("listed", ["b", "b.png", "images/b.png", "images/b", "images\\b.png"])
 def test_a_listed_name_may_be_the_end_of_a_path(folder, listed):
     assert letters(read_scene(folder, Split(Choice(names=[listed, "q"]))), "test") == "bq"
@@ -162,10 +172,3 @@ def test_a_choice_that_is_wrong_is_explained(setting, fault):
     with pytest.raises(ConfigError) as raised:
         load("splat_7k", [f"scene.{setting}"])
     assert fault in str(raised.value)
-
-
-def test_a_split_by_choice_keeps_the_tracks_of_points(tiny_scene):
-    scene = read_scene(tiny_scene)
-    tracks = Tracks(np.zeros((1, 3)), {scene.views[0].name: np.array([0])})
-    for split in (Split(holdout=Choice(every=3, offset=1)), Split(train=Choice(every=2))):
-        assert split.applied(replace(scene, test=(), tracks=tracks)).tracks is tracks

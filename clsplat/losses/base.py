@@ -75,7 +75,7 @@ class ViewLosses:
     frame: Frame
     comparison: Comparison
     losses: list[LossValue]
-    learning: Callable[[], None] | None = field(default=None, kw_only=True)  # changes what a transform learns
+    learning: Sequence[Callable[[], None]] = field(default=(), kw_only=True)  # each changes numbers that are learned
 
     @property
     def loss(self) -> float:

@@ -66,8 +66,8 @@ class Split:
 
 def _with_test(scene: Scene, test: set[int]) -> Scene:
     """The views of a scene, with its extent, where these are for testing."""
-    divided = make_scene(scene.path, list(scene.views), test, scene.points, scene.background)
-    return replace(divided, tracks=scene.tracks)
+    made = make_scene(scene.path, list(scene.views), test, scene.points, scene.background)
+    return replace(scene, train=made.train, test=made.test, extent=made.extent)
 
 
 def _of(scene: Scene, choice: int | Choice, folders: Sequence[Path]) -> set[int]:

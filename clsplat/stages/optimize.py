@@ -29,6 +29,7 @@ from clsplat.training.trainer import Trainer
 from clsplat.views.colours import Colours
 from clsplat.views.detail import course
 from clsplat.views.sampling import Sampler, ViewSettings
+from clsplat.views.transients import Transients
 
 LOG = logging.getLogger("clsplat")
 DISTRIBUTION_INTERVAL = 5  # reports
@@ -59,6 +60,8 @@ class Optimize(Keeping):
     """Losses and penalties; training minimises their sum."""
     colours: OneOf[Colours] | None = None
     """Colours of each photograph, where exposures differ: `gain`, `affine`, `auto`; without it, those of the scene."""
+    transients: Transients | None = None
+    """Pixels that are left out, where photographs show what the scene does not have; without it, none."""
     dropout: Probability = 0.0
     """Probability with which a step leaves a Gaussian out, by step, 0.9 at most; for few photographs.  The opacities of
     the others are divided by 1 less it (DropGaussian, Park et al. 2025).  Pictures and measurements leave none out."""
@@ -183,7 +186,7 @@ class Optimize(Keeping):
         parts = run.rasterizer, run.model, run.adam, run.stats, photographs.background
         rates, colours = self.rates.settled(views.full_size(last)), photograph_colours(self.colours, run, last)
         trainer = Trainer(*parts, self.losses, rates, run.scene.extent, run.numbers, self.update, colours)
-        trainer.dropout, trainer.seed = self.dropout, run.seed
+        trainer.transients, trainer.dropout, trainer.seed = self.transients, self.dropout, run.seed
         return trainer
 
     def _act(self, run: Run) -> None:

@@ -2,6 +2,7 @@
 
 import json
 import logging
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from clsplat.views.photograph_colours import TABLE, PhotographColours
 from clsplat.views.photographs import Mask
 
 LOG = logging.getLogger("clsplat")
+KNOWN = "known exposures"  # in the numbers of a run: whether its colours began with exposures that were measured
 GUESSED = 1.0  # dB by which figures in the photographs' colours are better, from which on the log says why
 
 
@@ -34,13 +36,13 @@ def photograph_colours(colours: Colours | None, run: Run, last: int) -> Photogra
     if not isinstance(colours, ColourModel):
         return None
     views = [view.name for view in run.scene.split("train")]
-    exposures = exposures_of(run)
-    rate = colours.rate_of(last, len(set(views)), bool(exposures.log_gains))
-    found = PhotographColours(colours, views, rate)
+    found = PhotographColours(colours, views, 0.0)
     if not found.table.begun(run.numbers):
+        exposures = exposures_of(run)
         found.begin(run.numbers, exposures.log_gains)
+        run.numbers[KNOWN] = float(bool(exposures.log_gains))
         LOG.info("colours of photographs: %s", exposures.text)
-    return found
+    return replace(found, rate=colours.rate_of(last, len(set(views)), run.numbers.get(KNOWN, 1.0) > 0))
 
 
 def exposures_of(run: Run) -> Exposures:
@@ -76,8 +78,10 @@ def colours_of(run: Run) -> ColourModel | None:
     if not any(name.startswith(f"{TABLE}/") for name in run.numbers):
         return None
     found = [getattr(stage, "colours", None) for stage in getattr(run.settings, "stages", ())]
-    models = [one.model if isinstance(one, Auto) else one for one in found]
-    return next((model for model in reversed(models) if isinstance(model, ColourModel)), None)
+    models = [one.in_use if isinstance(one, Auto) else one for one in found]
+    columns = {name.split("/")[-1] for name in run.numbers if name.startswith(f"{TABLE}/")}
+    begun = (one for one in reversed(models) if isinstance(one, ColourModel) and columns.issuperset(one.columns))
+    return next(begun, None)
 
 
 def write_view_colours(run: Run, colours: PhotographColours | None) -> None:

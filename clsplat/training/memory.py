@@ -14,10 +14,10 @@ from clsplat.render.rasterizer import PIXEL_SUMS, RECORD
 PAIRS_PER_GAUSSIAN = 5  # (tile, Gaussian) pairs, an estimate; trained scenes have 1.5 to 4
 FRAME_GAUSSIAN = 4 * (RECORD + 2 + 5 + 7)  # records, mean2d; keys and radius; sorting by depth
 FRAME_PAIR = 4 * (RECORD + 6)  # gradient record; tile and Gaussian of the pair, sorting by tile
-FRAME_PIXEL = 4 * (4 * 3 + 3 + 9 + 2 * 3 + 2 * 3 + 2)
+FRAME_PIXEL = 4 * (4 * 3 + 3 + 9 + 2 * 3 + 2 * 3 + 2 + 2)
 # image, photograph, gradient, second render; transmittance, texture, mask; SSIM's derivatives; a photograph that is
 # changed and its gradient, or the sums of a blur; the image in the colours of its photograph and its gradient; the
-# entropy of weights and its gradient
+# entropy of weights and its gradient; residuals, and the mask that leaves out the large ones
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,8 @@ STAGES = {
     "ssim_gradient": "loss",
     "weight_entropy": "loss",
     "apply_mask": "loss",
+    "measure_residuals": "loss",
+    "mask_transients": "loss",
     "covariance_trace": "loss",
     "anisotropy": "loss",
     "blend_backward": "blend backward",

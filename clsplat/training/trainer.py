@@ -30,6 +30,7 @@ from clsplat.views.photograph_colours import PhotographColours, change_back, cha
 from clsplat.views.photographs import Photograph, apply_mask
 from clsplat.views.texture import known_gradient
 from clsplat.views.transforms import PhotographTransform, Planes
+from clsplat.views.transients import Transients, measure_residuals
 
 TEXTURE = int(constants("splat.h")["SUM_TEXTURE"])
 
@@ -71,6 +72,7 @@ class Trainer:
     numbers: dict[str, float] = field(default_factory=dict)  # of a transform that learns, by name; a step changes them
     rows: Rows = "all"  # Gaussians that a step changes
     colours: PhotographColours | None = None  # of the photographs, where they have colours of their own
+    transients: Transients | None = None  # which pixels are left out; None: none
     dropout: Schedule = 0.0  # probability with which a step leaves a Gaussian out, by step
     seed: int = 0  # of what is drawn
 
@@ -116,6 +118,7 @@ class Trainer:
         planes = photograph.planes(workspace, transforms, step, self.numbers)
         gradient = workspace.array("grad_image", frame.image.shape)
         image, own = self._coloured(camera, frame.image)
+        planes, learning = self._without_transients(planes, image, step)
         comparison = Comparison(workspace, camera, image, planes.colours, gradient, planes.mask, step)
         if reads_entropy:  # losses of colours overwrite three planes alone
             gradient.fill(0)
@@ -124,9 +127,9 @@ class Trainer:
             apply_mask(workspace, camera, image, planes.mask)
             apply_mask(workspace, camera, planes.colours, planes.mask)
         learned = learned_of(transforms)
-        of_transform, learning = self._learn(learned, planes, comparison) if learned else ([], None)
+        of_transform, learn = self._learn(learned, planes, comparison) if learned else ([], [])
         values = [returned(loss, loss.add(comparison)) for loss in self.losses if isinstance(loss, ImageLoss)]
-        return ViewLosses(frame, comparison, [*values, *of_transform, *own], learning=learning)
+        return ViewLosses(frame, comparison, [*values, *of_transform, *own], learning=[*learning, *learn])
 
     def backward(self, view: ViewLosses) -> ViewGradients:
         """Return the derivative of the losses that `compare` returned, as sums over pixels."""
@@ -155,7 +158,18 @@ class Trainer:
         changed = change_colours(self.rasterizer.workspace, camera, image, matrix)
         return changed, [LossValue("colours", lambda: penalty)]
 
-    def _uncoloured(self, view: ViewLosses, gradient: Array) -> tuple[Array, Callable[[], None] | None]:
+    def _without_transients(self, planes: Planes, image: Array, step: int) -> tuple[Planes, list[Callable[[], None]]]:
+        """The photograph without what the scene does not have, and what adds the view's residuals to the others."""
+        if (transients := self.transients) is None:
+            return planes, []
+        workspace, camera = planes.workspace, planes.camera
+        residuals, counts = measure_residuals(workspace, camera, image, planes.colours, planes.mask)
+        threshold = transients.threshold(self.numbers, step)
+        if threshold is not None:
+            planes = replace(planes, mask=transients.mask(workspace, camera, residuals, threshold))
+        return planes, [lambda: transients.learn(self.numbers, counts())]
+
+    def _uncoloured(self, view: ViewLosses, gradient: Array) -> tuple[Array, Sequence[Callable[[], None]]]:
         """The gradient by the image as it was rendered, and what changes the numbers of transforms and photographs."""
         colours, comparison, learning = self.colours, view.comparison, view.learning
         camera, number = comparison.camera, comparison.camera.view
@@ -165,16 +179,11 @@ class Trainer:
         workspace = self.rasterizer.workspace
         gradient, by_matrix = change_back(workspace, camera, view.frame.image, matrix, gradient)
 
-        def learn() -> None:
-            if learning:
-                learning()
-            colours.learn(self.numbers, number, by_matrix(), comparison.step)
-
-        return gradient, learn
+        return gradient, [*learning, lambda: colours.learn(self.numbers, number, by_matrix(), comparison.step)]
 
     def _learn(
         self, transform: LearnedTransform, planes: Planes, comparison: Comparison
-    ) -> tuple[list[LossValue], Callable[[], None]]:
+    ) -> tuple[list[LossValue], list[Callable[[], None]]]:
         """Begin the derivatives by the transform's numbers; return its own loss, and what changes the numbers.
 
         The host waits for them after all of the step is enqueued, so that the device does not wait for the host.
@@ -189,13 +198,13 @@ class Trainer:
             gradients = {name: derivative + of_numbers[name] for name, derivative in of_images().items()}
             transform.update(self.numbers, gradients, comparison.step)
 
-        return [LossValue(name_of(transform), lambda: value)], learn
+        return [LossValue(name_of(transform), lambda: value)], [learn]
 
     def update(self, view: ViewGradients, stale: Collection[str] = ()) -> None:
         """Apply what `differentiate` returned: change parameters, moments and statistics."""
         grad_mean2d = self._update(view, stale)
-        if view.learning:
-            view.learning()
+        for learn in view.learning:
+            learn()
         self.rasterizer.device.timings.section = "statistics"
         self.stats.add(view, grad_mean2d)
 

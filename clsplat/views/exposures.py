@@ -27,6 +27,7 @@ FEWEST = 20  # values of a photograph whose exposure is measured
 ROUNDS = 10
 EXACT = 0.01  # of a logarithm: smaller differences weigh no more
 CONVERGED = 1e-6  # of the first residual
+ROUNDING = 1e-9  # of a logarithm: residuals of such differences are none
 Integers = NDArray[np.intp]
 Read = Callable[[View], tuple[NDArray[np.uint8], Mask | None]]
 
@@ -141,7 +142,8 @@ def _corrections(photograph: Integers, point: Integers, rest: Floats, weights: F
 
     found, residual = np.zeros(count), gathered(rest)
     direction, square = residual.copy(), float((residual**2).sum())
-    goal = CONVERGED**2 * square
+    of_rounding = ROUNDING * np.bincount(photograph, weights, minlength=count)
+    goal = max(CONVERGED**2 * square, float((of_rounding**2).sum()))
     for _ in range(count):
         if square <= goal:
             break

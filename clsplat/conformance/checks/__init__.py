@@ -14,6 +14,7 @@ from clsplat.conformance.checks import (
     pixel_box,
     projection,
     tiles,
+    transients,
     update,
     whole,
 )
@@ -27,6 +28,7 @@ KERNELS: list[Check] = [
     *pixel_box.CHECKS.listed,
     *images.CHECKS.listed,
     *colours.CHECKS.listed,
+    *transients.CHECKS.listed,
     *update.CHECKS.listed,
     *averages.CHECKS.listed,
     *density.CHECKS.listed,

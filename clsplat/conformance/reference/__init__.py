@@ -85,6 +85,7 @@ from clsplat.conformance.reference.projection_backward import (
 )
 from clsplat.conformance.reference.random import dropped, normal3, philox
 from clsplat.conformance.reference.splitting import mean_jacobian, screen_splitting, splitting
+from clsplat.conformance.reference.transients import residual_numbers, residuals, without_transients
 from clsplat.conformance.reference.world_filter import (
     filtered,
     sampling_interval,
@@ -144,6 +145,8 @@ __all__ = [
     "render",
     "render_backward",
     "reset_logit",
+    "residual_numbers",
+    "residuals",
     "rotation_matrix",
     "sampling_interval",
     "screen_gain",
@@ -159,4 +162,5 @@ __all__ = [
     "ssim_taps",
     "view_error",
     "weight_entropy",
+    "without_transients",
 ]

@@ -1,0 +1,77 @@
+/* Pixels in which a photograph shows what the scene does not have: how large residuals are, how many there are of each
+ * size, and the pixels that are left when the large ones do not count.
+ *
+ * A residual is the mean over the channels of |image - photograph|; -1 in pixels that do not count.  Bins are eighths
+ * of octaves from 2^-12 on: the upper bits of the float itself.  Planes are [channels,H',W'] with H', W' whole tiles,
+ * zero outside the image.  Counters are integer atomics, so counts do not depend on the order of the items. */
+#include "planes.h"
+
+#define BINS 96        // twelve octaves, up to 1; the first and the last hold what lies beyond
+#define BIN_SHIFT 20   // bits of the mantissa that a bin does not see: 3 of 23 are left
+#define FIRST_BIN 920  // (127 - 12) * 8: the upper bits of 2^-12
+
+/* Residuals and their number by bin.  One group of TEAM items = one row.  Local memory: BINS * 4 bytes. */
+__kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
+void measure_residuals(
+    __global const float *restrict image,       // [3,H',stride]
+    __global const float *restrict photograph,  // [3,H',stride]
+    __global const float *restrict mask,        // [H',stride] 0 or 1; read where `masked`
+    __global float *restrict residuals,         // [H',stride]
+    __global uint *restrict numbers,            // [BINS], 0 before
+    const uint masked,
+    const uint width,
+    const uint height,
+    const uint rows,                            // H'
+    const uint stride)
+{
+    __local uint own[BINS];
+    const uint item = get_local_id(0), y = get_group_id(1), plane = rows * stride;
+    for (uint k = item; k < BINS; k += TEAM)
+        own[k] = 0;
+    barrier(CLK_LOCAL_MEM_FENCE);
+    for (uint x = item; x < stride; x += TEAM) {
+        const uint at = y * stride + x;
+        const bool counts = x < width && y < height && (!masked || mask[at] != 0.0f);
+        const float red = fabs(image[at] - photograph[at]);
+        const float green = fabs(image[plane + at] - photograph[plane + at]);
+        const float blue = fabs(image[2 * plane + at] - photograph[2 * plane + at]);
+        const float residual = (red + green + blue) * (1.0f / 3.0f);
+        residuals[at] = counts ? residual : -1.0f;
+        if (counts)
+            atomic_inc(own + clamp((as_int(residual) >> BIN_SHIFT) - FIRST_BIN, 0, BINS - 1));
+    }
+    barrier(CLK_LOCAL_MEM_FENCE);
+    for (uint k = item; k < BINS; k += TEAM)
+        if (own[k] > 0)
+            atomic_add(numbers + k, own[k]);
+}
+
+/* 1 in pixels whose residual, or at least as many of those in the box about them as not, are below a threshold; else 0.
+ * One item = one pixel; dimension 1 is the row. */
+__kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
+void mask_transients(
+    __global const float *restrict residuals,  // [H',stride]
+    __global float *restrict mask,             // [H',stride]
+    const float threshold,
+    const uint reach,                          // px from the middle of the box to its edges
+    const uint width,
+    const uint height,
+    const uint stride)
+{
+    const uint x = get_global_id(0), y = get_global_id(1);
+    if (x >= stride)
+        return;
+    const float own = residuals[y * stride + x];
+    bool kept = !(own < 0.0f);  // what is not a number stays: the losses find it
+    if (kept && own >= threshold) {
+        uint counted = 0, below = 0;
+        for (uint row = y > reach ? y - reach : 0; row <= y + reach && row < height; row++)
+            for (uint column = x > reach ? x - reach : 0; column <= x + reach && column < width; column++) {
+                const float residual = residuals[row * stride + column];
+                counted += residual >= 0.0f;
+                below += residual >= 0.0f && residual < threshold;
+            }
+        kept = 2 * below >= counted;
+    }
+    mask[y * stride + x] = kept ? 1.0f : 0.0f;
+}
