@@ -158,7 +158,7 @@ def test_a_choice_may_keep_photographs_out_to_choose_by(tiny_scene, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("photographs", "dropout", "keep"), [(4, 0.2, "last"), (11, 0.2, "best"), (25, 0, "best"), (43, 0, "last")]
+    ("photographs", "dropout", "keep"), [(4, 0.2, "last"), (20, 0.2, "best"), (25, 0, "best"), (43, 0, "last")]
 )
 def test_the_recipe_for_photographs_chooses_by_their_number(photographs, dropout, keep):
     settings = load("photos").settings
