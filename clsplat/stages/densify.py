@@ -39,7 +39,8 @@ class Densify(Scheduled):
 
     patience: Annotated[int, Field(gt=0)] | None = None
     """Measurements of the validation views in a row without a better one after which nothing grows any more, in a
-    training with `keep: best`; pruning continues.  Without it, growth goes on."""
+    training with `keep: best`, whose own patience counts anew from there; pruning continues.  Without it, growth goes
+    on."""
     grow_until: Annotated[int, Field(gt=0)] | None = None
     """Global step from which on nothing grows; pruning continues.  Without it, growth goes on."""
 
@@ -87,7 +88,7 @@ class Densify(Scheduled):
         if self.patience is None or best is None or run.is_refit:  # whose pipeline says the step
             return False
         if best.growth_ended is None and best.since >= self.patience:
-            best = run.best = best.model_copy(update={"growth_ended": run.step})
+            best = run.best = best.model_copy(update={"growth_ended": run.step, "since": 0})
             LOG.info("step %d: growth ends: the model was best at step %d", run.step, best.found.step)
         return best.growth_ended is not None
 
