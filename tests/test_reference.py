@@ -153,6 +153,16 @@ def test_chain_mip(rng):
     check_chain(rng, gaussians, camera, 1, variance=0.1, compensate=1.0)
 
 
+def test_chain_of_a_step_with_dropout(rng):
+    """A constant factor of the opacities changes the gradients as it should."""
+    camera = general_camera()
+    gaussians = random_gaussians(rng, camera, 1)
+    plain = ref.project(gaussians, camera, 1).opacity
+    gaussians.opacity_factor = 1.25
+    np.testing.assert_allclose(ref.project(gaussians, camera, 1).opacity, 1.25 * plain)
+    check_chain(rng, gaussians, camera, 1, compensate=1.0)
+
+
 @pytest.mark.parametrize("side", [(1.25, 0.1), (-1.0, 0.1), (0.1, 1.0), (0.1, -0.9), (1.3, 1.0)])
 def test_chain_clamped_ray(rng, side):
     """Far outside the frustum, but wide enough to reach the image: J uses the clamped ray."""

@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 
 from clsplat.errors import MemoryLimitError
+from clsplat.gaussians.left_out import left_out_arguments
 from clsplat.gaussians.tables import DeviceModel, Gradients
 from clsplat.opencl.device import Array, Device
 from clsplat.opencl.program import Program, constants
@@ -151,7 +152,7 @@ class Rasterizer:
             items=-(-count // self._lanes),
             **shape_arguments(model, camera),
             sh_base=gaussians["sh_base"],
-            **gaussians.hidden_arguments(camera.view),
+            **left_out_arguments(model, camera.view, self.workspace.array("left_out", stride)),
             splats=splats,
             **vars(footprints),
             radius=radius,

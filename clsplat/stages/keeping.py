@@ -92,6 +92,7 @@ class Keeping(Stage):
             since=0,
             apart=apart,
             last=now,
+            growth_ended=best.growth_ended if best else None,
         )
         run.best_tables = tables
 

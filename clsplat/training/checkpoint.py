@@ -233,7 +233,7 @@ def _restore(run: Run, state: State, tables: Arrays) -> None:
     run.best = state.best
     restore_sky(run, behind)
     if run.is_refit:
-        run.train_on_all()
+        run.divide(run.original.with_fold())
     run.train_seconds, run.cpu_seconds, run.metrics = state.train_seconds, state.cpu_seconds, state.metrics
     run.records.lines, run.inputs_before, run.written = state.records, state.inputs, state.written
 

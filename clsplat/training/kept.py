@@ -63,6 +63,8 @@ class Best(BaseModel):
     """The first that had learnt its photographs by heart."""
     last: Measured
     """The last that was measured."""
+    growth_ended: Count | None = None
+    """Global step from which on nothing grew, since validation found no better model; None: growth goes on."""
     taken: Count | None = None
     """Global step after which the training left this model; None: it goes on."""
     refit: Literal["none", "due", "begun"] = "none"
@@ -75,7 +77,7 @@ class Best(BaseModel):
 
     def figures(self) -> dict[str, Any]:
         """Return what metrics.json has of it."""
-        facts = self.model_dump(include={"evaluations", "last", "apart"})
+        facts = self.model_dump(include={"evaluations", "last", "apart", "growth_ended"})
         return {**self.found.model_dump(), **facts, "ended": self.taken, "refit": self.refit != "none"}
 
     def told(self) -> str:

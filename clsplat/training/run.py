@@ -142,12 +142,11 @@ class Run:
         self.numbers, self.metrics, self.written, self.whole = {}, {}, {}, True
         self.best, self.best_tables = best, {}
         self.next_stage(0)
-        self.train_on_all()
+        self.divide(self.original.with_fold())
 
-    def train_on_all(self) -> None:
-        """Put the validation views among those that are trained on."""
-        self.original, downscales = self.original.with_fold(), self.scene.downscales
-        self.scene = self.original.downscaled(*downscales)
+    def divide(self, original: Scene) -> None:
+        """Take the scene, as it was read, with another split of its views."""
+        self.original, self.scene = original, original.downscaled(*self.scene.downscales)
         self._filter_views, self._texture_quantiles = None, {}
 
     @contextmanager

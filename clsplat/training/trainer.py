@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 
 from clsplat.density.statistics import SplatStats
 from clsplat.errors import ConfigError
-from clsplat.gaussians.tables import DeviceModel
+from clsplat.gaussians.tables import DeviceModel, Dropout
 from clsplat.losses.base import (
     Comparison,
     ImageLoss,
@@ -23,6 +23,7 @@ from clsplat.opencl.device import Array
 from clsplat.opencl.program import constants
 from clsplat.render.camera import DeviceCamera
 from clsplat.render.rasterizer import Content, Rasterizer
+from clsplat.schedule import Schedule, at_step
 from clsplat.training.adam import Adam, Rates, Rows
 from clsplat.training.sky import LearnedSky
 from clsplat.views.learned import LearnedTransform, learned_of, name_of
@@ -74,6 +75,8 @@ class Trainer:
     colours: PhotographColours | None = None  # of the photographs, where they have colours of their own
     transients: Transients | None = None  # which pixels are left out; None: none
     sky: LearnedSky | None = None  # of the model, where it has one
+    dropout: Schedule = 0.0  # probability with which a step leaves a Gaussian out, by step
+    seed: int = 0  # of what is drawn
 
     def step(
         self,
@@ -112,7 +115,7 @@ class Trainer:
         workspace, camera, timings = self.rasterizer.workspace, photograph.camera, self.rasterizer.device.timings
         reads_entropy = any(isinstance(loss, ImageLoss) and loss.reads_entropy for loss in self.losses)
         content: Content = "entropy" if reads_entropy else "colour"
-        frame = self.rasterizer.forward(self.model, camera, self.background, content)
+        frame = self.rasterizer.forward(self._drawn(step), camera, self.background, content)
         timings.section = "loss"
         planes = photograph.planes(workspace, transforms, step, self.numbers)
         gradient = workspace.array("grad_image", frame.image.shape)
@@ -146,8 +149,14 @@ class Trainer:
         count = self.stats.pixel_sums
         self.rasterizer.device.timings.section = "statistics"
         texture = known_gradient(workspace, camera, photograph, mask) if count > TEXTURE else None
-        pixel_sums = self.rasterizer.pixel_sums(self.model, view.frame, gradient, count, texture, view.behind)
+        model = self._drawn(comparison.step)
+        pixel_sums = self.rasterizer.pixel_sums(model, view.frame, gradient, count, texture, view.behind)
         return ViewGradients(view.frame, comparison, view.losses, pixel_sums, learning=learning)
+
+    def _drawn(self, step: int) -> DeviceModel:
+        """The model as a step draws it."""
+        probability = at_step(self.dropout, step)
+        return replace(self.model, dropout=Dropout(probability, self.seed, step)) if probability else self.model
 
     def _coloured(self, camera: DeviceCamera, image: Array) -> tuple[Array, list[LossValue]]:
         """The image in the colours of its photograph, where that has its own, and the loss of their numbers."""

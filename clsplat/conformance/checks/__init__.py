@@ -7,6 +7,7 @@ from clsplat.conformance.checks import (
     colours,
     compression,
     density,
+    dropout,
     essential,
     images,
     large,
@@ -21,6 +22,7 @@ from clsplat.conformance.checks import (
 
 KERNELS: list[Check] = [
     *projection.CHECKS.listed,
+    *dropout.CHECKS.listed,
     *tiles.CHECKS.listed,
     *large.CHECKS.listed,
     *blending.CHECKS.listed,
