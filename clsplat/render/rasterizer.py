@@ -21,8 +21,7 @@ RECORD = int(constants()["RECORD"])
 PIXEL_SUMS = int(constants()["PIXEL_SUMS"])
 MAX_PAIRS = 2**31  # more than fit in memory, and few enough for sums of 32 bits: no other limit
 Content = Literal["colour", "depth", "entropy"]
-# channels of the splats: colour, or (depth of the mean in scene units, 1, 0); or colour with a fourth plane of the
-# image, the entropy of a pixel's blend weights
+# channels: colour, or (depth of the mean in scene units, 1, 0); or colour and a fourth plane, the entropy of weights
 
 
 @dataclass(frozen=True)
@@ -55,8 +54,7 @@ class Rasterizer:
     def __init__(self, device: Device, sort: Sort = "auto", budget: Budget | None = None) -> None:
         self.device = device
         self.budget = budget or Budget(MAX_PAIRS)
-        records = device.info.allocation // (4 * RECORD)  # of pairs, in one buffer
-        self._limit = min(self.budget.pairs, records, MAX_PAIRS)
+        self._limit = min(self.budget.pairs, device.info.allocation // (4 * RECORD), MAX_PAIRS)  # in one buffer
         self._bands: dict[int, int] = {}  # rows of tiles of a frame -> number of bands
         self.workspace = Workspace(device)
         self.tiler = Tiler(device, self.workspace, sort)
@@ -127,8 +125,7 @@ class Rasterizer:
 
     def _blend(self, content: Content, **defines: int) -> Program:
         """The kernels of blending; without sums and entropy that nobody reads."""
-        if content == "entropy":
-            defines["WEIGHT_ENTROPY"] = 1
+        defines |= {"WEIGHT_ENTROPY": 1} if content == "entropy" else {}
         return self.device.program(f"blend_{self.device.schedule}.cl", **defines)
 
     def _split(self, camera: DeviceCamera) -> list[Band]:
