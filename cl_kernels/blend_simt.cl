@@ -118,6 +118,7 @@ void blend_backward(
     __global const float *restrict image,       // [3 + WEIGHT_ENTROPY,tiles_y*TILE,tiles_x*TILE]
     __global const float *restrict grad_image,  // [3 + WEIGHT_ENTROPY,tiles_y*TILE,tiles_x*TILE]
     __global const float *restrict texture,     // [tiles_y*TILE,tiles_x*TILE] read where PIXEL_SUMS > SUM_WEIGHT
+    __global const float *restrict behind,      // [tiles_y*TILE,tiles_x*TILE] T dL/dT, read where GRAD_BEHIND
     __global const uint *restrict tile_last,    // [T]
     __global float *restrict pair_sums,         // [P,RECORD] in emission order
     const uint first_tile)                      // of this launch
@@ -134,6 +135,9 @@ void blend_backward(
         p.green = grad_image[plane + at];
         p.blue = grad_image[2 * plane + at];
         p.rest = p.red * image[at] + p.green * image[plane + at] + p.blue * image[2 * plane + at];
+#if GRAD_BEHIND
+        p.rest = p.rest + behind[at];
+#endif
 #if PIXEL_SUMS > SUM_WEIGHT
         p.texture = texture[at];
 #endif

@@ -177,6 +177,7 @@ void blend_backward(
     __global const float *restrict image,       // [3 + WEIGHT_ENTROPY,tiles_y*TILE,tiles_x*TILE]
     __global const float *restrict grad_image,  // [3 + WEIGHT_ENTROPY,tiles_y*TILE,tiles_x*TILE]
     __global const float *restrict texture,     // [tiles_y*TILE,tiles_x*TILE] read where PIXEL_SUMS > SUM_WEIGHT
+    __global const float *restrict behind,      // [tiles_y*TILE,tiles_x*TILE] T dL/dT, read where GRAD_BEHIND
     __global const uint *restrict tile_last,    // [T]
     __global float *restrict pair_sums,         // [P,RECORD] in emission order
     const uint first_tile)                      // of this launch
@@ -199,6 +200,9 @@ void blend_backward(
             p.blue = VLOAD(grad_image + 2 * plane + at);
             p.rest = p.red * VLOAD(image + at) + p.green * VLOAD(image + plane + at) +
                      p.blue * VLOAD(image + 2 * plane + at);
+#if GRAD_BEHIND
+            p.rest = p.rest + VLOAD(behind + at);
+#endif
 #if PIXEL_SUMS > SUM_WEIGHT
             p.texture = VLOAD(texture + at);
 #endif

@@ -124,6 +124,8 @@ static inline VI to_VI(VF whole) { return as_VI(whole + ROUND_MAGIC) - 0x4b40000
 static inline VF larger(VF a, VF b) { return b > a ? b : a; }
 static inline VF smaller(VF a, VF b) { return b < a ? b : a; }
 
+static inline VF magnitude(VF v) { return as_VF(as_VI(v) & 0x7fffffff); }
+
 /* e^x for x in [POWER_MIN, 80]: 2^n from the exponent bits, 2^f by a minimax polynomial on [-1/2, 1/2].
  * Relative error 3e-7 near 0, 1.3e-6 at the ends.  Outside the range the result is undefined. */
 static inline VF exp_power(VF x)

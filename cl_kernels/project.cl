@@ -3,7 +3,8 @@
  * Kerbl et al. 2023, section 4, with the linearised perspective of Zwicker et al. 2001.  Both filters are numbers:
  * `filter_variance`, scene units^2, is added to the squared scales, `screen_variance`, px^2, to the screen covariance.
  * The opacity is multiplied by the energy factor of the first, and with `compensate` = 1 also by that of the second
- * (Mip-Splatting, Yu et al. 2024, eq. 9 and 11).  With PIXEL_BOX `screen_variance` and `compensate` are 0.
+ * (Mip-Splatting, Yu et al. 2024, eq. 9 and 11), and by a constant, which changes no derivative by a logit: that is the
+ * sum over pixels of dL/dpower times 1 - sigmoid.  With PIXEL_BOX `screen_variance` and `compensate` are 0.
  *
  * One item = LANES Gaussians.  No local memory.  Deterministic: no item writes what another reads. */
 #include "backward.h"
@@ -59,6 +60,7 @@ void project_forward(
     const float near_plane,                          // scene units
     const float screen_variance,                     // px^2
     const float compensate,                          // 0 or 1
+    const float opacity_factor,                      // 1, or that of the step's dropout
     const uint row_begin,                            // of the band of tiles whose pairs are listed
     const uint row_end,
     const uint hidden_plane,                         // that has the view
@@ -86,7 +88,7 @@ void project_forward(
                     (v - 0.5f - r < grid_y) & (v - 0.5f + r >= 1.0f);
     VSTORE((seen ? r : (VF)(0.0f)), radius + i);
 
-    const VF opacity = sigmoid(VLOAD(logit_opacity + i)) * s.energy;
+    const VF opacity = sigmoid(VLOAD(logit_opacity + i)) * s.energy * opacity_factor;
 #if PIXEL_BOX  // no pixel shows more of it than its whole area
     const VI opaque = opacity * smaller(TWO_PI * sqrt(s.determinant), (VF)(1.0f)) > ALPHA_MIN;
 #else

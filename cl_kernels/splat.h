@@ -175,14 +175,15 @@ static inline void blend(pixels_t *p, const row_splat_t s, const VF pixel, const
     p->t = k.next;
 }
 
-static inline VF magnitude(VF t) { return as_VF(as_VI(t) & 0x7fffffff); }
-
 /* State of LANES pixels for gradients: g = dL/dcolour of the pixel; rest = g . (colour that is blended after this
  * splat, background included), which starts as g . final colour.  Then dL/dalpha = t (c . g) - rest_after / (1 -
  * alpha): front to back, without dividing the transmittance.
  *
  * The entropy adds -(ln w + 1) dL/dH to what a splat of weight w shows of g, c . g: the sum over all splats and the
- * background starts as -(1 - H) dL/dH, since their weights have the sum 1. */
+ * background starts as -(1 - H) dL/dH, since their weights have the sum 1.
+ *
+ * A loss of the final transmittance T adds -T / (1 - alpha) dL/dT, the same for all splats: rest starts larger by
+ * T dL/dT, the plane `behind`. */
 typedef struct {
     VF t, rest, red, green, blue;
 #if PIXEL_SUMS > SUM_WEIGHT

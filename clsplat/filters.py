@@ -15,6 +15,7 @@ from pydantic import AfterValidator, Field
 from clsplat.formats.ply import MAX_NUMBER
 from clsplat.gaussians.tables import DeviceModel, Gaussians
 from clsplat.opencl.device import Array, Device
+from clsplat.render.backdrops import Backdrop
 from clsplat.render.camera import camera_values
 from clsplat.scene.scene import View
 from clsplat.settings import OneOf, Settings
@@ -160,6 +161,8 @@ class ModelSettings(Settings):
     """Blur of Gaussians in the world."""
     screen_filter: OneOf[ScreenFilter] = Dilation()
     """Blur of splats in the image."""
+    background: OneOf[Backdrop] | None = None
+    """What is behind the Gaussians: `directions`, a sky that is learned, or `auto`; without it, `scene.background`."""
 
     def model(self, gaussians: Gaussians, degree: int) -> DeviceModel:
         """Return the Gaussians with the numbers of these settings; `degree` is the active one."""

@@ -12,7 +12,8 @@ from typing import Protocol, TypeVar
 LOG = logging.getLogger("clsplat")
 Item = TypeVar("Item")
 INTERVAL = 5.0  # seconds between lines of the log
-WATCH = 0.5  # seconds between two looks at work that does not count by itself
+WATCH, SLOWEST = 0.5, 5.0  # seconds between two looks at work that does not count by itself: at first, and at most
+LOOKS = 40  # in the time that has passed, at most, for a look may cost a process
 
 
 class Listener(Protocol):
@@ -102,7 +103,8 @@ def watched(count: Count, look: Callable[[], int]) -> Iterator[None]:
     ended, context = threading.Event(), contextvars.copy_context()
 
     def watch() -> None:
-        while not ended.wait(WATCH):
+        began = time.monotonic()
+        while not ended.wait(min(max(WATCH, (time.monotonic() - began) / LOOKS), SLOWEST)):
             done = look()
             if done > count.done:
                 count.reach(min(done, count.total))

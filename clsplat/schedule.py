@@ -10,14 +10,13 @@
 import inspect
 import math
 from abc import abstractmethod
-from collections.abc import Callable
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import AfterValidator, Field, GetCoreSchemaHandler, ValidationError, WrapValidator
+from pydantic import AfterValidator, Field, GetCoreSchemaHandler, WrapValidator
 from pydantic_core import CoreSchema, core_schema
 
 from clsplat.errors import ConfigError
-from clsplat.settings import Settings
+from clsplat.settings import Settings, in_one_sentence
 
 Point = Annotated[list[float], Field(min_length=2, max_length=2)]  # global step, value
 
@@ -140,16 +139,7 @@ NOTATIONS = (
 
 def explained(more: str = "") -> WrapValidator:
     """Make one sentence of the errors of all notations; `more` names other values that the field accepts."""
-
-    def validated(value: Any, validate: Callable[[Any], Any]) -> Any:
-        try:
-            return validate(value)
-        except ValidationError as error:
-            found = [one["msg"] for one in error.errors() if one["type"] == "value_error"]
-            messages = [message.removeprefix("Value error, ") for message in found]
-            raise ValueError(next((text for text in messages if text != NOTATIONS), NOTATIONS + more)) from None
-
-    return WrapValidator(validated)
+    return in_one_sentence(NOTATIONS + more)
 
 
 Schedule = Annotated[float | PointList | Annotated[Curve, _Curves()], explained()]
@@ -170,21 +160,24 @@ def divided(schedule: Schedule, factor: float) -> Schedule:
 
 
 class Bounded:
-    """Requires every value of a schedule to be at least `lowest`, or, where `above`, larger."""
+    """Requires every value of a schedule to be at least `lowest`, or, where `above`, larger; and at most `most`."""
 
-    def __init__(self, lowest: float, above: bool = False) -> None:
-        self.lowest, self.above = lowest, above
+    def __init__(self, lowest: float, above: bool = False, most: float = math.inf) -> None:
+        self.lowest, self.above, self.most = lowest, above, most
 
     def __call__(self, schedule: Any) -> Any:
         lowest = min(values_of(schedule))
         if lowest < self.lowest or (self.above and lowest == self.lowest):
             bound = "larger than" if self.above else "at least"
             raise ValueError(f"expected values {bound} {self.lowest:g}")
+        if max(values_of(schedule)) > self.most:
+            raise ValueError(f"expected values of at most {self.most:g}")
         return schedule
 
 
 NonNegative = Annotated[Schedule, AfterValidator(Bounded(0))]
 Positive = Annotated[Schedule, AfterValidator(Bounded(0, above=True))]
+Probability = Annotated[Schedule, AfterValidator(Bounded(0, most=0.9))]
 AtLeastOne = Annotated[Schedule, AfterValidator(Bounded(1))]
 
 

@@ -15,7 +15,15 @@ import typing
 from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeVar
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, GetCoreSchemaHandler, GetJsonSchemaHandler
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    GetCoreSchemaHandler,
+    GetJsonSchemaHandler,
+    ValidationError,
+    WrapValidator,
+)
 from pydantic_core import CoreSchema, core_schema
 
 from clsplat.errors import ConfigError
@@ -151,6 +159,19 @@ def _readable(text: str) -> str:
     if "\0" in text or any("\ud800" <= letter <= "\udfff" for letter in text):
         raise ValueError("expected a path: no name of a file holds such a character")
     return text
+
+
+def in_one_sentence(expected: str) -> WrapValidator:
+    """Make one sentence of the errors of a field's notations: the first that one of them says itself, or `expected`."""
+
+    def validated(value: Any, validate: Callable[[Any], Any]) -> Any:
+        try:
+            return validate(value)
+        except ValidationError as error:
+            own = [one["msg"].removeprefix("Value error, ") for one in error.errors() if one["type"] == "value_error"]
+            raise ValueError(next((text for text in own if not expected.startswith(text)), expected)) from None
+
+    return WrapValidator(validated)
 
 
 ReadPath = Annotated[str, AfterValidator(_readable)]  # a file or folder that is read

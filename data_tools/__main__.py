@@ -6,8 +6,10 @@ from typing import Annotated, Literal
 import typer
 
 from clsplat.scene.detect import format_names
+from data_tools.features import CameraModel
+from data_tools.mapping import Mapper
+from data_tools.matching import Matching
 from data_tools.multiscale import write_multiscale
-from data_tools.photos import CameraModel, Mapper, Matching
 from data_tools.synthetic import Options, write_dataset
 from data_tools.undistort import Blank
 
@@ -63,10 +65,12 @@ def photos(
 def video(
     file: Annotated[Path, typer.Argument(help="A video.")],
     out: Annotated[Path, typer.Argument(help="Folder for the frames.")],
-    frames: Annotated[int, typer.Option(min=1, help="Equal parts; the sharpest frame of each is written.")] = 100,
+    frames: Annotated[
+        int, typer.Option(min=1, help="Parts with the same motion; the sharpest frame of each is written.")
+    ] = 100,
     long_side: Annotated[int | None, typer.Option(min=16, help="Pixels, at most.")] = None,
 ) -> None:
-    """Take sharp, evenly spaced frames of a video."""
+    """Take sharp frames of a video, with the same motion between them."""
     from data_tools.video import write_frames
 
     print(f"{write_frames(file, out, frames, long_side)} frames in {out}")

@@ -2,10 +2,13 @@
 
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
-import numpy as np
+from clsplat.errors import DataError
 
 COUNT_ROWS = """
 import sqlite3, sys
@@ -14,46 +17,67 @@ with sqlite3.connect(sys.argv[1], uri=True, timeout=0.1) as opened:
 """
 
 
+@contextmanager
+def opened(pycolmap: ModuleType, database: Path) -> Iterator[Any]:
+    """COLMAP's database for the block; a new one where there is none."""
+    rows = pycolmap.Database.open(str(database))
+    try:
+        yield rows
+    finally:
+        rows.close()
+
+
 def image_names(pycolmap: ModuleType, database: Path) -> list[str]:
-    """Return the names of the images, sorted."""
-    opened = pycolmap.Database.open(str(database))
+    """Return the names of the images, sorted; none where there is no database."""
+    if not database.exists():
+        return []
+    with opened(pycolmap, database) as rows:
+        return sorted(image.name for image in rows.read_all_images())
+
+
+def without_features(rows: Any) -> dict[int, str]:
+    """Return the images of an opened database whose features are not in it, by number, in order of their names."""
+    return {
+        image.image_id: image.name
+        for image in sorted(rows.read_all_images(), key=lambda image: image.name)
+        if not (rows.exists_keypoints(image.image_id) and rows.exists_descriptors(image.image_id))
+    }
+
+
+def clear_features(pycolmap: ModuleType, database: Path) -> None:
+    """Remove features and matches; cameras and images stay."""
+    with opened(pycolmap, database) as rows:
+        for clear in ("two_view_geometries", "matches", "descriptors", "keypoints"):
+            getattr(rows, f"clear_{clear}")()
+
+
+def feature_counts(pycolmap: ModuleType, database: Path) -> dict[str, int]:
+    """Return the number of features of each image."""
+    with opened(pycolmap, database) as rows:
+        return {image.name: rows.num_keypoints_for_image(image.image_id) for image in rows.read_all_images()}
+
+
+def verified(pycolmap: ModuleType, database: Path) -> dict[tuple[str, str], int]:
+    """Return the pairs whose matches pass geometric verification, with the number of these."""
+    with opened(pycolmap, database) as rows:
+        names = {image.image_id: image.name for image in rows.read_all_images()}
+        pairs, counts = rows.read_two_view_geometry_num_inliers()
+    found = zip(map(pycolmap.pair_id_to_image_pair, pairs), counts, strict=True)
+    return {(names[a], names[b]): count for (a, b), count in found if count}
+
+
+@contextmanager
+def explained(place: Path, what: str) -> Iterator[None]:
+    """pycolmap's errors as one sentence."""
     try:
-        return sorted(image.name for image in opened.read_all_images())
-    finally:
-        opened.close()
-
-
-def without_features(pycolmap: ModuleType, database: Path) -> list[str]:
-    """Return the names of images whose features are not in the database, or not all, sorted."""
-    opened = pycolmap.Database.open(str(database))
-    try:
-        return sorted(
-            image.name
-            for image in opened.read_all_images()
-            if not (opened.exists_keypoints(image.image_id) and opened.exists_descriptors(image.image_id))
-        )
-    finally:
-        opened.close()
-
-
-def matched_pairs(pycolmap: ModuleType, database: Path) -> int:
-    """Return the number of pairs whose matches pass geometric verification."""
-    opened = pycolmap.Database.open(str(database))
-    try:
-        _, inliers = opened.read_two_view_geometry_num_inliers()
-        return int(np.count_nonzero(inliers))
-    finally:
-        opened.close()
+        yield
+    except (ValueError, RuntimeError) as error:
+        raise DataError(f"{place}: could not {what} ({str(error).splitlines()[0]}); check the photographs") from error
 
 
 def pairs_done(database: Path) -> int:
     """Return the number of pairs that were looked at, while pycolmap writes; 0 where that cannot be read just now."""
     return _rows(database, "two_view_geometries")
-
-
-def features_done(database: Path) -> int:
-    """Return the number of images with features, while pycolmap writes; 0 where that cannot be read just now."""
-    return _rows(database, "descriptors")
 
 
 def _rows(database: Path, table: str) -> int:

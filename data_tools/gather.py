@@ -8,15 +8,24 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from clsplat.errors import DataError
+from clsplat.errors import DataError, amount
 from clsplat.files import atomic
 from clsplat.progress import Count
-from clsplat.scene.exif import exposure_of, write_exposures
-from clsplat.scene.images import IMAGE_SUFFIXES, read_image
+from clsplat.reading import read_file
+from clsplat.scene.exif import copied, exposure_of, write_exposures
+from clsplat.scene.image_headers import JPEG, TAIL_SIZE, parse_header
+from clsplat.scene.images import IMAGE_SUFFIXES, MAX_BYTES, decode_image, read_grey
 
 LOG = logging.getLogger("clsplat")
-UNREADABLE_SUFFIXES = {".heic", ".heif", ".avif", ".dng", ".cr2", ".nef", ".arw"}  # photographs that OpenCV cannot read
+CONVERTED = {  # photographs that OpenCV cannot read, and what makes JPEG files of them
+    "HEIC": ({".heic", ".heif"}, "heif-convert d.heic d.jpg, or sips -s format jpeg *.heic --out . on a Mac"),
+    "AVIF": ({".avif"}, "ffmpeg -i d.avif d.jpg"),
+    "DNG": ({".dng"}, "darktable-cli d.dng d.jpg"),
+    "raw": ({".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"}, "darktable-cli d.nef d.jpg"),
+}
+UNREADABLE_SUFFIXES = {suffix for suffixes, _ in CONVERTED.values() for suffix in suffixes}
 MIN_PHOTOGRAPHS = 3  # in a folder, and in a model
+CHECKED_SIDE = 64  # px: a photograph that is linked is decoded as small as it can be, to know that it is one
 
 
 def list_photographs(folder: Path, without: Path | None = None) -> list[str]:
@@ -25,20 +34,32 @@ def list_photographs(folder: Path, without: Path | None = None) -> list[str]:
     Raises DataError when there are too few of them.
     """
     names, unreadable = _found(folder, without)
-    if unreadable:
-        LOG.warning(
-            "%s: %d files such as %s are left out: convert them to JPEG", folder, len(unreadable), unreadable[0]
-        )
+    for text in _how_to_convert(unreadable):
+        LOG.warning("%s: %s", folder, text)
     require_photographs(folder, without)
     return names
 
 
 def require_photographs(folder: Path, without: Path | None = None) -> None:
     """Raise DataError when there are too few photographs below a folder."""
-    names, _ = _found(folder, without)
+    names, unreadable = _found(folder, without)
     if len(names) < MIN_PHOTOGRAPHS:
         suffixes = ", ".join(sorted(IMAGE_SUFFIXES))
-        raise DataError(f"{folder}: found {len(names)} photographs; expected at least {MIN_PHOTOGRAPHS}, of {suffixes}")
+        more = "".join(f"; {text}" for text in _how_to_convert(unreadable))
+        raise DataError(
+            f"{folder}: found {len(names)} photographs; expected at least {MIN_PHOTOGRAPHS}, of {suffixes}{more}"
+        )
+
+
+def _how_to_convert(unreadable: list[str]) -> list[str]:
+    """A sentence for each kind of photographs that are left out."""
+    texts = []
+    for kind, (suffixes, command) in CONVERTED.items():
+        if found := [name for name in unreadable if Path(name).suffix.lower() in suffixes]:
+            are = "is" if len(found) == 1 else "are"
+            named = f"{amount(len(found), f'{kind} file')} such as {found[0]} {are} left out"
+            texts.append(f"{named}: make JPEG files of them, such as by {command}")
+    return texts
 
 
 def _found(folder: Path, without: Path | None) -> tuple[list[str], list[str]]:
@@ -69,22 +90,33 @@ def gather(photographs: Path, images: Path, names: list[str]) -> tuple[list[str]
             kept.append(name)
             continue
         try:
-            stored, upright = read_image(photographs / name), read_image(photographs / name, upright=True)
+            _gather_one(photographs / name, images / name)
         except DataError as error:
             damaged[name] = str(error).removeprefix(f"{photographs / name}: ").partition(";")[0]
             continue
-        (images / name).parent.mkdir(parents=True, exist_ok=True)
-        if stored.shape[:2] == upright.shape[:2] and (stored[:, :, :3] == upright[:, :, :3]).all():
-            link(photographs / name, images / name)
-        else:
-            _, encoded = cv2.imencode(".jpg", np.ascontiguousarray(upright[:, :, ::-1]), [cv2.IMWRITE_JPEG_QUALITY, 98])
-            with atomic(images / name) as file:
-                file.write(encoded.tobytes())
         kept.append(name)
-    write_exposures(images, {name: exposure_of(photographs / name) for name in kept})  # a copy has none
+    write_exposures(images, {name: exposure_of(photographs / name) for name in kept})  # a copy of a PNG has none
     if len(kept) < MIN_PHOTOGRAPHS:
         raise DataError(f"{photographs}: only {len(kept)} of {len(names)} photographs can be read; export them again")
     return kept, damaged
+
+
+def _gather_one(source: Path, target: Path) -> None:
+    """Link a photograph, or write it upright, with its EXIF data.  Raises DataError where it cannot be read."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    data = read_file(source, "an image", limit=MAX_BYTES)
+    if data.startswith(JPEG) and (header := parse_header(data, data[-TAIL_SIZE:], lambda: data)):
+        is_upright = header.orientation == 1
+        pixels = read_grey(source, CHECKED_SIDE)[0] if is_upright else decode_image(data, source, upright=True)
+    else:
+        stored, pixels = decode_image(data, source), decode_image(data, source, upright=True)
+        is_upright = stored.shape[:2] == pixels.shape[:2] and bool((stored[:, :, :3] == pixels[:, :, :3]).all())
+    if is_upright:
+        link(source, target)
+    else:
+        _, encoded = cv2.imencode(".jpg", np.ascontiguousarray(pixels[:, :, ::-1]), [cv2.IMWRITE_JPEG_QUALITY, 98])
+        with atomic(target) as file:
+            file.write(copied(data, encoded.tobytes()))
 
 
 def link(source: Path, target: Path) -> None:

@@ -1,8 +1,8 @@
-"""Sharp, evenly spaced frames of a video."""
+"""Sharp frames of a video, with the same motion between them."""
 
 import json
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
@@ -17,14 +17,17 @@ from clsplat.files import write_text
 from clsplat.progress import Count
 from clsplat.reading import read_json, sha256
 from clsplat.scene.images import image_size, is_image, write_image
+from clsplat.scene.sharpness import SIDE, sharpness
 
 LOG = logging.getLogger("clsplat")
 RECORD = ".frames.json"  # beside the frames: what they were made from
-SHARPNESS_SIDE = 480  # px: sharpness is measured at this size: at full size, noise counts as detail
+FLOW_SIDE = 120  # px: motion is measured at this size
+CELLS = 4, 3  # in each of which the motion of all pixels is averaged, so that noise has little
+STILL = 0.1  # px from one frame to the next: what noise and coding leave of it
 
 
 def write_frames(video: Path, out: Path, frames: int = 100, long_side: int | None = None) -> int:
-    """Write the sharpest frame of each of `frames` equal parts of a video as PNG; return their number.
+    """Write the sharpest frame of each of `frames` parts of a video with the same motion as PNG; return their number.
 
     The format is PNG because a second lossy coding changes features and colours.  An interrupted call goes on: frames
     of the same video and settings stay unchanged.
@@ -34,9 +37,9 @@ def write_frames(video: Path, out: Path, frames: int = 100, long_side: int | Non
     chosen = _begun(out, settings)
     if chosen is None:
         LOG.info("%s: looking for sharp frames", video)
-        sharpness = [_sharpness(image) for image in _decoded(video)]
-        chosen = sharpest(sharpness, frames)
-        LOG.info("%d frames, of which %d are written", len(sharpness), len(chosen))
+        sharp, moved = _measured(video)
+        chosen = sharpest(sharp, moved, frames)
+        LOG.info("%d frames, of which %d are written", len(sharp), len(chosen))
         write_text(out / RECORD, json.dumps({**settings, "chosen": chosen}) + "\n")
     files = {place: _file(out, i) for i, place in enumerate(chosen, 1)}
     count = Count("frames written", len(files))
@@ -95,10 +98,35 @@ def _is_whole(path: Path) -> bool:
         return False
 
 
-def sharpest(sharpness: list[float], parts: int) -> list[int]:
-    """Return the index of the largest value in each of `parts` equal parts, the first of equal ones."""
-    edges = np.linspace(0, len(sharpness), min(parts, len(sharpness)) + 1).astype(int)
-    return [int(a + np.argmax(sharpness[a:b])) for a, b in pairwise(edges)]
+def sharpest(sharpness: Sequence[float], motion: Sequence[float], parts: int) -> list[int]:
+    """Return the index of the sharpest frame in each of at most `parts` parts with the same motion, the first of
+    equal ones.
+
+    motion: of each frame from the one before, px.  A camera that rests gives one frame, however long it does; where it
+    always rests, parts are equally long.
+    """
+    way = np.cumsum(np.maximum(np.asarray(motion, float) - STILL, 0))
+    if not way[-1] > 0:
+        way = np.arange(1.0, len(sharpness) + 1)
+    edges = np.searchsorted(way, np.linspace(0, way[-1], min(parts, len(sharpness)) + 1)[1:-1], side="right")
+    return [int(a + np.argmax(sharpness[a:b])) for a, b in pairwise([0, *edges.tolist(), len(sharpness)]) if b > a]
+
+
+def _measured(video: Path) -> tuple[list[float], list[float]]:
+    """Sharpness of each frame, and the middle length of its motion from the frame before, px."""
+    sharp: list[float] = []
+    moved: list[float] = []
+    empty = np.empty(0, np.float32)
+    flow, before = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST), None
+    for image in _decoded(video):
+        grey = np.asarray(cv2.cvtColor(_limited(image, SIDE), cv2.COLOR_BGR2GRAY), np.uint8)
+        sharp.append(sharpness(grey))
+        small = _limited(grey, FLOW_SIDE)
+        way = np.zeros((*small.shape, 2), np.float32) if before is None else flow.calc(before, small, empty)
+        way = cv2.resize(way, CELLS, interpolation=cv2.INTER_AREA)
+        moved.append(float(np.median(np.linalg.norm(way, axis=2))))
+        before = small
+    return sharp, moved
 
 
 def _decoded(video: Path) -> Iterator[NDArray[np.uint8]]:
@@ -116,12 +144,6 @@ def _decoded(video: Path) -> Iterator[NDArray[np.uint8]]:
         reader.release()
     if not found:
         raise DataError(f"{video}: not a video that OpenCV decodes; convert it to MP4 (H.264)")
-
-
-def _sharpness(image: NDArray[np.uint8]) -> float:
-    """Variance of the Laplacian of the reduced grey image, grey levels²."""
-    grey = cv2.cvtColor(_limited(image, SHARPNESS_SIDE), cv2.COLOR_BGR2GRAY)
-    return float(cv2.Laplacian(grey, cv2.CV_64F).var())
 
 
 def _limited(image: NDArray[np.uint8], long_side: int | None) -> NDArray[np.uint8]:

@@ -18,6 +18,7 @@ HEADINGS = {
     "rules": "Density rules",
     "prepare": "Prepare steps",
     "views": "Orders, transforms and colours",
+    "filters": "Filters and backgrounds",
 }
 INTRODUCTIONS = {
     "stages": "A pipeline is a list of stages. Those that can stand in `during` run every so many steps of training.",
@@ -27,7 +28,7 @@ INTRODUCTIONS = {
     "statistics that a rule names are summed and cost time.",
     "views": "What a training step compares with: the keys `order` and `transforms` of `optimize.views`, and "
     "`optimize.colours`.",
-    "filters": "The two low-pass filters of `model`: one in the scene, one on the screen.",
+    "filters": "Keys of `model`: the two low-pass filters, one in the scene and one on the screen, and the background.",
     "prepare": "`prepare` is a list: what makes a scene of photographs, once, on the host.",
 }
 WORDS = {"integer": "whole number", "string": "text", "boolean": "true or false", "null": "none", "object": "keys"}

@@ -45,6 +45,26 @@ def test_the_sharp_frames_of_a_video(video, tmp_path):
     np.testing.assert_allclose(levels, np.arange(1, 30, 3), atol=0.6)
 
 
+def test_a_camera_that_rests_gives_one_frame(tmp_path, rng):
+    """It rests, passes a wall in the middle third of the video, and rests again."""
+    wall = cv2.GaussianBlur(rng.integers(0, 255, (90, 300, 3)).astype(np.uint8), (0, 0), 2)
+    writer = cv2.VideoWriter(str(tmp_path / "v.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10, (120, 90))
+    for i in range(60):
+        place = 3 * int(np.clip(i - 20, 0, 20))
+        writer.write(wall[:, place : place + 120])
+    writer.release()
+    write_frames(tmp_path / "v.avi", tmp_path / "frames", 8)
+    chosen = json.loads((tmp_path / "frames" / ".frames.json").read_text())["chosen"]
+    assert len(chosen) == 8
+    assert sum(20 <= place <= 41 for place in chosen) >= 6
+
+
+def test_parts_have_the_same_motion():
+    assert sharpest([1, 3, 2, 1, 2, 3], [0] * 6, 3) == [1, 2, 5]
+    assert sharpest([1, 1, 1, 1, 2, 1], [0, 0, 0, 0, 5, 5], 2) == [4, 5]
+    assert sharpest([1.0], [0.0], 4) == [0]
+
+
 def test_frames_are_not_taken_twice(video, tmp_path):
     write_frames(video, tmp_path / "frames", frames=4, long_side=48)
     files = sorted((tmp_path / "frames").glob("*.png"))
@@ -114,7 +134,7 @@ def test_frames_do_not_mix_with_images_of_the_user(video, tmp_path):
 def test_frames_go_on_where_a_call_was_killed(video, tmp_path, monkeypatch):
     write_frames(video, tmp_path / "whole", frames=6)
     written: list[str] = []
-    write, looked = video_tool.write_image, video_tool._sharpness
+    write, looked = video_tool.write_image, video_tool._measured
 
     def killed(path: Path, pixels: np.ndarray) -> None:
         if len(written) == 2:
@@ -128,7 +148,7 @@ def test_frames_go_on_where_a_call_was_killed(video, tmp_path, monkeypatch):
     monkeypatch.setattr(
         video_tool, "write_image", lambda path, pixels: (written.append(path.name), write(path, pixels))
     )
-    monkeypatch.setattr(video_tool, "_sharpness", lambda image: pytest.fail("was measured before") or looked(image))
+    monkeypatch.setattr(video_tool, "_measured", lambda image: pytest.fail("was measured before") or looked(image))
     assert write_frames(video, tmp_path / "frames", frames=6) == 6
     assert written == [f"frame_{i:05d}.png" for i in range(1, 7)]
     assert contents(tmp_path / "frames") == contents(tmp_path / "whole")
@@ -147,7 +167,7 @@ def test_not_a_video(tmp_path):
 
 @pytest.mark.parametrize(("values", "parts", "chosen"), [([1, 3, 2], 9, [0, 1, 2]), ([2, 2, 1, 5], 2, [0, 3])])
 def test_sharpest(values, parts, chosen):
-    assert sharpest(values, parts) == chosen
+    assert sharpest(values, [0.0] * len(values), parts) == chosen
 
 
 # ---- pyramids

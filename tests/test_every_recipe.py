@@ -36,11 +36,14 @@ RECIPES = [
 ]
 LOOKS_AT_VIEWS = {"fastgs_7k", "speedy_7k", "mini_7k", "taming_7k"}
 ACTS = {  # what decides in a family of recipes; `clone` in all others
-    "auto": "clone split", "fast": "clone prune_useless", "fastgs": "split prune_inaccurate", "gdgs": "clone_crowded",
-    "mcmc": "relocate", "micro_splatting": "split_textured", "micro_splatting_v2": "merge_neighbours prune_unimportant",
+    "auto": "clone split prune_spare", "fast": "clone prune_useless",
+    "fastgs": "split prune_inaccurate", "gdgs": "clone_crowded", "mcmc": "relocate",
+    "micro_splatting": "split_textured", "micro_splatting_v2": "merge_neighbours prune_unimportant",
     "mini": "clone prune_useless", "speedy": "prune_least", "steep": "split_saddle",
 }  # fmt: skip
-SENSITIVE = {"auto": [f"densify.rules.{rule}.gradient_above=0.5" for rule in (0, 1)]}  # so few steps promise little
+SENSITIVE = {
+    "auto": [f"stages.1.during.1.rules.{rule}.gradient_above=0.5" for rule in (0, 1)]
+}  # so few steps promise little
 LEARNS = {"auto_opti3dgs", "auto_opti3dgs_7k"}
 ONE_THREAD = {"POCL_MAX_PTHREAD_COUNT": "1", "POCL_CPU_MAX_CU_COUNT": "1", "CL_CONFIG_CPU_TBB_NUM_WORKERS": "1"}
 ALONE = """

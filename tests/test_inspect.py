@@ -20,6 +20,7 @@ from clsplat.inspect.inspection import Inspection
 from clsplat.inspect.page import MAX_NAMES, inspection_page
 from clsplat.inspect.survey import distortion
 from clsplat.scene.detect import read_scene
+from clsplat.scene.exif import CameraExposure, write_exposures
 from clsplat.scene.lens import Lens
 from clsplat.scene.view import load_image, load_mask
 from clsplat.stages.init import require_ahead
@@ -57,7 +58,9 @@ def write(path: Path, model: ColmapModel, kind: str = "bin", size: tuple[int, in
 
 
 def photograph(file: Path, size: tuple[int, int] = SIZE) -> None:
-    noise = np.random.default_rng(1).integers(0, 255, (size[1], size[0], 3), np.uint8)
+    noise = np.random.default_rng(list((file.parent.name + file.name).encode())).integers(
+        0, 255, (size[1], size[0], 3), np.uint8
+    )
     _, data = cv2.imencode(file.suffix, noise)
     file.write_bytes(data.tobytes())
 
@@ -123,6 +126,20 @@ def test_blender_and_nerfstudio(tiny_scene):
     facts = Inspection.of(tiny_scene).facts
     assert (facts.kind, facts.registered, facts.train, facts.test) == ("Blender", 10, 8, 2)
     assert facts.points.count > 0
+
+
+def test_photographs_that_are_blurred_the_same_or_exposed_otherwise_are_named(scene, tmp_path):
+    images = sorted((scene / "images").iterdir())
+    cv2.imwrite(str(images[3]), cv2.GaussianBlur(cv2.imread(str(images[3])), (0, 0), 2))
+    cv2.imwrite(str(images[9]), cv2.imread(str(images[5])) ^ 1)
+    seconds = {image.name: 0.01 * (4 if i > 11 else 1) for i, image in enumerate(images)}
+    write_exposures(scene / "images", {name: CameraExposure(one, 2.0, 100.0) for name, one in seconds.items()})
+    inspection = Inspection.of(scene)
+    assert said(inspection, "warning").startswith(f"1 photograph is blurred ({images[3].name}): leave them out")
+    notes = [finding.text for finding in inspection.findings if finding.level == "note"]
+    assert notes[0].startswith(f"{images[5].name}, {images[9].name} look the same")
+    assert f"jumps by more than a stop 1 time ({images[11].name} to {images[12].name}: 2.0)" in notes[1]
+    assert len(notes) == 2
 
 
 def test_distortion_is_the_displacement_at_the_corner():

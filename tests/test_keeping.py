@@ -3,6 +3,7 @@
 import json
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -16,6 +17,7 @@ from clsplat.pipeline.loading import load
 from clsplat.report.charts import NAMES
 from clsplat.report.parting import parting
 from clsplat.runs.experiment import Job
+from clsplat.runs.refitting import as_trained
 from clsplat.runs.summary import summary
 from clsplat.training import checkpoint, kept
 from clsplat.training.kept import Best, Measured
@@ -145,6 +147,40 @@ def test_patience_ends_a_training(tiny_scene, tmp_path, pipeline, best):
     longer = train(tiny_scene, run.out, "optimize.patience=99", pipeline=pipeline, resume=True)
     assert longer.step == 40
     assert digest(run.out) == digest(best)
+
+
+def grown(out: Path) -> dict[int, bool]:
+    """By step, whether an edit has added Gaussians."""
+    return {line["step"]: line["after"] > line["before"] for line in lines(out) if line["kind"] == "densify"}
+
+
+def test_growth_ends_where_validation_finds_no_better_model(tiny_scene, tmp_path, pipeline, best):
+    assert grown(best) == {15: True, 20: True, 25: True}
+    for patience, expected in ((1, {15: True, 20: False, 25: False}), (3, {15: True, 20: True, 25: False})):
+        out = train(tiny_scene, tmp_path / str(patience), f"densify.patience={patience}", pipeline=pipeline).out
+        assert grown(out) == expected
+        assert metrics(out)["kept"]["growth_ended"] == (20 if patience == 1 else 25)
+        assert digest(out) == digest(best), "of a step before"
+    until = train(tiny_scene, tmp_path / "until", "densify.grow_until=20", pipeline=pipeline).out
+    assert grown(until) == {15: True, 20: False, 25: False}
+    again = shutil.copytree(tmp_path / "1", tmp_path / "again")
+    for path in checkpoint.saved(again):
+        if int(path.stem.removeprefix("step_")) > 22:
+            path.unlink()
+    for name in ("point_cloud.ply", "metrics.json", "report.html", "checksums.json"):
+        (again / name).unlink()
+    train(tiny_scene, again, "densify.patience=1", pipeline=pipeline, resume=True)
+    equal_ends(again, tmp_path / "1")
+
+
+def test_a_refit_ends_growth_at_the_same_step(tiny_scene, pipeline):
+    pipeline = load(pipeline, ["densify.patience=1", "optimize.refit=true"])
+    found = Measured(step=30, train=20, validation=20)
+    best = Best(found=found, degree=0, metrics={}, evaluations=9, since=2, apart=None, last=found, growth_ended=20)
+    run = SimpleNamespace(best=best.model_copy(update={"refit": "begun"}), is_refit=True)
+    training = as_trained(pipeline, run).settings.training
+    density = next(stage for stage in training.during if stage.stage == "densify")
+    assert (training.steps, density.patience, density.grow_until) == (30, None, 20)
 
 
 def test_training_that_goes_on_goes_on_from_the_last_step(tiny_scene, tmp_path, pipeline, best):

@@ -1,8 +1,11 @@
 """Structure from motion on real photographs, against the poses they came with; and photographs that need care."""
 
 import shutil
+import signal
 import sqlite3
-from contextlib import closing, nullcontext
+import subprocess
+import sys
+from contextlib import closing
 from pathlib import Path
 
 import cv2
@@ -16,11 +19,14 @@ from clsplat.scene.detect import read_scene
 from clsplat.scene.lens import Lens
 from clsplat.scene.scene import Camera, View
 from clsplat.scene.view import load_image, load_mask
-from data_tools import photos as photos_tool
+from data_tools import features as features_tool
+from data_tools import mapping as mapping_tool
 from data_tools import undistort as undistort_tool
 from data_tools.colmap_writer import write_model
+from data_tools.features import Sought, find_features
 from data_tools.gather import list_photographs
-from data_tools.photos import find_features, map_cameras, match_features
+from data_tools.mapping import map_cameras
+from data_tools.matching import match_features
 from data_tools.undistort import undistort_scene
 from data_tools.vocabulary import alike
 from tests.colmap_writer import CameraEntry, ColmapModel, ImageEntry, PointEntry
@@ -30,11 +36,13 @@ from tests.refusals import refusal
 from tests.test_data_tools import contents
 from tests.test_masks import with_orientation
 
+ROOT = Path(__file__).parent.parent
+
 
 def place(photos: Path, out: Path, **matching: object) -> Path:
     for name in ("features", "matches", "cameras"):
         (out / name).mkdir(parents=True)
-    find_features(photos, out / "features", long_side=480, features=2048)
+    find_features(photos, out / "features", Sought(480, 2048))
     match_features(out / "features", out / "matches", **matching)
     map_cameras(out / "matches", out / "cameras")
     return out / "cameras"
@@ -65,14 +73,19 @@ def aligned_errors(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return np.linalg.norm(b - scale * a @ (u @ sign @ vt).T, axis=1)
 
 
-def test_cameras_are_where_they_were(placed):
+def pose_errors(placed: Path) -> np.ndarray:
+    """Distances of cameras from where they were, by the size of their path."""
     truth = {view.name: view.position for view in read_scene(data_set("fox_opencv")).views}
     views = read_scene(placed).views
-    assert len(views) == 14
     errors = aligned_errors(np.stack([v.position for v in views]), np.stack([truth[v.name] for v in views]))
-    reach = np.linalg.norm(np.ptp([truth[v.name] for v in views], axis=0))
-    assert np.median(errors) < 0.01 * reach
-    assert errors.max() < 0.03 * reach
+    return errors / np.linalg.norm(np.ptp([truth[v.name] for v in views], axis=0))
+
+
+def test_cameras_are_where_they_were(placed):
+    errors = pose_errors(placed)
+    assert len(errors) == 14
+    assert np.median(errors) < 0.01
+    assert errors.max() < 0.03
 
 
 def test_the_same_photographs_give_the_same_cameras(photos, placed, tmp_path):
@@ -91,8 +104,23 @@ def test_photographs_that_show_nothing(tmp_path):
     pytest.importorskip("pycolmap")
     for i in range(3):
         cv2.imwrite(str(tmp_path / f"{i}.png"), np.full((64, 64, 3), 80, np.uint8))
-    with pytest.raises(DataError, match="no two of the 3 photographs show the same features"):
+    with pytest.raises(DataError, match="half of them have at most 0 features"):
         place(tmp_path, tmp_path / "out")
+
+
+@pytest.mark.parametrize(("few", "attempt"), [(40, "smaller angles and fewer matches"), (16, "denser features")])
+def test_another_attempt_places_what_the_first_does_not(photos, tmp_path, monkeypatch, few, attempt):
+    """With so few features of each photograph."""
+    monkeypatch.setattr(mapping_tool, "DENSER", Sought(480, 1500))
+    for name in ("features", "matches", "cameras"):
+        (tmp_path / name).mkdir()
+    find_features(photos, tmp_path / "features", Sought(480, few))
+    match_features(tmp_path / "features", tmp_path / "matches")
+    figures = map_cameras(tmp_path / "matches", tmp_path / "cameras")
+    assert figures["attempt"] == attempt
+    assert figures["registered"] >= 12
+    assert pose_errors(tmp_path / "cameras").max() < 0.05
+    assert not list((tmp_path / "cameras").glob(".*")), "what attempts have made is removed"
 
 
 # ---- interrupted and gone on with
@@ -116,32 +144,27 @@ def few(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_features_are_found_once_for_each_photograph(few, tmp_path, monkeypatch):
-    pycolmap = pytest.importorskip("pycolmap")
-    monkeypatch.setattr(photos_tool, "CHUNK", 2)
+def test_features_are_found_once_for_each_photograph_also_after_a_kill(few, tmp_path, monkeypatch):
+    pytest.importorskip("pycolmap")
     for name in ("whole", "half"):
         (tmp_path / name).mkdir()
-    find_features(few, tmp_path / "whole", long_side=320, features=500)
-    asked: list[str] = []
-    extract = pycolmap.extract_features
-
-    def killed(database: str, images: str, names: list[str], **options: object) -> None:
-        if asked:
-            raise KeyboardInterrupt
-        asked.extend(names)
-        extract(database, images, names, **options)
-
-    monkeypatch.setattr(pycolmap, "extract_features", killed)
-    with pytest.raises(KeyboardInterrupt):
-        find_features(few, tmp_path / "half", long_side=320, features=500)
-
-    def counted(database: str, images: str, names: list[str], **options: object) -> None:
-        asked.extend(names)
-        extract(database, images, names, **options)
-
-    monkeypatch.setattr(pycolmap, "extract_features", counted)
-    find_features(few, tmp_path / "half", long_side=320, features=500)
-    assert asked == sorted(path.name for path in few.iterdir())
+    find_features(few, tmp_path / "whole", Sought(320, 500))
+    killed = f"""
+import os, signal
+from pathlib import Path
+from data_tools import features
+find, calls = features.sift, []
+def counted(*a):
+    calls.append(a)
+    return find(*a) if len(calls) < 3 else os.kill(os.getpid(), signal.SIGKILL)
+features.sift = counted
+features.find_features(Path({str(few)!r}), Path({str(tmp_path / "half")!r}), features.Sought(320, 500))
+"""
+    assert subprocess.run([sys.executable, "-c", killed], cwd=ROOT).returncode == -signal.SIGKILL
+    sift, sizes = features_tool.sift, []
+    monkeypatch.setattr(features_tool, "sift", lambda *a: (sizes.append(a[0].shape), sift(*a))[1])
+    find_features(few, tmp_path / "half", Sought(320, 500))
+    assert len(sizes) == 3, "two of five were kept"
     assert rows(tmp_path / "half" / "database.db") == rows(tmp_path / "whole" / "database.db")
     for file in sorted((tmp_path / "whole" / "images").iterdir()):
         assert (tmp_path / "half" / "images" / file.name).read_bytes() == file.read_bytes()
@@ -151,7 +174,7 @@ def test_a_database_without_all_photographs_starts_again(few, tmp_path):
     pycolmap = pytest.importorskip("pycolmap")
     for name in ("whole", "half"):
         (tmp_path / name).mkdir()
-    find_features(few, tmp_path / "whole", long_side=320, features=500)
+    find_features(few, tmp_path / "whole", Sought(320, 500))
     first = sorted(path.name for path in few.iterdir())[:2]
     (tmp_path / "half" / "images").mkdir()
     for name in first:
@@ -159,7 +182,7 @@ def test_a_database_without_all_photographs_starts_again(few, tmp_path):
     database = str(tmp_path / "half" / "database.db")
     pycolmap.Database.open(database).close()
     pycolmap.import_images(database, str(few), image_names=first)
-    find_features(few, tmp_path / "half", long_side=320, features=500)
+    find_features(few, tmp_path / "half", Sought(320, 500))
     assert rows(tmp_path / "half" / "database.db") == rows(tmp_path / "whole" / "database.db")
 
 
@@ -210,23 +233,16 @@ def test_counting_pairs_loses_none(placed, tmp_path, monkeypatch):
     assert rows(tmp_path / "database.db") == rows(placed.parent / "matches" / "database.db")
 
 
-def test_features_are_counted_while_they_are_found(photos, tmp_path, monkeypatch):
-    monkeypatch.setattr(progress, "WATCH", 0.01)
-    heard: set[int] = set()
+def test_features_are_counted_while_they_are_found(few, tmp_path):
+    heard: list[int] = []
 
     def hear(what: str, done: int, total: int, /, *, seconds_left: float | None) -> None:
         if what == "photographs with features":
-            heard.add(done)
+            heard.append(done)
 
-    for name in ("counted", "alone"):
-        (tmp_path / name).mkdir()
     with heard_by(hear):
-        find_features(photos, tmp_path / "counted", long_side=480, features=2048)
-    assert max(heard) == 14
-    assert heard - {0, 10, 14}, "counts inside of a call"
-    monkeypatch.setattr(photos_tool, "watched", lambda *_: nullcontext())
-    find_features(photos, tmp_path / "alone", long_side=480, features=2048)
-    assert rows(tmp_path / "counted" / "database.db") == rows(tmp_path / "alone" / "database.db")
+        find_features(few, tmp_path, Sought(320, 500))
+    assert heard == [0, 1, 2, 3, 4, 5]
 
 
 @pytest.mark.parametrize("blank", ["crop", "mask"])
@@ -296,7 +312,7 @@ def test_damaged_photographs_are_left_out_and_turned_ones_turned(tmp_path, caplo
     (tmp_path / "out").mkdir()
     summary = find_features(photos, tmp_path / "out")
     images = tmp_path / "out" / "images"
-    assert summary == {"photographs": 4, "damaged": {"broken.jpg": "not an image, or a damaged one"}}
+    assert summary == {"photographs": 4, "cameras": 2, "damaged": {"broken.jpg": "not an image, or a damaged one"}}
     warned = "1 of 5 photographs cannot be read: broken.jpg (not an image, or a damaged one); export them again"
     assert [record.getMessage() for record in caplog.records] == [warned]
     assert sorted(path.name for path in images.iterdir()) == ["0.png", "1.png", "2.png", "turned.jpg"]

@@ -103,7 +103,11 @@ MATCHING = {
 }
 SUBDIVIDE = (".start", ".at_most", ".beta", ".children", ".radius_above")
 THINNING = {
-    *(f"densify~{n}.{key}" for n in (2, 3) for key in ("budget", "every", "max_gaussians", "start", "stop")),
+    *(
+        f"densify~{n}.{key}"
+        for n in (2, 3)
+        for key in ("budget", "every", "grow_until", "max_gaussians", "patience", "start", "stop")
+    ),
     *(f"densify~2.rules.prune_unimportant{key}" for key in ("", ".start", ".share")),
     *(f"densify~3.rules.merge_neighbours{key}" for key in ("", ".start", ".colour_below", ".distance_below")),
 }
@@ -112,7 +116,7 @@ LIMITED = {  # a limit of the opacity, in front of the resets
     *("reset_opacity~2.when_background", "reset_opacity~3.every", "reset_opacity~3.start"),
     *("reset_opacity~3.stop", "reset_opacity~3.to", "reset_opacity~3.when_background"),
 }
-STAGE = ("budget", "every", "max_gaussians", "start", "stop")
+STAGE = ("budget", "every", "grow_until", "max_gaussians", "patience", "start", "stop")
 
 
 def rules(stage: str, **keys: str) -> set[str]:

@@ -153,6 +153,16 @@ def test_chain_mip(rng):
     check_chain(rng, gaussians, camera, 1, variance=0.1, compensate=1.0)
 
 
+def test_chain_of_a_step_with_dropout(rng):
+    """A constant factor of the opacities changes the gradients as it should."""
+    camera = general_camera()
+    gaussians = random_gaussians(rng, camera, 1)
+    plain = ref.project(gaussians, camera, 1).opacity
+    gaussians.opacity_factor = 1.25
+    np.testing.assert_allclose(ref.project(gaussians, camera, 1).opacity, 1.25 * plain)
+    check_chain(rng, gaussians, camera, 1, compensate=1.0)
+
+
 @pytest.mark.parametrize("side", [(1.25, 0.1), (-1.0, 0.1), (0.1, 1.0), (0.1, -0.9), (1.3, 1.0)])
 def test_chain_clamped_ray(rng, side):
     """Far outside the frustum, but wide enough to reach the image: J uses the clamped ray."""
@@ -699,3 +709,32 @@ def test_gradients_of_the_colours_of_a_photograph(rng):
 def test_white_balance_keeps_the_luminance_of_its_gains():
     gains = np.log(np.diag(ref.gain_matrix(0.3, 0.1, -0.2)))
     assert gains @ [0.299, 0.587, 0.114] == pytest.approx(0.3)
+
+
+def test_gradients_of_a_sky(rng):
+    """By its texels, through splats in front of it by its planes, and of the loss of what covers it."""
+    side, height, width = 8, 6, 7
+    texels, gradient = rng.random((side, side, 3)), rng.normal(size=(3, height, width))
+    directions, left = rng.normal(size=(height, width, 3)), rng.random((height, width))
+    numeric = five_point(lambda: (gradient * left * ref.sky_image(texels, directions)).sum(), texels)
+    assert relative_error(ref.sky_gradient(side, directions, left, gradient), numeric) < FD_TOLERANCE
+    chosen = rng.random((height, width)) < 0.5
+    _, by_left = ref.sky_cover(chosen, left, 0.3)
+    numeric = five_point(lambda: ref.sky_cover(chosen, left, 0.3)[0], left)
+    assert relative_error(by_left, numeric) < FD_TOLERANCE
+
+
+def test_a_sky_has_no_seam(rng):
+    """Neighbouring directions have neighbouring colours everywhere, and a colour of all texels is that of the sky."""
+    texels, directions = rng.random((9, 9, 3)), rng.normal(size=(40, 50, 3))
+    directions[:10, :, 0] = 0  # where octants meet
+    near = directions + 1e-7 * rng.normal(size=directions.shape)
+    assert np.abs(ref.sky_image(texels, directions) - ref.sky_image(texels, near)).max() < 1e-5
+    np.testing.assert_allclose(ref.sky_image(np.full((9, 9, 1), 0.3), directions), 0.3)
+
+
+def test_pixels_show_the_sky_where_six_of_nine_match():
+    sky = np.zeros((3, 5, 5))
+    photograph = np.zeros((3, 5, 5))
+    photograph[:, :2] = 1
+    assert ref.shows_sky(sky, photograph, 0.1).any(axis=1).tolist() == [False, False, True, True, True]

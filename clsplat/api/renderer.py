@@ -1,7 +1,7 @@
 """Rendering and its derivatives with NumPy in and out."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -97,16 +97,17 @@ class Renderer:
     def render(self, view: View, background: Colour | None = None, depth: bool = False) -> Picture:
         """Render a view.
 
-        background: a colour in [0, 1], one number or three; by default that of the model, else black; depth: compute
-        it, which takes another pass.  Raises ValueError for a camera that cannot be and for other backgrounds,
-        NumericError where a value of the picture is not finite.
+        background: a colour in [0, 1], one number or three; by default the model's sky or colour, else black;
+        depth: compute it, which takes another pass.  Raises ValueError for a camera that cannot be and for other
+        backgrounds, NumericError where a value of the picture is not finite.
         """
         view.camera.check()
         camera, colour = upload_camera(self.device, view), self._colour(background)
-        found = layers(self.rasterizer, self._model, camera, self.device.upload(colour), depth)
+        model = self._model if background is None else replace(self._model, sky=None)
+        found = layers(self.rasterizer, model, camera, self.device.upload(colour), depth)
         for values in found.arrays:
             require_finite(values, view)
-        return Picture(found.image, found.alpha, found.depth, view, colour, self._model, self)
+        return Picture(found.image, found.alpha, found.depth, view, colour, model, self)
 
     def backward(self, picture: Picture, image: Floats | None, alpha: Floats | None) -> Gradients:
         """Return the gradients of a loss, as Picture.backward does."""

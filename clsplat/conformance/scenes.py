@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.conformance import reference as ref
-from clsplat.gaussians.tables import DeviceModel, Gaussians
+from clsplat.gaussians.tables import DeviceModel, Dropout, Gaussians
 from clsplat.opencl.device import Device
 from clsplat.render.camera import DeviceCamera, upload_camera
 from clsplat.scene.scene import Camera, View
@@ -29,6 +29,7 @@ class Case:
     variance: float = 0.3
     compensate: float = 0.0
     pixel_box: float = 0.0  # 1: with a variance of 0
+    dropout: Dropout | None = None
 
     @property
     def size(self) -> tuple[int, int]:
@@ -36,7 +37,8 @@ class Case:
 
     def model(self, device: Device) -> DeviceModel:
         gaussians = Gaussians(device, self.parameters)
-        return DeviceModel(gaussians, self.degree, self.near, self.variance, self.compensate, self.pixel_box)
+        numbers = self.near, self.variance, self.compensate, self.pixel_box
+        return DeviceModel(gaussians, self.degree, *numbers, self.dropout)
 
     def device_camera(self, device: Device) -> DeviceCamera:
         return upload_camera(device, self.view)
@@ -52,6 +54,7 @@ class Case:
             p["logit_opacity"][:, 0],
             sh,
             np.zeros(0) if filters is None else filters[:, 0],
+            self.dropout.opacity_factor if self.dropout else 1.0,
         )
 
     def camera(self) -> ref.Camera:
@@ -65,7 +68,12 @@ class Case:
         return numbers | {"pixel_box": self.pixel_box}
 
     def project(self, thresholds: ref.Thresholds = SHARP) -> ref.Splats:
-        return ref.project(self.gaussians(), self.camera(), self.degree, **self.numbers(), thresholds=thresholds)
+        splats = ref.project(self.gaussians(), self.camera(), self.degree, **self.numbers(), thresholds=thresholds)
+        if self.dropout:
+            left_out = ref.dropped(**vars(self.dropout), count=len(splats.visible))
+            for values in (values for values in vars(splats).values() if isinstance(values, np.ndarray)):
+                values[left_out] = 0
+        return splats
 
 
 def random_case(rng: np.random.Generator, count: int, width: int = 40, height: int = 30, **changes: Any) -> Case:

@@ -1,4 +1,4 @@
-"""Apply density rules, as one edit; reset opacities (Kerbl et al. 2023, section 5); move means at random."""
+"""Apply density rules, as one edit; reset or lower opacities (Kerbl et al. 2023, section 5); move means at random."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -60,6 +60,16 @@ def cap_opacity(gaussians: Gaussians, limit: float) -> None:
         logit_opacity=gaussians["logit_opacity"],
         limit=limit,
         stride=gaussians.capacity,
+        count=gaussians.count,
+    )
+
+
+def decay_opacity(gaussians: Gaussians, factor: float) -> None:
+    """Multiply all opacities by a factor in (0, 1)."""
+    gaussians.device.program("density.cl").decay_opacity(
+        items=gaussians.count,
+        logit_opacity=gaussians["logit_opacity"],
+        fall=1 - factor,
         count=gaussians.count,
     )
 

@@ -124,7 +124,8 @@ def merged(models: Sequence[Model], names: Sequence[str]) -> Model:
         models = [model.baked() for model in models]
     degree = max(model.sh_degree for model in models)
     tables = [with_degree(model.tables(), degree) for model in models]
-    return Model(**{n: np.concatenate([t[n] for t in tables]) for n in tables[0]}, rendering=first.rendering)
+    merged: dict[str, Any] = {n: np.concatenate([t[n] for t in tables]) for n in tables[0]}
+    return Model(**merged, rendering=first.rendering, sky=first.sky)
 
 
 def _kind(model: Model) -> str:

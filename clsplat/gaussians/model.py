@@ -32,6 +32,7 @@ from clsplat.formats.table import for_writing, read, write
 from clsplat.gaussians.quaternions import product, quaternion_of
 from clsplat.gaussians.run_model import model_at
 from clsplat.gaussians.sh import rotated_sh
+from clsplat.gaussians.sky import Sky, sky_beside, sky_file
 from clsplat.gaussians.tables import DeviceModel, Gaussians
 from clsplat.opencl.device import Device
 
@@ -96,6 +97,7 @@ class Model:
         None  # [N, 1] scene units², the world filter where it is not yet part of the scales
     )
     rendering: Rendering = Rendering()
+    sky: Sky | None = None  # behind the Gaussians, in place of a background of one colour
 
     def __post_init__(self) -> None:
         count = len(self.means)
@@ -114,7 +116,8 @@ class Model:
         numbers = self.rendering
         gaussians = Gaussians(device, self.tables())
         screen = numbers.screen_variance, numbers.compensate, numbers.pixel_box
-        return DeviceModel(gaussians, self.sh_degree, numbers.near, *screen)
+        sky = self.sky.upload(device) if self.sky else None
+        return DeviceModel(gaussians, self.sh_degree, numbers.near, *screen, sky=sky)
 
     def tables(self) -> dict[str, Floats]:
         """The arrays by name; filter_variance where there is one."""
@@ -174,7 +177,8 @@ class Model:
         near = self.rendering.near * scale
         if near >= MAX_NUMBER or (not_finite({**self.tables(), **tables}) & ~not_finite(self.tables())).any():
             raise ValueError("expected a smaller scale and translation: no model file holds so large numbers")
-        return replace(self, **tables, rendering=replace(self.rendering, near=near))
+        sky = self.sky.turned(turn) if self.sky and rotation is not None else self.sky
+        return replace(self, **tables, rendering=replace(self.rendering, near=near), sky=sky)
 
     def baked(self) -> "Model":
         """Return the model with the world filter as part of its scales and opacities (Yu et al. 2024, eq. 9).
@@ -196,11 +200,14 @@ class Model:
     def save(self, path: str | Path, options: Writing | None = None) -> str:
         """Write a file in the format that its name stands for: .ply, .spz, .sog, .glb and others (docs/formats.md).
 
-        A world filter that is not `baked` is kept in a PLY, as a property `filter_3D`, and baked for other formats.
+        A world filter that is not `baked` is kept in a PLY, as a property `filter_3D`, and baked for other formats.  A
+        sky is written beside it, as NAME_sky.json.
         Returns the SHA-256 of what was written; of a folder of SOG that of its meta.json.
         Raises ConfigError for another name, and OutputError when the file cannot be written.
         """
         model = self if for_writing(Path(path)).keeps_filter else self.baked()
+        if self.sky:
+            self.sky.write(sky_file(Path(path)))
         return write(Path(path), model.as_file(), options)
 
     def as_file(self) -> SplatFile:
@@ -232,7 +239,8 @@ def load(path: str | Path, options: Reading | None = None) -> Model:
     """
     path = Path(path)
     file = read(model_at(path), options)
-    model = Model(**file.parameters, rendering=Rendering.of(file.rendering, file.mode))
+    sky = sky_beside(model_at(path), file.rendering.get("sky") == "directions" and not (options and options.quiet))
+    model = Model(**file.parameters, rendering=Rendering.of(file.rendering, file.mode), sky=sky)
     if file.placement is None:
         return model
     scale = float(np.cbrt(np.linalg.det(file.placement[:3, :3])))

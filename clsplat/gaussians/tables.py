@@ -19,10 +19,10 @@ from clsplat.formats.splats import PARAMETERS as PARAMETERS
 from clsplat.formats.splats import SH_C0 as SH_C0
 from clsplat.formats.splats import degree_of
 from clsplat.formats.splats import sh_coefficients as sh_coefficients
+from clsplat.gaussians.sky import DeviceSky
 from clsplat.opencl.device import Array, Device
 
-HIDDEN = "hidden"  # bit v % HIDDEN_VIEWS of component v // HIDDEN_VIEWS: training view v leaves the Gaussian out
-HIDDEN_VIEWS = 22  # to a component, a whole number that to_VI of lanes.h converts
+HIDDEN = "hidden"  # which training views leave a Gaussian out; see left_out.py
 INTERVAL2 = "sampling_interval2"  # scene units², the smallest over training views; exists only where it is read
 ALIGNMENT = 64  # capacity is a multiple of this: wide kernels need no tail
 GROWTH = 1.5
@@ -127,13 +127,6 @@ class Gaussians:
             self.add(name, components, self.tables[name].zero_fresh)
             self.set(name, kept)
 
-    def hidden_arguments(self, view: int | None) -> dict[str, Any]:
-        """Return the arguments of project_forward that leave out what is hidden in a training view, by its number."""
-        if view is None or HIDDEN not in self.tables:
-            return {"hidden": self["filter_variance"], "hidden_plane": 0, "hidden_bit": 0}  # any table: no bit counts
-        plane, bit = divmod(view, HIDDEN_VIEWS)
-        return {"hidden": self[HIDDEN], "hidden_plane": plane, "hidden_bit": 1 << bit}
-
     def not_finite(self) -> list[str]:
         """Return the names of the parameters that hold NaN or infinity, or whose moments do."""
         program = self.device.program("check.cl")
@@ -194,6 +187,20 @@ class Gradients:
         return {**{f"grad_{name}": array for name, array in self.arrays.items()}, "grad_mean2d": self.mean2d}
 
 
+@dataclass(frozen=True)
+class Dropout:
+    """What one step leaves out: each Gaussian with a probability below 1, by (seed, step, row)."""
+
+    probability: float
+    seed: int
+    step: int  # global
+
+    @property
+    def opacity_factor(self) -> float:
+        """Factor of the opacities of the others, which keeps the mean opacity of a Gaussian (Park et al. 2025)."""
+        return 1 / (1 - self.probability)
+
+
 @dataclass
 class DeviceModel:
     """Gaussians and the numbers with which they are rendered."""
@@ -204,23 +211,13 @@ class DeviceModel:
     screen_variance: float = 0.3  # px²
     compensate: float = 0.0  # 1: the opacity falls as the screen filter enlarges the splat
     pixel_box: float = 0.0  # 1: splats are integrated over the box of each pixel instead
+    dropout: Dropout | None = None  # of a step
+    sky: DeviceSky | None = None  # behind them, in place of a background of one colour
 
     @property
     def defines(self) -> dict[str, int]:
         """What chooses the programs that project, list and blend these splats."""
         return {"PIXEL_BOX": 1} if self.pixel_box else {}
-
-
-def hide(gaussians: Gaussians, left_out: NDArray[np.bool_]) -> None:
-    """Write which Gaussians each training view leaves out, [V, N], into the table HIDDEN."""
-    views, count = left_out.shape
-    bits = np.zeros((count, -(-views // HIDDEN_VIEWS)), np.float32)  # whole numbers
-    for view in range(views):
-        plane, bit = divmod(view, HIDDEN_VIEWS)
-        bits[:, plane] += left_out[view] * np.float32(1 << bit)
-    if HIDDEN not in gaussians.tables:
-        gaussians.add(HIDDEN, bits.shape[1])
-    gaussians.set(HIDDEN, bits)
 
 
 def checked_rows(rows: NDArray[np.integer], count: int) -> NDArray[np.uint32]:

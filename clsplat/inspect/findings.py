@@ -36,7 +36,8 @@ class Finding:
 
 def findings(facts: Facts) -> list[Finding]:
     """Return the findings about a dataset, errors first, then warnings and notes."""
-    found = [*_unreadable(facts), *_photographs(facts), *_cameras(facts), *_poses(facts), *_points(facts)]
+    parts = (_unreadable, _photographs, _looks, _cameras, _poses, _points)
+    found = [finding for part in parts for finding in part(facts)]
     if facts.refusal and not any(finding.level == "error" for finding in found):
         found.append(Finding("error", facts.refusal))
     return sorted(found, key=lambda finding: LEVELS.index(finding.level))
@@ -120,6 +121,19 @@ def _photographs(facts: Facts) -> Iterator[Finding]:
     if colmap and facts.same_base:
         fault = f"{_are(facts.same_base, 'file name')} in several folders"
         yield Finding("note", fault, "views keep the folder in their names; a tool that drops it confuses the files")
+
+
+def _looks(facts: Facts) -> Iterator[Finding]:
+    blurred, jumps = facts.looks.blurred, facts.looks.jumps
+    if blurred:
+        fault = f"{_are(len(blurred), 'photograph')} blurred ({_listed(blurred)})"
+        yield Finding("warning", fault, "leave them out, or take them again: the model learns the blur")
+    for names in facts.looks.same[:MAX_NAMES]:
+        yield Finding("note", f"{_listed(names)} look the same", "one of them is enough")
+    if jumps:
+        named = _listed([f"{a} to {b}: {stops:.1f}" for a, b, stops in jumps])
+        fault = f"the exposure jumps by more than a stop {amount(len(jumps), 'time')} ({named})"
+        yield Finding("note", fault, "--set optimize.colours=auto gives each photograph its own")
 
 
 def _cameras(facts: Facts) -> Iterator[Finding]:

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.inspect.looks import LookFacts, looks_of
 from clsplat.scene.decoding import ImageFile, decode_all
 from clsplat.scene.lens import BORDER_POINTS, Lens
 from clsplat.scene.parts import Parts
@@ -77,6 +78,7 @@ class Facts:
     submodels: dict[str, int]  # images of each COLMAP model; the first is used
     cameras: list[CameraFacts]
     photos: PhotographFacts
+    looks: LookFacts
     points: PointFacts | None
     seen: dict[str, int]  # points seen by each view; empty where the dataset has no such counts
     extent: float | None  # scene units
@@ -115,6 +117,7 @@ def survey(parts: Parts) -> Facts:
         submodels=parts.submodels,
         cameras=_cameras(parts),
         photos=_photographs(views, set(missing)),
+        looks=looks_of(parts, set(missing)),
         points=_points(parts, extent, centres) if parts.points else None,
         seen=parts.observed if any(parts.observed.values()) else {},
         extent=extent,

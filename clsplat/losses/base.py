@@ -76,6 +76,7 @@ class ViewLosses:
     comparison: Comparison
     losses: list[LossValue]
     learning: Sequence[Callable[[], None]] = field(default=(), kw_only=True)  # each changes numbers that are learned
+    behind: Array | None = field(default=None, kw_only=True)  # T dL/dT, [rows, stride], of what the splats leave
 
     @property
     def loss(self) -> float:

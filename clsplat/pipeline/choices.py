@@ -1,12 +1,85 @@
-"""What a run writes into its pipeline file of what it chose by its photographs: `chosen`, and the `reason`."""
+"""Choices that a run makes by its photographs, and what it writes of them into its pipeline file."""
 
-from typing import Any
+import json
+from typing import Annotated, Any, ClassVar
+
+from pydantic import AfterValidator, Field, model_validator
+
+from clsplat.scene.capture import UNITS, Measure
+from clsplat.settings import Settings
 
 WRITTEN = ("chosen", "reason")  # keys of a choice
+Row = Annotated[list[Any], Field(min_length=2)]  # the least measure, then the value of each key
+
+
+def _ascending(rows: list[Row]) -> list[Row]:
+    bounds = [row[0] for row in rows]
+    numbers = all(isinstance(bound, int | float) and not isinstance(bound, bool) for bound in bounds)
+    if not rows or not numbers or bounds != sorted(set(bounds)) or bounds[0] != 0:
+        raise ValueError("expected rows [from, values…], the first one from 0, with growing numbers")
+    return rows
+
+
+class CaptureChoice(Settings):
+    """Settings that go together, and follow from a measure of the photographs.
+
+    They replace what the file says at their places, before training; `--set` of one of these places, or of one that
+    holds it or lies inside, removes the choice.  Where the dataset does not have the measure, the file's values stay.
+    """
+
+    output_keys: ClassVar[frozenset[str]] = frozenset({"chosen", "instead_of", "reason"})
+
+    keys: Annotated[list[str], Field(min_length=1)]
+    """Places of the settings, as in `--set`: keys of the model, of stages, or `scene.validation`."""
+    by: Measure
+    """What is measured."""
+    values: Annotated[list[Row], AfterValidator(_ascending)]
+    """Rows [from, a value of each key]: those of the last row whose bound the measure reaches."""
+    since: str
+    """Why these values, in a few words."""
+    chosen: list[Any] | None = None
+    """Written by a run: the values."""
+    instead_of: list[Any] | None = None
+    """Written by a run: what stood there before."""
+    reason: str = ""
+    """Written by a run: what was measured."""
+
+    @model_validator(mode="after")
+    def _of_each_key(self) -> "CaptureChoice":
+        if wrong := next((row for row in self.values if len(row) != 1 + len(self.keys)), None):
+            raise ValueError(f"values: expected [from, {', '.join(self.keys)}], got {len(wrong)} of them")
+        return self
+
+    def of(self, measures: dict[Measure, float], before: list[Any]) -> "CaptureChoice":
+        """Return it with what follows from the measures; before: the values that are replaced."""
+        found = measures.get(self.by)
+        if found is None:
+            reason, chosen = f"the dataset does not tell {self.by}", before
+        else:
+            reason = f"{found:,.4g} {UNITS[self.by]}; {self.since}"
+            chosen = next(values for bound, *values in reversed(self.values) if found >= bound)
+        return self.model_copy(update={"chosen": chosen, "instead_of": before, "reason": reason})
+
+    @property
+    def settings(self) -> list[tuple[str, Any]]:
+        """Each key with what was chosen for it."""
+        return list(zip(self.keys, self.chosen or [], strict=True))
+
+    @property
+    def told(self) -> str:
+        """What was chosen, and why; before that, by what it will be."""
+        if not self.reason:
+            return f"{', '.join(self.keys)}: by {self.by}"
+        values = ", ".join(f"{key}={json.dumps(value)}" for key, value in self.settings)
+        return f"{values}, since {self.reason}"
+
+    def undone(self) -> "CaptureChoice":
+        """Return it before a choice."""
+        return self.model_copy(update={"chosen": None, "instead_of": None, "reason": ""})
 
 
 def without_choices(data: Any) -> Any:
-    """Return plain data of a resolved pipeline as it was before a run chose."""
+    """Return plain data of a resolved pipeline without what `auto` keys chose."""
     if isinstance(data, list):
         return [without_choices(item) for item in data]
     if not isinstance(data, dict):

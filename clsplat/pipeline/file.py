@@ -15,6 +15,7 @@ from clsplat.errors import ConfigError
 from clsplat.filters import ModelSettings
 from clsplat.names import fault_of_name
 from clsplat.opencl.discovery import Schedule
+from clsplat.pipeline.choices import CaptureChoice
 from clsplat.prepare.steps import Step
 from clsplat.render.rasterizer import MAX_PAIRS, RECORD, Budget
 from clsplat.render.tiles import Sort
@@ -118,6 +119,8 @@ Name = Annotated[str, Field(pattern=r"^[\w.-]*\w[\w.-]*$"), AfterValidator(_fold
 class PipelineFile(Settings):
     """The keys of a pipeline file."""
 
+    output_keys: ClassVar[frozenset[str]] = frozenset({"choices"})  # what they set is compared at its place
+
     name: Name
     """Name of the pipeline, and of its run folder."""
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
@@ -130,6 +133,8 @@ class PipelineFile(Settings):
     """How the device renders."""
     prepare: list[OneOf[Step]] = Field([])
     """Steps from photographs to a scene; their results are kept."""
+    choices: list[CaptureChoice] = Field([])
+    """Settings that follow from the photographs."""
     stages: Annotated[list[OneOf[Stage]], Field(min_length=1)]
     """Stages, in order."""
     plugins: dict[str, str] = Field(default={})

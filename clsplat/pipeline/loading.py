@@ -13,6 +13,7 @@ from clsplat.density.edit import Rule
 from clsplat.density.statistics import Statistic
 from clsplat.errors import ConfigError, OverrideError, one_line
 from clsplat.names import PREPARED
+from clsplat.pipeline.choosing import check_choices, without_overridden
 from clsplat.pipeline.explanation import explain, first_fault, place_text
 from clsplat.pipeline.file import STAGE_LISTS, PipelineFile
 from clsplat.pipeline.files import find
@@ -53,7 +54,7 @@ class Pipeline:
         """Return every setting with its value, as plain data in the shape of a file."""
         data = self.settings.model_dump(mode="json")
         data |= {key: [_untagged(stage) for stage in data[key]] for key in STAGE_LISTS}
-        return data if data["plugins"] else {key: value for key, value in data.items() if key != "plugins"}
+        return {key: value for key, value in data.items() if value or key not in ("plugins", "choices")}
 
     def text(self) -> str:
         """Return the text of the resolved file."""
@@ -81,10 +82,11 @@ def checked(path: Path, document: Document, overrides: Sequence[str] = ()) -> Pi
     tagged = with_new_names(_tagged_file(document, path), warn_about=str(path))
     data = copy.deepcopy(tagged)
     try:
+        places = []
         for override in overrides:
-            apply(data, override, PipelineFile)
+            places.append(apply(data, override, PipelineFile))
             data = with_new_names(data, warn_about=f"--set {override}", old_wins=True)
-        return Pipeline(path, _validated(data, path, document))
+        return Pipeline(path, _validated(without_overridden(data, places), path, document))
     except ConfigError:
         _blame(tagged, overrides, path, document)
         raise
@@ -100,6 +102,10 @@ def _validated(data: dict[str, Any], path: Path, document: Document) -> Pipeline
     _check_order(path, settings)
     _check_screen_filter(path, settings)
     _check_keeping(path, settings)
+    try:
+        check_choices(settings)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {one_line(error)}") from error
     return settings.model_copy(update={"plugins": plugins.used_by(_kinds(settings))})
 
 

@@ -40,27 +40,41 @@ def apply(data: dict[str, Any], text: str, root: type[BaseModel]) -> Place:
 
     Raises OverrideError.
     """
-    names, value = split(text)
+    _, value = split(text)
     try:
         parsed = parse_value(value)
     except ConfigError as error:
         raise OverrideError(text, f"the value cannot be read: {error}") from error
-    if names[0] in NOT_SETTABLE:
-        raise OverrideError(text, f"'{names[0]}' cannot be set; {NOT_SETTABLE[names[0]]}")
-    node = _Node(data, root, ())
-    for name in names[:-1]:
-        node = node.child(name, text)
-    last = names[-1]
+    node, last = _found(data, text, root)
     if isinstance(node.data, list):
         i = node.number(last, text)
         node.data[i] = with_tags(parsed, node.inside)
         return (*node.place, i)
     if not isinstance(node.data, dict):
-        raise NoSuchKey(text, f"nothing lies below {quoted(names[-2])}")
+        raise NoSuchKey(text, f"nothing lies below {quoted(node.place[-1])}")
     if not node.place and last not in root.model_fields:
         raise NoSuchKey(text, f"no key {quoted(last)} at the top of a pipeline")
     node.data[last] = with_tags(parsed, node.annotation(last))
     return (*node.place, last)
+
+
+def value_at(data: dict[str, Any], place: str, root: type[BaseModel]) -> Any:
+    """Return the value at a place, in the notation of --set; None where the data have none.  Raises OverrideError."""
+    node, last = _found(data, f"{place}=", root)
+    if isinstance(node.data, list):
+        return node.data[node.number(last, place)]
+    return node.data.get(last) if isinstance(node.data, dict) else None
+
+
+def _found(data: dict[str, Any], text: str, root: type[BaseModel]) -> "tuple[_Node, str]":
+    """What holds the key of 'place=value', and the key's name in it.  Raises OverrideError."""
+    names, _ = split(text)
+    if names[0] in NOT_SETTABLE:
+        raise OverrideError(text, f"'{names[0]}' cannot be set; {NOT_SETTABLE[names[0]]}")
+    node = _Node(data, root, ())
+    for name in names[:-1]:
+        node = node.child(name, text)
+    return node, names[-1]
 
 
 class _Node:

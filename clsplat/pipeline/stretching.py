@@ -9,6 +9,7 @@ from collections.abc import Callable
 from fractions import Fraction
 from typing import Any, TypeVar
 
+from clsplat.pipeline.choices import CaptureChoice
 from clsplat.pipeline.file import PipelineFile
 from clsplat.schedule import divided
 from clsplat.settings import Settings
@@ -71,6 +72,10 @@ def _stretched(value: Any, factor: float | Fraction) -> Any:
     if isinstance(value, list):
         is_points = bool(value) and all(isinstance(item, list) for item in value)
         return _points(value, factor) if is_points else [_stretched(item, factor) for item in value]
+    if isinstance(value, CaptureChoice):  # whose rows begin with what is measured, and not with steps
+        return value.model_copy(
+            update={"values": [[bound, *(_stretched(one, factor) for one in row)] for bound, *row in value.values]}
+        )
     if not isinstance(value, Settings):
         return value
     fields = {name: getattr(value, name) for name in type(value).model_fields}

@@ -10,10 +10,12 @@ from clsplat.names import LOCK
 from clsplat.prepare.cache import RECORD, plan, prepare
 from clsplat.prepare.steps import FindFeatures, MapCameras, MatchFeatures, Step
 from clsplat.reading import read_json
+from data_tools.features import CameraModel
 from data_tools.gather import link
-from data_tools.photos import IMAGES, CameraModel, Mapper, Matching
+from data_tools.mapping import Mapper
+from data_tools.matching import Matching
+from data_tools.names import IMAGES, MODEL
 
-MODEL = "sparse"
 STEPS = ".steps"  # in the folder of the scene: results from which an interrupted call continues
 
 

@@ -10,18 +10,13 @@ from clsplat.errors import DataError
 from clsplat.scene.detect import holds_scene
 from clsplat.settings import Settings
 from clsplat.training.found import photographs_text
+from data_tools.features import CameraModel, Sought, find_features
 from data_tools.gather import require_photographs
-from data_tools.photos import (
-    CameraModel,
-    Cameras,
-    Mapper,
-    Matching,
-    find_features,
-    left_out,
-    map_cameras,
-    match_features,
-)
+from data_tools.mapping import Mapper, map_cameras
+from data_tools.matching import Matching, match_features
 from data_tools.pycolmap_import import require_pycolmap
+from data_tools.sharing import Cameras
+from data_tools.told import left_out
 from data_tools.undistort import Blank, undistort_scene
 
 Positive = Annotated[int, Field(gt=0)]
@@ -61,6 +56,7 @@ class Step(Settings):
 class FindFeatures(Step):
     """Find SIFT features of photographs."""
 
+    version: ClassVar[int] = 2  # by OpenCV; photographs without EXIF data share a camera
     resumes: ClassVar[bool] = True
 
     stage: Literal["find_features"] = "find_features"
@@ -72,7 +68,7 @@ class FindFeatures(Step):
     camera_model: CameraModel = "SIMPLE_RADIAL"
     """Camera model of COLMAP; OPENCV_FISHEYE for fisheye lenses."""
     cameras: Cameras = "auto"
-    """Which photographs share a camera; auto: those of the same size and focal length."""
+    """Which photographs of one size share a camera; auto: those of which EXIF tells the same lens, or nothing."""
 
     def check(self, source: Path, without: Path) -> None:
         if holds_scene(source):
@@ -85,9 +81,8 @@ class FindFeatures(Step):
 
     def make(self, source: Path, out: Path, without: Path) -> dict[str, Any]:
         self.check(source, without)
-        return find_features(
-            source, out, self.long_side, self.features, self.camera_model, self.cameras, without.resolve()
-        )
+        sought = Sought(self.long_side, self.features)
+        return find_features(source, out, sought, self.camera_model, self.cameras, without.resolve())
 
     def told(self, figures: dict[str, Any]) -> str:
         return super().told({**figures, "damaged": ", ".join(figures.get("damaged", ()))})
@@ -115,12 +110,14 @@ class MatchFeatures(Step):
 
 
 class MapCameras(Step):
-    """Find cameras and points from matches."""
+    """Find cameras and points from matches; where photographs are left out, again with other settings."""
+
+    resumes: ClassVar[bool] = True
 
     stage: Literal["map_cameras"] = "map_cameras"
 
     mapper: Mapper = "incremental"
-    """How cameras are found: one after the other, or all at once (global)."""
+    """How cameras are found first: one after the other, or all at once (global)."""
     threads: Positive = 1
     """Number of threads; more than one are faster, and the result does not repeat to the bit."""
 

@@ -2,15 +2,18 @@
 
 from dataclasses import dataclass, fields
 from itertools import pairwise
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
 from clsplat.errors import MemoryLimitError
+from clsplat.gaussians.left_out import left_out_arguments
 from clsplat.gaussians.tables import DeviceModel, Gradients
 from clsplat.opencl.device import Array, Device
 from clsplat.opencl.program import Program, constants
+from clsplat.render.arguments import shape_arguments
 from clsplat.render.camera import DeviceCamera
+from clsplat.render.sky import Skies
 from clsplat.render.tiles import Band, Footprints, Sort, TileLists, Tiler, TooManyPairs
 from clsplat.render.workspace import Workspace
 
@@ -18,8 +21,7 @@ RECORD = int(constants()["RECORD"])
 PIXEL_SUMS = int(constants()["PIXEL_SUMS"])
 MAX_PAIRS = 2**31  # more than fit in memory, and few enough for sums of 32 bits: no other limit
 Content = Literal["colour", "depth", "entropy"]
-# channels of the splats: colour, or (depth of the mean in scene units, 1, 0); or colour with a fourth plane of the
-# image, the entropy of a pixel's blend weights
+# channels: colour, or (depth of the mean in scene units, 1, 0); or colour and a fourth plane, the entropy of weights
 
 
 @dataclass(frozen=True)
@@ -52,11 +54,12 @@ class Rasterizer:
     def __init__(self, device: Device, sort: Sort = "auto", budget: Budget | None = None) -> None:
         self.device = device
         self.budget = budget or Budget(MAX_PAIRS)
-        records = device.info.allocation // (4 * RECORD)  # of pairs, in one buffer
-        self._limit = min(self.budget.pairs, records, MAX_PAIRS)
+        self._limit = min(self.budget.pairs, device.info.allocation // (4 * RECORD), MAX_PAIRS)  # in one buffer
         self._bands: dict[int, int] = {}  # rows of tiles of a frame -> number of bands
         self.workspace = Workspace(device)
         self.tiler = Tiler(device, self.workspace, sort)
+        self.skies = Skies(device, self.workspace)
+        self._black = device.zeros(3)
         device.program("project.cl")  # built at once, as the others
         self._blend("colour")
         self._lanes = int(device.tuning["LANES"])
@@ -65,14 +68,18 @@ class Rasterizer:
     def forward(
         self, model: DeviceModel, camera: DeviceCamera, background: Array, content: Content = "colour"
     ) -> Frame:
-        """Render the model.  background: [3].
+        """Render the model.  background: [3], where the model has no sky.
 
         Where the pairs of all tiles are more than the budget or the device's memory, the frame is rendered in bands of
         rows: the same bits.  Raises MemoryLimitError where one row at a time does not fit.
         """
+        sky = model.sky if content != "depth" else None
         while True:
             try:
-                return self._forward(model, camera, background, content)
+                frame = self._forward(model, camera, self._black if sky else background, content)
+                if sky:
+                    self.skies.paint(sky, camera, frame.image, frame.transmittance)
+                return frame
             except TooManyPairs as error:
                 if not self._narrow(camera):
                     raise MemoryLimitError(
@@ -118,8 +125,7 @@ class Rasterizer:
 
     def _blend(self, content: Content, **defines: int) -> Program:
         """The kernels of blending; without sums and entropy that nobody reads."""
-        if content == "entropy":
-            defines["WEIGHT_ENTROPY"] = 1
+        defines |= {"WEIGHT_ENTROPY": 1} if content == "entropy" else {}
         return self.device.program(f"blend_{self.device.schedule}.cl", **defines)
 
     def _split(self, camera: DeviceCamera) -> list[Band]:
@@ -143,7 +149,7 @@ class Rasterizer:
             items=-(-count // self._lanes),
             **shape_arguments(model, camera),
             sh_base=gaussians["sh_base"],
-            **gaussians.hidden_arguments(camera.view),
+            **left_out_arguments(model, camera.view, self.workspace.array("left_out", stride)),
             splats=splats,
             **vars(footprints),
             radius=radius,
@@ -159,27 +165,42 @@ class Rasterizer:
         return self.tiler.build(splats, footprints, band, count, limit, model.defines)
 
     def pixel_sums(
-        self, model: DeviceModel, frame: Frame, grad_image: Array, count: int = PIXEL_SUMS, texture: Array | None = None
+        self,
+        model: DeviceModel,
+        frame: Frame,
+        grad_image: Array,
+        count: int = PIXEL_SUMS,
+        texture: Array | None = None,
+        behind: Array | None = None,
     ) -> Array:
         """Return the sums over each Gaussian's pixels that give its gradients, [count, S]; see cl_kernels/splat.h.
 
         grad_image: as the frame's image, zero outside it.  A `count` above PIXEL_SUMS takes more time; those of
-        the texture need `texture`, [rows, stride], below 0 where it is not known.  Memory as in `forward`.
+        the texture need `texture`, [rows, stride], below 0 where it is not known.  behind: [rows, stride] T dL/dT of a
+        loss of what the splats leave, T.  Memory as in `forward`.
         """
         bands = frame.bands
         while True:
             try:
-                return self._pixel_sums(model, frame, bands, grad_image, count, texture)
+                return self._pixel_sums(model, frame, bands, grad_image, count, texture, behind)
             except MemoryLimitError:
                 if not self._narrow(frame.camera):
                     raise
                 bands = self._split(frame.camera)
 
     def _pixel_sums(
-        self, model: DeviceModel, frame: Frame, bands: list[Band], grad_image: Array, count: int, texture: Array | None
+        self,
+        model: DeviceModel,
+        frame: Frame,
+        bands: list[Band],
+        grad_image: Array,
+        count: int,
+        texture: Array | None,
+        behind: Array | None,
     ) -> Array:
         gaussians = model.gaussians
         defines = {} if count == PIXEL_SUMS else {"PIXEL_SUMS": count}
+        of_blend = {**defines, "GRAD_BEHIND": 1} if behind else defines
         pixel_sums = self.workspace.array("pixel_sums", (count, gaussians.capacity))
         for number, band in enumerate(bands):
             lists = frame.lists
@@ -187,7 +208,7 @@ class Rasterizer:
                 lists = self._project_band(model, frame.camera, band, frame.splats, frame.radius, frame.content)
             pair_sums = self.workspace.array("pair_sums", (lists.pairs, RECORD))
             for first_tile, groups in self._launches(band):
-                self._blend(frame.content, **defines, **model.defines).blend_backward(
+                self._blend(frame.content, **of_blend, **model.defines).blend_backward(
                     groups=groups,
                     tile_offset=lists.tile_offset,
                     tile_pairs=lists.tile_pairs,
@@ -197,6 +218,7 @@ class Rasterizer:
                     image=frame.image,
                     grad_image=grad_image,
                     texture=texture or frame.transmittance,  # without a texture the kernel reads none
+                    behind=behind or frame.transmittance,
                     tile_last=frame.tile_last,
                     pair_sums=pair_sums,
                     first_tile=first_tile,
@@ -226,19 +248,3 @@ class Rasterizer:
             **gradients.arguments(),
         )
         return gradients
-
-
-def shape_arguments(model: DeviceModel, camera: DeviceCamera) -> dict[str, Any]:
-    """Return the arguments of every kernel that projects Gaussians, by name."""
-    gaussians = model.gaussians
-    names = ("means", "quats", "log_scales", "logit_opacity", "sh_rest", "filter_variance")
-    return {
-        **{name: gaussians[name] for name in names},
-        "camera": camera.array,
-        "near_plane": model.near,
-        "screen_variance": 0.0 if model.pixel_box else model.screen_variance,
-        "compensate": 0.0 if model.pixel_box else model.compensate,
-        "degree": model.degree,
-        "stride": gaussians.capacity,
-        "count": gaussians.count,
-    }

@@ -3,23 +3,53 @@
 import logging
 from dataclasses import replace
 
+from clsplat.pipeline.choosing import choose
+from clsplat.pipeline.file import PipelineFile
 from clsplat.pipeline.loading import Pipeline
 from clsplat.pipeline.stretching import of_trainings
+from clsplat.scene.capture import measured
 from clsplat.stages.optimize import Optimize
 from clsplat.training.colours import settled
 from clsplat.training.run import Run
+from clsplat.training.skies import settled as settled_sky
 from clsplat.views.colours import Auto
 
 LOG = logging.getLogger("clsplat")
 
 
 def settle(pipeline: Pipeline, run: Run) -> Pipeline:
-    """Return the pipeline with what its keys `auto` choose by the photographs of a run, which takes it; log reasons.
+    """Return the pipeline with what its `choices` and its keys `auto` choose by the photographs of a run, which takes
+    it; log reasons.
 
     Choices that are made already stay.
     """
+    with run.status.stage("choose"):
+        return _taken(_with_colours(_by_capture(pipeline, run), run), run)
+
+
+def _by_capture(pipeline: Pipeline, run: Run) -> Pipeline:
+    """The pipeline with what its `choices` choose."""
+    if not any(not one.reason for one in pipeline.settings.choices):
+        return pipeline
+    chosen = replace(pipeline, settings=choose(pipeline.settings, measured(run.scene)))
+    if chosen.settings.scene.validation != pipeline.settings.scene.validation:
+        run.divide(chosen.settings.scene.split.with_validation(run.original.with_fold()))
+    for one in chosen.settings.choices:
+        LOG.info("%s", one.told)
+    return chosen
+
+
+def _taken(pipeline: Pipeline, run: Run) -> Pipeline:
+    """The same; the run has its settings."""
+    run.settings, run.pipeline, run.model_settings = pipeline.settings, pipeline.resolved(), pipeline.settings.model
+    return pipeline
+
+
+def _with_colours(pipeline: Pipeline, run: Run) -> Pipeline:
+    """The pipeline with what its keys `auto` choose."""
     open_ones = [one.colours for one in pipeline.stages if isinstance(one, Optimize) and isinstance(one.colours, Auto)]
-    if all(colours.chosen for colours in open_ones):
+    background = pipeline.settings.model.background
+    if all(colours.chosen for colours in open_ones) and (getattr(background, "chosen", "") is not None):
         return pipeline
 
     def chosen(training: Optimize) -> Optimize:
@@ -29,7 +59,12 @@ def settle(pipeline: Pipeline, run: Run) -> Pipeline:
         LOG.info("optimize.colours: %s, since %s", colours.chosen, colours.reason)
         return training.model_copy(update={"colours": colours})
 
-    with run.status.stage("choose"):
-        found = replace(pipeline, settings=of_trainings(pipeline.settings, chosen))
-    run.settings, run.pipeline = found.settings, found.resolved()
-    return found
+    return replace(pipeline, settings=_with_sky(of_trainings(pipeline.settings, chosen), run))
+
+
+def _with_sky(settings: PipelineFile, run: Run) -> PipelineFile:
+    """Settings with the choice of a sky, where it is open."""
+    background = settled_sky(settings.model.background, run)
+    if background is settings.model.background:
+        return settings
+    return settings.model_copy(update={"model": settings.model.model_copy(update={"background": background})})

@@ -6,6 +6,7 @@ from pathlib import Path
 from clsplat import lock
 from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import Pipeline
+from clsplat.runs.choices import settle
 from clsplat.runs.default_folder import start_of
 from clsplat.runs.folders import Start, check_run_folder
 from clsplat.runs.opening import check_start, open_run
@@ -41,11 +42,13 @@ def describe(
         check_start(pipeline, out, device, start)
     else:
         run = open_run(pipeline, out, device, start, read=read)
+        pipeline = settle(pipeline, run)
         if start == "resume":
             resumed = restore(pipeline, run)
             verdict = f"would go on from step {run.step}" if resumed else "nothing to resume; would run"
         for stage in pipeline.stages[run.cursor :]:
             stage.check_in(run)
+    lines += [f"  {one.told}" for one in pipeline.settings.choices]
     lines += [f"  {stage.stage:<14} {_detail(stage, run)}".rstrip() for stage in pipeline.stages]
     return f"{verdict} in {out}:\n" + "\n".join(lines)
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ from clsplat.compare.run_folder import read_metrics
 from clsplat.errors import ConfigError, DataError
 from clsplat.names import CHECKSUMS, METRICS, PIPELINE, STATUS, is_inside
 from clsplat.pipeline.choices import without_choices
+from clsplat.pipeline.choosing import undone
 from clsplat.pipeline.loading import Pipeline, load
 from clsplat.reading import read_json, sha256
 from clsplat.training import checkpoint
@@ -61,7 +63,7 @@ def has_ended(pipeline: Pipeline, out: Path) -> bool:
 
 def _asked(pipeline: Pipeline) -> Any:
     """The resolved pipeline without what a run chose."""
-    return without_choices(pipeline.resolved())
+    return without_choices(replace(pipeline, settings=undone(pipeline.settings)).resolved())
 
 
 def restart(out: Path) -> str:

@@ -5,7 +5,9 @@ from dataclasses import replace
 
 from clsplat.pipeline.loading import Pipeline
 from clsplat.stages.base import Stage
+from clsplat.stages.densify import Densify
 from clsplat.stages.optimize import Optimize
+from clsplat.training.kept import Best
 from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
@@ -43,9 +45,16 @@ def as_trained(pipeline: Pipeline, run: Run) -> Pipeline:
     return replace(pipeline, settings=pipeline.settings.model_copy(update={"stages": stages}))
 
 
+def _as_grown(stage: Densify, best: Best) -> Densify:
+    """The same, with the step from which on nothing grew in the place of its patience."""
+    ended = [step for step in (stage.grow_until, best.growth_ended if stage.patience else None) if step is not None]
+    return stage.model_copy(update={"patience": None, "grow_until": min(ended, default=None)})
+
+
 def _as_trained(stage: Optimize, run: Run, before: int) -> Optimize:
     if run.is_refit and run.best:
-        return stage.model_copy(update={"steps": run.best.found.step, **WITHOUT})
+        during = [_as_grown(inner, run.best) if isinstance(inner, Densify) else inner for inner in stage.during]
+        return stage.model_copy(update={"steps": run.best.found.step, "during": during, **WITHOUT})
     taken = run.best.taken if run.best else None
     ended = taken is not None and before < taken < before + stage.steps
     return stage.model_copy(update={"steps": taken - before}) if taken and ended else stage

@@ -130,7 +130,7 @@ def _declared(out: Path, sums: dict[str, str]) -> tuple[list[str], list[str]]:
     found = {path.relative_to(out).as_posix(): stage for path, stage in paths}
     folders = [name for name, stage in found.items() if not any(stage.named_outputs().values())]
     files = [name for name in found if name not in folders]
-    optional = [name for name in files if name not in sums and Path(name).stem.endswith("_raw")]  # of a world filter
+    optional = [name for name in files if name not in sums and Path(name).stem.endswith(("_raw", "_sky"))]
     return [RECORDS, METRICS, *(name for name in files if name not in optional)], [] if sums else folders
 
 

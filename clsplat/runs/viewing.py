@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from clsplat.errors import ConfigError
 from clsplat.gaussians.model import load
+from clsplat.gaussians.sky_splats import with_sky_splats
 from clsplat.names import PIPELINE
 from clsplat.pipeline.loading import load as load_pipeline
 from clsplat.results import check_no_file_of_a_run
@@ -70,7 +71,8 @@ def view(
     title = " and ".join(loaded) + (f" · {source.scene_name}" if source else "")
     if found is None:
         LOG.info("without a scene up is -y; give --scene where the picture stands on its head")
-    Page(title, {name: pack(model, splats) for name, model in loaded.items()}, stand, background, views).write(out)
+    shown = {name: pack(with_sky_splats(model), splats) for name, model in loaded.items()}
+    Page(title, shown, stand, background, views).write(out)
     return out
 
 

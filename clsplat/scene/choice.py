@@ -1,16 +1,16 @@
 """A choice of a scene's views by their names: every n-th, a list, or the lines of a file."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from difflib import get_close_matches
 from pathlib import Path, PurePosixPath
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-from pydantic import Field, ValidationError, WrapValidator, model_validator
+from pydantic import Field, model_validator
 
 from clsplat.errors import DataError, quoted
 from clsplat.reading import read_text
 from clsplat.scene.scene import every_nth
-from clsplat.settings import ReadPath, Settings
+from clsplat.settings import ReadPath, Settings, in_one_sentence
 
 LARGEST = 1 << 24  # bytes of a list of names
 NOTATIONS = "expected a number, {every, offset}, {names: […]} or {file: …}"
@@ -60,22 +60,9 @@ class Choice(Settings):
         return {_index_of(name, names, place) for name in listed}
 
 
-def _explained(notations: str) -> WrapValidator:
-    """Make one sentence of the errors of all notations."""
-
-    def validated(value: Any, validate: Callable[[Any], Any]) -> Any:
-        try:
-            return validate(value)
-        except ValidationError as error:
-            own = [one["msg"].removeprefix("Value error, ") for one in error.errors() if one["type"] == "value_error"]
-            raise ValueError(next(iter(own), notations)) from None
-
-    return WrapValidator(validated)
-
-
 Number = Annotated[int, Field(ge=0)]
-Chosen = Annotated[Number | Choice, _explained(NOTATIONS)]
-ChosenOrAuto = Annotated[Number | Choice | Literal["auto"], _explained(f"{NOTATIONS}, or auto")]
+Chosen = Annotated[Number | Choice, in_one_sentence(NOTATIONS)]
+ChosenOrAuto = Annotated[Number | Choice | Literal["auto"], in_one_sentence(f"{NOTATIONS}, or auto")]
 
 
 def choose(choice: int | Choice, names: Sequence[str], folders: Sequence[Path]) -> set[int]:

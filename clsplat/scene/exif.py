@@ -4,18 +4,21 @@ import json
 import math
 import struct
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from clsplat.errors import DataError
 from clsplat.files import write_text
 from clsplat.reading import opened, read_json
-from clsplat.scene.image_headers import HEAD_SIZE, JPEG, segments
+from clsplat.scene.image_headers import HEAD_SIZE, exif_segment, orientation_place
 
 BESIDE = "exposures.json"  # in a folder of images
 SUB_FOLDER = 0x8769  # tags: where those of the exposure are
 SECONDS, APERTURE, ISO = 0x829A, 0x829D, 0x8827
-SHORT, LONG, RATIONAL = 3, 4, 5  # kinds of values
+MAKE, MODEL, FOCAL, FOCAL_35 = 0x010F, 0x0110, 0x920A, 0xA405  # mm, and mm on film of 35 mm
+TEXT, SHORT, LONG, RATIONAL = 2, 3, 4, 5  # kinds of values
+Value = float | str
 
 
 @dataclass(frozen=True)
@@ -40,37 +43,64 @@ def exposure_of(path: Path) -> CameraExposure | None:
 
 def parsed(head: bytes) -> CameraExposure | None:
     """Return the exposure in the first bytes of a JPEG file, or None."""
-    if not head.startswith(JPEG):
-        return None
-    for marker, at, length in segments(head):
-        if marker == 0xE1 and head[at + 4 : at + 10] == b"Exif\0\0":
-            try:
-                return _of_block(head[at + 10 : at + 2 + length])
-            except (struct.error, KeyError):
-                return None
-    return None
+    tags = _tags(head)
+    return checked(tags.get(SECONDS), tags.get(APERTURE), tags.get(ISO))
 
 
-def _of_block(block: bytes) -> CameraExposure | None:
-    """The exposure in a TIFF block.  Raises struct.error where it is cut, KeyError where it has none."""
-    order = {b"II": "<", b"MM": ">"}[block[:2]]
-    (start,) = struct.unpack_from(order + "I", block, 4)
-    inner = _values(block, order, int(start))[SUB_FOLDER]
-    values = _values(block, order, int(inner))
-    return checked(values[SECONDS], values[APERTURE], values[ISO])
+def optics_of(path: Path) -> tuple[Value, ...] | None:
+    """Return make, model and focal lengths of the camera that took a JPEG file; None where it does not tell them.
+
+    Raises DataError when it cannot be read.
+    """
+    with opened(path, "an image") as file:
+        tags = _tags(file.read(HEAD_SIZE))
+    told = [tags.get(tag, "") for tag in (MAKE, MODEL, FOCAL, FOCAL_35)]
+    return tuple(told) if any(told[2:]) else None
 
 
-def _values(block: bytes, order: str, start: int) -> dict[int, float]:
-    """The numbers of a folder of tags; of several that of the first."""
-    found: dict[int, float] = {}
+def copied(head: bytes, jpeg: bytes) -> bytes:
+    """Return a JPEG file of upright pixels with the EXIF data in the first bytes of another, but for the rotation."""
+    found = exif_segment(head)
+    if found is None:
+        return jpeg
+    at, length = found
+    block = bytearray(head[at : at + 2 + length])
+    if place := orientation_place(bytes(block[10:])):
+        block[10 + place : 12 + place] = struct.pack({b"II": "<H", b"MM": ">H"}[bytes(block[10:12])], 1)
+    return jpeg[:2] + bytes(block) + jpeg[2:]
+
+
+def _tags(head: bytes) -> dict[int, Value]:
+    """What the first bytes of a JPEG file tell by tag, as far as it can be read."""
+    found = exif_segment(head)
+    tags: dict[int, Value] = {}
+    if found is None:
+        return tags
+    at, length = found
+    block = head[at + 10 : at + 2 + length]
+    with suppress(struct.error, KeyError, ValueError):  # cut, without such a folder, or with no number for its place
+        order = {b"II": "<", b"MM": ">"}[block[:2]]
+        (start,) = struct.unpack_from(order + "I", block, 4)
+        tags.update(_values(block, order, int(start)))
+        tags.update(_values(block, order, int(tags[SUB_FOLDER])))
+    return tags
+
+
+def _values(block: bytes, order: str, start: int) -> dict[int, Value]:
+    """The numbers and texts of a folder of tags; of several numbers the first."""
+    found: dict[int, Value] = {}
     (entries,) = struct.unpack_from(order + "H", block, start)
     for at in range(start + 2, start + 2 + 12 * entries, 12):
-        tag, kind, _, value = struct.unpack_from(order + "HHII", block, at)
+        tag, kind, count, value = struct.unpack_from(order + "HHII", block, at)
         if kind == RATIONAL:
             above, below = struct.unpack_from(order + "II", block, value)
-            found[tag] = above / below if below else math.nan
+            if below:
+                found[tag] = above / below
         elif kind in (SHORT, LONG):
             (found[tag],) = struct.unpack_from(order + ("H" if kind == SHORT else "I"), block, at + 8)
+        elif kind == TEXT:
+            place = value if count > 4 else at + 8
+            found[tag] = block[place : place + count].split(b"\0")[0].decode("ascii", "replace").strip()
     return found
 
 

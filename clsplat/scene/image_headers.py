@@ -53,9 +53,22 @@ def _jpeg(head: bytes, tail: bytes, whole: Callable[[], bytes]) -> Header | None
             # An end marker cannot be part of the pixels; that of a thumbnail lies before them.
             complete = JPEG_END in tail or whole().find(JPEG_END, at) >= 0
             return Header(width, height, orientation, complete)
-        if marker == 0xE1 and head[at + 4 : at + 10] == b"Exif\0\0":
+        if _is_exif(head, marker, at):
             orientation = _orientation(head[at + 10 : at + 2 + length])
     return None
+
+
+def exif_segment(head: bytes) -> tuple[int, int] | None:
+    """Return the place and the length of the Exif segment in the first bytes of a JPEG file; None without one.
+
+    Its block of tags begins 10 bytes behind the place.
+    """
+    found = ((at, length) for marker, at, length in segments(head) if _is_exif(head, marker, at))
+    return next(found, None) if head.startswith(JPEG) else None
+
+
+def _is_exif(head: bytes, marker: int, at: int) -> bool:
+    return marker == 0xE1 and head[at + 4 : at + 10] == b"Exif\0\0"
 
 
 def segments(head: bytes) -> Iterator[tuple[int, int, int]]:
@@ -73,13 +86,19 @@ def segments(head: bytes) -> Iterator[tuple[int, int, int]]:
 
 def _orientation(exif: bytes) -> int:
     """The orientation in a TIFF block, 1 to 8; 1 where there is none."""
+    at = orientation_place(exif)
+    value = struct.unpack_from({b"II": "<", b"MM": ">"}[exif[:2]] + "H", exif, at)[0] if at else 1
+    return int(value) if 1 <= value <= 8 else 1
+
+
+def orientation_place(exif: bytes) -> int | None:
+    """Return where the orientation, 2 bytes, lies in a TIFF block; None where there is none."""
     order = {b"II": "<", b"MM": ">"}.get(exif[:2])
     if order is None or len(exif) < 8:
-        return 1
+        return None
     (start,) = struct.unpack_from(order + "I", exif, 4)
     entries = struct.unpack_from(order + "H", exif, start)[0] if start + 2 <= len(exif) else 0
     for at in range(start + 2, min(start + 2 + 12 * entries, len(exif) - 11), 12):
-        tag, _, _, value = struct.unpack_from(order + "HHIH", exif, at)
-        if tag == ORIENTATION:
-            return int(value) if 1 <= value <= 8 else 1
-    return 1
+        if struct.unpack_from(order + "H", exif, at)[0] == ORIENTATION:
+            return at + 8
+    return None

@@ -13,13 +13,19 @@ from numpy.typing import NDArray
 from clsplat.errors import DataError, quoted, shortened
 from clsplat.files import atomic
 from clsplat.reading import opened, read_file
-from clsplat.scene.image_headers import HEAD_SIZE, TAIL_SIZE, Header, is_cut, parse_header
+from clsplat.scene.image_headers import HEAD_SIZE, JPEG, TAIL_SIZE, Header, is_cut, parse_header
 from clsplat.scene.png import pixels_only
 
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # its lines name no file; errors here do
 logger = logging.getLogger("clsplat")
 Missing = Literal["refuse", "skip"]  # what to do about photographs that a dataset names and does not have
 MAX_BYTES = (1 << 31) - 1  # of an image file: OpenCV decodes no longer ones
+REDUCED = {  # what OpenCV decodes to grey, by the divisor of the size
+    1: cv2.IMREAD_GRAYSCALE,
+    2: cv2.IMREAD_REDUCED_GRAYSCALE_2,
+    4: cv2.IMREAD_REDUCED_GRAYSCALE_4,
+    8: cv2.IMREAD_REDUCED_GRAYSCALE_8,
+}
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"})  # in lower case
 
 
@@ -88,11 +94,39 @@ def read_image(path: Path, upright: bool = False) -> NDArray[Any]:
     return decode_image(read_file(path, "an image", limit=MAX_BYTES), path, upright)
 
 
+def read_grey(path: Path, long_side: int) -> tuple[NDArray[np.uint8], tuple[float, float]]:
+    """Return a photograph as stored in grey, [H, W], no side longer than `long_side` px, and the stored px of one px.
+
+    A JPEG decoder makes half, a quarter or an eighth of the size for less.  Raises DataError as decode_image does.
+    """
+    data = read_file(path, "an image", limit=MAX_BYTES)
+    header = parse_header(data[:HEAD_SIZE], data[-TAIL_SIZE:], lambda: data) if data.startswith(JPEG) else None
+    longest = max(header.width, header.height) if header else 0
+    half = next((n for n in (8, 4, 2) if longest >= n * long_side), 1)
+    pixels = _decoded(data, path, REDUCED[half] | cv2.IMREAD_IGNORE_ORIENTATION)
+    height, width = pixels.shape[:2]
+    shrink = max(1.0, max(height, width) / long_side)
+    size = max(1, round(width / shrink)), max(1, round(height / shrink))
+    if size != (width, height):
+        pixels = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
+    return np.asarray(pixels, np.uint8), (half * width / size[0], half * height / size[1])
+
+
 def decode_image(data: bytes, path: Path, upright: bool = False) -> NDArray[Any]:
     """Decode the bytes of the image file `path`, as read_image does.  Raises DataError when they are damaged."""
+    pixels = _decoded(data, path, cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH if upright else cv2.IMREAD_UNCHANGED)
+    if pixels.dtype not in (np.uint8, np.uint16):
+        raise DataError(f"{path}: {pixels.dtype} pixels; expected 8 or 16 bits per channel: convert it to PNG")
+    if pixels.ndim == 2:
+        pixels = pixels[:, :, None]
+    if pixels.shape[2] == 1:
+        return np.repeat(pixels, 3, axis=2)
+    return np.ascontiguousarray(pixels[:, :, [2, 1, 0, 3][: pixels.shape[2]]])  # OpenCV decodes to BGR
+
+
+def _decoded(data: bytes, path: Path, flags: int) -> NDArray[Any]:
     if is_cut(data):  # some versions of OpenCV fill the rest with grey
         raise DataError(f"{path}: the end of the file is missing; copy it again")
-    flags = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH if upright else cv2.IMREAD_UNCHANGED
     pixels, fault = None, ""
     try:  # not cv2.imread: that needs ASCII paths on Windows
         pixels = cv2.imdecode(np.frombuffer(pixels_only(data), np.uint8), flags)
@@ -102,10 +136,4 @@ def decode_image(data: bytes, path: Path, upright: bool = False) -> NDArray[Any]
         pass
     if pixels is None:
         raise DataError(f"{path}: not an image, or a damaged one{fault}; copy or export it again")
-    if pixels.dtype not in (np.uint8, np.uint16):
-        raise DataError(f"{path}: {pixels.dtype} pixels; expected 8 or 16 bits per channel: convert it to PNG")
-    if pixels.ndim == 2:
-        pixels = pixels[:, :, None]
-    if pixels.shape[2] == 1:
-        return np.repeat(pixels, 3, axis=2)
-    return np.ascontiguousarray(pixels[:, :, [2, 1, 0, 3][: pixels.shape[2]]])  # OpenCV decodes to BGR
+    return np.asarray(pixels)

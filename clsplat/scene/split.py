@@ -47,6 +47,11 @@ class Split:
             test = {scene.views[i].name for i in scene.test}
             smaller = replace(scene, views=tuple(views))
             scene = _with_test(smaller, {i for i, view in enumerate(views) if view.name in test})
+        return self.with_validation(scene)
+
+    def with_validation(self, scene: Scene) -> Scene:
+        """Return a scene that has all training views, some of them for validation.  Raises DataError as `applied`."""
+        folders = [scene.path, *([self.folder] if self.folder else [])]
         if self.validation == 0:
             return scene
         fold = _auto(scene) if self.validation == "auto" else _of(scene, self.validation, folders)

@@ -3,9 +3,9 @@
 import logging
 from collections.abc import Collection, Iterator
 from dataclasses import asdict
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
-from pydantic import model_validator
+from pydantic import Field, model_validator
 
 from clsplat.density.budget import Budget, Moment
 from clsplat.density.control import densify
@@ -27,7 +27,8 @@ class Densify(Scheduled):
     stage: Literal["densify"] = "densify"
     needs: ClassVar[frozenset[str]] = frozenset({"model", "stats"})
     edits: ClassVar[bool] = True
-    training_keys: ClassVar[frozenset[str]] = frozenset({"max_gaussians"})
+    training_keys: ClassVar[frozenset[str]] = frozenset({"max_gaussians", "patience", "grow_until"})
+    step_keys: ClassVar[frozenset[str]] = frozenset({"grow_until"})
 
     rules: list[OneOf[Rule]]
     """Which Gaussians grow or are removed; the first growing rule decides, pruning rules override growth."""
@@ -35,6 +36,13 @@ class Densify(Scheduled):
     """Number of Gaussians at which growth stops, by step; without it, as many as fit in memory.  Pruning continues."""
     budget: OneOf[Budget] | None = None
     """Number of Gaussians at which the growth of an edit stops, from the course of the training; needs `stop`."""
+
+    patience: Annotated[int, Field(gt=0)] | None = None
+    """Measurements of the validation views in a row without a better one after which nothing grows any more, in a
+    training with `keep: best`, whose own patience counts anew from there; pruning continues.  Without it, growth goes
+    on."""
+    grow_until: Annotated[int, Field(gt=0)] | None = None
+    """Global step from which on nothing grows; pruning continues.  Without it, growth goes on."""
 
     @property
     def statistics(self) -> set[str]:
@@ -72,8 +80,22 @@ class Densify(Scheduled):
         if change.after == 0:
             raise NumericError(f"step {run.step}: every Gaussian was pruned; weaken the prune rules or lower the rates")
 
+    def _has_grown(self, run: Run) -> bool:
+        """Whether growth has ended, by its step or by validation; a run keeps the step."""
+        if self.grow_until is not None and run.step >= self.grow_until:
+            return True
+        best = run.best
+        if self.patience is None or best is None or run.is_refit:  # whose pipeline says the step
+            return False
+        if best.growth_ended is None and best.since >= self.patience:
+            best = run.best = best.model_copy(update={"growth_ended": run.step, "since": 0})
+            LOG.info("step %d: growth ends: the model was best at step %d", run.step, best.found.step)
+        return best.growth_ended is not None
+
     def _limits(self, run: Run, edit: Edit) -> Iterator[int]:
         """The numbers of Gaussians at which the settings stop growth."""
+        if self._has_grown(run):
+            yield 0
         if self.max_gaussians is not None:
             yield int(edit.at(self.max_gaussians))
         if self.budget and self.every and self.stop:

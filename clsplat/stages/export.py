@@ -12,6 +12,8 @@ from clsplat.formats.splats import Reading, Writing
 from clsplat.formats.table import endings, for_writing
 from clsplat.gaussians.clusters import DeviceClusters
 from clsplat.gaussians.model import load
+from clsplat.gaussians.sky import sky_file
+from clsplat.gaussians.sky_splats import with_sky_splats
 from clsplat.reading import sha256
 from clsplat.stages.base import CADENCE, Scheduled, path_in_run
 from clsplat.training.run import Run
@@ -24,17 +26,21 @@ class Export(Scheduled):
     """Write the model in the format that the name of the file stands for, by default a PLY, and read it back.
 
     A world filter is applied to scales and opacities, so that any viewer can show the file.  A second file, a PLY with
-    `_raw` in its name, holds the model as trained, with the filter as a property `filter_3D`.
+    `_raw` in its name, holds the model as trained, with the filter as a property `filter_3D`.  A sky is beside them,
+    with `_sky.json` in its name, which clsplat alone reads, or among the Gaussians.
     """
 
     stage: Literal["export"] = "export"
     needs: ClassVar[frozenset[str]] = frozenset({"model"})
-    output_keys: ClassVar[frozenset[str]] = CADENCE | {"file", "quality"}
+    output_keys: ClassVar[frozenset[str]] = CADENCE | {"file", "quality", "sky"}
 
     file: Annotated[str, path_in_run(*WRITTEN)] = "point_cloud.ply"
     """Path inside the run folder; its ending is the format: .ply, .compressed.ply, .spz, .sog, .glb, .splat, .usda."""
     quality: Literal["small", "balanced", "high"] = "balanced"
     """Of SPZ, bits of the harmonics; of SOG, entries of their palette."""
+    sky: Literal["beside", "splats"] = "beside"
+    """A sky that was learned (`model.background`): a file beside the model, or 10 000 Gaussians on a far sphere, which
+    every viewer shows."""
 
     @model_validator(mode="after")
     def _quality_of_its_format(self) -> "Export":
@@ -46,11 +52,13 @@ class Export(Scheduled):
 
     def outputs(self, out: Path) -> list[Path]:
         path = out / self.file
-        return [path, path.with_name(f"{path.stem}_raw.ply")]
+        return [path, path.with_name(f"{path.stem}_raw.ply"), sky_file(path)]
 
     def run(self, run: Run) -> None:
-        model = run.host_model()
-        path, raw = self.outputs(run.out)
+        model = with_sky_splats(run.host_model()) if self.sky == "splats" else run.host_model()
+        path, raw, behind = self.outputs(run.out)
+        run.written.pop(_name(behind, run), None)
+        behind.unlink(missing_ok=True)
         files = {path: model.baked()}
         if model.filter_variance is not None:
             files[raw] = model
@@ -63,10 +71,13 @@ class Export(Scheduled):
             except DataError as error:
                 raise OutputError(f"{error}; it was written just now: check the disk and its space") from error
             LOG.info("%s Gaussians written to %s", f"{len(one):,}", file)
+        if behind.is_file():
+            run.written[_name(behind, run)] = sha256(behind)
+            LOG.info("their sky written to %s; `export: {sky: splats}` makes Gaussians of it", behind)
 
     def verify(self, run: Run) -> None:
-        path, raw = self.outputs(run.out)
-        for file in (path, raw) if _name(raw, run) in run.written or raw.exists() else (path,):
+        path, *more = self.outputs(run.out)
+        for file in (path, *(one for one in more if _name(one, run) in run.written or one.exists())):
             if _name(file, run) not in run.written:
                 raise DataError(f"{file}: this run has no record of writing it; move it away, and use --restart")
             if sha256(file) != run.written[_name(file, run)]:

@@ -4,7 +4,8 @@ from typing import ClassVar, Literal
 
 from clsplat.density.importance import useless
 from clsplat.density.thresholds import Share
-from clsplat.gaussians.tables import HIDDEN, HIDDEN_VIEWS, hide
+from clsplat.gaussians.left_out import HIDDEN_VIEWS, hide
+from clsplat.gaussians.tables import HIDDEN
 from clsplat.stages.base import Scheduled
 from clsplat.training.run import Run
 

@@ -24,6 +24,7 @@ from clsplat.settings import ReadPath
 from clsplat.stages.base import Stage
 from clsplat.training.memory import first_tables
 from clsplat.training.run import Run
+from clsplat.training.skies import begin_sky
 
 LOG = logging.getLogger("clsplat")
 MIN_DISTANCE2 = 1.0e-7  # scene units²: coincident points still get a size
@@ -82,6 +83,7 @@ class Init(Stage):
         gaussians = Gaussians(run.device, parameters)
         run.model = run.model_settings.model(gaussians, degree if self.source in MODEL_SOURCES else 0)
         run.refresh_filter()
+        begin_sky(run, load(Path(self.file)).sky if source in MODEL_SOURCES and self.file else None)
         LOG.info("%s Gaussians from %s", f"{run.model.gaussians.count:,}", self._origin(source, run.scene))
 
     def _origin(self, source: str, scene: Scene) -> str:

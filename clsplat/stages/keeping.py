@@ -7,10 +7,10 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field, model_validator
 
 from clsplat.errors import ConfigError
-from clsplat.gaussians.tables import Gaussians
 from clsplat.stages.base import Scheduled, Stage
 from clsplat.stages.evaluate import Evaluate
-from clsplat.training.kept import Best, Measured, tables_of
+from clsplat.training.kept import Best, Measured
+from clsplat.training.kept_tables import copied_of, put_back
 from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
@@ -81,7 +81,7 @@ class Keeping(Stage):
             run.best = best.after(now)
             return
         apart = (best and best.apart) or (now if now.is_apart else None)
-        tables, evaluations = tables_of(run.model), best.evaluations + 1 if best else 1
+        tables, evaluations = copied_of(run), best.evaluations + 1 if best else 1
         copied = {split: dict(one) for split, one in averages.items()}
         run.best = Best(
             found=now,
@@ -92,6 +92,7 @@ class Keeping(Stage):
             since=0,
             apart=apart,
             last=now,
+            growth_ended=best.growth_ended if best else None,
         )
         run.best_tables = tables
 
@@ -108,8 +109,7 @@ class Keeping(Stage):
             return
         with run.changing():
             if best.found.step != run.step:
-                gaussians = Gaussians(run.device, run.best_tables)
-                run.model = run.model_settings.model(gaussians, best.degree)
+                put_back(run, run.best_tables, best.degree)
                 run.adam = run.stats = None
                 run.numbers.update(best.numbers)
             run.metrics.update(best.metrics)

@@ -12,7 +12,7 @@ from clsplat.density.statistics import SplatStats
 from clsplat.errors import Interrupted
 from clsplat.losses.base import ImageLoss, Loss, Penalty, ViewGradients, ViewLosses, require_symmetric
 from clsplat.names import VIEW_COLOURS
-from clsplat.schedule import Points
+from clsplat.schedule import Points, Probability
 from clsplat.settings import OneOf
 from clsplat.stages.base import Scheduled
 from clsplat.stages.densify import Densify
@@ -22,8 +22,9 @@ from clsplat.training import checkpoint
 from clsplat.training.adam import Adam, Rates, Rows
 from clsplat.training.colours import photograph_colours, write_view_colours
 from clsplat.training.forecast import Forecast
+from clsplat.training.profile import clocks
 from clsplat.training.rescue import finite_values
-from clsplat.training.run import Run, Stopped, clocks
+from clsplat.training.run import Run, Stopped
 from clsplat.training.skipping import Skip, Visit
 from clsplat.training.trainer import Trainer
 from clsplat.views.colours import Colours
@@ -47,7 +48,7 @@ class Optimize(Keeping):
     needs: ClassVar[frozenset[str]] = frozenset({"model"})
     makes: ClassVar[frozenset[str]] = frozenset({"adam", "stats"})
     output_keys: ClassVar[frozenset[str]] = frozenset({"log_every"})
-    training_keys: ClassVar[frozenset[str]] = frozenset({"rates", "update", "skip"})
+    training_keys: ClassVar[frozenset[str]] = frozenset({"rates", "update", "skip", "dropout"})
 
     rates: Rates = Rates()
     """Learning rates."""
@@ -62,6 +63,9 @@ class Optimize(Keeping):
     """Colours of each photograph, where exposures differ: `gain`, `affine`, `auto`; without it, those of the scene."""
     transients: Transients | None = None
     """Pixels that are left out, where photographs show what the scene does not have; without it, none."""
+    dropout: Probability = 0.0
+    """Probability with which a step leaves a Gaussian out, by step, 0.9 at most; for few photographs.  The opacities of
+    the others are divided by 1 less it (DropGaussian, Park et al. 2025).  Pictures and measurements leave none out."""
     skip: Skip | None = None
     """Steps that skip the backward pass, where a view has converged; without it, none."""
     during: list[OneOf[Scheduled]] = Field([])
@@ -182,7 +186,8 @@ class Optimize(Keeping):
             stage.attach(run)
         parts = run.rasterizer, run.model, run.adam, run.stats, photographs.background
         rates, colours = self.rates.settled(views.full_size(last)), photograph_colours(self.colours, run, last)
-        return Trainer(*parts, self.losses, rates, run.scene.extent, run.numbers, self.update, colours, self.transients)
+        own = colours, self.transients, run.sky, self.dropout, run.seed
+        return Trainer(*parts, self.losses, rates, run.scene.extent, run.numbers, self.update, *own)
 
     def _act(self, run: Run) -> None:
         """Run the stages that are due and do not edit; those that fail run again when the run goes on."""

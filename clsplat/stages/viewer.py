@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from clsplat.gaussians.sky_splats import with_sky_splats
 from clsplat.pages.page import require_end
 from clsplat.scene.scene import View
 from clsplat.scene.stand import Stand
@@ -38,6 +39,7 @@ class Viewer(Stage):
 
     def run(self, run: Run) -> None:
         path, model = run.out / self.file, run.host_model()
+        shown = with_sky_splats(model)
         scene, name = run.scene.downscaled(run.downscale), run.photographs.background_name
 
         def read(view: View) -> NDArray[np.uint8]:
@@ -48,14 +50,14 @@ class Viewer(Stage):
 
         views = described(scene, read, self.photographs, self.photograph_budget, through)
         stand = Stand.of(model.means, scene.views, (scene.split("test") or scene.views)[0])
-        page = Page(f"{run.name} · {run.scene_name}", {run.name: pack(model)}, stand, name, views)
+        page = Page(f"{run.name} · {run.scene_name}", {run.name: pack(shown)}, stand, name, views)
         if page.size > MAX_SIZE and page.fitting:  # else the photographs are the fault, which the page says
             LOG.warning(
                 "%s: shows the %s most important of %s Gaussians, so that browsers can open it; "
                 "`clsplat compress` makes models of fewer",
-                *(path, f"{page.fitting:,}", f"{len(model):,}"),
+                *(path, f"{page.fitting:,}", f"{len(shown):,}"),
             )
-            page = Page(page.title, {run.name: pack(model, page.fitting)}, stand, name, views)
+            page = Page(page.title, {run.name: pack(shown, page.fitting)}, stand, name, views)
         page.write(path)
         LOG.info("viewer written to %s, %.1f MB", path, path.stat().st_size / 1e6)
 

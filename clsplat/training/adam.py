@@ -9,7 +9,8 @@ from clsplat.errors import ConfigError
 from clsplat.gaussians.tables import PARAMETERS, DeviceModel, Gaussians, Gradients, moment_tables, sh_coefficients
 from clsplat.opencl.device import Array
 from clsplat.opencl.program import constants
-from clsplat.render.rasterizer import Frame, shape_arguments
+from clsplat.render.arguments import shape_arguments
+from clsplat.render.rasterizer import Frame
 from clsplat.schedule import Decay, NonNegative, at_step, explained
 from clsplat.settings import Settings
 

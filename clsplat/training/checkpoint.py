@@ -20,11 +20,12 @@ from clsplat.errors import ClsplatError, ConfigError, DataError, NotFiniteError,
 from clsplat.files import atomic
 from clsplat.gaussians.tables import Gaussians
 from clsplat.names import CHECKPOINTS, PIPELINE
-from clsplat.training import archive, kept
+from clsplat.training import archive, kept, sky
 from clsplat.training.adam import Adam
 from clsplat.training.advice import lower_rate
 from clsplat.training.archive import Arrays
 from clsplat.training.changes import differences
+from clsplat.training.kept_tables import restore_sky
 from clsplat.training.run import Run
 from clsplat.training.state import State, check_tables
 
@@ -94,6 +95,8 @@ def load(path: Path) -> tuple[State, Arrays]:
         raise DataError(f"it has no stage {state.cursor}")
     own, best = kept.split_tables(tables)
     kept.check(state.best, best)
+    behind, own = sky.split_tables(own)
+    sky.check_tables(behind)
     check_tables(state, {name.removeprefix("gaussians/"): table for name, table in own.items()})
     return state, tables
 
@@ -181,7 +184,8 @@ def _write(run: Run, kind: str) -> Path:
     with atomic(path) as file:
         tables = ((_key(name), run.model.gaussians.get(name)) for name in run.model.gaussians.tables)
         best = ((kept.FOLDER + name, table) for name, table in run.best_tables.items())
-        archive.write(file, state.model_dump(), chain(tables, best))
+        behind = ((sky.FOLDER + name, table) for name, table in (run.sky.tables() if run.sky else {}).items())
+        archive.write(file, state.model_dump(), chain(tables, behind, best))
     return path
 
 
@@ -211,6 +215,7 @@ def _take_changes(run: Run, path: Path, state: State) -> list[str]:
 
 def _restore(run: Run, state: State, tables: Arrays) -> None:
     tables, run.best_tables = kept.split_tables(tables)
+    behind, tables = sky.split_tables(tables)
     gaussians = Gaussians(run.device, {name.removeprefix("gaussians/"): table for name, table in tables.items()})
     run.model = run.model_settings.model(gaussians, state.degree)
     if state.updates:
@@ -226,8 +231,9 @@ def _restore(run: Run, state: State, tables: Arrays) -> None:
     run.step, run.cursor, run.stage_step = state.step, state.cursor, state.stage_step
     run.acted, run.edited, run.whole, run.numbers = state.acted, state.edited, True, state.numbers
     run.best = state.best
+    restore_sky(run, behind)
     if run.is_refit:
-        run.train_on_all()
+        run.divide(run.original.with_fold())
     run.train_seconds, run.cpu_seconds, run.metrics = state.train_seconds, state.cpu_seconds, state.metrics
     run.records.lines, run.inputs_before, run.written = state.records, state.inputs, state.written
 

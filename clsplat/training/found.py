@@ -14,7 +14,9 @@ def photographs_text(found: Mapping[str, Mapping[str, Any]]) -> str:
     cameras = found.get("map_cameras", {})
     try:
         damaged = [f"{name} ({reason})" for name, reason in found.get("find_features", {}).get("damaged", {}).items()]
-        placed, lost = int(cameras["registered"]), [*damaged, *map(str, cameras["not_registered"])]
+        why = cameras.get("reasons", {})
+        missing = [f"{name} ({why[name]})" if name in why else str(name) for name in cameras["not_registered"]]
+        placed, lost = int(cameras["registered"]), [*damaged, *missing]
         text = f"{placed} of {placed + len(lost)} photographs placed, {float(cameras['error_px']):.2f} px"
     except (AttributeError, KeyError, TypeError, ValueError):
         return ""

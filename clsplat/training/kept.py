@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from clsplat.errors import DataError
 from clsplat.gaussians.model import WIDTHS
 from clsplat.gaussians.tables import INTERVAL2, PARAMETERS, DeviceModel
+from clsplat.training import sky
 
 FOLDER = "best/"  # before the names of its tables in a checkpoint
 APART = 6.0  # dB: a model that is so much better where it was trained has learnt its photographs by heart (ours)
@@ -62,6 +63,8 @@ class Best(BaseModel):
     """The first that had learnt its photographs by heart."""
     last: Measured
     """The last that was measured."""
+    growth_ended: Count | None = None
+    """Global step from which on nothing grew, since validation found no better model; None: growth goes on."""
     taken: Count | None = None
     """Global step after which the training left this model; None: it goes on."""
     refit: Literal["none", "due", "begun"] = "none"
@@ -74,7 +77,7 @@ class Best(BaseModel):
 
     def figures(self) -> dict[str, Any]:
         """Return what metrics.json has of it."""
-        facts = self.model_dump(include={"evaluations", "last", "apart"})
+        facts = self.model_dump(include={"evaluations", "last", "apart", "growth_ended"})
         return {**self.found.model_dump(), **facts, "ended": self.taken, "refit": self.refit != "none"}
 
     def told(self) -> str:
@@ -109,6 +112,8 @@ def check(best: Best | None, tables: Tables) -> None:
         if tables:
             raise DataError("it holds a best model that it says nothing of")
         return
+    behind, tables = sky.split_tables(tables)
+    sky.check_tables(behind)
     if missing := [name for name in (*PARAMETERS, "filter_variance") if name not in tables]:
         raise DataError(f"its best model lacks {', '.join(missing)}")
     count = len(tables["means"])

@@ -1,5 +1,6 @@
 """The time of a training step on the device, by stage."""
 
+import time
 from collections import defaultdict
 
 from clsplat.opencl.timings import Timings
@@ -24,6 +25,12 @@ STAGES = {
     "ssim_maps": "loss",
     "ssim_gradient": "loss",
     "weight_entropy": "loss",
+    "sky_matches": "loss",
+    "sky_cover": "loss",
+    "sky_forward": "blend",
+    "sky_backward": "blend backward",
+    "sky_gather": "sum records",
+    "sky_update": "update",
     "apply_mask": "loss",
     "measure_residuals": "loss",
     "mask_transients": "loss",
@@ -59,3 +66,8 @@ def stage_milliseconds(timings: Timings, steps: int = 1) -> dict[str, float]:
     for (label, section), seconds in timings.take().items():
         totals[STAGES.get(label.partition(":")[2], section)] += 1e3 * sum(seconds) / steps
     return {name: totals[name] for name in (*ORDER, "other") if name in totals}
+
+
+def clocks() -> tuple[float, float]:
+    """Return the time, and that of all threads of this process, in s."""
+    return time.perf_counter(), time.process_time()

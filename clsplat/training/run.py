@@ -1,7 +1,6 @@
 """The state of a pipeline while it runs."""
 
 import logging
-import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -28,7 +27,9 @@ from clsplat.settings import Settings
 from clsplat.training.adam import Adam
 from clsplat.training.kept import Best, Tables
 from clsplat.training.memory import MemoryPlan, plan
+from clsplat.training.profile import clocks
 from clsplat.training.records import Records
+from clsplat.training.sky import LearnedSky
 from clsplat.training.status import StatusFile
 from clsplat.views.exposures import Exposures
 from clsplat.views.photographs import Photographs
@@ -56,11 +57,6 @@ class Progress:
     growth_known: bool = True  # False: rules will make steps slower, and it is not known yet how much
 
 
-def clocks() -> tuple[float, float]:
-    """Return the time, and that of all threads of this process, in s."""
-    return time.perf_counter(), time.process_time()
-
-
 @dataclass
 class Run:
     """The mutable state of a pipeline; stages read and change it."""
@@ -83,6 +79,7 @@ class Run:
     losses: list[Loss] = field(default_factory=list)  # added from Python, beside those of the pipeline
     adam: Adam | None = None
     stats: SplatStats | None = None
+    sky: LearnedSky | None = None  # of the model, where it has one
     step: int = 0  # updates done, or in progress
     cursor: int = 0  # stage in progress
     stage_step: int = 0  # steps done in it
@@ -115,6 +112,7 @@ class Run:
         """The model.  Raises ConfigError when no stage has made one."""
         if self._model is None:
             raise ConfigError("no model yet: an init stage must come first")
+        self._model.sky = self.sky.sky if self.sky else None
         return self._model
 
     @model.setter
@@ -140,16 +138,15 @@ class Run:
 
     def begin_again(self, best: Best) -> None:
         """Come to the beginning of the pipeline, to train again for the steps of the best model."""
-        self._model, self.adam, self.stats, self.step, self.divisor = None, None, None, 0, 1.0
+        self._model, self.adam, self.stats, self.sky, self.step, self.divisor = None, None, None, None, 0, 1.0
         self.numbers, self.metrics, self.written, self.whole = {}, {}, {}, True
         self.best, self.best_tables = best, {}
         self.next_stage(0)
-        self.train_on_all()
+        self.divide(self.original.with_fold())
 
-    def train_on_all(self) -> None:
-        """Put the validation views among those that are trained on."""
-        self.original, downscales = self.original.with_fold(), self.scene.downscales
-        self.scene = self.original.downscaled(*downscales)
+    def divide(self, original: Scene) -> None:
+        """Take the scene, as it was read, with another split of its views."""
+        self.original, self.scene = original, original.downscaled(*self.scene.downscales)
         self._filter_views, self._texture_quantiles = None, {}
 
     @contextmanager
@@ -235,7 +232,8 @@ class Run:
         tables = {name: self.model.gaussians.get(name) for name in (*PARAMETERS, "filter_variance")}
         if not tables["filter_variance"].any():
             del tables["filter_variance"]
-        return Model(**tables, rendering=Rendering.of({"version": __version__, **self.rendering()}, "default"))
+        rendering = Rendering.of({"version": __version__, **self.rendering()}, "default")
+        return Model(**tables, rendering=rendering, sky=self.sky.sky.host() if self.sky else None)
 
     def rendering(self) -> dict[str, Any]:
         """Return the numbers for rendering a model file as in training."""
@@ -246,5 +244,6 @@ class Run:
             "compensate": model.compensate,
             **({"pixel_box": model.pixel_box} if model.pixel_box else {}),
             "background": self.photographs.background_name,
+            **({"sky": "directions"} if self.sky else {}),
             "alpha": self.original.views[0].alpha,
         }

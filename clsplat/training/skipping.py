@@ -2,14 +2,14 @@
 
 import logging
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
-from pydantic import Field, ValidationError, WrapValidator
+from pydantic import Field
 
 from clsplat.losses.base import ViewLosses
-from clsplat.settings import Settings
+from clsplat.settings import Settings, in_one_sentence
 from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
@@ -22,14 +22,6 @@ class Visit:
 
     skipped: bool = False
     numbers: Mapping[str, float] = field(default_factory=dict)  # those that change when the step is done
-
-
-def _share_or_auto(value: Any, validate: Callable[[Any], Any]) -> Any:
-    """One sentence in the place of the errors of both kinds."""
-    try:
-        return validate(value)
-    except ValidationError:
-        raise ValueError("expected 'auto' or a share from 0 to 1") from None
 
 
 class Skip(Settings):
@@ -55,7 +47,9 @@ class Skip(Settings):
     """Share of a view's average that stays at a visit."""
     warm_up: Annotated[int, Field(gt=0)] = 500
     """Steps from `start` on that are not skipped; `auto` needs several for each photograph."""
-    least: Annotated[Literal["auto"] | Annotated[float, Field(ge=0, le=1)], WrapValidator(_share_or_auto)] = "auto"
+    least: Annotated[
+        Literal["auto"] | Annotated[float, Field(ge=0, le=1)], in_one_sentence("expected 'auto' or a share from 0 to 1")
+    ] = "auto"
     """Least share of steps that do the whole work; `auto`: the share of the warm-up that would not have been
     skipped."""
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 
 from clsplat.density.statistics import SplatStats
 from clsplat.errors import ConfigError
-from clsplat.gaussians.tables import DeviceModel
+from clsplat.gaussians.tables import DeviceModel, Dropout
 from clsplat.losses.base import (
     Comparison,
     ImageLoss,
@@ -23,7 +23,9 @@ from clsplat.opencl.device import Array
 from clsplat.opencl.program import constants
 from clsplat.render.camera import DeviceCamera
 from clsplat.render.rasterizer import Content, Rasterizer
+from clsplat.schedule import Schedule, at_step
 from clsplat.training.adam import Adam, Rates, Rows
+from clsplat.training.sky import LearnedSky
 from clsplat.views.learned import LearnedTransform, learned_of, name_of
 from clsplat.views.photograph_colours import PhotographColours, change_back, change_colours
 from clsplat.views.photographs import Photograph, apply_mask
@@ -72,6 +74,9 @@ class Trainer:
     rows: Rows = "all"  # Gaussians that a step changes
     colours: PhotographColours | None = None  # of the photographs, where they have colours of their own
     transients: Transients | None = None  # which pixels are left out; None: none
+    sky: LearnedSky | None = None  # of the model, where it has one
+    dropout: Schedule = 0.0  # probability with which a step leaves a Gaussian out, by step
+    seed: int = 0  # of what is drawn
 
     def step(
         self,
@@ -110,7 +115,7 @@ class Trainer:
         workspace, camera, timings = self.rasterizer.workspace, photograph.camera, self.rasterizer.device.timings
         reads_entropy = any(isinstance(loss, ImageLoss) and loss.reads_entropy for loss in self.losses)
         content: Content = "entropy" if reads_entropy else "colour"
-        frame = self.rasterizer.forward(self.model, camera, self.background, content)
+        frame = self.rasterizer.forward(self._drawn(step), camera, self.background, content)
         timings.section = "loss"
         planes = photograph.planes(workspace, transforms, step, self.numbers)
         gradient = workspace.array("grad_image", frame.image.shape)
@@ -126,7 +131,12 @@ class Trainer:
         learned = learned_of(transforms)
         of_transform, learn = self._learn(learned, planes, comparison) if learned else ([], [])
         values = [returned(loss, loss.add(comparison)) for loss in self.losses if isinstance(loss, ImageLoss)]
-        return ViewLosses(frame, comparison, [*values, *of_transform, *own], learning=[*learning, *learn])
+        behind = None
+        if self.sky and (cover := self.sky.cover(self.rasterizer, frame, comparison)):
+            behind, value = cover
+            own.append(value)
+        losses = [*values, *of_transform, *own]
+        return ViewLosses(frame, comparison, losses, learning=[*learning, *learn], behind=behind)
 
     def backward(self, view: ViewLosses) -> ViewGradients:
         """Return the derivative of the losses that `compare` returned, as sums over pixels."""
@@ -135,11 +145,18 @@ class Trainer:
         if mask is not None:
             apply_mask(workspace, camera, gradient, mask)
         gradient, learning = self._uncoloured(view, gradient)
+        learning = [*self._of_sky(view, gradient), *learning]
         count = self.stats.pixel_sums
         self.rasterizer.device.timings.section = "statistics"
         texture = known_gradient(workspace, camera, photograph, mask) if count > TEXTURE else None
-        pixel_sums = self.rasterizer.pixel_sums(self.model, view.frame, gradient, count, texture)
+        model = self._drawn(comparison.step)
+        pixel_sums = self.rasterizer.pixel_sums(model, view.frame, gradient, count, texture, view.behind)
         return ViewGradients(view.frame, comparison, view.losses, pixel_sums, learning=learning)
+
+    def _drawn(self, step: int) -> DeviceModel:
+        """The model as a step draws it."""
+        probability = at_step(self.dropout, step)
+        return replace(self.model, dropout=Dropout(probability, self.seed, step)) if probability else self.model
 
     def _coloured(self, camera: DeviceCamera, image: Array) -> tuple[Array, list[LossValue]]:
         """The image in the colours of its photograph, where that has its own, and the loss of their numbers."""
@@ -172,6 +189,13 @@ class Trainer:
         gradient, by_matrix = change_back(workspace, camera, view.frame.image, matrix, gradient)
 
         return gradient, [*learning, lambda: colours.learn(self.numbers, number, by_matrix(), comparison.step)]
+
+    def _of_sky(self, view: ViewLosses, gradient: Array) -> list[Callable[[], None]]:
+        """What changes the sky after the Gaussians.  gradient: by the image as it was rendered."""
+        if (sky := self.sky) is None:
+            return []
+        by_texels = sky.by_texels(self.rasterizer, view.frame, gradient)
+        return [lambda: sky.update(self.rasterizer, view.frame, by_texels, view.comparison.step)]
 
     def _learn(
         self, transform: LearnedTransform, planes: Planes, comparison: Comparison

@@ -78,7 +78,13 @@ class Tuning:
         screen = {"type": "dilation", "variance": numbers.screen_variance, "compensate": int(numbers.compensate)}
         if numbers.pixel_box:
             screen = {"type": "box"}
-        return {"model.sh_degree": self.model.sh_degree, "model.near": numbers.near, "model.screen_filter": screen}
+        sky = self.model.sky and {"type": "directions", "side": self.model.sky.side}
+        return {
+            "model.sh_degree": self.model.sh_degree,
+            "model.near": numbers.near,
+            "model.screen_filter": screen,
+            **({"model.background": sky} if sky else {}),
+        }
 
 
 def require_steps(steps: int) -> None:

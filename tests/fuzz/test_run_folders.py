@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import clsplat
+from clsplat.gaussians.sky import Sky, sky_beside
 from clsplat.names import INPUTS
 from clsplat.runs.verify import verify
 from clsplat.training import archive
@@ -85,3 +86,18 @@ def test_a_damaged_file_of_a_whole_run_is_read_equal_or_told(name, run: Path):
 def held(name: str, content: Any, found: dict[str, Any]) -> Any:
     """What a check holds a file to: all of it, but of status.json, which has no checksum, the state and the files."""
     return [content["state"], [one["file"] for one in found["objects"]]] if name == "status.json" else content
+
+
+def test_a_damaged_sky_is_a_map_or_refused(folder: Path):
+    path = folder / "model_sky.json"
+    Sky(np.linspace(0, 1, 192, dtype=np.float32).reshape(64, 3)).write(path)
+
+    @fuzzed(data=damaged([path.read_bytes()], ["side", "texels", "NaN", "1e999", "null", "[[0, 0, 0]]"]))
+    def reads(data):
+        path.write_bytes(data)
+        found = outcome(sky_beside, folder / "model.ply")
+        if found is not None:
+            assert found.texels.shape == (found.side**2, 3)
+            assert np.isfinite(found.texels).all()
+
+    reads()

@@ -14,7 +14,7 @@ from clsplat.conformance.checks.projection import (
     splats_of,
 )
 from clsplat.conformance.scenes import Case, random_case, with_world_filter
-from clsplat.gaussians.tables import HIDDEN_VIEWS, hide
+from clsplat.gaussians.left_out import HIDDEN_VIEWS, hide
 from clsplat.render.camera import CAMERA
 from clsplat.render.rasterizer import RECORD, Budget, Rasterizer
 from tests.kernels.figures import hold

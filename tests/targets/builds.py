@@ -26,7 +26,8 @@ FITTED: tuple[dict[str, int | str], ...] = ({}, {"SPLAT_GROUP": 64})  # once it 
 SCHEDULES: tuple[Schedule, ...] = ("simt", "wide")
 SUMS = sorted({kind.pixel_sums for kind in variants(Statistic).values()} - {PIXEL_SUMS})
 BOX = {"PIXEL_BOX": 1}
-BLEND: list[dict[str, int]] = [*({"PIXEL_SUMS": count} for count in SUMS), BOX, {**BOX, "PIXEL_SUMS": SUMS[-1]}]
+BEHIND = {"GRAD_BEHIND": 1}
+BLEND: list[dict[str, int]] = [*({"PIXEL_SUMS": n} for n in SUMS), BOX, {**BOX, "PIXEL_SUMS": SUMS[-1]}, BEHIND]
 PASSED = {  # what call sites of Device.program add to the tuning; a test holds it against them
     "adam.cl": [BOX],
     "large.cl": [BOX],

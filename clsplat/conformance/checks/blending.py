@@ -1,6 +1,7 @@
 """The two schedules of blending: images, and the sums over pixels from which gradients come."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -153,6 +154,28 @@ def entropy_of_weights(device: Device, rng: np.random.Generator) -> Iterator[Fig
         weights[:, :height, :width] = rng.normal(size=(4, height, width))
         m = rasterizer.pixel_sums(model, frame, device.upload(weights)).get()[:, :count].T.astype(np.float64)
         yield from sum_figures(case, m, weights[:, :height, :width], f"with the entropy, {what}")
+
+
+@CHECKS.add("blend_backward")
+def loss_of_what_is_left(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    """A loss of the transmittance alone is that of an image of black splats before one white channel."""
+    for count, width, height in ((1, 16, 16), (17, 33, 15), (65, 24, 24)):
+        case, what = safe_case(rng, count, width, height, MARGIN), f"with the transmittance, {count} Gaussians"
+        rasterizer, model, camera = Rasterizer(device, "radix"), case.model(device), case.device_camera(device)
+        frame = rasterizer.forward(model, camera, device.upload(BACKGROUND))
+        planes = np.zeros((4, camera.rows, camera.stride), np.float32)
+        planes[:, :height, :width] = rng.normal(size=(4, height, width))
+        behind = device.upload(planes[3] * np.abs(frame.transmittance.get()))
+        sums = rasterizer.pixel_sums(model, frame, device.upload(planes[:3]), behind=behind)
+        splats, weights = case.project(), planes[:, :height, :width].astype(np.float64)
+        of_image = ref.blend_backward(splats, width, height, BACKGROUND.astype(np.float64), weights[:3])
+        black, only = replace(splats, colour=0 * splats.colour), np.stack([weights[3], *np.zeros((2, height, width))])
+        of_left = ref.blend_backward(black, width, height, np.array([1.0, 0, 0]), only)
+        mean2d, conic = gradients_of_sums(splats, sums.get()[:, :count].T.astype(np.float64))
+        yield by_norm("blend_backward", f"splat means, {what}", mean2d, of_image.mean2d + of_left.mean2d, GRADIENT)
+        yield by_norm("blend_backward", f"conics, {what}", conic, of_image.conic + of_left.conic, GRADIENT)
+        opacity = (of_image.opacity + of_left.opacity) * splats.opacity
+        yield by_norm("blend_backward", f"opacities, {what}", sums.get()[0, :count], opacity, GRADIENT)
 
 
 @CHECKS.add("sum_records")

@@ -13,7 +13,7 @@ from clsplat.conformance.checks.images import comparison_of, magnitude_of, plane
 from clsplat.conformance.comparison import GRADIENT, SUM, Figure, by_element, by_norm, equal
 from clsplat.conformance.scenes import random_case, safe_case, with_world_filter
 from clsplat.density.basic import Clone, PruneFaint, PruneLarge, Split
-from clsplat.density.control import add_noise, cap_opacity, densify
+from clsplat.density.control import add_noise, cap_opacity, decay_opacity, densify
 from clsplat.density.edit import Edit
 from clsplat.density.statistics import ABS_X, SEEN, WEIGHT, SplatStats
 from clsplat.density.thresholds import SceneScale
@@ -181,6 +181,19 @@ def opacity_reset(device: Device, rng: np.random.Generator) -> Iterator[Figure |
             expected[capped] = ref.reset_logit(expected[capped], ratio[capped], 0.3)
             found = gaussians.get("logit_opacity")[:, 0]
             yield by_element("cap_opacity", f"opacities of {count} Gaussians", found, expected, 2e-5, floor=1)
+
+
+@CHECKS.add("decay_opacity")
+def opacity_decay(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    for count in COUNTS:
+        for factor in (0.995, 0.5):
+            case = random_case(rng, count)
+            case.parameters["logit_opacity"][:] = rng.uniform(-8, 6, (count, 1))
+            gaussians, before = case.model(device).gaussians, case.gaussians().logit_opacity
+            expected = ref.decayed_logit(before, factor)
+            decay_opacity(gaussians, factor)
+            found = gaussians.get("logit_opacity")[:, 0]
+            yield by_element("decay_opacity", f"opacities of {count} Gaussians", found, expected, 2e-5, floor=1)
 
 
 @CHECKS.add("add_noise")

@@ -13,7 +13,7 @@ from clsplat.conformance.comparison import CONIC, DEPTH, PROJECTION, SUM, Figure
 from clsplat.conformance.scenes import Case, random_case, with_world_filter
 from clsplat.conformance.sums import gradients_of_sums
 from clsplat.filters import FilterViews, Smoothing
-from clsplat.gaussians.tables import HIDDEN_VIEWS, hide
+from clsplat.gaussians.left_out import HIDDEN_VIEWS, hide
 from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import PIXEL_SUMS, Rasterizer
 

@@ -33,6 +33,7 @@ from clsplat.conformance.reference.density import (
     PRUNE,
     SPLIT,
     adc_actions,
+    decayed_logit,
     mean_gradient,
     reset_logit,
     screen_gain,
@@ -82,7 +83,8 @@ from clsplat.conformance.reference.projection_backward import (
     project_backward,
     ratio_gradient,
 )
-from clsplat.conformance.reference.random import normal3, philox
+from clsplat.conformance.reference.random import dropped, normal3, philox
+from clsplat.conformance.reference.sky import rays, shows_sky, sky_cover, sky_gradient, sky_image, sky_update
 from clsplat.conformance.reference.splitting import mean_jacobian, screen_splitting, splitting
 from clsplat.conformance.reference.transients import residual_numbers, residuals, without_transients
 from clsplat.conformance.reference.world_filter import (
@@ -114,6 +116,8 @@ __all__ = [
     "coloured_backward",
     "contribution",
     "covariance_trace",
+    "decayed_logit",
+    "dropped",
     "dssim",
     "falloff_squares",
     "filtered",
@@ -139,6 +143,7 @@ __all__ = [
     "psnr",
     "ratio_gradient",
     "ray_limits",
+    "rays",
     "render",
     "render_backward",
     "reset_logit",
@@ -153,6 +158,11 @@ __all__ = [
     "sh_basis_gradient",
     "shared_logit",
     "shared_means",
+    "shows_sky",
+    "sky_cover",
+    "sky_gradient",
+    "sky_image",
+    "sky_update",
     "split_children",
     "splitting",
     "ssim_map",

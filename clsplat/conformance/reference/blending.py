@@ -13,6 +13,7 @@ from clsplat.conformance.reference.kinds import Camera, Gaussians, SplatGradient
 from clsplat.conformance.reference.pixel_box import box_derivatives, box_response
 from clsplat.conformance.reference.projection import project
 from clsplat.conformance.reference.projection_backward import project_backward
+from clsplat.conformance.reference.sky import planes_behind
 
 
 class BlendStep(NamedTuple):
@@ -67,7 +68,7 @@ def blend(
         image += splats.colour[step.splat][:, None, None] * weight
         transmittance = np.where(step.blended, step.before * (1 - step.alpha), transmittance)
         count += step.blended
-    return image + np.asarray(background)[:, None, None] * transmittance, transmittance, count
+    return image + planes_behind(background) * transmittance, transmittance, count
 
 
 def blend_weights(splats: Splats, width: int, height: int, thresholds: Thresholds = Thresholds()) -> NDArray[Any]:
@@ -119,8 +120,8 @@ def alpha_gradients(
     grad_image, grad_entropy = grad_image[:3], grad_image[3:]
     entropy = entropy_gradients(splats, width, height, thresholds) if len(grad_entropy) else iter(())
     image, final, _ = blend(splats, width, height, background, thresholds)
-    through_background = np.einsum("c,chw->hw", background, grad_image)
-    behind = image - np.asarray(background)[:, None, None] * final  # S_N - S_i, once splat i has been taken off
+    through_background = (planes_behind(background) * grad_image).sum(axis=0)
+    behind = image - planes_behind(background) * final  # S_N - S_i, once splat i has been taken off
     for step in blend_steps(splats, width, height, thresholds):
         i, alpha, before = step.splat, step.alpha, step.before
         colour = splats.colour[i][:, None, None]

@@ -57,6 +57,7 @@ class Gaussians:
     logit_opacity: NDArray[Any]  # [N]
     sh: NDArray[Any]  # [N,K,3]
     filter_variance: NDArray[Any] = field(default_factory=lambda: np.zeros(0))  # [N] scene units²; zeros when not given
+    opacity_factor: float = 1.0  # of all opacities: that of a step's dropout
 
     def __post_init__(self) -> None:
         if len(self.filter_variance) == 0:

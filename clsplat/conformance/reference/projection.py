@@ -146,7 +146,7 @@ def project(
         x, y, z = foot.point
         mean2d = np.array([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy])
         splats.radius[n] = vanilla_radius(mean2d, foot.dilated, camera.width, camera.height)
-        opacity = np.prod(opacity_factors(gaussians.logit_opacity[n], foot, compensate))
+        opacity = gaussians.opacity_factor * np.prod(opacity_factors(gaussians.logit_opacity[n], foot, compensate))
         brightest = opacity * min(1, 2 * np.pi * np.sqrt(det)) if pixel_box else opacity
         if not brightest > thresholds.alpha_min:
             continue

@@ -78,8 +78,9 @@ def project_backward(
     for n in np.flatnonzero(splats.visible).tolist():
         foot = footprint(gaussians, n, camera, variance)
 
-        # Opacity o = sigmoid * ρ * κ
+        # Opacity o = sigmoid * ρ * κ, with the constant in ρ
         sigmoid, rho, kappa = opacity_factors(gaussians.logit_opacity[n], foot, compensate)
+        rho = rho * gaussians.opacity_factor
         grad["logit_opacity"][n] = grad_opacity[n] * rho * kappa * sigmoid * (1 - sigmoid)
         grad_kappa = grad_opacity[n] * sigmoid * rho
 

@@ -19,6 +19,12 @@ def philox(counter: tuple[int, int, int, int], key: tuple[int, int]) -> tuple[in
     return c0, c1, c2, c3
 
 
+def dropped(probability: float, seed: int, step: int, count: int) -> NDArray[np.bool_]:
+    """Which of `count` Gaussians a step leaves out, [N]: by one word each (Park et al. 2025)."""
+    words = [philox((row, step, 2, 0), (seed, 0))[0] for row in range(count)]
+    return np.array([word / 2**32 < probability for word in words])
+
+
 def normal3(counter: tuple[int, int, int, int], key: tuple[int, int]) -> NDArray[np.float64]:
     """Three standard normal numbers, [3]."""
     a, b, c, d = (((bits >> 8) + 1) / 2**24 for bits in philox(counter, key))

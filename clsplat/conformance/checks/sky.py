@@ -1,0 +1,137 @@
+"""A background of directions: pictures, derivatives, what covers it, and its Adam."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.conformance import reference as ref
+from clsplat.conformance.check import Checks, Note
+from clsplat.conformance.checks.images import outside, planes_of
+from clsplat.conformance.comparison import SUM, Figure, by_element, by_norm, equal
+from clsplat.conformance.scenes import Case, random_case
+from clsplat.gaussians.sky import DeviceSky
+from clsplat.opencl.device import Array, Device
+from clsplat.render.camera import DeviceCamera
+from clsplat.render.sky import Skies
+from clsplat.render.workspace import Workspace
+
+CHECKS = Checks()
+SIZES = ((1, 1, 8), (17, 33, 8), (65, 40, 13), (257, 5, 24))  # px, texels of a side: around vectors, tiles and seams
+NEAR = 2e-6  # of a texel's weight: places are differences of numbers up to 512
+
+
+def wide_case(rng: np.random.Generator, width: int, height: int) -> Case:
+    """A camera of a wide lens that looks anywhere."""
+    case = random_case(rng, 1, width, height)
+    turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    pose = np.column_stack([turn * np.linalg.det(turn), case.view.world_to_camera[:, 3]])
+    camera = replace(case.view.camera, fx=0.25 * width, fy=0.3 * width)
+    return replace(case, view=replace(case.view, camera=camera, world_to_camera=pose))
+
+
+class View:
+    """A camera before a random map, with what splats leave of each pixel."""
+
+    def __init__(self, device: Device, rng: np.random.Generator, width: int, height: int, side: int) -> None:
+        case = wide_case(rng, width, height)
+        self.camera: DeviceCamera = case.device_camera(device)
+        self.directions = ref.rays(case.camera(), width, height)
+        self.texels = rng.random((side, side, 3)).astype(np.float32)
+        self.sky = DeviceSky(device.upload(planes_in_rows(self.texels)), side)
+        self.free = rng.random((side, side)) < 0.95
+        self.learned = device.upload(self.free.reshape(1, -1).astype(np.float32))
+        self.left = rng.random((height, width)).astype(np.float32)
+        self.transmittance = self.planes(np.where(rng.random(self.left.shape) < 0.5, -1, 1) * self.left[None])
+        self.skies = Skies(device, Workspace(device))
+
+    def planes(self, image: NDArray[Any]) -> Array:
+        return planes_of(self.camera.array.device, self.camera, np.asarray(image, np.float32))
+
+    def inside(self, planes: NDArray[Any]) -> NDArray[Any]:
+        return planes[..., : self.camera.height, : self.camera.width]
+
+
+def planes_in_rows(texels: NDArray[Any]) -> NDArray[np.float32]:
+    """[side, side, C] -> [C, side * side]."""
+    return np.ascontiguousarray(texels.reshape(-1, texels.shape[2]).T, np.float32)
+
+
+def sky_figures(device: Device, rng: np.random.Generator, width: int, height: int, side: int) -> Iterator[Figure]:
+    """Compare a picture and the derivative by the map; finished pixels have a negative transmittance."""
+    view, what = View(device, rng, width, height, side), f"{width} x {height} px, {side} texels a side"
+    image, gradient = rng.random((3, height, width)), rng.normal(size=(3, height, width)).astype(np.float32)
+    planes = view.planes(image)
+    view.skies.paint(view.sky, view.camera, planes, view.transmittance)
+    expected = image.astype(np.float32) + view.left * ref.sky_image(view.texels.astype(np.float64), view.directions)
+    found = planes.get()
+    yield by_element("sky_forward", f"picture, {what}", view.inside(found), expected, 5 * NEAR, floor=1.0)
+    yield equal("sky_forward", f"pixels outside the image, {what}", outside(view.camera, found), 0.0)
+    by_texels = view.skies.by_texels(view.sky, view.camera, view.transmittance, view.planes(gradient))
+    all_texels = ref.sky_gradient(side, view.directions, view.left.astype(np.float64), gradient.astype(np.float64))
+    shown = view.skies.runs(view.camera, side).shown.get()
+    rows = all_texels.reshape(-1, 3)
+    yield by_norm("sky_backward", f"derivatives, {what}", by_texels.get().T, rows[shown], SUM)
+    yield by_norm("sky_gather", f"derivatives by texels, {what}", by_texels.get().T, rows[shown], SUM)
+    hidden = np.delete(rows, shown, axis=0)
+    yield equal("sky_gather", f"texels that are not shown, {what}", hidden, 0.0)
+
+
+def cover_figures(device: Device, rng: np.random.Generator, width: int, height: int, side: int) -> Iterator[Figure]:
+    """Compare the loss of what covers the sky; photographs are far from the difference that decides."""
+    view, what, difference, weight = View(device, rng, width, height, side), f"{width} x {height} px", 0.02, 0.3
+    sky = ref.sky_image(view.texels.astype(np.float64), view.directions)
+    far = np.where(rng.random((height, width)) < 0.3, 2.0, 0.4) * difference
+    photograph = (sky + far * np.where(rng.random(sky.shape) < 0.5, -1, 1)).astype(np.float32)
+    scale = weight / (width * height)
+    behind, sums = view.skies.cover(
+        view.sky, view.learned, view.camera, view.planes(photograph), view.transmittance, difference, scale
+    )
+    held = ref.sky_image(1.0 - view.free[..., None], view.directions)[0] > 0
+    chosen, found = ref.shows_sky(sky, np.where(held, 9, photograph), difference), behind.get()
+    loss, by_left = ref.sky_cover(chosen, view.left.astype(np.float64), weight)
+    for kernel in ("sky_matches", "sky_cover"):
+        expected = view.left * by_left
+        yield by_element(kernel, f"T dL/dT, {what}", view.inside(found), expected, NEAR, floor=scale)
+    yield equal("sky_cover", f"T dL/dT outside the image, {what}", outside(view.camera, found[None]), 0.0)
+    value = np.array([scale * sums.get().sum(dtype=np.float64)])
+    yield by_element("sky_cover", f"loss, {what}", value, np.array([loss]), SUM, floor=0.1)
+
+
+@CHECKS.add("sky_forward", "sky_backward", "sky_gather")
+def sky(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    for width, height, side in SIZES:
+        yield from sky_figures(device, rng, width, height, side)
+
+
+@CHECKS.add("sky_matches", "sky_cover")
+def cover_of_the_sky(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    for width, height, side in SIZES:
+        yield from cover_figures(device, rng, width, height, side)
+
+
+@CHECKS.add("sky_update")
+def adam_of_the_sky(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    """Three updates; texels that the view does not show stay."""
+    side = 16
+    view, texels = View(device, rng, 9, 7, side), side**2
+    shown = view.skies.runs(view.camera, side).shown.get()
+    moments = {name: device.zeros((width, texels)) for name, width in (("moment1", 3), ("moment2", 3), ("biases", 2))}
+    moments["free"], free = view.learned, view.free.ravel()[shown]
+    expected = planes_in_rows(view.texels)[:, shown].astype(np.float64)
+    first, second = np.zeros_like(expected), np.zeros_like(expected)
+    before, pixels = view.sky.texels.get(), 3 * 9 * 7
+    for updates in (1, 2, 3):
+        gradient = (rng.normal(size=expected.shape) / pixels).astype(np.float32)
+        view.skies.update(view.sky, view.camera, device.upload(gradient), moments, 0.01)
+        given = pixels * gradient.astype(np.float64)
+        new, first, second = ref.sky_update(expected, (first, second), given, updates, 0.01)
+        expected = np.where(free, new, expected)
+    found = view.sky.texels.get()
+    yield by_element("sky_update", "colours of texels", found[:, shown], expected, 1e-6, floor=1.0)
+    yield by_element("sky_update", "their first moments", moments["moment1"].get()[:, shown], first, 1e-5, floor=0.1)
+    yield by_element("sky_update", "their second moments", moments["moment2"].get()[:, shown], second, 1e-5, floor=0.1)
+    hidden = np.setdiff1d(np.arange(texels), shown)
+    yield equal("sky_update", "texels that the view does not show", found[:, hidden], before[:, hidden])

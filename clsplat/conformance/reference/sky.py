@@ -1,0 +1,87 @@
+"""A background of directions: an octahedral map seen through a camera, its derivatives, and the loss of what covers it.
+
+A map is [side, side, C]: row j, column i.  Directions are [H, W, 3] in the scene.
+"""
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.conformance.reference.kinds import Camera
+
+Entry = tuple[int, int, float]  # row and column of a texel, weight
+
+
+def planes_behind(background: NDArray[Any]) -> NDArray[Any]:
+    """A background of one colour, [3], or of a picture, [3, H, W], as planes."""
+    array = np.asarray(background)
+    return array if array.ndim == 3 else array[:, None, None]
+
+
+def rays(camera: Camera, width: int, height: int) -> NDArray[Any]:
+    """Directions through the centres of pixels."""
+    x = (np.arange(width) + 0.5 - camera.cx) / camera.fx
+    y = (np.arange(height) + 0.5 - camera.cy) / camera.fy
+    in_camera = np.stack([*np.meshgrid(x, y), np.ones((height, width))], axis=-1)
+    return in_camera @ camera.world_to_camera[:, :3]  # each row times the rotation: turned back
+
+
+def map_entries(direction: NDArray[Any], side: int) -> Iterator[Entry]:
+    """The four texels about a direction, [3], with their weights."""
+    x, y, z = direction / np.abs(direction).sum()
+    if z < 0:
+        x, y = (1 - abs(y)) * (-1 if x < 0 else 1), (1 - abs(x)) * (-1 if y < 0 else 1)
+    a, b = (x + 1) * side / 2 - 0.5, (y + 1) * side / 2 - 0.5
+    first_i, first_j = int(np.floor(a)), int(np.floor(b))
+    for j in (first_j, first_j + 1):
+        for i in (first_i, first_i + 1):
+            row, column = j, i
+            if column in (-1, side):  # the edge's other half is its neighbour
+                row, column = side - 1 - row, min(max(column, 0), side - 1)
+            if row in (-1, side):
+                row, column = min(max(row, 0), side - 1), side - 1 - column
+            yield row, column, (1 - abs(a - i)) * (1 - abs(b - j))
+
+
+def sky_image(texels: NDArray[Any], directions: NDArray[Any]) -> NDArray[Any]:
+    """The map's values in directions, [C, H, W]."""
+    height, width, _ = directions.shape
+    image = np.zeros((texels.shape[2], height, width))
+    for v, u in np.ndindex(height, width):
+        for row, column, weight in map_entries(directions[v, u], len(texels)):
+            image[:, v, u] += weight * texels[row, column]
+    return image
+
+
+def sky_gradient(side: int, directions: NDArray[Any], transmittance: NDArray[Any], grad: NDArray[Any]) -> NDArray[Any]:
+    """Derivatives of sum(grad * T * sky_image) by the map.  grad: [C, H, W]; transmittance: [H, W]."""
+    by_texels = np.zeros((side, side, len(grad)))
+    for v, u in np.ndindex(*transmittance.shape):
+        for row, column, weight in map_entries(directions[v, u], side):
+            by_texels[row, column] += weight * transmittance[v, u] * grad[:, v, u]
+    return by_texels
+
+
+def shows_sky(sky: NDArray[Any], photograph: NDArray[Any], difference: float) -> NDArray[Any]:
+    """Pixels whose 3 x 3 neighbourhood in the photograph shows the sky in 6 of 9 places, [H, W]; images [3, H, W]."""
+    matches = np.pad(np.abs(sky - photograph).mean(axis=0) <= difference, 1)
+    height, width = photograph.shape[1:]
+    counts = sum(matches[v : v + height, u : u + width].astype(int) for v in range(3) for u in range(3))
+    return np.asarray(counts) >= 6
+
+
+def sky_cover(chosen: NDArray[Any], transmittance: NDArray[Any], weight: float) -> tuple[float, NDArray[Any]]:
+    """The loss of what covers the sky, and its derivative by the transmittance, [H, W]."""
+    share = chosen / chosen.size
+    return float(weight * (share * (1 - transmittance)).sum()), -weight * share
+
+
+def sky_update(
+    texels: NDArray[Any], moments: tuple[NDArray[Any], NDArray[Any]], grad: NDArray[Any], updates: int, rate: float
+) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """New values and moments of texels that have had so many updates, this one among them; grad: in pixels of L1."""
+    first, second = 0.9 * moments[0] + 0.1 * grad, 0.999 * moments[1] + 0.001 * grad**2
+    step = first / (1 - 0.9**updates) / (np.sqrt(second / (1 - 0.999**updates)) + 1)
+    return texels - rate * step, first, second

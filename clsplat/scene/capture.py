@@ -1,0 +1,36 @@
+"""What is measured of a capture before training, for the choices that follow from it."""
+
+from collections.abc import Container
+from typing import Literal
+
+import numpy as np
+
+from clsplat.scene.scene import Scene
+
+Measure = Literal["photographs", "photographs_per_point", "pixels", "points"]
+UNITS: dict[Measure, str] = {
+    "photographs": "training photographs",
+    "photographs_per_point": "training photographs show a point, in the mean",
+    "pixels": "pixels has a training photograph, in the median",
+    "points": "points",
+}
+
+
+def measured(scene: Scene) -> dict[Measure, float]:
+    """Return the measures that a scene, as it is trained on, has; views for validation count as training views."""
+    views = {view.name: view for view in reversed(scene.with_fold().split("train"))}  # the largest size of each
+    found: dict[Measure, float | None] = {
+        "photographs": len(views),
+        "photographs_per_point": _photographs_per_point(scene, views),
+        "pixels": float(np.median([view.camera.width * view.camera.height for view in views.values()])),
+        "points": len(scene.points) if scene.points else None,
+    }
+    return {measure: value for measure, value in found.items() if value is not None}
+
+
+def _photographs_per_point(scene: Scene, names: Container[str]) -> float | None:
+    if scene.tracks is None:
+        return None
+    rows = [scene.tracks.seen[name] for name in scene.tracks.seen if name in names]
+    counts = np.bincount(np.concatenate(rows)) if rows else np.zeros(0)
+    return float(counts[counts > 0].mean()) if counts.any() else None

@@ -1,0 +1,30 @@
+"""The tables of the best model of a run: copied to the host, and put back."""
+
+from clsplat.gaussians.tables import Gaussians
+from clsplat.render.backdrops import Auto, Directions
+from clsplat.training import sky
+from clsplat.training.kept import Tables, tables_of
+from clsplat.training.run import Run
+from clsplat.training.sky import FOLDER, LearnedSky
+
+
+def copied_of(run: Run) -> Tables:
+    """Copy what the run's model needs to be rendered, and to be trained from anew, to the host."""
+    own = run.sky.tables() if run.sky else {}
+    return {**tables_of(run.model), **{FOLDER + name: table for name, table in own.items()}}
+
+
+def put_back(run: Run, tables: Tables, degree: int) -> None:
+    """Make what was copied the run's model."""
+    own, of_gaussians = sky.split_tables(tables)
+    run.model = run.model_settings.model(Gaussians(run.device, of_gaussians), degree)
+    restore_sky(run, own)
+
+
+def restore_sky(run: Run, tables: Tables) -> None:
+    """Give a run the sky of its tables, by their own names; without any it has none."""
+    given = run.model_settings.background
+    background = given.model if isinstance(given, Auto) else given
+    run.sky = None
+    if tables and isinstance(background, Directions):
+        run.sky = LearnedSky.of_tables(background, tables, run.device)

@@ -1,0 +1,84 @@
+"""The sky of a run: whether there is one, and what it begins with."""
+
+import logging
+from collections.abc import Iterator
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.gaussians.sky import Sky
+from clsplat.render.backdrops import Auto, Backdrop, Directions
+from clsplat.scene.images import read_image
+from clsplat.scene.scene import View
+from clsplat.training.run import Run
+from clsplat.training.sky import LearnedSky
+from clsplat.views.sky_share import Seen, looked_at, panorama
+
+LOG = logging.getLogger("clsplat")
+
+
+def begin_sky(run: Run, own: Sky | None = None) -> None:
+    """Give the run's new model its first sky, where it is to have one.
+
+    own: what a model had that is trained further; without it, or at another size of the map, the colours of the sky
+    that the photographs show.
+    """
+    settings = settled(run.model_settings.background, run)
+    background = settings.in_use if isinstance(settings, Auto) else settings
+    if not isinstance(background, Directions):
+        run.sky = None
+        return
+    texels, free = _first(run, background.side)
+    sky = own if own and own.side == background.side else Sky(texels)
+    run.sky = LearnedSky(background, sky.upload(run.device), free)
+    LOG.info("sky: %d of %d x %d colours by direction are learned", free.sum(), background.side, background.side)
+
+
+def settled(background: Backdrop | None, run: Run) -> Backdrop | None:
+    """Return what is behind the Gaussians, with the choice that follows from a run's photographs; one that is made
+    stays."""
+    if not isinstance(background, Auto) or background.chosen is not None:
+        return background
+    chosen, reason = _choice(background, run)
+    LOG.info("model.background: %s, since %s", chosen, reason)
+    return background.model_copy(update={"chosen": chosen, "reason": reason})
+
+
+def _choice(background: Auto, run: Run) -> tuple[Literal["on", "off"], str]:
+    """Whether there is a sky, and why."""
+    if run.scene.points is None:
+        return "off", "the dataset has no points, and what is far from them is not known"
+    first = run.scene.split("train")[0]
+    if first.alpha == "transparency" and read_image(first.image_path).shape[2] == 4:
+        return "off", "the photographs have transparency"
+    seen = _seen(run)
+    number = sum(one.share >= background.share for one in seen)
+    text = (
+        f"{number} of {len(seen)} photographs show bright or blue regions without points in {background.share:.0%} or "
+        "more of their upper third"
+    )
+    enough = number >= background.photographs * len(seen)
+    return ("on" if enough else "off"), f"{text}; {'' if enough else 'not '}{background.photographs:.0%} of them"
+
+
+def _first(run: Run, side: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """The first colours of the map and which are learned; all, from the mean of the upper thirds of photographs, where
+    none shows a sky."""
+    seen = _seen(run)
+    if found := panorama(seen, side):
+        return found
+    uppers = [one.image[: max(1, len(one.image) // 3)].mean(axis=(0, 1)) / 255 for one in seen]
+    return np.tile(np.mean(uppers, axis=0), (side**2, 1)).astype(np.float32), np.ones(side**2, bool)
+
+
+def _seen(run: Run) -> list[Seen]:
+    """What each training photograph shows of the sky."""
+    return list(looked_at(run.scene, _photographs(run)))
+
+
+def _photographs(run: Run) -> Iterator[tuple[View, NDArray[np.uint8]]]:
+    """The training photographs at the first size that they have, [height, width, 3]."""
+    views = list({view.name: view for view in reversed(run.scene.split("train"))}.values())[::-1]
+    for view in run.status.counted(views, "photographs", len(views)):
+        yield view, run.photographs.get(view).image()

@@ -1,0 +1,130 @@
+"""SIFT features of photographs (Lowe 2004): found by OpenCV at the size asked for, kept in COLMAP's database.
+
+The database has the images in order of their names, so that the same photographs give the same rows.  Each photograph's
+features are written at once: a call that is killed goes on with the next one.
+"""
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.progress import counted
+from clsplat.scene.images import read_grey
+from data_tools.database import explained, image_names, opened, remove, without_features
+from data_tools.gather import gather, list_photographs
+from data_tools.names import DATABASE, IMAGES
+from data_tools.pycolmap_import import require_pycolmap
+from data_tools.sharing import Cameras, sharing, sharing_text
+from data_tools.told import warn_of
+
+LOG = logging.getLogger("clsplat")
+CameraModel = Literal["SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "PINHOLE", "SIMPLE_PINHOLE"]
+LAYERS, MAX_EDGE, BLUR = 3, 10.0, 1.6  # Lowe 2004: scales of an octave, ratio of curvatures, px
+LEVELS = 512  # of a root of a share, as COLMAP stores it; larger ones than 255 are cut
+
+
+@dataclass(frozen=True)
+class Sought:
+    """Which features: at most `count` in an image of `long_side` px; `contrast` is a share of the range of grey."""
+
+    long_side: int = 1600
+    count: int = 8192
+    contrast: float = 0.02  # COLMAP's; Lowe 2004 has 0.04
+
+
+def find_features(
+    photographs: Path,
+    out: Path,
+    sought: Sought = Sought(),
+    camera_model: CameraModel = "SIMPLE_RADIAL",
+    cameras: Cameras = "auto",
+    without: Path | None = None,
+) -> dict[str, Any]:
+    """Find features in photographs; return their number, that of their cameras, and why some cannot be read.
+
+    Photographs with an EXIF rotation are copied upright, others are linked.  With `cameras: auto`, photographs of one
+    size share a camera where EXIF tells the same lens of them, or nothing.  Raises DataError when fewer than three
+    can be read.
+    """
+    pycolmap = require_pycolmap()
+    names, damaged = gather(photographs, out / IMAGES, list_photographs(photographs, without))
+    groups = sharing(out / IMAGES, names, cameras)
+    figures = {"photographs": len(names), "cameras": len(groups), "damaged": damaged}
+    warn_of(figures)
+    if told := sharing_text(out / IMAGES, groups):
+        LOG.info("%s", told)
+    with explained(photographs, "find features"):
+        if image_names(pycolmap, out / DATABASE) != sorted(names):  # a new database, or one cut short
+            remove(out / DATABASE)
+            _register(pycolmap, out, groups, camera_model)
+    add_features(out / IMAGES, out / DATABASE, sought)
+    return figures
+
+
+def add_features(images: Path, database: Path, sought: Sought) -> None:
+    """Find the features of those photographs of a database that have none.  Raises DataError."""
+    pycolmap = require_pycolmap()
+    with explained(images, "find features"), opened(pycolmap, database) as rows:
+        missing = without_features(rows)
+        for number, name in counted(missing.items(), "photographs with features", len(missing)):
+            pixels, (across, down) = read_grey(images / name, sought.long_side)
+            keypoints, descriptors = sift(pixels, sought)
+            keypoints[:, :3] *= across, down, (across + down) / 2
+            with pycolmap.DatabaseTransaction(rows):
+                rows.write_keypoints(number, keypoints)
+                kind = pycolmap.FeatureExtractorType.SIFT
+                rows.write_descriptors(number, pycolmap.FeatureDescriptors(data=descriptors, type=kind))
+
+
+def sift(pixels: NDArray[np.uint8], sought: Sought) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    """Return features as COLMAP stores them, those of the highest contrast: x, y, scale in px and angle [M, 4], with
+    the descriptors [M, 128].
+
+    Pixel (0, 0) has its centre at (0.5, 0.5).  Descriptors are RootSIFT (Arandjelović and Zisserman 2012).
+    """
+    detector = cv2.SIFT.create(
+        nfeatures=sought.count,
+        nOctaveLayers=LAYERS,
+        contrastThreshold=sought.contrast,
+        edgeThreshold=MAX_EDGE,
+        sigma=BLUR,
+        enable_precise_upscale=True,
+    )
+    found, described = detector.detectAndCompute(pixels, None)
+    if not found:
+        return np.empty((0, 4), np.float32), np.empty((0, 128), np.uint8)
+    best = np.argsort([-one.response for one in found], kind="stable")[: sought.count]
+    keypoints = [(one.pt[0] + 0.5, one.pt[1] + 0.5, one.size / 2, np.deg2rad(one.angle)) for one in found]
+    shares = described / np.maximum(described.sum(axis=1, keepdims=True), 1.0e-6)
+    descriptors = np.clip(np.rint(LEVELS * np.sqrt(shares)), 0, 255).astype(np.uint8)
+    return np.array(keypoints, np.float32)[best], descriptors[best]
+
+
+def _register(pycolmap: ModuleType, out: Path, groups: Sequence[Sequence[str]], camera_model: CameraModel) -> None:
+    """Write the images into a new database, each group with a camera of its own, whose focal length EXIF tells."""
+    reader = pycolmap.ImageReaderOptions()
+    reader.camera_model = camera_model
+    camera_of: Mapping[str, int] = {name: number for number, group in enumerate(groups, 1) for name in group}
+    with opened(pycolmap, out / DATABASE) as rows, pycolmap.DatabaseTransaction(rows):
+        for number, group in enumerate(groups, 1):
+            camera = pycolmap.infer_camera_from_image(out / IMAGES / group[0], reader)
+            camera.camera_id = number
+            rows.write_camera(camera, use_camera_id=True)
+            rig = pycolmap.Rig()
+            rig.rig_id = number
+            rig.add_ref_sensor(camera.sensor_id)
+            rows.write_rig(rig, use_rig_id=True)
+        for number, name in enumerate(sorted(camera_of), 1):
+            image = pycolmap.Image(name=name, camera_id=camera_of[name], image_id=number)
+            rows.write_image(image, use_image_id=True)
+            frame = pycolmap.Frame()
+            frame.frame_id, frame.rig_id = number, camera_of[name]
+            frame.add_data_id(image.data_id)
+            rows.write_frame(frame, use_frame_id=True)

@@ -1,0 +1,158 @@
+"""Cameras and points from matches, by pycolmap: several attempts, until all photographs are placed or none is left.
+
+The next attempt is made where one leaves photographs out.  What is kept is the model with the most photographs, the
+first of those that have as many.
+"""
+
+import logging
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from clsplat.errors import DataError
+from clsplat.progress import Count
+from data_tools.database import clear_features, explained, image_names, verified
+from data_tools.features import Sought, add_features
+from data_tools.gather import MIN_PHOTOGRAPHS, link
+from data_tools.matching import match_within
+from data_tools.names import DATABASE, IMAGES, MODEL
+from data_tools.pycolmap_import import require_pycolmap
+from data_tools.reasons import Matched, diagnosis, reasons
+from data_tools.told import warn_of
+from data_tools.turning import only_turned
+
+LOG = logging.getLogger("clsplat")
+Mapper = Literal["incremental", "global"]
+ENOUGH = 0.9  # share of the photographs: with more, no more features are looked for
+DENSE = f".dense.{DATABASE}"
+DENSER = Sought(long_side=2400, count=16384, contrast=0.01)
+LOOSE = {  # COLMAP's own values: 100 matches, 16 and 1.5 degrees, 30 matches, a quarter of them
+    "init_min_num_inliers": 50,
+    "init_min_tri_angle": 5.0,
+    "abs_pose_min_num_inliers": 15,
+    "abs_pose_min_inlier_ratio": 0.15,
+}
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """How cameras are looked for; `told` in words."""
+
+    told: str
+    mapper: Mapper = "incremental"
+    loose: bool = False  # fewer matches and smaller angles are enough
+    dense: bool = False  # with more features, and all pairs of up to 200 photographs
+
+
+LATER = (
+    Attempt("smaller angles and fewer matches", loose=True),
+    Attempt("denser features", loose=True, dense=True),
+    Attempt("denser features, all cameras at once", "global", dense=True),
+)
+
+
+def map_cameras(source: Path, out: Path, mapper: Mapper = "incremental", threads: int = 1) -> dict[str, Any]:
+    """Place cameras and points; keep the largest model as sparse/0 and tell of the others.
+
+    `mapper: global` is faster for many photographs; more than one thread is faster and not repeatable to the bit.
+    Raises DataError, with the likely reason, when no attempt gives a model of three images.
+    """
+    pycolmap = require_pycolmap()
+    link(source / IMAGES, out / IMAGES)
+    names = image_names(pycolmap, source / DATABASE)
+    matched = Matched.of(pycolmap, source / DATABASE, source / IMAGES)
+    if only_turned(pycolmap, source / DATABASE):
+        raise DataError(
+            f"{source / IMAGES}: the photographs match like those of a camera that only turned on the spot, which tell "
+            "no depth; walk around the scene, a step between photographs"
+        )
+    models, used = list[Any](), (first := Attempt("as set", mapper))
+    for attempt in (first, *LATER):
+        placed = models[0].num_reg_images() if models else 0
+        if placed == len(names) or (attempt.dense and placed >= ENOUGH * len(names)):
+            break
+        if attempt is not first:
+            LOG.info("%d of %d photographs are placed; another attempt: %s", placed, len(names), attempt.told)
+        found = _attempt(source, out, attempt, threads, models[:1])
+        if found and found[0].num_reg_images() > placed:
+            models, used = found, attempt
+    if not models:
+        raise DataError(f"{source / IMAGES}: the {len(names)} photographs could not be placed: {diagnosis(matched)}")
+    if used.dense:
+        matched = Matched.of(pycolmap, out / DENSE, source / IMAGES)
+    figures = {**_written(models, out, names), "attempt": used.told}
+    figures["reasons"] = reasons(matched, [_names(model) for model in models])
+    for left in out.glob(".*"):
+        shutil.rmtree(left) if left.is_dir() else left.unlink()
+    warn_of(figures)
+    return figures
+
+
+def _attempt(source: Path, out: Path, attempt: Attempt, threads: int, before: Sequence[Any]) -> list[Any]:
+    """The models of an attempt, the largest first; one of the same features goes on with the model from before."""
+    pycolmap = require_pycolmap()
+    database, work = source / DATABASE, out / ".models"
+    if attempt.dense:
+        database = _denser(source, out)
+    if not verified(pycolmap, database):
+        return []
+    shutil.rmtree(work, ignore_errors=True)
+    work.mkdir()
+    is_global = attempt.mapper == "global"
+    options = pycolmap.GlobalPipelineOptions() if is_global else pycolmap.IncrementalPipelineOptions()
+    options.num_threads = options.mapper.num_threads = threads
+    options.random_seed = options.mapper.random_seed = 0
+    options.min_model_size = MIN_PHOTOGRAPHS
+    if attempt.loose:
+        options.mapper.mergedict(LOOSE)
+    pycolmap.set_random_seed(0)
+    with explained(source / IMAGES, "place the cameras"):
+        function = pycolmap.global_mapping if is_global else pycolmap.incremental_mapping
+        count = Count("photographs placed", len(image_names(pycolmap, database)))
+
+        def placed() -> None:
+            count.reach(min(max(2, count.done) + 1, count.total))
+
+        more: dict[str, Any] = {} if is_global else {"next_image_callback": placed}
+        if attempt.loose and not attempt.dense and before:
+            (out / ".before").mkdir(exist_ok=True)
+            before[0].write(str(out / ".before"))
+            more["input_path"] = str(out / ".before")
+            count.reach(before[0].num_reg_images())
+        found = function(str(database), str(out / IMAGES), str(work), options=options, **more).values()
+    models = [model for model in found if model.num_reg_images() >= MIN_PHOTOGRAPHS and model.num_points3D()]
+    return sorted(models, key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
+
+
+def _denser(source: Path, out: Path) -> Path:
+    """A database with more features of the same images, matched; one that was begun is gone on with."""
+    database = out / DENSE
+    if not database.exists():
+        half = database.with_name(f".half.{DATABASE}")
+        shutil.copyfile(source / DATABASE, half)
+        clear_features(require_pycolmap(), half)
+        half.replace(database)
+    add_features(source / IMAGES, database, DENSER)
+    match_within(database)
+    return database
+
+
+def _written(models: Sequence[Any], out: Path, names: Sequence[str]) -> dict[str, Any]:
+    """Write the first model; return figures of it, and of the others."""
+    best = models[0]
+    (out / MODEL / "0").mkdir(parents=True, exist_ok=True)
+    best.write(str(out / MODEL / "0"))
+    placed = _names(best)
+    return {
+        "registered": len(placed),
+        "not_registered": [name for name in names if name not in placed],
+        "other_models": [model.num_reg_images() for model in models[1:]],
+        "points": best.num_points3D(),
+        "error_px": round(best.compute_mean_reprojection_error(), 3),
+    }
+
+
+def _names(model: Any) -> set[str]:
+    return {model.images[number].name for number in model.reg_image_ids()}

@@ -1,0 +1,3 @@
+"""Names of files in the folders between photographs and cameras."""
+
+DATABASE, IMAGES, PAIRS, MODEL = "database.db", "images", "pairs.txt", "sparse"

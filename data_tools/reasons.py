@@ -1,0 +1,96 @@
+"""Why photographs could not be placed: what their features and matches tell."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from statistics import median
+from types import ModuleType
+
+from clsplat.errors import amount, first_few
+from clsplat.scene.sharpness import BLURRED, sharpness_of
+from data_tools.database import feature_counts, verified
+
+FEW_FEATURES = 300  # of a photograph: a wall of one colour has tens, a garden thousands
+FEW_MATCHES = 30  # of a photograph with the points of a model: COLMAP places none with fewer
+SHARPNESS_OF = 15  # placed photographs that the others are compared with
+
+
+@dataclass
+class Matched:
+    """The photographs with their features, and the pairs that match."""
+
+    images: Path
+    features: dict[str, int]
+    pairs: dict[tuple[str, str], int]  # matches that pass verification
+    sharpness: dict[str, float] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, pycolmap: ModuleType, database: Path, images: Path) -> "Matched":
+        """Read them from COLMAP's database."""
+        return cls(images, feature_counts(pycolmap, database), verified(pycolmap, database))
+
+    @cached_property
+    def matches(self) -> dict[str, dict[str, int]]:
+        """The number of verified matches of each photograph with others."""
+        found: dict[str, dict[str, int]] = {name: {} for name in self.features}
+        for (a, b), count in self.pairs.items():
+            found[a][b] = found[b][a] = count
+        return found
+
+    def sharpness_of(self, name: str) -> float:
+        """The sharpness of a photograph, measured once."""
+        if name not in self.sharpness:
+            self.sharpness[name] = sharpness_of(self.images / name)
+        return self.sharpness[name]
+
+
+def diagnosis(matched: Matched) -> str:
+    """Return the likely reason why photographs give no model, with a remedy."""
+    count, middle = len(matched.features), round(median(matched.features.values()))
+    alone = sum(not others for others in matched.matches.values())
+    if middle < FEW_FEATURES:
+        return (
+            f"half of them have at most {middle} features, where thousands are usual: they are blurred, or show plain "
+            "surfaces; take sharp ones, of things with texture"
+        )
+    if not matched.pairs:
+        return "no two of them show the same features; take some with more overlap, of a scene in which nothing moves"
+    if alone > count / 2:
+        return (
+            f"{alone} of them match no other one, and {amount(len(matched.pairs), 'pair')} show the same features; "
+            "take photographs of one scene, with more overlap"
+        )
+    return "take more sharp ones, from places a step apart, of a textured scene in which nothing moves"
+
+
+def reasons(matched: Matched, models: Sequence[set[str]]) -> dict[str, str]:
+    """Return the likely reason of each photograph that is not in the first of the models."""
+    placed = models[0]
+    compared = [matched.sharpness_of(name) for name in sorted(placed)[:: max(1, len(placed) // SHARPNESS_OF)]]
+    found = {}
+    for name in sorted(set(matched.features) - placed):
+        other = next((model for model in models[1:] if name in model), None)
+        found[name] = (
+            f"in another model, with {first_few(sorted(other - {name}))}"
+            if other
+            else _reason(matched, name, placed, median(compared))
+        )
+    return found
+
+
+def _reason(matched: Matched, name: str, placed: set[str], sharp: float) -> str:
+    matches = matched.matches[name]
+    among = {other: count for other, count in matches.items() if other in placed}
+    if matched.features[name] < FEW_FEATURES:
+        return f"only {amount(matched.features[name], 'feature')}: blurred, dark, or of a plain surface"
+    if matched.sharpness_of(name) < BLURRED * sharp:
+        return "blurred"
+    if not matches:
+        return "shows nothing that another photograph shows"
+    best = max(matches, key=lambda other: (matches[other], other))
+    if not among:
+        return f"matches {best} alone, which is not placed either"
+    if max(among.values()) < FEW_MATCHES:
+        return f"few matches, at most {max(among.values())}, with {max(among, key=lambda o: (among[o], o))}"
+    return f"{matches[best]} matches with {best}, but too few on points of the model"

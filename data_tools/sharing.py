@@ -1,0 +1,43 @@
+"""Which photographs were taken with one camera: by what EXIF tells of it, and by their size."""
+
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Literal
+
+from clsplat.errors import amount
+from clsplat.scene.exif import optics_of
+from clsplat.scene.images import read_header
+
+Cameras = Literal["auto", "one", "per_folder", "per_image"]
+Key = Callable[[Path, str], object]
+KEYS: dict[Cameras, Key] = {  # what photographs that share a camera have in common, beside their size
+    "auto": lambda images, name: optics_of(images / name),
+    "one": lambda images, name: None,
+    "per_folder": lambda images, name: Path(name).parent,
+    "per_image": lambda images, name: name,
+}
+
+
+def sharing(images: Path, names: Sequence[str], cameras: Cameras) -> list[list[str]]:
+    """Return the photographs in groups that share a camera, in order of their first names.
+
+    Raises DataError when one cannot be read.
+    """
+    groups: dict[object, list[str]] = defaultdict(list)
+    for name in sorted(names):
+        header = read_header(images / name)
+        groups[header.width, header.height, KEYS[cameras](images, name)].append(name)
+    return list(groups.values())
+
+
+def sharing_text(images: Path, groups: Sequence[Sequence[str]]) -> str:
+    """Return a sentence about photographs that share a camera because nothing is known of theirs; "" without them."""
+    unknown = [group for group in groups if len(group) > 1 and optics_of(images / group[0]) is None]
+    if not unknown:
+        return ""
+    count = sum(map(len, unknown))
+    return (
+        f"{count} photographs have no EXIF data of their lens: those of one size share a camera, "
+        f"{amount(len(unknown), 'camera')} in all; --set find_features.cameras=per_image gives each its own"
+    )

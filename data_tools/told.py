@@ -1,0 +1,38 @@
+"""What steps from photographs to cameras have left out, in sentences."""
+
+import logging
+from collections.abc import Mapping
+from typing import Any
+
+from clsplat.errors import first_few
+
+LOG = logging.getLogger("clsplat")
+
+
+def warn_of(figures: Mapping[str, Any]) -> None:
+    """Log what a step has left out."""
+    for text in left_out(figures):
+        LOG.warning("%s", text)
+
+
+def left_out(figures: Mapping[str, Any]) -> list[str]:
+    """Return warnings of the photographs that a step has left out, by what it returned."""
+    texts = []
+    if damaged := figures.get("damaged"):
+        names = [f"{name} ({reason})" for name, reason in damaged.items()]
+        count = figures["photographs"] + len(names)
+        texts.append(f"{len(names)} of {count} photographs cannot be read: {first_few(names)}; export them again")
+    if missing := figures.get("not_registered"):
+        reasons = figures.get("reasons", {})
+        named = first_few([f"{name} ({reasons[name]})" if name in reasons else name for name in missing])
+        texts.append(
+            f"{len(missing)} of {figures['registered'] + len(missing)} photographs could not be placed: {named}; "
+            "the scene is made of the others: for more, add photographs from places between, or raise "
+            "match_features.neighbours"
+        )
+    if others := figures.get("other_models"):
+        texts.append(
+            f"{len(others)} smaller models, of {', '.join(map(str, others))} photographs, are left out: add "
+            "photographs that join them to the largest"
+        )
+    return texts

@@ -1,0 +1,233 @@
+"""Photographs as people take them: turned by EXIF, of several lenses, and sets that give no model."""
+
+import math
+import struct
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from clsplat.errors import DataError
+from clsplat.scene.exif import copied, exposure_of, optics_of
+from clsplat.scene.images import read_grey, read_header, read_image
+from data_tools import mapping
+from data_tools.database import image_names, opened
+from data_tools.features import Sought, find_features, sift
+from data_tools.gather import gather, list_photographs
+from data_tools.mapping import map_cameras
+from data_tools.matching import match_features
+from data_tools.reasons import Matched, diagnosis, reasons
+from data_tools.told import left_out
+from tests.refusals import refusal
+
+# ---- lenses
+
+
+@pytest.mark.parametrize("damage", ["a text for a place", "no focal length", "cut"])
+def test_exif_that_is_damaged_tells_no_lens(tmp_path, damage):
+    segment = bytearray(exif())
+    if damage == "a text for a place":
+        segment[segment.index(struct.pack("<HH", 0x8769, 4)) + 2] = 2
+    if damage == "no focal length":
+        segment[-4:] = bytes(4)  # its divisor
+    path = take(tmp_path / "a.jpg", (16, 16), bytes(segment[:60] if damage == "cut" else segment))
+    assert optics_of(path) is None
+    assert (exposure_of(path) is None) == (damage != "no focal length")
+
+
+def exif(orientation: int = 1, focal: float = 4.2, model: str = "Phone 1") -> bytes:
+    """An Exif segment: orientation, make, model, exposure and focal length."""
+    texts, rationals = [b"Maker\0", model.encode() + b"\0"], [(1, 50), (18, 10), (round(focal * 100), 100)]
+    outer, inner = 8 + 2 + 12 * 4 + 4, 2 + 12 * 4 + 4
+    ends = [outer + inner, outer + inner + len(texts[0])]
+    data = ends[1] + len(texts[1])
+    block = b"II*\0" + struct.pack("<IH", 8, 4)
+    block += struct.pack("<HHII", 0x010F, 2, len(texts[0]), ends[0])
+    block += struct.pack("<HHII", 0x0110, 2, len(texts[1]), ends[1])
+    block += struct.pack("<HHIHH", 0x0112, 3, 1, orientation, 0) + struct.pack("<HHII", 0x8769, 4, 1, outer) + bytes(4)
+    block += struct.pack("<H", 4)
+    for place, tag in enumerate((0x829A, 0x829D)):
+        block += struct.pack("<HHII", tag, 5, 1, data + 8 * place)
+    block += struct.pack("<HHIHH", 0x8827, 3, 1, 100, 0) + struct.pack("<HHII", 0x920A, 5, 1, data + 16) + bytes(4)
+    block += b"".join(texts) + b"".join(struct.pack("<II", *pair) for pair in rationals)
+    return b"\xff\xe1" + struct.pack(">H", len(block) + 8) + b"Exif\0\0" + block
+
+
+def take(path: Path, size: tuple[int, int], segment: bytes = b"", seed: int = 0) -> Path:
+    """A photograph of `size` (width, height) with an Exif segment."""
+    pixels = cv2.GaussianBlur(
+        np.random.default_rng(seed).integers(0, 256, (*size[::-1], 3)).astype(np.uint8), (0, 0), 2
+    )
+    _, data = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, 95])
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(data.tobytes()[:2] + segment + data.tobytes()[2:])
+    return path
+
+
+def test_turned_photographs_keep_what_exif_tells_but_for_the_rotation(tmp_path):
+    for i in range(3):
+        take(tmp_path / "p" / f"{i}.jpg", (64, 48), exif(6), seed=i)
+    (tmp_path / "images").mkdir()
+    gather(tmp_path / "p", tmp_path / "images", ["0.jpg", "1.jpg", "2.jpg"])
+    source, turned = tmp_path / "p" / "0.jpg", tmp_path / "images" / "0.jpg"
+    assert not turned.is_symlink()
+    assert (read_header(source).orientation, read_header(turned).orientation) == (6, 1)
+    assert (read_header(turned).width, read_header(turned).height) == (48, 64)
+    assert optics_of(turned) == optics_of(source) == ("Maker", "Phone 1", 4.2, "")
+    assert exposure_of(turned) == exposure_of(source)
+    assert exposure_of(turned).value == pytest.approx(math.log2(100 / 50 / 1.8**2))
+    assert np.abs(read_image(turned).astype(int) - read_image(source, upright=True)).max() < 12
+
+
+def test_exif_of_the_other_byte_order_and_none_at_all(tmp_path):
+    _, jpeg = cv2.imencode(".jpg", np.zeros((8, 8, 3), np.uint8))
+    block = b"MM\0*" + struct.pack(">IHHHIHHI", 8, 1, 0x0112, 3, 1, 3, 0, 0)
+    head = jpeg.tobytes()[:2] + b"\xff\xe1" + struct.pack(">H", len(block) + 8) + b"Exif\0\0" + block
+    (tmp_path / "a.jpg").write_bytes(copied(head, jpeg.tobytes()))
+    assert read_header(tmp_path / "a.jpg").orientation == 1
+    assert b"MM\0*" in (tmp_path / "a.jpg").read_bytes()
+    assert copied(jpeg.tobytes(), jpeg.tobytes()) == jpeg.tobytes()
+
+
+@pytest.mark.parametrize(("cameras", "groups"), [("auto", 4), ("one", 2), ("per_folder", 3), ("per_image", 8)])
+def test_which_photographs_share_a_camera(tmp_path, cameras, groups, caplog):
+    """Of one lens: across, and turned; of another; and without EXIF data."""
+    pycolmap = pytest.importorskip("pycolmap")
+    caplog.set_level("INFO")
+    for i, orientation in enumerate((1, 6, 1, 8)):
+        take(tmp_path / "p" / f"{i}.jpg", (96, 72), exif(orientation), seed=i)
+    for i, segment in enumerate((exif(focal=9.0), exif(focal=9.0), b"", b"")):
+        take(tmp_path / "p" / "b" / f"{i}.jpg", (96, 72), segment, seed=9 + i)
+    (tmp_path / "out").mkdir()
+    figures = find_features(tmp_path / "p", tmp_path / "out", Sought(96, 50), cameras=cameras)
+    assert figures["cameras"] == groups
+    with opened(pycolmap, tmp_path / "out" / "database.db") as rows:
+        images, cameras_found = rows.read_all_images(), rows.read_all_cameras()
+    assert [image.name for image in images] == image_names(pycolmap, tmp_path / "out" / "database.db")
+    assert {image.camera_id for image in images} == set(range(1, groups + 1))
+    if cameras == "auto":
+        shared = {image.name: image.camera_id for image in images}
+        assert shared["0.jpg"] == shared["2.jpg"] != shared["1.jpg"] == shared["3.jpg"]
+        assert {(one.width, one.height) for one in cameras_found} == {(96, 72), (72, 96)}
+        assert (
+            "2 photographs have no EXIF data of their lens: those of one size share a camera, 1 camera" in caplog.text
+        )
+
+
+# ---- features
+
+
+def test_reduced_photographs_tell_where_their_pixels_were(tmp_path):
+    """A JPEG of an odd size, made smaller by its decoder first; a spot stays where it is."""
+    pixels = np.full((901, 1203, 3), 60, np.uint8)
+    cv2.circle(pixels, (1000, 700), 24, (200, 200, 200), -1)
+    cv2.imwrite(str(tmp_path / "a.jpg"), pixels)
+    for long_side in (2000, 800, 300, 160):
+        grey, (across, down) = read_grey(tmp_path / "a.jpg", long_side)
+        assert max(grey.shape) == min(long_side, 1203)
+        weight = np.maximum(grey.astype(float) - 80, 0)
+        y, x = (np.indices(grey.shape) * weight).sum(axis=(1, 2)) / weight.sum()
+        np.testing.assert_allclose([(x + 0.5) * across, (y + 0.5) * down], [1000.5, 700.5], atol=0.3)
+
+
+def test_features_lie_where_spots_are():
+    pixels = np.full((120, 160), 90, np.float32)
+    y, x = np.indices(pixels.shape) + 0.5
+    spots = [(40.0, 30.0), (110.25, 70.75), (60.5, 95.0)]
+    for at in spots:
+        pixels += 120 * np.exp(-((x - at[0]) ** 2 + (y - at[1]) ** 2) / (2 * 3.0**2))
+    keypoints, descriptors = sift(np.rint(pixels).astype(np.uint8), Sought(count=50))
+    for at in spots:
+        assert np.linalg.norm(keypoints[:, :2] - at, axis=1).min() < 0.1
+    assert descriptors.dtype == np.uint8
+    assert descriptors.shape == (len(keypoints), 128)
+    np.testing.assert_allclose((descriptors.astype(float) ** 2).sum(axis=1), 512**2, rtol=0.1)
+    assert len(sift(np.rint(pixels).astype(np.uint8), Sought(count=2))[0]) == 2
+
+
+# ---- photographs that cannot be placed
+
+
+def test_files_that_cannot_be_read_come_with_how_to_convert_them(tmp_path, caplog):
+    for name in ("a.jpg", "b.jpg", "c.jpg", "d.HEIC", "e.dng"):
+        (tmp_path / name).touch()
+    assert len(list_photographs(tmp_path)) == 3
+    assert "1 HEIC file such as d.HEIC is left out" in caplog.text
+    assert "1 DNG file such as e.dng is left out" in caplog.text
+    (tmp_path / "a.jpg").unlink()
+    text = refusal(list_photographs, tmp_path)
+    assert "found 2 photographs" in text
+    assert "heif-convert" in text
+
+
+def matched(tmp_path: Path) -> Matched:
+    """Six photographs, of which three are in the model, and one is blurred."""
+    names = ["a", "b", "c", "blurred", "plain", "alone", "pair", "other", "few", "many"]
+    for name in names:
+        pixels = np.random.default_rng(0).integers(0, 256, (60, 80, 3)).astype(np.uint8)
+        cv2.imwrite(str(tmp_path / name) + ".png", cv2.GaussianBlur(pixels, (0, 0), 3) if name == "blurred" else pixels)
+        (tmp_path / f"{name}.png").rename(tmp_path / name)
+    pairs = {("a", "b"): 200, ("b", "c"): 150, ("pair", "other"): 90, ("few", "a"): 18, ("many", "a"): 80}
+    return Matched(tmp_path, {name: 40 if name == "plain" else 3000 for name in names}, pairs)
+
+
+def test_each_photograph_that_is_not_placed_has_a_reason(tmp_path):
+    found = reasons(matched(tmp_path), [{"a", "b", "c"}])
+    assert found == {
+        "blurred": "blurred",
+        "plain": "only 40 features: blurred, dark, or of a plain surface",
+        "alone": "shows nothing that another photograph shows",
+        "pair": "matches other alone, which is not placed either",
+        "other": "matches pair alone, which is not placed either",
+        "few": "few matches, at most 18, with a",
+        "many": "80 matches with a, but too few on points of the model",
+    }
+    assert reasons(matched(tmp_path), [{"a", "b", "c"}, {"pair", "other"}])["pair"] == "in another model, with other"
+    figures = {"registered": 3, "not_registered": ["plain"], "reasons": found, "other_models": [2]}
+    assert "1 of 4 photographs could not be placed: plain (only 40 features: blurred" in left_out(figures)[0]
+    assert diagnosis(matched(tmp_path)).startswith("take more sharp ones")
+
+
+def blocks(seed: int, width: int, height: int) -> np.ndarray:
+    """A picture full of corners."""
+    rng = np.random.default_rng(seed)
+    pixels = np.full((height, width, 3), 128, np.uint8)
+    for _ in range(width * height // 300):
+        x, y, colour = int(rng.integers(width)), int(rng.integers(height)), rng.integers(0, 256, 3).tolist()
+        cv2.rectangle(pixels, (x, y), (x + int(rng.integers(3, 25)), y + int(rng.integers(3, 25))), colour, -1)
+    return cv2.GaussianBlur(pixels, (0, 0), 0.8)
+
+
+def turned(number: int) -> np.ndarray:
+    """What a camera sees that turns before a far wall, by 6 degrees each time."""
+    angle = math.radians(6 * number - 15)
+    turn = np.array([[math.cos(angle), 0, math.sin(angle)], [0, 1, 0], [-math.sin(angle), 0, math.cos(angle)]])
+    near, far = (
+        np.array([[250, 0, 120], [0, 250, 90], [0, 0, 1.0]]),
+        np.array([[250, 0, 300], [0, 250, 150], [0, 0, 1]]),
+    )
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    return cv2.warpPerspective(blocks(1, 600, 300), far @ turn @ np.linalg.inv(near), (240, 180), flags=flags)
+
+
+@pytest.mark.parametrize(
+    ("pixels", "sentence"),
+    [
+        (turned, "match like those of a camera that only turned on the spot"),
+        (lambda number: blocks(10 + number, 240, 180), "no two of them show the same features"),
+        (lambda number: np.full((180, 240, 3), 180 + number, np.uint8), "half of them have at most 0 features"),
+    ],
+    ids=["turned", "other places", "a wall"],
+)
+def test_sets_that_cannot_work_end_in_a_sentence(tmp_path, monkeypatch, pixels, sentence):
+    pytest.importorskip("pycolmap")
+    monkeypatch.setattr(mapping, "DENSER", Sought(240, 1000, 0.01))
+    for name in ("photographs", "features", "matches", "cameras"):
+        (tmp_path / name).mkdir()
+    for number in range(6):
+        cv2.imwrite(str(tmp_path / "photographs" / f"{number}.png"), pixels(number))
+    find_features(tmp_path / "photographs", tmp_path / "features", Sought(240, 600))
+    match_features(tmp_path / "features", tmp_path / "matches")
+    with pytest.raises(DataError, match=sentence):
+        map_cameras(tmp_path / "matches", tmp_path / "cameras")

@@ -1,0 +1,171 @@
+"""Settings that follow from a measure of the photographs: what is measured, chosen, written, and overridden."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from clsplat.errors import ConfigError
+from clsplat.pipeline.choosing import choose, undone
+from clsplat.pipeline.loading import load
+from clsplat.pipeline.stretching import in_steps
+from clsplat.runs.description import describe
+from clsplat.runs.found import has_ended
+from clsplat.runs.single import run_pipeline
+from clsplat.scene.capture import measured
+from clsplat.scene.detect import read_scene
+from clsplat.scene.scene import Tracks
+from clsplat.schedule import at_step
+from tests.few_steps import FEW
+from tests.test_training import digest, train
+
+pytestmark = pytest.mark.slow
+
+DEGREE = "{keys: [model.sh_degree], by: photographs, values: [[0, 0], [8, 1], [24, 2]], since: few say little}"
+RESET = "{keys: [reset_opacity.stop], by: photographs, values: [[0, 1], [9, null]], since: they decay}"
+PATIENCE = "{keys: [optimize.patience], by: photographs, values: [[0, 4], [8, null]], since: many are enough}"
+KEEP = (
+    "{keys: [scene.validation, optimize.keep, optimize.patience], by: photographs, "
+    "values: [[0, 0, last, null], [8, auto, best, 2], [9, 0, last, null]], since: few are learnt by heart}"
+)
+BOTH = f"choices=[{DEGREE}, {RESET}]"
+
+
+def test_the_last_row_that_a_measure_reaches_decides():
+    settings = load("smoke", [BOTH]).settings
+    for count, degree, stop in ((1, 0, 1), (7.9, 0, 1), (8, 1, 1), (23, 1, None), (500, 2, None)):
+        chosen = choose(settings, {"photographs": count})
+        reset = next(stage for stage in chosen.training.during if stage.stage == "reset_opacity")
+        assert (chosen.model.sh_degree, reset.stop) == (degree, stop)
+        assert [one.chosen for one in chosen.choices] == [[degree], [stop]]
+        assert chosen.choices[0].instead_of == [settings.model.sh_degree]
+        assert chosen.choices[0].reason == f"{count:,.4g} training photographs; few say little"
+        assert undone(chosen) == settings
+        assert choose(chosen, {"photographs": 30}) == chosen, "a choice that is made stays"
+
+
+def test_without_the_measure_the_value_of_the_file_stays():
+    settings = load("smoke", [BOTH.replace("photographs", "points")]).settings
+    chosen = choose(settings, {"photographs": 3})
+    assert chosen.model == settings.model
+    assert chosen.choices[0].reason == "the dataset does not tell points"
+
+
+@pytest.mark.parametrize(
+    ("override", "left"),
+    [
+        ("model.sh_degree=2", ["reset_opacity.stop"]),
+        ("model={sh_degree: 2}", ["reset_opacity.stop"]),
+        ("stages.1.during.2.stop=7", ["model.sh_degree"]),
+        ("optimize.during=[checkpoint: {every: 5}, reset_opacity: {every: 9}]", ["model.sh_degree"]),
+        ("optimize.steps=7", ["model.sh_degree", "reset_opacity.stop"]),
+    ],
+)
+def test_an_override_takes_the_place_of_a_choice(tmp_path, override, left):
+    text = load("smoke", [BOTH]).text()
+    (tmp_path / "own.yaml").write_text(text)
+    names = [stage.stage for stage in load("smoke").settings.training.during]
+    override = override.replace("during.2", f"during.{names.index('reset_opacity')}")
+    if override.startswith("optimize.during"):
+        override = "optimize.during=[{stage: reset_opacity, every: 9}]"
+    assert [one.keys for one in load(str(tmp_path / "own.yaml"), [override]).settings.choices] == [
+        [key] for key in left
+    ]
+
+
+@pytest.mark.parametrize(
+    ("choices", "complaint"),
+    [
+        (DEGREE.replace("sh_degree", "sh_degre"), "sh_degre"),
+        (DEGREE.replace("[8, 1]", "[8, 9]"), "at 8 photographs: model.sh_degree: "),
+        (DEGREE.replace("[8, 1]", "[8, 1], [8, 2]"), "growing numbers"),
+        (DEGREE.replace("[0, 0]", "[1, 0]"), "the first one from 0"),
+        (DEGREE.replace("photographs", "moons"), "photographs_per_point"),
+        (f"{DEGREE}, {DEGREE}", "chosen twice"),
+        (
+            DEGREE.replace("model.sh_degree", "optimize.patience").replace("[0, 0]", "[0, 4]"),
+            "'patience' is for 'keep: best'",
+        ),
+        (DEGREE.replace("model.sh_degree", "scene.holdout"), "before photographs are measured"),
+    ],
+)
+def test_a_choice_that_cannot_be_made_is_refused_before_a_run(choices, complaint):
+    with pytest.raises(ConfigError, match=complaint):
+        load("smoke", [f"choices=[{choices}]"])
+
+
+def test_in_fewer_steps_schedules_end_earlier_and_bounds_stay():
+    schedule = "{keys: [optimize.dropout], by: photographs, values: [[0, [[0, 0.0], [50, 0.2]]], [24, 0]], since: few}"
+    settings = load("smoke", [f"choices=[{schedule}, {RESET}]"]).settings
+    dropout, reset = in_steps(settings, settings.training.steps // 2).choices
+    assert dropout.values == [[0, [[0, 0.0], [25, 0.2]]], [24, 0]]
+    assert reset == settings.choices[1]
+
+
+def test_what_is_measured_of_a_scene(tiny_scene):
+    scene = read_scene(tiny_scene)
+    train_names = [view.name for view in scene.split("train")]
+    rows = {name: np.arange(i % 2 + 1) for i, name in enumerate(train_names)}  # point 0 in all, point 1 in each second
+    others = {view.name: np.array([0, 1, 2]) for view in scene.split("test")}
+    found = measured(replace(scene, tracks=Tracks(np.zeros((3, 3)), {**rows, **others})))
+    count = len(train_names)
+    assert found["photographs"] == count
+    assert found["pixels"] == 40 * 40
+    assert found["points"] == len(scene.points)
+    assert found["photographs_per_point"] == (count + count // 2) / 2, "of points that training photographs show"
+    sizes = measured(scene.downscaled(1, 2))
+    assert (sizes["photographs"], sizes["pixels"]) == (count, 1600), "each photograph counts once"
+    assert "photographs_per_point" not in sizes
+
+
+def test_a_run_writes_what_it_chose_and_repeats_without_choosing(tiny_scene, tmp_path):
+    asked = load("smoke", [f"scene.path='{tiny_scene}'", *FEW, BOTH])
+    run_pipeline(asked, tmp_path / "run", None, "new")
+    written = load(str(tmp_path / "run" / "pipeline.yaml"))
+    assert written.settings.model.sh_degree == 1
+    assert [one.chosen for one in written.settings.choices] == [[1], [1]]
+    assert "model.sh_degree=1, since 8 training photographs; few say little" in (tmp_path / "run/log.txt").read_text()
+    assert has_ended(asked, tmp_path / "run"), "the same command finds it up to date"
+    plain = train(tiny_scene, tmp_path / "plain", *FEW, "model.sh_degree=1", "reset_opacity.stop=1")
+    assert digest(plain.out) == digest(tmp_path / "run")
+    run_pipeline(written, tmp_path / "again", None, "new")
+    assert digest(tmp_path / "again") == digest(tmp_path / "run")
+
+
+def test_a_description_tells_choices_and_reasons(tiny_scene, tmp_path):
+    asked = load("smoke", [f"scene.path='{tiny_scene}'", *FEW, BOTH])
+    text = describe(asked, tmp_path / "run", None, "new")
+    assert "model.sh_degree=1, since 8 training photographs; few say little" in text
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_choice_may_keep_photographs_out_to_choose_by(tiny_scene, tmp_path):
+    settings = [f"scene.path='{tiny_scene}'", *FEW]
+    asked = load("smoke", [*settings, f"choices=[{KEEP}]"])
+    run_pipeline(asked, tmp_path / "run", None, "new")
+    plain = "scene.validation=auto", "optimize.keep=best", "optimize.patience=2"
+    train(tiny_scene, tmp_path / "plain", *FEW, *plain)
+    assert digest(tmp_path / "run") == digest(tmp_path / "plain")
+    found = [json.loads((tmp_path / name / "metrics.json").read_text()) for name in ("run", "plain")]
+    assert found[0]["validation"] == found[1]["validation"]
+    assert has_ended(asked, tmp_path / "run")
+    written = load(str(tmp_path / "run" / "pipeline.yaml"))
+    run_pipeline(written, tmp_path / "again", None, "new")
+    assert digest(tmp_path / "again") == digest(tmp_path / "run")
+    removed = load("smoke", [*settings, f"choices=[{KEEP}]", "scene.validation=0"])
+    assert removed.settings.choices == [], "what goes together is not chosen in part"
+
+
+@pytest.mark.parametrize(
+    ("photographs", "dropout", "keep"), [(4, 0.2, "last"), (20, 0.2, "best"), (25, 0, "best"), (43, 0, "last")]
+)
+def test_the_recipe_for_photographs_chooses_by_their_number(photographs, dropout, keep):
+    settings = load("photos").settings
+    chosen = choose(settings, {"photographs": photographs})
+    training = chosen.training
+    assert (at_step(training.dropout, 7000), training.keep) == (dropout, keep)
+    assert training.refit is (keep == "best")
+    plain = load("splat_7k").settings
+    many = choose(settings, {"photographs": 200})
+    assert (many.training, many.model) == (plain.training, plain.model), "nothing is lost where there are many"

@@ -1,0 +1,245 @@
+"""Whole runs with a sky: a background of directions that is learned."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import clsplat
+from clsplat.errors import DataError
+from clsplat.gaussians.octahedral import sampled, texel_directions
+from clsplat.gaussians.sky import Sky, sky_beside
+from clsplat.gaussians.sky_splats import with_sky_splats
+from clsplat.metrics.images import psnr
+from clsplat.pipeline.choices import without_choices
+from clsplat.pipeline.loading import load
+from clsplat.render.backdrops import Auto
+from clsplat.runs.found import has_ended
+from clsplat.runs.model_file import evaluate
+from clsplat.runs.single import run_pipeline
+from clsplat.training import checkpoint
+from clsplat.training.sky import check_tables, split_tables
+from clsplat.views.sky_share import looked_at, panorama
+from tests.few_steps import FEW
+from tests.test_training import digest, train
+from tests.yards import Yard, painted
+
+pytestmark = pytest.mark.slow
+SKY = (*FEW, "model.background={type: directions, side: 16}")
+LONGER = ("optimize.steps=300", "reset_opacity.every=1000", "optimize.evaluate.every=1000", "scene.holdout=4")
+
+
+@pytest.fixture(scope="module")
+def with_sky(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run of twelve steps with a sky; nothing is changed in it."""
+    out = tmp_path_factory.mktemp("runs") / "sky"
+    train(tiny_scene, out, *SKY)
+    return out
+
+
+@pytest.fixture(scope="module")
+def yard(tmp_path_factory: pytest.TempPathFactory) -> tuple[Yard, Path]:
+    found = Yard(np.random.default_rng(3))
+    return found, found.write(tmp_path_factory.mktemp("yard") / "scene")
+
+
+@pytest.fixture(scope="module")
+def learned(yard, tmp_path_factory) -> Path:
+    """A run that finds out by itself that there is a sky."""
+    out = tmp_path_factory.mktemp("runs") / "yard"
+    asked = load("smoke", [f"scene.path='{yard[1]}'", *LONGER, "model.background=auto"])
+    run_pipeline(asked, out, None, "new")
+    assert has_ended(asked, out), "the same command finds it up to date"
+    return out
+
+
+def sky_bytes(out: Path) -> bytes:
+    return (out / "point_cloud_sky.json").read_bytes()
+
+
+# ---- the oracle
+
+
+def test_a_painted_sky_is_found_again(yard, learned):
+    """From places that no photograph was taken from, where no Gaussian covers it."""
+    capture, model = yard[0], clsplat.load(learned)
+    renderer = clsplat.Renderer(model)
+    view = capture.views[4]  # held out
+    picture, above = renderer.render(view), capture.rays(view)[..., 1] < -0.05
+    assert above.mean() > 0.4
+    rendered, truth = (np.rint(255 * np.clip(image, 0, 1)) for image in (picture.image, painted(capture.rays(view))))
+    error = np.mean((rendered[above] - truth[above]) ** 2)
+    assert 10 * np.log10(255**2 / error) > 35
+    assert picture.alpha[above].mean() < 0.02
+    without = evaluate_without(learned, model)
+    assert evaluate(learned)["test"]["1"]["psnr"] > without + 3
+
+
+def evaluate_without(out: Path, model) -> float:
+    """PSNR of test views on black."""
+    renderer = clsplat.Renderer(model)
+    settings = load(str(out / "pipeline.yaml")).settings.scene
+    views = settings.read(settings.folder)[0].split("test")
+    found = [np.rint(255 * np.clip(renderer.render(view, 0.0).image, 0, 1)).astype(np.uint8) for view in views]
+    photographs = [np.rint(255 * view.photograph()).astype(np.uint8) for view in views]
+    return float(np.mean([psnr(a, b) for a, b in zip(found, photographs, strict=True)]))
+
+
+def test_a_choice_is_written_with_its_reason(learned):
+    found = load(str(learned / "pipeline.yaml")).settings.model.background
+    assert isinstance(found, Auto)
+    assert found.chosen == "on"
+    assert found.reason.startswith("9 of 9 photographs show bright or blue regions without points in 15% or more")
+    assert f"model.background: on, since {found.reason}" in (learned / "log.txt").read_text()
+
+
+def test_where_photographs_show_none_the_bits_are_those_without_the_key(tiny_scene, tmp_path, few_steps, rng):
+    asked = load("smoke", [f"scene.path='{tiny_scene}'", *FEW, "model.background=auto"])
+    run_pipeline(asked, tmp_path / "run", None, "new")
+    found = load(str(tmp_path / "run" / "pipeline.yaml")).settings.model.background
+    assert (found.chosen, found.reason) == ("off", "the photographs have transparency")
+    assert digest(tmp_path / "run") == digest(few_steps)
+    assert not (tmp_path / "run" / "point_cloud_sky.json").exists()
+    folder = Yard(rng, clear=False).write(tmp_path / "wall")
+    run = train(folder, tmp_path / "walled", *FEW, "model.background=auto")
+    assert run.sky is None
+
+
+def test_what_a_run_chose_is_no_setting_of_its_pipeline():
+    asked = load("smoke", ["model.background=auto"]).resolved()
+    chosen = load("smoke", ["model.background={type: auto, chosen: on, reason: it is blue}"]).resolved()
+    assert asked != chosen
+    assert without_choices(asked) == without_choices(chosen)
+
+
+def test_directions_in_which_no_photograph_shows_sky_are_left_to_gaussians(yard):
+    """The sky begins with the colours of the photographs."""
+    _, folder = yard
+    scene = clsplat.read_scene(folder)
+    photographs = [(view, np.rint(255 * view.photograph()).astype(np.uint8)) for view in scene.views]
+    texels, free = panorama(list(looked_at(scene, photographs)), 32)
+    directions = texel_directions(32)
+    looked = np.abs(directions[:, 1]) < 0.4
+    assert not free[looked & (directions[:, 1] > 0.35)].any()
+    assert np.ptp(texels[~free], axis=0).max() == 0, "one colour, which stays"
+    sky = looked & (directions[:, 1] < -0.2)
+    assert free[sky].all()
+    np.testing.assert_allclose(texels[sky], painted(directions[sky]), atol=0.1)
+
+
+# ---- bits
+
+
+def test_a_resumed_run_ends_with_the_bits_of_one_that_was_not(with_sky, tiny_scene, tmp_path):
+    out = tmp_path / "run"
+    shutil.copytree(with_sky, out)
+    (out / "checkpoints" / "step_000012.npz").unlink()
+    for name in ("point_cloud.ply", "point_cloud_sky.json", "metrics.json", "checksums.json"):
+        (out / name).unlink()
+    train(tiny_scene, out, *SKY, resume=True)
+    train(tiny_scene, tmp_path / "again", *SKY)
+    assert digest(out) == digest(with_sky) == digest(tmp_path / "again")
+    assert sky_bytes(out) == sky_bytes(with_sky) == sky_bytes(tmp_path / "again")
+
+
+def test_the_best_model_is_left_with_the_sky_of_its_step(tiny_scene, tmp_path):
+    wild = "model.background={type: directions, side: 16, rate: {points: [[0, 0.005], [9, 5.0]], between: steps}}"
+    kept = (
+        "scene.validation=2",
+        "optimize.keep=best",
+        "optimize.evaluate.split=validation",
+        "optimize.evaluate.every=4",
+    )
+    run = train(tiny_scene, tmp_path / "run", *FEW, *kept, wild)
+    assert run.best.found.step == 8, "the last steps ruin it"
+    _, then = checkpoint.load(tmp_path / "run" / "checkpoints" / "step_000008.npz")
+    np.testing.assert_array_equal(sky_beside(tmp_path / "run" / "point_cloud.ply").texels, then["sky/texels"])
+
+
+# ---- where it goes
+
+
+def test_a_run_folder_is_rendered_and_measured_with_its_sky(learned):
+    measured = json.loads((learned / "metrics.json").read_text())["test"]["1"]
+    assert evaluate(learned)["test"]["1"]["psnr"] == measured["psnr"]
+    assert "point_cloud_sky.json" in json.loads((learned / "checksums.json").read_text())
+
+
+def test_a_model_file_without_its_sky_says_so(learned, tmp_path, caplog):
+    shutil.copy(learned / "point_cloud.ply", tmp_path / "alone.ply")
+    assert clsplat.load(tmp_path / "alone.ply").sky is None
+    assert "was trained with a sky, which is drawn where alone_sky.json lies beside it" in caplog.text
+    model = clsplat.load(learned)
+    model.save(tmp_path / "moved.ply")
+    np.testing.assert_array_equal(clsplat.load(tmp_path / "moved.ply").sky.texels, model.sky.texels)
+
+
+def test_an_export_of_splats_shows_the_sky_without_its_file(yard, learned, tmp_path):
+    out = tmp_path / "run"
+    shutil.copytree(learned, out)
+    run_pipeline(load(str(out / "pipeline.yaml"), ["export.sky=splats"]), out, None, "resume")
+    assert not (out / "point_cloud_sky.json").exists()
+    model, before = clsplat.load(out), clsplat.load(learned)
+    assert len(model) == len(before) + 10_000
+    assert model.sky is None
+    view = yard[0].views[4]
+    found, expected = (clsplat.Renderer(one).render(view).image for one in (model, before))
+    assert np.abs(found - expected).mean() < 0.02
+
+
+def test_gaussians_of_a_sky_have_its_colours_in_all_directions(rng, learned):
+    model = clsplat.load(learned)
+    baked = with_sky_splats(model, 500)
+    added = baked[len(model) :]
+    directions = added.means - np.median(model.means, axis=0)
+    expected = np.clip(sampled(model.sky.texels, directions), 0, 1)
+    np.testing.assert_allclose(added.colours, expected, atol=2e-3)
+    assert with_sky_splats(baked) is baked
+
+
+def test_a_turned_model_has_a_turned_sky(rng, learned):
+    model = clsplat.load(learned)
+    turn = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
+    direction = np.array([0.3, -0.8, 0.2])
+    found = sampled(model.transformed(rotation=turn).sky.texels, turn @ direction)
+    np.testing.assert_allclose(found, sampled(model.sky.texels, direction), atol=0.02)
+    assert model.transformed(scale=2.0).sky is model.sky
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        "[]",
+        '{"side": 8}',
+        '{"side": 8, "texels": [[1, 2]]}',
+        '{"side": true, "texels": []}',
+        '{"side": 8, "texels": 1}',
+    ],
+)
+def test_a_damaged_sky_is_refused(tmp_path, damage):
+    (tmp_path / "point_cloud_sky.json").write_text(damage)
+    with pytest.raises(DataError, match=r"point_cloud_sky\.json: expected"):
+        sky_beside(tmp_path / "point_cloud.ply")
+
+
+def test_a_damaged_sky_in_a_checkpoint_is_refused(with_sky):
+    _, tables = checkpoint.archive.read(with_sky / "checkpoints" / "step_000012.npz")
+    behind, _ = split_tables(tables)
+    check_tables(behind)
+    for name, table in {"texels": behind["texels"][:-1], "biases": behind["moment1"]}.items():
+        with pytest.raises(DataError, match=f"{name} of its sky"):
+            check_tables({**behind, name: table})
+    with pytest.raises(DataError, match="not finite"):
+        check_tables({**behind, "moment2": behind["moment2"] * np.nan})
+    with pytest.raises(DataError, match="another sky"):
+        check_tables({"texels": behind["texels"], "biases": behind["biases"]})
+
+
+def test_a_sky_file_keeps_every_bit(rng, tmp_path):
+    sky = Sky(rng.normal(size=(64, 3)).astype(np.float32))
+    sky.write(tmp_path / "model_sky.json")
+    np.testing.assert_array_equal(sky_beside(tmp_path / "model.ply").texels, sky.texels)
+    assert replace(sky).side == 8
