@@ -35,7 +35,7 @@ class Sought:
     """Which features: at most `count` in an image of `long_side` px; `contrast` is a share of the range of grey."""
 
     long_side: int = 1600
-    count: int = 8192
+    count: int = 12288
     contrast: float = 0.02  # COLMAP's; Lowe 2004 has 0.04
 
 

@@ -63,7 +63,7 @@ class FindFeatures(Step):
 
     long_side: Positive = 1600
     """Longer side in px of the images in which features are found; larger photographs are made smaller."""
-    features: Positive = 8192
+    features: Positive = 12288
     """Largest number of features of a photograph."""
     camera_model: CameraModel = "SIMPLE_RADIAL"
     """Camera model of COLMAP; OPENCV_FISHEYE for fisheye lenses."""
