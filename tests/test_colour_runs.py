@@ -127,14 +127,14 @@ def test_figures_are_by_the_colours_of_the_training_that_has_begun():
 
 
 def test_the_best_model_is_left_with_the_colours_of_its_step(tiny_scene, tmp_path):
-    wild = "optimize.colours={type: gain, rate: {points: [[0, 0.01], [9, 3.0]], between: steps}}"
+    wild = "optimize.rates.means=[[8, 1.0e-3], [9, 0.9]]"
     kept = (
         "scene.validation=2",
         "optimize.keep=best",
         "optimize.evaluate.split=validation",
         "optimize.evaluate.every=4",
     )
-    run = train(tiny_scene, tmp_path / "run", *FEW, *kept, wild)
+    run = train(tiny_scene, tmp_path / "run", *GAIN, *kept, wild)
     assert run.best.found.step == 8, "the last steps ruin it"
     then, _ = checkpoint.load(tmp_path / "run" / "checkpoints" / "step_000008.npz")
     assert {name: run.numbers[name] for name in then.numbers} == then.numbers

@@ -10,7 +10,7 @@ import pytest
 
 from clsplat.errors import DataError
 from clsplat.scene.camera import Camera
-from clsplat.scene.exif import BESIDE, CameraExposure, exposure_of, read_exposures, write_exposures
+from clsplat.scene.exif import BESIDE, CameraExposure, checked, exposure_of, read_exposures, write_exposures
 from clsplat.scene.exposures import camera_exposures
 from clsplat.scene.scene import View
 from clsplat.views.exposures import noted
@@ -73,12 +73,18 @@ def test_a_damaged_file_is_refused_in_one_line(tmp_path, text):
     assert "\n" not in str(refused.value)
 
 
+@pytest.mark.parametrize("numbers", [(1e9, 2, 100), (0.01, 1e200, 100), (0.01, 2, 1e-300), (0.01, 0, 100), (0.01, 2)])
+def test_what_no_camera_can_have_is_no_exposure(numbers):
+    assert checked(*numbers, *[None] * (3 - len(numbers))) is None
+    assert checked(0.01, 2, 100) is not None
+
+
 def test_a_photograph_that_is_turned_keeps_its_exposure(tmp_path):
-    """Its upright copy has no EXIF data."""
+    """So does its upright copy."""
     for number, orientation in enumerate((1, 6, 1)):
         (tmp_path / f"{number}.jpg").write_bytes(with_exposure(iso=100 * (number + 1), orientation=orientation))
     gather(tmp_path, tmp_path / "images", ["0.jpg", "1.jpg", "2.jpg"])
-    assert exposure_of(tmp_path / "images" / "1.jpg") is None
+    assert exposure_of(tmp_path / "images" / "1.jpg").iso == 200
     assert {name: one.iso for name, one in read_exposures(tmp_path / "images").items()} == {
         "0.jpg": 100,
         "1.jpg": 200,

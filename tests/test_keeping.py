@@ -191,6 +191,29 @@ def test_training_that_goes_on_goes_on_from_the_last_step(tiny_scene, tmp_path, 
     assert sorted(psnr_of(out, "validation")) == list(range(4, 49, 4))
 
 
+@pytest.mark.parametrize(
+    "own", ["{every: 50, split: validation, stop: 40}", "{every: 60, split: validation, start: 60}"]
+)
+def test_a_measurement_that_is_never_due_is_refused_before_the_first_step(tiny_scene, tmp_path, pipeline, own):
+    during = f"optimize.during=[evaluate: {own}]"
+    with pytest.raises(ConfigError, match="needs a measurement of the validation views before the last step"):
+        train(tiny_scene, tmp_path / "run", during, pipeline=pipeline)
+
+
+def test_a_measurement_at_another_size_is_not_the_one_to_choose_by(tiny_scene, tmp_path, pipeline):
+    during = "optimize.during=[evaluate: {every: 4, split: validation, downscales: [2]}]"
+    run = train(tiny_scene, tmp_path / "run", during, "optimize.steps=100", pipeline=pipeline)
+    assert run.best.evaluations + run.best.since == 1, "every 100 steps"
+
+
+def test_a_training_that_patience_ends_has_a_checkpoint_of_its_end(tiny_scene, tmp_path, pipeline):
+    """Also where `during` names the checkpoint first."""
+    during = "optimize.during=[checkpoint: {every: 40}, evaluate: {every: 4, split: validation}]"
+    run = train(tiny_scene, tmp_path / "run", during, *PATIENT, pipeline=pipeline)
+    assert run.step < 40
+    assert checkpoint.saved(tmp_path / "run")[-1].name == f"step_{run.step:06d}.npz"
+
+
 def test_without_a_measurement_of_ones_own_there_are_twenty(pipeline):
     training = load("splat_7k", ["scene.validation=auto", "optimize.keep=best"]).settings.training
     train_, validation, *others = training.inner

@@ -18,6 +18,7 @@ SUB_FOLDER = 0x8769  # tags: where those of the exposure are
 SECONDS, APERTURE, ISO = 0x829A, 0x829D, 0x8827
 MAKE, MODEL, FOCAL, FOCAL_35 = 0x010F, 0x0110, 0x920A, 0xA405  # mm, and mm on film of 35 mm
 TEXT, SHORT, LONG, RATIONAL = 2, 3, 4, 5  # kinds of values
+POSSIBLE = ((1e-7, 1e5), (0.1, 1e3), (0.1, 1e8))  # seconds, f-number, ISO
 Value = float | str
 
 
@@ -105,9 +106,10 @@ def _values(block: bytes, order: str, start: int) -> dict[int, Value]:
 
 
 def checked(seconds: object, aperture: object, iso: object) -> CameraExposure | None:
-    """Return an exposure, or None where a value is no positive number."""
+    """Return an exposure, or None where a value is no number that a camera can have."""
     numbers = [float(one) for one in (seconds, aperture, iso) if isinstance(one, int | float)]
-    return CameraExposure(*numbers) if len(numbers) == 3 and all(0 < one < math.inf for one in numbers) else None
+    possible = len(numbers) == 3 and all(low < one < high for one, (low, high) in zip(numbers, POSSIBLE, strict=True))
+    return CameraExposure(*numbers) if possible else None
 
 
 def write_exposures(folder: Path, exposures: Mapping[str, CameraExposure | None]) -> None:

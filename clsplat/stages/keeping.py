@@ -32,7 +32,8 @@ class Keeping(Stage):
     steps: Annotated[int, Field(gt=0)]
     """Number of training steps."""
     keep: Literal["last", "best"] = "last"
-    """Model that the training leaves: that of its last step, or the one with the best PSNR at the validation views."""
+    """Model that the training leaves: that of its last step, or the one with the best PSNR at the validation views, in
+    the photographs' colours where they have colours of their own."""
     patience: Annotated[int, Field(gt=0)] | None = None
     """Measurements of the validation views without a better one after which the training ends; without it, none."""
     refit: bool = False
@@ -59,13 +60,28 @@ class Keeping(Stage):
         train = Evaluate.model_validate({**facts, "split": "train", "most": SHOWN, "start": start, "stop": stop})
         return [train] if own else [train, Evaluate.model_validate({**facts, "split": "validation"})]
 
+    def in_turn(self, during: Sequence[Scheduled]) -> list[Scheduled]:
+        """Return all stages of `during` in the order in which they act: first the measurements of `keep: best`, since
+        they may end the training."""
+        first = sorted(during, key=lambda stage: not _validates(stage)) if self.keep == "best" else during
+        return [*self.measuring(during), *first]
+
     def begin_to_keep(self, run: Run) -> None:
         """Forget the best of an earlier training.  Raises ConfigError where there is nothing to choose by."""
-        if self.keep == "best" and not run.scene.split("validation"):
+        if self.keep == "last":
+            return
+        if not run.scene.split("validation"):
             raise ConfigError(
                 "optimize.keep: best chooses by validation views; expected some: set scene.validation=auto"
             )
-        if self.keep == "best" and run.stage_step == 0:
+        last = run.step - run.stage_step + self.steps
+        found = [stage for stage in self.in_turn(getattr(self, "during", ())) if _validates(stage)]
+        if not any(stage.due(step, step == last) for stage in found for step in range(last - self.steps + 1, last + 1)):
+            raise ConfigError(
+                "optimize.keep: best needs a measurement of the validation views before the last step; expected "
+                "an `evaluate: {every: …, split: validation}` in `during` that is due, or none: it is made then"
+            )
+        if run.stage_step == 0:
             run.best, run.best_tables = None, {}
 
     def judge(self, run: Run, stage: Scheduled) -> None:
@@ -73,7 +89,8 @@ class Keeping(Stage):
         if self.keep == "last" or not _validates(stage):
             return
         averages = {split: run.metrics.get(split, {}) for split in ("train", "validation")}
-        train, validation = (one.get(f"{run.downscale:g}", {}).get("psnr") for one in averages.values())
+        measured = [one.get(f"{run.downscale:g}", {}) for one in averages.values()]
+        train, validation = (one.get("psnr_colour", one.get("psnr")) for one in measured)
         if train is None or validation is None:  # at another size, or masks leave out all
             return
         best, now = run.best, Measured(step=run.step, train=train, validation=validation)
@@ -119,4 +136,7 @@ class Keeping(Stage):
 
 
 def _validates(stage: Scheduled) -> bool:
-    return isinstance(stage, Evaluate) and stage.split == "validation" and stage.file is None
+    """Whether a stage measures validation views at the size of the training."""
+    if not isinstance(stage, Evaluate) or stage.split != "validation":
+        return False
+    return stage.file is None and stage.downscales is None

@@ -106,7 +106,7 @@ class Optimize(Keeping):
     @property
     def inner(self) -> list[Scheduled]:
         """The stages that act between two steps."""
-        return [*self.measuring(self.during), *self.during]
+        return self.in_turn(self.during)
 
     def run(self, run: Run) -> None:
         for _ in self.iterate(run):
