@@ -75,7 +75,13 @@ def map_cameras(source: Path, out: Path, mapper: Mapper = "incremental", threads
             break
         if attempt is not first:
             LOG.info("%d of %d photographs are placed; another attempt: %s", placed, len(names), attempt.told)
-        found = _attempt(source, out, attempt, threads, models[:1])
+        try:
+            found = _attempt(source, out, attempt, threads, models[:1])
+        except (DataError, RuntimeError, ValueError) as error:  # pycolmap's are of the last two
+            if not models:
+                raise
+            LOG.warning("the attempt failed (%s); the model from before stays", error)
+            break
         if found and found[0].num_reg_images() > placed:
             models, used = found, attempt
     if not models:

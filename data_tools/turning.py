@@ -5,9 +5,10 @@ that K⁻¹ H K is a rotation for one focal length and all pairs.  A plane that 
 too, but R + t nᵀ/d is no rotation.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import cv2
 import numpy as np
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 
 from data_tools.database import opened
 
-PAIRS = 60  # of the most matches, that are looked at
+PHOTOGRAPHS = 60  # that are looked at, evenly spaced, each with the one that it has the most matches with
 NEAR = 3.0  # px: of a match that a homography explains
 EXPLAINED = 0.9  # share of the matches of a pair
 FOCALS = np.geomspace(0.4, 4.0, 47)  # of the longer side
@@ -24,39 +25,47 @@ Floats = NDArray[np.float64]
 
 
 def only_turned(pycolmap: ModuleType, database: Path) -> bool:
-    """Return whether the matched pairs, at least one for each further photograph, are those of a camera that turned."""
-    homographies, count = _homographies(pycolmap, database)
-    if len(homographies) < max(2, count - 1) * EXPLAINED:
-        return False
-    return min(_from_turns(homographies, focal) for focal in FOCALS) < MADE_UP
+    """Return whether nearly all photographs match another one as those of a camera that turned."""
+    homographies = _homographies(pycolmap, database)
+    return len(homographies) > 1 and min(_from_turns(homographies, focal) for focal in FOCALS) < MADE_UP
 
 
-def _homographies(pycolmap: ModuleType, database: Path) -> tuple[list[Floats], int]:
-    """Homographies of the pairs that have one, in units of the longer side from the middle; number of photographs.
-
-    Where one of the pairs is better explained without, there are none.
-    """
+def _homographies(pycolmap: ModuleType, database: Path) -> list[Floats]:
+    """Homographies that explain the matches of photographs, in units of the longer side from the middle; none where
+    they do not for one photograph of ten."""
     with opened(pycolmap, database) as rows:
         images = {image.image_id: image for image in rows.read_all_images()}
         cameras = {camera.camera_id: camera for camera in rows.read_all_cameras()}
         numbers, geometries = rows.read_two_view_geometries()
-        pairs = sorted(zip(numbers, geometries, strict=True), key=lambda pair: -len(pair[1].inlier_matches))[:PAIRS]
+        names = sorted(images)
+        sample = names[:: -(-len(names) // PHOTOGRAPHS)]
+        best = _best_pairs(pycolmap, dict(zip(numbers, geometries, strict=True)))
+        pairs = [best[number] for number in sample if number in best]
         points = {}
         for number in {one for pair, _ in pairs for one in pycolmap.pair_id_to_image_pair(pair)}:
             camera = cameras[images[number].camera_id]
             size = np.array([camera.width, camera.height])
             points[number] = (rows.read_keypoints(number)[:, :2] - size / 2) / size.max(), size.max()
-    found, shares = [], []
+    found = []
     for pair, geometry in pairs:
         a, b = pycolmap.pair_id_to_image_pair(pair)
         matches = np.asarray(geometry.inlier_matches)
         if len(matches) >= 8:
             first, second = points[a][0][matches[:, 0]], points[b][0][matches[:, 1]]
             matrix, explained = cv2.findHomography(first, second, cv2.RANSAC, NEAR / points[b][1])
-            if matrix is not None:
+            if matrix is not None and explained.mean() >= EXPLAINED:
                 found.append(np.asarray(matrix, np.float64))
-                shares.append(float(explained.mean()))
-    return (found if shares and np.median(shares) >= EXPLAINED else []), len(images)
+    return found if len(found) >= EXPLAINED * len(sample) else []
+
+
+def _best_pairs(pycolmap: ModuleType, geometries: Mapping[int, Any]) -> dict[int, tuple[int, Any]]:
+    """The pair of the most matches, with its geometry, by photograph."""
+    found: dict[int, tuple[int, Any]] = {}
+    for pair, geometry in geometries.items():
+        for number in pycolmap.pair_id_to_image_pair(pair):
+            if number not in found or len(geometry.inlier_matches) > len(found[number][1].inlier_matches):
+                found[number] = pair, geometry
+    return found
 
 
 def _from_turns(homographies: Sequence[Floats], focal: float) -> float:

@@ -125,14 +125,14 @@ class Skies:
         difference: float,
         scale: float,
     ) -> tuple[Array, Array]:
-        """Return T dL/dT of the loss of what covers the sky, [rows, stride], and its sums of 1 - T by row, [rows].
+        """Return T dL/dT of the loss of what covers the sky, [1, rows, stride], and its sums of 1 - T by row, [rows].
 
         free: [1, side * side] 1 for a texel that is learned, else 0; photograph: [3, rows, stride]; difference: up to
         which a pixel shows the sky; scale: factor of the sums.
         """
         runs, wide = self.runs(camera, sky.side), camera.stride + 2 * BORDER
         matches = self.workspace.array("sky matches", (camera.rows + 2, wide))
-        behind = self.workspace.array("behind", (camera.rows, camera.stride))
+        behind = self.workspace.array("behind", (1, camera.rows, camera.stride))
         sums = self.workspace.array("sky sums", camera.rows)
         matches.fill(0)
         self._program.sky_matches(

@@ -45,6 +45,8 @@ class Keeping(Stage):
         if self.keep != "best" and (self.patience or self.refit):
             raise ValueError(f"'{'patience' if self.patience else 'refit'}' is for 'keep: best'; give both or neither")
         inner = getattr(self, "during", ())
+        if self.keep != "best" and any(getattr(stage, "patience", None) for stage in inner):
+            raise ValueError("'densify.patience' is for 'keep: best'; give both or neither")
         if self.keep == "best" and any("average" in stage.makes for stage in inner):
             raise ValueError("'keep: best' leaves the model of one step, and not the average of several; choose one")
         return self

@@ -28,6 +28,8 @@ def begin_sky(run: Run, own: Sky | None = None) -> None:
     background = settings.in_use if isinstance(settings, Auto) else settings
     if not isinstance(background, Directions):
         run.sky = None
+        if own:
+            LOG.warning("the sky of the model is left out; model.background: directions keeps it")
         return
     texels, free = _first(run, background.side)
     sky = own if own and own.side == background.side else Sky(texels)

@@ -45,7 +45,7 @@ class LearnedSky:
         return {name: np.ascontiguousarray(array.get().T) for name, array in arrays.items()}
 
     def cover(self, rasterizer: Rasterizer, frame: Frame, comparison: Comparison) -> tuple[Array, LossValue] | None:
-        """Return T dL/dT of the loss of what covers the sky, [rows, stride], and its value; None where it has no
+        """Return T dL/dT of the loss of what covers the sky, [1, rows, stride], and its value; None where it has no
         weight."""
         camera, step = comparison.camera, comparison.step
         weight = at_step(self.settings.cover, step)

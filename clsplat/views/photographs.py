@@ -163,6 +163,7 @@ def unpack(workspace: Workspace, camera: DeviceCamera, pixels: Array, factor: fl
 
 def apply_mask(workspace: Workspace, camera: DeviceCamera, planes: Array, mask: Array) -> None:
     """Set `planes` [channels, rows, stride] to zero where the mask [1, rows, stride] is zero."""
+    assert planes.shape[1:] == mask.shape[1:] == (camera.rows, camera.stride)
     pixels = camera.rows * camera.stride
     workspace.device.program("loss.cl").apply_mask(
         items=(pixels, planes.shape[0]), planes=planes, mask=mask, pixels=pixels
