@@ -1,8 +1,8 @@
 /* A background of directions: what is behind the Gaussians, as a picture of all directions from the scene.
  *
  * The picture is an octahedral map (Meyer et al. 2010, "On floating-point normal vectors", section 2.2): with s = |x| +
- * |y| + |z|, a direction (x, y, z) lies at (u, v) = (x, y) / s where z >= 0, and at (x - sign(x) z', y - sign(y) z') / s,
- * z' = z, else.  So (u, v) fills the square [-1, 1]^2 without a gap, and the square's edges meet on the sphere.  side *
+ * |y| + |z|, a direction (x, y, z) lies at (u, v) = (x, y) / s where z >= 0, and at (x - sign(x) z, y - sign(y) z) / s
+ * else.  So (u, v) fills the square [-1, 1]^2 without a gap, and the square's edges meet on the sphere.  side *
  * side texels have their centres at -1 + (2 i + 1) / side; between four of them colours are bilinear.  A pixel has the
  * colour C + T b, with b the map's colour in the direction of its ray and T what the splats leave.
  *
@@ -154,8 +154,8 @@ void sky_matches(
     }
 }
 
-/* The loss of what covers the sky: weight / (width height) times the sum of 1 - T over pixels of which most of the 3 x 3
- * about them match.  Writes T dL/dT, which blend_backward reads, and the sum of each row.
+/* The loss of what covers the sky: weight / (width height) times the sum of 1 - T over pixels of which most of the
+ * 3 x 3 about them match.  Writes T dL/dT, which blend_backward reads, and the sum of each row.
  * One group = one row.  Local memory: TEAM * 4 bytes. */
 __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
 void sky_cover(
@@ -246,9 +246,9 @@ void sky_gather(
     by_texels[channel * shown + place] = sum;
 }
 
-/* Adam on the texels that the view shows and that are learned, each with the bias of its own updates: 1 - BETA^t, by the recursion of the
- * moments for a gradient of 1.  The gradient is counted in pixels of L1: a texel of which less than a pixel is seen,
- * behind a wall, hardly moves.  One item = one texel. */
+/* Adam on the texels that the view shows and that are learned, each with the bias of its own updates: 1 - BETA^t, by
+ * the recursion of the moments for a gradient of 1.  The gradient is counted in pixels of L1: a texel of which less
+ * than a pixel is seen, behind a wall, hardly moves.  One item = one texel. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void sky_update(
     __global const uint *restrict shown_texels,  // [shown]

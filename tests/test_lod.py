@@ -117,7 +117,7 @@ def test_that_a_file_is_merged_alone_is_said(alone, tmp_path):
 def test_options_that_need_photographs_are_refused_without_them(option, alone, tmp_path):
     message = rf"model\.ply: no photographs are known, needed for --{option}; give --scene, or leave that out$"
     with pytest.raises(ConfigError, match=message):
-        clsplat.write_levels(alone, tmp_path / "site", **{option: 2})
+        clsplat.write_levels(alone, tmp_path / "site", **{option: STEPS})
     assert [path.name for path in tmp_path.iterdir()] == ["model.ply"]
 
 

@@ -415,7 +415,12 @@ def test_order_of_gaussians_does_not_matter(rng):
     camera = general_camera()
     gaussians = random_gaussians(rng, camera, 1)
     shuffle = np.array([3, 0, 4, 1, 2])
-    shuffled = ref.Gaussians(**{name: values[shuffle] for name, values in vars(gaussians).items()})
+    shuffled = ref.Gaussians(
+        **{
+            name: np.take(values, shuffle, axis=0) if np.ndim(values) else values
+            for name, values in vars(gaussians).items()
+        }
+    )
     image = ref.render(gaussians, camera, BACKGROUND, 1).image
     np.testing.assert_array_equal(ref.render(shuffled, camera, BACKGROUND, 1).image, image)
 

@@ -64,7 +64,7 @@ def remove_cut_kernels() -> None:
 def _start_of_the_machine() -> str:
     """What Linux names each start of the machine by; '' elsewhere."""
     with suppress(OSError):
-        return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+        return Path("/proc/sys/kernel/random/boot_id").read_text("utf-8").strip()
     return ""
 
 
