@@ -25,7 +25,7 @@ STEPS = 30
 AVERAGED = f"""
 name: averaged
 stages:
-  - init: {{source: auto, opacity: 0.3}}
+  - init: {{source: random, count: 1000, opacity: 0.3}}
   - optimize:
       steps: {STEPS}
       losses: [l1]
@@ -131,7 +131,7 @@ def ball_scene(folder: Path, channels: int) -> Path:
     return folder
 
 
-STILL = "optimize.steps=20", "optimize.densify.stop=1", "optimize.rates.means=1e-9", "init.count=300"
+STILL = "optimize.steps=20", "optimize.densify.stop=1", "optimize.rates.means=1e-9", "init.source=auto", "init.count=300"
 
 
 def distances(run: Run) -> np.ndarray:

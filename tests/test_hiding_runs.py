@@ -17,7 +17,7 @@ STEPS = 24
 HIDING = f"""
 name: hiding
 stages:
-  - init: {{source: auto, opacity: 0.3}}
+  - init: {{source: random, count: 1000, opacity: 0.3}}
   - optimize:
       steps: {STEPS}
       update: seen
