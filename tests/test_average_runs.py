@@ -131,7 +131,13 @@ def ball_scene(folder: Path, channels: int) -> Path:
     return folder
 
 
-STILL = "optimize.steps=20", "optimize.densify.stop=1", "optimize.rates.means=1e-9", "init.source=auto", "init.count=300"
+STILL = (
+    "init.source=auto",
+    "init.count=300",
+    "optimize.steps=20",
+    "optimize.densify.stop=1",
+    "optimize.rates.means=1e-9",
+)
 
 
 def distances(run: Run) -> np.ndarray:
