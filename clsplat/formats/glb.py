@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.errors import DataError, quoted
-from clsplat.formats.gltf import EXTENSION, PREFIX, Gltf
+from clsplat.errors import DataError
+from clsplat.formats.gltf import EXTENSION, PREFIX, Gltf, fault
 from clsplat.formats.output import written
 from clsplat.formats.ply import checked_numbers
 from clsplat.formats.splats import (
@@ -54,7 +54,7 @@ def read_glb(path: Path) -> SplatFile:
         degrees = {part["sh_rest"].shape[1] for part in parts}
         extras = tree.get("asset", {}).get("extras")
     except (ValueError, KeyError, IndexError, TypeError, AttributeError, RecursionError, OverflowError) as error:
-        raise DataError(f"{path}: its JSON is damaged ({quoted(error)}); copy or export the file again") from error
+        raise DataError(f"{path}: its JSON is damaged ({fault(error)}); copy or export the file again") from error
     if len(degrees) > 1:
         raise DataError(f"{path}: its parts have different SH degrees; expected one: export them apart")
     parameters = flipped({name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
@@ -148,9 +148,14 @@ def _chunks(path: Path, data: bytes) -> tuple[bytes, bytes]:
             raise DataError(f"{path}: holds {len(data)} bytes; its chunks are longer: copy or export it again")
         found.setdefault(kind, data[start + 8 : start + 8 + length])
         start += 8 + length
-    if not 0 < len(found.get(JSON, b"")) <= MAX_JSON:
+    text = found.get(JSON, b"")
+    if not text:
         raise DataError(f"{path}: has no chunk of JSON; copy or export it again")
-    return found[JSON], found.get(BINARY, b"")
+    if len(text) > MAX_JSON:
+        raise DataError(
+            f"{path}: its JSON has {len(text)} bytes; expected {MAX_JSON} at most: export it with fewer primitives"
+        )
+    return text, found.get(BINARY, b"")
 
 
 def _parameters(path: Path, found: Gltf, primitive: dict[str, Any]) -> Parameters:

@@ -1,5 +1,6 @@
 """The parts of glTF that hold Gaussians: primitives, where their node stands, and accessors."""
 
+import json
 import logging
 from pathlib import Path
 from typing import Any
@@ -18,10 +19,15 @@ SHARED = 8  # times that a byte is read, on average: equal columns may be one ac
 FLIP = np.diag([1.0, -1, -1, 1])  # between the axes of glTF and those of a PLY
 
 
+class NoIndex(ValueError):
+    """A value is no index, size or offset; the message tells it in words."""
+
+
 class Gltf:
     """A file's primitives of Gaussians, all in the same place.
 
-    Raises DataError where there are none, or more than one place; the errors of Python for a tree that is damaged.
+    Raises DataError where there are none, or more than one place; for a tree that is damaged the errors of Python,
+    which `fault` tells in words.
     """
 
     def __init__(self, path: Path, tree: dict[str, Any], binary: bytes) -> None:
@@ -49,16 +55,27 @@ class Gltf:
         one = self.tree["accessors"][_index(number)]
         kind, count, start = COMPONENTS[one["componentType"]], _index(one["count"]), _index(one.get("byteOffset", 0))
         view = self.tree["bufferViews"][_index(one["bufferView"])]
-        if WIDTHS.get(one["type"]) != width or "sparse" in one or "uri" in self.tree["buffers"][_index(view["buffer"])]:
+        buffer = self.tree["buffers"][_index(view["buffer"])]
+        if WIDTHS.get(one["type"]) != width or "sparse" in one or view["buffer"] or "uri" in buffer:
             raise DataError(
                 f"{self.path}: accessor {number} is a {quoted(one['type'])}, or lies elsewhere; expected {width} "
                 "numbers a row in the file itself: export it again"
             )
         size = width * np.dtype(kind).itemsize
-        stride = _index(view.get("byteStride", size)) or size
-        start += _index(view.get("byteOffset", 0))
-        if stride < size or start + stride * max(count - 1, 0) + size * min(count, 1) > len(self.binary):
-            raise DataError(f"{self.path}: accessor {number} has {count} rows, more than the file; copy it again")
+        stride = _index(view.get("byteStride", size))
+        length, offset = _index(view["byteLength"]), _index(view.get("byteOffset", 0))
+        if stride < size:
+            raise DataError(
+                f"{self.path}: the rows of accessor {number} are {stride} bytes apart; expected {size} at least: "
+                "export it again"
+            )
+        held = min(_index(buffer["byteLength"]), len(self.binary))
+        if offset + length > held or start + stride * max(count - 1, 0) + size * min(count, 1) > length:
+            raise DataError(
+                f"{self.path}: accessor {number} has {count} rows, more than its view of {length} bytes from {offset} "
+                f"on holds, or than the file, whose buffer has {held} bytes; copy or export it again"
+            )
+        start += offset
         self.left -= count * size
         if self.left < 0:
             raise DataError(f"{self.path}: its accessors share their numbers too often; export it again")
@@ -126,8 +143,25 @@ class Gltf:
         return sorted(set(range(len(nodes))) - {child for node in nodes for child in node.get("children", [])})
 
 
+def fault(error: Exception) -> str:
+    """Return in words what an error of Python says about a tree."""
+    if isinstance(error, NoIndex):
+        return str(error)
+    if isinstance(error, json.JSONDecodeError):
+        return f"line {error.lineno}, column {error.colno}: {error.msg}"
+    if isinstance(error, UnicodeDecodeError):
+        return f"byte {error.start} is no UTF-8"
+    if isinstance(error, RecursionError):
+        return "nested too deeply"
+    if isinstance(error, KeyError):
+        return f"{quoted(error.args[0])} is missing or unknown"
+    if isinstance(error, IndexError):
+        return "an index is beyond the end of its list"
+    return "a value is of another kind, size or shape than in glTF 2.0"
+
+
 def _index(value: Any) -> int:
-    """A whole number from 0 on.  Raises ValueError."""
-    if not isinstance(value, int) or not 0 <= value < 1 << 40:
-        raise ValueError(f"expected a whole number, got {quoted(value)}")
+    """A whole number from 0 on.  Raises NoIndex."""
+    if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 1 << 40:
+        raise NoIndex(f"{quoted(value)} where a whole number from 0 on is expected")
     return value

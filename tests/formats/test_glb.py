@@ -152,6 +152,7 @@ def test_whole_numbers_and_strides_are_read(tmp_path, rng):
     rows = np.zeros((5, 8), "<i2")
     rows[:, :4] = [0, 32767, 0, -32768]
     tree["bufferViews"].append({"buffer": 0, "byteOffset": len(binary), "byteLength": 80, "byteStride": 16})
+    tree["buffers"][0]["byteLength"] += 80
     number = tree["meshes"][0]["primitives"][0]["attributes"][f"{KHR}:ROTATION"]
     tree["accessors"][number] |= {"componentType": 5122, "normalized": True, "bufferView": len(tree["bufferViews"]) - 1}
     (tmp_path / "b.glb").write_bytes(glued(tree, binary + rows.tobytes()))
@@ -169,12 +170,19 @@ def change(place, value):
 
 
 REFUSED = {
-    "count": (change(["accessors", 0, "count"], 10**9), "more than the file"),
+    "count": (change(["accessors", 0, "count"], 10**9), "has 1000000000 rows, more than its view of 48 bytes"),
     "counts": (change(["accessors", 0, "count"], 3), "different counts"),
-    "stride": (change(["bufferViews", 0, "byteStride"], 4), "more than the file"),
-    "view": (change(["accessors", 0, "bufferView"], 99), "its JSON is damaged"),
-    "negative": (change(["bufferViews", 0, "byteOffset"], -4), "its JSON is damaged"),
-    "text": (change(["nodes", 0], "x"), "its JSON is damaged"),
+    "stride": (change(["bufferViews", 0, "byteStride"], 4), "are 4 bytes apart; expected 12 at least"),
+    "no stride": (change(["bufferViews", 0, "byteStride"], 0), "are 0 bytes apart; expected 12 at least"),
+    "short view": (change(["bufferViews", 0, "byteLength"], 1), "has 4 rows, more than its view of 1 bytes"),
+    "long view": (change(["bufferViews", 0, "byteLength"], 10**9), "or than the file"),
+    "length of a view": (change(["bufferViews", 0, "byteLength"], "a"), r"\('a' where a whole number from 0 on is"),
+    "short buffer": (change(["buffers", 0, "byteLength"], 3), "whose buffer has 3 bytes; copy or export it again"),
+    "other buffer": (change(["buffers"], [{"byteLength": 0}] * 2), "whose buffer has 0 bytes"),
+    "view": (change(["accessors", 0, "bufferView"], 99), r"its JSON is damaged \(an index is beyond the end"),
+    "negative": (change(["bufferViews", 0, "byteOffset"], -4), r"\(-4 where a whole number from 0 on is expected\)"),
+    "kind": (change(["accessors", 0, "componentType"], 7), r"its JSON is damaged \(7 is missing or unknown\)"),
+    "text": (change(["nodes", 0], "x"), r"its JSON is damaged \(a value is of another kind"),
     "circle": (change(["nodes", 0], {"children": [0]}), "no tree"),
     "doubled": (change(["nodes"], [*({"children": [i + 1] * 2} for i in range(50)), {}]), "no tree"),
     "shared": (change(["nodes"], [{"children": [1, 2]}, {"children": [2]}, {"mesh": 0}]), "node 2 occurs twice"),
@@ -199,6 +207,31 @@ def test_a_damaged_glb_is_refused(fault, tmp_path, rng):
     changed(tree)
     (tmp_path / "a.glb").write_bytes(glued(tree, binary))
     with pytest.raises(DataError, match=words):
+        read(tmp_path / "a.glb")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (b"[" * 100_000, "nested too deeply"),
+        (b'{"a" 1}', "line 1, column 6: Expecting ':' delimiter"),
+        (b'{"a": "\xff"}', "byte 7 is no UTF-8"),
+    ],
+)
+def test_json_that_cannot_be_read_is_told_in_words(text, words, tmp_path):
+    text += b" " * (-len(text) % 4)
+    chunk = struct.pack("<2I", len(text), 0x4E4F534A) + text
+    (tmp_path / "a.glb").write_bytes(struct.pack("<4s2I", b"glTF", 2, 12 + len(chunk)) + chunk)
+    with pytest.raises(DataError) as caught:
+        read(tmp_path / "a.glb")
+    assert f"a.glb: its JSON is damaged ({words}" in str(caught.value)
+    assert "Error" not in str(caught.value)
+
+
+def test_json_that_is_too_long_is_told_with_the_limit(tmp_path, rng, monkeypatch):
+    monkeypatch.setattr("clsplat.formats.glb.MAX_JSON", 100)
+    write(tmp_path / "a.glb", splats(rng, 4, 0))
+    with pytest.raises(DataError, match=r"its JSON has \d+ bytes; expected 100 at most"):
         read(tmp_path / "a.glb")
 
 
