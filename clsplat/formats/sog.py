@@ -25,6 +25,7 @@ from clsplat.formats.splats import MAX_DEGREE, SplatFile, logits, sh_coefficient
 
 PIXELS_PER_BYTE = 16  # of all images; real ones have less than one
 PER_ROW = 64  # centroids
+MAX_PALETTE = 1 << 16  # centroids, as labels have 16 bits
 WIDTHS = {3: 1, 8: 2, 15: 3}  # degree by coefficients of a centroid
 LIMIT = 1e30  # of numbers in meta.json
 ROTATED = 252  # alpha of a quaternion whose largest component is w
@@ -107,13 +108,18 @@ class _Sog:
             raise DataError(f"{self.path}: shN has {len(files)} files; expected centroids and labels")
         labels = webp.decode(self.path, "labels of shN", files[1], self.count, self._most(self.count))
         chosen = labels[: self.count, 0].astype(np.intp) | labels[: self.count, 1].astype(np.intp) << 8
-        entries = 1 + int(chosen.max(initial=0))
+        used = entries = 1 + int(chosen.max(initial=0))
         if self.old:
             degree = self._degree_of_width(files[0])
         else:
+            entries = self._whole("shN.count", self._part("shN").get("count", used), MAX_PALETTE)
             degree = self._whole("shN.bands", self._part("shN").get("bands"), MAX_DEGREE)
         size = sh_coefficients(degree) - 1
-        most = self._most(PER_ROW * size * 1024)
+        if used > entries:
+            raise DataError(
+                f"{self.path}: labels of shN name {used} centroids; shN.count is {entries}: export it again"
+            )
+        most = self._most(size * MAX_PALETTE)
         centroids = webp.decode(self.path, "centroids of shN", files[0], entries * size, most)
         table = centroids[: entries * size, :3].reshape(entries, 3 * size)
         return np.asarray(self._looked_up("shN", table)[chosen])

@@ -230,6 +230,9 @@ REFUSED = {
     "text": ({"sh0__codebook": ["x"] * 256}, "expected 256 numbers"),
     "huge": ({"means__mins": [1e300, 0, 0]}, r"expected 3 numbers below 1e\+30"),
     "bands": ({"shN__bands": 4}, "from 1 to 3"),
+    "palette": ({"shN__count": 2**40}, "shN.count is 1099511627776; expected a whole number from 1 to 65536"),
+    "longer palette": ({"shN__count": 60000}, "centroids of shN has .* px; expected 180000 at least"),
+    "shorter palette": ({"shN__count": 2}, r"labels of shN name \d+ centroids; shN.count is 2"),
     "not JSON": ({"means": 3}, "has no 'means'"),
 }
 
