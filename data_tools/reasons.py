@@ -84,13 +84,13 @@ def _reason(matched: Matched, name: str, placed: set[str], sharp: float) -> str:
     among = {other: count for other, count in matches.items() if other in placed}
     if matched.features[name] < FEW_FEATURES:
         return f"only {amount(matched.features[name], 'feature')}: blurred, dark, or of a plain surface"
-    if matched.sharpness_of(name) < BLURRED * sharp:
-        return "blurred"
-    if not matches:
+    if not matches:  # however soft: one of broad shapes is as soft as a blurred one, and a blurred one has few features
         return "shows nothing that another photograph shows"
     best = max(matches, key=lambda other: (matches[other], other))
     if not among:
         return f"matches {best} alone, which is not placed either"
+    is_soft = matched.sharpness_of(name) < BLURRED * sharp
     if max(among.values()) < FEW_MATCHES:
-        return f"few matches, at most {max(among.values())}, with {max(among, key=lambda o: (among[o], o))}"
-    return f"{matches[best]} matches with {best}, but too few on points of the model"
+        found = f"few matches, at most {max(among.values())}, with {max(among, key=lambda o: (among[o], o))}"
+        return f"{found}; it may be blurred" if is_soft else found
+    return "blurred" if is_soft else f"{matches[best]} matches with {best}, but too few on points of the model"

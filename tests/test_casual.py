@@ -162,13 +162,15 @@ def test_files_that_cannot_be_read_come_with_how_to_convert_them(tmp_path, caplo
 
 
 def matched(tmp_path: Path) -> Matched:
-    """Six photographs, of which three are in the model, and one is blurred."""
-    names = ["a", "b", "c", "blurred", "plain", "alone", "pair", "other", "few", "many"]
+    """Photographs of which three are in the model, and three are soft: two of its place, and one of another."""
+    names = ["a", "b", "c", "blurred", "soft", "elsewhere", "plain", "alone", "pair", "other", "few", "many"]
+    soft = ("blurred", "soft", "elsewhere")
     for name in names:
         pixels = np.random.default_rng(0).integers(0, 256, (60, 80, 3)).astype(np.uint8)
-        cv2.imwrite(str(tmp_path / name) + ".png", cv2.GaussianBlur(pixels, (0, 0), 3) if name == "blurred" else pixels)
+        cv2.imwrite(str(tmp_path / name) + ".png", cv2.GaussianBlur(pixels, (0, 0), 3) if name in soft else pixels)
         (tmp_path / f"{name}.png").rename(tmp_path / name)
     pairs = {("a", "b"): 200, ("b", "c"): 150, ("pair", "other"): 90, ("few", "a"): 18, ("many", "a"): 80}
+    pairs |= {("blurred", "a"): 60, ("soft", "a"): 20}
     return Matched(tmp_path, {name: 40 if name == "plain" else 3000 for name in names}, pairs)
 
 
@@ -176,6 +178,8 @@ def test_each_photograph_that_is_not_placed_has_a_reason(tmp_path):
     found = reasons(matched(tmp_path), [{"a", "b", "c"}])
     assert found == {
         "blurred": "blurred",
+        "soft": "few matches, at most 20, with a; it may be blurred",
+        "elsewhere": "shows nothing that another photograph shows",
         "plain": "only 40 features: blurred, dark, or of a plain surface",
         "alone": "shows nothing that another photograph shows",
         "pair": "matches other alone, which is not placed either",
