@@ -10,6 +10,7 @@ from clsplat import progress, terminal
 from clsplat.prepare.cache import Planned, prepare
 from clsplat.prepare.steps import FindFeatures, MapCameras
 from clsplat.progress import Count, clock, heard_by, watched
+from clsplat.runs.opening import READ_SCENE, counts_of
 from clsplat.training.found import photographs_text
 from clsplat.training.run import Progress
 from clsplat.training.status import StatusFile
@@ -89,12 +90,15 @@ def test_work_that_does_not_count_is_watched(monkeypatch):
     assert not [thread for thread in threading.enumerate() if thread.name == "count"]
 
 
-def test_status_json_has_the_time_left_of_a_preparation_until_the_training(tmp_path):
+def test_status_json_has_no_time_left_while_later_steps_of_a_preparation_are_to_come(tmp_path):
     status = StatusFile(tmp_path)
-    with heard_by(status.count):
-        status.count("pairs", 3, 9, seconds_left=4.0)
-    assert status.now.seconds_left == 4
-    assert status.now.progress.unit == "pairs"
+    listen = counts_of(status)
+    for stage, left in (("match_features", None), (READ_SCENE, 4), ("undistort", None)):
+        with status.stage(stage):
+            listen("pairs", 3, 9, seconds_left=4.0)
+            assert status.now.seconds_left == left
+            assert status.now.progress.unit == "pairs"
+    status.note(seconds_left=4)
     status.enter("running")
     assert status.now.seconds_left is None
 

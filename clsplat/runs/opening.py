@@ -9,13 +9,15 @@ from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import Pipeline, prepared_folder
 from clsplat.prepare.cache import Planned, note, noted, prepare
 from clsplat.prepare.facts import facts
-from clsplat.progress import heard_by
+from clsplat.progress import Listener, heard_by
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.runs.folders import Start
 from clsplat.runs.scenes import ReadScene, RunScene, read_run_scene
 from clsplat.training.run import Run
 from clsplat.training.status import StatusFile
 from clsplat.views.photographs import Photographs
+
+READ_SCENE = "read_scene"  # the last stage of the preparation
 
 
 def open_run(
@@ -36,12 +38,24 @@ def open_run(
         status.enter("preparing", device=opened.text)
     status = status or StatusFile(out)
     folder, root = pipeline.settings.scene.folder, prepared_folder(out)
-    with heard_by(status.count):
+    with heard_by(counts_of(status)):
         folder = prepare(planned, folder, root, status.stage)
-        with status.stage("read_scene"):
+        with status.stage(READ_SCENE):
             run = make_run(pipeline, read(pipeline.settings.scene, folder), opened, out, status)
     run.prepared, run.found = note(planned) if planned else None, facts(planned)
     return run
+
+
+def counts_of(status: StatusFile) -> Listener:
+    """Return what notes counts of the preparation, and the time left in its last stage alone.
+
+    Before that the time of later steps is not known, such as that of finding the cameras while pairs are matched.
+    """
+
+    def note_count(what: str, done: int, total: int, /, *, seconds_left: float | None) -> None:
+        status.count(what, done, total, seconds_left=seconds_left if status.now.stage == READ_SCENE else None)
+
+    return note_count
 
 
 def check_start(

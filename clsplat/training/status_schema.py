@@ -46,7 +46,8 @@ class Status(BaseModel):
     gaussians: Whole | None = None
     """Number of Gaussians at the last report."""
     seconds_left: Seconds | None = None
-    """Time that the training in progress still needs, estimated at the last report; in a preparation, its step."""
+    """Time that the training in progress still needs, estimated at the last report; of a preparation, reading the scene
+    alone."""
     checkpoint: str | None = None
     """Newest checkpoint that was saved, a file in the folder `checkpoints`."""
     cells: Whole | None = None
