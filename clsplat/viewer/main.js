@@ -75,19 +75,17 @@ class Viewer extends Walk {
     const exact = this.at >= 0, native = exact ? this.camera.lens[0] : this.info.focal;
     const [across, down] = [wide, high].map(side => Math.max(1, Math.round(side * scale)));
     const frame = framed(this.camera, across, down, exact, native);
-    let drawn = 0;
     this.layers.forEach((layer, i) => {
       layer.sorter.ask([...axis(this.camera, 2), frame.translation[2]], this.first(layer, share));
       this.painter.blend(layer, frame, {mode: this.mode, first: layer.first, dot: Math.max(1, 1.5 * ratio * scale)});
       const corner = along ? [i * wide, 0] : [0, (parts - 1 - i) * high];
       this.painter.show([...corner, wide, high], this.background);
-      drawn += layer.drawn;
     });
     const corners = this.layers.map((_, i) => along ? [i * width, 0] : [0, i * height]);
     this.frustums.draw(framed(this.camera, width, height, exact), corners, ratio);
     this.dirty = false;
     this.whole = resting;
-    this.panel.statistics(drawn, this.ms, scale);
+    this.panel.statistics(this.ms, scale);
     if (resting && !this.flight && this.layers.every(layer => layer.sorter.current)) this.settle();
   }
 

@@ -37,11 +37,12 @@ class Settings extends Panel {
     find("angle").textContent = `${Math.round(angle)}°`;
   }
 
-  // drawn: splats; ms: of a frame while moving, null when not measured; scale: of the picture's resolution
-  statistics(drawn, ms, scale) {
-    const sum = key => this.viewer.layers.reduce((whole, layer) => whole + layer.header[key], 0), faint = sum("faint");
-    const parts = [`${thousands(drawn)} of ${thousands(sum("count"))} splats`];
-    if (faint) parts[0] += ` + ${thousands(faint)} too faint to draw`;
+  // ms: of a frame while moving, null when not measured; scale: of the picture's resolution
+  statistics(ms, scale) {
+    const {layers} = this.viewer;
+    const parts = layers.map(({drawn, header: {name, count, faint}}) =>
+      `${layers.length > 1 ? `${name}: ` : ""}${thousands(drawn)} of ${thousands(count)} splats` +
+      (faint ? ` + ${thousands(faint)} too faint to draw` : ""));
     if (ms !== null) parts.push(`${ms < 10 ? ms.toFixed(1) : Math.round(ms)} ms a frame`);
     if (scale < 1) parts.push(`${Math.round(100 * scale)} % resolution`);
     find("statistics").textContent = parts.join(" · ");

@@ -1,6 +1,7 @@
 """The page in a real browser, without a display: what it draws, what its controls do, and that nothing leaves it."""
 
 import json
+import re
 from base64 import b64decode
 from dataclasses import replace
 from pathlib import Path
@@ -324,6 +325,9 @@ def test_two_models_share_a_camera(browser, tmp_path):
     assert min(left.mean(), right.mean()) > 5
     assert np.abs(left.astype(int) - right).mean() > 5
     assert browser.run("document.getElementById('names').innerText").split() == ["a", "b"]
+    told = browser.run("document.getElementById('statistics').textContent")
+    counts = [pack(one).count for one in (model, other)]
+    assert re.match(r"a: \d+ of {} splats.* · b: \d+ of {} splats".format(*counts), told), told
     assert browser.run("document.getElementById('strip')") is None, "there are no views"
 
 
