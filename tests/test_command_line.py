@@ -90,6 +90,7 @@ NEAR = {
     "--devise x run": "clsplat: no option --devise; did you mean --device?",
     "render x --split tset": "invalid value for '--split'",
     "run smokee": "no pipeline named 'smokee'; did you mean 'smoke'?",
+    "check lodout": "no pipeline named 'lodout', and no such file or folder; `clsplat pipelines` lists pipelines",
     "run smoke --scene x --set steps=3": "--set steps=3: no key 'steps' at the top of a pipeline; did you mean",
     "resume nowhere": "nowhere: has no pipeline.yaml; expected the folder of a run",
     "status nowhere": "nowhere: has no readable status.json; expected the folder of a run",
@@ -180,6 +181,10 @@ def test_a_run_folder_is_a_model_with_its_scene(finished, tiny_scene, tmp_path):
 
 def test_a_run_folder_that_is_no_model_says_why(finished, tmp_path):
     assert "expected a model file or a run folder" in clsplat("evaluate", tmp_path, expect=3).stderr
+    (tmp_path / "a.JPG").touch()
+    for command in ("evaluate", "view"):
+        said = clsplat(command, tmp_path, expect=3).stderr
+        assert f"for a model of its photographs, run `clsplat run photos --scene {tmp_path}` first" in said
     run = tmp_path / "run"
     shutil.copytree(finished, run)
     text = (run / "pipeline.yaml").read_text()

@@ -36,5 +36,6 @@ def find(name: str) -> Path:
         remedy = f"with a scene it is `clsplat run splat_7k --scene {path}`"
         raise ConfigError(f"{path}: is a folder, expected a pipeline file; {remedy}")
     near = difflib.get_close_matches(name, files, n=1)
-    hint = f"; did you mean '{near[0]}'?" if near else f"; there are {', '.join(files)}, or give a path"
+    unknown = ", and no such file or folder; `clsplat pipelines` lists pipelines"
+    hint = f"; did you mean '{near[0]}'?" if near else unknown
     raise ConfigError(f"no pipeline named {quoted(name)}{hint}")

@@ -2,12 +2,13 @@
 
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 
 from clsplat.errors import ConfigError, DataError
 from clsplat.formats.table import located
 from clsplat.gaussians.model import Model
-from clsplat.gaussians.run_model import model_of_run
+from clsplat.gaussians.run_model import MODEL, model_at, model_of_run
 from clsplat.names import PIPELINE
 from clsplat.pages.page import scene_name
 from clsplat.pipeline.file import SceneSettings
@@ -15,6 +16,7 @@ from clsplat.pipeline.loading import Pipeline, load
 from clsplat.prepare.cache import noted
 from clsplat.runs.found import has_pipeline
 from clsplat.scene.detect import read_scene
+from clsplat.scene.images import is_image
 from clsplat.scene.scene import Alpha, Scene
 from clsplat.stages.export import Export
 
@@ -40,14 +42,14 @@ class Source:
         trained = scene if scene is not None and has_pipeline(scene) else run
         if trained is None and scene is None:
             if model.is_dir() and not located(model).is_file():
-                raise DataError(f"{model}: has no pipeline.yaml; expected a model file or a run folder")
+                raise _no_model(model)
             raise ConfigError(
                 f"{model}: a model file does not name its scene; give the folder of a scene, or a run folder"
             )
         settings = load(str(trained / PIPELINE)).settings.scene if trained is not None else SceneSettings()
         file = model_of_run(model) if run == model else model
         if run == model and not file.is_file():
-            raise DataError(f"{model}: has no {file.name}; finish the run with `clsplat resume {model}`")
+            raise _no_model(model, file.name)
         given = scene if scene is not None else run or model
         folder = photographs_of(given)
         name = scene_name(settings.path if settings.path and has_pipeline(given) else folder)
@@ -56,6 +58,22 @@ class Source:
     def scene(self, model: Model) -> Scene:
         """Read the photographs as the model was trained on, at their full size."""
         return read_scene(self.folder, self.settings.split).with_alpha(self.alpha or model.rendering.alpha)
+
+
+def require_model(path: Path) -> None:
+    """Raise DataError for a folder that holds no model."""
+    if path.is_dir() and not (file := model_at(path)).is_file():
+        raise _no_model(path, file.name)
+
+
+def _no_model(folder: Path, name: str = MODEL) -> DataError:
+    """The error of a folder without a model, with the remedy for what it is."""
+    if has_pipeline(folder):
+        return DataError(f"{folder}: has no {name}; finish the run with `clsplat resume {folder}`")
+    fault = f"{folder}: has no {PIPELINE}; expected a model file or a run folder"
+    if any(map(is_image, chain(folder.glob("*"), folder.glob("images/*")))):
+        return DataError(f"{fault}; for a model of its photographs, run `clsplat run photos --scene {folder}` first")
+    return DataError(fault)
 
 
 def run_of(model: Path) -> Path | None:
