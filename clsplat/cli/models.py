@@ -94,9 +94,10 @@ def view(
 ) -> None:
     """Write a page to walk through a model, beside its photographs; it opens offline."""
     before = "replaced; " if is_there(out) else ""
-    page = commands.view(
-        *models, scene=scene, out=out, photographs=photographs, photograph_budget=photograph_budget, splats=splats
-    )
+    with terminal.counted():
+        page = commands.view(
+            *models, scene=scene, out=out, photographs=photographs, photograph_budget=photograph_budget, splats=splats
+        )
     terminal.remark(f"{page}: {before}{page.stat().st_size / 1e6:.1f} MB; open it in a browser")
 
 

@@ -2,7 +2,7 @@
 
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.errors import ConfigError
-from clsplat.gaussians.model import load
+from clsplat.gaussians.model import Model, load
 from clsplat.gaussians.sky_splats import with_sky_splats
 from clsplat.names import PIPELINE
 from clsplat.pipeline.loading import load as load_pipeline
+from clsplat.progress import counted
 from clsplat.results import check_no_file_of_a_run
-from clsplat.runs.source import Source, run_of
+from clsplat.runs.source import Source, require_model, run_of
 from clsplat.scene.photographs import load_photograph
 from clsplat.scene.scene import View
 from clsplat.scene.stand import Stand
@@ -26,6 +27,7 @@ from clsplat.views.photographs import BACKGROUNDS
 
 LOG = logging.getLogger("clsplat")
 MOST = 2  # models beside each other
+MANY = 2_000_000  # splats: a page of more opens slowly
 
 
 def view(
@@ -53,11 +55,15 @@ def view(
         raise ConfigError(f"no photographs '{photographs}'; there are none, test and all")
     if not 0 <= photograph_budget < math.inf:
         raise ConfigError(f"--photograph-budget {photograph_budget:g}: expected MB, a finite number of at least 0")
+    for path in models:
+        require_model(path)
     source = next((Source.of(path, scene) for path in models if scene is not None or run_of(path)), None)
     if photographs == "all" and source is None:
         raise ConfigError("--photographs all needs the photographs of a scene; give --scene, or a run folder")
     _tell_of_scenes(models, source)
-    loaded = {name: load(path) for name, path in zip(names(models), models, strict=True)}
+    called = names(models)
+    loaded = dict(zip(called, map(load, counted(models, "models read", len(models))), strict=True))
+    _advise(loaded, splats)
     first = next(iter(loaded.values()))
     found = source.scene(first).downscaled(source.settings.downscale) if source else None
     background = first.rendering.background or (found.background if found else "black")
@@ -71,9 +77,21 @@ def view(
     title = " and ".join(loaded) + (f" · {source.scene_name}" if source else "")
     if found is None:
         LOG.info("without a scene up is -y; give --scene where the picture stands on its head")
-    shown = {name: pack(with_sky_splats(model), splats) for name, model in loaded.items()}
+    packed = counted(loaded.items(), "models packed", len(loaded))
+    shown = {name: pack(with_sky_splats(model), splats) for name, model in packed}
     Page(title, shown, stand, background, views).write(out)
     return out
+
+
+def _advise(loaded: Mapping[str, Model], splats: int | None) -> None:
+    """Warn of models with more splats than a page shows smoothly, before they are packed, which takes minutes."""
+    for name, model in loaded.items():
+        if min(len(model), splats or len(model)) > MANY:
+            LOG.warning(
+                "%s: has %s splats; they take a while to pack, and browsers show %s smoothly: give --splats %d, "
+                "which keeps the most important, or make a smaller model with `clsplat compress`",
+                *(name, f"{len(model):,}", f"{MANY:,}", MANY),
+            )
 
 
 def _tell_of_scenes(models: Sequence[Path], source: Source | None) -> None:

@@ -13,6 +13,7 @@ from clsplat.cli import app
 from clsplat.errors import ConfigError, DataError, OutputError
 from clsplat.pipeline.files import shipped
 from clsplat.pipeline.loading import load
+from clsplat.progress import heard_by
 from clsplat.runs.viewing import names
 from clsplat.scene.detect import read_scene
 from clsplat.stages.viewer import Viewer
@@ -43,6 +44,18 @@ def test_a_run_writes_a_viewer_and_its_report_leads_to_it(run):
     assert viewer.count('"photograph":null') == 8, "training views have a thumbnail alone"
     assert '<a class="viewer" href="viewer.html">' in report
     assert Page(report).elements["a"] == 2, "the viewer and the model"
+
+
+def test_more_splats_than_a_page_shows_smoothly_come_with_advice(run, tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr("clsplat.runs.viewing.MANY", 10)
+    heard = []
+    with heard_by(lambda *what, seconds_left: heard.append(what)):
+        clsplat.view(run, out=tmp_path / "a.html")
+    assert "browsers show 10 smoothly: give --splats 10" in caplog.text
+    assert heard == [("models read", i, 1) for i in (0, 1)] + [("models packed", i, 1) for i in (0, 1)]
+    caplog.clear()
+    clsplat.view(run, out=tmp_path / "a.html", splats=10)
+    assert "smoothly" not in caplog.text
 
 
 def test_titles_name_the_folder_that_the_user_gave(run, tiny_scene, tmp_path, monkeypatch):
