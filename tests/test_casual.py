@@ -203,6 +203,25 @@ def blocks(seed: int, width: int, height: int) -> np.ndarray:
     return cv2.GaussianBlur(pixels, (0, 0), 0.8)
 
 
+def test_a_blurred_photograph_is_told_from_one_of_another_place_that_is_as_soft(tmp_path):
+    pycolmap = pytest.importorskip("pycolmap")
+    wide = blocks(1, 900, 600)
+    pictures = {f"{i}.png": wide[:, 60 * i : 60 * i + 700] for i in range(3)}
+    pictures |= {"blurred.png": cv2.GaussianBlur(wide[:, 90:790], (0, 0), 2)}
+    pictures |= {"elsewhere.png": cv2.GaussianBlur(blocks(2, 700, 600), (0, 0), 2)}
+    for name in ("photographs", "features", "matches"):
+        (tmp_path / name).mkdir()
+    for name, pixels in pictures.items():
+        cv2.imwrite(str(tmp_path / "photographs" / name), pixels)
+    find_features(tmp_path / "photographs", tmp_path / "features", Sought(700, 3000))
+    match_features(tmp_path / "features", tmp_path / "matches")
+    found = Matched.of(pycolmap, tmp_path / "matches" / "database.db", tmp_path / "photographs")
+    assert reasons(found, [{"0.png", "1.png", "2.png"}]) == {
+        "blurred.png": "blurred",
+        "elsewhere.png": "shows nothing that another photograph shows",
+    }
+
+
 def turned(number: int) -> np.ndarray:
     """What a camera sees that turns before a far wall, by 6 degrees each time."""
     angle = math.radians(6 * number - 15)
