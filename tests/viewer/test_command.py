@@ -51,7 +51,7 @@ def test_more_splats_than_a_page_shows_smoothly_come_with_advice(run, tmp_path, 
     heard = []
     with heard_by(lambda *what, seconds_left: heard.append(what)):
         clsplat.view(run, out=tmp_path / "a.html")
-    assert "browsers show 10 smoothly: give --splats 10" in caplog.text
+    assert "browsers show 10 smoothly: --splats 10 keeps" in caplog.text
     assert heard == [("models read", i, 1) for i in (0, 1)] + [("models packed", i, 1) for i in (0, 1)]
     caplog.clear()
     clsplat.view(run, out=tmp_path / "a.html", splats=10)
