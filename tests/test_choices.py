@@ -10,6 +10,7 @@ from clsplat.errors import ConfigError
 from clsplat.pipeline.choosing import choose, undone
 from clsplat.pipeline.loading import load
 from clsplat.pipeline.stretching import in_steps
+from clsplat.runs import minutes
 from clsplat.runs.description import describe
 from clsplat.runs.found import has_ended
 from clsplat.runs.single import run_pipeline
@@ -198,6 +199,14 @@ def test_each_row_may_have_its_reason():
     assert choose(settings, {"photographs": 9}).choices[0].reason == "9 training photographs; few"
     with pytest.raises(ConfigError, match="words for each of 3 rows"):
         load("smoke", [f"choices=[{reasons.replace('[none, few, many]', '[none, few]')}]"])
+
+
+def test_photos_in_a_time_says_what_to_set_and_takes_it():
+    chosen = choose(load("photos").settings, {"photographs": 20})
+    with pytest.raises(ConfigError, match=r"chosen by 20 training photographs; .*add --set optimize\.refit=false"):
+        minutes.rehearsals_of(replace(load("photos"), settings=chosen), None, 1.0)
+    once = choose(load("photos", ["optimize.refit=false"]).settings, {"photographs": 20}).training
+    assert (once.refit, once.keep, once.patience) == (False, "best", 4)
 
 
 @pytest.mark.parametrize(

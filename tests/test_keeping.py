@@ -323,7 +323,9 @@ def test_other_models_at_the_end_are_refused(tmp_path):
 
 def test_minutes_know_no_refit(tiny_scene, tmp_path, pipeline):
     job = Job.open(pipeline, tiny_scene, tmp_path / "run", REFIT)
-    with pytest.raises(ConfigError, match="a refit trains twice"):
+    with pytest.raises(
+        ConfigError, match=r"optimize\.refit trains twice, .*; expected one training: add --set optimize\.refit=false"
+    ):
         job.run(minutes=5)
 
 

@@ -136,9 +136,12 @@ def rehearsals_of(pipeline: Pipeline, run: Run, minutes: float) -> list[Rehearsa
     if trains != 1:
         raise ConfigError(f"{pipeline.path}: --minutes: expected one stage that trains, found {trains}; leave it out")
     if pipeline.settings.training.refit:
+        chosen = next((one for one in pipeline.settings.choices if "optimize.refit" in one.keys and one.reason), None)
         raise ConfigError(
-            f"{pipeline.path}: --minutes: a refit trains twice, for nobody knows how long: set optimize.refit=false or "
-            "leave --minutes out"
+            f"{pipeline.path}: --minutes: optimize.refit trains twice, for nobody knows how long"
+            + (f" (chosen by {chosen.reason})" if chosen else "")
+            + "; expected one training: add --set optimize.refit=false, which leaves the best model by the validation "
+            "photographs, or leave --minutes out"
         )
     steps = pipeline.settings.training.steps
     found, took = list[Rehearsal](), 0.0
