@@ -136,12 +136,10 @@ def rehearsals_of(pipeline: Pipeline, run: Run, minutes: float) -> list[Rehearsa
     if trains != 1:
         raise ConfigError(f"{pipeline.path}: --minutes: expected one stage that trains, found {trains}; leave it out")
     if pipeline.settings.training.refit:
-        chosen = next((one for one in pipeline.settings.choices if "optimize.refit" in one.keys and one.reason), None)
+        made = [f" (chosen by {one.reason})" for one in pipeline.settings.choices if "optimize.refit" in one.keys]
         raise ConfigError(
-            f"{pipeline.path}: --minutes: optimize.refit trains twice, for nobody knows how long"
-            + (f" (chosen by {chosen.reason})" if chosen else "")
-            + "; expected one training: add --set optimize.refit=false, which leaves the best model by the validation "
-            "photographs, or leave --minutes out"
+            f"{pipeline.path}: --minutes: optimize.refit trains twice, for nobody knows how long{''.join(made)}; expected "
+            "one training: add --set optimize.refit=false, which leaves its best model, or leave --minutes out"
         )
     steps = pipeline.settings.training.steps
     found, took = list[Rehearsal](), 0.0
