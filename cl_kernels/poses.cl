@@ -10,7 +10,7 @@
  *
  * dL/dq has no part along q, so that the length of q does not matter.  The world filter is round: it does not turn.
  *
- * One item = LANES Gaussians; one group of POSE_GROUP items writes its sums, which the host adds in double in their
+ * One item = LANES Gaussians; one group of POSE_GROUP items writes its sums, which the host adds in 64 bits in their
  * order.  Local memory: POSE_GROUP * POSE_SUMS * 4 bytes.  Deterministic. */
 #include "backward.h"
 
@@ -39,6 +39,7 @@ static inline void pose_terms(
     }
 }
 
+/* The sums of each group, from the sums over pixels of each Gaussian. */
 __kernel __attribute__((reqd_work_group_size(POSE_GROUP, 1, 1)))
 void pose_gradient(
     __global const float *restrict means,            // [3,S] scene units

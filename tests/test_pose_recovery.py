@@ -18,7 +18,7 @@ from clsplat.training.adam import Adam, Rates
 from clsplat.training.trainer import Trainer
 from clsplat.views.photograph_poses import PhotographPoses
 from clsplat.views.photographs import Photograph
-from clsplat.views.poses import Poses, moved
+from clsplat.views.poses import Move, Poses
 
 VIEWS, STEPS, ANGLE, DEPTH = 6, 900, np.radians(0.3), 3.0
 RATE = Decay(initial=2e-3, final=2e-5, over=STEPS)
@@ -37,18 +37,18 @@ def errors(truth: list[View], found: list[np.ndarray]) -> tuple[float, float]:
 
 def learned(rng: np.random.Generator, info, jitter: float) -> tuple[tuple[float, float], tuple[float, float]]:
     """Errors of cameras before and after they are learned; jitter: 1 for 0.3 degrees and 0.3 % of the depth."""
-    case, device = random_case(rng, 120, 64, 48), Device(info)
+    case, device = random_case(rng, 200, 96, 72), Device(info)
     model, rasterizer = case.model(device), Rasterizer(device)
     background, photographs = device.upload(np.full(3, 0.3, np.float32)), list[Photograph]()
     places = [np.array([0.25 * number - 0.6, 0.15 * (number % 3), 0]) for number in range(VIEWS)]
     truth = [
-        replace(case.view, name=str(n), world_to_camera=moved(case.view.world_to_camera, np.zeros(3), place))
+        replace(case.view, name=str(n), world_to_camera=Move(np.zeros(3), place, 0).of(case.view.world_to_camera))
         for n, place in enumerate(places)
     ]
     turns, shifts = jitter * rng.normal(size=(2, VIEWS, 3)) * np.array([[[ANGLE]], [[0.003 * DEPTH]]])
     turns, shifts = turns - turns.mean(axis=0), shifts - shifts.mean(axis=0)
     views = [
-        replace(view, world_to_camera=moved(view.world_to_camera, turn, shift))
+        replace(view, world_to_camera=Move(turn, shift, 0).of(view.world_to_camera))
         for view, turn, shift in zip(truth, turns, shifts, strict=True)
     ]
     for number, (view, given) in enumerate(zip(truth, views, strict=True)):
@@ -56,8 +56,8 @@ def learned(rng: np.random.Generator, info, jitter: float) -> tuple[tuple[float,
         pixels = np.ascontiguousarray(np.rint(255 * values).astype(np.uint8).transpose(2, 0, 1))
         photographs.append(Photograph(replace(upload_camera(device, given), view=number), device.upload(pixels)))
     numbers = dict[str, float]()
-    poses = PhotographPoses(views, 0, *Poses(start=0, turn=RATE, shift=RATE).rates(STEPS, VIEWS), extent=DEPTH)
-    poses.begin(numbers)
+    poses = PhotographPoses(views, 0, *Poses(start=0, turn=RATE, shift=RATE).rates(STEPS, VIEWS))
+    poses.begin(numbers, dict.fromkeys((view.name for view in views), DEPTH))
     parts = rasterizer, model, Adam(model.gaussians), SplatStats(model.gaussians, []), background
     trainer = Trainer(*parts, (L1(weight=0.8), Dssim(weight=0.2)), STILL, numbers=numbers, poses=poses)
     for step in range(1, STEPS + 1):

@@ -20,6 +20,7 @@ from clsplat.training.run import Run
 from clsplat.views.photograph_poses import PhotographPoses
 from clsplat.views.poses import Floats, Poses
 
+FEWEST, POINTS = 10, 10_000  # of the points that tell a depth
 LOG = logging.getLogger("clsplat")
 
 
@@ -37,10 +38,21 @@ def photograph_poses(poses: Poses | None, run: Run, last: int) -> PhotographPose
         )
     views = run.scene.split("train")
     rates = poses.rates(last, len({view.name for view in views}))
-    found = PhotographPoses(views, poses.start, *rates, extent=run.scene.extent)
+    found = PhotographPoses(views, poses.start, *rates)
     if not found.begun(run.numbers):
-        found.begin(run.numbers)
+        found.begin(run.numbers, {view.name: depth_of(view, run.scene) for view in views})
     return found
+
+
+def depth_of(view: View, scene: Scene) -> float:
+    """Return the median depth of the scene's points that a view may show; the extent where they are too few."""
+    points = np.zeros((0, 3)) if scene.points is None else scene.points.positions
+    points = np.asarray(points[:: 1 + len(points) // POINTS], np.float64)
+    x, y, z = np.einsum("ij,nj->in", view.world_to_camera[:, :3], points) + view.world_to_camera[:, 3:]
+    z = np.where(z > 0, z, np.inf)
+    column, row = (view.camera.fx * x / z + view.camera.cx, view.camera.fy * y / z + view.camera.cy)
+    inside = np.isfinite(z) & (column >= 0) & (column < view.camera.width) & (row >= 0) & (row < view.camera.height)
+    return float(np.median(z[inside])) if np.count_nonzero(inside) >= FEWEST else float(scene.extent)
 
 
 def refined(numbers: Mapping[str, float], scene: Scene) -> Scene:
@@ -87,11 +99,12 @@ def write_view_poses(run: Run, poses: PhotographPoses | None) -> None:
         },
     }
     write_text(run.out / VIEW_POSES, json.dumps(data, indent=1) + "\n")
-    turns, shifts = ([math.hypot(*table.row(run.numbers, view)) for view in table.views] for table in poses.tables)
+    moves = [poses.move(run.numbers, view) for view in poses.tables[0].views]
+    turns, shifts = [math.hypot(*move.turn) for move in moves], [math.hypot(*move.shift) / move.depth for move in moves]
     LOG.info(
-        "poses of %d photographs in %s: turned by up to %.3f°, shifted by up to %.2g extents; medians %.3f°, %.2g",
-        *(len(names), VIEW_POSES, math.degrees(max(turns)), max(shifts) / poses.extent),
-        *(math.degrees(float(np.median(turns))), float(np.median(shifts)) / poses.extent),
+        "poses of %d photographs in %s: turned by up to %.3f°, shifted by up to %.2g of the depth; medians %.3f°, %.2g",
+        *(len(names), VIEW_POSES, math.degrees(max(turns)), max(shifts)),
+        *(math.degrees(float(np.median(turns))), float(np.median(shifts))),
     )
 
 

@@ -16,10 +16,10 @@ from clsplat.render.workspace import Workspace
 from clsplat.scene.view import View
 from clsplat.schedule import Schedule, at_step
 from clsplat.views.photographs import Photograph
-from clsplat.views.poses import Floats, gradients, moved
+from clsplat.views.poses import Floats, Move
 from clsplat.views.view_table import ViewTable
 
-TURNS, SHIFTS, AXES = "pose_turns", "pose_shifts", ("x", "y", "z")
+TURNS, SHIFTS, DEPTHS, AXES = "pose_turns", "pose_shifts", "pose_depths", ("x", "y", "z")
 SUMS, GROUP = (int(constants("poses.cl")[name]) for name in ("POSE_SUMS", "POSE_GROUP"))
 
 
@@ -30,8 +30,7 @@ class PhotographPoses:
     views: Sequence[View]  # by number
     start: int = 0  # global step after which they are learned
     turn_rate: Schedule = 0.0  # rad
-    shift_rate: Schedule = 0.0  # shares of the extent
-    extent: float = 1.0  # scene units
+    shift_rate: Schedule = 0.0  # shares of the depth
 
     @cached_property
     def tables(self) -> tuple[ViewTable, ViewTable]:
@@ -43,16 +42,22 @@ class PhotographPoses:
         """Whether the numbers hold the tables."""
         return self.tables[0].begun(numbers)
 
-    def begin(self, numbers: dict[str, float]) -> None:
-        """Set the numbers before the first step."""
+    def begin(self, numbers: dict[str, float], depths: Mapping[str, float]) -> None:
+        """Set the numbers before the first step.  depths: by view, scene units; see Move."""
         for table in self.tables:
             table.begin(numbers, {})
+        numbers.update({f"{DEPTHS}/{view}": depths[view] for view in self.tables[0].views})
+
+    def move(self, numbers: Mapping[str, float], view: str) -> Move:
+        """Return how far the camera of a view has moved."""
+        turn, shift = (table.row(numbers, view) for table in self.tables)
+        return Move(turn, shift, numbers[f"{DEPTHS}/{view}"])
 
     def pose(self, numbers: Mapping[str, float], view: int) -> Floats:
         """Return the pose, [3, 4], of a training view by its number."""
-        turn, shift = (table.row(numbers, self.views[view].name) for table in self.tables)
+        move = self.move(numbers, self.views[view].name)
         pose: Floats = np.asarray(self.views[view].world_to_camera, np.float64)
-        return moved(pose, turn, shift) if turn.any() or shift.any() else pose
+        return move.of(pose) if move.turn.any() or move.shift.any() else pose
 
     def place(self, photograph: Photograph, numbers: Mapping[str, float], step: int) -> Photograph:
         """Return a photograph with its camera as it is at a global step."""
@@ -69,13 +74,14 @@ class PhotographPoses:
         if number is None or step <= self.start:
             return None
         waiting = pose_gradient(workspace, model, frame, pixel_sums)
-        return lambda numbers: self._learn(numbers, self.views[number].name, waiting(), step)
+        return lambda numbers: self._learn(numbers, number, waiting(), step)
 
-    def _learn(self, numbers: dict[str, float], name: str, sums: Floats, step: int) -> None:
-        turns, shifts = self.tables
-        by_turn, by_shift = gradients(turns.row(numbers, name), sums[:3], sums[3:])
+    def _learn(self, numbers: dict[str, float], number: int, sums: Floats, step: int) -> None:
+        name, (turns, shifts) = self.views[number].name, self.tables
+        move = self.move(numbers, name)
+        by_turn, by_shift = move.gradients(self.pose(numbers, number), sums[:3], sums[3:])
         turns.update(numbers, name, by_turn, at_step(self.turn_rate, step))
-        shifts.update(numbers, name, by_shift, self.extent * at_step(self.shift_rate, step))
+        shifts.update(numbers, name, by_shift, move.depth * at_step(self.shift_rate, step))
 
 
 def pose_gradient(workspace: Workspace, model: DeviceModel, frame: Frame, pixel_sums: Array) -> Callable[[], Floats]:
