@@ -15,7 +15,7 @@ from clsplat.runs import cameras
 from clsplat.runs.model_file import evaluate
 from clsplat.scene.detect import read_scene
 from clsplat.schedule import at_step
-from clsplat.training.poses import poses_beside, refined
+from clsplat.training.poses import photograph_poses, poses_beside, refined
 from clsplat.views.photograph_poses import PhotographPoses
 from clsplat.views.poses import Move, Poses
 from tests.few_steps import FEW
@@ -130,6 +130,7 @@ def test_a_resumed_run_ends_with_the_bits_of_one_that_was_not(with_poses, tiny_s
     assert digest(out) == digest(with_poses) == digest(tmp_path / "again")
     assert run.numbers == again.numbers
     assert sum(value for name, value in run.numbers.items() if name.endswith("x/updates")) == 2 * (12 - 2)
+    assert photograph_poses(None, run, 24).move(run.numbers, run.scene.split("train")[0].name).shift.any(), "they stay"
     for table in PhotographPoses(run.scene.split("train")).tables:
         rows = np.array([table.row(run.numbers, view) for view in table.views])
         assert rows.sum(axis=0) == pytest.approx(np.zeros(3), abs=1e-12)

@@ -25,18 +25,20 @@ LOG = logging.getLogger("clsplat")
 
 
 def photograph_poses(poses: Poses | None, run: Run, last: int) -> PhotographPoses | None:
-    """Return the poses of a training whose last global step is given, or None where they are the dataset's.
+    """Return the poses of a training whose last global step is given, or None where they are the dataset's:
+    those that a training before has learned stay.
 
     The numbers of a run that begins are set; a resumed run has them.  Raises ConfigError where the model has a sky.
     """
+    views = run.scene.split("train")
     if poses is None:
-        return None
+        learned = PhotographPoses(views)  # by a training before, whose model this one goes on with
+        return learned if learned.begun(run.numbers) else None
     if run.sky:
         raise ConfigError(
             "optimize.poses: the model has a sky, which is not learned together with poses; leave out optimize.poses, "
             "or model.background"
         )
-    views = run.scene.split("train")
     rates = poses.rates(last, len({view.name for view in views}))
     found = PhotographPoses(views, poses.start, *rates)
     if not found.begun(run.numbers):
