@@ -384,6 +384,21 @@ def test_a_folder_with_cameras_is_not_a_folder_of_photographs(tiny_scene, tmp_pa
     assert not list((tmp_path / "r" / "p").iterdir())
 
 
+def test_a_scene_that_holds_cameras_is_taken_as_it_is(pipeline, tiny_scene, tmp_path):
+    """Its run folder is that of a pipeline without `prepare`, and goes on as such a one."""
+    words = ["run", str(pipeline), "--scene", str(tiny_scene), "--set", "optimize.steps=3", "--out", "runs/a"]
+    code, told = clsplat(*words, "--dry-run")
+    assert code == 0
+    assert f"{tiny_scene} holds cameras; left out: find_features\n" in told
+    assert clsplat(*words)[0] == 0
+    folder = tmp_path / "runs" / "a"
+    assert f"# {tiny_scene} holds cameras; left out: find_features" in (folder / "pipeline.yaml").read_text()
+    assert not (tmp_path / "runs" / "prepared").exists()
+    assert clsplat("check", "runs/a")[0] == 0
+    assert clsplat("resume", "runs/a", "--steps", "5")[0] == 0
+    assert json.loads((folder / "metrics.json").read_text())["steps"] == 5
+
+
 def test_the_note_of_a_run_names_its_photographs(pipeline, photos, tmp_path):
     run(pipeline, photos)
     note = json.loads((tmp_path / "runs" / "smoke" / "prepared.json").read_text())

@@ -1,8 +1,9 @@
 """From a pipeline file to checked stages, and back to the resolved file that a run folder holds."""
 
 import copy
+import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,8 @@ from clsplat.prepare.cache import Planned, plan
 from clsplat.settings import Settings, variants
 from clsplat.stages.base import Scheduled, Stage, written_twice
 from clsplat.stages.optimize import Optimize
+
+LOG = logging.getLogger("clsplat")
 
 
 @dataclass(frozen=True)
@@ -86,10 +89,20 @@ def checked(path: Path, document: Document, overrides: Sequence[str] = ()) -> Pi
         for override in overrides:
             places.append(apply(data, override, PipelineFile))
             data = with_new_names(data, warn_about=f"--set {override}", old_wins=True)
-        return Pipeline(path, _validated(without_overridden(data, places), path, document))
+        return _as_needed(Pipeline(path, _validated(without_overridden(data, places), path, document)))
     except ConfigError:
         _blame(tagged, overrides, path, document)
         raise
+
+
+def _as_needed(pipeline: Pipeline) -> Pipeline:
+    """The pipeline without steps of `prepare` whose work a scene has behind it; say so."""
+    steps, scene = pipeline.settings.prepare, pipeline.settings.scene
+    if not steps or scene.path is None or not steps[0].is_done_in(scene.folder):
+        return pipeline
+    reason = f"{scene.folder} holds cameras; left out: {', '.join(step.stage for step in steps)}"
+    LOG.info("%s", reason)
+    return replace(pipeline, settings=pipeline.settings.model_copy(update={"prepare": []}), reason=reason)
 
 
 def _validated(data: dict[str, Any], path: Path, document: Document) -> PipelineFile:

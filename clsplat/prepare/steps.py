@@ -37,6 +37,10 @@ class Step(Settings):
         Nothing is written.
         """
 
+    def is_done_in(self, source: Path) -> bool:
+        """Return whether `source` needs neither this step nor those after it: such as a scene that holds cameras."""
+        return False
+
     @abstractmethod
     def make(self, source: Path, out: Path, without: Path) -> dict[str, Any]:
         """Fill the folder `out` from `source`, without reading below `without`; return figures for the log.
@@ -70,12 +74,12 @@ class FindFeatures(Step):
     cameras: Cameras = "auto"
     """Which photographs of one size share a camera; auto: those of which EXIF tells the same lens, or nothing."""
 
+    def is_done_in(self, source: Path) -> bool:
+        return holds_scene(source)
+
     def check(self, source: Path, without: Path) -> None:
         if holds_scene(source):
-            raise DataError(
-                f"{source}: holds cameras already; train it with a pipeline without `prepare`, such as splat_7k, "
-                "or give the folder of the photographs alone"
-            )
+            raise DataError(f"{source}: holds cameras already; give the folder of the photographs alone")
         require_photographs(source, without.resolve())
         require_pycolmap()
 

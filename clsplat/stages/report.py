@@ -11,6 +11,7 @@ from clsplat.files import write_text
 from clsplat.names import PIPELINE
 from clsplat.pages.page import duration, render, require_end
 from clsplat.reading import read_text
+from clsplat.report.advice import advice
 from clsplat.report.cameras import cameras
 from clsplat.report.charts import gaussians_charts, training_charts
 from clsplat.report.parting import parting
@@ -36,12 +37,14 @@ class Report(Stage):
     """Path inside the run folder."""
 
     def run(self, run: Run) -> None:
+        advised = advice(run)
         page = render(
             "report.html.j2",
             title=run.scene_name,
             subtitle=f"{run.name} · {run.device.text}",
             main=_main(run),
             parting=parting(run),
+            advice=advised,
             photographs=photographs_text(run.found) or f"{amount(len(run.original.views), 'photograph')}",
             viewers=_addresses(run, "viewer", run.out / self.file),
             models=_addresses(run, "export", run.out / self.file),
@@ -55,6 +58,8 @@ class Report(Stage):
         )
         write_text(run.out / self.file, page)
         LOG.info("report written to %s", run.out / self.file)
+        for text in advised:
+            LOG.info("advice: %s", text)
 
     def verify(self, run: Run) -> None:
         require_end(run.out / self.file)
