@@ -55,9 +55,11 @@ if TYPE_CHECKING:
     from clsplat.gaussians.model import Rendering as Rendering
     from clsplat.gaussians.model import load as load
     from clsplat.scene.camera import Camera as Camera
+    from clsplat.scene.choice import Choice as Choice
     from clsplat.scene.detect import read_scene as read_scene
     from clsplat.scene.scene import PointCloud as PointCloud
     from clsplat.scene.scene import Scene as Scene
+    from clsplat.scene.split import Split as Split
     from clsplat.scene.view import View as View
 
 __version__ = "0.1.0"
@@ -74,8 +76,10 @@ _ROOMS = {  # where the names come from, which `import clsplat` does not import
     "clsplat.formats.splats": "Reading Writing",
     "clsplat.gaussians.model": "Model Rendering load",
     "clsplat.scene.camera": "Camera",
+    "clsplat.scene.choice": "Choice",
     "clsplat.scene.detect": "read_scene",
     "clsplat.scene.scene": "PointCloud Scene",
+    "clsplat.scene.split": "Split",
     "clsplat.scene.view": "View",
 }
 _PLACES = {name: room for room, names in _ROOMS.items() for name in names.split()}

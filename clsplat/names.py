@@ -19,10 +19,11 @@ UNDISTORTED = "undistorted"
 PREPARED = "prepared"
 COMPARISON = "compare.html"
 VIEW_COLOURS = "view_colours.json"
+VIEW_POSES = "view_poses.json"
 RESERVED = frozenset(
     {
         *(PIPELINE, METRICS, RECORDS, TRIAL, STATUS, LOG_FILE, NOTE, INPUTS, CHECKSUMS, LOCK),
-        *(CHECKPOINTS, UNDISTORTED, PREPARED, COMPARISON, "cameras.json", VIEW_COLOURS),
+        *(CHECKPOINTS, UNDISTORTED, PREPARED, COMPARISON, "cameras.json", VIEW_COLOURS, VIEW_POSES),
     }
 )
 BEFORE_A_RUN = frozenset({STATUS, LOG_FILE, LOCK, UNDISTORTED})  # written before pipeline.yaml

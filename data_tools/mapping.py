@@ -16,7 +16,7 @@ from clsplat.progress import Count
 from data_tools.database import clear_features, explained, image_names, verified
 from data_tools.features import Sought, add_features
 from data_tools.gather import MIN_PHOTOGRAPHS, link
-from data_tools.matching import match_within
+from data_tools.matching import Pairing, match_within
 from data_tools.names import DATABASE, IMAGES, MODEL
 from data_tools.pycolmap_import import require_pycolmap
 from data_tools.reasons import Matched, diagnosis, reasons
@@ -43,7 +43,7 @@ class Attempt:
     told: str
     mapper: Mapper = "incremental"
     loose: bool = False  # fewer matches and smaller angles are enough
-    dense: bool = False  # with more features, and all pairs of up to 200 photographs
+    dense: bool = False  # with more features, matched as those of the first attempt are
 
 
 LATER = (
@@ -53,8 +53,13 @@ LATER = (
 )
 
 
-def map_cameras(source: Path, out: Path, mapper: Mapper = "incremental", threads: int = 1) -> dict[str, Any]:
-    """Place cameras and points; keep the largest model as sparse/0 and tell of the others.
+MOST = 1 + len(LATER)  # attempts
+
+
+def map_cameras(
+    source: Path, out: Path, mapper: Mapper = "incremental", threads: int = 1, attempts: int = MOST
+) -> dict[str, Any]:
+    """Place cameras and points, in so many attempts at most; keep the largest model as sparse/0, tell of the others.
 
     `mapper: global` is faster for many photographs; more than one thread is faster and not repeatable to the bit.
     Raises DataError, with the likely reason, when no attempt gives a model of three images.
@@ -69,7 +74,7 @@ def map_cameras(source: Path, out: Path, mapper: Mapper = "incremental", threads
             "no depth; walk around the scene, a step between photographs"
         )
     models, used = list[Any](), (first := Attempt("as set", mapper))
-    for attempt in (first, *LATER):
+    for attempt in (first, *LATER)[:attempts]:
         placed = models[0].num_reg_images() if models else 0
         if placed == len(names) or (attempt.dense and placed >= ENOUGH * len(names)):
             break
@@ -141,7 +146,7 @@ def _denser(source: Path, out: Path) -> Path:
         clear_features(require_pycolmap(), half)
         half.replace(database)
     add_features(source / IMAGES, database, DENSER)
-    match_within(database)
+    match_within(database, Pairing.beside(source))
     return database
 
 

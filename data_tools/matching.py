@@ -1,9 +1,11 @@
 """Which features of two photographs show the same point: found and verified by pycolmap, kept in its database."""
 
+import json
 import logging
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Literal
@@ -13,15 +15,31 @@ import numpy as np
 from clsplat.errors import DataError
 from clsplat.files import write_text
 from clsplat.progress import Count, watched
+from clsplat.reading import read_json
 from data_tools.database import explained, image_names, opened, pairs_done, verified
 from data_tools.gather import link
-from data_tools.names import DATABASE, IMAGES, PAIRS
+from data_tools.names import DATABASE, IMAGES, MATCHING, PAIRS
 from data_tools.pycolmap_import import require_pycolmap
 from data_tools.vocabulary import alike
 
 LOG = logging.getLogger("clsplat")
 Matching = Literal["auto", "exhaustive", "sequential", "vocabulary"]
 MAX_EXHAUSTIVE = 200  # photographs whose pairs are all matched: the time grows with the square of their number
+
+
+@dataclass(frozen=True)
+class Pairing:
+    """Which pairs are matched, and by how many threads: see match_features."""
+
+    matching: Matching = "auto"
+    neighbours: int = 10
+    threads: int = 1
+
+    @classmethod
+    def beside(cls, folder: Path) -> "Pairing":
+        """Return the one by which match_features made a folder; the usual one of a folder of an earlier version."""
+        path = folder / MATCHING
+        return cls(**read_json(path, "how photographs were matched")) if path.is_file() else cls()
 
 
 def match_features(
@@ -39,20 +57,22 @@ def match_features(
         half = out / f".{DATABASE}"
         shutil.copyfile(source / DATABASE, half)
         half.replace(database)
-    chosen = match_within(database, matching, neighbours, threads)
+    pairing = Pairing(matching, neighbours, threads)
+    write_text(out / MATCHING, json.dumps(asdict(pairing)) + "\n")
+    chosen = match_within(database, pairing)
     return {"matching": chosen, "pairs": len(verified(pycolmap, database))}
 
 
-def match_within(database: Path, matching: Matching = "auto", neighbours: int = 10, threads: int = 1) -> Matching:
+def match_within(database: Path, how: Pairing) -> Matching:
     """Match the photographs of a database as match_features does, but for pairs that it holds; return how.
 
     Raises DataError.
     """
     pycolmap = require_pycolmap()
-    count = len(image_names(pycolmap, database))
+    count, matching, neighbours = len(image_names(pycolmap, database)), how.matching, how.neighbours
     chosen = ("exhaustive" if count <= MAX_EXHAUSTIVE else "vocabulary") if matching == "auto" else matching
     options, verification = pycolmap.FeatureMatchingOptions(), pycolmap.TwoViewGeometryOptions()
-    options.use_gpu, options.num_threads, verification.ransac.random_seed = False, threads, 0
+    options.use_gpu, options.num_threads, verification.ransac.random_seed = False, how.threads, 0
     common = {
         "matching_options": options,
         "verification_options": verification,

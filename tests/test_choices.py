@@ -10,6 +10,7 @@ from clsplat.errors import ConfigError
 from clsplat.pipeline.choosing import choose, undone
 from clsplat.pipeline.loading import load
 from clsplat.pipeline.stretching import in_steps
+from clsplat.runs import minutes
 from clsplat.runs.description import describe
 from clsplat.runs.found import has_ended
 from clsplat.runs.single import run_pipeline
@@ -29,6 +30,7 @@ KEEP = (
     "{keys: [scene.validation, optimize.keep, optimize.patience], by: photographs, "
     "values: [[0, 0, last, null], [8, auto, best, 2], [9, 0, last, null]], since: few are learnt by heart}"
 )
+AUTO = "model.background={type: auto, chosen: on, reason: it is blue}"
 BOTH = f"choices=[{DEGREE}, {RESET}]"
 
 
@@ -153,8 +155,58 @@ def test_a_choice_may_keep_photographs_out_to_choose_by(tiny_scene, tmp_path):
     written = load(str(tmp_path / "run" / "pipeline.yaml"))
     run_pipeline(written, tmp_path / "again", None, "new")
     assert digest(tmp_path / "again") == digest(tmp_path / "run")
-    removed = load("smoke", [*settings, f"choices=[{KEEP}]", "scene.validation=0"])
-    assert removed.settings.choices == [], "what goes together is not chosen in part"
+
+
+def test_an_override_wins_for_one_key_alone():
+    """Where the row's values go together with it; elsewhere the file's stay beside it."""
+    asked = load("smoke", [f"choices=[{KEEP}]", "optimize.patience=3"])
+    repeated = load("smoke", ["optimize.patience=3", f"choices=[{KEEP}]"])
+    assert repeated.resolved() == asked.resolved()
+    chosen = choose(asked.settings, {"photographs": 8})
+    assert (chosen.scene.validation, chosen.training.keep, chosen.training.patience) == ("auto", "best", 3)
+    assert chosen.choices[0].reason == "8 training photographs; few are learnt by heart; optimize.patience as set"
+    assert undone(chosen) == asked.settings
+    with pytest.raises(ConfigError, match=r"at 9 photographs: .*'patience' is for 'keep: best'"):
+        choose(asked.settings, {"photographs": 9})
+    without = choose(load("smoke", [f"choices=[{KEEP}]", "scene.validation=0"]).settings, {"photographs": 8})
+    assert (without.scene.validation, without.training.keep) == (0, "last")
+    assert without.choices[0].reason.endswith("scene.validation as set, with which the rest does not go together")
+    with pytest.raises(ConfigError, match=r"optimize\.patience: expected a whole number, got 'many'"):
+        load("smoke", [f"choices=[{KEEP}]", "optimize.patience=many"])
+    with pytest.raises(ConfigError, match="stepz"):
+        load("smoke", [f"choices=[{KEEP}]", "optimize.patience=3", "optimize.stepz=3"])
+
+
+def test_other_photographs_are_chosen_for_again(tmp_path):
+    asked = load("smoke", [f"choices=[{DEGREE}, {KEEP}]", "scene.path=one"])
+    made = replace(asked, settings=choose(asked.settings, {"photographs": 8}))
+    (tmp_path / "run.yaml").write_text(made.text())
+    again = load(str(tmp_path / "run.yaml"))
+    assert again.settings.training.keep == "best"
+    changed = load(str(tmp_path / "run.yaml"), ["optimize.patience=5"]).settings
+    assert (changed.training.keep, changed.training.patience) == ("best", 5)
+    assert choose(undone(changed), {"photographs": 8}).training == changed.training
+    other = load(str(tmp_path / "run.yaml"), ["scene.path=two"])
+    assert other.resolved() == load("smoke", [f"choices=[{DEGREE}, {KEEP}]", "scene.path=two"]).resolved()
+    (tmp_path / "auto.yaml").write_text(load("smoke", [AUTO]).text())
+    assert load(str(tmp_path / "auto.yaml"), ["scene.path=two"]).settings.model.background.chosen is None
+    assert load(str(tmp_path / "auto.yaml"), ["seed=2"]).settings.model.background.chosen == "on"
+
+
+def test_each_row_may_have_its_reason():
+    reasons = DEGREE.replace("since: few say little", "since: [none, few, many]")
+    settings = load("smoke", [f"choices=[{reasons}]"]).settings
+    assert choose(settings, {"photographs": 9}).choices[0].reason == "9 training photographs; few"
+    with pytest.raises(ConfigError, match="words for each of 3 rows"):
+        load("smoke", [f"choices=[{reasons.replace('[none, few, many]', '[none, few]')}]"])
+
+
+def test_photos_in_a_time_says_what_to_set_and_takes_it():
+    chosen = choose(load("photos").settings, {"photographs": 20})
+    with pytest.raises(ConfigError, match=r"chosen by 20 training photographs; .*add --set optimize\.refit=false"):
+        minutes.rehearsals_of(replace(load("photos"), settings=chosen), None, 1.0)
+    once = choose(load("photos", ["optimize.refit=false"]).settings, {"photographs": 20}).training
+    assert (once.refit, once.keep, once.patience) == (False, "best", 4)
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from clsplat.conformance import reference as ref
+from clsplat.errors import ConfigError
 from clsplat.pipeline.loading import load
 from clsplat.schedule import at_step
 from clsplat.views.colours import IDENTITY, Affine, Auto, Gain
@@ -88,6 +89,12 @@ def test_rates_follow_how_often_a_photograph_is_visited():
     ]
     assert reach == pytest.approx([1, 1], rel=0.05), "as far as a gain of e"
     assert Gain(rate=0.5).rate_of(7000, 50) == 0.5
+
+
+@pytest.mark.parametrize("rate", ["1000", "{initial: 0.1, final: 2, over: 9}", "-1"])
+def test_a_rate_that_ends_in_no_numbers_is_refused(rate):
+    with pytest.raises(ConfigError, match=r"expected values (of at most 0\.5|at least 0)"):
+        load("smoke", [f"optimize.colours={{type: gain, rate: {rate}}}"])
 
 
 def test_the_key_takes_names_and_mappings():

@@ -6,6 +6,7 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -19,6 +20,7 @@ from clsplat.compress.target import Point, Target
 from clsplat.errors import ConfigError, DataError, Interrupted, OutputError
 from clsplat.formats.table import detect, read
 from clsplat.gaussians.model import Rendering
+from clsplat.gaussians.sky import Sky
 from clsplat.names import LOCK
 from clsplat.pipeline.loading import Pipeline
 from clsplat.runs import model_file, runner
@@ -69,6 +71,13 @@ def test_targets(text, most, change):
 def test_what_is_no_target_is_refused(text):
     with pytest.raises(ConfigError, match="expected a size such as 5MB"):
         Target.of(text)
+
+
+def test_a_file_is_copied_with_its_sky(few_steps, tmp_path, rng):
+    sky = Sky(rng.random((64, 3), np.float32))
+    replace(clsplat.load(few_steps), sky=sky).save(tmp_path / "rung.sog")
+    search._copy(tmp_path / "rung.sog", tmp_path / "compressed.sog")
+    np.testing.assert_array_equal(clsplat.load(tmp_path / "compressed.sog").sky.texels, sky.texels)
 
 
 def test_the_best_of_a_size_and_the_smallest_of_a_loss():

@@ -321,9 +321,17 @@ def test_other_models_at_the_end_are_refused(tmp_path):
             load(str(tmp_path / "x.yaml"))
 
 
+@pytest.mark.parametrize(("steps", "every"), [(7000, 350), (2019, 100), (730, 104), (350, 116), (199, 199), (12, 12)])
+def test_a_training_is_measured_near_its_end(pipeline, steps, every):
+    """A refit of a short one would be up to 99 steps shorter than it."""
+    training = load(pipeline).settings.training.model_copy(update={"steps": steps, "keep": "best"})
+    assert {one.every for one in training.measuring([])} == {every}
+    assert steps % every < 20
+
+
 def test_minutes_know_no_refit(tiny_scene, tmp_path, pipeline):
     job = Job.open(pipeline, tiny_scene, tmp_path / "run", REFIT)
-    with pytest.raises(ConfigError, match="a refit trains twice"):
+    with pytest.raises(ConfigError, match=r"a refit trains twice, .*; add --set optimize\.refit=false"):
         job.run(minutes=5)
 
 

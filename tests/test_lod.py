@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ import clsplat
 from clsplat.cli import app
 from clsplat.errors import ConfigError, DataError, Interrupted, OutputError
 from clsplat.formats.table import bytes_of, read
+from clsplat.gaussians.sky import Sky
 from clsplat.lod import levels
 from clsplat.lod.decimation import decimated
 from clsplat.lod.table import table
@@ -71,6 +73,15 @@ def test_sizes_are_those_of_the_files(trained):
     assert found["bytes"] == bytes_of(folder) == sum(map(len, tree(folder).values()))
     meta = (folder / "lod-meta.json").stat().st_size
     assert sum(level["bytes"] for level in found["levels"]) == found["bytes"] - meta
+
+
+def test_a_sky_goes_with_the_levels(few_steps, tmp_path, rng, caplog):
+    sky = Sky(rng.random((64, 3), np.float32))
+    replace(clsplat.load(few_steps), sky=sky).save(tmp_path / "model.ply")
+    caplog.set_level("INFO")
+    clsplat.write_levels(tmp_path / "model.ply", tmp_path / "site", levels=2)
+    np.testing.assert_array_equal(clsplat.load(tmp_path / "site").sky.texels, sky.texels)
+    assert "the sky of the finest level is in lod-meta_sky.json" in caplog.text
 
 
 def test_the_written_level_0_is_a_model(trained, few_steps, tiny_scene):

@@ -26,7 +26,7 @@ from data_tools.colmap_writer import write_model
 from data_tools.features import Sought, find_features
 from data_tools.gather import list_photographs
 from data_tools.mapping import map_cameras
-from data_tools.matching import match_features
+from data_tools.matching import Pairing, match_features
 from data_tools.undistort import undistort_scene
 from data_tools.vocabulary import alike
 from tests.colmap_writer import CameraEntry, ColmapModel, ImageEntry, PointEntry
@@ -121,6 +121,23 @@ def test_another_attempt_places_what_the_first_does_not(photos, tmp_path, monkey
     assert figures["registered"] >= 12
     assert pose_errors(tmp_path / "cameras").max() < 0.05
     assert not list((tmp_path / "cameras").glob(".*")), "what attempts have made is removed"
+
+
+def test_further_attempts_match_as_the_first_and_can_be_turned_off(photos, tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr(mapping_tool, "DENSER", Sought(320, 300))
+    for name in ("features", "matches", "cameras", "once"):
+        (tmp_path / name).mkdir()
+    find_features(photos, tmp_path / "features", Sought(240, 16))
+    match_features(tmp_path / "features", tmp_path / "matches", "sequential", 2)
+    caplog.set_level("INFO")
+    with pytest.raises(DataError, match="could not be placed"):
+        map_cameras(tmp_path / "matches", tmp_path / "once", attempts=1)
+    assert "another attempt" not in caplog.text
+    used = list[Pairing]()
+    monkeypatch.setattr(mapping_tool, "match_within", lambda database, pairing: used.append(pairing))
+    with pytest.raises(DataError):
+        map_cameras(tmp_path / "matches", tmp_path / "cameras")
+    assert set(used) == {Pairing("sequential", 2)}
 
 
 # ---- interrupted and gone on with

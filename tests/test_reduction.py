@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from clsplat.conformance import reference as ref
-from clsplat.density.contribution import sensitivities
+from clsplat.density.contribution import best, sensitivities
 from clsplat.errors import ConfigError, Interrupted
 from clsplat.formats.packing import morton_order
 from clsplat.formats.table import read
 from clsplat.gaussians.model import Model, load
 from clsplat.pipeline.loading import load as load_pipeline
 from clsplat.runs import opening, runner
-from clsplat.stages.reduction import PruneLeast, band_energy, best, columns_of, scores
+from clsplat.stages.reduction import PruneLeast, band_energy, columns_of, scores
 from clsplat.training.run import Progress, Run
 from tests.test_training import train
 
@@ -83,8 +83,7 @@ def test_the_least_gaussians_go(tiny_scene, pipeline, tmp_path):
 def test_the_score_may_be_the_change_of_the_image(tiny_scene, pipeline, tmp_path):
     run = opened(tiny_scene, pipeline, tmp_path)
     by_weight = scores(run)
-    photographs = [run.photographs.get(view) for view in run.scene.split("train")]
-    score = sensitivities(run.rasterizer, run.model, photographs, run.photographs.background)
+    score = sensitivities(run.survey().looks(run.scene.split("train")), run.model.gaussians.count)
     before = run.model.gaussians.get("means")
     PruneLeast(stage="prune_least", remove=0.8, score="sensitivity").act(run)
     kept = np.sort(np.argsort(-score, kind="stable")[: round(0.2 * len(before))])

@@ -11,11 +11,12 @@ import pytest
 import clsplat
 from clsplat.errors import DataError
 from clsplat.gaussians.octahedral import sampled, texel_directions
-from clsplat.gaussians.sky import Sky, sky_beside
+from clsplat.gaussians.sky import Sky, keep_sky, sky_beside
 from clsplat.gaussians.sky_splats import with_sky_splats
 from clsplat.metrics.images import psnr
 from clsplat.pipeline.choices import without_choices
 from clsplat.pipeline.loading import load
+from clsplat.reading import sha256
 from clsplat.render.backdrops import Auto
 from clsplat.runs.found import has_ended
 from clsplat.runs.model_file import evaluate
@@ -177,6 +178,21 @@ def test_a_model_file_without_its_sky_says_so(learned, tmp_path, caplog):
     np.testing.assert_array_equal(clsplat.load(tmp_path / "moved.ply").sky.texels, model.sky.texels)
 
 
+def test_another_model_of_the_same_name_does_not_take_a_sky(learned, tmp_path, caplog):
+    """Not by a file that another program wrote there, nor by our own of a model without one."""
+    model = clsplat.load(learned)
+    model.save(tmp_path / "scene.ply")
+    model.save(tmp_path / "scene.spz")
+    assert all(clsplat.load(tmp_path / name).sky for name in ("scene.ply", "scene.spz")), "they share it"
+    (tmp_path / "elsewhere").mkdir()
+    model[::2].save(tmp_path / "elsewhere" / "other.spz")
+    shutil.copy(tmp_path / "elsewhere" / "other.spz", tmp_path / "scene.spz")
+    assert clsplat.load(tmp_path / "scene.spz").sky is None
+    assert "scene_sky.json: is the sky of another model than scene.spz" in caplog.text
+    replace(model, sky=None).save(tmp_path / "scene.ply")
+    assert clsplat.load(tmp_path / "scene.ply").sky is None, "its bytes are those of the model with the sky"
+
+
 def test_an_export_of_splats_shows_the_sky_without_its_file(yard, learned, tmp_path):
     out = tmp_path / "run"
     shutil.copytree(learned, out)
@@ -240,6 +256,7 @@ def test_a_damaged_sky_in_a_checkpoint_is_refused(with_sky):
 
 def test_a_sky_file_keeps_every_bit(rng, tmp_path):
     sky = Sky(rng.normal(size=(64, 3)).astype(np.float32))
-    sky.write(tmp_path / "model_sky.json")
+    (tmp_path / "model.ply").write_bytes(b"a model")
+    keep_sky(sky, tmp_path / "model.ply", sha256(tmp_path / "model.ply"))
     np.testing.assert_array_equal(sky_beside(tmp_path / "model.ply").texels, sky.texels)
     assert replace(sky).side == 8

@@ -70,12 +70,24 @@ def test_a_file_may_lie_with_the_photographs_that_a_scene_was_prepared_from(fold
     [
         (Choice(names=["bb.png"]), "no photograph is called 'bb.png'; did you mean 'b.png'?"),
         (Choice(file="test.txt"), "test.txt: cannot be read"),
-        (Choice(names=list(LETTERS)), "every image is held out for testing"),
+        (
+            Choice(names=list(LETTERS)),
+            "scene.holdout takes all 24 photographs for testing; expected some to train with",
+        ),
+        (Choice(every=1), "scene.holdout takes all 24 photographs"),
     ],
 )
 def test_a_list_that_is_wrong_is_refused(folder, choice, fault):
     with pytest.raises(DataError, match=fault.replace("?", r"\?")):
         read_scene(folder, Split(choice))
+
+
+@pytest.mark.parametrize("split", [Split(8, Choice(names=["a", "i"])), Split(8, None, Choice(names=["a", "b"]))])
+def test_a_test_photograph_in_another_list_is_named(folder, split):
+    with pytest.raises(
+        DataError, match=r"scene\.(train|validation): the list of names: '[ai]' is held out for testing"
+    ):
+        read_scene(folder, split)
 
 
 def test_a_name_that_two_photographs_end_in_is_refused(tmp_path):
@@ -164,6 +176,8 @@ def test_a_dataset_without_any_photograph_is_refused(folder):
         ("holdout=-1", "expected a number, {every, offset}, {names: […]} or {file: …}, got -1"),
         ("holdout={every: 8, offset: 8}", "expected an offset below every, 8"),
         ("holdout={every: 8, names: [a]}", "expected a number, {every, offset}"),
+        ("holdout={names: [42]}", "expected names of photographs as text: put numbers in quotes, as in '0042'"),
+        ("train={names: [1.5]}", "put numbers in quotes, as in '0042', got 1.5"),
         ("validation=best", "or auto, got 'best'"),
         ("missing=ignore", "'refuse' or 'skip'"),
     ],

@@ -16,6 +16,7 @@ from clsplat.formats.output import written
 from clsplat.formats.splats import Reading, Writing, with_degree
 from clsplat.formats.table import bytes_of, located, tell_losses
 from clsplat.gaussians.model import load
+from clsplat.gaussians.sky import keep_sky, sky_beside
 from clsplat.reading import read_file, sha256
 from clsplat.runs.model_file import ModelFile
 from clsplat.tuning.folder import claimed
@@ -158,5 +159,7 @@ def _result(out: Path, form: Format) -> Path:
 
 
 def _copy(source: Path, file: Path) -> None:
+    """Copy a model file, and the sky beside it."""
     with written(file) as output:
         output.write(read_file(source))
+    keep_sky(sky_beside(source), file, output.sha256)

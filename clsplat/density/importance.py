@@ -1,45 +1,21 @@
 """Importance by blend weights, view by view (Mini-Splatting, Fang and Wang 2024)."""
 
-from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from clsplat.density.contribution import Weights, largest_of, weights
 from clsplat.density.edit import Edit, Rule
 from clsplat.density.survey import WEIGHT, Survey
 from clsplat.density.thresholds import Share
 
 
-@dataclass(frozen=True)
-class Weights:
-    """What each Gaussian is in the training views."""
-
-    total: NDArray[np.float64]  # [N] blend weight, alpha T, summed over all pixels
-    views: NDArray[np.int64]  # [N] in which it is useful
-
-
-def weights(survey: Survey, of_view: float, drawn: int | None = None) -> Weights:
-    """Return the weights, and the views in which a Gaussian is one of the largest that make `of_view` of the weight.
-
-    drawn: the number of views; None: all.
-    """
-    total, views = np.zeros(survey.count), np.zeros(survey.count, np.int64)
-    for look in survey.looks(survey.views if drawn is None else survey.drawn(drawn)):
-        weight = look.sum(WEIGHT).astype(np.float64)
-        total += weight
-        views += largest_of(weight, of_view)
-    return Weights(total, views)
-
-
-def largest_of(weight: NDArray[np.float64], share: float) -> NDArray[np.bool_]:
-    """Return the fewest Gaussians, [N], that make this share of the weight; those without weight are none of them."""
-    order = np.argsort(-weight, kind="stable")
-    before = np.cumsum(weight[order]) - weight[order]
-    found = np.zeros(len(weight), bool)
-    found[order] = (before < share * weight.sum()) & (weight[order] > 0)
-    return found
+def drawn_weights(survey: Survey, of_view: float | None = None, drawn: int | None = None) -> Weights:
+    """Return the weights in training views.  drawn: the number of views; None: all; of_view: as in `weights`."""
+    views = survey.views if drawn is None else survey.drawn(drawn)
+    return weights(survey.looks(views), survey.count, of_view)
 
 
 def useless(survey: Survey, of_view: float) -> NDArray[np.bool_]:
@@ -70,6 +46,6 @@ class PruneUseless(Rule):
     """Share of the weight in all views that stays; the smallest weights go."""
 
     def mark(self, edit: Edit) -> None:
-        found = edit.survey.once(weights, self.of_view, self.views)
+        found = edit.survey.once(drawn_weights, self.of_view, self.views)
         kept = largest_of(found.total, self.of_all) & (found.views >= self.views_below)
         edit.choose(~kept, copies=0, kept=0)

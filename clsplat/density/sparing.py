@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from clsplat.density.edit import Edit, Rule
-from clsplat.density.survey import WEIGHT, Survey
+from clsplat.density.importance import drawn_weights
+from clsplat.density.survey import Survey
 from clsplat.gaussians.tables import Gaussians
 from clsplat.render.pictures import inside
 from clsplat.scene.scene import View
@@ -16,14 +17,6 @@ from clsplat.schedule import Positive
 
 HIDDEN = -40.0  # logit of an opacity that no pixel shows
 FRACTION = 256  # the number is found to one part in so many
-
-
-def total_weights(survey: Survey) -> NDArray[np.float64]:
-    """Return the blend weights, alpha T, of the Gaussians, summed over all training views, [N]."""
-    total = np.zeros(survey.count)
-    for look in survey.looks(survey.views):
-        total += look.sum(WEIGHT)
-    return total
 
 
 def squared_error(survey: Survey, views: list[View]) -> float:
@@ -73,7 +66,7 @@ class PruneSpare(Rule):
 
     def mark(self, edit: Edit) -> None:
         survey, gaussians = edit.survey, edit.gaussians
-        order = np.argsort(survey.once(total_weights), kind="stable")
+        order = np.argsort(survey.once(drawn_weights).total, kind="stable")
         views = survey.drawn(self.views)
         limit = (1 + edit.at(self.error_rise)) * squared_error(survey, views)
 

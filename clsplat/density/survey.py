@@ -40,6 +40,13 @@ class Look:
         """Render the view of a photograph.  background: [3]."""
         return cls(rasterizer, model, photograph, rasterizer.forward(model, photograph.camera, background))
 
+    @classmethod
+    def each(
+        cls, rasterizer: Rasterizer, model: DeviceModel, photographs: Iterable[Photograph], background: Array
+    ) -> Iterator["Look"]:
+        """Render the views of photographs, one after another.  background: [3]."""
+        return (cls.at(rasterizer, model, photograph, background) for photograph in photographs)
+
     def counted(self) -> NDArray[np.bool_]:
         """Return which pixels count, [height, width]."""
         camera, mask = self.photograph.camera, self.photograph.counted()
@@ -116,9 +123,8 @@ class Survey:
 
     def looks(self, views: Iterable[View]) -> Iterator[Look]:
         """Render views, one after another."""
-        for view in views:
-            photograph = self._photographs.get(view)
-            yield Look.at(self._rasterizer, self._model, photograph, self._photographs.background)
+        photographs = (self._photographs.get(view) for view in views)
+        return Look.each(self._rasterizer, self._model, photographs, self._photographs.background)
 
     @property
     def count(self) -> int:

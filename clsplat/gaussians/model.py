@@ -32,7 +32,7 @@ from clsplat.formats.table import for_writing, read, write
 from clsplat.gaussians.quaternions import product, quaternion_of
 from clsplat.gaussians.run_model import model_at
 from clsplat.gaussians.sh import rotated_sh
-from clsplat.gaussians.sky import Sky, sky_beside, sky_file
+from clsplat.gaussians.sky import Sky, keep_sky, sky_beside
 from clsplat.gaussians.tables import DeviceModel, Gaussians
 from clsplat.opencl.device import Device
 
@@ -201,14 +201,14 @@ class Model:
         """Write a file in the format that its name stands for: .ply, .spz, .sog, .glb and others (docs/formats.md).
 
         A world filter that is not `baked` is kept in a PLY, as a property `filter_3D`, and baked for other formats.  A
-        sky is written beside it, as NAME_sky.json.
+        sky is written beside it, as NAME_sky.json, which names the SHA-256 of the file: no other model takes it.
         Returns the SHA-256 of what was written; of a folder of SOG that of its meta.json.
         Raises ConfigError for another name, and OutputError when the file cannot be written.
         """
         model = self if for_writing(Path(path)).keeps_filter else self.baked()
-        if self.sky:
-            self.sky.write(sky_file(Path(path)))
-        return write(Path(path), model.as_file(), options)
+        digest = write(Path(path), model.as_file(), options)
+        keep_sky(self.sky, Path(path), digest)
+        return digest
 
     def as_file(self) -> SplatFile:
         """Return what a model file holds, with the arrays of the model."""

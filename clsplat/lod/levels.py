@@ -8,11 +8,13 @@ from typing import Any
 
 from clsplat.errors import ConfigError, DataError, amount
 from clsplat.files import new_folder, require_free
+from clsplat.formats.lod import LOD_META
 from clsplat.formats.lod_writing import write_lod
 from clsplat.formats.splats import Writing, require_moderate
 from clsplat.formats.table import bytes_of
 from clsplat.gaussians.clusters import DeviceClusters
 from clsplat.gaussians.model import Model, load
+from clsplat.gaussians.sky import keep_sky, sky_file
 from clsplat.lod.decimation import decimated
 from clsplat.lod.training import Level, Plan, Training
 from clsplat.runs.model_file import ModelFile
@@ -45,7 +47,11 @@ def levels_of_detail(
     with new_folder(folder) as place:
         with training.held() if training else nullcontext():
             levels = _levels(first, plan, training)
-        write_lod(place, [level.model.as_file() for level in levels], writing)
+        digest = write_lod(place, [level.model.as_file() for level in levels], writing)
+        keep_sky(first.sky, place / LOD_META, digest)
+    if first.sky:
+        told = sky_file(folder / LOD_META).name
+        LOG.info("%s: the sky of the finest level is in %s, which clsplat alone draws", folder, told)
     return {
         "folder": str(folder),
         "bytes": bytes_of(folder),

@@ -90,7 +90,7 @@ def measure(
     """
     results = []
     for view in views:
-        photograph = photographs.get(view)
+        photograph = photographs.placed(view)
         if photograph.empty:
             LOG.warning("%s: not measured, since its mask leaves out every pixel; look at the mask", view.name)
             continue

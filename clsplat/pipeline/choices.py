@@ -1,7 +1,7 @@
 """Choices that a run makes by its photographs, and what it writes of them into its pipeline file."""
 
 import json
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
@@ -9,6 +9,7 @@ from clsplat.scene.capture import UNITS, Measure
 from clsplat.settings import Settings
 
 WRITTEN = ("chosen", "reason")  # keys of a choice
+Others = Literal["row", "file"]
 Row = Annotated[list[Any], Field(min_length=2)]  # the least measure, then the value of each key
 
 
@@ -24,7 +25,8 @@ class CaptureChoice(Settings):
     """Settings that go together, and follow from a measure of the photographs.
 
     They replace what the file says at their places, before training; `--set` of one of these places, or of one that
-    holds it or lies inside, removes the choice.  Where the dataset does not have the measure, the file's values stay.
+    holds it or lies inside, wins there alone.  Where the others do not go together with it, or the dataset does not
+    have the measure, the file's values stay.
     """
 
     output_keys: ClassVar[frozenset[str]] = frozenset({"chosen", "instead_of", "reason"})
@@ -35,8 +37,10 @@ class CaptureChoice(Settings):
     """What is measured."""
     values: Annotated[list[Row], AfterValidator(_ascending)]
     """Rows [from, a value of each key]: those of the last row whose bound the measure reaches."""
-    since: str
-    """Why these values, in a few words."""
+    since: str | list[str]
+    """Why these values, in a few words: of all rows, or of each."""
+    given: dict[str, Any] = Field({})
+    """Written for `--set`: values that take the place of those in the rows, by key."""
     chosen: list[Any] | None = None
     """Written by a run: the values."""
     instead_of: list[Any] | None = None
@@ -48,16 +52,30 @@ class CaptureChoice(Settings):
     def _of_each_key(self) -> "CaptureChoice":
         if wrong := next((row for row in self.values if len(row) != 1 + len(self.keys)), None):
             raise ValueError(f"values: expected [from, {', '.join(self.keys)}], got {len(wrong)} of them")
+        if isinstance(self.since, list) and len(self.since) != len(self.values):
+            raise ValueError(f"since: expected words, or words for each of {len(self.values)} rows")
+        if wrong_key := next((key for key in self.given if key not in self.keys), None):
+            raise ValueError(f"given: expected some of {', '.join(self.keys)}, got {wrong_key}")
         return self
 
-    def of(self, measures: dict[Measure, float], before: list[Any]) -> "CaptureChoice":
-        """Return it with what follows from the measures; before: the values that are replaced."""
+    def of(self, measures: dict[Measure, float], before: list[Any], others: Others = "row") -> "CaptureChoice":
+        """Return it with what follows from the measures; before: the values that are replaced.
+
+        others: whether what stands beside `given` values is of the row that the measure reaches, or of the file.
+        """
         found = measures.get(self.by)
         if found is None:
             reason, chosen = f"the dataset does not tell {self.by}", before
         else:
-            reason = f"{found:,.4g} {UNITS[self.by]}; {self.since}"
-            chosen = next(values for bound, *values in reversed(self.values) if found >= bound)
+            at = max(number for number, row in enumerate(self.values) if found >= row[0])
+            chosen = self.values[at][1:]
+            reason = f"{found:,.4g} {UNITS[self.by]}; {self.since if isinstance(self.since, str) else self.since[at]}"
+        if self.given:
+            keys = ", ".join(self.given)
+            alone = others == "file" and found is not None
+            reason += f"; {keys} as set" + (", with which the rest does not go together" if alone else "")
+            beside = before if alone else chosen
+            chosen = [self.given.get(key, value) for key, value in zip(self.keys, beside, strict=True)]
         return self.model_copy(update={"chosen": chosen, "instead_of": before, "reason": reason})
 
     @property

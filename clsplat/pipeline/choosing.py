@@ -2,18 +2,21 @@
 
 import copy
 import json
-from collections.abc import Collection, Sequence
-from typing import Any
+from collections.abc import Callable, Collection, Iterator, Sequence
+from itertools import compress
+from typing import Any, Literal
 
 from pydantic import ValidationError
 
 from clsplat.errors import ConfigError
-from clsplat.pipeline.choices import CaptureChoice
+from clsplat.pipeline.choices import CaptureChoice, Others, without_choices
 from clsplat.pipeline.explanation import first_fault, place_text
 from clsplat.pipeline.file import PipelineFile
-from clsplat.pipeline.overrides import apply, value_at
+from clsplat.pipeline.overrides import apply, split, value_at
+from clsplat.pipeline.renamed import with_new_names
 from clsplat.pipeline.yaml_file import Place
 from clsplat.scene.capture import Measure
+from clsplat.stages.optimize import Optimize
 
 LATE = ("model", "stages")  # parts of a pipeline that are used after the photographs are read
 
@@ -21,20 +24,46 @@ LATE = ("model", "stages")  # parts of a pipeline that are used after the photog
 def choose(settings: PipelineFile, measures: dict[Measure, float]) -> PipelineFile:
     """Return the settings with the values that follow from the measures; choices that are made stay.
 
-    Raises ConfigError where they do not go together.
+    Where those of a row do not go together with what `--set` gave for one of them, the file's stay.
+    Raises ConfigError where they do not go together either.
     """
     data = settings.model_dump(mode="json")
+    before = [[value_at(data, key, PipelineFile) for key in one.keys] for one in settings.choices]
 
-    def made(one: CaptureChoice) -> CaptureChoice:
-        return one if one.reason else one.of(measures, [value_at(data, key, PipelineFile) for key in one.keys])
-
-    choices = [made(one) for one in settings.choices]
-    try:
+    def made(others: Others) -> PipelineFile:
+        pairs = zip(settings.choices, before, strict=True)
+        choices = [one if one.reason else one.of(measures, old, others) for one, old in pairs]
         return _with(settings, choices, [pair for one in choices for pair in one.settings])
+
+    try:
+        return _checked(lambda: made("row"), measures)
+    except ConfigError:
+        if not any(one.given and not one.reason for one in settings.choices):
+            raise
+        return _checked(lambda: made("file"), measures)
+
+
+def _checked(made: Callable[[], PipelineFile], measures: dict[Measure, float]) -> PipelineFile:
+    """Settings that go together.  Raises ConfigError."""
+    measured = ", ".join(f"{value:,.4g} {measure}" for measure, value in measures.items())
+    try:
+        settings = made()
+        check_keeping(settings)
     except ValidationError as error:
         place, complaint = first_fault(error, PipelineFile)
-        measured = ", ".join(f"{value:,.4g} {measure}" for measure, value in measures.items())
         raise ConfigError(f"choices, at {measured}: {place_text(place)}: {complaint}") from error
+    except ConfigError as error:
+        raise ConfigError(f"choices, at {measured}: {error}") from error
+    return settings
+
+
+def check_keeping(settings: PipelineFile) -> None:
+    """Raise ConfigError where a training has nothing to choose its model by, or one of several is a refit."""
+    trainings = [stage for stage in settings.stages if isinstance(stage, Optimize)]
+    if any(stage.keep == "best" for stage in trainings) and settings.scene.validation == 0:
+        raise ConfigError("optimize.keep: best chooses by validation views; expected scene.validation: auto")
+    if any(stage.refit for stage in trainings) and len(trainings) > 1:
+        raise ConfigError(f"optimize.refit: expected one stage that trains, found {len(trainings)}")
 
 
 def undone(settings: PipelineFile) -> PipelineFile:
@@ -44,21 +73,109 @@ def undone(settings: PipelineFile) -> PipelineFile:
     return _with(settings, [one.undone() for one in settings.choices], before) if made else settings
 
 
+def forgotten(data: dict[str, Any]) -> dict[str, Any]:
+    """Return a file's data as they were before a run chose for its own photographs, by `choices` and keys `auto`."""
+    data, before = copy.deepcopy(data), list[tuple[str, Any]]()
+    for _, choice in _choices(data):
+        made = [choice.pop(name, None) for name in ("reason", "chosen", "instead_of")]
+        if made[0] and isinstance(made[2], list):
+            before += zip(choice["keys"], made[2], strict=False)
+    for key, value in before:
+        _set(data, key, value)
+    return dict(without_choices(data))
+
+
+def held(data: dict[str, Any], places: Sequence[Place]) -> dict[Place, tuple[int, str]]:
+    """Return those places of overrides that are one of several keys of a choice, with its number and the key.
+
+    It has the value in the place of its rows', so that the file's need not go together with it.
+    """
+    found: dict[Place, tuple[int, str]] = {}
+    for number, choice in _choices(data):
+        if len(choice["keys"]) < 2:
+            continue
+        for key in choice["keys"]:
+            touching = {place for place in places if _touch(place, _place(data, key))}
+            if touching == {_place(data, key)}:
+                found[touching.pop()] = number, key
+    return found
+
+
+def _is_of_photographs(override: str) -> bool:
+    """Whether an override sets which photographs are trained with, by which a run may have chosen."""
+    names, _ = split(override)
+    return names[0] == "scene" and names[1:2] != ["validation"]
+
+
+def overridden(tagged: dict[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
+    """Return a file's data with overrides, also in its choices; with other photographs what a run chose is forgotten.
+
+    Raises OverrideError.
+    """
+    if any(_is_of_photographs(override) for override in overrides):
+        tagged = forgotten(tagged)
+    data, places = _applied(tagged, overrides, warn="yes")
+    chosen = held(data, places)
+    if not chosen:
+        return without_overridden(data, places)
+    less, _ = _applied(tagged, [one for one, place in zip(overrides, places, strict=True) if place not in chosen])
+    for number, key in chosen.values():
+        choice, value = less["choices"][number], value_at(data, key, PipelineFile)
+        choice["given"] = {**choice.get("given", {}), key: value}
+        if isinstance(chosen_values := choice.get("chosen"), list):  # by a run
+            pairs = zip(choice["keys"], chosen_values, strict=False)
+            choice["chosen"] = [value if one == key else old for one, old in pairs]
+            _set(less, key, value)
+    return without_overridden(less, [place for place in places if place not in chosen])
+
+
+def _applied(
+    tagged: dict[str, Any], overrides: Sequence[str], warn: Literal["yes", "no"] = "no"
+) -> tuple[dict[str, Any], list[Place]]:
+    """A file's data with overrides at their places, and these."""
+    data, places = copy.deepcopy(tagged), list[Place]()
+    for override in overrides:
+        places.append(apply(data, override, PipelineFile))
+        data = with_new_names(data, warn_about=f"--set {override}" if warn == "yes" else "", old_wins=True)
+    return data, places
+
+
 def without_overridden(data: dict[str, Any], places: Collection[Place]) -> dict[str, Any]:
-    """Return a file's data without the choices of what an override has set, around it or inside of it."""
+    """Return a file's data with choices without the keys that an override has set, around them or inside of them."""
     if not places or not isinstance(choices := data.get("choices"), list):
         return data
+    left = list(choices)
+    for number, choice in _choices(data):
+        kept = [not any(_touch(_place(data, key), place) for place in places) for key in choice["keys"]]
+        if not all(kept):
+            left[number] = _columns(choice, kept)
+    return {**data, "choices": [one for one in left if one is not None]}
 
-    def is_set(choice: Any) -> bool:
-        keys = choice.get("keys") if isinstance(choice, dict) else None
-        own = [_place(data, key) for key in keys if isinstance(key, str)] if isinstance(keys, list) else []
-        return any(_touch(one, place) for one in own for place in places)
 
-    return {**data, "choices": [one for one in choices if not is_set(one)]}
+def _columns(choice: dict[str, Any], kept: list[bool]) -> dict[str, Any] | None:
+    """A choice of some of its keys; None of none."""
+    own = {name: choice[name] for name in ("keys", "chosen", "instead_of") if isinstance(choice.get(name), list)}
+    rows = [[row[0], *compress(row[1:], kept)] for row in choice["values"]]
+    less = {**choice, **{name: list(compress(values, kept)) for name, values in own.items()}, "values": rows}
+    return less if any(kept) else None
+
+
+def _choices(data: dict[str, Any]) -> Iterator[tuple[int, dict[str, Any]]]:
+    """The choices of a file's data that have the shape of one, with their numbers."""
+    choices = data.get("choices")
+    for number, one in enumerate(choices if isinstance(choices, list) else ()):
+        keys, rows = (one.get("keys"), one.get("values")) if isinstance(one, dict) else (None, None)
+        if not isinstance(keys, list) or not isinstance(rows, list):
+            continue
+        if all(isinstance(key, str) for key in keys) and all(isinstance(row, list) and row for row in rows):
+            yield number, one
 
 
 def check_choices(settings: PipelineFile) -> None:
-    """Raise ConfigError where a choice has no place, where two have the same, or where values do not go together."""
+    """Raise ConfigError where a choice has no place, where two have the same, or where values do not go together.
+
+    Beside what `--set` gave for one of them, those of one row need to.
+    """
     data, places = settings.model_dump(mode="json"), list[Place]()
     for number, key in [(number, key) for number, one in enumerate(settings.choices) for key in one.keys]:
         place, what = _place(data, key), f"choices[{number}]: {key}"
@@ -67,9 +184,15 @@ def check_choices(settings: PipelineFile) -> None:
         if any(_touch(place, other) for other in places):
             raise ConfigError(f"{what} is chosen twice; expected one choice for each place")
         places.append(place)
-    still_open = undone(settings)
-    for by, bound in sorted({(one.by, bound) for one in settings.choices for bound, *_ in one.values}):
-        choose(still_open, {by: bound})
+    still_open, faults = undone(settings), list[ConfigError]()
+    bounds = sorted({(one.by, bound) for one in settings.choices for bound, *_ in one.values})
+    for by, bound in bounds:
+        try:
+            choose(still_open, {by: bound})
+        except ConfigError as error:
+            faults.append(error)
+    if faults and (len(faults) == len(bounds) or not any(one.given for one in settings.choices)):
+        raise faults[0]
 
 
 def _with(settings: PipelineFile, choices: Sequence[CaptureChoice], values: Sequence[tuple[str, Any]]) -> PipelineFile:

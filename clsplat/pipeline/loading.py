@@ -14,7 +14,7 @@ from clsplat.density.edit import Rule
 from clsplat.density.statistics import Statistic
 from clsplat.errors import ConfigError, OverrideError, one_line
 from clsplat.names import PREPARED
-from clsplat.pipeline.choosing import check_choices, without_overridden
+from clsplat.pipeline.choosing import check_choices, check_keeping, held, overridden
 from clsplat.pipeline.explanation import explain, first_fault, place_text
 from clsplat.pipeline.file import STAGE_LISTS, PipelineFile
 from clsplat.pipeline.files import find
@@ -83,13 +83,8 @@ def checked(path: Path, document: Document, overrides: Sequence[str] = ()) -> Pi
     if not isinstance(document.data, dict):
         raise ConfigError(f"{path}:1: expected keys such as name and stages")
     tagged = with_new_names(_tagged_file(document, path), warn_about=str(path))
-    data = copy.deepcopy(tagged)
     try:
-        places = []
-        for override in overrides:
-            places.append(apply(data, override, PipelineFile))
-            data = with_new_names(data, warn_about=f"--set {override}", old_wins=True)
-        return _as_needed(Pipeline(path, _validated(without_overridden(data, places), path, document)))
+        return _as_needed(Pipeline(path, _validated(overridden(tagged, overrides), path, document)))
     except ConfigError:
         _blame(tagged, overrides, path, document)
         raise
@@ -114,8 +109,8 @@ def _validated(data: dict[str, Any], path: Path, document: Document) -> Pipeline
         raise ConfigError(explain(error, PipelineFile, path, document)) from error
     _check_order(path, settings)
     _check_screen_filter(path, settings)
-    _check_keeping(path, settings)
     try:
+        check_keeping(settings)
         check_choices(settings)
     except ConfigError as error:
         raise ConfigError(f"{path}: {one_line(error)}") from error
@@ -143,10 +138,14 @@ def _blame(data: dict[str, Any], overrides: Sequence[str], path: Path, document:
     known = [key.place for key in settable(_validated(data, path, document))]
     for override in overrides:
         names, _ = split(override)
+        before = copy.deepcopy(data)
         try:
             place = apply(data, override, PipelineFile)
         except NoSuchKey as error:
             raise OverrideError(override, error.reason + suggestion(names, known)) from error
+        if held(data, [place]):  # whose values need not go together with those of the file
+            data = before
+            continue
         data = with_new_names(data, old_wins=True)
         try:
             _check_order(path, PipelineFile.model_validate(data))
@@ -217,15 +216,6 @@ def _check_screen_filter(path: Path, settings: PipelineFile) -> None:
                         "splats, which model.screen_filter.type 'box' does not have; expected another screen filter "
                         "(mip is the nearest), or another rule"
                     )
-
-
-def _check_keeping(path: Path, settings: PipelineFile) -> None:
-    """Raise ConfigError where a training has nothing to choose its model by, or one of several is a refit."""
-    trainings = [stage for stage in settings.stages if isinstance(stage, Optimize)]
-    if any(stage.keep == "best" for stage in trainings) and settings.scene.validation == 0:
-        raise ConfigError(f"{path}: optimize.keep: best chooses by validation views; expected scene.validation: auto")
-    if any(stage.refit for stage in trainings) and len(trainings) > 1:
-        raise ConfigError(f"{path}: optimize.refit: expected one stage that trains, found {len(trainings)}")
 
 
 def _check_order(path: Path, settings: PipelineFile) -> None:

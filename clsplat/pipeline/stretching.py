@@ -73,9 +73,9 @@ def _stretched(value: Any, factor: float | Fraction) -> Any:
         is_points = bool(value) and all(isinstance(item, list) for item in value)
         return _points(value, factor) if is_points else [_stretched(item, factor) for item in value]
     if isinstance(value, CaptureChoice):  # whose rows begin with what is measured, and not with steps
-        return value.model_copy(
-            update={"values": [[bound, *(_stretched(one, factor) for one in row)] for bound, *row in value.values]}
-        )
+        rows = [[bound, *(_stretched(one, factor) for one in row)] for bound, *row in value.values]
+        given = {key: _stretched(one, factor) for key, one in value.given.items()}
+        return value.model_copy(update={"values": rows, "given": given})
     if not isinstance(value, Settings):
         return value
     fields = {name: getattr(value, name) for name in type(value).model_fields}

@@ -12,7 +12,7 @@ from clsplat.settings import Settings
 from clsplat.training.found import photographs_text
 from data_tools.features import CameraModel, Sought, find_features
 from data_tools.gather import require_photographs
-from data_tools.mapping import Mapper, map_cameras
+from data_tools.mapping import MOST, Mapper, map_cameras
 from data_tools.matching import Matching, match_features
 from data_tools.pycolmap_import import require_pycolmap
 from data_tools.sharing import Cameras
@@ -124,9 +124,11 @@ class MapCameras(Step):
     """How cameras are found first: one after the other, or all at once (global)."""
     threads: Positive = 1
     """Number of threads; more than one are faster, and the result does not repeat to the bit."""
+    attempts: Annotated[int, Field(ge=1, le=MOST)] = MOST
+    """Largest number of attempts; 1: none but the first.  Further ones match as `match_features` does."""
 
     def make(self, source: Path, out: Path, without: Path) -> dict[str, Any]:
-        return map_cameras(source, out, self.mapper, self.threads)
+        return map_cameras(source, out, self.mapper, self.threads, self.attempts)
 
     def told(self, figures: dict[str, Any]) -> str:
         return photographs_text({self.stage: figures})

@@ -1,6 +1,6 @@
 """A view's camera on the device, and the size of its planes."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -38,6 +38,7 @@ class DeviceCamera:
     tiles_y: int
     tile: int
     view: int | None = None  # its number in the table HIDDEN; without one every Gaussian is drawn
+    values: NDArray[Any] = field(default_factory=lambda: np.zeros((), CAMERA), repr=False, compare=False)  # on the host
 
     @property
     def tiles(self) -> int:
@@ -58,13 +59,21 @@ class DeviceCamera:
         return {"width": self.width, "height": self.height, "rows": self.rows, "stride": self.stride}
 
 
+def moved_camera(camera: DeviceCamera, world_to_camera: NDArray[np.floating]) -> DeviceCamera:
+    """Return a camera with another pose, [3, 4]; the lens and the planes stay."""
+    values = camera.values.copy()
+    values["world_to_camera"] = world_to_camera.ravel()
+    values["position"] = -world_to_camera[:, :3].T @ world_to_camera[:, 3]
+    return replace(camera, array=camera.array.device.upload(values.reshape(1)), values=values)
+
+
 def upload_camera(device: Device, view: View) -> DeviceCamera:
     """Copy a view's camera to the device.  Raises DataError as `camera_values`."""
     tile = int(device.tuning["TILE"])
     values = camera_values(view, tile)
     tiles_x, tiles_y = int(values["tiles_x"]), int(values["tiles_y"])
     array = device.upload(values.reshape(1))
-    return DeviceCamera(array, view.camera.width, view.camera.height, tiles_x, tiles_y, tile)
+    return DeviceCamera(array, view.camera.width, view.camera.height, tiles_x, tiles_y, tile, values=values)
 
 
 def camera_values(view: View, tile: int) -> NDArray[Any]:

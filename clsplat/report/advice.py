@@ -10,6 +10,7 @@ from clsplat.metrics.views import ViewMetrics, measure
 from clsplat.scene.stand import closest_point, upward
 from clsplat.scene.view import View
 from clsplat.training.colours import colours_of
+from clsplat.training.poses import refined
 from clsplat.training.run import Run
 from clsplat.views.colours import Gain
 
@@ -27,7 +28,7 @@ UNEVEN = 3.0  # times the median gap
 
 def advice(run: Run) -> list[str]:
     """Return sentences, or none where nothing stands out.  Renders at most MOST training views."""
-    views = run.scene.downscaled(run.downscale).split("train")
+    views = refined(run.numbers, run.scene).downscaled(run.downscale).split("train")
     chosen = [views[(2 * i + 1) * len(views) // (2 * MOST)] for i in range(MOST)] if len(views) > MOST else views
     counted = run.status.counted(run.until_interrupted(chosen), "views", len(chosen))
     found = measure(run.rasterizer, run.model, counted, run.photographs, colours=Gain())

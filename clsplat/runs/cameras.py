@@ -8,10 +8,12 @@ from clsplat.runs.found import has_pipeline
 from clsplat.runs.source import Source
 from clsplat.scene.detect import read_scene
 from clsplat.scene.scene import HOLDOUT, Scene
+from clsplat.training.poses import poses_beside
 
 
 def write(scene: Path | Scene, out: Path, format_: str, images: str = "none") -> list[Path]:
-    """Write the cameras; return the files.  scene: a dataset, in a folder or as read, or a run folder.
+    """Write the cameras; return the files.  scene: a dataset, in a folder or as read, or a run folder, whose
+    cameras are those that it has learned.
 
     Raises ClsplatError.
     """
@@ -24,4 +26,4 @@ def _read(folder: Path) -> Scene:
     if not has_pipeline(folder):
         return read_scene(folder, HOLDOUT)
     source = Source.of(folder, None)
-    return read_scene(source.folder, source.settings.split)
+    return poses_beside(source.file, read_scene(source.folder, source.settings.split))

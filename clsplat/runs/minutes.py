@@ -136,12 +136,10 @@ def rehearsals_of(pipeline: Pipeline, run: Run, minutes: float) -> list[Rehearsa
     if trains != 1:
         raise ConfigError(f"{pipeline.path}: --minutes: expected one stage that trains, found {trains}; leave it out")
     if pipeline.settings.training.refit:
-        raise ConfigError(
-            f"{pipeline.path}: --minutes: a refit trains twice, for nobody knows how long: set optimize.refit=false or "
-            "leave --minutes out"
-        )
-    steps = pipeline.settings.training.steps
-    found, took = list[Rehearsal](), 0.0
+        made = [f", chosen by {one.reason}" for one in pipeline.settings.choices if "optimize.refit" in one.keys]
+        told = f"a refit trains twice, for nobody knows how long{''.join(made)}; add --set optimize.refit=false"
+        raise ConfigError(f"{pipeline.path}: --minutes: {told} to train once, or leave --minutes out")
+    steps, found, took = pipeline.settings.training.steps, list[Rehearsal](), 0.0
     until = time.perf_counter() + 60 * minutes
     run.status.note(seconds_left=None)
     with run.status.stage("rehearse"):

@@ -18,6 +18,7 @@ from clsplat.render.rasterizer import Rasterizer
 from clsplat.runs.pictures import KINDS, write_pictures
 from clsplat.runs.source import Source
 from clsplat.training.colours import colours_beside
+from clsplat.training.poses import poses_beside
 from clsplat.video.pictures import LAYERS, Canvas
 from clsplat.views.photographs import Photographs
 
@@ -38,7 +39,8 @@ class ModelFile:
         self.source = Source.of(model, scene)
         self.loaded = load(self.source.file)
         self.device = open_correct(device)
-        self.photographs = self.source.scene(self.loaded)
+        found = self.source.scene(self.loaded)
+        self.photographs = poses_beside(self.source.file, found) if scene is None else found
         self.downscale = self.source.settings.downscale if downscale is None else downscale
         self.scene = self.photographs.downscaled(self.downscale)
         self.background = self.loaded.rendering.background or self.scene.background

@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 from difflib import get_close_matches
 from pathlib import Path, PurePosixPath
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from clsplat.errors import DataError, quoted
 from clsplat.reading import read_text
@@ -14,6 +14,12 @@ from clsplat.settings import ReadPath, Settings, in_one_sentence
 
 LARGEST = 1 << 24  # bytes of a list of names
 NOTATIONS = "expected a number, {every, offset}, {names: […]} or {file: …}"
+
+
+def _text(value: Any) -> Any:
+    if not isinstance(value, str):
+        raise ValueError("expected names of photographs as text: put numbers in quotes, as in '0042'")
+    return value
 
 
 class Choice(Settings):
@@ -26,7 +32,7 @@ class Choice(Settings):
     """Every n-th view, in order of name."""
     offset: Annotated[int, Field(ge=0)] = 0
     """Place of the first of them, counted from 0."""
-    names: Annotated[list[str], Field(min_length=1)] | None = None
+    names: Annotated[list[Annotated[str, BeforeValidator(_text)]], Field(min_length=1)] | None = None
     """Names of the views."""
     file: ReadPath | None = None
     """Text file with a name a line; a relative path is one in the folder of the dataset."""
@@ -40,11 +46,11 @@ class Choice(Settings):
             raise ValueError(f"expected an offset below every, {self.every}")
         return self
 
-    def of(self, names: Sequence[str], folders: Sequence[Path]) -> set[int]:
+    def of(self, names: Sequence[str], folders: Sequence[Path], tested: Sequence[str] = ()) -> set[int]:
         """Return the indices of the chosen ones of `names`.
 
-        folders: where a relative file is looked for, in order.  Raises DataError for a name that no view has, or
-        several have.
+        folders: where a relative file is looked for, in order; tested: names that are for testing.
+        Raises DataError for a name that no view has, or several have.
         """
         if self.every is not None:
             return every_nth(names, self.every, self.offset)
@@ -57,7 +63,13 @@ class Choice(Settings):
             listed = [line for line in lines if line and not line.startswith("#")]
             if not listed:
                 raise DataError(f"{place}: is empty; expected the name of a photograph in each line")
-        return {_index_of(name, names, place) for name in listed}
+        found_at = {name: _indices_of(name, names) for name in listed}
+        if name := next((one for one in listed if not found_at[one] and _indices_of(one, tested)), None):
+            raise DataError(
+                f"{place}: {quoted(name)} is held out for testing; expected training photographs: take it out of this "
+                "list, or out of scene.holdout"
+            )
+        return {_only(name, found, names, place) for name, found in found_at.items()}
 
 
 Number = Annotated[int, Field(ge=0)]
@@ -65,24 +77,28 @@ Chosen = Annotated[Number | Choice, in_one_sentence(NOTATIONS)]
 ChosenOrAuto = Annotated[Number | Choice | Literal["auto"], in_one_sentence(f"{NOTATIONS}, or auto")]
 
 
-def choose(choice: int | Choice, names: Sequence[str], folders: Sequence[Path]) -> set[int]:
+def choose(choice: int | Choice, names: Sequence[str], folders: Sequence[Path], tested: Sequence[str] = ()) -> set[int]:
     """Return the indices of the chosen names; a number chooses every n-th from the first on, 0 none.
 
     Raises DataError as Choice.of does.
     """
-    return choice.of(names, folders) if isinstance(choice, Choice) else every_nth(names, choice)
+    return choice.of(names, folders, tested) if isinstance(choice, Choice) else every_nth(names, choice)
 
 
-def _index_of(listed: str, names: Sequence[str], place: str) -> int:
-    """The index of the only name that a listed one means, whole or as an end, with or without its suffix."""
+def _indices_of(listed: str, names: Sequence[str]) -> list[int]:
+    """The indices of names that a listed one means, whole or as an end, with or without its suffix."""
     if listed in names:
-        return names.index(listed)
+        return [names.index(listed)]
     wanted = PurePosixPath(listed.replace("\\", "/"))
-    found = [
+    return [
         i
         for i, path in enumerate(map(PurePosixPath, names))
         if any(one.parts[-len(wanted.parts) :] == wanted.parts for one in (path, path.with_suffix("")))
     ]
+
+
+def _only(listed: str, found: Sequence[int], names: Sequence[str], place: str) -> int:
+    """The index that was found.  Raises DataError for none, and for several."""
     if len(found) == 1:
         return found[0]
     if found:

@@ -39,14 +39,20 @@ class Split:
         folders = [scene.path, *([self.folder] if self.folder else [])]
         if isinstance(self.holdout, Choice) and not (self.holdout.every and scene.test):  # the dataset says which
             names = [view.name for view in scene.views]
-            scene = _with_test(scene, self.holdout.of(names, folders))
+            test = _chosen(scene, "holdout", self.holdout, names, folders)
+            if len(test) == len(names):
+                raise DataError(
+                    f"{scene.path}: scene.holdout takes all {len(names)} photographs for testing; expected some to "
+                    "train with: name fewer of them, or raise `every`"
+                )
+            scene = _with_test(scene, test)
         if self.train is not None:
-            kept = _of(scene, self.train, folders) | set(scene.test)
+            kept = _of(scene, "train", self.train, folders) | set(scene.test)
             LOG.info("scene.train leaves out %s", amount(len(scene.views) - len(kept), "photograph"))
             views = [view for i, view in enumerate(scene.views) if i in kept]
-            test = {scene.views[i].name for i in scene.test}
+            tested = {scene.views[i].name for i in scene.test}
             smaller = replace(scene, views=tuple(views))
-            scene = _with_test(smaller, {i for i, view in enumerate(views) if view.name in test})
+            scene = _with_test(smaller, {i for i, view in enumerate(views) if view.name in tested})
         return self.with_validation(scene)
 
     def with_validation(self, scene: Scene) -> Scene:
@@ -54,7 +60,7 @@ class Split:
         folders = [scene.path, *([self.folder] if self.folder else [])]
         if self.validation == 0:
             return scene
-        fold = _auto(scene) if self.validation == "auto" else _of(scene, self.validation, folders)
+        fold = _auto(scene) if self.validation == "auto" else _of(scene, "validation", self.validation, folders)
         train = tuple(i for i in scene.train if i not in fold)
         if not fold or not train:
             raise DataError(
@@ -70,10 +76,19 @@ def _with_test(scene: Scene, test: set[int]) -> Scene:
     return replace(scene, train=made.train, test=made.test, extent=made.extent)
 
 
-def _of(scene: Scene, choice: int | Choice, folders: Sequence[Path]) -> set[int]:
-    """The indices of the chosen ones of the training views."""
-    chosen = choose(choice, [scene.views[i].name for i in scene.train], folders)
-    return {scene.train[i] for i in chosen}
+def _of(scene: Scene, key: str, choice: int | Choice, folders: Sequence[Path]) -> set[int]:
+    """The indices of the chosen ones of the training views; key: the setting that chooses."""
+    names = [scene.views[i].name for i in scene.train]
+    return {scene.train[i] for i in _chosen(scene, key, choice, names, folders)}
+
+
+def _chosen(scene: Scene, key: str, choice: int | Choice, names: Sequence[str], folders: Sequence[Path]) -> set[int]:
+    """The indices of the chosen names.  Raises DataError, with the place of the choice."""
+    tested = [scene.views[i].name for i in scene.test] if key != "holdout" else []
+    try:
+        return choose(choice, names, folders, tested)
+    except DataError as error:
+        raise DataError(f"{scene.path}: scene.{key}: {error}") from error
 
 
 def _auto(scene: Scene) -> set[int]:

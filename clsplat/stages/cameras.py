@@ -8,13 +8,16 @@ from pydantic import Field
 from clsplat.cameras.table import PLACES, checked, write_cameras
 from clsplat.errors import DataError
 from clsplat.stages.base import Stage, path_in_run
+from clsplat.training.poses import refined
 from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
 
 
 class Cameras(Stage):
-    """Write the cameras of the scene, at the photographs' full size, so that a model travels with its views."""
+    """Write the cameras of the scene, at the photographs' full size, so that a model travels with its views.
+
+    After a training with `poses` they are the learned ones; see `optimize.poses`."""
 
     stage: Literal["cameras"] = "cameras"
     output_keys: ClassVar[frozenset[str]] = frozenset({"formats", "folder"})
@@ -30,7 +33,7 @@ class Cameras(Stage):
 
     def run(self, run: Run) -> None:
         for name in self.formats:
-            for path in write_cameras(run.original, run.out / self.folder, name, over=True):
+            for path in write_cameras(refined(run.numbers, run.original), run.out / self.folder, name, over=True):
                 LOG.info("cameras written to %s", path)
 
     def verify(self, run: Run) -> None:

@@ -17,6 +17,7 @@ from clsplat.scene.scene import View
 from clsplat.settings import ReadPath
 from clsplat.stages.base import CADENCE, Scheduled
 from clsplat.training.colours import colours_of, tell_of_colours
+from clsplat.training.poses import refined
 from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
@@ -95,7 +96,7 @@ class Evaluate(Scheduled):
             return
         perceptual, model = self._perceptual(), self._model(run)
         for downscale in self.downscales or [run.downscale]:
-            views = self._chosen(run.original.downscaled(downscale).split(self.split))
+            views = self._chosen(refined(run.numbers, run.original).downscaled(downscale).split(self.split))
             photographs = run.photographs if downscale in run.scene.downscales else run.photographs.fresh()
             counted = run.status.counted(run.until_interrupted(views), "views", len(views))
             results = measure(run.rasterizer, model, counted, photographs, perceptual, colours=colours_of(run))

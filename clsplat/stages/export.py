@@ -57,8 +57,8 @@ class Export(Scheduled):
     def run(self, run: Run) -> None:
         model = with_sky_splats(run.host_model()) if self.sky == "splats" else run.host_model()
         path, raw, behind = self.outputs(run.out)
-        run.written.pop(_name(behind, run), None)
-        behind.unlink(missing_ok=True)
+        if _name(behind, run) not in run.written:
+            behind.unlink(missing_ok=True)
         files = {path: model.baked()}
         if model.filter_variance is not None:
             files[raw] = model
@@ -71,8 +71,10 @@ class Export(Scheduled):
             except DataError as error:
                 raise OutputError(f"{error}; it was written just now: check the disk and its space") from error
             LOG.info("%s Gaussians written to %s", f"{len(one):,}", file)
+        run.written.pop(_name(behind, run), None)
         if behind.is_file():
             run.written[_name(behind, run)] = sha256(behind)
+        if model.sky:
             LOG.info("their sky written to %s; `export: {sky: splats}` makes Gaussians of it", behind)
 
     def verify(self, run: Run) -> None:

@@ -56,7 +56,8 @@ class Keeping(Stage):
         if self.keep == "last":
             return []
         own = next((stage for stage in during if _validates(stage)), None)
-        every = own.every if own else min(max(SHORTEST, self.steps // EVALUATIONS), self.steps)
+        parts = max(1, min(EVALUATIONS, self.steps // SHORTEST))  # whole ones: what is not measured cannot be the best
+        every = own.every if own else self.steps // parts
         start, stop = (own.start, own.stop) if own else (0, None)
         facts = {"metrics": [*PSNR_AND_SSIM], "every": every}
         train = Evaluate.model_validate({**facts, "split": "train", "most": SHOWN, "start": start, "stop": stop})

@@ -11,8 +11,8 @@ from pydantic import Field, field_validator
 from clsplat.density.statistics import SplatStats
 from clsplat.errors import Interrupted
 from clsplat.losses.base import ImageLoss, Loss, Penalty, ViewGradients, ViewLosses, require_symmetric
-from clsplat.names import VIEW_COLOURS
-from clsplat.schedule import Points, Probability
+from clsplat.names import VIEW_COLOURS, VIEW_POSES
+from clsplat.schedule import Probability
 from clsplat.settings import OneOf
 from clsplat.stages.base import Scheduled
 from clsplat.stages.densify import Densify
@@ -22,13 +22,14 @@ from clsplat.training import checkpoint
 from clsplat.training.adam import Adam, Rates, Rows
 from clsplat.training.colours import photograph_colours, write_view_colours
 from clsplat.training.forecast import Forecast
+from clsplat.training.poses import photograph_poses, write_view_poses
 from clsplat.training.profile import clocks
 from clsplat.training.rescue import finite_values
 from clsplat.training.run import Run, Stopped
 from clsplat.training.skipping import Skip, Visit
 from clsplat.training.trainer import Trainer
 from clsplat.views.colours import Colours
-from clsplat.views.detail import course
+from clsplat.views.poses import Poses
 from clsplat.views.sampling import Sampler, ViewSettings
 from clsplat.views.transients import Transients
 
@@ -61,6 +62,8 @@ class Optimize(Keeping):
     """Losses and penalties; training minimises their sum."""
     colours: OneOf[Colours] | None = None
     """Colours of each photograph, where exposures differ: `gain`, `affine`, `auto`; without it, those of the scene."""
+    poses: Poses | None = None
+    """Places of the cameras that are learned with the model, where poses are not exact; without it, the dataset's."""
     transients: Transients | None = None
     """Pixels that are left out, where photographs show what the scene does not have; without it, none."""
     dropout: Probability = 0.0
@@ -94,7 +97,7 @@ class Optimize(Keeping):
             stage.check()
 
     def outputs(self, out: Path) -> list[Path]:
-        own = [out / VIEW_COLOURS] if self.colours else []
+        own = [*([out / VIEW_COLOURS] if self.colours else []), *([out / VIEW_POSES] if self.poses else [])]
         return [*(path for stage in self.during for path in stage.outputs(out)), *own]
 
     def acting(self, step: int) -> list[Scheduled]:
@@ -119,7 +122,7 @@ class Optimize(Keeping):
     def iterate(self, run: Run) -> Iterator[ViewLosses]:
         """Train step by step; what a step yields, ViewGradients unless it is skipped, is valid until the next."""
         self.begin_to_keep(run)
-        views = self._views(run)
+        views = self.views.settled(run.training_images)
         last_step = run.step - run.stage_step + self.steps
         trainer, sampler = self._trainer(run, views, last_step), Sampler(run.scene.split("train"), views, run.seed)
         (memory := run.memory_plan()).check(count := run.model.gaussians.count)
@@ -151,6 +154,7 @@ class Optimize(Keeping):
             yield view
         self.leave(run)  # a resumed run may have no step left
         write_view_colours(run, trainer.colours)
+        write_view_poses(run, trainer.poses)
 
     @property
     def statistics(self) -> set[str]:
@@ -167,13 +171,6 @@ class Optimize(Keeping):
     def _density(self) -> list[Densify]:
         return [stage for stage in self.during if isinstance(stage, Densify)]
 
-    def _views(self, run: Run) -> ViewSettings:
-        """The settings of the samples, with what follows from the photographs."""
-        views = self.views.settled(run.training_images)
-        if isinstance(views.resolution, Points) and views is not self.views:
-            LOG.info(course(views.resolution))
-        return views
-
     def _trainer(self, run: Run, views: ViewSettings, last: int) -> Trainer:
         """Attach moments, statistics and tables to the run's Gaussians; a resumed run has them."""
         gaussians, photographs = run.model.gaussians, run.photographs
@@ -186,8 +183,9 @@ class Optimize(Keeping):
             stage.attach(run)
         parts = run.rasterizer, run.model, run.adam, run.stats, photographs.background
         rates, colours = self.rates.settled(views.full_size(last)), photograph_colours(self.colours, run, last)
+        poses = photograph_poses(self.poses, run, last)
         own = colours, self.transients, run.sky, self.dropout, run.seed
-        return Trainer(*parts, self.losses, rates, run.scene.extent, run.numbers, self.update, *own)
+        return Trainer(*parts, self.losses, rates, run.scene.extent, run.numbers, self.update, *own, poses=poses)
 
     def _act(self, run: Run) -> None:
         """Run the stages that are due and do not edit; those that fail run again when the run goes on."""

@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Collection
+from dataclasses import asdict
 from itertools import pairwise
 from typing import Annotated, ClassVar, Literal
 
@@ -9,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from clsplat.density.contribution import SCORES, Score
+from clsplat.density.contribution import SCORES, Score, best, keep
 from clsplat.density.thresholds import Share
 from clsplat.formats.splats import MAX_DEGREE, sh_coefficients
 from clsplat.gaussians.tables import PARAMETERS
@@ -24,8 +25,8 @@ def scores(run: Run, score: Score = "weight") -> NDArray[np.float64]:
     """Return what each Gaussian does to the training views, [N], summed over their pixels: its blend weight, or the
     squares of the image's derivatives by its value."""
     views = run.scene.split("train")
-    photographs = (run.photographs.get(view) for view in run.status.counted(views, "views", len(views)))
-    return SCORES[score](run.rasterizer, run.model, photographs, run.photographs.background).astype(np.float64)
+    looks = run.survey().looks(run.status.counted(views, "views", len(views)))
+    return SCORES[score](looks, run.model.gaussians.count).astype(np.float64)
 
 
 class PruneLeast(Scheduled):
@@ -59,15 +60,12 @@ class PruneLeast(Scheduled):
         gaussians, score = run.model.gaussians, scores(run, self.score)
         share = 1 - (self.remove or 0) if self.keep is None else self.keep
         kept = best(score, max(1, round(share * len(score))))
-        before = gaussians.count
-        source = run.device.upload(kept.astype(np.uint32))
-        gaussians.rearrange(source, run.device.zeros(len(kept), np.uint32), len(kept))
+        change = keep(gaussians, kept, self.stage)
         run.refresh_filter()
-        causes = {self.stage: before - len(kept)}
-        run.records.add(run.step, "densify", before=before, after=len(kept), causes=causes, grown={})
+        run.records.add(run.step, "densify", **asdict(change))
         lost = 100 * (1 - score[kept].sum() / (score.sum() or 1))
         LOG.info(
-            "%s Gaussians kept; the others had %.2g %% of the %s", f"{len(kept):,} of {before:,}", lost, self.score
+            "%s Gaussians kept; the others had %.2g %% of the %s", f"{len(kept):,} of {len(score):,}", lost, self.score
         )
 
 
@@ -106,11 +104,6 @@ class ReduceSh(Scheduled):
         if run.adam is not None:
             run.adam.forget("sh_rest")
         LOG.info("%d of %d bands of harmonics are zero", dropped.sum(), dropped.size)
-
-
-def best(score: NDArray[np.float64], count: int) -> NDArray[np.int64]:
-    """Return the places of the `count` largest scores, ascending; of equal ones the first."""
-    return np.sort(np.argsort(-score, kind="stable")[:count])
 
 
 def band_energy(rest: NDArray[np.float32]) -> NDArray[np.float64]:

@@ -8,9 +8,11 @@ from typing import Annotated, ClassVar, Literal
 
 from clsplat.errors import DataError, amount
 from clsplat.metrics.views import render_view
+from clsplat.render.camera import upload_camera
 from clsplat.scene.images import image_size, is_image, write_image
 from clsplat.scene.view import View
 from clsplat.stages.base import Stage, path_in_run
+from clsplat.training.poses import refined
 from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
@@ -30,14 +32,14 @@ class Render(Stage):
 
     def _views(self, run: Run) -> dict[Path, View]:
         """The views of the split, by the file of their render."""
-        views = run.scene.downscaled(run.downscale).split(self.split)
+        views = refined(run.numbers, run.scene).downscaled(run.downscale).split(self.split)
         return dict(zip(image_paths(run.out / self.folder, [view.name for view in views]), views, strict=True))
 
     def run(self, run: Run) -> None:
         views = self._views(run)
         counted = run.status.counted(run.until_interrupted(views.items()), "views", len(views))
         for path, view in counted:
-            camera = run.photographs.camera(view)
+            camera = upload_camera(run.device, view)
             write_image(path, render_view(run.rasterizer, run.model, camera, run.photographs.background))
         LOG.info("%s written to %s", amount(len(views), "image"), run.out / self.folder)
 

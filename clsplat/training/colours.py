@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.errors import DataError, quoted
+from clsplat.errors import DataError, NumericError, quoted
 from clsplat.files import write_text
 from clsplat.names import VIEW_COLOURS
 from clsplat.reading import read_json
@@ -89,6 +89,8 @@ def write_view_colours(run: Run, colours: PhotographColours | None) -> None:
     if colours is None:
         return
     rows = {view: colours.table.row(run.numbers, view) for view in colours.table.views}
+    if wrong := next((view for view, row in rows.items() if not np.isfinite(colours.model.matrix(row)).all()), None):
+        raise NumericError(f"the colours of {quoted(wrong)} are not finite; lower optimize.colours.rate")
     data: dict[str, Any] = {
         "meaning": "a colour c of the model, red, green and blue, is min(1, E c + b) in the photograph; "
         "matrix: the rows of [E | b]",

@@ -39,6 +39,7 @@ STAGES = {
     "blend_backward": "blend backward",
     "sum_records": "sum records",
     "project_backward": "update",
+    "pose_gradient": "update",
     "adam_step": "update",
     "update_gaussians": "update",
     "count_seen": "statistics",

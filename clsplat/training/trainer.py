@@ -28,6 +28,7 @@ from clsplat.training.adam import Adam, Rates, Rows
 from clsplat.training.sky import LearnedSky
 from clsplat.views.learned import LearnedTransform, learned_of, name_of
 from clsplat.views.photograph_colours import PhotographColours, change_back, change_colours
+from clsplat.views.photograph_poses import PhotographPoses
 from clsplat.views.photographs import Photograph, apply_mask
 from clsplat.views.texture import known_gradient
 from clsplat.views.transforms import PhotographTransform, Planes
@@ -77,6 +78,7 @@ class Trainer:
     sky: LearnedSky | None = None  # of the model, where it has one
     dropout: Schedule = 0.0  # probability with which a step leaves a Gaussian out, by step
     seed: int = 0  # of what is drawn
+    poses: PhotographPoses | None = None  # of the cameras, where they are learned
 
     def step(
         self,
@@ -112,6 +114,7 @@ class Trainer:
             if not isinstance(loss, ImageLoss | Penalty):
                 raise ConfigError(f"the loss {type(loss).__name__}: expected a subclass of ImageLoss or of Penalty")
         require_symmetric(self.losses, transforms)
+        photograph = self.poses.place(photograph, self.numbers, step) if self.poses else photograph
         workspace, camera, timings = self.rasterizer.workspace, photograph.camera, self.rasterizer.device.timings
         reads_entropy = any(isinstance(loss, ImageLoss) and loss.reads_entropy for loss in self.losses)
         content: Content = "entropy" if reads_entropy else "colour"
@@ -151,6 +154,8 @@ class Trainer:
         texture = known_gradient(workspace, camera, photograph, mask) if count > TEXTURE else None
         model = self._drawn(comparison.step)
         pixel_sums = self.rasterizer.pixel_sums(model, view.frame, gradient, count, texture, view.behind)
+        if self.poses and (learn := self.poses.learning(workspace, model, view.frame, pixel_sums, comparison.step)):
+            learning.append(lambda: learn(self.numbers))
         return ViewGradients(view.frame, comparison, view.losses, pixel_sums, learning=learning)
 
     def _drawn(self, step: int) -> DeviceModel:
@@ -187,7 +192,6 @@ class Trainer:
         matrix = colours.matrix(self.numbers, number)
         workspace = self.rasterizer.workspace
         gradient, by_matrix = change_back(workspace, camera, view.frame.image, matrix, gradient)
-
         return gradient, [*learning, lambda: colours.learn(self.numbers, number, by_matrix(), comparison.step)]
 
     def _of_sky(self, view: ViewLosses, gradient: Array) -> list[Callable[[], None]]:

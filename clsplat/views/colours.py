@@ -10,9 +10,9 @@ from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
-from clsplat.schedule import Decay, NonNegative, Schedule, explained
+from clsplat.schedule import Bounded, Decay, Schedule, explained
 from clsplat.settings import OneOf, Settings
 
 Floats = NDArray[np.float64]
@@ -20,6 +20,7 @@ LUMINANCE = np.array([0.299, 0.587, 0.114])  # BT.601
 IDENTITY = np.eye(3, 4)
 FEW_VISITS = 400  # of a photograph: with fewer, Adam at 2e-3 cannot reach a gain of 1.5
 MOST = 5e-2  # learning rate
+Rate = Annotated[Schedule, AfterValidator(Bounded(0, most=0.5))]  # Adam's steps are as long: a gain of 1.6 in each
 SPREAD = 0.03  # of the exposures: smaller ones are within what tracks measure
 # Of the differences: 17 to 31 % in three captures as they are, 40 to 71 % in the same with exposures changed by 25 %.
 EXPLAINED = 1 / 3
@@ -39,9 +40,9 @@ class ColourModel(Colours):
     training_keys: ClassVar[frozenset[str]] = frozenset({"rate"})
     columns: ClassVar[tuple[str, ...]]  # names of a photograph's numbers
 
-    rate: Annotated[Literal["auto"] | NonNegative, explained(", or auto")] = "auto"
+    rate: Annotated[Literal["auto"] | Rate, explained(", or auto")] = "auto"
     """Learning rate of the numbers, by Adam, by step; auto: 1e-2 to 1e-3, where each photograph is visited 400 times or
-    more 2e-3 to 2e-5; where no tracks tell the exposures, as large as a gain of 2.7 needs, up to 5e-2."""
+    more 2e-3 to 2e-5; where no tracks tell the exposures, as large as a gain of 2.7 needs, up to 5e-2.  At most 0.5."""
 
     def rate_of(self, steps: int, photographs: int, known: bool = True) -> Schedule:
         """Return the learning rate by step of a training with so many steps and photographs.

@@ -1,5 +1,6 @@
 """The sample of a training step: a view, at a size, with transforms of its photograph."""
 
+import logging
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Annotated
@@ -12,10 +13,12 @@ from clsplat.errors import ConfigError
 from clsplat.scene.scene import View
 from clsplat.schedule import AtLeastOne, Points, at_step, explained
 from clsplat.settings import OneOf, Settings
-from clsplat.views.detail import DetailDivisor
+from clsplat.views.detail import DetailDivisor, course
 from clsplat.views.learned import learned_of
 from clsplat.views.order import Order, Uniform, ViewPool
 from clsplat.views.transforms import PhotographTransform
+
+LOG = logging.getLogger("clsplat")
 
 
 class ViewSettings(Settings):
@@ -39,7 +42,9 @@ class ViewSettings(Settings):
         step."""
         if not isinstance(self.resolution, DetailDivisor):
             return self
-        return self.model_copy(update={"resolution": self.resolution.of(photographs())})
+        found = self.resolution.of(photographs())
+        LOG.info(course(found))
+        return self.model_copy(update={"resolution": found})
 
     def divisor(self, step: int) -> float:
         """Return the divisor of the photographs' size at a global step.  Raises ConfigError before it is settled."""

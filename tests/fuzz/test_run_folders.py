@@ -11,6 +11,7 @@ import pytest
 import clsplat
 from clsplat.gaussians.sky import Sky, sky_beside
 from clsplat.names import INPUTS
+from clsplat.reading import sha256
 from clsplat.runs.verify import verify
 from clsplat.training import archive
 from clsplat.training.status import read_status
@@ -89,13 +90,14 @@ def held(name: str, content: Any, found: dict[str, Any]) -> Any:
 
 
 def test_a_damaged_sky_is_a_map_or_refused(folder: Path):
-    path = folder / "model_sky.json"
-    Sky(np.linspace(0, 1, 192, dtype=np.float32).reshape(64, 3)).write(path)
+    path, model = folder / "model_sky.json", folder / "model.ply"
+    model.write_bytes(b"a model")
+    Sky(np.linspace(0, 1, 192, dtype=np.float32).reshape(64, 3)).write(path, {model.name: sha256(model)})
 
-    @fuzzed(data=damaged([path.read_bytes()], ["side", "texels", "NaN", "1e999", "null", "[[0, 0, 0]]"]))
+    @fuzzed(data=damaged([path.read_bytes()], ["side", "texels", "models", "NaN", "1e999", "null", "[[0, 0, 0]]"]))
     def reads(data):
         path.write_bytes(data)
-        found = outcome(sky_beside, folder / "model.ply")
+        found = outcome(sky_beside, model)
         if found is not None:
             assert found.texels.shape == (found.side**2, 3)
             assert np.isfinite(found.texels).all()

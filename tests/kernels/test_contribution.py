@@ -8,12 +8,14 @@ from clsplat.conformance.checks.blending import MARGIN
 from clsplat.conformance.checks.compression import photograph_of
 from clsplat.conformance.scenes import random_case, safe_case
 from clsplat.density.contribution import contributions
+from clsplat.density.survey import Look
 from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import Budget, Rasterizer
 
 
 def weights(rasterizer, model, photographs):
-    return contributions(rasterizer, model, photographs, rasterizer.device.zeros(3))
+    looks = Look.each(rasterizer, model, photographs, rasterizer.device.zeros(3))
+    return contributions(looks, model.gaussians.count)
 
 
 @pytest.mark.parametrize(

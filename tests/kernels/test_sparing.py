@@ -10,7 +10,8 @@ from clsplat.conformance import reference as ref
 from clsplat.conformance.checks.blending import MARGIN
 from clsplat.conformance.scenes import Case, safe_case
 from clsplat.density.edit import Edit
-from clsplat.density.sparing import PruneSpare, most, squared_error, total_weights
+from clsplat.density.importance import drawn_weights
+from clsplat.density.sparing import PruneSpare, most, squared_error
 from clsplat.density.statistics import SplatStats
 from clsplat.density.survey import Survey
 from clsplat.density.thresholds import SceneScale
@@ -74,8 +75,8 @@ def test_as_many_go_as_the_views_allow(device, rng, count, width, height):
     photographs = photographs_like(rng, case, 2)
     survey = survey_of(device, case, photographs, masks)
     weight = sum(ref.contribution(case.project(), width, height, mask) for mask in masks)
-    np.testing.assert_allclose(total_weights(survey), weight, rtol=1e-4, atol=1e-5)
-    order = np.argsort(total_weights(survey), kind="stable")
+    np.testing.assert_allclose(drawn_weights(survey).total, weight, rtol=1e-4, atol=1e-5)
+    order = np.argsort(drawn_weights(survey).total, kind="stable")
     before = error_of(case, np.arange(count), photographs, masks)
     assert squared_error(survey, survey.views) == pytest.approx(before, rel=1e-3)
     for rise in (0.02, 0.3, 3.0):
@@ -106,7 +107,7 @@ def test_a_picture_without_error_keeps_what_is_seen(device, rng):
     case.parameters["means"][::4] -= 20 * case.view.world_to_camera[2, :3]  # behind the camera
     photographs = photographs_like(rng, case, 1)
     survey = survey_of(device, case, photographs, [None])
-    unseen = np.flatnonzero(total_weights(survey) == 0)
+    unseen = np.flatnonzero(drawn_weights(survey).total == 0)
     assert 5 <= len(unseen) < 20
     assert set(unseen) <= set(pruned(survey, PruneSpare(error_rise=1e-12)))
 

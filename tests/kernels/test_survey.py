@@ -51,7 +51,8 @@ def test_numbers_of_flagged_pixels_are_exact(device, rng, count, width, height):
 def test_squares_are_those_of_the_reference(device, rng, count, width, height):
     case = safe_case(rng, count, width, height, MARGIN if count < 60 else 2e-6)
     look = look_at(device, case)
-    found = sensitivities(look.rasterizer, look.model, [look.photograph] * 2, device.upload(BACKGROUND))
+    looks = Look.each(look.rasterizer, look.model, [look.photograph] * 2, device.upload(BACKGROUND))
+    found = sensitivities(looks, look.model.gaussians.count)
     assert found.shape == (count,)
     expected = 2 * squares(case)
     np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4 * expected.max(initial=0))

@@ -12,6 +12,7 @@ from clsplat.conformance.checks.blending import MARGIN
 from clsplat.conformance.comparison import GRADIENT, SUM, Figure, by_element, by_norm, equal
 from clsplat.conformance.scenes import Case, random_case, safe_case
 from clsplat.density.contribution import contributions, sensitivities
+from clsplat.density.survey import Look
 from clsplat.formats.palette import LEVELS
 from clsplat.gaussians import members
 from clsplat.gaussians.clusters import DeviceClusters
@@ -37,17 +38,19 @@ def contribution(device: Device, rng: np.random.Generator) -> Iterator[Figure | 
         masks = (None, rng.random((height, width)) < 0.6)
         photographs = [photograph_of(device, case, mask) for mask in masks]
         expected = sum(ref.contribution(case.project(), width, height, mask) for mask in masks)
-        found, again = (
-            contributions(Rasterizer(device, "radix"), case.model(device), photographs, device.zeros(3))
-            for _ in range(2)
-        )
+        black, background = np.zeros(3, np.float32), rng.random(3).astype(np.float32)
+        found, again = (contributions(_looks(device, case, photographs, black), count) for _ in range(2))
         what = f"blend weights of {count} Gaussians"
         yield by_element("blend_backward", what, found, np.asarray(expected), SUM, floor=0.1)
         yield equal("blend_backward", f"{what}, a second time", again, found)
-        background = rng.random(3).astype(np.float32)
-        found = sensitivities(Rasterizer(device, "radix"), case.model(device), photographs, device.upload(background))
+        found = sensitivities(_looks(device, case, photographs, background), count)
         squares = np.sum([_squares(case, background, mask) for mask in masks], axis=0)
         yield by_norm("blend_backward", f"squared changes of the image by {count} Gaussians", found, squares, GRADIENT)
+
+
+def _looks(device: Device, case: Case, photographs: list[Photograph], background: NDArray[Any]) -> Iterator[Look]:
+    """The views of photographs, by a new rasterizer and model."""
+    return Look.each(Rasterizer(device, "radix"), case.model(device), photographs, device.upload(background))
 
 
 def _squares(case: Case, background: NDArray[Any], mask: Mask | None) -> NDArray[Any]:

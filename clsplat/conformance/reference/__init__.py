@@ -72,6 +72,7 @@ from clsplat.conformance.reference.penalties import (
     mean_opacity,
     mean_scale,
 )
+from clsplat.conformance.reference.poses import moved_camera, pose_gradient
 from clsplat.conformance.reference.projection import (
     clamped_ray,
     footprint,
@@ -134,10 +135,12 @@ __all__ = [
     "mean_opacity",
     "mean_scale",
     "member_sums",
+    "moved_camera",
     "ms_ssim",
     "nearest_vectors",
     "normal3",
     "philox",
+    "pose_gradient",
     "project",
     "project_backward",
     "psnr",

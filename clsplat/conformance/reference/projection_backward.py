@@ -61,6 +61,23 @@ def ratio_gradient(foot: Footprint) -> NDArray[Any]:
     return adjugate(foot.sharp) / det1 - det0 / det1**2 * adjugate(foot.dilated)
 
 
+def covariance_gradient(
+    splats: Splats, n: int, foot: Footprint, compensate: float, grad_conic: NDArray[Any], grad_kappa: float
+) -> NDArray[Any]:
+    """dL/dV, [2,2], from the conic and from κ = sqrt(1 + compensate (det V / det V1 - 1))."""
+    # Conic -> 2D covariance: G_V = -K G_K K (that of V itself for the pixel's box)
+    a, b, c = splats.conic[n]
+    conic = np.array([[a, b], [b, c]])
+    ga, gb, gc = grad_conic
+    grad_v = np.array([[ga, gb / 2], [gb / 2, gc]])
+    if not splats.pixel_box:
+        grad_v = -conic @ grad_v @ conic
+    if compensate != 0:
+        _, _, kappa = opacity_factors(0.0, foot, compensate)
+        grad_v += grad_kappa * compensate / (2 * kappa) * ratio_gradient(foot)
+    return grad_v
+
+
 def project_backward(
     gaussians: Gaussians,
     camera: Camera,
@@ -84,16 +101,7 @@ def project_backward(
         grad["logit_opacity"][n] = grad_opacity[n] * rho * kappa * sigmoid * (1 - sigmoid)
         grad_kappa = grad_opacity[n] * sigmoid * rho
 
-        # Conic -> 2D covariance: G_V = -K G_K K (that of V itself for the pixel's box)
-        # then κ = sqrt(1 + compensate (det V / det V1 - 1))
-        a, b, c = splats.conic[n]
-        conic = np.array([[a, b], [b, c]])
-        ga, gb, gc = grad_conic[n]
-        grad_v = np.array([[ga, gb / 2], [gb / 2, gc]])
-        if not splats.pixel_box:
-            grad_v = -conic @ grad_v @ conic
-        if compensate != 0:
-            grad_v += grad_kappa * compensate / (2 * kappa) * ratio_gradient(foot)
+        grad_v = covariance_gradient(splats, n, foot, compensate, grad_conic[n], grad_kappa)
 
         # 2D -> 3D covariance: V = M Σ Mᵀ, M = J W
         m = foot.jacobian @ camera.rotation

@@ -1,0 +1,82 @@
+"""Jittered cameras are found again: photographs of a model that is known, from places that are known."""
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from clsplat.conformance.scenes import random_case
+from clsplat.density.statistics import SplatStats
+from clsplat.losses.image import L1, Dssim
+from clsplat.metrics.views import render_floats
+from clsplat.opencl.device import Device
+from clsplat.render.camera import upload_camera
+from clsplat.render.rasterizer import Rasterizer
+from clsplat.scene.view import View
+from clsplat.schedule import Decay
+from clsplat.training.adam import Adam, Rates
+from clsplat.training.trainer import Trainer
+from clsplat.views.photograph_poses import PhotographPoses
+from clsplat.views.photographs import Photograph
+from clsplat.views.poses import Move, Poses
+
+VIEWS, STEPS, ANGLE, DEPTH = 6, 900, np.radians(0.3), 3.0
+RATE = Decay(initial=2e-3, final=2e-5, over=STEPS)
+STILL = Rates(means=0, quats=0, log_scales=0, logit_opacity=0, sh_base=0, sh_rest=0)  # cameras alone are unknown
+
+
+def errors(truth: list[View], found: list[np.ndarray]) -> tuple[float, float]:
+    """The largest angle in rad, and the largest distance of centres."""
+    angles = [
+        Rotation.from_matrix(pose[:, :3] @ view.world_to_camera[:, :3].T).magnitude()
+        for view, pose in zip(truth, found, strict=True)
+    ]
+    centres = [-pose[:, :3].T @ pose[:, 3] - view.position for view, pose in zip(truth, found, strict=True)]
+    return max(angles), float(np.linalg.norm(centres, axis=1).max())
+
+
+def learned(rng: np.random.Generator, info, jitter: float) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Errors of cameras before and after they are learned; jitter: 1 for 0.3 degrees and 0.3 % of the depth."""
+    case, device = random_case(rng, 200, 96, 72), Device(info)
+    model, rasterizer = case.model(device), Rasterizer(device)
+    background, photographs = device.upload(np.full(3, 0.3, np.float32)), list[Photograph]()
+    places = [np.array([0.25 * number - 0.6, 0.15 * (number % 3), 0]) for number in range(VIEWS)]
+    truth = [
+        replace(case.view, name=str(n), world_to_camera=Move(np.zeros(3), place, 0).of(case.view.world_to_camera))
+        for n, place in enumerate(places)
+    ]
+    turns, shifts = jitter * rng.normal(size=(2, VIEWS, 3)) * np.array([[[ANGLE]], [[0.003 * DEPTH]]])
+    turns, shifts = turns - turns.mean(axis=0), shifts - shifts.mean(axis=0)
+    views = [
+        replace(view, world_to_camera=Move(turn, shift, 0).of(view.world_to_camera))
+        for view, turn, shift in zip(truth, turns, shifts, strict=True)
+    ]
+    for number, (view, given) in enumerate(zip(truth, views, strict=True)):
+        values = np.clip(render_floats(rasterizer, model, upload_camera(device, view), background), 0, 1)
+        pixels = np.ascontiguousarray(np.rint(255 * values).astype(np.uint8).transpose(2, 0, 1))
+        photographs.append(Photograph(replace(upload_camera(device, given), view=number), device.upload(pixels)))
+    numbers = dict[str, float]()
+    poses = PhotographPoses(views, 0, *Poses(start=0, turn=RATE, shift=RATE).rates(STEPS, VIEWS))
+    poses.begin(numbers, dict.fromkeys((view.name for view in views), DEPTH))
+    parts = rasterizer, model, Adam(model.gaussians), SplatStats(model.gaussians, []), background
+    trainer = Trainer(*parts, (L1(weight=0.8), Dssim(weight=0.2)), STILL, numbers=numbers, poses=poses)
+    for step in range(1, STEPS + 1):
+        trainer.step(photographs[step % VIEWS], step)
+    given = [view.world_to_camera for view in views]
+    return errors(truth, given), errors(truth, [poses.pose(numbers, number) for number in range(VIEWS)])
+
+
+def test_jittered_cameras_are_found_again(rng, info):
+    before, after = learned(rng, info, 1.0)
+    print(np.degrees(before[0]), np.degrees(after[0]), before[1], after[1])
+    assert np.degrees(before[0]) > 0.4
+    assert after[0] < before[0] / 5
+    assert after[1] < before[1] / 5
+
+
+def test_exact_cameras_stay(rng, info):
+    before, after = learned(rng, info, 0.0)
+    print(np.degrees(after[0]), after[1])
+    assert before[0] < 1e-9
+    assert np.degrees(after[0]) < 0.02
+    assert after[1] < 0.001 * DEPTH
