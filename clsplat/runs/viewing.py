@@ -88,8 +88,8 @@ def _advise(loaded: Mapping[str, Model], splats: int | None) -> None:
     for name, model in loaded.items():
         if min(len(model), splats or len(model)) > MANY:
             LOG.warning(
-                "%s: has %s splats; they take a while to pack, and browsers show %s smoothly: --splats %d keeps the most "
-                "important",
+                "%s: has %s splats; they take a while to pack, and browsers show %s smoothly: --splats %d keeps the "
+                "most important",
                 *(name, f"{len(model):,}", f"{MANY:,}", MANY),
             )
 
