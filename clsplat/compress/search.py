@@ -109,7 +109,7 @@ def compress(
             search.points += rung
             search.write()
             before = keep
-            if wanted.ends(rung, whole.psnr) and keep < 1:  # at 1 nothing is trained: the next rung can be better
+            if wanted.ends(rung, whole.psnr) and keep < 1:  # after the model itself: a trained rung can be better
                 break
         return _finished(search, form)
 
