@@ -31,6 +31,7 @@ BLEND: list[dict[str, int]] = [*({"PIXEL_SUMS": n} for n in SUMS), BOX, {**BOX, 
 PASSED = {  # what call sites of Device.program add to the tuning; a test holds it against them
     "adam.cl": [BOX],
     "large.cl": [BOX],
+    "poses.cl": [BOX],
     "project.cl": [BOX],
     "blend_simt.cl": BLEND,
     "blend_wide.cl": BLEND,
