@@ -95,8 +95,13 @@ def resumable(kind: type[Settings], key: str) -> Literal["output", "training"] |
 
 def variants(base: type[Base]) -> dict[str, type[Base]]:
     """Return the subclasses of `base` that have a name, by name.  Raises ConfigError when two have the same one."""
+    return dict(_named(base, tuple(Settings.defined)))
+
+
+@functools.lru_cache(maxsize=256)
+def _named(base: type[Base], defined: tuple[type["Settings"], ...]) -> dict[str, type[Base]]:
     found: dict[str, type[Base]] = {}
-    for kind in Settings.defined:
+    for kind in defined:
         if not issubclass(kind, base) or (tag := tag_of(kind)) is None:
             continue
         if tag[1] in found:

@@ -162,7 +162,6 @@ def test_a_loss_that_is_added_acts_from_the_next_step_on(tiny_scene):
     ("arguments", "error", "message"),
     [
         (("smokee",), ConfigError, "no pipeline named 'smokee'"),
-        (("photos",), ConfigError, "prepares its scene; use clsplat.run"),
         (("smoke", {"optimize.step": 3}), ConfigError, "did you mean"),
         (("smoke", {"optimize.steps": np.zeros(2)}), ConfigError, "set: Object of type ndarray"),
         (("smoke", {}, None, "resume"), ConfigError, "resume: expected the folder of a run as `out`"),
@@ -174,6 +173,11 @@ def test_what_cannot_be_trained_is_a_sentence(tiny_scene, arguments, error, mess
         clsplat.Trainer(tiny_scene, pipeline, set=settings, out=out, start=start)
     assert message in str(raised.value)
     assert "\n" not in str(raised.value)
+
+
+def test_photographs_are_left_to_a_run(tiny_scene):
+    with pytest.raises(ConfigError, match="prepares its scene; use clsplat"):
+        clsplat.Trainer(tiny_scene / "train", "photos")
 
 
 def test_folders_that_are_missing_or_taken_are_refused(tiny_scene, tmp_path):

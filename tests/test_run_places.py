@@ -26,8 +26,9 @@ def test_the_folder_of_the_photographs_and_the_root_are_no_run_folders(tiny_scen
     with pytest.raises(ConfigError, match="is the root of a file system"):
         opened(tiny_scene, Path(Path.cwd().anchor))
     opened(tiny_scene, tiny_scene / "runs" / "a")
+    photographs = tiny_scene / "train"
     with pytest.raises(ConfigError, match="is the folder of the photographs, or right in it"):
-        outputs.check_places(load("photos", [f"scene.path={str(tiny_scene)!r}"]), tiny_scene / "run")
+        outputs.check_places(load("photos", [f"scene.path={str(photographs)!r}"]), photographs / "run")
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 import types
 import typing
+from functools import lru_cache
 from typing import Any
 
 from pydantic import BaseModel
@@ -37,6 +38,7 @@ def annotation_of(field: FieldInfo) -> Any:
     return typing.Annotated[field.annotation, *field.metadata] if field.metadata else field.annotation
 
 
+@lru_cache(maxsize=1024)
 def tags(model: type[BaseModel]) -> tuple[Any, ...]:
     """Return the names of the model in pipeline files; none when it is not a variant."""
     field = next((model.model_fields[name] for name in TAGS if name in model.model_fields), None)
