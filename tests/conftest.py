@@ -6,7 +6,6 @@ that clsplat would choose), each with the wide schedule at 16 and 8 lanes and wi
 
 import functools
 import os
-import shutil
 import signal
 import sys
 from collections.abc import Generator, Iterator
@@ -27,7 +26,7 @@ from clsplat.opencl.program import Program
 from clsplat.scene.readers import Reader
 from clsplat.settings import Settings, rebuild
 from data_tools.synthetic import Options, write_dataset
-from tests.few_steps import FEW
+from tests.few_steps import FEW, killed
 
 hypothesis.settings.register_profile("suite", deadline=None)  # a busy machine is no fault
 hypothesis.settings.load_profile("suite")
@@ -184,8 +183,4 @@ def few_steps(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
 @pytest.fixture
 def killed_run(few_steps: Path, tmp_path: Path) -> Path:
     """That run as it was killed after step 8 and its checkpoints."""
-    shutil.copytree(few_steps, tmp_path / "run")
-    (tmp_path / "run" / "checkpoints" / "step_000012.npz").unlink()
-    for name in ("point_cloud.ply", "metrics.json", "checksums.json"):
-        (tmp_path / "run" / name).unlink()
-    return tmp_path / "run"
+    return killed(few_steps, tmp_path / "run")

@@ -1,7 +1,6 @@
 """Whole runs in which photographs have colours of their own."""
 
 import json
-import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -21,7 +20,7 @@ from clsplat.training import checkpoint
 from clsplat.training.colours import colours_beside, colours_of
 from clsplat.views.colours import Affine, Auto, Gain
 from clsplat.views.exposures import UNKNOWN
-from tests.few_steps import FEW
+from tests.few_steps import FEW, killed
 from tests.test_exposures import Wall
 from tests.test_training import digest, train
 
@@ -38,11 +37,7 @@ def with_gains(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
 
 
 def test_a_resumed_run_ends_with_the_bits_of_one_that_was_not(with_gains, tiny_scene, tmp_path):
-    out = tmp_path / "run"
-    shutil.copytree(with_gains, out)
-    (out / "checkpoints" / "step_000012.npz").unlink()
-    for name in ("point_cloud.ply", "metrics.json", "checksums.json"):
-        (out / name).unlink()
+    out = killed(with_gains, tmp_path / "run")
     run = train(tiny_scene, out, *GAIN, resume=True)
     again = train(tiny_scene, tmp_path / "again", *GAIN)
     assert digest(out) == digest(with_gains) == digest(tmp_path / "again")

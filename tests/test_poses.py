@@ -1,7 +1,6 @@
 """Places of cameras: their derivatives, their table, and whole runs in which they are learned."""
 
 import json
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,7 @@ from clsplat.schedule import at_step
 from clsplat.training.poses import photograph_poses, poses_beside, refined
 from clsplat.views.photograph_poses import PhotographPoses
 from clsplat.views.poses import Move, Poses
-from tests.few_steps import FEW
+from tests.few_steps import FEW, killed
 from tests.test_reference import BACKGROUND, general_camera, random_gaussians, to_world
 from tests.test_training import digest, train
 
@@ -120,11 +119,7 @@ def with_poses(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
 
 @pytest.mark.slow
 def test_a_resumed_run_ends_with_the_bits_of_one_that_was_not(with_poses, tiny_scene, tmp_path):
-    out = tmp_path / "run"
-    shutil.copytree(with_poses, out)
-    (out / "checkpoints" / "step_000012.npz").unlink()
-    for name in ("point_cloud.ply", "metrics.json", "checksums.json"):
-        (out / name).unlink()
+    out = killed(with_poses, tmp_path / "run")
     run = train(tiny_scene, out, *ON, resume=True)
     again = train(tiny_scene, tmp_path / "again", *ON)
     assert digest(out) == digest(with_poses) == digest(tmp_path / "again")

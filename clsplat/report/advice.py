@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from clsplat.errors import amount
 from clsplat.metrics.views import ViewMetrics, measure
-from clsplat.scene.stand import closest_point, upward
-from clsplat.scene.view import View
+from clsplat.scene.stand import across, closest_point, upward
+from clsplat.scene.view import View, some_of
 from clsplat.training.colours import colours_of
 from clsplat.training.poses import refined
 from clsplat.training.run import Run
@@ -29,7 +29,7 @@ UNEVEN = 3.0  # times the median gap
 def advice(run: Run) -> list[str]:
     """Return sentences, or none where nothing stands out.  Renders at most MOST training views."""
     views = refined(run.numbers, run.scene).downscaled(run.downscale).split("train")
-    chosen = [views[(2 * i + 1) * len(views) // (2 * MOST)] for i in range(MOST)] if len(views) > MOST else views
+    chosen = some_of(views, MOST)
     counted = run.status.counted(run.until_interrupted(chosen), "views", len(chosen))
     found = measure(run.rasterizer, run.model, counted, run.photographs, colours=Gain())
     lines = [line for line in run.records.read("view") if line["downscale"] == run.downscale]
@@ -89,9 +89,9 @@ def widest_gap(views: Sequence[View]) -> tuple[float, str, str] | None:
     axes = np.stack([view.world_to_camera[2, :3] for view in views])
     from_middle = centres - closest_point(centres, axes, centres.mean(axis=0))
     distances = np.linalg.norm(from_middle, axis=1)
-    angles, across = _around(from_middle, upward(views))
+    angles, aside = _around(from_middle, upward(views))
     aimed = -(axes * from_middle).sum(axis=1) / np.maximum(distances, 1e-12)
-    if aimed.mean() < AIMED or np.median(across / np.maximum(distances, 1e-12)) < AROUND:
+    if aimed.mean() < AIMED or np.median(aside / np.maximum(distances, 1e-12)) < AROUND:
         return None
     order = np.argsort(angles, kind="stable")
     gaps = np.degrees(np.diff(np.append(angles[order], angles[order[0]] + 2 * np.pi)))
@@ -104,8 +104,7 @@ def widest_gap(views: Sequence[View]) -> tuple[float, str, str] | None:
 
 def _around(offsets: NDArray[np.floating], up: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Angles around the upward axis, radians, and distances from it, of offsets, [V, 3]."""
-    ahead = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
-    ahead /= np.linalg.norm(ahead)
+    ahead = across(up)
     x, y = offsets @ ahead, offsets @ np.cross(up, ahead)
     return np.arctan2(y, x), np.hypot(x, y)
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from clsplat.pages.page import charts
 from clsplat.pages.plan import Marks, plan
 from clsplat.scene.scene import SPLITS
-from clsplat.scene.stand import upward
+from clsplat.scene.stand import across, upward
 from clsplat.scene.view import View
 from clsplat.training.run import Run
 
@@ -22,10 +22,10 @@ def cameras(run: Run) -> list[Markup]:
     scene = run.original
     if len(scene.views) < 2:
         return []
-    across, ahead = _axes(scene.views)
+    right, ahead = _axes(scene.views)
 
     def flat(points: NDArray[np.floating]) -> NDArray[np.float64]:
-        return np.stack([points @ across, points @ ahead], axis=-1)
+        return np.stack([points @ right, points @ ahead], axis=-1)
 
     marks = []
     for split in SPLITS:
@@ -44,6 +44,5 @@ def cameras(run: Run) -> list[Markup]:
 def _axes(views: Sequence[View]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Two directions across the mean upward one of the cameras, each [3]."""
     up = upward(views)
-    across = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
-    across /= np.linalg.norm(across)
-    return across, np.cross(across, up)
+    right = across(up)
+    return right, np.cross(right, up)

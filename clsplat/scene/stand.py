@@ -52,6 +52,12 @@ def upward(views: Sequence[View]) -> NDArray[np.float64]:
     return np.asarray(axis / np.linalg.norm(axis), np.float64)
 
 
+def across(up: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return a unit direction across a unit one, both [3]."""
+    found = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
+    return np.asarray(found / np.linalg.norm(found), np.float64)
+
+
 def closest_point(
     centres: NDArray[np.floating], axes: NDArray[np.floating], prior: NDArray[np.floating]
 ) -> NDArray[np.float64]:

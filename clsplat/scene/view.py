@@ -1,7 +1,7 @@
 """A photograph with its camera: reading its pixels at the size of the camera."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -218,6 +218,13 @@ def is_turned(view: View, path: Path, size: Callable[[bool], Size]) -> bool:
         f"same size{'' if view.lens else ', or a larger image of the same shape'}: use the images the cameras were "
         "made from"
     )
+
+
+def some_of(views: Sequence[View], most: int) -> Sequence[View]:
+    """Return at most so many views, from the middles of as many equal parts."""
+    if len(views) <= most:
+        return views
+    return [views[(2 * i + 1) * len(views) // (2 * most)] for i in range(most)]
 
 
 def fits(view: View, size: Size) -> bool:

@@ -1,7 +1,6 @@
 """Metrics of a split."""
 
 import logging
-from collections.abc import Sequence
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import AfterValidator, Field, field_validator
@@ -13,7 +12,7 @@ from clsplat.metrics.lpips import InputRange
 from clsplat.metrics.perceptual import Metric, Perceptual
 from clsplat.metrics.views import mean, measure
 from clsplat.names import fault_of_output
-from clsplat.scene.scene import View
+from clsplat.scene.view import some_of
 from clsplat.settings import ReadPath
 from clsplat.stages.base import CADENCE, Scheduled
 from clsplat.training.colours import colours_of, tell_of_colours
@@ -82,12 +81,6 @@ class Evaluate(Scheduled):
     def _model(self, run: Run) -> DeviceModel:
         return run.model if self.file is None else load(run.out / self.file).upload(run.device)
 
-    def _chosen(self, views: Sequence[View]) -> Sequence[View]:
-        """At most so many, from the middles of as many equal parts."""
-        if self.most is None or len(views) <= self.most:
-            return views
-        return [views[(2 * i + 1) * len(views) // (2 * self.most)] for i in range(self.most)]
-
     def run(self, run: Run) -> None:
         if not run.scene.split(self.split):
             if self.split != "test" or run.pipeline["scene"]["holdout"] != 0:  # who wants none need not be told
@@ -96,7 +89,8 @@ class Evaluate(Scheduled):
             return
         perceptual, model = self._perceptual(), self._model(run)
         for downscale in self.downscales or [run.downscale]:
-            views = self._chosen(refined(run.numbers, run.original).downscaled(downscale).split(self.split))
+            found = refined(run.numbers, run.original).downscaled(downscale).split(self.split)
+            views = some_of(found, self.most or len(found))
             photographs = run.photographs if downscale in run.scene.downscales else run.photographs.fresh()
             counted = run.status.counted(run.until_interrupted(views), "views", len(views))
             results = measure(run.rasterizer, model, counted, photographs, perceptual, colours=colours_of(run))
