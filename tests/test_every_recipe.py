@@ -29,7 +29,7 @@ STEPS = 24
 RECIPES = [
     name
     for name, file in shipped().items()
-    if name != "compress"
+    if name not in ("compress", "blocks")  # which start from a model
     and f"{name}_7k" not in shipped()
     and not load(name).settings.prepare
     and any(isinstance(s, Optimize) for s in load(name).stages)

@@ -14,9 +14,9 @@ Corner = Annotated[list[float | None], Field(min_length=3, max_length=3)]
 class Box(Settings):
     """A box with its lower faces and without its upper ones, so that boxes side by side share no point."""
 
-    low: Corner = Field([None, None, None])
+    low: Corner = Field(default=[None, None, None])
     """Lowest x, y and z, scene units; null: none."""
-    high: Corner = Field([None, None, None])
+    high: Corner = Field(default=[None, None, None])
     """First x, y and z beyond it, scene units; null: none."""
 
     @model_validator(mode="after")
