@@ -13,8 +13,8 @@ from data_tools.synthetic import Options
 PITCH, LOT = 1.0, 0.72  # scene units: from one street to the next, and the side of what is between two
 HEIGHTS = (0.18, 1.1)  # of houses
 PARKS = 0.12  # share of the lots
-FLIGHT = 4.0  # height of the cameras
-TILTS = (20.0, 45.0)  # of the cameras from straight down, degrees
+FLIGHT = 2.5  # height of the cameras
+TILTS = (10.0, 35.0)  # of the cameras from straight down, degrees
 CITY_VERSION = 1  # increase it when the images change
 PLASTIC = 1.32471795724474602596  # its powers spread points evenly over a square (Roberts 2018)
 WALLS: tuple[Vector, ...] = ((0.62, 0.30, 0.20), (0.70, 0.62, 0.48), (0.42, 0.46, 0.52), (0.55, 0.20, 0.16))
@@ -92,7 +92,7 @@ class City(Options):
     lots: int = 12
 
     version = CITY_VERSION
-    points = 40_000
+    points = 20_000
     noise = 0.01
 
     @property
@@ -104,7 +104,7 @@ class City(Options):
     def world(self) -> World:
         """The ground, and what stands on the lots."""
         half, places = self.half, range(self.lots)
-        reach = half + 4 * FLIGHT
+        reach = half + 6 * FLIGHT
         base = Box(centre=(0, 0, -0.1), half=(reach, reach, 0.1), paint=partial(ground, half))
         at = [(i + 0.5) * PITCH - half for i in places]
         return World((base, *(shape for x in places for y in places for shape in lot(x, y, (at[x], at[y])))), 0.9, 2)

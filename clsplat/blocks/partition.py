@@ -36,7 +36,7 @@ class Block:
     cell: Cell
     gaussians: int  # of the coarse model that it owns
     pairs: float  # share of those of the whole
-    start: Bits  # [N] the Gaussians that it starts from: its own, and those that its views see
+    start: Bits  # [N] the Gaussians that it starts from: its own, and those that its views see, or none
     views: list[dict[str, Any]]  # name, why, share of pixels
     memory: int  # bytes on the device at the beginning
 
@@ -117,7 +117,7 @@ class Partitioner:
         return Partition(blocks, self.model, coarse, self.extent, memory, len(self.views))
 
     def _members(self, owner: NDArray[np.int64], found: list[Cell], sight: float) -> tuple[Membership, Bits]:
-        """The views of each block, and the Gaussians that these see, [B, N]."""
+        """The views of each block, and the Gaussians that these see, or no view sees, [B, N]."""
         places = np.stack([view.position for view in self.views])
         inside = np.stack([cell.grown(NEAR_CELL).holds(places) for cell in found], axis=1)
         shares, seen = np.zeros(inside.shape), np.zeros((len(found), len(owner)), bool)
@@ -128,7 +128,7 @@ class Partitioner:
         for view, block in np.argwhere(members.chosen & ~members.of_views):
             (look,) = self._looks([self.views[view]])
             seen[block] |= share_of(look, owner, len(found))[1]
-        return members, seen
+        return members, seen | ~seen.any(axis=0)  # what is hidden from all views may come to light in any
 
     def _looks(self, views: Sequence[View]) -> Iterator[Look]:
         photographs = (self.photographs.get(view) for view in views)
