@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 import clsplat
 from clsplat.cli import app
 from clsplat.density.box import Box
-from clsplat.errors import ClsplatError, ConfigError
+from clsplat.errors import ClsplatError, ConfigError, DataError
 from clsplat.pipeline.loading import load
 from clsplat.scene.detect import read_scene
 
@@ -166,6 +166,12 @@ def test_what_blocks_cannot_share_is_refused(override, message, tiny_scene, few_
     with pytest.raises(ConfigError, match=message):
         train(tiny_scene, few_steps, tmp_path / "out", override)
     assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_without_a_coarse_model_is_refused(tiny_scene, tmp_path):
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(DataError, match=r"empty: has no pipeline\.yaml; expected a model file or a run folder"):
+        train(tiny_scene, tmp_path / "empty", tmp_path / "out")
 
 
 @pytest.mark.parametrize(("option", "value"), [("blocks", 0), ("sight", 1.0), ("steps", "some")])

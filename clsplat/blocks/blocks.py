@@ -24,7 +24,7 @@ from clsplat.pipeline.loading import Pipeline, load
 from clsplat.reading import read_json, sha256
 from clsplat.runs.experiment import as_setting
 from clsplat.runs.scenes import read_run_scene
-from clsplat.runs.source import photographs_of
+from clsplat.runs.source import photographs_of, require_model
 from clsplat.tuning.folder import claimed
 from clsplat.tuning.tuning import trained
 from clsplat.views.photographs import Photographs
@@ -160,8 +160,9 @@ def train_in_blocks(
 
 
 def _given(coarse: str) -> Path | None:
-    """The file of a coarse model that is given; None for the name or the file of a pipeline."""
+    """The file of a coarse model that is given; None for the name or the file of a pipeline.  Raises DataError."""
     path = Path(coarse)
     if path.is_dir() or (path.is_file() and detect(path)):
+        require_model(path)
         return as_trained(model_at(path))
     return None
