@@ -14,6 +14,7 @@ from clsplat.density.box import Box
 from clsplat.errors import ClsplatError, ConfigError, DataError
 from clsplat.pipeline.loading import load
 from clsplat.scene.detect import read_scene
+from data_tools.multiscale import write_multiscale
 
 pytestmark = pytest.mark.slow
 
@@ -172,6 +173,12 @@ def test_a_folder_without_a_coarse_model_is_refused(tiny_scene, tmp_path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(DataError, match=r"empty: has no pipeline\.yaml; expected a model file or a run folder"):
         train(tiny_scene, tmp_path / "empty", tmp_path / "out")
+
+
+def test_a_scene_of_several_sizes_is_refused(tiny_scene, few_steps, tmp_path):
+    write_multiscale(tiny_scene, tmp_path / "scene", 2)
+    with pytest.raises(DataError, match="has each photograph in several sizes; expected one for blocks"):
+        train(tmp_path / "scene", few_steps, tmp_path / "out")
 
 
 @pytest.mark.parametrize(("option", "value"), [("blocks", 0), ("sight", 1.0), ("steps", "some")])

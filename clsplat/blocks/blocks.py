@@ -71,6 +71,10 @@ class Blocks:
         rasterizer = self.pipeline.settings.rasterizer
         self.device = open_correct(device, rasterizer.schedule, rasterizer.sort)
         self.scene = read_run_scene(self.pipeline.settings.scene, self.pipeline.settings.scene.folder)
+        if len(self.scene.original.downscales) > 1:
+            raise DataError(
+                f"{self.scene.original.path}: has each photograph in several sizes; expected one for blocks"
+            )
 
     def question(self) -> dict[str, Any]:
         """Return what the folder belongs to."""
