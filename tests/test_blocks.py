@@ -135,12 +135,15 @@ def test_a_block_that_fails_is_named_and_the_others_are_trained(tiny_scene, few_
     assert not (tmp_path / "out" / "merged.ply").exists()
 
 
-def test_steps_are_shared_by_views(tiny_scene, few_steps, tmp_path):
-    found = train(tiny_scene, few_steps, tmp_path / "out", "optimize.steps=16", blocks=2, sight=NEVER, steps="shared")
+def test_steps_are_shared_by_views_with_rates_that_make_up_for_it(tiny_scene, few_steps, tmp_path):
+    shared = {"blocks": 2, "sight": NEVER, "steps": "shared"}
+    found = train(tiny_scene, few_steps, tmp_path / "out", "optimize.steps=16", **shared)
     for block in found["blocks"]:
-        assert json.loads((tmp_path / "out" / block["name"] / "metrics.json").read_text())["steps"] == 2 * len(
-            block["views"]
-        )
+        folder, share = tmp_path / "out" / block["name"], len(block["views"]) / 8
+        assert json.loads((folder / "metrics.json").read_text())["steps"] == 16 * share
+        rates = load(str(folder / "pipeline.yaml")).settings.training.rates
+        assert rates.log_scales == pytest.approx(4.0e-3 / share**0.5)
+        assert rates.means.initial == pytest.approx(6.4e-5 / share**0.5)
 
 
 def test_the_coarse_model_is_trained_where_none_is_given(tiny_scene, tmp_path):

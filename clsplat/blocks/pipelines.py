@@ -9,8 +9,9 @@ from typing import Any
 from clsplat.blocks.partition import GROWTH, Block
 from clsplat.errors import ConfigError
 from clsplat.gaussians.run_model import MODEL
+from clsplat.pipeline.file import PipelineFile
 from clsplat.pipeline.loading import Pipeline, checked
-from clsplat.pipeline.stretching import stretched
+from clsplat.pipeline.stretching import of_trainings, stretched
 from clsplat.pipeline.yaml_file import Document
 from clsplat.stages.base import Stage
 from clsplat.stages.densify import Densify
@@ -44,7 +45,7 @@ def require_divisible(pipeline: Pipeline) -> None:
 def of_block(pipeline: Pipeline, block: Block, start: Path, extent: float, share: Fraction = Fraction(1)) -> Pipeline:
     """Return the training of a block from its first Gaussians, up to its model, cropped to its cell.
 
-    extent: of the whole scene; share: of the pipeline's steps that are trained.
+    extent: of the whole scene; share: of the pipeline's steps that are trained, with the rates of `_shared`.
     """
     data, last = pipeline.resolved(), _last(pipeline)
     growth, cell = block.cell.grown(GROWTH).model_dump(), block.cell.box.model_dump()
@@ -54,7 +55,7 @@ def of_block(pipeline: Pipeline, block: Block, start: Path, extent: float, share
     changed = {**data, "name": f"{pipeline.settings.name}_{block.name}", "scene": scene}
     changed["stages"] = [*stages, {"crop": {"inside": cell}}, {"export": {"file": MODEL}}]
     found = checked(pipeline.path, Document(changed))
-    return found if share == 1 else replace(found, settings=stretched(found.settings, share))
+    return found if share == 1 else replace(found, settings=_shared(found.settings, share))
 
 
 def of_merged(pipeline: Pipeline, file: Path) -> Pipeline:
@@ -69,6 +70,22 @@ def of_coarse(coarse: Pipeline, pipeline: Pipeline) -> Pipeline:
     data = pipeline.resolved()
     same = {key: data[key] for key in ("scene", "model", "rasterizer", "seed") if key in data}
     return checked(coarse.path, Document({**coarse.resolved(), **same}))
+
+
+def _shared(settings: PipelineFile, share: Fraction) -> PipelineFile:
+    """Settings with a share of the steps, and rates that are larger as its root is smaller.
+
+    Adam divides by the root of the mean square of gradients over steps.  Where a share p of the views show a
+    Gaussian, it has gradients in that share of the steps, and each moves it as 1 / √p.  In a block p is larger by
+    1 / share.
+    """
+
+    def changed(training: Optimize) -> Optimize:
+        if training.update != "all":  # rows that are not seen keep their moments
+            return training
+        return training.model_copy(update={"rates": training.rates.times(float(share) ** -0.5)})
+
+    return of_trainings(stretched(settings, share), changed)
 
 
 def _last(pipeline: Pipeline) -> int:
