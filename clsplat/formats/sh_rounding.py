@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.floating]
 ISOTROPIC = 0.02  # share of all directions alike beside those that the moments tell; 0.005 to 0.1 differ little
+USUAL = 0.028  # root of the mean square of harmonics: fox after 7 000 steps; after 2 500 steps it has half
 LEVELS = 511  # whole numbers that moments are made of: their sums are exact in float64, in any order
 TAIL = 1e-4  # share of values that may lie beyond LEVELS
 ROWS = 1 << 15  # that are rounded at once
@@ -24,6 +25,12 @@ def steps(log_weights: NDArray[np.float64], median: float, most: float) -> NDArr
     """Return a step for each Gaussian, [N]: a power of two, about `median` for the median weight, from 1 to `most`."""
     exponents = np.rint(np.log2(median) - log_weights / 2)
     return np.asarray(np.exp2(np.clip(exponents, 0, np.log2(most))), np.float32)
+
+
+def usual_step(rest: Floats, step: float) -> float:
+    """Return a step that is chosen for harmonics of the size USUAL, and for smaller ones so much smaller."""
+    size = float(np.sqrt(np.square(np.clip(rest, -1, 1), dtype=np.float64).mean())) if rest.size else 0.0
+    return step * min(1.0, max(size / USUAL, 1e-3))
 
 
 def visible_form(rest: Floats) -> NDArray[np.float64]:

@@ -9,11 +9,13 @@ part's vector is rounded like the harmonics of an SPZ (sh_rounding.py): the less
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.formats.sh_rounding import rounded_rows, steps, visible_form
+from clsplat.formats.sh_rounding import rounded_rows, steps, usual_step, visible_form
 
 RUN = 512  # Gaussians; a run of 256 takes fewer bytes and loses more
+REPEATED = 0.75  # share of different vectors, at most, of harmonics that come from a palette
 LLOYD_STEPS = 3  # of each division
 AT_ONCE = 0.5  # share of the parts, at most, that are divided before their errors are computed again
+TINY = 1e-300  # in the place of the weight of an empty part
 LEVELS = 128  # to a coefficient of 1
 LARGEST_STEP = 64.0  # levels
 Floats = NDArray[np.float64]
@@ -25,15 +27,16 @@ def tree_palette(
 ) -> tuple[Floats, Labels]:
     """Return vectors [E, 3 K], E at most `entries`, for harmonics [N, 3 K], and for each Gaussian its vector, [N].
 
-    log_weights: of weights.py; median_step: of vectors, in LEVELS, in the median.
+    log_weights: of weights.py; median_step: of vectors, in LEVELS, in the median, for harmonics of the usual size.
     """
-    runs = np.arange(len(rest)) // max(RUN, -(-len(rest) // entries))
+    run = len(rest) if _repeated(rest) else max(RUN, -(-len(rest) // entries))
+    runs = np.arange(len(rest)) // run
     form, weights = visible_form(rest), np.exp2(log_weights)
     labels = _divided(_in_form(rest, form), weights, runs, entries)
     held = np.bincount(labels, weights)
     vectors = _sums(labels, weights, rest, len(held)) / held[:, None]
     log_held = np.log2(held)
-    step = steps(log_held - np.median(log_held), median_step, LARGEST_STEP)
+    step = steps(log_held - np.median(log_held), usual_step(rest, median_step), LARGEST_STEP)
     first = np.zeros(len(held), np.int64)
     first[labels[::-1]] = np.arange(len(labels))[::-1]
     order = np.lexsort((first, step, runs[first]))
@@ -41,6 +44,12 @@ def tree_palette(
     place[order] = np.arange(len(order))
     rounded = rounded_rows(LEVELS * vectors, step, form).astype(np.float64) / LEVELS
     return rounded[order], place[labels]
+
+
+def _repeated(rest: NDArray[np.float32]) -> bool:
+    """Whether many harmonics are repeated, by a palette for all that they had before: runs would repeat its vectors."""
+    most = int(REPEATED * len(rest))
+    return len(np.unique(rest[:, 0])) <= most and len(np.unique(rest, axis=0)) <= most
 
 
 def _in_form(rest: NDArray[np.float32], form: Floats) -> NDArray[np.float32]:
@@ -58,10 +67,11 @@ def _divided(points: NDArray[np.float32], weights: Floats, labels: Labels, entri
     """Parts of points [N, c], where they begin as `labels` and are divided until there are so many."""
     labels, parts = labels.copy(), int(labels[-1]) + 1
     while parts < entries:
-        mean = _sums(labels, weights, points, parts) / np.bincount(labels, weights)[:, None]
+        held = np.maximum(np.bincount(labels, weights, minlength=parts), TINY)  # a half may be empty
+        mean = _sums(labels, weights, points, parts) / held[:, None]
         away = (points - mean[labels]).astype(np.float32)
         spread = _sums(labels, weights, np.square(away), parts)
-        errors = np.where(np.bincount(labels) > 1, spread.sum(axis=1), 0)
+        errors = np.where(np.bincount(labels, minlength=parts) > 1, spread.sum(axis=1), 0)
         most = min(entries - parts, -(-parts // round(1 / AT_ONCE)))
         chosen = np.argsort(-errors, kind="stable")[:most]
         chosen = chosen[errors[chosen] > 0]
@@ -75,7 +85,7 @@ def _divided(points: NDArray[np.float32], weights: Floats, labels: Labels, entri
         beyond = _halves(points[rows], weights[rows], own, beyond)
         labels[rows[beyond]] = parts + own[beyond]
         parts += len(chosen)
-    return np.unique(labels, return_inverse=True)[1].reshape(-1)  # a half may have become empty
+    return np.unique(labels, return_inverse=True)[1].reshape(-1)
 
 
 def _halves(points: NDArray[np.float32], weights: Floats, own: Labels, beyond: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -83,7 +93,7 @@ def _halves(points: NDArray[np.float32], weights: Floats, own: Labels, beyond: N
     parts = int(own.max()) + 1
     for _ in range(LLOYD_STEPS):
         half = 2 * own + beyond
-        held = np.maximum(np.bincount(half, weights, minlength=2 * parts), 1e-300)
+        held = np.maximum(np.bincount(half, weights, minlength=2 * parts), TINY)
         means = (_sums(half, weights, points, 2 * parts) / held[:, None]).reshape(parts, 2, -1)
         across = means[:, 1] - means[:, 0]
         middle = (across * (means[:, 0] + means[:, 1]) / 2).sum(axis=1)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from clsplat.errors import DataError
 from clsplat.formats.packing import beyond_bytes, from_smallest_three, smallest_three, tell_cut
-from clsplat.formats.sh_rounding import rounded_rows, steps, visible_form
+from clsplat.formats.sh_rounding import rounded_rows, steps, usual_step, visible_form
 from clsplat.formats.splats import MAX_DEGREE, PARAMETERS, Parameters, Writing, logits, opacities, sh_coefficients, unit
 from clsplat.formats.weights import log_weights
 
@@ -180,7 +180,7 @@ def _sh_steps(p: Parameters, options: Writing) -> NDArray[np.float32]:
     median, most = MEDIAN_STEP[options.quality]
     if options.sh_bits or most == 1 or not p["sh_rest"].shape[1]:
         return np.ones(len(p["means"]), np.float32)
-    return steps(log_weights(p), median, most)
+    return steps(log_weights(p), usual_step(p["sh_rest"], median), most)
 
 
 def _rounded_sh(

@@ -7,7 +7,7 @@ import pytest
 
 from clsplat.formats import sh_rounding
 from clsplat.formats.packing import morton_order
-from clsplat.formats.sh_rounding import rounded_rows, steps, visible_form
+from clsplat.formats.sh_rounding import rounded_rows, steps, usual_step, visible_form
 from clsplat.formats.sh_tree import LEVELS, tree_palette
 from clsplat.formats.splats import SplatFile, Writing, unit
 from clsplat.formats.table import write
@@ -177,6 +177,21 @@ def test_a_palette_for_neighbours_is_nearer_to_gaussians_that_weigh_more(rng):
     vectors, labels = tree_palette(same, np.zeros(50), 20, 1.0)
     assert len(vectors) == 1
     assert not labels.any()
+
+
+def test_a_palette_that_the_model_had_before_is_shared_by_all(rng):
+    few = seen_from_one_side(rng, 300).parameters["sh_rest"]
+    rest = few[rng.integers(0, 300, 2000)]
+    vectors, labels = tree_palette(rest, rng.normal(size=2000), 400, 1.0)
+    assert len(vectors) <= 300
+    assert np.abs(vectors[labels] - rest).mean() < 4 / LEVELS
+
+
+def test_small_harmonics_have_smaller_steps(rng):
+    rest = rng.normal(0, 0.1, (500, 45))
+    assert usual_step(rest, 4.0) == 4
+    assert usual_step(np.zeros((0, 45)), 4.0) < 1
+    np.testing.assert_allclose(usual_step(rest / 10, 4.0), 4 * 0.01 / sh_rounding.USUAL, rtol=0.05)
 
 
 def test_a_sog_is_the_shape_of_the_model_and_converts_again_without_loss(tmp_path, rng):
