@@ -30,7 +30,7 @@ WHOLE = (8, 8)  # bits of harmonics
 MEDIAN_STEP = {"small": (10.0, 128.0), "balanced": (4.0, 64.0), "high": (1.0, 1.0)}
 SMALLEST_SHARE = {"small": 0.25, "balanced": 0.25, "high": 0.0}  # of a Gaussian's smallest deviation, of its position
 MAX_ZEROS = 16  # last bits of a position, at most
-TURN_STEP = {"small": 8, "balanced": 4, "high": 1}  # levels of quaternions, of 511
+TURN_STEP = {"small": 4, "balanced": 4, "high": 1}  # levels of quaternions, of 511
 
 
 @dataclass(frozen=True)
