@@ -6,7 +6,7 @@ with its size in the picture, and fall with what lies before it, which no table 
     w = opacity * sqrt(area) / distance,  area: the product of its two largest scales
 
 The distance is to the middle of the model, for cameras are not known.  A root of the area, not the area: large
-Gaussians are covered more often.  On trained scenes it has the best order of the products of powers that were tried.
+Gaussians are covered more often, and with a larger power fox and lego lose more at the same size.
 """
 
 import numpy as np
