@@ -1,0 +1,25 @@
+"""Run what a command was given: a matrix through a store, where its `execution` has one."""
+
+from pathlib import Path
+
+from clsplat.cluster.execution import execution_of
+from clsplat.cluster.sweep import run_sweep
+from clsplat.errors import ConfigError
+from clsplat.opencl.device import Device
+from clsplat.pipeline.matrix import Experiment
+from clsplat.runs.experiment import Job
+
+
+def run_job(job: Job, device: str | Device | None, live: int | None = None, minutes: float | None = None) -> Path:
+    """Run a job, and return its folder; arguments as for `Job.run`.  Raises ClsplatError."""
+    work = job.work
+    execution = execution_of(work.execution, work.path) if isinstance(work, Experiment) else None
+    if not isinstance(work, Experiment) or execution is None or execution.keeps is None:
+        job.run(device, live, minutes)
+        return job.out
+    if live is not None or minutes is not None:
+        raise ConfigError("--live and --minutes are for one run; the cells of a store run in other processes")
+    if isinstance(device, Device):
+        raise ConfigError("expected the name of a device: the cells of a store run in other processes")
+    run_sweep(work, job.out, execution, device, job.start)
+    return job.out
