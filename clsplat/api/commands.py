@@ -52,9 +52,10 @@ def describe_run(
     set: Overrides = (),
     device: "str | Device | None" = None,
     start: Literal["new", "resume", "restart"] = "new",
+    on: PathLike | None = None,
 ) -> str:
     """Check all that `run` would need and return what it would do, as lines of text; nothing is written."""
-    return _job(pipeline, scene, out, set, start).describe(device)
+    return _job(pipeline, scene, out, set, start, on).describe(device)
 
 
 def resume(
@@ -106,7 +107,7 @@ def check(pipeline: PathLike) -> dict[str, Any]:
     Of a run folder return `whole`, its `state`, and `objects`: every file, whether it is `whole`, and a `detail`.  Of a
     model file return its `format`, `ranges`, `bounds`, `degenerate` counts, `findings`, and whether it is `valid`.
     """
-    from clsplat.runs.check import check
+    from clsplat.cluster.commands import check
 
     load_plugins()
     return check(str(pipeline))

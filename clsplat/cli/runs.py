@@ -53,7 +53,7 @@ def run(
         raise ConfigError("--resume goes on with a run and --restart begins it again; give one of them")
     start: Literal["new", "resume", "restart"] = "resume" if resume else "restart" if restart else "new"
     if dry_run:
-        terminal.show(commands.describe_run(pipeline, scene, out, set=set_ or (), device=device, start=start))
+        terminal.show(commands.describe_run(pipeline, scene, out, set=set_ or (), device=device, start=start, on=on))
     else:
         found = commands.run(
             pipeline, scene, out, set=set_ or (), device=device, start=start, live=live, minutes=minutes, on=on
@@ -86,7 +86,7 @@ def resume(
     changes = [*(set_ or ()), *([f"optimize.steps={steps}"] if steps is not None else [])]
     if dry_run:
         file = folder / "pipeline.yaml"
-        terminal.show(commands.describe_run(file, scene, folder, set=changes, device=device, start="resume"))
+        terminal.show(commands.describe_run(file, scene, folder, set=changes, device=device, start="resume", on=on))
     else:
         _show_summary(commands.resume(folder, scene, set=changes, device=device, live=live, on=on))
 

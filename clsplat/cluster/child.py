@@ -6,11 +6,18 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 from clsplat.cluster.attempt import ERRORS, PIPELINE_FILE, Attempt
 from clsplat.errors import OutputError
 from clsplat.files import told_as
 
+# Ctrl-C in the terminal is for the supervisor, which passes it on
+APART: dict[str, Any] = (
+    {"creationflags": getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)}
+    if os.name == "nt"
+    else {"start_new_session": True}
+)
 POLL = 0.25  # seconds between two looks at a process
 PATIENCE = 90.0  # seconds for the last step and its checkpoint, before the process is killed
 Command = Sequence[str]  # words; these stand for what is known where it runs
@@ -41,7 +48,7 @@ def supervise(attempt: Attempt, command: Command, is_stopped: Callable[[], bool]
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
             stderr=errors,
-            start_new_session=os.name != "nt",  # Ctrl-C in the terminal is for the supervisor, which passes it on
+            **APART,
         )
     try:
         code = _wait(process, attempt, is_stopped)

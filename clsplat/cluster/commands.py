@@ -1,12 +1,14 @@
 """Run what a command was given: a matrix through a store, where its `execution` has one."""
 
 from pathlib import Path
+from typing import Any
 
-from clsplat.cluster.execution import execution_of
+from clsplat.cluster.execution import check_execution, execution_of
 from clsplat.cluster.sweep import run_sweep
 from clsplat.errors import ConfigError
 from clsplat.opencl.device import Device
 from clsplat.pipeline.matrix import Experiment
+from clsplat.runs import check as runs_check
 from clsplat.runs.experiment import Job
 
 
@@ -23,3 +25,11 @@ def run_job(job: Job, device: str | Device | None, live: int | None = None, minu
         raise ConfigError("expected the name of a device: the cells of a store run in other processes")
     run_sweep(work, job.out, execution, device, job.start)
     return job.out
+
+
+def check(pipeline: str) -> dict[str, Any]:
+    """Check as `clsplat.runs.check`, and the `execution` of a matrix.  Raises ConfigError, DataError."""
+    found = runs_check.check(pipeline)
+    if "cells" in found:
+        check_execution(Path(found["path"]))
+    return found

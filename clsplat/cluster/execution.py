@@ -88,6 +88,13 @@ def execution_of(values: dict[str, Any], path: Path, place: tuple[str, ...] = ("
         raise ConfigError(explain(error, Execution, path, Document(values, lines))) from error
 
 
+def check_execution(file: Path) -> None:
+    """Check the `execution` of a file, where it has one.  Raises ConfigError with the line."""
+    data = read_yaml(file).data
+    if isinstance(data, dict) and "execution" in data:
+        execution_of(data["execution"], file)
+
+
 def values_of(file: Path | None) -> dict[str, Any] | None:
     """Return the keys of an execution file as plain data, which were checked; None without.  Raises ConfigError."""
     if file is None:

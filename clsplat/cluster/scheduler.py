@@ -40,6 +40,8 @@ LOOPBACK = "127.0.0.1"
 ANSWER = 20.0  # seconds that a scheduler may take to answer
 SETTINGS = {
     "distributed.scheduler.allowed-failures": 1000,  # attempts are counted in the store
+    "distributed.scheduler.worker-ttl": "60s",  # of one that is frozen: its cell goes on elsewhere
+    "distributed.worker.preload": ["clsplat.cluster.preload"],
     "distributed.worker.memory.target": False,  # of a worker's share of memory, which its child does not take from
     "distributed.worker.memory.spill": False,
     "distributed.worker.memory.pause": False,

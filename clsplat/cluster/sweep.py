@@ -136,7 +136,15 @@ class _Sweep:
         return self.stop.is_set()
 
     def go(self, drive: Drive, wanted: Sequence[Wanted]) -> None:
-        drive.began, drive.ended, drive.look = self._began, self._ended, self.look
+        drive.ended, drive.look = self._ended, self.look
+
+        def began(cell: Cell) -> None:
+            if drive.is_same and not self.running and not self.outcomes:  # so that its waiting cells are seen
+                for one in wanted:
+                    self.keys[one.cell.name] = self.store.add(one.on(cell.spec["bits"])).key
+            self._began(cell)
+
+        drive.began = began
         self.status.enter("running")
         drive.run(wanted)
 
@@ -145,10 +153,13 @@ class _Sweep:
         self.running[cell.name] = cell
         self.store.note_sweep(self.experiment.name, self.keys)
         self.status.note(stage=cell.name)
-        LOG.info("cell %s of %s: %s", len(self.keys), len(self.experiment.cells), cell.name)
+        number = len(self.outcomes) + len(self.running)
+        LOG.info("cell %d of %d: %s", number, len(self.experiment.cells), cell.name)
 
     def _ended(self, cell: Cell, outcome: Outcome) -> None:
         self.running.pop(cell.name, None)
+        if outcome.state == "stopped" and self.stop.is_set():
+            return
         if outcome.state == "published":
             self._place(cell)
         else:

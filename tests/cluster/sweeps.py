@@ -50,7 +50,11 @@ class Sweep:
         """Start the command, also again."""
         words = ["run", str(self.file), "--out", str(self.out), "--resume"]
         return subprocess.Popen(
-            [sys.executable, "-m", "clsplat", *words], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+            [sys.executable, "-m", "clsplat", *words],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,  # as in a terminal of its own
         )
 
     def saved(self) -> set[str]:

@@ -6,6 +6,7 @@ They take minutes: CLSPLAT_KILLS is the number of kills, over six cells where it
 import os
 import random
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -70,20 +71,51 @@ def test_a_frozen_supervisor_that_wakes_finds_the_same_bits(tiny_scene, tmp_path
     assert model.parent.joinpath("manifest.json").is_file()
 
 
-def test_a_signal_saves_and_the_same_command_goes_on(tiny_scene, tmp_path, expected):
-    sweep = Sweep(tmp_path, tiny_scene, CELLS, "inline")
+@pytest.mark.parametrize("engine", ["inline", "local"])
+def test_a_signal_saves_and_the_same_command_goes_on_elsewhere(tiny_scene, tmp_path, expected, engine):
+    """SIGTERM for the command alone, Ctrl-C for all processes of the terminal; then the store has moved."""
+    sweep = Sweep(tmp_path, tiny_scene, CELLS, engine)
     process = sweep.start()
     until(lambda: bool(sweep.saved()))
-    process.send_signal(signal.SIGTERM)
-    process.communicate()
+    if engine == "inline":
+        process.send_signal(signal.SIGTERM)
+    else:
+        os.killpg(process.pid, signal.SIGINT)
+    errors = process.communicate()[1]
     assert process.returncode == 130
+    assert "Traceback" not in errors
     assert not left_behind()
     moved = sweep.store.root.rename(tmp_path / "elsewhere")  # as another mount point would
     sweep.file.write_text(sweep.file.read_text().replace(str(sweep.store.root), str(moved)))
     process = sweep.start()
-    process.communicate()
-    assert process.returncode == 0
+    errors = process.communicate()[1]
+    assert process.returncode == 0, errors
     assert sweep.models() == expected
     sweep.store.root = moved
-    begun = [event for event in sweep.store.events() if event["event"] == "start"]
-    assert begun[1]["from"], "it went on from a checkpoint"
+    assert any(event.get("from") for event in sweep.store.events()), "it went on from a checkpoint"
+
+
+def test_cells_go_on_when_a_worker_of_a_scheduler_is_gone_and_another_comes(tiny_scene, tmp_path, expected):
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    words = ["-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", str(port), "--no-dashboard"]
+    processes = [subprocess.Popen([sys.executable, *words], stderr=subprocess.DEVNULL)]
+    offer = [sys.executable, "-m", "clsplat", "worker", "--scheduler", f"dask://127.0.0.1:{port}"]
+    sweep = Sweep(tmp_path, tiny_scene, CELLS, f"dask://127.0.0.1:{port}")
+    try:
+        time.sleep(5)  # until it listens
+        processes.append(subprocess.Popen(offer))
+        command = sweep.start()
+        processes.append(command)
+        until(lambda: bool(sweep.saved()))
+        kill([*psutil.Process(processes[1].pid).children(recursive=True), psutil.Process(processes[1].pid)])
+        processes.append(subprocess.Popen(offer))
+        errors = command.communicate()[1]
+        assert command.returncode == 0, errors
+        assert sweep.models() == expected
+        assert sweep.events("publish") == CELLS
+    finally:
+        for process in reversed(processes):
+            process.terminate()
+            process.wait(60)
