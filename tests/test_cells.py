@@ -214,6 +214,18 @@ def test_an_attempt_that_was_removed_ends_its_run(store, terms, monkeypatch):
     assert "was removed while its run went on" in outcome.message
 
 
+def test_a_process_that_was_frozen_until_its_attempt_was_removed_takes_the_result(store, terms, monkeypatch):
+    monkeypatch.setattr("clsplat.cluster.attempt.BEAT", 0.0)
+    folder = store.add(CELL)
+    other = folder.begin("other", terms.since)
+    (other.path / "point_cloud.ply").write_bytes(b"bits")
+    publishes = f"import os, shutil, sys, time; os.rename({str(other.path)!r}, {str(folder.result)!r})\n"
+    other.manifest()
+    outcome = run_cell(CELL, store, command(publishes + "shutil.rmtree(sys.argv[2]); time.sleep(60)"), terms)
+    assert outcome.state == "published"
+    assert told(store) == ["start", "skip"]
+
+
 def test_attempts_are_removed_by_the_age_of_their_lease_alone(store, terms):
     folder = store.add(CELL)
     old, young = folder.begin("a", terms.since), folder.begin("b", terms.since)

@@ -17,14 +17,14 @@ from typing import Any
 from clsplat.errors import ConfigError, DataError, OutputError
 from clsplat.files import PARTIAL, told_as, write_text
 from clsplat.formats.table import CODECS
-from clsplat.names import CHECKPOINTS, LOCK, LOG_FILE, METRICS, RECORDS, STATUS, TRIAL
+from clsplat.names import CHECKPOINTS, LOCK, LOG_FILE, METRICS, NOTE, RECORDS, STATUS, TRIAL
 from clsplat.processes import Owner
 from clsplat.reading import read_file, read_json, sha256
 from clsplat.training import checkpoint
 from clsplat.training.status import read_status
 
 LEASE, MANIFEST, PIPELINE_FILE, ERRORS = "lease.json", "manifest.json", "cell.yaml", "errors.txt"
-OWN = frozenset({LEASE, MANIFEST, PIPELINE_FILE, ERRORS, STATUS, LOCK})  # of one attempt alone
+OWN = frozenset({LEASE, MANIFEST, PIPELINE_FILE, ERRORS, STATUS, LOCK, NOTE})  # of one attempt alone; NOTE has a path
 GROWING = frozenset({LOG_FILE, RECORDS, TRIAL})  # files that a run appends to: links of them would be one file
 MEASURED = ("psnr", "ssim", "views")  # figures of metrics.json that a device's bits decide
 BEAT = 10.0  # seconds between two beats of a lease

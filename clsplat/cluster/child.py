@@ -24,6 +24,10 @@ Command = Sequence[str]  # words; these stand for what is known where it runs
 PYTHON, FILE, OUT = "{python}", "{pipeline}", "{out}"
 
 
+class LeaseLost(OutputError):
+    """The folder of an attempt was removed while its run went on."""
+
+
 def run_command(device: str | None, plugins: Sequence[Path] = ()) -> Command:
     """Return the command of a run on a device, which ends when its standard input does."""
     loaded = [word for path in plugins for word in ("--plugin", str(path))]
@@ -40,7 +44,7 @@ def filled(command: Command, pipeline: Path, out: Path) -> list[str]:
 def supervise(attempt: Attempt, command: Command, is_stopped: Callable[[], bool]) -> int:
     """Run an attempt to its end; return its exit code, negative where a signal ended it.
 
-    Where `is_stopped`, the run saves its state and ends.  Raises OutputError where the lease is lost.
+    Where `is_stopped`, the run saves its state and ends.  Raises LeaseLost.
     """
     with told_as(attempt.path), (attempt.path / ERRORS).open("wb") as errors:
         process = subprocess.Popen(
@@ -70,7 +74,7 @@ def _wait(process: "subprocess.Popen[bytes]", attempt: Attempt, is_stopped: Call
         except subprocess.TimeoutExpired:
             pass
         if not attempt.beat():
-            raise OutputError(f"{attempt.path}: was removed while its run went on; run the sweep again")
+            raise LeaseLost(f"{attempt.path}: was removed while its run went on; run the sweep again")
         if told is None and is_stopped():
             told = time.monotonic()
             if process.stdin:

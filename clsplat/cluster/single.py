@@ -9,7 +9,7 @@ from clsplat.cluster.child import run_command
 from clsplat.cluster.plugin_files import plugin_files
 from clsplat.cluster.probe import places
 from clsplat.cluster.store import Store
-from clsplat.cluster.sweep import wanted_cells
+from clsplat.cluster.sweep import ask_to_stop, wanted_cells
 from clsplat.cluster.task import Terms, run_cell
 from clsplat.errors import ClsplatError, ConfigError, Interrupted
 from clsplat.pipeline.loading import load
@@ -41,13 +41,14 @@ def run_one(
         last = len(experiment.cells) - 1
         raise ConfigError(f"{pipeline}: is a matrix; expected --index from 0 to {last}, the number of a cell")
     chosen = experiment.cells[index or 0]
-    store, stop = Store(root), threading.Event()
-    with stopping_on_signals(stop.set):
+    store, stop, driving = Store(root), threading.Event(), threading.Event()
+    with stopping_on_signals(lambda: ask_to_stop(stop, driving)):
         terms = Terms(store.now(), retries, "cell")
         (wanted,) = wanted_cells(Experiment(experiment.path, experiment.name, "", [chosen]), store)
         (place,) = places("cell", [device or ""])
         cell = wanted.on(place.bits)
         store.note_sweep(f"{experiment.name}-{cell.name}"[:150], {cell.name: cell.key})
+        driving.set()
         outcome = run_cell(cell, store, run_command(place.device, plugin_files()), terms, stop.is_set)
     if outcome.state == "stopped":
         raise Interrupted(f"cell {cell.name}: {outcome.message}; the same command goes on with it")

@@ -29,7 +29,7 @@ from clsplat.runs import folders
 from clsplat.runs.experiment import check_matrix_folder, compare, first_of
 from clsplat.runs.failures import failures_recorded
 from clsplat.runs.folders import Start
-from clsplat.signals import stopping_on_signals
+from clsplat.signals import stop_at_once, stopping_on_signals
 from clsplat.stages.optimize import Optimize
 from clsplat.training.status import StatusFile
 
@@ -50,11 +50,11 @@ def run_sweep(
     """
     check_matrix_folder(out)
     store = Store(execution.keeps or Path())
-    stop = threading.Event()
+    stop, driving = threading.Event(), threading.Event()
     with (
         folders.opened(out, start, cells=len(experiment.cells), done=0, failed={}) as status,
         failures_recorded(status),
-        stopping_on_signals(stop.set),
+        stopping_on_signals(lambda: ask_to_stop(stop, driving)),
         terminal.counted(),
     ):
         write_text(out / PIPELINE, experiment.text)
@@ -63,12 +63,20 @@ def run_sweep(
         with _engine(execution, store, device, sweep.is_stopped) as engine:
             terms = Terms(store.now(), execution.retries)
             drive = Drive(store, engine, execution.placement.bits == "same", terms, stop.is_set)
+            driving.set()
             sweep.go(drive, wanted)
         status.require_held()
         compare(experiment, out, sweep.failures)
         if sweep.failures:
             raise first_of(sweep.failures, len(experiment.cells), "failed")
         status.end("done", exit_code=0)
+
+
+def ask_to_stop(stop: threading.Event, driving: threading.Event) -> None:
+    """Let the cells that run save their state and stop; before they run, and at the second signal, stop at once."""
+    if stop.is_set() or not driving.is_set():
+        stop_at_once()
+    stop.set()
 
 
 @contextmanager

@@ -9,7 +9,7 @@ from typing import Literal
 
 from clsplat.cluster.attempt import PIPELINE_FILE, Attempt
 from clsplat.cluster.cell import Cell
-from clsplat.cluster.child import Command, supervise
+from clsplat.cluster.child import Command, LeaseLost, supervise
 from clsplat.cluster.folder import ATTEMPTS, CellFolder, Different
 from clsplat.cluster.store import Store
 from clsplat.errors import ClsplatError, ConfigError, DataError, Interrupted, MemoryLimitError, one_line
@@ -72,7 +72,12 @@ def _run_cell(cell: Cell, store: Store, command: Command, terms: Terms, is_stopp
         begun_from = attempt.lease.get("from")
         store.tell("start", cell=cell.key, attempt=attempt.path.name, worker=terms.worker, **{"from": begun_from})
         _equip(cell, store, folder, attempt)
-        code = supervise(attempt, command, stopped)
+        try:
+            code = supervise(attempt, command, stopped)
+        except LeaseLost:
+            if folder.published():  # by another process, while this one was frozen
+                continue
+            raise
         store.tell("end", cell=cell.key, attempt=attempt.path.name, exit_code=code)
         if code == 0:
             _require_same_scene(cell, attempt)

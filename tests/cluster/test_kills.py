@@ -50,10 +50,11 @@ def test_kills_of_workers_runs_and_drivers_lose_nothing(tiny_scene, tmp_path, ex
         time.sleep(0.05)
     assert process.returncode == 0, process.communicate()[1]
     assert sweep.models() == expected
-    assert killed >= min(KILLS, 2)
+    assert killed >= KILLS, "there were too few checkpoints to wait for"
     assert sweep.events("publish") == CELLS
     assert sweep.events("start") > CELLS
     until(lambda: not left_behind(), 90)
+    print(f"{killed} kills, {sweep.events('start')} starts, {sweep.events('publish')} published, hashes as undisturbed")
 
 
 def test_a_frozen_supervisor_that_wakes_finds_the_same_bits(tiny_scene, tmp_path, expected):
