@@ -29,8 +29,7 @@ def cell(
     set_: SetOption = None,
 ) -> None:
     """Run one cell of a matrix, unless its result is in the store; what every queue can call."""
-    result = sweeps.run_cell(pipeline, store, scene, index=index, set=set_ or (), device=device)
-    terminal.remark(str(result))
+    sweeps.run_cell(pipeline, store, scene, index=index, set=set_ or (), device=device)
 
 
 @command("cancel", "clsplat cancel runs/store", "clsplat cancel runs/store seed=1")

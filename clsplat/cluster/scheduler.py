@@ -24,7 +24,7 @@ from clsplat.cluster.plugin_files import plugin_files
 from clsplat.cluster.probe import Place, places
 from clsplat.cluster.store import Store
 from clsplat.cluster.task import Outcome, Terms, run_cell
-from clsplat.errors import ConfigError, DeviceError, InternalError, Interrupted
+from clsplat.errors import ConfigError, DeviceError, InternalError, Interrupted, one_line
 from clsplat.signals import stopping_on_signals
 
 try:
@@ -77,9 +77,7 @@ def engine(execution: Execution, store: Store, devices: list[str] | None) -> "Cl
             execution.address, security=security(execution.tls), set_as_default=False, timeout=ANSWER
         )
     except OSError as error:
-        raise DeviceError(
-            f"{execution.engine}: no worker can start there ({error.__cause__ or error}); is there a `dask scheduler`?"
-        ) from None
+        raise _unanswered(execution, error) from None
     return Cluster(client, store)
 
 
@@ -112,9 +110,7 @@ async def _serve(execution: Execution, found: Sequence[Place], stop: threading.E
     try:
         await asyncio.wait_for(asyncio.gather(*nannies), ANSWER)
     except (OSError, TimeoutError, RuntimeError) as error:
-        raise DeviceError(
-            f"{execution.engine}: no worker can start there ({error.__cause__ or error}); is there a `dask scheduler`?"
-        ) from None
+        raise _unanswered(execution, error) from None
     while not stop.is_set() and any(nanny.status is distributed.Status.running for nanny in nannies):
         await asyncio.sleep(0.2)
     await asyncio.gather(*(nanny.close(timeout=5) for nanny in nannies))
@@ -124,6 +120,11 @@ def warn_of_open_port(execution: Execution) -> None:
     """Say so where a scheduler elsewhere is reached without TLS."""
     if execution.insecure:
         LOG.warning("%s: is not encrypted; whoever reaches the scheduler's port can run code", execution.engine)
+
+
+def _unanswered(execution: Execution, error: BaseException) -> DeviceError:
+    reason = one_line(error.__cause__ or error) or "no answer"
+    return DeviceError(f"{execution.engine}: cannot be worked with ({reason}); start it with `dask scheduler`")
 
 
 def security(tls: Tls | None) -> Any:
