@@ -44,7 +44,7 @@ def cancel(
 @command(
     "worker",
     "clsplat worker --scheduler dask://127.0.0.1:8786",
-    "clsplat worker --scheduler tls://head:8786 --tls-ca ca.pem --tls-cert cert.pem --tls-key key.pem",
+    "clsplat worker --scheduler dask://head:8786 --insecure",
 )
 def worker(
     scheduler: Annotated[str, typer.Option(metavar="ADDRESS", help="dask://HOST:PORT, or tls://HOST:PORT.")],

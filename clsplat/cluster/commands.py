@@ -4,7 +4,6 @@ from pathlib import Path
 from typing import Any
 
 from clsplat.cluster.execution import check_execution, execution_of
-from clsplat.cluster.sweep import run_sweep
 from clsplat.errors import ConfigError
 from clsplat.opencl.device import Device
 from clsplat.pipeline.matrix import Experiment
@@ -23,6 +22,8 @@ def run_job(job: Job, device: str | Device | None, live: int | None = None, minu
         raise ConfigError("--live and --minutes are for one run; the cells of a store run in other processes")
     if isinstance(device, Device):
         raise ConfigError("expected the name of a device: the cells of a store run in other processes")
+    from clsplat.cluster.sweep import run_sweep  # and what tells devices apart, which a single run does not need
+
     run_sweep(work, job.out, execution, device, job.start)
     return job.out
 

@@ -206,8 +206,9 @@ class Cluster:
             workers=[address] if address else None,
             pure=False,
         )
-        self._tickets.append(_Future(self, future, address))
-        return self._tickets[-1]
+        ticket = _Future(self, future, address)
+        self._tickets = [*(one for one in self._tickets if not one.is_over), ticket]
+        return ticket
 
     def close(self) -> None:
         """Let the cells that run save their state and end, then the workers of this machine."""

@@ -157,9 +157,10 @@ class _Sweep:
         drive.run(wanted)
 
     def _began(self, cell: Cell) -> None:
-        self.keys[cell.name] = cell.key
+        if self.keys.get(cell.name) != cell.key or not self.running:
+            self.keys[cell.name] = cell.key
+            self.store.note_sweep(self.experiment.name, self.keys)
         self.running[cell.name] = cell
-        self.store.note_sweep(self.experiment.name, self.keys)
         self.status.note(stage=cell.name)
         number = len(self.outcomes) + len(self.running)
         LOG.info("cell %d of %d: %s", number, len(self.experiment.cells), cell.name)
