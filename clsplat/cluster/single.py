@@ -6,10 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from clsplat.cluster.child import run_command
+from clsplat.cluster.fingerprint import Scenes
 from clsplat.cluster.plugin_files import plugin_files
 from clsplat.cluster.probe import places
 from clsplat.cluster.store import Store
-from clsplat.cluster.sweep import ask_to_stop, wanted_cells
+from clsplat.cluster.sweep import ask_to_stop, wanted_cell
 from clsplat.cluster.task import Terms, run_cell
 from clsplat.errors import ClsplatError, ConfigError, Interrupted
 from clsplat.pipeline.loading import load
@@ -44,7 +45,7 @@ def run_one(
     store, stop, driving = Store(root), threading.Event(), threading.Event()
     with stopping_on_signals(lambda: ask_to_stop(stop, driving)):
         terms = Terms(store.now(), retries, "cell")
-        (wanted,) = wanted_cells(Experiment(experiment.path, experiment.name, "", [chosen]), store)
+        wanted = wanted_cell(chosen, Scenes(store.scenes), store)
         (place,) = places("cell", [device or ""])
         cell = wanted.on(place.bits)
         store.note_sweep(f"{experiment.name}-{cell.name}"[:150], {cell.name: cell.key})

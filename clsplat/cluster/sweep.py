@@ -21,6 +21,7 @@ from clsplat.cluster.task import Outcome, Terms
 from clsplat.errors import ClsplatError, Interrupted, one_line
 from clsplat.files import write_text
 from clsplat.names import PIPELINE
+from clsplat.pipeline import matrix
 from clsplat.pipeline.loading import Pipeline
 from clsplat.pipeline.matrix import Experiment
 from clsplat.prepare.cache import plan, prepare
@@ -59,7 +60,7 @@ def run_sweep(
     ):
         write_text(out / PIPELINE, experiment.text)
         sweep = _Sweep(experiment, status, store, stop)
-        wanted = wanted_cells(experiment, store)
+        wanted = sweep.wanted()
         with _engine(execution, store, device, sweep.is_stopped) as engine:
             terms = Terms(store.now(), execution.retries)
             drive = Drive(store, engine, execution.placement.bits == "same", terms, stop.is_set)
@@ -95,22 +96,18 @@ def _engine(execution: Execution, store: Store, device: str | None, is_stopped: 
         engine.close()
 
 
-def wanted_cells(experiment: Experiment, store: Store) -> list[Wanted]:
-    """Return the cells of a matrix; what `prepare` makes for them is made now, once for all.
+def wanted_cell(cell: matrix.Cell, scenes: Scenes, store: Store) -> Wanted:
+    """Return the cell of a matrix; what `prepare` makes for it is made now, before its runs.
 
-    Raises ConfigError and DataError.
+    Raises ConfigError, DataError and the errors of the steps.
     """
-    scenes = Scenes(store.scenes)
-    found = []
-    for cell in experiment.cells:
-        settings = cell.pipeline.settings
-        if settings.prepare:
-            folder = settings.scene.folder
-            prepare(plan(settings.prepare, folder, store.prepared), folder, store.prepared)
-        known = scenes.known(cell.pipeline)
-        spec = {"pipeline": placeless(cell.pipeline), "scene": known.digest, "code": code_digest(), "bits": ""}
-        found.append(Wanted(Cell(cell.name, spec, cell.pipeline.text()), steps_of(cell.pipeline) * known.pixels))
-    return found
+    settings = cell.pipeline.settings
+    if settings.prepare:
+        folder = settings.scene.folder
+        prepare(plan(settings.prepare, folder, store.prepared), folder, store.prepared)
+    known = scenes.known(cell.pipeline)
+    spec = {"pipeline": placeless(cell.pipeline), "scene": known.digest, "code": code_digest(), "bits": ""}
+    return Wanted(Cell(cell.name, spec, cell.pipeline.text()), steps_of(cell.pipeline) * known.pixels)
 
 
 def steps_of(pipeline: Pipeline) -> int:
@@ -143,6 +140,18 @@ class _Sweep:
         self.look()
         return self.stop.is_set()
 
+    def wanted(self) -> list[Wanted]:
+        """Return the cells whose scenes can be read; the others have failed."""
+        scenes, found = Scenes(self.store.scenes), []
+        for cell in self.experiment.cells:
+            try:
+                found.append(wanted_cell(cell, scenes, self.store))
+            except Interrupted:
+                raise
+            except ClsplatError as error:
+                self._failed(cell.name, error)
+        return found
+
     def go(self, drive: Drive, wanted: Sequence[Wanted]) -> None:
         drive.ended, drive.look = self._ended, self.look
 
@@ -174,10 +183,12 @@ class _Sweep:
         else:
             error = Interrupted(outcome.message) if outcome.state == "stopped" else ClsplatError(outcome.message)
             error.exit_code = outcome.exit_code
-            self.failures[cell.name] = error
-            LOG.warning("cell %s %s: %s", cell.name, outcome.state, one_line(error))
+            self._failed(cell.name, error)
         self.outcomes[cell.name] = outcome
-        self.status.note(done=len(self.outcomes), failed={name: one_line(one) for name, one in self.failures.items()})
+        self.status.note(
+            done=len({*self.outcomes, *self.failures}),
+            failed={name: one_line(one) for name, one in self.failures.items()},
+        )
         self.status.refresh()
 
     def _place(self, cell: Cell) -> None:
@@ -189,5 +200,8 @@ class _Sweep:
             self.status.require_held()
             place_copy(result, here)
         except ClsplatError as error:
-            self.failures[cell.name] = error
-            LOG.warning("cell %s: %s", cell.name, one_line(error))
+            self._failed(cell.name, error)
+
+    def _failed(self, name: str, error: ClsplatError) -> None:
+        self.failures[name] = error
+        LOG.warning("cell %s failed: %s", name, one_line(error))
