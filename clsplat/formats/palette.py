@@ -151,7 +151,7 @@ def palette(
     `weights`, [N], say how much errors count: a point is in that share as often as its weight says.  Points that are at
     most `entries` different ones are kept; the last is then repeated.
     """
-    if (kept := _different(points, entries)) is not None:
+    if (kept := different(points, entries)) is not None:
         return kept
     whole = _whole_numbers(points)
     chosen = _drawn(len(points), SAMPLE * entries, weights)
@@ -181,15 +181,25 @@ def _drawn(count: int, most: int, weights: NDArray[np.float64] | None) -> NDArra
     return np.asarray(np.searchsorted(passed, (np.arange(most) + 0.5) / most * passed[-1]))
 
 
-def _different(points: NDArray[np.float32], most: int) -> tuple[NDArray[np.float64], NDArray[np.int64]] | None:
-    """The points themselves as a palette of `most` vectors, and their labels; None where more of them differ."""
+def different(
+    points: NDArray[np.float32], most: int, padded: bool = True
+) -> tuple[NDArray[np.float64], NDArray[np.int64]] | None:
+    """Return the points themselves as a palette, and their labels; None where more than `most` of them differ.
+
+    padded: in ascending order, the last repeated up to `most`; else in the order in which the points have them.
+    """
     if len(np.unique(points[:, 0])) > most:  # at once for most models
         return None
-    different, labels = np.unique(points, axis=0, return_inverse=True)
-    if len(different) > most:
+    found, first, labels = np.unique(points, axis=0, return_index=True, return_inverse=True)
+    if len(found) > most:
         return None
-    repeated = np.repeat(different[-1:], most - len(different), axis=0)
-    return np.concatenate([different, repeated]).astype(np.float64), labels.reshape(-1)
+    labels = labels.reshape(-1)
+    if padded:
+        return np.concatenate([found, np.repeat(found[-1:], most - len(found), axis=0)]).astype(np.float64), labels
+    order = np.argsort(first)
+    place = np.empty_like(order)
+    place[order] = np.arange(len(order))
+    return found[order].astype(np.float64), place[labels]
 
 
 def _whole_numbers(values: NDArray[np.float32]) -> NDArray[np.float32]:

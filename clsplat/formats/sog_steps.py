@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.formats.packing import from_smallest_three, smallest_three
-from clsplat.formats.splats import logits, opacities, unit
+from clsplat.formats.splats import MAX_LOG, logits, opacities, unit
 
 Floats = NDArray[np.floating]
 SMALL = 25  # percentile of the sizes that steps of positions are compared with
@@ -35,7 +35,8 @@ def rounded_means(means: Floats, log_scales: Floats, share: float) -> NDArray[np
     t = np.sign(wide) * np.log1p(np.abs(wide))
     low, span = t.min(axis=0), np.ptp(t, axis=0)
     level = np.where(span > 0, span, 1) / LEVELS
-    sizes = np.exp(log_scales.astype(np.float64).mean(axis=1, keepdims=True)) / (1 + np.abs(wide))  # in t
+    size = np.exp(np.minimum(log_scales.astype(np.float64).mean(axis=1, keepdims=True), MAX_LOG))
+    sizes = size / (1 + np.abs(wide))  # in t
     bits = np.floor(np.log2(np.maximum(share * np.percentile(sizes, SMALL, axis=0) / level, 1)))
     step = np.exp2(np.minimum(bits, 8))
     levels = np.rint((t - low) / level)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from decimal import ROUND_CEILING, ROUND_FLOOR, ROUND_HALF_EVEN, Context
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,21 +17,29 @@ from numpy.typing import NDArray
 from clsplat.formats import webp
 from clsplat.formats.output import written
 from clsplat.formats.packing import morton_order, smallest_three
-from clsplat.formats.palette import codebook, nearest, palette
-from clsplat.formats.sog import PER_ROW, ROTATED
+from clsplat.formats.palette import Clustering, HostClusters, codebook, different, nearest, palette
+from clsplat.formats.sh_tree import tree_palette
+from clsplat.formats.sog import MAX_PALETTE, PER_ROW, ROTATED
 from clsplat.formats.sog_files import META, with_images
+from clsplat.formats.sog_steps import rounded, rounded_means, rounded_opacities, rounded_quats
 from clsplat.formats.splats import (
     Parameters,
     SplatFile,
     Writing,
-    degree_of,
     opacities,
     require_moderate,
     require_some,
     unit,
 )
+from clsplat.formats.weights import log_weights
 
-PALETTES = {"small": 1024, "balanced": 4096, "high": 16384}  # entries at most
+Quality = Literal["small", "balanced", "high"]
+PALETTES = {"small": 1024, "balanced": 4096, "high": 16384}  # entries at most, of a palette for all
+SHARES = {"small": 0.16, "balanced": 0.3, "high": 0.45}  # entries at most for a splat, of a palette for neighbours
+MEDIAN_STEPS = {"small": 6.0, "balanced": 5.0, "high": 3.0}  # of its vectors, in 128ths
+TURN_STEP, ALPHA_STEP = 4, 2  # levels of 255
+SIZE_SHARE = 0.125  # of a small Gaussian's size, for its position
+COLOUR_STEP = 0.03  # of the coefficients of band 0; 1 changes a colour by 0.28
 SMALLEST = 1024  # entries for so many splats, and twice as many for twice as many
 DIGITS = 16  # of the SHA-256 of an image in a folder, in its name
 EPOCH = (1980, 1, 1, 0, 0, 0)  # of files in the ZIP: the same model gives the same bytes
@@ -50,7 +58,7 @@ def write_sog(path: Path, splats: SplatFile, options: Writing) -> str:
 def write_as_ordered(path: Path, splats: SplatFile, options: Writing) -> str:
     """Write a SOG as `write_sog` does, whose splats stay in the order that they have."""
     in_folder = path.name == META
-    p = splats.parameters
+    p, harmonics = _quantised(splats.parameters, options)
     width = -(-int(np.ceil(np.sqrt(len(splats)))) // 4) * 4
     images: dict[str, bytes] = {}
     meta: dict[str, Any] = {"version": 2, "count": len(splats), "asset": {"generator": "clsplat"}}
@@ -75,8 +83,8 @@ def write_as_ordered(path: Path, splats: SplatFile, options: Writing) -> str:
         entries = codebook(p[table])
         planes = nearest(p[table], entries).T
         meta[name] = {"codebook": [_short(number) for number in entries], "files": [image(name, *planes, *more)]}
-    if p["sh_rest"].shape[1]:
-        meta["shN"] = _harmonics(p["sh_rest"], options, image)
+    if harmonics is not None:
+        meta["shN"] = _write_harmonics(harmonics, splats.sh_degree, image)
     images[META] = json.dumps(meta, separators=(",", ":"), sort_keys=True, allow_nan=False).encode()
     return _write_beside(path, images) if in_folder else _write(path, _zipped(images))
 
@@ -130,20 +138,26 @@ class Harmonics:
     def of(
         cls,
         rest: NDArray[np.float32],
-        options: Writing,
+        quality: Quality,
+        clustering: Clustering = HostClusters,
         weights: NDArray[np.float64] | None = None,
         better: Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.int64]]] | None = None,
         step: float | None = None,
     ) -> "Harmonics":
-        """Quantise harmonics [N, c]; errors count by `weights` [N].  Those of `values` come out as they are.
+        """Quantise harmonics [N, c] by vectors for all; errors count by `weights` [N].  Those of `values` come out as
+        they are.
 
         better: makes of a palette [E, c] another one, and the label of each splat.  step: of numbers, where those are
         few enough.
         """
-        entries = min(PALETTES[options.quality], max(1, int(SMALLEST * 2.0 ** np.floor(np.log2(len(rest) / SMALLEST)))))
-        vectors, labels = palette(rest, entries, options.clustering, weights)
+        vectors, labels = palette(rest, _few(len(rest), quality), clustering, weights)
         if better and not np.array_equal(vectors[labels].astype(np.float32), rest):
             vectors, labels = better(vectors)
+        return cls.by(vectors, labels, step)
+
+    @classmethod
+    def by(cls, vectors: NDArray[np.float64], labels: NDArray[np.int64], step: float | None = None) -> "Harmonics":
+        """Those that vectors [E, c] and labels [N] stand for."""
         numbers = np.array([_short(number) for number in codebook(vectors, step)])
         return cls(numbers, nearest(vectors, numbers), labels)
 
@@ -153,16 +167,42 @@ class Harmonics:
         return self.numbers.astype(np.float32)[self.palette][self.labels]
 
 
-def _harmonics(rest: NDArray[np.float32], options: Writing, image: Any) -> dict[str, Any]:
-    found, size = Harmonics.of(rest, options), rest.shape[1] // 3
+def _few(count: int, quality: Quality) -> int:
+    """Entries of a palette for all Gaussians."""
+    return min(PALETTES[quality], max(1, int(SMALLEST * 2.0 ** np.floor(np.log2(count / SMALLEST)))))
+
+
+def _quantised(p: Parameters, options: Writing) -> tuple[Parameters, Harmonics | None]:
+    """The tables, rounded, and a palette of the harmonics.
+
+    Harmonics that are a palette already stay as they are, and so do the tables then: whoever made it rounded them.
+    In `high` the tables have the precision of the format.
+    """
+    rest, most = p["sh_rest"], min(MAX_PALETTE, int(SHARES[options.quality] * len(p["sh_rest"])))
+    if not rest.shape[1]:
+        return p, None
+    if (kept := different(rest, _few(len(rest), options.quality)) or different(rest, most, padded=False)) is not None:
+        return p, Harmonics.by(*kept)
+    most = max(most, _few(len(rest), options.quality))
+    harmonics = Harmonics.by(*tree_palette(rest, log_weights(p), most, MEDIAN_STEPS[options.quality]))
+    if options.quality == "high":
+        return p, harmonics
+    quats, log_scales = rounded_quats(p["quats"], p["log_scales"], TURN_STEP)
+    changed = {
+        "means": rounded_means(p["means"], p["log_scales"], SIZE_SHARE),
+        "quats": quats,
+        "log_scales": log_scales,
+        "logit_opacity": rounded_opacities(p["logit_opacity"], ALPHA_STEP),
+        "sh_base": rounded(p["sh_base"], COLOUR_STEP),
+    }
+    return {**p, **changed}, harmonics
+
+
+def _write_harmonics(found: Harmonics, bands: int, image: Any) -> dict[str, Any]:
+    size = found.palette.shape[1] // 3
     files = [image("shN_centroids", *found.palette.reshape(-1, 3).T, across=PER_ROW * size)]
     files.append(image("shN_labels", found.labels & 255, found.labels >> 8, np.zeros_like(found.labels)))
-    return {
-        "count": len(found.palette),
-        "bands": degree_of(rest.shape[1]),
-        "codebook": found.numbers.tolist(),
-        "files": files,
-    }
+    return {"count": len(found.palette), "bands": bands, "codebook": found.numbers.tolist(), "files": files}
 
 
 def _short(number: float, rounding: str = ROUND_HALF_EVEN) -> float:

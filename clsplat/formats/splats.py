@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.errors import DataError
-from clsplat.formats.palette import Clustering, HostClusters
 
 PARAMETERS = ("means", "quats", "log_scales", "logit_opacity", "sh_base", "sh_rest")
 SH_C0 = 0.28209479177387814  # basis function of band 0
@@ -75,7 +74,6 @@ class Writing:
     axes: Literal["spz", "ply"] = "spz"  # SPZ: as its specification says, or those of the PLY, for readers that differ
     spz_version: Literal[3, 4] = 3
     quality: Literal["small", "balanced", "high"] = "balanced"  # SPZ and SOG
-    clustering: Clustering = HostClusters  # SOG: who computes its palette; the bytes do not depend on it
     quiet: bool = False  # no line about what the format does not keep: it was said
 
 

@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 
 from clsplat.errors import DataError
 from clsplat.formats.packing import beyond_bytes, from_smallest_three, smallest_three, tell_cut
+from clsplat.formats.sh_rounding import rounded_rows, steps, usual_step, visible_form
 from clsplat.formats.splats import MAX_DEGREE, PARAMETERS, Parameters, Writing, logits, opacities, sh_coefficients, unit
+from clsplat.formats.weights import log_weights
 
 LOG = logging.getLogger("clsplat")
 MAGIC = b"NGSP"
@@ -23,7 +25,12 @@ COLOUR = 0.15
 MAX_INT24 = 2**23 - 1
 FRACTION, FINE_FRACTION = 12, 20  # bits of positions; the second for quality high
 ROWS = 1 << 13  # that are decoded at once: what that takes beside the result is little
-QUALITY = {"small": (6, 5), "balanced": (8, 8), "high": (8, 8)}  # bits of band 1 and of the others
+WHOLE = (8, 8)  # bits of harmonics
+# steps of harmonics, in levels of 256: of the Gaussian of median weight, and at most
+MEDIAN_STEP = {"small": (10.0, 128.0), "balanced": (4.0, 64.0), "high": (1.0, 1.0)}
+SMALLEST_SHARE = {"small": 0.25, "balanced": 0.25, "high": 0.0}  # of a Gaussian's smallest deviation, of its position
+MAX_ZEROS = 16  # last bits of a position, at most
+TURN_STEP = {"small": 4, "balanced": 4, "high": 1}  # levels of quaternions, of 511
 
 
 @dataclass(frozen=True)
@@ -126,31 +133,64 @@ def fraction_of(path: Path, means: NDArray[np.float32], fine: bool) -> int:
 
 
 def packed(path: Path, p: Parameters, fraction: int, options: Writing) -> list[bytes]:
-    """Return the bytes of each plane; values beyond its range are cut."""
-    fixed = np.rint(p["means"].astype(np.float64) * 2**fraction).astype("<i4")
-    largest, others = smallest_three(np.roll(unit(p["quats"]), -1, axis=1))
-    levels = np.minimum(np.rint(511 * np.abs(others) * 2**0.5), 511).astype(np.uint32)
-    levels |= (others < 0).astype(np.uint32) << np.uint32(9)
-    rotations = largest.astype(np.uint32) << np.uint32(30)
-    for i, shift in enumerate((20, 10, 0)):
-        rotations |= levels[:, i] << np.uint32(shift)
+    """Return the bytes of each plane; values beyond its range are cut.
+
+    Gaussians whose harmonics have fine steps come first, and keep their order among themselves: alike bytes compress.
+    """
+    sh_steps = _sh_steps(p, options)
+    order = np.argsort(sh_steps, kind="stable")
+    p, sh_steps = {name: table[order] for name, table in p.items()}, sh_steps[order]
     cut = {
         "alphas": 255 * opacities(p["logit_opacity"]),
         "colours": 255 * (COLOUR * p["sh_base"].astype(np.float64) + 0.5),
         "scales": 16 * (p["log_scales"].astype(np.float64) + 10),
-        "harmonics": _rounded_bits(p["sh_rest"], options.sh_bits or QUALITY[options.quality]),
+        "harmonics": _rounded_sh(p["sh_rest"], sh_steps, options.sh_bits) + 128,
     }
     tell_cut(path, "SPZ", "harmonics from -1 to 1", np.abs(p["sh_rest"]) > 1)
     tell_cut(path, "SPZ", "colours from -0.44 to 1.44", beyond_bytes(cut["colours"]))
     tell_cut(path, "SPZ", "scales from 4.5e-05 to 379", beyond_bytes(cut["scales"]))
     alphas, colours, scales, harmonics = (np.clip(np.rint(v), 0, 255).astype(np.uint8).tobytes() for v in cut.values())
-    positions = np.ascontiguousarray(fixed.view(np.uint8).reshape(-1, 4)[:, :3]).tobytes()
-    return [positions, alphas, colours, scales, rotations.astype("<u4").tobytes(), harmonics]
+    positions = _fixed(p, fraction, SMALLEST_SHARE[options.quality])
+    return [positions, alphas, colours, scales, _rotations(p["quats"], TURN_STEP[options.quality]), harmonics]
 
 
-def _rounded_bits(rest: NDArray[np.float32], bits: tuple[int, int]) -> NDArray[np.float64]:
-    """Harmonics as levels around 128, rounded to multiples of 2^(8 - bits)."""
-    steps = np.full(rest.shape[1], 2.0 ** (8 - bits[1]))
-    steps[:9] = 2.0 ** (8 - bits[0])
-    levels: NDArray[np.float64] = np.rint(128 * rest.astype(np.float64) / steps) * steps + 128
-    return levels
+def _fixed(p: Parameters, fraction: int, share: float) -> bytes:
+    """Positions in 24 bits, in steps of at most `share` of the smallest standard deviation: powers of two."""
+    size = p["log_scales"].min(axis=1, keepdims=True).astype(np.float64) / np.log(2)
+    step = np.exp2(np.clip(np.floor(size + np.log2(share) + fraction), 0, MAX_ZEROS)) if share else 1.0
+    multiples = np.rint(p["means"].astype(np.float64) * 2**fraction / step) * step
+    fixed = np.minimum(multiples, MAX_INT24 + 1 - step).astype("<i4")
+    return np.ascontiguousarray(fixed.view(np.uint8).reshape(-1, 4)[:, :3]).tobytes()
+
+
+def _rotations(quats: NDArray[np.float32], step: int) -> bytes:
+    """The three smallest components of quaternions in 9 bits, as multiples of `step`, their signs, and which."""
+    largest, others = smallest_three(np.roll(unit(quats), -1, axis=1))
+    multiples = np.rint(511 / step * np.abs(others) * 2**0.5) * step
+    levels = np.minimum(multiples, 511).astype(np.uint32)
+    levels |= (others < 0).astype(np.uint32) << np.uint32(9)
+    rotations = largest.astype(np.uint32) << np.uint32(30)
+    for i, shift in enumerate((20, 10, 0)):
+        rotations |= levels[:, i] << np.uint32(shift)
+    return rotations.astype("<u4").tobytes()
+
+
+def _sh_steps(p: Parameters, options: Writing) -> NDArray[np.float32]:
+    """The step of the harmonics of each Gaussian, [N] levels; 1 for all where bits are given, or all are kept."""
+    median, most = MEDIAN_STEP[options.quality]
+    if options.sh_bits or most == 1 or not p["sh_rest"].shape[1]:
+        return np.ones(len(p["means"]), np.float32)
+    return steps(log_weights(p), usual_step(p["sh_rest"], median), most)
+
+
+def _rounded_sh(
+    rest: NDArray[np.float32], sh_steps: NDArray[np.float32], bits: tuple[int, int] | None
+) -> NDArray[np.float64]:
+    """Harmonics as levels from -128 to 127: multiples of each Gaussian's step, or of 2^(8 - bits)."""
+    levels = 128 * np.clip(rest.astype(np.float64), -1, 1)
+    if bits is None and sh_steps.max(initial=1) > 1:
+        found = rounded_rows(levels, sh_steps, visible_form(rest))
+        return np.asarray(np.clip(found, -128, 128 - sh_steps[:, None]), np.float64)
+    columns = np.full(rest.shape[1], 2.0 ** (8 - (bits or WHOLE)[1]))
+    columns[:9] = 2.0 ** (8 - (bits or WHOLE)[0])
+    return np.asarray(np.rint(levels / columns) * columns)

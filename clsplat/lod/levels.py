@@ -2,7 +2,6 @@
 
 import logging
 from contextlib import nullcontext
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +9,8 @@ from clsplat.errors import ConfigError, DataError, amount
 from clsplat.files import new_folder, require_free
 from clsplat.formats.lod import LOD_META
 from clsplat.formats.lod_writing import write_lod
-from clsplat.formats.splats import Writing, require_moderate
+from clsplat.formats.splats import require_moderate
 from clsplat.formats.table import bytes_of
-from clsplat.gaussians.clusters import DeviceClusters
 from clsplat.gaussians.model import Model, load
 from clsplat.gaussians.sky import keep_sky, sky_file
 from clsplat.lod.decimation import decimated
@@ -43,11 +41,10 @@ def levels_of_detail(
         told = amount(len(first), "Gaussian")
         LOG.warning("%s: has %s; below a million one SOG is better: `clsplat convert`", model, told)
     training = Training(opened, folder.with_name(f"{folder.name}.training"), plan) if opened else None
-    writing = Writing(clustering=partial(DeviceClusters, opened.device)) if opened else Writing()
     with new_folder(folder) as place:
         with training.held() if training else nullcontext():
             levels = _levels(first, plan, training)
-        digest = write_lod(place, [level.model.as_file() for level in levels], writing)
+        digest = write_lod(place, [level.model.as_file() for level in levels])
         keep_sky(first.sky, place / LOD_META, digest)
     if first.sky:
         told = sky_file(folder / LOD_META).name

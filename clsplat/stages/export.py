@@ -1,7 +1,6 @@
 """The model as a file."""
 
 import logging
-from functools import partial
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
@@ -10,7 +9,6 @@ from pydantic import model_validator
 from clsplat.errors import DataError, OutputError
 from clsplat.formats.splats import Reading, Writing
 from clsplat.formats.table import endings, for_writing
-from clsplat.gaussians.clusters import DeviceClusters
 from clsplat.gaussians.model import load
 from clsplat.gaussians.sky import sky_file
 from clsplat.gaussians.sky_splats import with_sky_splats
@@ -62,7 +60,7 @@ class Export(Scheduled):
         files = {path: model.baked()}
         if model.filter_variance is not None:
             files[raw] = model
-        options = Writing(quality=self.quality, clustering=partial(DeviceClusters, run.device))
+        options = Writing(quality=self.quality)
         for file, one in files.items():
             run.written[_name(file, run)] = one.save(file, options)
             try:

@@ -10,7 +10,6 @@ from pydantic import Field
 from clsplat.density.visible_error import VisibleError
 from clsplat.errors import amount
 from clsplat.formats.sog_writing import Harmonics
-from clsplat.formats.splats import Writing
 from clsplat.gaussians import members
 from clsplat.gaussians.clusters import DeviceClusters, most_alike
 from clsplat.stages.base import Scheduled
@@ -47,13 +46,10 @@ class PaletteSh(Scheduled):
         gaussians = run.model.gaussians
         if not gaussians.sh_degree:
             return
-        rest, options = (
-            gaussians.get("sh_rest"),
-            Writing(quality=self.quality, clustering=partial(DeviceClusters, run.device)),
-        )
+        rest, clustering = gaussians.get("sh_rest"), partial(DeviceClusters, run.device)
         error = visible_error(run)
         better = partial(error.palette, rest, nearest=partial(most_alike, run.device)) if error.weights.any() else None
-        found = Harmonics.of(rest, options, error.weights, better, self.step)
+        found = Harmonics.of(rest, self.quality, clustering, error.weights, better, self.step)
         gaussians.set("sh_rest", found.values)
         gaussians.set("sh_base", gaussians.get("sh_base") + error.base_change(rest - found.values))
         members.set_clusters(gaussians, found.labels, error.weights)

@@ -255,9 +255,9 @@ def test_a_crop_and_an_opacity_leave_what_they_say(source, tmp_path):
 
 def test_axes_are_of_the_file_that_is_read_or_else_written(source, tmp_path):
     means = np.sort(load(source).means[:, 1])
-    clsplat.convert(source, tmp_path / "ply_axes.spz", axes="ply")
+    clsplat.convert(source, tmp_path / "ply_axes.spz", axes="ply", quality="high")
     np.testing.assert_allclose(np.sort(-load(tmp_path / "ply_axes.spz").means[:, 1]), means, atol=1e-3)
-    clsplat.convert(tmp_path / "ply_axes.spz", tmp_path / "right.spz", axes="ply")
+    clsplat.convert(tmp_path / "ply_axes.spz", tmp_path / "right.spz", axes="ply", quality="high")
     np.testing.assert_allclose(np.sort(load(tmp_path / "right.spz").means[:, 1]), means, atol=1e-3)
 
 

@@ -15,7 +15,7 @@ from clsplat.formats import lod
 from clsplat.formats.lod_tree import Limits, half_boxes, tree
 from clsplat.formats.lod_writing import write_lod
 from clsplat.formats.packing import morton_order
-from clsplat.formats.splats import SplatFile
+from clsplat.formats.splats import SplatFile, Writing
 from clsplat.formats.table import bytes_of, detect, read, write
 from clsplat.gaussians.checkup import examine, verdict
 from clsplat.gaussians.conversion import convert
@@ -35,7 +35,7 @@ def levels(rng: np.random.Generator, counts: tuple[int, ...] = (700, 300, 100)) 
 @pytest.fixture
 def written(tmp_path: Path, rng: np.random.Generator) -> tuple[Path, list[SplatFile]]:
     made = levels(rng)
-    write_lod(tmp_path / "site", made, limits=SMALL)
+    write_lod(tmp_path / "site", made, Writing(quality="high"), SMALL)
     return tmp_path / "site", made
 
 
@@ -129,7 +129,7 @@ def test_boxes_are_those_of_splat_transform(tmp_path):
 
 def test_the_same_levels_give_the_same_bytes(written, tmp_path, rng):
     folder, made = written
-    assert write_lod(tmp_path / "again", made, limits=SMALL)
+    assert write_lod(tmp_path / "again", made, Writing(quality="high"), SMALL)
     files = {file.relative_to(folder): file.read_bytes() for file in folder.rglob("*") if file.is_file()}
     again = {p.relative_to(tmp_path / "again"): p.read_bytes() for p in (tmp_path / "again").rglob("*") if p.is_file()}
     assert files == again

@@ -1,0 +1,212 @@
+"""Harmonics rounded by weights and visible errors: against a slow reference, in SPZ and in SOG."""
+
+import gzip
+
+import numpy as np
+import pytest
+
+from clsplat.formats import sh_rounding
+from clsplat.formats.packing import morton_order
+from clsplat.formats.sh_rounding import rounded_rows, steps, usual_step, visible_form
+from clsplat.formats.sh_tree import LEVELS, tree_palette
+from clsplat.formats.splats import SplatFile, Writing, unit
+from clsplat.formats.table import write
+from clsplat.formats.weights import LARGEST, log_weights
+from tests.formats.models import splats, there_and_back
+
+
+def seen_from_one_side(rng: np.random.Generator, count: int, degree: int = 3) -> SplatFile:
+    """A model whose harmonics lie mostly along a few directions, as those of cameras on one side do."""
+    source = splats(rng, count, degree)
+    coefficients = source.parameters["sh_rest"].shape[1] // 3
+    few = rng.normal(0, 0.1, (3, coefficients))
+    rest = np.einsum("nfc,fk->nkc", rng.normal(size=(count, 3, 3)), few) + rng.normal(0, 0.01, (count, coefficients, 3))
+    source.parameters["sh_rest"] = rest.reshape(count, -1).astype(np.float32)
+    source.parameters["log_scales"] = rng.uniform(-6, -3, (count, 3)).astype(np.float32)
+    return source
+
+
+def shown(error: np.ndarray, form: np.ndarray) -> np.ndarray:
+    """What shows of the errors of each Gaussian, e^T G e over its channels, [N]."""
+    channels = error.astype(np.float64).reshape(len(error), len(form), 3)
+    return np.einsum("nkc,kl,nlc->n", channels, form, channels)
+
+
+def covariances(one: SplatFile) -> np.ndarray:
+    """Of each Gaussian, [N, 3, 3]."""
+    w, x, y, z = unit(one.parameters["quats"]).T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    turned = np.moveaxis(np.array(rows), 2, 0) * np.exp(one.parameters["log_scales"].astype(np.float64))[:, None]
+    return turned @ turned.transpose(0, 2, 1)
+
+
+def test_weights_do_not_depend_on_the_size_of_the_scene_and_grow_with_opacity_and_area(rng):
+    p = splats(rng, 200).parameters
+    found = log_weights(p)
+    larger = {**p, "means": 10 * p["means"], "log_scales": p["log_scales"] + np.float32(np.log(10))}
+    np.testing.assert_allclose(log_weights(larger), found, atol=1e-5)
+    assert abs(np.median(found)) < 1e-9
+    more = {name: table.copy() for name, table in p.items()}
+    middle = np.argsort(found)[90:110]
+    more["logit_opacity"][middle[0]] += 1
+    more["log_scales"][middle[1]] += 0.5
+    after = log_weights(more)
+    changed = after - found - np.median(after - found)
+    assert (changed[middle[:2]] > 0.1).all()
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 50])
+def test_weights_are_finite_of_any_model(count, rng):
+    p = splats(rng, count).parameters
+    for name, value in (("logit_opacity", -1e30), ("logit_opacity", 1e30), ("log_scales", 1e15), ("means", 1e15)):
+        p[name][: count // 2] = value
+        assert np.isfinite(log_weights(p)).all()
+        assert (np.abs(log_weights(p)) <= LARGEST).all()
+    p["means"][:] = 3
+    assert np.isfinite(log_weights(p)).all()
+
+
+def test_steps_are_as_the_roots_of_the_weights(rng):
+    found = steps(np.array([-20.0, -4, -2, 0, 2, 4, 6]), 4, 64)
+    np.testing.assert_array_equal(found, [64, 16, 8, 4, 2, 1, 1])
+
+
+@pytest.mark.parametrize("count", [1, 50])
+def test_rounding_is_that_of_the_reference(count, rng):
+    """The reference solves for what the rest of the coefficients should take up, one coefficient after another."""
+    rest = seen_from_one_side(rng, count).parameters["sh_rest"]
+    form, step = visible_form(rest), np.exp2(rng.integers(-7, -2, count)).astype(np.float32)
+    expected = np.empty(rest.shape)
+    for row in range(count):
+        for channel in range(3):
+            wanted = rest[row, channel::3].astype(np.float64)
+            for k in reversed(range(15)):
+                value = np.rint(wanted[k] / step[row]) * step[row]
+                change = np.linalg.solve(form[:k, :k], form[:k, k]) * (wanted[k] - value)
+                wanted[:k] += change
+                wanted[k] = value
+            expected[row, channel::3] = wanted
+    found = rounded_rows(rest, step, form)
+    assert (np.abs(found - expected) > 1e-6).any(axis=1).mean() < 0.05  # a tie of float32 is none of float64
+
+
+def test_less_shows_of_rounding_than_of_rounding_each_alone(rng):
+    rest = seen_from_one_side(rng, 400).parameters["sh_rest"]
+    step = np.full(400, 1 / 32, np.float32)
+    form = visible_form(rest)
+    found, alone = rounded_rows(rest, step, form), np.rint(rest / step[:, None]) * step[:, None]
+    np.testing.assert_array_equal(found, np.rint(found * 32) / 32)
+    assert shown(found - rest, form).sum() < 0.4 * shown(alone - rest, form).sum()
+    np.testing.assert_array_equal(rounded_rows(rest, step, np.eye(15)), alone)
+
+
+@pytest.mark.parametrize("rows", [7, 64])
+def test_rounding_is_the_same_in_any_blocks(rows, rng, monkeypatch):
+    rest = seen_from_one_side(rng, 150, 2).parameters["sh_rest"]
+    step = np.full(150, 1 / 32, np.float32)
+    form = visible_form(rest)
+    table = rest.astype(np.float64).reshape(150, 8, 3)
+    moments = np.einsum("nkc,nlc->kl", table, table)
+    expected = 8 * moments / np.trace(moments) + sh_rounding.ISOTROPIC * np.eye(8)
+    np.testing.assert_allclose(form, expected, atol=0.02)
+    found = rounded_rows(rest, step, form)
+    monkeypatch.setattr(sh_rounding, "ROWS", rows)
+    np.testing.assert_array_equal(visible_form(rest), form)
+    np.testing.assert_array_equal(rounded_rows(rest, step, form), found)
+    assert np.isfinite(rounded_rows(0 * rest, step, visible_form(0 * rest))).all()
+
+
+def test_an_spz_has_multiples_of_a_step_that_grows_as_weights_fall(tmp_path, rng):
+    source = seen_from_one_side(rng, 500)
+    found = there_and_back(tmp_path / "a.spz", source).parameters
+    levels = 128 * found["sh_rest"]
+    np.testing.assert_array_equal(levels, np.rint(levels))
+    expected = np.sort(steps(log_weights(source.parameters), 4, 64))
+    np.testing.assert_array_equal(levels, np.rint(levels / expected[:, None]) * expected[:, None])
+    assert len(np.unique(expected)) > 4
+    write(tmp_path / "high.spz", source, Writing(quality="high"))
+    assert (tmp_path / "a.spz").stat().st_size < 0.8 * (tmp_path / "high.spz").stat().st_size
+    exact = source.rows(morton_order(source.parameters["means"])).parameters["sh_rest"]
+    given = there_and_back(tmp_path / "b.spz", source, Writing(sh_bits=(8, 8))).parameters["sh_rest"]
+    assert np.abs(given - exact).max() <= 1 / 256
+
+
+def test_positions_and_rotations_of_an_spz_are_within_their_steps(tmp_path, rng):
+    source = splats(rng, 300, 0)
+    found, expected = there_and_back(tmp_path / "a.spz", source), source.rows(morton_order(source.parameters["means"]))
+    smallest = np.exp(expected.parameters["log_scales"].min(axis=1, keepdims=True))
+    away = np.abs(found.parameters["means"] - expected.parameters["means"])
+    assert (away <= np.maximum(smallest / 8, 2**-13) * 1.0001).all()
+    cosine = np.abs((unit(found.parameters["quats"]) * unit(expected.parameters["quats"])).sum(axis=1))
+    assert np.degrees(2 * np.arccos(np.minimum(cosine, 1))).max() < 0.7
+
+
+def test_the_gzip_of_an_spz_is_one_that_other_programs_read(tmp_path, rng):
+    for degree in (0, 3):
+        write(tmp_path / "a.spz", splats(rng, 200, degree))
+        assert len(gzip.decompress((tmp_path / "a.spz").read_bytes())) == 16 + 200 * (20 + 3 * ((degree + 1) ** 2 - 1))
+
+
+@pytest.mark.parametrize(("count", "entries"), [(1, 1), (40, 40), (700, 30), (1500, 300)])
+def test_a_palette_for_neighbours_has_the_means_of_its_parts(count, entries, rng):
+    rest = seen_from_one_side(rng, count).parameters["sh_rest"]
+    weights = rng.normal(size=count)
+    vectors, labels = tree_palette(rest, weights, entries, 1.0)
+    assert len(vectors) <= entries
+    np.testing.assert_array_equal(np.unique(labels), np.arange(len(vectors)))
+    sums = np.zeros((len(vectors), 45))
+    np.add.at(sums, labels, np.exp2(weights)[:, None] * rest)
+    means = sums / np.bincount(labels, np.exp2(weights))[:, None]
+    np.testing.assert_allclose(np.rint(vectors * LEVELS), vectors * LEVELS)
+    assert np.abs(vectors - means).mean() < 16 / LEVELS
+    for _ in range(2):
+        np.testing.assert_array_equal(tree_palette(rest, weights, entries, 1.0)[1], labels)
+
+
+def test_a_palette_for_neighbours_is_nearer_to_gaussians_that_weigh_more(rng):
+    rest = seen_from_one_side(rng, 2000).parameters["sh_rest"]
+    weights = np.where(np.arange(2000) % 4 == 0, 3.0, -3.0)
+    vectors, labels = tree_palette(rest, weights, 400, 2.0)
+    errors = shown(vectors[labels] - rest, visible_form(rest))
+    assert errors[::4].mean() < 0.3 * errors[weights < 0].mean()
+    same = np.tile(rest[:1], (50, 1))
+    vectors, labels = tree_palette(same, np.zeros(50), 20, 1.0)
+    assert len(vectors) == 1
+    assert not labels.any()
+
+
+def test_a_palette_that_the_model_had_before_is_shared_by_all(rng):
+    few = seen_from_one_side(rng, 300).parameters["sh_rest"]
+    rest = few[rng.integers(0, 300, 2000)]
+    vectors, labels = tree_palette(rest, rng.normal(size=2000), 400, 1.0)
+    assert len(vectors) <= 300
+    assert np.abs(vectors[labels] - rest).mean() < 4 / LEVELS
+
+
+def test_small_harmonics_have_smaller_steps(rng):
+    rest = rng.normal(0, 0.1, (500, 45))
+    assert usual_step(rest, 4.0) == 4
+    assert usual_step(np.zeros((0, 45)), 4.0) < 1
+    np.testing.assert_allclose(usual_step(rest / 10, 4.0), 4 * 0.01 / sh_rounding.USUAL, rtol=0.05)
+
+
+def test_a_sog_is_the_shape_of_the_model_and_converts_again_without_loss(tmp_path, rng):
+    source = seen_from_one_side(rng, 1500)
+    found = there_and_back(tmp_path / "a.sog", source)
+    order = morton_order(source.parameters["means"])
+    expected, shapes = covariances(source.rows(order)), covariances(found)
+    size = np.linalg.norm(expected, axis=(1, 2))
+    assert (np.linalg.norm(shapes - expected, axis=(1, 2)) < 0.15 * size).all()
+    for name, bound in (("means", 0.01), ("sh_base", 0.03), ("logit_opacity", 1.0)):
+        away = np.abs(found.parameters[name] - source.parameters[name][order])
+        assert np.percentile(away, 90) <= bound, name
+    again = there_and_back(tmp_path / "b.sog", found)
+    rows = np.lexsort(found.parameters["means"].T), np.lexsort(again.parameters["means"].T)
+    for name in ("sh_rest", "log_scales", "quats", "sh_base"):
+        np.testing.assert_allclose(
+            again.parameters[name][rows[1]], found.parameters[name][rows[0]], atol=1e-4, err_msg=name
+        )
