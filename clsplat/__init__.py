@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from clsplat import errors as errors
     from clsplat import metrics as metrics
+    from clsplat.api.blocks import train_in_blocks as train_in_blocks
     from clsplat.api.commands import check as check
     from clsplat.api.commands import compare_runs as compare_runs
     from clsplat.api.commands import convert as convert
@@ -70,6 +71,7 @@ _HERE = Path(__file__).resolve().parent
 _ROOMS = {  # where the names come from, which `import clsplat` does not import
     "clsplat.api.commands": "check compare_runs convert copy_pipeline describe_run evaluate pipeline_schema"
     " pipelines resume run status status_schema view",
+    "clsplat.api.blocks": "train_in_blocks",
     "clsplat.api.compression": "compress_model write_levels",
     "clsplat.api.device": "Device",
     "clsplat.api.renderer": "Gradients Picture Renderer",

@@ -36,6 +36,21 @@ def synthetic(
 
 
 @app.command()
+def city(
+    out: Annotated[Path, typer.Argument(help="Folder to make.")],
+    size: Annotated[int, typer.Option(min=8, help="Width and height of the images, pixels.")] = 256,
+    train: Annotated[int, typer.Option(min=1, help="Number of training views.")] = 300,
+    test: Annotated[int, typer.Option(min=1, help="Number of held-out views.")] = 30,
+    lots: Annotated[int, typer.Option(min=1, max=64, help="Houses and parks along each side.")] = 12,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the surface points and their noise.")] = 0,
+) -> None:
+    """Ray-cast a city from the air: streets, houses, roofs; with exact cameras, in the Blender layout."""
+    from data_tools.city import City
+
+    print(write_dataset(out, City(size=size, train=train, test=test, seed=seed, lots=lots)))
+
+
+@app.command()
 def multiscale(
     source: Annotated[Path, typer.Argument(help="Folder of a single-scale Blender dataset.")],
     out: Annotated[Path, typer.Argument(help="Folder to make.")],

@@ -29,7 +29,7 @@ STEPS = 24
 RECIPES = [
     name
     for name, file in shipped().items()
-    if name != "compress"
+    if name not in ("compress", "blocks", "blocks_coarse")  # two start from a model, one is splat_7k at half size
     and f"{name}_7k" not in shipped()
     and not load(name).settings.prepare
     and any(isinstance(s, Optimize) for s in load(name).stages)

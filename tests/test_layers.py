@@ -11,7 +11,7 @@ ROWS = (  # from the top down; a module imports only from lower rows, or from it
     {"cli"},
     {"torch"},
     {"api"},
-    {"compress", "lod"},
+    {"blocks", "compress", "lod"},
     {"tuning"},
     {"cluster"},
     {"runs"},
@@ -57,6 +57,7 @@ def unit(module: str) -> str:
 
 
 TEXTS = {  # what turns results into lines of text
+    "clsplat.blocks.table": {"table"},
     "clsplat.cluster.overview": {"overview_text"},
     "clsplat.compress.page": {"table"},
     "clsplat.conformance.page": {"check_place", "write_page"},

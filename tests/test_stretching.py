@@ -131,7 +131,8 @@ def test_a_number_that_is_corrected_comes_after_growth_and_small_photographs(nam
     training = load(name).settings.training
     last, resolution = last_edit(training), training.views.resolution
     assert last <= training.steps
-    assert last >= resolution.until if isinstance(resolution, DetailDivisor) else at_step(resolution, last) == 1
+    is_fixed = not isinstance(resolution, DetailDivisor)
+    assert at_step(resolution, last) == at_step(resolution, training.steps) if is_fixed else last >= resolution.until
     grows = [stage for stage in training.during if stage.stage == "densify" and stage.stop]
     assert not any(stage.due(step) for stage in grows for step in range(last, training.steps))
 

@@ -20,8 +20,8 @@ from clsplat.cluster.task import Terms
 from clsplat.errors import ClsplatError, ConfigError
 from clsplat.pipeline.matrix import load_experiment
 from clsplat.runs.experiment import Job
-from tests.test_cells import SPEC, WRITES, command
 from tests.test_matrix import STAGES
+from tests.test_sweep_cells import SPEC, WRITES, command
 
 PLACE = Place("inline", "a device", "b")
 

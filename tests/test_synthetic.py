@@ -16,7 +16,7 @@ from data_tools import __main__ as command
 from data_tools import synthetic
 from data_tools.shapes import Box, Cylinder, Shape, Sphere
 from data_tools.still_life import SCENE
-from data_tools.synthetic import Options, trace, write_dataset
+from data_tools.synthetic import STILL_LIFE, Options, write_dataset
 
 Array = NDArray[Any]
 
@@ -81,10 +81,10 @@ def test_a_tilted_cylinder_lies_along_minus_y() -> None:
 def test_normals_point_at_the_camera_and_have_length_one(dataset: Path) -> None:
     pose, _, _ = frames(dataset, "train")[0]
     y, x = (v.ravel() + 0.5 for v in np.mgrid[:24, :24])
-    origin, directions = synthetic.camera_rays(pose, 24, x, y)
-    distance, index = trace(origin, directions)
+    origin, directions = STILL_LIFE.camera_rays(pose, 24, x, y)
+    distance, index = STILL_LIFE.trace(origin, directions)
     hit = np.isfinite(distance)
-    normal = synthetic.by_shape(Shape.normal, index[hit], origin + distance[hit] * directions[:, hit])
+    normal = STILL_LIFE.by_shape(Shape.normal, index[hit], origin + distance[hit] * directions[:, hit])
     np.testing.assert_allclose(np.linalg.norm(normal, axis=0), 1, rtol=1e-9)
     assert (normal * directions[:, hit]).sum(axis=0).max() < 0
 
@@ -98,7 +98,7 @@ def test_a_surface_point_projects_onto_the_pixel_that_sees_it(dataset: Path, spl
         assert backward < 0
         assert image[int(y), int(x), 3] > 0
         ray = pose[:3, :3] @ [(x - 12) / focal, (12 - y) / focal, -1]
-        distance, _ = trace(pose[:3, 3:], column(*ray / np.linalg.norm(ray)))
+        distance, _ = STILL_LIFE.trace(pose[:3, 3:], column(*ray / np.linalg.norm(ray)))
         assert distance[0] == pytest.approx(np.linalg.norm(point - pose[:3, 3]), abs=1e-9)
 
 
@@ -106,7 +106,7 @@ def test_alpha_is_the_silhouette(dataset: Path) -> None:
     for pose, focal, image in frames(dataset, "test"):
         y, x = np.mgrid[:24, :24] + 0.5
         rays = pose[:3, :3] @ np.stack([(x - 12) / focal, (12 - y) / focal, -np.ones_like(x)]).reshape(3, -1)
-        seen = np.isfinite(trace(pose[:3, 3:], rays / np.linalg.norm(rays, axis=0))[0]).reshape(24, 24)
+        seen = np.isfinite(STILL_LIFE.trace(pose[:3, 3:], rays / np.linalg.norm(rays, axis=0))[0]).reshape(24, 24)
         alpha = image[..., 3]
         assert seen[alpha == 255].all()
         assert not seen[alpha == 0].any()

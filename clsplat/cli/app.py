@@ -29,6 +29,7 @@ SYNONYMS = {
     **dict.fromkeys(("export", "transform", "merge"), "convert"),
     **dict.fromkeys(("shrink", "prune", "quantise", "quantize"), "compress"),
     **dict.fromkeys(("decimate", "simplify", "levels", "stream"), "lod"),
+    **dict.fromkeys(("split", "tiles", "city"), "blocks"),
     "diff": "compare",
     "help": "--help",
     "version": "--version",
@@ -36,7 +37,8 @@ SYNONYMS = {
 
 
 ORDER = [
-    *("run", "resume", "status", "cell", "cancel", "worker", "check", "pipelines", "devices", "doctor", "inspect"),
+    *("run", "blocks", "resume", "status", "cell", "cancel", "worker"),
+    *("check", "pipelines", "devices", "doctor", "inspect"),
     *("render", "view", "evaluate", "convert", "compress", "lod", "compare", "bench", "data"),
 ]
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from clsplat.density.box import Box
 from clsplat.density.edit import Edit, Rule
 from clsplat.density.rows import apply_edit
 from clsplat.gaussians.tables import Gaussians
@@ -21,11 +22,13 @@ class Change:
     grown: dict[str, int]  # of these, the ones that became several
 
 
-def densify(edit: Edit, rules: Sequence[Rule], tiler: Tiler, limit: int | None = None) -> Change:
+def densify(
+    edit: Edit, rules: Sequence[Rule], tiler: Tiler, limit: int | None = None, inside: Box | None = None
+) -> Change:
     """Apply the rules in their order, as one rearrangement of all tables, and set the statistics to zero.
 
-    Growth stops at `limit` Gaussians: those with the largest mean of the first column grow first.  Rules read in
-    `edit.room` how many they may add.
+    inside: the part of space in which Gaussians grow.  Growth stops at `limit` Gaussians: those with the largest mean
+    of the first column grow first.  Rules read in `edit.room` how many they may add.
     """
     edit.max_rows = limit
     gaussians = edit.gaussians
@@ -36,6 +39,8 @@ def densify(edit: Edit, rules: Sequence[Rule], tiler: Tiler, limit: int | None =
         rows = edit.rows()
         rule.mark(edit)
         decided_by[edit.rows() != rows] = edit.rule
+    if inside is not None:
+        edit.undo_growth(~inside.holds(gaussians.get("means")))
     if limit is not None and int(edit.rows().sum(dtype=np.int64)) > limit:
         edit.limit(limit)
     rows = edit.rows()

@@ -23,3 +23,9 @@ def model_of_run(folder: Path) -> Path:
     except (DataError, KeyError, TypeError):  # not finished, or of an earlier version
         name = MODEL
     return folder / (name if isinstance(name, str) and is_inside(name) else MODEL)
+
+
+def as_trained(file: Path) -> Path:
+    """Return the PLY beside a model of a run that holds its world filter apart, where there is one, else the model."""
+    raw = file.with_name(f"{file.stem}_raw.ply")
+    return raw if raw.is_file() else file

@@ -6,6 +6,7 @@
 A file is complete and strict: unknown keys are errors, and every value has its default in its model.
 """
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
@@ -54,6 +55,9 @@ class SceneSettings(Settings):
     validation: ChosenOrAuto = 0
     """Training views that are kept out to choose by (`optimize.keep`), as in `holdout`; auto: every 8th, from the
     fifth on, and two at least."""
+    extent: Annotated[float, Field(gt=0)] | None = None
+    """Radius of the scene, scene units, of which sizes and rates are shares; without it, that of the training
+    cameras.  A part of a scene is trained with that of the whole."""
     missing: Missing = "refuse"
     """Photographs that the dataset names and does not have: an error, or `skip`: the scene is read without them."""
 
@@ -80,8 +84,9 @@ class SceneSettings(Settings):
         return self.applied(read_scene(folder, self.split))
 
     def applied(self, scene: Scene) -> tuple[Scene, Background]:
-        """Return a scene with these settings for alpha, and its background."""
-        return scene.with_alpha(self.alpha), scene.background if self.background == "auto" else self.background
+        """Return a scene with these settings for alpha and extent, and its background."""
+        found = replace(scene.with_alpha(self.alpha), extent=self.extent or scene.extent)
+        return found, scene.background if self.background == "auto" else self.background
 
 
 class RasterizerSettings(Settings):

@@ -7,6 +7,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
+from clsplat.density.box import Box
 from clsplat.density.budget import Budget, Moment
 from clsplat.density.control import densify
 from clsplat.density.edit import Edit, Rule
@@ -36,6 +37,9 @@ class Densify(Scheduled):
     """Number of Gaussians at which growth stops, by step; without it, as many as fit in memory.  Pruning continues."""
     budget: OneOf[Budget] | None = None
     """Number of Gaussians at which the growth of an edit stops, from the course of the training; needs `stop`."""
+
+    inside: Box | None = None
+    """Part of space in which Gaussians grow; those outside train and are pruned.  Without it, all space."""
 
     patience: Annotated[int, Field(gt=0)] | None = None
     """Measurements of the validation views in a row without a better one after which nothing grows any more, in a
@@ -70,7 +74,7 @@ class Densify(Scheduled):
         edit = Edit(run.model.gaussians, run.stats, scale, run.step, run.seed, run.survey())
         fits = run.memory_plan().limit
         limit = min([fits, *self._limits(run, edit)])
-        change = densify(edit, self.rules, run.rasterizer.tiler, limit)
+        change = densify(edit, self.rules, run.rasterizer.tiler, limit, self.inside)
         run.refresh_filter()
         if change.after == fits:
             most = f"{fits:,} Gaussians, the most that fit in the device's memory; with smaller photographs more do"

@@ -11,7 +11,7 @@ from clsplat.opencl.device import Array
 from clsplat.opencl.program import constants
 from clsplat.render.arguments import shape_arguments
 from clsplat.render.rasterizer import Frame
-from clsplat.schedule import Decay, NonNegative, at_step, explained
+from clsplat.schedule import Decay, NonNegative, Schedule, at_step, divided, explained
 from clsplat.settings import Settings
 
 
@@ -36,6 +36,12 @@ class FullSizeDecay(Settings):
         return Decay(initial=self.initial, final=self.final, start=start, over=self.until - start)
 
 
+def _times(rate: FullSizeDecay | Schedule, factor: float) -> FullSizeDecay | Schedule:
+    if isinstance(rate, FullSizeDecay):
+        return rate.model_copy(update={"initial": rate.initial * factor, "final": rate.final * factor})
+    return divided(rate, 1 / factor)
+
+
 class Rates(Settings):
     """Learning rates by parameter, each by step.  Those of `means` are multiplied by the scene's extent."""
 
@@ -53,6 +59,11 @@ class Rates(Settings):
     """Of band 0 of the spherical harmonics."""
     sh_rest: NonNegative = 1.25e-4
     """Of the other bands, which cost most; where it is 0 they are left alone, with their moments."""
+
+    def times(self, factor: float) -> "Rates":
+        """Return all rates times a factor."""
+        values = {name: getattr(self, name) for name in PARAMETERS}
+        return self.model_copy(update={name: _times(value, factor) for name, value in values.items()})
 
     def settled(self, full_size: int) -> "Rates":
         """Return rates by step alone; full_size: the first step at the full size of the photographs."""

@@ -1,1 +1,1 @@
-"""A model trained further from its photographs, in a folder of its own, and measured; `compress` and `lod` do that."""
+"""A model trained further, in a folder of its own, and measured; `compress`, `lod` and `blocks` do that."""

@@ -50,18 +50,8 @@ class Tuning:
         return replace(pipeline, settings=stretched(pipeline.settings, Fraction(self.steps, first)))
 
     def trained(self, pipeline: Pipeline, folder: Path, file: str = MODEL) -> Path:
-        """Run a pipeline in a folder; return the file that it writes there.
-
-        What an earlier call has finished is left alone, what it has begun goes on, and what was lost is made again.
-        """
-        if not is_done_with(pipeline, folder) or changed(folder):
-            begun: Start = "resume" if checkpoint.saved(folder) else "restart"
-            start: Start = begun if is_there(folder) else "new"
-            try:
-                run_pipeline(pipeline, folder, self.device, start)
-            except Interrupted as error:
-                raise Interrupted(f"stopped in {folder.name}; the same command goes on") from error
-        return folder / file
+        """Run a pipeline in a folder, as the function `trained`; return the file that it writes there."""
+        return trained(pipeline, folder, self.device, file)
 
     def _scene(self) -> dict[str, Any]:
         settings, numbers = self.source.settings, self.model.rendering
@@ -85,6 +75,21 @@ class Tuning:
             "model.screen_filter": screen,
             **({"model.background": sky} if sky else {}),
         }
+
+
+def trained(pipeline: Pipeline, folder: Path, device: Device, file: str = MODEL) -> Path:
+    """Run a pipeline in a folder; return the file that it writes there.
+
+    What an earlier call has finished is left alone, what it has begun goes on, and what was lost is made again.
+    """
+    if not is_done_with(pipeline, folder) or changed(folder):
+        begun: Start = "resume" if checkpoint.saved(folder) else "restart"
+        start: Start = begun if is_there(folder) else "new"
+        try:
+            run_pipeline(pipeline, folder, device, start)
+        except Interrupted as error:
+            raise Interrupted(f"stopped in {folder.name}; the same command goes on") from error
+    return folder / file
 
 
 def require_steps(steps: int) -> None:

@@ -18,7 +18,7 @@ from clsplat.cluster.execution import Execution
 from clsplat.cluster.probe import Place
 from clsplat.cluster.store import Store
 from clsplat.cluster.task import Terms
-from tests.test_cells import SPEC
+from tests.test_sweep_cells import SPEC
 
 
 def measure(cells: int, workers: int, folder: Path) -> None:

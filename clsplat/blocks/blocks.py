@@ -1,0 +1,171 @@
+"""A scene trained in blocks by one command: a coarse model, its partition, runs of blocks, the merged model."""
+
+import hashlib
+import logging
+from dataclasses import dataclass, field
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.blocks.partition import SIGHT, Block, Partition, Partitioner
+from clsplat.blocks.pipelines import of_block, of_coarse, of_merged, require_divisible
+from clsplat.conformance.quick import open_correct
+from clsplat.errors import ClsplatError, ConfigError, DataError, Interrupted, amount, as_clsplat_error, one_line, quoted
+from clsplat.formats.ply_joining import join_plys
+from clsplat.formats.table import detect
+from clsplat.gaussians.model import load as load_model
+from clsplat.gaussians.run_model import as_trained, model_at
+from clsplat.names import METRICS
+from clsplat.opencl.device import Device
+from clsplat.pipeline.loading import Pipeline, load
+from clsplat.reading import read_json, sha256
+from clsplat.runs.scenes import read_run_scene
+from clsplat.runs.source import as_setting, photographs_of, require_model
+from clsplat.tuning.folder import claimed
+from clsplat.tuning.tuning import trained
+from clsplat.views.photographs import Photographs
+
+LOG = logging.getLogger("clsplat")
+RECORD, COARSE, MERGED = "blocks.json", "coarse", "merged"
+MOST = 99  # blocks
+Steps = Literal["each", "shared"]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is asked for."""
+
+    pipeline: str = "blocks"
+    coarse: str = "blocks_coarse"  # a pipeline, or a model
+    blocks: int = 4
+    sight: float = SIGHT  # share of a view's pixels from which on it belongs to a block
+    steps: Steps = "each"  # of a block: those of the pipeline, or its share of them by its views
+    overrides: list[str] = field(default_factory=list)
+    coarse_overrides: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.blocks <= MOST:
+            raise ConfigError(f"--blocks {self.blocks}: expected 1 to {MOST}")
+        if not 0 <= self.sight < 1:
+            raise ConfigError(f"--sight {self.sight:g}: expected a share of a view's pixels from 0 to below 1")
+        if self.steps not in get_args(Steps):
+            raise ConfigError(f"--steps {quoted(self.steps)}: expected one of {', '.join(get_args(Steps))}")
+
+
+class Blocks:
+    """The work in a folder."""
+
+    def __init__(self, scene: Path, out: Path, plan: Plan, device: str | Device | None) -> None:
+        self.out, self.plan = out, plan
+        where = [f"scene.path={as_setting(photographs_of(scene))}"]
+        self.pipeline = load(plan.pipeline, [*where, "init.file=coarse", *plan.overrides])
+        require_divisible(self.pipeline)
+        self.given = _given(plan.coarse)
+        self.coarse = None if self.given else of_coarse(load(plan.coarse, plan.coarse_overrides), self.pipeline)
+        if self.given and plan.coarse_overrides:
+            raise ConfigError("--set-coarse is for a coarse model that is trained; leave it out, or give a pipeline")
+        rasterizer = self.pipeline.settings.rasterizer
+        self.device = open_correct(device, rasterizer.schedule, rasterizer.sort)
+        self.scene = read_run_scene(self.pipeline.settings.scene, self.pipeline.settings.scene.folder)
+        if len(self.scene.original.downscales) > 1:
+            raise DataError(
+                f"{self.scene.original.path}: has each photograph in several sizes; expected one for blocks"
+            )
+
+    def question(self) -> dict[str, Any]:
+        """Return what the folder belongs to."""
+        pipelines = {"pipeline": self.pipeline, **({"coarse": self.coarse} if self.coarse else {})}
+        texts = {name: hashlib.sha256(one.text().encode()).hexdigest() for name, one in pipelines.items()}
+        asked = {"blocks": self.plan.blocks, "sight": self.plan.sight, "steps": self.plan.steps}
+        model = {"model": sha256(self.given)} if self.given else {}
+        return {**asked, "photographs": self.scene.identity.digest, **model, **texts}
+
+    def partition(self) -> Partition:
+        """Train the coarse model where that is not done, and cut it; write the manifest."""
+        file = self.given
+        if file is None and self.coarse is not None:
+            LOG.info("the coarse model")
+            file = as_trained(trained(self.coarse, self.out / COARSE, self.device))
+        assert file is not None
+        photographs = Photographs(self.device, self.scene.background, budget=0)  # each is used once in a pass
+        work = Partitioner(load_model(file), self.scene.scene, self.device, photographs)
+        found = work.partition(self.plan.blocks, sha256(file), self.plan.sight)
+        found.write(self.out)
+        return found
+
+    def of_block(self, block: Block, partition: Partition) -> Pipeline:
+        """Return the pipeline of a block."""
+        share = Fraction(len(block.views), partition.views) if self.plan.steps == "shared" else Fraction(1)
+        return of_block(self.pipeline, block, self.out / f"{block.name}.ply", partition.extent, share)
+
+    def train(self, partition: Partition) -> list[Path]:
+        """Train the blocks that are not done; return their models, in order.
+
+        One that fails does not stop the others; at the end an error names the first, and has its exit code.
+        """
+        files, failures = [], dict[str, ClsplatError]()
+        pipelines = [self.of_block(block, partition) for block in partition.blocks]
+        for block, pipeline in zip(partition.blocks, pipelines, strict=True):
+            LOG.info("%s of %d: %s", block.name, len(pipelines), amount(len(block.views), "view"))
+            try:
+                files.append(as_trained(trained(pipeline, self.out / block.name, self.device)))
+            except Interrupted:
+                raise
+            except Exception as error:
+                failures[block.name] = as_clsplat_error(error)
+                LOG.warning("%s failed: %s", block.name, one_line(failures[block.name]))
+        if failures:
+            name, first = next(iter(failures.items()))
+            told = f"{len(failures)} of {len(pipelines)} blocks failed; the first, {name}: {first}"
+            whole = ClsplatError(f"{told}; the same command trains them again, and leaves the others alone")
+            whole.exit_code = first.exit_code
+            raise whole
+        return files
+
+    def merge(self, partition: Partition, files: list[Path]) -> Path:
+        """Write the models of all blocks as one, in the order of their numbers; return its file."""
+        file = self.out / f"{MERGED}.ply"
+
+        def check(number: int, means: NDArray[np.float32]) -> None:
+            if not partition.blocks[number].cell.box.holds(means).all():
+                raise DataError(
+                    f"{files[number]}: holds Gaussians outside its cell; remove its folder, and train it again"
+                )
+
+        count = join_plys(file, files, check)
+        LOG.info("%s of %s merged", amount(count, "Gaussian"), amount(len(files), "block"))
+        return file
+
+    def finish(self, file: Path) -> Path:
+        """Run what follows a training on the merged model; return its folder."""
+        trained(of_merged(self.pipeline, file), self.out / MERGED, self.device)
+        return self.out / MERGED
+
+
+def train_in_blocks(
+    scene: Path, out: Path, plan: Plan | None = None, device: str | Device | None = None, *, only_plan: bool = False
+) -> dict[str, Any]:
+    """Train a scene in blocks, in a folder; return the manifest, and beside it `run`, the folder of the merged model.
+
+    What an earlier call has finished is left alone, and what it has begun goes on.  only_plan: stop after the
+    partition.  Raises ClsplatError; one of a block names it.
+    """
+    work = Blocks(scene, out, plan or Plan(), device)
+    with claimed(out, work.question(), RECORD, "a scene in blocks", "another --out"):
+        partition = work.partition()
+        if only_plan:
+            return {**partition.data(), "run": None}
+        run = work.finish(work.merge(partition, work.train(partition)))
+    return {**partition.data(), "run": str(run), "metrics": read_json(run / METRICS)}
+
+
+def _given(coarse: str) -> Path | None:
+    """The file of a coarse model that is given; None for the name or the file of a pipeline.  Raises DataError."""
+    path = Path(coarse)
+    if path.is_dir() or (path.is_file() and detect(path)):
+        require_model(path)
+        return as_trained(model_at(path))
+    return None

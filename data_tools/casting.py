@@ -1,0 +1,108 @@
+"""A ray caster for painted convex bodies, by which the scenes with exact cameras are made.
+
+    primary ray -> closest shape -> paint x (key light x shadow + sky x openness) -> mean of the pixel's samples
+
+The z axis points up.  Colours are linear light until `photograph` encodes them.  Points and directions are [3, R], as
+in shapes.py.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data_tools.shapes import Array, Shape, align, disc, dot, rotate, unit
+
+BLOCK = 65536  # rays at a time, by measurement: smaller blocks cost calls, larger ones memory
+SKIN = 1e-6  # secondary rays start this far above the surface
+
+# Light: one jittered shadow ray and one sky ray per sample; a pixel's grid x grid samples share the work.
+KEY_DIRECTION = unit(np.array([[0.45], [-0.62], [0.95]]))
+KEY_LIGHT = np.array([[1.0], [0.95], [0.86]])
+KEY_WIDTH = 0.11  # radius of the light over its distance
+SKY_LIGHT = np.array([[0.36], [0.41], [0.50]])
+BOUNCE = 0.45  # light on a shape that blocks the sky, over the skylight it blocks
+
+
+@dataclass(frozen=True)
+class World:
+    """Shapes in this light, and the square photographs that are taken of them."""
+
+    shapes: tuple[Shape, ...]
+    camera_angle_x: float  # field of view, radians
+    grid: int  # a pixel is the mean of grid x grid rays
+
+    def trace(self, origins: Array, directions: Array) -> tuple[Array, NDArray[np.intp]]:
+        """Distance to the closest shape (inf = miss) and its index in `shapes`, both [R]."""
+        distance = np.full(np.broadcast_shapes(origins.shape, directions.shape)[1], np.inf)
+        index = np.zeros(distance.shape, np.intp)
+        for i, shape in enumerate(self.shapes):
+            here = shape.intersect(origins, directions)
+            index[here < distance] = i
+            distance = np.minimum(distance, here)
+        return distance, index
+
+    def by_shape(self, of: Callable[[Shape, Array], Array], index: NDArray[np.intp], points: Array) -> Array:
+        """Evaluate `Shape.normal` or `Shape.texture` at points, each on the shape that it lies on, [3, R]."""
+        out = np.zeros(points.shape)
+        for i in np.unique(index):
+            here = np.flatnonzero(index == i)
+            out[:, here] = of(self.shapes[i], points[:, here])
+        return out
+
+    def shade(self, points: Array, index: NDArray[np.intp], sample: int) -> Array:
+        """Light that surface points send out, seen by the `sample`-th shadow ray and sky ray of all, [3, R]."""
+        count = self.grid * self.grid
+        lamp, sky = disc(count)[:, [sample * 7 % count, sample * 5 % count]].T  # far apart in neighbouring samples
+        normal = self.by_shape(Shape.normal, index, points)
+        start = points + SKIN * normal
+        to_key = unit(align(KEY_DIRECTION, KEY_WIDTH * lamp[0], KEY_WIDTH * lamp[1], 1.0))
+        lit = np.isinf(self.trace(start, to_key)[0]) * np.maximum(dot(KEY_DIRECTION, normal), 0)
+        to_sky = align(normal, sky[0], sky[1], np.sqrt(1 - dot(sky, sky)))
+        distance, blocker = self.trace(start, to_sky)
+        light = SKY_LIGHT * (0.75 + 0.25 * normal[2])
+        near = np.flatnonzero(np.isfinite(distance))
+        there = start[:, near] + distance[near] * to_sky[:, near]
+        light[:, near] *= BOUNCE * self.by_shape(Shape.texture, blocker[near], there)
+        return np.asarray(self.by_shape(Shape.texture, index, points) * (KEY_LIGHT * lit + light))
+
+    def camera_rays(self, pose: Array, size: int, x: Array, y: Array) -> tuple[Array, Array]:
+        """Origin [3, 1] and unit directions [3, R] of the rays through image positions x, y (pixels).
+
+        pose: camera-to-world [4, 4] in OpenGL axes.
+        """
+        focal = 0.5 * size / np.tan(0.5 * self.camera_angle_x)
+        through = np.array([(x - 0.5 * size) / focal, (0.5 * size - y) / focal, np.full(x.shape, -1.0)])
+        return pose[:3, 3:], unit(rotate(pose[:3, :3], through))
+
+    def photograph(self, pose: Array, size: int) -> NDArray[np.uint8]:
+        """Render one view, [size, size, 4] RGBA: colours with gamma 2 (close to sRGB), alpha = covered share."""
+        rows = max(1, BLOCK // size)
+        parts = [self.expose(pose, size, range(r, min(r + rows, size))) for r in range(0, size, rows)]
+        return np.concatenate(parts)
+
+    def expose(self, pose: Array, size: int, rows: range) -> NDArray[np.uint8]:
+        """Render some rows of a view, [rows, size, 4] RGBA."""
+        y, x = (v.ravel() for v in np.meshgrid(np.array(rows, float), np.arange(float(size)), indexing="ij"))
+        colour, cover = np.zeros((3, len(x))), np.zeros(len(x))
+        for sample in range(self.grid * self.grid):
+            down, right = divmod(sample, self.grid)
+            origin, directions = self.camera_rays(
+                pose, size, x + (right + 0.5) / self.grid, y + (down + 0.5) / self.grid
+            )
+            distance, index = self.trace(origin, directions)
+            hit = np.flatnonzero(np.isfinite(distance))
+            light = self.shade(origin + distance[hit] * directions[:, hit], index[hit], sample)
+            colour[:, hit] += np.sqrt(np.minimum(light, 1))  # encoded first: readers average encoded values
+            cover[hit] += 1
+        rgba = np.vstack([colour / np.maximum(cover, 1), cover / self.grid**2])
+        return np.rint(255 * rgba).astype(np.uint8).T.reshape(len(rows), size, 4)
+
+
+def camera_pose(position: Array, backward: Array) -> Array:
+    """Camera-to-world [4, 4] in OpenGL axes of a camera whose axis points away from `backward`, a unit vector [3]."""
+    right = unit(np.cross([0.0, 0.0, 1.0], backward))
+    pose = np.eye(4)
+    pose[:3] = np.stack([right, np.cross(backward, right), backward, position], axis=1)
+    return pose

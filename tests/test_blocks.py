@@ -1,0 +1,200 @@
+"""`clsplat blocks`: a scene is cut, its blocks are trained alone, and together they are the whole."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import clsplat
+from clsplat.cli import app
+from clsplat.density.box import Box
+from clsplat.errors import ClsplatError, ConfigError, DataError
+from clsplat.pipeline.loading import load
+from clsplat.scene.detect import read_scene
+from data_tools.multiscale import write_multiscale
+
+pytestmark = pytest.mark.slow
+
+COUNT = 3
+SHORT = ("optimize.steps=12", "checkpoint.every=4", "optimize.log_every=6", "model.sh_degree=1")
+MIP = ("model.world_filter={type: smoothing, variance: 0.2}", "model.screen_filter={type: mip, variance: 0.1}")
+NEVER = 0.9  # share of a view's pixels: then views belong to the block where they stand, or to their best
+
+
+def train(scene: Path, coarse: Path, out: Path, *overrides: str, **options) -> dict:
+    return clsplat.train_in_blocks(scene, out, coarse=coarse, overrides=[*SHORT, *overrides], **options)
+
+
+@pytest.fixture(scope="module")
+def trained(tiny_scene: Path, few_steps: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict]:
+    """A scene in three blocks; nothing is changed in it."""
+    out = tmp_path_factory.mktemp("blocks") / "out"
+    return out, train(tiny_scene, few_steps, out, blocks=COUNT, sight=NEVER)
+
+
+def boxes(found: dict) -> list:
+    return [Box(**block["cell"]) for block in found["blocks"]]
+
+
+def by_owner(model: clsplat.Model, found: dict) -> clsplat.Model:
+    """A model with its Gaussians in the order of the blocks that own them."""
+    held = np.stack([box.holds(model.means) for box in boxes(found)])
+    assert (held.sum(axis=0) == 1).all()
+    return model[np.argsort(held.argmax(axis=0), kind="stable")]
+
+
+@pytest.mark.parametrize("filters", [(), MIP], ids=["plain", "mip"])
+def test_with_every_camera_in_every_block_the_merged_model_is_the_whole(tiny_scene, few_steps, tmp_path, filters):
+    coarse = clsplat.load(few_steps)
+    coarse.logit_opacity[::50] = -9  # in no view
+    coarse.save(tmp_path / "coarse.ply")
+    whole = train(tiny_scene, tmp_path / "coarse.ply", tmp_path / "whole", *filters, blocks=1)
+    parts = train(tiny_scene, tmp_path / "coarse.ply", tmp_path / "parts", *filters, blocks=COUNT, sight=0)
+    assert [len(block["views"]) for block in parts["blocks"]] == [8] * COUNT
+    assert [block["start"] for block in parts["blocks"]] == [whole["gaussians"]] * COUNT
+    name = "point_cloud_raw.ply" if filters else "point_cloud.ply"
+    one, other = (clsplat.load(Path(found["run"]) / name) for found in (whole, parts))
+    for table, values in by_owner(one, parts).tables().items():
+        np.testing.assert_array_equal(other.tables()[table], values)
+    assert other.tables().keys() >= ({"filter_variance"} if filters else {"means"})
+    assert (by_owner(coarse, parts).means != other.means[: len(coarse)]).any()  # they were trained
+
+
+def test_the_crops_of_an_untrained_partition_are_the_coarse_model(trained, few_steps):
+    out, found = trained
+    starts = [clsplat.load(out / f"block_{i:02d}.ply") for i in range(COUNT)]
+    own = [start[box.holds(start.means)] for start, box in zip(starts, boxes(found), strict=True)]
+    assert [len(model) for model in own] == [block["gaussians"] for block in found["blocks"]]
+    whole = by_owner(clsplat.load(few_steps), found)
+    for table, values in whole.tables().items():
+        np.testing.assert_array_equal(np.concatenate([model.tables()[table] for model in own]), values)
+
+
+def test_every_camera_is_used_and_views_are_fewer_than_all(trained, tiny_scene):
+    _, found = trained
+    names = [[view["name"] for view in block["views"]] for block in found["blocks"]]
+    train_views = [view.name for view in read_scene(tiny_scene).split("train")]
+    assert set().union(*names) == set(train_views)
+    assert min(map(len, names)) < len(train_views)
+
+
+def test_a_block_trains_its_views_with_the_extent_of_the_whole_and_grows_in_its_cell(trained, tiny_scene):
+    out, found = trained
+    for block in found["blocks"]:
+        settings = load(str(out / block["name"] / "pipeline.yaml")).settings
+        assert settings.scene.train.names == [view["name"] for view in block["views"]]
+        assert settings.scene.extent == read_scene(tiny_scene).extent
+        (densify,) = [stage for stage in settings.training.during if stage.stage == "densify"]
+        assert densify.inside.model_dump() == block["growth"]
+        model = clsplat.load(out / block["name"])
+        assert boxes(found)[int(block["name"][-2:])].holds(model.means).all()
+
+
+def test_the_merged_run_is_measured_with_all_views(trained):
+    out, found = trained
+    assert Path(found["run"]) == out / "merged"
+    assert found["metrics"] == json.loads((out / "merged" / "metrics.json").read_text())
+    assert (found["metrics"]["test"]["1"]["views"], found["metrics"]["train"]["1"]["views"]) == (2, 8)
+    merged = clsplat.load(out / "merged.ply").means
+    parts = [clsplat.load(out / f"block_{i:02d}").means for i in range(COUNT)]
+    np.testing.assert_array_equal(merged, np.concatenate(parts))
+    np.testing.assert_array_equal(clsplat.load(out / "merged").means, merged)
+
+
+def test_killed_and_missing_blocks_go_on_with_equal_bits(trained, tiny_scene, few_steps, tmp_path):
+    out = tmp_path / "out"
+    train(tiny_scene, few_steps, out, blocks=COUNT, sight=NEVER)
+    for name in ("metrics.json", "checksums.json", "point_cloud.ply", "checkpoints/step_000012.npz"):
+        (out / "block_01" / name).unlink()
+    shutil.rmtree(out / "block_02")
+    shutil.rmtree(out / "merged")
+    (out / "merged.ply").unlink()
+    train(tiny_scene, few_steps, out, blocks=COUNT, sight=NEVER)
+    assert "resumed at step 8" in (out / "block_01" / "log.txt").read_text()
+    assert (out / "merged.ply").read_bytes() == (trained[0] / "merged.ply").read_bytes()
+    assert (out / "partition.json").read_bytes() == (trained[0] / "partition.json").read_bytes()
+
+
+def test_what_is_done_is_left_alone(trained, tiny_scene, few_steps, monkeypatch):
+    monkeypatch.setattr("clsplat.tuning.tuning.run_pipeline", lambda *_: pytest.fail("a run begins"))
+    again = train(tiny_scene, few_steps, trained[0], blocks=COUNT, sight=NEVER)
+    assert again == trained[1]
+
+
+def test_a_block_that_fails_is_named_and_the_others_are_trained(tiny_scene, few_steps, tmp_path):
+    (tmp_path / "out").mkdir()
+    train(tiny_scene, few_steps, tmp_path / "out", blocks=COUNT, sight=NEVER, only_plan=True)
+    (tmp_path / "out" / "block_01").write_text("in the way")
+    with pytest.raises(ClsplatError, match=r"1 of 3 blocks failed; the first, block_01: .*the same command") as caught:
+        train(tiny_scene, few_steps, tmp_path / "out", blocks=COUNT, sight=NEVER)
+    assert caught.value.exit_code == 7
+    assert [(tmp_path / "out" / f"block_{i:02d}" / "metrics.json").is_file() for i in (0, 2)] == [True] * 2
+    assert not (tmp_path / "out" / "merged.ply").exists()
+
+
+def test_steps_are_shared_by_views_with_rates_that_make_up_for_it(tiny_scene, few_steps, tmp_path):
+    shared = {"blocks": 2, "sight": NEVER, "steps": "shared"}
+    found = train(tiny_scene, few_steps, tmp_path / "out", "optimize.steps=16", **shared)
+    for block in found["blocks"]:
+        folder, share = tmp_path / "out" / block["name"], len(block["views"]) / 8
+        assert json.loads((folder / "metrics.json").read_text())["steps"] == 16 * share
+        rates = load(str(folder / "pipeline.yaml")).settings.training.rates
+        assert rates.log_scales == pytest.approx(4.0e-3 / share**0.5)
+        assert rates.means.initial == pytest.approx(6.4e-5 / share**0.5)
+
+
+def test_the_coarse_model_is_trained_where_none_is_given(tiny_scene, tmp_path):
+    coarse = ("optimize.steps=6", "optimize.views.resolution=1")
+    found = clsplat.train_in_blocks(
+        tiny_scene, tmp_path / "out", blocks=2, coarse_overrides=coarse, overrides=SHORT, only_plan=True
+    )
+    assert found["run"] is None
+    assert json.loads((tmp_path / "out" / "coarse" / "metrics.json").read_text())["steps"] == 6
+    assert found["gaussians"] == len(clsplat.load(tmp_path / "out" / "coarse"))
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("model.background={type: directions}", "model.background is not for blocks: each block would learn its own"),
+        ("optimize.colours={type: gain}", "optimize.colours is not for blocks: those of blocks would differ"),
+        ("scene.validation=4", "scene.validation is not for blocks: a block has no views to choose by"),
+        ("densify.inside={low: [0, null, null]}", "densify.inside is not for blocks: blocks set it; leave it out"),
+        ("init.source=random", "expected `init: {source: model}` first, and a stage 'optimize'"),
+    ],
+)
+def test_what_blocks_cannot_share_is_refused(override, message, tiny_scene, few_steps, tmp_path):
+    with pytest.raises(ConfigError, match=message):
+        train(tiny_scene, few_steps, tmp_path / "out", override)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_without_a_coarse_model_is_refused(tiny_scene, tmp_path):
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(DataError, match=r"empty: has no pipeline\.yaml; expected a model file or a run folder"):
+        train(tiny_scene, tmp_path / "empty", tmp_path / "out")
+
+
+def test_a_scene_of_several_sizes_is_refused(tiny_scene, few_steps, tmp_path):
+    write_multiscale(tiny_scene, tmp_path / "scene", 2)
+    with pytest.raises(DataError, match="has each photograph in several sizes; expected one for blocks"):
+        train(tmp_path / "scene", few_steps, tmp_path / "out")
+
+
+@pytest.mark.parametrize(("option", "value"), [("blocks", 0), ("sight", 1.0), ("steps", "some")])
+def test_options_out_of_bounds_are_refused(option, value, tiny_scene, few_steps, tmp_path):
+    with pytest.raises(ConfigError, match=f"--{option} "):
+        train(tiny_scene, few_steps, tmp_path / "out", **{option: value})
+
+
+def test_the_command_shows_the_plan(tiny_scene, few_steps, tmp_path):
+    arguments = ["blocks", "--scene", str(tiny_scene), "--coarse", str(few_steps), "--out", str(tmp_path / "out")]
+    shown = CliRunner().invoke(app, [*arguments, "--plan", "--blocks", "2"])
+    assert shown.exit_code == 0, shown.output
+    names = [line.split()[0] for line in shown.stdout.splitlines() if "%" in line]
+    assert names == ["block_00", "block_01", "whole"]
+    refused = CliRunner().invoke(app, [*arguments, "--plan", "--blocks", "3"])
+    assert "holds a scene in blocks that differs in blocks" in str(refused.exception)
