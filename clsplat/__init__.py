@@ -41,6 +41,9 @@ if TYPE_CHECKING:
     from clsplat.api.renderer import Gradients as Gradients
     from clsplat.api.renderer import Picture as Picture
     from clsplat.api.renderer import Renderer as Renderer
+    from clsplat.api.sweeps import cancel as cancel
+    from clsplat.api.sweeps import run_cell as run_cell
+    from clsplat.api.sweeps import work_for as work_for
     from clsplat.api.tools import devices as devices
     from clsplat.api.tools import doctor as doctor
     from clsplat.api.tools import inspect_scene as inspect_scene
@@ -66,12 +69,13 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 _HERE = Path(__file__).resolve().parent
 _ROOMS = {  # where the names come from, which `import clsplat` does not import
-    "clsplat.api.commands": "check compare_runs convert copy_pipeline describe_run evaluate pipeline_schema pipelines"
-    " resume run status status_schema view",
+    "clsplat.api.commands": "check compare_runs convert copy_pipeline describe_run evaluate pipeline_schema"
+    " pipelines resume run status status_schema view",
     "clsplat.api.blocks": "train_in_blocks",
     "clsplat.api.compression": "compress_model write_levels",
     "clsplat.api.device": "Device",
     "clsplat.api.renderer": "Gradients Picture Renderer",
+    "clsplat.api.sweeps": "cancel run_cell work_for",
     "clsplat.api.tools": "devices doctor inspect_scene load_plugin measure_growth measure_speed read_measurement",
     "clsplat.api.trainer": "Report Trainer",
     "clsplat.api.pictures": "camera_path render_path render_views write_cameras write_video",

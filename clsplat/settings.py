@@ -182,6 +182,14 @@ def in_one_sentence(expected: str) -> WrapValidator:
 ReadPath = Annotated[str, AfterValidator(_readable)]  # a file or folder that is read
 
 
+def is_read(kind: type[Settings], key: str) -> bool:
+    """Return whether a key holds the path of a file or folder that is read."""
+    field = kind.model_fields[key]
+    return ReadPath in (field.annotation, *typing.get_args(field.annotation)) or any(
+        isinstance(one, AfterValidator) and one.func is _readable for one in field.metadata
+    )
+
+
 class VariantName:
     """Marks a field that accepts the name of one of the variants of a base, or of those that `accepts` is true of."""
 

@@ -11,6 +11,7 @@ from contextlib import contextmanager, suppress
 from typing import Any, NoReturn
 
 NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK")  # the last is of Windows: Ctrl-Break, or the window closes
+GRACE = 60.0  # seconds for a process whose input has ended, before it is ended at once
 IMPORT_SECONDS = 10.0  # that a signal waits for the end of an import: a plug-in's may have none
 
 
@@ -43,6 +44,21 @@ def end_at_once_on_signals() -> None:
 def _end_at_once(number: int, frame: Any) -> NoReturn:
     with suppress(OSError):
         os.write(2, b"stopped\n")
+    os._exit(130)
+
+
+def stop_with_input() -> None:
+    """Let the end of standard input stop the process as SIGTERM does: whoever has started it has ended, or says so."""
+    threading.Thread(target=_watch_input, name="input", daemon=True).start()
+
+
+def _watch_input() -> None:
+    """Read with os.read: a buffered read that waits would abort the interpreter at its end."""
+    with suppress(OSError):
+        while os.read(0, 4096):
+            pass
+    _thread.interrupt_main(signal.SIGTERM)
+    time.sleep(GRACE)
     os._exit(130)
 
 

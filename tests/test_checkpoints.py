@@ -161,3 +161,12 @@ def test_a_run_whose_scene_has_moved_goes_on_where_it_is_now(killed_run, few_ste
         clsplat.resume(killed_run)
     clsplat.resume(killed_run, moved)
     assert (killed_run / "point_cloud.ply").read_bytes() == (few_steps / "point_cloud.ply").read_bytes()
+
+
+def test_checkpoints_by_time_come_between_those_by_step_and_change_no_bits(tiny_scene, few_steps, tmp_path):
+    train(tiny_scene, tmp_path / "run", *FEW, "checkpoint.every_seconds=1e-6", "checkpoint.keep=20")
+    assert steps_saved(tmp_path / "run") == [f"step_{step:06d}.npz" for step in range(1, 13)]
+    assert digest(tmp_path / "run") == digest(few_steps)
+    assert records(tmp_path / "run") == records(few_steps)
+    train(tiny_scene, tmp_path / "rare", *FEW, "checkpoint.every_seconds=1e6")
+    assert steps_saved(tmp_path / "rare") == steps_saved(few_steps)

@@ -13,6 +13,7 @@ ROWS = (  # from the top down; a module imports only from lower rows, or from it
     {"api"},
     {"blocks", "compress", "lod"},
     {"tuning"},
+    {"cluster"},
     {"runs"},
     {"conformance"},
     {"bench"},
@@ -57,6 +58,7 @@ def unit(module: str) -> str:
 
 TEXTS = {  # what turns results into lines of text
     "clsplat.blocks.table": {"table"},
+    "clsplat.cluster.overview": {"overview_text"},
     "clsplat.compress.page": {"table"},
     "clsplat.conformance.page": {"check_place", "write_page"},
     "clsplat.gaussians.checkup": {"lines", "verdict"},
@@ -104,6 +106,25 @@ def test_only_the_opencl_layer_imports_pyopencl(path):
         return
     for line, module in imports(path):
         assert not module.startswith("pyopencl"), f"{path}:{line}"
+
+
+def test_one_module_alone_imports_dask():
+    found = {
+        f"{path.parent.name}/{path.name}"
+        for path in MODULES
+        for _, module in imports(path)
+        if module.partition(".")[0] in ("dask", "distributed")
+    }
+    assert found == {"cluster/scheduler.py"}
+    assert "clsplat.cluster.scheduler" not in {
+        module for path in MODULES for node in ast.parse(path.read_text()).body for module in _named_by(node)
+    }, "it is imported where an engine needs it, not at the start"
+
+
+def _named_by(node: ast.stmt) -> list[str]:
+    if isinstance(node, ast.ImportFrom):
+        return [node.module or "", *(f"{node.module}.{alias.name}" for alias in node.names)]
+    return [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
 
 
 def test_inside_a_folder_imports_are_acyclic():

@@ -28,6 +28,7 @@ def run(
     start: Literal["new", "resume", "restart"] = "new",
     live: int | None = None,
     minutes: float | None = None,
+    on: PathLike | None = None,
 ) -> Path:
     """Run a pipeline or a matrix, as `clsplat run` does; return the run folder.
 
@@ -35,11 +36,12 @@ def run(
     settings by place, such as {"optimize.steps": 3000}; start: "resume" goes on from the newest checkpoint in `out`, if
     there is one, "restart" begins again where `out` holds a run, and removes its checkpoints and metrics; live: the
     port of a page on this machine that shows the model while it trains, 0 for the usual one; minutes: the time that the
-    run takes once its photographs are read, in as many steps as fit: they are chosen before it starts.
+    run takes once its photographs are read, in as many steps as fit: they are chosen before it starts; on: a file that
+    says where the cells of a matrix run, in the place of its `execution`.
     """
-    job = _job(pipeline, scene, out, set, start)
-    job.run(device, live, minutes)
-    return job.out
+    from clsplat.cluster.commands import run_job
+
+    return run_job(_job(pipeline, scene, out, set, start, on), device, live, minutes)
 
 
 def describe_run(
@@ -50,9 +52,10 @@ def describe_run(
     set: Overrides = (),
     device: "str | Device | None" = None,
     start: Literal["new", "resume", "restart"] = "new",
+    on: PathLike | None = None,
 ) -> str:
     """Check all that `run` would need and return what it would do, as lines of text; nothing is written."""
-    return _job(pipeline, scene, out, set, start).describe(device)
+    return _job(pipeline, scene, out, set, start, on).describe(device)
 
 
 def resume(
@@ -62,17 +65,18 @@ def resume(
     set: Overrides = (),
     device: "str | Device | None" = None,
     live: int | None = None,
+    on: PathLike | None = None,
 ) -> Path:
     """Go on with a run, or a matrix, from its newest checkpoint, as `clsplat resume` does; return the run folder.
 
-    scene: where its photographs are, if they have moved; live: as for `run`.
+    scene: where its photographs are, if they have moved; live, on: as for `run`.
     """
+    from clsplat.cluster.commands import run_job
+    from clsplat.cluster.execution import values_of
     from clsplat.runs.experiment import Job
 
     load_plugins()
-    job = Job.resume(Path(folder), overrides(set), path_of(scene))
-    job.run(device, live)
-    return job.out
+    return run_job(Job.resume(Path(folder), overrides(set), path_of(scene), values_of(path_of(on))), device, live)
 
 
 def status(folder: PathLike) -> dict[str, Any]:
@@ -80,10 +84,13 @@ def status(folder: PathLike) -> dict[str, Any]:
 
     A matrix has `cells`, `done` and `failed` in the place of the step.  `silent` is the time in s since the last
     heartbeat of a run that has not ended, `ahead` that by which it lies in the future, from a minute on; the state is
-    `killed` where its process is gone.
+    `killed` where its process is gone.  Of the store of a sweep return its `cells`, `counts` of their states, `events`.
     """
+    from clsplat.cluster.overview import is_store, store_status
     from clsplat.runs.status import run_status
 
+    if is_store(Path(folder)):
+        return store_status(Path(folder))
     return run_status(Path(folder))
 
 
@@ -100,7 +107,7 @@ def check(pipeline: PathLike) -> dict[str, Any]:
     Of a run folder return `whole`, its `state`, and `objects`: every file, whether it is `whole`, and a `detail`.  Of a
     model file return its `format`, `ranges`, `bounds`, `degenerate` counts, `findings`, and whether it is `valid`.
     """
-    from clsplat.runs.check import check
+    from clsplat.cluster.commands import check
 
     load_plugins()
     return check(str(pipeline))
@@ -227,8 +234,16 @@ def view(
     )
 
 
-def _job(pipeline: PathLike, scene: PathLike | None, out: PathLike | None, values: Overrides, start: "Start") -> "Job":
+def _job(
+    pipeline: PathLike,
+    scene: PathLike | None,
+    out: PathLike | None,
+    values: Overrides,
+    start: "Start",
+    on: PathLike | None = None,
+) -> "Job":
+    from clsplat.cluster.execution import values_of
     from clsplat.runs.experiment import Job
 
     load_plugins()
-    return Job.open(str(pipeline), path_of(scene), path_of(out), overrides(values), start)
+    return Job.open(str(pipeline), path_of(scene), path_of(out), overrides(values), start, values_of(path_of(on)))

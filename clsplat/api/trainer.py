@@ -21,10 +21,10 @@ from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import Pipeline, load
 from clsplat.runs import folders, opening, outputs, runner
 from clsplat.runs.choices import settle
-from clsplat.runs.experiment import as_setting
 from clsplat.runs.failures import failures_recorded
 from clsplat.runs.folders import Start
 from clsplat.runs.scenes import RunScene
+from clsplat.runs.source import as_setting
 from clsplat.runs.stepwise import is_trained, run_until_training, train
 from clsplat.scene.detect import read_scene
 from clsplat.scene.scene import Scene

@@ -22,9 +22,8 @@ from clsplat.names import METRICS
 from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import Pipeline, load
 from clsplat.reading import read_json, sha256
-from clsplat.runs.experiment import as_setting
 from clsplat.runs.scenes import read_run_scene
-from clsplat.runs.source import photographs_of, require_model
+from clsplat.runs.source import as_setting, photographs_of, require_model
 from clsplat.tuning.folder import claimed
 from clsplat.tuning.tuning import trained
 from clsplat.views.photographs import Photographs

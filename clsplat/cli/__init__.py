@@ -9,7 +9,7 @@ from typing import Any
 import typer
 
 from clsplat import streams, terminal
-from clsplat.cli import blocks, models, pictures, runs, tools  # noqa: F401  register their commands
+from clsplat.cli import blocks, models, pictures, runs, sweeps, tools  # noqa: F401  register their commands
 from clsplat.cli.app import Passed, app
 from clsplat.errors import Interrupted, as_clsplat_error, one_line
 from clsplat.signals import stop_at_once, stopping_on_signals

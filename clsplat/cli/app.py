@@ -13,6 +13,7 @@ from clsplat import __version__, terminal
 from clsplat.api import arguments, tools
 from clsplat.errors import ConfigError
 from clsplat.pipeline.files import shipped
+from clsplat.signals import stop_with_input
 
 SYNONYMS = {
     **dict.fromkeys(("train", "fit", "optimize", "start"), "run"),
@@ -36,7 +37,8 @@ SYNONYMS = {
 
 
 ORDER = [
-    *("run", "blocks", "resume", "status", "check", "pipelines", "devices", "doctor", "inspect"),
+    *("run", "blocks", "resume", "status", "cell", "cancel", "worker"),
+    *("check", "pipelines", "devices", "doctor", "inspect"),
     *("render", "view", "evaluate", "convert", "compress", "lod", "compare", "bench", "data"),
 ]
 
@@ -128,11 +130,16 @@ def common(
             "--plugin", metavar="FILE", help="A plug-in: a Python file with methods of your own; may be repeated."
         ),
     ] = None,
+    attended: Annotated[
+        bool, typer.Option("--attended", hidden=True, help="End when standard input ends, as by SIGTERM.")
+    ] = False,
     version: Annotated[
         bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version and exit.")
     ] = False,
 ) -> None:
     terminal.start_logging(debug)
+    if attended:
+        stop_with_input()
     context.obj = Common(device)
     if context.invoked_subcommand is not None:
         arguments.load_plugins()

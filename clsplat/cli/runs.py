@@ -10,6 +10,11 @@ from clsplat.api import commands
 from clsplat.cli.app import DeviceOption, JsonOption, LiveOption, PipelineArgument, SetOption, command, recipe_names
 from clsplat.errors import ConfigError, DataError, OutputError
 
+OnOption = Annotated[
+    Path | None,
+    typer.Option("--on", metavar="FILE", help="Where the cells of a matrix run: engine, store, devices."),
+]
+
 
 @command(
     "run",
@@ -39,6 +44,7 @@ def run(
         float | None,
         typer.Option(metavar="M", help="The time that it takes: trains in as many steps as fit, which it says before."),
     ] = None,
+    on: OnOption = None,
 ) -> None:
     """Run a pipeline, or all cells of a matrix."""
     if minutes is not None and dry_run:
@@ -47,10 +53,10 @@ def run(
         raise ConfigError("--resume goes on with a run and --restart begins it again; give one of them")
     start: Literal["new", "resume", "restart"] = "resume" if resume else "restart" if restart else "new"
     if dry_run:
-        terminal.show(commands.describe_run(pipeline, scene, out, set=set_ or (), device=device, start=start))
+        terminal.show(commands.describe_run(pipeline, scene, out, set=set_ or (), device=device, start=start, on=on))
     else:
         found = commands.run(
-            pipeline, scene, out, set=set_ or (), device=device, start=start, live=live, minutes=minutes
+            pipeline, scene, out, set=set_ or (), device=device, start=start, live=live, minutes=minutes, on=on
         )
         _show_summary(found)
 
@@ -74,14 +80,15 @@ def resume(
     set_: SetOption = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Check everything and say what would run.")] = False,
     live: LiveOption = None,
+    on: OnOption = None,
 ) -> None:
     """Go on with a run from its newest checkpoint, or train one that is done for longer."""
     changes = [*(set_ or ()), *([f"optimize.steps={steps}"] if steps is not None else [])]
     if dry_run:
         file = folder / "pipeline.yaml"
-        terminal.show(commands.describe_run(file, scene, folder, set=changes, device=device, start="resume"))
+        terminal.show(commands.describe_run(file, scene, folder, set=changes, device=device, start="resume", on=on))
     else:
-        _show_summary(commands.resume(folder, scene, set=changes, device=device, live=live))
+        _show_summary(commands.resume(folder, scene, set=changes, device=device, live=live, on=on))
 
 
 def _show_summary(folder: Path) -> None:
@@ -95,16 +102,21 @@ def _show_summary(folder: Path) -> None:
     "status",
     "clsplat status runs/splat_7k",
     "clsplat status runs/splat_7k --json",
+    "clsplat status runs/store",
     "clsplat status --schema > status.schema.json",
 )
 def status(
     folder: Annotated[
-        Path | None, typer.Argument(metavar="RUN", help="A run folder, or that of a matrix.", show_default=False)
+        Path | None,
+        typer.Argument(
+            metavar="RUN|STORE", help="A run folder, that of a matrix, or a store of cells.", show_default=False
+        ),
     ] = None,
     schema: Annotated[bool, typer.Option("--schema", help="Print the JSON schema of status.json.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Show the state of a run, its step and its metrics, from its files alone."""
+    """Show the state of a run, its step and its metrics, or of all cells of a store, from the files alone."""
+    from clsplat.cluster.overview import overview_text
     from clsplat.runs.status import status_text
 
     if schema:
@@ -116,7 +128,7 @@ def status(
     if as_json:
         terminal.show_json(found)
     else:
-        terminal.show(status_text(found))
+        terminal.show(overview_text(found) if "store" in found else status_text(found))
 
 
 @command(

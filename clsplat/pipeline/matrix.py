@@ -17,7 +17,7 @@ import json
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -28,6 +28,7 @@ from clsplat.names import fault_of_output
 from clsplat.pipeline.explanation import explain, place_text
 from clsplat.pipeline.file import Name
 from clsplat.pipeline.files import find
+from clsplat.pipeline.labels import distinct, value_text
 from clsplat.pipeline.loading import Pipeline, checked
 from clsplat.pipeline.stretching import in_steps
 from clsplat.pipeline.yaml_file import Document, Place, read_pipeline, read_yaml, yaml_text
@@ -70,6 +71,8 @@ class MatrixFile(Settings):
     """Name of the matrix, and of its run folder."""
     matrix: Matrix
     """The axes."""
+    execution: dict[str, JsonValue] = Field({})
+    """Where the cells run and are kept, as in a file of `--on`; without it, one after the other in the run folder."""
 
 
 @dataclass(frozen=True)
@@ -88,6 +91,7 @@ class Experiment:
     name: str
     text: str  # of the file, with the options that it was opened with
     cells: list[Cell]
+    execution: dict[str, Any] = field(default_factory=dict)  # as the file has it, unchecked
 
 
 @dataclass(frozen=True)
@@ -99,9 +103,12 @@ class _Choice:
     place: Place  # in the file
 
 
-def load_experiment(name: str, overrides: Sequence[str] = ()) -> Experiment | None:
+def load_experiment(
+    name: str, overrides: Sequence[str] = (), execution: dict[str, Any] | None = None
+) -> Experiment | None:
     """Read and check a pipeline file with `matrix:`, and every cell of it; None for a file without.
 
+    execution: that takes the place of the file's own.
     Raises ConfigError with file and line.
     """
     path = find(name)
@@ -114,7 +121,7 @@ def load_experiment(name: str, overrides: Sequence[str] = ()) -> Experiment | No
         file = MatrixFile.model_validate(own)
     except ValidationError as error:
         raise ConfigError(explain(error, MatrixFile, path, document)) from error
-    given, overrides = bool(overrides), _last_of_each([*file.matrix.options, *overrides])
+    given, overrides = bool(overrides) or execution is not None, _last_of_each([*file.matrix.options, *overrides])
     axes = _axes(file.matrix)
     _check_overrides(path, axes, overrides)
     bases = _bases(path, document, file.matrix)
@@ -127,7 +134,11 @@ def load_experiment(name: str, overrides: Sequence[str] = ()) -> Experiment | No
         cells = [_in_steps(cell, file.matrix.steps) for cell in cells]
     _check_names(path, cells)
     data = {**document.data, "matrix": {**document.data["matrix"], "options": overrides}}
-    return Experiment(path, file.name, yaml_text(data) if given else read_pipeline(path), cells)
+    if execution is not None:
+        data["execution"] = execution
+    return Experiment(
+        path, file.name, yaml_text(data) if given else read_pipeline(path), cells, data.get("execution", {})
+    )
 
 
 @dataclass(frozen=True)
@@ -141,7 +152,7 @@ class _Base:
 
 def _bases(path: Path, document: Document, matrix: Matrix) -> list[_Base]:
     if not matrix.pipelines:
-        data = {key: value for key, value in document.data.items() if key != "matrix"}
+        data = {key: value for key, value in document.data.items() if key not in ("matrix", "execution")}
         return [_Base("", path, Document(data, document.lines))]
     bases = []
     for i, name in enumerate(matrix.pipelines):
@@ -160,15 +171,15 @@ def _axes(matrix: Matrix) -> list[list[_Choice]]:
     """Every axis but the pipelines, in the order of the cells' names."""
     axes = []
     if matrix.scenes:
-        labels = _distinct([Path(scene).parts for scene in matrix.scenes])
+        labels = distinct([Path(scene).parts for scene in matrix.scenes])
         axes.append([
             _Choice(label, _override("scene.path", str(Path(scene).resolve())), ("matrix", "scenes", i))
             for i, (label, scene) in enumerate(zip(labels, matrix.scenes, strict=True))
         ])  # fmt: skip
-    keys = _distinct([tuple(key.split(".")) for key in matrix.set])
+    keys = distinct([tuple(key.split(".")) for key in matrix.set])
     for short, (key, values) in zip(keys, matrix.set.items(), strict=True):
         axes.append([
-            _Choice(f"{short}={_text(value)}", _override(key, value), ("matrix", "set", key, i))
+            _Choice(f"{short}={value_text(value)}", _override(key, value), ("matrix", "set", key, i))
             for i, value in enumerate(values)
         ])  # fmt: skip
     if matrix.seeds:
@@ -228,20 +239,5 @@ def _last_of_each(overrides: Sequence[str]) -> list[str]:
     return [override for i, override in enumerate(overrides) if places[i] not in places[i + 1 :]]
 
 
-def _distinct(paths: Sequence[tuple[str, ...]]) -> list[str]:
-    """The shortest ends of the paths that differ from each other."""
-    for length in range(1, max((len(parts) for parts in paths), default=0) + 1):
-        names = ["-".join(parts[-length:]) for parts in paths]
-        if len(set(names)) == len(names):
-            return names
-    return ["-".join(parts) for parts in paths]
-
-
 def _override(place: str, value: Any) -> str:
     return f"{place}={json.dumps(value)}"
-
-
-def _text(value: Any) -> str:
-    if isinstance(value, list):
-        return "+".join(_text(item) for item in value)
-    return value if isinstance(value, str) else json.dumps(value)

@@ -1,6 +1,5 @@
 """Running a pipeline, or the cells of a matrix one after the other and comparing them."""
 
-import json
 import logging
 import math
 from collections.abc import Iterator, Sequence
@@ -8,6 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 from clsplat import terminal
 from clsplat.compare.page import write_comparison
@@ -27,7 +27,7 @@ from clsplat.runs.folders import Start
 from clsplat.runs.found import has_begun, has_ended
 from clsplat.runs.scenes import read_run_scene
 from clsplat.runs.single import run_pipeline
-from clsplat.runs.source import photographs_of
+from clsplat.runs.source import overrides_of
 from clsplat.training.status import StatusFile
 
 LOG = logging.getLogger("clsplat")
@@ -49,31 +49,41 @@ class Job:
         out: Path | None = None,
         overrides: Sequence[str] = (),
         start: Start = "new",
+        execution: dict[str, Any] | None = None,
     ) -> "Job":
         """Check a pipeline file, or a shipped one by name; `overrides` are 'stage.key=value'.  Raises ConfigError.
 
         out: default runs/NAME, with a number where that is another run; start: "resume" goes on from the newest
-        checkpoint, "restart" begins again in a folder that holds a run.
+        checkpoint, "restart" begins again in a folder that holds a run; execution: of a matrix, in the place of its
+        own.
         """
         if out is not None:
             is_there(out)
-        changes = [*overrides, *([f"scene.path={as_setting(photographs_of(scene))}"] if scene is not None else [])]
-        if found := load_experiment(pipeline, changes):
+        changes = overrides_of(overrides, scene)
+        if found := load_experiment(pipeline, changes, execution):
             return cls(found, out or free_folder(Path("runs") / found.name, None, start), start)
+        if execution is not None:
+            raise ConfigError(f"{pipeline}: is a single run; --on is for a file with `matrix:`")
         checked = load(pipeline, changes)
         return cls(checked, out or free_folder(Path("runs") / checked.settings.name, checked, start), start)
 
     @classmethod
-    def resume(cls, out: Path, overrides: Sequence[str] = (), scene: Path | None = None) -> "Job":
+    def resume(
+        cls,
+        out: Path,
+        overrides: Sequence[str] = (),
+        scene: Path | None = None,
+        execution: dict[str, Any] | None = None,
+    ) -> "Job":
         """Take the pipeline that a run folder holds, to go on with it there.  Raises ConfigError or DataError.
 
-        scene: where its photographs are; default: where they were.
+        scene: where its photographs are; default: where they were; execution: as for `open`.
         """
         file = out / PIPELINE
         if not file.is_file():
             again = f"; give its `clsplat run … --out {out} --resume` again" if (out / STATUS).is_file() else ""
             raise DataError(f"{out}: has no pipeline.yaml; expected the folder of a run that has begun{again}")
-        return cls.open(str(file), scene, out, overrides, "resume")
+        return cls.open(str(file), scene, out, overrides, "resume", execution)
 
     def describe(self, device: str | Device | None = None) -> str:
         """What would run, as lines of text.  Raises what `run` raises before it begins."""
@@ -144,9 +154,9 @@ def run_matrix(
         write_text(out / PIPELINE, experiment.text)
         failures = _run_cells(experiment, status, device, start, live)
         status.require_held()
-        _compare(experiment, out, failures)
+        compare(experiment, out, failures)
         if failures:
-            raise _first_of(failures, count, "failed")
+            raise first_of(failures, count, "failed")
         status.end("done", exit_code=0)
 
 
@@ -204,21 +214,12 @@ def describe_matrix(experiment: Experiment, out: Path, device: str | Device | No
             refusals[cell.name] = error
         lines.append(f"  {cell.name}  {state}".rstrip())
     if refusals:
-        raise _first_of(refusals, len(lines), "would fail")
+        raise first_of(refusals, len(lines), "would fail")
     return f"would run {len(lines)} cells in {out}:\n" + "\n".join(lines)
 
 
-def as_setting(folder: Path) -> str:
-    """A folder as a value of `--set`, from wherever it is used.  Raises ConfigError when YAML cannot hold its name."""
-    path = str(folder.resolve())
-    try:
-        path.encode()
-    except UnicodeEncodeError:
-        raise ConfigError(f"--scene {path!r}: expected a path of UTF-8 text; rename the folder") from None
-    return json.dumps(path)
-
-
-def _compare(experiment: Experiment, out: Path, failures: dict[str, ClsplatError]) -> None:
+def compare(experiment: Experiment, out: Path, failures: dict[str, ClsplatError]) -> None:
+    """Write the page that compares the cells that have finished.  Raises what `write_comparison` raises."""
     finished = [out / cell.name for cell in experiment.cells if cell.name not in failures]
     remarks = [f"{name} failed and is not shown: {error}" for name, error in failures.items()]
     if finished:
@@ -226,7 +227,7 @@ def _compare(experiment: Experiment, out: Path, failures: dict[str, ClsplatError
         LOG.info("%d runs compared in %s", len(finished), out / COMPARISON)
 
 
-def _first_of(failures: dict[str, ClsplatError], cells: int, what: str) -> ClsplatError:
+def first_of(failures: dict[str, ClsplatError], cells: int, what: str) -> ClsplatError:
     """The error that stands for those of the cells, with the exit code of the first."""
     name, first = next(iter(failures.items()))
     whole = ClsplatError(f"{len(failures)} of {cells} cells {what}; the first, {name}: {first}")

@@ -1,5 +1,7 @@
 """Which model and which photographs a command names: by a file, by the folder of a scene, or by that of a run."""
 
+import json
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import chain
@@ -105,3 +107,18 @@ def photographs_of(scene: Path) -> Path:
 def _exports(pipeline: Pipeline) -> list[Export]:
     stages = [part for stage in pipeline.stages for part in (stage, *getattr(stage, "during", ()))]
     return [stage for stage in stages if isinstance(stage, Export)]
+
+
+def overrides_of(overrides: Sequence[str], scene: Path | None) -> list[str]:
+    """Return `overrides` with the folder of the photographs, where one is given.  Raises ConfigError, DataError."""
+    return [*overrides, *([f"scene.path={as_setting(photographs_of(scene))}"] if scene is not None else [])]
+
+
+def as_setting(folder: Path) -> str:
+    """A folder as a value of `--set`, from wherever it is used.  Raises ConfigError when YAML cannot hold its name."""
+    path = str(folder.resolve())
+    try:
+        path.encode()
+    except UnicodeEncodeError:
+        raise ConfigError(f"--scene {path!r}: expected a path of UTF-8 text; rename the folder") from None
+    return json.dumps(path)

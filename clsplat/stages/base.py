@@ -113,6 +113,10 @@ class Scheduled(Stage):
             return False
         return step > self.start and (self.stop is None or step < self.stop)
 
+    def is_overdue(self, run: Run) -> bool:
+        """Return whether the stage runs now beside its cadence: for one that changes no bits."""
+        return False
+
     def stale(self, run: Run) -> Collection[str]:
         """Return the parameters whose gradients the edit makes invalid."""
         return ()

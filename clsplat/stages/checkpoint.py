@@ -1,5 +1,6 @@
 """Save the run at a cadence."""
 
+import time
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
@@ -15,10 +16,16 @@ class Checkpoint(Scheduled):
     stage: Literal["checkpoint"] = "checkpoint"
     needs: ClassVar[frozenset[str]] = frozenset({"model"})
     ends: ClassVar[bool] = True
-    output_keys: ClassVar[frozenset[str]] = CADENCE | {"keep"}
+    output_keys: ClassVar[frozenset[str]] = CADENCE | {"keep", "every_seconds"}
 
     keep: Annotated[int, Field(gt=0)] = 2
     """Number of checkpoints that are kept, the newest ones."""
+
+    every_seconds: Annotated[float, Field(gt=0)] | None = None
+    """Seconds without a checkpoint after which one is saved between those of `every`; the bits do not depend on it."""
+
+    def is_overdue(self, run: Run) -> bool:
+        return self.every_seconds is not None and time.monotonic() - run.status.saved_at >= self.every_seconds
 
     def run(self, run: Run) -> None:
         checkpoint.save(run, self.keep)

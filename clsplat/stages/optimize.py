@@ -194,7 +194,7 @@ class Optimize(Keeping):
     def _act(self, run: Run) -> None:
         """Run the stages that are due and do not edit; those that fail run again when the run goes on."""
         for place, stage in enumerate(self.inner):
-            due = run.stage_step > 0 and stage.due(run.step, self.has_ended(run))
+            due = run.stage_step > 0 and (stage.due(run.step, self.has_ended(run)) or stage.is_overdue(run))
             if place < run.acted or stage.edits or not due:
                 continue
             run.acted = place + 1  # a checkpoint is of the state after it

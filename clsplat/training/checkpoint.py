@@ -6,6 +6,7 @@ finite is no checkpoint: it lies beside them as failed_N.npz, and a run goes on 
 
 import logging
 import re
+import time
 from collections.abc import Iterable
 from functools import cache
 from itertools import chain
@@ -44,6 +45,7 @@ def save(run: Run, keep: int | None = None) -> Path:
     if broken := run.model.gaussians.not_finite():
         raise NotFiniteError(f"step {run.step}: {set_aside(run, broken)}")
     path = _write(run, "refit" if run.is_refit else "step")
+    run.status.saved_at = time.monotonic()
     run.status.note(checkpoint=path.name)
     run.status.refresh()
     if keep is not None:

@@ -41,6 +41,7 @@ class StatusFile:
         before = read_status(out)
         checkpoint = before.get("checkpoint")
         self.was_done = before.get("state") == "done"  # the run that was in the folder before
+        self.saved_at = time.monotonic()  # s, of the newest checkpoint, or of the beginning
         self.has_run = False  # so that the folder is no longer as that run has left it
         self.now = Status(
             format=FORMAT,

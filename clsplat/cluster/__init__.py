@@ -1,0 +1,1 @@
+"""Sweeps: cells, the store that holds them, and the engines that run them."""

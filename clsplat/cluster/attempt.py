@@ -1,0 +1,217 @@
+"""An attempt at a cell: a run folder with a lease, and with a manifest when its run is done."""
+
+import hashlib
+import json
+import math
+import os
+import re
+import shutil
+import time
+from collections.abc import Iterable
+from contextlib import suppress
+from dataclasses import asdict
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from clsplat.errors import ConfigError, DataError, OutputError
+from clsplat.files import PARTIAL, told_as, write_text
+from clsplat.formats.table import CODECS
+from clsplat.names import CHECKPOINTS, LOCK, LOG_FILE, METRICS, NOTE, RECORDS, STATUS, TRIAL
+from clsplat.processes import Owner
+from clsplat.reading import read_file, read_json, sha256
+from clsplat.training import checkpoint
+from clsplat.training.status import read_status
+
+LEASE, MANIFEST, PIPELINE_FILE, ERRORS = "lease.json", "manifest.json", "cell.yaml", "errors.txt"
+OWN = frozenset({LEASE, MANIFEST, PIPELINE_FILE, ERRORS, STATUS, LOCK, NOTE})  # of one attempt alone; NOTE has a path
+GROWING = frozenset({LOG_FILE, RECORDS, TRIAL})  # files that a run appends to: links of them would be one file
+MEASURED = ("psnr", "ssim", "views")  # figures of metrics.json that a device's bits decide
+BEAT = 10.0  # seconds between two beats of a lease
+Rank = tuple[bool, int]  # of a checkpoint: whether it is of a refit, and its step
+
+
+class Attempt:
+    """A folder below `attempts`, written by one process."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._values: dict[str, Any] = {}
+        self._last = -math.inf
+
+    def take_lease(self, worker: str, since: float) -> None:
+        """Say who works here.  since: when its caller began, by the clock of the store.  Raises OutputError."""
+        self._values = {**asdict(Owner.this()), "worker": worker, "since": since, "begun": time.time()}
+        self._write()
+
+    def beat(self) -> bool:
+        """Renew the lease where that is due; return False where it is lost, with its folder."""
+        if time.monotonic() - self._last >= BEAT:
+            if not (self.path / LEASE).is_file():
+                return False
+            self._write()
+        return True
+
+    def end(self, exit_code: int) -> None:
+        """Note how the run ended; a lost folder stays lost."""
+        self._values["exit_code"] = exit_code
+        if self.path.is_dir():
+            self._write()
+
+    def _write(self) -> None:
+        write_text(self.path / LEASE, json.dumps({**self._values, "time": time.time()}) + "\n")
+        self._last = time.monotonic()
+
+    @cached_property
+    def lease(self) -> dict[str, Any]:
+        """What the lease says; nothing where it is missing or damaged."""
+        with suppress(DataError):
+            found = read_json(self.path / LEASE)
+            return found if isinstance(found, dict) else {}
+        return {}
+
+    @property
+    def exit_code(self) -> int | None:
+        """How its run ended; None where it goes on, or its process was killed."""
+        code = self.lease.get("exit_code")
+        return code if isinstance(code, int) else None
+
+    @property
+    def has_failed(self) -> bool:
+        return self.exit_code not in (None, 0, 130)
+
+    @property
+    def since(self) -> float:
+        """When its caller began, by the clock of the store."""
+        return float(self.lease.get("since", 0))
+
+    @property
+    def begun_at(self) -> Rank:
+        """The checkpoint that it went on from."""
+        return _rank_of(str(self.lease.get("from", "")))
+
+    @property
+    def beaten(self) -> float:
+        """When its lease was renewed last, by the clock of the store."""
+        for path in (self.path / LEASE, self.path):
+            with suppress(OSError):
+                return path.stat().st_mtime
+        return math.inf
+
+    @property
+    def newest(self) -> Rank:
+        """The newest of its checkpoints, whole or not."""
+        return max((_rank_of(path.name) for path in checkpoint.saved(self.path)), default=(False, 0))
+
+    def go_on_from(self, others: Iterable["Attempt"]) -> None:
+        """Take what the attempt with the newest checkpoint that is whole has written: links where that is possible.
+
+        A damaged checkpoint counts as none: the one before it is taken, of whatever attempt.  Raises OutputError.
+        """
+        found = [(_rank_of(path.name), path, other) for other in others for path in checkpoint.saved(other.path)]
+        for _, path, other in sorted(found, key=lambda one: one[0], reverse=True):
+            try:
+                checkpoint.load(path)
+            except (DataError, ConfigError):
+                continue
+            own = self.path / CHECKPOINTS / path.name
+            with told_as(self.path):
+                own.parent.mkdir(exist_ok=True)
+                try:
+                    link_or_copy(path, own)
+                except FileNotFoundError:  # its process has removed it since
+                    continue
+                self._take_files(other.path)
+            self._values["from"] = path.name
+            self._write()
+            return
+
+    def _take_files(self, source: Path) -> None:
+        """Take what another attempt has written, but its checkpoints and what is its own."""
+        for base, folders, files in os.walk(source):
+            here = Path(base).relative_to(source)
+            is_top = here == Path()
+            folders[:] = [name for name in folders if not (is_top and name == CHECKPOINTS)]
+            for name in files:
+                if (is_top and name in OWN) or PARTIAL.fullmatch(name):
+                    continue
+                (self.path / here).mkdir(parents=True, exist_ok=True)
+                copy = shutil.copyfile if is_top and name in GROWING else link_or_copy
+                with suppress(FileNotFoundError):  # replaced just now
+                    copy(Path(base) / name, self.path / here / name)
+
+    def message(self, exit_code: int) -> str:
+        """Return why its run failed: the line of its status, or the last that it printed."""
+        if text := read_status(self.path).get("message"):
+            return str(text)
+        lines: list[str] = []
+        with suppress(DataError):
+            lines = read_file(self.path / ERRORS).decode(errors="replace").strip().splitlines()
+        how = f"signal {-exit_code}" if exit_code < 0 else f"exit code {exit_code}"
+        return lines[-1].removeprefix("error: ") if lines else f"its process ended with {how}"
+
+    def manifest(self) -> dict[str, Any]:
+        """Write the manifest: hashes of all files, and of the bits.  Return it.  Raises OutputError."""
+        names = sorted(path.relative_to(self.path).as_posix() for path in self.path.rglob("*") if path.is_file())
+        kept = [name for name in names if name not in (LEASE, MANIFEST, ERRORS, LOCK)]
+        files = {name: sha256(self.path / name, kind=OutputError) for name in kept}
+        values = {
+            "attempt": self.path.name,
+            "from": self._values.get("from"),
+            "host": self._values.get("host"),
+            "worker": self._values.get("worker"),
+            "device": read_status(self.path).get("device"),
+            "seconds": round(time.time() - self._values.get("begun", time.time()), 3),
+            "bits": bits_of(self.path, files),
+            "files": files,
+        }
+        write_text(self.path / MANIFEST, json.dumps(values, indent=1) + "\n")
+        return values
+
+
+def _rank_of(name: str) -> Rank:
+    found = re.fullmatch(r"(step|refit)_(\d+)\.npz", name)
+    return (found[1] == "refit", int(found[2])) if found else (False, 0)
+
+
+def link_or_copy(source: Path, target: Path) -> None:
+    """Let a file that is never changed in place have a second name, or copy it.  Raises OSError."""
+    try:
+        os.link(source, target)
+    except FileExistsError:
+        raise
+    except OSError:
+        if not source.exists():
+            raise
+        shutil.copyfile(source, target)
+
+
+def bits_of(folder: Path, files: dict[str, str]) -> str:
+    """Return a hash of what a device computed: model files, and metrics without times.
+
+    files: the hashes of the run's files, by name.
+    """
+    suffixes = tuple(suffix for codec in CODECS for suffix in codec.endings)
+    models = {name: digest for name, digest in files.items() if name.lower().endswith(suffixes)}
+    figures: dict[str, Any] = {}
+    with suppress(DataError, AttributeError):
+        metrics = read_json(folder / METRICS)
+        figures = {key: metrics.get(key) for key in ("gaussians", "steps", "seed")}
+        for split in ("test", "train", "validation"):
+            for size, values in metrics.get(split, {}).items():
+                figures[f"{split} {size}"] = [values.get(key) for key in MEASURED]
+    return hashlib.sha256(json.dumps([models, figures], sort_keys=True).encode()).hexdigest()
+
+
+def place_copy(source: Path, target: Path) -> None:
+    """Let a folder hold the files of a result, linked where nothing changes them in place.  Raises OutputError."""
+    with told_as(target):
+        for base, _, files in os.walk(source):
+            here = target / Path(base).relative_to(source)
+            here.mkdir(parents=True, exist_ok=True)
+            for name in files:
+                if name in (LEASE, ERRORS) and Path(base) == source:
+                    continue
+                (here / name).unlink(missing_ok=True)
+                copy = shutil.copyfile if name in GROWING else link_or_copy
+                copy(Path(base) / name, here / name)

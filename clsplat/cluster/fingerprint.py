@@ -1,0 +1,114 @@
+"""Fingerprints of what a cell depends on: the content of its scene, and the program."""
+
+import hashlib
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from clsplat import __version__, resource_dir
+from clsplat.errors import ClsplatError, DataError
+from clsplat.files import write_text
+from clsplat.pipeline.loading import Pipeline
+from clsplat.prepare.cache import plan
+from clsplat.reading import read_json, sha256
+from clsplat.scene.decoding import ImageFile
+from clsplat.scene.detect import read_scene
+from clsplat.scene.identity import Identity
+from clsplat.scene.view import NO_FILE
+
+KEPT = 16  # hexadecimal digits of a hash
+LIBRARIES = ("numpy", "scipy", "opencv-contrib-python-headless")  # that decode photographs and place Gaussians
+
+
+@dataclass(frozen=True)
+class Known:
+    """What is known of a scene before any run."""
+
+    digest: str
+    pixels: float  # of all training photographs, for the order of cells
+
+
+@cache
+def code_digest() -> str:
+    """Return a hash of the program: the package, its kernels, and the libraries that decide over bits."""
+    state = hashlib.sha256(__version__.encode())
+    package = Path(__file__).resolve().parents[1]
+    kernels = resource_dir("cl_kernels")
+    for root, patterns in ((package, ("*.py",)), (kernels, ("*.cl", "*.h"))):
+        for path in sorted(path for pattern in patterns for path in root.rglob(pattern)):
+            state.update(f"{path.relative_to(root).as_posix()} {sha256(path)}\n".encode())
+    for name in LIBRARIES:
+        with suppress(PackageNotFoundError):
+            state.update(f"{name} {version(name)}\n".encode())
+    return state.hexdigest()[:KEPT]
+
+
+class Scenes:
+    """Fingerprints of scenes.  Hashes of photographs are kept by size and time of change, in a file a scene folder."""
+
+    def __init__(self, folder: Path) -> None:
+        """folder: of those files, which may be lost."""
+        self._folder = folder
+        self._known: dict[str, Known] = {}
+
+    def known(self, pipeline: Pipeline) -> Known:
+        """Return what is known of a pipeline's scene.
+
+        It is the identity that a run writes into inputs.json; where `prepare` makes the scene, that of prepared.json.
+        Raises DataError when the scene cannot be read, ConfigError when none is named.
+        """
+        settings = pipeline.settings
+        steps = [step.model_dump(mode="json") for step in settings.prepare]
+        key = json.dumps([settings.scene.model_dump(mode="json"), steps])
+        if key not in self._known:
+            self._known[key] = self._prepared(pipeline) if settings.prepare else self._read(pipeline)
+        return self._known[key]
+
+    def _prepared(self, pipeline: Pipeline) -> Known:
+        folder = pipeline.settings.scene.folder
+        return Known(plan(pipeline.settings.prepare, folder, self._folder / "prepared")[-1].key, 0.0)
+
+    def _read(self, pipeline: Pipeline) -> Known:
+        settings = pipeline.settings.scene
+        original, _ = settings.applied(read_scene(settings.folder, settings.split))
+        paths = [path for view in original.views for path in (view.image_path, view.mask_path)]
+        files = {}
+        with self._digests(settings.folder) as digest_of:
+            for path in paths:
+                if path is not None and path != NO_FILE and path not in files:
+                    files[path] = ImageFile(digest=digest_of(path))
+        pixels = sum(view.camera.width * view.camera.height for view in original.split("train")) / settings.downscale**2
+        return Known(Identity.of(original, files).digest, float(pixels))
+
+    @contextmanager
+    def _digests(self, scene: Path) -> Iterator[Any]:
+        """Yield a function that hashes a file below a scene, or knows its hash from before."""
+        place = hashlib.sha256(str(scene.resolve()).encode()).hexdigest()[:KEPT]
+        note = self._folder / f"{place}.json"
+        before: dict[str, Any] = {}
+        with suppress(DataError):
+            found = read_json(note)
+            before = found if isinstance(found, dict) else {}
+        after = dict(before)
+
+        def digest_of(path: Path) -> str:
+            try:
+                state = path.stat()
+                stamp = [state.st_size, state.st_mtime_ns]
+                match before.get(str(path)):
+                    case [size, time, str(digest)] if [size, time] == stamp:
+                        return digest
+                after[str(path)] = [*stamp, sha256(path)]
+            except (DataError, OSError):  # the run will say what is wrong with it
+                return ""
+            return str(after[str(path)][2])
+
+        yield digest_of
+        if after != before:
+            with suppress(ClsplatError):
+                write_text(note, json.dumps(after) + "\n")

@@ -1,0 +1,24 @@
+"""Offer the devices of this machine to a scheduler: what `clsplat worker` does."""
+
+import logging
+from collections.abc import Sequence
+
+from clsplat.cluster.execution import Execution
+from clsplat.cluster.probe import places
+from clsplat.processes import Owner
+
+LOG = logging.getLogger("clsplat")
+
+
+def offer(execution: Execution, devices: Sequence[str] | None = None) -> None:
+    """Prove each device by a short run, and work for a scheduler until it ends or a signal comes.
+
+    execution: its engine is the scheduler.  devices: names, default every device that works.
+    Raises DeviceError where there is none or no scheduler answers.
+    """
+    from clsplat.cluster import scheduler  # where Dask is installed
+
+    found = places(Owner.this().host, list(devices) if devices is not None else None)
+    for place in found:
+        LOG.info("offers %s, bits:%s", place.text, place.bits)
+    scheduler.serve(execution, found)

@@ -1,0 +1,128 @@
+"""The bits class of a device: the hash of what a fixed run gives on it.
+
+A name is not enough, and too much: other runtimes may give the same bits, and the same runtime others on another
+processor.  Devices of one class may go on with each other's cells.
+"""
+
+import hashlib
+import io
+import json
+import logging
+import subprocess
+import tempfile
+from contextlib import redirect_stdout, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from clsplat.caches import cache_folder
+from clsplat.cluster.child import filled, run_command
+from clsplat.cluster.fingerprint import code_digest
+from clsplat.errors import DataError, DeviceError, OutputError
+from clsplat.files import write_text
+from clsplat.opencl.discovery import DeviceInfo, choose, list_devices
+from clsplat.processes import Owner
+from clsplat.reading import read_file, read_json, sha256
+from data_tools.synthetic import Options, write_dataset
+
+LOG = logging.getLogger("clsplat")
+CLASS = 8  # hexadecimal digits of a bits class
+SECONDS = 600.0  # that the fixed run may take: a runtime may build its kernels for minutes
+PIPELINE = """\
+# What a training may use: spherical harmonics, growth, a reset, both filters.
+name: probe
+model:
+  sh_degree: 3
+  world_filter: {type: smoothing, variance: 0.2}
+  screen_filter: {type: mip, variance: 0.1}
+stages:
+  - init: {count: 500}
+  - optimize:
+      steps: 60
+      losses: [{type: l1, weight: 0.8}, {type: dssim, weight: 0.2}]
+      during:
+        - raise_sh: {every: 10}
+        - densify:
+            every: 10
+            start: 5
+            stop: 45
+            rules:
+              - {type: clone, gradient_above: 2.0e-4, size_below: 0.01}
+              - {type: split, gradient_above: 2.0e-4, size_above: 0.01}
+              - {type: prune_faint, opacity_below: 0.005}
+        - reset_opacity: {every: 20, stop: 30, to: 0.1}
+        - refresh_filter: {every: 10}
+  - export: {file: point_cloud.ply}
+"""
+
+
+@dataclass(frozen=True)
+class Place:
+    """A device that runs cells, one at a time."""
+
+    worker: str  # who offers it
+    device: str  # as `--device` takes it
+    bits: str  # its class
+    text: str = ""  # what it is
+
+
+def places(worker: str, devices: list[str] | None = None) -> list[Place]:
+    """Return the devices of this machine that work, or those of a list of names, with their classes.
+
+    Raises DeviceError where there is none, or one of the list does not work.
+    """
+    infos = list_devices()
+    chosen = [choose(name) for name in devices] if devices is not None else [one for one in infos if not one.fault()]
+    if not chosen:
+        raise DeviceError("no OpenCL device works; `clsplat devices` tells why")
+    return [Place(worker, word_of(info, infos), bits_class(info, infos), info.text) for info in chosen]
+
+
+def word_of(info: DeviceInfo, infos: list[DeviceInfo]) -> str:
+    """Return the words that name one device of several for `--device`."""
+    words = f"{info.platform} {info.name} {info.kind}"
+    same = [one.place for one in infos if one.matches(words)]
+    return f"{words}:{same.index(info.place)}"
+
+
+def bits_class(info: DeviceInfo, infos: list[DeviceInfo]) -> str:
+    """Return the class of a device; the fixed run is run once for a device, its driver and the program.
+
+    Raises DeviceError where it fails.
+    """
+    host = Owner.this().host
+    key = hashlib.sha256(json.dumps([host, info.text, info.driver, code_digest()]).encode()).hexdigest()
+    note = cache_folder() / "bits" / f"{key[:16]}.json"
+    with suppress(DataError):
+        found = read_json(note)
+        if isinstance(found, dict) and isinstance(found.get("bits"), str):
+            return str(found["bits"])
+    LOG.info("%s: a short run tells which devices give the same bits", info.text)
+    bits = _run(word_of(info, infos))
+    with suppress(OutputError):
+        write_text(note, json.dumps({"bits": bits, "device": info.text}) + "\n")
+    return bits
+
+
+def _run(device: str) -> str:
+    with tempfile.TemporaryDirectory(prefix="clsplat-") as name:
+        folder = Path(name)
+        with redirect_stdout(io.StringIO()):  # its bar
+            write_dataset(folder / "scene", Options(size=48, train=8, test=2, seed=0), workers=1)
+        write_text(folder / "probe.yaml", PIPELINE)
+        words = filled(run_command(device), folder / "probe.yaml", folder / "run")
+        with (folder / "errors.txt").open("wb") as errors:
+            command = [*words, "--scene", str(folder / "scene")]
+            process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=errors)
+            try:
+                process.wait(SECONDS)
+            except subprocess.TimeoutExpired:
+                raise DeviceError(f"{device}: the run of its test did not end in {SECONDS:.0f} s") from None
+            finally:
+                process.kill()
+                process.wait()
+                assert process.stdin
+                process.stdin.close()
+        if process.returncode:
+            lines = read_file(folder / "errors.txt").decode(errors="replace").strip().splitlines()
+            raise DeviceError(f"{device}: the run of its test failed: {lines[-1] if lines else process.returncode}")
+        return sha256(folder / "run" / "point_cloud.ply")[:CLASS]

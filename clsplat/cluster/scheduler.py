@@ -1,0 +1,239 @@
+"""Engines on Dask: a cluster of this machine, or a scheduler elsewhere.  Nothing else imports distributed.
+
+Dask gives membership, liveness and a queue.  What it does not give is in the store: going on inside of a cell, once in
+effect, stopping.  At most one cell a device is in flight, for a worker that dies takes all cells on its list with it.
+"""
+
+import asyncio
+import json
+import logging
+import threading
+import time
+import uuid
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+from clsplat.cluster.cell import Cell
+from clsplat.cluster.child import PATIENCE, run_command
+from clsplat.cluster.engine import Lost, Ticket
+from clsplat.cluster.execution import Execution, Tls
+from clsplat.cluster.fingerprint import code_digest
+from clsplat.cluster.plugin_files import plugin_files
+from clsplat.cluster.probe import Place, places
+from clsplat.cluster.store import Store
+from clsplat.cluster.task import Outcome, Terms, run_cell
+from clsplat.errors import ConfigError, DeviceError, InternalError, Interrupted, one_line
+from clsplat.signals import stopping_on_signals
+
+try:
+    import dask
+    import distributed
+except ImportError:
+    raise ConfigError("this engine needs Dask: pip install 'clsplat[cluster]'") from None
+
+LOG = logging.getLogger("clsplat")
+LOOK = 5.0  # seconds between two looks at the workers
+ALONE = 60.0  # seconds without a worker after which a sweep ends
+LOOPBACK = "127.0.0.1"
+ANSWER = 20.0  # seconds that a scheduler may take to answer
+SETTINGS = {
+    "distributed.scheduler.allowed-failures": 1000,  # attempts are counted in the store
+    "distributed.scheduler.worker-ttl": "60s",  # of one that is frozen: its cell goes on elsewhere
+    "distributed.worker.preload": ["clsplat.cluster.preload"],
+    "distributed.worker.memory.target": False,  # of a worker's share of memory, which its child does not take from
+    "distributed.worker.memory.spill": False,
+    "distributed.worker.memory.pause": False,
+    "distributed.worker.memory.terminate": False,
+    "distributed.comm.timeouts.connect": "60s",
+}
+
+
+def work(cell: str, store: str, command: list[str], terms: str) -> str:
+    """Run a cell on a worker: text in, text out."""
+    outcome = run_cell(Cell.from_json(cell), Store(Path(store)), command, Terms(**json.loads(terms)))
+    return json.dumps(asdict(outcome))
+
+
+def engine(execution: Execution, store: Store, devices: list[str] | None) -> "Cluster":
+    """Return the engine that `execution` names.  Raises DeviceError where there are no devices."""
+    dask.config.set(SETTINGS)
+    if execution.engine == "local":
+        found = places("local", devices)
+        cluster = distributed.LocalCluster(
+            n_workers=len(found),
+            threads_per_worker=1,
+            processes=True,
+            host=LOOPBACK,
+            dashboard_address=f"{LOOPBACK}:0",
+            memory_limit=0,
+            silence_logs=logging.CRITICAL,
+        )
+        return Cluster(distributed.Client(cluster, set_as_default=False), store, cluster, found)
+    warn_of_open_port(execution)
+    try:
+        client = distributed.Client(
+            execution.address, security=security(execution.tls), set_as_default=False, timeout=ANSWER
+        )
+    except OSError as error:
+        raise _unanswered(execution, error) from None
+    return Cluster(client, store)
+
+
+def serve(execution: Execution, found: Sequence[Place]) -> None:
+    """Let a process a device work for a scheduler, until that ends or a signal comes.  Raises DeviceError."""
+    dask.config.set(SETTINGS)
+    warn_of_open_port(execution)
+    stop = threading.Event()
+    with stopping_on_signals(stop.set):
+        asyncio.run(_serve(execution, found, stop))
+    if stop.is_set():
+        raise Interrupted("stopped; cells that ran here go on elsewhere")
+
+
+async def _serve(execution: Execution, found: Sequence[Place], stop: threading.Event) -> None:
+    options: dict[str, Any] = {"nthreads": 1, "memory_limit": 0, "security": security(execution.tls)}
+    if execution.is_local:
+        options["host"] = LOOPBACK
+    nannies = [
+        distributed.Nanny(
+            execution.address,
+            name=json.dumps({"host": place.worker, "device": place.device, "bits": place.bits, "code": code_digest()}),
+            resources={f"bits:{place.bits}": 1},
+            dashboard_address=f"{LOOPBACK}:0",
+            silence_logs=logging.CRITICAL,
+            **options,
+        )
+        for place in found
+    ]
+    try:
+        await asyncio.wait_for(asyncio.gather(*nannies), ANSWER)
+    except (OSError, TimeoutError, RuntimeError) as error:
+        raise _unanswered(execution, error) from None
+    while not stop.is_set() and any(nanny.status is distributed.Status.running for nanny in nannies):
+        await asyncio.sleep(0.2)
+    await asyncio.gather(*(nanny.close(timeout=5) for nanny in nannies))
+
+
+def warn_of_open_port(execution: Execution) -> None:
+    """Say so where a scheduler elsewhere is reached without TLS."""
+    if execution.insecure:
+        LOG.warning("%s: is not encrypted; whoever reaches the scheduler's port can run code", execution.engine)
+
+
+def _unanswered(execution: Execution, error: BaseException) -> DeviceError:
+    reason = one_line(error.__cause__ or error) or "no answer"
+    return DeviceError(f"{execution.engine}: cannot be worked with ({reason}); start it with `dask scheduler`")
+
+
+def security(tls: Tls | None) -> Any:
+    """Return the certificates as distributed takes them; None without."""
+    if tls is None:
+        return None
+    sides = {f"tls_{side}_{part}": getattr(tls, part) for side in ("client", "worker") for part in ("cert", "key")}
+    return distributed.Security(tls_ca_file=tls.ca, require_encryption=True, **sides)
+
+
+class _Future:
+    def __init__(self, cluster: "Cluster", future: Any, address: str | None) -> None:
+        self._cluster, self.future, self._address = cluster, future, address
+        self.is_over = False  # a future that was released has no state
+
+    def outcome(self) -> Outcome | None:
+        state = self.future.status
+        if state == "pending":
+            if self._address and self._address not in self._cluster.addresses:
+                self.is_over = True
+                self.future.cancel()
+                raise Lost
+            return None
+        if state == "finished":
+            outcome = Outcome(**json.loads(self.future.result()))
+            self.is_over = True
+            self.future.release()
+            return outcome
+        if state == "error" and not isinstance(error := self.future.exception(), distributed.KilledWorker):
+            raise InternalError(f"internal error (a defect) of a worker: {type(error).__name__}: {error}")
+        raise Lost
+
+
+class Cluster:
+    """The devices of a Dask cluster."""
+
+    def __init__(self, client: Any, store: Store, cluster: Any = None, found: list[Place] | None = None) -> None:
+        """cluster, found: of this machine, whose workers run cells on any of the devices; else each has its own."""
+        self._client, self._store, self._cluster, self._found = client, store, cluster, found
+        self._sweep = uuid.uuid4().hex
+        self._looked, self._seen = -LOOK, time.monotonic()
+        self._places: list[Place] = []
+        self._tickets: list[_Future] = []
+        self.addresses: set[str] = set()
+        self.command_of = lambda device: run_command(device, plugin_files())
+
+    def places(self) -> list[Place]:
+        """Return the devices whose workers live.  Raises DeviceError where there were none for a minute."""
+        now = time.monotonic()
+        if now - self._looked >= LOOK or (not self._places and now - self._looked >= 0.5):
+            self._looked = now
+            self._look(now)
+        return self._places
+
+    def _look(self, now: float) -> None:
+        workers = self._client.scheduler_info(n_workers=-1)["workers"]
+        self.addresses = set(workers)
+        if self._cluster and self._found and len(workers) < len(self._found):
+            self._cluster.scale(len(self._found))  # a worker that dies while it starts is not started again by itself
+        if workers:
+            self._seen = now
+            self._places = self._found or [one for address, w in workers.items() if (one := place_of(address, w))]
+        elif now - self._seen > ALONE:
+            raise DeviceError(
+                f"no worker for {ALONE:.0f} s; start some with `clsplat worker --scheduler ADDRESS`; what was done is "
+                "in the store"
+            )
+
+    def start(self, cell: Cell, place: Place, terms: Terms) -> Ticket:
+        own = replace(terms, worker=place.worker, sweep=self._sweep)
+        address = None if self._cluster else place.worker
+        future = self._client.submit(
+            work,
+            cell.json(),
+            str(self._store.root),
+            list(self.command_of(place.device)),
+            json.dumps(asdict(own)),
+            key=f"{cell.name}-{uuid.uuid4().hex[:8]}",
+            workers=[address] if address else None,
+            pure=False,
+        )
+        ticket = _Future(self, future, address)
+        self._tickets = [*(one for one in self._tickets if not one.is_over), ticket]
+        return ticket
+
+    def close(self) -> None:
+        """Let the cells that run save their state and end, then the workers of this machine."""
+        if self._pending:
+            self._store.stop(self._sweep)
+        end = time.monotonic() + PATIENCE
+        while self._pending and time.monotonic() < end:
+            time.sleep(0.1)
+        if self._pending:
+            LOG.warning("some cells did not end in %.0f s", PATIENCE)
+        self._client.close()
+        if self._cluster:
+            self._cluster.close()
+
+    @property
+    def _pending(self) -> "list[_Future]":
+        return [one for one in self._tickets if not one.is_over and one.future.status == "pending"]
+
+
+def place_of(address: str, worker: dict[str, Any]) -> Place | None:
+    """Return the device that a worker's name tells; None for a worker of another program, or version."""
+    try:
+        values = json.loads(str(worker["name"]))
+        if values["code"] != code_digest():
+            return None
+        return Place(address, str(values["device"]), str(values["bits"]), str(values["host"]))
+    except (ValueError, KeyError, TypeError):
+        return None

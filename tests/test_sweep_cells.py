@@ -1,0 +1,336 @@
+"""Cells: what names them, how one is run and published once, what stops it, what is removed."""
+
+import json
+import os
+import shutil
+import sys
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from clsplat.cluster import child
+from clsplat.cluster.attempt import LEASE, MANIFEST, Attempt
+from clsplat.cluster.cell import Cell
+from clsplat.cluster.child import FILE, OUT, PYTHON
+from clsplat.cluster.drive import Drive, Wanted
+from clsplat.cluster.engine import Inline, Lost
+from clsplat.cluster.fingerprint import Scenes
+from clsplat.cluster.folder import ATTEMPTS, Different
+from clsplat.cluster.overview import overview_text, store_status
+from clsplat.cluster.probe import Place
+from clsplat.cluster.store import Store
+from clsplat.cluster.task import Outcome, Terms, run_cell
+from clsplat.errors import ConfigError, Interrupted, OutputError
+from clsplat.names import CHECKPOINTS
+from clsplat.pipeline.loading import load
+
+SPEC = {"pipeline": {"name": "a", "seed": 0}, "scene": "s", "code": "c", "bits": "b"}
+CELL = Cell("first", SPEC, "name: a\n")
+WRITES = "import sys, pathlib; pathlib.Path(sys.argv[2], 'point_cloud.ply').write_bytes(b'bits')"
+WAITS = "import os, sys\nwhile os.read(0, 9): pass\nsys.exit(130)"
+
+
+def command(code: str) -> list[str]:
+    """A command in the place of a run: it gets the pipeline file and the run folder."""
+    return [PYTHON, "-S", "-c", code, FILE, OUT]
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Store:
+    return Store(tmp_path / "store")
+
+
+@pytest.fixture
+def terms(store: Store) -> Terms:
+    return Terms(store.now())
+
+
+def told(store: Store) -> list[str]:
+    return [event["event"] for event in store.events()]
+
+
+def keys(pipeline: str, scene: Path, folder: Path, *changes: str) -> str:
+    checked = load(pipeline, [f"scene.path={scene}", *changes])
+    return Cell.of("x", checked, Scenes(folder).known(checked).digest, "b").key
+
+
+def test_a_key_has_no_place_and_all_that_decides_over_the_bits(tiny_scene, tmp_path):
+    moved, notes = tmp_path / "moved", tmp_path / "notes"
+    shutil.copytree(tiny_scene, moved)
+    key = keys("smoke", tiny_scene, notes)
+    assert keys("smoke", moved, notes) == key
+    assert keys("smoke", moved, notes, "seed=1") != key
+    (tmp_path / "a.txt").write_text("train/r_000\n")
+    (tmp_path / "b.txt").write_text("train/r_000\n")
+    named = [keys("smoke", tiny_scene, notes, f"scene.holdout={{file: '{tmp_path / name}.txt'}}") for name in "ab"]
+    assert named[0] == named[1] != key
+    (tmp_path / "b.txt").write_text("train/r_001\n")
+    assert keys("smoke", tiny_scene, notes, f"scene.holdout={{file: '{tmp_path / 'b'}.txt'}}") != named[0]
+    image = next(iter(sorted(moved.rglob("*.png"))))
+    image.write_bytes(image.read_bytes() + b"\0")
+    assert keys("smoke", moved, notes) != key, "a photograph has changed"
+
+
+def test_a_fingerprint_is_what_a_run_writes_of_its_scene(few_steps, tiny_scene, tmp_path):
+    checked = load("smoke", [f"scene.path={tiny_scene}"])
+    expected = json.loads((few_steps / "inputs.json").read_text())["digest"]
+    assert Scenes(tmp_path).known(checked).digest == expected
+    assert Scenes(tmp_path).known(checked).digest == expected, "by the hashes that were kept"
+
+
+def test_a_cell_is_published_once_and_then_skipped(store, terms):
+    first = run_cell(CELL, store, command(WRITES), terms)
+    assert first.state == "published"
+    result = store.folder(CELL.key).result
+    assert (result / "point_cloud.ply").read_bytes() == b"bits"
+    assert not (result / LEASE).exists()
+    assert json.loads((result / MANIFEST).read_text())["bits"] == first.bits
+    assert run_cell(CELL, store, command("raise SystemExit(1)"), terms) == first
+    assert told(store) == ["start", "end", "publish", "skip"]
+    assert json.loads((store.folder(CELL.key).path / "spec.json").read_text()) == SPEC
+
+
+def test_a_result_that_was_damaged_is_run_again(store, terms):
+    run_cell(CELL, store, command(WRITES), terms)
+    (store.folder(CELL.key).result / "point_cloud.ply").write_bytes(b"bitz")
+    assert run_cell(CELL, store, command(WRITES), terms).state == "published"
+    assert (store.folder(CELL.key).result / "point_cloud.ply").read_bytes() == b"bits"
+    assert told(store).count("publish") == 2
+
+
+@pytest.mark.parametrize(("bits", "state"), [(b"bits", "published"), (b"others", "different")])
+def test_of_two_writers_the_first_is_published_and_the_second_compares(store, terms, bits, state):
+    folder = store.add(CELL)
+    first = folder.begin("a", terms.since)
+    (first.path / "point_cloud.ply").write_bytes(b"bits")
+    code = (
+        WRITES.replace("b'bits'", repr(bits)) + f"; import os; os.rename({str(first.path)!r}, {str(folder.result)!r})"
+    )
+    first.manifest()
+    outcome = run_cell(CELL, store, command(code), terms)
+    assert outcome.state == state
+    assert (folder.result / "point_cloud.ply").read_bytes() == b"bits"
+    if state == "published":
+        assert told(store)[-1] == "second"
+    else:
+        assert "gave other bits" in outcome.message
+        drive = Drive(store, Fake(outcome), True, terms)
+        with pytest.raises(Different, match="gave other bits"):
+            drive.run([Wanted(CELL, 1)])
+
+
+@pytest.mark.parametrize(
+    ("code", "starts"), [(2, 1), (3, 1), (5, 1), (1, 3), (4, 3), (6, 3), (7, 3), (130, 0), (-9, 3)], ids=str
+)
+def test_an_exit_code_decides_whether_a_cell_is_tried_again(store, terms, code, starts):
+    end = f"import os, sys; sys.stderr.write('error: as it is\\n'); sys.stderr.flush(); os._exit({code})"
+    if code == -9:
+        end = "import os, signal; os.kill(os.getpid(), signal.SIGKILL)"
+    if code == 130:  # from elsewhere: another attempt goes on, and ends
+        end = "import sys, pathlib; p = pathlib.Path(sys.argv[2]); n = len(list(p.parent.iterdir()));"
+        end += "sys.exit(130 if n == 1 else 0)"
+    outcome = run_cell(CELL, store, command(end), terms)
+    if code == 130:
+        assert (outcome.state, told(store).count("start")) == ("published", 2)
+        return
+    assert (outcome.state, told(store).count("start")) == ("failed", starts)
+    assert outcome.exit_code == (code if code > 0 else 1)
+    assert outcome.message == ("as it is" if code > 0 else "its process ended with signal 9")
+    failed = json.loads((store.folder(CELL.key).path / "failed.json").read_text())
+    assert (failed["exit_code"], failed["exit_codes"]) == (outcome.exit_code, [code] * starts)
+    again = replace(terms, since=store.now() + 1)
+    assert run_cell(CELL, store, command(WRITES), again).state == "published", "a later sweep tries it again"
+    assert not (store.folder(CELL.key).path / "failed.json").exists()
+
+
+def test_a_failure_after_a_newer_checkpoint_does_not_count(few_steps, store, terms):
+    saves = "import sys, pathlib, shutil, os; p = pathlib.Path(sys.argv[2], 'checkpoints'); p.mkdir(exist_ok=True)\n"
+    saves += f"left = sorted(pathlib.Path({str(few_steps / CHECKPOINTS)!r}).iterdir())\n"
+    saves += "new = [one for one in left if not (p / one.name).exists()]\n"
+    saves += "new and shutil.copy(new[0], p)\nos._exit(7)"
+    count = len(list((few_steps / CHECKPOINTS).iterdir()))
+    assert count > 1
+    assert run_cell(CELL, store, command(saves), replace(terms, retries=2)).state == "failed"
+    assert told(store).count("start") == count + 2
+
+
+@pytest.mark.parametrize("damage", ["cut", "flipped"])
+def test_an_attempt_goes_on_from_the_newest_checkpoint_that_is_whole(few_steps, store, terms, damage):
+    folder = store.add(CELL)
+    old = Attempt(folder.path / ATTEMPTS / ("a" * 32))
+    shutil.copytree(few_steps, old.path)
+    (old.path / "run.lock").write_text("{}")
+    *_, before, newest = sorted((old.path / CHECKPOINTS).glob("step_*.npz"))
+    data = bytearray(newest.read_bytes())
+    data[len(data) // 2] ^= 1
+    newest.write_bytes(data if damage == "flipped" else data[:-100])
+    new = folder.begin("b", terms.since)
+    assert [path.name for path in (new.path / CHECKPOINTS).iterdir()] == [before.name]
+    assert new.lease["from"] == before.name
+    assert not (new.path / "status.json").exists()
+    assert not (new.path / "run.lock").exists()
+    assert os.path.samefile(before, new.path / CHECKPOINTS / before.name)
+    assert not os.path.samefile(old.path / "metrics.jsonl", new.path / "metrics.jsonl"), "a run appends to it"
+
+
+def test_what_is_cancelled_saves_and_stops_and_a_later_call_goes_on(store, terms):
+    threading.Timer(0.3, store.cancel).start()
+    outcome = run_cell(CELL, store, command(WAITS), terms)
+    assert (outcome.state, outcome.exit_code) == ("stopped", 130)
+    assert store_status(store.root)["cells"][0]["state"] == "stopped"
+    assert run_cell(CELL, store, command(WRITES), terms).state == "stopped", "it began before"
+    time.sleep(0.02)
+    assert run_cell(CELL, store, command(WRITES), Terms(store.now())).state == "published"
+
+
+def test_one_cell_is_cancelled_by_its_name_or_the_beginning_of_its_key(store, terms):
+    other = replace(CELL, spec={**SPEC, "scene": "t"})
+    store.add(CELL)
+    store.add(other)
+    store.note_sweep("sweep", {"first": CELL.key})
+    assert store.cancel("first") == CELL.key == store.cancel(CELL.key[:12])
+    assert store.is_cancelled([CELL.key], terms.since)
+    assert not store.is_cancelled([other.key], terms.since)
+    with pytest.raises(ConfigError, match="no cell 'x'"):
+        store.cancel("x")
+
+
+def test_a_run_that_does_not_stop_is_killed(store, terms, monkeypatch):
+    monkeypatch.setattr(child, "PATIENCE", 0.1)
+    deaf = "import time\ntime.sleep(60)"
+    began = time.monotonic()
+    assert run_cell(CELL, store, command(deaf), terms, lambda: time.monotonic() > began + 0.3).state == "stopped"
+    assert store.folder(CELL.key).attempts()[0].exit_code == -9
+
+
+def test_an_attempt_that_was_removed_ends_its_run(store, terms, monkeypatch):
+    monkeypatch.setattr("clsplat.cluster.attempt.BEAT", 0.0)
+    removes = "import shutil, sys, time; shutil.rmtree(sys.argv[2]); time.sleep(60)"
+    outcome = run_cell(CELL, store, command(removes), terms)
+    assert outcome.state == "failed"
+    assert "was removed while its run went on" in outcome.message
+
+
+def test_a_process_that_was_frozen_until_its_attempt_was_removed_takes_the_result(store, terms, monkeypatch):
+    monkeypatch.setattr("clsplat.cluster.attempt.BEAT", 0.0)
+    folder = store.add(CELL)
+    other = folder.begin("other", terms.since)
+    (other.path / "point_cloud.ply").write_bytes(b"bits")
+    publishes = f"import os, shutil, sys, time; os.rename({str(other.path)!r}, {str(folder.result)!r})\n"
+    other.manifest()
+    outcome = run_cell(CELL, store, command(publishes + "shutil.rmtree(sys.argv[2]); time.sleep(60)"), terms)
+    assert outcome.state == "published"
+    assert told(store) == ["start", "skip"]
+
+
+def test_attempts_are_removed_by_the_age_of_their_lease_alone(store, terms):
+    folder = store.add(CELL)
+    old, young = folder.begin("a", terms.since), folder.begin("b", terms.since)
+    folder.collect(store.now() + 1e6)
+    assert old.path.is_dir(), "nothing is published"
+    os.utime(old.path / LEASE, (store.now() - 601, store.now() - 601))
+    run_cell(CELL, store, command(WRITES), terms)
+    assert not old.path.exists()
+    assert young.path.is_dir()
+
+
+def test_a_spec_is_never_changed(store):
+    folder = store.add(CELL)
+    with pytest.raises(OutputError, match="is of another cell"):
+        folder.write_spec({**SPEC, "seed": 1})
+
+
+def test_a_store_that_moved_goes_on(few_steps, store, terms, tmp_path):
+    folder = store.add(CELL)
+    shutil.copytree(few_steps / CHECKPOINTS, folder.begin("a", terms.since).path / CHECKPOINTS)
+    moved = Store(tmp_path / "moved")
+    store.root.rename(moved.root)
+    assert moved.add(CELL).begin("b", terms.since).lease["from"] == "step_000012.npz"
+
+
+class Fake:
+    """An engine whose cells end as they were told to; a Lost is raised."""
+
+    def __init__(self, *ends: Outcome | type[Lost], places: tuple[Place, ...] = (Place("w", "d", "b"),)) -> None:
+        self.ends, self._places, self.started = list(ends), places, []
+
+    def places(self):
+        return list(self._places)
+
+    def start(self, cell, place, terms):
+        self.started.append((cell.name, place.device, cell.spec["bits"]))
+        end = self.ends.pop(0)
+
+        class Ticket:
+            def outcome(self):
+                if end is Lost:
+                    raise Lost
+                return end
+
+        return Ticket()
+
+
+def wanted(*costs: float) -> list[Wanted]:
+    return [Wanted(Cell(f"{cost:g}", {**SPEC, "scene": str(cost)}, ""), cost) for cost in costs]
+
+
+def test_the_longest_cell_is_first_and_a_lost_one_starts_again(store, terms):
+    done = Outcome("published")
+    engine = Fake(Lost, done, done, done)
+    ended = []
+    Drive(store, engine, True, terms, ended=lambda cell, outcome: ended.append(cell.name)).run(wanted(1, 3, 2))
+    assert [name for name, *_ in engine.started] == ["3", "3", "2", "1"]
+    assert ended == ["3", "2", "1"]
+
+
+PLACES = (Place("w", "one", "x"), Place("w", "two", "y"), Place("w", "three", "y"))
+
+
+def test_a_sweep_stays_in_the_bits_class_of_most_devices(store, terms):
+    engine = Fake(*[Outcome("published")] * 3, places=PLACES)
+    Drive(store, engine, True, terms).run(wanted(1, 2, 3))
+    assert {bits for *_, bits in engine.started} == {"y"}
+
+
+def test_in_any_class_a_cell_stays_in_that_it_has_begun_in(store, terms):
+    (one,) = wanted(9)
+    store.add(one.on("x"))
+    engine = Fake(*[Outcome("published")] * 4, places=PLACES)
+    Drive(store, engine, False, terms).run([one, *wanted(1, 2, 3)])
+    assert engine.started[0] == ("9", "one", "x")
+    assert {bits for *_, bits in engine.started[1:]} == {"x", "y"}
+
+
+def test_a_signal_stops_a_sweep(store, terms):
+    with pytest.raises(Interrupted, match="with --resume goes on"):
+        Drive(store, Fake(), True, terms, is_stopped=lambda: True).run(wanted(1))
+
+
+def test_the_engine_of_this_process_runs_a_cell(store, terms, monkeypatch):
+    monkeypatch.setattr("clsplat.cluster.engine.run_command", lambda device, plugins: command(WRITES))
+    engine = Inline(store, PLACES[0], lambda: False)
+    ticket = engine.start(CELL, PLACES[0], terms)
+    assert ticket.outcome().state == "published"
+
+
+def test_the_state_of_a_store_is_in_its_files(store, terms):
+    cells = [replace(CELL, name=name, spec={**SPEC, "scene": name}) for name in ("done", "bad", "on", "new")]
+    run_cell(cells[0], store, command(WRITES), terms)
+    run_cell(cells[1], store, command("raise SystemExit(2)"), terms)
+    store.add(cells[2]).begin("w", terms.since)
+    store.add(cells[3])
+    store.note_sweep("sweep", {cell.name: cell.key for cell in cells})
+    found = store_status(store.root)
+    assert {cell["name"]: cell["state"] for cell in found["cells"]} == {
+        "done": "published",
+        "bad": "failed",
+        "on": "running",
+        "new": "waiting",
+    }
+    text = overview_text(found)
+    assert "1 failed, 1 published, 1 running, 1 waiting" in text
+    assert "bad: its process ended with exit code 2" in text
+    assert sys.executable not in text

@@ -1,0 +1,175 @@
+"""Sweeps: a matrix through a store, its folder as without one, and the engines that run its cells."""
+
+import json
+import os
+import shutil
+from contextlib import suppress
+from pathlib import Path
+
+import psutil
+import pytest
+
+from clsplat.api import commands, sweeps
+from clsplat.cluster import engine, single, sweep
+from clsplat.cluster.cell import Cell
+from clsplat.cluster.drive import Drive, Wanted
+from clsplat.cluster.execution import execution_of, values_of
+from clsplat.cluster.probe import Place
+from clsplat.cluster.store import Store
+from clsplat.cluster.task import Terms
+from clsplat.errors import ClsplatError, ConfigError
+from clsplat.pipeline.matrix import load_experiment
+from clsplat.runs.experiment import Job
+from tests.test_matrix import STAGES
+from tests.test_sweep_cells import SPEC, WRITES, command
+
+PLACE = Place("inline", "a device", "b")
+
+
+@pytest.fixture
+def file(tiny_scene: Path, tmp_path: Path) -> Path:
+    path = tmp_path / "x.yaml"
+    path.write_text(
+        f"name: sweep\nmatrix: {{scenes: ['{tiny_scene}'], seeds: [0, 1]}}\n"
+        f"execution: {{engine: inline, store: '{tmp_path / 'store'}'}}\n{STAGES}"
+    )
+    return path
+
+
+@pytest.fixture
+def runs(few_steps: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
+    """What stands for a run: it takes a finished one, but for the seeds that end otherwise, by `seed: N`."""
+    ends: dict[str, str] = {}
+
+    def run_command(device, plugins):
+        code = f"import sys, shutil\ntext, ends = open(sys.argv[1]).read(), {ends!r}\n"
+        code += "for seed, code in ends.items():\n    if seed in text: sys.exit(code)\n"
+        return command(code + f"shutil.copytree({str(few_steps)!r}, sys.argv[2], dirs_exist_ok=True)")
+
+    monkeypatch.setattr(engine, "run_command", run_command)
+    monkeypatch.setattr(single, "run_command", run_command)
+    for module in (sweep, single):
+        monkeypatch.setattr(module, "places", lambda worker, devices=None: [PLACE])
+    return ends
+
+
+def test_the_folder_of_a_matrix_has_what_it_has_without_a_store(file, runs, few_steps, tmp_path):
+    out = commands.run(file, out=tmp_path / "out")
+    assert sorted(path.name for path in out.iterdir() if path.is_dir()) == ["tiny-seed=0", "tiny-seed=1"]
+    assert "sweep: 2 runs" in (out / "compare.html").read_text()
+    status = json.loads((out / "status.json").read_text())
+    assert (status["state"], status["cells"], status["done"], status["failed"]) == ("done", 2, 2, {})
+    model = out / "tiny-seed=0" / "point_cloud.ply"
+    assert model.read_bytes() == (few_steps / "point_cloud.ply").read_bytes()
+    store = Store(tmp_path / "store")
+    (key,) = [key for cells in store.sweeps().values() for name, key in cells.items() if name == "tiny-seed=0"]
+    result = store.folder(key).result
+    assert os.path.samefile(model, result / "point_cloud.ply")
+    assert not os.path.samefile(model.with_name("metrics.jsonl"), result / "metrics.jsonl"), "a run appends to it"
+    shutil.rmtree(out / "tiny-seed=1")
+    runs["seed"] = "it is not run again"
+    assert commands.resume(out) == out, "with the execution that its file names"
+    assert (out / "tiny-seed=1" / "metrics.json").is_file()
+    assert [event["event"] for event in store.events()].count("start") == 2
+
+
+def test_a_cell_that_fails_leaves_the_others_and_its_exit_code(file, runs, tmp_path):
+    runs["seed: 1"] = 3
+    with pytest.raises(ClsplatError, match=r"1 of 2 cells failed; the first, tiny-seed=1: .* exit code 3") as error:
+        commands.run(file, out=tmp_path / "out")
+    assert error.value.exit_code == 3
+    assert "tiny-seed=1 failed and is not shown" in (tmp_path / "out" / "compare.html").read_text()
+    assert commands.status(tmp_path / "store")["counts"] == {"failed": 1, "published": 1}
+
+
+def test_a_scene_that_cannot_be_read_fails_its_cells_alone(file, runs, tmp_path):
+    (tmp_path / "empty").mkdir()
+    file.write_text(file.read_text().replace("scenes: [", f"scenes: ['{tmp_path / 'empty'}', "))
+    with pytest.raises(ClsplatError, match=r"2 of 4 cells failed; the first, empty-seed=0: ") as error:
+        commands.run(file, out=tmp_path / "out")
+    assert error.value.exit_code == 3
+    assert json.loads((tmp_path / "out" / "status.json").read_text())["done"] == 4
+    assert commands.status(tmp_path / "store")["counts"] == {"published": 2}
+
+
+def test_a_queue_runs_a_cell_by_its_number(file, runs, tmp_path):
+    result = sweeps.run_cell(file, tmp_path / "store", index=1)
+    assert sweeps.run_cell(file, tmp_path / "store", index=1) == result
+    spec = json.loads((result.parent / "spec.json").read_text())
+    assert (spec["pipeline"]["seed"], spec["bits"]) == (1, "b")
+    with pytest.raises(ConfigError, match="expected --index from 0 to 1"):
+        sweeps.run_cell(file, tmp_path / "store")
+    runs["seed: 0"] = 6
+    with pytest.raises(ClsplatError, match="cell tiny-seed=0: its process ended with exit code 6") as error:
+        sweeps.run_cell(file, tmp_path / "store", index=0)
+    assert error.value.exit_code == 6
+
+
+def test_another_execution_takes_the_place_of_the_files_and_is_noted(file, tmp_path):
+    on = tmp_path / "lab.yaml"
+    on.write_text("engine: inline\n")
+    job = Job.open(str(file), out=tmp_path / "out", execution=values_of(on))
+    assert job.work.execution == {"engine": "inline"}
+    assert "store" not in job.work.text
+    with pytest.raises(ConfigError, match="--on is for a file with `matrix:`"):
+        Job.open("smoke", execution=values_of(on))
+
+
+def test_without_a_store_the_cells_run_as_they_did(file, tmp_path, monkeypatch):
+    ran = []
+    monkeypatch.setattr(Job, "run", lambda job, *options: ran.append(options))
+    on = tmp_path / "lab.yaml"
+    on.write_text("engine: inline\n")
+    commands.run(file, out=tmp_path / "out", on=on)
+    assert ran == [(None, None, None)]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("engin: local", "x.yaml:3: engin: unknown key 'engin'"),
+        ("retries: 0", "x.yaml:3: retries: expected a value of at least 1"),
+        ("engine: dask://far:1", "expected tls:// for another machine, or insecure: true"),
+        ("engine: tls://far:1", "expected tls: "),
+        ("engine: ray", "engine: expected text that matches"),
+    ],
+)
+def test_a_wrong_execution_is_refused_with_its_line(tmp_path, text, words):
+    file = tmp_path / "x.yaml"
+    file.write_text(f"name: a\nmatrix: {{seeds: [0]}}\nexecution: {{{text}}}\n{STAGES}")
+    found = load_experiment(str(file))
+    with pytest.raises(ConfigError, match=words):
+        execution_of(found.execution, file)
+
+
+def test_a_scheduler_of_this_machine_needs_no_tls():
+    for address in ("dask://127.0.0.1:1", "dask://localhost:1"):
+        assert execution_of({"engine": address}, Path()).is_local
+
+
+def listening() -> set[str]:
+    """The addresses on which this process and those that it has started listen."""
+    this, found = psutil.Process(), []
+    for process in (this, *this.children(recursive=True)):
+        with suppress(psutil.NoSuchProcess):  # it has ended
+            found += process.net_connections("inet")
+    return {one.laddr.ip for one in found if one.status == psutil.CONN_LISTEN}
+
+
+def test_the_engine_of_a_machine_runs_cells_side_by_side_on_loopback_alone(tmp_path, monkeypatch):
+    scheduler = pytest.importorskip("clsplat.cluster.scheduler")
+    places = [Place("local", "one", "b"), Place("local", "two", "b")]
+    monkeypatch.setattr(scheduler, "places", lambda worker, devices: places)
+    store, ended, seen = Store(tmp_path / "store"), [], set()
+    cluster = scheduler.engine(execution_of({"engine": "local"}, Path()), store, None)
+    try:
+        cluster.command_of = lambda device: command(WRITES + f"; print({device!r})")
+        cells = [Wanted(Cell(f"cell {i}", {**SPEC, "scene": str(i)}, ""), i) for i in range(4)]
+        drive = Drive(store, cluster, True, Terms(store.now()), ended=lambda *end: ended.append(end))
+        drive.look = lambda: seen.update(listening())
+        drive.run(cells)
+    finally:
+        cluster.close()
+    assert {cell.name: outcome.state for cell, outcome in ended} == {f"cell {i}": "published" for i in range(4)}
+    assert seen == {"127.0.0.1"}
+    assert len({event["worker"] for event in store.events() if event["event"] == "start"}) == 1
