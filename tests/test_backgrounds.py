@@ -52,6 +52,17 @@ def test_a_run_resumes_and_repeats_to_the_bit(tiny_scene, tmp_path):
     train(tiny_scene, again, *steps, RANDOM, resume=True)
     assert digest(again) == whole
     assert digest(train(tiny_scene, tmp_path / "scene", *steps).out) != whole
+    found = train(tiny_scene, tmp_path / "transparent", *steps, "optimize.background=transparent").out
+    assert digest(found) == whole
+    opaque = [
+        digest(
+            train(
+                tiny_scene, tmp_path / f"opaque {name}", *steps, "scene.alpha=mask", f"optimize.background={name}"
+            ).out
+        )
+        for name in ("transparent", "scene")
+    ]
+    assert opaque[0] == opaque[1]
 
 
 @pytest.mark.slow
