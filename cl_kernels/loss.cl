@@ -50,6 +50,21 @@ void apply_mask(
         planes[channel * pixels + pixel] = 0.0f;
 }
 
+/* Put another colour behind transparent pixels: colours += transparency (behind - background).
+ * One item = one pixel of one channel; dimensions pixel, channel. */
+__kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
+void change_background(
+    __global float *restrict colours,             // [3,H',stride] over `background`
+    __global const float *restrict transparency,  // [H',stride] 0 to 1, 0 outside the image
+    __global const float *restrict background,    // [3]
+    __global const float *restrict behind,        // [3]
+    const uint pixels)                            // H' * stride
+{
+    const uint pixel = get_global_id(0), channel = get_global_id(1);
+    if (pixel < pixels)
+        colours[channel * pixels + pixel] += transparency[pixel] * (behind[channel] - background[channel]);
+}
+
 /* gradient (+)= l1 sign(x - y) + l2 2 (x - y).  Local memory: TEAM * 8 bytes. */
 __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
 void pixel_loss(

@@ -104,12 +104,9 @@ MATCHING = {
     for key in ("", ".start", ".statistic", ".as_many_as", ".gradient_above", ".opacity", *size)
 }
 SUBDIVIDE = (".start", ".at_most", ".beta", ".children", ".radius_above")
+STAGE = ("budget", "every", "grow_until", "inside", "max_gaussians", "patience", "per_pixel", "start", "stop")
 THINNING = {
-    *(
-        f"densify~{n}.{key}"
-        for n in (2, 3)
-        for key in ("budget", "every", "grow_until", "inside", "max_gaussians", "patience", "start", "stop")
-    ),
+    *(f"densify~{n}.{key}" for n in (2, 3) for key in STAGE),
     *(f"densify~2.rules.prune_unimportant{key}" for key in ("", ".start", ".share")),
     *(f"densify~3.rules.merge_neighbours{key}" for key in ("", ".start", ".colour_below", ".distance_below")),
 }
@@ -118,7 +115,6 @@ LIMITED = {  # a limit of the opacity, in front of the resets
     *("reset_opacity~2.when_background", "reset_opacity~3.every", "reset_opacity~3.start"),
     *("reset_opacity~3.stop", "reset_opacity~3.to", "reset_opacity~3.when_background"),
 }
-STAGE = ("budget", "every", "grow_until", "inside", "max_gaussians", "patience", "start", "stop")
 
 
 def rules(stage: str, **keys: str) -> set[str]:
@@ -182,10 +178,7 @@ DIFFERENCES = {
     ("splat", "auto"): {
         f"densify.rules.{rule}.{key}" for rule in ("clone", "split") for key in ("gradient_above", "statistic")
     }
-    | {
-        f"densify~2.{key}"
-        for key in ("every", "start", "stop", "max_gaussians", "budget", "grow_until", "inside", "patience")
-    }
+    | {f"densify~2.{key}" for key in STAGE}
     | {f"densify~2.rules.prune_spare{key}" for key in ("", ".start", ".error_rise", ".views")},
     ("auto", "auto_7k"): TWIN | {f"densify~2.{key}" for key in ("every", "start", "stop")},
     ("splat", "steep"): SADDLE,

@@ -66,6 +66,7 @@ FAULTS = {  # kernel -> file, text, wrong text
     "sum_errors": ("loss.cl", "total += row_errors[i]", "total = row_errors[i]"),
     "weight_entropy": ("loss.cl", "row = (3 * rows + y)", "row = (2 * rows + y)"),
     "unpack_pixels": ("loss.cl", "pixels + (channel * height + y)", "pixels + (channel * height)"),
+    "change_background": ("loss.cl", "(behind[channel] - background[channel])", "(behind[channel] - background[0])"),
     "apply_mask": ("loss.cl", "mask[pixel] == 0.0f", "mask[pixel] != 0.0f"),
     "pixel_loss": ("loss.cl", "(2.0f * l2)", "(1.99f * l2)"),
     "ssim_maps": ("loss.cl", "SSIM_C2 9.0e-4f", "SSIM_C2 9.1e-4f"),

@@ -158,6 +158,15 @@ def load_rgba(view: View) -> NDArray[np.uint8] | None:
     return np.asarray(np.rint(values * (255 / np.iinfo(pixels.dtype).max)), np.uint8)
 
 
+def load_transparency(view: View) -> NDArray[np.uint8] | None:
+    """Return how much of a background shows through the photograph of `view`, [H, W] up to 255; None where none does.
+
+    Raises DataError as load_image does.
+    """
+    rgba = load_rgba(view)
+    return None if rgba is None or (rgba[:, :, 3] == 255).all() else np.asarray(255 - rgba[:, :, 3])
+
+
 def load_mask(view: View) -> NDArray[np.bool_] | None:
     """Return which pixels of `load_image` count, [H, W], or None when all do.
 

@@ -5,6 +5,7 @@ from collections.abc import Collection, Iterator
 from dataclasses import asdict
 from typing import Annotated, ClassVar, Literal
 
+import numpy as np
 from pydantic import Field, model_validator
 
 from clsplat.density.box import Box
@@ -28,13 +29,16 @@ class Densify(Scheduled):
     stage: Literal["densify"] = "densify"
     needs: ClassVar[frozenset[str]] = frozenset({"model", "stats"})
     edits: ClassVar[bool] = True
-    training_keys: ClassVar[frozenset[str]] = frozenset({"max_gaussians", "patience", "grow_until"})
+    training_keys: ClassVar[frozenset[str]] = frozenset({"max_gaussians", "per_pixel", "patience", "grow_until"})
     step_keys: ClassVar[frozenset[str]] = frozenset({"grow_until"})
 
     rules: list[OneOf[Rule]]
     """Which Gaussians grow or are removed; the first growing rule decides, pruning rules override growth."""
     max_gaussians: AtLeastOne | None = None
     """Number of Gaussians at which growth stops, by step; without it, as many as fit in memory.  Pruning continues."""
+    per_pixel: Annotated[float, Field(gt=0)] | None = None
+    """Number of Gaussians at which growth stops, for each pixel of a training photograph (the median of them); without
+    it, no such number.  Pruning continues."""
     budget: OneOf[Budget] | None = None
     """Number of Gaussians at which the growth of an edit stops, from the course of the training; needs `stop`."""
 
@@ -102,6 +106,10 @@ class Densify(Scheduled):
             yield 0
         if self.max_gaussians is not None:
             yield int(edit.at(self.max_gaussians))
+        if self.per_pixel is not None:
+            views = [view for view in run.scene.split("train") if view.downscale == run.downscale]
+            sizes = [view.camera.width * view.camera.height for view in views]
+            yield max(1, int(self.per_pixel * float(np.median(sizes))))
         if self.budget and self.every and self.stop:
             left = len(range(run.step, self.stop, self.every))
             moment = Moment(run.step / self.stop, left, run.divisor)

@@ -20,6 +20,7 @@ from clsplat.stages.keeping import Keeping
 from clsplat.stages.progress import report
 from clsplat.training import checkpoint
 from clsplat.training.adam import Adam, Rates, Rows
+from clsplat.training.backgrounds import Behind, drawn_backgrounds
 from clsplat.training.colours import photograph_colours, write_view_colours
 from clsplat.training.forecast import Forecast
 from clsplat.training.poses import photograph_poses, write_view_poses
@@ -49,13 +50,12 @@ class Optimize(Keeping):
     needs: ClassVar[frozenset[str]] = frozenset({"model"})
     makes: ClassVar[frozenset[str]] = frozenset({"adam", "stats"})
     output_keys: ClassVar[frozenset[str]] = frozenset({"log_every"})
-    training_keys: ClassVar[frozenset[str]] = frozenset({"rates", "update", "skip", "dropout"})
+    training_keys: ClassVar[frozenset[str]] = frozenset({"rates", "update", "skip", "dropout", "background"})
 
     rates: Rates = Rates()
     """Learning rates."""
     update: Rows = "all"
-    """Gaussians that a step changes: `all`, or `seen`, which saves the time of those that the view culls: they keep
-    their parameters and Adam's moments, whatever penalties give them."""
+    """Gaussians that a step changes: `all`, or `seen`: those that the view culls keep their parameters and moments."""
     views: ViewSettings = ViewSettings()
     """View, size and photograph of each step."""
     losses: list[OneOf[Loss]]
@@ -69,6 +69,8 @@ class Optimize(Keeping):
     dropout: Probability = 0.0
     """Probability with which a step leaves a Gaussian out, by step, 0.9 at most; for few photographs.  The opacities of
     the others are divided by 1 less it (DropGaussian, Park et al. 2025).  Pictures and measurements leave none out."""
+    background: Behind = "scene"
+    """Colour behind all in a step; random: a new one, for which no Gaussian passes; transparent: if photographs are."""
     skip: Skip | None = None
     """Steps that skip the backward pass, where a view has converged; without it, none."""
     during: list[OneOf[Scheduled]] = Field([])
@@ -185,7 +187,9 @@ class Optimize(Keeping):
         rates, colours = self.rates.settled(views.full_size(last)), photograph_colours(self.colours, run, last)
         poses = photograph_poses(self.poses, run, last)
         own = colours, self.transients, run.sky, self.dropout, run.seed
-        return Trainer(*parts, self.losses, rates, run.scene.extent, run.numbers, self.update, *own, poses=poses)
+        trainer = Trainer(*parts, self.losses, rates, run.scene.extent, run.numbers, self.update, *own, poses=poses)
+        trainer.backgrounds = drawn_backgrounds(self.background, run)
+        return trainer
 
     def _act(self, run: Run) -> None:
         """Run the stages that are due and do not edit; those that fail run again when the run goes on."""
@@ -231,11 +235,8 @@ class Optimize(Keeping):
         return view
 
     def _differentiate(self, run: Run, trainer: Trainer, sampler: Sampler) -> tuple[ViewLosses, set[str], Visit]:
-        """The losses of one view, with gradients unless it is skipped, and the parameters that they do not update.
-
-        The kernels are timed halfway between reports, away from density edits.
-        """
-        run.device.timings.sampling = run.step % self.log_every == self.log_every // 2
+        """The losses of one view, with gradients unless it is skipped, and the parameters that they do not update."""
+        run.device.timings.sampling = run.step % self.log_every == self.log_every // 2  # away from density edits
         sample = sampler.at(run.step)
         photograph = run.photographs.of_sizes(sample.view, sample.original, sample.number)
         ahead = range(1, min(READ_AHEAD, self.steps - run.stage_step) + 1)

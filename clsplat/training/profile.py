@@ -32,6 +32,7 @@ STAGES = {
     "sky_gather": "sum records",
     "sky_update": "update",
     "apply_mask": "loss",
+    "change_background": "loss",
     "measure_residuals": "loss",
     "mask_transients": "loss",
     "covariance_trace": "loss",

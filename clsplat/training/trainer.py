@@ -26,6 +26,7 @@ from clsplat.render.rasterizer import Content, Rasterizer
 from clsplat.schedule import Schedule, at_step
 from clsplat.training.adam import Adam, Rates, Rows
 from clsplat.training.sky import LearnedSky
+from clsplat.views.backgrounds import Backgrounds
 from clsplat.views.learned import LearnedTransform, learned_of, name_of
 from clsplat.views.photograph_colours import PhotographColours, change_back, change_colours
 from clsplat.views.photograph_poses import PhotographPoses
@@ -79,6 +80,7 @@ class Trainer:
     dropout: Schedule = 0.0  # probability with which a step leaves a Gaussian out, by step
     seed: int = 0  # of what is drawn
     poses: PhotographPoses | None = None  # of the cameras, where they are learned
+    backgrounds: Backgrounds | None = None  # by step, in the place of `background`
 
     def step(
         self,
@@ -118,9 +120,10 @@ class Trainer:
         workspace, camera, timings = self.rasterizer.workspace, photograph.camera, self.rasterizer.device.timings
         reads_entropy = any(isinstance(loss, ImageLoss) and loss.reads_entropy for loss in self.losses)
         content: Content = "entropy" if reads_entropy else "colour"
-        frame = self.rasterizer.forward(self._drawn(step), camera, self.background, content)
+        background = self.backgrounds.at(step) if self.backgrounds else self.background
+        frame = self.rasterizer.forward(self._drawn(step), camera, background, content)
         timings.section = "loss"
-        planes = photograph.planes(workspace, transforms, step, self.numbers)
+        planes = photograph.planes(workspace, transforms, step, self.numbers, (self.background, background))
         gradient = workspace.array("grad_image", frame.image.shape)
         image, own = self._coloured(camera, frame.image)
         planes, learning = self._without_transients(planes, image, step)

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from clsplat.render.camera import DeviceCamera, moved_camera, upload_camera
 from clsplat.render.workspace import Workspace
 from clsplat.scene.photographs import load_photograph
 from clsplat.scene.scene import Background, View
+from clsplat.scene.view import load_transparency
 from clsplat.views.transforms import PhotographTransform, Planes
 
 Mask = NDArray[np.bool_]
@@ -30,10 +31,13 @@ class Photograph:
     colours: Array  # [3, height, width] uint8
     mask: Array | None = None  # [1, height, width] uint8, 1 in pixels that count; None: all count
     empty: bool = False  # whether the mask leaves out every pixel
+    transparency: Array | None = (
+        None  # [1, height, width] uint8, 255 where the background alone is seen; None: not kept
+    )
 
     @property
     def nbytes(self) -> int:
-        return self.colours.nbytes + (self.mask.nbytes if self.mask else 0)
+        return sum(array.nbytes for array in (self.colours, self.mask, self.transparency) if array)
 
     def image(self) -> NDArray[np.uint8]:
         """Return the colours on the host, [height, width, 3]."""
@@ -49,17 +53,29 @@ class Photograph:
         transforms: Sequence[PhotographTransform] = (),
         step: int = 0,
         numbers: Mapping[str, float] | None = None,
+        backgrounds: tuple[Array, Array] | None = None,
     ) -> Planes:
         """Return the photograph as float planes of whole tiles, after the transforms of a global step.
 
-        numbers: those of a transform that learns; without them it has its first ones.
+        numbers: those of a transform that learns; without them it has its first ones.  backgrounds: that of the
+        photographs, and what is behind transparent pixels in its place; each [3] in [0, 1].
         """
         colours = unpack(workspace, self.camera, self.colours, 1 / 255, "photograph")
+        if backgrounds and self.transparency:
+            change_background(workspace, self.camera, colours, self.transparency, *backgrounds)
         mask = unpack(workspace, self.camera, self.mask, 1.0, "mask") if self.mask else None
         planes = Planes(workspace, self.camera, colours, mask, numbers or {})
         for transform in transforms:
             planes = transform.apply(planes, step)
         return planes
+
+
+class Pixels(NamedTuple):
+    """A photograph on the host: [height, width] uint8 of each channel."""
+
+    colours: NDArray[np.uint8]  # [3, height, width]
+    mask: NDArray[np.uint8]  # [0 or 1, height, width]
+    transparency: NDArray[np.uint8] | None
 
 
 Key = tuple[str, int, int]  # name, width and height of a view
@@ -84,8 +100,16 @@ class Photographs:
         self.background = device.upload(np.array(BACKGROUNDS[background], np.float32))  # [3]
         self.budget = int(device.info.memory * BUDGET_SHARE) if budget is None else budget
         self._held: dict[Key, Photograph] = {}  # least recently used first
-        self._reading: dict[Key, Future[NDArray[Any]]] = {}
+        self._reading: dict[Key, Future[Pixels]] = {}
         self._reader: ThreadPoolExecutor | None = None
+        self._transparency = False
+
+    def keep_transparency(self) -> None:
+        """Keep the transparency of photographs too, for drawn backgrounds."""
+        if not self._transparency:
+            self._transparency = True
+            self._held.clear()
+            self._reading.clear()
 
     def fresh(self) -> "Photographs":
         """Return an empty copy, for views that are used once."""
@@ -102,11 +126,11 @@ class Photographs:
         photograph = self._held.pop(key, None)
         if photograph is None:
             reading = self._reading.pop(key, None)
-            pixels = reading.result() if reading else self._read(view)
-            self._make_room(pixels.nbytes)
-            colours, mask = pixels[:3], pixels[3:]
+            colours, mask, shows = reading.result() if reading else self._read(view)
+            self._make_room(colours.nbytes + mask.nbytes + (0 if shows is None else shows.nbytes))
             mask_on_device, empty = (self.device.upload(mask), not mask.any()) if len(mask) else (None, False)
-            photograph = Photograph(self.camera(view), self.device.upload(colours), mask_on_device, empty)
+            transparency = None if shows is None else self.device.upload(shows)
+            photograph = Photograph(self.camera(view), self.device.upload(colours), mask_on_device, empty, transparency)
         self._held[key] = photograph
         return photograph
 
@@ -141,10 +165,11 @@ class Photographs:
                 self._reader = self._reader or ThreadPoolExecutor(1, "photographs")
                 self._reading[key] = self._reader.submit(self._read, view)
 
-    def _read(self, view: View) -> NDArray[Any]:
-        """Colours and, where there is one, the mask: [3 or 4, height, width] uint8."""
+    def _read(self, view: View) -> Pixels:
         image = load_photograph(view, BACKGROUNDS[self.background_name], self.undistorted)
-        return np.ascontiguousarray(image.transpose(2, 0, 1))
+        pixels = np.ascontiguousarray(image.transpose(2, 0, 1))
+        shows = load_transparency(view) if self._transparency else None
+        return Pixels(pixels[:3], pixels[3:], None if shows is None else shows[None])
 
     def _make_room(self, size: int) -> None:
         held = sum(photograph.nbytes for photograph in self._held.values())
@@ -167,6 +192,20 @@ def unpack(workspace: Workspace, camera: DeviceCamera, pixels: Array, factor: fl
         stride=camera.stride,
     )
     return planes
+
+
+def change_background(
+    workspace: Workspace, camera: DeviceCamera, colours: Array, transparency: Array, background: Array, behind: Array
+) -> None:
+    """Put the colour `behind`, [3], in the place of the `background` of colours [3, rows, stride].
+
+    transparency: [1, height, width] uint8, 255 where the background alone is seen.
+    """
+    shown = unpack(workspace, camera, transparency, 1 / 255, "transparency")
+    pixels = camera.rows * camera.stride
+    workspace.device.program("loss.cl").change_background(
+        items=(pixels, 3), colours=colours, transparency=shown, background=background, behind=behind, pixels=pixels
+    )
 
 
 def apply_mask(workspace: Workspace, camera: DeviceCamera, planes: Array, mask: Array) -> None:

@@ -17,7 +17,7 @@ from clsplat.opencl.device import Array, Device
 from clsplat.render.camera import DeviceCamera
 from clsplat.render.workspace import Workspace
 from clsplat.views.haar import Haar
-from clsplat.views.photographs import apply_mask, unpack
+from clsplat.views.photographs import apply_mask, change_background, unpack
 from clsplat.views.texture import known_gradient
 from clsplat.views.transforms import Blur, Planes
 
@@ -127,7 +127,7 @@ def entropies(device: Device, rng: np.random.Generator) -> Iterator[Figure | Not
         yield by_element("weight_entropy", f"gradient, {what}", found, truth, SUM, floor=1e-9)
 
 
-@CHECKS.add("unpack_pixels", "apply_mask")
+@CHECKS.add("unpack_pixels", "apply_mask", "change_background")
 def photographs(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
     for width, height in SIZES:
         pixels = rng.integers(0, 256, (3, height, width)).astype(np.uint8)
@@ -142,6 +142,13 @@ def photographs(device: Device, rng: np.random.Generator) -> Iterator[Figure | N
         yield equal("unpack_pixels", f"mask, {what}", counted.get()[:, :height, :width], mask)
         apply_mask(workspace, camera, colours, counted)
         yield equal("apply_mask", f"masked colours, {what}", colours.get(), found * counted.get())
+        shows, before, after = pixels[:1], *rng.random((2, 3)).astype(np.float32)
+        uploaded = device.upload(np.ascontiguousarray(shows)), device.upload(before), device.upload(after)
+        masked = colours.get()
+        change_background(workspace, camera, colours, *uploaded)
+        truth = masked.astype(np.float64)
+        truth[:, :height, :width] += shows / 255 * (after - before.astype(np.float64))[:, None, None]
+        yield by_element("change_background", f"colours, {what}", colours.get(), truth, 1e-6, floor=1.0)
 
 
 @CHECKS.add("blur_rows", "blur_columns")

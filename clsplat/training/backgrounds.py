@@ -1,0 +1,33 @@
+"""What is behind everything in each step of a run's training, as `optimize.background` says."""
+
+import logging
+from typing import Literal
+
+from clsplat.errors import ConfigError
+from clsplat.scene.view import load_transparency
+from clsplat.training.run import Run
+from clsplat.views.backgrounds import Backgrounds
+
+Behind = Literal["scene", "random", "transparent"]
+LOG = logging.getLogger("clsplat")
+
+
+def drawn_backgrounds(setting: Behind, run: Run) -> Backgrounds | None:
+    """Return the colours that steps draw, or None where all have that of the scene; `transparent` asks the first
+    training photograph.
+
+    The photographs of the run keep their transparency for them.  Raises ConfigError for a model with a sky.
+    """
+    if setting == "transparent":
+        shows = load_transparency(run.scene.split("train")[0]) is not None
+        setting = "random" if shows else "scene"
+        LOG.info("background of the steps: %s, since photographs are %s", setting, "transparent" if shows else "opaque")
+    if setting == "scene":
+        return None
+    if run.sky:
+        raise ConfigError(
+            "optimize.background: a drawn one is for models without a sky; leave model.background out, or set "
+            "optimize.background to scene"
+        )
+    run.photographs.keep_transparency()
+    return Backgrounds(run.device, run.seed)
