@@ -9,11 +9,15 @@ import pytest
 
 from clsplat.cluster import fingerprint
 from clsplat.cluster.cell import Cell
+from clsplat.cluster.fingerprint import Scenes
 from clsplat.cluster.store import Store
+from clsplat.cluster.sweep import wanted_cell
 from clsplat.cluster.task import Terms, run_cell
 from clsplat.errors import ConfigError, DataError
+from clsplat.pipeline import matrix
 from clsplat.pipeline.loading import load
-from clsplat.pipeline.places import content_of
+from clsplat.pipeline.places import content_of, contents
+from clsplat.stages.video import Video
 from tests.few_steps import FEW, killed
 from tests.test_sweep_cells import CELL, WRITES, command, keys
 from tests.test_training import train
@@ -55,6 +59,18 @@ def test_a_key_has_the_content_of_the_model_that_a_folder_holds(few_steps, tiny_
         from_model(one, tiny_scene, tmp_path / "notes")
 
 
+def test_what_cannot_be_read_is_told(few_steps, tiny_scene, tmp_path, monkeypatch):
+    assert content_of(tmp_path / ("m" * 300)) == ""
+
+    def refuse(path):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr("clsplat.pipeline.places.model_at", refuse)
+    with pytest.raises(DataError, match=r"few: cannot be read \(Permission denied\); give another file"):
+        content_of(few_steps)
+    assert contents(load("smoke", [f"scene.path={tiny_scene}", f"init.file='{few_steps}'"])) == {}
+
+
 def test_a_list_of_names_is_the_one_in_the_folder_of_the_dataset(tiny_scene, tmp_path, monkeypatch):
     scene = tmp_path / "scene"
     shutil.copytree(tiny_scene, scene)
@@ -66,6 +82,18 @@ def test_a_list_of_names_is_the_one_in_the_folder_of_the_dataset(tiny_scene, tmp
     (tmp_path / "list.txt").write_text("train/r_001\n")
     assert Cell.of("x", checked, "s", "b").key == cell.key
     assert cell.files.keys() == {str(scene / "list.txt")}
+
+
+def test_the_name_of_a_camera_path_is_no_file(tmp_path, monkeypatch):
+    write(tmp_path / "ellipse", "a file of that name")
+    monkeypatch.chdir(tmp_path)
+    assert Video().place_of("path", None) is None
+    assert Video(path="mine.json").place_of("path", None) == Path("mine.json")
+
+
+def test_a_sweep_names_its_cells_as_they_are_named_here(tiny_scene, store, tmp_path):
+    found = wanted_cell(matrix.Cell("x", load("smoke", [f"scene.path={tiny_scene}"])), Scenes(tmp_path), store)
+    assert found.on("b").key == keys("smoke", tiny_scene, tmp_path)
 
 
 def test_a_cell_reads_the_same_files_in_whatever_folder_it_runs(tiny_scene, store, terms, tmp_path, monkeypatch):

@@ -1,6 +1,7 @@
 """The files that a pipeline names: where runs are compared, what they hold stands for their places."""
 
 import hashlib
+import os
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
@@ -50,10 +51,17 @@ def contents(pipeline: Pipeline) -> dict[str, str]:
 def content_of(place: Path) -> str:
     """Return a hash of a file, of a model with all of its files, or of that of a run folder; "" for no such place.
 
-    Raises DataError for a folder without a model.
+    Raises DataError for a folder without a model, and for what cannot be read.
     """
-    if not place.exists():
+    if not os.path.exists(place):
         return ""
+    try:
+        return _content_of(place)
+    except OSError as error:
+        raise DataError(f"{place}: cannot be read ({error.strerror}); give another file, or its rights") from error
+
+
+def _content_of(place: Path) -> str:
     model = model_at(place)
     if not model.is_file():
         raise DataError(f"{place}: holds no model; expected a file, or the folder of a finished run")
