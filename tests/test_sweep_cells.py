@@ -157,6 +157,16 @@ def test_a_failure_after_a_newer_checkpoint_does_not_count(few_steps, store, ter
     assert told(store).count("start") == count + 2
 
 
+def test_a_failure_beside_a_newer_checkpoint_that_is_damaged_counts(few_steps, store, terms):
+    old = Attempt(store.add(CELL).path / ATTEMPTS / ("a" * 32))
+    shutil.copytree(few_steps, old.path)
+    newest = max((old.path / CHECKPOINTS).glob("step_*.npz"))
+    newest.write_bytes(newest.read_bytes()[:-100])
+    starts = "import os, sys; sys.exit(2 if len(os.listdir(os.path.dirname(sys.argv[2]))) > 6 else 6)"
+    assert run_cell(CELL, store, command(starts), terms).exit_code == 6
+    assert told(store).count("start") == terms.retries
+
+
 @pytest.mark.parametrize("damage", ["cut", "flipped"])
 def test_an_attempt_goes_on_from_the_newest_checkpoint_that_is_whole(few_steps, store, terms, damage):
     folder = store.add(CELL)

@@ -7,7 +7,7 @@ import os
 import re
 import shutil
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import asdict
 from functools import cached_property
@@ -98,22 +98,12 @@ class Attempt:
                 return path.stat().st_mtime
         return math.inf
 
-    @property
-    def newest(self) -> Rank:
-        """The newest of its checkpoints, whole or not."""
-        return max((_rank_of(path.name) for path in checkpoint.saved(self.path)), default=(False, 0))
-
     def go_on_from(self, others: Iterable["Attempt"]) -> None:
         """Take what the attempt with the newest checkpoint that is whole has written: links where that is possible.
 
         A damaged checkpoint counts as none: the one before it is taken, of whatever attempt.  Raises OutputError.
         """
-        found = [(_rank_of(path.name), path, other) for other in others for path in checkpoint.saved(other.path)]
-        for _, path, other in sorted(found, key=lambda one: one[0], reverse=True):
-            try:
-                checkpoint.load(path)
-            except (DataError, ConfigError):
-                continue
+        for _, path, other in whole(others):
             own = self.path / CHECKPOINTS / path.name
             with told_as(self.path):
                 own.parent.mkdir(exist_ok=True)
@@ -167,6 +157,17 @@ class Attempt:
         }
         write_text(self.path / MANIFEST, json.dumps(values, indent=1) + "\n")
         return values
+
+
+def whole(attempts: Iterable[Attempt]) -> Iterator[tuple[Rank, Path, Attempt]]:
+    """Yield the checkpoints of attempts that can be read, from the newest on: rank, file, and whose it is."""
+    found = [(_rank_of(path.name), path, one) for one in attempts for path in checkpoint.saved(one.path)]
+    for rank, path, one in sorted(found, key=lambda entry: entry[0], reverse=True):
+        try:
+            checkpoint.load(path)
+        except (DataError, ConfigError):
+            continue
+        yield rank, path, one
 
 
 def _rank_of(name: str) -> Rank:

@@ -10,7 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from clsplat.cluster.attempt import LEASE, MANIFEST, Attempt
+from clsplat.cluster.attempt import LEASE, MANIFEST, Attempt, whole
 from clsplat.errors import DataError, OutputError
 from clsplat.files import make_folder, sync_below, sync_folder, told_as, write_text
 from clsplat.reading import read_json
@@ -87,9 +87,9 @@ class CellFolder:
         return attempt
 
     def failures(self, since: float) -> list[Attempt]:
-        """Return the attempts of callers since a time that have failed and left no newer checkpoint than now."""
+        """Return the attempts of callers since a time that have failed and left no newer checkpoint that is whole."""
         attempts = self.attempts()
-        newest = max((attempt.newest for attempt in attempts), default=(False, 0))
+        newest = next((rank for rank, *_ in whole(attempts)), (False, 0))
         return [one for one in attempts if one.has_failed and one.since >= since and one.begun_at >= newest]
 
     def publish(self, attempt: Attempt) -> dict[str, Any]:
