@@ -236,6 +236,23 @@ def test_a_process_that_was_frozen_until_its_attempt_was_removed_takes_the_resul
     assert told(store) == ["start", "skip"]
 
 
+def test_a_process_that_was_frozen_after_its_run_takes_the_result(store, terms, monkeypatch):
+    folder = store.add(CELL)
+    other = folder.begin("other", terms.since)
+    (other.path / "point_cloud.ply").write_bytes(b"bits")
+    other.manifest()
+
+    def sleeps(cell, attempt):
+        os.rename(other.path, folder.result)
+        shutil.rmtree(attempt.path)
+
+    monkeypatch.setattr("clsplat.cluster.task._require_same_scene", sleeps)
+    outcome = run_cell(CELL, store, command(WRITES), terms)
+    assert (outcome.state, outcome.message) == ("published", "")
+    assert told(store) == ["start", "end", "skip"]
+    assert not folder.attempts()
+
+
 def test_attempts_are_removed_by_the_age_of_their_lease_alone(store, terms):
     folder = store.add(CELL)
     old, young = folder.begin("a", terms.since), folder.begin("b", terms.since)

@@ -31,6 +31,10 @@ BEAT = 10.0  # seconds between two beats of a lease
 Rank = tuple[bool, int]  # of a checkpoint: whether it is of a refit, and its step
 
 
+class LeaseLost(OutputError):
+    """The folder of an attempt was removed while its run went on."""
+
+
 class Attempt:
     """A folder below `attempts`, written by one process."""
 
@@ -44,13 +48,16 @@ class Attempt:
         self._values = {**asdict(Owner.this()), "worker": worker, "since": since, "begun": time.time()}
         self._write()
 
-    def beat(self) -> bool:
-        """Renew the lease where that is due; return False where it is lost, with its folder."""
+    def beat(self) -> None:
+        """Renew the lease where that is due.  Raises LeaseLost."""
         if time.monotonic() - self._last >= BEAT:
-            if not (self.path / LEASE).is_file():
-                return False
+            self.require_lease()
             self._write()
-        return True
+
+    def require_lease(self) -> None:
+        """Raise LeaseLost where its folder was removed."""
+        if not (self.path / LEASE).is_file():
+            raise LeaseLost(f"{self.path}: was removed while its run went on; run the sweep again")
 
     def end(self, exit_code: int) -> None:
         """Note how the run ended; a lost folder stays lost."""

@@ -95,8 +95,11 @@ class CellFolder:
     def publish(self, attempt: Attempt) -> dict[str, Any]:
         """Rename an attempt with its manifest to the result; return the manifest of the result.
 
-        Where another attempt came first, their bits are compared.  Raises Different when they differ.
+        Where another attempt came first, their bits are compared.
+
+        Raises Different when they differ, LeaseLost where the attempt was removed, for its process slept too long.
         """
+        attempt.require_lease()
         ours = attempt.manifest()
         sync_below(attempt.path)
         with suppress(OSError):

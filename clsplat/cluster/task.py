@@ -7,9 +7,9 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Literal
 
-from clsplat.cluster.attempt import PIPELINE_FILE, Attempt
+from clsplat.cluster.attempt import PIPELINE_FILE, Attempt, LeaseLost
 from clsplat.cluster.cell import Cell
-from clsplat.cluster.child import Command, LeaseLost, supervise
+from clsplat.cluster.child import Command, supervise
 from clsplat.cluster.folder import ATTEMPTS, CellFolder, Different
 from clsplat.cluster.store import Store
 from clsplat.errors import ClsplatError, ConfigError, DataError, Interrupted, MemoryLimitError, one_line
@@ -74,14 +74,14 @@ def _run_cell(cell: Cell, store: Store, command: Command, terms: Terms, is_stopp
         _equip(cell, store, folder, attempt)
         try:
             code = supervise(attempt, command, stopped)
+            store.tell("end", cell=cell.key, attempt=attempt.path.name, exit_code=code)
+            if code == 0:
+                _require_same_scene(cell, attempt)
+                return _published(store, folder, attempt)
         except LeaseLost:
             if folder.published():  # by another process, while this one was frozen
                 continue
             raise
-        store.tell("end", cell=cell.key, attempt=attempt.path.name, exit_code=code)
-        if code == 0:
-            _require_same_scene(cell, attempt)
-            return _published(store, folder, attempt)
         if stopped():
             return Outcome("stopped", "", Interrupted.exit_code, "stopped, its state is saved")
         if code in FINAL or len(folder.failures(terms.since)) >= terms.retries:
