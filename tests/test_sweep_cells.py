@@ -23,7 +23,7 @@ from clsplat.cluster.overview import overview_text, store_status
 from clsplat.cluster.probe import Place
 from clsplat.cluster.store import Store
 from clsplat.cluster.task import Outcome, Terms, run_cell
-from clsplat.errors import ConfigError, Interrupted, OutputError
+from clsplat.errors import ConfigError, DeviceError, Interrupted, OutputError
 from clsplat.names import CHECKPOINTS
 from clsplat.pipeline.loading import load
 
@@ -329,6 +329,39 @@ def test_in_any_class_a_cell_stays_in_that_it_has_begun_in(store, terms):
     Drive(store, engine, False, terms).run([one, *wanted(1, 2, 3)])
     assert engine.started[0] == ("9", "one", "x")
     assert {bits for *_, bits in engine.started[1:]} == {"x", "y"}
+
+
+@pytest.mark.parametrize("published", ["x", "y", None])
+def test_of_classes_with_as_many_devices_that_with_most_results_is_taken(store, terms, published):
+    for one in wanted(1, 2) if published else []:
+        run_cell(one.on(published), store, command(WRITES), terms)
+    engine = Fake(*[Outcome("published")] * 3, places=PLACES[1::-1])
+    Drive(store, engine, True, terms).run(wanted(1, 2, 3))
+    assert {bits for *_, bits in engine.started} == {published or "x"}
+
+
+def test_a_sweep_whose_class_has_no_device_any_more_ends_and_names_the_others(store, terms, monkeypatch):
+    monkeypatch.setattr("clsplat.cluster.drive.ALONE", 0.2)
+    drive = Drive(store, Fake(places=PLACES), True, terms, bits="z")
+    looks = iter(range(40))
+    drive.is_stopped = lambda: next(looks) == 39
+    with pytest.raises(DeviceError, match=r"no device of bits class z for .* of x, y; offer one of that class"):
+        drive.run(wanted(1))
+
+
+def test_what_runs_costs_no_look_at_the_cells_that_wait(store, terms, monkeypatch):
+    looks = []
+    suits = Drive._suits
+    monkeypatch.setattr(Drive, "_suits", lambda *values: looks.append(1) or suits(*values))
+    engine = Fake()
+
+    def start(*values):
+        ends = [None, None, Outcome("published")]
+        return type("Ticket", (), {"outcome": lambda self: ends.pop(0)})()
+
+    engine.start = start
+    Drive(store, engine, False, terms).run(wanted(*range(5)))
+    assert len(looks) == 5
 
 
 def test_a_signal_stops_a_sweep(store, terms):

@@ -11,7 +11,7 @@ from clsplat.pipeline.yaml_file import Document, read_yaml
 from clsplat.settings import ReadPath, Settings
 
 STORE = "runs/store"
-LOOPBACK = ("127.0.0.1", "localhost", "[::1]")
+LOOPBACK = ("127.0.0.1", "localhost")
 
 
 class Placement(Settings):

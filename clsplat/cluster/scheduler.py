@@ -1,22 +1,22 @@
-"""Engines on Dask: a cluster of this machine, or a scheduler elsewhere.  Nothing else imports distributed.
+"""Engines on Dask: a cluster of this machine, or a scheduler elsewhere.  Only this and `serving` import distributed.
 
 Dask gives membership, liveness and a queue.  What it does not give is in the store: going on inside of a cell, once in
 effect, stopping.  At most one cell a device is in flight, for a worker that dies takes all cells on its list with it.
 """
 
-import asyncio
 import json
 import logging
-import threading
 import time
 import uuid
-from collections.abc import Sequence
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 from clsplat.cluster.cell import Cell
 from clsplat.cluster.child import PATIENCE, run_command
+from clsplat.cluster.drive import ALONE
 from clsplat.cluster.engine import Lost, Ticket
 from clsplat.cluster.execution import Execution, Tls
 from clsplat.cluster.fingerprint import code_digest
@@ -24,8 +24,7 @@ from clsplat.cluster.plugin_files import plugin_files
 from clsplat.cluster.probe import Place, places
 from clsplat.cluster.store import Store
 from clsplat.cluster.task import Outcome, Terms, run_cell
-from clsplat.errors import ConfigError, DeviceError, InternalError, Interrupted, one_line
-from clsplat.signals import stopping_on_signals
+from clsplat.errors import ConfigError, DeviceError, InternalError, one_line
 
 try:
     import dask
@@ -35,7 +34,6 @@ except ImportError:
 
 LOG = logging.getLogger("clsplat")
 LOOK = 5.0  # seconds between two looks at the workers
-ALONE = 60.0  # seconds without a worker after which a sweep ends
 LOOPBACK = "127.0.0.1"
 ANSWER = 20.0  # seconds that a scheduler may take to answer
 SETTINGS = {
@@ -58,7 +56,14 @@ def work(cell: str, store: str, command: list[str], terms: str) -> str:
 
 def engine(execution: Execution, store: Store, devices: list[str] | None) -> "Cluster":
     """Return the engine that `execution` names.  Raises DeviceError where there are no devices."""
-    dask.config.set(SETTINGS)
+    with ExitStack() as held:
+        held.enter_context(dask.config.set(SETTINGS))  # until the engine is closed
+        cluster = _engine(execution, store, devices)
+        cluster.settings = held.pop_all()
+        return cluster
+
+
+def _engine(execution: Execution, store: Store, devices: list[str] | None) -> "Cluster":
     if execution.engine == "local":
         found = places("local", devices)
         cluster = distributed.LocalCluster(
@@ -77,43 +82,8 @@ def engine(execution: Execution, store: Store, devices: list[str] | None) -> "Cl
             execution.address, security=security(execution.tls), set_as_default=False, timeout=ANSWER
         )
     except OSError as error:
-        raise _unanswered(execution, error) from None
+        raise unanswered(execution, error) from None
     return Cluster(client, store)
-
-
-def serve(execution: Execution, found: Sequence[Place]) -> None:
-    """Let a process a device work for a scheduler, until that ends or a signal comes.  Raises DeviceError."""
-    dask.config.set(SETTINGS)
-    warn_of_open_port(execution)
-    stop = threading.Event()
-    with stopping_on_signals(stop.set):
-        asyncio.run(_serve(execution, found, stop))
-    if stop.is_set():
-        raise Interrupted("stopped; cells that ran here go on elsewhere")
-
-
-async def _serve(execution: Execution, found: Sequence[Place], stop: threading.Event) -> None:
-    options: dict[str, Any] = {"nthreads": 1, "memory_limit": 0, "security": security(execution.tls)}
-    if execution.is_local:
-        options["host"] = LOOPBACK
-    nannies = [
-        distributed.Nanny(
-            execution.address,
-            name=json.dumps({"host": place.worker, "device": place.device, "bits": place.bits, "code": code_digest()}),
-            resources={f"bits:{place.bits}": 1},
-            dashboard_address=f"{LOOPBACK}:0",
-            silence_logs=logging.CRITICAL,
-            **options,
-        )
-        for place in found
-    ]
-    try:
-        await asyncio.wait_for(asyncio.gather(*nannies), ANSWER)
-    except (OSError, TimeoutError, RuntimeError) as error:
-        raise _unanswered(execution, error) from None
-    while not stop.is_set() and any(nanny.status is distributed.Status.running for nanny in nannies):
-        await asyncio.sleep(0.2)
-    await asyncio.gather(*(nanny.close(timeout=5) for nanny in nannies))
 
 
 def warn_of_open_port(execution: Execution) -> None:
@@ -122,7 +92,8 @@ def warn_of_open_port(execution: Execution) -> None:
         LOG.warning("%s: is not encrypted; whoever reaches the scheduler's port can run code", execution.engine)
 
 
-def _unanswered(execution: Execution, error: BaseException) -> DeviceError:
+def unanswered(execution: Execution, error: BaseException) -> DeviceError:
+    """Return the error of a scheduler that cannot be reached."""
     reason = one_line(error.__cause__ or error) or "no answer"
     return DeviceError(f"{execution.engine}: cannot be worked with ({reason}); start it with `dask scheduler`")
 
@@ -169,10 +140,14 @@ class Cluster:
         self._places: list[Place] = []
         self._tickets: list[_Future] = []
         self.addresses: set[str] = set()
+        self.settings = ExitStack()  # of Dask, which end with the cluster
         self.command_of = lambda device: run_command(device, plugin_files())
 
     def places(self) -> list[Place]:
-        """Return the devices whose workers live.  Raises DeviceError where there were none for a minute."""
+        """Return the devices whose workers live.
+
+        Raises DeviceError where the scheduler ended, or no worker of this version was there for a minute.
+        """
         now = time.monotonic()
         if now - self._looked >= LOOK or (not self._places and now - self._looked >= 0.5):
             self._looked = now
@@ -180,32 +155,46 @@ class Cluster:
         return self._places
 
     def _look(self, now: float) -> None:
-        workers = self._client.scheduler_info(n_workers=-1)["workers"]
+        with self._needs_scheduler():
+            workers = self._client.scheduler_info(n_workers=-1)["workers"]
         self.addresses = set(workers)
         if self._cluster and self._found and len(workers) < len(self._found):
             self._cluster.scale(len(self._found))  # a worker that dies while it starts is not started again by itself
-        if workers:
+        known = [one for address, worker in workers.items() if (one := place_of(address, worker))]
+        self._places = known if self._found is None else self._found if workers else []
+        if self._places:
             self._seen = now
-            self._places = self._found or [one for address, w in workers.items() if (one := place_of(address, w))]
         elif now - self._seen > ALONE:
+            others = f" ({len(workers)} of another version get no cells)" if workers else ""
             raise DeviceError(
-                f"no worker for {ALONE:.0f} s; start some with `clsplat worker --scheduler ADDRESS`; what was done is "
-                "in the store"
+                f"no worker of this version for {ALONE:.0f} s{others}; start some with `clsplat worker --scheduler "
+                "ADDRESS`; what was done is in the store"
             )
+
+    @contextmanager
+    def _needs_scheduler(self) -> Iterator[None]:
+        """Raise DeviceError where the block fails, for the scheduler is gone: its client has given up."""
+        try:
+            yield
+        except Exception as error:  # of which type depends on the moment
+            if isinstance(error, OSError) or self._client.status in ("closing", "closed"):
+                raise DeviceError("the scheduler ended; start it, and run the sweep again with --resume") from error
+            raise
 
     def start(self, cell: Cell, place: Place, terms: Terms) -> Ticket:
         own = replace(terms, worker=place.worker, sweep=self._sweep)
         address = None if self._cluster else place.worker
-        future = self._client.submit(
-            work,
-            cell.json(),
-            str(self._store.root),
-            list(self.command_of(place.device)),
-            json.dumps(asdict(own)),
-            key=f"{cell.name}-{uuid.uuid4().hex[:8]}",
-            workers=[address] if address else None,
-            pure=False,
-        )
+        with self._needs_scheduler():
+            future = self._client.submit(
+                work,
+                cell.json(),
+                str(self._store.root),
+                list(self.command_of(place.device)),
+                json.dumps(asdict(own)),
+                key=f"{cell.name}-{uuid.uuid4().hex[:8]}",
+                workers=[address] if address else None,
+                pure=False,
+            )
         ticket = _Future(self, future, address)
         self._tickets = [*(one for one in self._tickets if not one.is_over), ticket]
         return ticket
@@ -219,9 +208,10 @@ class Cluster:
             time.sleep(0.1)
         if self._pending:
             LOG.warning("some cells did not end in %.0f s", PATIENCE)
-        self._client.close()
-        if self._cluster:
-            self._cluster.close()
+        with self.settings:
+            self._client.close()
+            if self._cluster:
+                self._cluster.close()
 
     @property
     def _pending(self) -> "list[_Future]":
