@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from clsplat.cluster import child
-from clsplat.cluster.attempt import LEASE, MANIFEST, Attempt
+from clsplat.cluster.attempt import LEASE, MANIFEST, Attempt, place_copy
 from clsplat.cluster.cell import Cell
 from clsplat.cluster.child import FILE, OUT, PYTHON
 from clsplat.cluster.drive import Drive, Wanted
@@ -251,6 +251,16 @@ def test_a_process_that_was_frozen_after_its_run_takes_the_result(store, terms, 
     assert (outcome.state, outcome.message) == ("published", "")
     assert told(store) == ["start", "end", "skip"]
     assert not folder.attempts()
+
+
+def test_a_copy_of_a_result_gets_its_manifest_last(store, terms, tmp_path, monkeypatch):
+    run_cell(CELL, store, command(WRITES), terms)
+    result, copied = store.folder(CELL.key).result, []
+    for name in "abcdefgh":
+        (result / name).touch()
+    monkeypatch.setattr("clsplat.cluster.attempt.link_or_copy", lambda source, target: copied.append(target.name))
+    place_copy(result, tmp_path / "copy")
+    assert copied[-1] == MANIFEST != copied[-2]
 
 
 def test_attempts_are_removed_by_the_age_of_their_lease_alone(store, terms):

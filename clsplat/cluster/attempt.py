@@ -212,14 +212,27 @@ def bits_of(folder: Path, files: dict[str, str]) -> str:
 
 
 def place_copy(source: Path, target: Path) -> None:
-    """Let a folder hold the files of a result, linked where nothing changes them in place.  Raises OutputError."""
+    """Let a folder hold the files of a result, linked where nothing changes them in place; the manifest comes last.
+
+    Raises OutputError.
+    """
     with told_as(target):
+        (target / MANIFEST).unlink(missing_ok=True)
         for base, _, files in os.walk(source):
             here = target / Path(base).relative_to(source)
             here.mkdir(parents=True, exist_ok=True)
             for name in files:
-                if name in (LEASE, ERRORS) and Path(base) == source:
+                if name in (LEASE, ERRORS, MANIFEST) and Path(base) == source:
                     continue
                 (here / name).unlink(missing_ok=True)
                 copy = shutil.copyfile if name in GROWING else link_or_copy
                 copy(Path(base) / name, here / name)
+        link_or_copy(source / MANIFEST, target / MANIFEST)
+
+
+def is_placed(source: Path, target: Path) -> bool:
+    """Whether a folder holds the files of a result, as `place_copy` leaves them.  Raises DataError."""
+    if not (target / MANIFEST).is_file():
+        return False
+    found = read_json(target / MANIFEST)
+    return bool(found == read_json(source / MANIFEST)) and all((target / name).is_file() for name in found["files"])
