@@ -1,5 +1,6 @@
 """Cells: what names them, how one is run and published once, what stops it, what is removed."""
 
+import errno
 import json
 import os
 import shutil
@@ -146,6 +147,24 @@ def test_an_exit_code_decides_whether_a_cell_is_tried_again(store, terms, code, 
     assert not (store.folder(CELL.key).path / "failed.json").exists()
 
 
+@pytest.mark.parametrize("times", [1, 9])
+def test_a_result_that_cannot_be_written_counts_as_a_failure(store, terms, monkeypatch, times):
+    faults = [OSError(errno.ENOSPC, "No space left on device")] * times
+
+    def sync(path):
+        if faults:
+            raise faults.pop()
+
+    monkeypatch.setattr("clsplat.cluster.folder.sync_below", sync)
+    outcome = run_cell(CELL, store, command(WRITES), terms)
+    if times == 1:
+        assert (outcome.state, told(store).count("start")) == ("published", 2)
+        return
+    assert (outcome.state, outcome.exit_code, told(store).count("start")) == ("failed", 7, 3)
+    assert "cannot be written (No space left on device)" in outcome.message
+    assert store.folder(CELL.key).failed()["exit_codes"] == [7] * 3
+
+
 def test_a_failure_after_a_newer_checkpoint_does_not_count(few_steps, store, terms):
     saves = "import sys, pathlib, shutil, os; p = pathlib.Path(sys.argv[2], 'checkpoints'); p.mkdir(exist_ok=True)\n"
     saves += f"left = sorted(pathlib.Path({str(few_steps / CHECKPOINTS)!r}).iterdir())\n"
@@ -272,6 +291,9 @@ def test_attempts_are_removed_by_the_age_of_their_lease_alone(store, terms):
     run_cell(CELL, store, command(WRITES), terms)
     assert not old.path.exists()
     assert young.path.is_dir()
+    os.utime(young.path / LEASE, (store.now() - 601, store.now() - 601))
+    run_cell(CELL, store, command(WRITES), terms)
+    assert not young.path.exists(), "the next call finds the result, and that"
 
 
 def test_a_spec_is_never_changed(store):
@@ -401,6 +423,8 @@ def test_the_state_of_a_store_is_in_its_files(store, terms):
         "new": "waiting",
     }
     text = overview_text(found)
+    store.folder(cells[1].key).begin("w", terms.since)
+    assert store_status(store.root)["counts"] == {"published": 1, "running": 2, "waiting": 1}, "it is tried again"
     assert "1 failed, 1 published, 1 running, 1 waiting" in text
     assert "bad: its process ended with exit code 2" in text
     assert sys.executable not in text

@@ -82,6 +82,7 @@ class CellFolder:
         attempt = Attempt(self.path / ATTEMPTS / uuid.uuid4().hex)
         with told_as(attempt.path):
             make_folder(attempt.path)
+            (self.path / FAILED).unlink(missing_ok=True)  # it is tried again
         attempt.take_lease(worker, since)
         attempt.go_on_from(other for other in self.attempts() if other.path != attempt.path)
         return attempt
@@ -101,7 +102,8 @@ class CellFolder:
         """
         attempt.require_lease()
         ours = attempt.manifest()
-        sync_below(attempt.path)
+        with told_as(attempt.path):
+            sync_below(attempt.path)
         with suppress(OSError):
             os.rename(attempt.path, self.result)
             sync_folder(self.path)
