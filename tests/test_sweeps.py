@@ -143,6 +143,8 @@ def test_a_wrong_execution_is_refused_with_its_line(tmp_path, text, words):
     found = load_experiment(str(file))
     with pytest.raises(ConfigError, match=words):
         execution_of(found.execution, file)
+    with pytest.raises(ConfigError, match=words):
+        commands.describe_run(file, out=tmp_path / "out")
 
 
 def test_a_scheduler_of_this_machine_needs_no_tls():
