@@ -16,9 +16,9 @@ def offer(execution: Execution, devices: Sequence[str] | None = None) -> None:
     execution: its engine is the scheduler.  devices: names, default every device that works.
     Raises DeviceError where there is none or no scheduler answers.
     """
-    from clsplat.cluster import serving  # where Dask is installed
+    from clsplat.cluster import scheduler  # where Dask is installed
 
     found = places(Owner.this().host, list(devices) if devices is not None else None)
     for place in found:
         LOG.info("offers %s, bits:%s", place.text, place.bits)
-    serving.serve(execution, found)
+    scheduler.serve(execution, found)

@@ -1,14 +1,16 @@
-"""Engines on Dask: a cluster of this machine, or a scheduler elsewhere.  Only this and `serving` import distributed.
+"""Engines on Dask: a cluster of this machine, or a scheduler elsewhere.  Nothing else imports distributed.
 
 Dask gives membership, liveness and a queue.  What it does not give is in the store: going on inside of a cell, once in
 effect, stopping.  At most one cell a device is in flight, for a worker that dies takes all cells on its list with it.
 """
 
+import asyncio
 import json
 import logging
+import threading
 import time
 import uuid
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -18,13 +20,14 @@ from clsplat.cluster.cell import Cell
 from clsplat.cluster.child import PATIENCE, run_command
 from clsplat.cluster.drive import ALONE
 from clsplat.cluster.engine import Lost, Ticket
-from clsplat.cluster.execution import Execution, Tls
+from clsplat.cluster.execution import Execution, Tls, unanswered, warn_of_open_port
 from clsplat.cluster.fingerprint import code_digest
 from clsplat.cluster.plugin_files import plugin_files
-from clsplat.cluster.probe import Place, places
+from clsplat.cluster.probe import Place, place_of, places
 from clsplat.cluster.store import Store
 from clsplat.cluster.task import Outcome, Terms, run_cell
-from clsplat.errors import ConfigError, DeviceError, InternalError, one_line
+from clsplat.errors import ConfigError, DeviceError, InternalError, Interrupted
+from clsplat.signals import stopping_on_signals
 
 try:
     import dask
@@ -86,16 +89,37 @@ def _engine(execution: Execution, store: Store, devices: list[str] | None) -> "C
     return Cluster(client, store)
 
 
-def warn_of_open_port(execution: Execution) -> None:
-    """Say so where a scheduler elsewhere is reached without TLS."""
-    if execution.insecure:
-        LOG.warning("%s: is not encrypted; whoever reaches the scheduler's port can run code", execution.engine)
+def serve(execution: Execution, found: Sequence[Place]) -> None:
+    """Let a process a device work for a scheduler, until that ends or a signal comes.  Raises DeviceError."""
+    warn_of_open_port(execution)
+    stop = threading.Event()
+    with dask.config.set(SETTINGS), stopping_on_signals(stop.set):
+        asyncio.run(_serve(execution, found, stop))
+    if stop.is_set():
+        raise Interrupted("stopped; cells that ran here go on elsewhere")
 
 
-def unanswered(execution: Execution, error: BaseException) -> DeviceError:
-    """Return the error of a scheduler that cannot be reached."""
-    reason = one_line(error.__cause__ or error) or "no answer"
-    return DeviceError(f"{execution.engine}: cannot be worked with ({reason}); start it with `dask scheduler`")
+async def _serve(execution: Execution, found: Sequence[Place], stop: threading.Event) -> None:
+    options: dict[str, Any] = {"nthreads": 1, "memory_limit": 0, "security": security(execution.tls)}
+    if execution.is_local:
+        options["host"] = LOOPBACK
+    nannies = [
+        distributed.Nanny(
+            execution.address,
+            name=json.dumps({"host": place.worker, "device": place.device, "bits": place.bits, "code": code_digest()}),
+            dashboard_address=f"{LOOPBACK}:0",
+            silence_logs=logging.CRITICAL,
+            **options,
+        )
+        for place in found
+    ]
+    try:
+        await asyncio.wait_for(asyncio.gather(*nannies), ANSWER)
+    except (OSError, TimeoutError, RuntimeError) as error:
+        raise unanswered(execution, error) from None
+    while not stop.is_set() and any(nanny.status is distributed.Status.running for nanny in nannies):
+        await asyncio.sleep(0.2)
+    await asyncio.gather(*(nanny.close(timeout=5) for nanny in nannies))
 
 
 def security(tls: Tls | None) -> Any:
@@ -216,14 +240,3 @@ class Cluster:
     @property
     def _pending(self) -> "list[_Future]":
         return [one for one in self._tickets if not one.is_over and one.future.status == "pending"]
-
-
-def place_of(address: str, worker: dict[str, Any]) -> Place | None:
-    """Return the device that a worker's name tells; None for a worker of another program, or version."""
-    try:
-        values = json.loads(str(worker["name"]))
-        if values["code"] != code_digest():
-            return None
-        return Place(address, str(values["device"]), str(values["bits"]), str(values["host"]))
-    except (ValueError, KeyError, TypeError):
-        return None
