@@ -13,8 +13,9 @@ LOG = logging.getLogger("clsplat")
 
 
 def drawn_backgrounds(setting: Behind, run: Run) -> Backgrounds | None:
-    """Return the colours that steps draw, or None where all have that of the scene; `transparent` asks the first
-    training photograph.
+    """Return the colours that steps draw, or None where all have that of the scene.
+
+    For `transparent` the first training photograph decides.
 
     The photographs of the run keep their transparency for them.  Raises ConfigError for a model with a sky.
     """
