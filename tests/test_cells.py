@@ -41,6 +41,11 @@ def test_a_cell_grows_by_half_the_share_on_each_side_that_has_a_bound():
     assert right.grown(0.2).high == [None] * 3
 
 
+def test_nothing_is_not_cut():
+    with pytest.raises(DataError, match="holds no Gaussians"):
+        cells(np.zeros((0, 3)), np.zeros(0), 2)
+
+
 def test_equal_places_are_not_cut():
     with pytest.raises(DataError, match="cannot be cut: 5 Gaussians for 2 blocks; give fewer --blocks"):
         cells(np.ones((5, 3)), np.ones(5), 2)

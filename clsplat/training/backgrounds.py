@@ -22,7 +22,9 @@ def drawn_backgrounds(setting: Behind, run: Run) -> Backgrounds | None:
     if setting == "transparent":
         shows = load_transparency(run.scene.split("train")[0]) is not None
         setting = "random" if shows else "scene"
-        LOG.info("background of the steps: %s, since photographs are %s", setting, "transparent" if shows else "opaque")
+        LOG.info(
+            "background of the steps: %s, since the first photograph is %stransparent", setting, "" if shows else "not "
+        )
     if setting == "scene":
         return None
     if run.sky:
