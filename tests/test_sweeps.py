@@ -14,6 +14,7 @@ from clsplat.cluster import engine, single, sweep
 from clsplat.cluster.cell import Cell
 from clsplat.cluster.drive import Drive, Wanted
 from clsplat.cluster.execution import execution_of, values_of
+from clsplat.cluster.overview import store_status
 from clsplat.cluster.probe import Place
 from clsplat.cluster.store import Store
 from clsplat.cluster.task import Terms
@@ -225,3 +226,21 @@ def test_the_engine_of_a_machine_runs_cells_side_by_side_on_loopback_alone(tmp_p
     assert seen == {"127.0.0.1"}
     assert {key: scheduler.dask.config.get(key) for key in before} == before, "what this process had set"
     assert len({event["worker"] for event in store.events() if event["event"] == "start"}) == 1
+
+
+def test_damaged_records_of_a_store_do_not_stop_who_looks(file, runs, tmp_path):
+    commands.run(file, out=tmp_path / "out")
+    store = Store(tmp_path / "store")
+    before = store_status(store.root)
+    (store.root / "events" / "x.jsonl").write_text('3\n[1]\n{"time": "x"}\n{"time": null}\n{"ti')
+    (store.root / "events" / "y.jsonl").mkdir()
+    assert store_status(store.root) == before
+    for damage in ("[1]", '{"pipeline": 3}'):
+        for folder in store.folders():
+            (folder.path / "spec.json").write_text(damage)
+        assert store_status(store.root)["counts"] == before["counts"]
+
+
+def test_a_single_pipeline_has_no_cell_by_number(runs, tmp_path):
+    with pytest.raises(ConfigError, match="leave --index out"):
+        single.run_one("smoke", tmp_path / "store", index=1)
