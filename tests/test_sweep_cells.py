@@ -1,5 +1,6 @@
 """Cells: what names them, how one is run and published once, what stops it, what is removed."""
 
+import errno
 import json
 import os
 import shutil
@@ -12,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from clsplat.cluster import child
-from clsplat.cluster.attempt import LEASE, MANIFEST, Attempt
+from clsplat.cluster.attempt import LEASE, MANIFEST, Attempt, place_copy
 from clsplat.cluster.cell import Cell
 from clsplat.cluster.child import FILE, OUT, PYTHON
 from clsplat.cluster.drive import Drive, Wanted
@@ -23,7 +24,7 @@ from clsplat.cluster.overview import overview_text, store_status
 from clsplat.cluster.probe import Place
 from clsplat.cluster.store import Store
 from clsplat.cluster.task import Outcome, Terms, run_cell
-from clsplat.errors import ConfigError, Interrupted, OutputError
+from clsplat.errors import ConfigError, DeviceError, Interrupted, OutputError
 from clsplat.names import CHECKPOINTS
 from clsplat.pipeline.loading import load
 
@@ -146,6 +147,24 @@ def test_an_exit_code_decides_whether_a_cell_is_tried_again(store, terms, code, 
     assert not (store.folder(CELL.key).path / "failed.json").exists()
 
 
+@pytest.mark.parametrize("times", [1, 9])
+def test_a_result_that_cannot_be_written_counts_as_a_failure(store, terms, monkeypatch, times):
+    faults = [OSError(errno.ENOSPC, "No space left on device")] * times
+
+    def sync(path):
+        if faults:
+            raise faults.pop()
+
+    monkeypatch.setattr("clsplat.cluster.folder.sync_below", sync)
+    outcome = run_cell(CELL, store, command(WRITES), terms)
+    if times == 1:
+        assert (outcome.state, told(store).count("start")) == ("published", 2)
+        return
+    assert (outcome.state, outcome.exit_code, told(store).count("start")) == ("failed", 7, 3)
+    assert "cannot be written (No space left on device)" in outcome.message
+    assert store.folder(CELL.key).failed()["exit_codes"] == [7] * 3
+
+
 def test_a_failure_after_a_newer_checkpoint_does_not_count(few_steps, store, terms):
     saves = "import sys, pathlib, shutil, os; p = pathlib.Path(sys.argv[2], 'checkpoints'); p.mkdir(exist_ok=True)\n"
     saves += f"left = sorted(pathlib.Path({str(few_steps / CHECKPOINTS)!r}).iterdir())\n"
@@ -155,6 +174,16 @@ def test_a_failure_after_a_newer_checkpoint_does_not_count(few_steps, store, ter
     assert count > 1
     assert run_cell(CELL, store, command(saves), replace(terms, retries=2)).state == "failed"
     assert told(store).count("start") == count + 2
+
+
+def test_a_failure_beside_a_newer_checkpoint_that_is_damaged_counts(few_steps, store, terms):
+    old = Attempt(store.add(CELL).path / ATTEMPTS / ("a" * 32))
+    shutil.copytree(few_steps, old.path)
+    newest = max((old.path / CHECKPOINTS).glob("step_*.npz"))
+    newest.write_bytes(newest.read_bytes()[:-100])
+    starts = "import os, sys; sys.exit(2 if len(os.listdir(os.path.dirname(sys.argv[2]))) > 6 else 6)"
+    assert run_cell(CELL, store, command(starts), terms).exit_code == 6
+    assert told(store).count("start") == terms.retries
 
 
 @pytest.mark.parametrize("damage", ["cut", "flipped"])
@@ -226,6 +255,33 @@ def test_a_process_that_was_frozen_until_its_attempt_was_removed_takes_the_resul
     assert told(store) == ["start", "skip"]
 
 
+def test_a_process_that_was_frozen_after_its_run_takes_the_result(store, terms, monkeypatch):
+    folder = store.add(CELL)
+    other = folder.begin("other", terms.since)
+    (other.path / "point_cloud.ply").write_bytes(b"bits")
+    other.manifest()
+
+    def sleeps(cell, attempt):
+        os.rename(other.path, folder.result)
+        shutil.rmtree(attempt.path)
+
+    monkeypatch.setattr("clsplat.cluster.task._require_same_scene", sleeps)
+    outcome = run_cell(CELL, store, command(WRITES), terms)
+    assert (outcome.state, outcome.message) == ("published", "")
+    assert told(store) == ["start", "end", "skip"]
+    assert not folder.attempts()
+
+
+def test_a_copy_of_a_result_gets_its_manifest_last(store, terms, tmp_path, monkeypatch):
+    run_cell(CELL, store, command(WRITES), terms)
+    result, copied = store.folder(CELL.key).result, []
+    for name in "abcdefgh":
+        (result / name).touch()
+    monkeypatch.setattr("clsplat.cluster.attempt.link_or_copy", lambda source, target: copied.append(target.name))
+    place_copy(result, tmp_path / "copy")
+    assert copied[-1] == MANIFEST != copied[-2]
+
+
 def test_attempts_are_removed_by_the_age_of_their_lease_alone(store, terms):
     folder = store.add(CELL)
     old, young = folder.begin("a", terms.since), folder.begin("b", terms.since)
@@ -235,6 +291,9 @@ def test_attempts_are_removed_by_the_age_of_their_lease_alone(store, terms):
     run_cell(CELL, store, command(WRITES), terms)
     assert not old.path.exists()
     assert young.path.is_dir()
+    os.utime(young.path / LEASE, (store.now() - 601, store.now() - 601))
+    run_cell(CELL, store, command(WRITES), terms)
+    assert not young.path.exists(), "the next call finds the result, and that"
 
 
 def test_a_spec_is_never_changed(store):
@@ -304,6 +363,39 @@ def test_in_any_class_a_cell_stays_in_that_it_has_begun_in(store, terms):
     assert {bits for *_, bits in engine.started[1:]} == {"x", "y"}
 
 
+@pytest.mark.parametrize("published", ["x", "y", None])
+def test_of_classes_with_as_many_devices_that_with_most_results_is_taken(store, terms, published):
+    for one in wanted(1, 2) if published else []:
+        run_cell(one.on(published), store, command(WRITES), terms)
+    engine = Fake(*[Outcome("published")] * 3, places=PLACES[1::-1])
+    Drive(store, engine, True, terms).run(wanted(1, 2, 3))
+    assert {bits for *_, bits in engine.started} == {published or "x"}
+
+
+def test_a_sweep_whose_class_has_no_device_any_more_ends_and_names_the_others(store, terms, monkeypatch):
+    monkeypatch.setattr("clsplat.cluster.drive.ALONE", 0.2)
+    drive = Drive(store, Fake(places=PLACES), True, terms, bits="z")
+    looks = iter(range(40))
+    drive.is_stopped = lambda: next(looks) == 39
+    with pytest.raises(DeviceError, match=r"no device of bits class z for .* of x, y; offer one of that class"):
+        drive.run(wanted(1))
+
+
+def test_what_runs_costs_no_look_at_the_cells_that_wait(store, terms, monkeypatch):
+    looks = []
+    suits = Drive._suits
+    monkeypatch.setattr(Drive, "_suits", lambda *values: looks.append(1) or suits(*values))
+    engine = Fake()
+
+    def start(*values):
+        ends = [None, None, Outcome("published")]
+        return type("Ticket", (), {"outcome": lambda self: ends.pop(0)})()
+
+    engine.start = start
+    Drive(store, engine, False, terms).run(wanted(*range(5)))
+    assert len(looks) == 5
+
+
 def test_a_signal_stops_a_sweep(store, terms):
     with pytest.raises(Interrupted, match="with --resume goes on"):
         Drive(store, Fake(), True, terms, is_stopped=lambda: True).run(wanted(1))
@@ -331,6 +423,8 @@ def test_the_state_of_a_store_is_in_its_files(store, terms):
         "new": "waiting",
     }
     text = overview_text(found)
+    store.folder(cells[1].key).begin("w", terms.since)
+    assert store_status(store.root)["counts"] == {"published": 1, "running": 2, "waiting": 1}, "it is tried again"
     assert "1 failed, 1 published, 1 running, 1 waiting" in text
     assert "bad: its process ended with exit code 2" in text
     assert sys.executable not in text

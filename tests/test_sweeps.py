@@ -14,10 +14,11 @@ from clsplat.cluster import engine, single, sweep
 from clsplat.cluster.cell import Cell
 from clsplat.cluster.drive import Drive, Wanted
 from clsplat.cluster.execution import execution_of, values_of
+from clsplat.cluster.overview import store_status
 from clsplat.cluster.probe import Place
 from clsplat.cluster.store import Store
 from clsplat.cluster.task import Terms
-from clsplat.errors import ClsplatError, ConfigError
+from clsplat.errors import ClsplatError, ConfigError, DeviceError
 from clsplat.pipeline.matrix import load_experiment
 from clsplat.runs.experiment import Job
 from tests.test_matrix import STAGES
@@ -67,9 +68,11 @@ def test_the_folder_of_a_matrix_has_what_it_has_without_a_store(file, runs, few_
     assert os.path.samefile(model, result / "point_cloud.ply")
     assert not os.path.samefile(model.with_name("metrics.jsonl"), result / "metrics.jsonl"), "a run appends to it"
     shutil.rmtree(out / "tiny-seed=1")
+    (out / "tiny-seed=0" / "metrics.json").unlink()  # as a kill while it was placed would leave it
     runs["seed"] = "it is not run again"
     assert commands.resume(out) == out, "with the execution that its file names"
-    assert (out / "tiny-seed=1" / "metrics.json").is_file()
+    for cell in ("tiny-seed=0", "tiny-seed=1"):
+        assert (out / cell / "metrics.json").is_file()
     assert [event["event"] for event in store.events()].count("start") == 2
 
 
@@ -140,11 +143,59 @@ def test_a_wrong_execution_is_refused_with_its_line(tmp_path, text, words):
     found = load_experiment(str(file))
     with pytest.raises(ConfigError, match=words):
         execution_of(found.execution, file)
+    with pytest.raises(ConfigError, match=words):
+        commands.describe_run(file, out=tmp_path / "out")
 
 
 def test_a_scheduler_of_this_machine_needs_no_tls():
     for address in ("dask://127.0.0.1:1", "dask://localhost:1"):
         assert execution_of({"engine": address}, Path()).is_local
+
+
+class FakeClient:
+    """The client of a scheduler, with workers by their addresses."""
+
+    def __init__(self, **workers: str) -> None:
+        """workers: the version of the program of each."""
+        self.status = "running"
+        self.info = {"workers": {name: {"name": self.told(code)} for name, code in workers.items()}}
+
+    @staticmethod
+    def told(code: str) -> str:
+        return json.dumps({"host": "h", "device": "d", "bits": "b", "code": code})
+
+    def scheduler_info(self, n_workers):
+        return self.info
+
+    def submit(self, *words, **options):
+        raise RuntimeError("the client is closed")
+
+
+def test_workers_of_another_version_alone_end_a_sweep(tmp_path, monkeypatch):
+    scheduler = pytest.importorskip("clsplat.cluster.scheduler")
+    monkeypatch.setattr(scheduler, "ALONE", -1.0)
+    with pytest.raises(DeviceError, match=r"no worker of this version for .* \(1 of another version get no cells\)"):
+        scheduler.Cluster(FakeClient(old="another"), Store(tmp_path)).places()
+
+
+def test_a_worker_that_is_gone_gets_no_cell(tmp_path):
+    scheduler = pytest.importorskip("clsplat.cluster.scheduler")
+    client = FakeClient(one=scheduler.code_digest())
+    cluster = scheduler.Cluster(client, Store(tmp_path))
+    assert [place.worker for place in cluster.places()] == ["one"]
+    client.info = {"workers": {}}
+    cluster._looked = -scheduler.LOOK
+    assert cluster.places() == []
+
+
+def test_a_scheduler_that_ended_is_told_with_what_to_do(tmp_path):
+    scheduler = pytest.importorskip("clsplat.cluster.scheduler")
+    client = FakeClient()
+    cluster = scheduler.Cluster(client, Store(tmp_path))
+    client.info, client.status = {}, "closed"
+    for call in (cluster.places, lambda: cluster.start(Cell("a", SPEC, ""), PLACE, Terms(0.0))):
+        with pytest.raises(DeviceError, match=r"the scheduler ended; .* with --resume"):
+            call()
 
 
 def listening() -> set[str]:
@@ -161,6 +212,7 @@ def test_the_engine_of_a_machine_runs_cells_side_by_side_on_loopback_alone(tmp_p
     places = [Place("local", "one", "b"), Place("local", "two", "b")]
     monkeypatch.setattr(scheduler, "places", lambda worker, devices: places)
     store, ended, seen = Store(tmp_path / "store"), [], set()
+    before = {key: scheduler.dask.config.get(key) for key in scheduler.SETTINGS}
     cluster = scheduler.engine(execution_of({"engine": "local"}, Path()), store, None)
     try:
         cluster.command_of = lambda device: command(WRITES + f"; print({device!r})")
@@ -172,4 +224,23 @@ def test_the_engine_of_a_machine_runs_cells_side_by_side_on_loopback_alone(tmp_p
         cluster.close()
     assert {cell.name: outcome.state for cell, outcome in ended} == {f"cell {i}": "published" for i in range(4)}
     assert seen == {"127.0.0.1"}
+    assert {key: scheduler.dask.config.get(key) for key in before} == before, "what this process had set"
     assert len({event["worker"] for event in store.events() if event["event"] == "start"}) == 1
+
+
+def test_damaged_records_of_a_store_do_not_stop_who_looks(file, runs, tmp_path):
+    commands.run(file, out=tmp_path / "out")
+    store = Store(tmp_path / "store")
+    before = store_status(store.root)
+    (store.root / "events" / "x.jsonl").write_text('3\n[1]\n{"time": "x"}\n{"time": null}\n{"ti')
+    (store.root / "events" / "y.jsonl").mkdir()
+    assert store_status(store.root) == before
+    for damage in ("[1]", '{"pipeline": 3}'):
+        for folder in store.folders():
+            (folder.path / "spec.json").write_text(damage)
+        assert store_status(store.root)["counts"] == before["counts"]
+
+
+def test_a_single_pipeline_has_no_cell_by_number(runs, tmp_path):
+    with pytest.raises(ConfigError, match="leave --index out"):
+        single.run_one("smoke", tmp_path / "store", index=1)

@@ -242,8 +242,7 @@ def _job(
     start: "Start",
     on: PathLike | None = None,
 ) -> "Job":
-    from clsplat.cluster.execution import values_of
-    from clsplat.runs.experiment import Job
+    from clsplat.cluster.commands import open_job
 
     load_plugins()
-    return Job.open(str(pipeline), path_of(scene), path_of(out), overrides(values), start, values_of(path_of(on)))
+    return open_job(str(pipeline), path_of(scene), path_of(out), overrides(values), start, path_of(on))

@@ -36,6 +36,8 @@ def cells(means: NDArray[np.floating], weights: Floats, count: int) -> list[Cell
 
     A cell of several shares is cut across its longest side.  Raises DataError where so many are not to be had.
     """
+    if not len(means):
+        raise DataError("the coarse model holds no Gaussians; expected one at least")
     weights = weights if weights.any() else np.ones(len(means))
     return _cut(means.astype(np.float64), weights, Box(), count)
 

@@ -7,7 +7,7 @@ import os
 import re
 import shutil
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import asdict
 from functools import cached_property
@@ -31,6 +31,10 @@ BEAT = 10.0  # seconds between two beats of a lease
 Rank = tuple[bool, int]  # of a checkpoint: whether it is of a refit, and its step
 
 
+class LeaseLost(OutputError):
+    """The folder of an attempt was removed while its run went on."""
+
+
 class Attempt:
     """A folder below `attempts`, written by one process."""
 
@@ -44,13 +48,16 @@ class Attempt:
         self._values = {**asdict(Owner.this()), "worker": worker, "since": since, "begun": time.time()}
         self._write()
 
-    def beat(self) -> bool:
-        """Renew the lease where that is due; return False where it is lost, with its folder."""
+    def beat(self) -> None:
+        """Renew the lease where that is due.  Raises LeaseLost."""
         if time.monotonic() - self._last >= BEAT:
-            if not (self.path / LEASE).is_file():
-                return False
+            self.require_lease()
             self._write()
-        return True
+
+    def require_lease(self) -> None:
+        """Raise LeaseLost where its folder was removed."""
+        if not (self.path / LEASE).is_file():
+            raise LeaseLost(f"{self.path}: was removed while its run went on; run the sweep again")
 
     def end(self, exit_code: int) -> None:
         """Note how the run ended; a lost folder stays lost."""
@@ -98,22 +105,12 @@ class Attempt:
                 return path.stat().st_mtime
         return math.inf
 
-    @property
-    def newest(self) -> Rank:
-        """The newest of its checkpoints, whole or not."""
-        return max((_rank_of(path.name) for path in checkpoint.saved(self.path)), default=(False, 0))
-
     def go_on_from(self, others: Iterable["Attempt"]) -> None:
         """Take what the attempt with the newest checkpoint that is whole has written: links where that is possible.
 
         A damaged checkpoint counts as none: the one before it is taken, of whatever attempt.  Raises OutputError.
         """
-        found = [(_rank_of(path.name), path, other) for other in others for path in checkpoint.saved(other.path)]
-        for _, path, other in sorted(found, key=lambda one: one[0], reverse=True):
-            try:
-                checkpoint.load(path)
-            except (DataError, ConfigError):
-                continue
+        for _, path, other in whole(others):
             own = self.path / CHECKPOINTS / path.name
             with told_as(self.path):
                 own.parent.mkdir(exist_ok=True)
@@ -169,6 +166,17 @@ class Attempt:
         return values
 
 
+def whole(attempts: Iterable[Attempt]) -> Iterator[tuple[Rank, Path, Attempt]]:
+    """Yield the checkpoints of attempts that can be read, from the newest on: rank, file, and whose it is."""
+    found = [(_rank_of(path.name), path, one) for one in attempts for path in checkpoint.saved(one.path)]
+    for rank, path, one in sorted(found, key=lambda entry: entry[0], reverse=True):
+        try:
+            checkpoint.load(path)
+        except (DataError, ConfigError):
+            continue
+        yield rank, path, one
+
+
 def _rank_of(name: str) -> Rank:
     found = re.fullmatch(r"(step|refit)_(\d+)\.npz", name)
     return (found[1] == "refit", int(found[2])) if found else (False, 0)
@@ -204,14 +212,27 @@ def bits_of(folder: Path, files: dict[str, str]) -> str:
 
 
 def place_copy(source: Path, target: Path) -> None:
-    """Let a folder hold the files of a result, linked where nothing changes them in place.  Raises OutputError."""
+    """Let a folder hold the files of a result, linked where nothing changes them in place; the manifest comes last.
+
+    Raises OutputError.
+    """
     with told_as(target):
+        (target / MANIFEST).unlink(missing_ok=True)
         for base, _, files in os.walk(source):
             here = target / Path(base).relative_to(source)
             here.mkdir(parents=True, exist_ok=True)
             for name in files:
-                if name in (LEASE, ERRORS) and Path(base) == source:
+                if name in (LEASE, ERRORS, MANIFEST) and Path(base) == source:
                     continue
                 (here / name).unlink(missing_ok=True)
                 copy = shutil.copyfile if name in GROWING else link_or_copy
                 copy(Path(base) / name, here / name)
+        link_or_copy(source / MANIFEST, target / MANIFEST)
+
+
+def is_placed(source: Path, target: Path) -> bool:
+    """Whether a folder holds the files of a result, as `place_copy` leaves them.  Raises DataError."""
+    if not (target / MANIFEST).is_file():
+        return False
+    found = read_json(target / MANIFEST)
+    return bool(found == read_json(source / MANIFEST)) and all((target / name).is_file() for name in found["files"])

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from clsplat.cluster.attempt import ERRORS, PIPELINE_FILE, Attempt
-from clsplat.errors import OutputError
 from clsplat.files import told_as
 
 # Ctrl-C in the terminal is for the supervisor, which passes it on
@@ -22,10 +21,6 @@ POLL = 0.25  # seconds between two looks at a process
 PATIENCE = 90.0  # seconds for the last step and its checkpoint, before the process is killed
 Command = Sequence[str]  # words; these stand for what is known where it runs
 PYTHON, FILE, OUT = "{python}", "{pipeline}", "{out}"
-
-
-class LeaseLost(OutputError):
-    """The folder of an attempt was removed while its run went on."""
 
 
 def run_command(device: str | None, plugins: Sequence[Path] = ()) -> Command:
@@ -73,8 +68,7 @@ def _wait(process: "subprocess.Popen[bytes]", attempt: Attempt, is_stopped: Call
             return process.wait(POLL)
         except subprocess.TimeoutExpired:
             pass
-        if not attempt.beat():
-            raise LeaseLost(f"{attempt.path}: was removed while its run went on; run the sweep again")
+        attempt.beat()
         if told is None and is_stopped():
             told = time.monotonic()
             if process.stdin:

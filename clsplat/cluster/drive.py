@@ -11,9 +11,10 @@ from clsplat.cluster.folder import Different
 from clsplat.cluster.probe import Place
 from clsplat.cluster.store import Store
 from clsplat.cluster.task import Outcome, Terms
-from clsplat.errors import Interrupted
+from clsplat.errors import DeviceError, Interrupted
 
 LOOK = 0.05  # seconds between two looks at what runs
+ALONE = 60.0  # seconds without a device that may run a cell, after which a sweep ends
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,7 @@ class Drive:
     ended: Callable[[Cell, Outcome], None] = lambda cell, outcome: None
     look: Callable[[], None] = lambda: None  # called again and again
     bits: str | None = None  # the class of all cells, once it is chosen
+    _seen: float = field(default_factory=time.monotonic)  # when a device of that class was there last
     _running: dict[Place, tuple[Wanted, Cell, Ticket]] = field(default_factory=dict)
 
     def run(self, wanted: Sequence[Wanted]) -> None:
@@ -65,15 +67,36 @@ class Drive:
         places = self.engine.places()
         classes = [place.bits for place in places]
         if self.is_same and self.bits is None and classes:
-            self.bits = Counter(classes).most_common(1)[0][0]
+            self.bits = self._chosen(classes, waiting)
+        self._require_class(classes)
         for place in places:
-            suited = [i for i, one in enumerate(waiting) if self._suits(one, place.bits, classes)]
-            if place in self._running or not suited:
+            if place in self._running:
                 continue
-            one = waiting.pop(suited[0])
+            suited = next((i for i, one in enumerate(waiting) if self._suits(one, place.bits, classes)), None)
+            if suited is None:
+                continue
+            one = waiting.pop(suited)
             cell = one.on(place.bits)
             self.began(cell)
             self._running[place] = (one, cell, self.engine.start(cell, place, self.terms))
+
+    def _chosen(self, classes: Sequence[str], wanted: Sequence[Wanted]) -> str:
+        """Return the class of most devices; of several that in which most cells are published, then by name."""
+        counts = Counter(classes)
+        most = sorted(own for own in counts if counts[own] == max(counts.values()))
+        return max(most, key=lambda own: sum(self.store.folder(one.on(own).key).result.is_dir() for one in wanted))
+
+    def _require_class(self, classes: Sequence[str]) -> None:
+        """Raise DeviceError where devices are there, but for `ALONE` seconds none of the chosen class."""
+        now = time.monotonic()
+        if not self.is_same or not classes or self.bits in classes or self._running:
+            self._seen = now
+        elif now - self._seen > ALONE:
+            others = ", ".join(sorted({*classes}))
+            raise DeviceError(
+                f"no device of bits class {self.bits} for {ALONE:.0f} s; there are devices of {others}; "
+                "offer one of that class, or set placement: {bits: any}; what was done is in the store"
+            )
 
     def _suits(self, one: Wanted, bits: str, classes: Sequence[str]) -> bool:
         """Whether a cell may run in a class: one that has begun stays in its own, where that has devices now."""

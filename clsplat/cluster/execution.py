@@ -1,17 +1,19 @@
 """How the cells of a matrix are run: the keys of `execution:`, or of a file that `--on` names."""
 
+import logging
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, ValidationError, model_validator
 
-from clsplat.errors import ConfigError
+from clsplat.errors import ConfigError, DeviceError, one_line
 from clsplat.pipeline.explanation import explain, first_fault, place_text
 from clsplat.pipeline.yaml_file import Document, read_yaml
 from clsplat.settings import ReadPath, Settings
 
+LOG = logging.getLogger("clsplat")
 STORE = "runs/store"
-LOOPBACK = ("127.0.0.1", "localhost", "[::1]")
+LOOPBACK = ("127.0.0.1", "localhost")
 
 
 class Placement(Settings):
@@ -113,3 +115,15 @@ def options(values: dict[str, Any]) -> Execution:
     except ValidationError as error:
         place, complaint = first_fault(error, Execution)
         raise ConfigError(f"--scheduler: {place_text(place)}: {complaint}" if place else complaint) from error
+
+
+def warn_of_open_port(execution: Execution) -> None:
+    """Say so where a scheduler elsewhere is reached without TLS."""
+    if execution.insecure:
+        LOG.warning("%s: is not encrypted; whoever reaches the scheduler's port can run code", execution.engine)
+
+
+def unanswered(execution: Execution, error: BaseException) -> DeviceError:
+    """Return the error of a scheduler that cannot be reached."""
+    reason = one_line(error.__cause__ or error) or "no answer"
+    return DeviceError(f"{execution.engine}: cannot be worked with ({reason}); start it with `dask scheduler`")

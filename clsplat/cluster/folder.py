@@ -10,7 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from clsplat.cluster.attempt import LEASE, MANIFEST, Attempt
+from clsplat.cluster.attempt import LEASE, MANIFEST, Attempt, whole
 from clsplat.errors import DataError, OutputError
 from clsplat.files import make_folder, sync_below, sync_folder, told_as, write_text
 from clsplat.reading import read_json
@@ -82,23 +82,28 @@ class CellFolder:
         attempt = Attempt(self.path / ATTEMPTS / uuid.uuid4().hex)
         with told_as(attempt.path):
             make_folder(attempt.path)
+            (self.path / FAILED).unlink(missing_ok=True)  # it is tried again
         attempt.take_lease(worker, since)
         attempt.go_on_from(other for other in self.attempts() if other.path != attempt.path)
         return attempt
 
     def failures(self, since: float) -> list[Attempt]:
-        """Return the attempts of callers since a time that have failed and left no newer checkpoint than now."""
+        """Return the attempts of callers since a time that have failed and left no newer checkpoint that is whole."""
         attempts = self.attempts()
-        newest = max((attempt.newest for attempt in attempts), default=(False, 0))
+        newest = next((rank for rank, *_ in whole(attempts)), (False, 0))
         return [one for one in attempts if one.has_failed and one.since >= since and one.begun_at >= newest]
 
     def publish(self, attempt: Attempt) -> dict[str, Any]:
         """Rename an attempt with its manifest to the result; return the manifest of the result.
 
-        Where another attempt came first, their bits are compared.  Raises Different when they differ.
+        Where another attempt came first, their bits are compared.
+
+        Raises Different when they differ, LeaseLost where the attempt was removed, for its process slept too long.
         """
+        attempt.require_lease()
         ours = attempt.manifest()
-        sync_below(attempt.path)
+        with told_as(attempt.path):
+            sync_below(attempt.path)
         with suppress(OSError):
             os.rename(attempt.path, self.result)
             sync_folder(self.path)

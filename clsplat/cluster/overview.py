@@ -40,10 +40,11 @@ def store_status(root: Path) -> dict[str, Any]:
 
 
 def _cell(folder: CellFolder, name: str, now: float) -> dict[str, Any]:
-    spec: dict[str, Any] = {}
+    spec: Any = {}
     with suppress(DataError):
         spec = read_json(folder.path / SPEC)
-    pipeline = spec.get("pipeline", {})
+    spec = spec if isinstance(spec, dict) and isinstance(spec.get("pipeline"), dict) else {"pipeline": {}}  # damaged
+    pipeline = spec["pipeline"]
     found = {"key": folder.key, "name": name, "pipeline": pipeline.get("name"), "seed": pipeline.get("seed")}
     found |= {"bits": spec.get("bits")}
     if manifest := folder.manifest():

@@ -13,6 +13,7 @@ import tempfile
 from contextlib import redirect_stdout, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from clsplat.caches import cache_folder
 from clsplat.cluster.child import filled, run_command
@@ -63,6 +64,17 @@ class Place:
     device: str  # as `--device` takes it
     bits: str  # its class
     text: str = ""  # what it is
+
+
+def place_of(address: str, worker: dict[str, Any]) -> Place | None:
+    """Return the device that a worker's name tells; None for a worker of another program, or version."""
+    try:
+        values = json.loads(str(worker["name"]))
+        if values["code"] != code_digest():
+            return None
+        return Place(address, str(values["device"]), str(values["bits"]), str(values["host"]))
+    except (ValueError, KeyError, TypeError):
+        return None
 
 
 def places(worker: str, devices: list[str] | None = None) -> list[Place]:

@@ -10,21 +10,23 @@ import logging
 import threading
 import time
 import uuid
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 from clsplat.cluster.cell import Cell
 from clsplat.cluster.child import PATIENCE, run_command
+from clsplat.cluster.drive import ALONE
 from clsplat.cluster.engine import Lost, Ticket
-from clsplat.cluster.execution import Execution, Tls
+from clsplat.cluster.execution import Execution, Tls, unanswered, warn_of_open_port
 from clsplat.cluster.fingerprint import code_digest
 from clsplat.cluster.plugin_files import plugin_files
-from clsplat.cluster.probe import Place, places
+from clsplat.cluster.probe import Place, place_of, places
 from clsplat.cluster.store import Store
 from clsplat.cluster.task import Outcome, Terms, run_cell
-from clsplat.errors import ConfigError, DeviceError, InternalError, Interrupted, one_line
+from clsplat.errors import ConfigError, DeviceError, InternalError, Interrupted
 from clsplat.signals import stopping_on_signals
 
 try:
@@ -35,7 +37,6 @@ except ImportError:
 
 LOG = logging.getLogger("clsplat")
 LOOK = 5.0  # seconds between two looks at the workers
-ALONE = 60.0  # seconds without a worker after which a sweep ends
 LOOPBACK = "127.0.0.1"
 ANSWER = 20.0  # seconds that a scheduler may take to answer
 SETTINGS = {
@@ -58,7 +59,14 @@ def work(cell: str, store: str, command: list[str], terms: str) -> str:
 
 def engine(execution: Execution, store: Store, devices: list[str] | None) -> "Cluster":
     """Return the engine that `execution` names.  Raises DeviceError where there are no devices."""
-    dask.config.set(SETTINGS)
+    with ExitStack() as held:
+        held.enter_context(dask.config.set(SETTINGS))  # until the engine is closed
+        cluster = _engine(execution, store, devices)
+        cluster.settings = held.pop_all()
+        return cluster
+
+
+def _engine(execution: Execution, store: Store, devices: list[str] | None) -> "Cluster":
     if execution.engine == "local":
         found = places("local", devices)
         cluster = distributed.LocalCluster(
@@ -77,16 +85,15 @@ def engine(execution: Execution, store: Store, devices: list[str] | None) -> "Cl
             execution.address, security=security(execution.tls), set_as_default=False, timeout=ANSWER
         )
     except OSError as error:
-        raise _unanswered(execution, error) from None
+        raise unanswered(execution, error) from None
     return Cluster(client, store)
 
 
 def serve(execution: Execution, found: Sequence[Place]) -> None:
     """Let a process a device work for a scheduler, until that ends or a signal comes.  Raises DeviceError."""
-    dask.config.set(SETTINGS)
     warn_of_open_port(execution)
     stop = threading.Event()
-    with stopping_on_signals(stop.set):
+    with dask.config.set(SETTINGS), stopping_on_signals(stop.set):
         asyncio.run(_serve(execution, found, stop))
     if stop.is_set():
         raise Interrupted("stopped; cells that ran here go on elsewhere")
@@ -100,7 +107,6 @@ async def _serve(execution: Execution, found: Sequence[Place], stop: threading.E
         distributed.Nanny(
             execution.address,
             name=json.dumps({"host": place.worker, "device": place.device, "bits": place.bits, "code": code_digest()}),
-            resources={f"bits:{place.bits}": 1},
             dashboard_address=f"{LOOPBACK}:0",
             silence_logs=logging.CRITICAL,
             **options,
@@ -110,21 +116,10 @@ async def _serve(execution: Execution, found: Sequence[Place], stop: threading.E
     try:
         await asyncio.wait_for(asyncio.gather(*nannies), ANSWER)
     except (OSError, TimeoutError, RuntimeError) as error:
-        raise _unanswered(execution, error) from None
+        raise unanswered(execution, error) from None
     while not stop.is_set() and any(nanny.status is distributed.Status.running for nanny in nannies):
         await asyncio.sleep(0.2)
     await asyncio.gather(*(nanny.close(timeout=5) for nanny in nannies))
-
-
-def warn_of_open_port(execution: Execution) -> None:
-    """Say so where a scheduler elsewhere is reached without TLS."""
-    if execution.insecure:
-        LOG.warning("%s: is not encrypted; whoever reaches the scheduler's port can run code", execution.engine)
-
-
-def _unanswered(execution: Execution, error: BaseException) -> DeviceError:
-    reason = one_line(error.__cause__ or error) or "no answer"
-    return DeviceError(f"{execution.engine}: cannot be worked with ({reason}); start it with `dask scheduler`")
 
 
 def security(tls: Tls | None) -> Any:
@@ -169,10 +164,14 @@ class Cluster:
         self._places: list[Place] = []
         self._tickets: list[_Future] = []
         self.addresses: set[str] = set()
+        self.settings = ExitStack()  # of Dask, which end with the cluster
         self.command_of = lambda device: run_command(device, plugin_files())
 
     def places(self) -> list[Place]:
-        """Return the devices whose workers live.  Raises DeviceError where there were none for a minute."""
+        """Return the devices whose workers live.
+
+        Raises DeviceError where the scheduler ended, or no worker of this version was there for a minute.
+        """
         now = time.monotonic()
         if now - self._looked >= LOOK or (not self._places and now - self._looked >= 0.5):
             self._looked = now
@@ -180,32 +179,46 @@ class Cluster:
         return self._places
 
     def _look(self, now: float) -> None:
-        workers = self._client.scheduler_info(n_workers=-1)["workers"]
+        with self._needs_scheduler():
+            workers = self._client.scheduler_info(n_workers=-1)["workers"]
         self.addresses = set(workers)
         if self._cluster and self._found and len(workers) < len(self._found):
             self._cluster.scale(len(self._found))  # a worker that dies while it starts is not started again by itself
-        if workers:
+        known = [one for address, worker in workers.items() if (one := place_of(address, worker))]
+        self._places = known if self._found is None else self._found if workers else []
+        if self._places:
             self._seen = now
-            self._places = self._found or [one for address, w in workers.items() if (one := place_of(address, w))]
         elif now - self._seen > ALONE:
+            others = f" ({len(workers)} of another version get no cells)" if workers else ""
             raise DeviceError(
-                f"no worker for {ALONE:.0f} s; start some with `clsplat worker --scheduler ADDRESS`; what was done is "
-                "in the store"
+                f"no worker of this version for {ALONE:.0f} s{others}; start some with `clsplat worker --scheduler "
+                "ADDRESS`; what was done is in the store"
             )
+
+    @contextmanager
+    def _needs_scheduler(self) -> Iterator[None]:
+        """Raise DeviceError where the block fails, for the scheduler is gone: its client has given up."""
+        try:
+            yield
+        except Exception as error:  # of which type depends on the moment
+            if isinstance(error, OSError) or self._client.status in ("closing", "closed"):
+                raise DeviceError("the scheduler ended; start it, and run the sweep again with --resume") from error
+            raise
 
     def start(self, cell: Cell, place: Place, terms: Terms) -> Ticket:
         own = replace(terms, worker=place.worker, sweep=self._sweep)
         address = None if self._cluster else place.worker
-        future = self._client.submit(
-            work,
-            cell.json(),
-            str(self._store.root),
-            list(self.command_of(place.device)),
-            json.dumps(asdict(own)),
-            key=f"{cell.name}-{uuid.uuid4().hex[:8]}",
-            workers=[address] if address else None,
-            pure=False,
-        )
+        with self._needs_scheduler():
+            future = self._client.submit(
+                work,
+                cell.json(),
+                str(self._store.root),
+                list(self.command_of(place.device)),
+                json.dumps(asdict(own)),
+                key=f"{cell.name}-{uuid.uuid4().hex[:8]}",
+                workers=[address] if address else None,
+                pure=False,
+            )
         ticket = _Future(self, future, address)
         self._tickets = [*(one for one in self._tickets if not one.is_over), ticket]
         return ticket
@@ -219,21 +232,11 @@ class Cluster:
             time.sleep(0.1)
         if self._pending:
             LOG.warning("some cells did not end in %.0f s", PATIENCE)
-        self._client.close()
-        if self._cluster:
-            self._cluster.close()
+        with self.settings:
+            self._client.close()
+            if self._cluster:
+                self._cluster.close()
 
     @property
     def _pending(self) -> "list[_Future]":
         return [one for one in self._tickets if not one.is_over and one.future.status == "pending"]
-
-
-def place_of(address: str, worker: dict[str, Any]) -> Place | None:
-    """Return the device that a worker's name tells; None for a worker of another program, or version."""
-    try:
-        values = json.loads(str(worker["name"]))
-        if values["code"] != code_digest():
-            return None
-        return Place(address, str(values["device"]), str(values["bits"]), str(values["host"]))
-    except (ValueError, KeyError, TypeError):
-        return None

@@ -35,6 +35,8 @@ def run_one(
     """
     experiment = load_experiment(pipeline, overrides)
     if experiment is None:
+        if index:
+            raise ConfigError(f"{pipeline}: is a single pipeline, which has no cell {index}; leave --index out")
         checked = load(pipeline, list(overrides))
         cells = [MatrixCell(checked.settings.name, checked)]
         experiment = Experiment(checked.path, checked.settings.name, "", cells)

@@ -85,12 +85,13 @@ class Store:
 
     def events(self) -> list[dict[str, Any]]:
         """Return what all processes have told, in order of time; a line that a crash has cut is left out."""
-        found = []
+        found: list[dict[str, Any]] = []
         for path in (self.root / EVENTS).glob("*.jsonl"):
-            for line in read_file(path).decode(errors="replace").splitlines():
+            for line in read_file(path).decode(errors="replace").splitlines() if path.is_file() else ():
                 with suppress(ValueError):
-                    found.append(json.loads(line))
-        return sorted(found, key=lambda event: float(event.get("time", 0)))
+                    event = json.loads(line)
+                    found += [event] if isinstance(event, dict) and isinstance(event.get("time"), float | int) else []
+        return sorted(found, key=lambda event: float(event["time"]))
 
     def note_sweep(self, name: str, keys: Mapping[str, str]) -> None:
         """Write the cells of a matrix, by name, for those who look at the store."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from clsplat import terminal
-from clsplat.cluster.attempt import MANIFEST, place_copy
+from clsplat.cluster.attempt import is_placed, place_copy
 from clsplat.cluster.cell import Cell
 from clsplat.cluster.drive import Drive, Wanted
 from clsplat.cluster.engine import Engine, Inline
@@ -25,7 +25,6 @@ from clsplat.pipeline import matrix
 from clsplat.pipeline.loading import Pipeline
 from clsplat.pipeline.matrix import Experiment
 from clsplat.prepare.cache import plan, prepare
-from clsplat.reading import read_json
 from clsplat.runs import folders
 from clsplat.runs.experiment import check_matrix_folder, compare, first_of
 from clsplat.runs.failures import failures_recorded
@@ -194,7 +193,7 @@ class _Sweep:
         """Put a result into the folder of the matrix, unless it is there."""
         result, here = self.store.folder(cell.key).result, self.status.out / cell.name
         try:
-            if (here / MANIFEST).is_file() and read_json(here / MANIFEST) == read_json(result / MANIFEST):
+            if is_placed(result, here):
                 return
             self.status.require_held()
             place_copy(result, here)

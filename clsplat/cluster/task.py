@@ -7,12 +7,12 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Literal
 
-from clsplat.cluster.attempt import PIPELINE_FILE, Attempt
+from clsplat.cluster.attempt import PIPELINE_FILE, Attempt, LeaseLost
 from clsplat.cluster.cell import Cell
-from clsplat.cluster.child import Command, LeaseLost, supervise
+from clsplat.cluster.child import Command, supervise
 from clsplat.cluster.folder import ATTEMPTS, CellFolder, Different
 from clsplat.cluster.store import Store
-from clsplat.errors import ClsplatError, ConfigError, DataError, Interrupted, MemoryLimitError, one_line
+from clsplat.errors import ClsplatError, ConfigError, DataError, Interrupted, MemoryLimitError, OutputError, one_line
 from clsplat.files import make_folder, write_text
 from clsplat.names import INPUTS, NOTE, PREPARED
 from clsplat.reading import read_json
@@ -65,6 +65,7 @@ def _run_cell(cell: Cell, store: Store, command: Command, terms: Terms, is_stopp
     while True:
         if found := folder.published():
             store.tell("skip", cell=cell.key, worker=terms.worker)
+            folder.collect(store.now())
             return Outcome("published", str(found["bits"]))
         if stopped():
             return Outcome("stopped", "", Interrupted.exit_code, "stopped")
@@ -75,19 +76,25 @@ def _run_cell(cell: Cell, store: Store, command: Command, terms: Terms, is_stopp
         _equip(cell, store, folder, attempt)
         try:
             code = supervise(attempt, command, stopped)
+            store.tell("end", cell=cell.key, attempt=attempt.path.name, exit_code=code)
+            if code == 0:
+                _require_same_scene(cell, attempt)
+                return _published(store, folder, attempt)
+            message = attempt.message(code)
         except LeaseLost:
             if folder.published():  # by another process, while this one was frozen
                 continue
             raise
-        store.tell("end", cell=cell.key, attempt=attempt.path.name, exit_code=code)
-        if code == 0:
-            _require_same_scene(cell, attempt)
-            return _published(store, folder, attempt)
+        except Different:
+            raise
+        except OutputError as error:  # of its result: as if the run had not been able to write
+            code, message = error.exit_code, one_line(error)
+            attempt.end(code)
         if stopped():
             return Outcome("stopped", "", Interrupted.exit_code, "stopped, its state is saved")
         if code in FINAL or len(folder.failures(terms.since)) >= terms.retries:
-            return _given_up(folder, store, code, attempt.message(code))
-        LOG.warning("cell %s: %s; it is tried again", cell.name, attempt.message(code))
+            return _given_up(folder, store, code, message)
+        LOG.warning("cell %s: %s; it is tried again", cell.name, message)
 
 
 def _equip(cell: Cell, store: Store, folder: CellFolder, attempt: Attempt) -> None:

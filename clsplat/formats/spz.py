@@ -30,6 +30,7 @@ from clsplat.formats.splats import (
     Writing,
     flip,
     flipped,
+    require_moderate,
     require_some,
 )
 from clsplat.formats.spz_planes import EXTENSIONS, HEADER, MAGIC, MIP, Header, fraction_of, packed, unpacked
@@ -64,6 +65,7 @@ def write_spz(path: Path, splats: SplatFile, options: Writing) -> str:
     Raises OutputError; DataError where positions are too large.
     """
     require_some(path, splats)
+    require_moderate(path, splats, "SPZ")  # one value that is not finite would spoil the harmonics of all
     p = splats.rows(morton_order(splats.parameters["means"])).parameters
     fraction = fraction_of(path, p["means"], options.quality == "high")
     planes = packed(path, flipped(p) if options.axes == "spz" else p, fraction, options)

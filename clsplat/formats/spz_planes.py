@@ -144,12 +144,12 @@ def packed(path: Path, p: Parameters, fraction: int, options: Writing) -> list[b
         "alphas": 255 * opacities(p["logit_opacity"]),
         "colours": 255 * (COLOUR * p["sh_base"].astype(np.float64) + 0.5),
         "scales": 16 * (p["log_scales"].astype(np.float64) + 10),
-        "harmonics": _rounded_sh(p["sh_rest"], sh_steps, options.sh_bits) + 128,
     }
     tell_cut(path, "SPZ", "harmonics from -1 to 1", np.abs(p["sh_rest"]) > 1)
     tell_cut(path, "SPZ", "colours from -0.44 to 1.44", beyond_bytes(cut["colours"]))
     tell_cut(path, "SPZ", "scales from 4.5e-05 to 379", beyond_bytes(cut["scales"]))
-    alphas, colours, scales, harmonics = (np.clip(np.rint(v), 0, 255).astype(np.uint8).tobytes() for v in cut.values())
+    alphas, colours, scales = (np.clip(np.rint(v), 0, 255).astype(np.uint8).tobytes() for v in cut.values())
+    harmonics = _rounded_sh(p["sh_rest"], sh_steps, options.sh_bits).tobytes()
     positions = _fixed(p, fraction, SMALLEST_SHARE[options.quality])
     return [positions, alphas, colours, scales, _rotations(p["quats"], TURN_STEP[options.quality]), harmonics]
 
@@ -185,12 +185,13 @@ def _sh_steps(p: Parameters, options: Writing) -> NDArray[np.float32]:
 
 def _rounded_sh(
     rest: NDArray[np.float32], sh_steps: NDArray[np.float32], bits: tuple[int, int] | None
-) -> NDArray[np.float64]:
-    """Harmonics as levels from -128 to 127: multiples of each Gaussian's step, or of 2^(8 - bits)."""
-    levels = 128 * np.clip(rest.astype(np.float64), -1, 1)
+) -> NDArray[np.uint8]:
+    """Harmonics as levels, 128 for 0: multiples of each Gaussian's step, or of 2^(8 - bits)."""
+    levels = np.clip(rest, -1, 1) * np.float32(128)
     if bits is None and sh_steps.max(initial=1) > 1:
-        found = rounded_rows(levels, sh_steps, visible_form(rest))
-        return np.asarray(np.clip(found, -128, 128 - sh_steps[:, None]), np.float64)
-    columns = np.full(rest.shape[1], 2.0 ** (8 - (bits or WHOLE)[1]))
-    columns[:9] = 2.0 ** (8 - (bits or WHOLE)[0])
-    return np.asarray(np.rint(levels / columns) * columns)
+        found = np.minimum(rounded_rows(levels, sh_steps, visible_form(rest)), 128 - sh_steps[:, None])
+    else:
+        columns = np.full(rest.shape[1], 2.0 ** (8 - (bits or WHOLE)[1]), np.float32)
+        columns[:9] = 2.0 ** (8 - (bits or WHOLE)[0])
+        found = np.rint(levels / columns) * columns
+    return np.asarray(np.clip(found + 128, 0, 255), np.uint8)

@@ -13,15 +13,18 @@ LOG = logging.getLogger("clsplat")
 
 
 def drawn_backgrounds(setting: Behind, run: Run) -> Backgrounds | None:
-    """Return the colours that steps draw, or None where all have that of the scene; `transparent` asks the first
-    training photograph.
+    """Return the colours that steps draw, or None where all have that of the scene.
+
+    For `transparent` the first training photograph decides.
 
     The photographs of the run keep their transparency for them.  Raises ConfigError for a model with a sky.
     """
     if setting == "transparent":
         shows = load_transparency(run.scene.split("train")[0]) is not None
         setting = "random" if shows else "scene"
-        LOG.info("background of the steps: %s, since photographs are %s", setting, "transparent" if shows else "opaque")
+        LOG.info(
+            "background of the steps: %s, since the first photograph is %stransparent", setting, "" if shows else "not "
+        )
     if setting == "scene":
         return None
     if run.sky:

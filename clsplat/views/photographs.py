@@ -31,9 +31,7 @@ class Photograph:
     colours: Array  # [3, height, width] uint8
     mask: Array | None = None  # [1, height, width] uint8, 1 in pixels that count; None: all count
     empty: bool = False  # whether the mask leaves out every pixel
-    transparency: Array | None = (
-        None  # [1, height, width] uint8, 255 where the background alone is seen; None: not kept
-    )
+    transparency: Array | None = None  # [1, height, width] uint8, 255: the background alone; None: opaque, or not kept
 
     @property
     def nbytes(self) -> int:

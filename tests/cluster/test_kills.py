@@ -10,6 +10,8 @@ import socket
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import psutil
@@ -96,27 +98,58 @@ def test_a_signal_saves_and_the_same_command_goes_on_elsewhere(tiny_scene, tmp_p
     assert any(event.get("from") for event in sweep.store.events()), "it went on from a checkpoint"
 
 
-def test_cells_go_on_when_a_worker_of_a_scheduler_is_gone_and_another_comes(tiny_scene, tmp_path, expected):
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+@contextmanager
+def scheduler(port: int, processes: list["subprocess.Popen[str]"]) -> Iterator["subprocess.Popen[bytes]"]:
+    """A scheduler on a port; at the end all processes are ended, and it as the last."""
     words = ["-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", str(port), "--no-dashboard"]
-    processes = [subprocess.Popen([sys.executable, *words], stderr=subprocess.DEVNULL)]
-    offer = [sys.executable, "-m", "clsplat", "worker", "--scheduler", f"dask://127.0.0.1:{port}"]
-    sweep = Sweep(tmp_path, tiny_scene, CELLS, f"dask://127.0.0.1:{port}")
+    process = subprocess.Popen([sys.executable, *words], stderr=subprocess.DEVNULL)
     try:
         time.sleep(5)  # until it listens
-        processes.append(subprocess.Popen(offer))
-        command = sweep.start()
-        processes.append(command)
+        yield process
+    finally:
+        for one in (*reversed(processes), process):
+            one.terminate()
+            one.wait(60)
+
+
+def free_port() -> int:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return int(free.getsockname()[1])
+
+
+def offer(port: int) -> "subprocess.Popen[str]":
+    words = [sys.executable, "-m", "clsplat", "worker", "--scheduler", f"dask://127.0.0.1:{port}"]
+    return subprocess.Popen(words, text=True)
+
+
+def test_cells_go_on_when_a_worker_of_a_scheduler_is_gone_and_another_comes(tiny_scene, tmp_path, expected):
+    port, processes = free_port(), []
+    sweep = Sweep(tmp_path, tiny_scene, CELLS, f"dask://127.0.0.1:{port}")
+    with scheduler(port, processes):
+        processes += [offer(port), sweep.start()]
         until(lambda: bool(sweep.saved()))
-        kill([*psutil.Process(processes[1].pid).children(recursive=True), psutil.Process(processes[1].pid)])
-        processes.append(subprocess.Popen(offer))
-        errors = command.communicate()[1]
-        assert command.returncode == 0, errors
+        kill([*psutil.Process(processes[0].pid).children(recursive=True), psutil.Process(processes[0].pid)])
+        processes.append(offer(port))
+        errors = processes[1].communicate()[1]
+        assert processes[1].returncode == 0, errors
         assert sweep.models() == expected
         assert sweep.events("publish") == CELLS
-    finally:
-        for process in reversed(processes):
-            process.terminate()
-            process.wait(60)
+
+
+def test_a_scheduler_that_is_killed_ends_a_sweep_which_goes_on_with_another(tiny_scene, tmp_path, expected):
+    port, processes = free_port(), []
+    sweep = Sweep(tmp_path, tiny_scene, CELLS, f"dask://127.0.0.1:{port}")
+    with scheduler(port, processes) as first:
+        processes += [offer(port), sweep.start()]
+        until(lambda: bool(sweep.saved()))
+        first.kill()
+        errors = processes[1].communicate(timeout=200)[1]
+        assert processes[1].returncode == 4, errors
+        assert "the scheduler ended; start it, and run the sweep again with --resume" in errors
+    until(lambda: not left_behind(), 90)
+    with scheduler(port, processes):
+        processes += [offer(port), sweep.start()]
+        errors = processes[-1].communicate()[1]
+        assert processes[-1].returncode == 0, errors
+        assert sweep.models() == expected
