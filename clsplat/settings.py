@@ -13,6 +13,7 @@ import pkgutil
 import textwrap
 import typing
 from collections.abc import Callable, Iterable
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeVar
 
 from pydantic import (
@@ -45,6 +46,11 @@ class Settings(BaseModel):
     @classmethod
     def __pydantic_init_subclass__(cls, **options: Any) -> None:
         Settings.defined.append(cls)
+
+    def place_of(self, key: str, scene: str | None) -> Path | None:
+        """Return the file or folder that is read where a key names one, else None.  scene: folder of the dataset."""
+        value = getattr(self, key)
+        return Path(value) if isinstance(value, str) and is_read(type(self), key) else None
 
     @classmethod
     def __get_pydantic_json_schema__(cls, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:

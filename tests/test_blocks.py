@@ -118,6 +118,19 @@ def test_killed_and_missing_blocks_go_on_with_equal_bits(trained, tiny_scene, fe
     assert (out / "partition.json").read_bytes() == (trained[0] / "partition.json").read_bytes()
 
 
+def test_a_folder_of_blocks_and_its_scene_can_move(trained, tiny_scene, few_steps, tmp_path):
+    scene, out = tmp_path / "scene", tmp_path / "moved"
+    shutil.copytree(tiny_scene, scene)
+    shutil.copytree(trained[0], out)
+    for name in ("metrics.json", "checksums.json", "point_cloud.ply", "checkpoints/step_000012.npz"):
+        (out / "block_01" / name).unlink()
+    train(scene, few_steps, out, blocks=COUNT, sight=NEVER)
+    assert "resumed at step 8" in (out / "block_01" / "log.txt").read_text()
+    assert "resumed at step 12" in (out / "block_00" / "log.txt").read_text()
+    for name in ("merged.ply", "merged/point_cloud.ply", "partition.json"):
+        assert (out / name).read_bytes() == (trained[0] / name).read_bytes()
+
+
 def test_what_is_done_is_left_alone(trained, tiny_scene, few_steps, monkeypatch):
     monkeypatch.setattr("clsplat.tuning.tuning.run_pipeline", lambda *_: pytest.fail("a run begins"))
     again = train(tiny_scene, few_steps, trained[0], blocks=COUNT, sight=NEVER)

@@ -12,7 +12,8 @@ from typer.testing import CliRunner
 import clsplat
 from clsplat.cli import app
 from clsplat.errors import ConfigError, DataError, Interrupted, OutputError
-from clsplat.formats.table import bytes_of, read
+from clsplat.formats.model_files import bytes_of
+from clsplat.formats.table import read
 from clsplat.gaussians.sky import Sky
 from clsplat.lod import levels
 from clsplat.lod.decimation import decimated

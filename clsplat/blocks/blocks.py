@@ -1,6 +1,7 @@
 """A scene trained in blocks by one command: a coarse model, its partition, runs of blocks, the merged model."""
 
 import hashlib
+import json
 import logging
 from dataclasses import dataclass, field
 from fractions import Fraction
@@ -11,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.blocks.partition import SIGHT, Block, Partition, Partitioner
-from clsplat.blocks.pipelines import of_block, of_coarse, of_merged, require_divisible
+from clsplat.blocks.pipelines import of_block, of_coarse, of_merged, require_divisible, without_start
 from clsplat.conformance.quick import open_correct
 from clsplat.errors import ClsplatError, ConfigError, DataError, Interrupted, amount, as_clsplat_error, one_line, quoted
 from clsplat.formats.ply_joining import join_plys
@@ -21,6 +22,7 @@ from clsplat.gaussians.run_model import as_trained, model_at
 from clsplat.names import METRICS
 from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import Pipeline, load
+from clsplat.pipeline.places import placeless
 from clsplat.reading import read_json, sha256
 from clsplat.runs.scenes import read_run_scene
 from clsplat.runs.source import as_setting, photographs_of, require_model
@@ -77,11 +79,12 @@ class Blocks:
 
     def question(self) -> dict[str, Any]:
         """Return what the folder belongs to."""
-        pipelines = {"pipeline": self.pipeline, **({"coarse": self.coarse} if self.coarse else {})}
-        texts = {name: hashlib.sha256(one.text().encode()).hexdigest() for name, one in pipelines.items()}
+        pipelines = {"pipeline": without_start(self.pipeline), **({"coarse": self.coarse} if self.coarse else {})}
+        texts = {name: json.dumps(placeless(one), sort_keys=True) for name, one in pipelines.items()}
+        digests = {name: hashlib.sha256(text.encode()).hexdigest() for name, text in texts.items()}
         asked = {"blocks": self.plan.blocks, "sight": self.plan.sight, "steps": self.plan.steps}
         model = {"model": sha256(self.given)} if self.given else {}
-        return {**asked, "photographs": self.scene.identity.digest, **model, **texts}
+        return {**asked, "photographs": self.scene.identity.digest, **model, **digests}
 
     def partition(self) -> Partition:
         """Train the coarse model where that is not done, and cut it; write the manifest."""
@@ -120,7 +123,9 @@ class Blocks:
         if failures:
             name, first = next(iter(failures.items()))
             told = f"{len(failures)} of {len(pipelines)} blocks failed; the first, {name}: {first}"
-            whole = ClsplatError(f"{told}; the same command trains them again, and leaves the others alone")
+            whole = ClsplatError(
+                f"{told}; when that is mended, the same command trains them, and leaves the others alone"
+            )
             whole.exit_code = first.exit_code
             raise whole
         return files

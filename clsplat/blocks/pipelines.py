@@ -72,6 +72,13 @@ def of_coarse(coarse: Pipeline, pipeline: Pipeline) -> Pipeline:
     return checked(coarse.path, Document({**coarse.resolved(), **same}))
 
 
+def without_start(pipeline: Pipeline) -> Pipeline:
+    """Return the pipeline without the file of its first model."""
+    first, *others = pipeline.stages
+    stages = [first.model_copy(update={"file": None}), *others]
+    return replace(pipeline, settings=pipeline.settings.model_copy(update={"stages": stages}))
+
+
 def _shared(settings: PipelineFile, share: Fraction) -> PipelineFile:
     """Settings with a share of the steps, and rates that are larger as its root is smaller.
 

@@ -2,7 +2,8 @@
 
 import hashlib
 import json
-from collections.abc import Iterator
+import zlib
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
@@ -10,6 +11,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+import data_tools
 from clsplat import __version__, resource_dir
 from clsplat.errors import ClsplatError, DataError
 from clsplat.files import write_text
@@ -22,7 +24,9 @@ from clsplat.scene.identity import Identity
 from clsplat.scene.view import NO_FILE
 
 KEPT = 16  # hexadecimal digits of a hash
-LIBRARIES = ("numpy", "scipy", "opencv-contrib-python-headless")  # that decode photographs and place Gaussians
+# decode photographs, place Gaussians, and compress models: OpenCV has libwebp
+LIBRARIES = ("numpy", "scipy", "opencv-contrib-python-headless", "zstandard")
+PACKAGE = Path(__file__).resolve().parents[1]
 
 
 @dataclass(frozen=True)
@@ -36,16 +40,38 @@ class Known:
 @cache
 def code_digest() -> str:
     """Return a hash of the program: the package, its kernels, and the libraries that decide over bits."""
-    state = hashlib.sha256(__version__.encode())
-    package = Path(__file__).resolve().parents[1]
-    kernels = resource_dir("cl_kernels")
-    for root, patterns in ((package, ("*.py",)), (kernels, ("*.cl", "*.h"))):
-        for path in sorted(path for pattern in patterns for path in root.rglob(pattern)):
-            state.update(f"{path.relative_to(root).as_posix()} {sha256(path)}\n".encode())
-    for name in LIBRARIES:
+    own = [*_sources(PACKAGE, "*.py"), *_sources(resource_dir("cl_kernels"), "*.cl", "*.h")]
+    return _digest([__version__, *own, *_versions(*LIBRARIES), f"zlib {zlib.ZLIB_RUNTIME_VERSION}", _builtin_zstd()])
+
+
+@cache
+def tools_digest() -> str:
+    """Return a hash of what else decides over the bits of scenes that `prepare` makes."""
+    return _digest([*_sources(Path(data_tools.__file__).resolve().parent, "*.py"), *_versions("pycolmap")])
+
+
+def _sources(root: Path, *patterns: str) -> list[str]:
+    paths = sorted(path for pattern in patterns for path in root.rglob(pattern))
+    return [f"{path.relative_to(root).as_posix()} {sha256(path)}" for path in paths]
+
+
+def _versions(*names: str) -> Iterator[str]:
+    for name in names:
         with suppress(PackageNotFoundError):
-            state.update(f"{name} {version(name)}\n".encode())
-    return state.hexdigest()[:KEPT]
+            yield f"{name} {version(name)}"
+
+
+def _builtin_zstd() -> str:
+    """The Zstandard of Python itself, from 3.14 on."""
+    with suppress(ImportError):
+        from compression import zstd
+
+        return f"zstd {zstd.zstd_version}"
+    return ""
+
+
+def _digest(parts: Iterable[str]) -> str:
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:KEPT]
 
 
 class Scenes:

@@ -9,11 +9,11 @@ from pathlib import Path
 
 from clsplat import terminal
 from clsplat.cluster.attempt import is_placed, place_copy
-from clsplat.cluster.cell import Cell, placeless
+from clsplat.cluster.cell import Cell
 from clsplat.cluster.drive import Drive, Wanted
 from clsplat.cluster.engine import Engine, Inline
 from clsplat.cluster.execution import Execution
-from clsplat.cluster.fingerprint import Scenes, code_digest
+from clsplat.cluster.fingerprint import Scenes
 from clsplat.cluster.probe import places
 from clsplat.cluster.progress import Watched
 from clsplat.cluster.store import Store
@@ -105,8 +105,7 @@ def wanted_cell(cell: matrix.Cell, scenes: Scenes, store: Store) -> Wanted:
         folder = settings.scene.folder
         prepare(plan(settings.prepare, folder, store.prepared), folder, store.prepared)
     known = scenes.known(cell.pipeline)
-    spec = {"pipeline": placeless(cell.pipeline), "scene": known.digest, "code": code_digest(), "bits": ""}
-    return Wanted(Cell(cell.name, spec, cell.pipeline.text()), steps_of(cell.pipeline) * known.pixels)
+    return Wanted(Cell.of(cell.name, cell.pipeline, known.digest, bits=""), steps_of(cell.pipeline) * known.pixels)
 
 
 def steps_of(pipeline: Pipeline) -> int:

@@ -69,6 +69,7 @@ def _run_cell(cell: Cell, store: Store, command: Command, terms: Terms, is_stopp
             return Outcome("published", str(found["bits"]))
         if stopped():
             return Outcome("stopped", "", Interrupted.exit_code, "stopped")
+        cell.require_files()
         attempt = folder.begin(terms.worker, terms.since)
         begun_from = attempt.lease.get("from")
         store.tell("start", cell=cell.key, attempt=attempt.path.name, worker=terms.worker, **{"from": begun_from})
@@ -107,7 +108,8 @@ def _equip(cell: Cell, store: Store, folder: CellFolder, attempt: Attempt) -> No
 
 
 def _require_same_scene(cell: Cell, attempt: Attempt) -> None:
-    """Raise DataError where the photographs are not those that the cell was named by."""
+    """Raise DataError where the photographs, or other files, are not those that the cell was named by."""
+    cell.require_files()
     for name, key in ((NOTE, "inputs"), (INPUTS, "digest")):
         if not (attempt.path / name).is_file():
             continue

@@ -12,9 +12,10 @@ from clsplat.compress.rungs import Ladder, checked_keeps
 from clsplat.compress.target import Point, Target
 from clsplat.errors import ConfigError, quoted
 from clsplat.files import write_text
+from clsplat.formats.model_files import bytes_of, located
 from clsplat.formats.output import written
 from clsplat.formats.splats import Reading, Writing, with_degree
-from clsplat.formats.table import bytes_of, located, tell_losses
+from clsplat.formats.table import tell_losses
 from clsplat.gaussians.model import load
 from clsplat.gaussians.sky import keep_sky, sky_beside
 from clsplat.reading import read_file, sha256

@@ -11,10 +11,11 @@ from clsplat.formats.codec import Codec, Start
 from clsplat.formats.compressed_ply import is_compressed, read_compressed_ply, write_compressed_ply
 from clsplat.formats.glb import read_glb, write_glb
 from clsplat.formats.ksplat import looks_like_ksplat, read_ksplat
-from clsplat.formats.lod import LOD_META, files_of_lod, looks_like_lod, read_lod
+from clsplat.formats.lod import LOD_META, looks_like_lod, read_lod
+from clsplat.formats.model_files import located
 from clsplat.formats.ply import checked_numbers, read_ply, write_ply
 from clsplat.formats.sog import looks_like_sog, read_sog
-from clsplat.formats.sog_files import META, with_images
+from clsplat.formats.sog_files import META
 from clsplat.formats.sog_writing import write_sog
 from clsplat.formats.splat import looks_like_splat, read_splat, write_splat
 from clsplat.formats.splats import MIP_VARIANCE, NEAR, VARIANCE, Reading, SplatFile, Writing, not_finite, settled
@@ -138,26 +139,6 @@ CODECS = (
 def endings(reads: bool = False) -> list[str]:
     """Return the endings of names that are written, or of those that are read."""
     return [end for codec in CODECS if (codec.read if reads else codec.write) for end in codec.endings]
-
-
-def located(path: Path) -> Path:
-    """Return the file of a model: of a folder with a meta.json, or a lod-meta.json, that one."""
-    places = (path / name for name in (META, LOD_META)) if path.is_dir() else ()
-    return next(filter(Path.is_file, places), path)
-
-
-def bytes_of(path: Path) -> int:
-    """Return the size of a model: of a folder of SOG, or of levels, that of all files that its JSON names.
-
-    Raises DataError where one is missing.
-    """
-    place = located(path)
-    files = {META: with_images, LOD_META: files_of_lod}.get(place.name, lambda one: [one])
-    try:
-        return sum(one.stat().st_size for one in files(place))
-    except OSError as error:
-        missing = "" if error.filename == str(place) else f"names {quoted(error.filename)}, which "
-        raise DataError(f"{place}: {missing}cannot be read ({error.strerror}); copy or export it again") from error
 
 
 def detect(path: Path) -> Codec | None:

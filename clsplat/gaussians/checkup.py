@@ -7,8 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.formats.lod import LOD_META, faults_of_levels
+from clsplat.formats.model_files import located
 from clsplat.formats.splats import Reading, not_finite, told_too_large
-from clsplat.formats.table import detect, located, named
+from clsplat.formats.table import detect, named
 from clsplat.gaussians.model import Model, load
 
 ENOUGH = 16  # Gaussians, from which their numbers tell something

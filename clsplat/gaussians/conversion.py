@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.errors import ConfigError, DataError, quoted
+from clsplat.formats.model_files import bytes_of
 from clsplat.formats.ply import MAX_NUMBER
 from clsplat.formats.splats import MAX_DEGREE, Reading, Writing, with_degree
-from clsplat.formats.table import bytes_of, detect, for_writing
+from clsplat.formats.table import detect, for_writing
 from clsplat.gaussians.model import Model, load
 from clsplat.gaussians.run_model import model_at
 from clsplat.results import check_no_file_of_a_run

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from clsplat.errors import DataError
-from clsplat.formats.table import located
+from clsplat.formats.model_files import located
 from clsplat.names import METRICS, is_inside
 from clsplat.reading import read_json
 

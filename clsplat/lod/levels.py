@@ -9,8 +9,8 @@ from clsplat.errors import ConfigError, DataError, amount
 from clsplat.files import new_folder, require_free
 from clsplat.formats.lod import LOD_META
 from clsplat.formats.lod_writing import write_lod
+from clsplat.formats.model_files import bytes_of
 from clsplat.formats.splats import require_moderate
-from clsplat.formats.table import bytes_of
 from clsplat.gaussians.model import Model, load
 from clsplat.gaussians.sky import keep_sky, sky_file
 from clsplat.lod.decimation import decimated

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from clsplat.errors import ConfigError
-from clsplat.formats.table import located
+from clsplat.formats.model_files import located
 from clsplat.gaussians.model import Model, load
 from clsplat.reading import sha256
 from clsplat.runs.model_file import ModelFile

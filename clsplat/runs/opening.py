@@ -7,6 +7,7 @@ from clsplat.errors import ConfigError
 from clsplat.names import UNDISTORTED
 from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import Pipeline, prepared_folder
+from clsplat.pipeline.places import contents
 from clsplat.prepare.cache import Planned, note, noted, prepare
 from clsplat.prepare.facts import facts
 from clsplat.progress import Listener, heard_by
@@ -97,4 +98,5 @@ def make_run(pipeline: Pipeline, scene: RunScene, device: Device, out: Path, sta
         status=status,
         model_settings=settings.model,
         identity=scene.identity,
+        read=contents(pipeline),
     )

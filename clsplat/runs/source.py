@@ -8,7 +8,7 @@ from itertools import chain
 from pathlib import Path
 
 from clsplat.errors import ConfigError, DataError
-from clsplat.formats.table import located
+from clsplat.formats.model_files import located
 from clsplat.gaussians.model import Model
 from clsplat.gaussians.run_model import MODEL, model_at, model_of_run
 from clsplat.names import PIPELINE

@@ -46,6 +46,10 @@ class Choice(Settings):
             raise ValueError(f"expected an offset below every, {self.every}")
         return self
 
+    def place_of(self, key: str, scene: str | None) -> Path | None:
+        place = super().place_of(key, scene)
+        return place and Path(scene or "") / place
+
     def of(self, names: Sequence[str], folders: Sequence[Path], tested: Sequence[str] = ()) -> set[int]:
         """Return the indices of the chosen ones of `names`.
 

@@ -1,7 +1,7 @@
 """Settings in which two resolved pipelines differ, and whether a run can go on with them."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any, Literal, NamedTuple
 
 from clsplat.errors import shortened
@@ -20,6 +20,11 @@ class Difference(NamedTuple):
 
     def __str__(self) -> str:
         return f"{self.place} was {shortened(repr(self.was), 80)}, is {shortened(repr(self.now), 80)}"
+
+    def is_of_place(self, were: Mapping[str, str], are: Mapping[str, str]) -> bool:
+        """Whether the same file lies at another place now.  were, are: hashes of the files that settings name."""
+        is_text = isinstance(self.was, str) and isinstance(self.now, str)
+        return is_text and self.was in were and were[self.was] == are.get(self.now)
 
     @property
     def stage(self) -> int | None:

@@ -180,6 +180,7 @@ def _write(run: Run, kind: str) -> Path:
         changes=run.changes,
         device=run.device.text,
         inputs=run.inputs,
+        read=run.read,
         pipeline=run.pipeline,
     )
     path = run.out / CHECKPOINTS / f"{kind}_{run.step:06d}.npz"
@@ -198,7 +199,7 @@ def _take_changes(run: Run, path: Path, state: State) -> list[str]:
     if run.inputs and state.inputs == run.inputs:  # the same scene, wherever it lies now
         before = {**before, "scene": {**before["scene"], "path": run.pipeline["scene"]["path"]}}
     for difference in differences(before, run.pipeline, run.settings):
-        if difference.kind == "output":
+        if difference.kind == "output" or difference.is_of_place(state.read, run.read):
             continue
         if difference.kind is None:
             raise ConfigError(f"{path} was made with other settings: {difference}; {remedy}")

@@ -74,6 +74,7 @@ class Run:
     status: StatusFile
     model_settings: ModelSettings
     identity: Identity | None = None  # of the original scene and its photographs
+    read: dict[str, str] = field(default_factory=dict)  # hashes of the files that settings name, by their text
     prepared: dict[str, str] | None = None  # hash of the inputs of `prepare:`, and the folder of its result
     found: dict[str, dict[str, Any]] = field(default_factory=dict)  # by the steps of `prepare:`
     losses: list[Loss] = field(default_factory=list)  # added from Python, beside those of the pipeline

@@ -39,6 +39,7 @@ class State(BaseModel):
     changes: list[str]
     device: str
     inputs: str  # identity of the scene
+    read: dict[str, str] = {}  # hashes of the files that settings name, by their text; older files have none
     pipeline: dict[str, Any]
 
     def is_trained(self, pipeline: dict[str, Any]) -> bool:

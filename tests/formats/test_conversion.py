@@ -15,9 +15,10 @@ import clsplat
 from clsplat.cli import app
 from clsplat.density.mixture import mass_of
 from clsplat.errors import ConfigError, DataError
+from clsplat.formats.model_files import bytes_of
 from clsplat.formats.ply import write_ply
 from clsplat.formats.splats import inverse_opacities, opacities
-from clsplat.formats.table import CODECS, bytes_of, detect, read, write
+from clsplat.formats.table import CODECS, detect, read, write
 from clsplat.gaussians.checkup import examine, lines, verdict
 from clsplat.gaussians.conversion import transform_of
 from clsplat.gaussians.model import Rendering, load

@@ -14,9 +14,10 @@ from clsplat.files import new_folder
 from clsplat.formats import lod
 from clsplat.formats.lod_tree import Limits, half_boxes, tree
 from clsplat.formats.lod_writing import write_lod
+from clsplat.formats.model_files import bytes_of
 from clsplat.formats.packing import morton_order
 from clsplat.formats.splats import SplatFile, Writing
-from clsplat.formats.table import bytes_of, detect, read, write
+from clsplat.formats.table import detect, read, write
 from clsplat.gaussians.checkup import examine, verdict
 from clsplat.gaussians.conversion import convert
 from clsplat.gaussians.model import load

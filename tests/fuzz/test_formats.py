@@ -13,8 +13,9 @@ import pytest
 from clsplat.errors import ConfigError
 from clsplat.formats.lod_tree import Limits
 from clsplat.formats.lod_writing import write_lod
+from clsplat.formats.model_files import bytes_of
 from clsplat.formats.splats import Reading, Writing
-from clsplat.formats.table import CODECS, bytes_of, detect, read, write
+from clsplat.formats.table import CODECS, detect, read, write
 from clsplat.gaussians.checkup import examine
 from tests.formats.models import splats
 from tests.formats.test_glb import glued, parts
