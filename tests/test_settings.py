@@ -43,6 +43,7 @@ def loaded(tmp_path: Path):
 @pytest.fixture
 def own(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Forget afterwards the variants that a test defines."""
+    load("smoke")  # the first pipeline of a process makes all variants known that there are
     with monkeypatch.context() as patch:
         patch.setattr(Settings, "defined", list(Settings.defined))
         yield
