@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 import pytest
 
 from clsplat import names
+from clsplat.cluster.execution import Execution
 from clsplat.errors import ConfigError
 from clsplat.pipeline.file import PipelineFile
 from clsplat.pipeline.loading import load
@@ -20,9 +21,10 @@ READ = {  # text that is read, or compared, and never the name of something that
     "Auto.reason", "CaptureChoice.given", "CaptureChoice.reason", "CaptureChoice.since", "CaptureChoice.keys",
     "SceneSettings.path", "Init.file", "Evaluate.file", "Evaluate.lpips", "Matrix.pipelines", "Matrix.scenes",
     "Matrix.set", "Matrix.options", "PipelineFile.plugins", "Snapshot.view", "Snapshot.size", "Timelapse.folder",
-    "Video.path", "Video.size", "Choice.names", "Choice.file",
+    "Video.path", "Video.size", "Choice.names", "Choice.file", "MatrixFile.execution", "Execution.engine",
+    "Execution.devices", "Tls.ca", "Tls.cert", "Tls.key",
 }  # fmt: skip
-NAMES = {"PipelineFile.name", "MatrixFile.name"}  # of folders
+NAMES = {"PipelineFile.name", "MatrixFile.name", "Execution.store"}  # of folders
 OUTSIDE = [
     "", ".", "./", "..", "../x", "a/../../x", "a/..", "..\\x", "a\\..\\..\\x", "/x", "//host/share/x", "\\x",
     "\\\\h\\s\\x",
@@ -61,6 +63,7 @@ def text_fields() -> list[tuple[type[Settings], str]]:
 
 def test_every_text_in_a_pipeline_is_known_to_be_read_or_checked_as_an_output():
     found = {f"{kind.__name__}.{name}" for kind, name in text_fields()}
+    assert Execution in Settings.defined
     checked = {
         f"{kind.__name__}.{n}" for kind, n in text_fields() if issubclass(kind, Stage) and n in kind.named_outputs()
     }

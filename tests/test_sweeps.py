@@ -6,7 +6,6 @@ import shutil
 from contextlib import suppress
 from pathlib import Path
 
-import psutil
 import pytest
 
 from clsplat.api import commands, sweeps
@@ -23,6 +22,8 @@ from clsplat.pipeline.matrix import load_experiment
 from clsplat.runs.experiment import Job
 from tests.test_matrix import STAGES
 from tests.test_sweep_cells import SPEC, WRITES, command
+
+psutil = pytest.importorskip("psutil", exc_type=ImportError)  # of Dask
 
 PLACE = Place("inline", "a device", "b")
 

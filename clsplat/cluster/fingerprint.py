@@ -15,6 +15,7 @@ import data_tools
 from clsplat import __version__, resource_dir
 from clsplat.errors import ClsplatError, DataError
 from clsplat.files import write_text
+from clsplat.names import PREPARED
 from clsplat.pipeline.loading import Pipeline
 from clsplat.prepare.cache import plan
 from clsplat.reading import read_json, sha256
@@ -97,7 +98,7 @@ class Scenes:
 
     def _prepared(self, pipeline: Pipeline) -> Known:
         folder = pipeline.settings.scene.folder
-        return Known(plan(pipeline.settings.prepare, folder, self._folder / "prepared")[-1].key, 0.0)
+        return Known(plan(pipeline.settings.prepare, folder, self._folder / PREPARED)[-1].key, 0.0)
 
     def _read(self, pipeline: Pipeline) -> Known:
         settings = pipeline.settings.scene

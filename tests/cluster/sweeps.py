@@ -9,11 +9,13 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-import psutil
+import pytest
 
 from clsplat.cluster.store import Store
 from clsplat.pipeline.matrix import load_experiment
 from clsplat.runs import experiment
+
+psutil = pytest.importorskip("psutil", exc_type=ImportError)  # of Dask
 
 PIPELINE = """\
 stages:
@@ -82,31 +84,31 @@ def undisturbed(sweep: Sweep, out: Path) -> dict[str, str]:
     return models(out)
 
 
-def runs_below(process: "subprocess.Popen[str]") -> list[psutil.Process]:
+def runs_below(process: "subprocess.Popen[str]") -> "list[psutil.Process]":
     """The processes that train."""
     return [one for one in _below(process) if "--attended" in _words(one)]
 
 
-def workers_below(process: "subprocess.Popen[str]") -> list[psutil.Process]:
+def workers_below(process: "subprocess.Popen[str]") -> "list[psutil.Process]":
     """The processes of Dask's workers."""
     return [one for one in _below(process) if any("spawn_main" in word for word in _words(one))]
 
 
-def _below(process: "subprocess.Popen[str]") -> list[psutil.Process]:
+def _below(process: "subprocess.Popen[str]") -> "list[psutil.Process]":
     try:
         return psutil.Process(process.pid).children(recursive=True)
     except psutil.NoSuchProcess:
         return []
 
 
-def _words(process: psutil.Process) -> list[str]:
+def _words(process: "psutil.Process") -> list[str]:
     try:
         return process.cmdline()
     except psutil.Error:
         return []
 
 
-def kill(processes: list[psutil.Process]) -> int:
+def kill(processes: "list[psutil.Process]") -> int:
     """Kill them; return how many were there."""
     count = 0
     for one in processes:

@@ -14,10 +14,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-import psutil
 import pytest
 
 from tests.cluster.sweeps import Sweep, kill, runs_below, undisturbed, until, workers_below
+
+psutil = pytest.importorskip("psutil", exc_type=ImportError)  # of Dask
 
 KILLS = int(os.environ.get("CLSPLAT_KILLS", "0"))
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(not KILLS, reason="CLSPLAT_KILLS=20 runs it: minutes")]
@@ -30,7 +31,7 @@ def expected(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> dict
     return undisturbed(Sweep(folder, tiny_scene, CELLS, "inline"), folder / "out")
 
 
-def left_behind() -> list[psutil.Process]:
+def left_behind() -> "list[psutil.Process]":
     return [one for one in psutil.process_iter(["cmdline"]) if "--attended" in (one.info["cmdline"] or [])]
 
 

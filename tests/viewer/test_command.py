@@ -91,7 +91,7 @@ def test_the_stage_and_the_command_show_the_same(run, tmp_path):
 
 
 def test_every_shipped_pipeline_ends_with_a_viewer_and_a_report():
-    for name in shipped():
+    for name in shipped().keys() - {"blocks_coarse"}:  # a model to cut, which is not for looking at
         checked = load(name)
         assert checked.names[-2:] == ["viewer", "report"], name
         assert isinstance(checked.stages[-2], Viewer)
