@@ -17,6 +17,12 @@ DATASET = f"The folder of a dataset: {format_names()}."
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False)
 
+Out = Annotated[Path, typer.Argument(help="Folder to make.")]
+Size = Annotated[int, typer.Option(min=8, help="Width and height of the images, pixels.")]
+Train = Annotated[int, typer.Option(min=1, help="Number of training views.")]
+Test = Annotated[int, typer.Option(min=1, help="Number of held-out views.")]
+Seed = Annotated[int, typer.Option(min=0, help="Seed of the surface points and their noise.")]
+
 
 @app.callback()
 def data_tools() -> None:
@@ -25,11 +31,11 @@ def data_tools() -> None:
 
 @app.command()
 def synthetic(
-    out: Annotated[Path, typer.Argument(help="Folder to make.")],
-    size: Annotated[int, typer.Option(min=8, help="Width and height of the images, pixels.")] = 256,
-    train: Annotated[int, typer.Option(min=1, help="Number of training views.")] = 60,
-    test: Annotated[int, typer.Option(min=1, help="Number of held-out views.")] = 12,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the surface points and their noise.")] = 0,
+    out: Out,
+    size: Size = 256,
+    train: Train = 60,
+    test: Test = 12,
+    seed: Seed = 0,
 ) -> None:
     """Ray-cast the demo scene: a still life with exact cameras, in the Blender (NeRF-synthetic) layout."""
     print(write_dataset(out, Options(size, train, test, seed)))
@@ -37,12 +43,12 @@ def synthetic(
 
 @app.command()
 def city(
-    out: Annotated[Path, typer.Argument(help="Folder to make.")],
-    size: Annotated[int, typer.Option(min=8, help="Width and height of the images, pixels.")] = 256,
-    train: Annotated[int, typer.Option(min=1, help="Number of training views.")] = 300,
-    test: Annotated[int, typer.Option(min=1, help="Number of held-out views.")] = 30,
+    out: Out,
+    size: Size = 256,
+    train: Train = 300,
+    test: Test = 30,
     lots: Annotated[int, typer.Option(min=1, max=64, help="Houses and parks along each side.")] = 12,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the surface points and their noise.")] = 0,
+    seed: Seed = 0,
 ) -> None:
     """Ray-cast a city from the air: streets, houses, roofs; with exact cameras, in the Blender layout."""
     from data_tools.city import City

@@ -17,6 +17,8 @@ import numpy as np
 import pytest
 
 from clsplat import plugins
+from clsplat.cluster.store import Store
+from clsplat.cluster.task import Terms
 from clsplat.conformance import quick
 from clsplat.opencl import device as opencl_device
 from clsplat.opencl import program
@@ -184,3 +186,15 @@ def few_steps(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
 def killed_run(few_steps: Path, tmp_path: Path) -> Path:
     """That run as it was killed after step 8 and its checkpoints."""
     return killed(few_steps, tmp_path / "run")
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Store:
+    """An empty store of cells."""
+    return Store(tmp_path / "store")
+
+
+@pytest.fixture
+def terms(store: Store) -> Terms:
+    """How a cell is run in it now."""
+    return Terms(store.now())

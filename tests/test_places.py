@@ -10,9 +10,8 @@ import pytest
 from clsplat.cluster import fingerprint
 from clsplat.cluster.cell import Cell
 from clsplat.cluster.fingerprint import Scenes
-from clsplat.cluster.store import Store
 from clsplat.cluster.sweep import wanted_cell
-from clsplat.cluster.task import Terms, run_cell
+from clsplat.cluster.task import run_cell
 from clsplat.errors import ConfigError, DataError
 from clsplat.pipeline import matrix
 from clsplat.pipeline.loading import load
@@ -21,16 +20,6 @@ from clsplat.stages.video import Video
 from tests.few_steps import FEW, killed
 from tests.test_sweep_cells import CELL, WRITES, command, keys
 from tests.test_training import train
-
-
-@pytest.fixture
-def store(tmp_path: Path) -> Store:
-    return Store(tmp_path / "store")
-
-
-@pytest.fixture
-def terms(store: Store) -> Terms:
-    return Terms(store.now())
 
 
 def write(path: Path, text: str) -> Path:

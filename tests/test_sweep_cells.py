@@ -39,16 +39,6 @@ def command(code: str) -> list[str]:
     return [PYTHON, "-S", "-c", code, FILE, OUT]
 
 
-@pytest.fixture
-def store(tmp_path: Path) -> Store:
-    return Store(tmp_path / "store")
-
-
-@pytest.fixture
-def terms(store: Store) -> Terms:
-    return Terms(store.now())
-
-
 def told(store: Store) -> list[str]:
     return [event["event"] for event in store.events()]
 
