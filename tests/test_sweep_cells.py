@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from clsplat.cluster import child
-from clsplat.cluster.attempt import LEASE, MANIFEST, Attempt, place_copy
+from clsplat.cluster.attempt import LEASE, MANIFEST, Attempt
 from clsplat.cluster.cell import Cell
 from clsplat.cluster.child import FILE, OUT, PYTHON
 from clsplat.cluster.drive import Drive, Wanted
@@ -21,6 +21,7 @@ from clsplat.cluster.engine import Inline, Lost
 from clsplat.cluster.fingerprint import Scenes
 from clsplat.cluster.folder import ATTEMPTS, Different
 from clsplat.cluster.overview import overview_text, store_status
+from clsplat.cluster.placing import place_copy
 from clsplat.cluster.probe import Place
 from clsplat.cluster.store import Store
 from clsplat.cluster.task import Outcome, Terms, run_cell
@@ -267,7 +268,8 @@ def test_a_copy_of_a_result_gets_its_manifest_last(store, terms, tmp_path, monke
     result, copied = store.folder(CELL.key).result, []
     for name in "abcdefgh":
         (result / name).touch()
-    monkeypatch.setattr("clsplat.cluster.attempt.link_or_copy", lambda source, target: copied.append(target.name))
+    for module in ("copies", "placing"):
+        monkeypatch.setattr(f"clsplat.cluster.{module}.link_or_copy", lambda _, target: copied.append(target.name))
     place_copy(result, tmp_path / "copy")
     assert copied[-1] == MANIFEST != copied[-2]
 

@@ -77,6 +77,27 @@ def test_the_folder_of_a_matrix_has_what_it_has_without_a_store(file, runs, few_
     assert [event["event"] for event in store.events()].count("start") == 2
 
 
+def test_a_run_that_went_on_in_the_folder_of_a_matrix_is_not_shown_as_its_cell(file, runs, few_steps, tmp_path):
+    out = commands.run(file, out=tmp_path / "out")
+    one = out / "tiny-seed=0"
+    model, expected = one / "point_cloud.ply", (few_steps / "point_cloud.ply").read_bytes()
+    model.unlink()
+    model.write_bytes(b"another")
+    commands.run(file, out=out, start="resume")
+    assert model.read_bytes() == expected
+    pipeline = one / "pipeline.yaml"
+    pipeline.unlink()
+    pipeline.write_text((few_steps / "pipeline.yaml").read_text() + "# trained for longer\n")
+    (one / "checkpoints" / "step_000020.npz").write_bytes(b"later")
+    with pytest.raises(ClsplatError, match=r"seed=0: was trained on with other settings .*; move that folder") as error:
+        commands.run(file, out=out, start="resume")
+    assert error.value.exit_code == 2
+    assert "# trained" in pipeline.read_text(), "it stays"
+    commands.run(file, out=out, start="restart")
+    assert pipeline.read_bytes() == (few_steps / "pipeline.yaml").read_bytes()
+    assert not (one / "checkpoints" / "step_000020.npz").exists()
+
+
 def test_a_cell_that_fails_leaves_the_others_and_its_exit_code(file, runs, tmp_path):
     runs["seed: 1"] = 3
     with pytest.raises(ClsplatError, match=r"1 of 2 cells failed; the first, tiny-seed=1: .* exit code 3") as error:

@@ -8,12 +8,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from clsplat import terminal
-from clsplat.cluster.attempt import is_placed, place_copy
 from clsplat.cluster.cell import Cell
 from clsplat.cluster.drive import Drive, Wanted
 from clsplat.cluster.engine import Engine, Inline
 from clsplat.cluster.execution import Execution
 from clsplat.cluster.fingerprint import Scenes
+from clsplat.cluster.placing import is_placed, place_copy
 from clsplat.cluster.probe import places
 from clsplat.cluster.progress import Watched
 from clsplat.cluster.store import Store
@@ -58,7 +58,7 @@ def run_sweep(
         terminal.counted(),
     ):
         write_text(out / PIPELINE, experiment.text)
-        sweep = _Sweep(experiment, status, store, stop)
+        sweep = _Sweep(experiment, status, store, stop, is_anew=start == "restart")
         wanted = sweep.wanted()
         with _engine(execution, store, device, sweep.is_stopped) as engine:
             terms = Terms(store.now(), execution.retries)
@@ -121,6 +121,7 @@ class _Sweep:
     status: StatusFile
     store: Store
     stop: threading.Event
+    is_anew: bool  # whether what is in the folder of the matrix is replaced
     failures: dict[str, ClsplatError] = field(default_factory=dict)
     running: dict[str, Cell] = field(default_factory=dict)
     outcomes: dict[str, Outcome] = field(default_factory=dict)
@@ -193,7 +194,7 @@ class _Sweep:
         """Put a result into the folder of the matrix, unless it is there."""
         result, here = self.store.folder(cell.key).result, self.status.out / cell.name
         try:
-            if is_placed(result, here):
+            if not self.is_anew and is_placed(result, here):
                 return
             self.status.require_held()
             place_copy(result, here)
