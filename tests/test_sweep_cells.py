@@ -210,12 +210,24 @@ def test_one_cell_is_cancelled_by_its_name_or_the_beginning_of_its_key(store, te
     other = replace(CELL, spec={**SPEC, "scene": "t"})
     store.add(CELL)
     store.add(other)
-    store.note_sweep("sweep", {"first": CELL.key})
+    store.note_sweep("sweep", {"first": CELL.key}, "")
     assert store.cancel("first") == CELL.key == store.cancel(CELL.key[:12])
     assert store.is_cancelled([CELL.key], terms.since)
     assert not store.is_cancelled([other.key], terms.since)
     with pytest.raises(ConfigError, match="no cell 'x'"):
         store.cancel("x")
+
+
+def test_matrices_of_one_name_keep_their_cells(store, terms):
+    changed = replace(CELL, spec={**SPEC, "scene": "t"})
+    for cell in (CELL, changed):
+        store.add(cell)
+        store.note_sweep("sweep", {"first": cell.key}, cell.key)
+    assert {cell["name"] for cell in store_status(store.root)["cells"]} == {"first"}
+    with pytest.raises(ConfigError, match="no cell 'first'; 2 cells are named so; give a key"):
+        store.cancel("first")
+    run_cell(CELL, store, command(WRITES), terms)
+    assert store.cancel("first") == changed.key
 
 
 def test_a_run_that_does_not_stop_is_killed(store, terms, monkeypatch):
@@ -286,6 +298,13 @@ def test_attempts_are_removed_by_the_age_of_their_lease_alone(store, terms):
     os.utime(young.path / LEASE, (store.now() - 601, store.now() - 601))
     run_cell(CELL, store, command(WRITES), terms)
     assert not young.path.exists(), "the next call finds the result, and that"
+
+
+def test_a_damaged_spec_is_written_again(store, terms):
+    folder = store.add(CELL)
+    (folder.path / "spec.json").write_text('{"pipe')
+    assert run_cell(CELL, store, command(WRITES), terms).state == "published"
+    assert json.loads((folder.path / "spec.json").read_text()) == SPEC
 
 
 def test_a_spec_is_never_changed(store):
@@ -388,6 +407,24 @@ def test_what_runs_costs_no_look_at_the_cells_that_wait(store, terms, monkeypatc
     assert len(looks) == 5
 
 
+def test_a_device_that_suits_no_cell_is_asked_once(store, terms, monkeypatch):
+    looks = []
+    suits = Drive._suits
+    monkeypatch.setattr(Drive, "_suits", lambda drive, one, bits, _: looks.append(bits) or suits(drive, one, bits, _))
+    monkeypatch.setattr("clsplat.cluster.drive.LOOK", 0.0)
+    engine, begun = Fake(places=PLACES[:2]), wanted(*range(5))
+    for one in begun:
+        store.add(one.on("x"))
+
+    def start(*values):
+        ends = [*[None] * 9, Outcome("published")]
+        return type("Ticket", (), {"outcome": lambda self: ends.pop(0)})()
+
+    engine.start = start
+    Drive(store, engine, False, terms).run(begun)
+    assert looks.count("y") == 4, "one look at each cell that waits"
+
+
 def test_a_signal_stops_a_sweep(store, terms):
     with pytest.raises(Interrupted, match="with --resume goes on"):
         Drive(store, Fake(), True, terms, is_stopped=lambda: True).run(wanted(1))
@@ -406,7 +443,7 @@ def test_the_state_of_a_store_is_in_its_files(store, terms):
     run_cell(cells[1], store, command("raise SystemExit(2)"), terms)
     store.add(cells[2]).begin("w", terms.since)
     store.add(cells[3])
-    store.note_sweep("sweep", {cell.name: cell.key for cell in cells})
+    store.note_sweep("sweep", {cell.name: cell.key for cell in cells}, "")
     found = store_status(store.root)
     assert {cell["name"]: cell["state"] for cell in found["cells"]} == {
         "done": "published",
@@ -417,6 +454,8 @@ def test_the_state_of_a_store_is_in_its_files(store, terms):
     text = overview_text(found)
     store.folder(cells[1].key).begin("w", terms.since)
     assert store_status(store.root)["counts"] == {"published": 1, "running": 2, "waiting": 1}, "it is tried again"
+    store.folder(cells[1].key).give_up(2, "of another process, which has tried it too")
+    assert store_status(store.root)["counts"] == {"published": 1, "running": 2, "waiting": 1}, "it runs still"
     assert "1 failed, 1 published, 1 running, 1 waiting" in text
     assert "bad: its process ended with exit code 2" in text
     assert sys.executable not in text

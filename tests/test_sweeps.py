@@ -64,7 +64,7 @@ def test_the_folder_of_a_matrix_has_what_it_has_without_a_store(file, runs, few_
     model = out / "tiny-seed=0" / "point_cloud.ply"
     assert model.read_bytes() == (few_steps / "point_cloud.ply").read_bytes()
     store = Store(tmp_path / "store")
-    (key,) = [key for cells in store.sweeps().values() for name, key in cells.items() if name == "tiny-seed=0"]
+    (key,) = [key for cells in store.sweeps() for name, key in cells.items() if name == "tiny-seed=0"]
     result = store.folder(key).result
     assert os.path.samefile(model, result / "point_cloud.ply")
     assert not os.path.samefile(model.with_name("metrics.jsonl"), result / "metrics.jsonl"), "a run appends to it"
@@ -248,6 +248,16 @@ def test_the_engine_of_a_machine_runs_cells_side_by_side_on_loopback_alone(tmp_p
     assert seen == {"127.0.0.1"}
     assert {key: scheduler.dask.config.get(key) for key in before} == before, "what this process had set"
     assert len({event["worker"] for event in store.events() if event["event"] == "start"}) == 1
+
+
+def test_a_cell_whose_spec_was_changed_fails_alone(file, runs, tmp_path):
+    commands.run(file, out=tmp_path / "out")
+    store = Store(tmp_path / "store")
+    (key,) = [cells["tiny-seed=1"] for cells in store.sweeps()]
+    (store.folder(key).path / "spec.json").write_text("{}")
+    runs["seed"] = "no cell is run again"
+    with pytest.raises(ClsplatError, match=r"1 of 2 cells failed; the first, tiny-seed=1: .*remove .*: its cell runs"):
+        commands.run(file, out=tmp_path / "out", start="resume")
 
 
 def test_damaged_records_of_a_store_do_not_stop_who_looks(file, runs, tmp_path):

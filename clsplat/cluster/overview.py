@@ -28,7 +28,7 @@ def store_status(root: Path) -> dict[str, Any]:
     """
     store = Store.opened(root)
     now = time.time()
-    names = {key: name for cells in store.sweeps().values() for name, key in cells.items()}
+    names = {key: name for cells in store.sweeps() for name, key in cells.items()}
     cells = [_cell(folder, names.get(folder.key, ""), now) for folder in store.folders()]
     counts: dict[str, int] = {}
     for cell in cells:
@@ -49,10 +49,12 @@ def _cell(folder: CellFolder, name: str, now: float) -> dict[str, Any]:
     found |= {"bits": spec.get("bits")}
     if manifest := folder.manifest():
         return {**found, "state": "published", **{key: manifest.get(key) for key in ("seconds", "device", "worker")}}
-    if failed := folder.failed():
-        return {**found, "state": "failed", "message": failed.get("message"), "exit_code": failed.get("exit_code")}
     attempts = sorted(folder.attempts(), key=lambda attempt: attempt.beaten)
-    return {**found, "attempts": len(attempts), **(_attempt(attempts[-1], now) if attempts else {"state": "waiting"})}
+    alive = [one for one in attempts if one.exit_code is None and now - one.beaten < GONE]
+    if (failed := folder.failed()) and not alive:
+        return {**found, "state": "failed", "message": failed.get("message"), "exit_code": failed.get("exit_code")}
+    last = (alive or attempts)[-1:]
+    return {**found, "attempts": len(attempts), **(_attempt(last[0], now) if last else {"state": "waiting"})}
 
 
 def _attempt(attempt: Attempt, now: float) -> dict[str, Any]:

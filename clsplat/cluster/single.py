@@ -50,7 +50,7 @@ def run_one(
         wanted = wanted_cell(chosen, Scenes(store.scenes), store)
         (place,) = places("cell", [device or ""])
         cell = wanted.on(place.bits)
-        store.note_sweep(f"{experiment.name}-{cell.name}"[:150], {cell.name: cell.key})
+        store.note_sweep(f"{experiment.name}-{cell.name}", {cell.name: cell.key}, cell.key)
         driving.set()
         outcome = run_cell(cell, store, run_command(place.device, plugin_files()), terms, stop.is_set)
     if outcome.state == "stopped":

@@ -3,7 +3,7 @@
 import logging
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -157,7 +157,9 @@ class _Sweep:
         def began(cell: Cell) -> None:
             if drive.is_same and not self.running and not self.outcomes:  # so that its waiting cells are seen
                 for one in wanted:
-                    self.keys[one.cell.name] = self.store.add(one.on(cell.spec["bits"])).key
+                    self.keys[one.cell.name] = one.on(cell.spec["bits"]).key
+                    with suppress(ClsplatError):  # told when that cell runs
+                        self.store.add(one.on(cell.spec["bits"]))
             self._began(cell)
 
         drive.began = began
@@ -167,7 +169,7 @@ class _Sweep:
     def _began(self, cell: Cell) -> None:
         if self.keys.get(cell.name) != cell.key or not self.running:
             self.keys[cell.name] = cell.key
-            self.store.note_sweep(self.experiment.name, self.keys)
+            self.store.note_sweep(self.experiment.name, self.keys, self.experiment.text)
         self.running[cell.name] = cell
         self.status.note(stage=cell.name)
         number = len(self.outcomes) + len(self.running)
