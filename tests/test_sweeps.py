@@ -3,6 +3,7 @@
 import json
 import os
 import shutil
+import subprocess
 from contextlib import suppress
 from pathlib import Path
 
@@ -12,13 +13,13 @@ from clsplat.api import commands, sweeps
 from clsplat.cluster import engine, single, sweep
 from clsplat.cluster.cell import Cell
 from clsplat.cluster.drive import Drive, Wanted
-from clsplat.cluster.execution import execution_of, values_of
 from clsplat.cluster.overview import store_status
 from clsplat.cluster.probe import Place
 from clsplat.cluster.store import Store
 from clsplat.cluster.task import Terms
 from clsplat.errors import ClsplatError, ConfigError, DeviceError
-from clsplat.pipeline.matrix import load_experiment
+from clsplat.pipeline.execution import Execution, Tls, options, values_of
+from clsplat.pipeline.schema import json_schema
 from clsplat.runs.experiment import Job
 from tests.test_matrix import STAGES
 from tests.test_sweep_cells import SPEC, WRITES, command
@@ -134,7 +135,8 @@ def test_another_execution_takes_the_place_of_the_files_and_is_noted(file, tmp_p
     on = tmp_path / "lab.yaml"
     on.write_text("engine: inline\n")
     job = Job.open(str(file), out=tmp_path / "out", execution=values_of(on))
-    assert job.work.execution == {"engine": "inline"}
+    assert job.work.execution.keeps is None
+    assert "engine: inline" in job.work.text
     assert "store" not in job.work.text
     with pytest.raises(ConfigError, match="--on is for a file with `matrix:`"):
         Job.open("smoke", execution=values_of(on))
@@ -152,26 +154,97 @@ def test_without_a_store_the_cells_run_as_they_did(file, tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("engin: local", "x.yaml:3: engin: unknown key 'engin'"),
-        ("retries: 0", "x.yaml:3: retries: expected a value of at least 1"),
+        ("engin: local", "x.yaml:3: execution.engin: unknown key 'engin'"),
+        ("retries: 0", "x.yaml:3: execution.retries: expected a value of at least 1"),
+        ("store: ''", "x.yaml:3: execution.store: expected the path of a folder, got ''"),
+        ("retries: 2", "retries has no effect with engine inline: expected a store too"),
+        ("placement: {bits: any}", "placement has no effect with engine inline: expected a store too"),
+        ("devices: [pocl]", "devices has no effect with engine inline: expected a store too"),
+        ("engine: local, tls: {ca: a, cert: b, key: c}", "tls has no effect with engine local: certificates are for"),
+        ("engine: local, insecure: true", "insecure has no effect with engine local: it is for an engine dask://"),
+        (
+            "engine: dask://127.0.0.1:1, devices: [a]",
+            "devices has no effect with engine dask://127.0.0.1:1: a",
+        ),
         ("engine: dask://far:1", "expected tls:// for another machine, or insecure: true"),
-        ("engine: tls://far:1", "expected tls: "),
-        ("engine: ray", "engine: expected text that matches"),
+        ("engine: tls://far:1", "tls://far:1: expected tls: "),
+        ("engine: ray", "x.yaml:3: execution.engine: expected text that matches"),
     ],
 )
 def test_a_wrong_execution_is_refused_with_its_line(tmp_path, text, words):
     file = tmp_path / "x.yaml"
     file.write_text(f"name: a\nmatrix: {{seeds: [0]}}\nexecution: {{{text}}}\n{STAGES}")
-    found = load_experiment(str(file))
+    for call in (commands.check, commands.run):
+        with pytest.raises(ConfigError, match=words):
+            call(file)
+    on = tmp_path / "lab.yaml"
+    on.write_text(f"{{{text}}}\n")
+    with pytest.raises(ConfigError, match=f"lab.yaml:1: .*{words.removeprefix('x.yaml:3: execution.')}"):
+        values_of(on)
+
+
+def test_the_schema_of_pipeline_files_has_the_keys_of_execution():
+    assert json_schema()["properties"]["execution"] == {"$ref": "#/$defs/Execution"}
+    assert {"Execution", "Placement", "Tls"} <= json_schema()["$defs"].keys()
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"engine": "dask://far:1"}, r"expected tls:// for another machine, or insecure: true \(--insecure\)"),
+        ({"engine": "tls://far:1"}, r"\(--tls-ca, --tls-cert and --tls-key\)"),
+        ({"engine": "tls://far:1", "tls": {"ca": "a", "key": "b"}}, "^--tls-cert: 'cert' is missing"),
+        ({"engine": "far"}, "^--scheduler: expected text that matches"),
+    ],
+)
+def test_a_wrong_option_of_a_worker_is_named(given, words):
     with pytest.raises(ConfigError, match=words):
-        execution_of(found.execution, file)
+        options(given)
+
+
+@pytest.fixture(scope="module")
+def authority(tmp_path_factory: pytest.TempPathFactory) -> Tls:
+    """A certificate that has signed itself."""
+    folder = tmp_path_factory.mktemp("tls")
+    if not (openssl := shutil.which("openssl")):
+        pytest.skip("needs openssl")
+    curve = ["-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1"]
+    words = ["req", "-x509", *curve, "-days", "2", "-subj", "/CN=localhost"]
+    for name, locked in {"a": ["-nodes"], "b": ["-passout", "pass:word"]}.items():
+        files = ["-keyout", f"{folder}/{name}.key", "-out", f"{folder}/{name}.pem"]
+        subprocess.run([openssl, *words, *locked, *files], check=True, capture_output=True)
+    (folder / "no.pem").write_text("no certificate")
+    return Tls(ca=f"{folder}/a.pem", cert=f"{folder}/a.pem", key=f"{folder}/a.key")
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"ca": "gone.pem"}, r"tls.ca \(--tls-ca\): .*gone.pem: .*No such file"),
+        ({"key": "gone.pem"}, r"tls.key \(--tls-key\): .*gone.pem: .*No such file"),
+        ({"ca": "no.pem"}, r"tls.ca \(--tls-ca\): .*no.pem: expected a certificate in PEM"),
+        ({"cert": "b.pem"}, r"b.pem, .*a.key: expected .* \(KEY_VALUES_MISMATCH\)"),
+        ({"cert": "b.pem", "key": "b.key"}, "b.pem, .*b.key: expected .*, without a password"),
+    ],
+)
+def test_certificates_that_cannot_be_used_are_named(authority, changed, words):
+    scheduler = pytest.importorskip("clsplat.cluster.scheduler")
+    folder = Path(authority.ca).parent
+    assert scheduler.security(authority).require_encryption
     with pytest.raises(ConfigError, match=words):
-        commands.describe_run(file, out=tmp_path / "out")
+        scheduler.security(authority.model_copy(update={key: str(folder / name) for key, name in changed.items()}))
+
+
+def test_a_device_is_not_chosen_for_a_scheduler(file, tmp_path):
+    on = tmp_path / "lab.yaml"
+    on.write_text("engine: dask://127.0.0.1:1\n")
+    with pytest.raises(ConfigError, match="--device: a scheduler has the devices that `clsplat worker --device NAME`"):
+        commands.run(file, out=tmp_path / "out", on=on, device="pocl")
 
 
 def test_a_scheduler_of_this_machine_needs_no_tls():
     for address in ("dask://127.0.0.1:1", "dask://localhost:1"):
-        assert execution_of({"engine": address}, Path()).is_local
+        assert Execution(engine=address).is_local
 
 
 class FakeClient:
@@ -235,7 +308,7 @@ def test_the_engine_of_a_machine_runs_cells_side_by_side_on_loopback_alone(tmp_p
     monkeypatch.setattr(scheduler, "places", lambda worker, devices: places)
     store, ended, seen = Store(tmp_path / "store"), [], set()
     before = {key: scheduler.dask.config.get(key) for key in scheduler.SETTINGS}
-    cluster = scheduler.engine(execution_of({"engine": "local"}, Path()), store, None)
+    cluster = scheduler.engine(Execution(engine="local"), store, None)
     try:
         cluster.command_of = lambda device: command(WRITES + f"; print({device!r})")
         cells = [Wanted(Cell(f"cell {i}", {**SPEC, "scene": str(i)}, ""), i) for i in range(4)]

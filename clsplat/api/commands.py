@@ -72,7 +72,7 @@ def resume(
     scene: where its photographs are, if they have moved; live, on: as for `run`.
     """
     from clsplat.cluster.commands import run_job
-    from clsplat.cluster.execution import values_of
+    from clsplat.pipeline.execution import values_of
     from clsplat.runs.experiment import Job
 
     load_plugins()
@@ -107,7 +107,7 @@ def check(pipeline: PathLike) -> dict[str, Any]:
     Of a run folder return `whole`, its `state`, and `objects`: every file, whether it is `whole`, and a `detail`.  Of a
     model file return its `format`, `ranges`, `bounds`, `degenerate` counts, `findings`, and whether it is `valid`.
     """
-    from clsplat.cluster.commands import check
+    from clsplat.runs.check import check
 
     load_plugins()
     return check(str(pipeline))
@@ -242,7 +242,8 @@ def _job(
     start: "Start",
     on: PathLike | None = None,
 ) -> "Job":
-    from clsplat.cluster.commands import open_job
+    from clsplat.pipeline.execution import values_of
+    from clsplat.runs.experiment import Job
 
     load_plugins()
-    return open_job(str(pipeline), path_of(scene), path_of(out), overrides(values), start, path_of(on))
+    return Job.open(str(pipeline), path_of(scene), path_of(out), overrides(values), start, values_of(path_of(on)))

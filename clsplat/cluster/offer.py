@@ -3,8 +3,8 @@
 import logging
 from collections.abc import Sequence
 
-from clsplat.cluster.execution import Execution
 from clsplat.cluster.probe import places
+from clsplat.pipeline.execution import Execution
 from clsplat.processes import Owner
 
 LOG = logging.getLogger("clsplat")

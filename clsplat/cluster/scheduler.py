@@ -18,15 +18,16 @@ from typing import Any
 
 from clsplat.cluster.cell import Cell
 from clsplat.cluster.child import PATIENCE, run_command
+from clsplat.cluster.connection import require_certificates, unanswered, warn_of_open_port
 from clsplat.cluster.drive import ALONE
 from clsplat.cluster.engine import Lost, Ticket
-from clsplat.cluster.execution import Execution, Tls, unanswered, warn_of_open_port
 from clsplat.cluster.fingerprint import code_digest
 from clsplat.cluster.plugin_files import plugin_files
 from clsplat.cluster.probe import Place, place_of, places
 from clsplat.cluster.store import Store
 from clsplat.cluster.task import Outcome, Terms, run_cell
 from clsplat.errors import ConfigError, DeviceError, InternalError, Interrupted
+from clsplat.pipeline.execution import Execution, Tls
 from clsplat.signals import stopping_on_signals
 
 try:
@@ -123,9 +124,10 @@ async def _serve(execution: Execution, found: Sequence[Place], stop: threading.E
 
 
 def security(tls: Tls | None) -> Any:
-    """Return the certificates as distributed takes them; None without."""
+    """Return the certificates as distributed takes them; None without.  Raises ConfigError."""
     if tls is None:
         return None
+    require_certificates(tls)
     sides = {f"tls_{side}_{part}": getattr(tls, part) for side in ("client", "worker") for part in ("cert", "key")}
     return distributed.Security(tls_ca_file=tls.ca, require_encryption=True, **sides)
 

@@ -11,7 +11,6 @@ from clsplat import terminal
 from clsplat.cluster.cell import Cell
 from clsplat.cluster.drive import Drive, Wanted
 from clsplat.cluster.engine import Engine, Inline
-from clsplat.cluster.execution import Execution
 from clsplat.cluster.fingerprint import Scenes
 from clsplat.cluster.placing import is_placed, place_copy
 from clsplat.cluster.probe import places
@@ -22,6 +21,7 @@ from clsplat.errors import ClsplatError, Interrupted, one_line
 from clsplat.files import write_text
 from clsplat.names import PIPELINE
 from clsplat.pipeline import matrix
+from clsplat.pipeline.execution import Execution
 from clsplat.pipeline.loading import Pipeline
 from clsplat.pipeline.matrix import Experiment
 from clsplat.prepare.cache import plan, prepare

@@ -1,19 +1,18 @@
 """How the cells of a matrix are run: the keys of `execution:`, or of a file that `--on` names."""
 
-import logging
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, field_validator, model_validator
 
-from clsplat.errors import ConfigError, DeviceError, one_line
-from clsplat.pipeline.explanation import explain, first_fault, place_text
-from clsplat.pipeline.yaml_file import Document, read_yaml
+from clsplat.errors import ConfigError
+from clsplat.pipeline.explanation import explain, first_fault
+from clsplat.pipeline.yaml_file import read_yaml
 from clsplat.settings import ReadPath, Settings
 
-LOG = logging.getLogger("clsplat")
 STORE = "runs/store"
 LOOPBACK = ("127.0.0.1", "localhost")
+OF_A_STORE = ("devices", "placement", "retries")  # keys that only cells of a store obey
 
 
 class Placement(Settings):
@@ -53,14 +52,40 @@ class Execution(Settings):
     tls: Tls | None = None
     """Certificates for tls://."""
 
+    @field_validator("store")
+    @classmethod
+    def _names_a_folder(cls, store: str | None) -> str | None:
+        if store == "":  # of a variable that was not set: it would be the working folder
+            raise ValueError("expected the path of a folder")
+        return store
+
     @model_validator(mode="after")
-    def _is_safe(self) -> "Execution":
+    def _is_meant(self) -> "Execution":
+        """Refuse keys that nothing would obey, and a scheduler that anybody could reach."""
         scheme = self.engine.partition("://")[0]
+        unused = {key: "expected a store too, without which cells run one after the other" for key in OF_A_STORE}
+        unused = unused if self.keeps is None else {}
+        if self.has_workers:
+            unused["devices"] = "a scheduler has the devices that `clsplat worker --device NAME` offers"
+        if scheme != "tls":
+            unused["tls"] = "certificates are for an engine tls://HOST:PORT"
+        if scheme != "dask":
+            unused["insecure"] = "it is for an engine dask://HOST:PORT"
+        for key, reason in unused.items():
+            if getattr(self, key) != type(self).model_fields[key].default:
+                raise ValueError(f"{key} has no effect with engine {self.engine}: {reason}; or leave it out")
         if scheme == "dask" and not self.is_local and not self.insecure:
-            raise ValueError(f"{self.engine}: expected tls:// for another machine, or insecure: true")
+            raise ValueError(f"{self.engine}: expected tls:// for another machine, or insecure: true (--insecure)")
         if scheme == "tls" and self.tls is None:
-            raise ValueError(f"{self.engine}: expected tls: {{ca: …, cert: …, key: …}}")
+            raise ValueError(
+                f"{self.engine}: expected tls: {{ca: …, cert: …, key: …}} (--tls-ca, --tls-cert and --tls-key)"
+            )
         return self
+
+    @property
+    def has_workers(self) -> bool:
+        """Whether cells run on the devices that workers offer to a scheduler."""
+        return self.engine.startswith(("dask://", "tls://"))
 
     @property
     def is_local(self) -> bool:
@@ -80,50 +105,25 @@ class Execution(Settings):
         return Path(self.store)
 
 
-def execution_of(values: dict[str, Any], path: Path, place: tuple[str, ...] = ("execution",)) -> Execution:
-    """Check the keys of `execution` of a file.  place: where they stand in it.  Raises ConfigError, with the line."""
-    try:
-        return Execution.model_validate(values)
-    except ValidationError as error:
-        document = read_yaml(path)
-        lines = {line[len(place) :]: n for line, n in document.lines.items() if line[: len(place)] == place}
-        raise ConfigError(explain(error, Execution, path, Document(values, lines))) from error
-
-
-def check_execution(file: Path) -> None:
-    """Check the `execution` of a file, where it has one.  Raises ConfigError with the line."""
-    data = read_yaml(file).data
-    if isinstance(data, dict) and "execution" in data:
-        execution_of(data["execution"], file)
-
-
 def values_of(file: Path | None) -> dict[str, Any] | None:
     """Return the keys of an execution file as plain data, which were checked; None without.  Raises ConfigError."""
     if file is None:
         return None
-    data = read_yaml(file).data
-    if not isinstance(data, dict):
+    document = read_yaml(file)
+    if not isinstance(document.data, dict):
         raise ConfigError(f"{file}:1: expected keys such as engine and store")
-    execution_of(data, file, ())
-    return data
+    try:
+        Execution.model_validate(document.data)
+    except ValidationError as error:
+        raise ConfigError(explain(error, Execution, file, document)) from error
+    return document.data
 
 
 def options(values: dict[str, Any]) -> Execution:
-    """Check keys that options of a command gave.  Raises ConfigError."""
+    """Check keys that options of `clsplat worker` gave.  Raises ConfigError with the option."""
     try:
         return Execution.model_validate(values)
     except ValidationError as error:
         place, complaint = first_fault(error, Execution)
-        raise ConfigError(f"--scheduler: {place_text(place)}: {complaint}" if place else complaint) from error
-
-
-def warn_of_open_port(execution: Execution) -> None:
-    """Say so where a scheduler elsewhere is reached without TLS."""
-    if execution.insecure:
-        LOG.warning("%s: is not encrypted; whoever reaches the scheduler's port can run code", execution.engine)
-
-
-def unanswered(execution: Execution, error: BaseException) -> DeviceError:
-    """Return the error of a scheduler that cannot be reached."""
-    reason = one_line(error.__cause__ or error) or "no answer"
-    return DeviceError(f"{execution.engine}: cannot be worked with ({reason}); start it with `dask scheduler`")
+        option = "-".join(map(str, place)).replace("engine", "scheduler")
+        raise ConfigError(f"--{option}: {complaint}" if place else complaint) from error
