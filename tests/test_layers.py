@@ -57,7 +57,7 @@ def unit(module: str) -> str:
 
 
 TEXTS = {  # what turns results into lines of text
-    "clsplat.blocks.table": {"table"},
+    "clsplat.blocks.table": {"status_table", "table"},
     "clsplat.cluster.overview": {"overview_text"},
     "clsplat.compress.page": {"table"},
     "clsplat.conformance.page": {"check_place", "write_page"},

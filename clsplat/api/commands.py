@@ -84,14 +84,12 @@ def status(folder: PathLike) -> dict[str, Any]:
 
     A matrix has `cells`, `done` and `failed` in the place of the step.  `silent` is the time in s since the last
     heartbeat of a run that has not ended, `ahead` that by which it lies in the future, from a minute on; the state is
-    `killed` where its process is gone.  Of the store of a sweep return its `cells`, `counts` of their states, `events`.
+    `killed` where its process is gone.  Of the store of a sweep return its `cells`, `counts` of their states, `events`,
+    of a scene in blocks its `state` and its `parts`.
     """
-    from clsplat.cluster.overview import is_store, store_status
-    from clsplat.runs.status import run_status
+    from clsplat.blocks.folder import status_of
 
-    if is_store(Path(folder)):
-        return store_status(Path(folder))
-    return run_status(Path(folder))
+    return status_of(Path(folder))
 
 
 def status_schema() -> dict[str, Any]:
@@ -104,10 +102,11 @@ def status_schema() -> dict[str, Any]:
 def check(pipeline: PathLike) -> dict[str, Any]:
     """Validate a pipeline or a matrix; return its `path`, its `name`, and its `stages` or `cells`.
 
-    Of a run folder return `whole`, its `state`, and `objects`: every file, whether it is `whole`, and a `detail`.  Of a
-    model file return its `format`, `ranges`, `bounds`, `degenerate` counts, `findings`, and whether it is `valid`.
+    Of a run folder, or that of a scene in blocks, return `whole`, its `state`, and `objects`: every file, whether it is
+    `whole`, and a `detail`.  Of a model file return its `format`, `ranges`, `bounds`, `degenerate` counts, `findings`,
+    and whether it is `valid`.
     """
-    from clsplat.runs.check import check
+    from clsplat.blocks.folder import check
 
     load_plugins()
     return check(str(pipeline))

@@ -11,10 +11,11 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.blocks.folder import COARSE, MERGED, RECORD
 from clsplat.blocks.partition import SIGHT, Block, Partition, Partitioner
 from clsplat.blocks.pipelines import of_block, of_coarse, of_merged, require_divisible, without_start
 from clsplat.conformance.quick import open_correct
-from clsplat.errors import ClsplatError, ConfigError, DataError, Interrupted, amount, as_clsplat_error, one_line, quoted
+from clsplat.errors import ClsplatError, ConfigError, DataError, NoneInsideError, amount, quoted
 from clsplat.formats.ply_joining import join_plys
 from clsplat.formats.table import detect
 from clsplat.gaussians.model import load as load_model
@@ -24,6 +25,7 @@ from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import Pipeline, load
 from clsplat.pipeline.places import placeless
 from clsplat.reading import read_json, sha256
+from clsplat.runs.failures import Failures
 from clsplat.runs.scenes import read_run_scene
 from clsplat.runs.source import as_setting, photographs_of, require_model
 from clsplat.tuning.folder import claimed
@@ -31,7 +33,6 @@ from clsplat.tuning.tuning import trained
 from clsplat.views.photographs import Photographs
 
 LOG = logging.getLogger("clsplat")
-RECORD, COARSE, MERGED = "blocks.json", "coarse", "merged"
 MOST = 99  # blocks
 Steps = Literal["each", "shared"]
 
@@ -104,44 +105,43 @@ class Blocks:
         share = Fraction(len(block.views), partition.views) if self.plan.steps == "shared" else Fraction(1)
         return of_block(self.pipeline, block, self.out / f"{block.name}.ply", partition.extent, share)
 
-    def train(self, partition: Partition) -> list[Path]:
-        """Train the blocks that are not done; return their models, in order.
+    def train(self, partition: Partition) -> list[tuple[Block, Path]]:
+        """Train the blocks that are not done; return them with their models, in order.
 
-        One that fails does not stop the others; at the end an error names the first, and has its exit code.
+        One in whose cell no Gaussian is left has no model.  One that fails does not stop the others; at the end an
+        error names the first, and has its exit code.
         """
-        files, failures = [], dict[str, ClsplatError]()
+        files, failures = [], Failures("blocks")
         pipelines = [self.of_block(block, partition) for block in partition.blocks]
         for block, pipeline in zip(partition.blocks, pipelines, strict=True):
             LOG.info("%s of %d: %s", block.name, len(pipelines), amount(len(block.views), "view"))
-            try:
-                files.append(as_trained(trained(pipeline, self.out / block.name, self.device)))
-            except Interrupted:
-                raise
-            except Exception as error:
-                failures[block.name] = as_clsplat_error(error)
-                LOG.warning("%s failed: %s", block.name, one_line(failures[block.name]))
+            with failures.kept(block.name):
+                try:
+                    files.append((block, as_trained(trained(pipeline, self.out / block.name, self.device))))
+                except NoneInsideError:
+                    LOG.warning("%s: no Gaussian is left in its cell; the model goes on without it", block.name)
         if failures:
-            name, first = next(iter(failures.items()))
-            told = f"{len(failures)} of {len(pipelines)} blocks failed; the first, {name}: {first}"
-            whole = ClsplatError(
-                f"{told}; when that is mended, the same command trains them, and leaves the others alone"
-            )
-            whole.exit_code = first.exit_code
-            raise whole
+            remedy = "when that is mended, the same command trains them, and leaves the others alone"
+            other = f"other settings need another --out; --coarse {self.out / COARSE} keeps the coarse model there"
+            whole = failures.whole(len(pipelines))
+            error = ClsplatError(f"{whole}; {remedy if self.given else f'{remedy}; {other}'}")
+            error.exit_code = whole.exit_code
+            raise error
+        if not files:
+            raise NoneInsideError("no Gaussian is left in any block; expected another pipeline, with another --out")
         return files
 
-    def merge(self, partition: Partition, files: list[Path]) -> Path:
+    def merge(self, parts: list[tuple[Block, Path]]) -> Path:
         """Write the models of all blocks as one, in the order of their numbers; return its file."""
         file = self.out / f"{MERGED}.ply"
 
         def check(number: int, means: NDArray[np.float32]) -> None:
-            if not partition.blocks[number].cell.box.holds(means).all():
-                raise DataError(
-                    f"{files[number]}: holds Gaussians outside its cell; remove its folder, and train it again"
-                )
+            block, path = parts[number]
+            if not block.cell.box.holds(means).all():
+                raise DataError(f"{path}: holds Gaussians outside its cell; remove its folder, and train it again")
 
-        count = join_plys(file, files, check)
-        LOG.info("%s of %s merged", amount(count, "Gaussian"), amount(len(files), "block"))
+        count = join_plys(file, [path for _, path in parts], check)
+        LOG.info("%s of %s merged", amount(count, "Gaussian"), amount(len(parts), "block"))
         return file
 
     def finish(self, file: Path) -> Path:
@@ -163,7 +163,7 @@ def train_in_blocks(
         partition = work.partition()
         if only_plan:
             return {**partition.data(), "run": None}
-        run = work.finish(work.merge(partition, work.train(partition)))
+        run = work.finish(work.merge(work.train(partition)))
     return {**partition.data(), "run": str(run), "metrics": read_json(run / METRICS)}
 
 

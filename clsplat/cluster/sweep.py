@@ -17,7 +17,7 @@ from clsplat.cluster.probe import places
 from clsplat.cluster.progress import Watched
 from clsplat.cluster.store import Store
 from clsplat.cluster.task import Outcome, Terms
-from clsplat.errors import ClsplatError, Interrupted, one_line
+from clsplat.errors import ClsplatError, Interrupted
 from clsplat.files import write_text
 from clsplat.names import PIPELINE
 from clsplat.pipeline import matrix
@@ -26,8 +26,8 @@ from clsplat.pipeline.loading import Pipeline
 from clsplat.pipeline.matrix import Experiment
 from clsplat.prepare.cache import plan, prepare
 from clsplat.runs import folders
-from clsplat.runs.experiment import check_matrix_folder, compare, first_of
-from clsplat.runs.failures import failures_recorded
+from clsplat.runs.experiment import check_matrix_folder, compare
+from clsplat.runs.failures import Failures, failures_recorded
 from clsplat.runs.folders import Start
 from clsplat.signals import stop_at_once, stopping_on_signals
 from clsplat.stages.optimize import Optimize
@@ -68,7 +68,7 @@ def run_sweep(
         status.require_held()
         compare(experiment, out, sweep.failures)
         if sweep.failures:
-            raise first_of(sweep.failures, len(experiment.cells), "failed")
+            raise sweep.failures.whole(len(experiment.cells))
         status.end("done", exit_code=0)
 
 
@@ -122,7 +122,7 @@ class _Sweep:
     store: Store
     stop: threading.Event
     is_anew: bool  # whether what is in the folder of the matrix is replaced
-    failures: dict[str, ClsplatError] = field(default_factory=dict)
+    failures: Failures = field(default_factory=lambda: Failures("cells"))
     running: dict[str, Cell] = field(default_factory=dict)
     outcomes: dict[str, Outcome] = field(default_factory=dict)
     keys: dict[str, str] = field(default_factory=dict)
@@ -143,12 +143,8 @@ class _Sweep:
         """Return the cells whose scenes can be read; the others have failed."""
         scenes, found = Scenes(self.store.scenes), []
         for cell in self.experiment.cells:
-            try:
+            with self.failures.kept(cell.name):
                 found.append(wanted_cell(cell, scenes, self.store))
-            except Interrupted:
-                raise
-            except ClsplatError as error:
-                self._failed(cell.name, error)
         return found
 
     def go(self, drive: Drive, wanted: Sequence[Wanted]) -> None:
@@ -184,25 +180,18 @@ class _Sweep:
         else:
             error = Interrupted(outcome.message) if outcome.state == "stopped" else ClsplatError(outcome.message)
             error.exit_code = outcome.exit_code
-            self._failed(cell.name, error)
+            self.failures.note(cell.name, error)
         self.outcomes[cell.name] = outcome
         self.status.note(
             done=len({*self.outcomes, *self.failures}),
-            failed={name: one_line(one) for name, one in self.failures.items()},
+            failed=self.failures.texts(),
         )
         self.status.refresh()
 
     def _place(self, cell: Cell) -> None:
         """Put a result into the folder of the matrix, unless it is there."""
         result, here = self.store.folder(cell.key).result, self.status.out / cell.name
-        try:
-            if not self.is_anew and is_placed(result, here):
-                return
-            self.status.require_held()
-            place_copy(result, here)
-        except ClsplatError as error:
-            self._failed(cell.name, error)
-
-    def _failed(self, name: str, error: ClsplatError) -> None:
-        self.failures[name] = error
-        LOG.warning("cell %s failed: %s", name, one_line(error))
+        with self.failures.kept(cell.name):
+            if self.is_anew or not is_placed(result, here):
+                self.status.require_held()
+                place_copy(result, here)
