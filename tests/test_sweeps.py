@@ -6,6 +6,7 @@ import shutil
 import subprocess
 from contextlib import suppress
 from pathlib import Path
+from unittest.mock import ANY
 
 import pytest
 
@@ -65,7 +66,7 @@ def test_the_folder_of_a_matrix_has_what_it_has_without_a_store(file, runs, few_
     model = out / "tiny-seed=0" / "point_cloud.ply"
     assert model.read_bytes() == (few_steps / "point_cloud.ply").read_bytes()
     store = Store(tmp_path / "store")
-    (key,) = [key for cells in store.sweeps() for name, key in cells.items() if name == "tiny-seed=0"]
+    (key,) = [key for _, cells in store.sweeps() for name, key in cells.items() if name == "tiny-seed=0"]
     result = store.folder(key).result
     assert os.path.samefile(model, result / "point_cloud.ply")
     assert not os.path.samefile(model.with_name("metrics.jsonl"), result / "metrics.jsonl"), "a run appends to it"
@@ -326,7 +327,7 @@ def test_the_engine_of_a_machine_runs_cells_side_by_side_on_loopback_alone(tmp_p
 def test_a_cell_whose_spec_was_changed_fails_alone(file, runs, tmp_path):
     commands.run(file, out=tmp_path / "out")
     store = Store(tmp_path / "store")
-    (key,) = [cells["tiny-seed=1"] for cells in store.sweeps()]
+    (key,) = [cells["tiny-seed=1"] for _, cells in store.sweeps()]
     (store.folder(key).path / "spec.json").write_text("{}")
     runs["seed"] = "no cell is run again"
     with pytest.raises(ClsplatError, match=r"1 of 2 cells failed; the first, tiny-seed=1: .*remove .*: its cell runs"):
@@ -339,11 +340,24 @@ def test_damaged_records_of_a_store_do_not_stop_who_looks(file, runs, tmp_path):
     before = store_status(store.root)
     (store.root / "events" / "x.jsonl").write_text('3\n[1]\n{"time": "x"}\n{"time": null}\n{"ti')
     (store.root / "events" / "y.jsonl").mkdir()
-    assert store_status(store.root) == before
+    assert store_status(store.root) == {**before, "time": ANY}
     for damage in ("[1]", '{"pipeline": 3}'):
         for folder in store.folders():
             (folder.path / "spec.json").write_text(damage)
         assert store_status(store.root)["counts"] == before["counts"]
+
+
+def test_a_page_is_of_a_store_and_never_over_a_file_of_a_run(few_steps, store, tmp_path):
+    store.now()
+    (store.root / "cells").mkdir()
+    commands.status(store.root, tmp_path / "page.html")
+    assert "no cells" in (tmp_path / "page.html").read_text()
+    for folder, html, words in (
+        (few_steps, tmp_path / "page.html", "--html: .* is no store of cells"),
+        (store.root, tmp_path / "page.txt", "ends in .html"),
+    ):
+        with pytest.raises(ConfigError, match=words):
+            commands.status(folder, html)
 
 
 def test_a_single_pipeline_has_no_cell_by_number(runs, tmp_path):

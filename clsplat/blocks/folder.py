@@ -6,9 +6,10 @@ from pathlib import Path
 from typing import Any
 
 from clsplat.cluster.overview import is_store, store_status
-from clsplat.errors import DataError, one_line
+from clsplat.errors import ConfigError, DataError, one_line
 from clsplat.names import END_STATES
 from clsplat.reading import read_json
+from clsplat.results import check_result
 from clsplat.runs import check as runs_check
 from clsplat.runs import file_checks
 from clsplat.runs.found import has_state
@@ -28,11 +29,24 @@ def is_in_blocks(folder: Path) -> bool:
     return (folder / RECORD).is_file()
 
 
-def status_of(folder: Path) -> dict[str, Any]:
-    """Return the state of what a folder holds: a scene in blocks, a store of cells, or a run.  Raises DataError."""
+def status_of(folder: Path, html: Path | None = None) -> dict[str, Any]:
+    """Return the state of what a folder holds: a scene in blocks, a store of cells, or a run.
+
+    html: a page to be written of a store.  Raises DataError; ConfigError where the page is of something else.
+    """
+    if html is not None and not is_store(folder):
+        raise ConfigError(f"--html: {folder} is no store of cells; a run and a matrix have pages in their folders")
     if is_in_blocks(folder):
         return blocks_status(folder)
-    return store_status(folder) if is_store(folder) else run_status(folder)
+    if not is_store(folder):
+        return run_status(folder)
+    found = store_status(folder)
+    if html is not None:
+        from clsplat.cluster.page import write_page  # and what fills templates, which a look does not need
+
+        check_result(html, ".html")
+        write_page(found, html)
+    return found
 
 
 def check(pipeline: str) -> dict[str, Any]:

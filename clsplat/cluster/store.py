@@ -102,12 +102,14 @@ class Store:
         file = f"{name[:50]}-{hashlib.sha256(text.encode()).hexdigest()[:8]}.json"
         write_text(self.root / SWEEPS / file, json.dumps({"name": name, "cells": keys}, indent=1) + "\n")
 
-    def sweeps(self) -> list[dict[str, str]]:
-        """Return the cells of each matrix: keys by the cells' names."""
+    def sweeps(self) -> list[tuple[str, dict[str, str]]]:
+        """Return the name of each matrix, and its cells: keys by the cells' names."""
         found = []
         for path in sorted((self.root / SWEEPS).glob("*.json")):
             with suppress(DataError, KeyError, TypeError, AttributeError):
-                found.append({str(name): str(key) for name, key in read_json(path)["cells"].items()})
+                values = read_json(path)
+                cells = {str(name): str(key) for name, key in values["cells"].items()}
+                found.append((str(values["name"]), cells))
         return found
 
     def add(self, cell: Cell) -> CellFolder:
@@ -147,7 +149,7 @@ class Store:
 
         Of several cells of a name it is the one that is not published.
         """
-        named = {key for cells in self.sweeps() for name, key in cells.items() if name == cell}
+        named = {key for _, cells in self.sweeps() for name, key in cells.items() if name == cell}
         named = {key for key in named if not self.folder(key).result.is_dir()} or named
         named = named or {folder.key for folder in self.folders() if folder.key.startswith(cell)}
         if len(named) != 1:
