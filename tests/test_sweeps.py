@@ -14,6 +14,7 @@ from clsplat.api import commands, sweeps
 from clsplat.cluster import engine, single, sweep
 from clsplat.cluster.cell import Cell
 from clsplat.cluster.drive import Drive, Wanted
+from clsplat.cluster.fingerprint import code_digest
 from clsplat.cluster.overview import store_status
 from clsplat.cluster.probe import Place
 from clsplat.cluster.store import Store
@@ -162,6 +163,12 @@ def test_without_a_store_the_cells_run_as_they_did(file, tmp_path, monkeypatch):
         ("placement: {bits: any}", "placement has no effect with engine inline: expected a store too"),
         ("devices: [pocl]", "devices has no effect with engine inline: expected a store too"),
         ("engine: local, tls: {ca: a, cert: b, key: c}", "tls has no effect with engine local: certificates are for"),
+        ("engine: slurm, insecure: true", "slurm: expected slurm: {jobs: …, cores: …, memory: …, walltime: …}"),
+        (
+            "engine: slurm, slurm: {jobs: 2, cores: 4, memory: 8GB, walltime: '1:00:00'}",
+            "slurm: expected tls: ",
+        ),
+        ("engine: local, slurm: {jobs: 2, cores: 4, memory: 8GB, walltime: '1:00:00'}", "slurm has no effect with"),
         ("engine: local, insecure: true", "insecure has no effect with engine local: it is for an engine dask://"),
         (
             "engine: dask://127.0.0.1:1, devices: [a]",
@@ -229,17 +236,17 @@ def authority(tmp_path_factory: pytest.TempPathFactory) -> Tls:
     ],
 )
 def test_certificates_that_cannot_be_used_are_named(authority, changed, words):
-    scheduler = pytest.importorskip("clsplat.cluster.scheduler")
+    library = pytest.importorskip("clsplat.cluster.library")
     folder = Path(authority.ca).parent
-    assert scheduler.security(authority).require_encryption
+    assert library.security(authority).require_encryption
     with pytest.raises(ConfigError, match=words):
-        scheduler.security(authority.model_copy(update={key: str(folder / name) for key, name in changed.items()}))
+        library.security(authority.model_copy(update={key: str(folder / name) for key, name in changed.items()}))
 
 
 def test_a_device_is_not_chosen_for_a_scheduler(file, tmp_path):
     on = tmp_path / "lab.yaml"
     on.write_text("engine: dask://127.0.0.1:1\n")
-    with pytest.raises(ConfigError, match="--device: a scheduler has the devices that `clsplat worker --device NAME`"):
+    with pytest.raises(ConfigError, match="--device: a scheduler has the devices that its workers offer"):
         commands.run(file, out=tmp_path / "out", on=on, device="pocl")
 
 
@@ -254,7 +261,8 @@ class FakeClient:
     def __init__(self, **workers: str) -> None:
         """workers: the version of the program of each."""
         self.status = "running"
-        self.info = {"workers": {name: {"name": self.told(code)} for name, code in workers.items()}}
+        told = {name: {"metrics": {"clsplat": self.told(code)}} for name, code in workers.items()}
+        self.info = {"workers": told}
 
     @staticmethod
     def told(code: str) -> str:
@@ -272,11 +280,18 @@ def test_workers_of_another_version_alone_end_a_sweep(tmp_path, monkeypatch):
     monkeypatch.setattr(scheduler, "ALONE", -1.0)
     with pytest.raises(DeviceError, match=r"no worker of this version for .* \(1 of another version get no cells\)"):
         scheduler.Cluster(FakeClient(old="another"), Store(tmp_path)).places()
+    jobs = type("Jobs", (), {"scale": lambda *count: None})()
+    waits = [True, False]
+    queue = scheduler.Cluster(FakeClient(), Store(tmp_path), jobs, jobs=(2, lambda: waits.pop(0)))
+    assert queue.places() == [], "its jobs wait"
+    queue._looked = -scheduler.LOOK
+    with pytest.raises(DeviceError, match=r"no worker .*; no job waits; .*slurm has what they printed"):
+        queue.places()
 
 
 def test_a_worker_that_is_gone_gets_no_cell(tmp_path):
     scheduler = pytest.importorskip("clsplat.cluster.scheduler")
-    client = FakeClient(one=scheduler.code_digest())
+    client = FakeClient(one=code_digest())
     cluster = scheduler.Cluster(client, Store(tmp_path))
     assert [place.worker for place in cluster.places()] == ["one"]
     client.info = {"workers": {}}
@@ -305,10 +320,11 @@ def listening() -> set[str]:
 
 def test_the_engine_of_a_machine_runs_cells_side_by_side_on_loopback_alone(tmp_path, monkeypatch):
     scheduler = pytest.importorskip("clsplat.cluster.scheduler")
+    library = pytest.importorskip("clsplat.cluster.library")
     places = [Place("local", "one", "b"), Place("local", "two", "b")]
     monkeypatch.setattr(scheduler, "places", lambda worker, devices: places)
     store, ended, seen = Store(tmp_path / "store"), [], set()
-    before = {key: scheduler.dask.config.get(key) for key in scheduler.SETTINGS}
+    before = {key: library.dask.config.get(key) for key in library.SETTINGS}
     cluster = scheduler.engine(Execution(engine="local"), store, None)
     try:
         cluster.command_of = lambda device: command(WRITES + f"; print({device!r})")
@@ -320,7 +336,7 @@ def test_the_engine_of_a_machine_runs_cells_side_by_side_on_loopback_alone(tmp_p
         cluster.close()
     assert {cell.name: outcome.state for cell, outcome in ended} == {f"cell {i}": "published" for i in range(4)}
     assert seen == {"127.0.0.1"}
-    assert {key: scheduler.dask.config.get(key) for key in before} == before, "what this process had set"
+    assert {key: library.dask.config.get(key) for key in before} == before, "what this process had set"
     assert len({event["worker"] for event in store.events() if event["event"] == "start"}) == 1
 
 

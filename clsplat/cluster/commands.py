@@ -19,7 +19,9 @@ def run_job(job: Job, device: str | Device | None, live: int | None = None, minu
     if isinstance(device, Device):
         raise ConfigError("expected the name of a device: the cells of a store run in other processes")
     if device is not None and work.execution.has_workers:
-        raise ConfigError("--device: a scheduler has the devices that `clsplat worker --device NAME` offers")
+        raise ConfigError(
+            "--device: a scheduler has the devices that its workers offer, by `clsplat worker --device NAME`"
+        )
     from clsplat.cluster.sweep import run_sweep  # and what tells devices apart, which a single run does not need
 
     run_sweep(work, job.out, work.execution, device, job.start)

@@ -33,12 +33,33 @@ class Tls(Settings):
     """Its private key."""
 
 
+class Slurm(Settings):
+    """Jobs of a SLURM cluster, each of which is a worker with one device: that which a run would choose there."""
+
+    jobs: Annotated[int, Field(ge=1)]
+    """Jobs at a time."""
+    cores: Annotated[int, Field(ge=1)]
+    """CPU cores of a job."""
+    memory: Annotated[str, Field(pattern=r"^\d+(\.\d+)? ?[KMGT]i?B$")]
+    """Memory of a job, such as 16GB."""
+    walltime: Annotated[str, Field(pattern=r"^[\d:-]+$")]
+    """Time of a job, HH:MM:SS.  Two minutes before its end its cell saves its state, and the next job goes on."""
+    partition: str | None = None
+    """Where jobs are submitted; without it, that which the cluster has as its default."""
+    account: str | None = None
+    """Who pays for it."""
+    options: list[str] = Field([])
+    """Other options of sbatch, such as --gres=gpu:1."""
+    interface: str | None = None
+    """Network interface by which nodes reach this machine, such as ib0; without it, that of its name."""
+
+
 class Execution(Settings):
     """Where the cells of a matrix run, and where they are kept."""
 
-    engine: Annotated[str, Field(pattern=r"^(inline|local|(dask|tls)://[^/:\s]+:\d{1,5})$")] = "inline"
-    """inline: one after the other in this process; local: one process a device of this machine; dask://HOST:PORT or
-    tls://HOST:PORT: on the devices that `clsplat worker` offers to that scheduler."""
+    engine: Annotated[str, Field(pattern=r"^(inline|local|slurm|(dask|tls)://[^/:\s]+:\d{1,5})$")] = "inline"
+    """inline: one after the other in this process; local: one process a device of this machine; slurm: jobs that this
+    process submits; dask://HOST:PORT or tls://HOST:PORT: the devices that `clsplat worker` offers to that scheduler."""
     store: ReadPath | None = None
     """Folder of cells and results, shared by all machines; without it runs/store, and inline runs without a store."""
     devices: Literal["auto"] | Annotated[list[str], Field(min_length=1)] = "auto"
@@ -50,7 +71,9 @@ class Execution(Settings):
     insecure: bool = False
     """Whether a scheduler on another machine may be reached without TLS: whoever reaches its port can run code."""
     tls: Tls | None = None
-    """Certificates for tls://."""
+    """Certificates for tls:// and slurm."""
+    slurm: Slurm | None = None
+    """The jobs of engine slurm."""
 
     @field_validator("store")
     @classmethod
@@ -66,16 +89,24 @@ class Execution(Settings):
         unused = {key: "expected a store too, without which cells run one after the other" for key in OF_A_STORE}
         unused = unused if self.keeps is None else {}
         if self.has_workers:
-            unused["devices"] = "a scheduler has the devices that `clsplat worker --device NAME` offers"
-        if scheme != "tls":
-            unused["tls"] = "certificates are for an engine tls://HOST:PORT"
-        if scheme != "dask":
-            unused["insecure"] = "it is for an engine dask://HOST:PORT"
+            unused["devices"] = "a scheduler has the devices that its workers offer"
+        if scheme not in ("tls", "slurm"):
+            unused["tls"] = "certificates are for an engine tls://HOST:PORT, and slurm"
+        if scheme not in ("dask", "slurm"):
+            unused["insecure"] = "it is for an engine dask://HOST:PORT, and slurm"
+        if scheme != "slurm":
+            unused["slurm"] = "it is for engine slurm"
         for key, reason in unused.items():
             if getattr(self, key) != type(self).model_fields[key].default:
                 raise ValueError(f"{key} has no effect with engine {self.engine}: {reason}; or leave it out")
         if scheme == "dask" and not self.is_local and not self.insecure:
             raise ValueError(f"{self.engine}: expected tls:// for another machine, or insecure: true (--insecure)")
+        if scheme == "slurm" and self.slurm is None:
+            raise ValueError("slurm: expected slurm: {jobs: …, cores: …, memory: …, walltime: …}")
+        if scheme == "slurm" and self.tls is None and not self.insecure:
+            raise ValueError(
+                "slurm: expected tls: {ca: …, cert: …, key: …}, or insecure: true, for jobs on other machines"
+            )
         if scheme == "tls" and self.tls is None:
             raise ValueError(
                 f"{self.engine}: expected tls: {{ca: …, cert: …, key: …}} (--tls-ca, --tls-cert and --tls-key)"
@@ -85,7 +116,7 @@ class Execution(Settings):
     @property
     def has_workers(self) -> bool:
         """Whether cells run on the devices that workers offer to a scheduler."""
-        return self.engine.startswith(("dask://", "tls://"))
+        return self.engine.startswith(("dask://", "tls://", "slurm"))
 
     @property
     def is_local(self) -> bool:
