@@ -289,6 +289,18 @@ def test_workers_of_another_version_alone_end_a_sweep(tmp_path, monkeypatch):
         queue.places()
 
 
+@pytest.mark.parametrize("starter", ["nobody", "this machine", "a queue"])
+def test_a_cell_stays_with_the_worker_of_its_device(tmp_path, monkeypatch, starter):
+    scheduler = pytest.importorskip("clsplat.cluster.scheduler")
+    client, sent = FakeClient(), []
+    monkeypatch.setattr(client, "submit", lambda *words, **options: sent.append(options["workers"]))
+    found, starts = [PLACE] if starter == "this machine" else None, starter != "nobody"
+    scheduler.Cluster(client, Store(tmp_path), object() if starts else None, found).start(
+        Cell("a", SPEC, ""), PLACE, Terms(0.0)
+    )
+    assert sent == [None if found else [PLACE.worker]], "the workers of this machine have the same devices"
+
+
 def test_a_worker_that_is_gone_gets_no_cell(tmp_path):
     scheduler = pytest.importorskip("clsplat.cluster.scheduler")
     client = FakeClient(one=code_digest())

@@ -166,7 +166,7 @@ class Cluster:
 
     def start(self, cell: Cell, place: Place, terms: Terms) -> Ticket:
         own = replace(terms, worker=place.worker, sweep=self._sweep)
-        address = None if self._cluster else place.worker
+        address = place.worker if self._found is None else None
         with self._needs_scheduler():
             future = self._client.submit(
                 work,
