@@ -66,14 +66,20 @@ def test_the_worker_of_a_job_takes_what_the_queue_gives(monkeypatch, tls):
     assert slurm_worker.main(["nowhere"]) == 2
 
 
-@pytest.mark.parametrize(("told", "waits"), [("12", True), ("", False)])
-def test_jobs_wait_while_the_queue_knows_them(tmp_path, monkeypatch, told, waits):
+@pytest.mark.parametrize(
+    ("answer", "left"),
+    [("echo 7; echo 12", "ac"), ("true", "c"), ("exit 1", "abc")],
+    ids=["one has ended", "all have", "no answer"],
+)
+def test_jobs_that_ended_are_forgotten_where_the_queue_says_so(tmp_path, monkeypatch, answer, left):
     squeue = tmp_path / "squeue"
-    squeue.write_text(f"#!/bin/sh\n[ $3 = --jobs=12,13 ] && echo '{told}'\n")
+    squeue.write_text(f"#!/bin/sh\n{answer}\n")
     squeue.chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
-    known = {name: SimpleNamespace(job_id=number) for name, number in {"a": "12", "b": "13", "c": None}.items()}
-    assert slurm.are_waiting(SimpleNamespace(workers=known)) == waits
+    numbers = {"a": "12", "b": "13", "c": None}  # the last is being submitted
+    found = SimpleNamespace(workers={name: SimpleNamespace(job_id=number) for name, number in numbers.items()})
+    assert slurm.are_waiting(found) == ("a" in left)
+    assert "".join(found.workers) == left
 
 
 def test_the_logs_of_jobs_have_a_folder(tmp_path):

@@ -243,6 +243,13 @@ def test_certificates_that_cannot_be_used_are_named(authority, changed, words):
         library.security(authority.model_copy(update={key: str(folder / name) for key, name in changed.items()}))
 
 
+def test_a_worker_looks_at_its_certificates_before_it_proves_a_device(authority, monkeypatch):
+    pytest.importorskip("clsplat.cluster.library")
+    monkeypatch.setattr("clsplat.cluster.offer.places", lambda *words: pytest.fail("a device is proved"))
+    with pytest.raises(ConfigError, match=r"tls.ca \(--tls-ca\): gone.pem"):
+        sweeps.work_for("tls://127.0.0.1:1", tls=("gone.pem", authority.cert, authority.key))
+
+
 def test_a_device_is_not_chosen_for_a_scheduler(file, tmp_path):
     on = tmp_path / "lab.yaml"
     on.write_text("engine: dask://127.0.0.1:1\n")

@@ -42,4 +42,7 @@ def warn_of_open_port(execution: Execution) -> None:
 def unanswered(execution: Execution, error: BaseException) -> DeviceError:
     """Return the error of a scheduler that cannot be reached."""
     reason = one_line(error.__cause__ or error) or "no answer"
-    return DeviceError(f"{execution.engine}: cannot be worked with ({reason}); start it with `dask scheduler`")
+    remedy = "start it with `dask scheduler`"
+    if execution.tls:
+        remedy += " and certificates of the authority that tls.ca (--tls-ca) names"
+    return DeviceError(f"{execution.engine}: cannot be worked with ({reason}); {remedy}")

@@ -4,6 +4,7 @@ import logging
 from collections.abc import Sequence
 from typing import Any
 
+from clsplat.cluster.connection import require_certificates
 from clsplat.cluster.probe import places
 from clsplat.pipeline.execution import Execution
 from clsplat.processes import Owner
@@ -19,6 +20,8 @@ def offer(execution: Execution, devices: Sequence[str] | None = None, **options:
     """
     from clsplat.cluster import serving  # where Dask is installed
 
+    if execution.tls:
+        require_certificates(execution.tls)  # before a device is proved, which takes a while
     found = places(Owner.this().host, list(devices) if devices is not None else None)
     for place in found:
         LOG.info("offers %s, bits:%s", place.text, place.bits)

@@ -112,12 +112,13 @@ class Cluster:
         jobs: tuple[int, Callable[[], bool]] = (0, lambda: False),
     ) -> None:
         """cluster: what starts workers, and starts them again; found: the devices of this machine, on any of which its
-        workers run cells, else each has its own; jobs: their number, and whether some wait in a queue.
+        workers run cells, else each has its own; jobs: their number, and what tells whether some wait in a queue.
         """
         self._client, self._store, self._cluster, self._found = client, store, cluster, found
         self._count, self._are_waiting = len(found or ()) or jobs[0], jobs[1]
         self._sweep = uuid.uuid4().hex
         self._looked, self._seen = -LOOK, time.monotonic()
+        self._asked = self._seen  # when the queue was asked
         self._places: list[Place] = []
         self._tickets: list[_Future] = []
         self.addresses: set[str] = set()
@@ -140,6 +141,9 @@ class Cluster:
             workers = self._client.scheduler_info(n_workers=-1)["workers"]
         self.addresses = set(workers)
         if self._cluster and len(workers) < self._count:
+            if self._places and now - self._asked > ALONE:
+                self._asked = now
+                self._are_waiting()
             self._cluster.scale(self._count)  # a worker that dies while it starts is not started again by itself
         known = [one for address, worker in workers.items() if (one := place_of(address, worker))]
         self._places = known if self._found is None else self._found if workers else []

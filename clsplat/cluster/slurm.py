@@ -36,11 +36,18 @@ def cluster(execution: Execution, keys: Slurm, logs: Path) -> Any:
 
 
 def are_waiting(found: Any) -> bool:
-    """Whether a job of a cluster is in the queue, or begins."""
-    numbers = ",".join(str(job.job_id) for job in found.workers.values() if job.job_id)
-    words = ["squeue", "--noheader", "--format=%i", f"--jobs={numbers}"]
-    told = subprocess.run(words, capture_output=True, text=True, check=False)  # fails where it knows none of them
-    return bool(numbers and told.stdout.strip())
+    """Whether a job of a cluster is in the queue; those that ended are forgotten, so that they are submitted again.
+
+    Dask knows of the end of a job by its worker alone, which may not have come.
+    """
+    words = ["squeue", "--me", "--noheader", "--format=%i"]
+    told = subprocess.run(words, capture_output=True, text=True, check=False)
+    if told.returncode:  # SLURM does not answer just now
+        return True
+    for name, job in list(found.workers.items()):
+        if job.job_id and str(job.job_id) not in told.stdout.split():
+            found.workers.pop(name, None)
+    return any(job.job_id for job in found.workers.values())
 
 
 def jobs(execution: Execution, keys: Slurm, logs: Path) -> Any:
