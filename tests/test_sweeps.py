@@ -11,7 +11,7 @@ from unittest.mock import ANY
 import pytest
 
 from clsplat.api import commands, sweeps
-from clsplat.cluster import engine, single, sweep
+from clsplat.cluster import batch, engine, single
 from clsplat.cluster.cell import Cell
 from clsplat.cluster.drive import Drive, Wanted
 from clsplat.cluster.fingerprint import code_digest
@@ -53,7 +53,7 @@ def runs(few_steps: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
 
     monkeypatch.setattr(engine, "run_command", run_command)
     monkeypatch.setattr(single, "run_command", run_command)
-    for module in (sweep, single):
+    for module in (batch, single):
         monkeypatch.setattr(module, "places", lambda worker, devices=None: [PLACE])
     return ends
 
