@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 from clsplat.blocks.folder import COARSE, MERGED, RECORD
 from clsplat.blocks.partition import SIGHT, Block, Partition, Partitioner
 from clsplat.blocks.pipelines import of_block, of_coarse, of_merged, require_divisible, without_start
+from clsplat.cluster.batch import Batch
+from clsplat.cluster.store import Store
 from clsplat.conformance.quick import open_correct
 from clsplat.errors import ClsplatError, ConfigError, DataError, NoneInsideError, amount, quoted
 from clsplat.formats.ply_joining import join_plys
@@ -22,14 +24,16 @@ from clsplat.gaussians.model import load as load_model
 from clsplat.gaussians.run_model import as_trained, model_at
 from clsplat.names import METRICS
 from clsplat.opencl.device import Device
+from clsplat.pipeline.execution import Execution
 from clsplat.pipeline.loading import Pipeline, load
+from clsplat.pipeline.matrix import Cell
 from clsplat.pipeline.places import placeless
 from clsplat.reading import read_json, sha256
 from clsplat.runs.failures import Failures
 from clsplat.runs.scenes import read_run_scene
 from clsplat.runs.source import as_setting, photographs_of, require_model
 from clsplat.tuning.folder import claimed
-from clsplat.tuning.tuning import trained
+from clsplat.tuning.tuning import is_trained, trained
 from clsplat.views.photographs import Photographs
 
 LOG = logging.getLogger("clsplat")
@@ -61,8 +65,14 @@ class Plan:
 class Blocks:
     """The work in a folder."""
 
-    def __init__(self, scene: Path, out: Path, plan: Plan, device: str | Device | None) -> None:
-        self.out, self.plan = out, plan
+    def __init__(
+        self, scene: Path, out: Path, plan: Plan, device: str | Device | None, execution: Execution | None = None
+    ) -> None:
+        """execution: where blocks are trained; without it one after the other in this process."""
+        if execution is not None and execution.keeps is None:
+            raise ConfigError("--on: blocks are trained as cells of a store; expected the key store, or another engine")
+        self.out, self.plan, self.execution = out, plan, execution
+        self._name = device if isinstance(device, str) else None
         where = [f"scene.path={as_setting(photographs_of(scene))}"]
         self.pipeline = load(plan.pipeline, [*where, "init.file=coarse", *plan.overrides])
         require_divisible(self.pipeline)
@@ -112,12 +122,17 @@ class Blocks:
         error names the first, and has its exit code.
         """
         files, failures = [], Failures("blocks")
-        pipelines = [self.of_block(block, partition) for block in partition.blocks]
-        for block, pipeline in zip(partition.blocks, pipelines, strict=True):
+        pipelines = {block.name: self.of_block(block, partition) for block in partition.blocks}
+        if self.execution:
+            self._train_as_cells(self.execution, pipelines, failures)
+        for block in partition.blocks:
+            if block.name in failures:
+                continue
             LOG.info("%s of %d: %s", block.name, len(pipelines), amount(len(block.views), "view"))
             with failures.kept(block.name):
                 try:
-                    files.append((block, as_trained(trained(pipeline, self.out / block.name, self.device))))
+                    model = trained(pipelines[block.name], self.out / block.name, self.device)
+                    files.append((block, as_trained(model)))
                 except NoneInsideError:
                     LOG.warning("%s: no Gaussian is left in its cell; the model goes on without it", block.name)
         if failures:
@@ -130,6 +145,15 @@ class Blocks:
         if not files:
             raise NoneInsideError("no Gaussian is left in any block; expected another pipeline, with another --out")
         return files
+
+    def _train_as_cells(self, execution: Execution, pipelines: dict[str, Pipeline], failures: Failures) -> None:
+        """Train the blocks that are not done as cells of a store, and put their runs into the folders of blocks."""
+        cells = [
+            Cell(name, pipeline) for name, pipeline in pipelines.items() if not is_trained(pipeline, self.out / name)
+        ]
+        if cells:
+            name, store = f"{self.pipeline.settings.name}-{self.out.name}", Store(execution.keeps or Path())
+            Batch(name, str(self.out.resolve()), cells, self.out, store, failures).run(execution, self._name)
 
     def merge(self, parts: list[tuple[Block, Path]]) -> Path:
         """Write the models of all blocks as one, in the order of their numbers; return its file."""
@@ -151,14 +175,20 @@ class Blocks:
 
 
 def train_in_blocks(
-    scene: Path, out: Path, plan: Plan | None = None, device: str | Device | None = None, *, only_plan: bool = False
+    scene: Path,
+    out: Path,
+    plan: Plan | None = None,
+    device: str | Device | None = None,
+    *,
+    only_plan: bool = False,
+    execution: Execution | None = None,
 ) -> dict[str, Any]:
     """Train a scene in blocks, in a folder; return the manifest, and beside it `run`, the folder of the merged model.
 
     What an earlier call has finished is left alone, and what it has begun goes on.  only_plan: stop after the
-    partition.  Raises ClsplatError; one of a block names it.
+    partition; execution: where blocks are trained as cells of a store.  Raises ClsplatError; one of a block names it.
     """
-    work = Blocks(scene, out, plan or Plan(), device)
+    work = Blocks(scene, out, plan or Plan(), device, execution)
     with claimed(out, work.question(), RECORD, "a scene in blocks", "another --out"):
         partition = work.partition()
         if only_plan:

@@ -85,7 +85,7 @@ def trained(pipeline: Pipeline, folder: Path, device: Device, file: str = MODEL)
     What an earlier call has finished is left alone, what it has begun goes on, and what was lost is made again.  Where
     all checkpoints are damaged it begins anew.
     """
-    if not is_done_with(pipeline, folder) or changed(folder):
+    if not is_trained(pipeline, folder):
         is_whole = _is_any_whole(folder)
         if checkpoint.saved(folder) and not is_whole:
             LOG.warning("%s: no checkpoint is whole; it is trained again from the beginning", folder)
@@ -96,6 +96,11 @@ def trained(pipeline: Pipeline, folder: Path, device: Device, file: str = MODEL)
         except Interrupted as error:
             raise Interrupted(f"stopped in {folder.name}; the same command goes on") from error
     return folder / file
+
+
+def is_trained(pipeline: Pipeline, folder: Path) -> bool:
+    """Whether a run of a pipeline has come to its end in a folder, with files that are whole."""
+    return is_done_with(pipeline, folder) and not changed(folder)
 
 
 def _is_any_whole(folder: Path) -> bool:
