@@ -8,6 +8,7 @@ from clsplat.errors import ConfigError
 from clsplat.losses.base import Comparison, ImageLoss, LossValue
 from clsplat.render.rasterizer import Content
 from clsplat.schedule import at_step
+from clsplat.settings import ReadPath
 
 
 class InverseDepth(ImageLoss):
@@ -20,6 +21,9 @@ class InverseDepth(ImageLoss):
     """
 
     type: Literal["inverse_depth"] = "inverse_depth"
+    folder: ReadPath | None = None
+    """Folder of depth maps, one for each photograph: `a.png` for a.jpg, 8 or 16 bits, bright is near, linear in 1/z.
+    Each is fitted to the points of its photograph, and compared with in their place; without it, the points alone."""
     reads_photograph: ClassVar[bool] = False
 
     def reads(self, step: int) -> Content:

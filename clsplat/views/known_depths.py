@@ -1,4 +1,4 @@
-"""Depths that are known at some pixels of the training photographs: those of the points that they show."""
+"""Depths that are known at some pixels of the training photographs: of the points that they show, or of depth maps."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from clsplat.opencl.device import Array, Device
 from clsplat.render.camera import DeviceCamera
 from clsplat.scene.tracks import Tracks
+from clsplat.views.depth_maps import DepthMaps
 
 SURE = 4  # photographs that show a point whose depth counts whole; those of fewer count less
 
@@ -24,17 +25,25 @@ class KnownDepths:
 
 
 class PointDepths:
-    """The points that structure from motion has found in each training view, by the number of the view."""
+    """The points that structure from motion has found in each training view, by the number of the view.
 
-    def __init__(self, device: Device, tracks: Tracks, names: Sequence[str], extent: float) -> None:
-        self.device, self.tracks, self.extent = device, tracks, extent
+    maps: are compared with in the place of the points, which they are fitted to.
+    """
+
+    def __init__(
+        self, device: Device, tracks: Tracks, names: Sequence[str], extent: float, maps: DepthMaps | None = None
+    ) -> None:
+        self.device, self.tracks, self.names, self.extent, self.maps = device, tracks, names, extent, maps
         self._rows = [tracks.seen.get(name, np.empty(0, np.int64)) for name in names]
         counts = np.bincount(np.concatenate([*tracks.seen.values(), np.empty(0, np.int64)]))
         self._counts = np.pad(counts, (0, len(tracks.positions) - len(counts)))
         self._held: dict[tuple[int, int, int], KnownDepths | None] = {}
 
     def at(self, camera: DeviceCamera) -> KnownDepths | None:
-        """Return what is known at the size of a camera with a number; None where nothing is."""
+        """Return what is known at the size of a camera with a number; None where nothing is.
+
+        Raises DataError where a depth map cannot be read.
+        """
         if camera.view is None:
             return None
         key = camera.view, camera.width, camera.height
@@ -43,13 +52,19 @@ class PointDepths:
         return self._held[key]
 
     def _uploaded(self, camera: DeviceCamera, rows: NDArray[np.int64]) -> KnownDepths | None:
-        pixels, depths, kept = nearest_in_pixels(camera, self.tracks.positions[rows])
-        if not len(pixels):
-            return None
+        places, depths, kept = nearest_in_pixels(camera, self.tracks.positions[rows])
+        inverse: NDArray[np.floating] = 1 / depths
         weights = np.minimum(1.0, self._counts[rows[kept]] / SURE)
-        inverse, places = (1 / depths).astype(np.float32), pixels.astype(np.uint32)
-        upload = self.device.upload
-        return KnownDepths(upload(places), upload(inverse), upload(weights.astype(np.float32)), self.extent)
+        if self.maps and camera.view is not None:
+            pixels = places // camera.stride, places % camera.stride
+            found = self.maps.at(self.names[camera.view], (camera.width, camera.height), *pixels, inverse)
+            if found is None:
+                return None
+            places, inverse, weights = found[0] * camera.stride + found[1], found[2], np.ones(len(found[2]))
+        if not len(places):
+            return None
+        upload, values = self.device.upload, (inverse.astype(np.float32), weights.astype(np.float32))
+        return KnownDepths(upload(places.astype(np.uint32)), upload(values[0]), upload(values[1]), self.extent)
 
 
 def nearest_in_pixels(
