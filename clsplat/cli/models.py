@@ -113,7 +113,8 @@ def convert(
     ],
     sh_degree: Annotated[int | None, typer.Option(metavar="N", help="Keep harmonics to this degree.")] = None,
     sh_bits: Annotated[
-        str | None, typer.Option(metavar="A/B", help="SPZ: bits of band 1 and of the others; default: 8/8.")
+        str | None,
+        typer.Option(metavar="A/B", help="SPZ: bits of harmonics, of band 1 and of the others; default: by --quality."),
     ] = None,
     axes: Annotated[
         Literal["spz", "ply"],
@@ -121,7 +122,7 @@ def convert(
     ] = "spz",
     spz_version: Annotated[int, typer.Option(metavar="3|4", help="SPZ: 4 needs the extra spz.")] = 3,
     quality: Annotated[
-        Literal["small", "balanced", "high"], typer.Option(help="Of SPZ (bits) and SOG (palette).")
+        Literal["small", "balanced", "high"], typer.Option(help="Of SPZ and SOG: how finely all is rounded.")
     ] = "balanced",
     keep_nan: Annotated[
         bool, typer.Option("--keep-nan", help="Keep Gaussians that are not finite or too large, in a PLY.")

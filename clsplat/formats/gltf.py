@@ -44,7 +44,9 @@ class Gltf:
                     self.primitives.append(primitive)
                     placements.append(matrix)
         if not self.primitives:
-            raise DataError(f"{path}: holds no Gaussians ({EXTENSION}); expected a primitive that has some")
+            raise DataError(
+                f"{path}: holds no Gaussians ({EXTENSION}); expected a primitive that has some: export it again"
+            )
         if any(not np.allclose(one, placements[0]) for one in placements):
             raise DataError(f"{path}: its Gaussians stand in several places; export them apart, then merge them")
         if not np.allclose(placements[0], np.eye(4)):

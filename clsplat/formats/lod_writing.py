@@ -15,6 +15,7 @@ from clsplat.formats.output import written
 from clsplat.formats.sog_files import META
 from clsplat.formats.sog_writing import write_as_ordered
 from clsplat.formats.splats import SplatFile, Writing, require_moderate, require_some
+from clsplat.formats.weights import log_weights
 
 USUAL = Limits()
 
@@ -40,8 +41,10 @@ def write_lod(folder: Path, levels: Sequence[SplatFile], options: Writing | None
         "filenames": list(files.rows),
         "tree": shape,
     }
-    for name, (number, rows) in files.rows.items():
-        write_as_ordered(folder / name, levels[number].rows(np.concatenate(rows)), options or Writing())
+    weights = [log_weights(level.parameters) for level in levels]
+    for name, (number, parts) in files.rows.items():
+        rows = np.concatenate(parts)
+        write_as_ordered(folder / name, levels[number].rows(rows), weights[number][rows], options or Writing())
     with written(folder / LOD_META) as file:
         file.write(json.dumps(meta, separators=(",", ":"), allow_nan=False).encode())
     return file.sha256

@@ -25,7 +25,7 @@ def codebook(values: NDArray[np.floating], step: float | None = None) -> NDArray
     of another gains.  Values that are at most ENTRIES different numbers are kept; the last is then repeated.  So are
     the multiples of `step` next to them, where the values are more.
     """
-    ordered = np.sort(values.astype(np.float64), axis=None)
+    ordered = np.sort(values.astype(np.float64) + 0.0, axis=None)  # -0 and 0 are one: which comes first is by chance
     for values in [ordered] + ([np.rint(ordered / step) * step] if step else []):
         different = np.unique(values)
         if len(different) <= ENTRIES:

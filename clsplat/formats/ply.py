@@ -148,7 +148,9 @@ def _parameters(path: Path, vertices: NDArray[Any]) -> Parameters:
     degree = next((d for d in range(MAX_DEGREE + 1) if 3 * (sh_coefficients(d) - 1) == rest), None)
     columns = tuple(f"f_rest_{i}" for i in range(rest))
     if degree is None or not set(columns) <= set(names):
-        raise DataError(f"{path}: has {rest} f_rest properties; expected 0, 9, 24 or 45, numbered from 0 on")
+        raise DataError(
+            f"{path}: has {rest} f_rest properties; expected 0, 9, 24 or 45, numbered from 0 on: export it again"
+        )
     parameters = {name: _columns(vertices, columns) for name, columns in columns_of.items()}
     by_channel = _columns(vertices, columns)
     per_channel = sh_coefficients(degree) - 1

@@ -2,8 +2,8 @@
 
 What shows of errors e of the K coefficients above band 0 is w e^T G e: w as weights.py estimates it, and G the mean of
 Y(d) Y(d)^T over the directions d from which the model is seen.  Training moves coefficients along Y(d) for the cameras
-that it has, so that their own second moments stand for G: those of fox and lego have correlations of 0.86 and 0.88
-with the G of the cameras.  From these two:
+that it has, so that their own second moments are an estimate of G: those of fox and lego have correlations of 0.86 and
+0.88 with the G of the cameras.  From these two:
 
     steps  a Gaussian's step is as 1 / sqrt(w), which is the least error for a number of bits (reverse water-filling)
     order  coefficients are rounded one after another, the highest first, and those that are still to be rounded take up

@@ -105,7 +105,7 @@ class _Sog:
             return np.zeros((self.count, 0), np.float32)
         files = self._data("shN")
         if len(files) != 2:
-            raise DataError(f"{self.path}: shN has {len(files)} files; expected centroids and labels")
+            raise DataError(f"{self.path}: shN has {len(files)} files; expected centroids and labels: export it again")
         labels = webp.decode(self.path, "labels of shN", files[1], self.count, self._most(self.count))
         chosen = labels[: self.count, 0].astype(np.intp) | labels[: self.count, 1].astype(np.intp) << 8
         used = entries = 1 + int(chosen.max(initial=0))
@@ -128,7 +128,9 @@ class _Sog:
         """The degree of a version 1, which no number tells: its centroids are 64 a row."""
         width, _ = webp.size(self.path, "centroids of shN", data)
         if width // PER_ROW not in WIDTHS:
-            raise DataError(f"{self.path}: centroids of shN are {width} px wide; expected 192, 512 or 960")
+            raise DataError(
+                f"{self.path}: centroids of shN are {width} px wide; expected 192, 512 or 960: export it again"
+            )
         return WIDTHS[width // PER_ROW]
 
     def _looked_up(self, name: str, levels: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -147,7 +149,9 @@ class _Sog:
         """The first pixels of an image, one for each splat, [count, 4]."""
         group = self.images[name]
         if number >= len(group):
-            raise DataError(f"{self.path}: {name} names {len(group)} files; expected {number + 1} at least")
+            raise DataError(
+                f"{self.path}: {name} names {len(group)} files; expected {number + 1} at least: export it again"
+            )
         pixels = webp.decode(self.path, f"image {number} of {name}", group[number], self.count, self._most(self.count))
         return pixels[: self.count]
 
@@ -167,9 +171,14 @@ class _Sog:
         """The files of a part.  Raises DataError for names that leave the folder."""
         names = self._part(name).get("files")
         if not isinstance(names, list) or not 1 <= len(names) <= 2 or not all(isinstance(one, str) for one in names):
-            raise DataError(f"{self.path}: {name}.files is {quoted(names)}; expected the names of one or two files")
+            raise DataError(
+                f"{self.path}: {name}.files is {quoted(names)}; expected the names of one or two files: export it again"
+            )
         if wrong := [one for one in names if not is_beside(one)]:
-            raise DataError(f"{self.path}: {name}.files has {quoted(wrong[0])}; expected the name of a file beside it")
+            raise DataError(
+                f"{self.path}: {name}.files has {quoted(wrong[0])}; "
+                "expected the name of a file beside it: export it again"
+            )
         return [self.files.read(one) for one in names]
 
     def _ends(self, name: str, count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -188,5 +197,7 @@ class _Sog:
 
     def _whole(self, place: str, value: Any, most: int = webp.MAX_SIDE**2) -> int:
         if not isinstance(value, int) or isinstance(value, bool) or not 1 <= value <= most or math.isnan(value):
-            raise DataError(f"{self.path}: {place} is {quoted(value)}; expected a whole number from 1 to {most}")
+            raise DataError(
+                f"{self.path}: {place} is {quoted(value)}; expected a whole number from 1 to {most}: export it again"
+            )
         return value

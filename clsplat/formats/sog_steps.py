@@ -16,7 +16,7 @@ Floats = NDArray[np.floating]
 SMALL = 25  # percentile of the sizes that steps of positions are compared with
 LEVELS = 65535  # of a position, from 0
 TINY = 2.0**-40  # levels, in the place of a size of 0
-LEAST_BITS, MOST_BITS = 2, 8  # last bits of a position that are alike; the first where each Gaussian has its own step
+MOST_BITS = 8  # last bits of a position that are alike
 _SIGNED = [turn for turn in product((0, 1, -1), repeat=4) if np.count_nonzero(turn) in (1, 2, 4)]
 # rotations of the axes onto axes, [24, 4]; a quaternion and its negative are one
 _TURNS = np.array([np.divide(turn, np.linalg.norm(turn)) for turn in _SIGNED if next(filter(None, turn)) > 0])
@@ -31,7 +31,8 @@ def rounded_means(means: Floats, log_scales: Floats, share: float) -> NDArray[np
     """Return positions [N, 3] in steps of at most `share` of the size that a quarter of the Gaussians do not reach.
 
     Steps are powers of two of the levels of a SOG, for each axis, so that low bits are alike.  The least position of an
-    axis stays, and so does the greatest: they are the range that levels divide.
+    axis stays, and so does the greatest: they are the range that levels divide.  For training that follows: what a
+    Gaussian weighs changes in it.
     """
     levels, low, level = _levels(means)
     bits = np.floor(np.log2(np.maximum(share * np.percentile(_sizes(means, log_scales), SMALL, axis=0) / level, 1)))
@@ -45,12 +46,12 @@ def weighed_means(
 ) -> NDArray[np.float32]:
     """Return positions [N, 3] in steps of about `share` of the size of each Gaussian, those of median weight.
 
-    The step is as 1 / sqrt(weight) (sh_rounding.py): a power of two of the levels of a SOG, from LEAST_BITS on.
+    The step is as 1 / sqrt(weight) (sh_rounding.py): a power of two of the levels of a SOG.
     """
     levels, low, level = _levels(means)
     sizes = np.maximum(_sizes(means, log_scales) / level, TINY)
     wanted = np.log2(share * sizes) - log_weights[:, None] / 2
-    step = np.exp2(np.clip(np.floor(wanted), LEAST_BITS, MOST_BITS))
+    step = np.exp2(np.clip(np.floor(wanted), 0, MOST_BITS))
     return _positions(low + np.clip(np.rint(levels / step) * step, 0, LEVELS) * level)
 
 

@@ -54,13 +54,17 @@ def write_sog(path: Path, splats: SplatFile, options: Writing) -> str:
     """
     require_some(path, splats)
     require_moderate(path, splats, "SOG")
-    return write_as_ordered(path, splats.rows(morton_order(splats.parameters["means"])), options)
+    ordered = splats.rows(morton_order(splats.parameters["means"]))
+    return write_as_ordered(path, ordered, log_weights(ordered.parameters), options)
 
 
-def write_as_ordered(path: Path, splats: SplatFile, options: Writing) -> str:
-    """Write a SOG as `write_sog` does, whose splats stay in the order that they have."""
+def write_as_ordered(path: Path, splats: SplatFile, weights: NDArray[np.float64], options: Writing) -> str:
+    """Write a SOG as `write_sog` does, whose splats stay in the order that they have.
+
+    weights: their binary logarithms, [N], of weights.py: of the model that the splats may be a part of.
+    """
     in_folder = path.name == META
-    p, harmonics = _quantised(splats.parameters, options)
+    p, harmonics = _quantised(splats.parameters, weights, options)
     width = -(-int(np.ceil(np.sqrt(len(splats)))) // 4) * 4
     images: dict[str, bytes] = {}
     meta: dict[str, Any] = {"version": 2, "count": len(splats), "asset": {"generator": "clsplat"}}
@@ -174,21 +178,21 @@ def _few(count: int, quality: Quality) -> int:
     return min(PALETTES[quality], max(1, int(SMALLEST * 2.0 ** np.floor(np.log2(count / SMALLEST)))))
 
 
-def _quantised(p: Parameters, options: Writing) -> tuple[Parameters, Harmonics | None]:
+def _quantised(p: Parameters, weights: NDArray[np.float64], options: Writing) -> tuple[Parameters, Harmonics | None]:
     """The tables, rounded, and a palette of the harmonics.
 
     Harmonics that are a palette already stay as they are, and so do the tables then: whoever made it rounded them.
     In `high` the tables have the precision of the format.
     """
-    rest, most = p["sh_rest"], min(MAX_PALETTE, int(SHARES[options.quality] * len(p["sh_rest"])))
-    if not rest.shape[1]:
-        return p, None
-    if (kept := different(rest, _few(len(rest), options.quality)) or different(rest, most, padded=False)) is not None:
-        return p, Harmonics.by(*kept)
-    most = max(most, _few(len(rest), options.quality))
-    weights = log_weights(p)
-    harmonics = Harmonics.by(*tree_palette(rest, weights, most, MEDIAN_STEPS[options.quality]))
-    base = base_for(p["sh_base"], rest - harmonics.values, visible_form(rest))
+    rest, base = p["sh_rest"], p["sh_base"]
+    most, few = min(MAX_PALETTE, int(SHARES[options.quality] * len(rest))), _few(len(rest), options.quality)
+    kept = (different(rest, few) or different(rest, most, padded=False)) if rest.shape[1] else None
+    harmonics = None if kept is None else Harmonics.by(*kept)
+    if harmonics and rest.any():
+        return p, harmonics
+    if rest.any():
+        harmonics = Harmonics.by(*tree_palette(rest, weights, max(most, few), MEDIAN_STEPS[options.quality]))
+        base = base_for(base, rest - harmonics.values, visible_form(rest))
     if options.quality == "high":
         return {**p, "sh_base": base}, harmonics
     quats, log_scales = rounded_quats(p["quats"], p["log_scales"], TURN_STEP)

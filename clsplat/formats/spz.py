@@ -17,8 +17,6 @@ import zlib
 from collections.abc import Callable
 from pathlib import Path
 
-import deflate
-
 from clsplat.errors import DataError
 from clsplat.formats import zstd
 from clsplat.formats.output import written
@@ -90,6 +88,8 @@ def write_spz(path: Path, splats: SplatFile, options: Writing) -> str:
 
 def _gzip(data: bytes) -> bytes:
     """Bytes as one member of gzip."""
+    import deflate  # here, as only this needs it
+
     check = struct.pack("<2I", zlib.crc32(data), len(data) & 0xFFFFFFFF)
     return GZIP_START + deflate.deflate_compress(data, LEVEL) + check
 

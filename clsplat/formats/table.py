@@ -58,8 +58,9 @@ CODECS = (
         (".spz",),
         "versions 1 to 4",
         "version 3, or 4 with the extra `spz`, in groups of like precision, each along a Morton curve",
-        "rounds: position to 2^-12 or a quarter of the smallest deviation, log scale to 1/16, quaternions to 7 bits, "
-        "colours and opacity to 8, harmonics to 8 or fewer by the weight of the Gaussian; "
+        "rounds: position to 2^-12 or half of the smallest deviation, more where the Gaussian weighs little, "
+        "log scale to 1/16, quaternions to 7 bits, opacity to 8, colours and harmonics to 8 or fewer by the weight of "
+        "the Gaussian; "
         "cuts: harmonics beyond 1, colours beyond -0.44 and 1.44, scales beyond 4.5e-5 and 379; order",
         lambda start: start.data.startswith((b"NGSP", b"\x1f\x8b")),
         read_spz,
@@ -73,8 +74,9 @@ CODECS = (
         (".sog", META),
         "versions 1 and 2, bundled or as a folder with meta.json",
         "version 2, bundled, or as the files beside a meta.json, along a Morton curve",
-        "position to 16 bits of a logarithm, or an eighth of a small Gaussian's size, quaternions to 6 bits, scales "
-        "and colours to 256 values, opacity to 7 bits, harmonics to a palette, names of axes, order",
+        "position to 16 bits of a logarithm, or a quarter of a Gaussian's size, more where it weighs little, "
+        "quaternions to 6 bits, scales and colours to 256 values or to steps of 10 % and 0.014, opacity to 7 bits, "
+        "harmonics to a palette, names of axes, order",
         lambda start: looks_like_sog(start.data),
         lambda path, options: read_sog(path),
         write_sog,

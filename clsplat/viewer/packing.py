@@ -25,7 +25,6 @@ from clsplat.gaussians.model import Model
 
 BLOCK = 256  # splats
 LEVELS = 8
-TABLES = ("scales", "opacity", "base", "rest")
 MIN_OPACITY = 1 / 255  # fainter Gaussians are never drawn (ALPHA_MIN of cl_kernels/common.h)
 MIN_NORM2 = 1e-12  # shorter quaternions have no direction (QUAT_NORM2_MIN)
 FLATTEST = 9.0  # log of the largest by the smallest scale: thinner ones look the same under the screen filter

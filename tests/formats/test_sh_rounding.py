@@ -157,6 +157,24 @@ def test_an_spz_has_multiples_of_a_step_that_grows_as_weights_fall(tmp_path, rng
     assert np.abs(given - exact).max() <= 1 / 256
 
 
+def test_each_gaussian_of_an_spz_has_the_steps_of_its_own_weight(tmp_path, rng):
+    source = seen_from_one_side(rng, 500)
+    source.parameters["log_scales"] += rng.uniform(-3, 3, (500, 1)).astype(np.float32)
+    found = there_and_back(tmp_path / "a.spz", source).parameters
+    p = source.rows(morton_order(source.parameters["means"])).parameters
+    own = np.argsort(steps(log_weights(p), usual_step(p["sh_rest"], 3, 5), 64), kind="stable")
+    p = {name: table[own] for name, table in p.items()}
+    weights = log_weights(p)[:, None]
+    base = base_for(p["sh_base"], p["sh_rest"] - found["sh_rest"], visible_form(p["sh_rest"]))
+    step = steps(weights, 2**0.5, 16)
+    levels = 255 * (0.15 * found["sh_base"].astype(np.float64) + 0.5)
+    np.testing.assert_allclose(levels, np.rint(levels / step) * step, atol=1e-3)
+    assert (np.abs(found["sh_base"] - base) <= step / 2 / 255 / 0.15 + 1e-5).all()
+    assert np.abs(base - p["sh_base"]).max() > 0.05, "errors of harmonics are large enough to tell"
+    largest = np.exp(p["log_scales"].min(axis=1, keepdims=True)) / 4 * np.exp2(-weights / 2)  # half a step
+    assert (np.abs(found["means"] - p["means"]) <= np.maximum(largest, 2**-13) * 1.0001).all()
+
+
 def test_positions_and_rotations_of_an_spz_are_within_their_steps(tmp_path, rng):
     source = splats(rng, 300, 0)
     found, expected = there_and_back(tmp_path / "a.spz", source), source.rows(morton_order(source.parameters["means"]))

@@ -197,7 +197,7 @@ def test_a_palette_does_not_depend_on_the_number_of_threads(rng):
 def test_a_transparent_splat_keeps_its_colour(tmp_path, rng):
     source = splats(rng, 100, 0)
     source.parameters["logit_opacity"][:] = -20
-    found = there_and_back(tmp_path / "a.sog", source)
+    found = there_and_back(tmp_path / "a.sog", source, Writing(quality="high"))
     expected = source.rows(morton_order(source.parameters["means"]))
     assert_close(found, expected, 0.8, sh_base=0.1, opacity=1.01 / 255)
 
@@ -366,7 +366,7 @@ def test_processors_with_and_without_avx_512_write_the_same_bytes(tmp_path):
 def test_positions_are_as_fine_as_their_range_wherever_it_lies(place, tmp_path, rng):
     source = splats(rng, 400, 0)
     source.parameters["means"][:] += place
-    found = there_and_back(tmp_path / "a.sog", source).parameters["means"]
+    found = there_and_back(tmp_path / "a.sog", source, Writing(quality="high")).parameters["means"]
     expected = source.rows(morton_order(source.parameters["means"])).parameters["means"]
     assert np.abs(found - expected).max() < (0.05 if place == 5e5 else 1e-3)  # float32 holds steps of 0.03 there
     with zipfile.ZipFile(tmp_path / "a.sog") as archive:
