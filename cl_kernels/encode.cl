@@ -1,7 +1,8 @@
 /* What a network reads of a sample: the integrated positional encoding of its conical frustum, and the encoding of the
  * direction that it is seen in (Barron et al. 2021).
  *
- * A frustum from t0 to t1 of a cone is a normal distribution (equations 7 and 8): with m = (t0 + t1) / 2, h = (t1 - t0) / 2 and s = 3 m^2 + h^2
+ * A frustum from t0 to t1 of a cone is a normal distribution (equations 7 and 8): with m = (t0 + t1) / 2,
+ * h = (t1 - t0) / 2 and s = 3 m^2 + h^2
  *
  *   mean along the ray   m + 2 m h^2 / s
  *   variance along it    h^2 / 3 - 4/15 h^4 (12 m^2 - h^2) / s^2
