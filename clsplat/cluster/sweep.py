@@ -30,7 +30,7 @@ from clsplat.runs.experiment import check_matrix_folder, compare, first_of
 from clsplat.runs.failures import failures_recorded
 from clsplat.runs.folders import Start
 from clsplat.signals import stop_at_once, stopping_on_signals
-from clsplat.stages.optimize import Optimize
+from clsplat.stages.training import Training
 from clsplat.training.status import StatusFile
 
 LOG = logging.getLogger("clsplat")
@@ -110,7 +110,7 @@ def wanted_cell(cell: matrix.Cell, scenes: Scenes, store: Store) -> Wanted:
 
 def steps_of(pipeline: Pipeline) -> int:
     """Return the steps of all trainings of a pipeline."""
-    return sum(stage.steps for stage in pipeline.stages if isinstance(stage, Optimize))
+    return sum(stage.steps for stage in pipeline.stages if isinstance(stage, Training))
 
 
 @dataclass
