@@ -20,6 +20,8 @@ from clsplat.fields.shape import FieldShape
 from clsplat.opencl.device import open_device
 from clsplat.pipeline.loading import load
 from clsplat.render.camera import upload_camera
+from clsplat.runs.source import require_model
+from clsplat.runs.verify import verify
 from clsplat.scene.camera import Camera
 from clsplat.scene.images import read_image
 from clsplat.scene.view import View
@@ -133,6 +135,18 @@ def test_a_field_stands_beside_gaussians_in_a_comparison(finished, few_steps, tm
     page = (tmp_path / "compare.html").read_text()
     assert "parameters" in page
     assert "Gaussians" in page
+
+
+def test_the_files_of_a_run_of_a_field_are_checked(finished):
+    found = verify(finished)
+    assert found["whole"]
+    details = [one["detail"] for one in found["objects"]]
+    assert [text for text in details if text.startswith("step 12, ") and text.endswith(" parameters")]
+
+
+def test_commands_on_models_say_that_a_run_has_none(finished):
+    with pytest.raises(DataError, match="is the run of a field, which no model file holds"):
+        require_model(finished)
 
 
 def test_a_field_that_is_not_finite_stops_the_run_and_is_set_aside(tiny_scene, tmp_path, pipeline):
