@@ -3,15 +3,16 @@
 import logging
 from collections.abc import Iterator
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
-from pydantic import field_validator
+from pydantic import Field, field_validator
 
 from clsplat.density.statistics import SplatStats
 from clsplat.losses.base import ImageLoss, Loss, Penalty, ViewGradients, ViewLosses, require_symmetric
 from clsplat.names import VIEW_COLOURS, VIEW_POSES
 from clsplat.schedule import Probability
 from clsplat.settings import OneOf
+from clsplat.stages.base import Scheduled
 from clsplat.stages.densify import Densify
 from clsplat.stages.keeping import Keeping
 from clsplat.stages.progress import report
@@ -68,6 +69,10 @@ class Optimize(Keeping):
     """Colour behind all; random: another in each step; transparent: random where the first photograph is so."""
     skip: Skip | None = None
     """Steps that skip the backward pass, where a view has converged; without it, none."""
+    during: list[OneOf[Scheduled]] = Field([])
+    """Stages that run every so many steps."""
+    log_every: Annotated[int, Field(gt=0)] = 100
+    """Steps between lines of metrics.jsonl."""
 
     @field_validator("losses")
     @classmethod

@@ -11,6 +11,7 @@ from clsplat.errors import ConfigError, NotFiniteError
 from clsplat.fields.shape import FieldShape
 from clsplat.schedule import Decay, NonNegative, at_step
 from clsplat.settings import OneOf
+from clsplat.stages.base import Scheduled
 from clsplat.stages.progress import report
 from clsplat.stages.training import Training
 from clsplat.training import checkpoint
@@ -51,6 +52,10 @@ class TrainField(Training):
     """Steps until the rate is that of `rate`, along a quarter of a sine."""
     warm_up_from: Annotated[float, Field(ge=0, le=1)] = 0.01
     """Share of the rate at the first step."""
+    during: list[OneOf[Scheduled]] = Field([])
+    """Stages that run every so many steps."""
+    log_every: Annotated[int, Field(gt=0)] = 100
+    """Steps between lines of metrics.jsonl."""
 
     @model_validator(mode="after")
     def _same_rays(self) -> "TrainField":

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 from pydantic import Field, field_validator
 
@@ -23,12 +23,11 @@ class Training(Stage):
 
     steps: Annotated[int, Field(gt=0)]
     """Number of training steps."""
-    during: list[OneOf[Scheduled]] = Field([])
-    """Stages that run every so many steps."""
-    log_every: Annotated[int, Field(gt=0)] = 100
-    """Steps between lines of metrics.jsonl."""
+    if TYPE_CHECKING:  # fields of each training, behind its own: files have them in that order
+        during: list[OneOf[Scheduled]]
+        log_every: int
 
-    @field_validator("during")
+    @field_validator("during", check_fields=False)
     @classmethod
     def _on_a_cadence(cls, during: list[Scheduled]) -> list[Scheduled]:
         for stage in during:
