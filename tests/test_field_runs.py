@@ -253,3 +253,20 @@ def test_space_that_is_far_away_is_encoded_as_nothing(small_field):
     """Distances of a million: the features vanish, and the picture stays finite."""
     view = View.looking_at([1e6, 0, 0], [0, 0, 0], [0, 0, 1], Camera(5, 3, 9.0, 9.0, 2.5, 1.5))
     assert np.isfinite(paint(small_field, view)).all()
+
+
+def test_a_field_that_is_trained_on_goes_on_with_its_moments(tiny_scene, tmp_path, pipeline):
+    """Two stages of one shape are one training; one of another shape begins anew, in a run that goes on too."""
+    two = tmp_path / "two.yaml"
+    (stage, *_) = PIPELINE.split("  - evaluate: {split: test, downscales")
+    training = stage.partition("stages:\n")[2]
+    two.write_text(stage + training)
+    run = train(tiny_scene, tmp_path / "same", "stages.0.steps=4", "stages.1.steps=4", pipeline=str(two))
+    assert run.learned_field is not None
+    assert run.learned_field.updates == 8
+    two.write_text(stage + training.replace("width: 32", "width: 16"))
+    run = train(tiny_scene, tmp_path / "other", "stages.0.steps=4", "stages.1.steps=4", pipeline=str(two))
+    assert run.learned_field is not None
+    assert (run.learned_field.updates, run.learned_field.field.shape.width) == (4, 16)
+    state, _ = checkpoint.load(checkpoint.saved(tmp_path / "other")[-1])
+    assert (state.step, state.updates) == (8, {"field": 4})

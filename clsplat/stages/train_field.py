@@ -27,8 +27,9 @@ LOG = logging.getLogger("clsplat")
 class TrainField(Training):
     """Train a field of densities and colours on random rays of the photographs (Mip-NeRF, Barron et al. 2021).
 
-    A step draws its rays from one photograph, or from several; where these have several sizes, a ray counts as the area
-    of its pixel.  Stages that render, measure and report take the field as they take Gaussians; there is no model file.
+    A step draws its rays from one photograph, or from several, as many from each.  Where photographs have several
+    sizes, the loss is that of all their pixels, each counted as its area (section 4): so all sizes count alike.
+    Stages that render, measure and report take the field as they take Gaussians; there is no model file.
     """
 
     stage: Literal["train_field"] = "train_field"
@@ -66,17 +67,17 @@ class TrainField(Training):
         return self
 
     def run(self, run: Run) -> None:
-        run.learned_field = run.learned_field or self._first(run)
+        field = run.learned_field = self._begun(run)
         last = run.step - run.stage_step + self.steps
         pool, forecast = ViewPool(run.scene.split("train"), run.seed), Forecast.of(run.step, last, [])
         seconds: list[float] = []  # of the steps since the last report
         self.act_between(run)
         while not self.has_ended(run):
             start = clocks()
-            self._step(run, run.learned_field, pool)
+            self._step(run, field, pool)
             run.status.count("steps", run.stage_step, self.steps, step=run.step, steps=last)
             is_reported = run.step % self.log_every == 0 or run.stage_step == self.steps or run.interrupted
-            values = self._values(run, run.learned_field) if is_reported else (0.0, 0.0)
+            values = self._values(run, field) if is_reported else (0.0, 0.0)
             seconds.append(run.add_training_time(start))
             if is_reported:
                 report(run, forecast, values, seconds)
@@ -88,7 +89,10 @@ class TrainField(Training):
         share = math.sin(0.5 * math.pi * min(step / self.warm_up, 1.0)) if self.warm_up else 1.0
         return (self.warm_up_from + (1 - self.warm_up_from) * share) * at_step(self.rate, step)
 
-    def _first(self, run: Run) -> LearnedField:
+    def _begun(self, run: Run) -> LearnedField:
+        """The field of the run, where an earlier step has trained one of this shape; else a new one."""
+        if run.learned_field and run.learned_field.field.shape == self.field:
+            return run.learned_field
         field = LearnedField.first(self.field, run.seed, run.photographs.background)
         LOG.info("a field of %s parameters", f"{self.field.learned:,}")
         return field
@@ -113,7 +117,8 @@ class TrainField(Training):
             photograph = run.photographs.get(view)
             if photograph.mask is not None:
                 raise ConfigError(f"train_field: {view.name} has a mask; expected photographs whose pixels all count")
-            yield Shown(photograph.camera, photograph, self.rays // self.photographs, view.downscale**2)
+            area = view.camera.width * view.camera.height * view.downscale**2  # which its rays stand for
+            yield Shown(photograph.camera, photograph, self.rays // self.photographs, area)
 
     def _values(self, run: Run, field: LearnedField) -> tuple[float, float]:
         """The loss of the last step and the PSNR of its fine level, dB.

@@ -160,7 +160,7 @@ def _write(run: Run, kind: str) -> Path:
         field=run.learned_field.field.shape if run.learned_field else None,
         degree=0 if run.learned_field else run.model.degree,
         zero_fresh=[] if run.learned_field else run.model.gaussians.zero_fresh,
-        updates=run.adam.updates if run.adam else {},
+        updates=run_tables.updates_of(run),
         numbers=run.numbers,
         best=run.best,
         train_seconds=run.train_seconds,

@@ -29,7 +29,7 @@ class Shown:
     camera: DeviceCamera
     photograph: Photograph
     rays: int
-    weight: float  # of each ray: the area of its pixel
+    weight: float  # of each ray: the area of what it stands for, px^2 of the full size
 
 
 class LearnedField:
@@ -42,6 +42,7 @@ class LearnedField:
         self._gradient = device.zeros(count)
         self._program = device.program("dense.cl")
         self._beta1, self._beta2 = constants("adam.h")["BETA1"], constants("adam.h")["BETA2"]
+        self.updates = 0  # which count for the bias of the moments
         self.rate = 0.0  # of the last step
         self._scales: list[tuple[int, float]] = []  # of the last step: rays, and what a squared difference counts
 
@@ -76,7 +77,7 @@ class LearnedField:
         """Do one update (Barron et al. 2021, section 3.3).
 
         The loss is that of the fine level and `coarse_weight` of that of the coarse one; each is the mean squared
-        difference of the rays, weighted by the areas of their pixels.
+        difference of the rays, weighted by what they stand for.
         """
         whole = CHANNELS * sum(one.rays * one.weight for one in shown)
         self.rate = rate
@@ -86,7 +87,8 @@ class LearnedField:
         for one in shown:
             self._differentiate(one, one.weight / whole, coarse_weight, Draw(seed, step, first), errors)
             first += one.rays
-        self.update(self._gradient, rate, step)
+        self.updates += 1
+        self.update(self._gradient, rate, self.updates)
 
     def update(self, gradient: Array, rate: float, number: int) -> None:
         """Change the parameters by Adam, for the update `number`, from a gradient, [P]."""

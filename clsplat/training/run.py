@@ -103,7 +103,7 @@ class Run:
 
     @model.setter
     def model(self, model: DeviceModel) -> None:
-        self._model = model
+        self._model, self.learned_field = model, None
 
     def painter(self, rasterizer: Rasterizer | None = None) -> Painter:
         """Return what renders views, with another rasterizer than the training's.  Raises ConfigError as `model`."""

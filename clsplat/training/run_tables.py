@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from clsplat.density.statistics import FOLDER as STATS_FOLDER
 from clsplat.density.statistics import SEEN, SplatStats
+from clsplat.errors import DataError
 from clsplat.gaussians.tables import Gaussians
 from clsplat.training import field, kept, sky
 from clsplat.training.adam import Adam
@@ -15,6 +16,8 @@ from clsplat.training.field import LearnedField
 from clsplat.training.kept_tables import restore_sky
 from clsplat.training.run import Run
 from clsplat.training.state import State, check_tables
+
+UPDATES = "field"  # name of their number
 
 
 def tables_of(run: Run) -> Iterator[tuple[str, NDArray[np.float32]]]:
@@ -28,9 +31,18 @@ def tables_of(run: Run) -> Iterator[tuple[str, NDArray[np.float32]]]:
     yield from ((kept.FOLDER + name, table) for name, table in run.best_tables.items())
 
 
+def updates_of(run: Run) -> dict[str, int]:
+    """Return how often Adam has updated each of its tables."""
+    if run.learned_field:
+        return {UPDATES: run.learned_field.updates}
+    return run.adam.updates if run.adam else {}
+
+
 def check(state: State, tables: Arrays) -> None:
     """Raise DataError for tables that are not those of the state."""
     if state.field:
+        if state.updates.keys() != {UPDATES}:
+            raise DataError("it counts updates of other parameters than those of its field")
         field.check_tables(state.field, *field.split_tables(tables))
         return
     own, best = kept.split_tables(tables)
@@ -45,6 +57,7 @@ def restore(run: Run, state: State, tables: Arrays) -> None:
     if state.field:
         own, _ = field.split_tables(tables)
         run.learned_field = LearnedField.of_tables(state.field, own, run.photographs.background)
+        run.learned_field.updates = state.updates[UPDATES]
         return
     tables, run.best_tables = kept.split_tables(tables)
     behind, tables = sky.split_tables(tables)
