@@ -34,6 +34,7 @@ ROWS = (  # from the top down; a module imports only from lower rows, or from it
         "caches",
         "errors",
         "files",
+        "harmonics",
         "holder",
         "lock",
         "names",

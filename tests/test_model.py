@@ -11,7 +11,7 @@ from clsplat.conformance.reference import sh_basis
 from clsplat.conformance.scenes import Case, random_case, with_world_filter
 from clsplat.errors import OutputError
 from clsplat.gaussians.model import Model, Rendering, load
-from clsplat.gaussians.sh import basis, rotated_sh
+from clsplat.harmonics import basis, rotated_sh
 from clsplat.scene.view import View
 from tests.html_page import HOSTILE, Page
 

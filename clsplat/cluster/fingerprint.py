@@ -26,7 +26,7 @@ from clsplat.scene.view import NO_FILE
 
 KEPT = 16  # hexadecimal digits of a hash
 # decode photographs, place Gaussians, and compress models: OpenCV has libwebp
-LIBRARIES = ("numpy", "scipy", "opencv-contrib-python-headless", "zstandard")
+LIBRARIES = ("numpy", "scipy", "opencv-contrib-python-headless", "zstandard", "deflate")
 PACKAGE = Path(__file__).resolve().parents[1]
 
 

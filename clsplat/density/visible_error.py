@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.density.survey import WEIGHT, Look
-from clsplat.gaussians.sh import basis
 from clsplat.gaussians.tables import SH_C0
+from clsplat.harmonics import basis
 
 Floats = NDArray[np.float64]
 Nearest = Callable[[NDArray[np.float32], NDArray[np.float32]], NDArray[np.int64]]

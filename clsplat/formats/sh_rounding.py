@@ -8,17 +8,24 @@ with the G of the cameras.  From these two:
     steps  a Gaussian's step is as 1 / sqrt(w), which is the least error for a number of bits (reverse water-filling)
     order  coefficients are rounded one after another, the highest first, and those that are still to be rounded take up
            what shows of the error so far: the nearest plane of Babai (1986)
+    base   what of the errors is the same from where the model is seen goes into band 0: the mean of Y(d), which follows
+           from G, for products of the bands 1 to 3 span each of them
 """
 
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.formats.splats import SH_C0
+from clsplat.harmonics import basis
+
 Floats = NDArray[np.floating]
 ISOTROPIC = 0.02  # share of all directions alike beside those that the moments tell; 0.005 to 0.1 differ little
-USUAL = 0.028  # root of the mean square of harmonics: fox after 7 000 steps; after 2 500 steps it has half
+USUAL = 0.028  # root of the mean square of harmonics: fox after 7 000 steps; Lego has 0.037, the kitchen 0.043
 LEVELS = 511  # whole numbers that moments are made of: their sums are exact in float64, in any order
 TAIL = 1e-4  # share of values that may lie beyond LEVELS
 ROWS = 1 << 15  # that are rounded at once
+DIRECTIONS = 128  # from which the mean of Y(d) is known as a sum of products
+DIGITS = 6  # of that mean: further ones are the processor's
 
 
 def steps(log_weights: NDArray[np.float64], median: float, most: float) -> NDArray[np.float32]:
@@ -27,10 +34,10 @@ def steps(log_weights: NDArray[np.float64], median: float, most: float) -> NDArr
     return np.asarray(np.exp2(np.clip(exponents, 0, np.log2(most))), np.float32)
 
 
-def usual_step(rest: Floats, step: float) -> float:
-    """Return a step that is chosen for harmonics of the size USUAL, and for smaller ones so much smaller."""
+def usual_step(rest: Floats, step: float, most: float) -> float:
+    """Return a step that is chosen for harmonics of the size USUAL, and for others in proportion, up to `most`."""
     size = float(np.sqrt(np.square(np.clip(rest, -1, 1), dtype=np.float64).mean())) if rest.size else 0.0
-    return step * min(1.0, max(size / USUAL, 1e-3))
+    return min(most, step * max(size / USUAL, 1e-3))
 
 
 def visible_form(rest: Floats) -> NDArray[np.float64]:
@@ -47,6 +54,32 @@ def visible_form(rest: Floats) -> NDArray[np.float64]:
             form += whole[:, :, channel].T @ whole[:, :, channel]
     trace = np.trace(form)
     return (form * (count / trace) if trace else form) + ISOTROPIC * np.eye(count)
+
+
+def base_for(base: Floats, errors: Floats, form: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Return coefficients of band 0, [N, 3], that take up what is the same everywhere of errors of the others.
+
+    errors: what the others lack, [N, 3 K].
+    """
+    count = len(form)
+    lacking = errors.reshape(len(errors), count, 3)
+    change = np.zeros(base.shape)
+    for k, mean in enumerate(mean_basis(form)):
+        change += mean * lacking[:, k]
+    return np.asarray(base + change / SH_C0, np.float32)
+
+
+def mean_basis(form: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the mean of Y(d), [K], over directions that have the form G; 0 where G does not tell, as for one band."""
+    count = len(form)
+    half = np.random.default_rng(0).normal(size=(DIRECTIONS // 2, 3))
+    half /= np.linalg.norm(half, axis=1, keepdims=True)
+    values = basis(np.concatenate([half, -half]))[:, :count]
+    pairs = np.triu_indices(count)
+    products = values[:, pairs[0]] * values[:, pairs[1]]
+    told = np.linalg.lstsq(products, values, rcond=1e-9)[0]
+    moments = form * (count / (4 * np.pi) / np.trace(form))  # of |Y|², K / 4 pi from everywhere
+    return np.asarray(np.round(moments[pairs] @ told, DIGITS))
 
 
 def rounded_rows(rest: Floats, steps: NDArray[np.float32], form: NDArray[np.float64]) -> NDArray[np.float32]:

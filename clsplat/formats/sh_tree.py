@@ -36,7 +36,7 @@ def tree_palette(
     held = np.bincount(labels, weights)
     vectors = _sums(labels, weights, rest, len(held)) / held[:, None]
     log_held = np.log2(held)
-    step = steps(log_held - np.median(log_held), usual_step(rest, median_step), LARGEST_STEP)
+    step = steps(log_held - np.median(log_held), usual_step(rest, median_step, median_step), LARGEST_STEP)
     first = np.zeros(len(held), np.int64)
     first[labels[::-1]] = np.arange(len(labels))[::-1]
     order = np.lexsort((first, step, runs[first]))

@@ -15,6 +15,8 @@ from clsplat.formats.splats import MAX_LOG, logits, opacities, unit
 Floats = NDArray[np.floating]
 SMALL = 25  # percentile of the sizes that steps of positions are compared with
 LEVELS = 65535  # of a position, from 0
+TINY = 2.0**-40  # levels, in the place of a size of 0
+LEAST_BITS, MOST_BITS = 2, 8  # last bits of a position that are alike; the first where each Gaussian has its own step
 _SIGNED = [turn for turn in product((0, 1, -1), repeat=4) if np.count_nonzero(turn) in (1, 2, 4)]
 # rotations of the axes onto axes, [24, 4]; a quaternion and its negative are one
 _TURNS = np.array([np.divide(turn, np.linalg.norm(turn)) for turn in _SIGNED if next(filter(None, turn)) > 0])
@@ -31,17 +33,44 @@ def rounded_means(means: Floats, log_scales: Floats, share: float) -> NDArray[np
     Steps are powers of two of the levels of a SOG, for each axis, so that low bits are alike.  The least position of an
     axis stays, and so does the greatest: they are the range that levels divide.
     """
+    levels, low, level = _levels(means)
+    bits = np.floor(np.log2(np.maximum(share * np.percentile(_sizes(means, log_scales), SMALL, axis=0) / level, 1)))
+    step = np.exp2(np.minimum(bits, MOST_BITS))
+    coarse = np.where(levels > 0, np.floor(levels / step) * step + step - 1, 0)
+    return _positions(low + coarse * level)
+
+
+def weighed_means(
+    means: Floats, log_scales: Floats, log_weights: NDArray[np.float64], share: float
+) -> NDArray[np.float32]:
+    """Return positions [N, 3] in steps of about `share` of the size of each Gaussian, those of median weight.
+
+    The step is as 1 / sqrt(weight) (sh_rounding.py): a power of two of the levels of a SOG, from LEAST_BITS on.
+    """
+    levels, low, level = _levels(means)
+    sizes = np.maximum(_sizes(means, log_scales) / level, TINY)
+    wanted = np.log2(share * sizes) - log_weights[:, None] / 2
+    step = np.exp2(np.clip(np.floor(wanted), LEAST_BITS, MOST_BITS))
+    return _positions(low + np.clip(np.rint(levels / step) * step, 0, LEVELS) * level)
+
+
+def _levels(means: Floats) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Positions in levels of a SOG, [N, 3]; the least of each axis, and how much a level is, [3], of logarithms."""
     wide = means.astype(np.float64)
     t = np.sign(wide) * np.log1p(np.abs(wide))
     low, span = t.min(axis=0), np.ptp(t, axis=0)
     level = np.where(span > 0, span, 1) / LEVELS
+    return np.rint((t - low) / level), low, level
+
+
+def _sizes(means: Floats, log_scales: Floats) -> NDArray[np.float64]:
+    """Geometric means of standard deviations where the positions are logarithms, [N, 3]."""
     size = np.exp(np.minimum(log_scales.astype(np.float64).mean(axis=1, keepdims=True), MAX_LOG))
-    sizes = size / (1 + np.abs(wide))  # in t
-    bits = np.floor(np.log2(np.maximum(share * np.percentile(sizes, SMALL, axis=0) / level, 1)))
-    step = np.exp2(np.minimum(bits, 8))
-    levels = np.rint((t - low) / level)
-    coarse = low + np.where(levels > 0, np.floor(levels / step) * step + step - 1, 0) * level
-    return np.asarray(np.sign(coarse) * np.expm1(np.abs(coarse)), np.float32)
+    return np.asarray(size / (1 + np.abs(means.astype(np.float64))))
+
+
+def _positions(logarithms: NDArray[np.float64]) -> NDArray[np.float32]:
+    return np.asarray(np.sign(logarithms) * np.expm1(np.abs(logarithms)), np.float32)
 
 
 def rounded_quats(quats: Floats, log_scales: Floats, step: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

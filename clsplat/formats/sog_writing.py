@@ -18,10 +18,11 @@ from clsplat.formats import webp
 from clsplat.formats.output import written
 from clsplat.formats.packing import morton_order, smallest_three
 from clsplat.formats.palette import Clustering, HostClusters, codebook, different, nearest, palette
+from clsplat.formats.sh_rounding import base_for, visible_form
 from clsplat.formats.sh_tree import tree_palette
 from clsplat.formats.sog import MAX_PALETTE, PER_ROW, ROTATED
 from clsplat.formats.sog_files import META, with_images
-from clsplat.formats.sog_steps import rounded, rounded_means, rounded_opacities, rounded_quats
+from clsplat.formats.sog_steps import rounded, rounded_opacities, rounded_quats, weighed_means
 from clsplat.formats.splats import (
     Parameters,
     SplatFile,
@@ -35,11 +36,12 @@ from clsplat.formats.weights import log_weights
 
 Quality = Literal["small", "balanced", "high"]
 PALETTES = {"small": 1024, "balanced": 4096, "high": 16384}  # entries at most, of a palette for all
-SHARES = {"small": 0.16, "balanced": 0.3, "high": 0.45}  # entries at most for a splat, of a palette for neighbours
+SHARES = {"small": 0.16, "balanced": 0.42, "high": 0.45}  # entries at most for a splat, of a palette for neighbours
 MEDIAN_STEPS = {"small": 6.0, "balanced": 5.0, "high": 3.0}  # of its vectors, in 128ths
 TURN_STEP, ALPHA_STEP = 4, 2  # levels of 255
-SIZE_SHARE = 0.125  # of a small Gaussian's size, for its position
-COLOUR_STEP = 0.03  # of the coefficients of band 0; 1 changes a colour by 0.28
+SIZE_SHARE = 0.25  # of a Gaussian's size, for its position: of one of median weight
+SCALE_STEP = 0.1  # of logarithms of standard deviations
+COLOUR_STEP = 0.05  # of the coefficients of band 0; 1 changes a colour by 0.28
 SMALLEST = 1024  # entries for so many splats, and twice as many for twice as many
 DIGITS = 16  # of the SHA-256 of an image in a folder, in its name
 EPOCH = (1980, 1, 1, 0, 0, 0)  # of files in the ZIP: the same model gives the same bytes
@@ -184,16 +186,18 @@ def _quantised(p: Parameters, options: Writing) -> tuple[Parameters, Harmonics |
     if (kept := different(rest, _few(len(rest), options.quality)) or different(rest, most, padded=False)) is not None:
         return p, Harmonics.by(*kept)
     most = max(most, _few(len(rest), options.quality))
-    harmonics = Harmonics.by(*tree_palette(rest, log_weights(p), most, MEDIAN_STEPS[options.quality]))
+    weights = log_weights(p)
+    harmonics = Harmonics.by(*tree_palette(rest, weights, most, MEDIAN_STEPS[options.quality]))
+    base = base_for(p["sh_base"], rest - harmonics.values, visible_form(rest))
     if options.quality == "high":
-        return p, harmonics
+        return {**p, "sh_base": base}, harmonics
     quats, log_scales = rounded_quats(p["quats"], p["log_scales"], TURN_STEP)
     changed = {
-        "means": rounded_means(p["means"], p["log_scales"], SIZE_SHARE),
+        "means": weighed_means(p["means"], p["log_scales"], weights, SIZE_SHARE),
         "quats": quats,
-        "log_scales": log_scales,
+        "log_scales": rounded(log_scales, SCALE_STEP),
         "logit_opacity": rounded_opacities(p["logit_opacity"], ALPHA_STEP),
-        "sh_base": rounded(p["sh_base"], COLOUR_STEP),
+        "sh_base": rounded(base, COLOUR_STEP),
     }
     return {**p, **changed}, harmonics
 

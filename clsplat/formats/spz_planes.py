@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from clsplat.errors import DataError
 from clsplat.formats.packing import beyond_bytes, from_smallest_three, smallest_three, tell_cut
-from clsplat.formats.sh_rounding import rounded_rows, steps, usual_step, visible_form
+from clsplat.formats.sh_rounding import base_for, rounded_rows, steps, usual_step, visible_form
 from clsplat.formats.splats import MAX_DEGREE, PARAMETERS, Parameters, Writing, logits, opacities, sh_coefficients, unit
 from clsplat.formats.weights import log_weights
 
@@ -26,9 +26,13 @@ MAX_INT24 = 2**23 - 1
 FRACTION, FINE_FRACTION = 12, 20  # bits of positions; the second for quality high
 ROWS = 1 << 13  # that are decoded at once: what that takes beside the result is little
 WHOLE = (8, 8)  # bits of harmonics
-# steps of harmonics, in levels of 256: of the Gaussian of median weight, and at most
-MEDIAN_STEP = {"small": (10.0, 128.0), "balanced": (4.0, 64.0), "high": (1.0, 1.0)}
-SMALLEST_SHARE = {"small": 0.25, "balanced": 0.25, "high": 0.0}  # of a Gaussian's smallest deviation, of its position
+# steps of harmonics, in levels of 256: of the Gaussian of median weight, for the usual size and at most; of any one
+MEDIAN_STEP = {"small": (7.5, 12.5), "balanced": (3.0, 5.0), "high": (1.0, 1.0)}
+LARGEST_STEP = {"small": 128.0, "balanced": 64.0, "high": 1.0}
+# step of positions: a share of the smallest deviation, for a Gaussian of median weight
+SMALLEST_SHARE = {"small": 0.5, "balanced": 0.5, "high": 0.0}
+# steps of colours, in levels of 255: of the Gaussian of median weight, and at most
+BASE_STEP = {"small": (2**0.5, 16.0), "balanced": (2**0.5, 16.0), "high": (1.0, 1.0)}
 MAX_ZEROS = 16  # last bits of a position, at most
 TURN_STEP = {"small": 4, "balanced": 4, "high": 1}  # levels of quaternions, of 511
 
@@ -137,26 +141,31 @@ def packed(path: Path, p: Parameters, fraction: int, options: Writing) -> list[b
 
     Gaussians whose harmonics have fine steps come first, and keep their order among themselves: alike bytes compress.
     """
-    sh_steps = _sh_steps(p, options)
+    weights = log_weights(p)
+    sh_steps = _sh_steps(p["sh_rest"], weights, options)
     order = np.argsort(sh_steps, kind="stable")
-    p, sh_steps = {name: table[order] for name, table in p.items()}, sh_steps[order]
+    p, weights = {name: table[order] for name, table in p.items()}, weights[order]
+    harmonics, base = _rounded_sh(p, sh_steps[order], options.sh_bits)
     cut = {
         "alphas": 255 * opacities(p["logit_opacity"]),
-        "colours": 255 * (COLOUR * p["sh_base"].astype(np.float64) + 0.5),
+        "colours": 255 * (COLOUR * base.astype(np.float64) + 0.5),
         "scales": 16 * (p["log_scales"].astype(np.float64) + 10),
     }
     tell_cut(path, "SPZ", "harmonics from -1 to 1", np.abs(p["sh_rest"]) > 1)
     tell_cut(path, "SPZ", "colours from -0.44 to 1.44", beyond_bytes(cut["colours"]))
     tell_cut(path, "SPZ", "scales from 4.5e-05 to 379", beyond_bytes(cut["scales"]))
+    step = steps(weights, *BASE_STEP[options.quality])[:, None]
+    cut["colours"] = np.rint(cut["colours"] / step) * step
     alphas, colours, scales = (np.clip(np.rint(v), 0, 255).astype(np.uint8).tobytes() for v in cut.values())
-    harmonics = _rounded_sh(p["sh_rest"], sh_steps, options.sh_bits).tobytes()
-    positions = _fixed(p, fraction, SMALLEST_SHARE[options.quality])
-    return [positions, alphas, colours, scales, _rotations(p["quats"], TURN_STEP[options.quality]), harmonics]
+    positions = _fixed(p, weights, fraction, SMALLEST_SHARE[options.quality])
+    rotations = _rotations(p["quats"], TURN_STEP[options.quality])
+    return [positions, alphas, colours, scales, rotations, harmonics.tobytes()]
 
 
-def _fixed(p: Parameters, fraction: int, share: float) -> bytes:
-    """Positions in 24 bits, in steps of at most `share` of the smallest standard deviation: powers of two."""
-    size = p["log_scales"].min(axis=1, keepdims=True).astype(np.float64) / np.log(2)
+def _fixed(p: Parameters, weights: NDArray[np.float64], fraction: int, share: float) -> bytes:
+    """Positions in 24 bits, in steps of about `share` of the smallest standard deviation, and more where weights are
+    small: powers of two."""
+    size = p["log_scales"].min(axis=1, keepdims=True).astype(np.float64) / np.log(2) - weights[:, None] / 2
     step = np.exp2(np.clip(np.floor(size + np.log2(share) + fraction), 0, MAX_ZEROS)) if share else 1.0
     multiples = np.rint(p["means"].astype(np.float64) * 2**fraction / step) * step
     fixed = np.minimum(multiples, MAX_INT24 + 1 - step).astype("<i4")
@@ -175,23 +184,27 @@ def _rotations(quats: NDArray[np.float32], step: int) -> bytes:
     return rotations.astype("<u4").tobytes()
 
 
-def _sh_steps(p: Parameters, options: Writing) -> NDArray[np.float32]:
+def _sh_steps(rest: NDArray[np.float32], weights: NDArray[np.float64], options: Writing) -> NDArray[np.float32]:
     """The step of the harmonics of each Gaussian, [N] levels; 1 for all where bits are given, or all are kept."""
-    median, most = MEDIAN_STEP[options.quality]
-    if options.sh_bits or most == 1 or not p["sh_rest"].shape[1]:
-        return np.ones(len(p["means"]), np.float32)
-    return steps(log_weights(p), usual_step(p["sh_rest"], median), most)
+    most = LARGEST_STEP[options.quality]
+    if options.sh_bits or most == 1 or not rest.shape[1]:
+        return np.ones(len(rest), np.float32)
+    return steps(weights, usual_step(rest, *MEDIAN_STEP[options.quality]), most)
 
 
 def _rounded_sh(
-    rest: NDArray[np.float32], sh_steps: NDArray[np.float32], bits: tuple[int, int] | None
-) -> NDArray[np.uint8]:
-    """Harmonics as levels, 128 for 0: multiples of each Gaussian's step, or of 2^(8 - bits)."""
+    p: Parameters, sh_steps: NDArray[np.float32], bits: tuple[int, int] | None
+) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    """Harmonics as levels, 128 for 0: multiples of each Gaussian's step, or of 2^(8 - bits); and band 0, which takes up
+    the errors of the first."""
+    rest = p["sh_rest"]
     levels = np.clip(rest, -1, 1) * np.float32(128)
     if bits is None and sh_steps.max(initial=1) > 1:
-        found = np.minimum(rounded_rows(levels, sh_steps, visible_form(rest)), 128 - sh_steps[:, None])
+        form = visible_form(rest)
+        found = np.minimum(rounded_rows(levels, sh_steps, form), 128 - sh_steps[:, None])
+        base = base_for(p["sh_base"], rest - found / 128, form)
     else:
         columns = np.full(rest.shape[1], 2.0 ** (8 - (bits or WHOLE)[1]), np.float32)
         columns[:9] = 2.0 ** (8 - (bits or WHOLE)[0])
-        found = np.rint(levels / columns) * columns
-    return np.asarray(np.clip(found + 128, 0, 255), np.uint8)
+        found, base = np.rint(levels / columns) * columns, p["sh_base"]
+    return np.asarray(np.clip(found + 128, 0, 255), np.uint8), base

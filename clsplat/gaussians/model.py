@@ -31,9 +31,9 @@ from clsplat.formats.splats import (
 from clsplat.formats.table import for_writing, read, write
 from clsplat.gaussians.quaternions import product, quaternion_of
 from clsplat.gaussians.run_model import model_at
-from clsplat.gaussians.sh import rotated_sh
 from clsplat.gaussians.sky import Sky, keep_sky, sky_beside
 from clsplat.gaussians.tables import DeviceModel, Gaussians
+from clsplat.harmonics import rotated_sh
 from clsplat.opencl.device import Device
 
 Floats = NDArray[np.float32]

@@ -22,7 +22,7 @@ from clsplat.formats.table import CODECS, detect, read, write
 from clsplat.gaussians.checkup import examine, lines, verdict
 from clsplat.gaussians.conversion import transform_of
 from clsplat.gaussians.model import Rendering, load
-from clsplat.gaussians.sh import basis
+from clsplat.harmonics import basis
 from clsplat.results import check_no_file_of_a_run
 from clsplat.viewer.packing import pack
 from tests.formats.models import splats

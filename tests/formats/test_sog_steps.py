@@ -8,7 +8,7 @@ import pytest
 from clsplat.conformance import reference as ref
 from clsplat.formats.packing import morton_order
 from clsplat.formats.palette import ENTRIES, codebook
-from clsplat.formats.sog_steps import LEVELS, rounded, rounded_means, rounded_opacities, rounded_quats
+from clsplat.formats.sog_steps import LEVELS, rounded, rounded_means, rounded_opacities, rounded_quats, weighed_means
 from clsplat.formats.splats import opacities, unit
 from tests.formats.models import splats, there_and_back
 
@@ -39,6 +39,17 @@ def test_positions_stay_within_a_step_and_their_range_stays(rng):
     t = np.sign(found) * np.log1p(np.abs(found.astype(np.float64)))
     levels = np.rint((t - t.min(axis=0)) / np.ptp(t, axis=0) * LEVELS).astype(int)
     assert all(len(np.unique(column & 255)) <= 64 + 1 for column in levels.T)
+
+
+def test_positions_of_gaussians_that_weigh_little_have_larger_steps(rng):
+    means, sizes = rng.normal(size=(3000, 3)).astype(np.float32), rng.normal(-3, 0.5, (3000, 3)).astype(np.float32)
+    weights = rng.uniform(-4, 4, 3000)
+    found = weighed_means(means, sizes, weights, 0.25)
+    largest = 0.25 * np.exp(sizes.mean(axis=1)) * np.exp2(-weights / 2) / 2  # half a step
+    level = np.log1p(np.abs(means)).max() * 2 / LEVELS * 5
+    moved = np.abs(found - means).max(axis=1)
+    assert (moved < np.maximum(largest, 4 * level) * 1.05).all()
+    assert moved[weights < -2].mean() > 3 * moved[weights > 2].mean()
 
 
 def test_positions_of_a_scene_without_extent_stay(rng):
