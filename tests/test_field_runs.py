@@ -27,6 +27,7 @@ from clsplat.scene.images import read_image
 from clsplat.scene.view import View
 from clsplat.stages.train_field import TrainField
 from clsplat.training import checkpoint
+from clsplat.views.order import ViewPool
 from tests.test_training import ONE_CORE, train
 
 pytestmark = pytest.mark.slow
@@ -111,6 +112,17 @@ def test_training_makes_the_loss_smaller(tiny_scene, tmp_path, pipeline):
     lines = [json.loads(line) for line in (tmp_path / "run/metrics.jsonl").read_text().splitlines()]
     losses = [line["loss"] for line in lines if line["kind"] == "train"]
     assert np.mean(losses[-5:]) < 0.6 * np.mean(losses[:3])
+
+
+def test_photographs_of_all_sizes_count_alike(finished, tiny_scene, pipeline):
+    """A ray of a small photograph stands for more area, and as many rays come from each."""
+    run = train(tiny_scene, finished, pipeline=pipeline, resume=True)
+    (stage, *_) = load(pipeline).stages
+    assert isinstance(stage, TrainField)
+    pool = ViewPool(run.scene.split("train"), run.seed)
+    shown = [one for step in range(1, 5) for one in stage._shown(run, pool, step)]
+    assert {one.camera.width for one in shown} == {40, 20}
+    assert {(one.rays, one.weight) for one in shown} == {(32, 1600)}
 
 
 def test_a_run_that_was_killed_ends_with_the_bits_of_one_that_was_not(finished, tiny_scene, tmp_path, pipeline):
