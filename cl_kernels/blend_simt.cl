@@ -4,24 +4,31 @@
 
 #define PIXELS (TILE * TILE)
 #define BATCH PIXELS  // splats in local memory: each item loads one
+#if INVERSE_DEPTH
+#define QUADS 4       // of four floats: the whole splat record
+#else
 #define QUADS 3       // of four floats: what blending reads of a splat record
+#endif
 
-/* Load a record in aligned quads; the last field is SPLAT_POWER_MIN (or BOX_TURNED, in its
- * place) instead of SPLAT_X_MIN, which blending does not
- * read. */
+/* Load a record in aligned quads; in three, the last field is SPLAT_POWER_MIN (or BOX_TURNED, in its place) instead of
+ * SPLAT_X_MIN, which blending does not read. */
 static inline void load_quads(__global const float *splats, const uint splat, float4 *quads)
 {
     __global const float4 *record = (__global const float4 *)splats + (size_t)splat * (RECORD / 4);
     for (uint k = 0; k < QUADS; k++)
         quads[k] = record[k];
+#if QUADS == 3
     quads[QUADS - 1].w = record[SPLAT_POWER_MIN / 4].y;
+#endif
 }
 
 static inline void unpack_quads(const float4 *quads, float *splat)
 {
     for (uint k = 0; k < QUADS; k++)
         vstore4(quads[k], k, splat);
+#if QUADS == 3
     splat[SPLAT_POWER_MIN] = quads[QUADS - 1].w;
+#endif
 }
 
 #if PIXEL_BOX
@@ -37,7 +44,7 @@ static inline row_splat_t splat_on_line(const float *splat, const float row, con
 #define SPLAT_AT(splat, row, pixel) splat_at_row(splat, row)
 #endif
 
-/* One work-group = one tile, one item = one pixel.  Local memory: BATCH * 48 + 4 bytes.  Deterministic. */
+/* One work-group = one tile, one item = one pixel.  Local memory: BATCH * QUADS * 16 + 4 bytes.  Deterministic. */
 __kernel __attribute__((reqd_work_group_size(PIXELS, 1, 1)))
 void blend_forward(
     __global const uint *restrict tile_offset,  // [T+1]
@@ -46,7 +53,7 @@ void blend_forward(
     __global const float *restrict splats,      // [N,RECORD]
     __constant float *restrict background,      // [3]
     __constant camera_t *restrict camera,       // [1]
-    __global float *restrict image,             // [3 + WEIGHT_ENTROPY,tiles_y*TILE,tiles_x*TILE]
+    __global float *restrict image,             // [3 + FOURTH_PLANE,tiles_y*TILE,tiles_x*TILE]
     __global float *restrict transmittance,     // [tiles_y*TILE,tiles_x*TILE]
     __global uint *restrict tile_last,          // [T] pairs of the tile up to the last that any pixel blends
     const uint first_tile)                      // of this launch
@@ -101,12 +108,14 @@ void blend_forward(
     transmittance[at] = inside ? t : 0.0f;
 #if WEIGHT_ENTROPY
     image[3 * plane + at] = inside ? p.entropy - t * log_weight(t) : 0.0f;
+#elif INVERSE_DEPTH
+    image[3 * plane + at] = inside ? p.inverse_depth : 0.0f;
 #endif
 }
 
 /* One item owns one splat of a batch and adds the tile's pixels one after another: at step s, item i computes pixel
  * s - i, which item i - 1 computed at the step before, so every pixel blends its splats front to back.  No atomics, no
- * sums across items.  Local memory: PIXELS * 20 bytes, * 24 with a texture or the entropy, * 28 with both.
+ * sums across items.  Local memory: PIXELS * 20 bytes, * 24 with a texture or a fourth plane, * 28 with both.
  * Deterministic. */
 __kernel __attribute__((reqd_work_group_size(SPLAT_GROUP, 1, 1)))
 void blend_backward(
@@ -115,8 +124,8 @@ void blend_backward(
     __global const uint *restrict pair_splat,   // [P]
     __global const float *restrict splats,      // [N,RECORD]
     __constant camera_t *restrict camera,       // [1]
-    __global const float *restrict image,       // [3 + WEIGHT_ENTROPY,tiles_y*TILE,tiles_x*TILE]
-    __global const float *restrict grad_image,  // [3 + WEIGHT_ENTROPY,tiles_y*TILE,tiles_x*TILE]
+    __global const float *restrict image,       // [3 + FOURTH_PLANE,tiles_y*TILE,tiles_x*TILE]
+    __global const float *restrict grad_image,  // [3 + FOURTH_PLANE,tiles_y*TILE,tiles_x*TILE]
     __global const float *restrict texture,     // [tiles_y*TILE,tiles_x*TILE] read where PIXEL_SUMS > SUM_WEIGHT
     __global const float *restrict behind,      // [tiles_y*TILE,tiles_x*TILE] T dL/dT, read where GRAD_BEHIND
     __global const uint *restrict tile_last,    // [T]
@@ -144,6 +153,9 @@ void blend_backward(
 #if WEIGHT_ENTROPY
         p.entropy = grad_image[3 * plane + at];
         p.rest = p.rest - p.entropy * (1.0f - image[3 * plane + at]);
+#elif INVERSE_DEPTH
+        p.inverse_depth = grad_image[3 * plane + at];
+        p.rest = p.rest + p.inverse_depth * image[3 * plane + at];
 #endif
         pixels[i] = p;
     }
@@ -172,8 +184,13 @@ void blend_backward(
                 barrier(CLK_LOCAL_MEM_FENCE);
             }
         if (owns) {
+#if INVERSE_DEPTH
+            const float last = m.inverse_depth;
+#else
+            const float last = 0.0f;
+#endif
             const float sums[RECORD] = {m.power, m.x, m.y, m.xx, m.xy, m.yy, m.red, m.green, m.blue,
-                                        m.abs_x, m.abs_y, m.weight, m.texture, m.blended, m.square, 0.0f};
+                                        m.abs_x, m.abs_y, m.weight, m.texture, m.blended, m.square, last};
             __global sums_part_t *record = (__global sums_part_t *)pair_sums + (size_t)pair * (RECORD / 4);
             for (uint k = 0; k < SUMS_PARTS; k++)
                 record[k] = vload4(k, sums);

@@ -22,7 +22,7 @@ void blend_forward(
     __global const float *restrict splats,      // [N,RECORD]
     __constant float *restrict background,      // [3]
     __constant camera_t *restrict camera,       // [1]
-    __global float *restrict image,             // [3 + WEIGHT_ENTROPY,tiles_y*TILE,tiles_x*TILE]
+    __global float *restrict image,             // [3 + FOURTH_PLANE,tiles_y*TILE,tiles_x*TILE]
     __global float *restrict transmittance,     // [tiles_y*TILE,tiles_x*TILE]
     __global uint *restrict tile_last,          // [T] pairs of the tile up to the last that any pixel blends
     const uint first_tile)                      // of this launch
@@ -92,6 +92,8 @@ void blend_forward(
             VSTORE(t * inside, transmittance + at);
 #if WEIGHT_ENTROPY
             VSTORE((p.entropy - t * log_weight(t)) * inside, image + 3 * plane + at);
+#elif INVERSE_DEPTH
+            VSTORE(p.inverse_depth * inside, image + 3 * plane + at);
 #endif
         }
 }
@@ -109,7 +111,12 @@ static inline void store_record(const pixel_sums_t m, __global float *record)
 {
     const VF a = FOLD_TWICE(m.power, m.x, m.y, m.xx), b = FOLD_TWICE(m.xy, m.yy, m.red, m.green);
     const VF c = FOLD_TWICE(m.blue, m.abs_x, m.abs_y, m.weight);
-    const VF d = FOLD_TWICE(m.texture, m.blended, m.square, (VF)(0.0f));
+#if INVERSE_DEPTH
+    const VF last = m.inverse_depth;
+#else
+    const VF last = (VF)(0.0f);
+#endif
+    const VF d = FOLD_TWICE(m.texture, m.blended, m.square, last);
 #if LANES == 16
     const VF low = FOLD(a, b, s014589cd, s2367abef), high = FOLD(c, d, s014589cd, s2367abef);
     *(__global float16 *)record = FOLD(low, high, even, odd);
@@ -174,8 +181,8 @@ void blend_backward(
     __global const uint *restrict pair_splat,   // [P]
     __global const float *restrict splats,      // [N,RECORD]
     __constant camera_t *restrict camera,       // [1]
-    __global const float *restrict image,       // [3 + WEIGHT_ENTROPY,tiles_y*TILE,tiles_x*TILE]
-    __global const float *restrict grad_image,  // [3 + WEIGHT_ENTROPY,tiles_y*TILE,tiles_x*TILE]
+    __global const float *restrict image,       // [3 + FOURTH_PLANE,tiles_y*TILE,tiles_x*TILE]
+    __global const float *restrict grad_image,  // [3 + FOURTH_PLANE,tiles_y*TILE,tiles_x*TILE]
     __global const float *restrict texture,     // [tiles_y*TILE,tiles_x*TILE] read where PIXEL_SUMS > SUM_WEIGHT
     __global const float *restrict behind,      // [tiles_y*TILE,tiles_x*TILE] T dL/dT, read where GRAD_BEHIND
     __global const uint *restrict tile_last,    // [T]
@@ -209,6 +216,9 @@ void blend_backward(
 #if WEIGHT_ENTROPY
             p.entropy = VLOAD(grad_image + 3 * plane + at);
             p.rest = p.rest - p.entropy * (1.0f - VLOAD(image + 3 * plane + at));
+#elif INVERSE_DEPTH
+            p.inverse_depth = VLOAD(grad_image + 3 * plane + at);
+            p.rest = p.rest + p.inverse_depth * VLOAD(image + 3 * plane + at);
 #endif
             pixels[y * COLUMNS + column] = p;
         }

@@ -42,6 +42,9 @@
 #ifndef WEIGHT_ENTROPY
 #define WEIGHT_ENTROPY 0  // 1: the image has a fourth plane, the entropy of the blend weights (splat.h)
 #endif
+#ifndef INVERSE_DEPTH
+#define INVERSE_DEPTH 0  // 1: the fourth plane of the image is the blended inverse depth (splat.h)
+#endif
 #ifndef GRAD_BEHIND
 #define GRAD_BEHIND 0  // 1: the loss depends on what the splats leave of a pixel, beside its colour (splat.h)
 #endif

@@ -126,12 +126,12 @@ void project_forward(
     const VF fields[RECORD] = {
         u, v, s.xy / longer, sqrt(longer), sqrt(s.determinant / longer), opacity,
         larger(colour[0], zero), larger(colour[1], zero), larger(colour[2], zero),
-        v - half_y, v + half_y, u - half_x, u + half_x, turned ? (VF)(1.0f) : zero, zero, zero};
+        v - half_y, v + half_y, u - half_x, u + half_x, turned ? (VF)(1.0f) : zero, s.inverse_z, zero};
 #else
     const VF fields[RECORD] = {
         u, v, s.conic_xx, s.conic_xy, s.conic_yy, opacity,
         larger(colour[0], zero), larger(colour[1], zero), larger(colour[2], zero),
-        v - half_y, v + half_y, u - half_x, u + half_x, power_min, zero, zero};
+        v - half_y, v + half_y, u - half_x, u + half_x, power_min, s.inverse_z, zero};
 #endif
     const footprint_t footprint = footprint_of(fields, visible, camera->tiles_x, row_begin, row_end);
     VI mask;

@@ -10,7 +10,8 @@
  * With PIXEL_BOX alpha is the mean of that Gaussian over the pixel instead (pixel_box.h), and has to be >= 1/255.
  *
  * With WEIGHT_ENTROPY the image and its gradient have a fourth plane, H = -sum_i w_i ln w_i - T ln T with w = alpha T
- * and the last T: how far a pixel is from showing one splat alone. */
+ * and the last T: how far a pixel is from showing one splat alone.  With INVERSE_DEPTH, never both, it is a fourth
+ * channel, D = sum_i w_i / z_i with the depths of the means, and 0 behind the splats. */
 #ifndef CLSPLAT_SPLAT_H
 #define CLSPLAT_SPLAT_H
 #include "lanes.h"
@@ -28,6 +29,7 @@
 #define SPLAT_X_MIN 11
 #define SPLAT_X_MAX 12
 #define SPLAT_POWER_MIN 13 // ln(ALPHA_MIN / opacity)
+#define SPLAT_INVERSE_DEPTH 14  // of the mean, scene units^-1
 
 /* fields of a gradient record, [RECORD] floats: sums over pixels, with p = dL/dpower and w = alpha T */
 #define SUM_POWER 0    // p; divided by the opacity it is dL/dopacity
@@ -43,6 +45,7 @@
 #define SUM_TEXTURE 12 // w times the texture at the pixel, there
 #define SUM_BLENDED 13 // the texture of the pixels that the splat is blended in, there: with ones, their number
 #define SUM_SQUARE 14  // (dL/dG)^2 with G = e^power, so that alpha = opacity G
+#define SUM_INVERSE_DEPTH 15  // w dL/dD; summed where INVERSE_DEPTH, apart from the others (inverse_depth.cl)
 
 /* With PIXEL_BOX p = dL/dln(alpha), and SUM_X to SUM_YY are p times the derivatives of ln(alpha), by x and y of the
  * mean and by k, ln s and ln t of pixel_box.h. */
@@ -51,7 +54,7 @@
  * with sums; else whole. */
 #if LANES == 1
 typedef float4 sums_part_t;
-#define SUMS_PARTS ((PIXEL_SUMS + 3) / 4)
+#define SUMS_PARTS (INVERSE_DEPTH ? RECORD / 4 : (PIXEL_SUMS + 3) / 4)
 #else
 typedef float16 sums_part_t;
 #define SUMS_PARTS 1
@@ -60,6 +63,9 @@ typedef float16 sums_part_t;
 /* Partial sums, one set per lane. */
 typedef struct {
     VF power, x, y, xx, xy, yy, red, green, blue, abs_x, abs_y, weight, texture, blended, square;
+#if INVERSE_DEPTH
+    VF inverse_depth;
+#endif
 } pixel_sums_t;
 
 #if PIXEL_BOX
@@ -157,8 +163,12 @@ typedef struct {
     VF t, red, green, blue;
 #if WEIGHT_ENTROPY
     VF entropy;
+#elif INVERSE_DEPTH
+    VF inverse_depth;
 #endif
 } pixels_t;
+
+#define FOURTH_PLANE (WEIGHT_ENTROPY || INVERSE_DEPTH)
 
 /* ln w; finite for the weight 0 of what is not blended. */
 static inline VF log_weight(const VF w) { return log_positive(larger(w, (VF)(1.0e-30f))); }
@@ -171,6 +181,8 @@ static inline void blend(pixels_t *p, const row_splat_t s, const VF pixel, const
     p->blue += k.weight * colour[2];
 #if WEIGHT_ENTROPY
     p->entropy -= k.weight * log_weight(k.weight);
+#elif INVERSE_DEPTH
+    p->inverse_depth += k.weight * colour[SPLAT_INVERSE_DEPTH - SPLAT_RED];
 #endif
     p->t = k.next;
 }
@@ -191,6 +203,8 @@ typedef struct {
 #endif
 #if WEIGHT_ENTROPY
     VF entropy;  // dL/dH
+#elif INVERSE_DEPTH
+    VF inverse_depth;  // dL/dD
 #endif
 } grad_pixels_t;
 
@@ -202,6 +216,8 @@ static inline void blend_backward_step(grad_pixels_t *p, const row_splat_t s, co
     VF shade = colour[0] * p->red + colour[1] * p->green + colour[2] * p->blue;
 #if WEIGHT_ENTROPY
     shade = shade - p->entropy * (log_weight(k.weight) + 1.0f);
+#elif INVERSE_DEPTH
+    shade = shade + colour[SPLAT_INVERSE_DEPTH - SPLAT_RED] * p->inverse_depth;
 #endif
     p->rest = p->rest - k.weight * shade;
     const VF grad_alpha = p->t * shade - p->rest / k.remain;
@@ -230,6 +246,9 @@ static inline void blend_backward_step(grad_pixels_t *p, const row_splat_t s, co
     m->red += k.weight * p->red;
     m->green += k.weight * p->green;
     m->blue += k.weight * p->blue;
+#if INVERSE_DEPTH
+    m->inverse_depth += k.weight * p->inverse_depth;
+#endif
 #if PIXEL_SUMS > SUM_ABS_X && PIXEL_BOX
     m->abs_x += magnitude(power_x);
     m->abs_y += magnitude(power_y);

@@ -80,6 +80,10 @@ class NotFiniteError(NumericError):
     """The state of a training is not finite; it was set aside, as failed_N.npz."""
 
 
+class NoneInsideError(NumericError):
+    """No Gaussian lies in a part of space."""
+
+
 class OutputError(ClsplatError):
     """A file cannot be written or read back, or a folder is in use."""
 

@@ -63,6 +63,13 @@ def match_features(
     return {"matching": chosen, "pairs": len(verified(pycolmap, database))}
 
 
+def most_pairs(photographs: int, matching: Matching, neighbours: int) -> int:
+    """Return the largest number of pairs that match_features looks at."""
+    every = photographs * (photographs - 1) // 2
+    is_each = matching == "exhaustive" or (matching == "auto" and photographs <= MAX_EXHAUSTIVE)
+    return every if is_each else min(every, 2 * neighbours * photographs)
+
+
 def match_within(database: Path, how: Pairing) -> Matching:
     """Match the photographs of a database as match_features does, but for pairs that it holds; return how.
 

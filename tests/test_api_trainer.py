@@ -15,7 +15,8 @@ from clsplat.api.renderer import Renderer
 from clsplat.conformance.scenes import random_case
 from clsplat.density.statistics import SplatStats
 from clsplat.errors import ConfigError, DataError
-from clsplat.losses.base import Comparison, HostLoss
+from clsplat.losses.base import Comparison
+from clsplat.losses.host import HostLoss
 from clsplat.losses.image import L1, Dssim
 from clsplat.render.camera import upload_camera
 from clsplat.render.workspace import Workspace

@@ -11,9 +11,10 @@ from typer.testing import CliRunner
 import clsplat
 from clsplat.cli import app
 from clsplat.density.box import Box
-from clsplat.errors import ClsplatError, ConfigError, DataError
+from clsplat.errors import ClsplatError, ConfigError, DataError, NoneInsideError
 from clsplat.pipeline.loading import load
 from clsplat.scene.detect import read_scene
+from clsplat.tuning import tuning
 from data_tools.multiscale import write_multiscale
 
 pytestmark = pytest.mark.slow
@@ -146,6 +147,92 @@ def test_a_block_that_fails_is_named_and_the_others_are_trained(tiny_scene, few_
     assert caught.value.exit_code == 7
     assert [(tmp_path / "out" / f"block_{i:02d}" / "metrics.json").is_file() for i in (0, 2)] == [True] * 2
     assert not (tmp_path / "out" / "merged.ply").exists()
+
+
+def test_a_block_whose_checkpoints_are_all_damaged_begins_anew(trained, tiny_scene, few_steps, tmp_path, caplog):
+    out = tmp_path / "out"
+    shutil.copytree(trained[0], out)
+    (out / "block_01" / "point_cloud.ply").unlink()
+    for path in (out / "block_01" / "checkpoints").iterdir():
+        path.write_bytes(b"damaged")
+    train(tiny_scene, few_steps, out, blocks=COUNT, sight=NEVER)
+    assert "block_01: no checkpoint is whole; it is trained again from the beginning" in caplog.text
+    assert (out / "merged.ply").read_bytes() == (trained[0] / "merged.ply").read_bytes()
+
+
+def test_a_block_without_gaussians_at_its_end_is_left_out(
+    trained, tiny_scene, few_steps, tmp_path, monkeypatch, caplog
+):
+    def empty(pipeline, folder, *options):
+        if folder.name == "block_01":
+            raise NoneInsideError("crop: none lies inside")
+        return tuning.trained(pipeline, folder, *options)
+
+    out = tmp_path / "out"
+    shutil.copytree(trained[0], out)
+    monkeypatch.setattr("clsplat.blocks.blocks.trained", empty)
+    train(tiny_scene, few_steps, out, blocks=COUNT, sight=NEVER)
+    assert "block_01: no Gaussian is left in its cell; the model goes on without it" in caplog.text
+    parts = [clsplat.load(trained[0] / f"block_{i:02d}").means for i in (0, 2)]
+    np.testing.assert_array_equal(clsplat.load(out / "merged").means, np.concatenate(parts))
+
+
+def test_a_box_without_gaussians_is_told_apart(few_steps, tiny_scene, tmp_path):
+    file = tmp_path / "x.yaml"
+    stages = [{"init": {"source": "model", "file": str(few_steps)}}, {"crop": {"inside": {"low": [99, 99, 99]}}}]
+    file.write_text(json.dumps({"name": "x", "stages": stages}))
+    with pytest.raises(NoneInsideError):
+        clsplat.run(file, tiny_scene, tmp_path / "out")
+
+
+def test_blocks_trained_as_cells_of_a_store_are_those_trained_here(
+    trained, tiny_scene, few_steps, tmp_path, monkeypatch
+):
+    on, out, here = tmp_path / "lab.yaml", tmp_path / "out", []
+    run = tuning.run_pipeline
+    monkeypatch.setattr(tuning, "run_pipeline", lambda *words: here.append(words[1].name) or run(*words))
+    on.write_text(f"engine: inline\nstore: '{tmp_path / 'store'}'\n")
+    for _ in range(2):  # the second time all is done
+        train(tiny_scene, few_steps, out, blocks=COUNT, sight=NEVER, on=on)
+        assert here == ["merged"]
+    assert (out / "merged.ply").read_bytes() == (trained[0] / "merged.ply").read_bytes()
+    cells = clsplat.status(tmp_path / "store")["cells"]
+    assert [(cell["name"], cell["state"]) for cell in cells] == [(f"block_{i:02d}", "published") for i in range(COUNT)]
+    on.write_text("engine: inline\n")
+    with pytest.raises(ConfigError, match="--on: blocks are trained as cells of a store; expected the key store"):
+        train(tiny_scene, few_steps, out, blocks=COUNT, sight=NEVER, on=on)
+
+
+def test_status_tells_of_each_run_of_a_scene_in_blocks(trained, tmp_path):
+    out = tmp_path / "out"
+    assert clsplat.status(trained[0])["state"] == "done"
+    shutil.copytree(trained[0], out)
+    shutil.rmtree(out / "merged")
+    (out / "block_02" / "status.json").write_text("{")
+    shown = CliRunner().invoke(app, ["status", str(out)])
+    assert shown.exit_code == 0, shown.output
+    first, *parts = shown.stdout.splitlines()
+    assert first.endswith("out: unfinished, 2 of 4 runs are done")
+    told = [Path(part.strip().split(" at ")[0].split(";")[0]).name for part in parts]
+    assert told == ["block_00: done", "block_01: done", "block_02: unknown", "merged: waiting"]
+    (out / "blocks.json").write_text("[]")
+    with pytest.raises(DataError, match=r"blocks.json: expected the number of blocks; remove .*"):
+        clsplat.status(out)
+
+
+@pytest.mark.parametrize("damaged", ["block_01/point_cloud.ply", "block_01.ply", "partition.json", "block_02", None])
+def test_check_finds_what_is_damaged_in_a_folder_of_blocks(trained, tmp_path, damaged):
+    out = tmp_path / "out"
+    shutil.copytree(trained[0], out)
+    if damaged == "block_02":
+        shutil.rmtree(out / damaged)
+    elif damaged:
+        (out / damaged).write_bytes((out / damaged).read_bytes()[:-9])
+    found = clsplat.check(out)
+    assert [one["file"] for one in found["objects"] if not one["whole"]] == ([damaged] if damaged else [])
+    assert len(found["objects"]) > 30
+    shown = CliRunner().invoke(app, ["check", str(out)])
+    assert f"clsplat blocks … --out {out}` again" in str(shown.exception) if damaged else shown.exit_code == 0
 
 
 def test_steps_are_shared_by_views_with_rates_that_make_up_for_it(tiny_scene, few_steps, tmp_path):

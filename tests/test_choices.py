@@ -18,6 +18,7 @@ from clsplat.scene.capture import measured
 from clsplat.scene.detect import read_scene
 from clsplat.scene.scene import Tracks
 from clsplat.schedule import at_step
+from clsplat.stages.densify import Densify
 from tests.few_steps import FEW
 from tests.test_training import digest, train
 
@@ -218,6 +219,9 @@ def test_the_recipe_for_photographs_chooses_by_their_number(photographs, dropout
     training = chosen.training
     assert (at_step(training.dropout, 7000), training.keep) == (dropout, keep)
     assert training.refit is (keep == "best")
+    assert (chosen.model.background is not None) == (keep == "best"), "what is far away"
+    (growing,) = [stage for stage in training.during if isinstance(stage, Densify)]
+    assert growing.per_pixel == {4: 0.3, 20: None, 25: None, 43: None}[photographs]
     plain = load("splat_7k").settings
     many = choose(settings, {"photographs": 200})
     assert (many.training, many.model) == (plain.training, plain.model), "nothing is lost where there are many"

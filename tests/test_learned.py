@@ -3,7 +3,7 @@
 import pytest
 
 from clsplat.errors import ConfigError
-from clsplat.losses.base import HostLoss
+from clsplat.losses.host import HostLoss
 from clsplat.pipeline.loading import load
 from tests.test_training import train
 

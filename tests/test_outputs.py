@@ -8,8 +8,8 @@ from typing import Annotated, Any, Literal
 import pytest
 
 from clsplat import names
-from clsplat.cluster.execution import Execution
 from clsplat.errors import ConfigError
+from clsplat.pipeline.execution import Execution
 from clsplat.pipeline.file import PipelineFile
 from clsplat.pipeline.loading import load
 from clsplat.pipeline.matrix import Matrix, MatrixFile, load_experiment
@@ -21,8 +21,9 @@ READ = {  # text that is read, or compared, and never the name of something that
     "Auto.reason", "CaptureChoice.given", "CaptureChoice.reason", "CaptureChoice.since", "CaptureChoice.keys",
     "SceneSettings.path", "Init.file", "Evaluate.file", "Evaluate.lpips", "Matrix.pipelines", "Matrix.scenes",
     "Matrix.set", "Matrix.options", "PipelineFile.plugins", "Snapshot.view", "Snapshot.size", "Timelapse.folder",
-    "Video.path", "Video.size", "Choice.names", "Choice.file", "MatrixFile.execution", "Execution.engine",
+    "Video.path", "Video.size", "Choice.names", "Choice.file", "Execution.engine",
     "Execution.devices", "Tls.ca", "Tls.cert", "Tls.key",
+    "Slurm.memory", "Slurm.walltime", "Slurm.partition", "Slurm.account", "Slurm.options", "Slurm.interface",
 }  # fmt: skip
 NAMES = {"PipelineFile.name", "MatrixFile.name", "Execution.store"}  # of folders
 OUTSIDE = [

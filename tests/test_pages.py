@@ -18,7 +18,7 @@ from tests.refusals import refusal
 from tests.test_cli import clsplat
 
 SOURCES = sorted(Path(package.__file__).parent.rglob("*.py"))
-PAGES = ("report", "compare", "compress", "inspect", "notebook", "doctor", "viewer", "live")
+PAGES = ("report", "compare", "compress", "inspect", "notebook", "doctor", "store", "viewer", "live")
 FOLDER = Path(package.__file__).parent / "pages" / "templates"
 DRAWINGS = {"clsplat/pages/svg.py", "clsplat/pages/plan.py", "clsplat/bench/table.py"}  # SVG, escaped there
 STATES = ("good", "warn", "bad", "note")  # colours of text with papers of their own

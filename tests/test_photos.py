@@ -239,6 +239,32 @@ def test_pairs_are_matched_once(photos, placed, tmp_path):
         ).read_bytes()
 
 
+def test_pairs_are_matched_once_also_after_a_kill(placed, tmp_path):
+    source, database = placed.parent / "features", tmp_path / "database.db"
+    killed = f"""
+import os, signal, threading, time
+from pathlib import Path
+from data_tools import matching
+def kill():
+    while matching.pairs_done(Path({str(database)!r})) < 5:
+        time.sleep(0.01)
+    os.kill(os.getpid(), signal.SIGKILL)
+threading.Thread(target=kill, daemon=True).start()
+matching.match_features(Path({str(source)!r}), Path({str(tmp_path)!r}))
+"""
+    assert subprocess.run([sys.executable, "-c", killed], cwd=ROOT).returncode == -signal.SIGKILL
+    with closing(sqlite3.connect(database)) as opened:
+        (kept,) = opened.execute("select count(*) from two_view_geometries").fetchone()
+        opened.execute("create table counted (pair)")
+        opened.execute("create trigger counts after insert on matches begin insert into counted values (1); end")
+        opened.commit()
+    assert 5 <= kept < 14 * 13 // 2, "it was killed in the middle"
+    match_features(source, tmp_path)
+    found = rows(database)
+    assert len(found.pop("counted")) in (14 * 13 // 2 - kept, 14 * 13 // 2 - kept - 1), "the last one may be half there"
+    assert found == rows(placed.parent / "matches" / "database.db")
+
+
 def test_counting_pairs_loses_none(placed, tmp_path, monkeypatch):
     """A reader in pycolmap's own process would release the locks of its writes."""
     monkeypatch.setattr(progress, "WATCH", 0.01)

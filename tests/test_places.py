@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from clsplat.cluster import fingerprint
+from clsplat.cluster.batch import wanted_cell
 from clsplat.cluster.cell import Cell
 from clsplat.cluster.fingerprint import Scenes
-from clsplat.cluster.sweep import wanted_cell
 from clsplat.cluster.task import run_cell
 from clsplat.errors import ConfigError, DataError
 from clsplat.pipeline import matrix

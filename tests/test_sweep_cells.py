@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from clsplat.cluster import child
-from clsplat.cluster.attempt import LEASE, MANIFEST, Attempt, place_copy
+from clsplat.cluster.attempt import LEASE, MANIFEST, Attempt
 from clsplat.cluster.cell import Cell
 from clsplat.cluster.child import FILE, OUT, PYTHON
 from clsplat.cluster.drive import Drive, Wanted
@@ -21,12 +21,15 @@ from clsplat.cluster.engine import Inline, Lost
 from clsplat.cluster.fingerprint import Scenes
 from clsplat.cluster.folder import ATTEMPTS, Different
 from clsplat.cluster.overview import overview_text, store_status
+from clsplat.cluster.page import store_page
+from clsplat.cluster.placing import place_copy
 from clsplat.cluster.probe import Place
 from clsplat.cluster.store import Store
 from clsplat.cluster.task import Outcome, Terms, run_cell
 from clsplat.errors import ConfigError, DeviceError, Interrupted, OutputError
 from clsplat.names import CHECKPOINTS
 from clsplat.pipeline.loading import load
+from tests.html_page import HOSTILE, Page
 
 SPEC = {"pipeline": {"name": "a", "seed": 0}, "scene": "s", "code": "c", "bits": "b"}
 CELL = Cell("first", SPEC, "name: a\n")
@@ -209,12 +212,24 @@ def test_one_cell_is_cancelled_by_its_name_or_the_beginning_of_its_key(store, te
     other = replace(CELL, spec={**SPEC, "scene": "t"})
     store.add(CELL)
     store.add(other)
-    store.note_sweep("sweep", {"first": CELL.key})
+    store.note_sweep("sweep", {"first": CELL.key}, "")
     assert store.cancel("first") == CELL.key == store.cancel(CELL.key[:12])
     assert store.is_cancelled([CELL.key], terms.since)
     assert not store.is_cancelled([other.key], terms.since)
     with pytest.raises(ConfigError, match="no cell 'x'"):
         store.cancel("x")
+
+
+def test_matrices_of_one_name_keep_their_cells(store, terms):
+    changed = replace(CELL, spec={**SPEC, "scene": "t"})
+    for cell in (CELL, changed):
+        store.add(cell)
+        store.note_sweep("sweep", {"first": cell.key}, cell.key)
+    assert {cell["name"] for cell in store_status(store.root)["cells"]} == {"first"}
+    with pytest.raises(ConfigError, match="no cell 'first'; 2 cells are named so; give a key"):
+        store.cancel("first")
+    run_cell(CELL, store, command(WRITES), terms)
+    assert store.cancel("first") == changed.key
 
 
 def test_a_run_that_does_not_stop_is_killed(store, terms, monkeypatch):
@@ -267,7 +282,8 @@ def test_a_copy_of_a_result_gets_its_manifest_last(store, terms, tmp_path, monke
     result, copied = store.folder(CELL.key).result, []
     for name in "abcdefgh":
         (result / name).touch()
-    monkeypatch.setattr("clsplat.cluster.attempt.link_or_copy", lambda source, target: copied.append(target.name))
+    for module in ("copies", "placing"):
+        monkeypatch.setattr(f"clsplat.cluster.{module}.link_or_copy", lambda _, target: copied.append(target.name))
     place_copy(result, tmp_path / "copy")
     assert copied[-1] == MANIFEST != copied[-2]
 
@@ -284,6 +300,13 @@ def test_attempts_are_removed_by_the_age_of_their_lease_alone(store, terms):
     os.utime(young.path / LEASE, (store.now() - 601, store.now() - 601))
     run_cell(CELL, store, command(WRITES), terms)
     assert not young.path.exists(), "the next call finds the result, and that"
+
+
+def test_a_damaged_spec_is_written_again(store, terms):
+    folder = store.add(CELL)
+    (folder.path / "spec.json").write_text('{"pipe')
+    assert run_cell(CELL, store, command(WRITES), terms).state == "published"
+    assert json.loads((folder.path / "spec.json").read_text()) == SPEC
 
 
 def test_a_spec_is_never_changed(store):
@@ -386,6 +409,24 @@ def test_what_runs_costs_no_look_at_the_cells_that_wait(store, terms, monkeypatc
     assert len(looks) == 5
 
 
+def test_a_device_that_suits_no_cell_is_asked_once(store, terms, monkeypatch):
+    looks = []
+    suits = Drive._suits
+    monkeypatch.setattr(Drive, "_suits", lambda drive, one, bits, _: looks.append(bits) or suits(drive, one, bits, _))
+    monkeypatch.setattr("clsplat.cluster.drive.LOOK", 0.0)
+    engine, begun = Fake(places=PLACES[:2]), wanted(*range(5))
+    for one in begun:
+        store.add(one.on("x"))
+
+    def start(*values):
+        ends = [*[None] * 9, Outcome("published")]
+        return type("Ticket", (), {"outcome": lambda self: ends.pop(0)})()
+
+    engine.start = start
+    Drive(store, engine, False, terms).run(begun)
+    assert looks.count("y") == 4, "one look at each cell that waits"
+
+
 def test_a_signal_stops_a_sweep(store, terms):
     with pytest.raises(Interrupted, match="with --resume goes on"):
         Drive(store, Fake(), True, terms, is_stopped=lambda: True).run(wanted(1))
@@ -398,13 +439,35 @@ def test_the_engine_of_this_process_runs_a_cell(store, terms, monkeypatch):
     assert ticket.outcome().state == "published"
 
 
+def test_the_page_of_a_store_shows_cells_that_run_and_have_run_and_escapes_their_names(few_steps, store, terms):
+    stages = {"stages": [{"init": {}}, {"optimize": {"steps": 12}}]}
+    copies = f"import shutil, sys; shutil.copytree({str(few_steps)!r}, sys.argv[2], dirs_exist_ok=True)"
+    pipeline = {**SPEC["pipeline"], **stages}
+    scene = json.loads((few_steps / "inputs.json").read_text())["digest"]
+    specs = [{**SPEC, "pipeline": pipeline, "scene": one} for one in (scene, "another")]
+    cells = [replace(CELL, name=name, spec=spec) for name, spec in zip((HOSTILE, "on"), specs, strict=True)]
+    assert run_cell(cells[0], store, command(copies), terms).state == "published"
+    attempt = store.add(cells[1]).begin("w", terms.since)
+    status = json.loads((few_steps / "status.json").read_text())
+    (attempt.path / "status.json").write_text(json.dumps({**status, "step": 6, "seconds_left": 75.0}))
+    store.note_sweep(HOSTILE, {cell.name: cell.key for cell in cells}, "")
+    html = store_page(store_status(store.root))
+    page = Page(html)
+    psnr = json.loads((few_steps / "metrics.json").read_text())["test"]["1"]["psnr"]
+    for words in ("12 / 12", "6 / 12", f"{psnr:.2f}", "1 min 15 s left", status["device"]):
+        assert words in page.text
+    assert '<progress value="6" max="12">' in html
+    assert page.text.count(HOSTILE) == 3, "a name, and that of the sweep of both"
+    assert page.elements["script"] == 0
+
+
 def test_the_state_of_a_store_is_in_its_files(store, terms):
     cells = [replace(CELL, name=name, spec={**SPEC, "scene": name}) for name in ("done", "bad", "on", "new")]
     run_cell(cells[0], store, command(WRITES), terms)
     run_cell(cells[1], store, command("raise SystemExit(2)"), terms)
     store.add(cells[2]).begin("w", terms.since)
     store.add(cells[3])
-    store.note_sweep("sweep", {cell.name: cell.key for cell in cells})
+    store.note_sweep("sweep", {cell.name: cell.key for cell in cells}, "")
     found = store_status(store.root)
     assert {cell["name"]: cell["state"] for cell in found["cells"]} == {
         "done": "published",
@@ -413,8 +476,14 @@ def test_the_state_of_a_store_is_in_its_files(store, terms):
         "new": "waiting",
     }
     text = overview_text(found)
+    page = Page(store_page(found))
+    assert "4 cells: 1 published, 1 running, 1 waiting, 1 failed" in page.text
+    assert page.text.count("its process ended with exit code 2") == 1
+    assert page.elements["tr"] == 1 + 4 + len(found["events"])
     store.folder(cells[1].key).begin("w", terms.since)
     assert store_status(store.root)["counts"] == {"published": 1, "running": 2, "waiting": 1}, "it is tried again"
+    store.folder(cells[1].key).give_up(2, "of another process, which has tried it too")
+    assert store_status(store.root)["counts"] == {"published": 1, "running": 2, "waiting": 1}, "it runs still"
     assert "1 failed, 1 published, 1 running, 1 waiting" in text
     assert "bad: its process ended with exit code 2" in text
     assert sys.executable not in text

@@ -11,7 +11,8 @@ from clsplat.density.statistics import SplatStats
 from clsplat.errors import ConfigError
 from clsplat.filters import FilterViews, measure_intervals
 from clsplat.gaussians.tables import INTERVAL2, DeviceModel, Gaussians
-from clsplat.losses.base import HostLoss, ImageLoss, Loss, returned
+from clsplat.losses.base import ImageLoss, Loss, returned
+from clsplat.losses.host import HostLoss
 from clsplat.losses.image import L1, L2, Dssim
 from clsplat.losses.penalties import Anisotropy
 from clsplat.opencl.device import Device

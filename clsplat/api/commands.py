@@ -72,26 +72,24 @@ def resume(
     scene: where its photographs are, if they have moved; live, on: as for `run`.
     """
     from clsplat.cluster.commands import run_job
-    from clsplat.cluster.execution import values_of
+    from clsplat.pipeline.execution import values_of
     from clsplat.runs.experiment import Job
 
     load_plugins()
     return run_job(Job.resume(Path(folder), overrides(set), path_of(scene), values_of(path_of(on))), device, live)
 
 
-def status(folder: PathLike) -> dict[str, Any]:
+def status(folder: PathLike, html: PathLike | None = None) -> dict[str, Any]:
     """Return how far a run or a matrix is, from its files: what status.json holds, `last` report, `metrics` at the end.
 
     A matrix has `cells`, `done` and `failed` in the place of the step.  `silent` is the time in s since the last
     heartbeat of a run that has not ended, `ahead` that by which it lies in the future, from a minute on; the state is
-    `killed` where its process is gone.  Of the store of a sweep return its `cells`, `counts` of their states, `events`.
+    `killed` where its process is gone.  Of the store of a sweep return its `cells`, `counts` of their states, `events`,
+    of a scene in blocks its `state` and its `parts`.  html: a page to be written of a store.
     """
-    from clsplat.cluster.overview import is_store, store_status
-    from clsplat.runs.status import run_status
+    from clsplat.blocks.folder import status_of
 
-    if is_store(Path(folder)):
-        return store_status(Path(folder))
-    return run_status(Path(folder))
+    return status_of(Path(folder), path_of(html))
 
 
 def status_schema() -> dict[str, Any]:
@@ -104,10 +102,11 @@ def status_schema() -> dict[str, Any]:
 def check(pipeline: PathLike) -> dict[str, Any]:
     """Validate a pipeline or a matrix; return its `path`, its `name`, and its `stages` or `cells`.
 
-    Of a run folder return `whole`, its `state`, and `objects`: every file, whether it is `whole`, and a `detail`.  Of a
-    model file return its `format`, `ranges`, `bounds`, `degenerate` counts, `findings`, and whether it is `valid`.
+    Of a run folder, or that of a scene in blocks, return `whole`, its `state`, and `objects`: every file, whether it is
+    `whole`, and a `detail`.  Of a model file return its `format`, `ranges`, `bounds`, `degenerate` counts, `findings`,
+    and whether it is `valid`.
     """
-    from clsplat.cluster.commands import check
+    from clsplat.blocks.folder import check
 
     load_plugins()
     return check(str(pipeline))
@@ -242,7 +241,8 @@ def _job(
     start: "Start",
     on: PathLike | None = None,
 ) -> "Job":
-    from clsplat.cluster.commands import open_job
+    from clsplat.pipeline.execution import values_of
+    from clsplat.runs.experiment import Job
 
     load_plugins()
-    return open_job(str(pipeline), path_of(scene), path_of(out), overrides(values), start, path_of(on))
+    return Job.open(str(pipeline), path_of(scene), path_of(out), overrides(values), start, values_of(path_of(on)))

@@ -47,9 +47,9 @@ def work_for(
 
     devices: names, default every device that works; tls: files of the authority, the certificate and its key.
     """
-    from clsplat.cluster.execution import options
     from clsplat.cluster.offer import offer
+    from clsplat.pipeline.execution import options
 
     load_plugins()
-    certificates = dict(zip(("ca", "cert", "key"), tls, strict=True)) if any(tls) else None
+    certificates = {key: file for key, file in zip(("ca", "cert", "key"), tls, strict=True) if file} or None
     offer(options({"engine": scheduler, "insecure": insecure, "tls": certificates}), devices)

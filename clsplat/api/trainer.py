@@ -14,7 +14,8 @@ from clsplat.api.arguments import PathLike, load_plugins, overrides
 from clsplat.api.device import proved
 from clsplat.errors import ClsplatError, ConfigError, DataError, Interrupted, OutputError
 from clsplat.gaussians.model import Model
-from clsplat.losses.base import HostFunction, HostLoss, ViewLosses
+from clsplat.losses.base import ViewLosses
+from clsplat.losses.host import HostFunction, HostLoss
 from clsplat.metrics.views import mean, measure
 from clsplat.names import CHECKSUMS, END_STATES
 from clsplat.opencl.device import Device

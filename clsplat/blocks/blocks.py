@@ -11,27 +11,32 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.blocks.folder import COARSE, MERGED, RECORD
 from clsplat.blocks.partition import SIGHT, Block, Partition, Partitioner
 from clsplat.blocks.pipelines import of_block, of_coarse, of_merged, require_divisible, without_start
+from clsplat.cluster.batch import Batch
+from clsplat.cluster.store import Store
 from clsplat.conformance.quick import open_correct
-from clsplat.errors import ClsplatError, ConfigError, DataError, Interrupted, amount, as_clsplat_error, one_line, quoted
+from clsplat.errors import ClsplatError, ConfigError, DataError, NoneInsideError, amount, quoted
 from clsplat.formats.ply_joining import join_plys
 from clsplat.formats.table import detect
 from clsplat.gaussians.model import load as load_model
 from clsplat.gaussians.run_model import as_trained, model_at
 from clsplat.names import METRICS
 from clsplat.opencl.device import Device
+from clsplat.pipeline.execution import Execution
 from clsplat.pipeline.loading import Pipeline, load
+from clsplat.pipeline.matrix import Cell
 from clsplat.pipeline.places import placeless
 from clsplat.reading import read_json, sha256
+from clsplat.runs.failures import Failures
 from clsplat.runs.scenes import read_run_scene
 from clsplat.runs.source import as_setting, photographs_of, require_model
 from clsplat.tuning.folder import claimed
-from clsplat.tuning.tuning import trained
+from clsplat.tuning.tuning import is_trained, trained
 from clsplat.views.photographs import Photographs
 
 LOG = logging.getLogger("clsplat")
-RECORD, COARSE, MERGED = "blocks.json", "coarse", "merged"
 MOST = 99  # blocks
 Steps = Literal["each", "shared"]
 
@@ -60,8 +65,14 @@ class Plan:
 class Blocks:
     """The work in a folder."""
 
-    def __init__(self, scene: Path, out: Path, plan: Plan, device: str | Device | None) -> None:
-        self.out, self.plan = out, plan
+    def __init__(
+        self, scene: Path, out: Path, plan: Plan, device: str | Device | None, execution: Execution | None = None
+    ) -> None:
+        """execution: where blocks are trained; without it one after the other in this process."""
+        if execution is not None and execution.keeps is None:
+            raise ConfigError("--on: blocks are trained as cells of a store; expected the key store, or another engine")
+        self.out, self.plan, self.execution = out, plan, execution
+        self._name = device if isinstance(device, str) else None
         where = [f"scene.path={as_setting(photographs_of(scene))}"]
         self.pipeline = load(plan.pipeline, [*where, "init.file=coarse", *plan.overrides])
         require_divisible(self.pipeline)
@@ -104,44 +115,57 @@ class Blocks:
         share = Fraction(len(block.views), partition.views) if self.plan.steps == "shared" else Fraction(1)
         return of_block(self.pipeline, block, self.out / f"{block.name}.ply", partition.extent, share)
 
-    def train(self, partition: Partition) -> list[Path]:
-        """Train the blocks that are not done; return their models, in order.
+    def train(self, partition: Partition) -> list[tuple[Block, Path]]:
+        """Train the blocks that are not done; return them with their models, in order.
 
-        One that fails does not stop the others; at the end an error names the first, and has its exit code.
+        One in whose cell no Gaussian is left has no model.  One that fails does not stop the others; at the end an
+        error names the first, and has its exit code.
         """
-        files, failures = [], dict[str, ClsplatError]()
-        pipelines = [self.of_block(block, partition) for block in partition.blocks]
-        for block, pipeline in zip(partition.blocks, pipelines, strict=True):
+        files, failures = [], Failures("blocks")
+        pipelines = {block.name: self.of_block(block, partition) for block in partition.blocks}
+        if self.execution:
+            self._train_as_cells(self.execution, pipelines, failures)
+        for block in partition.blocks:
+            if block.name in failures:
+                continue
             LOG.info("%s of %d: %s", block.name, len(pipelines), amount(len(block.views), "view"))
-            try:
-                files.append(as_trained(trained(pipeline, self.out / block.name, self.device)))
-            except Interrupted:
-                raise
-            except Exception as error:
-                failures[block.name] = as_clsplat_error(error)
-                LOG.warning("%s failed: %s", block.name, one_line(failures[block.name]))
+            with failures.kept(block.name):
+                try:
+                    model = trained(pipelines[block.name], self.out / block.name, self.device)
+                    files.append((block, as_trained(model)))
+                except NoneInsideError:
+                    LOG.warning("%s: no Gaussian is left in its cell; the model goes on without it", block.name)
         if failures:
-            name, first = next(iter(failures.items()))
-            told = f"{len(failures)} of {len(pipelines)} blocks failed; the first, {name}: {first}"
-            whole = ClsplatError(
-                f"{told}; when that is mended, the same command trains them, and leaves the others alone"
-            )
-            whole.exit_code = first.exit_code
-            raise whole
+            remedy = "when that is mended, the same command trains them, and leaves the others alone"
+            other = f"other settings need another --out; --coarse {self.out / COARSE} keeps the coarse model there"
+            whole = failures.whole(len(pipelines))
+            error = ClsplatError(f"{whole}; {remedy if self.given else f'{remedy}; {other}'}")
+            error.exit_code = whole.exit_code
+            raise error
+        if not files:
+            raise NoneInsideError("no Gaussian is left in any block; expected another pipeline, with another --out")
         return files
 
-    def merge(self, partition: Partition, files: list[Path]) -> Path:
+    def _train_as_cells(self, execution: Execution, pipelines: dict[str, Pipeline], failures: Failures) -> None:
+        """Train the blocks that are not done as cells of a store, and put their runs into the folders of blocks."""
+        cells = [
+            Cell(name, pipeline) for name, pipeline in pipelines.items() if not is_trained(pipeline, self.out / name)
+        ]
+        if cells:
+            name, store = f"{self.pipeline.settings.name}-{self.out.name}", Store(execution.keeps or Path())
+            Batch(name, str(self.out.resolve()), cells, self.out, store, failures).run(execution, self._name)
+
+    def merge(self, parts: list[tuple[Block, Path]]) -> Path:
         """Write the models of all blocks as one, in the order of their numbers; return its file."""
         file = self.out / f"{MERGED}.ply"
 
         def check(number: int, means: NDArray[np.float32]) -> None:
-            if not partition.blocks[number].cell.box.holds(means).all():
-                raise DataError(
-                    f"{files[number]}: holds Gaussians outside its cell; remove its folder, and train it again"
-                )
+            block, path = parts[number]
+            if not block.cell.box.holds(means).all():
+                raise DataError(f"{path}: holds Gaussians outside its cell; remove its folder, and train it again")
 
-        count = join_plys(file, files, check)
-        LOG.info("%s of %s merged", amount(count, "Gaussian"), amount(len(files), "block"))
+        count = join_plys(file, [path for _, path in parts], check)
+        LOG.info("%s of %s merged", amount(count, "Gaussian"), amount(len(parts), "block"))
         return file
 
     def finish(self, file: Path) -> Path:
@@ -151,19 +175,25 @@ class Blocks:
 
 
 def train_in_blocks(
-    scene: Path, out: Path, plan: Plan | None = None, device: str | Device | None = None, *, only_plan: bool = False
+    scene: Path,
+    out: Path,
+    plan: Plan | None = None,
+    device: str | Device | None = None,
+    *,
+    only_plan: bool = False,
+    execution: Execution | None = None,
 ) -> dict[str, Any]:
     """Train a scene in blocks, in a folder; return the manifest, and beside it `run`, the folder of the merged model.
 
     What an earlier call has finished is left alone, and what it has begun goes on.  only_plan: stop after the
-    partition.  Raises ClsplatError; one of a block names it.
+    partition; execution: where blocks are trained as cells of a store.  Raises ClsplatError; one of a block names it.
     """
-    work = Blocks(scene, out, plan or Plan(), device)
+    work = Blocks(scene, out, plan or Plan(), device, execution)
     with claimed(out, work.question(), RECORD, "a scene in blocks", "another --out"):
         partition = work.partition()
         if only_plan:
             return {**partition.data(), "run": None}
-        run = work.finish(work.merge(partition, work.train(partition)))
+        run = work.finish(work.merge(work.train(partition)))
     return {**partition.data(), "run": str(run), "metrics": read_json(run / METRICS)}
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.blocks.cells import Cell, cells, owners
+from clsplat.blocks.folder import MANIFEST, block_name
 from clsplat.blocks.views import Membership, pairs_of, share_of
 from clsplat.density.survey import Look
 from clsplat.files import write_text
@@ -25,7 +26,6 @@ LOG = logging.getLogger("clsplat")
 Bits = NDArray[np.bool_]
 NEAR_CELL, GROWTH = 0.2, 0.05  # shares of a cell's size by which it is grown: for cameras, and for growth of Gaussians
 SIGHT = 0.05  # share of a view's pixels
-MANIFEST = "partition.json"
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Block:
     @property
     def name(self) -> str:
         """The name of its folder."""
-        return f"block_{self.number:02d}"
+        return block_name(self.number)
 
     def data(self) -> dict[str, Any]:
         """Return what the manifest says of it."""

@@ -1,8 +1,10 @@
-"""A partition as a table in text."""
+"""A partition, and the state of its runs, as tables in text."""
 
 from typing import Any
 
+from clsplat.errors import one_line
 from clsplat.pages.columns import columns
+from clsplat.runs.status import status_text
 
 HEADINGS = ("block", "owns", "starts from", "views", "of these by place", "pairs", "MiB")
 
@@ -11,6 +13,16 @@ def table(found: dict[str, Any]) -> str:
     """Return a manifest as lines of text; MiB are those on the device at the beginning of a training."""
     whole = ["whole", *[f"{found['gaussians']:,}"] * 2, str(found["views"]), "", "100 %", _mib(found["memory"])]
     return columns([HEADINGS, *map(_cells, found["blocks"]), whole])
+
+
+def status_table(found: dict[str, Any]) -> str:
+    """Return what `blocks_status` found as lines of text, a run a line."""
+    done = sum(part["state"] == "done" for part in found["parts"])
+    lines = [f"{found['in_blocks']}: {found['state']}, {done} of {len(found['parts'])} runs are done"]
+    for part in found["parts"]:
+        first = status_text(part).partition("\n")[0] if "run" in part else f"{part['name']}: {part['state']}"
+        lines.append(f"{first}; {part['message']}" if part.get("message") else first)
+    return "\n  ".join(map(one_line, lines))
 
 
 def _cells(block: dict[str, Any]) -> list[str]:

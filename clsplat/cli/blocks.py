@@ -42,10 +42,14 @@ def blocks(
         list[str] | None,
         typer.Option("--set-coarse", metavar="KEY=VALUE", help="As --set, of the coarse model; may be repeated."),
     ] = None,
+    on: Annotated[
+        Path | None,
+        typer.Option("--on", metavar="FILE", help="Where blocks are trained, as cells of a store: engine, store."),
+    ] = None,
     as_json: JsonOption = False,
     device: DeviceOption = None,
 ) -> None:
-    """Train a large scene in blocks that fit the device, one after the other, and merge them to one model."""
+    """Train a large scene in blocks that fit the device, one after the other or on several, and merge them."""
     from clsplat.blocks.table import table
 
     if as_json:
@@ -61,6 +65,7 @@ def blocks(
         overrides=set_ or (),
         coarse_overrides=set_coarse or (),
         only_plan=plan,
+        on=on,
         device=device,
     )
     if as_json:

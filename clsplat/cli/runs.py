@@ -102,20 +102,22 @@ def _show_summary(folder: Path) -> None:
     "status",
     "clsplat status runs/splat_7k",
     "clsplat status runs/splat_7k --json",
-    "clsplat status runs/store",
+    "clsplat status runs/store --html store.html",
     "clsplat status --schema > status.schema.json",
 )
 def status(
     folder: Annotated[
         Path | None,
         typer.Argument(
-            metavar="RUN|STORE", help="A run folder, that of a matrix, or a store of cells.", show_default=False
+            metavar="RUN|STORE", help="A folder of a run, a matrix or blocks, or a store of cells.", show_default=False
         ),
     ] = None,
+    html: Annotated[Path | None, typer.Option("--html", metavar="FILE", help="Write a page of a store.")] = None,
     schema: Annotated[bool, typer.Option("--schema", help="Print the JSON schema of status.json.")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Show the state of a run, its step and its metrics, or of all cells of a store, from the files alone."""
+    from clsplat.blocks.table import status_table
     from clsplat.cluster.overview import overview_text
     from clsplat.runs.status import status_text
 
@@ -124,11 +126,12 @@ def status(
         return
     if folder is None:
         raise ConfigError("status: expected a run folder, or --schema")
-    found = commands.status(folder)
+    found = commands.status(folder, html)
     if as_json:
         terminal.show_json(found)
     else:
-        terminal.show(overview_text(found) if "store" in found else status_text(found))
+        text = overview_text if "store" in found else status_table if "in_blocks" in found else status_text
+        terminal.show(text(found))
 
 
 @command(

@@ -3,9 +3,7 @@
 import hashlib
 import json
 import math
-import os
 import re
-import shutil
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
@@ -14,10 +12,11 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from clsplat.cluster.copies import copy_files, link_or_copy
 from clsplat.errors import ConfigError, DataError, OutputError
-from clsplat.files import PARTIAL, told_as, write_text
+from clsplat.files import told_as, write_text
 from clsplat.formats.table import CODECS
-from clsplat.names import CHECKPOINTS, LOCK, LOG_FILE, METRICS, NOTE, RECORDS, STATUS, TRIAL
+from clsplat.names import CHECKPOINTS, LOCK, METRICS, NOTE, STATUS
 from clsplat.processes import Owner
 from clsplat.reading import read_file, read_json, sha256
 from clsplat.training import checkpoint
@@ -25,7 +24,6 @@ from clsplat.training.status import read_status
 
 LEASE, MANIFEST, PIPELINE_FILE, ERRORS = "lease.json", "manifest.json", "cell.yaml", "errors.txt"
 OWN = frozenset({LEASE, MANIFEST, PIPELINE_FILE, ERRORS, STATUS, LOCK, NOTE})  # of one attempt alone; NOTE has a path
-GROWING = frozenset({LOG_FILE, RECORDS, TRIAL})  # files that a run appends to: links of them would be one file
 MEASURED = ("psnr", "ssim", "views")  # figures of metrics.json that a device's bits decide
 BEAT = 10.0  # seconds between two beats of a lease
 Rank = tuple[bool, int]  # of a checkpoint: whether it is of a refit, and its step
@@ -118,24 +116,10 @@ class Attempt:
                     link_or_copy(path, own)
                 except FileNotFoundError:  # its process has removed it since
                     continue
-                self._take_files(other.path)
+                copy_files(other.path, self.path, {*OWN, CHECKPOINTS})
             self._values["from"] = path.name
             self._write()
             return
-
-    def _take_files(self, source: Path) -> None:
-        """Take what another attempt has written, but its checkpoints and what is its own."""
-        for base, folders, files in os.walk(source):
-            here = Path(base).relative_to(source)
-            is_top = here == Path()
-            folders[:] = [name for name in folders if not (is_top and name == CHECKPOINTS)]
-            for name in files:
-                if (is_top and name in OWN) or PARTIAL.fullmatch(name):
-                    continue
-                (self.path / here).mkdir(parents=True, exist_ok=True)
-                copy = shutil.copyfile if is_top and name in GROWING else link_or_copy
-                with suppress(FileNotFoundError):  # replaced just now
-                    copy(Path(base) / name, self.path / here / name)
 
     def message(self, exit_code: int) -> str:
         """Return why its run failed: the line of its status, or the last that it printed."""
@@ -182,18 +166,6 @@ def _rank_of(name: str) -> Rank:
     return (found[1] == "refit", int(found[2])) if found else (False, 0)
 
 
-def link_or_copy(source: Path, target: Path) -> None:
-    """Let a file that is never changed in place have a second name, or copy it.  Raises OSError."""
-    try:
-        os.link(source, target)
-    except FileExistsError:
-        raise
-    except OSError:
-        if not source.exists():
-            raise
-        shutil.copyfile(source, target)
-
-
 def bits_of(folder: Path, files: dict[str, str]) -> str:
     """Return a hash of what a device computed: model files, and metrics without times.
 
@@ -209,30 +181,3 @@ def bits_of(folder: Path, files: dict[str, str]) -> str:
             for size, values in metrics.get(split, {}).items():
                 figures[f"{split} {size}"] = [values.get(key) for key in MEASURED]
     return hashlib.sha256(json.dumps([models, figures], sort_keys=True).encode()).hexdigest()
-
-
-def place_copy(source: Path, target: Path) -> None:
-    """Let a folder hold the files of a result, linked where nothing changes them in place; the manifest comes last.
-
-    Raises OutputError.
-    """
-    with told_as(target):
-        (target / MANIFEST).unlink(missing_ok=True)
-        for base, _, files in os.walk(source):
-            here = target / Path(base).relative_to(source)
-            here.mkdir(parents=True, exist_ok=True)
-            for name in files:
-                if name in (LEASE, ERRORS, MANIFEST) and Path(base) == source:
-                    continue
-                (here / name).unlink(missing_ok=True)
-                copy = shutil.copyfile if name in GROWING else link_or_copy
-                copy(Path(base) / name, here / name)
-        link_or_copy(source / MANIFEST, target / MANIFEST)
-
-
-def is_placed(source: Path, target: Path) -> bool:
-    """Whether a folder holds the files of a result, as `place_copy` leaves them.  Raises DataError."""
-    if not (target / MANIFEST).is_file():
-        return False
-    found = read_json(target / MANIFEST)
-    return bool(found == read_json(source / MANIFEST)) and all((target / name).is_file() for name in found["files"])

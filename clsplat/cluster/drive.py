@@ -43,6 +43,8 @@ class Drive:
     look: Callable[[], None] = lambda: None  # called again and again
     bits: str | None = None  # the class of all cells, once it is chosen
     _seen: float = field(default_factory=time.monotonic)  # when a device of that class was there last
+    _unsuited: tuple[list[str], set[str]] = field(default_factory=lambda: ([], set()))
+    """The classes of all devices, and those that suit no cell that waits."""
     _running: dict[Place, tuple[Wanted, Cell, Ticket]] = field(default_factory=dict)
 
     def run(self, wanted: Sequence[Wanted]) -> None:
@@ -69,11 +71,14 @@ class Drive:
         if self.is_same and self.bits is None and classes:
             self.bits = self._chosen(classes, waiting)
         self._require_class(classes)
+        if self._unsuited[0] != classes:
+            self._unsuited = (classes, set())
         for place in places:
-            if place in self._running:
+            if place in self._running or place.bits in self._unsuited[1]:
                 continue
             suited = next((i for i, one in enumerate(waiting) if self._suits(one, place.bits, classes)), None)
             if suited is None:
+                self._unsuited[1].add(place.bits)  # looking again and again would read the store each time
                 continue
             one = waiting.pop(suited)
             cell = one.on(place.bits)
@@ -113,6 +118,7 @@ class Drive:
             del self._running[place]
             self.store.tell("lost", cell=cell.key, worker=place.worker)
             waiting.insert(0, one)
+            self._unsuited[1].clear()
             return
         if outcome is not None and outcome.state == "different":
             raise Different(outcome.message)

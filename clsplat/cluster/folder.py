@@ -1,6 +1,7 @@
 """The folder of one cell: its attempts, and its result."""
 
 import json
+import logging
 import os
 import re
 import shutil
@@ -16,6 +17,7 @@ from clsplat.files import make_folder, sync_below, sync_folder, told_as, write_t
 from clsplat.reading import read_json
 from clsplat.runs.found import sum_of
 
+LOG = logging.getLogger("clsplat")
 SPEC, ATTEMPTS, RESULT, FAILED = "spec.json", "attempts", "result", "failed.json"
 NAME = re.compile("[0-9a-f]{32}")  # of an attempt
 SILENT = 600.0  # seconds without a beat of its lease after which an attempt may be removed
@@ -37,16 +39,19 @@ class CellFolder:
         return self.path.name
 
     def write_spec(self, spec: Mapping[str, Any]) -> None:
-        """Write what the key was made of, once.  Raises OutputError where another one stands there."""
+        """Write what the key was made of, once, or again where it is damaged: the key is the hash of it.
+
+        Raises OutputError where another one stands there.
+        """
         file = self.path / SPEC
-        if not file.exists():
-            write_text(file, json.dumps(spec, indent=1, sort_keys=True) + "\n")
-            return
         try:
-            before = read_json(file)
+            before = read_json(file) if file.exists() else None
         except DataError as error:
-            raise OutputError(f"{error}; remove {self.path}, so that its cell runs again") from error
-        if before != spec:
+            LOG.warning("%s; it is written again", error)
+            before = None
+        if before is None:
+            write_text(file, json.dumps(spec, indent=1, sort_keys=True) + "\n")
+        elif before != spec:
             raise OutputError(f"{file}: is of another cell, or was changed; remove {self.path}: its cell runs again")
 
     def manifest(self) -> dict[str, Any] | None:

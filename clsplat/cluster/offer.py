@@ -2,23 +2,27 @@
 
 import logging
 from collections.abc import Sequence
+from typing import Any
 
-from clsplat.cluster.execution import Execution
+from clsplat.cluster.connection import require_certificates
 from clsplat.cluster.probe import places
+from clsplat.pipeline.execution import Execution
 from clsplat.processes import Owner
 
 LOG = logging.getLogger("clsplat")
 
 
-def offer(execution: Execution, devices: Sequence[str] | None = None) -> None:
+def offer(execution: Execution, devices: Sequence[str] | None = None, **options: Any) -> None:
     """Prove each device by a short run, and work for a scheduler until it ends or a signal comes.
 
-    execution: its engine is the scheduler.  devices: names, default every device that works.
+    execution: its engine is the scheduler; devices: names, default every device that works; options: as for `serve`.
     Raises DeviceError where there is none or no scheduler answers.
     """
-    from clsplat.cluster import scheduler  # where Dask is installed
+    from clsplat.cluster import serving  # where Dask is installed
 
+    if execution.tls:
+        require_certificates(execution.tls)  # before a device is proved, which takes a while
     found = places(Owner.this().host, list(devices) if devices is not None else None)
     for place in found:
         LOG.info("offers %s, bits:%s", place.text, place.bits)
-    scheduler.serve(execution, found)
+    serving.serve(execution, found, **options)

@@ -8,7 +8,9 @@ from typing import Any
 from clsplat.cluster.attempt import Attempt
 from clsplat.cluster.folder import SILENT, SPEC, CellFolder
 from clsplat.cluster.store import CELLS, Store
+from clsplat.compare.run_folder import read_metrics
 from clsplat.errors import DataError, one_line
+from clsplat.names import METRICS
 from clsplat.reading import read_json
 from clsplat.training.status import read_status
 
@@ -21,51 +23,74 @@ def is_store(folder: Path) -> bool:
 
 
 def store_status(root: Path) -> dict[str, Any]:
-    """Return the `cells` of a store with their states, `counts` of those, and `events` by kind.
+    """Return the `cells` of a store with their states, `counts` of those, `events` by kind, and the `time` of it all.
 
     State of a cell: published, failed, running, silent (its lease has no beat for a minute), stopped, or waiting.
     Raises DataError when the folder holds no store.
     """
     store = Store.opened(root)
     now = time.time()
-    names = {key: name for cells in store.sweeps().values() for name, key in cells.items()}
-    cells = [_cell(folder, names.get(folder.key, ""), now) for folder in store.folders()]
+    names = {key: (sweep, name) for sweep, cells in store.sweeps() for name, key in cells.items()}
+    cells = [_cell(folder, names.get(folder.key, ("", "")), now) for folder in store.folders()]
+    cells.sort(key=lambda cell: (cell["sweep"], cell["name"], cell["key"]))
     counts: dict[str, int] = {}
     for cell in cells:
         counts[cell["state"]] = counts.get(cell["state"], 0) + 1
     events: dict[str, int] = {}
     for event in store.events():
         events[str(event.get("event"))] = events.get(str(event.get("event")), 0) + 1
-    return {"store": str(root), "counts": counts, "events": events, "cells": cells}
+    return {"store": str(root), "time": now, "counts": counts, "events": events, "cells": cells}
 
 
-def _cell(folder: CellFolder, name: str, now: float) -> dict[str, Any]:
+def _cell(folder: CellFolder, names: tuple[str, str], now: float) -> dict[str, Any]:
+    """What is known of a cell.  names: of a sweep, and of the cell in it."""
     spec: Any = {}
     with suppress(DataError):
         spec = read_json(folder.path / SPEC)
     spec = spec if isinstance(spec, dict) and isinstance(spec.get("pipeline"), dict) else {"pipeline": {}}  # damaged
     pipeline = spec["pipeline"]
-    found = {"key": folder.key, "name": name, "pipeline": pipeline.get("name"), "seed": pipeline.get("seed")}
-    found |= {"bits": spec.get("bits")}
+    found = {"key": folder.key, "sweep": names[0], "name": names[1], "bits": spec.get("bits")}
+    found |= {"pipeline": pipeline.get("name"), "seed": pipeline.get("seed"), "steps": _steps(pipeline)}
     if manifest := folder.manifest():
-        return {**found, "state": "published", **{key: manifest.get(key) for key in ("seconds", "device", "worker")}}
-    if failed := folder.failed():
-        return {**found, "state": "failed", "message": failed.get("message"), "exit_code": failed.get("exit_code")}
+        values = {key: manifest.get(key) for key in ("seconds", "device", "host", "worker")}
+        return {**found, "state": "published", **values, **_figures(folder)}
     attempts = sorted(folder.attempts(), key=lambda attempt: attempt.beaten)
-    return {**found, "attempts": len(attempts), **(_attempt(attempts[-1], now) if attempts else {"state": "waiting"})}
+    alive = [one for one in attempts if one.exit_code is None and now - one.beaten < GONE]
+    if (failed := folder.failed()) and not alive:
+        return {**found, "state": "failed", "message": failed.get("message"), "exit_code": failed.get("exit_code")}
+    last = (alive or attempts)[-1:]
+    return {**found, "attempts": len(attempts), **(_attempt(last[0], now) if last else {"state": "waiting"})}
+
+
+def _steps(pipeline: dict[str, Any]) -> int | None:
+    """The steps of all trainings of a resolved pipeline."""
+    with suppress(KeyError, TypeError, AttributeError):
+        return int(sum(stage["optimize"]["steps"] for stage in pipeline["stages"] if "optimize" in stage))
+    return None
+
+
+def _figures(folder: CellFolder) -> dict[str, Any]:
+    """PSNR and SSIM of a result at its first size, of its test views where it has some, and its Gaussians."""
+    with suppress(DataError):
+        metrics = read_metrics(folder.result / METRICS)
+        sizes = [*metrics.test.values(), *metrics.train.values()]
+        found = {"psnr": sizes[0].psnr, "ssim": sizes[0].ssim} if sizes else {}
+        return {**found, "step": metrics.steps, "gaussians": metrics.gaussians}
+    return {}
 
 
 def _attempt(attempt: Attempt, now: float) -> dict[str, Any]:
     """The state of a cell by its last attempt."""
     status = read_status(attempt.path)
     silent = now - attempt.beaten
+    told = {"message": attempt.message(attempt.exit_code)} if attempt.has_failed and attempt.exit_code else {}
     if attempt.exit_code is not None:
         state = "stopped" if attempt.exit_code == 130 else "waiting"
     else:
         state = "running" if silent < GONE else "silent"
-    progress = {key: status.get(key) for key in ("step", "steps", "seconds_left", "stage")}
+    progress = {key: status.get(key) for key in ("step", "gaussians", "seconds_left", "stage", "device")}
     worker = {key: attempt.lease.get(key) for key in ("host", "worker")}
-    return {"state": state, "silent": round(max(0.0, silent)), **progress, **worker}
+    return {"state": state, "silent": round(max(0.0, silent)), **progress, **worker, **told}
 
 
 def overview_text(found: dict[str, Any]) -> str:
@@ -80,11 +105,10 @@ def overview_text(found: dict[str, Any]) -> str:
 
 def _detail(cell: dict[str, Any]) -> str:
     if cell["state"] == "published":
-        return f", {cell['seconds']:.0f} s" if isinstance(cell.get("seconds"), int | float) else ""
-    if cell["state"] == "failed":
-        return f": {cell['message']}"
-    step = f", step {cell['step']}/{cell.get('steps')}" if cell.get("step") is not None else ""
-    more = ""
+        psnr = f", {cell['psnr']:.2f} dB" if "psnr" in cell else ""
+        return psnr + (f", {cell['seconds']:.0f} s" if isinstance(cell.get("seconds"), int | float) else "")
+    step = f", step {cell['step']}/{cell['steps']}" if cell.get("step") is not None else ""
+    more = f": {cell['message']}" if cell.get("message") else ""
     if cell["state"] == "silent":
         waits = "; it goes on when its sweep is run again" if cell["silent"] > SILENT else ""
         more = f", no sign of life for {cell['silent']} s on {cell.get('host')}{waits}"

@@ -26,6 +26,7 @@ from clsplat.reading import read_file, read_json, sha256
 from data_tools.synthetic import Options, write_dataset
 
 LOG = logging.getLogger("clsplat")
+TOLD = "clsplat"  # name of what a worker tells of its device, among the figures that Dask keeps of it
 CLASS = 8  # hexadecimal digits of a bits class
 SECONDS = 600.0  # that the fixed run may take: a runtime may build its kernels for minutes
 PIPELINE = """\
@@ -67,9 +68,9 @@ class Place:
 
 
 def place_of(address: str, worker: dict[str, Any]) -> Place | None:
-    """Return the device that a worker's name tells; None for a worker of another program, or version."""
+    """Return the device that a worker tells; None for a worker of another program, or version."""
     try:
-        values = json.loads(str(worker["name"]))
+        values = json.loads(str(worker["metrics"][TOLD]))
         if values["code"] != code_digest():
             return None
         return Place(address, str(values["device"]), str(values["bits"]), str(values["host"]))

@@ -1,54 +1,36 @@
-"""Engines on Dask: a cluster of this machine, or a scheduler elsewhere.  Nothing else imports distributed.
+"""Engines on Dask: a cluster of this machine, jobs of a queue, or a scheduler elsewhere.
 
 Dask gives membership, liveness and a queue.  What it does not give is in the store: going on inside of a cell, once in
 effect, stopping.  At most one cell a device is in flight, for a worker that dies takes all cells on its list with it.
 """
 
-import asyncio
 import json
 import logging
-import threading
 import time
 import uuid
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from clsplat.cluster.cell import Cell
 from clsplat.cluster.child import PATIENCE, run_command
+from clsplat.cluster.connection import unanswered, warn_of_open_port
 from clsplat.cluster.drive import ALONE
 from clsplat.cluster.engine import Lost, Ticket
-from clsplat.cluster.execution import Execution, Tls, unanswered, warn_of_open_port
-from clsplat.cluster.fingerprint import code_digest
+from clsplat.cluster.library import LOOPBACK, SETTINGS, dask, distributed, security
 from clsplat.cluster.plugin_files import plugin_files
 from clsplat.cluster.probe import Place, place_of, places
 from clsplat.cluster.store import Store
 from clsplat.cluster.task import Outcome, Terms, run_cell
-from clsplat.errors import ConfigError, DeviceError, InternalError, Interrupted
-from clsplat.signals import stopping_on_signals
-
-try:
-    import dask
-    import distributed
-except ImportError:
-    raise ConfigError("this engine needs Dask: pip install 'clsplat[cluster]'") from None
+from clsplat.errors import DeviceError, InternalError
+from clsplat.pipeline.execution import Execution
 
 LOG = logging.getLogger("clsplat")
 LOOK = 5.0  # seconds between two looks at the workers
-LOOPBACK = "127.0.0.1"
 ANSWER = 20.0  # seconds that a scheduler may take to answer
-SETTINGS = {
-    "distributed.scheduler.allowed-failures": 1000,  # attempts are counted in the store
-    "distributed.scheduler.worker-ttl": "60s",  # of one that is frozen: its cell goes on elsewhere
-    "distributed.worker.preload": ["clsplat.cluster.preload"],
-    "distributed.worker.memory.target": False,  # of a worker's share of memory, which its child does not take from
-    "distributed.worker.memory.spill": False,
-    "distributed.worker.memory.pause": False,
-    "distributed.worker.memory.terminate": False,
-    "distributed.comm.timeouts.connect": "60s",
-}
 
 
 def work(cell: str, store: str, command: list[str], terms: str) -> str:
@@ -80,6 +62,12 @@ def _engine(execution: Execution, store: Store, devices: list[str] | None) -> "C
         )
         return Cluster(distributed.Client(cluster, set_as_default=False), store, cluster, found)
     warn_of_open_port(execution)
+    if execution.slurm:
+        from clsplat.cluster import slurm  # where dask-jobqueue is installed
+
+        queue = slurm.cluster(execution, execution.slurm, store.root / "slurm")
+        client = distributed.Client(queue, set_as_default=False)
+        return Cluster(client, store, queue, jobs=(execution.slurm.jobs, partial(slurm.are_waiting, queue)))
     try:
         client = distributed.Client(
             execution.address, security=security(execution.tls), set_as_default=False, timeout=ANSWER
@@ -87,47 +75,6 @@ def _engine(execution: Execution, store: Store, devices: list[str] | None) -> "C
     except OSError as error:
         raise unanswered(execution, error) from None
     return Cluster(client, store)
-
-
-def serve(execution: Execution, found: Sequence[Place]) -> None:
-    """Let a process a device work for a scheduler, until that ends or a signal comes.  Raises DeviceError."""
-    warn_of_open_port(execution)
-    stop = threading.Event()
-    with dask.config.set(SETTINGS), stopping_on_signals(stop.set):
-        asyncio.run(_serve(execution, found, stop))
-    if stop.is_set():
-        raise Interrupted("stopped; cells that ran here go on elsewhere")
-
-
-async def _serve(execution: Execution, found: Sequence[Place], stop: threading.Event) -> None:
-    options: dict[str, Any] = {"nthreads": 1, "memory_limit": 0, "security": security(execution.tls)}
-    if execution.is_local:
-        options["host"] = LOOPBACK
-    nannies = [
-        distributed.Nanny(
-            execution.address,
-            name=json.dumps({"host": place.worker, "device": place.device, "bits": place.bits, "code": code_digest()}),
-            dashboard_address=f"{LOOPBACK}:0",
-            silence_logs=logging.CRITICAL,
-            **options,
-        )
-        for place in found
-    ]
-    try:
-        await asyncio.wait_for(asyncio.gather(*nannies), ANSWER)
-    except (OSError, TimeoutError, RuntimeError) as error:
-        raise unanswered(execution, error) from None
-    while not stop.is_set() and any(nanny.status is distributed.Status.running for nanny in nannies):
-        await asyncio.sleep(0.2)
-    await asyncio.gather(*(nanny.close(timeout=5) for nanny in nannies))
-
-
-def security(tls: Tls | None) -> Any:
-    """Return the certificates as distributed takes them; None without."""
-    if tls is None:
-        return None
-    sides = {f"tls_{side}_{part}": getattr(tls, part) for side in ("client", "worker") for part in ("cert", "key")}
-    return distributed.Security(tls_ca_file=tls.ca, require_encryption=True, **sides)
 
 
 class _Future:
@@ -156,11 +103,22 @@ class _Future:
 class Cluster:
     """The devices of a Dask cluster."""
 
-    def __init__(self, client: Any, store: Store, cluster: Any = None, found: list[Place] | None = None) -> None:
-        """cluster, found: of this machine, whose workers run cells on any of the devices; else each has its own."""
+    def __init__(
+        self,
+        client: Any,
+        store: Store,
+        cluster: Any = None,
+        found: list[Place] | None = None,
+        jobs: tuple[int, Callable[[], bool]] = (0, lambda: False),
+    ) -> None:
+        """cluster: what starts workers, and starts them again; found: the devices of this machine, on any of which its
+        workers run cells, else each has its own; jobs: their number, and what tells whether some wait in a queue.
+        """
         self._client, self._store, self._cluster, self._found = client, store, cluster, found
+        self._count, self._are_waiting = len(found or ()) or jobs[0], jobs[1]
         self._sweep = uuid.uuid4().hex
         self._looked, self._seen = -LOOK, time.monotonic()
+        self._asked = self._seen  # when the queue was asked
         self._places: list[Place] = []
         self._tickets: list[_Future] = []
         self.addresses: set[str] = set()
@@ -182,17 +140,22 @@ class Cluster:
         with self._needs_scheduler():
             workers = self._client.scheduler_info(n_workers=-1)["workers"]
         self.addresses = set(workers)
-        if self._cluster and self._found and len(workers) < len(self._found):
-            self._cluster.scale(len(self._found))  # a worker that dies while it starts is not started again by itself
+        if self._cluster and len(workers) < self._count:
+            if self._places and now - self._asked > ALONE:
+                self._asked = now
+                self._are_waiting()
+            self._cluster.scale(self._count)  # a worker that dies while it starts is not started again by itself
         known = [one for address, worker in workers.items() if (one := place_of(address, worker))]
         self._places = known if self._found is None else self._found if workers else []
-        if self._places:
+        if self._places or (now - self._seen > ALONE and self._are_waiting()):
             self._seen = now
         elif now - self._seen > ALONE:
             others = f" ({len(workers)} of another version get no cells)" if workers else ""
+            start = "start some with `clsplat worker --scheduler ADDRESS`"
+            if self._cluster and self._found is None:
+                start = f"no job waits; {self._store.root / 'slurm'} has what they printed"
             raise DeviceError(
-                f"no worker of this version for {ALONE:.0f} s{others}; start some with `clsplat worker --scheduler "
-                "ADDRESS`; what was done is in the store"
+                f"no worker of this version for {ALONE:.0f} s{others}; {start}; what was done is in the store"
             )
 
     @contextmanager
@@ -207,7 +170,7 @@ class Cluster:
 
     def start(self, cell: Cell, place: Place, terms: Terms) -> Ticket:
         own = replace(terms, worker=place.worker, sweep=self._sweep)
-        address = None if self._cluster else place.worker
+        address = place.worker if self._found is None else None
         with self._needs_scheduler():
             future = self._client.submit(
                 work,

@@ -5,12 +5,12 @@ import threading
 from collections.abc import Sequence
 from pathlib import Path
 
+from clsplat.cluster.batch import ask_to_stop, wanted_cell
 from clsplat.cluster.child import run_command
 from clsplat.cluster.fingerprint import Scenes
 from clsplat.cluster.plugin_files import plugin_files
 from clsplat.cluster.probe import places
 from clsplat.cluster.store import Store
-from clsplat.cluster.sweep import ask_to_stop, wanted_cell
 from clsplat.cluster.task import Terms, run_cell
 from clsplat.errors import ClsplatError, ConfigError, Interrupted
 from clsplat.pipeline.loading import load
@@ -50,7 +50,7 @@ def run_one(
         wanted = wanted_cell(chosen, Scenes(store.scenes), store)
         (place,) = places("cell", [device or ""])
         cell = wanted.on(place.bits)
-        store.note_sweep(f"{experiment.name}-{cell.name}"[:150], {cell.name: cell.key})
+        store.note_sweep(f"{experiment.name}-{cell.name}", {cell.name: cell.key}, cell.key)
         driving.set()
         outcome = run_cell(cell, store, run_command(place.device, plugin_files()), terms, stop.is_set)
     if outcome.state == "stopped":

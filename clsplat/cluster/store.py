@@ -5,7 +5,7 @@
                 result/             the attempt that came first, renamed, with its manifest.json
                 failed.json         why it was given up
     prepared/  scenes/              what `prepare` makes; hashes of photographs
-    sweeps/<name>.json              the cells of a matrix by their names
+    sweeps/<name>-<hash>.json       the cells of a matrix by their names
     cancel/all  cancel/<key>        that what began before is to stop
     events/<host>-<process>.jsonl   one file a process: no two append to one
 
@@ -13,6 +13,7 @@ Engines start a cell at least once.  A cell counts once: attempts share no file,
 and publishing is a rename.
 """
 
+import hashlib
 import json
 import os
 import re
@@ -93,17 +94,22 @@ class Store:
                     found += [event] if isinstance(event, dict) and isinstance(event.get("time"), float | int) else []
         return sorted(found, key=lambda event: float(event["time"]))
 
-    def note_sweep(self, name: str, keys: Mapping[str, str]) -> None:
-        """Write the cells of a matrix, by name, for those who look at the store."""
-        write_text(self.root / SWEEPS / f"{name}.json", json.dumps({"name": name, "cells": keys}, indent=1) + "\n")
+    def note_sweep(self, name: str, keys: Mapping[str, str], text: str) -> None:
+        """Write the cells of a matrix, by name, for those who look at the store.
 
-    def sweeps(self) -> dict[str, dict[str, str]]:
-        """Return the cells of each matrix: keys by the cells' names, by the names of the matrices."""
-        found = {}
+        text: what tells this matrix from others of its name, such as its file.
+        """
+        file = f"{name[:50]}-{hashlib.sha256(text.encode()).hexdigest()[:8]}.json"
+        write_text(self.root / SWEEPS / file, json.dumps({"name": name, "cells": keys}, indent=1) + "\n")
+
+    def sweeps(self) -> list[tuple[str, dict[str, str]]]:
+        """Return the name of each matrix, and its cells: keys by the cells' names."""
+        found = []
         for path in sorted((self.root / SWEEPS).glob("*.json")):
             with suppress(DataError, KeyError, TypeError, AttributeError):
                 values = read_json(path)
-                found[str(values["name"])] = {str(name): str(key) for name, key in values["cells"].items()}
+                cells = {str(name): str(key) for name, key in values["cells"].items()}
+                found.append((str(values["name"]), cells))
         return found
 
     def add(self, cell: Cell) -> CellFolder:
@@ -139,8 +145,12 @@ class Store:
         return False
 
     def key_of(self, cell: str) -> str:
-        """Return the key of a cell by its name in a sweep, or by its key or the beginning of that."""
-        named = {key for cells in self.sweeps().values() for name, key in cells.items() if name == cell}
+        """Return the key of a cell by its name in a sweep, or by its key or the beginning of that.
+
+        Of several cells of a name it is the one that is not published.
+        """
+        named = {key for _, cells in self.sweeps() for name, key in cells.items() if name == cell}
+        named = {key for key in named if not self.folder(key).result.is_dir()} or named
         named = named or {folder.key for folder in self.folders() if folder.key.startswith(cell)}
         if len(named) != 1:
             fault = f"{len(named)} cells are named so; give a key" if named else "`clsplat status` lists the cells"

@@ -1,23 +1,19 @@
 """The base of losses and penalties: each adds to a gradient and returns its value, which is read on request."""
 
-import math
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
-import numpy as np
-from numpy.typing import NDArray
-from pydantic import PrivateAttr, ValidationError
-
-from clsplat.errors import ConfigError, NumericError, quoted
+from clsplat.errors import ConfigError
 from clsplat.gaussians.tables import Gaussians, Gradients
 from clsplat.opencl.device import Array
 from clsplat.render.camera import DeviceCamera
-from clsplat.render.rasterizer import Frame
+from clsplat.render.rasterizer import Content, Frame
 from clsplat.render.workspace import Workspace
-from clsplat.schedule import NonNegative, Schedule, at_step
+from clsplat.schedule import Schedule
 from clsplat.settings import Settings
+from clsplat.views.known_depths import KnownDepths
 from clsplat.views.learned import learned_of, name_of
 from clsplat.views.transforms import PhotographTransform
 
@@ -26,7 +22,7 @@ from clsplat.views.transforms import PhotographTransform
 class Comparison:
     """A rendered image beside its photograph, float planes [3, rows, stride], and the gradient that losses add to.
 
-    Image and gradient have a fourth plane, the entropy of blend weights, where a loss reads it.
+    Image and gradient have a fourth plane, such as the entropy of blend weights, where a loss reads it.
 
     Losses are means over the whole image, masked or not, so that a threshold means the same with and without a mask.
     """
@@ -39,6 +35,7 @@ class Comparison:
     mask: Array | None = None  # [1, rows, stride] 0 or 1
     step: int = 0  # global; schedules are taken at it
     accumulate: bool = False  # False: the next loss overwrites the gradient
+    depths: KnownDepths | None = None  # at pixels of the photograph, where a loss reads them
 
     @property
     def values(self) -> int:
@@ -105,9 +102,12 @@ class ImageLoss(Loss):
 
     symmetric: ClassVar[bool] = False
     """Whether it has the same value with image and photograph exchanged; a transform that learns needs that."""
-    reads_entropy: ClassVar[bool] = False  # the fourth plane of image and gradient, which then exists
     reads_photograph: ClassVar[bool] = True
     """Whether it compares; one that does not needs no symmetry, and is no loss to train on alone."""
+
+    def reads(self, step: int) -> Content:
+        """Return what it reads of the image at a global step: colours, or a fourth plane, which then exists."""
+        return "colour"
 
     @abstractmethod
     def add(self, comparison: Comparison) -> LossValue:
@@ -186,63 +186,17 @@ class Penalty(Loss):
         """Add weight · d(penalty)/d(parameter) to the gradients of the penalty's parameters."""
 
 
-HostFunction = Callable[[NDArray[np.float32], NDArray[np.float32]], tuple[float, NDArray[np.floating]]]
+def content_of(losses: Sequence[Loss], step: int) -> Content:
+    """Return what losses read of the image at a global step.
 
-
-class HostLoss(ImageLoss):
-    """A loss in NumPy: `function(image, photograph)` returns its value and its derivative by the image.
-
-    Arrays are [height, width, 3] float32.  Each step copies both images to the host and the derivative back.
+    Raises ConfigError for what is neither an ImageLoss nor a Penalty, and where two fourth planes are read.
     """
-
-    weight: NonNegative = 1.0
-    _function: HostFunction = PrivateAttr()
-
-    def __init__(self, function: HostFunction, weight: Schedule = 1.0) -> None:
-        """Raise ConfigError for a weight that is no schedule of numbers from 0 on."""
-        try:
-            super().__init__(weight=weight.item() if isinstance(weight, np.generic) else weight)
-        except ValidationError as error:
-            reason = error.errors()[0]["msg"].removeprefix("Value error, ")
-            raise ConfigError(f"the weight of the loss is {quoted(weight)}; {reason}") from None
-        self._function = function
-
-    @property
-    def name(self) -> str:
-        """The name of the function."""
-        return str(getattr(self._function, "__name__", "host"))
-
-    def add(self, comparison: Comparison) -> LossValue:
-        camera, weight = comparison.camera, at_step(self.weight, comparison.step)
-        height, width = camera.height, camera.width
-        image, photograph = (
-            np.ascontiguousarray(planes.get()[:3, :height, :width].transpose(1, 2, 0))
-            for planes in (comparison.image, comparison.photograph)
+    for loss in losses:
+        if not isinstance(loss, ImageLoss | Penalty):
+            raise ConfigError(f"the loss {type(loss).__name__}: expected a subclass of ImageLoss or of Penalty")
+    planes = {loss.reads(step) for loss in losses if isinstance(loss, ImageLoss)} - {"colour"}
+    if len(planes) > 1:
+        raise ConfigError(
+            f"losses read {' and '.join(sorted(planes))} of an image; expected one of them: leave one out"
         )
-        value, derivative = self._call(image, photograph)
-        if not (math.isfinite(value) and np.isfinite(derivative).all()):
-            raise NumericError(
-                f"step {comparison.step}: the loss '{self.name}' returned values that are not finite; "
-                "expected finite numbers: look for a division, root or logarithm of 0 in it"
-            )
-        planes = comparison.gradient.get() if comparison.accumulate else np.zeros(comparison.gradient.shape, np.float32)
-        planes[:3, :height, :width] += np.float32(weight) * derivative.transpose(2, 0, 1)
-        comparison.gradient.set(planes)
-        comparison.accumulate = True
-        return LossValue(self.name, lambda: weight * value)
-
-    def _call(self, image: NDArray[np.float32], photograph: NDArray[np.float32]) -> tuple[float, NDArray[np.float32]]:
-        """Value and derivative.  Raises ValueError where the function returns no such pair."""
-        found: Any = self._function(image, photograph)
-        try:
-            value, derivative = found
-            value, derivative = float(value), np.asarray(derivative, np.float32)
-        except (TypeError, ValueError):
-            raise ValueError(
-                f"the loss '{self.name}' returned {quoted(found)}; expected (value, derivative by the image)"
-            ) from None
-        if derivative.shape != image.shape:
-            raise ValueError(
-                f"the loss returned a derivative of {derivative.shape}; expected {image.shape}, as the image"
-            )
-        return value, derivative
+    return planes.pop() if planes else "colour"

@@ -6,6 +6,7 @@ import numpy as np
 
 from clsplat.errors import ConfigError
 from clsplat.losses.base import Comparison, ImageLoss, LossValue
+from clsplat.render.rasterizer import Content
 from clsplat.schedule import at_step
 
 
@@ -17,8 +18,10 @@ class WeightEntropy(ImageLoss):
     """
 
     type: Literal["weight_entropy"] = "weight_entropy"
-    reads_entropy: ClassVar[bool] = True
     reads_photograph: ClassVar[bool] = False
+
+    def reads(self, step: int) -> Content:
+        return "entropy"
 
     def add(self, comparison: Comparison) -> LossValue:
         camera, weight = comparison.camera, at_step(self.weight, comparison.step)

@@ -37,7 +37,8 @@ EXPECTATIONS = {
 def explain(error: ValidationError, root: type[BaseModel], path: Path, document: Document) -> str:
     """Describe the first fault, with its file and line."""
     place, complaint = first_fault(error, root)
-    return f"{path}:{document.line(place)}: {place_text(place)}: {complaint}"
+    where = f"{place_text(place)}: " if place else ""  # of the whole file
+    return f"{path}:{document.line(place)}: {where}{complaint}"
 
 
 def first_fault(error: ValidationError, root: type[BaseModel]) -> tuple[Place, str]:

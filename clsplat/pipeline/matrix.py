@@ -25,6 +25,7 @@ from pydantic import Field, JsonValue, ValidationError, model_validator
 
 from clsplat.errors import ConfigError, OverrideError, quoted, shortened
 from clsplat.names import fault_of_output
+from clsplat.pipeline.execution import Execution
 from clsplat.pipeline.explanation import explain, place_text
 from clsplat.pipeline.file import Name
 from clsplat.pipeline.files import find
@@ -71,7 +72,7 @@ class MatrixFile(Settings):
     """Name of the matrix, and of its run folder."""
     matrix: Matrix
     """The axes."""
-    execution: dict[str, JsonValue] = Field({})
+    execution: Execution = Execution()
     """Where the cells run and are kept, as in a file of `--on`; without it, one after the other in the run folder."""
 
 
@@ -91,7 +92,7 @@ class Experiment:
     name: str
     text: str  # of the file, with the options that it was opened with
     cells: list[Cell]
-    execution: dict[str, Any] = field(default_factory=dict)  # as the file has it, unchecked
+    execution: Execution = field(default_factory=Execution)
 
 
 @dataclass(frozen=True)
@@ -108,7 +109,7 @@ def load_experiment(
 ) -> Experiment | None:
     """Read and check a pipeline file with `matrix:`, and every cell of it; None for a file without.
 
-    execution: that takes the place of the file's own.
+    execution: keys that take the place of the file's own.
     Raises ConfigError with file and line.
     """
     path = find(name)
@@ -136,9 +137,8 @@ def load_experiment(
     data = {**document.data, "matrix": {**document.data["matrix"], "options": overrides}}
     if execution is not None:
         data["execution"] = execution
-    return Experiment(
-        path, file.name, yaml_text(data) if given else read_pipeline(path), cells, data.get("execution", {})
-    )
+    chosen = file.execution if execution is None else Execution.model_validate(execution)
+    return Experiment(path, file.name, yaml_text(data) if given else read_pipeline(path), cells, chosen)
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,9 @@ from clsplat.formats.model_files import files_of
 from clsplat.gaussians.run_model import model_at
 from clsplat.gaussians.sky import sky_file
 from clsplat.pipeline.loading import Pipeline
+from clsplat.prepare.cache import fingerprint
 from clsplat.reading import sha256
+from clsplat.scene.images import is_image
 from clsplat.settings import Settings
 
 Change = Callable[[str, Path], str]  # from the text of a path, and the place that it names, to another text
@@ -49,9 +51,10 @@ def contents(pipeline: Pipeline) -> dict[str, str]:
 
 
 def content_of(place: Path) -> str:
-    """Return a hash of a file, of a model with all of its files, or of that of a run folder; "" for no such place.
+    """Return a hash of a file, of a model with all of its files, of that of a run folder, or of a folder of images; ""
+    for no such place.
 
-    Raises DataError for a folder without a model, and for what cannot be read.
+    Raises DataError for a folder with neither, and for what cannot be read.
     """
     if not os.path.exists(place):
         return ""
@@ -63,6 +66,8 @@ def content_of(place: Path) -> str:
 
 def _content_of(place: Path) -> str:
     model = model_at(place)
+    if not model.is_file() and any(is_image(file) for file in place.rglob("*")):
+        return f"sha256:{fingerprint(place, place / 'nothing')}"
     if not model.is_file():
         raise DataError(f"{place}: holds no model; expected a file, or the folder of a finished run")
     others = [file for file in (*files_of(model), sky_file(model)) if file != model and file.is_file()]

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from clsplat.pipeline.execution import Execution
 from clsplat.pipeline.file import PipelineFile
 from clsplat.pipeline.matrix import Matrix
 from clsplat.prepare.steps import Step
@@ -22,9 +23,11 @@ def json_schema() -> dict[str, Any]:
         ]
     schema["properties"]["stages"]["items"] = _items(variants(Stage))
     schema["properties"]["prepare"]["items"] = _items(variants(Step))
-    matrix = Matrix.model_json_schema()
-    definitions |= {**matrix.pop("$defs", {}), "Matrix": matrix}
-    schema["properties"]["matrix"] = {"$ref": "#/$defs/Matrix"}
+    beside: dict[str, type[Settings]] = {"matrix": Matrix, "execution": Execution}
+    for key, kind in beside.items():
+        own = kind.model_json_schema()
+        definitions |= {**own.pop("$defs", {}), kind.__name__: own}
+        schema["properties"][key] = {"$ref": f"#/$defs/{kind.__name__}"}
     schema["required"].remove("stages")  # not required beside a matrix that names pipelines
     schema["anyOf"] = [
         {"required": ["stages"]},

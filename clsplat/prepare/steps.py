@@ -13,7 +13,7 @@ from clsplat.training.found import photographs_text
 from data_tools.features import CameraModel, Sought, find_features
 from data_tools.gather import require_photographs
 from data_tools.mapping import MOST, Mapper, map_cameras
-from data_tools.matching import Matching, match_features
+from data_tools.matching import Matching, match_features, most_pairs
 from data_tools.pycolmap_import import require_pycolmap
 from data_tools.sharing import Cameras
 from data_tools.told import left_out
@@ -27,6 +27,7 @@ class Step(Settings):
 
     version: ClassVar[int] = 1  # increase it when the result changes
     resumes: ClassVar[bool] = False  # whether `make` goes on with what an interrupted call left in `out`
+    of_first: ClassVar[tuple[float, float] | None] = None  # its time, least and most, by the first step's; a guess
 
     stage: str
     """Name of the step."""
@@ -40,6 +41,13 @@ class Step(Settings):
     def is_done_in(self, source: Path) -> bool:
         """Return whether `source` needs neither this step nor those after it: such as a scene that holds cameras."""
         return False
+
+    def pieces(self, photographs: int) -> tuple[int, str] | None:
+        """Return the number of pieces of its work on so many photographs, each of about the same time, and their name.
+
+        None: few photographs do not tell its time.
+        """
+        return None
 
     @abstractmethod
     def make(self, source: Path, out: Path, without: Path) -> dict[str, Any]:
@@ -83,6 +91,9 @@ class FindFeatures(Step):
         require_photographs(source, without.resolve())
         require_pycolmap()
 
+    def pieces(self, photographs: int) -> tuple[int, str] | None:
+        return photographs, "photographs"
+
     def make(self, source: Path, out: Path, without: Path) -> dict[str, Any]:
         self.check(source, without)
         sought = Sought(self.long_side, self.features)
@@ -109,6 +120,9 @@ class MatchFeatures(Step):
     threads: Positive = 1
     """Number of threads; more than one are faster, and the result does not always repeat to the bit."""
 
+    def pieces(self, photographs: int) -> tuple[int, str] | None:
+        return most_pairs(photographs, self.matching, self.neighbours), "pairs"
+
     def make(self, source: Path, out: Path, without: Path) -> dict[str, Any]:
         return match_features(source, out, self.matching, self.neighbours, self.threads)
 
@@ -117,6 +131,7 @@ class MapCameras(Step):
     """Find cameras and points from matches; where photographs are left out, again with other settings."""
 
     resumes: ClassVar[bool] = True
+    of_first: ClassVar[tuple[float, float]] = 0.3, 3.0  # 0.4 to 0.7 in three captures; further attempts take more
 
     stage: Literal["map_cameras"] = "map_cameras"
 
@@ -142,6 +157,7 @@ class Undistort(Step):
 
     version: ClassVar[int] = 2  # the tracks of points, and the exposures
     resumes: ClassVar[bool] = True
+    of_first: ClassVar[tuple[float, float]] = 0.1, 1.0
 
     stage: Literal["undistort"] = "undistort"
 

@@ -13,6 +13,7 @@ from clsplat.opencl.device import Array, Device
 from clsplat.opencl.program import Program, constants
 from clsplat.render.arguments import shape_arguments
 from clsplat.render.camera import DeviceCamera
+from clsplat.render.records import add_inverse_depth_gradient, sum_inverse_depths, sum_records
 from clsplat.render.sky import Skies
 from clsplat.render.tiles import Band, Footprints, Sort, TileLists, Tiler, TooManyPairs
 from clsplat.render.workspace import Workspace
@@ -20,8 +21,10 @@ from clsplat.render.workspace import Workspace
 RECORD = int(constants()["RECORD"])
 PIXEL_SUMS = int(constants()["PIXEL_SUMS"])
 MAX_PAIRS = 2**31  # more than fit in memory, and few enough for sums of 32 bits: no other limit
-Content = Literal["colour", "depth", "entropy"]
-# channels: colour, or (depth of the mean in scene units, 1, 0); or colour and a fourth plane, the entropy of weights
+Content = Literal["colour", "depth", "entropy", "inverse_depth"]
+# channels: colour, or (depth of the mean in scene units, 1, 0); or colour and a fourth plane, the entropy of weights or
+# the blended inverse depth of the means
+FOURTH_PLANE: dict[Content, str] = {"entropy": "WEIGHT_ENTROPY", "inverse_depth": "INVERSE_DEPTH"}
 
 
 @dataclass(frozen=True)
@@ -34,7 +37,7 @@ class Frame:
     radius: Array  # [S] px, 3 standard deviations; 0: not seen
     lists: TileLists
     tile_last: Array  # [T] pairs of each tile up to the last that any pixel blends
-    image: Array  # [3, rows, stride], zero outside the image; with the entropy [4, rows, stride]
+    image: Array  # [3, rows, stride], zero outside the image; with a fourth plane [4, rows, stride]
     transmittance: Array  # [rows, stride]
     bands: list[Band]  # `lists` belongs to the last one
     content: Content  # what was blended
@@ -100,7 +103,7 @@ class Rasterizer:
         array = self.workspace.array
         splats = array("splats", (model.gaussians.count, RECORD))
         radius = array("radius", model.gaussians.capacity)
-        image = array("image", (4 if content == "entropy" else 3, camera.rows, camera.stride))
+        image = array("image", (4 if content in FOURTH_PLANE else 3, camera.rows, camera.stride))
         transmittance = array("transmittance", (camera.rows, camera.stride))
         tile_last = array("tile_last", camera.tiles, np.uint32)
         bands = self._split(camera)
@@ -124,8 +127,8 @@ class Rasterizer:
         return Frame(camera, splats, depth_key, radius, lists, tile_last, image, transmittance, bands, content)
 
     def _blend(self, content: Content, **defines: int) -> Program:
-        """The kernels of blending; without sums and entropy that nobody reads."""
-        defines |= {"WEIGHT_ENTROPY": 1} if content == "entropy" else {}
+        """The kernels of blending; without sums and a fourth plane that nobody reads."""
+        defines |= {FOURTH_PLANE[content]: 1} if content in FOURTH_PLANE else {}
         return self.device.program(f"blend_{self.device.schedule}.cl", **defines)
 
     def _split(self, camera: DeviceCamera) -> list[Band]:
@@ -223,16 +226,9 @@ class Rasterizer:
                     pair_sums=pair_sums,
                     first_tile=first_tile,
                 )
-            self.device.program("gather.cl", **defines).sum_records(
-                items=-(-gaussians.count // self._lanes),
-                pair_sums=pair_sums,
-                first_pair=lists.first_pair,
-                tile_count=lists.tile_count,
-                pixel_sums=pixel_sums,
-                accumulate=int(number > 0),
-                stride=gaussians.capacity,
-                count=gaussians.count,
-            )
+            sum_records(pair_sums, lists, gaussians, pixel_sums, defines, accumulate=int(number > 0))
+            if frame.content == "inverse_depth":
+                sum_inverse_depths(self.workspace, pair_sums, lists, gaussians, accumulate=int(number > 0))
         return pixel_sums
 
     def gradients(self, model: DeviceModel, frame: Frame, pixel_sums: Array) -> Gradients:
@@ -247,4 +243,6 @@ class Rasterizer:
             pixel_sums=pixel_sums,
             **gradients.arguments(),
         )
+        if frame.content == "inverse_depth":
+            add_inverse_depth_gradient(self.workspace, frame.camera, frame.splats, gradients["means"])
         return gradients

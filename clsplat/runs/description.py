@@ -1,11 +1,13 @@
 """What a run would do, before it does it."""
 
 import logging
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from clsplat import lock
 from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import Pipeline
+from clsplat.prepare.cache import Planned
 from clsplat.runs.choices import settle
 from clsplat.runs.default_folder import start_of
 from clsplat.runs.folders import Start, check_run_folder
@@ -21,11 +23,20 @@ from clsplat.training.run import Run
 LOG = logging.getLogger("clsplat")
 
 
-def describe(
-    pipeline: Pipeline, out: Path, device: str | Device | None, start: Start, read: ReadScene = read_run_scene
-) -> str:
-    """Return a line for each stage of a run in `out`, which is left as it is; `read` reads the scene.
+Expect = Callable[[Pipeline, Sequence[Planned], Path, Device, Run | None], list[str]]
 
+
+def describe(
+    pipeline: Pipeline,
+    out: Path,
+    device: str | Device | None,
+    start: Start,
+    read: ReadScene = read_run_scene,
+    expect: Expect | None = None,
+) -> str:
+    """Return a line for each stage of a run in `out`, which is left as it is.
+
+    read: reads the scene; expect: returns lines that tell how long a new run takes, None: nothing tells it.
     Raises what the run would raise before its first stage; of its photographs only where nothing must be prepared.
     """
     planned = pipeline.preparation(out)
@@ -39,9 +50,10 @@ def describe(
     lines = [f"  {one.step.stage:<14} {one.why or 'done'}" for one in planned]
     run, verdict = None, "would run"
     if any(one.why for one in planned):
-        check_start(pipeline, out, device, start)
+        opened, _ = check_start(pipeline, out, device, start)
     else:
         run = open_run(pipeline, out, device, start, read=read)
+        opened = run.device
         pipeline = settle(pipeline, run)
         if start == "resume":
             resumed = restore(pipeline, run)
@@ -50,6 +62,8 @@ def describe(
             stage.check_in(run)
     lines += [f"  {one.told}" for one in pipeline.settings.choices]
     lines += [f"  {stage.stage:<14} {_detail(stage, run)}".rstrip() for stage in pipeline.stages]
+    if expect and start != "resume":
+        lines += expect(pipeline, planned, out, opened, run)
     return f"{verdict} in {out}:\n" + "\n".join(lines)
 
 

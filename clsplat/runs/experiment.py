@@ -11,7 +11,7 @@ from typing import Any
 
 from clsplat import terminal
 from clsplat.compare.page import write_comparison
-from clsplat.errors import ClsplatError, ConfigError, DataError, Interrupted, as_clsplat_error, one_line
+from clsplat.errors import ClsplatError, ConfigError, DataError, Interrupted
 from clsplat.files import is_there, write_text
 from clsplat.live.live import Live
 from clsplat.names import COMPARISON, OF_A_MATRIX, PIPELINE, STATUS
@@ -22,7 +22,8 @@ from clsplat.pipeline.yaml_file import read_yaml
 from clsplat.runs import description, folders, outputs
 from clsplat.runs.course import is_finished
 from clsplat.runs.default_folder import free_folder, start_of
-from clsplat.runs.failures import failures_recorded
+from clsplat.runs.expected import expected
+from clsplat.runs.failures import Failures, failures_recorded
 from clsplat.runs.folders import Start
 from clsplat.runs.found import has_begun, has_ended
 from clsplat.runs.scenes import read_run_scene
@@ -86,10 +87,13 @@ class Job:
         return cls.open(str(file), scene, out, overrides, "resume", execution)
 
     def describe(self, device: str | Device | None = None) -> str:
-        """What would run, as lines of text.  Raises what `run` raises before it begins."""
+        """What would run, as lines of text, of a single run with the time that it takes.
+
+        Raises what `run` raises before it begins.
+        """
         if isinstance(self.work, Experiment):
             return describe_matrix(self.work, self.out, device, self.start)
-        return description.describe(self.work, self.out, device, self.start)
+        return description.describe(self.work, self.out, device, self.start, expect=expected)
 
     def run(self, device: str | Device | None = None, live: int | None = None, minutes: float | None = None) -> None:
         """Run it; what is up to date is left alone.  Raises ClsplatError; status.json tells why.
@@ -156,31 +160,29 @@ def run_matrix(
         status.require_held()
         compare(experiment, out, failures)
         if failures:
-            raise first_of(failures, count, "failed")
+            raise failures.whole(count)
         status.end("done", exit_code=0)
 
 
 def _run_cells(
     experiment: Experiment, status: StatusFile, device: str | Device | None, start: Start, live: Live | None
-) -> dict[str, ClsplatError]:
-    """Run the cells one after the other; return the failures by the cells' names."""
-    failures: dict[str, ClsplatError] = {}
+) -> Failures:
+    """Run the cells one after the other; return those that failed."""
+    failures = Failures("cells")
     status.enter("running")
     for number, cell in enumerate(status.counted(experiment.cells, "cells", len(experiment.cells)), 1):
         title, folder = f"cell {number} of {len(experiment.cells)}: {cell.name}", status.out / cell.name
         status.note(stage=cell.name)
         try:
-            if start == "resume" and is_finished(cell.pipeline, folder):
-                LOG.info("%s is done", title)
-            else:
-                LOG.info("%s", title)
-                run_pipeline(cell.pipeline, folder, device, start, live)
+            with failures.kept(cell.name):
+                if start == "resume" and is_finished(cell.pipeline, folder):
+                    LOG.info("%s is done", title)
+                else:
+                    LOG.info("%s", title)
+                    run_pipeline(cell.pipeline, folder, device, start, live)
         except Interrupted as stopped:
             raise Interrupted(f"stopped in {title}; `clsplat resume {status.out}` goes on with it") from stopped
-        except Exception as error:
-            failures[cell.name] = as_clsplat_error(error)
-            LOG.warning("cell %s failed: %s", cell.name, one_line(failures[cell.name]))
-        status.note(done=number, failed={name: one_line(failure) for name, failure in failures.items()})
+        status.note(done=number, failed=failures.texts())
         status.refresh()
     return failures
 
@@ -200,7 +202,7 @@ def describe_matrix(experiment: Experiment, out: Path, device: str | Device | No
     check_matrix_folder(out)
     folders.check_run_folder(out, start)
     description.tell_of_waiting(out)
-    lines, refusals = [], dict[str, ClsplatError]()
+    lines, refusals = [], Failures("cells")
     read = cache(read_run_scene)  # each distinct scene once
     for cell in experiment.cells:
         folder = out / cell.name
@@ -214,7 +216,7 @@ def describe_matrix(experiment: Experiment, out: Path, device: str | Device | No
             refusals[cell.name] = error
         lines.append(f"  {cell.name}  {state}".rstrip())
     if refusals:
-        raise first_of(refusals, len(lines), "would fail")
+        raise refusals.whole(len(lines), "would fail")
     return f"would run {len(lines)} cells in {out}:\n" + "\n".join(lines)
 
 
@@ -225,11 +227,3 @@ def compare(experiment: Experiment, out: Path, failures: dict[str, ClsplatError]
     if finished:
         write_comparison(finished, out / COMPARISON, experiment.name, remarks)
         LOG.info("%d runs compared in %s", len(finished), out / COMPARISON)
-
-
-def first_of(failures: dict[str, ClsplatError], cells: int, what: str) -> ClsplatError:
-    """The error that stands for those of the cells, with the exit code of the first."""
-    name, first = next(iter(failures.items()))
-    whole = ClsplatError(f"{len(failures)} of {cells} cells {what}; the first, {name}: {first}")
-    whole.exit_code = first.exit_code
-    return whole

@@ -1,11 +1,49 @@
-"""Failures of a run, as its status.json tells them."""
+"""Failures of a run, as its status.json tells them, and of the parts of a whole, which goes on without them."""
 
+import logging
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import Literal
 
-from clsplat.errors import Interrupted, OutputError, as_clsplat_error, one_line
+from clsplat.errors import ClsplatError, Interrupted, OutputError, as_clsplat_error, one_line
 from clsplat.training.status import StatusFile
+
+LOG = logging.getLogger("clsplat")
+
+
+class Failures(dict[str, ClsplatError]):
+    """The parts that failed, by their names."""
+
+    def __init__(self, parts: str) -> None:
+        """parts: what they are, such as cells."""
+        super().__init__()
+        self._parts = parts
+
+    @contextmanager
+    def kept(self, name: str) -> Iterator[None]:
+        """Note a failure of the block as that of a part, and go on.  Raises Interrupted."""
+        try:
+            yield
+        except Interrupted:
+            raise
+        except Exception as error:
+            self.note(name, as_clsplat_error(error))
+
+    def note(self, name: str, error: ClsplatError) -> None:
+        """Note that a part failed, and say so."""
+        self[name] = error
+        LOG.warning("%s failed: %s", name, one_line(error))
+
+    def texts(self) -> dict[str, str]:
+        """Return why each failed, in a line."""
+        return {name: one_line(error) for name, error in self.items()}
+
+    def whole(self, count: int, what: str = "failed") -> ClsplatError:
+        """Return the error that stands for all, with the exit code of the first.  count: of all parts."""
+        name, first = next(iter(self.items()))
+        whole = ClsplatError(f"{len(self)} of {count} {self._parts} {what}; the first, {name}: {first}")
+        whole.exit_code = first.exit_code
+        return whole
 
 
 @contextmanager

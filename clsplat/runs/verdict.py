@@ -19,7 +19,7 @@ def verdict(found: dict[str, Any]) -> str:
     names = ", ".join(damaged[:3]) + (", …" if len(damaged) > 3 else "")
     return (
         f"{found['run']}: {found['state']}; {len(damaged)} of {len(found['objects'])} files are damaged or missing: "
-        f"{names}; copy them again, or {_remedy(found, damaged[0])}"
+        f"{names}; copy them again, or {found.get('remedy') or _remedy(found, damaged[0])}"
     )
 
 

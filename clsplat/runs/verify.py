@@ -62,7 +62,7 @@ def _objects(out: Path, whole: bool = False) -> Iterator[dict[str, Any]]:
     status, sums = read_status(out), read_sums(out) or {}
     ended = is_there(out / CHECKSUMS) and (PIPELINE in sums or not sums)  # while a run goes on it lists other files
     done = whole or status.get("state") == "done" or (not status and ended)
-    one = partial(_one, out)
+    one = partial(look_at, out)
     yield one(PIPELINE, pipeline)
     yield one(STATUS, file_checks.status_file)
     if "matrix" in settings or "cells" in status:
@@ -91,8 +91,8 @@ def _objects(out: Path, whole: bool = False) -> Iterator[dict[str, Any]]:
     yield from (one(name, file_checks.folder, stat.S_IFDIR) for name in folders)
 
 
-def _one(out: Path, name: str, look: Callable[[Path], str], kind: int = stat.S_IFREG) -> dict[str, Any]:
-    """What is found of one file, or of a folder."""
+def look_at(out: Path, name: str, look: Callable[[Path], str], kind: int = stat.S_IFREG) -> dict[str, Any]:
+    """Return what is found of one file of a folder, or of a folder in it."""
     path = out / name
     try:
         file_checks.require(path, kind)

@@ -8,7 +8,7 @@ import numpy as np
 
 from clsplat.density.box import Box
 from clsplat.density.contribution import keep
-from clsplat.errors import NumericError
+from clsplat.errors import NoneInsideError
 from clsplat.stages.base import Stage
 from clsplat.training.run import Run
 
@@ -29,7 +29,7 @@ class Crop(Stage):
         gaussians = run.model.gaussians
         kept = np.flatnonzero(self.inside.holds(gaussians.get("means")))
         if not len(kept):
-            raise NumericError(f"crop: none of {gaussians.count:,} Gaussians lies inside; expected a larger box")
+            raise NoneInsideError(f"crop: none of {gaussians.count:,} Gaussians lies inside; expected a larger box")
         change = keep(gaussians, kept, self.stage)
         run.refresh_filter()
         run.records.add(run.step, "densify", **asdict(change))

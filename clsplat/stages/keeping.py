@@ -61,6 +61,14 @@ class Keeping(Training):
         train = Evaluate.model_validate({**facts, "split": "train", "most": SHOWN, "start": start, "stop": stop})
         return [train] if own else [train, Evaluate.model_validate({**facts, "split": "validation"})]
 
+    @property
+    def fewest_steps(self) -> int:
+        """The fewest steps of the training, with those of a refit: where no measurement is better than the first."""
+        if self.patience is None:
+            return self.steps
+        every = self.measuring(getattr(self, "during", ()))[-1].every or self.steps
+        return min(self.steps, (1 + self.patience) * every) + (every if self.refit else 0)
+
     def in_turn(self, during: Sequence[Scheduled]) -> list[Scheduled]:
         """Return all stages of `during` in the order in which they act: first the measurements of `keep: best`, since
         they may end the training."""

@@ -19,6 +19,7 @@ from clsplat.stages.progress import report
 from clsplat.training.adam import Adam, Rates, Rows
 from clsplat.training.backgrounds import Behind, drawn_backgrounds
 from clsplat.training.colours import photograph_colours, write_view_colours
+from clsplat.training.depths import known_depths
 from clsplat.training.forecast import Forecast
 from clsplat.training.poses import photograph_poses, write_view_poses
 from clsplat.training.profile import clocks
@@ -32,8 +33,7 @@ from clsplat.views.sampling import Sampler, ViewSettings
 from clsplat.views.transients import Transients
 
 LOG = logging.getLogger("clsplat")
-DISTRIBUTION_INTERVAL = 5  # reports
-READ_AHEAD = 4  # photographs
+DISTRIBUTION_INTERVAL, READ_AHEAD = 5, 4  # reports; photographs
 
 
 class Optimize(Keeping):
@@ -152,9 +152,9 @@ class Optimize(Keeping):
         rates, colours = self.rates.settled(views.full_size(last)), photograph_colours(self.colours, run, last)
         poses = photograph_poses(self.poses, run, last)
         own = colours, self.transients, run.sky, self.dropout, run.seed
-        trainer = Trainer(*parts, self.losses, rates, run.scene.extent, run.numbers, self.update, *own, poses=poses)
-        trainer.backgrounds = drawn_backgrounds(self.background, run)
-        return trainer
+        behind, depths = drawn_backgrounds(self.background, run), known_depths(self.losses, run, poses)
+        trained = self.losses, rates, run.scene.extent, run.numbers, self.update
+        return Trainer(*parts, *trained, *own, poses=poses, backgrounds=behind, depths=depths)
 
     def _edit(self, run: Run, views: ViewSettings) -> None:
         """Run the edits that were due at the step before."""

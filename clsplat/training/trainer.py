@@ -4,7 +4,6 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
 
 from clsplat.density.statistics import SplatStats
-from clsplat.errors import ConfigError
 from clsplat.gaussians.tables import DeviceModel, Dropout
 from clsplat.losses.base import (
     Comparison,
@@ -15,6 +14,7 @@ from clsplat.losses.base import (
     PenaltyInputs,
     ViewGradients,
     ViewLosses,
+    content_of,
     gradient_by_photograph,
     require_symmetric,
     returned,
@@ -22,11 +22,12 @@ from clsplat.losses.base import (
 from clsplat.opencl.device import Array
 from clsplat.opencl.program import constants
 from clsplat.render.camera import DeviceCamera
-from clsplat.render.rasterizer import Content, Rasterizer
+from clsplat.render.rasterizer import Rasterizer
 from clsplat.schedule import Schedule, at_step
 from clsplat.training.adam import Adam, Rates, Rows
 from clsplat.training.sky import LearnedSky
 from clsplat.views.backgrounds import Backgrounds
+from clsplat.views.known_depths import PointDepths
 from clsplat.views.learned import LearnedTransform, learned_of, name_of
 from clsplat.views.photograph_colours import PhotographColours, change_back, change_colours
 from clsplat.views.photograph_poses import PhotographPoses
@@ -81,6 +82,7 @@ class Trainer:
     seed: int = 0  # of what is drawn
     poses: PhotographPoses | None = None  # of the cameras, where they are learned
     backgrounds: Backgrounds | None = None  # by step, in the place of `background`
+    depths: PointDepths | None = None  # that are known, where a loss reads them
 
     def step(
         self,
@@ -109,17 +111,13 @@ class Trainer:
     def compare(self, photograph: Photograph, step: int, transforms: Sequence[PhotographTransform] = ()) -> ViewLosses:
         """Render one view and compare it with its photograph; nothing is updated.
 
-        Raises ConfigError for a loss that is neither an ImageLoss nor a Penalty, and, where a transform learns, for one
-        that is not symmetric in image and photograph.
+        Raises ConfigError for a loss that is neither an ImageLoss nor a Penalty, for two that read different fourth
+        planes, and, where a transform learns, for one that is not symmetric in image and photograph.
         """
-        for loss in self.losses:
-            if not isinstance(loss, ImageLoss | Penalty):
-                raise ConfigError(f"the loss {type(loss).__name__}: expected a subclass of ImageLoss or of Penalty")
+        content = content_of(self.losses, step)
         require_symmetric(self.losses, transforms)
         photograph = self.poses.place(photograph, self.numbers, step) if self.poses else photograph
         workspace, camera, timings = self.rasterizer.workspace, photograph.camera, self.rasterizer.device.timings
-        reads_entropy = any(isinstance(loss, ImageLoss) and loss.reads_entropy for loss in self.losses)
-        content: Content = "entropy" if reads_entropy else "colour"
         background = self.backgrounds.at(step) if self.backgrounds else self.background
         frame = self.rasterizer.forward(self._drawn(step), camera, background, content)
         timings.section = "loss"
@@ -128,7 +126,8 @@ class Trainer:
         image, own = self._coloured(camera, frame.image)
         planes, learning = self._without_transients(planes, image, step)
         comparison = Comparison(workspace, camera, image, planes.colours, gradient, planes.mask, step)
-        if reads_entropy:  # losses of colours overwrite three planes alone
+        comparison.depths = self.depths.at(camera) if self.depths else None
+        if content != "colour":  # losses of colours overwrite three planes alone
             gradient.fill(0)
             comparison.accumulate = True
         if planes.mask is not None:  # pixels that do not count are black in both images and have no gradient
@@ -234,13 +233,13 @@ class Trainer:
     def _update(self, view: ViewGradients, stale: Collection[str]) -> Array:
         """Update the parameters and add the penalties to the view's losses.
 
-        Returns the gradient of the projected means, [2, S] px⁻¹.  Without penalties and stale parameters, gradients are
-        not written to memory.
+        Returns the gradient of the projected means, [2, S] px⁻¹.  Without penalties, stale parameters and depths,
+        gradients are not written to memory.
         """
         penalties = [loss for loss in self.losses if isinstance(loss, Penalty)]
         step = view.comparison.step
         rates = self.rates.at(step, self.extent)
-        if not (penalties or stale):
+        if not (penalties or stale or view.frame.content == "inverse_depth"):
             return self.adam.update(self.model, view.frame, view.pixel_sums, rates, self.rows)
         gradients = self.rasterizer.gradients(self.model, view.frame, view.pixel_sums)
         inputs = PenaltyInputs(self.rasterizer.workspace, self.model.gaussians, gradients, self.extent, step)

@@ -1,13 +1,14 @@
 """A model file trained further, from the photographs of its scene: stages of the recipe `compress`, as runs."""
 
 import json
+import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
-from clsplat.errors import ConfigError, Interrupted
+from clsplat.errors import ConfigError, DataError, Interrupted
 from clsplat.files import is_there
 from clsplat.gaussians.model import Model
 from clsplat.gaussians.run_model import MODEL
@@ -22,6 +23,7 @@ from clsplat.runs.single import run_pipeline
 from clsplat.runs.source import Source
 from clsplat.training import checkpoint
 
+LOG = logging.getLogger("clsplat")
 RECIPE, TRAINING = "compress", "optimize"
 LEAST = 20  # steps: each training of the recipe has some to average then
 
@@ -80,16 +82,38 @@ class Tuning:
 def trained(pipeline: Pipeline, folder: Path, device: Device, file: str = MODEL) -> Path:
     """Run a pipeline in a folder; return the file that it writes there.
 
-    What an earlier call has finished is left alone, what it has begun goes on, and what was lost is made again.
+    What an earlier call has finished is left alone, what it has begun goes on, and what was lost is made again.  Where
+    all checkpoints are damaged it begins anew.
     """
-    if not is_done_with(pipeline, folder) or changed(folder):
-        begun: Start = "resume" if checkpoint.saved(folder) else "restart"
+    if not is_trained(pipeline, folder):
+        is_whole = _is_any_whole(folder)
+        if checkpoint.saved(folder) and not is_whole:
+            LOG.warning("%s: no checkpoint is whole; it is trained again from the beginning", folder)
+        begun: Start = "resume" if is_whole else "restart"
         start: Start = begun if is_there(folder) else "new"
         try:
             run_pipeline(pipeline, folder, device, start)
         except Interrupted as error:
             raise Interrupted(f"stopped in {folder.name}; the same command goes on") from error
     return folder / file
+
+
+def is_trained(pipeline: Pipeline, folder: Path) -> bool:
+    """Whether a run of a pipeline has come to its end in a folder, with files that are whole."""
+    return is_done_with(pipeline, folder) and not changed(folder)
+
+
+def _is_any_whole(folder: Path) -> bool:
+    """Whether a checkpoint of a run can be read, or is of another format, which the run will say."""
+    for path in reversed(checkpoint.saved(folder)):
+        try:
+            checkpoint.load(path)
+        except DataError:
+            continue
+        except ConfigError:
+            pass
+        return True
+    return False
 
 
 def require_steps(steps: int) -> None:

@@ -14,10 +14,10 @@ from clsplat.cluster import scheduler
 from clsplat.cluster.cell import Cell
 from clsplat.cluster.child import OUT
 from clsplat.cluster.drive import Drive, Wanted
-from clsplat.cluster.execution import Execution
 from clsplat.cluster.probe import Place
 from clsplat.cluster.store import Store
 from clsplat.cluster.task import Terms
+from clsplat.pipeline.execution import Execution
 from tests.test_sweep_cells import SPEC
 
 

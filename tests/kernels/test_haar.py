@@ -10,8 +10,8 @@ from clsplat.conformance.checks.images import camera_of, haar_figures, planes_of
 from clsplat.conformance.scenes import random_case
 from clsplat.density.statistics import SplatStats
 from clsplat.errors import ConfigError
-from clsplat.losses.base import HostLoss
 from clsplat.losses.entropy import WeightEntropy
+from clsplat.losses.host import HostLoss
 from clsplat.losses.image import L1, L2, Dssim
 from clsplat.losses.penalties import Anisotropy
 from clsplat.render.rasterizer import Rasterizer

@@ -49,6 +49,7 @@ from clsplat.conformance.reference.harmonics import (
     sh_basis,
     sh_basis_gradient,
 )
+from clsplat.conformance.reference.inverse_depth import inverse_depth, inverse_depth_backward, inverse_depth_loss
 from clsplat.conformance.reference.kinds import (
     SMOOTH,
     Camera,
@@ -127,6 +128,9 @@ __all__ = [
     "gain_matrix",
     "haar_filtered",
     "haar_gradient",
+    "inverse_depth",
+    "inverse_depth_backward",
+    "inverse_depth_loss",
     "l1",
     "l2",
     "margin",

@@ -1,0 +1,69 @@
+/* The loss of inverse depths at some pixels of a view, where structure from motion or a file tells them.
+ *
+ * The fourth plane of the image is D = sum_i w_i / z_i (splat.h), with z the depth of a splat's mean: nothing behind
+ * the splats counts as infinitely far.  The loss is sum_k q_k |D(pixel k) - 1/z_k|, times a scale.  With m = sum over
+ * pixels of w dL/dD, dL/dz = -m / z^2.
+ *
+ * No local memory.  Deterministic: no pixel is listed twice, and sums have one order. */
+#include "splat.h"
+
+/* Add the gradient by the fourth plane; return each pixel's term.  One item = one listed pixel. */
+__kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
+void inverse_depth_loss(
+    __global const float *restrict image,     // [4,H',stride]
+    __global float *restrict gradient,        // [4,H',stride]
+    __global const uint *restrict pixels,     // [count] places in a plane, each once
+    __global const float *restrict targets,   // [count] 1/z, scene units^-1
+    __global const float *restrict weights,   // [count] q
+    __global float *restrict terms,           // [count] q |D - 1/z|
+    const float scale,                        // scene units
+    const uint plane,                         // H' stride
+    const uint count)
+{
+    const uint i = get_global_id(0);
+    if (i >= count)
+        return;
+    const uint at = 3 * plane + pixels[i];
+    const float difference = image[at] - targets[i];
+    terms[i] = weights[i] * fabs(difference);
+    gradient[at] += scale * weights[i] * (difference > 0.0f ? 1.0f : (difference < 0.0f ? -1.0f : 0.0f));
+}
+
+/* Sum the last field of each Gaussian's gradient records, m.  One item = one Gaussian. */
+__kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
+void sum_inverse_depths(
+    __global const float *restrict pair_sums,  // [P,RECORD]
+    __global const uint *restrict first_pair,  // [N]
+    __global const uint *restrict tile_count,  // [N]
+    __global float *restrict sums,             // [S]
+    const uint accumulate,                     // 1: add to `sums`
+    const uint count)
+{
+    const uint i = get_global_id(0);
+    if (i >= count)
+        return;
+    float sum = accumulate ? sums[i] : 0.0f;
+    const uint first = tile_count[i] > 0 ? first_pair[i] : 0;
+    for (uint pair = first; pair < first + tile_count[i]; pair++)
+        sum += pair_sums[(size_t)pair * RECORD + SUM_INVERSE_DEPTH];
+    sums[i] = sum;
+}
+
+/* Add what the depth of a mean gives to its gradient.  One item = one Gaussian. */
+__kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
+void inverse_depth_backward(
+    __global const float *restrict splats,  // [N,RECORD]
+    __global const float *restrict sums,    // [S] m
+    __constant camera_t *restrict camera,   // [1]
+    __global float *restrict grad_means,    // [3,S]
+    const uint stride,
+    const uint count)
+{
+    const uint i = get_global_id(0);
+    if (i >= count)
+        return;
+    const float inverse = splats[(size_t)i * RECORD + SPLAT_INVERSE_DEPTH];
+    const float by_depth = -sums[i] * inverse * inverse;
+    for (uint k = 0; k < 3; k++)
+        grad_means[k * stride + i] += camera->world_to_camera[8 + k] * by_depth;
+}

@@ -1,0 +1,160 @@
+"""How the cells of a matrix are run: the keys of `execution:`, or of a file that `--on` names."""
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, ValidationError, field_validator, model_validator
+
+from clsplat.errors import ConfigError
+from clsplat.pipeline.explanation import explain, first_fault
+from clsplat.pipeline.yaml_file import read_yaml
+from clsplat.settings import ReadPath, Settings
+
+STORE = "runs/store"
+LOOPBACK = ("127.0.0.1", "localhost")
+OF_A_STORE = ("devices", "placement", "retries")  # keys that only cells of a store obey
+
+
+class Placement(Settings):
+    """Which devices may run which cells."""
+
+    bits: Literal["same", "any"] = "same"
+    """same: all cells on devices of one bits class, that of most devices; any: each cell within a class."""
+
+
+class Tls(Settings):
+    """The certificates of a scheduler elsewhere, PEM files."""
+
+    ca: ReadPath
+    """Certificate of the authority."""
+    cert: ReadPath
+    """Certificate of this side."""
+    key: ReadPath
+    """Its private key."""
+
+
+class Slurm(Settings):
+    """Jobs of a SLURM cluster, each of which is a worker with one device: that which a run would choose there."""
+
+    jobs: Annotated[int, Field(ge=1)]
+    """Jobs at a time."""
+    cores: Annotated[int, Field(ge=1)]
+    """CPU cores of a job."""
+    memory: Annotated[str, Field(pattern=r"^\d+(\.\d+)? ?[KMGT]i?B$")]
+    """Memory of a job, such as 16GB."""
+    walltime: Annotated[str, Field(pattern=r"^[\d:-]+$")]
+    """Time of a job, HH:MM:SS.  Two minutes before its end its cell saves its state, and the next job goes on."""
+    partition: str | None = None
+    """Where jobs are submitted; without it, that which the cluster has as its default."""
+    account: str | None = None
+    """Who pays for it."""
+    options: list[str] = Field([])
+    """Other options of sbatch, such as --gres=gpu:1."""
+    interface: str | None = None
+    """Network interface by which nodes reach this machine, such as ib0; without it, that of its name."""
+
+
+class Execution(Settings):
+    """Where the cells of a matrix run, and where they are kept."""
+
+    engine: Annotated[str, Field(pattern=r"^(inline|local|slurm|(dask|tls)://[^/:\s]+:\d{1,5})$")] = "inline"
+    """inline: one after the other in this process; local: one process a device of this machine; slurm: jobs that this
+    process submits; dask://HOST:PORT or tls://HOST:PORT: the devices that `clsplat worker` offers to that scheduler."""
+    store: ReadPath | None = None
+    """Folder of cells and results, shared by all machines; without it runs/store, and inline runs without a store."""
+    devices: Literal["auto"] | Annotated[list[str], Field(min_length=1)] = "auto"
+    """Devices of this machine, as `--device` takes them; auto: every device that works; inline: the first."""
+    placement: Placement = Placement()
+    """Which devices may run which cells."""
+    retries: Annotated[int, Field(ge=1)] = 3
+    """Failures of a cell without a newer checkpoint after which it is given up."""
+    insecure: bool = False
+    """Whether a scheduler on another machine may be reached without TLS: whoever reaches its port can run code."""
+    tls: Tls | None = None
+    """Certificates for tls:// and slurm."""
+    slurm: Slurm | None = None
+    """The jobs of engine slurm."""
+
+    @field_validator("store")
+    @classmethod
+    def _names_a_folder(cls, store: str | None) -> str | None:
+        if store == "":  # of a variable that was not set: it would be the working folder
+            raise ValueError("expected the path of a folder")
+        return store
+
+    @model_validator(mode="after")
+    def _is_meant(self) -> "Execution":
+        """Refuse keys that nothing would obey, and a scheduler that anybody could reach."""
+        scheme = self.engine.partition("://")[0]
+        unused = {key: "expected a store too, without which cells run one after the other" for key in OF_A_STORE}
+        unused = unused if self.keeps is None else {}
+        if self.has_workers:
+            unused["devices"] = "a scheduler has the devices that its workers offer"
+        if scheme not in ("tls", "slurm"):
+            unused["tls"] = "certificates are for an engine tls://HOST:PORT, and slurm"
+        if scheme not in ("dask", "slurm"):
+            unused["insecure"] = "it is for an engine dask://HOST:PORT, and slurm"
+        if scheme != "slurm":
+            unused["slurm"] = "it is for engine slurm"
+        for key, reason in unused.items():
+            if getattr(self, key) != type(self).model_fields[key].default:
+                raise ValueError(f"{key} has no effect with engine {self.engine}: {reason}; or leave it out")
+        if scheme == "dask" and not self.is_local and not self.insecure:
+            raise ValueError(f"{self.engine}: expected tls:// for another machine, or insecure: true (--insecure)")
+        if scheme == "slurm" and self.slurm is None:
+            raise ValueError("slurm: expected slurm: {jobs: …, cores: …, memory: …, walltime: …}")
+        if scheme == "slurm" and self.tls is None and not self.insecure:
+            raise ValueError(
+                "slurm: expected tls: {ca: …, cert: …, key: …}, or insecure: true, for jobs on other machines"
+            )
+        if scheme == "tls" and self.tls is None:
+            raise ValueError(
+                f"{self.engine}: expected tls: {{ca: …, cert: …, key: …}} (--tls-ca, --tls-cert and --tls-key)"
+            )
+        return self
+
+    @property
+    def has_workers(self) -> bool:
+        """Whether cells run on the devices that workers offer to a scheduler."""
+        return self.engine.startswith(("dask://", "tls://", "slurm"))
+
+    @property
+    def is_local(self) -> bool:
+        """Whether the scheduler is on this machine."""
+        return self.engine.partition("://")[2].rpartition(":")[0] in LOOPBACK
+
+    @property
+    def address(self) -> str:
+        """The scheduler's address, as Dask has it."""
+        return self.engine.replace("dask://", "tcp://")
+
+    @property
+    def keeps(self) -> Path | None:
+        """The folder of the store; None: there is none."""
+        if self.store is None:
+            return None if self.engine == "inline" else Path(STORE)
+        return Path(self.store)
+
+
+def values_of(file: Path | None) -> dict[str, Any] | None:
+    """Return the keys of an execution file as plain data, which were checked; None without.  Raises ConfigError."""
+    if file is None:
+        return None
+    document = read_yaml(file)
+    if not isinstance(document.data, dict):
+        raise ConfigError(f"{file}:1: expected keys such as engine and store")
+    try:
+        Execution.model_validate(document.data)
+    except ValidationError as error:
+        raise ConfigError(explain(error, Execution, file, document)) from error
+    return document.data
+
+
+def options(values: dict[str, Any]) -> Execution:
+    """Check keys that options of `clsplat worker` gave.  Raises ConfigError with the option."""
+    try:
+        return Execution.model_validate(values)
+    except ValidationError as error:
+        place, complaint = first_fault(error, Execution)
+        option = "-".join(map(str, place)).replace("engine", "scheduler")
+        raise ConfigError(f"--{option}: {complaint}" if place else complaint) from error

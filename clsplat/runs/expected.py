@@ -1,0 +1,215 @@
+"""How long the parts of a run take, from what small parts of the work take on this machine now.
+
+Features and matches are tried on three of the photographs; training steps on made scenes of the photographs' size, with
+few and with many Gaussians.  What only the work itself tells is a range: how often cameras are sought, how many
+Gaussians grow, and at which step photographs for validation end the training.
+"""
+
+import logging
+import math
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+
+from clsplat.bench.scenes import SIZE, SIZES, case
+from clsplat.errors import ClsplatError, DataError
+from clsplat.opencl.device import Device
+from clsplat.pipeline.choosing import choose
+from clsplat.pipeline.file import PipelineFile
+from clsplat.pipeline.loading import Pipeline, prepared_folder
+from clsplat.prepare.cache import Planned
+from clsplat.scene.images import image_size
+from clsplat.scene.scene import every_nth
+from clsplat.stages.densify import Densify
+from clsplat.stages.optimize import Optimize
+from clsplat.training.run import Run
+from data_tools.gather import link, list_photographs
+
+LOG = logging.getLogger("clsplat")
+TRIED = 3  # photographs, the fewest of which features are found
+STEPS = 5  # training steps that are timed
+MEASURED = 20_000, 50_000  # Gaussians at most, of the two made scenes; the time of a step goes on as between them
+MISTAKEN = 1.5  # times as long, or as short, as a trial: photographs differ
+FEWEST = 5000  # Gaussians, where the points are not known yet: those of a small capture
+DENSEST = 1.0  # Gaussians for each pixel of a photograph, where no setting says the most; captures end at 0.1 to 1
+
+
+@dataclass(frozen=True)
+class Expected:
+    """What a part of a run takes, s: at least, at most, and from what that follows."""
+
+    name: str
+    seconds: tuple[float, float]
+    why: str
+
+    @property
+    def text(self) -> str:
+        """The part in one line."""
+        return f"  {self.name:<14} {_minutes(self.seconds)}: {self.why}"
+
+
+@dataclass(frozen=True)
+class Capture:
+    """What is known of the photographs before they are prepared, or of the scene that they have become."""
+
+    training: int  # photographs
+    size: tuple[int, int]  # px, of a photograph that is trained on
+    gaussians: int  # that the training begins with
+
+
+def expected(pipeline: Pipeline, planned: Sequence[Planned], out: Path, device: Device, run: Run | None) -> list[str]:
+    """Return a line for each part of a run in `out`, and one for all.  run: with its scene, where that is prepared.
+
+    Photographs are read and the device is used for some seconds; nothing is written but a temporary folder.
+    """
+    names = _photographs(pipeline, planned, out) if run is None else []
+    parts = list(_of_preparation(planned, pipeline.settings.scene.folder, names))
+    if (capture := _capture(pipeline, planned, names, run)) is not None:
+        settings = choose(pipeline.settings, {"photographs": capture.training}) if run is None else pipeline.settings
+        parts += [_of_training(training, settings, capture, device) for training in _trainings(settings)]
+    if not parts:
+        return []
+    low, high = (sum(one.seconds[end] for one in parts) for end in (0, 1))
+    told = "without measurements, pictures and pages; by what small parts take on this machine as it is now"
+    return [f"expected: {_minutes((low, high))}, {told}", *(one.text for one in parts)]
+
+
+def _photographs(pipeline: Pipeline, planned: Sequence[Planned], out: Path) -> list[str]:
+    """The names of what is to be prepared; none where `prepare` finds no photographs by itself."""
+    try:
+        return (
+            list_photographs(pipeline.settings.scene.folder, prepared_folder(out).parent.resolve()) if planned else []
+        )
+    except DataError:
+        return []
+
+
+def _of_preparation(planned: Sequence[Planned], folder: Path, names: Sequence[str]) -> Iterator[Expected]:
+    """The steps that are to be done: by pieces of their work, or by the time of the first one."""
+    if len(names) < TRIED or not any(one.why for one in planned):
+        return
+    try:
+        tried = _tried(planned, folder, names)
+    except ClsplatError as error:
+        LOG.info("the preparation cannot be tried on %d photographs: %s", TRIED, error)
+        return
+    whole = next(iter(tried.values()), 0.0) * len(names) / TRIED
+    for one in planned:
+        if not one.why:
+            continue
+        few, pieces, of_first = one.step.pieces(TRIED), one.step.pieces(len(names)), one.step.of_first
+        if few and pieces and one.step.stage in tried:
+            seconds = tried[one.step.stage] * pieces[0] / few[0]
+            yield Expected(one.step.stage, (seconds / MISTAKEN, MISTAKEN * seconds), "{} {}".format(*pieces))
+        elif of_first is not None:
+            why = f"a guess, {of_first[0]:g} to {of_first[1]:g} times what {planned[0].step.stage} takes"
+            yield Expected(one.step.stage, (of_first[0] * whole, of_first[1] * whole), why)
+
+
+def _tried(planned: Sequence[Planned], folder: Path, names: Sequence[str]) -> dict[str, float]:
+    """What the first steps take for some photographs that follow each other, s, by step.  Raises ClsplatError."""
+    first, found = (len(names) - TRIED) // 2, dict[str, float]()
+    with tempfile.TemporaryDirectory() as made, _quiet():
+        source = Path(made, "photographs")
+        for name in names[first : first + TRIED]:
+            (source / name).parent.mkdir(parents=True, exist_ok=True)
+            link(folder.resolve() / name, source / name)
+        for number, one in enumerate(planned):
+            if one.step.pieces(TRIED) is None:
+                break
+            target = Path(made, str(number))
+            target.mkdir()
+            began = time.perf_counter()
+            one.step.make(source, target, target)
+            found[one.step.stage], source = time.perf_counter() - began, target
+    return found
+
+
+def _capture(pipeline: Pipeline, planned: Sequence[Planned], names: Sequence[str], run: Run | None) -> Capture | None:
+    """What is known of the photographs; None: too little."""
+    if run is not None:
+        views = run.scene.with_fold().split("train")
+        cameras = sorted(((one.camera.width, one.camera.height) for one in views), key=lambda size: size[0] * size[1])
+        points = len(run.scene.points) if run.scene.points else FEWEST
+        return Capture(len(views), cameras[len(cameras) // 2], points)
+    scene = pipeline.settings.scene
+    if (found := _size(scene.folder, names)) is None:
+        return None
+    width, height = found
+    longest = getattr(planned[-1].step, "long_side", None) or max(width, height)
+    shrink = min(1.0, longest / max(width, height)) / scene.downscale
+    held = len(every_nth(names, scene.split.of_reader))
+    return Capture(len(names) - held, (max(1, round(shrink * width)), max(1, round(shrink * height))), FEWEST)
+
+
+def _size(folder: Path, names: Sequence[str]) -> tuple[int, int] | None:
+    """The size of the first photograph, px; None where none of the first ones can be read."""
+    for name in names[:TRIED]:
+        with suppress(DataError):
+            return image_size(folder / name)
+    return None
+
+
+def _trainings(settings: PipelineFile) -> list[Optimize]:
+    return [stage for stage in settings.stages if isinstance(stage, Optimize)]
+
+
+def _of_training(training: Optimize, settings: PipelineFile, capture: Capture, device: Device) -> Expected:
+    """A training: between its fewest steps with the Gaussians of its start, and its most with the most of them."""
+    pixels = capture.size[0] * capture.size[1]
+    most = max(capture.gaussians, int(_densest(training) * pixels))
+    each = _steps(device, capture.size, (capture.gaussians, most), settings)
+    steps = training.fewest_steps, training.steps * (2 if training.refit else 1)
+    of_steps, of_counts = (_range(*(f"{end:,}" for end in ends)) for ends in (steps, (capture.gaussians, most)))
+    times, size = _range(*(f"{1e3 * one:.0f}" for one in each)), "{}x{}".format(*capture.size)
+    why = f"{of_steps} steps of {times} ms, with {of_counts} Gaussians at {size} px; how many grow is a guess"
+    return Expected(training.stage, (steps[0] * each[0], steps[1] * each[1]), why)
+
+
+def _densest(training: Optimize) -> float:
+    """The most Gaussians for each pixel that a training may have: what its settings say, or what captures end at."""
+    growing = [stage for stage in training.during if isinstance(stage, Densify)]
+    return min([one.per_pixel or DENSEST for one in growing], default=0.0)
+
+
+def _steps(device: Device, size: tuple[int, int], counts: tuple[int, int], settings: PipelineFile) -> list[float]:
+    """The times of training steps with so many Gaussians, s: by those of two made scenes, on a line."""
+    few = min(counts[0], MEASURED[0])
+    many = max(2 * few, min(counts[1], MEASURED[1]))
+    base, grown = (_step(device, size, count, settings) for count in (few, many))
+    more = max(0.0, grown - base) / (many - few)
+    return [base + more * (count - few) for count in counts]
+
+
+def _step(device: Device, size: tuple[int, int], count: int, settings: PipelineFile) -> float:
+    """The time of a training step, s, of a made scene: so many Gaussians, which cover the photograph alike."""
+    width, height, usual = SIZES["A"]
+    spread = SIZE * math.sqrt(size[0] * size[1] / count * usual / (width * height))
+    one = case(device, *size, count, settings, spread)
+    for _ in range(STEPS):
+        one.step(record=True)
+    return median(one.clock) / 1e3
+
+
+def _minutes(seconds: tuple[float, float]) -> str:
+    ends = [max(0.1, one / 60) for one in seconds]
+    return _range(*(f"{one:.0f}" if one >= 10 else f"{one:.1f}" for one in ends)) + " min"
+
+
+def _range(low: str, high: str) -> str:
+    return low if low == high else f"{low} to {high}"
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Leave out what a trial tells of three photographs."""
+    level = LOG.level
+    LOG.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        LOG.setLevel(level)

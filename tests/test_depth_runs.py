@@ -1,0 +1,42 @@
+"""Trainings that know depths: they repeat and resume to the bit, and refuse what they cannot know."""
+
+import json
+
+import pytest
+
+from clsplat.errors import ConfigError, DataError
+from tests.test_training import digest, train
+from tests.yards import Yard
+
+pytestmark = pytest.mark.slow
+
+DEPTH = "{type: inverse_depth, weight: [[0, 0.5], [20, 0.0]]}"
+LOSSES = f"optimize.losses=[{{type: l1, weight: 0.8}}, {{type: dssim, weight: 0.2}}, {DEPTH}]"
+FEW = "optimize.steps=24", "optimize.checkpoint.every=8", "optimize.checkpoint.keep=9", "optimize.log_every=2"
+
+
+def test_runs_resume_and_repeat_to_the_bit(rng, tmp_path):
+    """While the loss has weight, and after."""
+    scene = Yard(rng).write(tmp_path / "scene")
+    first = train(scene, tmp_path / "first", *FEW, LOSSES)
+    again = train(scene, tmp_path / "again", *FEW, LOSSES)
+    assert digest(again.out) == digest(first.out)
+    plain = train(scene, tmp_path / "plain", *FEW)
+    assert digest(plain.out) != digest(first.out)
+    lines = [(run.out / "metrics.jsonl").read_text().splitlines() for run in (first, plain)]
+    losses = [[row["loss"] for row in map(json.loads, text) if row["kind"] == "train"] for text in lines]
+    assert losses[0][0] > losses[1][0] * 1.01, "it is part of the loss that is told"
+    for step in (16, 24):
+        (again.out / "checkpoints" / f"step_{step:06d}.npz").unlink()
+    (again.out / "point_cloud.ply").unlink()
+    assert digest(train(scene, tmp_path / "again", *FEW, LOSSES, resume=True).out) == digest(first.out)
+
+
+def test_a_scene_must_tell_which_photographs_show_a_point(tiny_scene, tmp_path):
+    with pytest.raises(DataError, match="nothing tells which photographs show a point, which the loss 'inverse_depth'"):
+        train(tiny_scene, tmp_path / "run", *FEW, LOSSES)
+
+
+def test_poses_are_not_learned_beside_it(rng, tmp_path):
+    with pytest.raises(ConfigError, match=r"the loss 'inverse_depth' does not go with optimize\.poses"):
+        train(Yard(rng).write(tmp_path / "scene"), tmp_path / "run", *FEW, LOSSES, "optimize.poses={start: 5}")

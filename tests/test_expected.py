@@ -1,0 +1,133 @@
+"""What a dry run says of the time that a run takes: parts are tried, and what they take is continued."""
+
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+import cv2
+import numpy as np
+import pytest
+
+from clsplat.opencl.device import Device
+from clsplat.pipeline.loading import load
+from clsplat.prepare.cache import plan
+from clsplat.prepare.steps import FindFeatures, MapCameras, MatchFeatures, Step, Undistort
+from clsplat.runs import expected as module
+from clsplat.runs.description import describe
+from clsplat.runs.experiment import Job
+from clsplat.settings import Settings
+from clsplat.stages.optimize import Optimize
+from data_tools.matching import MAX_EXHAUSTIVE, most_pairs
+
+COUNT = 23
+
+
+class List(Step):
+    """Writes the names of its photographs."""
+
+    tried: ClassVar[list[list[str]]] = []
+
+    stage: Literal["list"] = "list"
+
+    def pieces(self, photographs: int) -> tuple[int, str] | None:
+        return photographs, "photographs"
+
+    def make(self, source: Path, out: Path, without: Path) -> dict[str, Any]:
+        self.tried.append(sorted(path.name for path in source.iterdir()))
+        return {}
+
+
+Settings.defined.remove(List)  # not a step in other tests
+
+
+@pytest.fixture
+def photos(tmp_path: Path) -> Path:
+    (folder := tmp_path / "photos").mkdir()
+    for number in range(COUNT):
+        cv2.imwrite(str(folder / f"{number:02d}.png"), np.zeros((60, 80, 3), np.uint8))
+    return folder
+
+
+def expected(pipeline: str, photos: Path, monkeypatch: pytest.MonkeyPatch, *sets: str) -> list[str]:
+    """The lines, where features of three photographs take 3 s, their matches 6 s, and a step a millisecond for each
+    1,000 Gaussians."""
+    monkeypatch.setattr(module, "_tried", lambda *_: {"find_features": 3.0, "match_features": 6.0})
+    monkeypatch.setattr(module, "_step", lambda device, size, count, settings: count / 1e6)
+    asked = load(pipeline, [f"scene.path='{photos}'", *sets])
+    out = photos.parent / "runs" / "a"
+    return module.expected(asked, asked.preparation(out), out, None, None)  # type: ignore[arg-type]
+
+
+def test_parts_are_continued_by_the_number_of_their_pieces(photos, monkeypatch):
+    """23 photographs have 253 pairs; 20 are trained on, until 5 measurements 350 steps apart and a refit of 350, or
+    7,000 steps and as many again."""
+    lines = expected("photos", photos, monkeypatch, "densify.per_pixel=2")
+    assert lines[1].split()[:4] == ["find_features", f"{23 / 90:.1f}", "to", f"{23 / 40:.1f}"]
+    assert lines[2].split()[:4] == ["match_features", f"{2 * 253 / 90:.1f}", "to", f"{2 * 253 / 40:.0f}"]
+    assert [line.split()[0] for line in lines[3:]] == ["map_cameras", "undistort", "optimize"]
+    assert all("a guess" in line for line in lines[3:])
+    assert "2,100 to 14,000 steps of 5 to 10 ms, with 5,000 to 9,600 Gaussians at 80x60 px" in lines[-1]
+    assert lines[-1].split()[1:4] == ["0.2", "to", "2.2"]
+    assert lines[0].startswith("expected: ")
+
+
+def test_few_photographs_have_the_steps_that_would_be_chosen(photos, monkeypatch):
+    for path in sorted(photos.iterdir())[9:]:
+        path.unlink()
+    lines = expected("photos", photos, monkeypatch)
+    assert "3,000 steps of 5 ms" in lines[-1], "without photographs to choose by"
+
+
+def test_what_is_there_already_takes_no_time(tiny_scene, tmp_path):
+    """A scene that holds cameras has a line for its training alone; nothing is written."""
+    text = Job.open("smoke", tiny_scene, tmp_path / "run").describe()
+    parts = text[text.index("expected:") :].splitlines()
+    assert [line.split()[0] for line in parts] == ["expected:", "optimize"]
+    assert not list(tmp_path.iterdir())
+    asked = load("smoke", [f"scene.path='{tiny_scene}'"])
+    assert "expected" not in describe(asked, tmp_path / "run", None, "new"), "cells of a matrix are many"
+
+
+def test_three_photographs_that_follow_each_other_are_tried(photos, tmp_path):
+    List.tried.clear()
+    steps = plan([List(), List()], photos, tmp_path / "runs" / "prepared")
+    names = sorted(path.name for path in photos.iterdir())
+    assert set(module._tried(steps, photos, names)) == {"list"}
+    assert List.tried == [["10.png", "11.png", "12.png"], []]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["photos"]
+
+
+@pytest.mark.parametrize("count", [2, 11, MAX_EXHAUSTIVE, MAX_EXHAUSTIVE + 1])
+def test_pairs_are_all_of_them_or_those_of_neighbours(count):
+    every = count * (count - 1) // 2
+    assert most_pairs(count, "exhaustive", 10) == every
+    assert most_pairs(count, "auto", 10) == (every if count <= MAX_EXHAUSTIVE else 20 * count)
+    assert most_pairs(count, "sequential", 10) == min(every, 20 * count)
+
+
+def test_the_steps_that_are_tried_come_first():
+    steps = FindFeatures(), MatchFeatures(), MapCameras(), Undistort()
+    assert [one.pieces(3) for one in steps] == [(3, "photographs"), (3, "pairs"), None, None]
+    assert [one.of_first is None for one in steps] == [True, True, False, False]
+
+
+@pytest.mark.parametrize(
+    ("keys", "fewest"),
+    [
+        ({}, 7000),
+        ({"keep": "best"}, 7000),
+        ({"keep": "best", "patience": 4}, 1750),
+        ({"keep": "best", "patience": 40}, 7000),
+    ],
+)
+def test_patience_says_how_early_a_training_may_end(keys, fewest):
+    training = {"steps": 7000, "losses": [{"type": "l1"}], **keys}
+    assert Optimize.model_validate(training).fewest_steps == fewest
+    if "patience" in keys:
+        assert Optimize.model_validate({**training, "refit": True}).fewest_steps == fewest + 350
+
+
+def test_a_step_is_timed_on_a_made_scene(device: Device):
+    """Of few Gaussians, and beyond those that are measured on the line through two numbers of them."""
+    settings = load("smoke").settings
+    few, many = module._steps(device, (70, 50), (100, 1000), settings)
+    assert 0 < few <= many
