@@ -135,8 +135,9 @@ def line(progress: "training.Progress") -> str:
     """Return the progress at a step as text."""
     p = progress
     least = "" if p.growth_known else "at least "
+    count = "" if p.gaussians is None else f"gaussians {p.gaussians:,}  "
     return (
-        f"step {p.step}/{p.steps}  loss {p.loss:.4f}  psnr {p.psnr:.1f}  gaussians {p.gaussians:,}  "
+        f"step {p.step}/{p.steps}  loss {p.loss:.4f}  psnr {p.psnr:.1f}  {count}"
         f"{p.milliseconds:.1f} ms/step  {least}{clock(p.seconds_left)} left"
     )
 

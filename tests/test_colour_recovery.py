@@ -12,6 +12,7 @@ from clsplat.metrics.views import render_floats
 from clsplat.opencl.device import Device
 from clsplat.opencl.discovery import DeviceInfo
 from clsplat.render.camera import upload_camera
+from clsplat.render.painter import Splats
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.training.adam import Adam, Rates
 from clsplat.training.trainer import Trainer
@@ -40,7 +41,9 @@ class Capture:
                 [np.zeros((3, 3)), [0.1 * number - 0.4, 0.05 * number, 0]]
             )
             camera = upload_camera(device, replace(case.view, world_to_camera=moved))
-            values = np.clip(render_floats(self.rasterizer, self.model, camera, self.background) * np.exp(gains), 0, 1)
+            values = np.clip(
+                render_floats(Splats(self.rasterizer, self.model, self.background), camera) * np.exp(gains), 0, 1
+            )
             pixels = np.ascontiguousarray(np.rint(255 * values).astype(np.uint8).transpose(2, 0, 1))
             self.photographs.append(Photograph(replace(camera, view=number), device.upload(pixels)))
 

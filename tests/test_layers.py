@@ -25,7 +25,7 @@ ROWS = (  # from the top down; a module imports only from lower rows, or from it
     {"video"},
     {"density", "metrics"},
     {"losses"},
-    {"cameras", "viewer", "views", "filters"},
+    {"cameras", "fields", "viewer", "views", "filters"},
     {"render"},
     {"gaussians", "scene"},
     {"formats"},

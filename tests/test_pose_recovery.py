@@ -11,6 +11,7 @@ from clsplat.losses.image import L1, Dssim
 from clsplat.metrics.views import render_floats
 from clsplat.opencl.device import Device
 from clsplat.render.camera import upload_camera
+from clsplat.render.painter import Splats
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.scene.view import View
 from clsplat.schedule import Decay
@@ -52,7 +53,7 @@ def learned(rng: np.random.Generator, info, jitter: float) -> tuple[tuple[float,
         for view, turn, shift in zip(truth, turns, shifts, strict=True)
     ]
     for number, (view, given) in enumerate(zip(truth, views, strict=True)):
-        values = np.clip(render_floats(rasterizer, model, upload_camera(device, view), background), 0, 1)
+        values = np.clip(render_floats(Splats(rasterizer, model, background), upload_camera(device, view)), 0, 1)
         pixels = np.ascontiguousarray(np.rint(255 * values).astype(np.uint8).transpose(2, 0, 1))
         photographs.append(Photograph(replace(upload_camera(device, given), view=number), device.upload(pixels)))
     numbers = dict[str, float]()

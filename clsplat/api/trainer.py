@@ -202,7 +202,7 @@ class Trainer:
         """
         run = self._run
         views = run.scene.downscaled(run.downscale).split(split)
-        return mean(measure(run.rasterizer, run.model, views, run.photographs.fresh())) if views else {"views": 0}
+        return mean(measure(run.painter(), views, run.photographs.fresh())) if views else {"views": 0}
 
     def checkpoint(self) -> Path:
         """Save all that training needs to go on to the same bits, but for losses that were added; return the file.

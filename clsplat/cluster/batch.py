@@ -24,7 +24,7 @@ from clsplat.pipeline.loading import Pipeline
 from clsplat.prepare.cache import plan, prepare
 from clsplat.runs.failures import Failures
 from clsplat.signals import stop_at_once, stopping_on_signals
-from clsplat.stages.optimize import Optimize
+from clsplat.stages.training import Training
 
 LOG = logging.getLogger("clsplat")
 
@@ -172,4 +172,4 @@ def wanted_cell(cell: matrix.Cell, scenes: Scenes, store: Store) -> Wanted:
 
 def steps_of(pipeline: Pipeline) -> int:
     """Return the steps of all trainings of a pipeline."""
-    return sum(stage.steps for stage in pipeline.stages if isinstance(stage, Optimize))
+    return sum(stage.steps for stage in pipeline.stages if isinstance(stage, Training))

@@ -48,7 +48,8 @@ class RunMetrics(BaseModel):
 
     test: AveragesByDownscale
     train: AveragesByDownscale
-    gaussians: int
+    gaussians: int | None  # None: a field was trained
+    parameters: int | None = None  # of a field
     steps: int
     train_seconds: float
     cpu_seconds: float | None = None  # of all threads, in the training; older runs have none

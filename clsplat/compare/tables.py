@@ -59,7 +59,8 @@ class Table:
 def main_table(rows: Sequence[Row]) -> Table:
     """Return test metrics at the training size, and the costs."""
     costs = [
-        Column("Gaussians", _cells([[run.metrics.gaussians for run in row.runs] for row in rows], 0)),
+        *_cost(rows, "Gaussians", lambda metrics: metrics.gaussians),
+        *_cost(rows, "parameters", lambda metrics: metrics.parameters),
         Column("steps", _cells([[run.metrics.steps for run in row.runs] for row in rows], 0)),
         Column("training", [Cell(duration(fmean(run.metrics.train_seconds for run in row.runs))) for row in rows]),
         *_cost(rows, "CPU seconds", lambda metrics: metrics.cpu_seconds),

@@ -127,6 +127,11 @@ class Gaussians:
             self.add(name, components, self.tables[name].zero_fresh)
             self.set(name, kept)
 
+    @property
+    def zero_fresh(self) -> list[str]:
+        """The names of the tables that are zero in fresh rows."""
+        return [name for name, table in self.tables.items() if table.zero_fresh]
+
     def not_finite(self) -> list[str]:
         """Return the names of the parameters that hold NaN or infinity, or whose moments do."""
         program = self.device.program("check.cl")

@@ -21,8 +21,9 @@ class Curves {
   }
 
   draw() {
-    const {points} = this, first = points[0]?.[0], span = this.last - first || 1;
+    const first = this.points[0]?.[0], span = this.last - first || 1;
     for (const [name, [place, text]] of Object.entries(SHOWN)) {
+      const points = this.points.filter(point => point[place] !== null); // a field has no Gaussians
       const values = points.map(point => point[place]), low = Math.min(...values), high = Math.max(...values);
       const line = points.map((point, i) => {
         const height = high > low ? (values[i] - low) / (high - low) : 0.5;

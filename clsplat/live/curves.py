@@ -3,7 +3,7 @@
 from clsplat.training.run import Progress
 
 MOST = 600  # points that are kept: of more, every second one goes
-Point = tuple[int, float, float, int]  # step, loss, PSNR in dB, Gaussians
+Point = tuple[int, float, float, int | None]  # step, loss, PSNR in dB, Gaussians
 
 
 class Curves:

@@ -43,7 +43,7 @@ class Preview:
         started = time.perf_counter()
         view = fitted(order.view, side)
         camera = upload_camera(self.run.device, view)
-        image = render_view(rasterizer, self.run.model, camera, self.run.photographs.background)
+        image = render_view(self.run.painter(rasterizer), camera)
         _, data = cv2.imencode(".jpg", np.ascontiguousarray(image[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
         self._costs[side] = time.perf_counter() - started
         return Picture(data.tobytes(), self.run.step)

@@ -9,15 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.errors import DataError, NumericError
-from clsplat.gaussians.tables import DeviceModel
 from clsplat.losses.base import Comparison
 from clsplat.losses.image import ssim_maps
 from clsplat.metrics.colours import colour_figures
 from clsplat.metrics.images import psnr, ssim, to_8_bits
 from clsplat.metrics.perceptual import Image, Perceptual
-from clsplat.opencl.device import Array
 from clsplat.render.camera import DeviceCamera
-from clsplat.render.rasterizer import Rasterizer
+from clsplat.render.painter import Painter
+from clsplat.render.workspace import Workspace
 from clsplat.scene.scene import View
 from clsplat.views.colours import ColourModel
 from clsplat.views.photographs import Photograph, Photographs, unpack
@@ -41,16 +40,14 @@ class ViewMetrics:
         return {"view": self.view, "psnr": self.psnr, "ssim": self.ssim, **self.colours, **self.perceptual}
 
 
-def render_view(rasterizer: Rasterizer, model: DeviceModel, camera: DeviceCamera, background: Array) -> Image:
-    """Render to 8 bits, [height, width, 3]: clamped to [0, 1], rounded to the nearest.  background: [3]."""
-    return to_8_bits(render_floats(rasterizer, model, camera, background))
+def render_view(painter: Painter, camera: DeviceCamera) -> Image:
+    """Render to 8 bits, [height, width, 3]: clamped to [0, 1], rounded to the nearest."""
+    return to_8_bits(render_floats(painter, camera))
 
 
-def render_floats(
-    rasterizer: Rasterizer, model: DeviceModel, camera: DeviceCamera, background: Array
-) -> NDArray[np.float32]:
-    """Render to floats, [height, width, 3], as they are.  background: [3]."""
-    planes = rasterizer.forward(model, camera, background).image.get()
+def render_floats(painter: Painter, camera: DeviceCamera) -> NDArray[np.float32]:
+    """Render to floats, [height, width, 3], as they are."""
+    planes = painter.paint(camera).get()
     return np.ascontiguousarray(planes[:, : camera.height, : camera.width].transpose(1, 2, 0))
 
 
@@ -63,10 +60,10 @@ def require_finite(image: NDArray[np.float32], view: View) -> None:
         )
 
 
-def device_ssim(rasterizer: Rasterizer, photograph: Photograph, image: Image) -> float:
+def device_ssim(workspace: Workspace, photograph: Photograph, image: Image) -> float:
     """Return the SSIM of an 8-bit image, [height, width, 3], and the photograph, computed on the device."""
-    workspace, camera = rasterizer.workspace, photograph.camera
-    pixels = rasterizer.device.upload(np.ascontiguousarray(image.transpose(2, 0, 1)))
+    camera = photograph.camera
+    pixels = workspace.device.upload(np.ascontiguousarray(image.transpose(2, 0, 1)))
     rendered = unpack(workspace, camera, pixels, 1 / 255, "rendered")
     planes = photograph.planes(workspace)
     _, sums = ssim_maps(Comparison(workspace, camera, rendered, planes.colours, gradient=rendered))
@@ -74,8 +71,7 @@ def device_ssim(rasterizer: Rasterizer, photograph: Photograph, image: Image) ->
 
 
 def measure(
-    rasterizer: Rasterizer,
-    model: DeviceModel,
+    painter: Painter,
     views: Iterable[View],
     photographs: Photographs,
     perceptual: Perceptual = PSNR_AND_SSIM,
@@ -94,14 +90,14 @@ def measure(
         if photograph.empty:
             LOG.warning("%s: not measured, since its mask leaves out every pixel; look at the mask", view.name)
             continue
-        floats = render_floats(rasterizer, model, photograph.camera, photographs.background)
+        floats = render_floats(painter, photograph.camera)
         if finite:
             require_finite(floats, view)
         rendered = to_8_bits(floats)
         image, mask = photograph.image(), photograph.counted()
         own = colour_figures(floats, image, mask, colours) if colours else {}
         if mask is None:
-            similarity = device_ssim(rasterizer, photograph, rendered)
+            similarity = device_ssim(painter.workspace, photograph, rendered)
         else:
             rendered, image = rendered * mask[..., None], image * mask[..., None]
             similarity = ssim(rendered, image, mask)

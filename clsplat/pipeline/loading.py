@@ -25,7 +25,7 @@ from clsplat.pipeline.yaml_file import Document, read_yaml, yaml_text
 from clsplat.prepare.cache import Planned, plan
 from clsplat.settings import Settings, variants
 from clsplat.stages.base import Scheduled, Stage, written_twice
-from clsplat.stages.optimize import Optimize
+from clsplat.stages.training import Training
 
 LOG = logging.getLogger("clsplat")
 
@@ -196,7 +196,7 @@ def _untagged(stage: dict[str, Any]) -> dict[str, Any]:
 def _late(stages: Sequence[Stage], need: str) -> str:
     """Say of a part what should make it during a training, but does not act; "" where there is none."""
     for training in stages:
-        for inner in training.during if isinstance(training, Optimize) else ():
+        for inner in training.during if isinstance(training, Training) else ():
             if need in inner.makes:
                 cadence = f"{inner.stage} makes at every {inner.every} steps after step {inner.start}"
                 return f"{cadence}; the training ends before: set its start and its every"
@@ -233,7 +233,7 @@ def _check_order(path: Path, settings: PipelineFile) -> None:
                 f"{path}: stages[{i}] {stage.stage} needs '{need}', which no earlier stage makes ({makers} makes it)"
             )
         made = (made - stage.takes) | stage.makes
-        if isinstance(stage, Optimize):
+        if isinstance(stage, Training):
             made.update(part for inner in stage.acting(step) for part in inner.makes)
             step += stage.steps
     if place := written_twice(settings.stages):

@@ -9,6 +9,7 @@ from clsplat.pipeline.matrix import Matrix
 from clsplat.prepare.steps import Step
 from clsplat.settings import Settings, needs_settings, variants
 from clsplat.stages.base import Scheduled, Stage
+from clsplat.stages.training import Training
 
 
 def json_schema() -> dict[str, Any]:
@@ -32,7 +33,9 @@ def json_schema() -> dict[str, Any]:
         {"required": ["stages"]},
         {"required": ["matrix"], "properties": {"matrix": {"required": ["pipelines"]}}},
     ]
-    definitions["Optimize"]["properties"]["during"]["items"] = _items(variants(Scheduled), ["every"])
+    for kind in variants(Stage).values():
+        if issubclass(kind, Training):
+            definitions[kind.__name__]["properties"]["during"]["items"] = _items(variants(Scheduled), ["every"])
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
 
 

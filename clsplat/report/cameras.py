@@ -35,7 +35,7 @@ def cameras(run: Run) -> list[Markup]:
             marks.append(Marks(split, flat(np.stack([view.position for view in views])), flat(directions)))
     centres = np.concatenate([one.centres for one in marks])
     middle, reach = centres.mean(axis=0), FAR * float(np.abs(centres - centres.mean(axis=0)).max())
-    means = run.model.gaussians.get("means")
+    means = run.model.gaussians.get("means") if run.gaussians else np.zeros((0, 3), np.float32)
     points = flat(means[:: max(1, len(means) // MOST_POINTS)].astype(np.float64))
     near = points[(np.abs(points - middle) < max(reach, 1e-9)).all(axis=1)]
     return charts([plan("cameras from above", marks, near)])

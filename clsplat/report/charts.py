@@ -21,7 +21,7 @@ def training_charts(run: Run) -> list[Markup]:
     measured, trial = _measured(run), _measured(run, trial=True)
     running = DOTTED if any(line.name == NAMES["train"] for line in measured) else 0
     psnr = list(zip([r["step"] for r in train], over_views([r["psnr"] for r in train]), strict=True))
-    line = {key: [(r["step"], r[key]) for r in train] for key in ("loss", "gaussians", "ms")}
+    line = {key: [(r["step"], r[key]) for r in train if key in r] for key in ("loss", "gaussians", "ms")}
     seen = Line(psnr, f"training views, mean of the last {VIEWS}", COLOURS[0], running)
     return charts(
         [
@@ -87,7 +87,7 @@ def _shares(lines: Sequence[Line]) -> list[Line]:
 
 def _psnr_by_gaussians(run: Run) -> list[Line]:
     """Points in order of steps: where Gaussians are pruned, the line turns back.  No line for a single point."""
-    counts = {r["step"]: r["gaussians"] for r in run.records.read("train")}
+    counts = {r["step"]: r["gaussians"] for r in run.records.read("train") if "gaussians" in r}
     tests = [r for r in run.records.read("evaluate") if r["split"] == "test" and r["downscale"] == run.downscale]
     points = {r["step"]: (counts[r["step"]] / 1e3, r["psnr"]) for r in tests if r["step"] in counts}
     return [Line(list(points.values()))] if len(points) > 1 else []

@@ -33,7 +33,7 @@ def views(run: Run) -> dict[str, list[ViewFigure]]:
 
     def figure(record: dict[str, Any]) -> ViewFigure:
         photograph = run.photographs.get(by_name[record["view"]])
-        image = render_view(run.rasterizer, run.model, photograph.camera, run.photographs.background)
+        image = render_view(run.painter(), photograph.camera)
         return _figure(record, image, photograph.image())
 
     return {

@@ -13,7 +13,7 @@ from clsplat.names import CHECKPOINTS, CHECKSUMS, INPUTS, METRICS, NOTE, PIPELIN
 from clsplat.pipeline.loading import Pipeline, load
 from clsplat.runs.found import changed, has_ended, restart
 from clsplat.stages.base import Stage
-from clsplat.stages.optimize import Optimize
+from clsplat.stages.training import Training
 from clsplat.training import checkpoint
 from clsplat.training.status import read_status
 
@@ -46,12 +46,12 @@ class Course:
     def __init__(self, pipeline: Pipeline, out: Path, at: Place) -> None:
         begun = at.cursor + (at.stage_step > 0)
         ended, training, coming = (pipeline.stages[i:j] for i, j in ((0, at.cursor), (at.cursor, begun), (begun, None)))
-        last = takewhile(lambda stage: not (stage.edits or isinstance(stage, Optimize)), reversed(ended))
+        last = takewhile(lambda stage: not (stage.edits or isinstance(stage, Training)), reversed(ended))
         self.out = out
         self.repeatable: list[Stage] = [] if training else list(last)  # of the model as it is, the latest first
         self._coming = [path for stage in coming for path in stage.outputs(out)]
         self._training = [path for stage in training for path in stage.outputs(out)]
-        self._due = [path for stage in training if isinstance(stage, Optimize) for path in _due(stage, out, at)]
+        self._due = [path for stage in training if isinstance(stage, Training) for path in _due(stage, out, at)]
         self._from_beginning = begun == 0
 
     def writes(self, file: Path) -> bool:
@@ -76,7 +76,7 @@ def is_below(file: Path, places: Iterable[Path]) -> bool:
     return any(file.is_relative_to(place) for place in places)
 
 
-def _due(stage: Optimize, out: Path, at: Place) -> list[Path]:
+def _due(stage: Training, out: Path, at: Place) -> list[Path]:
     """The files, not folders, that a training which has begun writes anew: each time its stage is due."""
     last = at.step - at.stage_step + stage.steps
     return [

@@ -17,7 +17,7 @@ from clsplat.runs.runner import restore
 from clsplat.runs.scenes import ReadScene, read_run_scene
 from clsplat.stages.base import Scheduled, Stage
 from clsplat.stages.evaluate import Evaluate
-from clsplat.stages.optimize import Optimize
+from clsplat.stages.training import Training
 from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
@@ -74,7 +74,7 @@ def tell_of_waiting(out: Path) -> None:
 
 
 def _detail(stage: Stage, run: Run | None) -> str:
-    if isinstance(stage, Optimize):
+    if isinstance(stage, Training):
         return f"{stage.steps} steps; " + ", ".join(map(_cadence, stage.during))
     if isinstance(stage, Evaluate) and run:
         views = run.original.downscaled(run.downscale).split(stage.split)

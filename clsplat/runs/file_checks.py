@@ -18,6 +18,7 @@ from clsplat.reading import KINDS, read_json, sha256
 from clsplat.scene.identity import Identity
 from clsplat.scene.images import read_image
 from clsplat.training import archive, checkpoint
+from clsplat.training.found import size_text
 from clsplat.training.records import Records
 from clsplat.training.status_schema import status_of
 
@@ -62,7 +63,8 @@ def checkpoint_file(written: dict[str, str], path: Path) -> str:
     state, tables = checkpoint.load(path)
     if not any("optimize" in stage for stage in state.pipeline["stages"][state.cursor :]):
         written.update(state.written)
-    return f"step {state.step}, {len(tables['gaussians/means']):,} Gaussians"
+    gaussians = None if state.field else len(tables["gaussians/means"])
+    return f"step {state.step}, {size_text(gaussians, state.field.learned if state.field else None)}"
 
 
 def failed_state(path: Path) -> str:
@@ -101,7 +103,8 @@ def output(expected: str | None, path: Path) -> str:
     """Look at one output; return what it is.  Raises the errors of its reader, DataError where its bytes changed."""
     require_sum(expected, path)
     if path.name == METRICS:
-        return f"{read_metrics(path).gaussians:,} Gaussians"
+        metrics = read_metrics(path)
+        return size_text(metrics.gaussians, metrics.parameters)
     if path.name == RECORDS:
         return f"{len(Records(path.parent).read())} lines"
     if path.name.lower().endswith(tuple(endings(reads=True))):

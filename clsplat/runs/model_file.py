@@ -14,6 +14,7 @@ from clsplat.metrics.lpips import InputRange
 from clsplat.metrics.perceptual import Perceptual, metric_names
 from clsplat.metrics.views import PSNR_AND_SSIM, mean, measure
 from clsplat.opencl.device import Device
+from clsplat.render.painter import Splats
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.runs.pictures import KINDS, write_pictures
 from clsplat.runs.source import Source
@@ -73,8 +74,8 @@ class ModelFile:
             for split in ("test", "train"):
                 if scene.split(split):
                     views = scene.split(split)
-                    parts = self.rasterizer, self.model, views, photographs, perceptual
-                    results = measure(*parts, finite=True, colours=self.colours)
+                    painter = Splats(self.rasterizer, self.model, photographs.background)
+                    results = measure(painter, views, photographs, perceptual, finite=True, colours=self.colours)
                     metrics[split][f"{downscale:g}"] = mean(results, perceptual)
         return {**metrics, "gaussians": self.model.gaussians.count, "device": self.device.text}
 

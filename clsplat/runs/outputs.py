@@ -15,7 +15,7 @@ from clsplat.reading import read_file, read_json, sha256
 from clsplat.runs.course import Course, is_below
 from clsplat.runs.found import has_begun, not_whole, read_sums, sum_of
 from clsplat.stages.base import Stage
-from clsplat.stages.optimize import Optimize
+from clsplat.stages.training import Training
 from clsplat.training.run import Run
 
 
@@ -28,7 +28,8 @@ def write_metrics(pipeline: Pipeline, run: Run) -> None:
         "train": run.metrics.get("train", {}),
         **({"validation": run.metrics["validation"]} if "validation" in run.metrics else {}),
         **({"kept": run.best.figures()} if run.best else {}),
-        "gaussians": run.model.gaussians.count,
+        "gaussians": run.gaussians,
+        **({"parameters": run.learned_field.field.shape.learned} if run.learned_field else {}),
         "steps": run.step,
         "train_seconds": round(run.train_seconds, 3),
         "cpu_seconds": round(run.cpu_seconds, 3),
@@ -182,6 +183,6 @@ def acting(pipeline: Pipeline) -> Iterator[Stage]:
     step = 0
     for stage in pipeline.stages:
         yield stage
-        if isinstance(stage, Optimize):
+        if isinstance(stage, Training):
             yield from stage.acting(step)
             step += stage.steps

@@ -18,7 +18,7 @@ from clsplat.runs.inputs import require_same_inputs, write_inputs
 from clsplat.runs.outputs import Lost, check_outputs, keep_checksums, renew_checksums, write_checksums, write_metrics
 from clsplat.runs.refitting import as_trained, begin_if_due, is_due
 from clsplat.runs.signals import finishing_on_interrupt
-from clsplat.stages.optimize import Optimize
+from clsplat.stages.training import Training
 from clsplat.training import checkpoint
 from clsplat.training.rescue import saved_on_failure
 from clsplat.training.run import Progress, Run, Stopped
@@ -85,7 +85,7 @@ def restore(pipeline: Pipeline, run: Run) -> Path | None:
     if taken:
         require_same_inputs(run)
         stage = pipeline.stages[run.cursor] if run.cursor < len(pipeline.stages) else None
-        if isinstance(stage, Optimize) and stage.steps < run.stage_step:
+        if isinstance(stage, Training) and stage.steps < run.stage_step:
             raise ConfigError(
                 f"{taken}: already at step {run.step}; optimize.steps={stage.steps} would end before it: give "
                 f"{run.stage_step} or more, or begin anew: `clsplat run` with --restart or another --out"

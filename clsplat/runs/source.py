@@ -7,11 +7,12 @@ from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 
+from clsplat.compare.run_folder import read_metrics
 from clsplat.errors import ConfigError, DataError
 from clsplat.formats.model_files import located
 from clsplat.gaussians.model import Model
 from clsplat.gaussians.run_model import MODEL, model_at, model_of_run
-from clsplat.names import PIPELINE
+from clsplat.names import METRICS, PIPELINE
 from clsplat.pages.page import scene_name
 from clsplat.pipeline.file import SceneSettings
 from clsplat.pipeline.loading import Pipeline, load
@@ -70,12 +71,23 @@ def require_model(path: Path) -> None:
 
 def _no_model(folder: Path, name: str = MODEL) -> DataError:
     """The error of a folder without a model, with the remedy for what it is."""
+    if _has_field(folder):
+        shown = "its own stages `evaluate` and `render` show it"
+        return DataError(f"{folder}: is the run of a field, which no model file holds; expected Gaussians: {shown}")
     if has_pipeline(folder):
         return DataError(f"{folder}: has no {name}; finish the run with `clsplat resume {folder}`")
     fault = f"{folder}: has no {PIPELINE}; expected a model file or a run folder"
     if any(map(is_image, chain(folder.glob("*"), folder.glob("images/*")))):
         return DataError(f"{fault}; for a model of its photographs, run `clsplat run photos --scene {folder}` first")
     return DataError(fault)
+
+
+def _has_field(run: Path) -> bool:
+    """Whether a run that is done has trained a field in the place of Gaussians."""
+    try:
+        return read_metrics(run / METRICS).gaussians is None
+    except DataError:
+        return False
 
 
 def run_of(model: Path) -> Path | None:

@@ -7,7 +7,7 @@ from typing import Any
 from clsplat.errors import DataError
 from clsplat.names import METRICS
 from clsplat.reading import read_json
-from clsplat.training.found import photographs_text
+from clsplat.training.found import photographs_text, size_text
 
 TITLES = {"export": "model", "render": "renders"}  # of what these stages write; others give their own names
 BEFORE_FILES = {"export": "point_cloud.ply", "render": "renders", "viewer": "viewer.html", "report": "report.html"}
@@ -28,7 +28,8 @@ def summary(folder: Path) -> list[str]:
 def _lines(folder: Path, metrics: dict[str, Any]) -> Iterator[str]:
     test = next(iter(metrics["test"].values()), None)
     quality = f"test PSNR {test['psnr']:.2f} dB, SSIM {test['ssim']:.4f}; " if test else ""
-    yield f"{quality}{metrics['gaussians']:,} Gaussians; {metrics['train_seconds']:.0f} s of training"
+    size = size_text(metrics["gaussians"], metrics.get("parameters"))
+    yield f"{quality}{size}; {metrics['train_seconds']:.0f} s of training"
     placed = photographs_text(metrics.get("preparation", {}))
     if kept := metrics.get("kept"):
         name, what = (

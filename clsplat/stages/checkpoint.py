@@ -14,7 +14,7 @@ class Checkpoint(Scheduled):
     """Write everything that a resumed run needs to reach the same bits; also after the last step, to train longer."""
 
     stage: Literal["checkpoint"] = "checkpoint"
-    needs: ClassVar[frozenset[str]] = frozenset({"model"})
+    needs: ClassVar[frozenset[str]] = frozenset({"painter"})
     ends: ClassVar[bool] = True
     output_keys: ClassVar[frozenset[str]] = CADENCE | {"keep", "every_seconds"}
 

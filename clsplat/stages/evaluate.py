@@ -7,11 +7,11 @@ from pydantic import AfterValidator, Field, field_validator
 
 from clsplat.errors import amount
 from clsplat.gaussians.model import load
-from clsplat.gaussians.tables import DeviceModel
 from clsplat.metrics.lpips import InputRange
 from clsplat.metrics.perceptual import Metric, Perceptual
 from clsplat.metrics.views import mean, measure
 from clsplat.names import fault_of_output
+from clsplat.render.painter import Painter, Splats
 from clsplat.scene.view import some_of
 from clsplat.settings import ReadPath
 from clsplat.stages.base import CADENCE, Scheduled
@@ -38,7 +38,7 @@ class Evaluate(Scheduled):
     """
 
     stage: Literal["evaluate"] = "evaluate"
-    needs: ClassVar[frozenset[str]] = frozenset({"model"})
+    needs: ClassVar[frozenset[str]] = frozenset({"painter"})
     makes: ClassVar[frozenset[str]] = frozenset({"metrics"})
     output_keys: ClassVar[frozenset[str]] = CADENCE | {
         "split",
@@ -78,8 +78,10 @@ class Evaluate(Scheduled):
     def _perceptual(self) -> Perceptual:
         return Perceptual.open(self.metrics, self.lpips, self.lpips_input)
 
-    def _model(self, run: Run) -> DeviceModel:
-        return run.model if self.file is None else load(run.out / self.file).upload(run.device)
+    def _painter(self, run: Run) -> Painter:
+        if self.file is None:
+            return run.painter()
+        return Splats(run.rasterizer, load(run.out / self.file).upload(run.device), run.photographs.background)
 
     def run(self, run: Run) -> None:
         if not run.scene.split(self.split):
@@ -87,13 +89,13 @@ class Evaluate(Scheduled):
                 key = "holdout" if self.split == "test" else "validation"
                 LOG.warning("no %s views: nothing to evaluate (scene.%s chooses them)", self.split, key)
             return
-        perceptual, model = self._perceptual(), self._model(run)
+        perceptual, painter = self._perceptual(), self._painter(run)
         for downscale in self.downscales or [run.downscale]:
             found = refined(run.numbers, run.original).downscaled(downscale).split(self.split)
             views = some_of(found, self.most or len(found))
             photographs = run.photographs if downscale in run.scene.downscales else run.photographs.fresh()
             counted = run.status.counted(run.until_interrupted(views), "views", len(views))
-            results = measure(run.rasterizer, model, counted, photographs, perceptual, colours=colours_of(run))
+            results = measure(painter, counted, photographs, perceptual, colours=colours_of(run))
             if not results:
                 continue
             for result in results:

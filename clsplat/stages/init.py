@@ -43,7 +43,7 @@ class Init(Stage):
     """
 
     stage: Literal["init"] = "init"
-    makes: ClassVar[frozenset[str]] = frozenset({"model"})
+    makes: ClassVar[frozenset[str]] = frozenset({"model", "painter"})
     takes: ClassVar[frozenset[str]] = frozenset({"average", "palette"})
     edits: ClassVar[bool] = True
 

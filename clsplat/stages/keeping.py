@@ -7,8 +7,9 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field, model_validator
 
 from clsplat.errors import ConfigError
-from clsplat.stages.base import Scheduled, Stage
+from clsplat.stages.base import Scheduled
 from clsplat.stages.evaluate import Evaluate
+from clsplat.stages.training import Training
 from clsplat.training.kept import Best, Measured
 from clsplat.training.kept_tables import copied_of, put_back
 from clsplat.training.run import Run
@@ -19,18 +20,15 @@ PSNR_AND_SSIM = ("psnr", "ssim")
 SHOWN = 8  # training views that are measured beside the validation views, at most
 
 
-class Keeping(Stage):
+class Keeping(Training):
     """A training with a number of steps, and the model that it leaves.
 
     With `keep: best` the validation views (`scene.validation`) are measured as often as an `evaluate` of them in
     `during` says, or else every 20th part of the steps, 100 at least; some training views beside them.
     """
 
-    training_keys: ClassVar[frozenset[str]] = frozenset({"steps", "patience"})
-    step_keys: ClassVar[frozenset[str]] = frozenset({"steps"})
+    training_keys: ClassVar[frozenset[str]] = frozenset({"patience"})
 
-    steps: Annotated[int, Field(gt=0)]
-    """Number of training steps."""
     keep: Literal["last", "best"] = "last"
     """Model that the training leaves: that of its last step, or the one with the best PSNR at the validation views, in
     the photographs' colours where they have colours of their own."""
@@ -44,7 +42,7 @@ class Keeping(Stage):
     def _by_validation(self) -> "Keeping":
         if self.keep != "best" and (self.patience or self.refit):
             raise ValueError(f"'{'patience' if self.patience else 'refit'}' is for 'keep: best'; give both or neither")
-        inner = getattr(self, "during", ())
+        inner = self.during
         if self.keep != "best" and any(getattr(stage, "patience", None) for stage in inner):
             raise ValueError("'densify.patience' is for 'keep: best'; give both or neither")
         if self.keep == "best" and any("average" in stage.makes for stage in inner):
@@ -86,7 +84,7 @@ class Keeping(Stage):
                 "optimize.keep: best chooses by validation views; expected some: set scene.validation=auto"
             )
         last = run.step - run.stage_step + self.steps
-        found = [stage for stage in self.in_turn(getattr(self, "during", ())) if _validates(stage)]
+        found = [stage for stage in self.in_turn(self.during) if _validates(stage)]
         if not any(stage.due(step, step == last) for stage in found for step in range(last - self.steps + 1, last + 1)):
             raise ConfigError(
                 "optimize.keep: best needs a measurement of the validation views before the last step; expected "

@@ -2,14 +2,12 @@
 
 import logging
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, field_validator
 
 from clsplat.density.statistics import SplatStats
-from clsplat.errors import Interrupted
 from clsplat.losses.base import ImageLoss, Loss, Penalty, ViewGradients, ViewLosses, require_symmetric
 from clsplat.names import VIEW_COLOURS, VIEW_POSES
 from clsplat.schedule import Probability
@@ -18,7 +16,6 @@ from clsplat.stages.base import Scheduled
 from clsplat.stages.densify import Densify
 from clsplat.stages.keeping import Keeping
 from clsplat.stages.progress import report
-from clsplat.training import checkpoint
 from clsplat.training.adam import Adam, Rates, Rows
 from clsplat.training.backgrounds import Behind, drawn_backgrounds
 from clsplat.training.colours import photograph_colours, write_view_colours
@@ -27,7 +24,7 @@ from clsplat.training.forecast import Forecast
 from clsplat.training.poses import photograph_poses, write_view_poses
 from clsplat.training.profile import clocks
 from clsplat.training.rescue import finite_values
-from clsplat.training.run import Run, Stopped
+from clsplat.training.run import Run
 from clsplat.training.skipping import Skip, Visit
 from clsplat.training.trainer import Trainer
 from clsplat.views.colours import Colours
@@ -49,7 +46,6 @@ class Optimize(Keeping):
     stage: Literal["optimize"] = "optimize"
     needs: ClassVar[frozenset[str]] = frozenset({"model"})
     makes: ClassVar[frozenset[str]] = frozenset({"adam", "stats"})
-    output_keys: ClassVar[frozenset[str]] = frozenset({"log_every"})
     training_keys: ClassVar[frozenset[str]] = frozenset({"rates", "update", "skip", "dropout", "background"})
 
     rates: Rates = Rates()
@@ -85,41 +81,17 @@ class Optimize(Keeping):
             raise ValueError("expected at least one loss that compares images, such as l1")
         return losses
 
-    @field_validator("during")
-    @classmethod
-    def _on_a_cadence(cls, during: list[Scheduled]) -> list[Scheduled]:
-        for stage in during:
-            if stage.every is None:
-                raise ValueError(f"'{stage.stage}' needs 'every' inside 'during'")
-        return during
-
     def check(self) -> None:
         require_symmetric(self.losses, self.views.transforms)
-        for stage in self.during:
-            stage.check()
+        super().check()
 
     def outputs(self, out: Path) -> list[Path]:
         own = [*([out / VIEW_COLOURS] if self.colours else []), *([out / VIEW_POSES] if self.poses else [])]
-        return [*(path for stage in self.during for path in stage.outputs(out)), *own]
-
-    def acting(self, step: int) -> list[Scheduled]:
-        """Return the stages of `during` that run when the training begins after a global step."""
-        last = step + self.steps
-        before = range(step + 1, last)  # no edit follows the last
-        return [s for s in self.inner if any(map(s.due, before)) or (not s.edits and s.due(last, True))]
-
-    @property
-    def inner(self) -> list[Scheduled]:
-        """The stages that act between two steps."""
-        return self.in_turn(self.during)
+        return [*super().outputs(out), *own]
 
     def run(self, run: Run) -> None:
         for _ in self.iterate(run):
             pass
-
-    def act(self, run: Run) -> None:
-        with run.status.stage(self.stage):  # it goes on in its middle, so that its records stay
-            self.run(run)
 
     def iterate(self, run: Run) -> Iterator[ViewLosses]:
         """Train step by step; what a step yields, ViewGradients unless it is skipped, is valid until the next."""
@@ -131,7 +103,7 @@ class Optimize(Keeping):
         LOG.info(memory.text(count))
         forecast = Forecast.of(run.step, last_step, [stage.due for stage in self._density])
         seconds: list[float] = []  # of the steps since the last report
-        self._act(run)
+        self.act_between(run)
         while not self.has_ended(run):
             start = clocks()
             self._edit(run, views)
@@ -145,14 +117,7 @@ class Optimize(Keeping):
                     self.skip.tell(run)
                 report(run, forecast, (loss, psnr), seconds, DISTRIBUTION_INTERVAL * self.log_every)
                 seconds.clear()
-            with suppress(Stopped):
-                self._act(run)
-            run.between()
-            if run.interrupted:
-                told = f"saved in {checkpoint.save(run)}; `clsplat resume {run.out}` goes on from it"
-                raise Interrupted(f"stopped at step {run.step}, {told}")
-            if self.has_ended(run):
-                self.leave(run)
+            self.end_step(run)
             yield view
         self.leave(run)  # a resumed run may have no step left
         write_view_colours(run, trainer.colours)
@@ -190,20 +155,6 @@ class Optimize(Keeping):
         behind, depths = drawn_backgrounds(self.background, run), known_depths(self.losses, run, poses)
         trained = self.losses, rates, run.scene.extent, run.numbers, self.update
         return Trainer(*parts, *trained, *own, poses=poses, backgrounds=behind, depths=depths)
-
-    def _act(self, run: Run) -> None:
-        """Run the stages that are due and do not edit; those that fail run again when the run goes on."""
-        for place, stage in enumerate(self.inner):
-            due = run.stage_step > 0 and (stage.due(run.step, self.has_ended(run)) or stage.is_overdue(run))
-            if place < run.acted or stage.edits or not due:
-                continue
-            run.acted = place + 1  # a checkpoint is of the state after it
-            try:
-                stage.act(run)
-                self.judge(run, stage)
-            except BaseException:
-                run.acted = place
-                raise
 
     def _edit(self, run: Run, views: ViewSettings) -> None:
         """Run the edits that were due at the step before."""

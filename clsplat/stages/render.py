@@ -22,7 +22,7 @@ class Render(Stage):
     """Write one PNG for each view of a split, with the name of the view."""
 
     stage: Literal["render"] = "render"
-    needs: ClassVar[frozenset[str]] = frozenset({"model"})
+    needs: ClassVar[frozenset[str]] = frozenset({"painter"})
     output_keys: ClassVar[frozenset[str]] = frozenset({"split", "folder"})
 
     split: Literal["test", "train", "all"] = "test"
@@ -40,7 +40,7 @@ class Render(Stage):
         counted = run.status.counted(run.until_interrupted(views.items()), "views", len(views))
         for path, view in counted:
             camera = upload_camera(run.device, view)
-            write_image(path, render_view(run.rasterizer, run.model, camera, run.photographs.background))
+            write_image(path, render_view(run.painter(), camera))
         LOG.info("%s written to %s", amount(len(views), "image"), run.out / self.folder)
 
     def verify(self, run: Run) -> None:

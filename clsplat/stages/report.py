@@ -19,7 +19,7 @@ from clsplat.report.times import times
 from clsplat.report.views import views
 from clsplat.scene.scene import SPLITS
 from clsplat.stages.base import Stage, path_in_run
-from clsplat.training.found import photographs_text
+from clsplat.training.found import photographs_text, size_text
 from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
@@ -30,7 +30,7 @@ class Report(Stage):
     """Write report.html."""
 
     stage: Literal["report"] = "report"
-    needs: ClassVar[frozenset[str]] = frozenset({"model", "metrics"})
+    needs: ClassVar[frozenset[str]] = frozenset({"painter", "metrics"})
     output_keys: ClassVar[frozenset[str]] = frozenset({"file"})
 
     file: Annotated[str, path_in_run(".html")] = "report.html"
@@ -76,8 +76,12 @@ def _main(run: Run) -> str:
     test = run.metrics.get("test", {}).get(f"{run.downscale:g}")
     quality = [f"test PSNR {test['psnr']:.2f} dB, SSIM {test['ssim']:.4f}"] if test else []
     quality += [f"the model of step {run.model_step:,}"] if run.model_step != run.step else []
-    others = f"{run.model.gaussians.count:,} Gaussians", f"trained for {duration(run.train_seconds)}"
+    others = _size(run), f"trained for {duration(run.train_seconds)}"
     return " · ".join([*quality, *others])
+
+
+def _size(run: Run) -> str:
+    return size_text(run.gaussians, run.learned_field.field.shape.learned if run.learned_field else None)
 
 
 def _figures(run: Run) -> dict[str, str]:
@@ -94,7 +98,8 @@ def _figures(run: Run) -> dict[str, str]:
         found = run.best.found
         values["validation PSNR before the refit"] = f"{found.validation:.2f} dB"
         values["training PSNR before the refit"] = f"{found.train:.2f} dB"
-    values["Gaussians"] = f"{run.model.gaussians.count:,}"
+    number, _, what = _size(run).partition(" ")
+    values[what] = number
     values["steps"] = f"{run.step:,}"
     values["training"] = duration(run.train_seconds)
     return values

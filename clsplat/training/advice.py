@@ -13,8 +13,11 @@ LOWER = 0.1  # times the present rate
 def lower_rate(run: Run, broken: Collection[str]) -> str:
     """Return 'place=value' for `--set`: a lower rate of that broken parameter whose rate is the largest by its default.
 
-    The value is a tenth of the present one, or the default where that is smaller.
+    The value is a tenth of the present one, or the default where that is smaller.  A field has one rate.
     """
+    if run.learned_field:
+        (stage,) = run.pipeline["stages"][run.cursor]
+        return f"{stage}.rate={LOWER * run.learned_field.rate:.2g}"
     stages, default = run.pipeline["stages"], Rates()
     trains = [(i, name) for i, stage in enumerate(stages) for name, fields in stage.items() if "rates" in fields]
     place, stage = next((found for found in reversed(trains) if found[0] <= run.cursor), (0, "optimize"))

@@ -9,26 +9,20 @@ import re
 import time
 from collections.abc import Iterable
 from functools import cache
-from itertools import chain
 from pathlib import Path
 
 from pydantic import ValidationError
 
 from clsplat import __version__
-from clsplat.density.statistics import FOLDER as STATS_FOLDER
-from clsplat.density.statistics import SEEN, SplatStats
 from clsplat.errors import ClsplatError, ConfigError, DataError, NotFiniteError, OutputError
 from clsplat.files import atomic
-from clsplat.gaussians.tables import Gaussians
 from clsplat.names import CHECKPOINTS, PIPELINE
-from clsplat.training import archive, kept, sky
-from clsplat.training.adam import Adam
+from clsplat.training import archive, run_tables
 from clsplat.training.advice import lower_rate
 from clsplat.training.archive import Arrays
 from clsplat.training.changes import differences
-from clsplat.training.kept_tables import restore_sky
 from clsplat.training.run import Run
-from clsplat.training.state import State, check_tables
+from clsplat.training.state import State
 
 FORMAT = 4
 LOG = logging.getLogger("clsplat")
@@ -42,7 +36,7 @@ def save(run: Run, keep: int | None = None) -> Path:
     """
     if not run.whole:
         raise ClsplatError(f"{run.out}: step {run.step} is half done, so it is not saved; resume the run to go on")
-    if broken := run.model.gaussians.not_finite():
+    if broken := run.not_finite():
         raise NotFiniteError(f"step {run.step}: {set_aside(run, broken)}")
     path = _write(run, "refit" if run.is_refit else "step")
     run.status.saved_at = time.monotonic()
@@ -95,11 +89,7 @@ def load(path: Path) -> tuple[State, Arrays]:
         raise DataError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from error
     if state.cursor > len(state.pipeline.get("stages", ())):  # equal to it: all stages have ended
         raise DataError(f"it has no stage {state.cursor}")
-    own, best = kept.split_tables(tables)
-    kept.check(state.best, best)
-    behind, own = sky.split_tables(own)
-    sky.check_tables(behind)
-    check_tables(state, {name.removeprefix("gaussians/"): table for name, table in own.items()})
+    run_tables.check(state, tables)
     return state, tables
 
 
@@ -167,9 +157,10 @@ def _write(run: Run, kind: str) -> Path:
         stage_step=run.stage_step,
         acted=run.acted,
         edited=run.edited,
-        degree=run.model.degree,
-        zero_fresh=[name for name, table in run.model.gaussians.tables.items() if table.zero_fresh],
-        updates=run.adam.updates if run.adam else {},
+        field=run.learned_field.field.shape if run.learned_field else None,
+        degree=0 if run.learned_field else run.model.degree,
+        zero_fresh=[] if run.learned_field else run.model.gaussians.zero_fresh,
+        updates=run_tables.updates_of(run),
         numbers=run.numbers,
         best=run.best,
         train_seconds=run.train_seconds,
@@ -185,10 +176,7 @@ def _write(run: Run, kind: str) -> Path:
     )
     path = run.out / CHECKPOINTS / f"{kind}_{run.step:06d}.npz"
     with atomic(path) as file:
-        tables = ((_key(name), run.model.gaussians.get(name)) for name in run.model.gaussians.tables)
-        best = ((kept.FOLDER + name, table) for name, table in run.best_tables.items())
-        behind = ((sky.FOLDER + name, table) for name, table in (run.sky.tables() if run.sky else {}).items())
-        archive.write(file, state.model_dump(), chain(tables, behind, best))
+        archive.write(file, state.model_dump(), run_tables.tables_of(run))
     return path
 
 
@@ -217,30 +205,11 @@ def _take_changes(run: Run, path: Path, state: State) -> list[str]:
 
 
 def _restore(run: Run, state: State, tables: Arrays) -> None:
-    tables, run.best_tables = kept.split_tables(tables)
-    behind, tables = sky.split_tables(tables)
-    gaussians = Gaussians(run.device, {name.removeprefix("gaussians/"): table for name, table in tables.items()})
-    run.model = run.model_settings.model(gaussians, state.degree)
-    if state.updates:
-        run.adam = Adam(gaussians)
-        run.adam.updates = state.updates
-        columns = [name for name in tables if name.startswith(STATS_FOLDER) and name != SEEN]
-        run.stats = SplatStats(gaussians, [name.removeprefix(STATS_FOLDER) for name in columns])
-    for key, table in tables.items():  # those of rules, penalties and plug-ins too
-        name = key.removeprefix("gaussians/")
-        if name not in gaussians.tables:
-            gaussians.add(name, table.shape[1], zero_fresh=name in state.zero_fresh)
-        gaussians.set(name, table)
     run.step, run.cursor, run.stage_step = state.step, state.cursor, state.stage_step
     run.acted, run.edited, run.whole, run.numbers = state.acted, state.edited, True, state.numbers
     run.best = state.best
-    restore_sky(run, behind)
+    run_tables.restore(run, state, tables)
     if run.is_refit:
         run.divide(run.original.with_fold())
     run.train_seconds, run.cpu_seconds, run.metrics = state.train_seconds, state.cpu_seconds, state.metrics
     run.records.lines, run.inputs_before, run.written = state.records, state.inputs, state.written
-
-
-def _key(table: str) -> str:
-    """The key of a table in the file: parameters are in the folder `gaussians`."""
-    return table if "/" in table else f"gaussians/{table}"

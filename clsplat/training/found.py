@@ -21,3 +21,8 @@ def photographs_text(found: Mapping[str, Mapping[str, Any]]) -> str:
     except (AttributeError, KeyError, TypeError, ValueError):
         return ""
     return text + (f"; left out: {first_few(lost)}" if lost else "")
+
+
+def size_text(gaussians: int | None, parameters: int | None) -> str:
+    """Return how large what was trained is, in words."""
+    return f"{parameters or 0:,} parameters" if gaussians is None else f"{gaussians:,} Gaussians"

@@ -58,6 +58,20 @@ STAGES = {
     "hide_masked": "statistics",
     "sampling_interval": "filter",
     "filter_variance": "filter",
+    "draw_pixels": "cones",
+    "cast_rays": "cones",
+    "spread_edges": "cones",
+    "resample_edges": "cones",
+    "encode_frustums": "encode",
+    "encode_directions": "encode",
+    "dense_forward": "network",
+    "composite_forward": "colours of rays",
+    "composite_backward": "colours of rays, backward",
+    "dense_backward": "network backward",
+    "dense_weights": "network, weights",
+    "dense_biases": "network, weights",
+    "dense_sums": "network, weights",
+    "dense_update": "update",
 }
 ORDER = tuple(dict.fromkeys(STAGES.values()))
 

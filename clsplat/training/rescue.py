@@ -32,7 +32,7 @@ def finite_values(run: Run, view: str, losses: ViewLosses) -> tuple[float, float
 
     Raises NotFiniteError, with the state set aside, where the loss or the model is not finite.
     """
-    broken, loss = run.model.gaussians.not_finite(), losses.loss
+    broken, loss = run.not_finite(), losses.loss
     if broken or not math.isfinite(loss):
         told = checkpoint.set_aside(run, broken)
         raise NotFiniteError(f"step {run.step}, view '{view}': the loss is {loss}; {told}")
@@ -42,7 +42,7 @@ def finite_values(run: Run, view: str, losses: ViewLosses) -> tuple[float, float
 def _rescue(run: Run) -> str:
     """Save the state where it is whole; return a sentence about it."""
     try:
-        if run.whole and not run.model.gaussians.not_finite() and run.model.gaussians.count:
+        if run.whole and not run.not_finite() and run.gaussians != 0:
             return f"the state of step {run.step} is saved in {checkpoint.save(run)}; `clsplat resume` goes on from it"
         why = "the step that failed was not whole" if not run.whole else "the model is not finite"
     except Exception as error:  # the failure itself is what the user must see

@@ -1,6 +1,5 @@
 """The state of a pipeline while it runs."""
 
-import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -13,21 +12,25 @@ from numpy.typing import NDArray
 from clsplat import __version__
 from clsplat.density.statistics import SplatStats
 from clsplat.density.survey import Survey
-from clsplat.errors import ConfigError, Interrupted
+from clsplat.errors import ConfigError
 from clsplat.filters import FilterViews, ModelSettings, measure_intervals
 from clsplat.gaussians.model import Model, Rendering
 from clsplat.gaussians.tables import HIDDEN, INTERVAL2, PARAMETERS, DeviceModel
 from clsplat.losses.base import Loss
 from clsplat.opencl.device import Device
 from clsplat.pages.page import scene_name
+from clsplat.render.painter import Painter, Splats
 from clsplat.render.rasterizer import PIXEL_SUMS, Rasterizer
 from clsplat.scene.identity import Identity
 from clsplat.scene.scene import Scene
 from clsplat.settings import Settings
 from clsplat.training.adam import Adam
+from clsplat.training.field import LearnedField
 from clsplat.training.kept import Best, Tables
 from clsplat.training.memory import MemoryPlan, plan
 from clsplat.training.profile import clocks
+from clsplat.training.progress import Progress as Progress
+from clsplat.training.progress import Stopped as Stopped
 from clsplat.training.records import Records
 from clsplat.training.sky import LearnedSky
 from clsplat.training.status import StatusFile
@@ -35,26 +38,7 @@ from clsplat.views.exposures import Exposures
 from clsplat.views.photographs import Photographs
 from clsplat.views.texture import texture_quantile
 
-LOG = logging.getLogger("clsplat")
 Item = TypeVar("Item")
-
-
-class Stopped(Interrupted):
-    """A stage has ended before its end, since the run is to stop; it is repeated when the run goes on."""
-
-
-@dataclass(frozen=True)
-class Progress:
-    """The state of training, for the terminal."""
-
-    step: int
-    steps: int
-    loss: float
-    psnr: float  # dB, the mean over the training views of the last reports, before 8 bits
-    gaussians: int
-    milliseconds: float  # per step
-    seconds_left: float
-    growth_known: bool = True  # False: rules will make steps slower, and it is not known yet how much
 
 
 @dataclass
@@ -81,6 +65,7 @@ class Run:
     adam: Adam | None = None
     stats: SplatStats | None = None
     sky: LearnedSky | None = None  # of the model, where it has one
+    learned_field: LearnedField | None = None  # in the place of a model
     step: int = 0  # updates done, or in progress
     cursor: int = 0  # stage in progress
     stage_step: int = 0  # steps done in it
@@ -118,12 +103,27 @@ class Run:
 
     @model.setter
     def model(self, model: DeviceModel) -> None:
-        self._model = model
+        self._model, self.learned_field = model, None
+
+    def painter(self, rasterizer: Rasterizer | None = None) -> Painter:
+        """Return what renders views, with another rasterizer than the training's.  Raises ConfigError as `model`."""
+        if self.learned_field:
+            return self.learned_field.field
+        return Splats(rasterizer or self.rasterizer, self.model, self.photographs.background)
+
+    @property
+    def gaussians(self) -> int | None:
+        """The number of Gaussians; None where a field is trained."""
+        return None if self.learned_field else self.model.gaussians.count
+
+    def not_finite(self) -> list[str]:
+        """Return the names of what is trained that holds NaN or infinity."""
+        return self.learned_field.not_finite() if self.learned_field else self.model.gaussians.not_finite()
 
     def next_stage(self, cursor: int) -> None:
         """Come to the beginning of a stage."""
         self.cursor, self.stage_step, self.acted, self.edited = cursor, 0, 0, False
-        if self.has_model:
+        if self._model is not None:
             self.model.gaussians.tables.pop(HIDDEN, None)  # which a training has for itself
 
     @property
@@ -176,8 +176,8 @@ class Run:
 
     @property
     def has_model(self) -> bool:
-        """Whether there is a model, which a checkpoint can hold."""
-        return self._model is not None
+        """Whether there is a model or a field, which a checkpoint can hold."""
+        return self._model is not None or self.learned_field is not None
 
     def until_interrupted(self, items: Iterable[Item]) -> Iterator[Item]:
         """Yield the items of a long stage; raise Stopped between two of them when the run is to stop."""

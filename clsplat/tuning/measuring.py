@@ -4,6 +4,7 @@ import logging
 
 from clsplat.gaussians.model import Model
 from clsplat.metrics.views import mean, measure
+from clsplat.render.painter import Splats
 from clsplat.runs.model_file import ModelFile
 from clsplat.scene.decoding import decode_all, require_whole
 from clsplat.scene.identity import Identity
@@ -35,6 +36,8 @@ class Measurer:
     def figures(self, model: Model) -> tuple[float, float]:
         """Return PSNR, dB, and SSIM."""
         views = self.opened.scene.split(self.split)
-        results = measure(self.opened.rasterizer, model.upload(self.opened.device), views, self.photographs)
+        parts = self.opened.rasterizer, model.upload(self.opened.device), self.photographs.background
+        painter = Splats(*parts)
+        results = measure(painter, views, self.photographs)
         averages = mean(results)
         return averages["psnr"], averages["ssim"]

@@ -24,6 +24,7 @@ from clsplat.live.orders import Order
 from clsplat.live.preview import AIMS, QUALITY, SIDES, Preview
 from clsplat.metrics.views import render_view
 from clsplat.pipeline.loading import load
+from clsplat.render.painter import Splats
 from clsplat.runs import folders, opening, runner
 from clsplat.runs.experiment import Job
 from clsplat.runs.failures import failures_recorded
@@ -231,7 +232,7 @@ def test_a_picture_of_a_view_is_its_render(live, tiny_scene, tmp_path):
     for view in run.scene.views[:3]:
         jpeg = Preview(run).draw(Order(1, view, "still")).jpeg
         photograph = run.photographs.get(view)
-        render = render_view(run.rasterizer, run.model, photograph.camera, run.photographs.background)
+        render = render_view(Splats(run.rasterizer, run.model, run.photographs.background), photograph.camera)
         assert np.ptp(render) > 60
         _, data = cv2.imencode(".jpg", np.ascontiguousarray(render[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
         assert jpeg == data.tobytes()

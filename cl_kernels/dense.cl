@@ -1,0 +1,182 @@
+/* Dense layers of a network, forward and backward, as matrix products on tiles of samples (layers.h):
+ *
+ *   forward   y = larger(b + W^T x, lowest)               lowest: 0 for a ReLU, -FLT_MAX for none
+ *   backward  dL/dx = W dL/dy, 0 where x <= lowest        dL/dW = sum over samples of x dL/dy^T,  dL/db of dL/dy
+ *
+ * A weight is at [input, output].  Each sum has one order: over rows, or over the samples of CHUNK tiles and then over
+ * chunks; so there are no atomics, and no result depends on the number of threads.  No local memory. */
+#include "adam.h"
+#include "layers.h"
+
+#define UPDATE_EPSILON 1.0e-8f  // of Adam: the default of its paper, which Mip-NeRF keeps
+
+/* One item = BLOCK outputs of BLOCK vectors of samples; the outputs of a tile follow each other. */
+__kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
+void dense_forward(
+    __global const float *restrict inputs,      // [T,input_rows,SAMPLES]
+    __global const float *restrict parameters,  // [P] at first_parameter: weights [input_count,output_count], biases
+    __global float *restrict outputs,           // [T,output_rows,SAMPLES]
+    const uint first_parameter,
+    const uint input_rows,
+    const uint first_input,
+    const uint input_count,
+    const uint output_rows,
+    const uint output_count,
+    const float lowest,
+    const uint count)                           // items: T * COLUMNS * output_count / BLOCK
+{
+    const uint i = get_global_id(0);
+    if (i >= count)
+        return;
+    const uint blocks = output_count / BLOCK, column = i % COLUMNS * LANES;
+    const uint output = i / COLUMNS % blocks * BLOCK, tile = i / (COLUMNS * blocks);
+    __global const float *weights = parameters + first_parameter + output;
+    __global const float *biases = weights + input_count * output_count;
+    VF sums[BLOCK * BLOCK];
+    for (uint k = 0; k < BLOCK; k++)
+        for (uint v = 0; v < BLOCK; v++)
+            sums[k * BLOCK + v] = (VF)(biases[k]);
+    multiply_rows(sums, inputs + (tile * input_rows + first_input) * SAMPLES + column, weights, 1, output_count,
+                  input_count);
+    __global float *found = outputs + (tile * output_rows + output) * SAMPLES + column;
+    for (uint k = 0; k < BLOCK; k++)
+        for (uint v = 0; v < BLOCK; v++)
+            VSTORE(larger(sums[k * BLOCK + v], (VF)(lowest)), found + k * SAMPLES + v * COLUMNS * LANES);
+}
+
+/* Derivatives by the first derived_count inputs of a layer.  kept: 0, or 1 to add to what is there, before the gate.
+ * One item = BLOCK inputs of BLOCK vectors of samples. */
+__kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
+void dense_backward(
+    __global const float *restrict by_outputs,  // [T,output_rows,SAMPLES]
+    __global const float *restrict parameters,  // [P] as dense_forward
+    __global const float *restrict inputs,      // [T,input_rows,SAMPLES]
+    __global float *restrict by_inputs,         // [T,derived_count,SAMPLES]
+    const uint first_parameter,
+    const uint input_rows,
+    const uint derived_count,
+    const uint output_rows,
+    const uint output_count,
+    const float lowest,                         // inputs up to it have no gradient
+    const uint kept,
+    const uint count)                           // items: T * COLUMNS * derived_count / BLOCK
+{
+    const uint i = get_global_id(0);
+    if (i >= count)
+        return;
+    const uint blocks = derived_count / BLOCK, column = i % COLUMNS * LANES;
+    const uint input = i / COLUMNS % blocks * BLOCK, tile = i / (COLUMNS * blocks);
+    __global float *found = by_inputs + (tile * derived_count + input) * SAMPLES + column;
+    __global const float *gate = inputs + (tile * input_rows + input) * SAMPLES + column;
+    VF sums[BLOCK * BLOCK];
+    for (uint k = 0; k < BLOCK; k++)
+        for (uint v = 0; v < BLOCK; v++)
+            sums[k * BLOCK + v] = kept ? VLOAD(found + k * SAMPLES + v * COLUMNS * LANES) : (VF)(0.0f);
+    multiply_rows(sums, by_outputs + tile * output_rows * SAMPLES + column,
+                  parameters + first_parameter + input * output_count, output_count, 1, output_count);
+    for (uint k = 0; k < BLOCK; k++)
+        for (uint v = 0; v < BLOCK; v++) {
+            const uint at = k * SAMPLES + v * COLUMNS * LANES;
+            VSTORE((VLOAD(gate + at) <= lowest ? (VF)(0.0f) : sums[k * BLOCK + v]), found + at);
+        }
+}
+
+/* Derivatives by the weights of a layer: sums over the samples of a chunk of tiles.
+ * One item = BLOCK inputs by BLOCK outputs of one chunk. */
+__kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
+void dense_weights(
+    __global const float *restrict inputs,      // [T,input_rows,SAMPLES]
+    __global const float *restrict by_outputs,  // [T,output_rows,SAMPLES]
+    __global float *restrict partials,          // [chunks,P]
+    const uint first_parameter,
+    const uint parameter_count,                 // P
+    const uint input_rows,
+    const uint first_input,
+    const uint input_count,
+    const uint output_rows,
+    const uint output_count,
+    const uint tiles,                           // T
+    const uint count)                           // items: chunks * input_count * output_count / BLOCK^2
+{
+    const uint i = get_global_id(0);
+    if (i >= count)
+        return;
+    const uint output_blocks = output_count / BLOCK, input_blocks = input_count / BLOCK;
+    const uint output = i % output_blocks * BLOCK, input = i / output_blocks % input_blocks * BLOCK;
+    const uint chunk = i / (output_blocks * input_blocks);
+    VF sums[BLOCK * BLOCK];
+    for (uint k = 0; k < BLOCK; k++)
+        for (uint m = 0; m < BLOCK; m++)
+            sums[k * BLOCK + m] = (VF)(0.0f);
+    const uint first = chunk * CHUNK, own = tiles - first < CHUNK ? tiles - first : CHUNK;
+    multiply_samples(sums, inputs + (first * input_rows + first_input + input) * SAMPLES,
+                     by_outputs + (first * output_rows + output) * SAMPLES, input_rows * SAMPLES, output_rows * SAMPLES,
+                     own);
+    __global float *found = partials + chunk * parameter_count + first_parameter + input * output_count + output;
+    for (uint k = 0; k < BLOCK; k++)
+        for (uint m = 0; m < BLOCK; m++)
+            found[k * output_count + m] = sum_lanes(sums[k * BLOCK + m]);
+}
+
+/* Derivatives by the biases of a layer: sums over the samples of a chunk of tiles.  One item = one output of one
+ * chunk. */
+__kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
+void dense_biases(
+    __global const float *restrict by_outputs,  // [T,output_rows,SAMPLES]
+    __global float *restrict partials,          // [chunks,P]
+    const uint first_parameter,                 // of the biases
+    const uint parameter_count,                 // P
+    const uint output_rows,
+    const uint output_count,
+    const uint tiles,                           // T
+    const uint count)                           // items: chunks * output_count
+{
+    const uint i = get_global_id(0);
+    if (i >= count)
+        return;
+    const uint output = i % output_count, chunk = i / output_count;
+    VF sum = (VF)(0.0f);
+    for (uint tile = chunk * CHUNK; tile < (chunk + 1) * CHUNK && tile < tiles; tile++)
+        for (uint at = 0; at < SAMPLES; at += LANES)
+            sum += VLOAD(by_outputs + (tile * output_rows + output) * SAMPLES + at);
+    partials[chunk * parameter_count + first_parameter + output] = sum_lanes(sum);
+}
+
+/* Add the partial sums to the gradient, in the order of the chunks.  One item = LANES parameters. */
+__kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
+void dense_sums(
+    __global const float *restrict partials,  // [chunks,P]
+    __global float *restrict gradient,        // [P]
+    const uint chunks,
+    const uint count)                         // P, a multiple of PARAMETER_LINE
+{
+    const uint i = get_global_id(0) * LANES;
+    if (i >= count)
+        return;
+    VF sum = VLOAD(gradient + i);
+    for (uint chunk = 0; chunk < chunks; chunk++)
+        sum += VLOAD(partials + chunk * count + i);
+    VSTORE(sum, gradient + i);
+}
+
+/* Adam (Kingma and Ba 2015).  One item = LANES parameters. */
+__kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
+void dense_update(
+    __global float *restrict parameters,      // [P]
+    __global float *restrict moment1,         // [P]
+    __global float *restrict moment2,         // [P]
+    __global const float *restrict gradient,  // [P]
+    const float rate,                         // learning rate / (1 - BETA1^t)
+    const float correction2,                  // 1 / (1 - BETA2^t)
+    const uint count)                         // P, a multiple of PARAMETER_LINE
+{
+    const uint i = get_global_id(0) * LANES;
+    if (i >= count)
+        return;
+    const VF g = VLOAD(gradient + i);
+    const VF m = BETA1 * VLOAD(moment1 + i) + (1.0f - BETA1) * g;
+    const VF v = BETA2 * VLOAD(moment2 + i) + (1.0f - BETA2) * (g * g);
+    VSTORE(m, moment1 + i);
+    VSTORE(v, moment2 + i);
+    VSTORE(VLOAD(parameters + i) - rate * m / (sqrt(v * correction2) + UPDATE_EPSILON), parameters + i);
+}

@@ -1,0 +1,1 @@
+"""Fields of densities and colours: a network in the place of Gaussians."""

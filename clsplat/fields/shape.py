@@ -1,0 +1,141 @@
+"""The shape of a field: its network, its encodings and its samples, and where the network's parameters lie."""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from clsplat.opencl.program import constants
+from clsplat.settings import Settings
+
+LAYERS = constants("layers.h")
+BLOCK, SAMPLES, LINE = (int(LAYERS[name]) for name in ("BLOCK", "SAMPLES", "PARAMETER_LINE"))
+COLOUR_ROWS = int(constants("composite.cl")["COLOUR_ROWS"])
+COLOURS, DENSITIES = 3, 1  # outputs of the network
+LANES_MAX = 16
+Features = Annotated[int, Field(ge=BLOCK, le=1024, multiple_of=BLOCK)]
+
+
+def in_blocks(count: int) -> int:
+    """Return the rows of so many features: a multiple of BLOCK."""
+    return -(-count // BLOCK) * BLOCK
+
+
+@dataclass(frozen=True)
+class Layer:
+    """A dense layer and the place of its parameters: weights [rows, columns], then biases [columns].
+
+    Rows and columns beyond the inputs and outputs fill blocks: they are zero and stay so.
+    """
+
+    name: str
+    first: int  # parameter
+    inputs: tuple[int, ...]  # rows that are inputs
+    rows: int
+    outputs: int
+    columns: int
+
+    @property
+    def first_bias(self) -> int:
+        return self.first + self.rows * self.columns
+
+    @property
+    def end(self) -> int:
+        return self.first_bias + self.columns
+
+
+class FieldShape(Settings):
+    """A field of Mip-NeRF (Barron et al. 2021): integrated positional encoding, a network that both levels share."""
+
+    near: Annotated[float, Field(gt=0)] = 2.0
+    """Depth at which the samples of a ray begin, scene units; 2 for the Blender scenes."""
+    far: Annotated[float, Field(gt=0)] = 6.0
+    """Depth at which they end, scene units; 6 for the Blender scenes."""
+    coarse_samples: Annotated[int, Field(ge=LANES_MAX, le=1024, multiple_of=LANES_MAX)] = 128
+    """Samples of a ray in the coarse level."""
+    fine_samples: Annotated[int, Field(ge=LANES_MAX, le=1024, multiple_of=LANES_MAX)] = 128
+    """Samples of a ray in the fine level, placed by the weights of the coarse one."""
+    depth: Annotated[int, Field(ge=1, le=32)] = 8
+    """Layers of the trunk."""
+    width: Features = 256
+    """Outputs of each of them."""
+    skip: Annotated[int, Field(ge=0)] | None = 4
+    """Layer of the trunk, counted from 0, whose outputs the encoded position joins; without it, none."""
+    colour_width: Features = 128
+    """Outputs of the layer that reads the direction."""
+    degrees: Annotated[int, Field(ge=1, le=24)] = 16
+    """Frequencies of the position's encoding: 1, 2, 4, …"""
+    direction_degrees: Annotated[int, Field(ge=0, le=8)] = 4
+    """Frequencies of the direction's encoding."""
+
+    @model_validator(mode="after")
+    def _in_order(self) -> "FieldShape":
+        if self.far <= self.near:
+            raise ValueError(f"expected 'far' beyond 'near', {self.near:g}; it is {self.far:g}")
+        if self.skip is not None and self.skip >= self.depth - 1:
+            raise ValueError(f"expected 'skip' below {self.depth - 1}, so that a layer follows, or none")
+        return self
+
+    @property
+    def position_rows(self) -> int:
+        """Rows of the encoded position."""
+        return in_blocks(6 * self.degrees)
+
+    @property
+    def direction_rows(self) -> int:
+        """Rows of the encoded direction."""
+        return in_blocks(3 + 6 * self.direction_degrees)
+
+    @property
+    def layers(self) -> list[Layer]:
+        """The layers in their order: the trunk, density, bottleneck, condition, colour."""
+        width, position, direction = self.width, 6 * self.degrees, 3 + 6 * self.direction_degrees
+        described = [("trunk 0", [position], width)]  # the parts of the inputs, each in whole blocks; the outputs
+        for i in range(1, self.depth):
+            described.append((f"trunk {i}", [width, position] if i - 1 == self.skip else [width], width))
+        described += [("density", [width], DENSITIES), ("bottleneck", [width], width)]
+        described += [("condition", [width, direction], self.colour_width)]
+        described += [("colour", [self.colour_width], COLOURS)]
+        found, first = list[Layer](), 0
+        for name, parts, outputs in described:
+            inputs, rows = list[int](), 0
+            for part in parts:
+                inputs += range(rows, rows + part)
+                rows += in_blocks(part)
+            found.append(Layer(name, first, tuple(inputs), rows, outputs, in_blocks(outputs)))
+            first = found[-1].end
+        return found
+
+    @property
+    def parameters(self) -> int:
+        """Length of the table of parameters: that of all layers, in whole lines."""
+        return -(-self.layers[-1].end // LINE) * LINE
+
+    @property
+    def learned(self) -> int:
+        """Parameters that are learned: those that do not fill blocks."""
+        return sum((len(layer.inputs) + 1) * layer.outputs for layer in self.layers)
+
+    def first_parameters(self, seed: int) -> NDArray[np.float32]:
+        """Return first parameters, [parameters]: weights uniform within the square root of 6 / (inputs + outputs)
+        (Glorot and Bengio 2010) and biases of 0, as in the released code."""
+        random, values = np.random.default_rng([seed, self.learned]), np.zeros(self.parameters, np.float32)
+        for layer in self.layers:
+            limit = np.sqrt(6 / (len(layer.inputs) + layer.outputs))
+            weights = np.zeros((layer.rows, layer.columns), np.float32)
+            drawn = random.uniform(-limit, limit, (len(layer.inputs), layer.outputs))
+            weights[np.ix_(layer.inputs, range(layer.outputs))] = drawn
+            values[layer.first : layer.first_bias] = weights.ravel()
+        return values
+
+    def weights(self, parameters: NDArray[np.floating]) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+        """Return the weights [inputs, outputs] and biases [outputs] of each layer, without what fills blocks."""
+        found = []
+        for layer in self.layers:
+            table = parameters[layer.first : layer.first_bias].reshape(layer.rows, layer.columns)
+            own = table[np.ix_(layer.inputs, range(layer.outputs))]
+            biases = parameters[layer.first_bias : layer.first_bias + layer.outputs]
+            found.append((own.astype(np.float64), biases.astype(np.float64)))
+        return found

@@ -1,0 +1,81 @@
+"""The tables of a run in its checkpoint: those of a field, or of Gaussians, what is behind them, and the best model."""
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.density.statistics import FOLDER as STATS_FOLDER
+from clsplat.density.statistics import SEEN, SplatStats
+from clsplat.errors import DataError
+from clsplat.gaussians.tables import Gaussians
+from clsplat.training import field, kept, sky
+from clsplat.training.adam import Adam
+from clsplat.training.archive import Arrays
+from clsplat.training.field import LearnedField
+from clsplat.training.kept_tables import restore_sky
+from clsplat.training.run import Run
+from clsplat.training.state import State, check_tables
+
+UPDATES = "field"  # name of their number
+
+
+def tables_of(run: Run) -> Iterator[tuple[str, NDArray[np.float32]]]:
+    """Yield the tables by their keys in the file, each copied to the host when it is its turn."""
+    if run.learned_field:
+        yield from ((field.FOLDER + name, table) for name, table in run.learned_field.tables().items())
+        return
+    gaussians = run.model.gaussians
+    yield from ((_key(name), gaussians.get(name)) for name in gaussians.tables)
+    yield from ((sky.FOLDER + name, table) for name, table in (run.sky.tables() if run.sky else {}).items())
+    yield from ((kept.FOLDER + name, table) for name, table in run.best_tables.items())
+
+
+def updates_of(run: Run) -> dict[str, int]:
+    """Return how often Adam has updated each of its tables."""
+    if run.learned_field:
+        return {UPDATES: run.learned_field.updates}
+    return run.adam.updates if run.adam else {}
+
+
+def check(state: State, tables: Arrays) -> None:
+    """Raise DataError for tables that are not those of the state."""
+    if state.field:
+        if state.updates.keys() != {UPDATES}:
+            raise DataError("it counts updates of other parameters than those of its field")
+        field.check_tables(state.field, *field.split_tables(tables))
+        return
+    own, best = kept.split_tables(tables)
+    kept.check(state.best, best)
+    behind, own = sky.split_tables(own)
+    sky.check_tables(behind)
+    check_tables(state, {name.removeprefix("gaussians/"): table for name, table in own.items()})
+
+
+def restore(run: Run, state: State, tables: Arrays) -> None:
+    """Put the tables of a state into a run."""
+    if state.field:
+        own, _ = field.split_tables(tables)
+        run.learned_field = LearnedField.of_tables(state.field, own, run.photographs.background)
+        run.learned_field.updates = state.updates[UPDATES]
+        return
+    tables, run.best_tables = kept.split_tables(tables)
+    behind, tables = sky.split_tables(tables)
+    gaussians = Gaussians(run.device, {name.removeprefix("gaussians/"): table for name, table in tables.items()})
+    run.model = run.model_settings.model(gaussians, state.degree)
+    if state.updates:
+        run.adam = Adam(gaussians)
+        run.adam.updates = state.updates
+        columns = [name for name in tables if name.startswith(STATS_FOLDER) and name != SEEN]
+        run.stats = SplatStats(gaussians, [name.removeprefix(STATS_FOLDER) for name in columns])
+    for key, table in tables.items():  # those of rules, penalties and plug-ins too
+        name = key.removeprefix("gaussians/")
+        if name not in gaussians.tables:
+            gaussians.add(name, table.shape[1], zero_fresh=name in state.zero_fresh)
+        gaussians.set(name, table)
+    restore_sky(run, behind)
+
+
+def _key(table: str) -> str:
+    """The key of a table in the file: parameters are in the folder `gaussians`."""
+    return table if "/" in table else f"gaussians/{table}"
