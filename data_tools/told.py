@@ -27,8 +27,8 @@ def left_out(figures: Mapping[str, Any]) -> list[str]:
         named = first_few([f"{name} ({reasons[name]})" if name in reasons else name for name in missing])
         texts.append(
             f"{len(missing)} of {figures['registered'] + len(missing)} photographs could not be placed: {named}; "
-            "the scene is made of the others: for more, add photographs from places between, or raise "
-            "match_features.neighbours"
+            "the scene is made of the others: for more, add photographs from places between, or find more features "
+            "(find_features.long_side)"
         )
     if others := figures.get("other_models"):
         texts.append(

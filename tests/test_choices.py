@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import clsplat
 from clsplat.errors import ConfigError
 from clsplat.pipeline.choosing import choose, undone
 from clsplat.pipeline.loading import load
@@ -155,6 +156,10 @@ def test_a_choice_may_keep_photographs_out_to_choose_by(tiny_scene, tmp_path):
     assert has_ended(asked, tmp_path / "run")
     written = load(str(tmp_path / "run" / "pipeline.yaml"))
     run_pipeline(written, tmp_path / "again", None, "new")
+    assert digest(tmp_path / "again") == digest(tmp_path / "run")
+    for name in ("point_cloud.ply", "metrics.json", "checksums.json"):
+        (tmp_path / "run" / name).unlink()
+    clsplat.resume(tmp_path / "run")  # by the pipeline that the folder has, without choices to be made
     assert digest(tmp_path / "again") == digest(tmp_path / "run")
 
 

@@ -244,7 +244,7 @@ def test_a_damaged_record_of_a_search_is_told_with_its_remedy(text, few_steps, t
 def test_a_target_that_no_file_meets_leaves_page_and_nearest_file(few_steps, tmp_path):
     with pytest.raises(ConfigError, match=r"no file meets it; the nearest, .*_degree_0_balanced\.spz") as error:
         clsplat.compress_model(few_steps, target="1B", out=tmp_path / "out", format="spz", keep=[1.0])
-    assert "ask for less" in str(error.value)
+    assert "give a larger size" in str(error.value)
     assert not (tmp_path / "out" / "compressed.spz").exists()
     assert "No file meets" in (tmp_path / "out" / "compress.html").read_text()
     assert detect(tmp_path / "out" / "trials" / "keep_100_degree_0_balanced.spz").name == "SPZ"

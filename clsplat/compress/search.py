@@ -147,7 +147,7 @@ def _finished(search: Search, form: Format) -> dict[str, Any]:
         near = search.target.nearest(search.points)
         raise ConfigError(
             f"--target {search.target.text}: no file meets it; the nearest, {search.out / near.file}, has "
-            f"{near.bytes / 1e6:.3g} MB and {near.psnr - psnr:+z.2f} dB; ask for less, or train for longer with --steps"
+            f"{near.bytes / 1e6:.3g} MB and {near.psnr - psnr:+z.2f} dB; {search.target.remedy}"
             + (f"; {file.name} there is of another target" if file.exists() else "")
         )
     _copy(search.out / chosen.file, file)

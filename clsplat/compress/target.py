@@ -1,5 +1,6 @@
 """What a compressed model may weigh, or lose."""
 
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -40,6 +41,8 @@ class Target:
         if found is None or unit not in (*UNITS, "db"):
             raise ConfigError(f"--target {quoted(text)}: {EXPECTED}")
         value = float(found[1])
+        if not math.isfinite(value * UNITS.get(unit, 1)):
+            raise ConfigError(f"--target {quoted(text)}: {EXPECTED}")
         if unit == "db":
             if value > 0:
                 raise ConfigError(f"--target {quoted(text)}: a gain; {EXPECTED}")
@@ -65,6 +68,13 @@ class Target:
         """Return the file that misses the target least."""
         smallest, best = min(points, key=lambda point: point.bytes), max(points, key=lambda point: point.psnr)
         return best if self.most is None else smallest
+
+    @property
+    def remedy(self) -> str:
+        """What to do where no file meets it."""
+        if self.most is not None:
+            return "give a larger size, or a smaller share of the Gaussians with --keep"
+        return "allow a larger loss, or train for longer with --steps"
 
     def ends(self, rung: Sequence[Point], psnr: float) -> bool:
         """Return whether files of fewer Gaussians cannot be better: all of these fit, or none is good enough."""

@@ -79,7 +79,9 @@ def mean_basis(form: NDArray[np.float64]) -> NDArray[np.float64]:
     products = values[:, pairs[0]] * values[:, pairs[1]]
     told = np.linalg.lstsq(products, values, rcond=1e-9)[0]
     moments = form * (count / (4 * np.pi) / np.trace(form))  # of |Y|², K / 4 pi from everywhere
-    return np.asarray(np.round(moments[pairs] @ told, DIGITS))
+    mean = moments[pairs] @ told
+    size = mean @ np.linalg.solve(moments, mean)  # of a distribution at most 1: a form that has none tells too much
+    return np.asarray(np.round(mean / np.sqrt(max(size, 1.0)), DIGITS))
 
 
 def rounded_rows(rest: Floats, steps: NDArray[np.float32], form: NDArray[np.float64]) -> NDArray[np.float32]:

@@ -40,6 +40,7 @@ LOG = logging.getLogger("clsplat")
 HEADER4 = 32  # bytes, of version 4
 GZIP_RATIO = 1032  # most bytes that one byte of deflate can stand for
 RATIO4 = 1024  # most bytes of positions that one byte of version 4 may stand for, as in Niantic's library
+ALIKE = 1 << 27  # bytes of all planes that a file of version 4 of any size may stand for: 0.6 GB in memory
 BLOCK = 1 << 16  # bytes at once
 LEVEL = 12  # of libdeflate, its best: 3 % fewer bytes than zlib's
 GZIP_START = b"\x1f\x8b\x08\0\0\0\0\0\2\xff"  # without a time and a system: the same model gives the same bytes
@@ -79,11 +80,16 @@ def write_spz(path: Path, splats: SplatFile, options: Writing) -> str:
         frames = [zstd.compress(plane) for plane in streams]
         table = b"".join(struct.pack("<2Q", len(f), len(s)) for f, s in zip(frames, streams, strict=True))
         content = start + struct.pack("<BI12x", len(streams), HEADER4) + table + b"".join(frames)
-        if len(planes[0]) > len(content) * RATIO4:
+        if len(planes[0]) > len(content) * RATIO4 or sum(map(len, planes)) > _most_of_4(len(content)):
             raise DataError(f"{path}: so many equal splats are refused by readers of version 4; use version 3")
     with written(path) as file:
         file.write(content)
     return file.sha256
+
+
+def _most_of_4(held: int) -> int:
+    """Bytes of all planes for which a file of version 4 with so many bytes may stand."""
+    return max(held * RATIO4, ALIKE)
 
 
 def _gzip(data: bytes) -> bytes:
@@ -160,6 +166,7 @@ def _unpacked_4(path: Path, data: bytes) -> tuple[Header, Parameters]:
             f"{len(data)} bytes: copy or export it again"
         )
     _check_size(path, header, header.sizes[0], len(data) * RATIO4)
+    _check_size(path, header, sum(header.sizes), _most_of_4(len(data)))
     if header.flags & EXTENSIONS:
         _check_extensions(path, io.BytesIO(data[HEADER4:table]).read)
     start, frames = table + 16 * streams, []

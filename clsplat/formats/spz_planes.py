@@ -201,7 +201,7 @@ def _rounded_sh(
     levels = np.clip(rest, -1, 1) * np.float32(128)
     if bits is None and sh_steps.max(initial=1) > 1:
         form = visible_form(rest)
-        found = np.minimum(rounded_rows(levels, sh_steps, form), 128 - sh_steps[:, None])
+        found = np.clip(rounded_rows(levels, sh_steps, form), -128, 128 - sh_steps[:, None])
         base = base_for(p["sh_base"], rest - found / 128, form)
     else:
         columns = np.full(rest.shape[1], 2.0 ** (8 - (bits or WHOLE)[1]), np.float32)

@@ -90,9 +90,9 @@ def verdict(found: dict[str, Any]) -> str:
         return f"{found['model']}: valid"
     if not found["gaussians"]:
         return f"{found['model']}: it holds no Gaussians; export it again"
-    remedy = (
-        "write it again" if found["format"] == "streamed SOG" else "export it again, or mend it with `clsplat convert`"
-    )
+    remedy = "write it again" if found["format"] == "streamed SOG" else "export it again"
+    if found["degenerate"]["not_finite"]:
+        remedy += ", or drop those that are not finite with `clsplat convert`"
     return f"{found['model']}: {'; '.join(found['findings'])}; {remedy}"
 
 

@@ -1,6 +1,7 @@
 """Model files into one of another format: merged, moved, cropped, and with fewer Gaussians or harmonics."""
 
 import logging
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -37,7 +38,7 @@ class Changes:
         """Return the changed model.  Raises DataError where nothing is left, ConfigError for a transform too far."""
         kept = model[model.opacities >= self.drop_below] if self.drop_below else model
         if self.transform is not None:
-            scale = float(np.cbrt(np.linalg.det(self.transform[:3, :3])))
+            scale = round(float(np.cbrt(np.linalg.det(self.transform[:3, :3]))), 12)
             try:
                 kept = kept.transformed(scale, self.transform[:3, :3] / scale, self.transform[:3, 3])
             except ValueError as error:
@@ -204,10 +205,9 @@ def crop_of(text: str) -> tuple[float, ...]:
 
 def sh_bits_of(text: str) -> tuple[int, int]:
     """Return the bits of `A/B`: of band 1 and of the others.  Raises ConfigError."""
-    first, _, others = text.partition("/")
-    if not (first.isdecimal() and others.isdecimal() and 1 <= int(first) <= 8 and 1 <= int(others) <= 8):
+    if not (found := re.fullmatch("([1-8])/([1-8])", text)):
         raise ConfigError(f"--sh-bits {quoted(text)}: expected two numbers from 1 to 8, such as 8/6")
-    return int(first), int(others)
+    return int(found[1]), int(found[2])
 
 
 def checked_degree(degree: int | None) -> int | None:

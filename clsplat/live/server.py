@@ -5,6 +5,7 @@ import os
 import socket
 import socketserver
 import threading
+import time
 from collections.abc import Callable
 from contextlib import suppress
 from time import sleep
@@ -19,7 +20,7 @@ LOOPBACK = "127.0.0.1"
 PORT, TRIED = 8710, 20  # the first port that is tried where none is given, and how many
 CONNECTIONS = 32  # at a time; browsers keep six
 IDLE = 15.0  # seconds until a connection that asks for nothing more is closed
-HEAD = 2.0  # seconds that the beginning of a request, and each line of it, may take
+HEAD = 2.0  # seconds that the head of a request may take
 RATE, BURST = 30.0, 120.0  # answers a second, and at once after a rest: a page opens with many small pictures
 POLL = 0.1  # seconds until the server sees that it is to stop
 
@@ -132,13 +133,14 @@ class _Connection(socketserver.StreamRequestHandler):
     def _head(self) -> bytes | None:
         """The lines up to the empty one, or more than LONGEST bytes; None at the end."""
         self.rfile.peek(1)  # type: ignore[attr-defined]
-        self.connection.settimeout(HEAD)
-        head = b""
-        while len(head) <= LONGEST:
-            line = self.rfile.readline(LONGEST + 1 - len(head) + 1)
-            if not line:
+        head, line, end = b"", b"", time.monotonic() + HEAD
+        while len(head + line) <= LONGEST:
+            self.connection.settimeout(max(end - time.monotonic(), 1e-3))  # one end for all: bytes may come one by one
+            if not (byte := self.rfile.read1(1)):
                 return None
+            line += byte
             if line in (b"\r\n", b"\n"):
                 return head
-            head += line
-        return head
+            if byte == b"\n":
+                head, line = head + line, b""
+        return head + line

@@ -34,6 +34,7 @@ def _by_capture(pipeline: Pipeline, run: Run) -> Pipeline:
     chosen = replace(pipeline, settings=choose(pipeline.settings, measured(run.scene)))
     if chosen.settings.scene.validation != pipeline.settings.scene.validation:
         run.divide(chosen.settings.scene.split.with_validation(run.original.with_fold()))
+        run.identity = run.identity and run.identity.divided(run.original)  # as of a run that begins with that split
     for one in chosen.settings.choices:
         LOG.info("%s", one.told)
     return chosen

@@ -46,6 +46,8 @@ class Source:
         if trained is None and scene is None:
             if model.is_dir() and not located(model).is_file():
                 raise _no_model(model)
+            if not model.exists():
+                raise DataError(f"{model}: not found; expected a model file or a run folder")
             raise ConfigError(
                 f"{model}: a model file does not name its scene; give the folder of a scene, or a run folder"
             )

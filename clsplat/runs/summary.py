@@ -9,7 +9,11 @@ from clsplat.names import METRICS
 from clsplat.reading import read_json
 from clsplat.training.found import photographs_text, size_text
 
-TITLES = {"export": "model", "render": "renders"}  # of what these stages write; others give their own names
+TITLES = {
+    "export": "model",
+    "render": "renders",
+    "optimize": "pictures",
+}  # of what these stages write; others give their own names
 BEFORE_FILES = {"export": "point_cloud.ply", "render": "renders", "viewer": "viewer.html", "report": "report.html"}
 SHORTEST = 0.5  # seconds of a stage that is told
 
@@ -39,13 +43,13 @@ def _lines(folder: Path, metrics: dict[str, Any]) -> Iterator[str]:
     if scene := metrics.get("scene"):
         yield f"  scene    {scene}" + (f"; {placed}" if placed else "")
     files = {stage: folder / name for stage, name in metrics.get("files", BEFORE_FILES).items()}
-    for stage, file in files.items():
-        if file.exists():
-            yield f"  {TITLES.get(stage, stage):<8} {file}"
+    told = {TITLES.get(stage, stage): file for stage, file in files.items() if file.exists()}
+    for name, file in told.items():
+        yield f"  {name:<{max(8, *map(len, told))}} {file}"
     steps = {name: found.get("seconds", 0) for name, found in metrics.get("preparation", {}).items()}
     spent = {**steps, **metrics.get("seconds", {})}
-    if told := [f"{name} {seconds:.0f} s" for name, seconds in spent.items() if seconds >= SHORTEST]:
-        yield f"  time     {', '.join(told)}"
+    if long := [f"{name} {seconds:.0f} s" for name, seconds in spent.items() if seconds >= SHORTEST]:
+        yield f"  time     {', '.join(long)}"
     page = next((files[stage] for stage in ("report", "viewer") if stage in files and files[stage].exists()), None)
     if page:
         longer = f"; `clsplat resume {folder} --steps {2 * metrics['steps']}` trains longer"

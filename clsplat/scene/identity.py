@@ -3,7 +3,7 @@
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +35,12 @@ class Identity:
         """Return the identity of a scene whose image files were decoded."""
         train, test, fold = ({view.name: _row(view, files) for view in scene.split(name)} for name in SPLITS)
         return cls(train, test, _hash(scene.points.positions, scene.points.colours) if scene.points else "", fold)
+
+    def divided(self, scene: Scene) -> "Identity":
+        """Return the identity of the same views in the splits of `scene`."""
+        rows = self._rows
+        train, test, fold = ({view.name: rows[view.name] for view in scene.split(name)} for name in SPLITS)
+        return replace(self, train=train, test=test, validation=fold)
 
     @property
     def digest(self) -> str:

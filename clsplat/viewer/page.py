@@ -69,8 +69,13 @@ class Page:
     def fitting(self) -> int:
         """The number of splats of each model with which a page that is too large is not."""
         splats = sum(len(packed.data) * 4 / 3 for packed in self.models.values()) / 1e6
-        share = max(0.0, MAX_SIZE - (self.size - splats)) / max(splats, 1e-9)
-        return int(MARGIN * share * min(packed.count for packed in self.models.values()))
+        room = max(0.0, MAX_SIZE - (self.size - splats))
+        low, high = 0, max(packed.count for packed in self.models.values())
+        while low < high:  # a model with fewer splats keeps all of them
+            middle = (low + high + 1) // 2
+            held = sum(len(one.data) * 4 / 3 * min(1, middle / one.count) for one in self.models.values()) / 1e6
+            low, high = (middle, high) if held <= MARGIN * room else (low, middle - 1)
+        return low
 
     def write(self, path: Path) -> None:
         """Write the page.  Raises OutputError where it is too large for browsers, or cannot be written."""

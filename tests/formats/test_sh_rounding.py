@@ -130,6 +130,10 @@ def test_the_mean_of_harmonics_follows_from_their_second_moments(count, rng):
     for scale in (1, 7):
         np.testing.assert_allclose(mean_basis(scale * values.T @ values), expected, atol=2e-6)
     np.testing.assert_allclose(mean_basis(np.eye(count)), 0, atol=2e-6)
+    form = rng.normal(size=(count, count))
+    form = form @ form.T  # of no directions
+    mean, moments = mean_basis(form), form * (count / (4 * np.pi) / np.trace(form))
+    assert mean @ np.linalg.solve(moments, mean) < 1.001
 
 
 def test_band_0_takes_up_what_is_the_same_from_all_cameras(rng):

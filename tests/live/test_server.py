@@ -72,6 +72,18 @@ def test_a_request_that_does_not_end_is_closed_soon(server, monkeypatch, begun):
             pass
 
 
+def test_a_request_that_comes_a_byte_at_a_time_is_closed_soon(server, monkeypatch):
+    monkeypatch.setattr(module, "HEAD", 0.3)
+    with socket.create_connection(("127.0.0.1", server.port), timeout=0.05) as connection:
+        for _ in range(400):
+            with suppress(OSError):  # it was closed
+                connection.sendall(b"x")
+            with suppress(TimeoutError):
+                assert connection.recv(100) == b""
+                return
+    pytest.fail("it waits for more")
+
+
 def test_a_connection_that_says_nothing_is_closed(server, monkeypatch):
     monkeypatch.setattr(module._Connection, "timeout", 0.1)
     with socket.create_connection(("127.0.0.1", server.port), timeout=10) as connection:

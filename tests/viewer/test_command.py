@@ -93,6 +93,9 @@ def test_the_stage_and_the_command_show_the_same(run, tmp_path):
 def test_every_shipped_pipeline_ends_with_a_viewer_and_a_report():
     for name in shipped().keys() - {"blocks_coarse"}:  # a model to cut, which is not for looking at
         checked = load(name)
+        if "train_field" in checked.names:  # a field has no splats
+            assert checked.names[-1] == "report"
+            continue
         assert checked.names[-2:] == ["viewer", "report"], name
         assert isinstance(checked.stages[-2], Viewer)
 

@@ -120,6 +120,12 @@ def test_as_many_splats_fit_as_the_advice_says(page, monkeypatch):
     assert 0.5 * module.MAX_SIZE < fitting.size <= module.MAX_SIZE
 
 
+def test_a_small_model_beside_a_large_one_keeps_its_splats(page, monkeypatch):
+    large = replace(page, models={"a": pack(cloud(4000)), "b": pack(cloud(40))})
+    monkeypatch.setattr(module, "MAX_SIZE", 0.7 * large.size)
+    assert 500 < large.fitting < 3000
+
+
 def test_the_size_is_that_of_the_file(page, tmp_path):
     large = replace(page, models={"model": pack(cloud(20000))})
     large.write(tmp_path / "page.html")
