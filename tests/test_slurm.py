@@ -11,13 +11,18 @@ from clsplat.cluster import slurm_worker
 from clsplat.errors import ConfigError, DeviceError
 from clsplat.pipeline.execution import Execution, Slurm
 
-slurm = pytest.importorskip("clsplat.cluster.slurm", exc_type=ConfigError)
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="the interface lo")
 KEYS = Slurm(jobs=3, cores=4, memory="8GB", walltime="01:00:00", options=["--gres=gpu:1"], interface="lo")
 EXECUTION = Execution(engine="slurm", insecure=True, slurm=KEYS)
 
 
-def test_the_script_of_a_job_runs_a_worker_that_signals_reach(tmp_path):
+@pytest.fixture
+def slurm():
+    """The module, which loads Dask; where Dask is."""
+    return pytest.importorskip("clsplat.cluster.slurm", exc_type=ConfigError)
+
+
+def test_the_script_of_a_job_runs_a_worker_that_signals_reach(slurm, tmp_path):
     with slurm.jobs(EXECUTION, KEYS, tmp_path / "logs") as found:
         script = found.job_script()
     options = [line.removeprefix("#SBATCH ") for line in script.splitlines() if line.startswith("#SBATCH")]
@@ -31,7 +36,7 @@ def test_the_script_of_a_job_runs_a_worker_that_signals_reach(tmp_path):
 
 
 @pytest.mark.parametrize("refuses", [True, False])
-def test_jobs_that_slurm_would_refuse_end_a_sweep_at_once(tmp_path, monkeypatch, refuses):
+def test_jobs_that_slurm_would_refuse_end_a_sweep_at_once(slurm, tmp_path, monkeypatch, refuses):
     monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
     sbatch = tmp_path / "sbatch"
     sbatch.write_text("#!/bin/sh\necho 'allocation failure: Invalid partition' >&2\n" + "exit 1\n" * refuses)
@@ -43,7 +48,7 @@ def test_jobs_that_slurm_would_refuse_end_a_sweep_at_once(tmp_path, monkeypatch,
         slurm.cluster(EXECUTION, KEYS, tmp_path / "logs").close()
 
 
-def test_a_machine_without_slurm_is_told(tmp_path, monkeypatch):
+def test_a_machine_without_slurm_is_told(slurm, tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(ConfigError, match="sbatch is not on this machine"):
         slurm.cluster(EXECUTION, KEYS, tmp_path / "logs")
@@ -71,7 +76,7 @@ def test_the_worker_of_a_job_takes_what_the_queue_gives(monkeypatch, tls):
     [("echo 7; echo 12", "ac"), ("true", "c"), ("exit 1", "abc")],
     ids=["one has ended", "all have", "no answer"],
 )
-def test_jobs_that_ended_are_forgotten_where_the_queue_says_so(tmp_path, monkeypatch, answer, left):
+def test_jobs_that_ended_are_forgotten_where_the_queue_says_so(slurm, tmp_path, monkeypatch, answer, left):
     squeue = tmp_path / "squeue"
     squeue.write_text(f"#!/bin/sh\n{answer}\n")
     squeue.chmod(0o755)
@@ -82,6 +87,6 @@ def test_jobs_that_ended_are_forgotten_where_the_queue_says_so(tmp_path, monkeyp
     assert "".join(found.workers) == left
 
 
-def test_the_logs_of_jobs_have_a_folder(tmp_path):
+def test_the_logs_of_jobs_have_a_folder(slurm, tmp_path):
     with slurm.jobs(EXECUTION, KEYS, tmp_path / "logs"):
         assert Path(tmp_path / "logs").is_dir()

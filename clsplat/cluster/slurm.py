@@ -28,7 +28,7 @@ def cluster(execution: Execution, keys: Slurm, logs: Path) -> Any:
         raise ConfigError("engine slurm: sbatch is not on this machine; run the sweep where jobs are submitted")
     found = jobs(execution, keys, logs)
     with found._dummy_job.job_file() as script:
-        tried = subprocess.run([sbatch, "--test-only", script], capture_output=True, text=True, check=False)
+        tried = subprocess.run([sbatch, "--test-only", script], capture_output=True, encoding="utf-8", check=False)
     if tried.returncode:
         found.close()
         raise DeviceError(f"engine slurm: {one_line(tried.stderr)}; look at the keys of execution.slurm")
@@ -41,7 +41,7 @@ def are_waiting(found: Any) -> bool:
     Dask knows of the end of a job by its worker alone, which may not have come.
     """
     words = ["squeue", "--me", "--noheader", "--format=%i"]
-    told = subprocess.run(words, capture_output=True, text=True, check=False)
+    told = subprocess.run(words, capture_output=True, encoding="utf-8", check=False)
     if told.returncode:  # SLURM does not answer just now
         return True
     for name, job in list(found.workers.items()):
