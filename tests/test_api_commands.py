@@ -170,7 +170,7 @@ def test_measurements(runs, tiny_scene, tmp_path):
         (lambda: clsplat.resume("nowhere"), DataError, "nowhere: has no pipeline.yaml"),
         (lambda: clsplat.status("nowhere"), DataError, "nowhere: has no readable status.json"),
         (lambda: clsplat.load("nowhere.ply"), DataError, "nowhere.ply: cannot be read"),
-        (lambda: clsplat.evaluate("x.ply"), ConfigError, "a model file does not name its scene"),
+        (lambda: clsplat.evaluate("x.ply"), DataError, "x.ply: not found; expected a model file"),
         (lambda: clsplat.load_plugin("nowhere.py"), ConfigError, "no such file"),
     ],
 )

@@ -95,7 +95,7 @@ NEAR = {
     "resume nowhere": "nowhere: has no pipeline.yaml; expected the folder of a run",
     "status nowhere": "nowhere: has no readable status.json; expected the folder of a run",
     "pipelines --copy x": "--copy needs the name of a pipeline",
-    "evaluate x.ply": "x.ply: a model file does not name its scene; give the folder of a scene, or a run folder",
+    "evaluate x.ply": "x.ply: not found; expected a model file or a run folder",
     "evaluate x.ply --scene y --downscales nan": "expected downscale factors from 1 on, got nan",
     "evaluate x.ply --scene y --downscales inf": "expected downscale factors from 1 on, got inf",
 }
@@ -103,7 +103,7 @@ NEAR = {
 
 @pytest.mark.parametrize("arguments", NEAR)
 def test_near_misses_say_what_is_near(arguments):
-    code = 3 if arguments.startswith(("resume", "status")) else 2
+    code = 3 if arguments.startswith(("resume", "status")) or arguments == "evaluate x.ply" else 2
     assert NEAR[arguments] in clsplat(*arguments.split(), expect=code).stderr
 
 
