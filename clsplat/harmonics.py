@@ -3,7 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-DIRECTIONS = 64  # samples of a band's functions; a band has at most 7 functions
+DIRECTIONS = 64  # samples of a band's functions, of which it has at most 7; with their opposites, of all products
+DIGITS = 6  # of means of functions: further ones are the processor's
 
 
 def basis(directions: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -22,14 +23,29 @@ def basis(directions: NDArray[np.floating]) -> NDArray[np.float64]:
     return np.stack(values, axis=1)
 
 
+def mean_basis(form: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the mean of Y(d), [K], over directions d of which `form`, [K, K], is as the mean of Y(d) Y(d)^T.
+
+    Products of functions of the bands 1 to 3 span each of these; of one band alone they tell nothing, which gives 0.
+    """
+    count, half = len(form), _directions()
+    values = basis(np.concatenate([half, -half]))[:, :count]
+    pairs = np.triu_indices(count)
+    products = values[:, pairs[0]] * values[:, pairs[1]]
+    told = np.linalg.lstsq(products, values, rcond=1e-9)[0]
+    moments = form * (count / (4 * np.pi) / np.trace(form))  # of |Y|², K / 4 pi from everywhere
+    mean = moments[pairs] @ told
+    size = mean @ np.linalg.solve(moments, mean)  # of a distribution at most 1: a form that has none tells too much
+    return np.asarray(np.round(mean / np.sqrt(max(size, 1.0)), DIGITS))
+
+
 def rotated_sh(sh_rest: NDArray[np.floating], rotation: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the coefficients [N, (K-1)*3], coefficient-major, of the same colours after a rotation [3, 3].
 
     A rotation maps each band onto itself, so each band's matrix follows from values at a few directions.
     """
     count, coefficients = len(sh_rest), sh_rest.shape[1] // 3
-    directions = np.random.default_rng(0).normal(size=(DIRECTIONS, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    directions = _directions()
     before, after = basis(directions @ rotation), basis(directions)  # rows of d R are R^T d
     table = sh_rest.astype(np.float64).reshape(count, coefficients, 3)
     turned, first = np.empty_like(table), 0
@@ -41,3 +57,9 @@ def rotated_sh(sh_rest: NDArray[np.floating], rotation: NDArray[np.float64]) -> 
         turned[:, band] = np.einsum("ij,njc->nic", matrix, table[:, band])
         first += size
     return turned.reshape(count, 3 * coefficients)
+
+
+def _directions() -> NDArray[np.float64]:
+    """Unit vectors, [DIRECTIONS, 3], the same each time."""
+    found = np.random.default_rng(0).normal(size=(DIRECTIONS, 3))
+    return np.asarray(found / np.linalg.norm(found, axis=1, keepdims=True))

@@ -14,7 +14,7 @@ from clsplat.errors import ConfigError, quoted
 from clsplat.files import write_text
 from clsplat.formats.model_files import bytes_of, located
 from clsplat.formats.output import written
-from clsplat.formats.splats import Reading, Writing, with_degree
+from clsplat.formats.splats import Quality, Reading, Writing, with_degree
 from clsplat.formats.table import tell_losses
 from clsplat.gaussians.model import load
 from clsplat.gaussians.sky import keep_sky, sky_beside
@@ -26,7 +26,6 @@ from clsplat.tuning.tuning import Tuning, require_steps
 
 LOG = logging.getLogger("clsplat")
 Format = Literal["sog", "spz"]
-Quality = Literal["small", "balanced", "high"]
 KEEPS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18)  # shares of the Gaussians
 SETTINGS: dict[Format, tuple[tuple[int, Quality], ...]] = {  # of the harmonics: degree, quality
     "sog": ((3, "high"), (3, "balanced"), (3, "small")),  # a palette of a lower degree is hardly smaller

@@ -202,9 +202,14 @@ def different(
     return found[order].astype(np.float64), place[labels]
 
 
-def _whole_numbers(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Values as whole numbers from -LEVELS to LEVELS."""
+def usual_largest(values: NDArray[np.float32]) -> np.float32:
+    """Return the size that all values but a share TAIL do not exceed; 0 of none."""
     size = np.abs(values).ravel()
     place = min(int((1 - TAIL) * size.size), size.size - 1)
-    largest = np.partition(size, place)[place] or np.float32(1)
-    return np.rint(np.clip(values / largest, -1, 1) * np.float32(LEVELS))
+    return np.float32(np.partition(size, place)[place] if size.size else 0)
+
+
+def _whole_numbers(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Values as whole numbers from -LEVELS to LEVELS."""
+    largest = usual_largest(values) or np.float32(1)
+    return np.asarray(np.rint(np.clip(values / largest, -1, 1) * np.float32(LEVELS)))

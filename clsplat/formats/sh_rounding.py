@@ -15,17 +15,14 @@ that it has, so that their own second moments are an estimate of G: those of fox
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.formats.palette import LEVELS, usual_largest
 from clsplat.formats.splats import SH_C0
-from clsplat.harmonics import basis
+from clsplat.harmonics import mean_basis
 
 Floats = NDArray[np.floating]
 ISOTROPIC = 0.02  # share of all directions alike beside those that the moments tell; 0.005 to 0.1 differ little
 USUAL = 0.028  # root of the mean square of harmonics: fox after 7 000 steps; Lego has 0.037, the kitchen 0.043
-LEVELS = 511  # whole numbers that moments are made of: their sums are exact in float64, in any order
-TAIL = 1e-4  # share of values that may lie beyond LEVELS
 ROWS = 1 << 15  # that are rounded at once
-DIRECTIONS = 128  # from which the mean of Y(d) is known as a sum of products
-DIGITS = 6  # of that mean: further ones are the processor's
 
 
 def steps(log_weights: NDArray[np.float64], median: float, most: float) -> NDArray[np.float32]:
@@ -42,9 +39,7 @@ def usual_step(rest: Floats, step: float, most: float) -> float:
 
 def visible_form(rest: Floats) -> NDArray[np.float64]:
     """Return G for harmonics [N, 3 K], as [K, K] with a trace of K, the same bits with any number of threads."""
-    size = np.abs(rest)
-    place = min(int((1 - TAIL) * size.size), size.size - 1)
-    largest = np.partition(size, place, axis=None)[place] if size.size else 0
+    largest = usual_largest(rest)
     count = rest.shape[1] // 3
     form = np.zeros((count, count))
     for start in range(0, len(rest) if largest else 0, ROWS):
@@ -67,21 +62,6 @@ def base_for(base: Floats, errors: Floats, form: NDArray[np.float64]) -> NDArray
     for k, mean in enumerate(mean_basis(form)):
         change += mean * lacking[:, k]
     return np.asarray(base + change / SH_C0, np.float32)
-
-
-def mean_basis(form: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the mean of Y(d), [K], over directions that have the form G; 0 where G does not tell, as for one band."""
-    count = len(form)
-    half = np.random.default_rng(0).normal(size=(DIRECTIONS // 2, 3))
-    half /= np.linalg.norm(half, axis=1, keepdims=True)
-    values = basis(np.concatenate([half, -half]))[:, :count]
-    pairs = np.triu_indices(count)
-    products = values[:, pairs[0]] * values[:, pairs[1]]
-    told = np.linalg.lstsq(products, values, rcond=1e-9)[0]
-    moments = form * (count / (4 * np.pi) / np.trace(form))  # of |Y|², K / 4 pi from everywhere
-    mean = moments[pairs] @ told
-    size = mean @ np.linalg.solve(moments, mean)  # of a distribution at most 1: a form that has none tells too much
-    return np.asarray(np.round(mean / np.sqrt(max(size, 1.0)), DIGITS))
 
 
 def rounded_rows(rest: Floats, steps: NDArray[np.float32], form: NDArray[np.float64]) -> NDArray[np.float32]:

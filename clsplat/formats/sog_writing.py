@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from decimal import ROUND_CEILING, ROUND_FLOOR, ROUND_HALF_EVEN, Context
 from hashlib import sha256
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,7 @@ from clsplat.formats.sog_files import META, with_images
 from clsplat.formats.sog_steps import rounded, rounded_opacities, rounded_quats, weighed_means
 from clsplat.formats.splats import (
     Parameters,
+    Quality,
     SplatFile,
     Writing,
     opacities,
@@ -34,7 +35,6 @@ from clsplat.formats.splats import (
 )
 from clsplat.formats.weights import log_weights
 
-Quality = Literal["small", "balanced", "high"]
 PALETTES = {"small": 1024, "balanced": 4096, "high": 16384}  # entries at most, of a palette for all
 SHARES = {"small": 0.16, "balanced": 0.42, "high": 0.45}  # entries at most for a splat, of a palette for neighbours
 MEDIAN_STEPS = {"small": 6.0, "balanced": 5.0, "high": 3.0}  # of its vectors, in 128ths

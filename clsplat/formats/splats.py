@@ -30,6 +30,7 @@ MAX_EXPONENT = 700.0  # of e in float64
 MAX_LOG = 88.7  # of a scale in float32
 FLAT_LOG_SCALE = -13.815511  # log 1e-6: of the third axis of a disc
 FLIP_SH = (-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1)  # y and z change sign: bands 1 to 3
+Quality = Literal["small", "balanced", "high"]  # how finely SPZ and SOG are rounded
 Parameters = dict[str, NDArray[np.float32]]  # by the names of PARAMETERS, each [N, components]
 Floats = NDArray[np.floating]
 LOG = logging.getLogger("clsplat")
@@ -73,7 +74,7 @@ class Writing:
     sh_bits: tuple[int, int] | None = None  # SPZ: bits of band 1 and of the others, from 1 to 8; None: as `quality`
     axes: Literal["spz", "ply"] = "spz"  # SPZ: as its specification says, or those of the PLY, for readers that differ
     spz_version: Literal[3, 4] = 3
-    quality: Literal["small", "balanced", "high"] = "balanced"  # SPZ and SOG
+    quality: Quality = "balanced"  # SPZ and SOG
     quiet: bool = False  # no line about what the format does not keep: it was said
 
 

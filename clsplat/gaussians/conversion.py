@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from clsplat.errors import ConfigError, DataError, quoted
 from clsplat.formats.model_files import bytes_of
 from clsplat.formats.ply import MAX_NUMBER
-from clsplat.formats.splats import MAX_DEGREE, Reading, Writing, with_degree
+from clsplat.formats.splats import MAX_DEGREE, Quality, Reading, Writing, with_degree
 from clsplat.formats.table import detect, for_writing
 from clsplat.gaussians.model import Model, load
 from clsplat.gaussians.run_model import model_at
@@ -60,7 +60,7 @@ class Options:
     sh_bits: str | None = None  # A/B
     axes: Literal["spz", "ply"] = "spz"  # of SPZ files that are read, or where none is of the one that is written
     spz_version: int = 3
-    quality: Literal["small", "balanced", "high"] = "balanced"
+    quality: Quality = "balanced"
     keep_nan: bool = False
 
     def of(self, sources: Sequence[Path], out: Path) -> tuple[Reading, Writing]:

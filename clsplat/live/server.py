@@ -5,10 +5,9 @@ import os
 import socket
 import socketserver
 import threading
-import time
 from collections.abc import Callable
 from contextlib import suppress
-from time import sleep
+from time import monotonic, sleep
 from typing import Any
 
 from clsplat.errors import ConfigError
@@ -133,9 +132,9 @@ class _Connection(socketserver.StreamRequestHandler):
     def _head(self) -> bytes | None:
         """The lines up to the empty one, or more than LONGEST bytes; None at the end."""
         self.rfile.peek(1)  # type: ignore[attr-defined]
-        head, line, end = b"", b"", time.monotonic() + HEAD
+        head, line, end = b"", b"", monotonic() + HEAD
         while len(head + line) <= LONGEST:
-            self.connection.settimeout(max(end - time.monotonic(), 1e-3))  # one end for all: bytes may come one by one
+            self.connection.settimeout(max(end - monotonic(), 1e-3))  # one end for all: bytes may come one by one
             if not (byte := self.rfile.read1(1)):
                 return None
             line += byte

@@ -9,11 +9,8 @@ from clsplat.names import METRICS
 from clsplat.reading import read_json
 from clsplat.training.found import photographs_text, size_text
 
-TITLES = {
-    "export": "model",
-    "render": "renders",
-    "optimize": "pictures",
-}  # of what these stages write; others give their own names
+# of what these stages write; others give their own names
+TITLES = {"export": "model", "render": "renders", "optimize": "pictures"}
 BEFORE_FILES = {"export": "point_cloud.ply", "render": "renders", "viewer": "viewer.html", "report": "report.html"}
 SHORTEST = 0.5  # seconds of a stage that is told
 

@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import model_validator
 
 from clsplat.errors import DataError, OutputError
-from clsplat.formats.splats import Reading, Writing
+from clsplat.formats.splats import Quality, Reading, Writing
 from clsplat.formats.table import endings, for_writing
 from clsplat.gaussians.model import load
 from clsplat.gaussians.sky import sky_file
@@ -34,7 +34,7 @@ class Export(Scheduled):
 
     file: Annotated[str, path_in_run(*WRITTEN)] = "point_cloud.ply"
     """Path inside the run folder; its ending is the format: .ply, .compressed.ply, .spz, .sog, .glb, .splat, .usda."""
-    quality: Literal["small", "balanced", "high"] = "balanced"
+    quality: Quality = "balanced"
     """Of SPZ and SOG, how finely harmonics, colours, positions and rotations are rounded."""
     sky: Literal["beside", "splats"] = "beside"
     """A sky that was learned (`model.background`): a file beside the model, or 10 000 Gaussians on a far sphere, which

@@ -10,6 +10,7 @@ from pydantic import Field
 from clsplat.density.visible_error import VisibleError
 from clsplat.errors import amount
 from clsplat.formats.sog_writing import Harmonics
+from clsplat.formats.splats import Quality
 from clsplat.gaussians import members
 from clsplat.gaussians.clusters import DeviceClusters, most_alike
 from clsplat.stages.base import Scheduled
@@ -33,7 +34,7 @@ class PaletteSh(Scheduled):
     edits: ClassVar[bool] = True
     training_keys: ClassVar[frozenset[str]] = frozenset({"quality", "step"})
 
-    quality: Literal["small", "balanced", "high"] = "balanced"
+    quality: Quality = "balanced"
     """Of the SOG: `small`, `balanced` or `high`, which have 1,024, 4,096 and 16,384 vectors at most."""
     step: Annotated[float, Field(gt=0)] | None = None
     """Step of the coefficients of the vectors, where that makes 256 different ones at most: a larger one makes the

@@ -73,7 +73,7 @@ class Page:
         low, high = 0, max(packed.count for packed in self.models.values())
         while low < high:  # a model with fewer splats keeps all of them
             middle = (low + high + 1) // 2
-            held = sum(len(one.data) * 4 / 3 * min(1, middle / one.count) for one in self.models.values()) / 1e6
+            held = sum(len(one.data) * 4 / 3 * min(1, middle / max(one.count, 1)) for one in self.models.values()) / 1e6
             low, high = (middle, high) if held <= MARGIN * room else (low, middle - 1)
         return low
 

@@ -7,12 +7,12 @@ import pytest
 
 from clsplat.formats import sh_rounding
 from clsplat.formats.packing import morton_order
-from clsplat.formats.sh_rounding import base_for, mean_basis, rounded_rows, steps, usual_step, visible_form
+from clsplat.formats.sh_rounding import base_for, rounded_rows, steps, usual_step, visible_form
 from clsplat.formats.sh_tree import LEVELS, tree_palette
 from clsplat.formats.splats import SH_C0, SplatFile, Writing, unit
 from clsplat.formats.table import write
 from clsplat.formats.weights import LARGEST, log_weights
-from clsplat.harmonics import basis
+from clsplat.harmonics import basis, mean_basis
 from tests.formats.models import splats, there_and_back
 
 
