@@ -117,7 +117,7 @@ def spread(views: Sequence[View], frames: int) -> list[View]:
     if frames == len(views):
         return list(views)
     if len(views) == 1:
-        return [View(f"frame_{i:05d}", views[0].camera, views[0].world_to_camera) for i in range(1, frames + 1)]
+        return [replace(views[0], name=f"frame_{i:05d}") for i in range(1, frames + 1)]
     places = np.linspace(0, len(views) - 1, frames)
     poses = np.stack([view.world_to_camera for view in views])
     turns = scipy.spatial.transform.Slerp(

@@ -117,7 +117,7 @@ def still(view: View, size: Size | None = None) -> View:
     wanted = size or even_size(view.camera)
     if wanted == (view.camera.width, view.camera.height):
         return view
-    return View(view.name, like(view.camera, wanted), view.world_to_camera, view.image_path)
+    return View(view.name, like(view.camera, wanted), view.world_to_camera, view.image_path, time=view.time)
 
 
 def check_path_file(path: Path) -> None:
