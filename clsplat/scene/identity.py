@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from clsplat.scene.decoding import ImageFile
-from clsplat.scene.scene import SPLITS, Scene
+from clsplat.scene.scene import SPLITS, PointCloud, Scene
 from clsplat.scene.view import View
 
 MAX_NAMES = 3  # in a message
@@ -34,7 +34,7 @@ class Identity:
     def of(cls, scene: Scene, files: Mapping[Path, ImageFile]) -> "Identity":
         """Return the identity of a scene whose image files were decoded."""
         train, test, fold = ({view.name: _row(view, files) for view in scene.split(name)} for name in SPLITS)
-        return cls(train, test, _hash(scene.points.positions, scene.points.colours) if scene.points else "", fold)
+        return cls(train, test, _points_hash(scene.points) if scene.points else "", fold)
 
     def divided(self, scene: Scene) -> "Identity":
         """Return the identity of the same views in the splits of `scene`."""
@@ -99,6 +99,10 @@ def _row(view: View, files: Mapping[Path, ImageFile]) -> Row:
         "camera": _hash(numbers, view.world_to_camera, text=repr(distortion)),
         **({} if view.time is None else {"time": repr(view.time)}),
     }
+
+
+def _points_hash(points: PointCloud) -> str:
+    return _hash(points.positions, points.colours, *([] if points.times is None else [points.times]))
 
 
 def _hash(*arrays: ArrayLike, text: str = "") -> str:

@@ -43,6 +43,7 @@ class View:
     lens: Lens | None = None  # of the photograph on disk, where it has distortion
     downscale: float = 1  # divisor of the original photograph's size
     time: float | None = None  # in [0, 1], of the scene's first to last moment; None: the scene does not move
+    static_path: Path | None = None  # an image of the photograph's size, white in pixels that show nothing that moves
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "world_to_camera", checked_pose(self.name, self.world_to_camera))
