@@ -156,7 +156,9 @@ class Trainer:
         texture = known_gradient(workspace, camera, photograph, mask) if count > TEXTURE else None
         model = self._drawn(comparison.step)
         pixel_sums = self.rasterizer.pixel_sums(model, view.frame, gradient, count, texture, view.behind)
-        if self.poses and (learn := self.poses.learning(workspace, model, view.frame, pixel_sums, comparison.step)):
+        if self.poses and (
+            learn := self.poses.learning(workspace, view.frame.drawn, view.frame, pixel_sums, comparison.step)
+        ):
             learning.append(lambda: learn(self.numbers))
         return ViewGradients(view.frame, comparison, view.losses, pixel_sums, learning=learning)
 
@@ -233,13 +235,13 @@ class Trainer:
     def _update(self, view: ViewGradients, stale: Collection[str]) -> Array:
         """Update the parameters and add the penalties to the view's losses.
 
-        Returns the gradient of the projected means, [2, S] px⁻¹.  Without penalties, stale parameters and depths,
-        gradients are not written to memory.
+        Returns the gradient of the projected means, [2, S] px⁻¹.  Without penalties, stale parameters, motion
+        and depths, gradients are not written to memory.
         """
         penalties = [loss for loss in self.losses if isinstance(loss, Penalty)]
         step = view.comparison.step
         rates = self.rates.at(step, self.extent)
-        if not (penalties or stale or view.frame.content == "inverse_depth"):
+        if not (penalties or stale or self.model.gaussians.moves or view.frame.content == "inverse_depth"):
             return self.adam.update(self.model, view.frame, view.pixel_sums, rates, self.rows)
         gradients = self.rasterizer.gradients(self.model, view.frame, view.pixel_sums)
         inputs = PenaltyInputs(self.rasterizer.workspace, self.model.gaussians, gradients, self.extent, step)

@@ -67,6 +67,7 @@ from clsplat.conformance.reference.losses import (
     ssim_taps,
     view_error,
 )
+from clsplat.conformance.reference.motion import moved, moved_backward
 from clsplat.conformance.reference.penalties import (
     anisotropy,
     covariance_trace,
@@ -139,6 +140,8 @@ __all__ = [
     "mean_opacity",
     "mean_scale",
     "member_sums",
+    "moved",
+    "moved_backward",
     "moved_camera",
     "ms_ssim",
     "nearest_vectors",

@@ -1,0 +1,62 @@
+"""Gaussians that move, on the host: one moment of them, and the motion of those that stand still.
+
+The columns of the table are told in clsplat/formats/motion.py, and the formulas in cl_kernels/motion.cl.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.formats.motion import MOTION, STILL, fields_of
+from clsplat.formats.splats import Parameters
+from clsplat.gaussians.quaternions import product, quaternion_of
+
+FAINTEST = 1 / 255  # of a presence: what is fainter is nowhere to be seen
+LOGIT = 80.0  # of an opacity, at most where it fades
+
+
+def still(count: int, width: int) -> NDArray[np.float32]:
+    """Return the motion of Gaussians that are there always and never move, [count, width]."""
+    table = np.zeros((count, width), np.float32)
+    fields = fields_of(width)
+    table[:, fields["time_centre"]], table[:, fields["log_duration"]] = 0.5, STILL
+    return table
+
+
+def presence(motion: NDArray[np.floating], time: float) -> NDArray[np.float64]:
+    """Return the factor of each opacity at a time, [N] in (0, 1]."""
+    fields, table = fields_of(motion.shape[1]), motion.astype(np.float64)
+    dt = time - table[:, fields["time_centre"]]
+    with np.errstate(over="ignore"):
+        return np.exp(-0.5 * np.square(dt * np.exp(np.minimum(-table[:, fields["log_duration"]], LOGIT))))[:, 0]
+
+
+def at_time(parameters: Parameters, time: float) -> Parameters:
+    """Return the tables of static Gaussians as moving ones are at a time: those that are there, without motion."""
+    motion = parameters[MOTION].astype(np.float64)
+    fields, factor = fields_of(motion.shape[1]), presence(motion, time)
+    there = factor >= FAINTEST
+    tables = {name: table[there] for name, table in parameters.items() if name != MOTION}
+    motion, factor = motion[there], factor[there, None]
+    dt = time - motion[:, fields["time_centre"]]
+    moved = tables["means"].astype(np.float64)
+    for order, name in enumerate(("velocity", "acceleration", "jerk"), 1):
+        if name in fields:
+            moved = moved + motion[:, fields[name]] * dt**order
+    tables["means"] = moved.astype(np.float32)
+    if "turn" in fields:
+        tables["quats"] = (tables["quats"] + motion[:, fields["turn"]] * dt).astype(np.float32)
+    logit = tables["logit_opacity"].astype(np.float64)
+    bounded = np.minimum(logit, LOGIT)
+    faded = bounded + np.log(factor) - np.log1p(np.exp(bounded) * (1 - factor))
+    tables["logit_opacity"] = np.where(factor < 1, faded, logit).astype(np.float32)
+    return tables
+
+
+def transformed_motion(motion: NDArray[np.floating], scale: float, turn: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return the motion after x -> scale · turn x; turn: [3, 3], a rotation."""
+    fields, moved = fields_of(motion.shape[1]), motion.astype(np.float64)
+    for name in fields.keys() & {"velocity", "acceleration", "jerk"}:
+        moved[:, fields[name]] = scale * moved[:, fields[name]] @ turn.T
+    if "turn" in fields:
+        moved[:, fields["turn"]] = product(quaternion_of(turn.astype(np.float64)), moved[:, fields["turn"]])
+    return moved

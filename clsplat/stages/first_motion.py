@@ -1,0 +1,68 @@
+"""The motion of the first Gaussians: none, for a long time, at times of their own."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.errors import ConfigError, DataError
+from clsplat.filters import Motion
+from clsplat.formats.motion import MOTION, fields_of
+from clsplat.formats.splats import Parameters
+from clsplat.gaussians.motion import still
+from clsplat.scene.scene import Scene
+
+STREAM = 4  # of the random numbers, beside those of the points
+
+
+def require_times(scene: Scene, motion: Motion | None) -> None:
+    """Raise DataError for a scene whose views have no times, where Gaussians are to move."""
+    if motion is None:
+        return
+    if missing := [view.name for view in scene.views if view.time is None]:
+        which = "its views have no times" if len(missing) == len(scene.views) else f"{missing[0]} has no time"
+        raise DataError(
+            f"{scene.path}: {which}, and `model.time` lets Gaussians move; expected a time for each photograph "
+            "(docs/moving.md), or a pipeline of a scene that stands still, such as splat_7k"
+        )
+
+
+def moving(
+    parameters: Parameters,
+    motion: Motion | None,
+    seen: NDArray[np.floating] | None,
+    durations: tuple[float, float],
+    seed: int,
+) -> Parameters:
+    """Return the tables of Gaussians with a motion of none, where settings let them move, else as they are.
+
+    seen: [N] times in which their points were seen, NaN where that is not known; without them times are drawn.
+    durations: of those drawn, and of those seen; both by the scene's duration.
+    """
+    if motion is None:
+        return parameters
+    count = len(parameters["means"])
+    table, fields = still(count, motion.width), fields_of(motion.width)
+    times = np.random.default_rng([seed, count, STREAM]).uniform(0, 1, count)
+    duration = np.full(count, np.log(durations[0]))
+    if seen is not None:
+        known = np.isfinite(seen)
+        times[known], duration[known] = seen[known], np.log(durations[1])
+    table[:, fields["time_centre"]] = times[:, None]
+    table[:, fields["log_duration"]] = duration[:, None]
+    return {**parameters, MOTION: table}
+
+
+def with_motion(parameters: Parameters, motion: Motion | None, file: str) -> Parameters:
+    """Return the tables of a model file for settings of `model.time`: one that stands still gets a motion of none.
+
+    Raises ConfigError for another motion than that of the settings.
+    """
+    own, expected = (parameters[MOTION].shape[1] if MOTION in parameters else 0), motion.width if motion else 0
+    if own == expected:
+        return parameters
+    if own:
+        have = "another degree or rotation" if expected else "no `model.time`"
+        raise ConfigError(
+            f"{file}: holds Gaussians that move, and the pipeline has {have}; give those of the file, "
+            f"or start from one moment of it: `clsplat convert {file} FRAME.ply --time T`"
+        )
+    return {**parameters, MOTION: still(len(parameters["means"]), expected)}
