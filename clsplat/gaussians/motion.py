@@ -3,9 +3,12 @@
 The columns of the table are told in clsplat/formats/motion.py, and the formulas in cl_kernels/motion.cl.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.errors import DataError
 from clsplat.formats.motion import MOTION, STILL, fields_of
 from clsplat.formats.splats import Parameters
 from clsplat.gaussians.quaternions import product, quaternion_of
@@ -60,3 +63,18 @@ def transformed_motion(motion: NDArray[np.floating], scale: float, turn: NDArray
     if "turn" in fields:
         moved[:, fields["turn"]] = product(quaternion_of(turn.astype(np.float64)), moved[:, fields["turn"]])
     return moved
+
+
+def alike(tables: Sequence[Parameters], names: Sequence[str]) -> list[Parameters]:
+    """Return the tables of models with a motion in all of them where some move: the others stand still.
+
+    Raises DataError where they move in different ways.
+    """
+    widths = {one[MOTION].shape[1]: name for one, name in zip(tables, names, strict=True) if MOTION in one}
+    if len(widths) > 1:
+        first, second, *_ = widths.values()
+        raise DataError(
+            f"{second}: moves by a polynomial of another degree than {first}, or one of them turns; expected the same: "
+            "take one moment of them (`clsplat convert MODEL OUT --time T`)"
+        )
+    return [{**one, MOTION: one.get(MOTION, still(len(one["means"]), *widths))} if widths else one for one in tables]

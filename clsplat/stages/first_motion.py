@@ -1,6 +1,7 @@
 """The motion of the first Gaussians: none, for a long time, at times of their own."""
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from clsplat.errors import ConfigError, DataError
@@ -11,6 +12,8 @@ from clsplat.gaussians.motion import still
 from clsplat.scene.scene import Scene
 
 STREAM = 4  # of the random numbers, beside those of the points
+NEIGHBOURS = 16  # whose times say whether a point stands still (ours)
+STANDS = 0.18  # spread of those times above which it does (ours)
 
 
 def require_times(scene: Scene, motion: Motion | None) -> None:
@@ -34,8 +37,8 @@ def moving(
 ) -> Parameters:
     """Return the tables of Gaussians with a motion of none, where settings let them move, else as they are.
 
-    seen: [N] times in which their points were seen, NaN where that is not known; without them times are drawn.
-    durations: of those drawn, and of those seen; both by the scene's duration.
+    seen: [N] times in which their points were seen; without them times are drawn.  durations: of what stands still, and
+    the shortest of what moves; both by the scene's duration.
     """
     if motion is None:
         return parameters
@@ -44,11 +47,23 @@ def moving(
     times = np.random.default_rng([seed, count, STREAM]).uniform(0, 1, count)
     duration = np.full(count, np.log(durations[0]))
     if seen is not None:
-        known = np.isfinite(seen)
-        times[known], duration[known] = seen[known], np.log(durations[1])
+        times = seen.astype(np.float64)
+        spread = spread_of_times(parameters["means"], times)
+        duration = np.log(np.where(spread > STANDS, durations[0], np.maximum(spread, durations[1])))
     table[:, fields["time_centre"]] = times[:, None]
     table[:, fields["log_duration"]] = duration[:, None]
     return {**parameters, MOTION: table}
+
+
+def spread_of_times(positions: NDArray[np.floating], times: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return how far apart in time the points near each one were seen, the standard deviation, [N].
+
+    What stands still is seen at the same place at all moments: 0.29, if they are evenly spread.  What moves is there
+    for a while.
+    """
+    nearest = scipy.spatial.cKDTree(positions).query(positions, k=min(NEIGHBOURS, len(positions)), workers=-1)[1]
+    spread: NDArray[np.float64] = times[nearest.reshape(len(positions), -1)].std(axis=1)
+    return spread
 
 
 def with_motion(parameters: Parameters, motion: Motion | None, file: str) -> Parameters:

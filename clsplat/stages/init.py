@@ -64,12 +64,13 @@ class Init(Stage):
     """Largest number of points of a plane sweep."""
     times: Literal["uniform", "per_frame"] = "uniform"
     """Where Gaussians move, the time at which each is most opaque: drawn from all of the scene's duration, or that of
-    the moment in which its point was seen, where the dataset says so."""
+    the moment in which its point was seen, where the dataset says so.  Points whose neighbours were seen at all times
+    begin as what stands still, others with the spread of those times as their duration."""
     duration: Annotated[float, Field(gt=0)] = 4.0
     """Standard deviation of the time around that, by the scene's duration; a long one begins as a scene that stands
     still."""
     moment: Annotated[float, Field(gt=0)] = 0.1
-    """The same of Gaussians whose points were seen in one moment, with `times: per_frame`."""
+    """The shortest of the Gaussians whose points moved, with `times: per_frame`."""
     file: ReadPath | None = None
     """Model file of any format, or a run folder, for `source: model`."""
 
