@@ -12,7 +12,9 @@ from clsplat.conformance.check import Checks, Note
 from clsplat.conformance.comparison import CONIC, SUM, Figure, by_element, by_norm, equal, wrong
 from clsplat.conformance.scenes import Case, random_case
 from clsplat.formats.motion import MOTION, STILL, WIDTHS, fields_of, width_of
-from clsplat.gaussians.tables import Gradients, moment_tables
+from clsplat.gaussians.tables import Gaussians, Gradients, moment_tables
+from clsplat.losses.base import PenaltyInputs
+from clsplat.losses.motion import Brevity, Travel
 from clsplat.opencl.device import Device
 from clsplat.render.motion import at_moment, to_centres
 from clsplat.render.rasterizer import Rasterizer
@@ -123,3 +125,23 @@ def motion(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
     for width in WIDTHS:
         yield from moment_figures(device, rng, 65, width)
     yield from still_figures(device, rng)
+
+
+@CHECKS.add("travel", "brevity")
+def penalties_of_motion(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    for count in COUNTS:
+        table = moving_case(rng, count, 8).parameters[MOTION]
+        table[1::7, :3] = 0
+        for penalty, (value, gradient) in (
+            (Travel(weight=3.0), ref.travel(table.astype(np.float64), EXTENT)),
+            (Brevity(weight=3.0, below=0.4), ref.brevity(table.astype(np.float64), 0.4)),
+        ):
+            gaussians = Gaussians(device, {**random_case(rng, count).parameters, MOTION: table})
+            gradients, what = Gradients(gaussians), f"{count} Gaussians"
+            gradients[MOTION].fill(0.25)
+            inputs = PenaltyInputs(Workspace(device), gaussians, gradients, EXTENT, step=1)
+            found = np.array([penalty.add(inputs).value()])
+            yield by_element(penalty.type, f"value, {what}", found, np.array([3 * value]), SUM, floor=1e-7)
+            added = gradients[MOTION].get()[:, :count].T.astype(np.float64) - 0.25
+            floor = 1e-2 * max(1.0, float(np.abs(3 * gradient).max()))
+            yield by_element(penalty.type, f"gradient, {what}", added, 3 * gradient, 1e-4, floor)

@@ -67,7 +67,7 @@ from clsplat.conformance.reference.losses import (
     ssim_taps,
     view_error,
 )
-from clsplat.conformance.reference.motion import moved, moved_backward
+from clsplat.conformance.reference.motion import brevity, moved, moved_backward, travel
 from clsplat.conformance.reference.penalties import (
     anisotropy,
     covariance_trace,
@@ -114,6 +114,7 @@ __all__ = [
     "blend_steps",
     "blend_weights",
     "blurred",
+    "brevity",
     "clamped_ray",
     "coloured",
     "coloured_backward",
@@ -177,6 +178,7 @@ __all__ = [
     "splitting",
     "ssim_map",
     "ssim_taps",
+    "travel",
     "view_error",
     "weight_entropy",
     "without_transients",
