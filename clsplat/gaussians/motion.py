@@ -3,7 +3,7 @@
 The columns of the table are told in clsplat/formats/motion.py, and the formulas in cl_kernels/motion.cl.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,3 +78,20 @@ def alike(tables: Sequence[Parameters], names: Sequence[str]) -> list[Parameters
             "take one moment of them (`clsplat convert MODEL OUT --time T`)"
         )
     return [{**one, MOTION: one.get(MOTION, still(len(one["means"]), *widths))} if widths else one for one in tables]
+
+
+def moved_to(tables: Mapping[str, NDArray[np.float64]], by: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
+    """Return means, quaternions and motion of the same paths, told from centres that are `by`, [N], later in time."""
+    motion, way = tables[MOTION].copy(), by[:, None]
+    fields, still_there = fields_of(motion.shape[1]), np.zeros((len(by), 3))
+    first, second, third = (
+        motion[:, fields[name]].copy() if name in fields else still_there
+        for name in ("velocity", "acceleration", "jerk")
+    )
+    means = tables["means"] + first * way + second * way**2 + third * way**3
+    motion[:, fields["time_centre"]] += way
+    motion[:, fields["velocity"]] = first + 2 * second * way + 3 * third * way**2
+    if "acceleration" in fields:
+        motion[:, fields["acceleration"]] = second + 3 * third * way
+    quats = tables["quats"] + (motion[:, fields["turn"]] * way if "turn" in fields else 0)
+    return {"means": means, "quats": quats, MOTION: motion}
