@@ -109,11 +109,26 @@ def video(
         int, typer.Option(min=1, help="Parts with the same motion; the sharpest frame of each is written.")
     ] = 100,
     long_side: Annotated[int | None, typer.Option(min=16, help="Pixels, at most.")] = None,
+    times: Annotated[
+        bool, typer.Option("--times", help="Of a scene that moves: also times.json, when each frame was taken.")
+    ] = False,
 ) -> None:
     """Take sharp frames of a video, with the same motion between them."""
     from data_tools.video import write_frames
 
-    print(f"{write_frames(file, out, frames, long_side)} frames in {out}")
+    print(f"{write_frames(file, out, frames, long_side, times)} frames in {out}")
+
+
+@app.command()
+def moments(
+    scene: Annotated[Path, typer.Argument(help="Folder that holds videos/NAME.mp4 of each camera.")],
+    moments_: Annotated[int, typer.Option("--moments", min=2, help="Frames of each video, evenly spaced.")] = 60,
+    long_side: Annotated[int | None, typer.Option(min=16, help="Pixels, at most.")] = None,
+) -> None:
+    """Take frames of the videos of several cameras, at the same moments of each."""
+    from data_tools.moments import write_moments
+
+    print(f"{moments_} frames of each of {write_moments(scene, moments_, long_side)} cameras in {scene / 'videos'}")
 
 
 @app.command()

@@ -1,19 +1,26 @@
 """Scenes that move: the ray-cast one, the readers of times, and what is refused."""
 
+import json
+import shutil
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
+from clsplat.cameras.table import write_cameras
 from clsplat.inspect.figures import figures
 from clsplat.inspect.inspection import Inspection
 from clsplat.scene.detect import read_scene
 from clsplat.scene.points import read_points_ply, write_points_ply
 from clsplat.scene.scene import PointCloud, Scene
 from clsplat.scene.times import by_camera, moments_of
+from clsplat.scene.times_file import write_times
+from data_tools.colmap_writer import write_model
+from data_tools.moments import write_moments
 from data_tools.moving import STANDING, Moving, shapes_at
 from data_tools.synthetic import write_dataset
+from data_tools.undistort import undistort_scene
 from tests.refusals import refusal
 from tests.test_transforms import LENS, frames, write
 
@@ -30,6 +37,16 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def scene(folder: Path) -> Scene:
     return read_scene(folder)
+
+
+@pytest.fixture(scope="module")
+def tiny_colmap(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three cameras as COLMAP has them."""
+    folder, out = tmp_path_factory.mktemp("tiny"), tmp_path_factory.mktemp("colmap") / "scene"
+    undistort_scene(write(folder / "a", **LENS, frames=frames("a.png", "b.png", "c.png")), out)
+    points = PointCloud(np.eye(3, dtype=np.float32), np.zeros((3, 3), np.float32))
+    write_model(out / "sparse" / "0", list(read_scene(out, 0).views), points, None)
+    return out
 
 
 def test_no_training_view_has_a_camera_or_a_moment_of_those_held_out(scene):
@@ -74,7 +91,7 @@ def test_points_have_the_moment_at_which_they_were_seen(scene):
 
 
 def test_the_folder_is_the_same_each_time(folder, tmp_path):
-    write_dataset(tmp_path / "again", SMALL, workers=2)
+    write_dataset(tmp_path / "again", SMALL, workers=1)
     files = sorted(path.relative_to(folder) for path in folder.rglob("*") if path.is_file())
     assert len(files) == 10 + 6 + 1 + 4
     assert all((folder / name).read_bytes() == (tmp_path / "again" / name).read_bytes() for name in files)
@@ -148,3 +165,99 @@ def test_times_of_points_are_written_and_read(tmp_path):
     assert read_points_ply(tmp_path / "p.ply").times is None, "a scene that does not move has no clock"
     assert points.joined(points).times.tolist() == [0, 0.5, 1] * 2
     assert points.joined(PointCloud(points.positions, points.colours)).times is None
+
+
+def several_cameras(folder: Path, counts: dict[str, int], *posed: str) -> Path:
+    """Videos as folders of frames, and a transforms.json with a pose for each camera."""
+    rng = np.random.default_rng(3)
+    for name, count in counts.items():
+        (folder / "videos" / name).mkdir(parents=True)
+        for i in range(count):
+            image = rng.integers(0, 255, (48, 64, 3), np.uint8)
+            cv2.imwrite(str(folder / "videos" / name / f"{i:04}.png"), image)
+    names = [f"images/{name}.png" for name in posed or counts]
+    (folder / "transforms.json").write_text(json.dumps(LENS | {"frames": frames(*names)}))
+    return folder
+
+
+def test_a_folder_of_frames_for_each_camera_is_a_scene_that_moves(tmp_path):
+    folder = several_cameras(tmp_path, {"left": 3, "right": 3})
+    (folder / "static").mkdir()
+    cv2.imwrite(str(folder / "static" / "left.png"), np.full((48, 64), 255, np.uint8))
+    scene = read_scene(folder, 2)
+    assert [(view.name, view.time) for view in scene.split("train")] == [
+        ("right/0000.png", 0.0),
+        ("right/0001.png", 0.5),
+        ("right/0002.png", 1.0),
+    ]
+    assert [view.static_path for view in scene.split("test")] == [folder / "static" / "left.png"] * 3
+    assert figures(Inspection.of(folder).facts)["times"] == "3 moments, seen from 2 places"
+    assert len(by_camera(scene.views)) == 2
+
+
+def test_cameras_of_colmap_serve_videos_too(tiny_colmap, tmp_path):
+    scene = read_scene(tiny_colmap, 0)
+    for view in scene.views[:2]:
+        folder = tmp_path / "videos" / Path(view.name).stem
+        folder.mkdir(parents=True)
+        for i in range(2):
+            (folder / f"{i}.png").write_bytes(view.image_path.read_bytes())
+    (tmp_path / "sparse").symlink_to(tiny_colmap / "sparse")
+    moving = read_scene(tmp_path, 0)
+    assert [view.time for view in moving.views] == [0, 1, 0, 1]
+    assert moving.views[0].camera == scene.views[0].camera
+    assert moving.points is not None
+
+
+@pytest.mark.parametrize(
+    ("counts", "posed", "message"),
+    [
+        ({"a": 3, "b": 2}, (), "b has 2 frames, a has 3; expected the same moments of every camera"),
+        ({"a": 1, "b": 1}, (), "has one frame a camera; expected two moments"),
+        ({"a": 2, "b": 2}, ("a",), "1 of 2 cameras have no pose: b"),
+        ({"a": 2}, ("a", "x/a"), "images/a.png and images/x/a.png are both of the camera a"),
+        ({}, ("a",), "has no folders of frames"),
+    ],
+)
+def test_videos_that_do_not_fit_their_cameras_are_refused(tmp_path, counts, posed, message):
+    (tmp_path / "videos").mkdir()
+    assert message in refusal(read_scene, several_cameras(tmp_path, counts, *posed))
+
+
+def test_frames_of_videos_are_taken_at_the_same_moments(tmp_path, caplog):
+    folder = several_cameras(tmp_path, {"a": 8, "b": 9})
+    for name, count in {"a": 8, "b": 9}.items():
+        video = cv2.VideoWriter(str(folder / "videos" / f"{name}.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 25, (64, 48))
+        for i in range(count):
+            video.write(np.full((48, 64, 3), 20 * i, np.uint8))
+        video.release()
+        for file in (folder / "videos" / name).iterdir():
+            file.unlink()
+        (folder / "videos" / name).rmdir()
+    assert f"`clsplat data moments {folder}`" in refusal(read_scene, folder)
+    assert write_moments(folder, 3) == 2
+    assert "the end of b.avi is left out" in caplog.text
+    views = read_scene(folder, 0).views
+    assert [view.time for view in views] == [0, 0.5, 1] * 2
+    levels = [cv2.imread(str(view.image_path)).mean() for view in views]
+    assert levels == pytest.approx([0, 80, 140] * 2, abs=4)
+    assert write_moments(folder, 3) == 2
+    assert "expected 2 to 8" in refusal(write_moments, folder, 9)
+
+
+def test_a_colmap_folder_with_times_moves(tiny_colmap, tmp_path):
+    shutil.copytree(tiny_colmap, tmp_path / "scene")
+    names = [view.name for view in read_scene(tiny_colmap, 0).views]
+    write_times(tmp_path / "scene" / "images", {name: 5 + i for i, name in enumerate(names)})
+    times = [view.time for view in read_scene(tmp_path / "scene", 0).views]
+    assert times == pytest.approx(np.linspace(0, 1, len(names)))
+    undistort_scene(tmp_path / "scene", tmp_path / "pinhole")
+    assert [view.time for view in read_scene(tmp_path / "pinhole", 0).views] == pytest.approx(times)
+    write_times(tmp_path / "scene" / "images", {name: 5.0 for name in names[1:]})
+    assert f"1 of {len(names)} frames have no `time`: {names[0]}" in refusal(read_scene, tmp_path / "scene")
+
+
+def test_cameras_for_nerfstudio_keep_times(scene, tmp_path):
+    write_cameras(scene, tmp_path / "out", "nerfstudio", "copy")
+    again = {view.name: view.time for view in read_scene(tmp_path / "out").views}
+    assert again == pytest.approx({f"images/{view.name}.png": view.time for view in scene.views})
