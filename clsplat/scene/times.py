@@ -50,10 +50,14 @@ def moments_of(views: Iterable[View]) -> list[float]:
     return sorted({view.time for view in views if view.time is not None})
 
 
+def camera_key(view: View) -> bytes:
+    """Return what views of one camera have in common: pose, lens and size; names play no part."""
+    return view.world_to_camera.tobytes() + repr((view.camera, view.downscale)).encode()
+
+
 def by_camera(views: Sequence[View]) -> list[list[View]]:
-    """Return views by the camera that took them, in order of time: one pose, one lens, one size; names play no part."""
+    """Return views by the camera that took them, in order of time."""
     groups: dict[bytes, list[View]] = {}
     for view in views:
-        key = view.world_to_camera.tobytes() + repr((view.camera, view.downscale)).encode()
-        groups.setdefault(key, []).append(view)
+        groups.setdefault(camera_key(view), []).append(view)
     return [sorted(group, key=lambda view: view.time or 0.0) for group in groups.values()]
