@@ -119,7 +119,8 @@ class Painter {
   move(used, layer, moment) {
     if (!layer.motions) return;
     const {bends, turns} = layer.header.motion;
-    for (const [name, number] of Object.entries({wide: layer.wide, bends, turns})) this.gl.uniform1i(used.at(name), number);
+    const numbers = {wide: layer.wide, bends, turns};
+    for (const [name, number] of Object.entries(numbers)) this.gl.uniform1i(used.at(name), number);
     this.gl.uniform1f(used.at("moment"), moment);
   }
 

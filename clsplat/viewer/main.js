@@ -5,12 +5,15 @@ const REST = 200, SLOW = 40, QUICK = 20; // ms without a change until the full p
 class Viewer extends Walk {
   constructor(info, layers, painter, canvas) {
     super(info, canvas);
-    Object.assign(this, {layers, painter, mode: "splats", share: 1, quality: 1, background: info.background, ms: null, moment: 0});
-    for (const layer of layers) layer.sorter = new Sorter(layer.positions, layer.motion, layer.header.near, (order, first) => {
-      painter.reorder(layer, order);
-      layer.first = first;
-      this.change(false);
-    });
+    Object.assign(this, {layers, painter, mode: "splats", share: 1, quality: 1, ms: null, moment: 0});
+    this.background = info.background;
+    for (const layer of layers) {
+      layer.sorter = new Sorter(layer.positions, layer.motion, layer.header.near, (order, first) => {
+        painter.reorder(layer, order);
+        layer.first = first;
+        this.change(false);
+      });
+    }
     this.panel = new Settings(this);
     this.photographs = new Photographs(this, info.views);
     this.frustums = new Frustums(this, info.views);
@@ -48,7 +51,8 @@ class Viewer extends Walk {
     if (!resting && this.drew) this.adapt(passed);
     this.drew = this.dirty || (resting && !this.whole);
     if (this.drew) this.draw(resting);
-    if (this.whole && !this.flight && !this.clock?.playing && !this.controls.pressed.size) this.time = undefined; // a new order draws again
+    const moves = this.flight || this.clock?.playing || this.controls.pressed.size;
+    if (this.whole && !moves) this.time = undefined; // a new order draws again
     else this.scheduled ??= requestAnimationFrame(later => this.tick(later));
   }
 

@@ -41,7 +41,7 @@ class Clock {
   // Go on by seconds while it plays; from the last moment to the first.
   run(seconds) {
     if (!this.playing) return false;
-    this.to((this.viewer.moment + Math.min(0.1, seconds) / LOOP) % 1);
+    this.to((this.viewer.moment + Math.min(0.5, seconds) / LOOP) % 1);
     return true;
   }
 
