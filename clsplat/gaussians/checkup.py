@@ -29,8 +29,8 @@ def is_model(path: Path) -> bool:
 
 
 def examine(path: Path) -> dict[str, Any]:
-    """Return what a model file holds: `model` (its path), `format`, `gaussians`, `sh_degree`, `mode`, whether it `moves`,
-    `ranges`, `bounds` in scene units, `degenerate` counts, `findings` in words, and whether it is `valid`: without findings.
+    """Return what a model file holds: `model` (its path), `format`, `gaussians`, `sh_degree`, `mode`, if it `moves`,
+    `ranges`, `bounds` in scene units, `degenerate` counts, `findings` in words, if it is `valid`: without them.
 
     Raises DataError where it cannot be read.
     """

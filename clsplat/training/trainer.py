@@ -156,9 +156,7 @@ class Trainer:
         texture = known_gradient(workspace, camera, photograph, mask) if count > TEXTURE else None
         model = self._drawn(comparison.step)
         pixel_sums = self.rasterizer.pixel_sums(model, view.frame, gradient, count, texture, view.behind)
-        if self.poses and (
-            learn := self.poses.learning(workspace, view.frame.drawn, view.frame, pixel_sums, comparison.step)
-        ):
+        if self.poses and (learn := self.poses.learning(workspace, model, view.frame, pixel_sums, comparison.step)):
             learning.append(lambda: learn(self.numbers))
         return ViewGradients(view.frame, comparison, view.losses, pixel_sums, learning=learning)
 
