@@ -16,7 +16,7 @@ from clsplat.errors import ConfigError, DataError
 from clsplat.formats.motion import MOTION
 from clsplat.gaussians.model import load
 from clsplat.gaussians.tables import moment_tables
-from clsplat.stages.first_motion import moving, spread_of_times
+from clsplat.stages.first_motion import drift, moving
 from clsplat.training import checkpoint
 from clsplat.training.memory import first_tables, plan
 from data_tools.moving import Moving
@@ -139,14 +139,17 @@ def test_points_among_others_of_all_times_begin_as_what_stands_still(rng):
     times = rng.uniform(0, 1, 400)
     positions = rng.normal(0, 0.1, (400, 3))
     positions[200:] += np.array([10, 0, 0]) + 40 * times[200:, None]
-    spread = spread_of_times(positions, times)
+    spread, velocities = drift(positions, times)
     assert (spread[:200] > 0.2).mean() > 0.95
     assert (spread[200:] < 0.1).mean() > 0.95
+    assert np.median(np.abs(velocities[200:] - 40)) < 4
     parameters = {"means": positions.astype(np.float32)}
     motion = moving(parameters, load_settings(), times, (4.0, 0.1), 0)[MOTION]
     np.testing.assert_allclose(motion[:, 3], times, rtol=1e-6)
     assert (np.exp(motion[:200, 4]) > 3.9).mean() > 0.95
     assert (np.exp(motion[200:, 4]) < 0.2).mean() > 0.95
+    np.testing.assert_allclose(motion[spread < 0.18, :3], velocities[spread < 0.18], rtol=1e-4)
+    assert not motion[spread > 0.18, :3].any()
     drawn = moving(parameters, load_settings(), None, (4.0, 0.1), 0)[MOTION]
     assert np.ptp(drawn[:, 3]) > 0.9
     np.testing.assert_allclose(np.exp(drawn[:, 4]), 4, rtol=1e-5)

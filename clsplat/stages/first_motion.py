@@ -1,4 +1,4 @@
-"""The motion of the first Gaussians: none, for a long time, at times of their own."""
+"""The motion of the first Gaussians: none, for a long time, but where points were seen in some moments only."""
 
 import numpy as np
 import scipy
@@ -13,7 +13,7 @@ from clsplat.scene.scene import Scene
 
 STREAM = 4  # of the random numbers, beside those of the points
 NEIGHBOURS = 16  # whose times say whether a point stands still (ours)
-STANDS = 0.18  # spread of those times above which it does (ours)
+STANDS = 0.18  # spread of those times above which it does (ours); below it moves as they do
 
 
 def require_times(scene: Scene, motion: Motion | None) -> None:
@@ -35,7 +35,7 @@ def moving(
     durations: tuple[float, float],
     seed: int,
 ) -> Parameters:
-    """Return the tables of Gaussians with a motion of none, where settings let them move, else as they are.
+    """Return the tables of Gaussians with a first motion, where settings let them move, else as they are.
 
     seen: [N] times in which their points were seen; without them times are drawn.  durations: of what stands still, and
     the shortest of what moves; both by the scene's duration.
@@ -48,22 +48,30 @@ def moving(
     duration = np.full(count, np.log(durations[0]))
     if seen is not None:
         times = seen.astype(np.float64)
-        spread = spread_of_times(parameters["means"], times)
+        spread, velocities = drift(parameters["means"].astype(np.float64), times)
+        table[:, fields["velocity"]] = np.where(spread > STANDS, 0, velocities.T).T
         duration = np.log(np.where(spread > STANDS, durations[0], np.maximum(spread, durations[1])))
     table[:, fields["time_centre"]] = times[:, None]
     table[:, fields["log_duration"]] = duration[:, None]
     return {**parameters, MOTION: table}
 
 
-def spread_of_times(positions: NDArray[np.floating], times: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Return how far apart in time the points near each one were seen, the standard deviation, [N].
+def drift(
+    positions: NDArray[np.float64], times: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return how far apart in time the points near each one were seen, the standard deviation, [N], and how their
+    places follow their times, the slope in least squares, [N, 3] scene units by the scene's duration.
 
     What stands still is seen at the same place at all moments: 0.29, if they are evenly spread.  What moves is there
     for a while.
     """
     nearest = scipy.spatial.cKDTree(positions).query(positions, k=min(NEIGHBOURS, len(positions)), workers=-1)[1]
-    spread: NDArray[np.float64] = times[nearest.reshape(len(positions), -1)].std(axis=1)
-    return spread
+    nearest = nearest.reshape(len(positions), -1)
+    apart = times[nearest] - times[nearest].mean(axis=1, keepdims=True)
+    square = (apart**2).sum(axis=1)
+    along = (apart[:, :, None] * positions[nearest]).sum(axis=1)
+    velocities = np.divide(along, square[:, None], out=np.zeros_like(along), where=square[:, None] > 0)
+    return np.sqrt(square / nearest.shape[1]), velocities
 
 
 def with_motion(parameters: Parameters, motion: Motion | None, file: str) -> Parameters:

@@ -63,9 +63,9 @@ class Init(Stage):
     swept: Annotated[int, Field(gt=0)] = 20_000
     """Largest number of points of a plane sweep."""
     times: Literal["uniform", "per_frame"] = "uniform"
-    """Where Gaussians move, the time at which each is most opaque: drawn from all of the scene's duration, or that of
-    the moment in which its point was seen, where the dataset says so.  Points whose neighbours were seen at all times
-    begin as what stands still, others with the spread of those times as their duration."""
+    """Where Gaussians move, the time of each: drawn, or that at which its point was seen, where the dataset says so.
+    Points whose neighbours were seen at all times begin as what stands still; others have the spread of those times as
+    their duration, and the velocity of those neighbours."""
     duration: Annotated[float, Field(gt=0)] = 4.0
     """Standard deviation of the time around that, by the scene's duration; a long one begins as a scene that stands
     still."""
