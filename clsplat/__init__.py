@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from clsplat.api.blocks import train_in_blocks as train_in_blocks
     from clsplat.api.commands import check as check
     from clsplat.api.commands import compare_runs as compare_runs
-    from clsplat.api.commands import convert as convert
     from clsplat.api.commands import copy_pipeline as copy_pipeline
     from clsplat.api.commands import describe_run as describe_run
     from clsplat.api.commands import evaluate as evaluate
@@ -32,6 +31,7 @@ if TYPE_CHECKING:
     from clsplat.api.commands import view as view
     from clsplat.api.compression import compress_model as compress_model
     from clsplat.api.compression import write_levels as write_levels
+    from clsplat.api.converting import convert as convert
     from clsplat.api.device import Device as Device
     from clsplat.api.pictures import camera_path as camera_path
     from clsplat.api.pictures import render_path as render_path
@@ -69,7 +69,8 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 _HERE = Path(__file__).resolve().parent
 _ROOMS = {  # where the names come from, which `import clsplat` does not import
-    "clsplat.api.commands": "check compare_runs convert copy_pipeline describe_run evaluate pipeline_schema"
+    "clsplat.api.converting": "convert",
+    "clsplat.api.commands": "check compare_runs copy_pipeline describe_run evaluate pipeline_schema"
     " pipelines resume run status status_schema view",
     "clsplat.api.blocks": "train_in_blocks",
     "clsplat.api.compression": "compress_model write_levels",

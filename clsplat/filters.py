@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, Field
 
+from clsplat.formats.motion import MAX_DEGREE, width_of
 from clsplat.formats.ply import MAX_NUMBER
 from clsplat.gaussians.tables import DeviceModel, Gaussians
 from clsplat.opencl.device import Array, Device
@@ -150,6 +151,20 @@ class Box(ScreenFilter):
     """As `variance`: a box keeps the energy of a splat."""
 
 
+class Motion(Settings):
+    """How Gaussians move and fade over the time of a scene: a polynomial, and a bell curve of their opacity."""
+
+    degree: Annotated[int, Field(ge=1, le=MAX_DEGREE)] = 1
+    """Degree of the polynomial in time that a mean follows: 1 in FreeTimeGS, 3 in Spacetime Gaussians."""
+    rotation: bool = False
+    """Whether Gaussians turn too, at a constant rate."""
+
+    @property
+    def width(self) -> int:
+        """Columns of the table of the motion."""
+        return width_of(self.degree, self.rotation)
+
+
 class ModelSettings(Settings):
     """How Gaussians are rendered."""
 
@@ -163,6 +178,9 @@ class ModelSettings(Settings):
     """Blur of splats in the image."""
     background: OneOf[Backdrop] | None = None
     """What is behind the Gaussians: `directions`, a sky that is learned, or `auto`; without it, `scene.background`."""
+
+    time: Motion | None = None
+    """How Gaussians move, in a scene whose views have times; without it, they stand still."""
 
     def model(self, gaussians: Gaussians, degree: int) -> DeviceModel:
         """Return the Gaussians with the numbers of these settings; `degree` is the active one."""

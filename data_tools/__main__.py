@@ -5,6 +5,7 @@ from typing import Annotated, Literal
 
 import typer
 
+from clsplat.errors import ConfigError
 from clsplat.scene.detect import format_names
 from data_tools.features import CameraModel
 from data_tools.mapping import Mapper
@@ -32,13 +33,31 @@ def data_tools() -> None:
 @app.command()
 def synthetic(
     out: Out,
-    size: Size = 256,
-    train: Train = 60,
-    test: Test = 12,
+    size: Annotated[
+        int | None, typer.Option(min=8, help="Width and height of the images, pixels; default: 256, moving 160.")
+    ] = None,
+    train: Annotated[
+        int | None, typer.Option(min=1, help="Number of training views, moving: cameras; default: 60, moving 10.")
+    ] = None,
+    test: Annotated[
+        int | None, typer.Option(min=1, help="Number of held-out views, moving: cameras; default: 12, moving 2.")
+    ] = None,
     seed: Seed = 0,
+    moving: Annotated[
+        bool, typer.Option("--moving", help="A ball flies, a book turns, a lamp pulses; in the layout of D-NeRF.")
+    ] = False,
+    times: Annotated[
+        int | None, typer.Option(min=2, help="With --moving: moments, every fifth held out; default: 30.")
+    ] = None,
 ) -> None:
     """Ray-cast the demo scene: a still life with exact cameras, in the Blender (NeRF-synthetic) layout."""
-    print(write_dataset(out, Options(size, train, test, seed)))
+    from data_tools.moving import Moving
+
+    given = {"size": size, "train": train, "test": test, "times": times}
+    found = {name: value for name, value in given.items() if value is not None}
+    if times is not None and not moving:
+        raise ConfigError("--times is for a scene that moves; give --moving, too")
+    print(write_dataset(out, Moving(seed=seed, **found) if moving else Options(seed=seed, **found)))
 
 
 @app.command()
@@ -90,11 +109,26 @@ def video(
         int, typer.Option(min=1, help="Parts with the same motion; the sharpest frame of each is written.")
     ] = 100,
     long_side: Annotated[int | None, typer.Option(min=16, help="Pixels, at most.")] = None,
+    times: Annotated[
+        bool, typer.Option("--times", help="Of a scene that moves: also times.json, when each frame was taken.")
+    ] = False,
 ) -> None:
     """Take sharp frames of a video, with the same motion between them."""
     from data_tools.video import write_frames
 
-    print(f"{write_frames(file, out, frames, long_side)} frames in {out}")
+    print(f"{write_frames(file, out, frames, long_side, times)} frames in {out}")
+
+
+@app.command()
+def moments(
+    scene: Annotated[Path, typer.Argument(help="Folder that holds videos/NAME.mp4 of each camera.")],
+    moments_: Annotated[int, typer.Option("--moments", min=2, help="Frames of each video, evenly spaced.")] = 60,
+    long_side: Annotated[int | None, typer.Option(min=16, help="Pixels, at most.")] = None,
+) -> None:
+    """Take frames of the videos of several cameras, at the same moments of each."""
+    from data_tools.moments import write_moments
+
+    print(f"{moments_} frames of each of {write_moments(scene, moments_, long_side)} cameras in {scene / 'videos'}")
 
 
 @app.command()

@@ -7,7 +7,7 @@ in shapes.py.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +32,7 @@ class World:
     shapes: tuple[Shape, ...]
     camera_angle_x: float  # field of view, radians
     grid: int  # a pixel is the mean of grid x grid rays
+    canopy: tuple[Shape, ...] | None = None  # what keeps the sky's light off; None: all shapes
 
     def trace(self, origins: Array, directions: Array) -> tuple[Array, NDArray[np.intp]]:
         """Distance to the closest shape (inf = miss) and its index in `shapes`, both [R]."""
@@ -60,11 +61,12 @@ class World:
         to_key = unit(align(KEY_DIRECTION, KEY_WIDTH * lamp[0], KEY_WIDTH * lamp[1], 1.0))
         lit = np.isinf(self.trace(start, to_key)[0]) * np.maximum(dot(KEY_DIRECTION, normal), 0)
         to_sky = align(normal, sky[0], sky[1], np.sqrt(1 - dot(sky, sky)))
-        distance, blocker = self.trace(start, to_sky)
+        above = self if self.canopy is None else replace(self, shapes=self.canopy)
+        distance, blocker = above.trace(start, to_sky)
         light = SKY_LIGHT * (0.75 + 0.25 * normal[2])
         near = np.flatnonzero(np.isfinite(distance))
         there = start[:, near] + distance[near] * to_sky[:, near]
-        light[:, near] *= BOUNCE * self.by_shape(Shape.texture, blocker[near], there)
+        light[:, near] *= BOUNCE * above.by_shape(Shape.texture, blocker[near], there)
         return np.asarray(self.by_shape(Shape.texture, index, points) * (KEY_LIGHT * lit + light))
 
     def camera_rays(self, pose: Array, size: int, x: Array, y: Array) -> tuple[Array, Array]:

@@ -15,6 +15,7 @@ from clsplat.reading import read_file
 from clsplat.scene.exif import copied, exposure_of, write_exposures
 from clsplat.scene.image_headers import JPEG, TAIL_SIZE, parse_header
 from clsplat.scene.images import IMAGE_SUFFIXES, MAX_BYTES, decode_image, read_grey
+from clsplat.scene.times_file import read_times, write_times
 
 LOG = logging.getLogger("clsplat")
 CONVERTED = {  # photographs that OpenCV cannot read, and what makes JPEG files of them
@@ -96,6 +97,8 @@ def gather(photographs: Path, images: Path, names: list[str]) -> tuple[list[str]
             continue
         kept.append(name)
     write_exposures(images, {name: exposure_of(photographs / name) for name in kept})  # a copy of a PNG has none
+    if times := read_times(photographs):
+        write_times(images, {name: times[name] for name in kept if name in times})
     if len(kept) < MIN_PHOTOGRAPHS:
         raise DataError(f"{photographs}: only {len(kept)} of {len(names)} photographs can be read; export them again")
     return kept, damaged

@@ -61,6 +61,15 @@ class Options:
         """The text of OUT/synthetic.json, which identifies a finished data set."""
         return json.dumps({"scene": self.version, **asdict(self)}) + "\n"
 
+    def images(self) -> list[str]:
+        """The files of a finished data set beside its cameras, points and manifest."""
+        return [f"{split}/r_{i:03}.png" for split, poses in self.poses().items() for i in range(len(poses))]
+
+    def fill(self, out: Path, workers: int) -> str:
+        """Write images, cameras and points into `out`; return a line of text about them."""
+        count = fill(out, self, workers)
+        return f"{self.train} training and {self.test} test views, {self.size} px, {count:,} points"
+
 
 def write_dataset(out: Path, options: Options, workers: int | None = None) -> str:
     """Make folder `out`, all of it or nothing, and return a line of text about it.
@@ -75,13 +84,14 @@ def write_dataset(out: Path, options: Options, workers: int | None = None) -> st
     partial_out = out.parent / f".{out.name}.{os.getpid()}.partial"
     try:
         partial_out.mkdir(parents=True)
-        count = fill(partial_out, options, workers or os.cpu_count() or 1)
+        text = options.fill(partial_out, workers or os.cpu_count() or 1)
+        (partial_out / "synthetic.json").write_text(options.manifest(), "utf-8")
         partial_out.rename(out)
     except OSError as error:
         raise OutputError(f"{out}: cannot write the data set: {error}") from error
     finally:
         shutil.rmtree(partial_out, ignore_errors=True)
-    return f"wrote {out}: {options.train} training and {options.test} test views, {options.size} px, {count:,} points"
+    return f"wrote {out}: {text}"
 
 
 def is_complete(out: Path, options: Options) -> bool:
@@ -89,8 +99,7 @@ def is_complete(out: Path, options: Options) -> bool:
     manifest = out / "synthetic.json"
     if not manifest.exists() or read_file(manifest).decode(errors="replace") != options.manifest():
         return False
-    files = [f"{split}/r_{i:03}.png" for split, poses in options.poses().items() for i in range(len(poses))]
-    files += ["transforms_train.json", "transforms_test.json", "points3d.ply"]
+    files = [*options.images(), "transforms_train.json", "transforms_test.json", "points3d.ply"]
     return all((out / name).is_file() for name in files)
 
 
@@ -105,18 +114,21 @@ def fill(out: Path, options: Options, workers: int) -> int:
     for split in splits:
         (out / split).mkdir()
     for (split, i, pose), image in zip(jobs, track(images, "rendering", total=len(jobs)), strict=True):
-        png = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGBA2BGRA))[1]
-        (out / split / f"r_{i:03}.png").write_bytes(png.tobytes())
+        write_png(out / split / f"r_{i:03}.png", image)
         if split == "train":
-            points.append(surface_points(options, pose, image, rng))
+            points.append(surface_points(world, pose, image, -(-options.points // options.train), options.noise, rng))
     for split, poses in splits.items():
         (out / f"transforms_{split}.json").write_text(
             json.dumps(transforms(world, split, poses), indent=1) + "\n", "utf-8"
         )
     positions, colours = (np.concatenate(parts).astype(np.float32) for parts in zip(*points, strict=True))
     write_points_ply(out / "points3d.ply", PointCloud(positions, colours))
-    (out / "synthetic.json").write_text(options.manifest(), "utf-8")
     return len(positions)
+
+
+def write_png(path: Path, image: NDArray[np.uint8]) -> None:
+    """Write an image, [H, W, 4] RGBA."""
+    path.write_bytes(cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGBA2BGRA))[1].tobytes())
 
 
 def photographs(world: World, poses: list[Array], size: int, workers: int) -> Iterator[NDArray[np.uint8]]:
@@ -129,10 +141,9 @@ def photographs(world: World, poses: list[Array], size: int, workers: int) -> It
 
 
 def surface_points(
-    options: Options, pose: Array, image: NDArray[np.uint8], rng: np.random.Generator
+    world: World, pose: Array, image: NDArray[np.uint8], count: int, noise: float, rng: np.random.Generator
 ) -> tuple[Array, Array]:
     """Return noisy surface points of a view, as from structure from motion: positions and colours, [M, 3]."""
-    world, count = options.world, -(-options.points // options.train)
     rows, columns = np.nonzero(image[..., 3] == 255)
     chosen = rng.integers(len(rows), size=count) if len(rows) else np.zeros(0, int)
     x, y = np.stack([columns[chosen], rows[chosen]]) + rng.random((2, len(chosen)))
@@ -141,7 +152,7 @@ def surface_points(
     hit = np.isfinite(distance)
     positions = (origin + distance[hit] * directions[:, hit]).T
     colours = image[rows[chosen], columns[chosen], :3][hit] / 255
-    return positions + options.noise * rng.standard_normal(positions.shape), colours
+    return positions + noise * rng.standard_normal(positions.shape), colours
 
 
 def transforms(world: World, split: str, poses: list[Array]) -> dict[str, object]:

@@ -15,6 +15,7 @@ from clsplat.scene.exposures import camera_exposures
 from clsplat.scene.images import write_image
 from clsplat.scene.lens import shared
 from clsplat.scene.scene import View
+from clsplat.scene.times_file import write_times
 from clsplat.scene.view import load_image, load_mask
 from data_tools.colmap_writer import write_model
 from data_tools.made import Made, hash_of
@@ -46,6 +47,8 @@ def undistort_scene(source: Path, out: Path, long_side: int | None = None, blank
         views.append(replace(pinhole_view, name=name))
         count.reach(number)
     write_exposures(out / "images", dict(zip(names, camera_exposures(scene.views), strict=True)))
+    if times := {name: view.time for view, name in zip(scene.views, names, strict=True) if view.time is not None}:
+        write_times(out / "images", times)
     tracks = scene.tracks and replace(
         scene.tracks, seen={name: scene.tracks.seen[view.name] for view, name in zip(scene.views, names, strict=True)}
     )

@@ -18,6 +18,7 @@ from clsplat.progress import Count
 from clsplat.reading import read_json, sha256
 from clsplat.scene.images import image_size, is_image, write_image
 from clsplat.scene.sharpness import SIDE, sharpness
+from clsplat.scene.times_file import write_times
 
 LOG = logging.getLogger("clsplat")
 RECORD = ".frames.json"  # beside the frames: what they were made from
@@ -26,11 +27,12 @@ CELLS = 4, 3  # in each of which the motion of all pixels is averaged, so that n
 STILL = 0.1  # px from one frame to the next: what noise and coding leave of it
 
 
-def write_frames(video: Path, out: Path, frames: int = 100, long_side: int | None = None) -> int:
+def write_frames(video: Path, out: Path, frames: int = 100, long_side: int | None = None, times: bool = False) -> int:
     """Write the sharpest frame of each of `frames` parts of a video with the same motion as PNG; return their number.
 
     The format is PNG because a second lossy coding changes features and colours.  An interrupted call goes on: frames
-    of the same video and settings stay unchanged.
+    of the same video and settings stay unchanged.  times: also write times.json, of a scene that moves: the number of
+    each frame in the video.
     Raises DataError when the video cannot be decoded, and when `out` holds other images, which would mix with frames.
     """
     settings: dict[str, Any] = {"video": sha256(video, "a video"), "frames": frames, "long_side": long_side}
@@ -44,13 +46,15 @@ def write_frames(video: Path, out: Path, frames: int = 100, long_side: int | Non
     files = {place: _file(out, i) for i, place in enumerate(chosen, 1)}
     count = Count("frames written", len(files))
     missing = {place for place, path in files.items() if not _is_whole(path)}
-    for place, image in enumerate(_decoded(video) if missing else ()):
+    for place, image in enumerate(decoded(video) if missing else ()):
         if place in missing:
-            write_image(files[place], np.ascontiguousarray(_limited(image, long_side)[:, :, ::-1]))
+            write_image(files[place], np.ascontiguousarray(limited(image, long_side)[:, :, ::-1]))
             missing.remove(place)
             count.reach(count.done + 1)
     if missing:
         raise DataError(f"{out / RECORD}: names frame {min(missing)}, which the video does not have; remove {out}")
+    if times:
+        write_times(out, {path.name: place for place, path in files.items()})
     return len(files)
 
 
@@ -118,10 +122,10 @@ def _measured(video: Path) -> tuple[list[float], list[float]]:
     moved: list[float] = []
     empty = np.empty(0, np.float32)
     flow, before = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST), None
-    for image in _decoded(video):
-        grey = np.asarray(cv2.cvtColor(_limited(image, SIDE), cv2.COLOR_BGR2GRAY), np.uint8)
+    for image in decoded(video):
+        grey = np.asarray(cv2.cvtColor(limited(image, SIDE), cv2.COLOR_BGR2GRAY), np.uint8)
         sharp.append(sharpness(grey))
-        small = _limited(grey, FLOW_SIDE)
+        small = limited(grey, FLOW_SIDE)
         way = np.zeros((*small.shape, 2), np.float32) if before is None else flow.calc(before, small, empty)
         way = cv2.resize(way, CELLS, interpolation=cv2.INTER_AREA)
         moved.append(float(np.median(np.linalg.norm(way, axis=2))))
@@ -129,8 +133,8 @@ def _measured(video: Path) -> tuple[list[float], list[float]]:
     return sharp, moved
 
 
-def _decoded(video: Path) -> Iterator[NDArray[np.uint8]]:
-    """The frames, [H, W, 3] BGR.  Raises DataError when there is none."""
+def decoded(video: Path) -> Iterator[NDArray[np.uint8]]:
+    """Yield the frames of a video, [H, W, 3] BGR.  Raises DataError when there is none."""
     reader = cv2.VideoCapture(str(video))
     try:
         found = False
@@ -146,8 +150,8 @@ def _decoded(video: Path) -> Iterator[NDArray[np.uint8]]:
         raise DataError(f"{video}: not a video that OpenCV decodes; convert it to MP4 (H.264)")
 
 
-def _limited(image: NDArray[np.uint8], long_side: int | None) -> NDArray[np.uint8]:
-    """The image with no side longer than `long_side` px."""
+def limited(image: NDArray[np.uint8], long_side: int | None) -> NDArray[np.uint8]:
+    """Return the image with no side longer than `long_side` px."""
     height, width = image.shape[:2]
     factor = max(height, width) / (long_side or max(height, width))
     if factor <= 1:

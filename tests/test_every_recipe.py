@@ -32,6 +32,7 @@ RECIPES = [
     if name not in ("compress", "blocks", "blocks_coarse")  # two start from a model, one is splat_7k at half size
     and f"{name}_7k" not in shipped()
     and not load(name).settings.prepare
+    and not load(name).settings.model.time  # they need a scene that moves: test_dynamic.py
     and any(isinstance(s, Optimize) for s in load(name).stages)
 ]
 LOOKS_AT_VIEWS = {"fastgs_7k", "speedy_7k", "mini_7k", "taming_7k"}

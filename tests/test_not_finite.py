@@ -94,3 +94,4 @@ def test_the_advice_names_the_stage_that_trains(tiny_scene, tmp_path, few_steps)
     assert lower_rate(run, ["sh_rest"]) == "stages.1.rates.sh_rest=5e-05"
     run.pipeline = {**run.pipeline, "stages": [stages[0], stages[-1]]}
     assert lower_rate(run, ["means"]) == "optimize.rates.means=1.6e-05"
+    assert lower_rate(run, ["motion"]).startswith("optimize.rates.motion.velocity=")

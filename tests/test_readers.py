@@ -14,7 +14,7 @@ from clsplat.scene.detect import format_names, holds_scene, read_scene, readers
 from tests.refusals import refusal
 from tests.test_inspect import orbit, photograph, write
 
-SHIPPED = ["COLMAP", "Blender", "multi-scale Blender", "nerfstudio"]
+SHIPPED = ["multi-camera video", "COLMAP", "Blender", "multi-scale Blender", "nerfstudio"]
 
 
 @pytest.fixture(autouse=True)
@@ -33,7 +33,7 @@ class OneFile(Reader):
 
 def test_shipped_readers_come_in_order_of_precedence():
     assert [reader.name for reader in readers()] == SHIPPED
-    assert format_names() == "COLMAP, Blender, multi-scale Blender or nerfstudio"
+    assert format_names() == "multi-camera video, COLMAP, Blender, multi-scale Blender or nerfstudio"
 
 
 def test_readers_of_plugins_follow_in_order_of_definition():
@@ -60,7 +60,7 @@ def test_a_reader_that_extends_a_shipped_one_takes_its_place():
     class Wider(ColmapReader):
         name = "wider"
 
-    assert [reader.name for reader in readers()] == ["wider", *SHIPPED[1:]]
+    assert [reader.name for reader in readers()] == [SHIPPED[0], "wider", *SHIPPED[2:]]
 
 
 def test_a_reader_that_is_defined_again_replaces_the_one_before():

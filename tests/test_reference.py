@@ -743,3 +743,38 @@ def test_pixels_show_the_sky_where_six_of_nine_match():
     photograph = np.zeros((3, 5, 5))
     photograph[:, :2] = 1
     assert ref.shows_sky(sky, photograph, 0.1).any(axis=1).tolist() == [False, False, True, True, True]
+
+
+@pytest.mark.parametrize("turns", [False, True])
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_gradients_of_a_motion(rng, degree, turns):
+    """By the motion and by the logit at the centre, of a sum over what is there at a time."""
+    count, time = 6, 0.4
+    motion = rng.normal(0, 0.4, (count, 2 + 3 * degree + 4 * turns))
+    motion[:, 3], motion[:, 4] = rng.uniform(0.2, 0.6, count), rng.normal(-1, 0.2, count)
+    means, quats, logit = rng.normal(size=(count, 3)), rng.normal(size=(count, 4)), rng.normal(size=count)
+    weights = [rng.normal(size=table.shape) for table in (means, quats, logit)]
+
+    def value() -> float:
+        tables = ref.moved(motion, means, quats, logit, time, degree, turns)
+        return sum(float((weight * table).sum()) for weight, table in zip(weights, tables, strict=True))
+
+    by_motion, by_logit = ref.moved_backward(motion, logit, *weights, time, degree, turns)
+    assert by_motion.all()
+    assert relative_error(by_motion, five_point(value, motion)) < FD_TOLERANCE
+    assert relative_error(by_logit, five_point(value, logit)) < FD_TOLERANCE
+
+
+@pytest.mark.parametrize("penalty", [lambda m: ref.travel(m, 2.5), lambda m: ref.brevity(m, 0.4)])
+def test_gradients_of_penalties_on_the_motion(rng, penalty):
+    motion = rng.normal(0, 0.4, (7, 8))
+    motion[:, 4] = rng.normal(-1, 0.5, 7)
+    gradient, columns = penalty(motion)[1], np.flatnonzero(penalty(motion)[1].any(axis=0))
+    part = motion[:, columns].copy()
+
+    def value() -> float:
+        changed = motion.copy()
+        changed[:, columns] = part
+        return penalty(changed)[0]
+
+    assert relative_error(gradient[:, columns], five_point(value, part)) < FD_TOLERANCE

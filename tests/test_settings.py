@@ -52,7 +52,15 @@ def own(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 def test_variants_are_the_subclasses_with_a_name():
     images = ["inverse_depth", "weight_entropy", "l1", "l2", "dssim"]
-    assert list(variants(Loss)) == [*images, "covariance_trace", "anisotropy", "mean_scale", "mean_opacity"]
+    assert list(variants(Loss)) == [
+        *images,
+        "travel",
+        "brevity",
+        "covariance_trace",
+        "anisotropy",
+        "mean_scale",
+        "mean_opacity",
+    ]
     assert variants(Loss).keys() == variants(ImageLoss).keys() | variants(Penalty).keys()
     assert variants(Order)["paper"] is Paper
     assert tag_of(Paper) == ("type", "paper")
@@ -133,7 +141,7 @@ def test_a_word_means_the_variant_with_its_defaults(loaded):
         ({"rules": "[{type: splitt}]"}, "no rule named 'splitt'; did you mean 'split'?"),
         ({"losses": "[disim]"}, "small.yaml:7: stages[1].optimize.losses[0]: no loss named 'disim'; did you mean "
          "'dssim'?"),
-        ({"losses": "[xyz]"}, "no loss named 'xyz'; there are anisotropy, covariance_trace, dssim, "
+        ({"losses": "[xyz]"}, "no loss named 'xyz'; there are anisotropy, brevity, covariance_trace, dssim, "
          "inverse_depth, l1, l2"),
         ({"views": "{order: papr}"}, "small.yaml:6: stages[1].optimize.views.order: no order named 'papr'; did you "
          "mean 'paper'?"),

@@ -164,40 +164,6 @@ def evaluate(
     )
 
 
-def convert(
-    sources: PathLike | Sequence[PathLike],
-    out: PathLike,
-    *,
-    sh_degree: int | None = None,
-    sh_bits: str | None = None,
-    axes: Literal["spz", "ply"] = "spz",
-    spz_version: int = 3,
-    quality: Literal["small", "balanced", "high"] = "balanced",
-    keep_nan: bool = False,
-    crop: str | Sequence[float] | None = None,
-    transform: str | None = None,
-    drop_below: float = 0.0,
-) -> dict[str, Any]:
-    """Write models, merged, as one file of the format that its name stands for; return `format`, `gaussians`, `bytes`.
-
-    sh_bits: of SPZ, such as "8/6"; axes: of SPZ files that are read, or where none is of the one that is written; crop:
-    x0, y0, z0, x1, y1, z1 in scene units, after `transform`, such as "scale=2 rotate=90,0,0" (degrees); drop_below: an
-    opacity.  Gaussians that are not finite are dropped, unless `keep_nan`.
-    """
-    from clsplat.gaussians import conversion
-
-    files = [Path(source) for source in ([sources] if isinstance(sources, str | Path) else sources)]
-    box = crop if isinstance(crop, str) or crop is None else ",".join(map(str, crop))
-    options = conversion.Options(sh_bits, axes, spz_version, quality, keep_nan)
-    changes = conversion.Changes(
-        drop_below,
-        None if transform is None else conversion.transform_of(transform),
-        None if box is None else conversion.crop_of(box),
-        conversion.checked_degree(sh_degree),
-    )
-    return conversion.convert(files, Path(out), changes, options)
-
-
 def compare_runs(runs: Sequence[PathLike], out: PathLike = "compare.html") -> int:
     """Write the page that shows runs side by side; return their number.  The folder of a matrix stands for its runs."""
     from clsplat.compare.page import write_comparison

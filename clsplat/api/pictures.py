@@ -27,13 +27,15 @@ def render_views(
     kind: Literal["png", "npy"] = "png",
     depth: bool = False,
     alpha: bool = False,
+    time: float | None = None,
     device: "str | Device | None" = None,
 ) -> int:
     """Render a model at the views of a scene, one file for each view; return the number of files.
 
     model: a file, with `scene`, or a run folder, whose scene is the default; downscale: divisor of the photographs'
     size, by default that of the run, 1 for a file; kind: 8-bit images, or float32 arrays [height, width, 3]; depth,
-    alpha: files NAME_depth and NAME_alpha beside, as arrays [height, width] in scene units and in [0, 1].
+    alpha: files NAME_depth and NAME_alpha beside, as arrays [height, width] in scene units and in [0, 1]; time: of a
+    model that moves, in [0, 1], instead of the views' own.
     """
     from clsplat.runs import model_file
 
@@ -46,6 +48,7 @@ def render_views(
         downscale=downscale,
         kind=kind,
         layers=layer_names(depth, alpha),
+        time=time,
         device=device,
     )
 
@@ -60,6 +63,7 @@ def render_path(
     frames: int | None = None,
     fps: float | None = None,
     size: Size | None = None,
+    times: "str | float | tuple[float, float] | None" = None,
     side: PathLike | None = None,
     depth: bool = False,
     alpha: bool = False,
@@ -74,10 +78,12 @@ def render_path(
     and how long it `took`, s.
 
     model, scene: a file and its scene, or a run folder; video: a file that ends in .webm, or .mp4 with the extra
-    `video`; None: pictures of this `kind` into the folder `out`; path: ellipse, spiral, orbit, through, views, or a
-    file camera_path.json; frames: by default 120; fps: by default 30; size: even numbers, by default that of the
-    photographs by `downscale`; side: "photograph", of the nearest camera, or another model, on the right; depth, alpha:
-    files of these beside; save_path: a camera_path.json to write.
+    `video`; None: pictures of this `kind` into the folder `out`; path: ellipse, spiral, orbit, through, views,
+    fixed, fixed:NAME of a view, or a file camera_path.json; frames: by default 120; fps: by default 30; size: even
+    numbers, by default that of the photographs by `downscale`; times: of a model that moves, one moment in [0, 1],
+    or those of the first and the last frame, such as (0, 1) or "0..1", by default the whole or the views' own;
+    side: "photograph", of the nearest camera, or another model, on the right; depth, alpha: files of these beside;
+    save_path: a camera_path.json to write.
 
     Raises ConfigError for values out of bounds, without a scene that the path needs, and where other files would be
     replaced; DataError for files that cannot be read, and where the scene's cameras give no such path; NumericError for
@@ -87,7 +93,7 @@ def render_path(
     from clsplat.video.film import Wish
 
     load_plugins()
-    wish, place = Wish.of(str(path), frames, fps, size), filming.Place(path_of(video), Path(out), kind)
+    wish, place = Wish.of(str(path), frames, fps, size, times), filming.Place(path_of(video), Path(out), kind)
     extras = filming.Extras(None if side is None else str(side), layer_names(depth, alpha), path_of(save_path))
     return filming.film(Path(model), path_of(scene), place, wish, extras, downscale=downscale, device=device)
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from clsplat.api.device import proved
 from clsplat.gaussians.model import Model
-from clsplat.gaussians.tables import PARAMETERS, DeviceModel
+from clsplat.gaussians.tables import DeviceModel
 from clsplat.metrics.images import to_8_bits
 from clsplat.metrics.views import require_finite
 from clsplat.opencl.device import Array, Device
@@ -35,6 +35,7 @@ class Gradients:
     sh_base: Floats
     sh_rest: Floats
     mean2d: Floats  # [N, 2] px⁻¹, by the projected mean
+    motion: Floats | None = None  # [N, 5 or more] where the Gaussians move
 
     def __repr__(self) -> str:
         return f"Gradients(of {len(self.means):,} Gaussians)"
@@ -95,7 +96,7 @@ class Renderer:
         self.model, self._model = model, model.upload(self.device)
 
     def render(self, view: View, background: Colour | None = None, depth: bool = False) -> Picture:
-        """Render a view.
+        """Render a view; of a moving model, the moment of the view's time.
 
         background: a colour in [0, 1], one number or three; by default the model's sky or colour, else black;
         depth: compute it, which takes another pass.  Raises ValueError for a camera that cannot be and for other
@@ -128,7 +129,7 @@ class Renderer:
             both[:GEOMETRY] += sums
             pixel_sums.set(both)
         gradients = self.rasterizer.gradients(model, frame, pixel_sums)
-        arrays = {**{name: gradients[name] for name in PARAMETERS}, "mean2d": gradients.mean2d}
+        arrays = {**{name: gradients[name] for name in model.gaussians.trained}, "mean2d": gradients.mean2d}
         count = model.gaussians.count
         return Gradients(**{name: np.ascontiguousarray(a.get()[:, :count].T) for name, a in arrays.items()})
 

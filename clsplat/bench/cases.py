@@ -5,6 +5,7 @@ import time
 from collections import defaultdict
 from collections.abc import Collection
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -62,7 +63,8 @@ class Case:
         colour = device.zeros(3)
         colour.fill(1.0 if background == "white" else 0.0)
         model = settings.model.model(gaussians, gaussians.sh_degree)
-        zero_rates = Rates(**dict.fromkeys(PARAMETERS, 0.0))  # every step does the same work
+        none: dict[str, Any] = dict.fromkeys(PARAMETERS, 0.0)
+        zero_rates = Rates(**none)  # every step does the same work
         self.trainer = Trainer(
             Rasterizer(device, "radix"),
             model,

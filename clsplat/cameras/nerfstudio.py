@@ -40,6 +40,7 @@ def write(out: Path, views: list[Posed], points: PointCloud | None) -> list[Path
         {
             "file_path": f"{IMAGES}/{one.name}",
             **({} if common else {key: value for key, value in lens.items() if key != "camera_model"}),
+            **({} if one.view.time is None else {"time": one.view.time}),
             "transform_matrix": matrix,
         }
         for one, lens, matrix in zip(views, lenses, matrices, strict=True)

@@ -31,7 +31,7 @@ PLACES = {  # that each writes
 }
 UNDISTORTED = ("inria",)  # formats of cameras without lenses
 COPIES = ("none", "copy")  # of the photographs
-SPLIT = "nerfstudio"  # what keeps it
+SPLIT = "nerfstudio"  # what keeps it, and times
 
 
 def checked(scene: Scene, format_: str) -> list[Posed]:
@@ -64,6 +64,8 @@ def write_cameras(scene: Scene, out: Path, format_: str, images: str = "none", o
     if format_ != SPLIT and scene.test:
         lost = f"{len(scene.test)} of {len(views)}"
         LOG.warning("%s: %s does not keep which views are for testing, %s; %s does", out, format_, lost, SPLIT)
+    if format_ != SPLIT and any(one.view.time is not None for one in views):
+        LOG.warning("%s: %s does not keep the times of the views; %s does", out, format_, SPLIT)
     for path, source in counted(copies.items(), "photographs copied", len(copies)):
         with opened(source, "an image") as old, atomic(path) as new:
             shutil.copyfileobj(old, new)

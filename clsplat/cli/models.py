@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import typer
 
 from clsplat import terminal
-from clsplat.api import commands, compression
+from clsplat.api import commands, compression, converting
 from clsplat.cli.app import DeviceOption, ModelArgument, SceneOption, command
 from clsplat.errors import ConfigError, quoted
 from clsplat.files import is_there
@@ -104,6 +104,7 @@ def view(
 @command(
     "convert",
     "clsplat convert point_cloud.ply scene.spz",
+    "clsplat convert moving.ply frames --frames 30",
     "clsplat convert a.ply b.sog both.glb --transform 'rotate=90,0,0'",
 )
 def convert(
@@ -137,9 +138,15 @@ def convert(
     drop_below: Annotated[
         float, typer.Option(metavar="OPACITY", min=0, max=1, help="Drop Gaussians that are fainter.")
     ] = 0.0,
+    time: Annotated[
+        float | None, typer.Option(metavar="T", help="Of a model that moves: the moment, 0 to 1, that is written.")
+    ] = None,
+    frames: Annotated[
+        int | None, typer.Option(metavar="N", help="So many moments, each in a file; OUT is a folder, or frame.spz.")
+    ] = None,
 ) -> None:
     """Write models in another format: PLY, SPZ, SOG, glTF and others."""
-    done = commands.convert(
+    done = converting.convert(
         files[:-1],
         files[-1],
         sh_degree=sh_degree,
@@ -151,6 +158,8 @@ def convert(
         crop=crop,
         transform=transform,
         drop_below=drop_below,
+        time=time,
+        frames=frames,
     )
     share = 100 * done["bytes"] / max(done["bytes_read"], 1)
     size = f"{done['bytes'] / 1e6:.3g} MB, {share:,.1f} % of what was read"

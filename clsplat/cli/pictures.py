@@ -17,7 +17,7 @@ ScaleOption = Annotated[
 ]
 PathOption = Annotated[
     str | None,
-    typer.Option(metavar="PATH", help="A film: ellipse, spiral, orbit, through, views, or a camera_path.json."),
+    typer.Option(metavar="PATH", help="A film: ellipse, spiral, orbit, through, views, fixed[:VIEW], or a path file."),
 ]
 SideOption = Annotated[
     str | None, typer.Option(metavar="photograph|MODEL", help="Video: the nearest photograph, or a model, beside it.")
@@ -27,6 +27,12 @@ SideOption = Annotated[
 FormatOption = Annotated[Literal["png", "npy"], typer.Option("--format", help="8-bit images, or float32 arrays.")]
 SizeOption = Annotated[
     str | None, typer.Option(metavar="WxH", help="Film: px of a picture, even numbers; default: as the photographs.")
+]
+TimeOption = Annotated[
+    float | None, typer.Option(metavar="T", help="Of a model that moves: this moment, 0 to 1; default: of each view.")
+]
+TimesOption = Annotated[
+    str | None, typer.Option(metavar="A..B", help="Film: moments of its first and its last frame; default: 0..1.")
 ]
 SavePathOption = Annotated[
     Path | None, typer.Option(metavar="FILE.json", help="Film: write its path, too, for nerfstudio or for --path.")
@@ -39,6 +45,7 @@ SavePathOption = Annotated[
     "clsplat render point_cloud.ply --scene my_scene --split all --format npy",
     "clsplat render runs/splat_7k --video ellipse.webm --size 1280x720",
     "clsplat render runs/a --path views --side photograph --video both.webm",
+    "clsplat render runs/dynamic --path fixed --times 0..1 --video motion.webm",
 )
 def render(
     model: ModelArgument,
@@ -55,21 +62,27 @@ def render(
     size: SizeOption = None,
     file: Annotated[Path | None, typer.Option("--video", metavar="FILE", help="Film: .webm, or .mp4.")] = None,
     side: SideOption = None,
+    time: TimeOption = None,
+    times: TimesOption = None,
     save_path: SavePathOption = None,
     device: DeviceOption = None,
 ) -> None:
     """Render a model at the views of a scene, one file for each, named as the view; or film it along a path."""
     if scale is not None and not math.isfinite(scale):
         raise ConfigError(f"--scale {scale}: expected a finite number of at least 1")
+    if time is not None and times is not None:
+        raise ConfigError("--time and --times: expected one of them; --times A..B lets time run")
     if path is not None or file is not None:
         if split is not None:
             raise ConfigError("--split is for pictures of views; of a film, --path views shows all views")
         options: dict[str, Any] = {"path": path or "ellipse", "frames": frames, "fps": fps, "size": size, "side": side}
+        options["times"] = times if time is None else time
         options |= {"depth": depth, "alpha": alpha, "save_path": save_path, "downscale": scale, "kind": format_}
         found = pictures.render_path(model, scene, file, out=out, device=device, **options)
         terminal.remark(_told(found, pictures_wide=1 if side is None else 2))
         return
-    of_films = {"--frames": frames, "--fps": fps, "--size": size, "--side": side, "--save-path": save_path}
+    of_films: dict[str, Any] = {"--frames": frames, "--fps": fps, "--size": size, "--side": side, "--times": times}
+    of_films["--save-path"] = save_path
     if given := [name for name, value in of_films.items() if value is not None]:
         raise ConfigError(f"{given[0]} is for films; give --path or --video, too")
     count = pictures.render_views(
@@ -81,6 +94,7 @@ def render(
         kind=format_,
         depth=depth,
         alpha=alpha,
+        time=time,
         device=device,
     )
     terminal.remark(f"{amount(count, 'image')} written to {out}")

@@ -14,7 +14,7 @@ from clsplat.errors import ConfigError, quoted
 from clsplat.files import write_text
 from clsplat.formats.model_files import bytes_of, located
 from clsplat.formats.output import written
-from clsplat.formats.splats import Quality, Reading, Writing, with_degree
+from clsplat.formats.splats import Quality, Reading, Writing, require_still, with_degree
 from clsplat.formats.table import tell_losses
 from clsplat.gaussians.model import load
 from clsplat.gaussians.sky import keep_sky, sky_beside
@@ -95,6 +95,7 @@ def compress(
         raise ConfigError(f"--format {quoted(form)}: expected one of {', '.join(get_args(Format))}")
     opened = ModelFile(model, scene, device)
     source, first, measurer = opened.source, opened.loaded, Measurer(opened)
+    require_still(source.file, first.as_file(), form)
     question: dict[str, Any] = {"model": str(source.file), "sha256": sha256(located(source.file))}
     question |= {"scene": str(source.folder), "photographs": measurer.identity(), "keeps": shares, "steps": steps}
     size = bytes_of(source.file)  # which a damaged model has not: before the folder is made

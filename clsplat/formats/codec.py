@@ -40,6 +40,7 @@ class Codec:
     read: Callable[[Path, Reading], SplatFile] | None = None
     write: Callable[[Path, SplatFile, Writing], str] | None = None  # returns the SHA-256 of the file
     keeps_filter: bool = False  # filter_3D
+    keeps_motion: bool = False
     keeps_mode: bool = True  # the mark of a mip model
     keeps_numbers: bool = False  # of the rasterizer
     keeps_nan: bool = False

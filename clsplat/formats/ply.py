@@ -4,8 +4,9 @@
 
 f_rest is channel-major (all red, all green, all blue); opacity is a logit, scales are logarithms, rot is (w, x, y, z).
 Normals are written as zeros.  Where a world filter is not yet part of scales and opacity, `filter_3D` follows, its
-standard deviation (Mip-Splatting).  Comments hold the numbers that a rasterizer needs, and the mode for viewers:
-`SplatRenderMode: mip` when a screen filter reduces opacities to keep their energy, else `default`.
+standard deviation (Mip-Splatting); where Gaussians move, the columns of their motion (clsplat/formats/motion.py).
+Comments hold the numbers that a rasterizer needs, and the mode for viewers: `SplatRenderMode: mip` when a screen filter
+reduces opacities to keep their energy, else `default`.
 """
 
 import json
@@ -18,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.errors import DataError, quoted
+from clsplat.formats.motion import MOTION, columns_among, columns_of
 from clsplat.formats.output import written
 from clsplat.formats.splats import (
     FLAT_LOG_SCALE,
@@ -85,6 +87,9 @@ def write_ply(path: Path, parameters: Parameters, rendering: dict[str, Any]) -> 
     if "filter_variance" in parameters:
         blocks.append(np.sqrt(parameters["filter_variance"]))
         names.append(FILTER)
+    if MOTION in parameters:
+        blocks.append(parameters[MOTION])
+        names += columns_of(parameters[MOTION].shape[1])
     header = ["ply", "format binary_little_endian 1.0", *comments(rendering)]
     header += [f"element vertex {count}", *(f"property float {name}" for name in names), "end_header"]
     body = np.ascontiguousarray(np.concatenate(blocks, axis=1), "<f4")
@@ -161,7 +166,13 @@ def _parameters(path: Path, vertices: NDArray[Any]) -> Parameters:
     if FILTER in names:
         with np.errstate(over="ignore"):  # infinity is refused
             parameters["filter_variance"] = np.square(_columns(vertices, (FILTER,)))
-    return parameters
+    moving = columns_among(names)
+    if moving is None:
+        raise DataError(
+            f"{path}: has some properties of a motion and lacks others; expected velocity_0..2, time_centre and "
+            "log_duration, and none or all of acceleration_0..2, jerk_0..2 and turn_0..3: export it again"
+        )
+    return {**parameters, MOTION: _columns(vertices, moving)} if moving else parameters
 
 
 def _columns(vertices: NDArray[Any], columns: tuple[str, ...]) -> NDArray[np.float32]:

@@ -2,7 +2,8 @@
 
     means [3] scene units · quats [4] (w, x, y, z), unnormalised · log_scales [3] log of scene units
     logit_opacity [1] · sh_base [3] band 0 · sh_rest [(K-1)*3] the other bands, coefficient-major
-    filter_variance [1] scene units², the world filter; only in our own PLY
+    filter_variance [1] scene units², the world filter; only in our own PLY, as is
+    motion [5 or more], where Gaussians move (clsplat/formats/motion.py)
 
 Axes are those of the PLY of 3DGS: x right, y down, z ahead.
 """
@@ -16,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.errors import DataError
+from clsplat.formats.motion import MOTION
 
 PARAMETERS = ("means", "quats", "log_scales", "logit_opacity", "sh_base", "sh_rest")
 SH_C0 = 0.28209479177387814  # basis function of band 0
@@ -203,6 +205,15 @@ def require_moderate(path: Path, splats: SplatFile, name: str) -> None:
     """Raise DataError for values that the format `name` cannot hold."""
     if told := told_too_large(splats.parameters):
         raise DataError(f"{path}: {told}, which {name} cannot hold; `clsplat convert MODEL OTHER.ply` drops them")
+
+
+def require_still(path: Path, splats: SplatFile, name: str) -> None:
+    """Raise DataError for Gaussians that move, which the format `name` cannot hold."""
+    if MOTION in splats.parameters:
+        raise DataError(
+            f"{path}: the Gaussians move, which {name} cannot hold; write a PLY, or one moment: `clsplat convert MODEL "
+            "OUT --time T`, `--frames N` for several, or `model.at(time)`"
+        )
 
 
 def require_held(path: Path, held: int, expected: int, what: str) -> None:

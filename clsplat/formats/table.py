@@ -18,7 +18,17 @@ from clsplat.formats.sog import looks_like_sog, read_sog
 from clsplat.formats.sog_files import META
 from clsplat.formats.sog_writing import write_sog
 from clsplat.formats.splat import looks_like_splat, read_splat, write_splat
-from clsplat.formats.splats import MIP_VARIANCE, NEAR, VARIANCE, Reading, SplatFile, Writing, not_finite, settled
+from clsplat.formats.splats import (
+    MIP_VARIANCE,
+    NEAR,
+    VARIANCE,
+    Reading,
+    SplatFile,
+    Writing,
+    not_finite,
+    require_still,
+    settled,
+)
 from clsplat.formats.spz import read_spz, write_spz
 from clsplat.formats.usda import write_usda
 from clsplat.ply_header import MAX_HEADER
@@ -38,6 +48,7 @@ CODECS = (
         lambda path, options: read_ply(path),
         lambda path, splats, options: write_ply(path, splats.parameters, splats.rendering),
         keeps_filter=True,
+        keeps_motion=True,
         keeps_numbers=True,
         keeps_nan=True,
     ),
@@ -199,6 +210,8 @@ def write(path: Path, splats: SplatFile, options: Writing | None = None) -> str:
     assert codec.write is not None
     if not codec.keeps_filter and "filter_variance" in splats.parameters:
         raise ValueError(f"{path}: {codec.name} holds no world filter; call baked() first")
+    if not codec.keeps_motion:
+        require_still(path, splats, codec.name)
     if not codec.keeps_nan and (bad := int(not_finite(splats.parameters).sum())):
         raise DataError(
             f"{path}: {bad:,} Gaussians hold values that are not finite, which {codec.name} cannot hold; drop them, "

@@ -29,8 +29,8 @@ def is_model(path: Path) -> bool:
 
 
 def examine(path: Path) -> dict[str, Any]:
-    """Return what a model file holds: `model` (its path), `format`, `gaussians`, `sh_degree`, `mode`, `ranges`,
-    `bounds` in scene units, `degenerate` counts, `findings` in words, and whether it is `valid`: without findings.
+    """Return what a model file holds: `model` (its path), `format`, `gaussians`, `sh_degree`, `mode`, if it `moves`,
+    `ranges`, `bounds` in scene units, `degenerate` counts, `findings` in words, if it is `valid`: without them.
 
     Raises DataError where it cannot be read.
     """
@@ -55,6 +55,7 @@ def examine(path: Path) -> dict[str, Any]:
         "sh_degree": model.sh_degree,
         "mode": "box" if model.rendering.pixel_box else "mip" if model.rendering.compensate else "default",
         "world_filter": model.filter_variance is not None,
+        "moves": model.motion is not None,
         "ranges": _ranges(whole),
         "bounds": [whole.means.min(axis=0).tolist(), whole.means.max(axis=0).tolist()] if len(whole) else [],
         "degenerate": {
@@ -70,7 +71,7 @@ def examine(path: Path) -> dict[str, Any]:
 
 def lines(found: dict[str, Any]) -> str:
     """Return what `examine` found, a line for each fact."""
-    marks = " (mip)" * (found["mode"] == "mip") + " (filter_3D)" * found["world_filter"]
+    marks = " (mip)" * (found["mode"] == "mip") + " (filter_3D)" * found["world_filter"] + " (moves)" * found["moves"]
     rows = [
         f"{found['model']}: {found['format']}, {found['gaussians']:,} Gaussians, SH degree {found['sh_degree']}{marks}"
     ]
@@ -125,6 +126,9 @@ def _ranges(model: Model) -> dict[str, list[float]]:
         "harmonics": model.sh_rest,
         "quaternions": np.linalg.norm(model.quats.astype(np.float64), axis=1),
     }
+    if model.motion is not None:
+        quantities["speeds"] = np.linalg.norm(model.motion[:, :3].astype(np.float64), axis=1)
+        quantities["durations"] = np.exp(np.minimum(model.motion[:, 4].astype(np.float64), 700))
     return {
         name: [float(table.min()), float(np.median(table)), float(table.max())]
         for name, table in quantities.items()

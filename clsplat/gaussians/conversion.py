@@ -16,6 +16,7 @@ from clsplat.formats.ply import MAX_NUMBER
 from clsplat.formats.splats import MAX_DEGREE, Quality, Reading, Writing, with_degree
 from clsplat.formats.table import detect, for_writing
 from clsplat.gaussians.model import Model, load
+from clsplat.gaussians.motion import alike
 from clsplat.gaussians.run_model import model_at
 from clsplat.results import check_no_file_of_a_run
 
@@ -33,9 +34,11 @@ class Changes:
     transform: NDArray[np.float64] | None = None  # [4, 4], one scale, a rotation and a translation
     crop: tuple[float, ...] | None = None  # x0, y0, z0, x1, y1, z1, scene units: means outside go
     sh_degree: int | None = None  # at most
+    time: float | None = None  # of a moving model: that moment of it
 
     def of(self, model: Model) -> Model:
         """Return the changed model.  Raises DataError where nothing is left, ConfigError for a transform too far."""
+        model = model if self.time is None else model.at(self.time)
         kept = model[model.opacities >= self.drop_below] if self.drop_below else model
         if self.transform is not None:
             scale = round(float(np.cbrt(np.linalg.det(self.transform[:3, :3]))), 12)
@@ -109,8 +112,9 @@ def convert(
 def merged(models: Sequence[Model], names: Sequence[str]) -> Model:
     """Return one model of all Gaussians, with the numbers of the first for rendering and the largest SH degree.
 
-    Where one has a world filter and another has none, it is baked.  Raises DataError where some are mip models and
-    others are not, or of the pixel's box, for one filter serves all.
+    Where one has a world filter and another has none, it is baked; where some move, the others stand still.  Raises
+    DataError where some are mip models and others are not, or of the pixel's box, for one filter serves all, and where
+    they move in different ways.
     """
     first = models[0]
     if len(models) == 1:
@@ -125,7 +129,7 @@ def merged(models: Sequence[Model], names: Sequence[str]) -> Model:
     if any(model.filter_variance is None for model in models):
         models = [model.baked() for model in models]
     degree = max(model.sh_degree for model in models)
-    tables = [with_degree(model.tables(), degree) for model in models]
+    tables = alike([with_degree(model.tables(), degree) for model in models], names)
     merged: dict[str, Any] = {n: np.concatenate([t[n] for t in tables]) for n in tables[0]}
     return Model(**merged, rendering=first.rendering, sky=first.sky)
 

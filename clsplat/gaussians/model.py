@@ -1,24 +1,21 @@
 """A model on the host: NumPy arrays in the units of model files, and the numbers with which they are rendered."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.errors import DataError
+from clsplat.formats import motion as columns
 from clsplat.formats.ply import MAX_NUMBER
 from clsplat.formats.splats import (
     MAX_DEGREE,
     MAX_EXPONENT,
     MAX_LOG,
-    MIP_VARIANCE,
-    NEAR,
     PARAMETERS,
     SH_C0,
-    VARIANCE,
     Reading,
     SplatFile,
     Writing,
@@ -29,7 +26,9 @@ from clsplat.formats.splats import (
     sh_coefficients,
 )
 from clsplat.formats.table import for_writing, read, write
+from clsplat.gaussians.motion import at_time, transformed_motion
 from clsplat.gaussians.quaternions import product, quaternion_of
+from clsplat.gaussians.rendering import Rendering as Rendering
 from clsplat.gaussians.run_model import model_at
 from clsplat.gaussians.sky import Sky, keep_sky, sky_beside
 from clsplat.gaussians.tables import DeviceModel, Gaussians
@@ -41,42 +40,10 @@ WIDTHS = {  # of the tables
     **{"means": (3,), "quats": (4,), "log_scales": (3,), "logit_opacity": (1,), "sh_base": (3,)},
     "sh_rest": tuple(3 * (sh_coefficients(degree) - 1) for degree in range(MAX_DEGREE + 1)),
     "filter_variance": (1,),
+    columns.MOTION: tuple(columns.WIDTHS),
 }
+NUMBERS = Rendering()  # of a model that says none
 MIN_LOGIT = -80.0  # of an opacity that the filter spreads out to nothing: as little as the kernels know
-
-
-@dataclass(frozen=True)
-class Rendering:
-    """The numbers with which a model is rendered."""
-
-    near: float = NEAR  # scene units; nearer Gaussians are not drawn
-    screen_variance: float = VARIANCE  # px², added to every splat
-    compensate: float = 0.0  # 1: the opacity falls as that variance spreads a splat out
-    background: Literal["black", "white"] | None = None  # None: what the scene says
-    alpha: Literal["transparency", "mask"] = "transparency"  # what the fourth channel of its photographs was
-    notes: Mapping[str, Any] = field(default_factory=dict)  # what else the file says
-    pixel_box: float = 0.0  # 1: splats are integrated over the pixel's box instead; screen_variance is for viewers
-
-    @classmethod
-    def of(cls, comment: Mapping[str, Any], mode: str) -> "Rendering":
-        """Take the numbers from a file's comment; files of other programs get those of 3DGS or Mip-Splatting."""
-        mip = {"screen_variance": MIP_VARIANCE, "compensate": 1.0} if mode == "mip" else {}
-        names = ("near", "screen_variance", "compensate", "pixel_box")
-        given = {name: float(comment[name]) for name in names if isinstance(comment.get(name), int | float)}
-        return cls(
-            **{**mip, **given},
-            background=comment["background"] if comment.get("background") in ("black", "white") else None,
-            alpha="mask" if comment.get("alpha") == "mask" else "transparency",
-            notes=dict(comment),
-        )
-
-    def comment(self) -> dict[str, Any]:
-        """What a model file says about rendering."""
-        numbers = {"near": self.near, "screen_variance": self.screen_variance, "compensate": self.compensate}
-        known: dict[str, Any] = {"background": self.background} if self.background else {}
-        if self.pixel_box or "pixel_box" in self.notes:  # files of other models stay as they are
-            known["pixel_box"] = self.pixel_box
-        return {**self.notes, **numbers, **known, "alpha": self.alpha}
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,8 +63,9 @@ class Model:
     filter_variance: Floats | None = (
         None  # [N, 1] scene units², the world filter where it is not yet part of the scales
     )
-    rendering: Rendering = Rendering()
+    rendering: Rendering = NUMBERS
     sky: Sky | None = None  # behind the Gaussians, in place of a background of one colour
+    motion: Floats | None = None  # [N, 5 or more] of Gaussians that move, see clsplat/formats/motion.py
 
     def __post_init__(self) -> None:
         count = len(self.means)
@@ -120,9 +88,21 @@ class Model:
         return DeviceModel(gaussians, self.sh_degree, numbers.near, *screen, sky=sky)
 
     def tables(self) -> dict[str, Floats]:
-        """The arrays by name; filter_variance where there is one."""
-        names = (*PARAMETERS, *(() if self.filter_variance is None else ("filter_variance",)))
-        return {name: getattr(self, name) for name in names}
+        """The arrays by name; filter_variance and motion where there is one."""
+        tables = {name: getattr(self, name) for name in (*PARAMETERS, "filter_variance", columns.MOTION)}
+        return {name: table for name, table in tables.items() if table is not None}
+
+    def at(self, time: float) -> "Model":
+        """Return the static model of a moment, from 0 to 1: the Gaussians that are there; a static one as it is.
+
+        Raises ValueError for another time.
+        """
+        if not 0 <= time <= 1:
+            raise ValueError(f"the time is {time:g}; expected one from 0, the first moment, to 1, the last")
+        if self.motion is None:
+            return self
+        tables: dict[str, Any] = dict(at_time(self.tables(), time))
+        return replace(self, **tables, motion=None)
 
     @property
     def sh_degree(self) -> int:
@@ -171,6 +151,8 @@ class Model:
                 "log_scales": self.log_scales + np.log(scale),
                 "sh_rest": rotated_sh(self.sh_rest, turn),
             }
+            if self.motion is not None:
+                changed["motion"] = transformed_motion(self.motion, scale, turn)
             if self.filter_variance is not None:
                 changed["filter_variance"] = self.filter_variance * scale**2
             tables = {name: table.astype(np.float32) for name, table in changed.items()}
@@ -215,7 +197,8 @@ class Model:
         return SplatFile(self.tables(), self.rendering.comment(), "mip" if self.rendering.compensate else "default")
 
     def __repr__(self) -> str:
-        return f"Model({len(self):,} Gaussians, SH degree {self.sh_degree})"
+        moving = ", moving" if self.motion is not None else ""
+        return f"Model({len(self):,} Gaussians{moving}, SH degree {self.sh_degree})"
 
     def _repr_html_(self) -> str:
         from clsplat.pages.notebook import summary

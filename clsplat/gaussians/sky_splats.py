@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.gaussians.model import Model
+from clsplat.gaussians.motion import still
 from clsplat.gaussians.octahedral import sampled
 from clsplat.gaussians.tables import SH_C0
 
@@ -37,6 +38,8 @@ def with_sky_splats(model: Model, count: int = COUNT) -> Model:
         "sh_rest": np.zeros((count, model.sh_rest.shape[1])),
     }
     tables: dict[str, Any] = {name: np.concatenate([getattr(model, name), rows]) for name, rows in added.items()}
+    if model.motion is not None:
+        tables["motion"] = np.concatenate([model.motion, still(count, model.motion.shape[1])])
     notes = {**model.rendering.notes, "sky": "splats"}
     return replace(model, **tables, rendering=replace(model.rendering, notes=notes), sky=None)
 

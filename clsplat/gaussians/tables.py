@@ -6,6 +6,7 @@ Adam's moments and statistics are all tables, so that their rows always move tog
     means [3] scene units · quats [4] (w, x, y, z), unnormalised · log_scales [3] log of scene units
     logit_opacity [1] · sh_base [3] band 0 · sh_rest [(K-1)*3] the other bands, coefficient-major
     filter_variance [1] scene units², the world filter; zero when there is none, never optimised
+    motion [W] of Gaussians that move (clsplat/formats/motion.py); absent where none does
 """
 
 from collections.abc import Collection, Mapping
@@ -15,10 +16,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.formats.motion import MOTION
 from clsplat.formats.splats import PARAMETERS as PARAMETERS
 from clsplat.formats.splats import SH_C0 as SH_C0
 from clsplat.formats.splats import degree_of
 from clsplat.formats.splats import sh_coefficients as sh_coefficients
+from clsplat.gaussians.rows import checked_rows
 from clsplat.gaussians.sky import DeviceSky
 from clsplat.opencl.device import Array, Device
 
@@ -41,7 +44,7 @@ class Gaussians:
     """N Gaussians and their tables."""
 
     def __init__(self, device: Device, parameters: Mapping[str, NDArray[np.float32]]) -> None:
-        """Upload `parameters`, each [N, components] by the names of PARAMETERS; filter_variance may be given too."""
+        """Upload `parameters`, each [N, components] by the names of PARAMETERS; also filter_variance and motion."""
         self.device = device
         self.count = len(parameters["means"])
         self.capacity = _aligned(self.count)
@@ -51,9 +54,9 @@ class Gaussians:
             self.add(name, parameters[name].shape[1])
             self.set(name, parameters[name])
         self.add("filter_variance", 1)
-        for name in ("filter_variance", INTERVAL2):
+        for name in ("filter_variance", INTERVAL2, MOTION):
             if name in parameters:
-                self.add(name, 1)
+                self.add(name, parameters[name].shape[1])
                 self.set(name, parameters[name])
         self._rows = device.program("gather.cl")
 
@@ -128,6 +131,16 @@ class Gaussians:
             self.set(name, kept)
 
     @property
+    def trained(self) -> tuple[str, ...]:
+        """The names of the tables that training changes: the parameters, and the motion where there is one."""
+        return (*PARAMETERS, *([MOTION] if self.moves else []))
+
+    @property
+    def moves(self) -> bool:
+        """Whether the Gaussians have a motion."""
+        return MOTION in self.tables
+
+    @property
     def zero_fresh(self) -> list[str]:
         """The names of the tables that are zero in fresh rows."""
         return [name for name, table in self.tables.items() if table.zero_fresh]
@@ -135,7 +148,7 @@ class Gaussians:
     def not_finite(self) -> list[str]:
         """Return the names of the parameters that hold NaN or infinity, or whose moments do."""
         program = self.device.program("check.cl")
-        counters = {name: self.device.zeros(1, np.uint32) for name in PARAMETERS}
+        counters = {name: self.device.zeros(1, np.uint32) for name in self.trained}
         for name, counter in counters.items():
             for table in self.tables.keys() & {name, *moment_tables(name)}:
                 program.count_not_finite(
@@ -178,18 +191,21 @@ class Gradients:
     """Derivatives of the loss by each parameter, with the shapes of the parameters."""
 
     def __init__(self, gaussians: Gaussians) -> None:
-        self.size = gaussians.capacity, gaussians.sh_degree
-        self.arrays = {
-            name: gaussians.device.zeros((gaussians.tables[name].components, gaussians.capacity)) for name in PARAMETERS
-        }
+        shapes = {name: (gaussians.tables[name].components, gaussians.capacity) for name in gaussians.trained}
+        self.arrays = {name: gaussians.device.zeros(shape) for name, shape in shapes.items()}
         self.mean2d = gaussians.device.zeros((2, gaussians.capacity))  # px⁻¹, for density statistics
 
     def __getitem__(self, name: str) -> Array:
         return self.arrays[name]
 
+    def fits(self, gaussians: Gaussians) -> bool:
+        """Return whether the shapes are those of the parameters of these Gaussians."""
+        shapes = {name: (gaussians.tables[name].components, gaussians.capacity) for name in gaussians.trained}
+        return {name: array.shape for name, array in self.arrays.items()} == shapes
+
     def arguments(self) -> dict[str, Any]:
-        """Return the arrays by the names of the kernels' arguments."""
-        return {**{f"grad_{name}": array for name, array in self.arrays.items()}, "grad_mean2d": self.mean2d}
+        """Return those of the projection by the names of its kernels' arguments."""
+        return {**{f"grad_{name}": self.arrays[name] for name in PARAMETERS}, "grad_mean2d": self.mean2d}
 
 
 @dataclass(frozen=True)
@@ -223,21 +239,6 @@ class DeviceModel:
     def defines(self) -> dict[str, int]:
         """What chooses the programs that project, list and blend these splats."""
         return {"PIXEL_BOX": 1} if self.pixel_box else {}
-
-
-def checked_rows(rows: NDArray[np.integer], count: int) -> NDArray[np.uint32]:
-    """Return rows, [n], as a kernel takes them; raise ValueError unless they are different integers in [0, count)."""
-    if rows.ndim != 1 or not np.issubdtype(rows.dtype, np.integer):
-        raise ValueError(
-            f"rows: expected integers [n], got {rows.dtype} {list(rows.shape)}; np.flatnonzero gives the rows of a mask"
-        )
-    outside = rows[(rows < 0) | (rows >= count)]
-    if len(outside):
-        raise ValueError(f"rows: expected integers in [0, {count}), got {outside[0]}")
-    times = np.bincount(rows.astype(np.int64), minlength=1)
-    if times.max() > 1:
-        raise ValueError(f"rows: expected each row once, got row {times.argmax()} {times.max()} times")
-    return rows.astype(np.uint32)
 
 
 def moment_tables(parameter: str) -> tuple[str, str]:

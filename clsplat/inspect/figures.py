@@ -13,6 +13,8 @@ def figures(facts: Facts) -> dict[str, str]:
     lines = {"dataset": facts.kind if facts.kind != "none" else "none found", "images": _images(facts)}
     if facts.train is not None:
         lines["views"] = f"{facts.train} for training, {facts.test} for testing"
+    if facts.moments:
+        lines["times"] = f"{amount(facts.moments, 'moment')}, seen from {amount(facts.stations, 'place')}"
     if len(facts.submodels) > 1:
         lines["models"] = ", ".join(f"{name} ({amount(count, 'image')})" for name, count in facts.submodels.items())
     for i, camera in enumerate(facts.cameras[:MAX_CAMERAS]):

@@ -15,6 +15,7 @@ from clsplat.scene.lens import BORDER_POINTS, Lens
 from clsplat.scene.parts import Parts
 from clsplat.scene.points import MAX_VALUE
 from clsplat.scene.scene import View, camera_extent, strayed
+from clsplat.scene.times import by_camera, moments_of
 from clsplat.scene.view import fits
 
 SAMPLE_SIZE = 20_000  # points that coverage is measured on
@@ -83,6 +84,8 @@ class Facts:
     seen: dict[str, int]  # points seen by each view; empty where the dataset has no such counts
     extent: float | None  # scene units
     strayed: list[str]
+    moments: int  # different times of the views; 0 where the scene does not move
+    stations: int  # different cameras that took the views, where the scene moves
     one_place: bool  # all cameras have the same centre
     same_pose: list[list[str]]
     same_but_case: list[list[str]]
@@ -100,7 +103,7 @@ def survey(parts: Parts) -> Facts:
     """Measure a dataset that was read in pieces."""
     views, expected = parts.views, parts.expected
     missing = [file for file in expected if not os.path.exists(file)]  # never raises
-    known = {*expected, *(view.mask_path for view in views)}
+    known = {*expected, *(view.mask_path for view in views), *(view.static_path for view in views)}
     names = [view.name for view in views]
     centres = np.stack([view.position for view in views]) if views else np.empty((0, 3))
     extent = parts.scene.extent if parts.scene else camera_extent(views) if views else None
@@ -122,8 +125,10 @@ def survey(parts: Parts) -> Facts:
         seen=parts.observed if any(parts.observed.values()) else {},
         extent=extent,
         strayed=[view.name for view, far in zip(views, strayed(views), strict=True) if far] if views else [],
+        moments=len(moments_of(views)),
+        stations=len(by_camera(views)) if moments_of(views) else 0,
         one_place=len(views) > 1 and bool(np.allclose(centres, centres[0], rtol=0, atol=1e-9)),
-        same_pose=_repeated(names, [(view.downscale, *view.world_to_camera.ravel().round(9)) for view in views]),
+        same_pose=_repeated(names, [(v.time, v.downscale, *v.world_to_camera.ravel().round(9)) for v in views]),
         same_but_case=[group for group in _repeated(names, [n.casefold() for n in names]) if len(set(group)) > 1],
         same_base=sum(count > 1 for count in Counter(file.name for file in set(expected)).values()),
         faults=parts.faults,

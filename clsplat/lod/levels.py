@@ -10,7 +10,7 @@ from clsplat.files import new_folder, require_free
 from clsplat.formats.lod import LOD_META
 from clsplat.formats.lod_writing import write_lod
 from clsplat.formats.model_files import bytes_of
-from clsplat.formats.splats import require_moderate
+from clsplat.formats.splats import require_moderate, require_still
 from clsplat.gaussians.model import Model, load
 from clsplat.gaussians.sky import keep_sky, sky_file
 from clsplat.lod.decimation import decimated
@@ -36,6 +36,7 @@ def levels_of_detail(
     opened, first = _opened(model, scene, plan, device)
     if not len(first):
         raise DataError(f"{model}: the model holds no Gaussians; expected some to merge")
+    require_still(model, first.as_file(), "SOG")
     require_moderate(model, first.as_file(), "SOG")
     if len(first) < FEW:
         told = amount(len(first), "Gaussian")

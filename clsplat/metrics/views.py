@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from clsplat.losses.image import ssim_maps
 from clsplat.metrics.colours import colour_figures
 from clsplat.metrics.images import psnr, ssim, to_8_bits
 from clsplat.metrics.perceptual import Image, Perceptual
+from clsplat.metrics.stillness import Stillness, means
 from clsplat.render.camera import DeviceCamera
 from clsplat.render.painter import Painter
 from clsplat.render.workspace import Workspace
@@ -34,10 +35,18 @@ class ViewMetrics:
     ssim: float
     perceptual: dict[str, float | None] = field(default_factory=dict)
     colours: dict[str, float] = field(default_factory=dict)  # dB, by name, where photographs have colours of their own
+    still: dict[str, float] = field(default_factory=dict)  # of static pixels, where the scene moves: stillness.py
 
     def line(self) -> dict[str, Any]:
         """Return the figures as in a line of metrics.jsonl."""
-        return {"view": self.view, "psnr": self.psnr, "ssim": self.ssim, **self.colours, **self.perceptual}
+        return {
+            "view": self.view,
+            "psnr": self.psnr,
+            "ssim": self.ssim,
+            **self.colours,
+            **self.still,
+            **self.perceptual,
+        }
 
 
 def render_view(painter: Painter, camera: DeviceCamera) -> Image:
@@ -84,7 +93,7 @@ def measure(
     colours: the photographs' in training, for figures in their colours beside PSNR.
     With `finite`, NumericError is raised for a picture that is not finite, which counts as black otherwise.
     """
-    results = []
+    results, stillness = list[ViewMetrics](), Stillness()
     for view in views:
         photograph = photographs.placed(view)
         if photograph.empty:
@@ -96,14 +105,16 @@ def measure(
         rendered = to_8_bits(floats)
         image, mask = photograph.image(), photograph.counted()
         own = colour_figures(floats, image, mask, colours) if colours else {}
+        still = stillness.add(view, rendered, image, mask)
         if mask is None:
             similarity = device_ssim(painter.workspace, photograph, rendered)
         else:
             rendered, image = rendered * mask[..., None], image * mask[..., None]
             similarity = ssim(rendered, image, mask)
         more = perceptual.measure(rendered, image)
-        results.append(ViewMetrics(view.name, psnr(rendered, image, mask), similarity, more, own))
-    return results
+        results.append(ViewMetrics(view.name, psnr(rendered, image, mask), similarity, more, own, still))
+    flicker = stillness.figures()
+    return [replace(result, still={**result.still, **flicker.get(result.view, {})}) for result in results]
 
 
 def mean(results: Sequence[ViewMetrics], perceptual: Perceptual = PSNR_AND_SSIM) -> dict[str, Any]:
@@ -114,6 +125,7 @@ def mean(results: Sequence[ViewMetrics], perceptual: Perceptual = PSNR_AND_SSIM)
         "psnr": float(np.mean([r.psnr for r in results])),
         "ssim": float(np.mean([r.ssim for r in results])),
         **{name: float(np.mean([r.colours[name] for r in results])) for name in results[0].colours},
+        **means([r.still for r in results]),
         **perceptual.mean([r.perceptual for r in results]),
         "views": len(results),
     }

@@ -38,6 +38,7 @@ class DeviceCamera:
     tiles_y: int
     tile: int
     view: int | None = None  # its number in the table HIDDEN; without one every Gaussian is drawn
+    time: float | None = None  # of the scene, in [0, 1], at which moving Gaussians are shown
     values: NDArray[Any] = field(default_factory=lambda: np.zeros((), CAMERA), repr=False, compare=False)  # on the host
 
     @property
@@ -73,7 +74,8 @@ def upload_camera(device: Device, view: View) -> DeviceCamera:
     values = camera_values(view, tile)
     tiles_x, tiles_y = int(values["tiles_x"]), int(values["tiles_y"])
     array = device.upload(values.reshape(1))
-    return DeviceCamera(array, view.camera.width, view.camera.height, tiles_x, tiles_y, tile, values=values)
+    size = view.camera.width, view.camera.height, tiles_x, tiles_y
+    return DeviceCamera(array, *size, tile, time=view.time, values=values)
 
 
 def camera_values(view: View, tile: int) -> NDArray[Any]:

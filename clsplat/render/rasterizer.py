@@ -13,6 +13,7 @@ from clsplat.opencl.device import Array, Device
 from clsplat.opencl.program import Program, constants
 from clsplat.render.arguments import shape_arguments
 from clsplat.render.camera import DeviceCamera
+from clsplat.render.motion import at_moment, to_centres
 from clsplat.render.records import add_inverse_depth_gradient, sum_inverse_depths, sum_records
 from clsplat.render.sky import Skies
 from clsplat.render.tiles import Band, Footprints, Sort, TileLists, Tiler, TooManyPairs
@@ -41,6 +42,7 @@ class Frame:
     transmittance: Array  # [rows, stride]
     bands: list[Band]  # `lists` belongs to the last one
     content: Content  # what was blended
+    drawn: DeviceModel  # what was drawn: a moving model as it is at the time of the camera
 
 
 @dataclass(frozen=True)
@@ -77,6 +79,7 @@ class Rasterizer:
         rows: the same bits.  Raises MemoryLimitError where one row at a time does not fit.
         """
         sky = model.sky if content != "depth" else None
+        model = at_moment(self.workspace, model, camera)
         while True:
             try:
                 frame = self._forward(model, camera, self._black if sky else background, content)
@@ -123,8 +126,8 @@ class Rasterizer:
                     tile_last=tile_last,
                     first_tile=first_tile,
                 )
-        depth_key = array("depth_key", model.gaussians.capacity, np.uint32)
-        return Frame(camera, splats, depth_key, radius, lists, tile_last, image, transmittance, bands, content)
+        seen = splats, array("depth_key", model.gaussians.capacity, np.uint32), radius, lists, tile_last
+        return Frame(camera, *seen, image, transmittance, bands, content, model)
 
     def _blend(self, content: Content, **defines: int) -> Program:
         """The kernels of blending; without sums and a fourth plane that nobody reads."""
@@ -146,8 +149,7 @@ class Rasterizer:
     ) -> TileLists:
         gaussians = model.gaussians
         count, stride = gaussians.count, gaussians.capacity
-        arrays = (self.workspace.array(field.name, stride, np.uint32) for field in fields(Footprints))
-        footprints = Footprints(*arrays)
+        footprints = Footprints(*(self.workspace.array(field.name, stride, np.uint32) for field in fields(Footprints)))
         self.device.program("project.cl", **model.defines).project_forward(
             items=-(-count // self._lanes),
             **shape_arguments(model, camera),
@@ -201,14 +203,13 @@ class Rasterizer:
         texture: Array | None,
         behind: Array | None,
     ) -> Array:
-        gaussians = model.gaussians
         defines = {} if count == PIXEL_SUMS else {"PIXEL_SUMS": count}
         of_blend = {**defines, "GRAD_BEHIND": 1} if behind else defines
-        pixel_sums = self.workspace.array("pixel_sums", (count, gaussians.capacity))
+        pixel_sums = self.workspace.array("pixel_sums", (count, model.gaussians.capacity))
         for number, band in enumerate(bands):
             lists = frame.lists
             if len(bands) > 1:
-                lists = self._project_band(model, frame.camera, band, frame.splats, frame.radius, frame.content)
+                lists = self._project_band(frame.drawn, frame.camera, band, frame.splats, frame.radius, frame.content)
             pair_sums = self.workspace.array("pair_sums", (lists.pairs, RECORD))
             for first_tile, groups in self._launches(band):
                 self._blend(frame.content, **of_blend, **model.defines).blend_backward(
@@ -226,23 +227,24 @@ class Rasterizer:
                     pair_sums=pair_sums,
                     first_tile=first_tile,
                 )
-            sum_records(pair_sums, lists, gaussians, pixel_sums, defines, accumulate=int(number > 0))
+            sum_records(pair_sums, lists, model.gaussians, pixel_sums, defines, accumulate=int(number > 0))
             if frame.content == "inverse_depth":
-                sum_inverse_depths(self.workspace, pair_sums, lists, gaussians, accumulate=int(number > 0))
+                sum_inverse_depths(self.workspace, pair_sums, lists, model.gaussians, accumulate=int(number > 0))
         return pixel_sums
 
     def gradients(self, model: DeviceModel, frame: Frame, pixel_sums: Array) -> Gradients:
         """Return the derivatives of the loss by every parameter of the frame's model; valid until the next call."""
-        if self._gradients is None or self._gradients.size != (model.gaussians.capacity, model.gaussians.sh_degree):
+        if self._gradients is None or not self._gradients.fits(model.gaussians):
             self._gradients = Gradients(model.gaussians)
         gradients = self._gradients
         self.device.program("project.cl", **model.defines).project_backward(
             items=-(-model.gaussians.count // self._lanes),
-            **shape_arguments(model, frame.camera),
+            **shape_arguments(frame.drawn, frame.camera),
             splats=frame.splats,
             pixel_sums=pixel_sums,
             **gradients.arguments(),
         )
         if frame.content == "inverse_depth":
             add_inverse_depth_gradient(self.workspace, frame.camera, frame.splats, gradients["means"])
+        to_centres(model, frame.camera, gradients)
         return gradients

@@ -73,7 +73,7 @@ def film(
         raise ConfigError("--side needs --video: pictures of a folder stand alone")
     loaded = load(model)
     found = _scene(model, scene, loaded, downscale, needed=not wish.of_a_file or extras.side == PHOTOGRAPH)
-    made = plan(wish, found, loaded.means)
+    made = plan(wish, found, loaded.means, moves=loaded.motion is not None)
     if extras.save_path:
         camera_path.write(extras.save_path, made.views, made.fps)
     background = loaded.rendering.background or (found.background if found else "black")

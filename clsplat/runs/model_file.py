@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -18,8 +19,10 @@ from clsplat.render.painter import Splats
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.runs.pictures import KINDS, write_pictures
 from clsplat.runs.source import Source
+from clsplat.scene.view import View
 from clsplat.training.colours import colours_beside
 from clsplat.training.poses import poses_beside
+from clsplat.video.moments import require_motion, times_of
 from clsplat.video.pictures import LAYERS, Canvas
 from clsplat.views.photographs import Photographs
 
@@ -53,9 +56,17 @@ class ModelFile:
         """The model on the device."""
         return self.loaded.upload(self.device)
 
-    def render(self, split: str, out: Path, kind: str, layers: Sequence[str] = LAYERS[:1]) -> int:
-        """Write images (`kind` png) or float32 arrays (npy) of layers of the views of a split; return their number."""
-        views = self.scene.split(split)
+    def render(
+        self, split: str, out: Path, kind: str, layers: Sequence[str] = LAYERS[:1], time: float | None = None
+    ) -> int:
+        """Write images (`kind` png) or float32 arrays (npy) of layers of the views of a split; return their number.
+
+        time: of all views, in [0, 1], instead of their own.
+        """
+        views: Sequence[View] = self.scene.split(split)
+        if times := times_of(time):
+            require_motion(self.loaded.motion is not None)
+            views = [replace(view, time=times[0]) for view in views]
         if not views:
             raise DataError(f"{self.scene.path}: has no {split} views")
         background = Photographs(self.device, self.background).background
@@ -89,13 +100,14 @@ def render(
     downscale: float | None = None,
     kind: str = "png",
     layers: Sequence[str] = LAYERS[:1],
+    time: float | None = None,
     device: str | Device | None = None,
 ) -> int:
     """Render a model file or run folder at the views of a scene; return the number of files.  Raises ClsplatError."""
     for what, value, known in (("split", split, SPLITS), ("kind", kind, KINDS)):
         if value not in known:
             raise ConfigError(f"no {what} '{value}'; there are {', '.join(known)}")
-    return ModelFile(model, scene, device, downscale).render(split, out, kind, layers)
+    return ModelFile(model, scene, device, downscale).render(split, out, kind, layers, time)
 
 
 def evaluate(

@@ -18,7 +18,8 @@ from clsplat.scene.parts import Parts
 from clsplat.scene.points import MAX_VALUE, PointTable
 from clsplat.scene.quaternion import pose_matrix
 from clsplat.scene.readers import Reader
-from clsplat.scene.scene import Scene, View, every_nth, make_scene
+from clsplat.scene.scene import PointCloud, Scene, View, every_nth, make_scene
+from clsplat.scene.times_file import timed
 from clsplat.scene.tracks import Tracks
 
 logger = logging.getLogger("clsplat")
@@ -29,7 +30,8 @@ class ColmapReader(Reader):
 
     Of several models the reader takes the one with most images.  Every `holdout`-th view by name is for testing.
     Photographs of cameras with distortion are undistorted when they are read.  Masks lie in the folder
-    `masks`: their names are those of the images with .png appended, or in place of the suffix.
+    `masks`: their names are those of the images with .png appended, or in place of the suffix.  With a file
+    `images/times.json`, a number for each image by name, the scene moves.
     """
 
     name = "COLMAP"
@@ -44,7 +46,7 @@ class ColmapReader(Reader):
         folder = image_folder(path)
         views = sorted((view_of(image, cameras, folder) for image in images), key=lambda view: view.name)
         there = present(path, [view.image_path for view in views], self.missing)
-        views = [view for view, found in zip(views, there, strict=True) if found]
+        views = timed([view for view, found in zip(views, there, strict=True) if found], folder)
         table = read_point_table(model)
         points, tracks = (table.cloud(), tracks_of(images, table)) if table else (None, None)
         scene = make_scene(path, views, every_nth([view.name for view in views], holdout), points)
@@ -65,6 +67,13 @@ class ColmapReader(Reader):
                 parts.views.append(view)
                 parts.models[view.name] = cameras[image.camera].model if cameras else ""
                 parts.observed[view.name] = image.observed
+
+
+def camera_views(path: Path) -> tuple[list[View], PointCloud | None]:
+    """Return a view for each image of the largest model, whether or not its file exists, and the points."""
+    model, images = _largest_model(path)
+    cameras, folder, table = read_cameras(model), image_folder(path), read_point_table(model)
+    return [view_of(image, cameras, folder) for image in images], table.cloud() if table else None
 
 
 def tracks_of(images: Sequence[ImageRecord], table: PointTable) -> Tracks | None:

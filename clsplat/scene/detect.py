@@ -7,13 +7,14 @@ from clsplat.formats.table import detect as model_format
 from clsplat.scene.blender import BlenderReader
 from clsplat.scene.colmap import ColmapReader
 from clsplat.scene.images import is_image
+from clsplat.scene.multicamera import MulticameraReader
 from clsplat.scene.multiscale import MultiscaleReader
 from clsplat.scene.nerfstudio import NerfstudioReader
 from clsplat.scene.readers import Reader, reader_classes
 from clsplat.scene.scene import HOLDOUT, Scene
 from clsplat.scene.split import Split
 
-PRECEDENCE = (ColmapReader, BlenderReader, MultiscaleReader, NerfstudioReader)
+PRECEDENCE = (MulticameraReader, ColmapReader, BlenderReader, MultiscaleReader, NerfstudioReader)
 
 
 def readers() -> list[Reader]:

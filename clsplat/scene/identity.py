@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from clsplat.scene.decoding import ImageFile
-from clsplat.scene.scene import SPLITS, Scene
+from clsplat.scene.scene import SPLITS, PointCloud, Scene
 from clsplat.scene.view import View
 
 MAX_NAMES = 3  # in a message
-Row = dict[str, str]  # photograph, mask and camera of a view: hashes, "" where there is none
+Row = dict[str, str]  # photograph, mask and camera of a view: hashes, "" where there is none; the time where it has one
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Identity:
     def of(cls, scene: Scene, files: Mapping[Path, ImageFile]) -> "Identity":
         """Return the identity of a scene whose image files were decoded."""
         train, test, fold = ({view.name: _row(view, files) for view in scene.split(name)} for name in SPLITS)
-        return cls(train, test, _hash(scene.points.positions, scene.points.colours) if scene.points else "", fold)
+        return cls(train, test, _points_hash(scene.points) if scene.points else "", fold)
 
     def divided(self, scene: Scene) -> "Identity":
         """Return the identity of the same views in the splits of `scene`."""
@@ -53,8 +53,8 @@ class Identity:
         """Return what is another than it was, with counts and the first few names: 'the photographs of 2 views (…)'."""
         found = []
         old, new = before._rows, self._rows
-        for part in ("photograph", "mask", "camera"):
-            names = [name for name in old if name in new and old[name][part] != new[name][part]]
+        for part in ("photograph", "mask", "camera", "time"):
+            names = [name for name in old if name in new and old[name].get(part) != new[name].get(part)]
             found += [f"the {part} of {_named(names)}"] if names else []
         moved = [name for name in old if name in new and before._split_of(name) != self._split_of(name)]
         gone, fresh = [name for name in old if name not in new], [name for name in new if name not in old]
@@ -97,7 +97,12 @@ def _row(view: View, files: Mapping[Path, ImageFile]) -> Row:
         "photograph": files[view.image_path].digest if view.image_path in files else "",
         "mask": files[view.mask_path].digest if view.mask_path else "",
         "camera": _hash(numbers, view.world_to_camera, text=repr(distortion)),
+        **({} if view.time is None else {"time": repr(view.time)}),
     }
+
+
+def _points_hash(points: PointCloud) -> str:
+    return _hash(points.positions, points.colours, *([] if points.times is None else [points.times]))
 
 
 def _hash(*arrays: ArrayLike, text: str = "") -> str:

@@ -7,6 +7,7 @@ from clsplat.errors import DataError, quoted
 from clsplat.scene.parts import Parts
 from clsplat.scene.readers import Reader
 from clsplat.scene.scene import Scene, every_nth, make_scene
+from clsplat.scene.times import clock_of
 from clsplat.scene.transforms import Transforms, list_frames, view_name
 
 FILE = "transforms.json"
@@ -17,7 +18,7 @@ class NerfstudioReader(Reader):
     """A nerfstudio scene; views are in order of name.
 
     The lists `train_filenames` and `test_filenames` are the split where the file has one of them; images on neither
-    list are left out.  Otherwise every `holdout`-th view is for testing.
+    list are left out.  Otherwise every `holdout`-th view is for testing.  With a `time` in every frame the scene moves.
     """
 
     name = "nerfstudio"
@@ -28,16 +29,17 @@ class NerfstudioReader(Reader):
 
     def read(self, path: Path, holdout: int) -> Scene:
         transforms = Transforms(path / FILE)
-        views = sorted(transforms.views(self.missing), key=lambda view: view.name)
+        clock = clock_of(transforms.path, transforms.moments())
+        views = sorted(transforms.views(self.missing, clock), key=lambda view: view.name)
         train, test = (_listed(transforms, key) for key in ("train_filenames", "test_filenames"))
         if train is None and test is None:
-            return make_scene(path, views, every_nth([view.name for view in views], holdout), transforms.points())
+            return make_scene(path, views, every_nth([view.name for view in views], holdout), transforms.points(clock))
         test = test or set()
         kept = views if train is None else [view for view in views if view.name in train | test]
         if len(kept) < len(views):
             logger.info("%s: left out %d images that no split lists", transforms.path, len(views) - len(kept))
         held_out = {i for i, view in enumerate(kept) if view.name in test}
-        return make_scene(path, kept, held_out, transforms.points())
+        return make_scene(path, kept, held_out, transforms.points(clock))
 
     def list_parts(self, parts: Parts) -> None:
         list_frames(parts, FILE)

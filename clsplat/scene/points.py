@@ -2,6 +2,7 @@
 
 import io
 import logging
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,7 +19,9 @@ logger = logging.getLogger("clsplat")
 
 MAX_VALUE = 1e15  # of any number in a dataset: the squares of much larger ones overflow float32
 RGB = ("red", "green", "blue")
+TIME = "time"  # of a point, in the unit of the frames' times
 POINT = np.dtype([(name, "<f4") for name in "xyz"] + [(name, "u1") for name in RGB])
+TIMED_POINT = np.dtype([*POINT.descr, (TIME, "<f4")])
 
 
 class PointTable(NamedTuple):
@@ -29,26 +32,34 @@ class PointTable(NamedTuple):
     rgb: NDArray[Any]  # [M, 3], in 0..255
     error: Floats = np.empty(0)  # [M], mean reprojection error in pixels, or [0]; COLMAP writes -1 or 0 for unknown
     ids: NDArray[np.int64] = np.empty(0, np.int64)  # [M], by which images name them, or [0]
+    times: Floats = np.empty(0)  # [M], at which they were seen, in the unit of the frames' times, or [0]
 
     def kept(self) -> NDArray[np.bool_]:
         """Return which points are finite, [M]."""
-        return np.asarray((np.abs(self.positions) < MAX_VALUE).all(axis=1))
+        finite = (np.abs(self.positions) < MAX_VALUE).all(axis=1)
+        return np.asarray(finite & (np.abs(self.times) < MAX_VALUE) if len(self.times) else finite)
 
-    def cloud(self) -> PointCloud:
-        """Return the points that are finite; log the number of the others."""
+    def cloud(self, clock: Callable[[Floats], Floats] | None = None) -> PointCloud:
+        """Return the points that are finite; log the number of the others.
+
+        clock: takes times of the file to [0, 1]; without it the points have no times.
+        """
         kept = self.kept()
         if not kept.all():
             logger.warning("%s: dropped %s points that are not finite", self.file, f"{np.count_nonzero(~kept):,}")
         colours = np.asarray(self.rgb[kept], np.float32) / np.float32(255)
-        return PointCloud(np.asarray(self.positions[kept], np.float32), colours)
+        times = np.asarray(clock(self.times[kept]), np.float32) if clock and len(self.times) else None
+        return PointCloud(np.asarray(self.positions[kept], np.float32), colours, times)
 
 
-def read_points_ply(path: Path) -> PointCloud:
-    """Read x y z and red green blue (uchar) of the vertices of a PLY file; other properties are ignored.
+def read_points_ply(path: Path, clock: Callable[[Floats], Floats] | None = None) -> PointCloud:
+    """Read x y z and red green blue (uchar) of the vertices of a PLY file, and `time` by a clock as PointTable.cloud.
+
+    Other properties are ignored.
 
     Raises DataError when the file is damaged, big-endian, or lacks these properties.
     """
-    return read_ply_table(path).cloud()
+    return read_ply_table(path).cloud(clock)
 
 
 def read_ply_table(path: Path) -> PointTable:
@@ -62,17 +73,21 @@ def read_ply_table(path: Path) -> PointTable:
         raise DataError(f"{path}: expected x y z and uchar red green blue of each vertex, found {quoted(names)}")
     table = _read_ascii(path, data, header) if header.format == "ascii" else _read_binary(path, data, header)
     positions, rgb = (np.stack([table[name] for name in names], axis=1) for names in ("xyz", RGB))
-    return PointTable(path, positions, rgb)
+    times = np.asarray(table[TIME], np.float64) if TIME in names else np.empty(0)
+    return PointTable(path, positions, rgb, times=times)
 
 
 def write_points_ply(path: Path, points: PointCloud) -> None:
-    """Write points as binary little-endian PLY.  Raises OutputError when that fails."""
-    table = np.empty(len(points), POINT)
+    """Write points as binary little-endian PLY, with their times where they have some.  Raises OutputError."""
+    kind = POINT if points.times is None else TIMED_POINT
+    table = np.empty(len(points), kind)
+    if points.times is not None:
+        table[TIME] = points.times
     for i, name in enumerate("xyz"):
         table[name] = points.positions[:, i]
     for i, name in enumerate(RGB):
         table[name] = np.rint(points.colours[:, i] * 255)
-    properties = [f"property {'uchar' if POINT[name] == np.uint8 else 'float'} {name}" for name in POINT.names or ()]
+    properties = [f"property {'uchar' if kind[name] == np.uint8 else 'float'} {name}" for name in kind.names or ()]
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}", *properties, "end_header", ""]
     with atomic(path) as file:
         file.write("\n".join(lines).encode() + table.tobytes())

@@ -39,13 +39,15 @@ class PointCloud:
 
     positions: Floats  # [M, 3] float32, scene units
     colours: Floats  # [M, 3] float32, in [0, 1]
+    times: Floats | None = None  # [M] float32, in [0, 1], at which they were seen, where a moving scene has that
 
     def __len__(self) -> int:
         return len(self.positions)
 
     def joined(self, other: "PointCloud") -> "PointCloud":
-        """Return these points, then those of another cloud."""
-        pairs = (self.positions, other.positions), (self.colours, other.colours)
+        """Return these points, then those of another cloud; with times where both have them."""
+        pairs = [(self.positions, other.positions), (self.colours, other.colours)]
+        pairs += [(self.times, other.times)] if self.times is not None and other.times is not None else []
         return PointCloud(*(np.concatenate(pair).astype(np.float32) for pair in pairs))
 
 

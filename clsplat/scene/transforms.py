@@ -15,6 +15,7 @@ from clsplat.scene.lens import Lens, shared
 from clsplat.scene.parts import Parts
 from clsplat.scene.points import MAX_VALUE, read_ply_table, read_points_ply
 from clsplat.scene.scene import Camera, Floats, PointCloud, View
+from clsplat.scene.times import Clock, clock_of
 
 DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 LENSES = {  # the parameters of each camera_model, in COLMAP's order
@@ -71,7 +72,11 @@ class Transforms:
             raise DataError(f"{path}: has {len(frames)} frames; expected at most {MAX_FRAMES}: divide the scene")
         self.frames = [Frame(path.parent, f"{path}: frames[{i}]", own, self.table) for i, own in enumerate(frames)]
 
-    def views(self, missing: Missing = "refuse") -> list[View]:
+    def moments(self) -> list[tuple[str, float | None]]:
+        """Return the place and the `time` of every frame, as the file has it.  Raises DataError for another value."""
+        return [(frame.where, frame.number("time")) for frame in self.frames]
+
+    def views(self, missing: Missing = "refuse", clock: Clock | None = None) -> list[View]:
         """Return one view per frame, in the order of the file; of those whose image is missing as `missing` says.
 
         An image without a size in the file has the size of the first one.  Photographs of lenses with distortion are
@@ -84,12 +89,13 @@ class Transforms:
         require_files(self.path, filter(None, (frame.file("mask_path") for frame in frames)))
         has_sizes = all(frame.number("w") and frame.number("h") for frame in frames)
         size = None if has_sizes else image_size(images[there.index(True)])
-        return [view_of(frame, size) for frame in frames]
+        require_files(self.path, filter(None, (frame.file("static_path") for frame in frames)))
+        return [view_of(frame, size, clock) for frame in frames]
 
-    def points(self) -> PointCloud | None:
+    def points(self, clock: Clock | None = None) -> PointCloud | None:
         """Read the points; None when there are none."""
         path = self.points_path()
-        points = read_points_ply(path) if path else None
+        points = read_points_ply(path, clock) if path else None
         return points if points and len(points) else None
 
     def points_path(self) -> Path | None:
@@ -102,6 +108,8 @@ class Transforms:
 def list_frames(parts: Parts, *names: str) -> None:
     """Add the frames of those of the files `names` that exist to `parts`, and the points of the first file."""
     files = [parts.attempt(Transforms, parts.path / name) for name in names if (parts.path / name).is_file()]
+    moments = [moment for file in filter(None, files) for moment in parts.attempt(file.moments) or []]
+    clock = parts.attempt(clock_of, parts.path, moments)
     for transforms in filter(None, files):
         frames = [(frame, parts.attempt(image_path_of, frame)) for frame in transforms.frames]
         paths = [path for _, path in frames if path]
@@ -110,7 +118,7 @@ def list_frames(parts: Parts, *names: str) -> None:
             first = next((path for path in paths if os.path.isfile(path)), None)
             header = parts.attempt(read_header, first) if first else None
             size = (header.width, header.height) if header else None
-            views = [parts.attempt(view_of, frame, size) for frame, path in frames if path]
+            views = [parts.attempt(view_of, frame, size, clock) for frame, path in frames if path]
             parts.views += [view for view in views if view]
     if files and files[0]:
         place = parts.attempt(files[0].points_path)
@@ -122,12 +130,18 @@ def view_name(file_path: str) -> str:
     return PureWindowsPath(file_path).as_posix()
 
 
-def view_of(frame: Frame, size: tuple[int, int] | None) -> View:
-    """Return the view of a frame; `size` is the image's where the frame has none.  Raises DataError."""
+def view_of(frame: Frame, size: tuple[int, int] | None, clock: Clock | None = None) -> View:
+    """Return the view of a frame; `size` is the image's where the frame has none.
+
+    clock: of the scene, where it moves.  Raises DataError.
+    """
     image, mask = image_path_of(frame), frame.file("mask_path")
     lens = shared(lens_of(frame, camera_of(frame, size)))
     camera, distortion = (lens.pinhole, lens) if lens.distorts else (lens.camera, None)
-    return View(view_name(frame.value("file_path")), camera, pose_of(frame), image, mask, lens=distortion)
+    moment, still = frame.number("time"), frame.file("static_path")
+    time = None if clock is None or moment is None else float(clock(moment))
+    name, pose = view_name(frame.value("file_path")), pose_of(frame)
+    return View(name, camera, pose, image, mask, lens=distortion, time=time, static_path=still)
 
 
 def image_path_of(frame: Frame) -> Path:

@@ -10,17 +10,17 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clsplat.errors import DataError, PoseError, quoted
+from clsplat.errors import DataError, quoted
 from clsplat.scene.camera import Camera
 from clsplat.scene.images import read_image
 from clsplat.scene.lens import Lens
+from clsplat.scene.pose import Floats as Floats
+from clsplat.scene.pose import checked_pose, checked_time
 
-Floats = NDArray[np.floating]
 Size = tuple[int, int]  # width, height, px
 Alpha = Literal["transparency", "mask"]  # the meaning of a photograph's fourth channel
 BLACK = (0.0, 0.0, 0.0)
 NO_FILE = Path()  # of a view that is made by hand
-ROTATION_TOLERANCE = 2e-3  # of R Rᵀ: files are read to 1e-3, and an inverse has a little more
 MIN_WHITE = 0.99  # share of the largest value: JPEG does not store white exactly
 
 
@@ -30,7 +30,8 @@ class View:
 
     Two views are equal only when they are one object; compare names, downscales or poses.
 
-    A view that only serves to render a model needs no photograph.  Raises PoseError without a rotation.
+    A view that only serves to render a model needs no photograph.  Raises PoseError without a rotation, and for a time
+    outside [0, 1].
     """
 
     name: str
@@ -41,21 +42,12 @@ class View:
     alpha: Alpha = "transparency"
     lens: Lens | None = None  # of the photograph on disk, where it has distortion
     downscale: float = 1  # divisor of the original photograph's size
+    time: float | None = None  # in [0, 1], of the scene's first to last moment; None: the scene does not move
+    static_path: Path | None = None  # an image of the photograph's size, white in pixels that show nothing that moves
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "world_to_camera", np.asarray(self.world_to_camera, np.float64))
-        if self.world_to_camera.shape != (3, 4):
-            raise PoseError(f"the pose of {quoted(self.name)} has shape {self.world_to_camera.shape}; expected (3, 4)")
-        rotation = self.world_to_camera[:, :3]
-        if not np.isfinite(self.world_to_camera).all():
-            raise PoseError(f"the pose of {quoted(self.name)} has values that are not finite; expected finite numbers")
-        with np.errstate(all="ignore"):  # numbers near the end of the range
-            turned = rotation @ rotation.T
-        if not np.allclose(turned, np.eye(3), atol=ROTATION_TOLERANCE) or np.linalg.det(rotation) < 0:
-            raise PoseError(
-                f"the pose of {quoted(self.name)} has no rotation in its first three columns; "
-                "expected axes of length 1 at right angles, not mirrored"
-            )
+        object.__setattr__(self, "world_to_camera", checked_pose(self.name, self.world_to_camera))
+        object.__setattr__(self, "time", checked_time(self.name, self.time))
 
     @classmethod
     def looking_at(

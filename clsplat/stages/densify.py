@@ -14,6 +14,7 @@ from clsplat.density.control import densify
 from clsplat.density.edit import Edit, Rule
 from clsplat.density.thresholds import SceneScale
 from clsplat.errors import NumericError, amount
+from clsplat.formats.motion import MOTION
 from clsplat.gaussians.tables import PARAMETERS
 from clsplat.schedule import AtLeastOne
 from clsplat.settings import OneOf
@@ -69,7 +70,7 @@ class Densify(Scheduled):
         return self
 
     def stale(self, run: Run) -> Collection[str]:
-        return PARAMETERS
+        return (*PARAMETERS, MOTION)
 
     def run(self, run: Run) -> None:
         if run.stats is None:

@@ -22,6 +22,7 @@ from clsplat.scene.scene import PointCloud, Scene, View
 from clsplat.scene.view import load_image, load_rgba
 from clsplat.settings import ReadPath
 from clsplat.stages.base import Stage
+from clsplat.stages.first_motion import moving, require_times, with_motion
 from clsplat.training.memory import first_tables
 from clsplat.training.run import Run
 from clsplat.training.skies import begin_sky
@@ -61,6 +62,15 @@ class Init(Stage):
     """Number of random points; largest number of points on a hull."""
     swept: Annotated[int, Field(gt=0)] = 20_000
     """Largest number of points of a plane sweep."""
+    times: Literal["uniform", "per_frame"] = "uniform"
+    """Where Gaussians move, the time of each: drawn, or that at which its point was seen, where the dataset says so.
+    Points whose neighbours were seen at all times begin as what stands still; others have the spread of those times as
+    their duration, and the velocity of those neighbours."""
+    duration: Annotated[float, Field(gt=0)] = 4.0
+    """Standard deviation of the time around that, by the scene's duration; a long one begins as a scene that stands
+    still."""
+    moment: Annotated[float, Field(gt=0)] = 0.1
+    """The shortest of the Gaussians whose points moved, with `times: per_frame`."""
     file: ReadPath | None = None
     """Model file of any format, or a run folder, for `source: model`."""
 
@@ -69,6 +79,7 @@ class Init(Stage):
             raise ConfigError(f"init.file: source '{self.source}' needs a model file, or the folder of a run; give one")
 
     def check_in(self, run: Run) -> None:
+        require_times(run.scene, run.model_settings.time)
         source = self._source(run.scene)
         if source in MODEL_SOURCES:
             self._read()
@@ -79,6 +90,7 @@ class Init(Stage):
 
     def run(self, run: Run) -> None:
         degree = run.model_settings.sh_degree
+        require_times(run.scene, run.model_settings.time)
         parameters, source = self._parameters(run, degree)
         gaussians = Gaussians(run.device, parameters)
         run.model = run.model_settings.model(gaussians, degree if self.source in MODEL_SOURCES else 0)
@@ -108,7 +120,7 @@ class Init(Stage):
         """The parameters and their source: random points too where photographs agree on too few."""
         source = self._source(run.scene)
         if source in MODEL_SOURCES:
-            return with_degree(self._read(), degree), source
+            return with_motion(with_degree(self._read(), degree), run.model_settings.time, str(self.file)), source
         found = {"sweep": self._swept, "hull": self._on_hull, "points": self._points}
         points = found[source](run) if source in found else None
         if points is None:
@@ -116,7 +128,9 @@ class Init(Stage):
         if source == "points" and self.source == "auto" and len(points) < self.fewest and not has_alpha(run.scene):
             points, source = points.joined(self._sweep(run)), "both"
         self._require_memory(run, len(points))
-        return from_points(points, self.opacity, degree, self.scale), source
+        parameters = from_points(points, self.opacity, degree, self.scale)
+        seen = points.times if self.times == "per_frame" else None
+        return moving(parameters, run.model_settings.time, seen, (self.duration, self.moment), run.seed), source
 
     def _read(self) -> Parameters:
         assert self.file is not None  # as `check` requires
@@ -136,7 +150,8 @@ class Init(Stage):
     @staticmethod
     def _require_memory(run: Run, count: int) -> None:
         """Raise MemoryLimitError where so many Gaussians do not fit."""
-        run.memory_plan(first_tables(run.model_settings.sh_degree)).check(count)
+        motion = run.model_settings.time
+        run.memory_plan(first_tables(run.model_settings.sh_degree, motion.width if motion else 0)).check(count)
 
     def _random(self, run: Run) -> PointCloud:
         """Random points, where so many Gaussians fit.  Raises MemoryLimitError before any is made."""

@@ -12,6 +12,7 @@ from pydantic import Field, model_validator
 
 from clsplat.density.contribution import SCORES, Score, best, keep
 from clsplat.density.thresholds import Share
+from clsplat.formats.motion import MOTION
 from clsplat.formats.splats import MAX_DEGREE, sh_coefficients
 from clsplat.gaussians.tables import PARAMETERS
 from clsplat.stages.base import Scheduled
@@ -54,7 +55,7 @@ class PruneLeast(Scheduled):
         return self
 
     def stale(self, run: Run) -> Collection[str]:
-        return PARAMETERS
+        return (*PARAMETERS, MOTION)
 
     def run(self, run: Run) -> None:
         gaussians, score = run.model.gaussians, scores(run, self.score)

@@ -23,7 +23,13 @@ from clsplat.training.found import photographs_text, size_text
 from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
-COLOURS = {"psnr_colour": "in the photographs' colours", "psnr_affine": "with colours fitted"}  # metrics/colours.py
+MORE = {  # metrics/colours.py, metrics/stillness.py: name and unit
+    "psnr_colour": ("PSNR in the photographs' colours", "dB"),
+    "psnr_affine": ("PSNR with colours fitted", "dB"),
+    "psnr_static": ("PSNR of static pixels", "dB"),
+    "flicker": ("flicker of static pixels", "levels"),
+    "flicker_photographs": ("flicker of the photographs there", "levels"),
+}
 
 
 class Report(Stage):
@@ -90,9 +96,9 @@ def _figures(run: Run) -> dict[str, str]:
         for downscale, averages in by_downscale.items():
             suffix = "" if downscale == f"{run.downscale:g}" else f" at 1/{downscale}"
             values[f"{split} PSNR{suffix} ({amount(averages['views'], 'view')})"] = f"{averages['psnr']:.2f} dB"
-            for key, name in COLOURS.items():
+            for key, (name, unit) in MORE.items():
                 if averages.get(key) is not None:
-                    values[f"{split} PSNR {name}{suffix}"] = f"{averages[key]:.2f} dB"
+                    values[f"{split} {name}{suffix}"] = f"{averages[key]:.2f} {unit}"
             values[f"{split} SSIM{suffix}"] = f"{averages['ssim']:.4f}"
     if run.is_refit and run.best:
         found = run.best.found

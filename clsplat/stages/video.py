@@ -19,6 +19,7 @@ from clsplat.video.lenses import MAX_FRAMES, RATES, size_of
 from clsplat.video.pictures import Canvas
 
 LOG = logging.getLogger("clsplat")
+Moment = Annotated[float, Field(ge=0, le=1)]
 
 
 class Video(Stage):
@@ -26,16 +27,18 @@ class Video(Stage):
 
     stage: Literal["video"] = "video"
     needs: ClassVar[frozenset[str]] = frozenset({"model"})
-    output_keys: ClassVar[frozenset[str]] = frozenset({"path", "frames", "fps", "size", "file"})
+    output_keys: ClassVar[frozenset[str]] = frozenset({"path", "frames", "fps", "size", "times", "file"})
 
     path: ReadPath = "ellipse"
-    """One of ellipse, spiral, orbit, through and views, or a file camera_path.json of nerfstudio."""
+    """One of ellipse, spiral, orbit, through, views and fixed, fixed:NAME of a view, or a file camera_path.json."""
     frames: Annotated[int, Field(gt=0, le=MAX_FRAMES)] = FRAMES
     """Number of frames."""
     fps: Annotated[float, Field(ge=RATES[0], le=RATES[1])] = FPS
     """Frames a second."""
     size: str | None = None
     """WIDTHxHEIGHT, even numbers; without it, that of the photographs in training."""
+    times: Moment | tuple[Moment, Moment] | None = None
+    """Of a scene that moves: one moment, or those of the first and the last frame; without it, the whole."""
     file: Annotated[str, path_in_run(*encoding.WRITERS)] = "video.webm"
     """Path inside the run folder; .webm, or .mp4 with the extra video."""
 
@@ -48,11 +51,11 @@ class Video(Stage):
         return None if key == "path" and not self._wish().of_a_file else super().place_of(key, scene)
 
     def _wish(self) -> Wish:
-        return Wish.of(self.path, self.frames, self.fps, self.size)
+        return Wish.of(self.path, self.frames, self.fps, self.size, self.times)
 
     def _plan(self, run: Run) -> Film:
-        means = run.model.gaussians.get("means")
-        return plan(self._wish(), run.scene.downscaled(run.downscale), means)
+        gaussians = run.model.gaussians
+        return plan(self._wish(), run.scene.downscaled(run.downscale), gaussians.get("means"), gaussians.moves)
 
     def check(self) -> None:
         self._wish()

@@ -6,6 +6,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import Field
 
 from clsplat.errors import ConfigError
+from clsplat.formats.motion import MOTION
 from clsplat.gaussians.tables import PARAMETERS, DeviceModel, Gaussians, Gradients, moment_tables, sh_coefficients
 from clsplat.opencl.device import Array
 from clsplat.opencl.program import constants
@@ -13,6 +14,7 @@ from clsplat.render.arguments import shape_arguments
 from clsplat.render.rasterizer import Frame
 from clsplat.schedule import Decay, NonNegative, Schedule, at_step, divided, explained
 from clsplat.settings import Settings
+from clsplat.training.motion import MotionRates, update_motion
 
 
 class FullSizeDecay(Settings):
@@ -59,11 +61,14 @@ class Rates(Settings):
     """Of band 0 of the spherical harmonics."""
     sh_rest: NonNegative = 1.25e-4
     """Of the other bands, which cost most; where it is 0 they are left alone, with their moments."""
+    motion: MotionRates = MotionRates()
+    """Of the motion, where Gaussians move."""
 
     def times(self, factor: float) -> "Rates":
         """Return all rates times a factor."""
         values = {name: getattr(self, name) for name in PARAMETERS}
-        return self.model_copy(update={name: _times(value, factor) for name, value in values.items()})
+        times = {name: _times(value, factor) for name, value in values.items()}
+        return self.model_copy(update={**times, "motion": self.motion.times(factor)})
 
     def settled(self, full_size: int) -> "Rates":
         """Return rates by step alone; full_size: the first step at the full size of the photographs."""
@@ -72,7 +77,7 @@ class Rates(Settings):
         return self.model_copy(update={"means": self.means.from_step(full_size)})
 
     def at(self, step: int, extent: float) -> dict[str, float]:
-        """Return the rates of a global step, by the names of PARAMETERS.
+        """Return the rates of a global step, by the names of PARAMETERS and of the fields of the motion.
 
         Raises ConfigError before they are settled.
         """
@@ -82,7 +87,7 @@ class Rates(Settings):
                 "`settled(step)` returns"
             )
         rates = {name: at_step(getattr(self, name), step) for name in PARAMETERS}
-        return {**rates, "means": rates["means"] * extent}
+        return {**rates, "means": rates["means"] * extent, **self.motion.at(step, extent)}
 
 
 Rows = Literal["all", "seen"]  # Gaussians that an update changes
@@ -100,12 +105,12 @@ class Adam:
 
     def __init__(self, gaussians: Gaussians) -> None:
         self.gaussians = gaussians
-        self.updates = dict.fromkeys(PARAMETERS, 0)
+        self.updates = dict.fromkeys(gaussians.trained, 0)
         gaussians.device.program("adam.cl")  # built before the first step
         self._lanes = int(gaussians.device.tuning["LANES"])
         self._vectors = int(gaussians.device.tuning["VECTORS"])
         self._beta1, self._beta2 = constants("adam.h")["BETA1"], constants("adam.h")["BETA2"]
-        for name in PARAMETERS:
+        for name in gaussians.trained:
             for moment in moment_tables(name):
                 gaussians.add(moment, gaussians.tables[name].components, zero_fresh=True)
 
@@ -172,6 +177,10 @@ class Adam:
                 stride=gaussians.capacity,
                 count=gaussians.count,
             )
+
+        if gaussians.moves and MOTION not in without:
+            self.updates[MOTION] += 1
+            update_motion(gaussians, gradients, frame.depth_key, rates, self.updates[MOTION], _EVERY[rows])
 
     def _factors(self, name: str, rates: dict[str, float]) -> tuple[float, float]:
         """Rate and second factor of a parameter's next update, with the bias correction of the moments."""

@@ -2,12 +2,14 @@
 
 from collections.abc import Collection
 
+from clsplat.formats.motion import MOTION
 from clsplat.gaussians.tables import PARAMETERS
 from clsplat.schedule import at_step
 from clsplat.training.adam import Rates
 from clsplat.training.run import Run
 
 LOWER = 0.1  # times the present rate
+VELOCITY = "motion.velocity"  # whose rate is lowered where a motion is broken
 
 
 def lower_rate(run: Run, broken: Collection[str]) -> str:
@@ -24,9 +26,10 @@ def lower_rate(run: Run, broken: Collection[str]) -> str:
     present = Rates.model_validate(stages[place].get(stage, {}).get("rates", {}))
 
     def rate(rates: Rates, name: str) -> float:
-        return at_step(getattr(rates, name), run.step)
+        return at_step(rates.motion.velocity if name == VELOCITY else getattr(rates, name), run.step)
 
-    name = max(broken or PARAMETERS, key=lambda name: rate(present, name) / rate(default, name))
+    names = [VELOCITY if name == MOTION else name for name in broken or PARAMETERS]
+    name = max(names, key=lambda name: rate(present, name) / rate(default, name))
     alone = [other for _, other in trains].count(stage) <= 1
     value = min(LOWER * rate(present, name), rate(default, name))
     return f"{stage if alone else f'stages.{place}'}.rates.{name}={value:.2g}"

@@ -96,7 +96,7 @@ class Best(BaseModel):
 def tables_of(model: DeviceModel) -> Tables:
     """Copy what a model needs to be rendered, and to be trained from anew, to the host."""
     gaussians = model.gaussians
-    names = (*PARAMETERS, "filter_variance", *({INTERVAL2} & gaussians.tables.keys()))
+    names = (*gaussians.trained, "filter_variance", *({INTERVAL2} & gaussians.tables.keys()))
     return {name: gaussians.get(name) for name in names}
 
 

@@ -7,12 +7,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from clsplat.errors import MemoryLimitError
+from clsplat.formats.motion import MOTION
 from clsplat.gaussians.tables import ALIGNMENT, GROWTH, PARAMETERS, moment_tables, sh_coefficients
 from clsplat.opencl.discovery import DeviceInfo
 from clsplat.render.rasterizer import PIXEL_SUMS, RECORD
 
 PAIRS_PER_GAUSSIAN = 5  # (tile, Gaussian) pairs, an estimate; trained scenes have 1.5 to 4
 FRAME_GAUSSIAN = 4 * (RECORD + 2 + 5 + 7)  # records, mean2d; keys and radius; sorting by depth
+MOVED = 4 * (3 + 4 + 1)  # means, quaternions and logits of a moment
 FRAME_PAIR = 4 * (RECORD + 6)  # gradient record; tile and Gaussian of the pair, sorting by tile
 FRAME_PIXEL = 4 * (4 * 3 + 3 + 9 + 2 * 3 + 2 * 3 + 2 + 2)
 # image, photograph, gradient, second render; transmittance, texture, mask; SSIM's derivatives; a photograph that is
@@ -64,10 +66,13 @@ class MemoryPlan:
             )
 
 
-def first_tables(degree: int) -> dict[str, int]:
-    """Return the components of the tables that training has at least, by name: parameters and their moments."""
+def first_tables(degree: int, motion: int = 0) -> dict[str, int]:
+    """Return the components of the tables that training has at least, by name: parameters and their moments.
+
+    motion: the columns of the motion; 0 where nothing moves.
+    """
     widths = (3, 4, 3, 1, 3, 3 * (sh_coefficients(degree) - 1))
-    parameters = dict(zip(PARAMETERS, widths, strict=True))
+    parameters = dict(zip(PARAMETERS, widths, strict=True)) | ({MOTION: motion} if motion else {})
     return parameters | {table: width for name, width in parameters.items() for table in moment_tables(name)}
 
 
@@ -81,6 +86,7 @@ def plan(
     """
     sizes = [4 * width for width in components.values()]
     gradients = sum(4 * components[name] for name in PARAMETERS) + 8  # for penalties and edits
-    gaussian = sum(sizes) + FRAME_GAUSSIAN + 4 * pixel_sums + gradients
+    moving = 4 * components[MOTION] + MOVED if MOTION in components else 0
+    gaussian = sum(sizes) + FRAME_GAUSSIAN + 4 * pixel_sums + gradients + moving
     fixed = photographs + FRAME_PIXEL * pixels
     return MemoryPlan(gaussian, FRAME_PAIR, fixed, max(sizes), info.memory, info.allocation)

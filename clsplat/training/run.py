@@ -15,7 +15,7 @@ from clsplat.density.survey import Survey
 from clsplat.errors import ConfigError
 from clsplat.filters import FilterViews, ModelSettings, measure_intervals
 from clsplat.gaussians.model import Model, Rendering
-from clsplat.gaussians.tables import HIDDEN, INTERVAL2, PARAMETERS, DeviceModel
+from clsplat.gaussians.tables import HIDDEN, INTERVAL2, DeviceModel
 from clsplat.losses.base import Loss
 from clsplat.opencl.device import Device
 from clsplat.pages.page import scene_name
@@ -230,7 +230,7 @@ class Run:
 
     def host_model(self) -> Model:
         """Copy the model to the host, as it is trained: with a world filter that is not part of its scales."""
-        tables = {name: self.model.gaussians.get(name) for name in (*PARAMETERS, "filter_variance")}
+        tables = {name: self.model.gaussians.get(name) for name in (*self.model.gaussians.trained, "filter_variance")}
         if not tables["filter_variance"].any():
             del tables["filter_variance"]
         rendering = Rendering.of({"version": __version__, **self.rendering()}, "default")

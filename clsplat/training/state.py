@@ -7,6 +7,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from clsplat.errors import DataError
 from clsplat.fields.shape import FieldShape
+from clsplat.formats.motion import MOTION
 from clsplat.gaussians.model import WIDTHS
 from clsplat.gaussians.tables import PARAMETERS, moment_tables
 from clsplat.training.archive import Arrays
@@ -60,7 +61,8 @@ def check_tables(state: State, tables: Arrays) -> None:
             raise DataError(f"{name} is not [{count}, components] of float32")
     if count == 0:
         raise DataError("it holds no Gaussians")
-    for name in PARAMETERS:
+    trained = [*PARAMETERS, *([MOTION] if MOTION in tables else [])]
+    for name in trained:
         if tables[name].shape[1] not in WIDTHS[name]:
             raise DataError(f"{name} has {tables[name].shape[1]} components")
         moments = [moment for moment in moment_tables(name) if moment in tables]
@@ -68,5 +70,5 @@ def check_tables(state: State, tables: Arrays) -> None:
             raise DataError(f"{broken[0]} holds values that are not finite")
         if [tables[moment].shape for moment in moments] != [tables[name].shape] * (2 if state.updates else 0):
             raise DataError(f"the moments of {name} are not like it")
-    if state.updates and state.updates.keys() != set(PARAMETERS):
+    if state.updates and state.updates.keys() != set(trained):
         raise DataError("it counts updates of other parameters")

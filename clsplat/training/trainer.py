@@ -233,13 +233,13 @@ class Trainer:
     def _update(self, view: ViewGradients, stale: Collection[str]) -> Array:
         """Update the parameters and add the penalties to the view's losses.
 
-        Returns the gradient of the projected means, [2, S] px⁻¹.  Without penalties, stale parameters and depths,
-        gradients are not written to memory.
+        Returns the gradient of the projected means, [2, S] px⁻¹.  Without penalties, stale parameters, motion
+        and depths, gradients are not written to memory.
         """
         penalties = [loss for loss in self.losses if isinstance(loss, Penalty)]
         step = view.comparison.step
         rates = self.rates.at(step, self.extent)
-        if not (penalties or stale or view.frame.content == "inverse_depth"):
+        if not (penalties or stale or self.model.gaussians.moves or view.frame.content == "inverse_depth"):
             return self.adam.update(self.model, view.frame, view.pixel_sums, rates, self.rows)
         gradients = self.rasterizer.gradients(self.model, view.frame, view.pixel_sums)
         inputs = PenaltyInputs(self.rasterizer.workspace, self.model.gaussians, gradients, self.extent, step)

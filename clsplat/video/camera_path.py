@@ -1,7 +1,8 @@
 """Camera paths in files: nerfstudio's camera_path.json, read and written, and the list of cameras of 3DGS, read.
 
 render_width, render_height  px       fps, seconds      camera_type  perspective
-camera_path  a frame each: camera_to_world (16 numbers by rows, OpenGL axes), fov (degrees, vertical), aspect
+camera_path  a frame each: camera_to_world (16 numbers by rows, OpenGL axes), fov (degrees, vertical), aspect,
+             render_time (0 to 1, of a scene that moves)
 """
 
 import json
@@ -73,7 +74,10 @@ def read(path: Path, scene: Path | None = None) -> CameraPath:
         if fov is None or not 0.01 <= fov < 179:
             raise DataError(f"{frame.where}: fov is {quoted(fov)}; expected degrees from 0.01 to 179")
         pose = pose_of(Frame(path.parent, frame.where, {"transform_matrix": _rows(own.get("camera_to_world"))}))
-        views.append(View(f"frame_{i + 1:05d}", _camera(size, math.radians(fov)), move(pose)))
+        time = frame.number("render_time")
+        if time is not None and not 0 <= time <= 1:
+            raise DataError(f"{frame.where}: render_time is {time:g}; expected 0 to 1: export the path again")
+        views.append(View(f"frame_{i + 1:05d}", _camera(size, math.radians(fov)), move(pose), time=time))
     return CameraPath(views, rate, size)
 
 
@@ -117,7 +121,7 @@ def spread(views: Sequence[View], frames: int) -> list[View]:
     if frames == len(views):
         return list(views)
     if len(views) == 1:
-        return [View(f"frame_{i:05d}", views[0].camera, views[0].world_to_camera) for i in range(1, frames + 1)]
+        return [replace(views[0], name=f"frame_{i:05d}") for i in range(1, frames + 1)]
     places = np.linspace(0, len(views) - 1, frames)
     poses = np.stack([view.world_to_camera for view in views])
     turns = scipy.spatial.transform.Slerp(
@@ -142,7 +146,8 @@ def spread(views: Sequence[View], frames: int) -> list[View]:
 def _frame(view: View) -> dict[str, Any]:
     camera, matrix = view.camera, opengl_matrix(view.world_to_camera)
     fov = math.degrees(2 * math.atan(camera.height / 2 / camera.fy))
-    return {"camera_to_world": matrix.ravel().tolist(), "fov": fov, "aspect": camera.width / camera.height}
+    moment = {} if view.time is None else {"render_time": view.time}
+    return {"camera_to_world": matrix.ravel().tolist(), "fov": fov, "aspect": camera.width / camera.height, **moment}
 
 
 def _lens(frame: dict[str, Any]) -> dict[str, Any]:

@@ -2,19 +2,22 @@
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from clsplat.errors import ConfigError, quoted
 from clsplat.results import check_result
+from clsplat.scene.choice import Choice, choose
 from clsplat.scene.scene import Scene
 from clsplat.scene.view import View
 from clsplat.video import camera_path, encoding
 from clsplat.video.lenses import Size, checked_frames, checked_rate, checked_size, even_size, like
-from clsplat.video.paths import PATHS
+from clsplat.video.moments import Times, as_time_runs, times_of
+from clsplat.video.paths import PATHS, stay
 from clsplat.video.pictures import LAYERS, Canvas, Image, beside, shown
 from clsplat.video.rig import Floats, Rig
 
+FROM = ":"  # between a path and the name of a view
 FRAMES, FPS = 120, 30.0  # where neither the caller nor a file says
 Through = Callable[[Sequence[View]], Iterable[View]]  # what views pass, such as a display of progress
 Side = Callable[[View], Image]  # what stands beside a view's picture
@@ -24,27 +27,38 @@ Side = Callable[[View], Image]  # what stands beside a view's picture
 class Wish:
     """What film was asked for, checked before any work: None is a default."""
 
-    path: str = "ellipse"  # one of PATHS, or a file of a camera path
+    path: str = "ellipse"  # one of PATHS, fixed:NAME of a view, or a file of a camera path
     frames: int | None = None
     fps: float | None = None
     size: Size | None = None
+    times: Times | None = None  # of a scene that moves
 
     @classmethod
-    def of(cls, path: str, frames: int | None, fps: float | None, size: str | Size | None) -> "Wish":
+    def of(
+        cls,
+        path: str,
+        frames: int | None,
+        fps: float | None,
+        size: str | Size | None,
+        times: str | float | Sequence[float] | None = None,
+    ) -> "Wish":
         """Check what can be checked without a scene.  Raises ConfigError."""
-        if path not in PATHS and not path.lower().endswith(".json"):
+        if path.partition(FROM)[0] not in PATHS and not path.lower().endswith(".json"):
             raise ConfigError(f"no path {quoted(path)}; there are {', '.join(PATHS)}, and files of nerfstudio (.json)")
+        if FROM in path and path.partition(FROM)[0] in PATHS and not path.startswith(f"fixed{FROM}"):
+            raise ConfigError(f"no path {quoted(path)}; only `fixed{FROM}NAME` names a view")
         return cls(
             path,
             None if frames is None else checked_frames(frames),
             None if fps is None else checked_rate(fps),
             None if size is None else checked_size(size),
+            times_of(times),
         )
 
     @property
     def of_a_file(self) -> bool:
         """Whether the path is in a file, and needs no scene."""
-        return self.path not in PATHS
+        return self.path.partition(FROM)[0] not in PATHS
 
 
 @dataclass(frozen=True)
@@ -66,11 +80,18 @@ class Film:
         return len(self.views) / self.fps
 
 
-def plan(wish: Wish, scene: Scene | None, points: Floats) -> Film:
-    """Return the film of a scene.  points: [M, 3], means of a model, or points of the scene.
+def plan(wish: Wish, scene: Scene | None, points: Floats, moves: bool = False) -> Film:
+    """Return the film of a scene.  points: [M, 3], means of a model, or points of the scene; moves: whether it does.
 
-    Raises ConfigError without a scene where the path needs one, DataError where the scene has no such path.
+    Raises ConfigError without a scene where the path needs one, and for times where nothing moves; DataError where the
+    scene has no such path.
     """
+    found = _path(wish, scene, points)
+    return replace(found, views=as_time_runs(found.views, wish.times, moves))
+
+
+def _path(wish: Wish, scene: Scene | None, points: Floats) -> Film:
+    """The film without regard to time."""
     if wish.of_a_file:
         found = camera_path.read(Path(wish.path), scene.path if scene else None)
         views = found.resized(wish.size) if wish.size else found.views
@@ -79,6 +100,10 @@ def plan(wish: Wish, scene: Scene | None, points: Floats) -> Film:
         raise ConfigError(f"the path {wish.path} needs the cameras of a scene; give --scene, a run folder, or a file")
     rig = Rig.of(scene.views, points)
     size = wish.size or even_size(rig.camera)
+    if FROM in wish.path:
+        names = [view.name for view in scene.views]
+        (chosen,) = choose(Choice(names=[wish.path.partition(FROM)[2]]), names, [])
+        return Film(stay(scene.views[chosen], wish.frames or FRAMES, size), wish.fps or FPS)
     return Film(PATHS[wish.path](rig, wish.frames or FRAMES, size), wish.fps or FPS)
 
 
@@ -117,7 +142,7 @@ def still(view: View, size: Size | None = None) -> View:
     wanted = size or even_size(view.camera)
     if wanted == (view.camera.width, view.camera.height):
         return view
-    return View(view.name, like(view.camera, wanted), view.world_to_camera, view.image_path)
+    return View(view.name, like(view.camera, wanted), view.world_to_camera, view.image_path, time=view.time)
 
 
 def check_path_file(path: Path) -> None:

@@ -23,6 +23,7 @@ FARNESS = 0.75  # of the focus of a spiral, between near (0) and far (1), by inv
 TURNS = 2  # of a spiral
 SWAY = 0.3  # of its distance from what it looks at, at most: cameras that surround a scene give no front
 KEPT = 0.85  # of an arc that was photographed: at its ends half of what is seen was not
+MOMENT = 1e-3  # what the whole time of a scene counts beside a right angle: between the moments of one camera
 AGREEMENT = 0.5  # length of the mean direction of view: below it the cameras do not face one way
 
 
@@ -94,12 +95,25 @@ def views(rig: Rig, frames: int, size: Size) -> list[View]:
     return [replace(rig.views[i], camera=around(rig.views[i].camera, size), lens=None, mask_path=None) for i in chosen]
 
 
+def fixed(rig: Rig, frames: int, size: Size) -> list[View]:
+    """Stay at the camera in the middle of all: a film of what moves."""
+    middle = np.median(rig.positions, axis=0)
+    return stay(rig.views[int(np.linalg.norm(rig.positions - middle, axis=1).argmin())], frames, size)
+
+
+def stay(view: View, frames: int, size: Size) -> list[View]:
+    """Return a view as often as there are frames, without its photograph's moment."""
+    still = replace(view, camera=around(view.camera, size), lens=None, mask_path=None, time=None)
+    return [replace(still, name=f"frame_{i:05d}") for i in range(1, frames + 1)]
+
+
 PATHS: dict[str, Callable[[Rig, int, Size], list[View]]] = {
     "ellipse": ellipse,
     "spiral": spiral,
     "orbit": orbit,
     "through": through,
     "views": views,
+    "fixed": fixed,
 }
 
 
@@ -153,7 +167,11 @@ def _looking(rig: Rig, positions: Floats, target: Floats, size: Size) -> list[Vi
 
 
 def nearest(view: View, views: Sequence[View], reach: float) -> View:
-    """Return the photograph's view whose camera is closest: `reach` of distance counts as much as a right angle."""
+    """Return the photograph's view whose camera is closest: `reach` of distance counts as much as a right angle.
+
+    Of the moments of one camera it is the nearest.
+    """
     apart = np.array([np.linalg.norm(view.position - other.position) for other in views]) / reach
     turned = np.array([1 - view.world_to_camera[2, :3] @ other.world_to_camera[2, :3] for other in views])
-    return views[int((apart + turned).argmin())]
+    late = np.array([abs((view.time or 0.0) - (other.time or 0.0)) for other in views])
+    return views[int((apart + turned + MOMENT * late).argmin())]

@@ -1,7 +1,7 @@
 """Pictures of the layers of a view, 8 bits a channel, and the canvas that they are drawn on."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -50,7 +50,7 @@ class Canvas:
         depths = []
         for i in np.unique(np.linspace(0, len(views) - 1, min(PROBES, len(views))).round().astype(int)):
             view, longest = views[i], max(views[i].camera.width, views[i].camera.height)
-            small = View(view.name, view.camera.downscaled(max(1, longest / PROBE_SIDE)), view.world_to_camera)
+            small = replace(view, camera=view.camera.downscaled(max(1, longest / PROBE_SIDE)))
             found = self.layers(small, depth=True)
             assert found.depth is not None
             depths.append(found.depth[found.alpha > OPAQUE])

@@ -23,7 +23,9 @@ def stand_data(stand: Stand) -> dict[str, Any]:
 def camera_data(view: View) -> dict[str, Any]:
     """Return a view's pose, by rows, and its lens as camera.js reads them."""
     c = view.camera
-    return {"pose": rounded(view.world_to_camera.ravel()), "lens": [c.fx, c.fy, c.cx, c.cy, c.width, c.height]}
+    moment = {} if view.time is None else {"time": view.time}
+    lens = [c.fx, c.fy, c.cx, c.cy, c.width, c.height]
+    return {"pose": rounded(view.world_to_camera.ravel()), "lens": lens, **moment}
 
 
 def rounded(values: NDArray[np.floating]) -> list[float]:

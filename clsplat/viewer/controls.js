@@ -112,7 +112,8 @@ class Controls {
       f: () => viewer.panel.fullscreen(), c: () => viewer.screenshot(), "?": () => viewer.panel.help(),
       1: () => viewer.panel.mode?.("splats"), 2: () => viewer.panel.mode?.("points"),
       3: () => viewer.panel.mode?.("ellipsoids"), 4: () => viewer.panel.mode?.("opacity"),
-      " ": viewer.pause && (() => viewer.pause()),
+      " ": viewer.clock ? () => viewer.clock.turn() : viewer.pause && (() => viewer.pause()),
+      ",": viewer.clock && (() => viewer.clock.skip(-1)), ".": viewer.clock && (() => viewer.clock.skip(1)),
     }[key];
     if (!action || (event.target.matches("input") && key.startsWith("arrow"))) return;
     if (key === " " && event.target.closest("button")) return;

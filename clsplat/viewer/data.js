@@ -59,11 +59,29 @@ function unpacked(header, buffer, most) {
     places[4 * i + 3] = quats[i];
   }
   const sizes = interleaved(shapes, whole, count, 4, padded(Uint8Array, count, 1, 4), 4);
-  const each = 16 * texels;
+  const each = 16 * texels, motion = header.motion && moved(header.motion.columns, buffer, place, whole, count);
   const colours = interleaved(codes, whole, count, codes.length / whole, padded(Uint8Array, count, texels, 16), each);
-  return {count, whole, texels, tables, positions, places, sizes: new Uint32Array(sizes.buffer),
+  return {count, whole, texels, tables, positions, motion, places, sizes: new Uint32Array(sizes.buffer),
     colours: new Uint32Array(colours.buffer)};
 }
+
+// Planes [columns, whole] of half floats as rows of texels: {rows, wide: texels of a row}.
+function moved(columns, buffer, place, whole, count) {
+  const bytes = new Uint8Array(buffer, place, 2 * columns * whole), wide = Math.ceil(columns / 4);
+  const rows = padded(Float32Array, count, wide, 4);
+  for (let column = 0; column < columns; column++) {
+    for (let i = 0; i < count; i++) {
+      const from = 2 * (column * whole + i), half = bytes[from] + 256 * bytes[from + 1];
+      rows[4 * wide * i + column] = halfFloat(half);
+    }
+  }
+  return {rows, wide};
+}
+
+const halfFloat = half => {
+  const sign = half >> 15 ? -1 : 1, exponent = (half >> 10) & 31, rest = half & 1023;
+  return sign * (exponent ? 2 ** (exponent - 15) * (1 + rest / 1024) : rest * 2 ** -24);
+};
 
 // Planes [number, whole] of bytes as `each` bytes of a splat.
 function interleaved(planes, whole, count, number, out, each) {

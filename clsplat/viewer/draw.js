@@ -30,6 +30,8 @@ function texture(gl, format, width, height, kind, type, data, filter = gl.NEARES
   return made;
 }
 
+const moving = ({motions}) => motions ? {motions} : {}; // the texture, where there is one
+
 class Painter {
   constructor(canvas) {
     const wishes = {antialias: false, alpha: false, powerPreference: "high-performance"};
@@ -39,8 +41,8 @@ class Painter {
     this.half = !!(gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float"));
     this.most = gl.getParameter(gl.MAX_TEXTURE_SIZE);
     if (this.most < ROW) throw Error(`this device has textures of ${this.most} px; ${ROW} are needed`);
-    this.colours = program(gl, COVER, COLOURS);
-    this.splats = program(gl, SPLAT_VERTEX, SPLAT_FRAGMENT);
+    this.programs = {};
+    this.of(STANDS);
     this.present = program(gl, COVER, PRESENT);
     this.empty = gl.createVertexArray();
     this.quad = gl.createBuffer();
@@ -48,6 +50,12 @@ class Painter {
     gl.bufferData(gl.ARRAY_BUFFER, QUAD, gl.STATIC_DRAW);
     this.target = {};
     gl.disable(gl.DEPTH_TEST);
+  }
+
+  // The programs of models that stand still, or of those that move.
+  of(motion) {
+    return this.programs[motion] ??= {colours: program(this.gl, COVER, colours(motion)),
+      splats: program(this.gl, splatVertex(motion), SPLAT_FRAGMENT)};
   }
 
   // A texture that can be drawn to, with its framebuffer.
@@ -64,7 +72,12 @@ class Painter {
   layer(header, data) {
     const gl = this.gl, rows = rowsOf(data.count, 1), words = gl.RGBA_INTEGER;
     const wide = splatsInRow(data.texels) * data.texels, high = rowsOf(data.count, data.texels);
-    const layer = {header, count: data.count, texels: data.texels, drawn: 0};
+    const layer = {header, count: data.count, texels: data.texels, drawn: 0, ...this.of(data.motion ? MOVES : STANDS)};
+    if (data.motion) {
+      const {rows, wide} = data.motion, across = splatsInRow(wide) * wide;
+      layer.motions = texture(gl, gl.RGBA32F, across, rowsOf(data.count, wide), gl.RGBA, gl.FLOAT, rows);
+      layer.wide = wide;
+    }
     layer.tables = texture(gl, gl.R32F, 256, 4, gl.RED, gl.FLOAT, data.tables);
     layer.places = texture(gl, gl.RGBA32UI, ROW, rows, words, gl.UNSIGNED_INT, data.places);
     layer.sizes = texture(gl, gl.R32UI, ROW, rows, gl.RED_INTEGER, gl.UNSIGNED_INT, data.sizes);
@@ -102,12 +115,22 @@ class Painter {
     });
   }
 
-  // Compute the colours of the first splats, unless it was done for this place of the camera.
-  shade(layer, eye, first) {
-    const key = [...eye, first].join(), gl = this.gl, used = this.colours;
+  // What a program needs to know of the motion of a layer at a moment.
+  move(used, layer, moment) {
+    if (!layer.motions) return;
+    const {bends, turns} = layer.header.motion;
+    const numbers = {wide: layer.wide, bends, turns};
+    for (const [name, number] of Object.entries(numbers)) this.gl.uniform1i(used.at(name), number);
+    this.gl.uniform1f(used.at("moment"), moment);
+  }
+
+  // Compute the colours of the first splats, unless it was done for this place of the camera and this moment.
+  shade(layer, eye, first, moment) {
+    const key = [...eye, first, layer.motions ? moment : 0].join(), gl = this.gl, used = layer.colours;
     if (key === layer.key) return;
     layer.key = key;
-    this.bind(used, {tables: layer.tables, places: layer.places, codes: layer.codes});
+    this.bind(used, {tables: layer.tables, places: layer.places, codes: layer.codes, ...moving(layer)});
+    this.move(used, layer, moment);
     gl.uniform3fv(used.at("eye"), eye);
     gl.uniform1i(used.at("degree"), layer.header.degree);
     gl.uniform1i(used.at("texels"), layer.texels);
@@ -120,15 +143,17 @@ class Painter {
   }
 
   // Blend a layer into a surface of the size of `frame`: what `framed` of camera.js returns.
-  blend(layer, frame, {mode = "splats", first = layer.count, dot = 1.5} = {}) {
-    const gl = this.gl, used = this.splats, {header} = layer, {width, height} = frame;
-    this.shade(layer, frame.eye, first);
+  blend(layer, frame, {mode = "splats", first = layer.count, dot = 1.5, moment = 0} = {}) {
+    const gl = this.gl, used = layer.splats, {header} = layer, {width, height} = frame;
+    this.shade(layer, frame.eye, first, moment);
     const target = this.sized(width, height);
     gl.bindFramebuffer(gl.FRAMEBUFFER, target.frame);
     gl.viewport(0, 0, width, height);
     gl.clearColor(0, 0, 0, 0);
     gl.clear(gl.COLOR_BUFFER_BIT);
-    this.bind(used, {tables: layer.tables, places: layer.places, sizes: layer.sizes, colours: layer.shown.texture});
+    const shapes = {tables: layer.tables, places: layer.places, sizes: layer.sizes, colours: layer.shown.texture};
+    this.bind(used, {...shapes, ...moving(layer)});
+    this.move(used, layer, moment);
     gl.uniformMatrix3fv(used.at("rotation"), true, frame.rotation);
     gl.uniform3fv(used.at("translation"), frame.translation);
     gl.uniform4fv(used.at("intrinsics"), frame.intrinsics);

@@ -5,16 +5,20 @@ const REST = 200, SLOW = 40, QUICK = 20; // ms without a change until the full p
 class Viewer extends Walk {
   constructor(info, layers, painter, canvas) {
     super(info, canvas);
-    Object.assign(this, {layers, painter, mode: "splats", share: 1, quality: 1, background: info.background, ms: null});
-    for (const layer of layers) layer.sorter = new Sorter(layer.positions, layer.header.near, (order, first) => {
-      painter.reorder(layer, order);
-      layer.first = first;
-      this.change(false);
-    });
+    Object.assign(this, {layers, painter, mode: "splats", share: 1, quality: 1, ms: null, moment: 0});
+    this.background = info.background;
+    for (const layer of layers) {
+      layer.sorter = new Sorter(layer.positions, layer.motion, layer.header.near, (order, first) => {
+        painter.reorder(layer, order);
+        layer.first = first;
+        this.change(false);
+      });
+    }
     this.panel = new Settings(this);
     this.photographs = new Photographs(this, info.views);
     this.frustums = new Frustums(this, info.views);
     this.controls = new Controls(this, canvas);
+    if (info.step) this.clock = new Clock(this, info.step);
     this.photographs.compare("off");
     new ResizeObserver(() => { this.photographs.place(); this.change(); }).observe(this.stage);
     addEventListener("hashchange", () => this.adopt());
@@ -42,11 +46,13 @@ class Viewer extends Walk {
     this.time = time;
     if (this.flight) this.advance(time);
     if (this.controls.fly(passed / 1000) || this.flight) this.change();
+    this.clock?.run(passed / 1000);
     const resting = performance.now() - this.changed > REST;
     if (!resting && this.drew) this.adapt(passed);
     this.drew = this.dirty || (resting && !this.whole);
     if (this.drew) this.draw(resting);
-    if (this.whole && !this.flight && !this.controls.pressed.size) this.time = undefined; // a new order draws again
+    const moves = this.flight || this.clock?.playing || this.controls.pressed.size;
+    if (this.whole && !moves) this.time = undefined; // a new order draws again
     else this.scheduled ??= requestAnimationFrame(later => this.tick(later));
   }
 
@@ -76,8 +82,9 @@ class Viewer extends Walk {
     const [across, down] = [wide, high].map(side => Math.max(1, Math.round(side * scale)));
     const frame = framed(this.camera, across, down, exact, native);
     this.layers.forEach((layer, i) => {
-      layer.sorter.ask([...axis(this.camera, 2), frame.translation[2]], this.first(layer, share));
-      this.painter.blend(layer, frame, {mode: this.mode, first: layer.first, dot: Math.max(1, 1.5 * ratio * scale)});
+      layer.sorter.ask([...axis(this.camera, 2), frame.translation[2]], this.first(layer, share), this.moment);
+      const {mode, moment} = this, dot = Math.max(1, 1.5 * ratio * scale);
+      this.painter.blend(layer, frame, {mode, first: layer.first, dot, moment});
       const corner = along ? [i * wide, 0] : [0, (parts - 1 - i) * high];
       this.painter.show([...corner, wide, high], this.background);
     });
@@ -126,7 +133,8 @@ class Viewer extends Walk {
   // The pixels of a view at its own size, after `choose` and once the page is at rest: {width, height, data}.
   capture(part = 0) {
     const [width, height] = this.camera.lens.slice(4), layer = this.layers[part];
-    this.painter.blend(layer, framed(this.camera, width, height, true, this.camera.lens[0]), {first: layer.first});
+    this.painter.blend(layer, framed(this.camera, width, height, true, this.camera.lens[0]),
+      {first: layer.first, moment: this.moment});
     return {width, height, data: this.painter.pixels(this.background)};
   }
 }
@@ -140,7 +148,9 @@ async function open() {
     script.remove(); // its text is no longer needed
     const data = unpacked(header, buffer, painter.most), points = new Float32Array(data.places.buffer);
     const opacities = Float32Array.from(data.sizes, word => data.tables[256 + (word >>> 24)]);
-    layers.push({...painter.layer(header, data), positions: data.positions, points, opacities, first: 0});
+    const {positions} = data, motion = data.motion &&
+      {rows: data.motion.rows, stride: 4 * data.motion.wide, bends: header.motion.bends};
+    layers.push({...painter.layer(header, data), positions, motion, points, opacities, first: 0});
   }
   window.viewer = new Viewer(info, layers, painter, canvas);
   find("message").hidden = true;

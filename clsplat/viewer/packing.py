@@ -6,6 +6,8 @@
               is origin + unit · sign(t) (e^|t| - 1): as fine as cameras in the middle see it, near and far
     quats     [N] uint32: index of the largest component in bits 31-30, the others, from x on, 10 bits each
     scales    [3, N], opacity [1, N], colours [3 K, N] uint8: indices; colours by coefficient, then channel
+    motion    [columns, N] float16, where the model moves: those of clsplat/formats/motion.py, the turn as change of
+              the unit quaternion above, x, y, z, w
 
 All numbers are little-endian.  Splats stand in LEVELS parts of falling importance, so that the first parts alone show
 the scene coarsely; in a part they follow a curve through space, which keeps blocks small.
@@ -19,6 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.formats.motion import degree_of, fields_of
 from clsplat.formats.packing import morton_order, smallest_three
 from clsplat.formats.splats import MAX_LOG
 from clsplat.gaussians.model import Model
@@ -33,6 +36,7 @@ RANK_SHARE = 0.25  # of a table's spacing; the rest is by value
 KNEE = 0.5  # of colours of bands above 0: below it the table is even, above it logarithmic
 LEAST_RANGE = 3.0  # of that table: finer steps than of 0.01 cost bytes and show nothing
 BITS = 10  # of a component of a quaternion
+MAX_HALF = 65504.0  # of half floats
 
 Bytes = NDArray[np.uint8]
 Floats = NDArray[np.float64]
@@ -81,6 +85,9 @@ def pack(model: Model, limit: int | None = None) -> Packed:
         "unit": frame[1],
         "levels": [count * (level + 1) // LEVELS for level in range(LEVELS)],
     }
+    if model.motion is not None:
+        planes.append(_motion(model.motion, model.quats))
+        header["motion"] = _motion_header(model.motion.shape[1])
     data = b"".join(np.ascontiguousarray(plane).tobytes() for plane in planes)
     return Packed(header, gzip.compress(data, 7, mtime=0))
 
@@ -140,6 +147,23 @@ def _quaternions(quats: NDArray[np.float32]) -> NDArray[np.unsignedinteger]:
     shifts = np.array([2 * BITS, BITS, 0], np.uint32)
     packed = (codes << shifts).sum(axis=1, dtype=np.uint32) | (largest.astype(np.uint32) << np.uint32(30))
     return np.asarray(packed, "<u4")
+
+
+def _motion(motion: NDArray[np.floating], quats: NDArray[np.floating]) -> NDArray[np.float16]:
+    """The columns of the motion, [columns, N]; the turn that of the quaternion which is stored."""
+    columns = motion.astype(np.float64)
+    if (turn := fields_of(motion.shape[1]).get("turn")) is not None:
+        unit = np.roll(quats.astype(np.float64), -1, axis=1)
+        largest = np.take_along_axis(unit, np.abs(unit).argmax(axis=1)[:, None], axis=1)
+        norm = np.linalg.norm(unit, axis=1, keepdims=True) * np.where(largest < 0, -1.0, 1.0)
+        columns[:, turn] = np.roll(columns[:, turn], -1, axis=1) / norm
+    return columns.clip(-MAX_HALF, MAX_HALF).astype("<f2").T
+
+
+def _motion_header(columns: int) -> dict[str, int]:
+    """What the page needs to know of the columns: their number, that of the powers above the first, and the turn's."""
+    turn = fields_of(columns).get("turn")
+    return {"columns": columns, "bends": degree_of(columns) - 1, "turns": turn.start if turn else 0}
 
 
 def _table(values: NDArray[np.floating]) -> Floats:

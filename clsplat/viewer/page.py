@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from clsplat.errors import OutputError
 from clsplat.files import write_text
 from clsplat.pages.page import inline, render
@@ -18,8 +20,9 @@ from clsplat.viewer.packing import Packed
 FOLDER = Path(__file__).parent
 SCRIPTS = (
     *("data", "sort", "shaders", "draw", "camera", "motion", "controls", "photographs", "frustums"),
-    *("panel", "settings", "main"),
+    *("panel", "settings", "time", "main"),
 )
+STEP = 1 / 30  # between two moments, where the page has no views of several
 MAX_SIZE = 200.0  # MB: browsers need several times as much memory
 MARGIN = 0.97  # of that size, for splats that pack worse than the average
 MARK = b'<canvas id="frustums"'  # of viewer.html.j2
@@ -47,6 +50,7 @@ class Page:
             "first": first,
             "background": COLOURS[self.background],
             "file": re.sub(r"[^\w.-]+", "_", self.title),
+            **({"step": self._step} if self.moves else {}),
         }
         return render(
             "viewer.html.j2",
@@ -58,6 +62,17 @@ class Page:
             style=inline(style()),
             script=inline(script()),
         )
+
+    @property
+    def moves(self) -> bool:
+        """Whether a model moves."""
+        return any("motion" in packed.header for packed in self.models.values())
+
+    @property
+    def _step(self) -> float:
+        """Between two moments of the views."""
+        moments = np.unique([view["time"] for view in self.views if "time" in view])
+        return float(np.median(np.diff(moments))) if len(moments) > 1 else STEP
 
     @property
     def size(self) -> float:

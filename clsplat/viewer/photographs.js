@@ -48,6 +48,11 @@ class Photographs {
     this.chosen = i;
     this.items[i].setAttribute("aria-current", "true");
     this.items[i].scrollIntoView({behavior: seconds ? "smooth" : "instant", block: "nearest", inline: "center"});
+    const {clock} = this.viewer, {time} = this.views[i];
+    if (clock && time !== undefined) {
+      clock.stop();
+      clock.to(time);
+    }
     this.viewer.fly(cameraOf(this.views[i]), seconds, i);
   }
 

@@ -8,12 +8,40 @@ uniform usampler2D places; // position and quaternion of a splat
 float entry(int table, uint code) { return texelFetch(tables, ivec2(int(code), table), 0).x; }
 ivec2 spot(int i) { return ivec2(i & 4095, i >> 12); }`;
 
+// Where a splat is at the moment that is shown: what stands still is where it is.
+const STANDS = `
+vec4 moved(int i, vec3 mean) { return vec4(mean, 1); }  // its mean, and the factor of its opacity
+vec4 turned(int i, vec4 q) { return q; }`;
+
+// What moves has rows of velocity, time of its middle, log of its duration, coefficients of dt^2 and dt^3, and the
+// change of its quaternion (x, y, z, w), as far as there are some: cl_kernels/motion.cl.
+const MOVES = `
+uniform sampler2D motions;
+uniform int wide, bends, turns;  // texels of a row; number of coefficients; column of the turn, or 0
+uniform float moment;
+float column(int i, int k) {
+  int row = 4096 / wide;
+  return texelFetch(motions, ivec2((i % row) * wide + k / 4, i / row), 0)[k % 4];
+}
+vec3 three(int i, int k) { return vec3(column(i, k), column(i, k + 1), column(i, k + 2)); }
+vec4 moved(int i, vec3 mean) {
+  float dt = moment - column(i, 3), late = dt * exp(-column(i, 4));
+  vec3 way = three(i, 0);
+  if (bends > 0) way += three(i, 5) * dt;
+  if (bends > 1) way += three(i, 8) * dt * dt;
+  return vec4(mean + way * dt, exp(-.5 * late * late));
+}
+vec4 turned(int i, vec4 q) {
+  if (turns == 0) return q;
+  return normalize(q + vec4(three(i, turns), column(i, turns + 3)) * (moment - column(i, 3)));
+}`;
+
 // A triangle that covers the target.
 const COVER = `#version 300 es
 void main() { gl_Position = vec4(gl_VertexID == 1 ? 3 : -1, gl_VertexID == 2 ? 3 : -1, 0, 1); }`;
 
 // Colours of all splats for one place of the camera: max(0, 1/2 + sum_k basis_k(d) sh_k), one texel each.
-const COLOURS = HEAD + `
+const colours = motion => HEAD + motion + `
 uniform usampler2D codes;
 uniform vec3 eye;
 uniform int degree, texels, count;
@@ -25,7 +53,7 @@ void main() {
   if (i >= count) discard;
   uvec4 a[3];
   for (int k = 0; k < 3; k++) a[k] = texelFetch(codes, ivec2((i % row) * texels + min(k, texels - 1), i / row), 0);
-  vec3 d = normalize(uintBitsToFloat(texelFetch(places, at, 0).xyz) - eye);
+  vec3 d = normalize(moved(i, uintBitsToFloat(texelFetch(places, at, 0).xyz)).xyz - eye);
   float x = d.x, y = d.y, z = d.z, xx = x * x, yy = y * y, zz = z * z;
   float basis[16] = float[16](.28209479,
     -.48860251 * y, .48860251 * z, -.48860251 * x,
@@ -44,7 +72,7 @@ void main() {
   colour = vec4(max(sum, 0.), 1);
 }`;
 
-const SPLAT_VERTEX = HEAD + `
+const splatVertex = motion => HEAD + motion + `
 uniform usampler2D sizes;
 uniform sampler2D colours;
 uniform mat3 rotation;       // world to camera
@@ -68,10 +96,11 @@ void main() {
   int i = int(id);
   uvec4 place = texelFetch(places, spot(i), 0);
   uint shape = texelFetch(sizes, spot(i), 0).x;
-  vec3 m = rotation * uintBitsToFloat(place.xyz) + translation;
+  vec4 now = moved(i, uintBitsToFloat(place.xyz));
+  vec3 m = rotation * now.xyz + translation;
   if (!(m.z >= filters.x)) return;
   vec3 scale = vec3(entry(0, shape & 255u), entry(0, (shape >> 8) & 255u), entry(0, (shape >> 16) & 255u));
-  float opacity = entry(1, shape >> 24);
+  float opacity = entry(1, shape >> 24) * now.w;
 
   uint word = place.w;
   vec3 part = (vec3((word >> 20) & 1023u, (word >> 10) & 1023u, word & 1023u) / 1023. - .5) * 1.41421356;
@@ -79,6 +108,7 @@ void main() {
   uint largest = word >> 30;
   vec4 q = largest == 0u ? vec4(rest, part) : largest == 1u ? vec4(part.x, rest, part.yz)
          : largest == 2u ? vec4(part.xy, rest, part.z) : vec4(part, rest);
+  q = turned(i, q);
   float x = q.x, y = q.y, z = q.z, w = q.w;
   mat3 turn = mat3(1. - 2. * (y * y + z * z), 2. * (x * y + w * z), 2. * (x * z - w * y),
                    2. * (x * y - w * z), 1. - 2. * (x * x + z * z), 2. * (y * z + w * x),

@@ -2,7 +2,7 @@
 // positive floats are in the order of their values.  Splats before the near plane are left out.
 
 function sortInWorker() {
-  let positions, keys, ids, otherKeys, otherIds;
+  let positions, motion, now, keys, ids, otherKeys, otherIds;
   const counts = new Uint32Array(65537);
 
   function pass(shift, count, fromKeys, fromIds, toKeys, toIds) {
@@ -16,11 +16,25 @@ function sortInWorker() {
     }
   }
 
-  function sorted({row, near, first}) {
+  // The positions at a moment; of what is not there then, no numbers.
+  function at(moment) {
+    const {rows, stride, bends} = motion, faintest = 2 * Math.log(255);
+    for (let i = 0, k = 0; 3 * i < positions.length; i++, k += stride) {
+      const dt = moment - rows[k + 3], late = dt * Math.exp(-rows[k + 4]), gone = late * late > faintest;
+      for (let axis = 0; axis < 3; axis++) {
+        const bend = bends > 0 ? rows[k + 5 + axis] + (bends > 1 ? rows[k + 8 + axis] * dt : 0) : 0;
+        now[3 * i + axis] = gone ? NaN : positions[3 * i + axis] + dt * (rows[k + axis] + dt * bend);
+      }
+    }
+    return now;
+  }
+
+  function sorted({row, near, first, moment}) {
+    const places = motion ? at(moment) : positions;
     const [x, y, z, w] = row, depths = new Float32Array(keys.buffer);
     let count = 0;
     for (let i = 0; i < first; i++) {
-      const depth = x * positions[3 * i] + y * positions[3 * i + 1] + z * positions[3 * i + 2] + w;
+      const depth = x * places[3 * i] + y * places[3 * i + 1] + z * places[3 * i + 2] + w;
       if (!(depth >= near)) continue;
       depths[count] = depth;
       ids[count++] = i;
@@ -33,7 +47,8 @@ function sortInWorker() {
 
   onmessage = ({data}) => {
     if (data.positions) {
-      positions = data.positions;
+      ({positions, motion} = data);
+      now = motion && new Float32Array(positions.length);
       [keys, ids, otherKeys, otherIds] = Array.from({length: 4}, () => new Uint32Array(positions.length / 3));
     } else {
       const order = sorted(data);
@@ -44,11 +59,12 @@ function sortInWorker() {
 
 // One worker; it sorts for one pose at a time, and next for the last one that was asked for.
 class Sorter {
-  constructor(positions, near, done) {
+  // motion: {rows, stride, bends} of what moves
+  constructor(positions, motion, near, done) {
     const source = URL.createObjectURL(new Blob([`(${sortInWorker})()`], {type: "text/javascript"}));
     this.worker = new Worker(source);
     URL.revokeObjectURL(source);
-    this.worker.postMessage({positions}, [positions.buffer]);
+    this.worker.postMessage({positions, motion}, [positions.buffer]);
     this.near = near;
     this.number = 0; // of the last request
     this.busy = this.current = false; // current: the last order is of the last request
@@ -60,11 +76,11 @@ class Sorter {
     };
   }
 
-  // row: the third row of world_to_camera; first: the number of splats, the most important ones
-  ask(row, first) {
-    const key = [...row, first].join();
+  // row: the third row of world_to_camera; first: the number of splats, the most important ones; moment: of what moves
+  ask(row, first, moment) {
+    const key = [...row, first, moment].join();
     if (key === this.key) return;
-    Object.assign(this, {key, row, first});
+    Object.assign(this, {key, row, first, moment});
     this.number++;
     this.current = false;
     if (!this.busy) this.send();
@@ -72,6 +88,7 @@ class Sorter {
 
   send() {
     this.busy = true;
-    this.worker.postMessage({row: this.row, near: this.near, first: this.first, number: this.number});
+    const {row, near, first, moment, number} = this;
+    this.worker.postMessage({row, near, first, moment, number});
   }
 }

@@ -91,7 +91,7 @@ def pose_gradient(workspace: Workspace, model: DeviceModel, frame: Frame, pixel_
     items = -(-model.gaussians.count // int(device.tuning["LANES"]))
     sums = workspace.array("pose sums", (SUMS, -(-items // GROUP)))
     device.program("poses.cl", **model.defines).pose_gradient(
-        items=items, **shape_arguments(model, frame.camera), splats=frame.splats, pixel_sums=pixel_sums, sums=sums
+        items=items, **shape_arguments(frame.drawn, frame.camera), splats=frame.splats, pixel_sums=pixel_sums, sums=sums
     )
     copied = sums.get_later()
     return lambda: np.cumsum(copied(), axis=1, dtype=np.float64)[:, -1]

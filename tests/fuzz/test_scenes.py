@@ -17,7 +17,10 @@ from tests.fuzz.outcome import outcome
 
 POSE = [[1, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 5], [0, 0, 0, 1]]
 KEYS = ["w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "camera_angle_x", "camera_model", "is_fisheye"]
-WORDS = [f'"{key}": ' for key in [*KEYS, "file_path", "mask_path", "ply_file_path", "frames", "test_filenames"]]
+WORDS = [
+    f'"{key}": '
+    for key in [*KEYS, "file_path", "mask_path", "ply_file_path", "frames", "test_filenames", "time", "static_path"]
+]
 WORDS += [
     '"OPENCV_FISHEYE"',
     '"a.png"',
@@ -92,6 +95,7 @@ def tables() -> list[bytes]:
         {"frames": own, "ply_file_path": "points.ply"},
         {"camera_angle_x": 0.7, "frames": [{**frame, "file_path": f"./{frame['file_path'][0]}"} for frame in frames]},
         {**lens, "camera_model": "OPENCV_FISHEYE", "k1": 0.01, "k2": 0.001, "frames": masked},
+        {**lens, "frames": [{**frame, "time": i, "static_path": "a.png"} for i, frame in enumerate(frames)]},
     ]
     return [json.dumps(table, indent=i % 2 or None).encode() for i, table in enumerate(found)]
 
@@ -120,6 +124,32 @@ def test_a_damaged_table_of_sizes_is_read_or_refused(folder):
     @fuzzed(data=damaged([json.dumps(table).encode()], WORDS))
     def reads(data):
         (path / "metadata.json").write_bytes(data)
+        read_and_inspect(path)
+
+    reads()
+
+
+def test_a_damaged_table_of_moments_is_read_or_refused(folder):
+    path, _ = colmap(folder, "txt")
+    moments = {image.name: float(i) for i, image in enumerate(tiny_model().images)}
+
+    @fuzzed(data=damaged([json.dumps(moments).encode()], ["1e400", "null", "[1]", '"a.jpg": ']))
+    def reads(data):
+        (path / "images" / "times.json").write_bytes(data)
+        read_and_inspect(path)
+
+    reads()
+    (path / "images" / "times.json").unlink()
+
+
+def test_cameras_of_videos_that_are_damaged_are_read_or_refused(folder):
+    path = folder / "videos_of_two"
+    for name in ("a/0.png", "a/1.png", "b/0.png", "b/1.png"):
+        photo(path / "videos" / name)
+
+    @fuzzed(data=damaged(tables(), WORDS))
+    def reads(data):
+        (path / "transforms.json").write_bytes(data)
         read_and_inspect(path)
 
     reads()

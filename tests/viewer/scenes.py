@@ -1,7 +1,10 @@
 """A model that needs every part of the shaders, and cameras that need every part of the projection."""
 
+from dataclasses import replace
+
 import numpy as np
 
+from clsplat.formats.motion import fields_of
 from clsplat.gaussians.model import Model, Rendering
 from clsplat.scene.scene import Camera, Scene, View, make_scene
 
@@ -24,6 +27,18 @@ def cloud(count: int, rendering: Rendering = PLAIN, degree: int = 3, seed: int =
         sh_rest=rng.normal(0, 0.15, (count, 3 * ((degree + 1) ** 2 - 1))),
         rendering=rendering,
     )
+
+
+def moving(model: Model, width: int = 15, seed: int = 1) -> Model:
+    """The same splats, which come, go, bend their way and turn, as far as `width` columns of motion hold that."""
+    rng, fields = np.random.default_rng(seed), fields_of(width)
+    motion = np.zeros((len(model), width))
+    spread = {"velocity": 0.8, "acceleration": 0.5, "jerk": 0.5, "turn": 1.0}
+    for name, columns in fields.items():
+        motion[:, columns] = rng.normal(0, spread.get(name, 0.0), (len(model), columns.stop - columns.start))
+    motion[:, fields["time_centre"]] = rng.uniform(0, 1, (len(model), 1))
+    motion[:, fields["log_duration"]] = rng.normal(-1.2, 1, (len(model), 1))
+    return replace(model, motion=motion.astype(np.float32))
 
 
 def views() -> list[View]:

@@ -18,6 +18,7 @@ class Unpacked:
     scales: NDArray[np.float64]  # [N, 3]
     opacities: NDArray[np.float64]  # [N]
     sh: NDArray[np.float64]  # [N, K, 3]
+    motion: NDArray[np.float64]  # [N, columns]
 
 
 def unpacked(packed: Packed) -> Unpacked:
@@ -36,6 +37,7 @@ def unpacked(packed: Packed) -> Unpacked:
     words = take("<u4", count)
     shapes, opacities = take("u1", 3, count), take("u1", count)
     codes = take("u1", coefficients, 3, count)
+    motion = take("<f2", packed.header.get("motion", {"columns": 0})["columns"], count)
     assert place == len(raw)
     others = (np.stack([words >> 20, words >> 10, words], 1) % 1024 / 1023 - 0.5) * np.sqrt(2)
     largest = np.arange(4) == (words >> 30)[:, None]
@@ -45,4 +47,6 @@ def unpacked(packed: Packed) -> Unpacked:
     sh = np.concatenate([base[codes[:1]], rest[codes[1:]]]).transpose(2, 0, 1)
     t = own[:, :3] + own[:, 3:] * (steps[:3] + 256 * steps[3:]).T
     means = packed.header["origin"] + packed.header["unit"] * np.sign(t) * np.expm1(np.abs(t))
-    return Unpacked(means, np.roll(unit, 1, axis=1), scale[shapes].T, opacity[opacities], sh)
+    return Unpacked(
+        means, np.roll(unit, 1, axis=1), scale[shapes].T, opacity[opacities], sh, motion.T.astype(np.float64)
+    )

@@ -67,6 +67,7 @@ from clsplat.conformance.reference.losses import (
     ssim_taps,
     view_error,
 )
+from clsplat.conformance.reference.motion import brevity, moved, moved_backward, travel
 from clsplat.conformance.reference.penalties import (
     anisotropy,
     covariance_trace,
@@ -113,6 +114,7 @@ __all__ = [
     "blend_steps",
     "blend_weights",
     "blurred",
+    "brevity",
     "clamped_ray",
     "coloured",
     "coloured_backward",
@@ -139,6 +141,8 @@ __all__ = [
     "mean_opacity",
     "mean_scale",
     "member_sums",
+    "moved",
+    "moved_backward",
     "moved_camera",
     "ms_ssim",
     "nearest_vectors",
@@ -174,6 +178,7 @@ __all__ = [
     "splitting",
     "ssim_map",
     "ssim_taps",
+    "travel",
     "view_error",
     "weight_entropy",
     "without_transients",

@@ -12,7 +12,7 @@ def adam_step(
     moment1: NDArray[Any],
     moment2: NDArray[Any],
     step: int,
-    rate: float,
+    rate: float | NDArray[Any],
     beta1: float = 0.9,
     beta2: float = 0.999,
     epsilon: float = 1e-15,

@@ -1,0 +1,147 @@
+"""motion.cl: Gaussians at a moment, the gradients by their motion, and its update."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.conformance import reference as ref
+from clsplat.conformance.check import Checks, Note
+from clsplat.conformance.comparison import CONIC, SUM, Figure, by_element, by_norm, equal, wrong
+from clsplat.conformance.scenes import Case, random_case
+from clsplat.formats.motion import MOTION, STILL, WIDTHS, fields_of, width_of
+from clsplat.gaussians.tables import Gaussians, Gradients, moment_tables
+from clsplat.losses.base import PenaltyInputs
+from clsplat.losses.motion import Brevity, Travel
+from clsplat.opencl.device import Device
+from clsplat.render.motion import at_moment, to_centres
+from clsplat.render.rasterizer import Rasterizer
+from clsplat.render.workspace import Workspace
+from clsplat.training.adam import Adam
+from clsplat.training.motion import MotionRates, update_motion
+
+CHECKS = Checks()
+COUNTS = (1, 15, 17, 65)
+TIME = 0.375  # exact in float32
+EXTENT = 2.0
+
+
+def moving_case(rng: np.random.Generator, count: int, width: int = 5) -> Case:
+    """Gaussians that move about their places; some come and go, a tenth is not there at TIME, a tenth always."""
+    case, fields = random_case(rng, count), fields_of(width)
+    motion = rng.normal(0, 0.3, (count, width))
+    centre, duration = rng.uniform(0, 1, count), rng.normal(-1, 0.5, count)
+    apart = np.abs(TIME - centre) / np.exp(duration)
+    duration[(apart > 3) & (apart < 3.7)] += 0.5  # 3.33 is the end of what can be seen
+    centre[::10], duration[::10] = 0.875, -2.5
+    duration[5::10] = STILL
+    motion[:, fields["time_centre"]], motion[:, fields["log_duration"]] = centre[:, None], duration[:, None]
+    parameters = {**case.parameters, MOTION: motion.astype(np.float32)}
+    return replace(case, parameters=parameters, view=replace(case.view, time=TIME))
+
+
+def _wide(case: Case) -> dict[str, NDArray[Any]]:
+    return {name: table.astype(np.float64) for name, table in case.parameters.items()}
+
+
+def moment_figures(device: Device, rng: np.random.Generator, count: int, width: int) -> Iterator[Figure]:
+    """The tables at a moment, and the gradients by them carried back."""
+    case, (degree, turns) = moving_case(rng, count, width), WIDTHS[width]
+    model, camera, p, what = case.model(device), case.device_camera(device), _wide(case), f"{count} of {width} columns"
+    logit = p["logit_opacity"][:, 0]
+    drawn = at_moment(Workspace(device), model, camera).gaussians
+    means, quats, logits = ref.moved(p[MOTION], p["means"], p["quats"], logit, TIME, degree, turns)
+    there = np.isfinite(means).all(axis=1)
+    found = drawn.get("means")
+    yield wrong("move_forward", f"which are there, {what}", np.isfinite(found).all(axis=1) != there)
+    yield by_element("move_forward", f"means, {what}", found[there], means[there], 1e-6, floor=1.0)
+    yield by_element("move_forward", f"logits, {what}", drawn.get("logit_opacity")[there, 0], logits[there], 1e-5, 1.0)
+    yield by_element("turn_forward", f"quaternions, {what}", drawn.get("quats"), quats, 1e-6, floor=1.0)
+
+    gradients = Gradients(model.gaussians)
+    given = {name: rng.normal(size=p[name].shape).astype(np.float32) for name in ("means", "quats", "logit_opacity")}
+    for name, values in given.items():
+        values[~there] = 0
+        planes = np.zeros(gradients[name].shape, np.float32)
+        planes[:, :count] = values.T
+        gradients[name].set(planes)
+    to_centres(model, camera, gradients)
+    g = {name: values.astype(np.float64) for name, values in given.items()}
+    upstream = g["means"], g["quats"], g["logit_opacity"][:, 0]
+    by_motion, by_logit = ref.moved_backward(p[MOTION], logit, *upstream, TIME, degree, turns)
+    found, centre = gradients[MOTION].get()[:, :count].T, gradients["logit_opacity"].get()[0, :count]
+    kernel = "turn_backward" if turns else "move_backward"
+    for name, columns in fields_of(width).items():
+        yield by_norm(kernel, f"by {name}, {what}", found[:, columns], by_motion[:, columns], CONIC)
+    yield by_norm("move_backward", f"by the logit at the centre, {what}", centre, by_logit, CONIC)
+
+
+def still_figures(device: Device, rng: np.random.Generator) -> Iterator[Figure]:
+    """A motion of none gives the bits of none."""
+    case = random_case(rng, 65)
+    motion = np.zeros((65, width_of(3, True)), np.float32)
+    motion[:, 3], motion[:, 4] = rng.uniform(0, 1, 65), STILL
+    still = replace(
+        case, parameters={**case.parameters, MOTION: motion}, view=replace(case.view, time=float(np.float32(0.7)))
+    )
+    images = []
+    for one in (case, still):
+        frame = Rasterizer(device, "radix").forward(one.model(device), one.device_camera(device), device.zeros(3))
+        images.append(frame.image.get())
+    yield equal("move_forward", "an image of Gaussians that stand still", images[1], images[0])
+
+
+def step_figures(device: Device, rng: np.random.Generator, count: int, width: int) -> Iterator[Figure]:
+    """Two updates, in which durations reach their bound."""
+    case = moving_case(rng, count, width)
+    model, rates = case.model(device), MotionRates(log_duration=0.5, shortest=0.3).at(3, EXTENT)
+    gaussians, shortest = model.gaussians, float(np.log(0.3))
+    Adam(gaussians)
+    frame = Rasterizer(device, "radix").forward(model, case.device_camera(device), device.zeros(3))
+    values, m, v = case.parameters[MOTION].astype(np.float64), np.zeros((count, width)), np.zeros((count, width))
+    each = np.concatenate([np.full(c.stop - c.start, rates[name]) for name, c in fields_of(width).items()])
+    for step in (1, 2):
+        gradient = rng.normal(size=(count, width)).astype(np.float32)
+        gradients = Gradients(gaussians)
+        planes = np.zeros(gradients[MOTION].shape, np.float32)
+        planes[:, :count] = gradient.T
+        gradients[MOTION].set(planes)
+        values, m, v = ref.adam_step(values, gradient.astype(np.float64), m, v, step, each)
+        values[:, 4] = np.maximum(values[:, 4], shortest)
+        update_motion(gaussians, gradients, frame.depth_key, rates, step, 0xFFFFFFFF)
+    what = f"{count} of {width} columns"
+    yield by_element("motion_step", f"values, {what}", gaussians.get(MOTION), values, 2e-5, floor=1.0)
+    for moment, expected in zip(moment_tables(MOTION), (m, v), strict=True):
+        yield by_norm("motion_step", f"moments, {what}", gaussians.get(moment), expected, 3 * SUM)
+
+
+@CHECKS.add("move_forward", "turn_forward", "move_backward", "turn_backward", "motion_step")
+def motion(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    for count in COUNTS:
+        yield from moment_figures(device, rng, count, width_of(1, False))
+        yield from step_figures(device, rng, count, width_of(3, True))
+    for width in WIDTHS:
+        yield from moment_figures(device, rng, 65, width)
+    yield from still_figures(device, rng)
+
+
+@CHECKS.add("travel", "brevity")
+def penalties_of_motion(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+    for count in COUNTS:
+        table = moving_case(rng, count, 8).parameters[MOTION]
+        table[1::7, :3] = 0
+        for penalty, (value, gradient) in (
+            (Travel(weight=3.0), ref.travel(table.astype(np.float64), EXTENT)),
+            (Brevity(weight=3.0, below=0.4), ref.brevity(table.astype(np.float64), 0.4)),
+        ):
+            gaussians = Gaussians(device, {**random_case(rng, count).parameters, MOTION: table})
+            gradients, what = Gradients(gaussians), f"{count} Gaussians"
+            gradients[MOTION].fill(0.25)
+            inputs = PenaltyInputs(Workspace(device), gaussians, gradients, EXTENT, step=1)
+            found = np.array([penalty.add(inputs).value()])
+            yield by_element(penalty.type, f"value, {what}", found, np.array([3 * value]), SUM, floor=1e-7)
+            added = gradients[MOTION].get()[:, :count].T.astype(np.float64) - 0.25
+            floor = 1e-2 * max(1.0, float(np.abs(3 * gradient).max()))
+            yield by_element(penalty.type, f"gradient, {what}", added, 3 * gradient, 1e-4, floor)

@@ -1,0 +1,98 @@
+"""Moving Gaussians at one moment, and the gradients by their motion, one Gaussian at a time.
+
+A row of motion: velocity [3], time centre, log of the duration, then acceleration [3] and jerk [3] where the degree is
+2 or 3, then the turn [4] where Gaussians turn.  FreeTimeGS (Wang et al. 2025), Spacetime Gaussians (Li et al. 2024).
+"""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+PRESENCE_MIN = 1 / 255
+
+
+def coefficients(row: NDArray[Any], degree: int) -> list[NDArray[Any]]:
+    """The vectors b_1, b_2, … of the polynomial of a row."""
+    return [row[0:3], row[5:8], row[8:11]][:degree]
+
+
+def presence(row: NDArray[Any], time: float) -> float:
+    """The factor of the opacity at a time."""
+    distance = (time - row[3]) / np.exp(row[4])
+    return float(np.exp(-0.5 * distance**2))
+
+
+def moved(
+    motion: NDArray[Any],
+    means: NDArray[Any],
+    quats: NDArray[Any],
+    logit_opacity: NDArray[Any],
+    time: float,
+    degree: int,
+    turns: bool,
+) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """Means [N,3], quaternions [N,4] and logits [N] at a time; a mean is infinite where nothing can be seen."""
+    means, quats, logits = means.copy(), quats.copy(), logit_opacity.copy()
+    for n, row in enumerate(motion):
+        dt, factor = time - row[3], presence(row, time)
+        for order, vector in enumerate(coefficients(row, degree), 1):
+            means[n] += vector * dt**order
+        if turns:
+            quats[n] += row[-4:] * dt
+        if factor < PRESENCE_MIN:
+            means[n] = np.inf
+        alpha = factor / (1 + np.exp(-logit_opacity[n]))
+        with np.errstate(divide="ignore"):
+            logits[n] = np.log(alpha) - np.log1p(-alpha) if factor < 1 else logit_opacity[n]
+    return means, quats, logits
+
+
+def moved_backward(
+    motion: NDArray[Any],
+    logit_opacity: NDArray[Any],
+    grad_means: NDArray[Any],
+    grad_quats: NDArray[Any],
+    grad_logit: NDArray[Any],
+    time: float,
+    degree: int,
+    turns: bool,
+) -> tuple[NDArray[Any], NDArray[Any]]:
+    """dL/d(motion) [N,W] and dL/d(logit_opacity) [N] from the gradients at the time; those by means and quaternions are
+    the same at the centre.  Zero where nothing can be seen."""
+    grad_motion, grad_centre = np.zeros_like(motion), np.zeros_like(logit_opacity)
+    for n, row in enumerate(motion):
+        dt, factor, duration = time - row[3], presence(row, time), np.exp(row[4])
+        if factor < PRESENCE_MIN:
+            continue
+        alpha = 1 / (1 + np.exp(-logit_opacity[n]))
+        by_alpha_t = grad_logit[n] / (alpha * factor * (1 - alpha * factor))
+        grad_centre[n] = by_alpha_t * factor * alpha * (1 - alpha)
+        by_factor = by_alpha_t * alpha
+        for order, vector in enumerate(coefficients(row, degree), 1):
+            first = (0, 5, 8)[order - 1]
+            grad_motion[n, first : first + 3] = grad_means[n] * dt**order
+            grad_motion[n, 3] -= order * dt ** (order - 1) * (grad_means[n] @ vector)
+        if turns:
+            grad_motion[n, -4:] = grad_quats[n] * dt
+            grad_motion[n, 3] -= grad_quats[n] @ row[-4:]
+        grad_motion[n, 3] += by_factor * factor * dt / duration**2
+        grad_motion[n, 4] = by_factor * factor * (dt / duration) ** 2
+    return grad_motion, grad_centre
+
+
+def travel(motion: NDArray[Any], extent: float) -> tuple[float, NDArray[Any]]:
+    """Mean of min(s, 1) |v| by extent, and its gradient by the motion, in which s counts as a constant."""
+    time = np.minimum(np.exp(motion[:, 4]), 1)
+    speed = np.linalg.norm(motion[:, :3], axis=1)
+    gradient = np.zeros_like(motion)
+    gradient[:, :3] = (time / np.where(speed > 0, speed, 1) / len(motion) / extent)[:, None] * motion[:, :3]
+    return float((time * speed).mean()) / extent, gradient
+
+
+def brevity(motion: NDArray[Any], below: float) -> tuple[float, NDArray[Any]]:
+    """Mean of max(log(below / s), 0), and its gradient by the motion."""
+    shorter = np.log(below) - motion[:, 4]
+    gradient = np.zeros_like(motion)
+    gradient[:, 4] = -1.0 * (shorter > 0) / len(motion)
+    return float(np.maximum(shorter, 0).mean()), gradient

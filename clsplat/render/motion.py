@@ -1,0 +1,101 @@
+"""A moving model at the moment of a camera: Gaussians like any others, and the gradients back to their motion."""
+
+import copy
+import logging
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+from clsplat.formats.motion import MOTION, TURN, WIDTHS
+from clsplat.gaussians.tables import DeviceModel, Gaussians, Gradients, Table
+from clsplat.opencl.device import Array
+from clsplat.render.camera import DeviceCamera
+from clsplat.render.workspace import Workspace
+
+LOG = logging.getLogger("clsplat")
+FIRST = 0.0  # the moment that a camera without a time shows
+
+
+def at_moment(workspace: Workspace, model: DeviceModel, camera: DeviceCamera) -> DeviceModel:
+    """Return a model as it is at the time of a camera, in memory that the next one reuses; a static one as it is.
+
+    A camera without a time shows the first moment, which is told once.
+    """
+    gaussians = model.gaussians
+    if not gaussians.moves:
+        return model
+    if camera.time is None:
+        _tell_of_the_first()
+    stride = gaussians.capacity
+    means, logit = workspace.array("moved means", (3, stride)), workspace.array("moved logit", (1, stride))
+    gaussians.device.program("motion.cl").move_forward(
+        **_arguments(gaussians, camera),
+        means=gaussians["means"],
+        logit_opacity=gaussians["logit_opacity"],
+        moved_means=means,
+        moved_logit=logit,
+        degree=_shape(gaussians)[0],
+    )
+    moved = {"means": means, "logit_opacity": logit}
+    if turn := _turn(gaussians):
+        moved["quats"] = workspace.array("moved quats", (4, stride))
+        gaussians.device.program("motion.cl").turn_forward(
+            **_arguments(gaussians, camera), quats=gaussians["quats"], moved_quats=moved["quats"], **turn
+        )
+    return replace(model, gaussians=_with_tables(gaussians, moved))
+
+
+def to_centres(model: DeviceModel, camera: DeviceCamera, gradients: Gradients) -> None:
+    """Make gradients by a moving model at the time of a camera those by the model and its motion; a static one has
+    them already."""
+    gaussians = model.gaussians
+    if not gaussians.moves:
+        return
+    program = gaussians.device.program("motion.cl")
+    program.move_backward(
+        **_arguments(gaussians, camera),
+        logit_opacity=gaussians["logit_opacity"],
+        grad_means=gradients["means"],
+        grad_logit_opacity=gradients["logit_opacity"],
+        grad_motion=gradients[MOTION],
+        degree=_shape(gaussians)[0],
+    )
+    if turn := _turn(gaussians):
+        program.turn_backward(
+            **_arguments(gaussians, camera), grad_quats=gradients["quats"], grad_motion=gradients[MOTION], **turn
+        )
+
+
+def _arguments(gaussians: Gaussians, camera: DeviceCamera) -> dict[str, Any]:
+    return {
+        "items": -(-gaussians.count // int(gaussians.device.tuning["LANES"])),
+        "motion": gaussians[MOTION],
+        "time": FIRST if camera.time is None else camera.time,
+        "stride": gaussians.capacity,
+        "count": gaussians.count,
+    }
+
+
+def _shape(gaussians: Gaussians) -> tuple[int, bool]:
+    """The degree of the polynomials, and whether Gaussians turn."""
+    return WIDTHS[gaussians.tables[MOTION].components]
+
+
+def _turn(gaussians: Gaussians) -> dict[str, int]:
+    """The first plane of the turn, where there is one."""
+    return {"first": gaussians.tables[MOTION].components - TURN} if _shape(gaussians)[1] else {}
+
+
+def _with_tables(gaussians: Gaussians, arrays: dict[str, Array]) -> Gaussians:
+    """The same Gaussians with other arrays in the place of some; the tables of the first stay as they are."""
+    moved = copy.copy(gaussians)
+    own = {name: Table(array, array.shape[0], zero_fresh=False) for name, array in arrays.items()}
+    moved.tables = {**gaussians.tables, **own}
+    return moved
+
+
+@cache
+def _tell_of_the_first() -> None:
+    LOG.warning(
+        "a view without a time shows the first moment of a moving model; give the view a time, such as --time T"
+    )

@@ -1,0 +1,49 @@
+"""times.json in a folder of photographs: at which moment each of them was taken, in any unit."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+from clsplat.errors import DataError, quoted
+from clsplat.files import write_text
+from clsplat.reading import read_json
+from clsplat.scene.points import MAX_VALUE
+from clsplat.scene.times import clock_of
+from clsplat.scene.view import View
+
+FILE = "times.json"
+LARGEST = 1 << 26  # bytes
+
+
+def write_times(folder: Path, times: Mapping[str, float]) -> None:
+    """Write the moments of photographs by their names below `folder`.  Raises OutputError."""
+    write_text(folder / FILE, json.dumps(dict(times), indent=1) + "\n")
+
+
+def read_times(folder: Path) -> dict[str, float] | None:
+    """Return the moments of the photographs below `folder` by name, None without a file.  Raises DataError."""
+    path = folder / FILE
+    if not path.is_file():
+        return None
+    table = read_json(path, "moments of photographs in JSON", limit=LARGEST)
+    if not isinstance(table, dict):
+        raise DataError(f"{path}: expected a table with a number for each photograph, by name")
+    for name, value in table.items():
+        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < MAX_VALUE:
+            raise DataError(f"{path}: the time of {quoted(name)} is {quoted(value)}; expected a finite number")
+    return {name: float(value) for name, value in table.items()}
+
+
+def timed(views: list[View], folder: Path) -> list[View]:
+    """Return views with the times of the file in their folder of photographs; without a file the same.
+
+    Raises DataError as read_times and clock_of do.
+    """
+    times = read_times(folder)
+    if times is None:
+        return views
+    clock = clock_of(folder / FILE, [(view.name, times.get(view.name)) for view in views])
+    if clock is None:
+        raise DataError(f"{folder / FILE}: names none of the {len(views)} photographs; write their names as below it")
+    return [replace(view, time=float(clock(times[view.name]))) for view in views]

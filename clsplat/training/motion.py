@@ -1,0 +1,94 @@
+"""Adam on the motion of Gaussians: a rate for each of its fields, and the bound that updates keep."""
+
+import math
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar
+
+from pydantic import Field
+
+from clsplat.formats.motion import MOTION, fields_of
+from clsplat.gaussians.tables import Gaussians, Gradients, moment_tables
+from clsplat.opencl.device import Array
+from clsplat.opencl.program import constants
+from clsplat.schedule import Decay, NonNegative, at_step, divided
+from clsplat.settings import Settings
+
+LONGEST = 15.0  # log of a duration: nothing changes beyond it
+FAR = 3.0e38  # a bound beyond all values
+IN_EXTENTS = ("velocity", "acceleration", "jerk")
+
+
+class MotionRates(Settings):
+    """Learning rates of the motion, each by step, and the bound of durations; read where Gaussians move.
+
+    Times are shares of the time from the first to the last moment of the scene.
+    """
+
+    training_keys: ClassVar[frozenset[str]] = frozenset({"shortest"})
+
+    velocity: NonNegative = Decay(initial=1.0e-3, final=1.0e-5, over=30_000)
+    """Of velocities, as shares of the scene's extent; they fall, as in FreeTimeGS."""
+    time_centre: NonNegative = 1.0e-3
+    """Of the times at which Gaussians are most opaque."""
+    log_duration: NonNegative = 1.0e-2
+    """Of the logarithms of durations."""
+    acceleration: NonNegative = Decay(initial=1.0e-3, final=1.0e-5, over=30_000)
+    """Of accelerations, as shares of the scene's extent."""
+    jerk: NonNegative = Decay(initial=1.0e-3, final=1.0e-5, over=30_000)
+    """Of the coefficients of the third power of time, as shares of the scene's extent."""
+    turn: NonNegative = 1.0e-3
+    """Of the changes of quaternions by time."""
+    shortest: Annotated[float, Field(ge=0, lt=1)] = 0.02
+    """Shortest duration that an update leaves; what is shorter than a moment shows nothing between two of them."""
+
+    def times(self, factor: float) -> "MotionRates":
+        """Return all rates times a factor."""
+        return self.model_copy(update={name: divided(getattr(self, name), 1 / factor) for name in self._rates})
+
+    @property
+    def _rates(self) -> list[str]:
+        return [name for name in type(self).model_fields if name != "shortest"]
+
+    def at(self, step: int, extent: float) -> dict[str, float]:
+        """Return the rates of a global step by the names of the fields, and `shortest`."""
+        rates = {name: at_step(getattr(self, name), step) for name in self._rates}
+        return {**rates, **{name: rates[name] * extent for name in IN_EXTENTS}, "shortest": self.shortest}
+
+
+def update_motion(
+    gaussians: Gaussians,
+    gradients: Gradients,
+    depth_key: Array,
+    rates: Mapping[str, float],
+    updates: int,
+    every: int,
+) -> None:
+    """Update the motion, for the time of number `updates`, from gradients in memory.
+
+    depth_key: [S] of the view; rates: as MotionRates.at returns them; every: as in motion_step.
+    """
+    table, (moment1, moment2) = gaussians.tables[MOTION], moment_tables(MOTION)
+    beta1, beta2 = constants("adam.h")["BETA1"], constants("adam.h")["BETA2"]
+    shortest = math.log(rates["shortest"]) if rates["shortest"] else -LONGEST
+    bounds = {"log_duration": (shortest, LONGEST)}
+    shared: dict[str, Any] = {
+        "motion": table.array,
+        "gradient": gradients[MOTION],
+        "moment1": gaussians[moment1],
+        "moment2": gaussians[moment2],
+        "depth_key": depth_key,
+        "correction2": 1 / (1 - beta2**updates),
+        "every": every,
+        "stride": gaussians.capacity,
+        "count": gaussians.count,
+    }
+    for name, columns in fields_of(table.components).items():
+        lowest, highest = bounds.get(name, (-FAR, FAR))
+        gaussians.device.program("motion.cl").motion_step(
+            items=(-(-gaussians.count // int(gaussians.device.tuning["LANES"])), columns.stop - columns.start),
+            **shared,
+            rate=rates[name] / (1 - beta1**updates),
+            lowest=lowest,
+            highest=highest,
+            first=columns.start,
+        )

@@ -1,0 +1,109 @@
+"""Models that move: their file, a moment of them, and what refuses to lose the motion."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import clsplat
+from clsplat.errors import ConfigError, DataError
+from clsplat.formats.motion import MOTION, STILL, WIDTHS, columns_of, width_of
+from clsplat.gaussians.conversion import merged
+from clsplat.gaussians.model import Model, load
+from clsplat.gaussians.motion import presence, still
+
+
+def moving_model(width: int = 5, count: int = 40) -> Model:
+    """Gaussians of which the first is there always and the last is not there at 0."""
+    rng = np.random.default_rng(width)
+    motion = rng.normal(0, 0.2, (count, width)).astype(np.float32)
+    motion[:, 3], motion[:, 4] = rng.uniform(0, 1, count), rng.normal(-1, 0.3, count)
+    motion[0, :3], motion[0, 4] = 0, STILL
+    motion[0, 5:] = 0
+    motion[-1, 3], motion[-1, 4] = 1, -2
+    tables = {"means": 3, "quats": 4, "log_scales": 3, "logit_opacity": 1, "sh_base": 3, "sh_rest": 9}
+    return Model(**{n: rng.normal(size=(count, w)).astype(np.float32) for n, w in tables.items()}, motion=motion)
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+def test_a_ply_keeps_the_motion(tmp_path, width):
+    model = moving_model(width)
+    model.save(tmp_path / "model.ply")
+    found = load(tmp_path / "model.ply")
+    for name, table in model.tables().items():
+        np.testing.assert_array_equal(getattr(found, name), table)
+    for column in columns_of(width):
+        assert f"property float {column}\n".encode() in (tmp_path / "model.ply").read_bytes()
+
+
+def test_a_part_of_a_motion_is_refused(tmp_path):
+    moving_model(8).save(tmp_path / "model.ply")
+    data = (tmp_path / "model.ply").read_bytes().replace(b"float acceleration_1\n", b"float acceleration_9\n")
+    (tmp_path / "model.ply").write_bytes(data)
+    with pytest.raises(DataError, match="some properties of a motion and lacks others"):
+        load(tmp_path / "model.ply")
+
+
+@pytest.mark.parametrize("name", ["a.spz", "a.sog", "a.splat", "a.glb", "a.compressed.ply", "a.usda"])
+def test_other_formats_refuse_what_they_would_lose(tmp_path, name):
+    with pytest.raises(DataError, match="--time T"):
+        moving_model().save(tmp_path / name)
+    assert not (tmp_path / name).exists()
+    moving_model().at(0.5).save(tmp_path / name)
+
+
+def test_a_moment_has_the_formulas_of_the_kernel():
+    model = moving_model(width_of(3, True))
+    moment, motion = model.at(0.25), model.motion.astype(np.float64)
+    there = presence(motion, 0.25) >= 1 / 255
+    dt = 0.25 - motion[there, 3:4]
+    means = model.means[there] + motion[there, :3] * dt + motion[there, 5:8] * dt**2 + motion[there, 8:11] * dt**3
+    np.testing.assert_allclose(moment.means, means, atol=1e-6)
+    np.testing.assert_allclose(moment.quats, model.quats[there] + motion[there, 11:] * dt, atol=1e-6)
+    np.testing.assert_allclose(moment.opacities, model.opacities[there] * presence(motion, 0.25)[there], rtol=1e-5)
+    assert moment.motion is None
+    assert len(model.at(0)) < len(model)
+    np.testing.assert_array_equal(moment.means[0], model.means[0])
+    np.testing.assert_array_equal(moment.logit_opacity[0], model.logit_opacity[0])
+    assert moment.at(0.7) is moment
+    with pytest.raises(ValueError, match="from 0, the first moment"):
+        model.at(1.5)
+
+
+def test_a_moment_of_a_model_that_was_moved_is_the_moment_moved():
+    model, turn = moving_model(width_of(2, True)), np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]])
+    one, other = model.transformed(2.0, turn, (1, 2, 3)).at(0.6), model.at(0.6).transformed(2.0, turn, (1, 2, 3))
+    for name, table in one.tables().items():
+        np.testing.assert_allclose(table, getattr(other, name), atol=2e-5, err_msg=name)
+
+
+def test_merged_models_move_as_before():
+    moving, standing = moving_model(), replace(moving_model(), motion=None)
+    both = merged([standing, moving], ["a", "b"])
+    np.testing.assert_array_equal(both.motion[40:], moving.motion)
+    np.testing.assert_array_equal(both.motion[:40], still(40, 5))
+    assert len(both.at(0)) == 40 + len(moving.at(0))
+    with pytest.raises(DataError, match="another degree"):
+        merged([moving, moving_model(8)], ["a", "b"])
+
+
+def test_convert_writes_moments(tmp_path: Path):
+    model, source = moving_model(), tmp_path / "moving.ply"
+    model.save(source)
+    clsplat.convert(source, tmp_path / "one.spz", time=0.5)
+    done = clsplat.convert(source, tmp_path / "frames", frames=3)
+    assert [Path(name).name for name in done["files"]] == ["0000.ply", "0001.ply", "0002.ply"]
+    np.testing.assert_array_equal(load(tmp_path / "frames" / "0001.ply").means, model.at(0.5).means)
+    done = clsplat.convert(source, tmp_path / "frame.compressed.ply", frames=2)
+    assert [Path(name).name for name in done["files"]] == ["frame_0000.compressed.ply", "frame_0001.compressed.ply"]
+    for wrong in ({"time": 2.0}, {"frames": 1}, {"frames": 3, "time": 0.5}):
+        with pytest.raises(ConfigError, match="expected"):
+            clsplat.convert(source, tmp_path / "frames", **wrong)
+
+
+def test_some_gaussians_of_a_moving_model_move():
+    model = moving_model()
+    np.testing.assert_array_equal(model[[3, 5]].motion, model.motion[[3, 5]])
+    with pytest.raises(ValueError, match=f"{MOTION} has shape"):
+        replace(model, motion=np.zeros((40, 6), np.float32))

@@ -1,0 +1,94 @@
+"""Pages of models that move: what they hold, and what a browser draws at a moment."""
+
+from base64 import b64decode
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import clsplat
+from clsplat.formats.motion import MOTION, fields_of, width_of
+from clsplat.gaussians.motion import at_time
+from clsplat.metrics.images import psnr, to_8_bits
+from clsplat.scene.stand import Stand
+from clsplat.viewer.packing import pack
+from clsplat.viewer.page import Page
+from clsplat.viewer.photographs import described
+from tests.viewer.browser import CHROMIUM, Browser
+from tests.viewer.scenes import cloud, moving, scene
+from tests.viewer.unpacking import unpacked
+
+WIDTHS = [width_of(1, False), width_of(3, False), width_of(2, True)]
+MOMENTS = (0.0, 0.35, 0.6, 1.0)
+PIXELS = """(picture => {
+  let letters = "";
+  for (const byte of picture.data) letters += String.fromCharCode(byte);
+  return [picture.width, picture.height, btoa(letters)];
+})(viewer.capture())"""
+
+
+def page_of(folder, model) -> Page:
+    """A page whose photographs are renders at four moments."""
+    found = scene(folder)
+    found = replace(found, views=tuple(replace(v, time=t) for v, t in zip(found.views, MOMENTS, strict=True)))
+    stand = Stand.of(model.means, found.views, found.views[0])
+    renderer = clsplat.Renderer(model)
+    views = described(found, lambda view: to_8_bits(renderer.render(view).image), "none")
+    return Page("demo", {"demo": pack(model)}, stand, "white", views)
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+def test_motion_is_packed_beside_the_other_planes(width):
+    model = moving(cloud(300), width)
+    packed = pack(model)
+    found, fields = unpacked(packed), fields_of(width)
+    order = [int(np.linalg.norm(model.means - mean, axis=1).argmin()) for mean in found.means]
+    known = model.motion[order].astype(np.float64)
+    straight = slice(0, fields["turn"].start if "turn" in fields else width)
+    np.testing.assert_allclose(found.motion[:, straight], known[:, straight], rtol=1e-3, atol=1e-4)
+    tables = {name: values[order] for name, values in model.tables().items()}
+    later = at_time({**tables, MOTION: np.where(np.arange(width) == 4, 12.0, known).astype(np.float32)}, 0.7)
+    if "turn" in fields:
+        dt = 0.7 - found.motion[:, 3:4]
+        turned = found.quats + np.roll(found.motion[:, fields["turn"]], 1, axis=1) * dt
+        same = np.abs((turned * later["quats"]).sum(axis=1))
+        same /= np.linalg.norm(turned, axis=1) * np.linalg.norm(later["quats"], axis=1)
+        assert same.min() > 0.999
+    assert packed.header["motion"] == {
+        "columns": width,
+        "bends": (width - 2 - 4 * ("turn" in fields)) // 3 - 1,
+        "turns": fields["turn"].start if "turn" in fields else 0,
+    }
+
+
+def test_a_model_that_stands_still_has_no_motion_and_no_slider(tmp_path):
+    model = cloud(60)
+    assert "motion" not in pack(model).header
+    still, runs = page_of(tmp_path, model).text(), page_of(tmp_path, moving(model)).text()
+    assert ['id="moment"' in text for text in (still, runs)] == [False, True]
+    assert '"step": 0.35' in runs.replace('"step":0.35', '"step": 0.35')
+
+
+@pytest.mark.slow
+@pytest.mark.large
+@pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium: apt-get install chromium")
+def test_a_browser_draws_each_photograph_at_its_moment(tmp_path):
+    model = moving(cloud(500), 15)
+    page_of(tmp_path, model).write(tmp_path / "page.html")
+    renderer = clsplat.Renderer(model)
+    with Browser(tmp_path / "profile", 160, 200) as browser:
+        browser.open(tmp_path / "page.html")
+        for i, (view, moment) in enumerate(zip(scene(tmp_path).views[:2], MOMENTS, strict=False)):
+            browser.run(f"viewer.photographs.choose({i}, 0)")
+            browser.rest()
+            assert browser.run("viewer.moment") == moment
+            width, height, text = browser.run(PIXELS)
+            drawn = np.frombuffer(b64decode(text), np.uint8).reshape(height, width, 4)[..., :3]
+            known = to_8_bits(renderer.render(replace(view, time=moment)).image)
+            assert psnr(drawn, known) > 45
+        browser.key(".")
+        assert browser.run("[viewer.moment, viewer.photographs.chosen]") == [pytest.approx(0.7), -1], "away from it"
+        browser.key(" ")
+        assert browser.run("viewer.clock.playing") is True
+        browser.key(" ")
+        assert browser.errors == []
