@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from clsplat.bench.measurement import read_measurement
+from clsplat.bench.comparison import read_measurement
 from clsplat.errors import ConfigError, DataError
 from clsplat.formats.table import detect
 from clsplat.formats.table import read as read_ply

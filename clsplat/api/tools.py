@@ -115,10 +115,10 @@ def measure_growth(
 
 def read_measurement(file: PathLike, pipeline: PathLike = "splat") -> dict[str, Any]:
     """Read the `data()` of an earlier measurement from JSON, to be shown beside another of the same pipeline."""
-    from clsplat.bench import measurement
+    from clsplat.bench import comparison
 
     load_plugins()
-    return measurement.read_measurement(Path(file), str(pipeline))
+    return comparison.read_measurement(Path(file), str(pipeline))
 
 
 def load_plugin(file: PathLike) -> None:

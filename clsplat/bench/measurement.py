@@ -6,15 +6,15 @@ from pathlib import Path
 from typing import Any
 
 from clsplat.bench.cases import Result, run_bench
+from clsplat.bench.comparison import beside, peaks_text
 from clsplat.bench.peaks import Peaks, measure_peaks
 from clsplat.bench.scenes import SIZES, case, grown, real_case
 from clsplat.bench.table import growth_chart, growth_table, table
-from clsplat.errors import ConfigError, quoted
+from clsplat.errors import ConfigError
 from clsplat.files import write_text
 from clsplat.opencl.device import Device, open_device
 from clsplat.opencl.discovery import Schedule
 from clsplat.pipeline.loading import load
-from clsplat.reading import read_json
 
 
 @dataclass(frozen=True)
@@ -33,10 +33,10 @@ class Measurement:
 
     def text(self, earlier: dict[str, Any]) -> str:
         """Return tables of the times, beside the `data` of an earlier measurement unless that is empty."""
-        peaks = f"{self.peaks.gflops:.0f} GFLOP/s, {self.peaks.gexp:.1f} Gexp/s, copy {self.peaks.gbytes:.1f} GB/s"
+        head = [f"device: {self.device}", f"peaks: {peaks_text(asdict(self.peaks))}"]
         was = earlier.get("scenes", {})
         tables = [table(name, result, was.get(name)) for name, result in self.results.items()]
-        return "\n".join([f"device: {self.device}", f"peaks: {peaks}", *tables])
+        return "\n".join([*head, *(beside(self.data(), earlier) if earlier else ()), *tables])
 
 
 def measure(
@@ -71,13 +71,3 @@ def measure_growth(chart: Path, *, pipeline: str, repeats: int, schedule: Schedu
     sizes = [run_bench({"": one}, peaks, repeats)[""] for one in grown(opened, settings)]
     write_text(chart, growth_chart(sizes))
     return f"device: {opened.text}\n{growth_table(sizes)}"
-
-
-def read_measurement(path: Path, pipeline: str) -> dict[str, Any]:
-    """Read the data of an earlier measurement of the same pipeline.  Raises ConfigError."""
-    name = load(pipeline).settings.name
-    data = read_json(path, "the JSON of an earlier `clsplat bench --json`", ConfigError)
-    found = data if isinstance(data, dict) else {}
-    if found and (was := found.get("pipeline", "splat")) != name:
-        raise ConfigError(f"{path}: expected the pipeline '{name}', it has {quoted(was)}")
-    return found

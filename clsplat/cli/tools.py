@@ -8,7 +8,7 @@ import typer
 from clsplat import streams, terminal
 from clsplat.api import tools
 from clsplat.cli.app import DeviceOption, JsonOption, command
-from clsplat.errors import DataError, DeviceError
+from clsplat.errors import ConfigError, DataError, DeviceError
 
 
 @command("devices", "clsplat devices", "clsplat devices --json")
@@ -88,7 +88,7 @@ def bench(
     repeats: Annotated[int, typer.Option(min=1, metavar="N", help="Steps of each scene.")] = 20,
     as_json: JsonOption = False,
     against: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Compare with the JSON of an earlier run.")
+        Path | None, typer.Option(metavar="FILE", help="Compare with the JSON of an earlier run, which --json repeats.")
     ] = None,
     schedule: Annotated[Literal["auto", "wide", "simt"], typer.Option(help="wide for CPUs, simt for GPUs.")] = "auto",
     growth: Annotated[
@@ -98,6 +98,8 @@ def bench(
     device: DeviceOption = None,
 ) -> None:
     """Time the stages of a training step on fixed scenes, beside the device's measured peaks."""
+    if growth and (against or as_json):
+        raise ConfigError("bench: --growth writes a chart; leave out --against and --json")
     if as_json:
         terminal.keep_stdout_for_json()
     earlier = tools.read_measurement(against, pipeline) if against else {}
@@ -110,6 +112,6 @@ def bench(
         names, model=model, scene=scene, pipeline=pipeline, repeats=repeats, schedule=schedule, device=device
     )
     if as_json:
-        terminal.show_json(found.data())
+        terminal.show_json({**found.data(), **({"against": earlier} if earlier else {})})
     else:
         terminal.show(found.text(earlier))

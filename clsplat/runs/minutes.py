@@ -166,7 +166,8 @@ def rehearse(pipeline: Pipeline, run: Run, factor: float, until: float) -> Rehea
             run.status.count("steps", progress.step, progress.steps)
             if trained > until:
                 alone = f"a rehearsal in {progress.steps} steps alone takes longer on this device"
-                raise ConfigError(f"--minutes: expected more: {alone}; or a pipeline that does less")
+                done = f"{progress.step} of them were done in that time"
+                raise ConfigError(f"--minutes: expected more: {alone}, {done}; or a pipeline that does less")
 
         one = new_run(run, short, out=out, status=StatusFile(out), show=show)
         one.records.start()
