@@ -72,6 +72,15 @@ def _boot() -> str | None:
         return None
 
 
+def peak_memory() -> int | None:
+    """Return the bytes that this process has held at most; None where the system does not say."""
+    try:
+        lines = read_text(Path("/proc/self/status")).splitlines()
+        return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("VmHWM:"))
+    except (DataError, StopIteration):
+        return None
+
+
 def is_alive(process: int) -> bool:
     """Return whether a process of this machine runs; True where the system does not say.
 

@@ -30,7 +30,6 @@ ALLOWED = {  # module and function -> why it reads by itself
     "clsplat/files.py:_sync": "syncs what was written",
     "clsplat/training/archive.py:read": "takes a file that `regular` has opened",
     "clsplat/training/archive.py:write": "writes",
-    "clsplat/conformance/worker.py:_only_reader_of_stdin": "opens the null device",
     "clsplat/lock.py:check_free": "locks what it opens",
     "clsplat/lock.py:_opened": "opens for writing too",
     "clsplat/formats/sog_files.py:sog_files": "takes the bytes that `reading` has read",

@@ -2,7 +2,7 @@
 
 import logging
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Literal
@@ -39,6 +39,7 @@ class Terms:
     retries: int = 3  # failures without a newer checkpoint
     worker: str = "inline"
     sweep: str = ""  # a name that the caller's cells are stopped by
+    cores: Sequence[int] = ()  # that its run is kept to; none: those of its caller
 
 
 def run_cell(
@@ -75,7 +76,7 @@ def _run_cell(cell: Cell, store: Store, command: Command, terms: Terms, is_stopp
         store.tell("start", cell=cell.key, attempt=attempt.path.name, worker=terms.worker, **{"from": begun_from})
         _equip(cell, store, folder, attempt)
         try:
-            code = supervise(attempt, command, stopped)
+            code = supervise(attempt, command, stopped, terms.cores)
             store.tell("end", cell=cell.key, attempt=attempt.path.name, exit_code=code)
             if code == 0:
                 _require_same_scene(cell, attempt)
