@@ -412,7 +412,9 @@ def test_what_runs_costs_no_look_at_the_cells_that_wait(store, terms, monkeypatc
 def test_a_device_that_suits_no_cell_is_asked_once(store, terms, monkeypatch):
     looks = []
     suits = Drive._suits
-    monkeypatch.setattr(Drive, "_suits", lambda drive, one, bits, _: looks.append(bits) or suits(drive, one, bits, _))
+    monkeypatch.setattr(
+        Drive, "_suits", lambda drive, one, place, _: looks.append(place.bits) or suits(drive, one, place, _)
+    )
     monkeypatch.setattr("clsplat.cluster.drive.LOOK", 0.0)
     engine, begun = Fake(places=PLACES[:2]), wanted(*range(5))
     for one in begun:

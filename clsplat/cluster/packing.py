@@ -6,6 +6,7 @@ from typing import Literal
 
 from clsplat import cores
 from clsplat.bench.packing import known_packing, told
+from clsplat.conformance.host import available_memory
 from clsplat.errors import ConfigError, amount
 from clsplat.opencl.discovery import DeviceInfo
 
@@ -25,6 +26,14 @@ def shares_of(devices: Sequence[DeviceInfo], packing: Packing) -> list[Parts]:
         raise ConfigError(f"execution.packing: {packing} runs cannot share {amount(len(own), 'core')}; expected fewer")
     is_only = sum(info.kind == "CPU" for info in devices) == 1
     return [_parts(info, own, packing, is_only) if info.kind == "CPU" else [()] for info in devices]
+
+
+def memory_of_each(info: DeviceInfo, runs: int) -> int:
+    """Return the bytes that each of the runs of a device may take: of a CPU they share what the host has free."""
+    if runs == 1:
+        return info.memory
+    free = available_memory()
+    return info.memory // runs if free is None else min(info.memory, free // runs)
 
 
 def _parts(info: DeviceInfo, own: tuple[int, ...], packing: Packing, is_only: bool) -> Parts:

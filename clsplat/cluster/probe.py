@@ -9,6 +9,7 @@ import io
 import json
 import logging
 import subprocess
+import sys
 import tempfile
 from contextlib import redirect_stdout, suppress
 from dataclasses import dataclass, replace
@@ -18,7 +19,7 @@ from typing import Any
 from clsplat.caches import cache_folder
 from clsplat.cluster.child import filled, run_command
 from clsplat.cluster.fingerprint import code_digest
-from clsplat.cluster.packing import Packing, shares_of
+from clsplat.cluster.packing import Packing, memory_of_each, shares_of
 from clsplat.errors import DataError, DeviceError, OutputError
 from clsplat.files import write_text
 from clsplat.opencl.discovery import DeviceInfo, choose, list_devices
@@ -67,6 +68,8 @@ class Place:
     bits: str  # its class
     text: str = ""  # what it is
     cores: tuple[int, ...] = ()  # of a CPU that several runs share; none: all
+    memory: int = sys.maxsize  # bytes that a run may take
+    allocation: int = sys.maxsize  # bytes, largest single buffer
 
 
 def place_of(address: str, worker: dict[str, Any]) -> Place | None:
@@ -75,7 +78,9 @@ def place_of(address: str, worker: dict[str, Any]) -> Place | None:
         values = json.loads(str(worker["metrics"][TOLD]))
         if values["code"] != code_digest():
             return None
-        return Place(address, str(values["device"]), str(values["bits"]), str(values["host"]))
+        return Place(
+            address, str(values["device"]), str(values["bits"]), str(values["host"]), (), *map(int, values["limits"])
+        )
     except (ValueError, KeyError, TypeError):
         return None
 
@@ -92,7 +97,14 @@ def places(worker: str, devices: list[str] | None = None, packing: Packing = 1) 
         raise DeviceError("no OpenCL device works; `clsplat devices` tells why")
     found = []
     for info, parts in zip(chosen, shares_of(chosen, packing), strict=True):
-        own = Place(worker, word_of(info, infos), bits_class(info, infos), info.text)
+        own = Place(
+            worker,
+            word_of(info, infos),
+            bits_class(info, infos),
+            info.text,
+            memory=memory_of_each(info, len(parts)),
+            allocation=info.allocation,
+        )
         found += [replace(own, cores=part) for part in parts]
     return found
 
