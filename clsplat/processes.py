@@ -3,6 +3,7 @@
 import ctypes
 import os
 import platform
+import re
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -39,6 +40,11 @@ class Owner:
             return None
         host, namespace = values.get("host", this.host), values.get("pid_namespace") or this.pid_namespace
         return cls(process, host, namespace, values.get("boot") or this.boot)
+
+    @property
+    def host_word(self) -> str:
+        """The host as a part of a file's name."""
+        return re.sub(r"[^0-9A-Za-z-]", "_", self.host) or "host"
 
     @property
     def is_here(self) -> bool:

@@ -14,7 +14,7 @@ from clsplat.cluster.folder import ATTEMPTS, CellFolder, Different
 from clsplat.cluster.store import Store
 from clsplat.errors import ClsplatError, ConfigError, DataError, Interrupted, MemoryLimitError, OutputError, one_line
 from clsplat.files import make_folder, write_text
-from clsplat.names import INPUTS, NOTE, PREPARED
+from clsplat.names import INPUTS, NOTE, PREPARED, UNDISTORTED
 from clsplat.reading import read_json
 
 LOG = logging.getLogger("clsplat")
@@ -99,13 +99,21 @@ def _run_cell(cell: Cell, store: Store, command: Command, terms: Terms, is_stopp
 
 
 def _equip(cell: Cell, store: Store, folder: CellFolder, attempt: Attempt) -> None:
-    """Write the pipeline file of an attempt, and let it find what `prepare` has made.  Raises OutputError."""
+    """Write the pipeline file of an attempt, and let it find what other cells have made of the scene.
+
+    That is what `prepare` makes, and undistorted photographs.  Without links each cell makes its own.  Raises
+    OutputError.
+    """
     write_text(attempt.path / PIPELINE_FILE, cell.text)
-    link = folder.path / ATTEMPTS / PREPARED
-    if cell.spec["pipeline"].get("prepare") and not link.exists():
-        make_folder(store.prepared)
-        with suppress(OSError):  # without links each cell prepares by itself
-            link.symlink_to(os.path.relpath(store.prepared, link.parent), target_is_directory=True)
+    shared = {UNDISTORTED: store.undistorted(cell.spec["scene"], cell.spec["code"])}
+    if cell.spec["pipeline"].get("prepare"):
+        shared[PREPARED] = store.prepared
+    for name, target in shared.items():
+        make_folder(target)
+        link = folder.path / ATTEMPTS / name
+        if not link.exists():
+            with suppress(OSError):
+                link.symlink_to(os.path.relpath(target, link.parent), target_is_directory=True)
 
 
 def _require_same_scene(cell: Cell, attempt: Attempt) -> None:
