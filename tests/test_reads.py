@@ -39,7 +39,7 @@ ALLOWED = {  # module and function -> why it reads by itself
     "clsplat/video/webm.py:without_chance": "changes what was written before",
     "clsplat/viewer/page.py": "reads files of the package",
     "clsplat/live/page.py": "reads files of the package",
-    "clsplat/conformance/quick.py:_hash_of_kernels": "reads files of the package",
+    "clsplat/conformance/quick.py:_hash_of": "reads files of the package",
     "clsplat/opencl/program.py": "reads kernels, of the package and of plug-ins: code that is trusted",
     "clsplat/opencl/runtimes.py": "reads files of the system's loader, before clsplat can be imported",
     "clsplat/conformance/host.py:available_memory": "reads what the kernel tells, which has no size",

@@ -135,8 +135,8 @@ def test_an_exit_code_decides_whether_a_cell_is_tried_again(store, terms, code, 
     if code == -9:
         end = "import os, signal; os.kill(os.getpid(), signal.SIGKILL)"
     if code == 130:  # from elsewhere: another attempt goes on, and ends
-        end = "import sys, pathlib; p = pathlib.Path(sys.argv[2]); n = sum(not one.is_symlink() for one in p.parent.iterdir());"
-        end += "sys.exit(130 if n == 1 else 0)"
+        end = "import sys, pathlib; p = pathlib.Path(sys.argv[2]);"
+        end += "n = sum(not one.is_symlink() for one in p.parent.iterdir()); sys.exit(130 if n == 1 else 0)"
     outcome = run_cell(CELL, store, command(end), terms)
     if code == 130:
         assert (outcome.state, told(store).count("start")) == ("published", 2)
