@@ -18,6 +18,7 @@ CHECKPOINTS = "checkpoints"
 UNDISTORTED = "undistorted"
 PREPARED = "prepared"
 COMPARISON = "compare.html"
+SEAMS = "seams"
 VIEW_COLOURS = "view_colours.json"
 VIEW_POSES = "view_poses.json"
 RESERVED = frozenset(
