@@ -18,12 +18,13 @@ CHECKPOINTS = "checkpoints"
 UNDISTORTED = "undistorted"
 PREPARED = "prepared"
 COMPARISON = "compare.html"
+SEAMS = "seams"
 VIEW_COLOURS = "view_colours.json"
 VIEW_POSES = "view_poses.json"
 RESERVED = frozenset(
     {
         *(PIPELINE, METRICS, RECORDS, TRIAL, STATUS, LOG_FILE, NOTE, INPUTS, CHECKSUMS, LOCK),
-        *(CHECKPOINTS, UNDISTORTED, PREPARED, COMPARISON, "cameras.json", VIEW_COLOURS, VIEW_POSES),
+        *(CHECKPOINTS, UNDISTORTED, PREPARED, COMPARISON, SEAMS, "cameras.json", VIEW_COLOURS, VIEW_POSES),
     }
 )
 BEFORE_A_RUN = frozenset({STATUS, LOG_FILE, LOCK, UNDISTORTED})  # written before pipeline.yaml

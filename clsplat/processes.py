@@ -3,6 +3,7 @@
 import ctypes
 import os
 import platform
+import re
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -41,6 +42,11 @@ class Owner:
         return cls(process, host, namespace, values.get("boot") or this.boot)
 
     @property
+    def host_word(self) -> str:
+        """The host as a part of a file's name."""
+        return re.sub(r"[^0-9A-Za-z-]", "_", self.host) or "host"
+
+    @property
     def is_here(self) -> bool:
         """Whether its number counts here."""
         return replace(self, process=os.getpid()) == Owner.this()
@@ -69,6 +75,15 @@ def _boot() -> str | None:
     try:
         return read_text(BOOT_ID).strip() or None
     except DataError:
+        return None
+
+
+def peak_memory() -> int | None:
+    """Return the bytes that this process has held at most; None where the system does not say."""
+    try:
+        lines = read_text(Path("/proc/self/status")).splitlines()
+        return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("VmHWM:"))
+    except (DataError, StopIteration):
         return None
 
 

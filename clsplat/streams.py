@@ -4,7 +4,7 @@ import errno
 import os
 import sys
 from contextlib import suppress
-from typing import Any
+from typing import Any, TextIO
 
 from clsplat.errors import OutputError
 
@@ -102,3 +102,18 @@ def _silence(stream: Any) -> None:
         null = os.open(os.devnull, os.O_WRONLY)
         os.dup2(null, stream.fileno())
         os.close(null)
+
+
+def only_reader_of_stdin() -> int:
+    """Return a number for stdin; runtimes get an empty one: on Windows asking about a pipe may wait for readers."""
+    pipe, empty = os.dup(0), os.open(os.devnull, os.O_RDONLY)
+    os.dup2(empty, 0)
+    os.close(empty)
+    return pipe
+
+
+def only_writer_of_stdout() -> TextIO:
+    """Return stdout, and send what runtimes print there to stderr from here on."""
+    out = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)
+    return out

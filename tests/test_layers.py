@@ -32,6 +32,7 @@ ROWS = (  # from the top down; a module imports only from lower rows, or from it
     {"opencl", "pages"},
     {
         "caches",
+        "cores",
         "errors",
         "files",
         "harmonics",

@@ -168,6 +168,13 @@ def test_undistorted_once(tmp_path, rng, monkeypatch):
     np.testing.assert_array_equal(load_photograph(view, BLACK, folder), first)
 
 
+def test_undistorted_for_each_background_of_its_transparent_pixels(tmp_path, rng):
+    view, folder = distorted_view(tmp_path, rng), tmp_path / "undistorted"
+    store(view.image_path, np.zeros((40, 60, 4), np.uint8))
+    assert load_photograph(view, BLACK, folder).max() == 0
+    assert load_photograph(view, (1.0, 1.0, 1.0), folder).min() == 255
+
+
 def test_undistorted_again_when_the_photograph_changes(tmp_path, rng):
     view, folder = distorted_view(tmp_path, rng), tmp_path / "undistorted"
     first = load_photograph(view, BLACK, folder)

@@ -29,6 +29,7 @@ from clsplat.cluster.task import Outcome, Terms, run_cell
 from clsplat.errors import ConfigError, DeviceError, Interrupted, OutputError
 from clsplat.names import CHECKPOINTS
 from clsplat.pipeline.loading import load
+from clsplat.runs.opening import undistorted_folder
 from tests.html_page import HOSTILE, Page
 
 SPEC = {"pipeline": {"name": "a", "seed": 0}, "scene": "s", "code": "c", "bits": "b"}
@@ -40,6 +41,16 @@ WAITS = "import os, sys\nwhile os.read(0, 9): pass\nsys.exit(130)"
 def command(code: str) -> list[str]:
     """A command in the place of a run: it gets the pipeline file and the run folder."""
     return [PYTHON, "-S", "-c", code, FILE, OUT]
+
+
+UNDISTORTS = """
+import sys, pathlib
+shared = pathlib.Path(sys.argv[2]).parent / "undistorted" / "a.png"
+made = "was there" if shared.exists() else "made"
+shared.write_bytes(b"pixels")
+pathlib.Path(sys.argv[2], "point_cloud.ply").write_text("bits")
+pathlib.Path(sys.argv[2], "told.txt").write_text(made)
+"""
 
 
 def told(store: Store) -> list[str]:
@@ -124,8 +135,8 @@ def test_an_exit_code_decides_whether_a_cell_is_tried_again(store, terms, code, 
     if code == -9:
         end = "import os, signal; os.kill(os.getpid(), signal.SIGKILL)"
     if code == 130:  # from elsewhere: another attempt goes on, and ends
-        end = "import sys, pathlib; p = pathlib.Path(sys.argv[2]); n = len(list(p.parent.iterdir()));"
-        end += "sys.exit(130 if n == 1 else 0)"
+        end = "import sys, pathlib; p = pathlib.Path(sys.argv[2]);"
+        end += "n = sum(not one.is_symlink() for one in p.parent.iterdir()); sys.exit(130 if n == 1 else 0)"
     outcome = run_cell(CELL, store, command(end), terms)
     if code == 130:
         assert (outcome.state, told(store).count("start")) == ("published", 2)
@@ -349,6 +360,17 @@ def wanted(*costs: float) -> list[Wanted]:
     return [Wanted(Cell(f"{cost:g}", {**SPEC, "scene": str(cost)}, ""), cost) for cost in costs]
 
 
+def test_what_a_cell_undistorts_is_there_for_the_others_of_its_scene(store, terms):
+    cells = [CELL, replace(CELL, spec={**SPEC, "seed": 1}), replace(CELL, spec={**SPEC, "scene": "another"})]
+    assert {run_cell(cell, store, command(UNDISTORTS), terms).state for cell in cells} == {"published"}
+    results = [store.folder(cell.key).result for cell in cells]
+    assert [(result / "told.txt").read_text() for result in results] == ["made", "was there", "made"]
+    assert len([*store.root.glob("undistorted/*/a.png")]) == 2
+    attempt = store.folder(CELL.key).path / ATTEMPTS / "a"
+    assert undistorted_folder(attempt).parent.resolve().parent == store.root / "undistorted"
+    assert undistorted_folder(store.root / "run") == store.root / "run" / "undistorted", "that is no link"
+
+
 def test_the_longest_cell_is_first_and_a_lost_one_starts_again(store, terms):
     done = Outcome("published")
     engine = Fake(Lost, done, done, done)
@@ -412,7 +434,9 @@ def test_what_runs_costs_no_look_at_the_cells_that_wait(store, terms, monkeypatc
 def test_a_device_that_suits_no_cell_is_asked_once(store, terms, monkeypatch):
     looks = []
     suits = Drive._suits
-    monkeypatch.setattr(Drive, "_suits", lambda drive, one, bits, _: looks.append(bits) or suits(drive, one, bits, _))
+    monkeypatch.setattr(
+        Drive, "_suits", lambda drive, one, place, _: looks.append(place.bits) or suits(drive, one, place, _)
+    )
     monkeypatch.setattr("clsplat.cluster.drive.LOOK", 0.0)
     engine, begun = Fake(places=PLACES[:2]), wanted(*range(5))
     for one in begun:

@@ -273,7 +273,7 @@ class FakeClient:
 
     @staticmethod
     def told(code: str) -> str:
-        return json.dumps({"host": "h", "device": "d", "bits": "b", "code": code})
+        return json.dumps({"host": "h", "device": "d", "bits": "b", "limits": [8, 4], "code": code})
 
     def scheduler_info(self, n_workers):
         return self.info
@@ -341,7 +341,7 @@ def test_the_engine_of_a_machine_runs_cells_side_by_side_on_loopback_alone(tmp_p
     scheduler = pytest.importorskip("clsplat.cluster.scheduler")
     library = pytest.importorskip("clsplat.cluster.library")
     places = [Place("local", "one", "b"), Place("local", "two", "b")]
-    monkeypatch.setattr(scheduler, "places", lambda worker, devices: places)
+    monkeypatch.setattr(scheduler, "places", lambda worker, devices, packing: places)
     store, ended, seen = Store(tmp_path / "store"), [], set()
     before = {key: library.dask.config.get(key) for key in library.SETTINGS}
     cluster = scheduler.engine(Execution(engine="local"), store, None)

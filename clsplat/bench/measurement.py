@@ -7,13 +7,14 @@ from typing import Any
 
 from clsplat.bench.cases import Result, run_bench
 from clsplat.bench.comparison import beside, peaks_text
+from clsplat.bench.packing import Packings, measure_packings, task_of
 from clsplat.bench.peaks import Peaks, measure_peaks
 from clsplat.bench.scenes import SIZES, case, grown, real_case
 from clsplat.bench.table import growth_chart, growth_table, table
-from clsplat.errors import ConfigError
+from clsplat.errors import ConfigError, quoted
 from clsplat.files import write_text
 from clsplat.opencl.device import Device, open_device
-from clsplat.opencl.discovery import Schedule
+from clsplat.opencl.discovery import Schedule, choose, resolve_schedule
 from clsplat.pipeline.loading import load
 
 
@@ -61,6 +62,18 @@ def measure(
     if model is not None and scene is not None:
         cases[model.stem] = real_case(opened, model, scene, settings)
     return Measurement(opened.text, settings.name, peaks, run_bench(cases, peaks, repeats))
+
+
+def measure_packing(
+    scenes: Sequence[str], *, pipeline: str, repeats: int, schedule: Schedule, device: str | Device | None
+) -> Packings:
+    """Time the packings of a CPU with a training step of one fixed scene.  Raises ClsplatError."""
+    if len(scenes) != 1 or scenes[0] not in SIZES:
+        raise ConfigError(f"--packing: expected one scene, of {', '.join(SIZES)}, got {quoted(','.join(scenes))}")
+    load(pipeline)
+    info = device.info if isinstance(device, Device) else choose(device)
+    resolve_schedule(info, schedule)
+    return measure_packings(info, task_of(info, SIZES[scenes[0]], pipeline, repeats, schedule), scenes[0])
 
 
 def measure_growth(chart: Path, *, pipeline: str, repeats: int, schedule: Schedule, device: str | Device | None) -> str:

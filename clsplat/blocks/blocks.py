@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from clsplat.blocks.folder import COARSE, MERGED, RECORD
 from clsplat.blocks.partition import SIGHT, Block, Partition, Partitioner
 from clsplat.blocks.pipelines import of_block, of_coarse, of_merged, require_divisible, without_start
+from clsplat.blocks.seams import write_seams
 from clsplat.cluster.batch import Batch
 from clsplat.cluster.store import Store
 from clsplat.conformance.quick import open_correct
@@ -168,10 +169,12 @@ class Blocks:
         LOG.info("%s of %s merged", amount(count, "Gaussian"), amount(len(parts), "block"))
         return file
 
-    def finish(self, file: Path) -> Path:
-        """Run what follows a training on the merged model; return its folder."""
-        trained(of_merged(self.pipeline, file), self.out / MERGED, self.device)
-        return self.out / MERGED
+    def finish(self, file: Path, partition: Partition) -> Path:
+        """Run what follows a training on the merged model, and write where borders lie in it; return its folder."""
+        run = self.out / MERGED
+        trained(of_merged(self.pipeline, file), run, self.device)
+        write_seams([block.cell for block in partition.blocks], load_model(file), self.scene.scene, self.device, run)
+        return run
 
 
 def train_in_blocks(
@@ -193,7 +196,7 @@ def train_in_blocks(
         partition = work.partition()
         if only_plan:
             return {**partition.data(), "run": None}
-        run = work.finish(work.merge(work.train(partition)))
+        run = work.finish(work.merge(work.train(partition)), partition)
     return {**partition.data(), "run": str(run), "metrics": read_json(run / METRICS)}
 
 

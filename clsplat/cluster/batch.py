@@ -12,6 +12,7 @@ from clsplat.cluster.cell import Cell
 from clsplat.cluster.drive import Drive, Wanted
 from clsplat.cluster.engine import Engine, Inline
 from clsplat.cluster.fingerprint import Scenes
+from clsplat.cluster.need import Need
 from clsplat.cluster.placing import is_placed, place_copy
 from clsplat.cluster.probe import places
 from clsplat.cluster.progress import Watched
@@ -167,7 +168,9 @@ def wanted_cell(cell: matrix.Cell, scenes: Scenes, store: Store) -> Wanted:
         folder = settings.scene.folder
         prepare(plan(settings.prepare, folder, store.prepared), folder, store.prepared)
     known = scenes.known(cell.pipeline)
-    return Wanted(Cell.of(cell.name, cell.pipeline, known.digest, bits=""), steps_of(cell.pipeline) * known.pixels)
+    need = Need.of(cell.pipeline, known.scene) if known.scene else None
+    own = Cell.of(cell.name, cell.pipeline, known.digest, bits="")
+    return Wanted(own, steps_of(cell.pipeline) * known.pixels, need)
 
 
 def steps_of(pipeline: Pipeline) -> int:

@@ -8,7 +8,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from clsplat import cores
 from clsplat.cluster.attempt import ERRORS, PIPELINE_FILE, Attempt
+from clsplat.cores import Cores
 from clsplat.files import told_as
 
 # Ctrl-C in the terminal is for the supervisor, which passes it on
@@ -36,10 +38,11 @@ def filled(command: Command, pipeline: Path, out: Path) -> list[str]:
     return [values.get(word, word) for word in command]
 
 
-def supervise(attempt: Attempt, command: Command, is_stopped: Callable[[], bool]) -> int:
+def supervise(attempt: Attempt, command: Command, is_stopped: Callable[[], bool], own: Cores = ()) -> int:
     """Run an attempt to its end; return its exit code, negative where a signal ended it.
 
-    Where `is_stopped`, the run saves its state and ends.  Raises LeaseLost.
+    Where `is_stopped`, the run saves its state and ends.  own: the cores that it is kept to, none: those of this
+    process.  Raises LeaseLost.
     """
     with told_as(attempt.path), (attempt.path / ERRORS).open("wb") as errors:
         process = subprocess.Popen(
@@ -47,8 +50,11 @@ def supervise(attempt: Attempt, command: Command, is_stopped: Callable[[], bool]
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
             stderr=errors,
+            env=cores.limited(own) if own else None,
             **APART,
         )
+        if own:
+            cores.keep_to(own, process.pid)  # before it has started a runtime
     try:
         code = _wait(process, attempt, is_stopped)
     finally:

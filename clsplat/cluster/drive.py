@@ -8,10 +8,11 @@ from dataclasses import dataclass, field, replace
 from clsplat.cluster.cell import Cell
 from clsplat.cluster.engine import Engine, Lost, Ticket
 from clsplat.cluster.folder import Different
+from clsplat.cluster.need import Need
 from clsplat.cluster.probe import Place
 from clsplat.cluster.store import Store
 from clsplat.cluster.task import Outcome, Terms
-from clsplat.errors import DeviceError, Interrupted
+from clsplat.errors import DeviceError, Interrupted, MemoryLimitError
 
 LOOK = 0.05  # seconds between two looks at what runs
 ALONE = 60.0  # seconds without a device that may run a cell, after which a sweep ends
@@ -23,6 +24,7 @@ class Wanted:
 
     cell: Cell  # of no class
     cost: float  # steps times pixels, to compare
+    need: Need | None = None  # of memory; None: not known, it may run anywhere
 
     def on(self, bits: str) -> Cell:
         """Return the cell in a bits class."""
@@ -43,8 +45,8 @@ class Drive:
     look: Callable[[], None] = lambda: None  # called again and again
     bits: str | None = None  # the class of all cells, once it is chosen
     _seen: float = field(default_factory=time.monotonic)  # when a device of that class was there last
-    _unsuited: tuple[list[str], set[str]] = field(default_factory=lambda: ([], set()))
-    """The classes of all devices, and those that suit no cell that waits."""
+    _unsuited: tuple[list[Place], set[Place]] = field(default_factory=lambda: ([], set()))
+    """All devices, and those that suit no cell that waits."""
     _running: dict[Place, tuple[Wanted, Cell, Ticket]] = field(default_factory=dict)
 
     def run(self, wanted: Sequence[Wanted]) -> None:
@@ -58,6 +60,8 @@ class Drive:
             if self.is_stopped():
                 raise Interrupted("stopped; the same command with --resume goes on")
             self._hand_out(waiting)
+            if waiting and not self._running:
+                self._refuse(waiting)
             before = len(self._running)
             for place in list(self._running):
                 self._take_in(place, waiting)
@@ -71,14 +75,14 @@ class Drive:
         if self.is_same and self.bits is None and classes:
             self.bits = self._chosen(classes, waiting)
         self._require_class(classes)
-        if self._unsuited[0] != classes:
-            self._unsuited = (classes, set())
+        if self._unsuited[0] != places:
+            self._unsuited = (places, set())
         for place in places:
-            if place in self._running or place.bits in self._unsuited[1]:
+            if place in self._running or place in self._unsuited[1]:
                 continue
-            suited = next((i for i, one in enumerate(waiting) if self._suits(one, place.bits, classes)), None)
+            suited = next((i for i, one in enumerate(waiting) if self._suits(one, place, places)), None)
             if suited is None:
-                self._unsuited[1].add(place.bits)  # looking again and again would read the store each time
+                self._unsuited[1].add(place)  # looking again and again would read the store each time
                 continue
             one = waiting.pop(suited)
             cell = one.on(place.bits)
@@ -103,12 +107,40 @@ class Drive:
                 "offer one of that class, or set placement: {bits: any}; what was done is in the store"
             )
 
-    def _suits(self, one: Wanted, bits: str, classes: Sequence[str]) -> bool:
-        """Whether a cell may run in a class: one that has begun stays in its own, where that has devices now."""
+    def _suits(self, one: Wanted, place: Place, places: Sequence[Place]) -> bool:
+        """Whether a cell may run on a device: of its class, and such that holds it, as it ends where one does."""
+        allowed = self._allowed(one, places)
+        need = self._need(one, allowed)
+        if need is None or place not in allowed:
+            return place in allowed
+        return need.ends_on(place) or (need.begins_on(place) and not any(map(need.ends_on, allowed)))
+
+    def _allowed(self, one: Wanted, places: Sequence[Place]) -> list[Place]:
+        """The devices in whose class a cell may run: one that has begun stays in its own, where that is there now."""
         if self.is_same:
-            return bits == self.bits
-        begun = [own for own in set(classes) if self.store.folder(one.on(own).key).path.is_dir()]
-        return not begun or bits in begun
+            return [place for place in places if place.bits == self.bits]
+        begun = [own for own in {place.bits for place in places} if self.store.folder(one.on(own).key).path.is_dir()]
+        return [place for place in places if not begun or place.bits in begun]
+
+    def _need(self, one: Wanted, allowed: Sequence[Place]) -> Need | None:
+        """The memory that a cell needs; none where it is published."""
+        classes = {place.bits for place in allowed} if one.need else ()
+        return None if any(self.store.folder(one.on(own).key).result.is_dir() for own in classes) else one.need
+
+    def _refuse(self, waiting: list[Wanted]) -> None:
+        """End the cells that no device holds; it is called when nothing runs, so that the others are done."""
+        places = self.engine.places()
+        for one in list(waiting):
+            allowed = self._allowed(one, places)
+            need = self._need(one, allowed)
+            if need is None or not allowed or any(map(need.begins_on, allowed)):
+                continue
+            waiting.remove(one)
+            largest = max(allowed, key=need.limit_on)
+            cell, code, message = one.on(largest.bits), MemoryLimitError.exit_code, need.refusal(largest)
+            self.store.add(cell).give_up(code, message)
+            self.store.tell("failed", cell=cell.key, exit_code=code)
+            self.ended(cell, Outcome("failed", "", code, message))
 
     def _take_in(self, place: Place, waiting: list[Wanted]) -> None:
         one, cell, ticket = self._running[place]

@@ -22,6 +22,7 @@ from clsplat.reading import read_json, sha256
 from clsplat.scene.decoding import ImageFile
 from clsplat.scene.detect import read_scene
 from clsplat.scene.identity import Identity
+from clsplat.scene.scene import Scene
 from clsplat.scene.view import NO_FILE
 
 KEPT = 16  # hexadecimal digits of a hash
@@ -36,6 +37,7 @@ class Known:
 
     digest: str
     pixels: float  # of all training photographs, for the order of cells
+    scene: Scene | None = None  # as its files have it; None where `prepare` makes it
 
 
 @cache
@@ -110,7 +112,7 @@ class Scenes:
                 if path is not None and path != NO_FILE and path not in files:
                     files[path] = ImageFile(digest=digest_of(path))
         pixels = sum(view.camera.width * view.camera.height for view in original.split("train")) / settings.downscale**2
-        return Known(Identity.of(original, files).digest, float(pixels))
+        return Known(Identity.of(original, files).digest, float(pixels), original)
 
     @contextmanager
     def _digests(self, scene: Path) -> Iterator[Any]:

@@ -9,15 +9,17 @@ import io
 import json
 import logging
 import subprocess
+import sys
 import tempfile
 from contextlib import redirect_stdout, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from clsplat.caches import cache_folder
 from clsplat.cluster.child import filled, run_command
 from clsplat.cluster.fingerprint import code_digest
+from clsplat.cluster.packing import Packing, memory_of_each, shares_of
 from clsplat.errors import DataError, DeviceError, OutputError
 from clsplat.files import write_text
 from clsplat.opencl.discovery import DeviceInfo, choose, list_devices
@@ -65,6 +67,9 @@ class Place:
     device: str  # as `--device` takes it
     bits: str  # its class
     text: str = ""  # what it is
+    cores: tuple[int, ...] = ()  # of a CPU that several runs share; none: all
+    memory: int = sys.maxsize  # bytes that a run may take
+    allocation: int = sys.maxsize  # bytes, largest single buffer
 
 
 def place_of(address: str, worker: dict[str, Any]) -> Place | None:
@@ -73,21 +78,35 @@ def place_of(address: str, worker: dict[str, Any]) -> Place | None:
         values = json.loads(str(worker["metrics"][TOLD]))
         if values["code"] != code_digest():
             return None
-        return Place(address, str(values["device"]), str(values["bits"]), str(values["host"]))
+        return Place(
+            address, str(values["device"]), str(values["bits"]), str(values["host"]), (), *map(int, values["limits"])
+        )
     except (ValueError, KeyError, TypeError):
         return None
 
 
-def places(worker: str, devices: list[str] | None = None) -> list[Place]:
+def places(worker: str, devices: list[str] | None = None, packing: Packing = 1) -> list[Place]:
     """Return the devices of this machine that work, or those of a list of names, with their classes.
 
-    Raises DeviceError where there is none, or one of the list does not work.
+    packing: the runs that share a CPU, each of which has a place; "auto": what was measured, else one.
+    Raises DeviceError where there is none, or one of the list does not work, ConfigError for more runs than cores.
     """
     infos = list_devices()
     chosen = [choose(name) for name in devices] if devices is not None else [one for one in infos if not one.fault()]
     if not chosen:
         raise DeviceError("no OpenCL device works; `clsplat devices` tells why")
-    return [Place(worker, word_of(info, infos), bits_class(info, infos), info.text) for info in chosen]
+    found = []
+    for info, parts in zip(chosen, shares_of(chosen, packing), strict=True):
+        own = Place(
+            worker,
+            word_of(info, infos),
+            bits_class(info, infos),
+            info.text,
+            memory=memory_of_each(info, len(parts)),
+            allocation=info.allocation,
+        )
+        found += [replace(own, cores=part) for part in parts]
+    return found
 
 
 def word_of(info: DeviceInfo, infos: list[DeviceInfo]) -> str:

@@ -50,7 +50,7 @@ def engine(execution: Execution, store: Store, devices: list[str] | None) -> "Cl
 
 def _engine(execution: Execution, store: Store, devices: list[str] | None) -> "Cluster":
     if execution.engine == "local":
-        found = places("local", devices)
+        found = places("local", devices, execution.packing)
         cluster = distributed.LocalCluster(
             n_workers=len(found),
             threads_per_worker=1,
@@ -169,7 +169,7 @@ class Cluster:
             raise
 
     def start(self, cell: Cell, place: Place, terms: Terms) -> Ticket:
-        own = replace(terms, worker=place.worker, sweep=self._sweep)
+        own = replace(terms, worker=place.worker, sweep=self._sweep, cores=place.cores)
         address = place.worker if self._found is None else None
         with self._needs_scheduler():
             future = self._client.submit(

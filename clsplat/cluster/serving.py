@@ -42,7 +42,14 @@ async def _serve(execution: Execution, found: Sequence[Place], stop: threading.E
     if execution.is_local and "interface" not in options:
         options["host"] = LOOPBACK
     told = [
-        {"host": place.worker, "device": place.device, "bits": place.bits, "code": code_digest()} for place in found
+        {
+            "host": place.worker,
+            "device": place.device,
+            "bits": place.bits,
+            "limits": [place.memory, place.allocation],
+            "code": code_digest(),
+        }
+        for place in found
     ]
     nannies = [
         distributed.Nanny(

@@ -5,6 +5,7 @@
                 result/             the attempt that came first, renamed, with its manifest.json
                 failed.json         why it was given up
     prepared/  scenes/              what `prepare` makes; hashes of photographs
+    undistorted/<scene>-<code>/     photographs without the distortion of their lenses, made once a host
     sweeps/<name>-<hash>.json       the cells of a matrix by their names
     cancel/all  cancel/<key>        that what began before is to stop
     events/<host>-<process>.jsonl   one file a process: no two append to one
@@ -16,7 +17,6 @@ and publishing is a rename.
 import hashlib
 import json
 import os
-import re
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -27,7 +27,7 @@ from clsplat.cluster.cell import Cell
 from clsplat.cluster.folder import CellFolder
 from clsplat.errors import ConfigError, DataError
 from clsplat.files import make_folder, told_as, write_text
-from clsplat.names import PREPARED
+from clsplat.names import PREPARED, UNDISTORTED
 from clsplat.processes import Owner
 from clsplat.reading import read_file, read_json
 
@@ -41,7 +41,7 @@ class Store:
     def __init__(self, root: Path) -> None:
         self.root = root.absolute()
         owner = Owner.this()
-        self._own = f"{re.sub(r'[^0-9A-Za-z-]', '_', owner.host)}-{owner.process}"
+        self._own = f"{owner.host_word}-{owner.process}"
 
     @classmethod
     def opened(cls, root: Path) -> "Store":
@@ -59,6 +59,10 @@ class Store:
     def prepared(self) -> Path:
         """The folder of what `prepare` makes."""
         return self.root / PREPARED
+
+    def undistorted(self, scene: str, code: str) -> Path:
+        """Return the folder of the undistorted photographs of a scene.  Both are fingerprints, as in a cell's key."""
+        return self.root / UNDISTORTED / f"{scene[:16]}-{code}"
 
     def folder(self, key: str) -> CellFolder:
         """Return the folder of a cell, which need not exist."""

@@ -2,7 +2,7 @@
 
 import logging
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Literal
@@ -14,7 +14,7 @@ from clsplat.cluster.folder import ATTEMPTS, CellFolder, Different
 from clsplat.cluster.store import Store
 from clsplat.errors import ClsplatError, ConfigError, DataError, Interrupted, MemoryLimitError, OutputError, one_line
 from clsplat.files import make_folder, write_text
-from clsplat.names import INPUTS, NOTE, PREPARED
+from clsplat.names import INPUTS, NOTE, PREPARED, UNDISTORTED
 from clsplat.reading import read_json
 
 LOG = logging.getLogger("clsplat")
@@ -39,6 +39,7 @@ class Terms:
     retries: int = 3  # failures without a newer checkpoint
     worker: str = "inline"
     sweep: str = ""  # a name that the caller's cells are stopped by
+    cores: Sequence[int] = ()  # that its run is kept to; none: those of its caller
 
 
 def run_cell(
@@ -75,7 +76,7 @@ def _run_cell(cell: Cell, store: Store, command: Command, terms: Terms, is_stopp
         store.tell("start", cell=cell.key, attempt=attempt.path.name, worker=terms.worker, **{"from": begun_from})
         _equip(cell, store, folder, attempt)
         try:
-            code = supervise(attempt, command, stopped)
+            code = supervise(attempt, command, stopped, terms.cores)
             store.tell("end", cell=cell.key, attempt=attempt.path.name, exit_code=code)
             if code == 0:
                 _require_same_scene(cell, attempt)
@@ -98,13 +99,21 @@ def _run_cell(cell: Cell, store: Store, command: Command, terms: Terms, is_stopp
 
 
 def _equip(cell: Cell, store: Store, folder: CellFolder, attempt: Attempt) -> None:
-    """Write the pipeline file of an attempt, and let it find what `prepare` has made.  Raises OutputError."""
+    """Write the pipeline file of an attempt, and let it find what other cells have made of the scene.
+
+    That is what `prepare` makes, and undistorted photographs.  Without links each cell makes its own.  Raises
+    OutputError.
+    """
     write_text(attempt.path / PIPELINE_FILE, cell.text)
-    link = folder.path / ATTEMPTS / PREPARED
-    if cell.spec["pipeline"].get("prepare") and not link.exists():
-        make_folder(store.prepared)
-        with suppress(OSError):  # without links each cell prepares by itself
-            link.symlink_to(os.path.relpath(store.prepared, link.parent), target_is_directory=True)
+    shared = {UNDISTORTED: store.undistorted(cell.spec["scene"], cell.spec["code"])}
+    if cell.spec["pipeline"].get("prepare"):
+        shared[PREPARED] = store.prepared
+    for name, target in shared.items():
+        make_folder(target)
+        link = folder.path / ATTEMPTS / name
+        if not link.exists():
+            with suppress(OSError):
+                link.symlink_to(os.path.relpath(target, link.parent), target_is_directory=True)
 
 
 def _require_same_scene(cell: Cell, attempt: Attempt) -> None:

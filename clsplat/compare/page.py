@@ -14,6 +14,7 @@ from clsplat.compare import tables
 from clsplat.compare.comparison import Comparison, Row, Variant
 from clsplat.compare.crops import Crop, find_crops
 from clsplat.compare.run_folder import Points, RunFolder
+from clsplat.compare.seams import Seams, find_seams
 from clsplat.errors import ConfigError, DataError, amount
 from clsplat.files import write_text
 from clsplat.pages.page import charts, embedded, render
@@ -37,6 +38,15 @@ class CropFigure:
 
 
 @dataclass(frozen=True)
+class SeamFigure:
+    """The bands along the borders of blocks, as text and a data URL."""
+
+    text: str
+    rows: list[tuple[Variant, str, str]]  # PSNR of the band, and of the rest
+    picture: str
+
+
+@dataclass(frozen=True)
 class SceneSection:
     """The section of the page about one scene."""
 
@@ -50,6 +60,7 @@ class SceneSection:
     curves: list[Markup]
     crops: list[CropFigure]
     no_crops: str  # the reason
+    seams: SeamFigure | None = None
 
 
 def write_comparison(paths: Sequence[Path], out: Path, title: str = "", remarks: Sequence[str] = ()) -> int:
@@ -94,7 +105,7 @@ def _links(run: RunFolder, folder: Path) -> dict[str, str]:
 
 
 def _section(name: str, rows: Sequence[Row]) -> SceneSection:
-    crops, no_crops = _crops(rows)
+    crops, no_crops, seams = _pictures(rows)
     several_seeds = any(len(row.runs) > 1 for row in rows)
     explanations = ["mean ± standard deviation over seeds"] if several_seeds else []
     return SceneSection(
@@ -108,6 +119,7 @@ def _section(name: str, rows: Sequence[Row]) -> SceneSection:
         curves=_curves(rows),
         crops=[_figure(crop) for crop in crops],
         no_crops=no_crops,
+        seams=_seam_figure(seams, rows) if seams else None,
     )
 
 
@@ -170,8 +182,8 @@ def _size_charts(rows: Sequence[Row], split: str) -> list[str]:
     return drawings
 
 
-def _crops(rows: Sequence[Row]) -> tuple[list[Crop], str]:
-    """Crops of each row's first run, or the reason why there are none, such as missing photographs."""
+def _pictures(rows: Sequence[Row]) -> tuple[list[Crop], str, Seams | None]:
+    """Crops of each row's first run, or why there are none, such as missing photographs; and seams of blocks."""
     runs = [row.runs[0] for row in rows]
     settings = runs[0].scene
     try:
@@ -179,9 +191,20 @@ def _crops(rows: Sequence[Row]) -> tuple[list[Crop], str]:
         scene = photographs.downscaled(settings.downscale)
     except (DataError, ConfigError) as error:
         LOG.warning("no crops: %s", error)
-        return [], str(error)
+        return [], str(error), None
     crops = find_crops(runs, scene, background)
-    return crops, "" if crops else "there is no view that all runs rendered; add `- render` to the stages"
+    reason = "" if crops else "there is no view that all runs rendered; add `- render` to the stages"
+    return crops, reason, find_seams(runs, scene, background)
+
+
+def _seam_figure(seams: Seams, rows: Sequence[Row]) -> SeamFigure:
+    text = (
+        f"{100 * seams.share:.1f} % of the pixels of {amount(seams.views, 'view')} show what lies near a border of "
+        f"blocks; red in {seams.view}"
+    )
+    figures = zip(rows, seams.band, seams.rest, strict=True)
+    found = [(row.variant, f"{band:.2f}", f"{rest:.2f}") for row, band, rest in figures]
+    return SeamFigure(text, found, embedded(seams.picture))
 
 
 def _figure(crop: Crop) -> CropFigure:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from clsplat import __version__
+from clsplat import __version__, cores
 
 CODE = ("PYOPENCL_BUILD", "POCL_", "CL_", "RUSTICL_", "LP_", "IGC_", "AMD_", "GPU_", "CUDA_")  # may change what runs
 CACHES = ("POCL_CACHE", "CUDA_CACHE")  # do not
@@ -48,7 +48,8 @@ def system() -> dict[str, Any]:
 
 def code_variables() -> dict[str, str]:
     """Return the variables with which compilers and runtimes may make other code of the same kernels."""
-    return {name: value for name, value in _variables(CODE).items() if not name.startswith(CACHES)}
+    found = _variables(CODE)
+    return {name: value for name, value in found.items() if not name.startswith(CACHES) and name not in cores.LIMITS}
 
 
 def _variables(prefixes: tuple[str, ...]) -> dict[str, str]:

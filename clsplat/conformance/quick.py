@@ -2,7 +2,7 @@
 
 import hashlib
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from functools import cache
 from importlib.metadata import version
@@ -12,7 +12,6 @@ from typing import Literal
 from clsplat import __version__, resource_dir
 from clsplat.caches import cache_folder
 from clsplat.conformance import uses
-from clsplat.conformance.checks import BITONIC, ESSENTIAL
 from clsplat.conformance.host import code_variables
 from clsplat.conformance.supervision import supervised
 from clsplat.errors import DeviceError, MemoryLimitError, OutputError
@@ -55,6 +54,8 @@ def ensure_correct(device: Device, sort: Sort = "auto") -> None:
     if all(record.exists() for record in records):
         uses.begin(records)
         return
+    from clsplat.conformance.checks import BITONIC, ESSENTIAL  # a run on a device that is known needs no reference
+
     LOG.info("checking %s; this takes some seconds, more where it builds slowly", info.name)
     for result in supervised(info, schedule, [*ESSENTIAL, *(BITONIC if bitonic else [])], QUICK_SECONDS):
         if result.out_of_memory:
@@ -84,7 +85,7 @@ def forget(info: DeviceInfo, schedule: Resolved) -> None:
 
 def _record(info: DeviceInfo, schedule: Resolved, sort: str) -> Path:
     """A file for all that decides what was found: the checks, the driver, what is compiled for the device, and how."""
-    checks = (__version__, [check.name for check in (*ESSENTIAL, *BITONIC)])
+    checks = (__version__, _hash_of_checks())
     device = (info.platform, info.name, info.driver, version("pyopencl"))
     build = (schedule, sort, BUILD_OPTIONS, sorted(tuning_of(info, schedule).items()), _hash_of_kernels())
     decisive = repr((checks, device, build, code_variables()))
@@ -93,7 +94,17 @@ def _record(info: DeviceInfo, schedule: Resolved, sort: str) -> Path:
 
 @cache
 def _hash_of_kernels() -> str:
+    return _hash_of(resource_dir("cl_kernels").iterdir())
+
+
+@cache
+def _hash_of_checks() -> str:
+    here = Path(__file__).parent
+    return _hash_of(path for folder in ("checks", "reference") for path in (here / folder).glob("*.py"))
+
+
+def _hash_of(files: Iterable[Path]) -> str:
     together = hashlib.sha256()
-    for path in sorted(resource_dir("cl_kernels").iterdir()):
+    for path in sorted(files):
         together.update(path.name.encode() + path.read_bytes())
     return together.hexdigest()

@@ -19,14 +19,15 @@ from clsplat.conformance.checks import BY_NAME
 from clsplat.errors import ClsplatError, KernelError, MemoryLimitError, as_clsplat_error, one_line, shortened
 from clsplat.opencl.device import Device
 from clsplat.opencl.discovery import Schedule, list_devices
+from clsplat.streams import only_reader_of_stdin, only_writer_of_stdout
 
 LOG_LIMIT = 4000  # characters of a build log
 
 
 def main(platform: int, number: int, schedule: Schedule, names: list[str]) -> None:
     """Open the device and run the checks of these names."""
-    threading.Thread(target=_end_with, args=(_only_reader_of_stdin(),), daemon=True).start()
-    out = _only_writer_of_stdout()
+    threading.Thread(target=_end_with, args=(only_reader_of_stdin(),), daemon=True).start()
+    out = only_writer_of_stdout()
     info = next(info for info in list_devices() if info.place == (platform, number))
     opened = cache(lambda: Device(info, schedule))
     for name in names:
@@ -59,26 +60,11 @@ def _source_of(error: Exception) -> str:
     return f"the check ends with {type(error).__name__}, which may be a defect of clsplat"
 
 
-def _only_reader_of_stdin() -> int:
-    """Return a number for stdin; runtimes get an empty one: on Windows asking about a pipe may wait for readers."""
-    pipe, empty = os.dup(0), os.open(os.devnull, os.O_RDONLY)
-    os.dup2(empty, 0)
-    os.close(empty)
-    return pipe
-
-
 def _end_with(pipe: int) -> None:
     """End this process, whatever it does, when the other one closes its end of a pipe or has ended."""
     while os.read(pipe, 1024):
         pass
     os._exit(1)
-
-
-def _only_writer_of_stdout() -> TextIO:
-    """Return stdout, and send what runtimes print there to stderr from here on."""
-    out = os.fdopen(os.dup(1), "w", encoding="utf-8")
-    os.dup2(2, 1)
-    return out
 
 
 def _print(out: TextIO, **line: Any) -> None:

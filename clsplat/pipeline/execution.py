@@ -66,6 +66,9 @@ class Execution(Settings):
     """Devices of this machine, as `--device` takes them; auto: every device that works; inline: the first."""
     placement: Placement = Placement()
     """Which devices may run which cells."""
+    packing: Literal["auto"] | Annotated[int, Field(ge=1)] = "auto"
+    """Processes at once on each CPU of engine local, which share its cores; auto: what `clsplat bench --packing` found
+    best here, else one."""
     retries: Annotated[int, Field(ge=1)] = 3
     """Failures of a cell without a newer checkpoint after which it is given up."""
     insecure: bool = False
@@ -92,6 +95,8 @@ class Execution(Settings):
             unused["devices"] = "a scheduler has the devices that its workers offer"
         if scheme not in ("tls", "slurm"):
             unused["tls"] = "certificates are for an engine tls://HOST:PORT, and slurm"
+        if scheme != "local":
+            unused["packing"] = "it is for engine local"
         if scheme not in ("dask", "slurm"):
             unused["insecure"] = "it is for an engine dask://HOST:PORT, and slurm"
         if scheme != "slurm":

@@ -10,6 +10,7 @@ from clsplat.pipeline.loading import Pipeline, prepared_folder
 from clsplat.pipeline.places import contents
 from clsplat.prepare.cache import Planned, note, noted, prepare
 from clsplat.prepare.facts import facts
+from clsplat.processes import Owner
 from clsplat.progress import Listener, heard_by
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.runs.folders import Start
@@ -80,10 +81,20 @@ def check_start(
     return opened, planned
 
 
+def undistorted_folder(out: Path) -> Path:
+    """Return the folder of undistorted photographs: in the run folder, or where a link beside it leads.
+
+    A store puts the link there, so that its cells share them.  Each host has its own, for the names of temporary files
+    tell processes of one host apart.
+    """
+    shared = out.absolute().parent / UNDISTORTED
+    return shared / Owner.this().host_word if shared.is_symlink() and shared.is_dir() else out / UNDISTORTED
+
+
 def make_run(pipeline: Pipeline, scene: RunScene, device: Device, out: Path, status: StatusFile) -> Run:
     """Return a run of the pipeline on a scene, before its first stage."""
     settings = pipeline.settings
-    budget = settings.scene.image_budget
+    budget = None if settings.scene.image_budget is None else settings.scene.image_budget << 20
     return Run(
         device=device,
         scene=scene.scene,
@@ -94,7 +105,7 @@ def make_run(pipeline: Pipeline, scene: RunScene, device: Device, out: Path, sta
         settings=settings,
         pipeline=pipeline.resolved(),
         rasterizer=Rasterizer(device, settings.rasterizer.sort, settings.rasterizer.budget()),
-        photographs=Photographs(device, scene.background, None if budget is None else budget << 20, out / UNDISTORTED),
+        photographs=Photographs(device, scene.background, budget, undistorted_folder(out)),
         status=status,
         model_settings=settings.model,
         identity=scene.identity,

@@ -24,7 +24,7 @@ def load_photograph(
     """
     if view.lens is None or undistorted is None:
         return _loaded(view, background)
-    file = undistorted / f"{view.name}.{_key(view)}.png"
+    file = undistorted / f"{view.name}.{_key(view, background)}.png"
     try:
         return read_image(file).astype(np.uint8)
     except DataError:
@@ -36,10 +36,11 @@ def load_photograph(
     return pixels
 
 
-def _key(view: View) -> str:
-    """A hash of the file, the lens and the size."""
+def _key(view: View, background: tuple[float, float, float]) -> str:
+    """A hash of the file, the lens, the size, and what is behind transparent pixels."""
     state = view.image_path.stat() if view.image_path.exists() else None
-    parts = view.lens, view.camera, view.mask_path, view.alpha, state and (state.st_mtime_ns, state.st_size)
+    file = state and (state.st_mtime_ns, state.st_size)
+    parts = view.lens, view.camera, view.mask_path, view.alpha, background, file
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:12]
 
 

@@ -98,6 +98,18 @@ class Init(Stage):
         begin_sky(run, load(Path(self.file)).sky if source in MODEL_SOURCES and self.file else None)
         LOG.info("%s Gaussians from %s", f"{run.model.gaussians.count:,}", self._origin(source, run.scene))
 
+    def expected_count(self, scene: Scene) -> int:
+        """Return the number of Gaussians that it makes of a scene, or the most where that is found on the way.
+
+        Raises DataError where its model cannot be read.
+        """
+        source = self._source(scene)
+        if source in MODEL_SOURCES:
+            return len(self._read()["means"])
+        if source == "points":
+            return 0 if scene.points is None else len(scene.points)
+        return self.swept if source == "sweep" else self.count
+
     def _origin(self, source: str, scene: Scene) -> str:
         names = {
             "points": "the scene's points",

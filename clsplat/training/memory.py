@@ -5,11 +5,11 @@ Bytes are those of the tables for each Gaussian, and those of a frame for each G
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Protocol
 
 from clsplat.errors import MemoryLimitError
 from clsplat.formats.motion import MOTION
 from clsplat.gaussians.tables import ALIGNMENT, GROWTH, PARAMETERS, moment_tables, sh_coefficients
-from clsplat.opencl.discovery import DeviceInfo
 from clsplat.render.rasterizer import PIXEL_SUMS, RECORD
 
 PAIRS_PER_GAUSSIAN = 5  # (tile, Gaussian) pairs, an estimate; trained scenes have 1.5 to 4
@@ -76,8 +76,20 @@ def first_tables(degree: int, motion: int = 0) -> dict[str, int]:
     return parameters | {table: width for name, width in parameters.items() for table in moment_tables(name)}
 
 
+class Limits(Protocol):
+    """What a device holds."""
+
+    @property
+    def memory(self) -> int:
+        """Bytes in all."""
+
+    @property
+    def allocation(self) -> int:
+        """Bytes of a single buffer."""
+
+
 def plan(
-    info: DeviceInfo, components: Mapping[str, int], photographs: int, pixels: int, pixel_sums: int = PIXEL_SUMS
+    limits: Limits, components: Mapping[str, int], photographs: int, pixels: int, pixel_sums: int = PIXEL_SUMS
 ) -> MemoryPlan:
     """Return the plan for Gaussians with tables of these components, by name.
 
@@ -89,4 +101,4 @@ def plan(
     moving = 4 * components[MOTION] + MOVED if MOTION in components else 0
     gaussian = sum(sizes) + FRAME_GAUSSIAN + 4 * pixel_sums + gradients + moving
     fixed = photographs + FRAME_PIXEL * pixels
-    return MemoryPlan(gaussian, FRAME_PAIR, fixed, max(sizes), info.memory, info.allocation)
+    return MemoryPlan(gaussian, FRAME_PAIR, fixed, max(sizes), limits.memory, limits.allocation)

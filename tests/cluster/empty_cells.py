@@ -24,7 +24,7 @@ from tests.test_sweep_cells import SPEC
 def measure(cells: int, workers: int, folder: Path) -> None:
     """Print the time a cell, the memory of the driver along the way, and the events."""
     places = [Place("local", f"device {number}", "b") for number in range(workers)]
-    scheduler.places = lambda worker, devices: places
+    scheduler.places = lambda worker, devices, packing: places
     store, memory, process = Store(folder), [], psutil.Process()
     engine = scheduler.engine(Execution(engine="local"), store, None)
     engine.command_of = lambda device: ["touch", OUT]
