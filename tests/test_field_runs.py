@@ -49,6 +49,7 @@ stages:
         - evaluate: {{every: 6, split: test}}
         - checkpoint: {{every: 4}}
   - evaluate: {{split: test, downscales: [1, 2, 4]}}
+  - export_field
   - render
   - report
 """
@@ -157,8 +158,9 @@ def test_the_files_of_a_run_of_a_field_are_checked(finished):
 
 
 def test_commands_on_models_say_that_a_run_has_none(finished):
-    with pytest.raises(DataError, match="is the run of a field, which no model file holds"):
-        require_model(finished)
+    for path in (finished, finished / "field.npz"):
+        with pytest.raises(DataError, match="is a field, a network in the place of Gaussians; expected Gaussians: .*ren"):
+            require_model(path)
 
 
 def test_a_field_that_is_not_finite_stops_the_run_and_is_set_aside(tiny_scene, tmp_path, pipeline):

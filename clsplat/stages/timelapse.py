@@ -63,7 +63,7 @@ class Snapshot(Scheduled):
     def run(self, run: Run) -> None:
         view = still(self._view(run), checked_size(self.size) if self.size else None)
         path = run.out / self.folder / f"step_{run.step:06d}.png"
-        write_image(path, Canvas(run.rasterizer, run.model, run.photographs.background).picture(view))
+        write_image(path, Canvas(run.painter()).picture(view))
         run.records.add(run.step, KIND, folder=self.folder, file=path.name)
 
 

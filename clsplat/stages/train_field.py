@@ -29,11 +29,11 @@ class TrainField(Training):
 
     A step draws its rays from one photograph, or from several, as many from each.  Where photographs have several
     sizes, the loss is that of all their pixels, each counted as its area (section 4): so all sizes count alike.
-    Stages that render, measure and report take the field as they take Gaussians; there is no model file.
+    Stages that render, measure and report take the field as they take Gaussians; `export_field` writes a file of it.
     """
 
     stage: Literal["train_field"] = "train_field"
-    makes: ClassVar[frozenset[str]] = frozenset({"painter"})
+    makes: ClassVar[frozenset[str]] = frozenset({"painter", "field"})
     takes: ClassVar[frozenset[str]] = frozenset({"model"})
     training_keys: ClassVar[frozenset[str]] = frozenset({"rate", "coarse_weight"})
 

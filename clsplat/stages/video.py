@@ -67,7 +67,7 @@ class Video(Stage):
         def through(views: Sequence[View]) -> Iterator[View]:
             return counted(run.until_interrupted(views), "frames rendered", len(views))
 
-        canvas = Canvas(run.rasterizer, run.model, run.photographs.background)
+        canvas = Canvas(run.painter())
         with heard_by(run.status.count):
             shoot(canvas, film, {"colour": path}, None, through)
         LOG.info("video of %d frames written to %s, %.2f MB", len(film.views), path, path.stat().st_size / 1e6)
