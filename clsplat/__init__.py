@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from clsplat.api.compression import write_levels as write_levels
     from clsplat.api.converting import convert as convert
     from clsplat.api.device import Device as Device
+    from clsplat.api.field_renderer import FieldRenderer as FieldRenderer
     from clsplat.api.pictures import camera_path as camera_path
     from clsplat.api.pictures import render_path as render_path
     from clsplat.api.pictures import render_views as render_views
@@ -65,6 +66,8 @@ if TYPE_CHECKING:
     from clsplat.scene.scene import Scene as Scene
     from clsplat.scene.split import Split as Split
     from clsplat.scene.view import View as View
+    from clsplat.training.field_file import FieldModel as FieldModel
+    from clsplat.training.field_file import load_field as load_field
 
 __version__ = "0.1.0"
 _HERE = Path(__file__).resolve().parent
@@ -75,6 +78,7 @@ _ROOMS = {  # where the names come from, which `import clsplat` does not import
     "clsplat.api.blocks": "train_in_blocks",
     "clsplat.api.compression": "compress_model write_levels",
     "clsplat.api.device": "Device",
+    "clsplat.api.field_renderer": "FieldRenderer",
     "clsplat.api.renderer": "Gradients Picture Renderer",
     "clsplat.api.sweeps": "cancel run_cell work_for",
     "clsplat.api.tools": "devices doctor inspect_scene load_plugin measure_growth measure_speed read_measurement",
@@ -88,6 +92,7 @@ _ROOMS = {  # where the names come from, which `import clsplat` does not import
     "clsplat.scene.scene": "PointCloud Scene",
     "clsplat.scene.split": "Split",
     "clsplat.scene.view": "View",
+    "clsplat.training.field_file": "FieldModel load_field",
 }
 _PLACES = {name: room for room, names in _ROOMS.items() for name in names.split()}
 _MODULES = ("errors", "metrics")

@@ -12,7 +12,7 @@ from clsplat.errors import ConfigError, DataError
 from clsplat.formats.model_files import located
 from clsplat.gaussians.model import Model
 from clsplat.gaussians.run_model import MODEL, model_at, model_of_run
-from clsplat.names import METRICS, PIPELINE, is_inside
+from clsplat.names import METRICS, PIPELINE
 from clsplat.pages.page import scene_name
 from clsplat.pipeline.file import SceneSettings
 from clsplat.pipeline.loading import Pipeline, load
@@ -23,7 +23,7 @@ from clsplat.scene.images import is_image
 from clsplat.scene.scene import Alpha, Scene
 from clsplat.stages.export import Export
 from clsplat.stages.export_field import ExportField
-from clsplat.training.field_file import FieldModel, is_field
+from clsplat.training.field_file import FieldModel, field_of_run, is_field
 
 
 @dataclass(frozen=True)
@@ -96,10 +96,7 @@ def of_a_field(path: Path) -> DataError:
 def _shown_of_run(run: Path) -> Path:
     """The file of what a run has trained: Gaussians, or a field."""
     file = model_of_run(run)
-    if file.is_file() or not _has_field(run):
-        return file
-    name = read_metrics(run / METRICS).files.get("export_field", "field.npz")
-    return run / name if is_inside(name) else file
+    return file if file.is_file() or not _has_field(run) else field_of_run(run)
 
 
 def _has_field(run: Path) -> bool:

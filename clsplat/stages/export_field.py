@@ -8,7 +8,7 @@ from clsplat.errors import DataError, OutputError
 from clsplat.gaussians.model import Rendering
 from clsplat.reading import sha256
 from clsplat.stages.base import Stage, path_in_run
-from clsplat.training.field_file import ENDING, FieldModel, load_field
+from clsplat.training.field_file import ENDING, FILE, FieldModel, load_field
 from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
@@ -24,7 +24,7 @@ class ExportField(Stage):
     needs: ClassVar[frozenset[str]] = frozenset({"field"})
     output_keys: ClassVar[frozenset[str]] = frozenset({"file"})
 
-    file: Annotated[str, path_in_run(ENDING)] = "field.npz"
+    file: Annotated[str, path_in_run(ENDING)] = FILE
     """Path inside the run folder; .npz."""
 
     def run(self, run: Run) -> None:

@@ -20,13 +20,14 @@ from clsplat.fields.field import Field
 from clsplat.fields.shape import FieldShape
 from clsplat.files import atomic, is_there
 from clsplat.gaussians.model import Rendering
+from clsplat.gaussians.run_model import file_of_run
 from clsplat.opencl.device import Device
 from clsplat.reading import sha256
 from clsplat.training import archive
 from clsplat.views.photographs import BACKGROUNDS
 
 FORMAT: Final = 1
-ENDING, PARAMETERS = ".npz", "parameters"
+ENDING, FILE, PARAMETERS = ".npz", "field.npz", "parameters"
 
 
 class Notes(BaseModel):
@@ -84,9 +85,17 @@ def is_field(path: Path) -> bool:
     return path.suffix.lower() == ENDING
 
 
+def field_of_run(folder: Path) -> Path:
+    """Return the file of the field of a run folder: the last that `export_field` has written."""
+    return file_of_run(folder, "export_field", FILE)
+
+
 def load_field(path: str | Path) -> FieldModel:
-    """Read the file of a field.  Raises DataError when it is missing, damaged or of something else."""
-    path = Path(path)
+    """Read the file of a field, or that of a run folder.
+
+    Raises DataError when it is missing, damaged or of something else.
+    """
+    path = field_of_run(Path(path)) if Path(path).is_dir() else Path(path)
     if not is_there(path):
         raise DataError(f"{path}: not found; expected a file of the stage export_field")
     try:
