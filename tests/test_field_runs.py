@@ -168,6 +168,9 @@ def test_commands_on_models_say_that_a_run_has_none(finished):
             DataError, match=r"is a field, a network in the place of Gaussians; expected Gaussians: .*ren"
         ):
             require_model(path)
+    with pytest.raises(DataError, match="is a field"):
+        clsplat.convert(finished, finished / "a.ply")
+    assert clsplat.check(finished / "field.npz")["parameters"] == clsplat.load_field(finished).shape.learned
 
 
 def test_the_file_of_a_field_gives_the_figures_and_pictures_of_its_run(finished, tmp_path):

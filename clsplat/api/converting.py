@@ -34,6 +34,8 @@ def convert(
     from clsplat.gaussians import conversion, moments
 
     files = [Path(source) for source in ([sources] if isinstance(sources, str | Path) else sources)]
+    for file in files:
+        refuse_field(file)
     box = crop if isinstance(crop, str) or crop is None else ",".join(map(str, crop))
     options = conversion.Options(sh_bits, axes, spz_version, quality, keep_nan)
     changes = conversion.Changes(

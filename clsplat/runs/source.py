@@ -69,8 +69,7 @@ class Source:
 
 def require_model(path: Path) -> None:
     """Raise DataError for a folder that holds no Gaussians, and for the file of a field."""
-    if is_field(path):
-        raise of_a_field(path)
+    refuse_field(path)
     if path.is_dir() and not (file := model_at(path)).is_file():
         raise _no_model(path, file.name)
 
@@ -78,13 +77,19 @@ def require_model(path: Path) -> None:
 def _no_model(folder: Path, name: str = MODEL) -> DataError:
     """The error of a folder without a model, with the remedy for what it is."""
     if _has_field(folder):
-        return of_a_field(folder)
+        return DataError(f"{folder}: has no file of its field; run its pipeline again with the stage export_field")
     if has_pipeline(folder):
         return DataError(f"{folder}: has no {name}; finish the run with `clsplat resume {folder}`")
     fault = f"{folder}: has no {PIPELINE}; expected a model file or a run folder"
     if any(map(is_image, chain(folder.glob("*"), folder.glob("images/*")))):
         return DataError(f"{fault}; for a model of its photographs, run `clsplat run photos --scene {folder}` first")
     return DataError(fault)
+
+
+def refuse_field(path: Path) -> None:
+    """Raise DataError for the file of a field, and for a run that has trained one."""
+    if is_field(path) or (has_pipeline(path) and _has_field(path) and not model_of_run(path).is_file()):
+        raise of_a_field(path)
 
 
 def of_a_field(path: Path) -> DataError:
