@@ -164,13 +164,18 @@ def evaluate(
     )
 
 
-def compare_runs(runs: Sequence[PathLike], out: PathLike = "compare.html") -> int:
-    """Write the page that shows runs side by side; return their number.  The folder of a matrix stands for its runs."""
+def compare_runs(runs: Sequence[PathLike], out: PathLike = "compare.html", published: PathLike | None = None) -> int:
+    """Write the page that shows runs side by side; return their number.  The folder of a matrix stands for its runs.
+
+    published: a YAML file of figures that others have published, which are shown below, apart.
+    """
     from clsplat.compare.page import write_comparison
+    from clsplat.compare.published import read_published
     from clsplat.results import check_result
 
     check_result(Path(out), ".html")
-    return write_comparison([Path(folder) for folder in runs], Path(out))
+    tables = [] if published is None else read_published(Path(published))
+    return write_comparison([Path(folder) for folder in runs], Path(out), published=tables)
 
 
 def view(

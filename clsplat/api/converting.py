@@ -32,6 +32,7 @@ def convert(
     file of its own: `out` is a folder, for PLY, or the name whose number is still to come.
     """
     from clsplat.gaussians import conversion, moments
+    from clsplat.runs.source import refuse_field
 
     files = [Path(source) for source in ([sources] if isinstance(sources, str | Path) else sources)]
     for file in files:

@@ -241,7 +241,10 @@ def compare(
         list[Path], typer.Argument(metavar="RUN…", help="Run folders; that of a matrix stands for all its runs.")
     ],
     out: Annotated[Path, typer.Option(metavar="FILE", help="The page to write.")] = Path("compare.html"),
+    published: Annotated[
+        Path | None, typer.Option(metavar="FILE.yaml", help="Published figures, shown below the runs, apart from them.")
+    ] = None,
 ) -> None:
     """Show runs side by side on one page that opens offline."""
-    count = commands.compare_runs(runs, out)
+    count = commands.compare_runs(runs, out, published)
     terminal.remark(f"{count} runs compared in {out}")
