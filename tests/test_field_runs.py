@@ -208,6 +208,16 @@ def test_a_field_is_filmed(finished, tmp_path):
     assert (made["frames"], made["size"]) == (2, [16, 16])
 
 
+def test_stages_of_films_show_a_field(tiny_scene, tmp_path):
+    film = "  - timelapse\n  - video: {frames: 2, size: 16x16}\n"
+    snapshot = '        - snapshot: {every: 2, size: "16x16"}\n'
+    training, *_ = PIPELINE.split("        - evaluate")
+    (tmp_path / "film.yaml").write_text(training + snapshot + film)
+    out = clsplat.run(tmp_path / "film.yaml", tiny_scene, tmp_path / "run", set={"train_field.steps": 4})
+    assert len(list((out / "timelapse").glob("*.png"))) == 2
+    assert (out / "video.webm").stat().st_size > 0
+
+
 def test_a_field_renders_from_python(finished, tiny_scene, device):
     view = clsplat.read_scene(tiny_scene).split("test")[0]
     field = clsplat.load_field(finished)

@@ -30,7 +30,7 @@ class Snapshot(Scheduled):
     """
 
     stage: Literal["snapshot"] = "snapshot"
-    needs: ClassVar[frozenset[str]] = frozenset({"model"})
+    needs: ClassVar[frozenset[str]] = frozenset({"painter"})
     makes: ClassVar[frozenset[str]] = frozenset({"snapshots"})
     output_keys: ClassVar[frozenset[str]] = CADENCE | {"view", "size", "folder"}
 
@@ -71,7 +71,7 @@ class Timelapse(Stage):
     """Make a video of the pictures that a stage `snapshot` has written during training."""
 
     stage: Literal["timelapse"] = "timelapse"
-    needs: ClassVar[frozenset[str]] = frozenset({"model", "snapshots"})
+    needs: ClassVar[frozenset[str]] = frozenset({"painter", "snapshots"})
     output_keys: ClassVar[frozenset[str]] = frozenset({"folder", "file", "fps"})
 
     folder: str = FOLDER
