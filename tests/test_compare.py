@@ -108,7 +108,7 @@ def test_costs_are_shown_where_runs_have_noted_them(make_run, tmp_path):
     assert "<td>1,234</td>" in page_of(tmp_path, new, old), "the mean of those that have noted it"
 
 
-PUBLISHED = Path(__file__).parents[1] / "examples/published_blender.yaml"
+PUBLISHED = Path(__file__).parents[1] / "examples/published/blender.yaml"
 
 
 def test_published_figures_stand_apart_with_their_source(make_run, tmp_path):

@@ -37,7 +37,6 @@ VERBS = ("mark", "choose", "set_rows", "set_children")
 TESTED = {  # where
     **dict.fromkeys(("box_blur.py", "opacity_entropy.py"), "test_plugins.py"),
     "csv_reader.py": "test_csv_reader.py",
-    "published_blender.yaml": "test_compare.py",
     "test_opacity_entropy.py": "test_docs.py",
 }
 PAGES = ("README.md", "docs/python.md")

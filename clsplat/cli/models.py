@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import typer
 
 from clsplat import terminal
-from clsplat.api import commands, compression, converting
+from clsplat.api import commands, compression, converting, pages
 from clsplat.cli.app import DeviceOption, ModelArgument, SceneOption, command
 from clsplat.errors import ConfigError, quoted
 from clsplat.files import is_there
@@ -95,7 +95,7 @@ def view(
     """Write a page to walk through a model, beside its photographs; it opens offline."""
     before = "replaced; " if is_there(out) else ""
     with terminal.counted():
-        page = commands.view(
+        page = pages.view(
             *models, scene=scene, out=out, photographs=photographs, photograph_budget=photograph_budget, splats=splats
         )
     terminal.remark(f"{page}: {before}{page.stat().st_size / 1e6:.1f} MB; open it in a browser")
@@ -246,5 +246,5 @@ def compare(
     ] = None,
 ) -> None:
     """Show runs side by side on one page that opens offline."""
-    count = commands.compare_runs(runs, out, published)
+    count = pages.compare_runs(runs, out, published)
     terminal.remark(f"{count} runs compared in {out}")
