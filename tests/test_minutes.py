@@ -184,7 +184,7 @@ def test_a_rehearsal_leaves_no_trace_in_the_run(tiny_scene, tmp_path, monkeypatc
     """Of a training that ends before it can be corrected: the same bits as without a rehearsal."""
     monkeypatch.setattr(minutes, "most_steps", lambda *given: 50)
     monkeypatch.setattr(rehearsals, "EARLY", 1.0)
-    monkeypatch.setattr(minutes, "SOON", 1.0)
+    monkeypatch.setattr(rehearsals, "SOON", 1.0)
     out = clsplat.run("smoke", tiny_scene, tmp_path / "run", minutes=0.2)
     plain = clsplat.run("smoke", tiny_scene, tmp_path / "plain")
     assert digest(out) == digest(plain)

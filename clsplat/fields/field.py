@@ -48,7 +48,7 @@ class Field:
             self.levels.place(fine, image)
             weights, edges = (array.get()[: len(pixels)].astype(np.float64) for array in (fine.weights, fine.edges))
             covered, summed = weights.sum(axis=1), (weights * (edges[:, :-1] + edges[:, 1:]) / 2).sum(axis=1)
-            alpha[pixels] = covered
+            alpha[pixels] = np.minimum(covered, 1)  # a sum of rounded weights
             depths[pixels] = np.divide(summed, covered, out=np.zeros_like(covered), where=covered > 0)
         shown = np.ascontiguousarray(image.get()[:, : camera.height, : camera.width].transpose(1, 2, 0))
         return Layers(shown, alpha.reshape(size), depths.reshape(size) if depth else None)
