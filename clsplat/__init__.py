@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from clsplat import metrics as metrics
     from clsplat.api.blocks import train_in_blocks as train_in_blocks
     from clsplat.api.commands import check as check
-    from clsplat.api.commands import compare_runs as compare_runs
     from clsplat.api.commands import copy_pipeline as copy_pipeline
     from clsplat.api.commands import describe_run as describe_run
     from clsplat.api.commands import evaluate as evaluate
@@ -28,11 +27,13 @@ if TYPE_CHECKING:
     from clsplat.api.commands import run as run
     from clsplat.api.commands import status as status
     from clsplat.api.commands import status_schema as status_schema
-    from clsplat.api.commands import view as view
     from clsplat.api.compression import compress_model as compress_model
     from clsplat.api.compression import write_levels as write_levels
     from clsplat.api.converting import convert as convert
     from clsplat.api.device import Device as Device
+    from clsplat.api.field_renderer import FieldRenderer as FieldRenderer
+    from clsplat.api.pages import compare_runs as compare_runs
+    from clsplat.api.pages import view as view
     from clsplat.api.pictures import camera_path as camera_path
     from clsplat.api.pictures import render_path as render_path
     from clsplat.api.pictures import render_views as render_views
@@ -66,16 +67,20 @@ if TYPE_CHECKING:
     from clsplat.scene.scene import Scene as Scene
     from clsplat.scene.split import Split as Split
     from clsplat.scene.view import View as View
+    from clsplat.training.field_file import FieldModel as FieldModel
+    from clsplat.training.field_file import load_field as load_field
 
 __version__ = "0.1.0"
 _HERE = Path(__file__).resolve().parent
 _ROOMS = {  # where the names come from, which `import clsplat` does not import
     "clsplat.api.converting": "convert",
-    "clsplat.api.commands": "check compare_runs copy_pipeline describe_run evaluate pipeline_schema"
-    " pipelines resume run status status_schema view",
+    "clsplat.api.commands": "check copy_pipeline describe_run evaluate pipeline_schema"
+    " pipelines resume run status status_schema",
     "clsplat.api.blocks": "train_in_blocks",
     "clsplat.api.compression": "compress_model write_levels",
     "clsplat.api.device": "Device",
+    "clsplat.api.pages": "compare_runs view",
+    "clsplat.api.field_renderer": "FieldRenderer",
     "clsplat.api.renderer": "Gradients Picture Renderer",
     "clsplat.api.sweeps": "cancel run_cell work_for",
     "clsplat.api.tools": "devices doctor inspect_scene load_plugin measure_growth measure_packing measure_speed"
@@ -90,6 +95,7 @@ _ROOMS = {  # where the names come from, which `import clsplat` does not import
     "clsplat.scene.scene": "PointCloud Scene",
     "clsplat.scene.split": "Split",
     "clsplat.scene.view": "View",
+    "clsplat.training.field_file": "FieldModel load_field",
 }
 _PLACES = {name: room for room, names in _ROOMS.items() for name in names.split()}
 _MODULES = ("errors", "metrics")

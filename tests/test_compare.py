@@ -15,6 +15,7 @@ from clsplat.compare import crops
 from clsplat.compare.comparison import Comparison
 from clsplat.compare.differences import differing, flat
 from clsplat.compare.page import write_comparison
+from clsplat.compare.published import read_published
 from clsplat.compare.run_folder import RunFolder
 from clsplat.errors import ClsplatError, ConfigError, DataError
 from clsplat.pipeline.loading import load
@@ -105,6 +106,48 @@ def test_costs_are_shown_where_runs_have_noted_them(make_run, tmp_path):
     assert "CPU seconds" not in alone
     assert "device memory" not in alone
     assert "<td>1,234</td>" in page_of(tmp_path, new, old), "the mean of those that have noted it"
+
+
+PUBLISHED = Path(__file__).parents[1] / "examples/published/blender.yaml"
+
+
+def test_published_figures_stand_apart_with_their_source(make_run, tmp_path):
+    tables = read_published(PUBLISHED)
+    for table in tables:
+        assert list(table.rows) == ["Mip-NeRF", "3DGS", "3DGS + EWA", "Mip-Splatting"]
+    run, other = make_run("run", psnr=20.0), make_run("other", "init.opacity=0.3", psnr=19.0)
+    write_comparison([run, other], tmp_path / "page.html", published=tables)
+    measured, published = (tmp_path / "page.html").read_text().split("Published, not run here")
+    assert "<td>35.60</td>" in published, "with the digits of the others"
+    assert "35.6" not in measured
+    assert '<td class="best">20.00</td>' in measured, "figures of others are larger, and no part of the comparison"
+    assert all(table.source.replace('"', "&#34;") in published for table in tables)
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("a: 1", "unknown key 'a'"),
+        ("tables: []", "tables: expected a list of at least 1"),
+        ("- 1", "expected the key tables"),
+        (
+            "tables: [{title: a, source: b, protocol: c, columns: [d], rows: {e: [1.0, 2.0]}}]",
+            "expected 1 figures of 'e'",
+        ),
+        ("tables: [{title: a, source: b, protocol: c, columns: [d], rows: {e: [null]}}]", "expected a figure"),
+        ("tables: [{title: a, protocol: c, columns: [d], rows: {e: [1.0]}}]", "'source' is missing"),
+    ],
+)
+def test_a_file_of_published_figures_that_is_wrong_is_refused(text, complaint, tmp_path):
+    (tmp_path / "p.yaml").write_text(text)
+    with pytest.raises(ConfigError, match=rf"p\.yaml:1: .*{complaint}"):
+        read_published(tmp_path / "p.yaml")
+
+
+def test_what_sizes_mean_is_said_where_the_training_saw_others(make_run, tmp_path):
+    assert "sizes are shares" not in page_of(tmp_path, make_run("whole"))
+    halves = make_run("halves", "scene.downscale=2", "scene.levels=2")
+    assert "sizes are shares of the photographs&#39; own; trained at 1/2, 1/4" in page_of(tmp_path, halves)
 
 
 def test_lines_of_runs_with_one_seed_are_told_apart_by_their_folders(make_run, tmp_path):

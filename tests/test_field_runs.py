@@ -4,29 +4,34 @@ import hashlib
 import json
 import math
 import os
+import re
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from pydantic import ValidationError
 
+import clsplat
 from clsplat.compare.page import write_comparison
 from clsplat.errors import ConfigError, DataError, NotFiniteError
 from clsplat.fields.field import Field
 from clsplat.fields.shape import FieldShape
+from clsplat.gaussians.model import Rendering
 from clsplat.opencl.device import open_device
 from clsplat.pipeline.loading import load
 from clsplat.render.camera import upload_camera
+from clsplat.runs.rehearsal import Rehearsal
 from clsplat.runs.source import require_model
 from clsplat.runs.verify import verify
 from clsplat.scene.camera import Camera
 from clsplat.scene.images import read_image
 from clsplat.scene.view import View
 from clsplat.stages.train_field import TrainField
-from clsplat.training import checkpoint
+from clsplat.training import archive, checkpoint
 from clsplat.views.order import ViewPool
 from tests.test_training import ONE_CORE, train
 
@@ -49,6 +54,7 @@ stages:
         - evaluate: {{every: 6, split: test}}
         - checkpoint: {{every: 4}}
   - evaluate: {{split: test, downscales: [1, 2, 4]}}
+  - export_field
   - render
   - report
 """
@@ -157,8 +163,107 @@ def test_the_files_of_a_run_of_a_field_are_checked(finished):
 
 
 def test_commands_on_models_say_that_a_run_has_none(finished):
-    with pytest.raises(DataError, match="is the run of a field, which no model file holds"):
-        require_model(finished)
+    for path in (finished, finished / "field.npz"):
+        with pytest.raises(
+            DataError, match=r"is a field, a network in the place of Gaussians; expected Gaussians: .*ren"
+        ):
+            require_model(path)
+    with pytest.raises(DataError, match="is a field"):
+        clsplat.convert(finished, finished / "a.ply")
+    assert clsplat.check(finished / "field.npz")["parameters"] == clsplat.load_field(finished).shape.learned
+
+
+def test_the_file_of_a_field_gives_the_figures_and_pictures_of_its_run(finished, tmp_path):
+    """To the bit, from the run folder and from the file, which knows its run."""
+    recorded = json.loads((finished / "metrics.json").read_text())
+    found = clsplat.evaluate(finished / "field.npz", downscales=[1, 2])
+    assert {size: found["test"][size] for size in ("1", "2")} == {size: recorded["test"][size] for size in ("1", "2")}
+    assert (found["gaussians"], found["parameters"]) == (None, recorded["parameters"])
+    assert clsplat.render_views(finished, out=tmp_path / "images", depth=True) == 4
+    for path in (finished / "renders").rglob("*.png"):
+        assert next((tmp_path / "images").rglob(path.name)).read_bytes() == path.read_bytes()
+
+
+def test_a_description_of_a_run_tells_how_long_its_steps_take(tiny_scene, tmp_path, pipeline):
+    told = clsplat.describe_run(pipeline, tiny_scene, tmp_path / "run")
+    assert re.search(r"expected: 0\.1 min, .*\n  train_field +0\.1 min: 12 steps of \d+ ms, of 128 rays", told)
+
+
+def test_a_field_is_trained_in_the_steps_that_fit_into_a_time(tiny_scene, tmp_path, pipeline, monkeypatch):
+    """Schedules of the rate are stretched as those of Gaussians, and the pipeline that is written repeats the bits."""
+    monkeypatch.setattr(
+        "clsplat.runs.minutes.rehearsals_of", lambda *given: [Rehearsal(12, [0.01], during=0.0, after=0.0, growth=0.0)]
+    )
+    monkeypatch.setattr("clsplat.runs.minutes.most_steps", lambda rehearsals, seconds: 24)
+    out = clsplat.run(pipeline, tiny_scene, tmp_path / "run", minutes=0.002)
+    (stage, *_) = load(str(out / "pipeline.yaml")).stages
+    assert stage.warm_up == 4
+    assert stage.steps == json.loads((out / "metrics.json").read_text())["steps"] >= 10
+    again = clsplat.run(out / "pipeline.yaml", tiny_scene, tmp_path / "again")
+    assert (again / "field.npz").read_bytes() == (out / "field.npz").read_bytes()
+
+
+def test_a_field_is_filmed(finished, tmp_path):
+    made = clsplat.render_path(finished, video=tmp_path / "a.webm", frames=2, size="16x16", path="orbit")
+    assert (made["frames"], made["size"]) == (2, [16, 16])
+
+
+def test_stages_of_films_show_a_field(tiny_scene, tmp_path):
+    film = "  - timelapse\n  - video: {frames: 2, size: 16x16}\n"
+    snapshot = '        - snapshot: {every: 2, size: "16x16"}\n'
+    training, *_ = PIPELINE.split("        - evaluate")
+    (tmp_path / "film.yaml").write_text(training + snapshot + film)
+    out = clsplat.run(tmp_path / "film.yaml", tiny_scene, tmp_path / "run", set={"train_field.steps": 4})
+    assert len(list((out / "timelapse").glob("*.png"))) == 2
+    assert (out / "video.webm").stat().st_size > 0
+
+
+def test_a_field_renders_from_python(finished, tiny_scene, device):
+    view = clsplat.read_scene(tiny_scene).split("test")[0]
+    field = clsplat.load_field(finished)
+    picture = clsplat.FieldRenderer(field, device).render(view, depth=True)
+    assert picture.image.shape == (*picture.alpha.shape, 3) == (*picture.depth.shape, 3)
+    assert 0 <= picture.alpha.min() <= picture.alpha.max() <= 1
+    covered = picture.depth[picture.alpha > 0]
+    assert field.shape.near <= covered.min() <= covered.max() <= field.shape.far
+
+
+def test_a_field_before_another_background_is_lighter_by_what_it_does_not_cover(finished, tiny_scene, device):
+    """Coverage and picture belong together: 1 - alpha of the background shows."""
+    view = clsplat.read_scene(tiny_scene).split("test")[0]
+    field = clsplat.load_field(finished)
+    black, white = (
+        clsplat.FieldRenderer(replace(field, rendering=Rendering(background=name)), device).render(view)
+        for name in ("black", "white")
+    )
+    np.testing.assert_allclose(white.image - black.image, np.repeat(1 - white.alpha[..., None], 3, 2), atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        ({"format": 2}, "is of format '2'"),
+        ({"shape": {"width": 64}}, r"parameters are not \[\d+, 1\] of float32"),
+        ({"background": "pink"}, "background of its notes: "),
+        ({"shape": {"width": 63}}, r"shape\.width of its notes: .*multiple of 4"),
+    ],
+)
+def test_a_file_that_holds_no_such_field_is_refused_in_one_line(finished, tmp_path, change, complaint):
+    notes, arrays = archive.read(finished / "field.npz")
+    with (tmp_path / "field.npz").open("wb") as file:
+        archive.write(file, {**notes, **change}, arrays.items())
+    with pytest.raises(DataError, match=f"field.npz: {complaint}.*; expected a file of the stage export_field, whole"):
+        clsplat.load_field(tmp_path / "field.npz")
+
+
+def test_a_file_of_a_field_that_is_not_there_or_not_finite_is_refused(finished, tmp_path):
+    with pytest.raises(DataError, match="not found"):
+        clsplat.load_field(tmp_path / "field.npz")
+    field = clsplat.load_field(finished)
+    field.parameters[3] = np.inf
+    field.save(tmp_path / "field.npz")
+    with pytest.raises(DataError, match="hold values that are not finite"):
+        clsplat.load_field(tmp_path / "field.npz")
 
 
 def test_a_field_that_is_not_finite_stops_the_run_and_is_set_aside(tiny_scene, tmp_path, pipeline):

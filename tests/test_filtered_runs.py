@@ -152,7 +152,7 @@ def test_files_render_as_the_run_does(finished, tiny_scene, name):
 
 def on_device(run: Run, opened: ModelFile):
     """The opened model with its tables on the run's device."""
-    model = opened.model
+    model = opened.gaussians.upload(opened.device)
     tables = {name: model.gaussians.get(name) for name in (*PARAMETERS, "filter_variance")}
     return type(model)(
         type(model.gaussians)(run.device, tables), model.degree, model.near, model.screen_variance, model.compensate
@@ -191,6 +191,7 @@ def test_files_of_other_programs_that_hold_a_filter_render_with_mip(tmp_path, rn
         data = path.read_bytes().replace(b"comment clsplat {}\n", b"")
         mode = b"" if keep_filter else b"comment SplatRenderMode: mip\n"
         path.write_bytes(data.replace(b"comment SplatRenderMode: default\n", mode))
-        model = ModelFile(path, tiny_scene, None).model
+        opened = ModelFile(path, tiny_scene, None)
+        model = opened.gaussians.upload(opened.device)
         assert (model.screen_variance, model.compensate) == (0.1, 1)
         assert model.gaussians.get("filter_variance").any() == keep_filter

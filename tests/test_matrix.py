@@ -81,7 +81,7 @@ def test_cells_in_another_number_of_steps(write):
 
 def test_steps_need_a_stage_that_trains(write):
     text = "name: s\nmatrix: {seeds: [3], steps: 700}\nstages:\n  - init: {count: 300}\n  - export\n"
-    with pytest.raises(ConfigError, match="expected a stage 'optimize'"):
+    with pytest.raises(ConfigError, match="expected a stage that trains, such as 'optimize'"):
         load_experiment(write(text))
 
 

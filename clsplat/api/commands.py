@@ -164,41 +164,6 @@ def evaluate(
     )
 
 
-def compare_runs(runs: Sequence[PathLike], out: PathLike = "compare.html") -> int:
-    """Write the page that shows runs side by side; return their number.  The folder of a matrix stands for its runs."""
-    from clsplat.compare.page import write_comparison
-    from clsplat.results import check_result
-
-    check_result(Path(out), ".html")
-    return write_comparison([Path(folder) for folder in runs], Path(out))
-
-
-def view(
-    *models: PathLike,
-    scene: PathLike | None = None,
-    out: PathLike = "viewer.html",
-    photographs: Literal["none", "test", "all"] = "test",
-    photograph_budget: float = 4.0,
-    splats: int | None = None,
-) -> Path:
-    """Write a page that shows one model, or two with one camera, in any browser and offline; return the page.
-
-    models: files or run folders; scene: whose views and photographs are in the page, by default that of a run folder;
-    photographs: of which views, up to `photograph_budget` MB; splats: only so many, the most important ones.
-    """
-    from clsplat.runs import viewing
-
-    load_plugins()
-    return viewing.view(
-        [Path(model) for model in models],
-        path_of(scene),
-        Path(out),
-        photographs=photographs,
-        photograph_budget=photograph_budget,
-        splats=splats,
-    )
-
-
 def _job(
     pipeline: PathLike,
     scene: PathLike | None,

@@ -32,8 +32,11 @@ def convert(
     file of its own: `out` is a folder, for PLY, or the name whose number is still to come.
     """
     from clsplat.gaussians import conversion, moments
+    from clsplat.runs.source import refuse_field
 
     files = [Path(source) for source in ([sources] if isinstance(sources, str | Path) else sources)]
+    for file in files:
+        refuse_field(file)
     box = crop if isinstance(crop, str) or crop is None else ",".join(map(str, crop))
     options = conversion.Options(sh_bits, axes, spz_version, quality, keep_nan)
     changes = conversion.Changes(

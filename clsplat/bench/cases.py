@@ -55,7 +55,7 @@ class Case:
     def __init__(
         self, device: Device, parameters: Parameters, photograph: Photograph, background: str, settings: PipelineFile
     ) -> None:
-        self.device, self.photograph, optimize = device, photograph, settings.training
+        self.device, self.photograph, optimize = device, photograph, settings.optimize
         self._before = device.peak = device.allocated
         gaussians = Gaussians(device, parameters)
         for name in sorted(optimize.tables):

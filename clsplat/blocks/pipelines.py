@@ -92,7 +92,7 @@ def _shared(settings: PipelineFile, share: Fraction) -> PipelineFile:
             return training
         return training.model_copy(update={"rates": training.rates.times(float(share) ** -0.5)})
 
-    return of_trainings(stretched(settings, share), changed)
+    return of_trainings(stretched(settings, share), Optimize, changed)
 
 
 def _last(pipeline: Pipeline) -> int:

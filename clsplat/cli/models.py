@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import typer
 
 from clsplat import terminal
-from clsplat.api import commands, compression, converting
+from clsplat.api import commands, compression, converting, pages
 from clsplat.cli.app import DeviceOption, ModelArgument, SceneOption, command
 from clsplat.errors import ConfigError, quoted
 from clsplat.files import is_there
@@ -95,7 +95,7 @@ def view(
     """Write a page to walk through a model, beside its photographs; it opens offline."""
     before = "replaced; " if is_there(out) else ""
     with terminal.counted():
-        page = commands.view(
+        page = pages.view(
             *models, scene=scene, out=out, photographs=photographs, photograph_budget=photograph_budget, splats=splats
         )
     terminal.remark(f"{page}: {before}{page.stat().st_size / 1e6:.1f} MB; open it in a browser")
@@ -241,7 +241,10 @@ def compare(
         list[Path], typer.Argument(metavar="RUN…", help="Run folders; that of a matrix stands for all its runs.")
     ],
     out: Annotated[Path, typer.Option(metavar="FILE", help="The page to write.")] = Path("compare.html"),
+    published: Annotated[
+        Path | None, typer.Option(metavar="FILE.yaml", help="Published figures, shown below the runs, apart from them.")
+    ] = None,
 ) -> None:
     """Show runs side by side on one page that opens offline."""
-    count = commands.compare_runs(runs, out)
+    count = pages.compare_runs(runs, out, published)
     terminal.remark(f"{count} runs compared in {out}")

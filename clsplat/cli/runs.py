@@ -169,6 +169,8 @@ def check(
         _show_examined(found, as_json)
     elif as_json:
         terminal.show_json({**found, "valid": True})
+    elif "parameters" in found:
+        terminal.show(f"{found['path']}: valid; a field of {found['parameters']:,} parameters")
     elif "cells" in found:
         terminal.show(f"{found['path']}: valid; {len(found['cells'])} cells: {', '.join(found['cells'])}")
     else:

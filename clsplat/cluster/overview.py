@@ -65,7 +65,7 @@ def _cell(folder: CellFolder, names: tuple[str, str], now: float) -> dict[str, A
 def _steps(pipeline: dict[str, Any]) -> int | None:
     """The steps of all trainings of a resolved pipeline."""
     with suppress(KeyError, TypeError, AttributeError):
-        return int(sum(stage["optimize"]["steps"] for stage in pipeline["stages"] if "optimize" in stage))
+        return int(sum(part.get("steps", 0) for stage in pipeline["stages"] for part in stage.values()))
     return None
 
 

@@ -13,12 +13,14 @@ from markupsafe import Markup
 from clsplat.compare import tables
 from clsplat.compare.comparison import Comparison, Row, Variant
 from clsplat.compare.crops import Crop, find_crops
+from clsplat.compare.published import PublishedTable
 from clsplat.compare.run_folder import Points, RunFolder
 from clsplat.compare.seams import Seams, find_seams
 from clsplat.errors import ConfigError, DataError, amount
 from clsplat.files import write_text
 from clsplat.pages.page import charts, embedded, render
 from clsplat.pages.svg import Line, curve
+from clsplat.pipeline.file import SceneSettings
 from clsplat.training.forecast import VIEWS, over_views
 
 LOG = logging.getLogger("clsplat")
@@ -63,18 +65,30 @@ class SceneSection:
     seams: SeamFigure | None = None
 
 
-def write_comparison(paths: Sequence[Path], out: Path, title: str = "", remarks: Sequence[str] = ()) -> int:
+def write_comparison(
+    paths: Sequence[Path],
+    out: Path,
+    title: str = "",
+    remarks: Sequence[str] = (),
+    published: Sequence[PublishedTable] = (),
+) -> int:
     """Write the page on some run folders; return the number of runs on it.  Raises what Comparison.read raises."""
     comparison = Comparison.read(paths)
     faults = [fault for run in comparison.runs for fault in run.missing_plugins]
     for fault in faults:
         LOG.warning("%s", fault)
     remarks = [*remarks, *faults]
-    write_text(out, comparison_page(comparison, title, remarks, out.parent))
+    write_text(out, comparison_page(comparison, title, remarks, out.parent, published))
     return len(comparison.runs)
 
 
-def comparison_page(comparison: Comparison, title: str, remarks: Sequence[str], folder: Path) -> str:
+def comparison_page(
+    comparison: Comparison,
+    title: str,
+    remarks: Sequence[str],
+    folder: Path,
+    published: Sequence[PublishedTable] = (),
+) -> str:
     """Return the page for a folder; the default title is the names of the pipelines; `remarks` are at the top."""
     runs, scenes, variants = comparison.runs, comparison.scenes, comparison.variants
     names = list(dict.fromkeys(run.metrics.pipeline for run in runs))
@@ -89,6 +103,7 @@ def comparison_page(comparison: Comparison, title: str, remarks: Sequence[str], 
         means=tables.means_over_scenes(comparison) if len(scenes) > 1 else None,
         scenes=[_section(name, rows) for name, rows in scenes.items()],
         variants=variants,
+        published=published,
         settings=tables.differing_settings(variants),
         runs=[(comparison.variant(run), str(run.path), run.metrics.seed, _links(run, folder)) for run in runs],
     )
@@ -112,7 +127,7 @@ def _section(name: str, rows: Sequence[Row]) -> SceneSection:
         name=name,
         variants=[row.variant for row in rows],
         several_seeds=several_seeds,
-        explanations=explanations + (["bold: the best"] if len(rows) > 1 else []),
+        explanations=[*_sizes(rows[0].runs[0].scene), *explanations, *(["bold: the best"] if len(rows) > 1 else [])],
         remarks=list(tables.differing_conditions(rows)),
         main=tables.main_table(rows),
         other=tables.other_table(rows),
@@ -121,6 +136,14 @@ def _section(name: str, rows: Sequence[Row]) -> SceneSection:
         no_crops=no_crops,
         seams=_seam_figure(seams, rows) if seams else None,
     )
+
+
+def _sizes(scene: SceneSettings) -> list[str]:
+    """What sizes mean, where the training did not see the photographs as they are, or saw several."""
+    first, *more = (f"1/{downscale:g}" if downscale != 1 else "full size" for downscale in scene.downscales)
+    if first == "full size" and not more:
+        return []
+    return [f"sizes are shares of the photographs' own; trained at {', '.join([first, *more])}"]
 
 
 def _curves(rows: Sequence[Row]) -> list[Markup]:
@@ -133,7 +156,7 @@ def _curves(rows: Sequence[Row]) -> list[Markup]:
             Line(points, name, row.variant.colour, i)
             for row in rows
             for i, (run, name) in enumerate(zip(row.runs, _names(row), strict=True))
-            if len(points := points_of(run)) > 1
+            if len(dict(points := points_of(run))) > 1  # steps: one is no line
         ]
 
     def tested(run: RunFolder) -> Points:

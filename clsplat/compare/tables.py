@@ -134,7 +134,8 @@ def _group(rows: Sequence[Row], split: str, downscale: str) -> Group:
         for name, (heading, digits, best) in METRICS.items()
         if any(row.figures(split, downscale, name) for row in rows)
     ]
-    return Group(f"{split} views" + ("" if downscale == "1" else f" at 1/{downscale}"), columns)
+    size = "full size" if downscale == "1" else f"1/{downscale}"
+    return Group(f"{split} views" + ("" if downscale == rows[0].downscale == "1" else f" at {size}"), columns)
 
 
 def _table(rows: Sequence[Row], groups: list[Group]) -> Table:

@@ -94,7 +94,7 @@ def compress(
     if form not in get_args(Format):
         raise ConfigError(f"--format {quoted(form)}: expected one of {', '.join(get_args(Format))}")
     opened = ModelFile(model, scene, device)
-    source, first, measurer = opened.source, opened.loaded, Measurer(opened)
+    source, first, measurer = opened.source, opened.gaussians, Measurer(opened)
     require_still(source.file, first.as_file(), form)
     question: dict[str, Any] = {"model": str(source.file), "sha256": sha256(located(source.file))}
     question |= {"scene": str(source.folder), "photographs": measurer.identity(), "keeps": shares, "steps": steps}

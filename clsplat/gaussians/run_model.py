@@ -18,11 +18,16 @@ def model_at(path: Path) -> Path:
 
 def model_of_run(folder: Path) -> Path:
     """Return the model file of a run folder: the last export, as its metrics.json names it."""
+    return file_of_run(folder, "export", MODEL)
+
+
+def file_of_run(folder: Path, stage: str, default: str) -> Path:
+    """Return the file of the last stage of a name, as metrics.json of a run folder has it, else the default one."""
     try:
-        name = read_json(folder / METRICS)["files"]["export"]
+        name = read_json(folder / METRICS)["files"][stage]
     except (DataError, KeyError, TypeError):  # not finished, or of an earlier version
-        name = MODEL
-    return folder / (name if isinstance(name, str) and is_inside(name) else MODEL)
+        name = default
+    return folder / (name if isinstance(name, str) and is_inside(name) else default)
 
 
 def as_trained(file: Path) -> Path:

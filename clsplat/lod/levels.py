@@ -75,7 +75,7 @@ def _opened(model: Path, scene: Path | None, plan: Plan, device: Any) -> tuple[M
         alone = _alone(model, plan, device, "its photographs cannot be read")
         LOG.warning("%s; levels are merged alone, and not measured", fault)
         return None, alone
-    return opened, opened.loaded.baked()
+    return opened, opened.gaussians.baked()
 
 
 def _alone(model: Path, plan: Plan, device: Any, why: str) -> Model:

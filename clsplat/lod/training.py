@@ -61,7 +61,7 @@ class Training:
         self.place, self.plan, self.source = place, plan, opened.source
         self.steps = STEPS if plan.steps is None else plan.steps
         self.measurer = Measurer(opened)
-        self.tuning = Tuning("lod", opened.source, opened.loaded, self.steps, opened.device)
+        self.tuning = Tuning("lod", opened.source, opened.gaussians, self.steps, opened.device)
 
     def held(self) -> AbstractContextManager[None]:
         """Hold the folder of the training in a block, where anything is trained."""

@@ -28,6 +28,7 @@ from clsplat.scene.split import Split
 from clsplat.settings import OneOf, ReadPath, Settings
 from clsplat.stages.base import Stage
 from clsplat.stages.optimize import Optimize
+from clsplat.stages.training import Training
 
 
 class SceneSettings(Settings):
@@ -146,8 +147,16 @@ class PipelineFile(Settings):
     """Plug-ins of the run: name and sha256.  A run writes them, and a resumed run requires them."""
 
     @property
-    def training(self) -> Optimize:
+    def training(self) -> Training:
         """The first stage that trains.  Raises ConfigError when none does."""
+        for stage in self.stages:
+            if isinstance(stage, Training):
+                return stage
+        raise ConfigError(f"{self.name}: expected a stage that trains, such as 'optimize'")
+
+    @property
+    def optimize(self) -> Optimize:
+        """The first stage that trains Gaussians.  Raises ConfigError when none does."""
         for stage in self.stages:
             if isinstance(stage, Optimize):
                 return stage

@@ -16,8 +16,10 @@ from clsplat.settings import Settings
 from clsplat.stages.base import Scheduled
 from clsplat.stages.densify import Densify
 from clsplat.stages.optimize import Optimize
+from clsplat.stages.training import Training
 
 Value = TypeVar("Value")
+Kind = TypeVar("Kind", bound=Training)
 MOST = 2**63 - 1  # that a file can hold
 
 
@@ -25,21 +27,21 @@ def with_steps(settings: PipelineFile, steps: int, done: int) -> PipelineFile:
     """Return settings whose training has so many steps, of which those that are done are the same; stages that have not
     begun do so at the same share of the others."""
 
-    def changed(training: Optimize) -> Optimize:
+    def changed(training: Training) -> Training:
         left = (steps - done) / (training.steps - done)
         during = [_moved(stage, done, left) for stage in training.during]
         return training.model_copy(update={"steps": steps, "during": during})
 
-    return of_trainings(settings, changed)
+    return of_trainings(settings, Training, changed)
 
 
-def last_edit(training: Optimize) -> int:
+def last_edit(training: Training) -> int:
     """Return the step up to which Gaussians grow and the photographs' size changes; 0 where that is not said.
 
     One that is cut before would end with small photographs, or before its last pruning.
     """
     stops = [stage.stop for stage in training.during if isinstance(stage, Densify) and stage.stop is not None]
-    return max([*stops, int(training.views.last_change)])
+    return max([0, *stops, *([int(training.views.last_change)] if isinstance(training, Optimize) else [])])
 
 
 def in_steps(settings: PipelineFile, steps: int) -> PipelineFile:
@@ -57,9 +59,9 @@ def _moved(stage: Scheduled, done: int, left: float) -> Scheduled:
     return stage.model_copy(update={"every": every, "start": start, "stop": stop})
 
 
-def of_trainings(settings: PipelineFile, changed: Callable[[Optimize], Optimize]) -> PipelineFile:
-    """Return settings with other trainings."""
-    stages = [changed(stage) if isinstance(stage, Optimize) else stage for stage in settings.stages]
+def of_trainings(settings: PipelineFile, kind: type[Kind], changed: Callable[[Kind], Kind]) -> PipelineFile:
+    """Return settings with other trainings of a kind."""
+    stages = [changed(stage) if isinstance(stage, kind) else stage for stage in settings.stages]
     return settings.model_copy(update={"stages": stages})
 
 

@@ -6,6 +6,7 @@ from typing import Protocol
 from clsplat.gaussians.tables import DeviceModel
 from clsplat.opencl.device import Array
 from clsplat.render.camera import DeviceCamera
+from clsplat.render.pictures import Layers, layers
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.render.workspace import Workspace
 
@@ -19,6 +20,9 @@ class Painter(Protocol):
 
     def paint(self, camera: DeviceCamera) -> Array:
         """Return the picture, [3, rows, stride], not clamped; it is valid until the next."""
+
+    def layers(self, camera: DeviceCamera, depth: bool = False) -> Layers:
+        """Return the picture on the host, with coverage, and with depth where that is asked for."""
 
 
 @dataclass(frozen=True)
@@ -35,3 +39,6 @@ class Splats:
 
     def paint(self, camera: DeviceCamera) -> Array:
         return self.rasterizer.forward(self.model, camera, self.background).image
+
+    def layers(self, camera: DeviceCamera, depth: bool = False) -> Layers:
+        return layers(self.rasterizer, self.model, camera, self.background, depth)

@@ -18,7 +18,7 @@ class Layers:
     """A rendered view, layer by layer."""
 
     image: Floats  # [height, width, 3], background included
-    alpha: Floats  # [height, width] in [0, 1], how much of a pixel the Gaussians cover
+    alpha: Floats  # [height, width] in [0, 1], how much of a pixel the model covers
     depth: Floats | None  # [height, width] scene units, mean depth of what covers a pixel; 0 where nothing does
 
     @property

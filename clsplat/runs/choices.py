@@ -60,7 +60,7 @@ def _with_colours(pipeline: Pipeline, run: Run) -> Pipeline:
         LOG.info("optimize.colours: %s, since %s", colours.chosen, colours.reason)
         return training.model_copy(update={"colours": colours})
 
-    return replace(pipeline, settings=_with_sky(of_trainings(pipeline.settings, chosen), run))
+    return replace(pipeline, settings=_with_sky(of_trainings(pipeline.settings, Optimize, chosen), run))
 
 
 def _with_sky(settings: PipelineFile, run: Run) -> PipelineFile:

@@ -26,6 +26,7 @@ from clsplat.scene.images import image_size
 from clsplat.scene.scene import every_nth
 from clsplat.stages.densify import Densify
 from clsplat.stages.optimize import Optimize
+from clsplat.stages.train_field import TrainField
 from clsplat.training.run import Run
 from data_tools.gather import link, list_photographs
 
@@ -71,6 +72,8 @@ def expected(pipeline: Pipeline, planned: Sequence[Planned], out: Path, device: 
     if (capture := _capture(pipeline, planned, names, run)) is not None:
         settings = choose(pipeline.settings, {"photographs": capture.training}) if run is None else pipeline.settings
         parts += [_of_training(training, settings, capture, device) for training in _trainings(settings)]
+    if run is not None:
+        parts += [_of_field(one, run) for one in pipeline.settings.stages if isinstance(one, TrainField)]
     if not parts:
         return []
     low, high = (sum(one.seconds[end] for one in parts) for end in (0, 1))
@@ -168,6 +171,13 @@ def _of_training(training: Optimize, settings: PipelineFile, capture: Capture, d
     times, size = _range(*(f"{1e3 * one:.0f}" for one in each)), "{}x{}".format(*capture.size)
     why = f"{of_steps} steps of {times} ms, with {of_counts} Gaussians at {size} px; how many grow is a guess"
     return Expected(training.stage, (steps[0] * each[0], steps[1] * each[1]), why)
+
+
+def _of_field(training: TrainField, run: Run) -> Expected:
+    """A training of a field, whose steps all take the same time."""
+    each = training.time_of_step(run)
+    why = f"{training.steps:,} steps of {1e3 * each:.0f} ms, of {training.rays:,} rays"
+    return Expected(training.stage, (training.steps * each, training.steps * each), why)
 
 
 def _densest(training: Optimize) -> float:

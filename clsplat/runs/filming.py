@@ -9,11 +9,10 @@ from typing import Any
 
 from clsplat.conformance.quick import open_correct
 from clsplat.errors import ConfigError, DataError
-from clsplat.gaussians.model import Model, load
 from clsplat.opencl.device import Device
 from clsplat.progress import counted
-from clsplat.render.rasterizer import Rasterizer
 from clsplat.runs.found import has_pipeline
+from clsplat.runs.loaded import Loaded, moves, painter_of, points_of, read
 from clsplat.runs.pictures import KINDS, write_pictures
 from clsplat.runs.source import Source
 from clsplat.scene.photographs import load_photograph
@@ -23,7 +22,7 @@ from clsplat.video import camera_path
 from clsplat.video.film import Film, Side, Wish, check_path_file, files, plan, shoot
 from clsplat.video.paths import nearest
 from clsplat.video.pictures import Canvas, Image, letterboxed
-from clsplat.views.photographs import BACKGROUNDS, Photographs
+from clsplat.views.photographs import BACKGROUNDS
 
 LOG = logging.getLogger("clsplat")
 PHOTOGRAPH = "photograph"  # what can stand beside a picture; else a model
@@ -71,14 +70,14 @@ def film(
         check_path_file(extras.save_path)
     if extras.side and not videos:
         raise ConfigError("--side needs --video: pictures of a folder stand alone")
-    loaded = load(model)
+    loaded = _read(model, scene)
     found = _scene(model, scene, loaded, downscale, needed=not wish.of_a_file or extras.side == PHOTOGRAPH)
-    made = plan(wish, found, loaded.means, moves=loaded.motion is not None)
+    made = plan(wish, found, points_of(loaded, found), moves=moves(loaded))
     if extras.save_path:
         camera_path.write(extras.save_path, made.views, made.fps)
     background = loaded.rendering.background or (found.background if found else "black")
     opened = open_correct(device)
-    canvas = _canvas(loaded, opened, background)
+    canvas = Canvas(painter_of(loaded, opened, background))
     if not videos:
         taken = [view.image_path for view in found.views] if found else []
         written = write_pictures(canvas, made.views, place.out, place.kind, extras.layers, taken, film=True)
@@ -96,7 +95,12 @@ def film(
     }
 
 
-def _scene(model: Path, scene: Path | None, loaded: Model, downscale: float | None, needed: bool) -> Scene | None:
+def _read(model: Path, scene: Path | None) -> Loaded:
+    """What a model file or a run folder holds."""
+    return read(Source.of(model, scene).file if model.is_dir() and has_pipeline(model) else model)
+
+
+def _scene(model: Path, scene: Path | None, loaded: Loaded, downscale: float | None, needed: bool) -> Scene | None:
     """The scene of a model at the size of its run; None where none is known and none is needed."""
     if not needed and scene is None and not has_pipeline(model):
         return None
@@ -110,17 +114,13 @@ def _scene(model: Path, scene: Path | None, loaded: Model, downscale: float | No
     return source.scene(loaded).downscaled(source.settings.downscale if downscale is None else downscale)
 
 
-def _canvas(model: Model, device: Device, background: Background) -> Canvas:
-    return Canvas(Rasterizer(device), model.upload(device), Photographs(device, background).background)
-
-
 def _side(name: str | None, made: Film, scene: Scene | None, background: Background, device: Device) -> Side | None:
     """What stands beside a picture: the photograph whose camera is nearest, or another model."""
     if name is None:
         return None
     if name != PHOTOGRAPH:
-        other = load(Path(name))
-        return _canvas(other, device, other.rendering.background or background).picture
+        other = _read(Path(name), None)
+        return Canvas(painter_of(other, device, other.rendering.background or background)).picture
     assert scene is not None
     taken, reach = [view for view in scene.views if view.image_path != NO_FILE], scene.extent
     if not taken:

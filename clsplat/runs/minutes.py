@@ -10,7 +10,6 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from statistics import fmean
 from typing import Any
 
 from clsplat.errors import ConfigError, Interrupted
@@ -19,56 +18,28 @@ from clsplat.pipeline.file import PipelineFile
 from clsplat.pipeline.loading import Pipeline
 from clsplat.pipeline.stretching import last_edit, of_trainings, stretched, with_steps
 from clsplat.runs.folders import Start
+from clsplat.runs.rehearsal import Rehearsal, most_steps, predicted
 from clsplat.runs.runner import run_stages, write_pipeline
 from clsplat.signals import stop_if_signalled
-from clsplat.stages.optimize import Optimize
+from clsplat.stages.keeping import Keeping
+from clsplat.stages.training import Training
 from clsplat.training.run import Progress, Run
 from clsplat.training.status import StatusFile
 
 LOG = logging.getLogger("clsplat")
-FIRST = 200  # steps of the first rehearsal
+FIRST = 200  # steps of the first rehearsal at most; a training says how many of its own are enough
 LONGER = 3  # times the steps of one before
 SHARE = 0.03  # of the time: rehearsals that took less are followed by a longer one
 REPORTS = 20  # of a rehearsal; each gives the median time of its steps, without what is done once
-TREND = 0.5  # steepest power of the number of steps that the time of one is taken to follow
-EARLY, SOON = 0.25, 0.6  # shares of the training between which it is corrected, where growth ends
-TWICE = 0.4, 0.8  # where growth ends later
 
 Show = Callable[[Progress], None]
 Execute = Callable[[Pipeline, Run, Start, Show], None]
 
 
-@dataclass(frozen=True)
-class Rehearsal:
-    """What a pipeline took in few steps."""
-
-    steps: int
-    course: Sequence[float]  # s, a training step, in each of equal parts of the training
-    during: float  # s, of edits and measurements of the training: the same in any number of steps
-    after: float  # s, of what follows the training
-    growth: float  # the share of the steps after which no Gaussian grew
-
-    @property
-    def known(self) -> Sequence[float]:
-        """The shares of the training at which the number of steps is corrected: where growth ends, if that is soon."""
-        return [max(EARLY, self.growth)] if self.growth <= SOON else TWICE
-
-    @property
-    def step(self) -> float:
-        """The mean time of a step, s."""
-        return fmean(self.course)
-
-    def later(self, share: float) -> tuple[float, float]:
-        """How many times as long as at a share of the training steps take after it, in the mean and at the end."""
-        place = min(int(share * len(self.course)), len(self.course) - 1)
-        after = self.course[place + 1 :] or self.course[-1:]
-        return fmean(after) / self.course[place], self.course[-1] / self.course[place]
-
-
 def execute_within(minutes: float, pipeline: Pipeline, run: Run, start: Start, show: Show, execute: Execute) -> None:
     """Execute the pipeline in as many steps as take `minutes`, with their rehearsal.
 
-    Raises ConfigError where not exactly one stage trains, or FIRST steps take longer, and what `execute` raises.
+    Raises ConfigError where not exactly one stage trains, or its fewest steps take longer, and what `execute` raises.
     """
     until = time.perf_counter() + 60 * minutes
     rehearsals = rehearsals_of(pipeline, run, minutes)
@@ -132,23 +103,29 @@ def rehearsals_of(pipeline: Pipeline, run: Run, minutes: float) -> list[Rehearsa
 
     Raises ConfigError where not exactly one stage trains.
     """
-    trains = sum(isinstance(stage, Optimize) for stage in pipeline.stages)
+    trains = sum(isinstance(stage, Training) for stage in pipeline.stages)
     if trains != 1:
         raise ConfigError(f"{pipeline.path}: --minutes: expected one stage that trains, found {trains}; leave it out")
-    if pipeline.settings.training.refit:
+    training = pipeline.settings.training
+    if isinstance(training, Keeping) and training.refit:
         made = [f", chosen by {one.reason}" for one in pipeline.settings.choices if "optimize.refit" in one.keys]
         told = f"a refit trains twice, for nobody knows how long{''.join(made)}; add --set optimize.refit=false"
         raise ConfigError(f"{pipeline.path}: --minutes: {told} to train once, or leave --minutes out")
-    steps, found, took = pipeline.settings.training.steps, list[Rehearsal](), 0.0
+    first, found, took = fewest(training), list[Rehearsal](), 0.0
     until = time.perf_counter() + 60 * minutes
     run.status.note(seconds_left=None)
     with run.status.stage("rehearse"):
         while took < SHARE * 60 * minutes:
-            number, began = FIRST * LONGER ** len(found), time.perf_counter()
+            number, began = first * LONGER ** len(found), time.perf_counter()
             LOG.info("--minutes %g: %s is rehearsed in %d steps", minutes, pipeline.settings.name, number)
-            found.append(rehearse(pipeline, run, number / steps, until))
+            found.append(rehearse(pipeline, run, number / training.steps, until))
             took = time.perf_counter() - began
     return found
+
+
+def fewest(training: Training) -> int:
+    """Return the steps of its first rehearsal, and the fewest that it is cut to."""
+    return min(FIRST, training.rehearsed)
 
 
 def rehearse(pipeline: Pipeline, run: Run, factor: float, until: float) -> Rehearsal:
@@ -174,7 +151,7 @@ def rehearse(pipeline: Pipeline, run: Run, factor: float, until: float) -> Rehea
         start = time.perf_counter()
         run_stages(short, one)
         end = time.perf_counter()
-        during = trained - start - one.status.seconds["optimize"]
+        during = trained - start - one.status.seconds[pipeline.settings.training.stage]
         course = [line["ms"] / 1e3 for line in one.records.read("train")]
         growth = [line["step"] for line in one.records.read("densify") if any(line["grown"].values())]
         return Rehearsal(one.step, course, max(0.0, during), end - trained, max(growth, default=0) / one.step)
@@ -183,44 +160,18 @@ def rehearse(pipeline: Pipeline, run: Run, factor: float, until: float) -> Rehea
 def pipeline_for(pipeline: Pipeline, rehearsals: Sequence[Rehearsal], seconds: float, minutes: float) -> Pipeline:
     """Return the pipeline in as many steps as are predicted to take so many seconds.
 
-    Raises ConfigError where those are fewer than FIRST.
+    Raises ConfigError where those are fewer than the training may have.
     """
-    steps = pipeline.settings.training.steps
+    steps, first = pipeline.settings.training.steps, fewest(pipeline.settings.training)
     number = most_steps(rehearsals, seconds)
-    if number < FIRST:
-        least = minutes + (predicted(rehearsals, FIRST) - seconds) / 60
+    if number < first:
+        least = minutes + (predicted(rehearsals, first) - seconds) / 60
         expected = f"expected {math.ceil(10 * least) / 10:g} or more for this scene on this device"
         raise ConfigError(f"--minutes {minutes:g}: {expected}, or a pipeline that does less")
     told = f"{number:,} steps in the place of {steps:,}, which take about {seconds / 60:.1f} minutes more"
     reason = f"--minutes {minutes:g}: {told}, by a rehearsal in {rehearsals[-1].steps:,} steps"
     LOG.info("%s", reason)
     return replace(pipeline, settings=_reporting(stretched(pipeline.settings, number / steps)), reason=reason)
-
-
-def predicted(rehearsals: Sequence[Rehearsal], steps: int) -> float:
-    """Return the time of a number of steps, in s, from rehearsals in growing numbers of steps.
-
-    The time of a step is a power of their number, as the last two rehearsals have it: a model that trains longer has
-    more Gaussians, and smaller ones.
-    """
-    *_, last = rehearsals
-    power = 0.0
-    if len(rehearsals) > 1:
-        before = rehearsals[-2]
-        power = math.log(last.step / before.step) / math.log(last.steps / before.steps)
-        power = min(max(power, -TREND), TREND)
-    return last.during + last.after + steps * last.step * math.pow(steps / last.steps, power)
-
-
-def most_steps(rehearsals: Sequence[Rehearsal], seconds: float) -> int:
-    """Return the largest number of steps that are predicted to take no longer than `seconds`; 0 where none is."""
-    low, high = 0, FIRST
-    while predicted(rehearsals, high) <= seconds:
-        low, high = high, 2 * high
-    while high - low > 1:
-        middle = (low + high) // 2
-        low, high = (middle, high) if predicted(rehearsals, middle) <= seconds else (low, middle)
-    return low
 
 
 def new_run(run: Run, pipeline: Pipeline, **changes: Any) -> Run:
@@ -232,10 +183,10 @@ def new_run(run: Run, pipeline: Pipeline, **changes: Any) -> Run:
 def _reporting(settings: PipelineFile) -> PipelineFile:
     """With REPORTS reports of each training, or more: one is needed soon after each share at which it is corrected."""
 
-    def reporting(training: Optimize) -> Optimize:
+    def reporting(training: Training) -> Training:
         return training.model_copy(update={"log_every": min(training.log_every, -(-training.steps // REPORTS))})
 
-    return of_trainings(settings, reporting)
+    return of_trainings(settings, Training, reporting)
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""A model at the views of a scene: rendering and measuring without training."""
+"""A model, or a field, at the views of a scene: rendering and measuring without training."""
 
 import math
 from collections.abc import Sequence
@@ -9,18 +9,18 @@ from typing import Any
 
 from clsplat.conformance.quick import open_correct
 from clsplat.errors import ConfigError, DataError
-from clsplat.gaussians.model import load
-from clsplat.gaussians.tables import DeviceModel
+from clsplat.gaussians.model import Model
 from clsplat.metrics.lpips import InputRange
 from clsplat.metrics.perceptual import Perceptual, metric_names
 from clsplat.metrics.views import PSNR_AND_SSIM, mean, measure
 from clsplat.opencl.device import Device
-from clsplat.render.painter import Splats
-from clsplat.render.rasterizer import Rasterizer
+from clsplat.render.painter import Painter
+from clsplat.runs.loaded import moves, painter_of, read, size_of
 from clsplat.runs.pictures import KINDS, write_pictures
-from clsplat.runs.source import Source
+from clsplat.runs.source import Source, of_a_field
 from clsplat.scene.view import View
 from clsplat.training.colours import colours_beside
+from clsplat.training.field_file import FieldModel
 from clsplat.training.poses import poses_beside
 from clsplat.video.moments import require_motion, times_of
 from clsplat.video.pictures import LAYERS, Canvas
@@ -41,20 +41,26 @@ class ModelFile:
     ) -> None:
         """downscale: divisor of the photographs' size; default: that of the run, 1 for a file."""
         self.source = Source.of(model, scene)
-        self.loaded = load(self.source.file)
+        self.loaded = read(self.source.file)
         self.device = open_correct(device)
         found = self.source.scene(self.loaded)
         self.photographs = poses_beside(self.source.file, found) if scene is None else found
         self.downscale = self.source.settings.downscale if downscale is None else downscale
         self.scene = self.photographs.downscaled(self.downscale)
         self.background = self.loaded.rendering.background or self.scene.background
-        self.rasterizer = Rasterizer(self.device)
         self.colours = colours_beside(self.source.file)
 
+    @property
+    def gaussians(self) -> Model:
+        """The model.  Raises DataError where it is a field."""
+        if isinstance(self.loaded, FieldModel):
+            raise of_a_field(self.source.file)
+        return self.loaded
+
     @cached_property
-    def model(self) -> DeviceModel:
-        """The model on the device."""
-        return self.loaded.upload(self.device)
+    def painter(self) -> Painter:
+        """What renders it on the device."""
+        return painter_of(self.loaded, self.device, self.background)
 
     def render(
         self, split: str, out: Path, kind: str, layers: Sequence[str] = LAYERS[:1], time: float | None = None
@@ -65,14 +71,12 @@ class ModelFile:
         """
         views: Sequence[View] = self.scene.split(split)
         if times := times_of(time):
-            require_motion(self.loaded.motion is not None)
+            require_motion(moves(self.loaded))
             views = [replace(view, time=times[0]) for view in views]
         if not views:
             raise DataError(f"{self.scene.path}: has no {split} views")
-        background = Photographs(self.device, self.background).background
         images = [view.image_path for split in ("train", "test") for view in self.photographs.split(split)]
-        canvas = Canvas(self.rasterizer, self.model, background)
-        return len(write_pictures(canvas, views, out, kind, layers, images))
+        return len(write_pictures(Canvas(self.painter), views, out, kind, layers, images))
 
     def evaluate(
         self, downscales: Sequence[float] | None = None, perceptual: Perceptual = PSNR_AND_SSIM
@@ -85,10 +89,9 @@ class ModelFile:
             for split in ("test", "train"):
                 if scene.split(split):
                     views = scene.split(split)
-                    painter = Splats(self.rasterizer, self.model, photographs.background)
-                    results = measure(painter, views, photographs, perceptual, finite=True, colours=self.colours)
+                    results = measure(self.painter, views, photographs, perceptual, finite=True, colours=self.colours)
                     metrics[split][f"{downscale:g}"] = mean(results, perceptual)
-        return {**metrics, "gaussians": self.model.gaussians.count, "device": self.device.text}
+        return {**metrics, **size_of(self.loaded), "device": self.device.text}
 
 
 def render(

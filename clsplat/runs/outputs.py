@@ -21,7 +21,8 @@ from clsplat.training.run import Run
 
 def write_metrics(pipeline: Pipeline, run: Run) -> None:
     """Write what the run has come to, and where its files are: of each kind of stage that of the last."""
-    spent = {**run.status.seconds, "optimize": run.train_seconds}  # of this process, but training of all
+    trained = next((stage.stage for stage in reversed(pipeline.stages) if isinstance(stage, Training)), "optimize")
+    spent = {**run.status.seconds, trained: run.train_seconds}  # of this process, but training of all
     files = {stage.stage: path for stage in pipeline.stages for path in stage.outputs(run.out)[:1]}
     metrics = {
         "test": run.metrics.get("test", {}),

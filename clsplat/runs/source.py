@@ -22,6 +22,8 @@ from clsplat.scene.detect import read_scene
 from clsplat.scene.images import is_image
 from clsplat.scene.scene import Alpha, Scene
 from clsplat.stages.export import Export
+from clsplat.stages.export_field import ExportField
+from clsplat.training.field_file import FieldModel, field_of_run, is_field
 
 
 @dataclass(frozen=True)
@@ -52,7 +54,7 @@ class Source:
                 f"{model}: a model file does not name its scene; give the folder of a scene, or a run folder"
             )
         settings = load(str(trained / PIPELINE)).settings.scene if trained is not None else SceneSettings()
-        file = model_of_run(model) if run == model else model
+        file = _shown_of_run(model) if run == model else model
         if run == model and not file.is_file():
             raise _no_model(model, file.name)
         given = scene if scene is not None else run or model
@@ -60,13 +62,14 @@ class Source:
         name = scene_name(settings.path if settings.path and has_pipeline(given) else folder)
         return cls(file, folder, settings, name, settings.alpha)
 
-    def scene(self, model: Model) -> Scene:
+    def scene(self, model: Model | FieldModel) -> Scene:
         """Read the photographs as the model was trained on, at their full size."""
         return read_scene(self.folder, self.settings.split).with_alpha(self.alpha or model.rendering.alpha)
 
 
 def require_model(path: Path) -> None:
-    """Raise DataError for a folder that holds no model."""
+    """Raise DataError for a folder that holds no Gaussians, and for the file of a field."""
+    refuse_field(path)
     if path.is_dir() and not (file := model_at(path)).is_file():
         raise _no_model(path, file.name)
 
@@ -74,14 +77,31 @@ def require_model(path: Path) -> None:
 def _no_model(folder: Path, name: str = MODEL) -> DataError:
     """The error of a folder without a model, with the remedy for what it is."""
     if _has_field(folder):
-        shown = "its own stages `evaluate` and `render` show it"
-        return DataError(f"{folder}: is the run of a field, which no model file holds; expected Gaussians: {shown}")
+        return DataError(f"{folder}: has no file of its field; run its pipeline again with the stage export_field")
     if has_pipeline(folder):
         return DataError(f"{folder}: has no {name}; finish the run with `clsplat resume {folder}`")
     fault = f"{folder}: has no {PIPELINE}; expected a model file or a run folder"
     if any(map(is_image, chain(folder.glob("*"), folder.glob("images/*")))):
         return DataError(f"{fault}; for a model of its photographs, run `clsplat run photos --scene {folder}` first")
     return DataError(fault)
+
+
+def refuse_field(path: Path) -> None:
+    """Raise DataError for the file of a field, and for a run that has trained one."""
+    if is_field(path) or (has_pipeline(path) and _has_field(path) and not model_of_run(path).is_file()):
+        raise of_a_field(path)
+
+
+def of_a_field(path: Path) -> DataError:
+    """The error of a field where Gaussians are expected."""
+    shown = "`clsplat render` makes pictures of it where a stage export_field has written it, with --video a film"
+    return DataError(f"{path}: is a field, a network in the place of Gaussians; expected Gaussians: {shown}")
+
+
+def _shown_of_run(run: Path) -> Path:
+    """The file of what a run has trained: Gaussians, or a field."""
+    file = model_of_run(run)
+    return file if file.is_file() or not _has_field(run) else field_of_run(run)
 
 
 def _has_field(run: Path) -> bool:
@@ -118,9 +138,9 @@ def photographs_of(scene: Path) -> Path:
     return folder
 
 
-def _exports(pipeline: Pipeline) -> list[Export]:
+def _exports(pipeline: Pipeline) -> list[Export | ExportField]:
     stages = [part for stage in pipeline.stages for part in (stage, *getattr(stage, "during", ()))]
-    return [stage for stage in stages if isinstance(stage, Export)]
+    return [stage for stage in stages if isinstance(stage, Export | ExportField)]
 
 
 def overrides_of(overrides: Sequence[str], scene: Path | None) -> list[str]:

@@ -45,7 +45,7 @@ class Init(Stage):
 
     stage: Literal["init"] = "init"
     makes: ClassVar[frozenset[str]] = frozenset({"model", "painter"})
-    takes: ClassVar[frozenset[str]] = frozenset({"average", "palette"})
+    takes: ClassVar[frozenset[str]] = frozenset({"average", "palette", "field"})
     edits: ClassVar[bool] = True
 
     source: Literal["auto", "points", "sweep", "hull", "random", "model", "ply"] = "auto"

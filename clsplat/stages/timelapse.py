@@ -30,7 +30,7 @@ class Snapshot(Scheduled):
     """
 
     stage: Literal["snapshot"] = "snapshot"
-    needs: ClassVar[frozenset[str]] = frozenset({"model"})
+    needs: ClassVar[frozenset[str]] = frozenset({"painter"})
     makes: ClassVar[frozenset[str]] = frozenset({"snapshots"})
     output_keys: ClassVar[frozenset[str]] = CADENCE | {"view", "size", "folder"}
 
@@ -63,7 +63,7 @@ class Snapshot(Scheduled):
     def run(self, run: Run) -> None:
         view = still(self._view(run), checked_size(self.size) if self.size else None)
         path = run.out / self.folder / f"step_{run.step:06d}.png"
-        write_image(path, Canvas(run.rasterizer, run.model, run.photographs.background).picture(view))
+        write_image(path, Canvas(run.painter()).picture(view))
         run.records.add(run.step, KIND, folder=self.folder, file=path.name)
 
 
@@ -71,7 +71,7 @@ class Timelapse(Stage):
     """Make a video of the pictures that a stage `snapshot` has written during training."""
 
     stage: Literal["timelapse"] = "timelapse"
-    needs: ClassVar[frozenset[str]] = frozenset({"model", "snapshots"})
+    needs: ClassVar[frozenset[str]] = frozenset({"painter", "snapshots"})
     output_keys: ClassVar[frozenset[str]] = frozenset({"folder", "file", "fps"})
 
     folder: str = FOLDER

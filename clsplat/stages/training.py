@@ -20,6 +20,7 @@ class Training(Stage):
     training_keys: ClassVar[frozenset[str]] = frozenset({"steps"})
     step_keys: ClassVar[frozenset[str]] = frozenset({"steps"})
     output_keys: ClassVar[frozenset[str]] = frozenset({"log_every"})
+    rehearsed: ClassVar[int] = 200  # steps that tell what one takes; no time is so short that fewer are trained
 
     steps: Annotated[int, Field(gt=0)]
     """Number of training steps."""

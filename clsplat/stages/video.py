@@ -5,6 +5,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
 from clsplat.progress import counted, heard_by
@@ -26,7 +28,7 @@ class Video(Stage):
     """Film the model along a camera path: about the scene (ellipse, orbit, spiral) or along the photographs."""
 
     stage: Literal["video"] = "video"
-    needs: ClassVar[frozenset[str]] = frozenset({"model"})
+    needs: ClassVar[frozenset[str]] = frozenset({"painter"})
     output_keys: ClassVar[frozenset[str]] = frozenset({"path", "frames", "fps", "size", "times", "file"})
 
     path: ReadPath = "ellipse"
@@ -54,8 +56,8 @@ class Video(Stage):
         return Wish.of(self.path, self.frames, self.fps, self.size, self.times)
 
     def _plan(self, run: Run) -> Film:
-        gaussians = run.model.gaussians
-        return plan(self._wish(), run.scene.downscaled(run.downscale), gaussians.get("means"), gaussians.moves)
+        moves = run.gaussians is not None and run.model.gaussians.moves
+        return plan(self._wish(), run.scene.downscaled(run.downscale), _points(run), moves)
 
     def check(self) -> None:
         self._wish()
@@ -67,10 +69,17 @@ class Video(Stage):
         def through(views: Sequence[View]) -> Iterator[View]:
             return counted(run.until_interrupted(views), "frames rendered", len(views))
 
-        canvas = Canvas(run.rasterizer, run.model, run.photographs.background)
+        canvas = Canvas(run.painter())
         with heard_by(run.status.count):
             shoot(canvas, film, {"colour": path}, None, through)
         LOG.info("video of %d frames written to %s, %.2f MB", len(film.views), path, path.stat().st_size / 1e6)
 
     def verify(self, run: Run) -> None:
         verify_video(run.out / self.file, len(self._plan(run).views))
+
+
+def _points(run: Run) -> NDArray[np.float32]:
+    """Where something is, [M, 3]: the means of the Gaussians; for a field the scene's points, if it has any."""
+    if run.gaussians is not None:
+        return run.model.gaussians.get("means")
+    return run.scene.points.positions if run.scene.points else np.zeros((0, 3), np.float32)

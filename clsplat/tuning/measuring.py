@@ -5,6 +5,7 @@ import logging
 from clsplat.gaussians.model import Model
 from clsplat.metrics.views import mean, measure
 from clsplat.render.painter import Splats
+from clsplat.render.rasterizer import Rasterizer
 from clsplat.runs.model_file import ModelFile
 from clsplat.scene.decoding import decode_all, require_whole
 from clsplat.scene.identity import Identity
@@ -24,6 +25,7 @@ class Measurer:
                 "%s: has no test views; the training views are measured; scene.holdout keeps some for it",
                 opened.scene.path,
             )
+        self.rasterizer = Rasterizer(opened.device)
         self.photographs = Photographs(opened.device, opened.background)
 
     def identity(self) -> str:
@@ -36,8 +38,7 @@ class Measurer:
     def figures(self, model: Model) -> tuple[float, float]:
         """Return PSNR, dB, and SSIM."""
         views = self.opened.scene.split(self.split)
-        parts = self.opened.rasterizer, model.upload(self.opened.device), self.photographs.background
-        painter = Splats(*parts)
+        painter = Splats(self.rasterizer, model.upload(self.opened.device), self.photographs.background)
         results = measure(painter, views, self.photographs)
         averages = mean(results)
         return averages["psnr"], averages["ssim"]

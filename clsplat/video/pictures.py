@@ -7,13 +7,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.gaussians.tables import DeviceModel
 from clsplat.metrics.images import to_8_bits
 from clsplat.metrics.views import require_finite
-from clsplat.opencl.device import Array
 from clsplat.render.camera import upload_camera
-from clsplat.render.pictures import Layers, layers
-from clsplat.render.rasterizer import Rasterizer
+from clsplat.render.painter import Painter
+from clsplat.render.pictures import Layers
 from clsplat.scene.view import View
 
 Image = NDArray[np.uint8]
@@ -27,16 +25,13 @@ SMALLEST_RANGE = 1e-3  # of far
 
 @dataclass(frozen=True)
 class Canvas:
-    """A model on a device, with its background, [3]."""
+    """What paints a model, and the pictures of its views."""
 
-    rasterizer: Rasterizer
-    model: DeviceModel
-    background: Array
+    painter: Painter
 
     def layers(self, view: View, depth: bool = False) -> Layers:
         """Render a view.  Raises NumericError where the picture is not finite."""
-        camera = upload_camera(self.rasterizer.device, view)
-        found = layers(self.rasterizer, self.model, camera, self.background, depth)
+        found = self.painter.layers(upload_camera(self.painter.workspace.device, view), depth)
         for values in found.arrays:
             require_finite(values, view)
         return found

@@ -9,11 +9,14 @@ import numpy as np
 import pytest
 
 import clsplat
+from clsplat.fields.shape import FieldShape
+from clsplat.gaussians.model import Rendering
 from clsplat.gaussians.sky import Sky, sky_beside
 from clsplat.names import INPUTS
 from clsplat.reading import sha256
 from clsplat.runs.verify import verify
 from clsplat.training import archive
+from clsplat.training.field_file import FieldModel, load_field
 from clsplat.training.status import read_status
 from tests.fuzz.mutation import damaged, fuzzed
 from tests.fuzz.outcome import outcome
@@ -51,6 +54,23 @@ def test_a_damaged_archive_is_equal_or_refused(folder: Path):
             assert notes == NOTES
             assert arrays.keys() == ARRAYS.keys()
             assert all(np.array_equal(arrays[name], ARRAYS[name]) for name in ARRAYS)
+
+    reads()
+
+
+def test_a_damaged_field_is_equal_or_refused(folder: Path):
+    shape = FieldShape(depth=1, skip=None, width=4, colour_width=4, degrees=1)
+    field = FieldModel(shape, shape.first_parameters(0), Rendering(background="white"))
+    field.save(folder / "whole.npz")
+    path = folder / "field.npz"
+
+    @fuzzed(data=damaged([(folder / "whole.npz").read_bytes()], [*WORDS, "width", "white", "format"]))
+    def reads(data):
+        path.write_bytes(data)
+        found = outcome(load_field, path)
+        if found is not None:
+            assert (found.shape, found.rendering) == (field.shape, field.rendering)
+            assert np.array_equal(found.parameters, field.parameters)
 
     reads()
 
