@@ -14,10 +14,11 @@ from clsplat.progress import counted
 from clsplat.runs.found import has_pipeline
 from clsplat.runs.loaded import Loaded, moves, painter_of, points_of, read
 from clsplat.runs.pictures import KINDS, write_pictures
-from clsplat.runs.source import Source
+from clsplat.runs.source import Source, shown_of_run
 from clsplat.scene.photographs import load_photograph
 from clsplat.scene.scene import Background, Scene
 from clsplat.scene.view import NO_FILE, View
+from clsplat.training.field_file import is_field
 from clsplat.video import camera_path
 from clsplat.video.film import Film, Side, Wish, check_path_file, files, plan, shoot
 from clsplat.video.paths import nearest
@@ -70,7 +71,7 @@ def film(
         check_path_file(extras.save_path)
     if extras.side and not videos:
         raise ConfigError("--side needs --video: pictures of a folder stand alone")
-    loaded = _read(model, scene)
+    loaded = _read(model)
     found = _scene(model, scene, loaded, downscale, needed=not wish.of_a_file or extras.side == PHOTOGRAPH)
     made = plan(wish, found, points_of(loaded, found), moves=moves(loaded))
     if extras.save_path:
@@ -95,9 +96,10 @@ def film(
     }
 
 
-def _read(model: Path, scene: Path | None) -> Loaded:
-    """What a model file or a run folder holds."""
-    return read(Source.of(model, scene).file if model.is_dir() and has_pipeline(model) else model)
+def _read(model: Path) -> Loaded:
+    """What a model file or a run folder holds, wherever its photographs are."""
+    file = shown_of_run(model) if has_pipeline(model) else model
+    return read(file if is_field(file) else model)
 
 
 def _scene(model: Path, scene: Path | None, loaded: Loaded, downscale: float | None, needed: bool) -> Scene | None:
@@ -119,7 +121,7 @@ def _side(name: str | None, made: Film, scene: Scene | None, background: Backgro
     if name is None:
         return None
     if name != PHOTOGRAPH:
-        other = _read(Path(name), None)
+        other = _read(Path(name))
         return Canvas(painter_of(other, device, other.rendering.background or background)).picture
     assert scene is not None
     taken, reach = [view for view in scene.views if view.image_path != NO_FILE], scene.extent

@@ -54,7 +54,7 @@ class Source:
                 f"{model}: a model file does not name its scene; give the folder of a scene, or a run folder"
             )
         settings = load(str(trained / PIPELINE)).settings.scene if trained is not None else SceneSettings()
-        file = _shown_of_run(model) if run == model else model
+        file = shown_of_run(model) if run == model else model
         if run == model and not file.is_file():
             raise _no_model(model, file.name)
         given = scene if scene is not None else run or model
@@ -98,7 +98,7 @@ def of_a_field(path: Path) -> DataError:
     return DataError(f"{path}: is a field, a network in the place of Gaussians; expected Gaussians: {shown}")
 
 
-def _shown_of_run(run: Path) -> Path:
+def shown_of_run(run: Path) -> Path:
     """The file of what a run has trained: Gaussians, or a field."""
     file = model_of_run(run)
     return file if file.is_file() or not _has_field(run) else field_of_run(run)
