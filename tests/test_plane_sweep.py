@@ -8,10 +8,10 @@ import pytest
 from scipy.spatial import cKDTree
 
 from clsplat.scene.detect import read_scene
+from clsplat.scene.middle import centre_of
 from clsplat.scene.plane_sweep import swept_points
 from clsplat.scene.scene import Camera, PointCloud, View
 from clsplat.scene.view import load_image
-from clsplat.stages.init import centre_of
 from tests.data_sets import data_set
 from tests.test_training import train
 

@@ -2,7 +2,6 @@
 
 import logging
 import math
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
@@ -17,8 +16,9 @@ from clsplat.gaussians.model import load
 from clsplat.gaussians.tables import SH_C0, Gaussians, sh_coefficients
 from clsplat.scene.hull import hull_points
 from clsplat.scene.images import read_image
+from clsplat.scene.middle import centre_of, looked_at_box, random_points
 from clsplat.scene.plane_sweep import swept_points
-from clsplat.scene.scene import PointCloud, Scene, View
+from clsplat.scene.scene import PointCloud, Scene
 from clsplat.scene.view import load_image, load_rgba
 from clsplat.settings import ReadPath
 from clsplat.stages.base import Stage
@@ -31,7 +31,6 @@ LOG = logging.getLogger("clsplat")
 MIN_DISTANCE2 = 1.0e-7  # scene units²: coincident points still get a size
 MIN_POINTS = 100  # with fewer from a sweep or a hull, random ones are used
 MODEL_SOURCES = ("model", "ply")
-RANDOM_BOX = 1.3 / 4.03  # half side of the box by camera distance: the value of 3DGS for the Blender scenes
 
 
 class Init(Stage):
@@ -233,30 +232,3 @@ def neighbour_distance2(positions: NDArray[np.floating]) -> NDArray[np.float64]:
     distance = scipy.spatial.cKDTree(positions).query(positions, k=neighbours, workers=-1)[0]
     squared: NDArray[np.float64] = np.square(distance[:, 1:]).mean(axis=1)
     return np.maximum(squared, MIN_DISTANCE2)
-
-
-def random_points(scene: Scene, count: int, seed: int) -> PointCloud:
-    """Return grey points, uniform in a box around the point that the training cameras look at."""
-    centre, half_side = looked_at_box(scene)
-    rng = np.random.default_rng([seed, count])
-    spread = rng.uniform(-half_side, half_side, (count, 3))
-    return PointCloud((centre + spread).astype(np.float32), np.full((count, 3), 127 / 255, np.float32))
-
-
-def looked_at_box(scene: Scene) -> tuple[NDArray[np.floating], float]:
-    """Return the centre, [3], and half the side of a box around the point that the training cameras look at."""
-    views = scene.split("train")
-    positions, centre = np.stack([view.position for view in views]), centre_of(views)
-    return centre, RANDOM_BOX * float(np.median(np.linalg.norm(positions - centre, axis=1)))
-
-
-def centre_of(views: Sequence[View]) -> NDArray[np.floating]:
-    """Return the point that the cameras look at, [3] scene units."""
-    return looked_at(np.stack([v.position for v in views]), np.stack([v.world_to_camera[2, :3] for v in views]))
-
-
-def looked_at(positions: NDArray[np.floating], directions: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Return the point nearest to all optical axes, in least squares, [3] scene units."""
-    across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
-    point, *_ = np.linalg.lstsq(across.sum(axis=0), np.einsum("nij,nj->i", across, positions), rcond=None)
-    return np.asarray(point)
