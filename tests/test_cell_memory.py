@@ -1,6 +1,7 @@
 """Cells are given to devices whose memory holds the plan of their training."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 from clsplat.cluster.batch import wanted_cell
 from clsplat.cluster.drive import Drive
@@ -12,6 +13,8 @@ from clsplat.cluster.task import Outcome, run_cell
 from clsplat.pipeline import matrix
 from clsplat.pipeline.loading import load
 from clsplat.scene.detect import read_scene
+from clsplat.stages.init import Init
+from clsplat.training.memory import plan
 from tests.test_sweep_cells import WRITES, Fake, command, wanted
 
 NEED = Need(degree=3, photographs=1 << 20, budget=None, pixels=1 << 16, first=1000, most=100_000)
@@ -63,3 +66,16 @@ def test_the_need_of_a_cell_is_the_plan_of_its_training(tiny_scene, tmp_path):
     whole = read_scene(tiny_scene).split("train")
     assert need.photographs == sum(4 * view.camera.width * view.camera.height for view in whole)
     assert need.plan(held(10**5, "a")).limit >= 10**5 / 2
+
+
+def test_the_need_of_what_moves_is_the_plan_that_its_first_stage_requires(tiny_scene):
+    pipeline = load("dynamic_7k", ["init.source=random", "init.count=700"])
+    need, limits, asked = Need.of(pipeline, read_scene(tiny_scene)), held(10**5, "a"), []
+
+    def memory_plan(tables):
+        asked.append(plan(limits, tables, need.photographs, need.pixels))
+        return asked[-1]
+
+    run = SimpleNamespace(model_settings=pipeline.settings.model, memory_plan=memory_plan)
+    Init._require_memory(run, 700)
+    assert asked == [need.plan(limits)]

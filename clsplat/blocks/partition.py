@@ -150,5 +150,6 @@ class Partitioner:
         cameras = [self.views[view].camera for view in views]
         sizes = [4 * camera.width * camera.height for camera in cameras]
         held = min(int(BUDGET_SHARE * self.device.info.memory), sum(sizes))
-        tables = first_tables(self.model.sh_degree)
+        motion = self.model.motion
+        tables = first_tables(self.model.sh_degree, 0 if motion is None else motion.shape[1])
         return plan(self.device.info, tables, held, max(sizes) // 4).needed(gaussians)

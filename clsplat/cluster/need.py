@@ -29,6 +29,7 @@ class Need:
     pixels: int  # of the largest, whole tiles
     first: int  # Gaussians that it begins with
     most: int  # Gaussians at which its growth ends; where nothing says so, those that it begins with
+    motion: int = 0  # columns of the motion; 0 where nothing moves
 
     @classmethod
     def of(cls, pipeline: Pipeline, scene: Scene) -> "Need | None":
@@ -51,12 +52,13 @@ class Need:
             max(-(-camera.width // TILE) * -(-camera.height // TILE) * TILE**2 for camera in sizes),
             begins,
             max(begins, int(max(ends, default=0))),
+            settings.model.time.width if settings.model.time else 0,
         )
 
     def plan(self, limits: Limits) -> MemoryPlan:
         """Return the plan of its training on a device."""
         budget = int(limits.memory * BUDGET_SHARE) if self.budget is None else self.budget
-        return plan(limits, first_tables(self.degree), min(budget, self.photographs), self.pixels)
+        return plan(limits, first_tables(self.degree, self.motion), min(budget, self.photographs), self.pixels)
 
     def limit_on(self, limits: Limits) -> int:
         """Return the largest number of Gaussians that a device holds."""
