@@ -9,9 +9,11 @@ from clsplat.conformance import reference as ref
 from clsplat.conformance.checks.motion import TIME, moment_figures, motion, moving_case
 from clsplat.conformance.comparison import CONIC, relative_error
 from clsplat.conformance.scenes import random_case
+from clsplat.density.statistics import SplatStats
 from clsplat.formats.motion import MOTION, STILL, WIDTHS, width_of
 from clsplat.gaussians.model import Model
 from clsplat.gaussians.tables import PARAMETERS, DeviceModel, Gaussians
+from clsplat.losses.base import Comparison, ViewGradients
 from clsplat.render.motion import at_moment
 from clsplat.render.rasterizer import Rasterizer
 from tests.kernels.figures import hold
@@ -90,3 +92,21 @@ def test_what_is_not_there_counts_as_not_seen(device, rng):
     absent[::10] = True
     assert (frame.radius.get()[:65][absent] == 0).all()
     assert (frame.radius.get()[:65][~absent] > 0).mean() > 0.5
+
+
+def test_splitting_matrices_are_those_of_the_moment(device, rng):
+    case = moving_case(rng, 65, width_of(3, True))
+    camera, background = case.device_camera(device), device.zeros(3)
+    weights = device.upload(rng.normal(size=(3, camera.rows, camera.stride)).astype(np.float32))
+    rasterizer, found = Rasterizer(device, "radix"), []
+    moment = at_moment(rasterizer.workspace, case.model(device), camera).gaussians
+    static = Gaussians(device, {name: moment.get(name) for name in PARAMETERS})
+    for model in (case.model(device), replace(case.model(device), gaussians=static)):
+        frame = rasterizer.forward(model, camera, background)
+        pixel_sums = rasterizer.pixel_sums(model, frame, weights)
+        stats = SplatStats(model.gaussians, ("splitting",))
+        comparison = Comparison(rasterizer.workspace, camera, frame.image, frame.image, frame.image)
+        stats.add(ViewGradients(frame, comparison, [], pixel_sums), pixel_sums)
+        found.append(model.gaussians.get("stats/splitting"))
+    assert np.abs(found[1]).max() > 0
+    np.testing.assert_array_equal(*found)
