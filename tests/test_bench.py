@@ -1,13 +1,18 @@
 """Timed cases: whole steps with all that a pipeline names, which change nothing."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from clsplat.bench.cases import run_bench
+from clsplat.bench.cases import Case, run_bench
 from clsplat.bench.peaks import Peaks
-from clsplat.bench.scenes import case
+from clsplat.bench.scenes import case, synthetic
+from clsplat.formats.motion import MOTION
 from clsplat.gaussians.tables import INTERVAL2, PARAMETERS
 from clsplat.pipeline.loading import load
+from clsplat.render.camera import upload_camera
+from clsplat.views.photographs import Photograph
 
 SIZE = (64, 48, 300)  # width, height, Gaussians
 
@@ -42,6 +47,15 @@ def test_a_case_does_what_its_pipeline_names_and_changes_nothing(device, pipelin
     assert set(result.floors) <= set(result.stages)
     assert "other" not in result.stages
     assert 0 < result.memory < 2 * result.planned
+
+
+def test_a_case_that_moves_changes_nothing(device, rng):
+    parameters, view = synthetic(*SIZE)
+    parameters[MOTION] = rng.normal(0, 0.3, (SIZE[2], 5)).astype(np.float32)
+    pixels = rng.integers(0, 256, (3, SIZE[1], SIZE[0]), dtype=np.uint8)
+    photograph = Photograph(upload_camera(device, replace(view, time=0.5)), device.upload(pixels))
+    timed = Case(device, parameters, photograph, "black", load("dynamic_7k").settings)
+    np.testing.assert_array_equal(timed.trainer.model.gaussians.get(MOTION), parameters[MOTION])
 
 
 def test_a_case_starts_without_edits_due_and_is_timed_after_a_warm_up(device):

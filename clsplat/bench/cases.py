@@ -24,6 +24,7 @@ from clsplat.pipeline.file import PipelineFile
 from clsplat.render.rasterizer import RECORD, Frame, Rasterizer
 from clsplat.training.adam import Adam, Rates
 from clsplat.training.memory import plan
+from clsplat.training.motion import MotionRates
 from clsplat.training.profile import stage_milliseconds
 from clsplat.training.trainer import Trainer
 from clsplat.views.photographs import Photograph
@@ -64,7 +65,8 @@ class Case:
         colour.fill(1.0 if background == "white" else 0.0)
         model = settings.model.model(gaussians, gaussians.sh_degree)
         none: dict[str, Any] = dict.fromkeys(PARAMETERS, 0.0)
-        zero_rates = Rates(**none)  # every step does the same work
+        still = MotionRates(**dict.fromkeys(MotionRates.model_fields, 0.0))
+        zero_rates = Rates(**none, motion=still)  # every step does the same work
         self.trainer = Trainer(
             Rasterizer(device, "radix"),
             model,
