@@ -163,6 +163,7 @@ OPTIONAL = {  # in what few runs compute: doctor notices them, the check before 
     "project_forward, opacities beside what is dropped": ("project.cl", " * opacity_factor", ""),
     "draw_left_out, what the view hides": ("dropout.cl", "drawn || bits", "drawn"),
     "adam_step, rows not seen": ("adam.cl", "!= -1) | (VI)((int)every)", "!= 0) | (VI)((int)every)"),
+    "motion_step, rows not seen": ("motion.cl", "!= -1) | (VI)((int)every)", "!= 0) | (VI)((int)every)"),
     "update_gaussians, rows not seen": ("adam.cl", "].touched | (VI)((int)every)", "].touched | (VI)(-1)"),
     "update_gaussians, moments not seen": ("adam.h", "(updated ? v : v_before)", "v"),
     "blend_forward wide, inverse depth": ("blend_wide.cl", "p.inverse_depth * inside", "p.inverse_depth * t"),

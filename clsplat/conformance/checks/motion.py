@@ -93,14 +93,17 @@ def still_figures(device: Device, rng: np.random.Generator) -> Iterator[Figure]:
     yield equal("move_forward", "an image of Gaussians that stand still", images[1], images[0])
 
 
-def step_figures(device: Device, rng: np.random.Generator, count: int, width: int) -> Iterator[Figure]:
-    """Two updates, in which durations reach their bound."""
+def step_figures(
+    device: Device, rng: np.random.Generator, count: int, width: int, every: int = 0xFFFFFFFF
+) -> Iterator[Figure]:
+    """Two updates, in which durations reach their bound.  every: as in motion_step."""
     case = moving_case(rng, count, width)
     model, rates = case.model(device), MotionRates(log_duration=0.5, shortest=0.3).at(3, EXTENT)
     gaussians, shortest = model.gaussians, float(np.log(0.3))
     Adam(gaussians)
     frame = Rasterizer(device, "radix").forward(model, case.device_camera(device), device.zeros(3))
     values, m, v = case.parameters[MOTION].astype(np.float64), np.zeros((count, width)), np.zeros((count, width))
+    seen = np.full(count, every != 0) | (frame.depth_key.get()[:count] != 0xFFFFFFFF)
     each = np.concatenate([np.full(c.stop - c.start, rates[name]) for name, c in fields_of(width).items()])
     for step in (1, 2):
         gradient = rng.normal(size=(count, width)).astype(np.float32)
@@ -108,11 +111,13 @@ def step_figures(device: Device, rng: np.random.Generator, count: int, width: in
         planes = np.zeros(gradients[MOTION].shape, np.float32)
         planes[:, :count] = gradient.T
         gradients[MOTION].set(planes)
-        values, m, v = ref.adam_step(values, gradient.astype(np.float64), m, v, step, each)
-        values[:, 4] = np.maximum(values[:, 4], shortest)
-        update_motion(gaussians, gradients, frame.depth_key, rates, step, 0xFFFFFFFF)
-    what = f"{count} of {width} columns"
-    yield by_element("motion_step", f"values, {what}", gaussians.get(MOTION), values, 2e-5, floor=1.0)
+        values, m, v = ref.adam_step(values, gradient.astype(np.float64), m, v, step, each, seen=seen)
+        values[seen, 4] = np.maximum(values[seen, 4], shortest)
+        update_motion(gaussians, gradients, frame.depth_key, rates, step, every)
+    what = f"{count} of {width} columns" + (", of seen rows alone" if every == 0 else "")
+    found, before = gaussians.get(MOTION), case.parameters[MOTION]
+    yield equal("motion_step", f"values of rows not seen, {what}", found[~seen], before[~seen])
+    yield by_element("motion_step", f"values, {what}", found, values, 2e-5, floor=1.0)
     for moment, expected in zip(moment_tables(MOTION), (m, v), strict=True):
         yield by_norm("motion_step", f"moments, {what}", gaussians.get(moment), expected, 3 * SUM)
 
@@ -122,6 +127,7 @@ def motion(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
     for count in COUNTS:
         yield from moment_figures(device, rng, count, width_of(1, False))
         yield from step_figures(device, rng, count, width_of(3, True))
+        yield from step_figures(device, rng, count, width_of(3, True), every=0)
     for width in WIDTHS:
         yield from moment_figures(device, rng, 65, width)
     yield from still_figures(device, rng)
