@@ -36,6 +36,8 @@ class FilterViews:
 class WorldFilter(Settings):
     """A blur of Gaussians in the world."""
 
+    reads_means: ClassVar[bool] = False  # as the places of Gaussians, which those that move have at no view's time
+
     @abstractmethod
     def refresh(self, gaussians: Gaussians, views: FilterViews, near: float) -> None:
         """Write `filter_variance`, [S] scene units², for the present means; `near`: smallest depth, scene units."""
@@ -57,6 +59,7 @@ class Smoothing(WorldFilter):
     such interval (eq. 6); `global_max` the smallest z by the largest f of all views, as the paper's code does.
     """
 
+    reads_means: ClassVar[bool] = True
     type: Literal["smoothing"] = "smoothing"
     variance: Annotated[float, Field(ge=0)] = 0.2
     """Variance added to the squared scales, in sampling intervals²."""

@@ -44,6 +44,7 @@ class MergeNeighbours(Rule):
     """
 
     type: Literal["merge_neighbours"] = "merge_neighbours"
+    reads_means: ClassVar[bool] = True
     training_keys: ClassVar[frozenset[str]] = frozenset({"distance_below", "colour_below"})
 
     distance_below: Positive = 0.5

@@ -1,0 +1,32 @@
+"""Settings that do not go together with Gaussians that move are refused, with what to write instead."""
+
+import re
+
+import pytest
+
+from clsplat.errors import ConfigError
+from clsplat.pipeline.loading import load
+
+PIXELS = "optimize.losses=[l1, {type: covariance_trace, pixels: 2.0}]"
+
+
+@pytest.mark.parametrize(
+    ("override", "what", "remedy"),
+    [
+        (
+            "model.world_filter=smoothing",
+            "model.world_filter.type 'smoothing'",
+            "set `world_filter: {type: none}`",
+        ),
+        ("densify.rules=[merge_neighbours]", "stages[1] optimize: the rule 'merge_neighbours'", "remove the rule"),
+        (PIXELS, "stages[1] optimize: the loss 'covariance_trace' with `pixels`", "remove the loss"),
+    ],
+)
+def test_what_reads_places_at_rest_is_refused_beside_motion(override, what, remedy):
+    with pytest.raises(ConfigError, match=f"{re.escape(what)} reads .* beside model.time: {re.escape(remedy)}, or"):
+        load("dynamic_7k", [override])
+    load("splat_7k", [override])
+
+
+def test_each_shipped_filter_and_rule_that_reads_no_places_goes_together_with_motion():
+    load("dynamic_7k", ["model.screen_filter=mip", "densify.rules=[clone, split_saddle, prune_unimportant]"])
