@@ -34,7 +34,7 @@ def stacks(rng):
 
 
 def gathered(views, renders, photographs, counted=None):
-    found = Stillness()
+    found = Stillness(views)
     rows = [found.add(*one, counted) for one in zip(views, renders, photographs, strict=True)]
     return rows, found.figures()
 
@@ -89,6 +89,17 @@ def test_a_scene_that_does_not_move_has_no_such_figures(rng):
     renders, photographs = stacks(rng)
     assert gathered([moment("a", None)], renders[:1], photographs[:1]) == ([{}], {})
     assert gathered([moment("a", 0.5)], renders[:1], photographs[:1]) == ([{}], {}), "one moment"
+
+
+def test_a_camera_with_one_moment_takes_no_place_of_others_and_no_memory(rng, static):
+    renders, photographs = stacks(rng)
+    moving = [moment(f"m{i}", i / 19, x=1.0 + i, static_path=static) for i in range(20)]
+    assert Stillness(moving).held == 0
+    fixed = [moment(f"{i}", i / (MOMENTS - 1), static_path=static) for i in range(MOMENTS)]
+    places = [moment(f"p{i}{k}", k / 2, x=-1.0 - i) for i in range(9) for k in range(2)]
+    assert Stillness([*places, *fixed]).held == 8
+    _, figures = gathered([*moving[:MOMENTS], *fixed], [*renders, *renders], [*photographs, *photographs])
+    assert figures == gathered(fixed, renders, photographs)[1] != {}
 
 
 def test_means_are_over_the_views_that_have_a_figure():

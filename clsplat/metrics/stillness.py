@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from clsplat.metrics.images import Mask, psnr
 from clsplat.metrics.perceptual import Image
-from clsplat.scene.times import camera_key
+from clsplat.scene.times import by_camera, camera_key, moments_of
 from clsplat.scene.view import View, load_mask
 
 STILL = 3.0  # levels of standard deviation: the noise of a camera; what moves through a pixel gives more
-MOST_CAMERAS = 8  # whose sums are held, 24 bytes a pixel each
+MOST_CAMERAS = 8  # whose sums are held, 48 bytes a pixel each
 LEAST_MOMENTS = 2
 FLICKER, OF_PHOTOGRAPHS, STATIC, SHARE = "flicker", "flicker_photographs", "psnr_static", "static_share"
 
@@ -53,10 +53,20 @@ class Station:
 
 
 class Stillness:
-    """Gathers the views of a measurement, camera by camera."""
+    """Gathers the views of a measurement, camera by camera.
 
-    def __init__(self) -> None:
-        self._stations: dict[bytes, Station] = {}
+    Of a camera that shows one moment, as of one that moves, nothing is held.
+    """
+
+    def __init__(self, views: Sequence[View]) -> None:
+        """views: all that are to be added, in any order."""
+        cameras = [group for group in by_camera(views) if len(moments_of(group)) >= LEAST_MOMENTS]
+        self._stations = {camera_key(group[0]): Station() for group in cameras[:MOST_CAMERAS]}
+
+    @property
+    def held(self) -> int:
+        """The number of cameras whose sums are held."""
+        return len(self._stations)
 
     def add(self, view: View, rendered: Image, photograph: Image, counted: Mask | None) -> dict[str, float]:
         """Take a view's 8-bit images, [H, W, 3]; return its PSNR of static pixels where a file says which these are."""
@@ -69,10 +79,8 @@ class Stillness:
         return {STATIC: psnr(rendered, photograph, known)}
 
     def _gather(self, view: View, rendered: Image, photograph: Image, known: Mask | None, told: bool) -> None:
-        key = camera_key(view)
-        if key not in self._stations and len(self._stations) >= MOST_CAMERAS:
+        if (station := self._stations.get(camera_key(view))) is None:
             return
-        station = self._stations.setdefault(key, Station())
         station.views.append(view.name)
         station.renders.add(rendered)
         station.photographs.add(photograph)

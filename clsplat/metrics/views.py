@@ -81,20 +81,22 @@ def device_ssim(workspace: Workspace, photograph: Photograph, image: Image) -> f
 
 def measure(
     painter: Painter,
-    views: Iterable[View],
+    views: Sequence[View],
     photographs: Photographs,
     perceptual: Perceptual = PSNR_AND_SSIM,
     finite: bool = False,
     colours: ColourModel | None = None,
+    counted: Iterable[View] | None = None,
 ) -> list[ViewMetrics]:
     """Return the metrics of every view.
 
     Masked pixels are black in both images; PSNR and SSIM are means over the other pixels.
-    colours: the photographs' in training, for figures in their colours beside PSNR.
+    colours: the photographs' in training, for figures in their colours beside PSNR; counted: the views, of somebody who
+    counts them.
     With `finite`, NumericError is raised for a picture that is not finite, which counts as black otherwise.
     """
-    results, stillness = list[ViewMetrics](), Stillness()
-    for view in views:
+    results, stillness = list[ViewMetrics](), Stillness(views)
+    for view in views if counted is None else counted:
         photograph = photographs.placed(view)
         if photograph.empty:
             LOG.warning("%s: not measured, since its mask leaves out every pixel; look at the mask", view.name)

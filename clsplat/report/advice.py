@@ -31,7 +31,7 @@ def advice(run: Run) -> list[str]:
     views = refined(run.numbers, run.scene).downscaled(run.downscale).split("train")
     chosen = some_of(views, MOST)
     counted = run.status.counted(run.until_interrupted(chosen), "views", len(chosen))
-    found = measure(run.painter(), counted, run.photographs, colours=Gain())
+    found = measure(run.painter(), chosen, run.photographs, colours=Gain(), counted=counted)
     lines = [line for line in run.records.read("view") if line["downscale"] == run.downscale]
     test = {line["view"]: line["psnr"] for line in lines if line["split"] == "test" and line["step"] == run.model_step}
     return [

@@ -95,7 +95,7 @@ class Evaluate(Scheduled):
             views = some_of(found, self.most or len(found))
             photographs = run.photographs if downscale in run.scene.downscales else run.photographs.fresh()
             counted = run.status.counted(run.until_interrupted(views), "views", len(views))
-            results = measure(painter, counted, photographs, perceptual, colours=colours_of(run))
+            results = measure(painter, views, photographs, perceptual, colours=colours_of(run), counted=counted)
             if not results:
                 continue
             for result in results:
