@@ -20,9 +20,8 @@ from clsplat.density.statistics import SEEN, SplatStats
 from clsplat.density.survey import Survey
 from clsplat.density.thresholds import PixelQuantile, Quantile, SceneScale, Threshold
 from clsplat.errors import ConfigError
-from clsplat.formats.motion import MOTION
 from clsplat.gaussians.rows import checked_rows
-from clsplat.gaussians.tables import PARAMETERS, Gaussians, moment_tables
+from clsplat.gaussians.tables import Gaussians, moment_tables
 from clsplat.schedule import Schedule, at_step
 from clsplat.settings import Settings
 
@@ -166,9 +165,10 @@ class Edit:
             raise ValueError(f"{name}: expected [{len(rows)}, copies, {components}], got {list(values.shape)}")
         self.children.append((name, checked_rows(rows, self.gaussians.count), values))
 
-    def zero_moments(self, rows: NDArray[np.integer], parameters: Collection[str] = (*PARAMETERS, MOTION)) -> None:
-        """Set Adam's moments of different rows, [n], to zero."""
-        names = [table for parameter in parameters for table in moment_tables(parameter)]
+    def zero_moments(self, rows: NDArray[np.integer], parameters: Collection[str] | None = None) -> None:
+        """Set Adam's moments of different rows, [n], to zero; of all that is trained, or of some parameters."""
+        trained = self.gaussians.trained if parameters is None else parameters
+        names = [table for parameter in trained for table in moment_tables(parameter)]
         self.gaussians.zero_rows([name for name in names if name in self.gaussians.tables], rows)
 
     def rows(self) -> NDArray[np.uint32]:

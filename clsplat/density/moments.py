@@ -44,7 +44,7 @@ class SplitInTime(Grow):
         names = ("means", "quats", "log_scales", "logit_opacity", MOTION)
         tables = {name: gaussians.get(name)[rows].astype(np.float64) for name in names}
         fields = fields_of(tables[MOTION].shape[1])
-        duration = np.minimum(np.exp(np.minimum(tables[MOTION][:, 4], 0)), LONGEST)
+        duration = np.minimum(np.exp(np.minimum(tables[MOTION][:, fields["log_duration"]][:, 0], 0)), LONGEST)
         travel = np.linalg.norm(tables[MOTION][:, fields["velocity"]], axis=1) * duration
         size = np.exp(tables["log_scales"]).max(axis=1)
         far = (travel > edit.at(self.travel_above) * size) & (duration > self.duration_above)
@@ -77,7 +77,8 @@ class PruneAbsent(Rule):
         require_motion(self.type, gaussians)
         moments = np.unique([view.time or 0.0 for view in edit.survey.views])
         motion = gaussians.get(MOTION)
-        after = np.searchsorted(moments, motion[:, 3]).clip(1, max(len(moments) - 1, 1))
+        centres = motion[:, fields_of(motion.shape[1])["time_centre"]][:, 0]
+        after = np.searchsorted(moments, centres).clip(1, max(len(moments) - 1, 1))
         near = [presence_at(motion, moments[np.minimum(place, len(moments) - 1)]) for place in (after - 1, after)]
         most = opacities(gaussians.get("logit_opacity")[:, 0]) * np.maximum(*near)
         edit.choose(most < edit.at(self.opacity_below), copies=0, kept=0)
@@ -86,7 +87,7 @@ class PruneAbsent(Rule):
 def presence_at(motion: NDArray[np.float32], times: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the presence of each Gaussian at a time of its own, [N]."""
     shifted = motion.astype(np.float64)
-    shifted[:, 3] -= times
+    shifted[:, fields_of(motion.shape[1])["time_centre"]] -= times[:, None]
     return presence(shifted, 0.0)
 
 

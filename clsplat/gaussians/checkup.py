@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from clsplat.formats.lod import LOD_META, faults_of_levels
 from clsplat.formats.model_files import located
+from clsplat.formats.motion import fields_of
 from clsplat.formats.splats import Reading, not_finite, told_too_large
 from clsplat.formats.table import detect, named
 from clsplat.gaussians.model import Model, load
@@ -127,8 +128,9 @@ def _ranges(model: Model) -> dict[str, list[float]]:
         "quaternions": np.linalg.norm(model.quats.astype(np.float64), axis=1),
     }
     if model.motion is not None:
-        quantities["speeds"] = np.linalg.norm(model.motion[:, :3].astype(np.float64), axis=1)
-        quantities["durations"] = np.exp(np.minimum(model.motion[:, 4].astype(np.float64), 700))
+        fields, motion = fields_of(model.motion.shape[1]), model.motion.astype(np.float64)
+        quantities["speeds"] = np.linalg.norm(motion[:, fields["velocity"]], axis=1)
+        quantities["durations"] = np.exp(np.minimum(motion[:, fields["log_duration"]], 700))
     return {
         name: [float(table.min()), float(np.median(table)), float(table.max())]
         for name, table in quantities.items()

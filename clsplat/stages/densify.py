@@ -14,8 +14,6 @@ from clsplat.density.control import densify
 from clsplat.density.edit import Edit, Rule
 from clsplat.density.thresholds import SceneScale
 from clsplat.errors import NumericError, amount
-from clsplat.formats.motion import MOTION
-from clsplat.gaussians.tables import PARAMETERS
 from clsplat.schedule import AtLeastOne
 from clsplat.settings import OneOf
 from clsplat.stages.base import Scheduled
@@ -70,7 +68,7 @@ class Densify(Scheduled):
         return self
 
     def stale(self, run: Run) -> Collection[str]:
-        return (*PARAMETERS, MOTION)
+        return run.model.gaussians.trained
 
     def run(self, run: Run) -> None:
         if run.stats is None:

@@ -12,9 +12,7 @@ from pydantic import Field, model_validator
 
 from clsplat.density.contribution import SCORES, Score, best, keep
 from clsplat.density.thresholds import Share
-from clsplat.formats.motion import MOTION
 from clsplat.formats.splats import MAX_DEGREE, sh_coefficients
-from clsplat.gaussians.tables import PARAMETERS
 from clsplat.stages.base import Scheduled
 from clsplat.training.run import Run
 
@@ -55,7 +53,7 @@ class PruneLeast(Scheduled):
         return self
 
     def stale(self, run: Run) -> Collection[str]:
-        return (*PARAMETERS, MOTION)
+        return run.model.gaussians.trained
 
     def run(self, run: Run) -> None:
         gaussians, score = run.model.gaussians, scores(run, self.score)
