@@ -3,6 +3,8 @@
 from dataclasses import replace
 from types import SimpleNamespace
 
+import pytest
+
 from clsplat.cluster.batch import wanted_cell
 from clsplat.cluster.drive import Drive
 from clsplat.cluster.fingerprint import Scenes
@@ -42,6 +44,30 @@ def test_a_cell_runs_where_its_memory_is_and_where_nothing_holds_it_the_others_g
     assert "no device of the sweep holds it; of the largest, memory: " in told["3"].message
     (failed,) = [folder for folder in store.folders() if folder.failed()]
     assert failed.failed()["exit_code"] == 5
+
+
+@pytest.mark.parametrize("joins", [True, False])
+def test_where_devices_may_join_a_cell_waits_for_a_larger_one_and_is_told_once(
+    store, terms, caplog, monkeypatch, joins
+):
+    monkeypatch.setattr("clsplat.cluster.drive.LOOK", 0.0)
+    engine, told, looks = Fake(Outcome("published"), places=(held(10, "small"),)), [], []
+
+    def may_join(waited):
+        looks.append(waited)
+        if joins and len(looks) == 5:
+            engine._places = (*engine._places, held(200_000, "large"))
+        return len(looks) < 9
+
+    engine.may_join = may_join
+    (one,) = wanted(1)
+    one = replace(one, need=replace(NEED, first=100_000))
+    Drive(store, engine, True, terms, ended=lambda cell, end: told.append(end.state)).run([one])
+    assert told == ["published" if joins else "failed"]
+    assert engine.started == [("1", "large", "x")] * joins
+    assert [record.message for record in caplog.records] == ["no device holds 1 cell: 1; waiting for a larger one"]
+    assert len(looks) == (5 if joins else 9)
+    assert looks[0] == 0 < looks[-1]
 
 
 def test_where_no_device_holds_the_end_of_growth_one_that_holds_the_beginning_takes_it(store, terms):

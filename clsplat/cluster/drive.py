@@ -1,5 +1,6 @@
 """Hand the cells of a sweep to the devices of an engine: the longest first, one a device, those of one bits class."""
 
+import logging
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -12,8 +13,9 @@ from clsplat.cluster.need import Need
 from clsplat.cluster.probe import Place
 from clsplat.cluster.store import Store
 from clsplat.cluster.task import Outcome, Terms
-from clsplat.errors import DeviceError, Interrupted, MemoryLimitError
+from clsplat.errors import DeviceError, Interrupted, MemoryLimitError, amount, first_few
 
+LOG = logging.getLogger("clsplat")
 LOOK = 0.05  # seconds between two looks at what runs
 ALONE = 60.0  # seconds without a device that may run a cell, after which a sweep ends
 
@@ -45,6 +47,7 @@ class Drive:
     look: Callable[[], None] = lambda: None  # called again and again
     bits: str | None = None  # the class of all cells, once it is chosen
     _seen: float = field(default_factory=time.monotonic)  # when a device of that class was there last
+    _unheld: float | None = None  # since when nothing runs, for no device holds what waits
     _unsuited: tuple[list[Place], set[Place]] = field(default_factory=lambda: ([], set()))
     """All devices, and those that suit no cell that waits."""
     _running: dict[Place, tuple[Wanted, Cell, Ticket]] = field(default_factory=dict)
@@ -60,7 +63,9 @@ class Drive:
             if self.is_stopped():
                 raise Interrupted("stopped; the same command with --resume goes on")
             self._hand_out(waiting)
-            if waiting and not self._running:
+            if self._running:
+                self._unheld = None
+            elif waiting:
                 self._refuse(waiting)
             before = len(self._running)
             for place in list(self._running):
@@ -128,19 +133,38 @@ class Drive:
         return None if any(self.store.folder(one.on(own).key).result.is_dir() for own in classes) else one.need
 
     def _refuse(self, waiting: list[Wanted]) -> None:
-        """End the cells that no device holds; it is called when nothing runs, so that the others are done."""
-        places = self.engine.places()
-        for one in list(waiting):
+        """End the cells that no device holds, where none that does may join; it is called when nothing runs, so that
+        the others are done."""
+        places, found = self.engine.places(), list[tuple[Wanted, Need, list[Place]]]()
+        for one in waiting:
             allowed = self._allowed(one, places)
             need = self._need(one, allowed)
-            if need is None or not allowed or any(map(need.begins_on, allowed)):
-                continue
-            waiting.remove(one)
-            largest = max(allowed, key=need.limit_on)
-            cell, code, message = one.on(largest.bits), MemoryLimitError.exit_code, need.refusal(largest)
-            self.store.add(cell).give_up(code, message)
-            self.store.tell("failed", cell=cell.key, exit_code=code)
-            self.ended(cell, Outcome("failed", "", code, message))
+            if need is not None and allowed and not any(map(need.begins_on, allowed)):
+                found.append((one, need, allowed))
+        if found and not self._may_join(found):
+            for each in found:
+                self._give_up(*each)
+                waiting.remove(each[0])
+
+    def _may_join(self, found: Sequence[tuple[Wanted, Need, list[Place]]]) -> bool:
+        """Whether a device may still join that holds some of these cells; say so once."""
+        now = time.monotonic()
+        waited = 0.0 if self._unheld is None else now - self._unheld
+        if not self.engine.may_join(waited):
+            return False
+        if self._unheld is None:
+            names = first_few([one.cell.name for one, *_ in found])
+            LOG.warning("no device holds %s: %s; waiting for a larger one", amount(len(found), "cell"), names)
+        if self._unheld is None or waited > ALONE:
+            self._unheld = now
+        return True
+
+    def _give_up(self, one: Wanted, need: Need, allowed: Sequence[Place]) -> None:
+        largest = max(allowed, key=need.limit_on)
+        cell, code, message = one.on(largest.bits), MemoryLimitError.exit_code, need.refusal(largest)
+        self.store.add(cell).give_up(code, message)
+        self.store.tell("failed", cell=cell.key, exit_code=code)
+        self.ended(cell, Outcome("failed", "", code, message))
 
     def _take_in(self, place: Place, waiting: list[Wanted]) -> None:
         one, cell, ticket = self._running[place]

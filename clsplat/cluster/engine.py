@@ -28,6 +28,9 @@ class Engine(Protocol):
     def places(self) -> list[Place]:
         """Return the devices that are there now.  Raises ClsplatError where there will be none."""
 
+    def may_join(self, waited: float) -> bool:
+        """Whether other devices may still join a sweep that has waited for them, for so many seconds."""
+
     def start(self, cell: Cell, place: Place, terms: Terms) -> Ticket:
         """Begin to run a cell on a device that is free."""
 
@@ -51,6 +54,9 @@ class Inline:
 
     def places(self) -> list[Place]:
         return [self._place]
+
+    def may_join(self, waited: float) -> bool:
+        return False
 
     def start(self, cell: Cell, place: Place, terms: Terms) -> Ticket:
         command = run_command(place.device, plugin_files())

@@ -136,6 +136,10 @@ class Cluster:
             self._look(now)
         return self._places
 
+    def may_join(self, waited: float) -> bool:
+        """Whether workers may still join: elsewhere for a minute, of jobs as long as some wait in the queue."""
+        return self._found is None and (waited <= ALONE or self._are_waiting())
+
     def _look(self, now: float) -> None:
         with self._needs_scheduler():
             workers = self._client.scheduler_info(n_workers=-1)["workers"]
