@@ -25,6 +25,11 @@ class _Render(torch.autograd.Function):
     def forward(ctx: Any, renderer: Renderer, view: View, background: Colour | None, *tensors: torch.Tensor) -> Any:
         tables: dict[str, Any] = {n: t.detach().cpu().numpy() for n, t in zip(PARAMETERS, tensors, strict=True)}
         model, count = renderer.model, len(tables["means"])
+        if model.motion is not None:
+            raise ValueError(
+                "the renderer's model moves, which has no gradient here; expected one that stands still: give the "
+                "renderer one moment, `model.at(time)`"
+            )
         if model.filter_variance is not None and count != len(model):
             raise ValueError(
                 f"the renderer's model has a world filter of {len(model)} Gaussians, the parameters have {count}; "
@@ -52,8 +57,8 @@ def render(
 
     parameters: the tables of a model by name, float32 [N, components], before activation; filters and the like are
     those of the renderer's model, whose tables these replace.  The number of Gaussians may change from call to call,
-    but not where that model has a filter_variance.  Raises KeyError for a table that is missing and ValueError for a
-    shape that does not fit.
+    but not where that model has a filter_variance.  Raises KeyError for a table that is missing, and ValueError for a
+    shape that does not fit and for a renderer whose model moves.
     """
     apply: Any = _Render.apply
     image, alpha = apply(renderer, view, background, *(parameters[name] for name in PARAMETERS))

@@ -1,10 +1,13 @@
 """Rendering inside torch, where torch is present."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from clsplat.api.renderer import Renderer
 from clsplat.conformance.scenes import random_case, with_world_filter
+from clsplat.gaussians.motion import still
 from clsplat.gaussians.tables import PARAMETERS
 from tests.test_model import model_of
 
@@ -104,6 +107,16 @@ def test_another_number_of_gaussians_than_the_world_filter_has_is_refused(device
     clsplat.torch.render(renderer, case.view, parameters_of(model_of(case)))
     with pytest.raises(ValueError, match="has a world filter of 5 Gaussians, the parameters have 3; expected as many"):
         clsplat.torch.render(renderer, case.view, parameters_of(model_of(case)[:3]))
+
+
+def test_a_model_that_moves_is_refused_and_its_moment_is_not(device, rng):
+    case = random_case(rng, 5, *SIZE)
+    model = replace(model_of(case), motion=still(5, 5))
+    with pytest.raises(
+        ValueError, match=r"the renderer's model moves, .* give the renderer one moment, `model\.at\(time"
+    ):
+        clsplat.torch.render(Renderer(model, device), case.view, parameters_of(model))
+    clsplat.torch.render(Renderer(model.at(0.5), device), case.view, parameters_of(model.at(0.5)))
 
 
 def test_a_missing_table_and_a_wrong_shape_are_refused(device, rng):
