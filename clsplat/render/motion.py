@@ -97,5 +97,6 @@ def _with_tables(gaussians: Gaussians, arrays: dict[str, Array]) -> Gaussians:
 @cache
 def _tell_of_the_first() -> None:
     LOG.warning(
-        "a view without a time shows the first moment of a moving model; give the view a time, such as --time T"
+        "a view without a time, as on the live page, shows the first moment of a moving model; where it can have one, "
+        "give it: `--time T` of a command, `View.time` in Python"
     )
