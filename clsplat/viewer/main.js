@@ -18,7 +18,7 @@ class Viewer extends Walk {
     this.photographs = new Photographs(this, info.views);
     this.frustums = new Frustums(this, info.views);
     this.controls = new Controls(this, canvas);
-    if (info.step) this.clock = new Clock(this, info.step);
+    if (info.moments) this.clock = new Clock(this, info.moments);
     this.photographs.compare("off");
     new ResizeObserver(() => { this.photographs.place(); this.change(); }).observe(this.stage);
     addEventListener("hashchange", () => this.adopt());
