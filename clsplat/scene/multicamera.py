@@ -66,7 +66,7 @@ def _entries(path: Path) -> list[Path]:
 
 
 def _camera_names(path: Path) -> set[str]:
-    """The names that the cameras of a dataset may have; none where its files are damaged, which its own reader tells."""
+    """The names that the cameras of a dataset may have; none where files are damaged, as another reader tells."""
     try:
         if (path / TRANSFORMS).is_file():
             places = [frame.value("file_path") for frame in Transforms(path / TRANSFORMS).frames]

@@ -28,7 +28,7 @@ PIXELS = """(picture => {
 
 NEAREST = """(() => {
   viewer.pivot = null;
-  for (let x = 5; x < 160 && !viewer.pivot; x += 5) for (let y = 5; y < 200 && !viewer.pivot; y += 5) viewer.focus(x, y);
+  for (let x = 5; x < 160; x += 5) for (let y = 5; y < 200 && !viewer.pivot; y += 5) viewer.focus(x, y);
   return viewer.pivot;
 })()"""
 
