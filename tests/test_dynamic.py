@@ -36,7 +36,8 @@ train(short("dynamic_7k", Path(sys.argv[1])), Path(sys.argv[2]))
 """
 GUARDED = (  # penalties on the motion, and the rule that divides Gaussians in time
     "optimize.losses=[l1, {type: travel, weight: 0.1}, {type: brevity, weight: 0.1, below: 9}]",
-    "optimize.during=[{densify: {every: 1, start: 0, stop: 9, rules: [{type: split_in_time, gradient_above: 1.0e-9, travel_above: 0.01}]}}]",
+    "optimize.during=[{densify: {every: 1, start: 0, stop: 9, rules: ["
+    "{type: split_in_time, gradient_above: 1.0e-9, travel_above: 0.01}]}}]",
 )
 
 
