@@ -1,5 +1,6 @@
 """Training of a scene that moves: the recipe in few steps, what it writes, and what it refuses."""
 
+import json
 import os
 import shutil
 import subprocess
@@ -33,6 +34,11 @@ from pathlib import Path
 from tests.test_every_recipe import short, train
 train(short("dynamic_7k", Path(sys.argv[1])), Path(sys.argv[2]))
 """
+GUARDED = (  # penalties on the motion, and the rule that divides Gaussians in time
+    "optimize.losses=[l1, {type: travel, weight: 0.1}, {type: brevity, weight: 0.1, below: 9}]",
+    "optimize.during=[{densify: {every: 1, start: 0, stop: 9, rules: ["
+    "{type: split_in_time, gradient_above: 1.0e-9, travel_above: 0.01}]}}]",
+)
 
 
 @pytest.fixture(scope="module")
@@ -116,11 +122,15 @@ def test_a_static_recipe_trains_on_a_scene_that_moves(scene, tmp_path):
 def test_a_moving_model_starts_a_training_of_the_same_motion_alone(finished, scene, tmp_path):
     start = ("init.source='model'", f"init.file='{finished}'", "optimize.steps=2")
     bound = "optimize.rates={motion: {shortest: 0.9}}"
-    run = train_overridden(scene, tmp_path / "again", *start, "model.time={degree: 1}", bound)
+    run = train_overridden(scene, tmp_path / "again", *start, "model.time={degree: 1}", bound, *GUARDED)
     assert run.model.gaussians.tables[MOTION].components == 5
     shortest = [np.exp(table[:, 4].min()) for table in (load(finished).motion, run.model.gaussians.get(MOTION))]
     assert shortest[0] < 0.5
     assert shortest[1] == pytest.approx(0.9)
+    entries = [json.loads(line) for line in (tmp_path / "again" / "metrics.jsonl").read_text().splitlines()]
+    assert next(entry for entry in entries if entry["kind"] == "densify")["grown"]["split_in_time"] > 0
+    logged = next(entry for entry in entries if entry["kind"] == "train")
+    assert logged["loss"] > 10 ** (-logged["psnr"] / 20), "more than the image's L1, which its RMSE bounds"
     with pytest.raises(ConfigError, match="another degree"):
         train_overridden(scene, tmp_path / "other", *start, "model.time={degree: 2}")
     with pytest.raises(ConfigError, match=r"no `model\.time`"):

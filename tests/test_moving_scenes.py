@@ -216,12 +216,26 @@ def test_cameras_of_colmap_serve_videos_too(tiny_colmap, tmp_path):
         ({"a": 1, "b": 1}, (), "has one frame a camera; expected two moments"),
         ({"a": 2, "b": 2}, ("a",), "1 of 2 cameras have no pose: b"),
         ({"a": 2}, ("a", "x/a"), "images/a.png and images/x/a.png are both of the camera a"),
-        ({}, ("a",), "has no folders of frames"),
+        ({"a": 0}, ("a",), "has no folders of frames"),
     ],
 )
 def test_videos_that_do_not_fit_their_cameras_are_refused(tmp_path, counts, posed, message):
     (tmp_path / "videos").mkdir()
     assert message in refusal(read_scene, several_cameras(tmp_path, counts, *posed))
+
+
+def test_a_clip_that_no_camera_has_the_name_of_leaves_the_scene_to_its_reader(tmp_path):
+    several_cameras(tmp_path, {}, "0001", "0002")
+    (tmp_path / "images").mkdir()
+    for name in ("0001", "0002"):
+        cv2.imwrite(str(tmp_path / "images" / f"{name}.png"), np.zeros((48, 64, 3), np.uint8))
+    (tmp_path / "videos").mkdir()
+    for clip in (None, "clip.mp4"):
+        if clip:
+            (tmp_path / "videos" / clip).write_bytes(b"a video")
+        assert [view.time for view in read_scene(tmp_path, 0).views] == [None, None]
+    (tmp_path / "videos" / "0002.mp4").write_bytes(b"a video")
+    assert "a video without a folder" in refusal(read_scene, tmp_path)
 
 
 def test_frames_of_videos_are_taken_at_the_same_moments(tmp_path, caplog):

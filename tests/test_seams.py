@@ -11,6 +11,7 @@ from clsplat.blocks.cells import Cell
 from clsplat.blocks.seams import is_near, places
 from clsplat.compare.seams import find_seams
 from clsplat.density.box import Box
+from clsplat.errors import DataError
 from clsplat.scene.camera import Camera
 from clsplat.scene.view import View
 
@@ -76,3 +77,10 @@ def test_without_blocks_there_are_no_seams(runs):
     assert find_seams(own[:1], scene, "black") is None
     (own[1].path / "seams" / "a.png").unlink()
     assert find_seams(own, scene, "black") is None
+
+
+def test_a_mask_of_another_size_is_named(runs):
+    own, scene = runs
+    cv2.imwrite(str(own[1].path / "seams" / "a.png"), np.full((4, 2), 255, np.uint8))
+    with pytest.raises(DataError, match=r"seams.a\.png: is 2x4 px; expected 4x2 as the photograph"):
+        find_seams(own, scene, "black")

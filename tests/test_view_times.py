@@ -42,6 +42,8 @@ def test_what_copies_a_view_keeps_its_time(tmp_path):
     copies = [view.resized(2), still(view, (20, 20)), *spread([view], 3), scene.with_alpha("mask").views[0]]
     copies += scene.downscaled(2).views
     assert [copy.time for copy in copies] == [0.75] * len(copies)
+    assert [between.time for between in spread([moment(0.25), view], 3)] == [0.25, 0.5, 0.75]
+    assert [between.time for between in spread([moment(None), view], 3)] == [None] * 3
 
 
 def test_scenes_that_differ_in_a_time_are_two_scenes(tmp_path):

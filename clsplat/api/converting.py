@@ -31,7 +31,8 @@ def convert(
     time: the moment of a moving model, from 0 to 1, that a static one is written of; frames: so many moments, each in a
     file of its own: `out` is a folder, for PLY, or the name whose number is still to come.
     """
-    from clsplat.gaussians import conversion, moments
+    from clsplat.gaussians import conversion
+    from clsplat.gaussians.frames import checked_time, convert_frames
     from clsplat.runs.source import refuse_field
 
     files = [Path(source) for source in ([sources] if isinstance(sources, str | Path) else sources)]
@@ -44,8 +45,8 @@ def convert(
         None if transform is None else conversion.transform_of(transform),
         None if box is None else conversion.crop_of(box),
         conversion.checked_degree(sh_degree),
-        moments.checked_time(time),
+        checked_time(time),
     )
     if frames is not None:
-        return moments.convert_frames(files, Path(out), frames, changes, options)
+        return convert_frames(files, Path(out), frames, changes, options)
     return conversion.convert(files, Path(out), changes, options)

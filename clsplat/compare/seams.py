@@ -3,10 +3,13 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from clsplat.compare.run_folder import RunFolder
+from clsplat.errors import DataError
 from clsplat.metrics.perceptual import Image
 from clsplat.names import SEAMS
 from clsplat.scene.images import read_image
@@ -46,8 +49,8 @@ def find_seams(runs: Sequence[RunFolder], scene: Scene, background: Background) 
         mask = image_path(folder, view.name)
         if not mask.is_file() or not all(path.is_file() for path in renders):
             continue
-        band = read_image(mask).reshape(*read_image(mask).shape[:2], -1)[:, :, 0] > 0
         photograph = load_image(view, BACKGROUNDS[background])
+        band = _band(mask, photograph)
         views += 1
         for number, path in enumerate(renders):
             render = load_image(replace(view, image_path=path, lens=None))
@@ -61,6 +64,15 @@ def find_seams(runs: Sequence[RunFolder], scene: Scene, background: Background) 
         return None
     near, others = ([_decibels(value / count) for value in row] for row, count in zip(errors, pixels, strict=True))
     return Seams(float(pixels[0] / pixels.sum()), views, near, others, shown, picture)
+
+
+def _band(mask: Path, photograph: Image) -> NDArray[np.bool_]:
+    """The pixels of a band, [H, W].  Raises DataError for a mask of another size than the photograph."""
+    image = read_image(mask)
+    (height, width), (high, wide) = image.shape[:2], photograph.shape[:2]
+    if (height, width) != (high, wide):
+        raise DataError(f"{mask}: is {width}x{height} px; expected {wide}x{high} as the photograph: remove the file")
+    return np.asarray(image[:, :, 0] > 0)
 
 
 def _decibels(error: float) -> float:

@@ -7,12 +7,13 @@ from pathlib import Path, PurePosixPath
 
 from clsplat.errors import DataError, first_few
 from clsplat.scene.colmap import camera_views, find_models
+from clsplat.scene.colmap_files import read_images
 from clsplat.scene.images import is_image, read_header
 from clsplat.scene.nerfstudio import FILE as TRANSFORMS
 from clsplat.scene.readers import Reader
 from clsplat.scene.scene import PointCloud, Scene, every_nth, make_scene
 from clsplat.scene.times import Clock
-from clsplat.scene.transforms import Transforms, view_of
+from clsplat.scene.transforms import Transforms, view_name, view_of
 from clsplat.scene.view import View
 
 LOG = logging.getLogger("clsplat")
@@ -33,7 +34,9 @@ class MulticameraReader(Reader):
     expects = f"{VIDEOS}/ beside sparse/0 or {TRANSFORMS}"
 
     def matches(self, path: Path) -> bool:
-        return (path / VIDEOS).is_dir() and ((path / TRANSFORMS).is_file() or bool(find_models(path)))
+        """Return whether something in `videos` has the name of a camera: other videos may be what a scene came from."""
+        named = {entry.name if entry.is_dir() else entry.stem for entry in _entries(path)}
+        return bool(named) and not named.isdisjoint(_camera_names(path))
 
     def read(self, path: Path, holdout: int) -> Scene:
         frames = _frames(path)
@@ -50,9 +53,34 @@ class MulticameraReader(Reader):
         return make_scene(path, views, held_out, points)
 
 
+def names_of(image: str) -> tuple[str, str]:
+    """Return the names that the camera of an image may have: that of the image, and that of its folder."""
+    name = PurePosixPath(image)
+    return name.stem, name.parent.name
+
+
+def _entries(path: Path) -> list[Path]:
+    """What `videos` of a dataset holds, by name; nothing where there is no such folder."""
+    folder = path / VIDEOS
+    return sorted(entry for entry in folder.iterdir() if entry.name[0] != ".") if folder.is_dir() else []
+
+
+def _camera_names(path: Path) -> set[str]:
+    """The names that the cameras of a dataset may have; none where files are damaged, as another reader tells."""
+    try:
+        if (path / TRANSFORMS).is_file():
+            places = [frame.value("file_path") for frame in Transforms(path / TRANSFORMS).frames]
+            images = [view_name(place) for place in places if isinstance(place, str)]
+        else:
+            images = [image.name for model in find_models(path) for image in read_images(model)]
+    except DataError:
+        return set()
+    return {name for image in images for name in names_of(image)}
+
+
 def _frames(path: Path) -> dict[str, list[Path]]:
     """The frames of each camera in order.  Raises DataError for videos without frames, and where numbers differ."""
-    folders = sorted(entry for entry in (path / VIDEOS).iterdir() if entry.name[0] != ".")
+    folders = _entries(path)
     frames = {entry.name: sorted(filter(is_image, entry.iterdir())) for entry in folders if entry.is_dir()}
     frames = {name: files for name, files in frames.items() if files}
     packed = [entry for entry in folders if entry.suffix.lower() in VIDEO_SUFFIXES and entry.stem not in frames]
@@ -87,8 +115,7 @@ def _stations(path: Path, frames: dict[str, list[Path]]) -> tuple[dict[str, View
         posed, points = camera_views(path)
     stations: dict[str, View] = {}
     for view in posed:
-        name = PurePosixPath(view.name)
-        known = [part for part in (name.stem, name.parent.name) if part in frames]
+        known = [name for name in names_of(view.name) if name in frames]
         if not known:
             continue
         if known[0] in stations:

@@ -68,8 +68,8 @@ class Init(Stage):
     duration: Annotated[float, Field(gt=0)] = 4.0
     """Standard deviation of the time around that, by the scene's duration; a long one begins as a scene that stands
     still."""
-    moment: Annotated[float, Field(gt=0)] = 0.1
-    """The shortest of the Gaussians whose points moved, with `times: per_frame`."""
+    shortest: Annotated[float, Field(gt=0)] = 0.1
+    """Shortest duration of the Gaussians whose points moved, with `times: per_frame`, by the scene's duration."""
     file: ReadPath | None = None
     """Model file of any format, or a run folder, for `source: model`."""
 
@@ -141,7 +141,7 @@ class Init(Stage):
         self._require_memory(run, len(points))
         parameters = from_points(points, self.opacity, degree, self.scale)
         seen = points.times if self.times == "per_frame" else None
-        return moving(parameters, run.model_settings.time, seen, (self.duration, self.moment), run.seed), source
+        return moving(parameters, run.model_settings.time, seen, (self.duration, self.shortest), run.seed), source
 
     def _read(self) -> Parameters:
         assert self.file is not None  # as `check` requires

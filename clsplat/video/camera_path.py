@@ -117,7 +117,10 @@ def write(path: Path, views: Sequence[View], fps: float) -> None:
 
 
 def spread(views: Sequence[View], frames: int) -> list[View]:
-    """Return views at even places along a path, between two poses on the straight and the shortest turn."""
+    """Return views at even places along a path, between two poses on the straight and the shortest turn.
+
+    Times, where all views have one, are between those of the two.
+    """
     if frames == len(views):
         return list(views)
     if len(views) == 1:
@@ -132,14 +135,18 @@ def spread(views: Sequence[View], frames: int) -> list[View]:
         np.stack([np.interp(places, np.arange(len(views)), column) for column in columns.T], axis=1)
         for columns in (np.stack([view.position for view in views]), lenses)
     )
+    known = [view.time for view in views if view.time is not None]
+    moves = len(known) == len(views)
+    times = np.interp(places, np.arange(len(views)), known).tolist() if moves else [None] * frames
     first = views[0].camera
     return [
         View(
             f"frame_{i:05d}",
             Camera(first.width, first.height, *lens),
             np.column_stack([turn, -turn @ centre]),
+            time=time,
         )
-        for i, (turn, centre, lens) in enumerate(zip(turns, centres, lenses.tolist(), strict=True), 1)
+        for i, (turn, centre, lens, time) in enumerate(zip(turns, centres, lenses.tolist(), times, strict=True), 1)
     ]
 
 

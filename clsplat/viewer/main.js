@@ -18,7 +18,7 @@ class Viewer extends Walk {
     this.photographs = new Photographs(this, info.views);
     this.frustums = new Frustums(this, info.views);
     this.controls = new Controls(this, canvas);
-    if (info.step) this.clock = new Clock(this, info.step);
+    if (info.moments) this.clock = new Clock(this, info.moments);
     this.photographs.compare("off");
     new ResizeObserver(() => { this.photographs.place(); this.change(); }).observe(this.stage);
     addEventListener("hashchange", () => this.adopt());
@@ -106,12 +106,15 @@ class Viewer extends Walk {
   focus(x, y) {
     const {width, height} = this.pane(), [u, v] = [x % width, y % height], [layer] = this.layers;
     const frame = framed(this.camera, width, height, false), rows = [0, 1, 2].map(i => axis(this.camera, i));
-    const [fx, fy, cx, cy] = frame.intrinsics;
+    const [fx, fy, cx, cy] = frame.intrinsics, {motion} = layer;
     let nearest = Infinity;
     for (let i = 0; i < layer.count; i++) {
       const point = [layer.points[4 * i], layer.points[4 * i + 1], layer.points[4 * i + 2]];
+      const dt = motion ? this.moment - motion.rows[i * motion.stride + 3] : 0;
+      if (motion) for (let axis = 0; axis < 3; axis++) point[axis] += way(motion, i, axis, dt);
       const depth = dot(rows[2], point) + frame.translation[2];
-      if (depth < layer.header.near || depth > nearest || layer.opacities[i] < 0.4) continue;
+      if (depth < layer.header.near || depth > nearest) continue;
+      if (layer.opacities[i] * (motion ? presence(motion, i, dt) : 1) < 0.4) continue;
       const across = fx * (dot(rows[0], point) + frame.translation[0]) / depth + cx - u;
       const down = fy * (dot(rows[1], point) + frame.translation[1]) / depth + cy - v;
       if (across * across + down * down < 64) [nearest, this.pivot] = [depth, point];

@@ -22,7 +22,7 @@ SCRIPTS = (
     *("data", "sort", "shaders", "draw", "camera", "motion", "controls", "photographs", "frustums"),
     *("panel", "settings", "time", "main"),
 )
-STEP = 1 / 30  # between two moments, where the page has no views of several
+MOMENTS = 31  # from the first to the last, where the page has no views of several
 MAX_SIZE = 200.0  # MB: browsers need several times as much memory
 MARGIN = 0.97  # of that size, for splats that pack worse than the average
 MARK = b'<canvas id="frustums"'  # of viewer.html.j2
@@ -50,7 +50,7 @@ class Page:
             "first": first,
             "background": COLOURS[self.background],
             "file": re.sub(r"[^\w.-]+", "_", self.title),
-            **({"step": self._step} if self.moves else {}),
+            **({"moments": self._moments} if self.moves else {}),
         }
         return render(
             "viewer.html.j2",
@@ -69,10 +69,10 @@ class Page:
         return any("motion" in packed.header for packed in self.models.values())
 
     @property
-    def _step(self) -> float:
-        """Between two moments of the views."""
+    def _moments(self) -> list[float]:
+        """Those of the views, in order."""
         moments = np.unique([view["time"] for view in self.views if "time" in view])
-        return float(np.median(np.diff(moments))) if len(moments) > 1 else STEP
+        return [float(moment) for moment in (moments if len(moments) > 1 else np.linspace(0, 1, MOMENTS))]
 
     @property
     def size(self) -> float:

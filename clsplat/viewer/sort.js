@@ -1,6 +1,18 @@
 // The splats from back to front, in a worker: two counting sorts of 16 bits order the depths exactly, as the bits of
 // positive floats are in the order of their values.  Splats before the near plane are left out.
 
+// The presence of splat i at a time dt after that at which it is most opaque; motion: {rows, stride, bends} of what moves.
+function presence({rows, stride}, i, dt) {
+  const late = dt * Math.exp(-rows[i * stride + 4]);
+  return Math.exp(-late * late / 2);
+}
+
+// How far it has gone along an axis by then.
+function way({rows, stride, bends}, i, axis, dt) {
+  const k = i * stride + axis, bend = bends > 0 ? rows[k + 5] + (bends > 1 ? rows[k + 8] * dt : 0) : 0;
+  return dt * (rows[k] + dt * bend);
+}
+
 function sortInWorker() {
   let positions, motion, now, keys, ids, otherKeys, otherIds;
   const counts = new Uint32Array(65537);
@@ -18,12 +30,10 @@ function sortInWorker() {
 
   // The positions at a moment; of what is not there then, no numbers.
   function at(moment) {
-    const {rows, stride, bends} = motion, faintest = 2 * Math.log(255);
-    for (let i = 0, k = 0; 3 * i < positions.length; i++, k += stride) {
-      const dt = moment - rows[k + 3], late = dt * Math.exp(-rows[k + 4]), gone = late * late > faintest;
+    for (let i = 0; 3 * i < positions.length; i++) {
+      const dt = moment - motion.rows[i * motion.stride + 3], gone = presence(motion, i, dt) < 1 / 255;
       for (let axis = 0; axis < 3; axis++) {
-        const bend = bends > 0 ? rows[k + 5 + axis] + (bends > 1 ? rows[k + 8 + axis] * dt : 0) : 0;
-        now[3 * i + axis] = gone ? NaN : positions[3 * i + axis] + dt * (rows[k + axis] + dt * bend);
+        now[3 * i + axis] = gone ? NaN : positions[3 * i + axis] + way(motion, i, axis, dt);
       }
     }
     return now;
@@ -61,7 +71,7 @@ function sortInWorker() {
 class Sorter {
   // motion: {rows, stride, bends} of what moves
   constructor(positions, motion, near, done) {
-    const source = URL.createObjectURL(new Blob([`(${sortInWorker})()`], {type: "text/javascript"}));
+    const source = URL.createObjectURL(new Blob([`${presence}\n${way}\n(${sortInWorker})()`], {type: "text/javascript"}));
     this.worker = new Worker(source);
     URL.revokeObjectURL(source);
     this.worker.postMessage({positions, motion}, [positions.buffer]);

@@ -3,9 +3,9 @@
 const LOOP = 4; // s: the scene from its first moment to its last
 
 class Clock {
-  // step: between two moments of the photographs, of the whole
-  constructor(viewer, step) {
-    Object.assign(this, {viewer, step, playing: false});
+  // moments: of the photographs, in order, of the whole
+  constructor(viewer, moments) {
+    Object.assign(this, {viewer, moments, playing: false});
     this.range = find("moment");
     this.range.addEventListener("input", () => { this.stop(); this.to(+this.range.value); });
     find("play").addEventListener("click", () => this.turn());
@@ -32,17 +32,16 @@ class Clock {
     viewer.change();
   }
 
-  // The next or the last moment of the photographs.
+  // The next moment of the photographs, or the last before this one, where there is one.
   skip(by) {
     this.stop();
-    this.to(Math.round(this.viewer.moment / this.step + by) * this.step);
+    const beyond = this.moments.filter(moment => by * (moment - this.viewer.moment) > 1e-6);
+    if (beyond.length) this.to(by > 0 ? beyond[0] : beyond[beyond.length - 1]);
   }
 
   // Go on by seconds while it plays; from the last moment to the first.
   run(seconds) {
-    if (!this.playing) return false;
-    this.to((this.viewer.moment + Math.min(0.5, seconds) / LOOP) % 1);
-    return true;
+    if (this.playing) this.to((this.viewer.moment + Math.min(0.5, seconds) / LOOP) % 1);
   }
 
   show() {

@@ -9,7 +9,7 @@ from clsplat.conformance.checks.motion import moving_case
 from clsplat.conformance.scenes import random_case
 from clsplat.density.control import densify
 from clsplat.density.edit import Edit
-from clsplat.density.moments import PruneAbsent, SplitInTime
+from clsplat.density.motion import PruneAbsent, SplitInTime
 from clsplat.density.statistics import SEEN, SplatStats
 from clsplat.density.survey import Survey
 from clsplat.density.thresholds import SceneScale
