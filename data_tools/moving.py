@@ -114,9 +114,12 @@ class Moving(Options):
 
     def poses(self) -> dict[str, list[Array]]:
         """Camera-to-world matrices of the cameras of each split."""
+        seen = [(i + 0.5) / self.train for i in range(self.train)]
+        held_out = [(i + 1.0) / (self.test + 1) for i in range(self.test)]
+        apart = [place + 0.25 / self.train * bool(np.isclose(place, seen).any()) for place in held_out]
         return {
-            "train": [self._pose((i + 0.5) / self.train, HEIGHTS[i % 3]) for i in range(self.train)],
-            "test": [self._pose((i + 1.0) / (self.test + 1), HEIGHTS[1]) for i in range(self.test)],
+            "train": [self._pose(place, HEIGHTS[i % 3]) for i, place in enumerate(seen)],
+            "test": [self._pose(place, HEIGHTS[1]) for place in apart],
         }
 
     @staticmethod

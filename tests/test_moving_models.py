@@ -102,6 +102,18 @@ def test_convert_writes_moments(tmp_path: Path):
             clsplat.convert(source, tmp_path / "frames", **wrong)
 
 
+def test_speeds_beyond_what_a_file_holds_are_refused_and_dropped(tmp_path):
+    model = moving_model()
+    motion = model.motion.copy()
+    motion[3, 0], motion[3, 3:5] = 1e38, (1e38, 90)
+    fast = replace(model, motion=motion)
+    with pytest.raises(DataError, match="1 Gaussians are at no finite place"):
+        fast.at(0.5)
+    fast.save(tmp_path / "fast.ply")
+    clsplat.convert(tmp_path / "fast.ply", tmp_path / "rest.ply", time=0.5)
+    assert np.isfinite(load(tmp_path / "rest.ply").means).all()
+
+
 def test_some_gaussians_of_a_moving_model_move():
     model = moving_model()
     np.testing.assert_array_equal(model[[3, 5]].motion, model.motion[[3, 5]])

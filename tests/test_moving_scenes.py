@@ -195,6 +195,13 @@ def test_a_folder_of_frames_for_each_camera_is_a_scene_that_moves(tmp_path):
     assert len(by_camera(scene.views)) == 2
 
 
+def test_frames_are_in_the_order_of_the_numbers_in_their_names(tmp_path):
+    folder = several_cameras(tmp_path, {"a": 3})
+    for old, new in (("0000", "9"), ("0001", "10"), ("0002", "100")):
+        (folder / "videos" / "a" / f"{old}.png").rename(folder / "videos" / "a" / f"{new}.png")
+    assert [view.name for view in read_scene(folder, 0).views] == ["a/9.png", "a/10.png", "a/100.png"]
+
+
 def test_cameras_of_colmap_serve_videos_too(tiny_colmap, tmp_path):
     scene = read_scene(tiny_colmap, 0)
     for view in scene.views[:2]:
@@ -217,6 +224,7 @@ def test_cameras_of_colmap_serve_videos_too(tiny_colmap, tmp_path):
         ({"a": 2, "b": 2}, ("a",), "1 of 2 cameras have no pose: b"),
         ({"a": 2}, ("a", "x/a"), "images/a.png and images/x/a.png are both of the camera a"),
         ({"a": 0}, ("a",), "has no folders of frames"),
+        ({"a": 2, "b": 0}, (), "1 of 2 cameras have no frames: b"),
     ],
 )
 def test_videos_that_do_not_fit_their_cameras_are_refused(tmp_path, counts, posed, message):

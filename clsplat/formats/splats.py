@@ -26,7 +26,7 @@ NEAR, VARIANCE = 0.2, 0.3  # scene units and px²: nearest distance and screen f
 MIP_VARIANCE = 0.1  # px², of files that say no more than `mip` (Yu et al. 2024)
 MAX_FILE = 1 << 33  # bytes
 LARGEST = 1e15  # of LIMITED: beyond it neither viewers nor codebooks hold anything
-LIMITED = ("log_scales", "sh_base", "sh_rest")
+LIMITED = ("log_scales", "sh_base", "sh_rest", MOTION)
 MIN_ALPHA = 1e-6  # opacities of 0 and 1 have no logit
 MAX_EXPONENT = 700.0  # of e in float64
 MAX_LOG = 88.7  # of a scale in float32
@@ -164,15 +164,15 @@ def not_finite(parameters: Parameters) -> NDArray[np.bool_]:
 
 
 def too_large(parameters: Parameters) -> NDArray[np.bool_]:
-    """Return which Gaussians hold finite logarithms of scales or coefficients beyond LARGEST, [N]."""
-    return np.asarray(np.any([_beyond(parameters[name]) for name in LIMITED], axis=0))
+    """Return which Gaussians hold finite logarithms of scales, coefficients or motions beyond LARGEST, [N]."""
+    return np.asarray(np.any([_beyond(parameters[name]) for name in LIMITED if name in parameters], axis=0))
 
 
 def told_too_large(parameters: Parameters) -> str:
     """Say how many Gaussians hold values that are too large, and of which tables; '' of none."""
     if not (count := int(too_large(parameters).sum())):
         return ""
-    names = ", ".join(name for name in LIMITED if _beyond(parameters[name]).any())
+    names = ", ".join(name for name in LIMITED if name in parameters and _beyond(parameters[name]).any())
     return f"{count:,} of {len(parameters['means']):,} Gaussians hold {names} beyond {LARGEST:g}"
 
 

@@ -95,13 +95,18 @@ class Model:
     def at(self, time: float) -> "Model":
         """Return the static model of a moment, from 0 to 1: the Gaussians that are there; a static one as it is.
 
-        Raises ValueError for another time.
+        Raises ValueError for another time, DataError where some are at no finite place then.
         """
         if not 0 <= time <= 1:
             raise ValueError(f"the time is {time:g}; expected one from 0, the first moment, to 1, the last")
         if self.motion is None:
             return self
         tables: dict[str, Any] = dict(at_time(self.tables(), time))
+        if lost := int(not_finite(tables).sum()):
+            raise DataError(
+                f"at the time {time:g}, {lost:,} Gaussians are at no finite place; expected speeds below 1e15: "
+                "`clsplat convert MODEL OTHER.ply` drops the others"
+            )
         return replace(self, **tables, motion=None)
 
     @property

@@ -45,7 +45,8 @@ def at_time(parameters: Parameters, time: float) -> Parameters:
     for order, name in enumerate(("velocity", "acceleration", "jerk"), 1):
         if name in fields:
             moved = moved + motion[:, fields[name]] * dt**order
-    tables["means"] = moved.astype(np.float32)
+    with np.errstate(over="ignore", invalid="ignore"):  # of what Model.at refuses
+        tables["means"] = moved.astype(np.float32)
     if "turn" in fields:
         tables["quats"] = (tables["quats"] + motion[:, fields["turn"]] * dt).astype(np.float32)
     logit = tables["logit_opacity"].astype(np.float64)

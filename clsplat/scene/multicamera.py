@@ -2,6 +2,7 @@
 
 import logging
 import os
+import re
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
@@ -25,8 +26,8 @@ class MulticameraReader(Reader):
     """Videos of fixed cameras that ran together: frames in `videos/NAME`, cameras in `sparse` or transforms.json.
 
     A camera is that of the image `NAME.png` (of any suffix, in any folder), or of an image in a folder NAME.  Frames
-    are in order of name; the i-th of each camera is of the same moment.  Every `holdout`-th camera by name is for
-    testing.
+    are in order of name, in which 10 comes after 9; the i-th of each camera is of the same moment.  Every `holdout`-th
+    camera by name is for testing.
     Where there is `static/NAME.png`, it is white in pixels of that camera that show nothing that moves.
     """
 
@@ -81,7 +82,10 @@ def _camera_names(path: Path) -> set[str]:
 def _frames(path: Path) -> dict[str, list[Path]]:
     """The frames of each camera in order.  Raises DataError for videos without frames, and where numbers differ."""
     folders = _entries(path)
-    frames = {entry.name: sorted(filter(is_image, entry.iterdir())) for entry in folders if entry.is_dir()}
+    frames = {
+        entry.name: sorted(filter(is_image, entry.iterdir()), key=_in_order) for entry in folders if entry.is_dir()
+    }
+    empty = [name for name, files in frames.items() if not files]
     frames = {name: files for name, files in frames.items() if files}
     packed = [entry for entry in folders if entry.suffix.lower() in VIDEO_SUFFIXES and entry.stem not in frames]
     if packed:
@@ -91,6 +95,11 @@ def _frames(path: Path) -> dict[str, list[Path]]:
         )
     if not frames:
         raise DataError(f"{path / VIDEOS}: has no folders of frames; expected {VIDEOS}/NAME/0000.png … for each camera")
+    if empty:
+        raise DataError(
+            f"{path / VIDEOS}: {len(empty)} of {len(folders)} cameras have no frames: {first_few(empty)}; expected "
+            "images in each folder: add them, or remove the folder"
+        )
     counts = {name: len(files) for name, files in frames.items()}
     least, most = (of(counts, key=lambda name: counts[name]) for of in (min, max))
     if counts[least] != counts[most]:
@@ -101,6 +110,11 @@ def _frames(path: Path) -> dict[str, list[Path]]:
     if counts[least] < 2:
         raise DataError(f"{path / VIDEOS}: has one frame a camera; expected two moments at least, in order of name")
     return frames
+
+
+def _in_order(frame: Path) -> list[tuple[int, str]]:
+    """The key of a frame in the order of names, in which 10 comes after 9."""
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", frame.name)]
 
 
 def _stations(path: Path, frames: dict[str, list[Path]]) -> tuple[dict[str, View], PointCloud | None]:
