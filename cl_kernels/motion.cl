@@ -4,7 +4,8 @@
  *
  *   0-2 velocity v = b_1 · 3 centre tau · 4 log of the duration s · from 5 on b_2, then b_3 · last the turn c, 4 planes
  *
- * With dt = t - tau, times in [0, 1] over the scene (FreeTimeGS, Wang et al. 2025; Spacetime Gaussians, Li et al. 2024):
+ * With dt = t - tau, times in [0, 1] over the scene (FreeTimeGS, Wang et al. 2025; Spacetime Gaussians, Li et al.
+ * 2024):
  *
  *   mean(t) = mean + sum_k b_k dt^k     q(t) = q + c dt     alpha(t) = alpha g,  g = exp(-1/2 (dt / s)^2)
  *

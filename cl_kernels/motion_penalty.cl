@@ -1,6 +1,6 @@
 /* Penalties on the motion of Gaussians: value and gradient.  Planes of `motion` as in motion.cl; s is the duration.
  *
- *   travel    min(s, 1) |v|: the way in the time in which it is there, at most that of the scene; s counts as a constant
+ *   travel    min(s, 1) |v|: the way in the time in which it is there, at most that of the scene; s is a constant
  *   brevity   max(log(s_0 / s), 0): how much shorter it is there than s_0
  *
  * One item = LANES Gaussians; each adds to the gradient and writes one sum.  No local memory.  Deterministic. */

@@ -195,7 +195,7 @@ def test_model_without_images_or_folder(tmp_path: Path) -> None:
 
 
 def test_detect_says_what_it_looked_for(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"looked for COLMAP .* Blender .* nerfstudio"):
+    with pytest.raises(DataError, match=r"looked for multi-camera video .* COLMAP .* Blender .* nerfstudio"):
         read_scene(tmp_path)
     with pytest.raises(DataError, match="no such folder"):
         read_scene(tmp_path / "none")

@@ -23,7 +23,7 @@ from clsplat.gaussians.model import Rendering
 from clsplat.gaussians.sky import Sky
 from clsplat.names import LOCK
 from clsplat.pipeline.loading import Pipeline
-from clsplat.runs import model_file, runner
+from clsplat.runs import loaded, runner
 from clsplat.runs.model_file import Source, evaluate
 from clsplat.training.run import Run
 from clsplat.tuning.tuning import Tuning
@@ -172,7 +172,7 @@ def test_the_model_and_its_scene_are_opened_once(few_steps, tmp_path, monkeypatc
         opened.append(path)
         return clsplat.load(path)
 
-    monkeypatch.setattr(model_file, "load", load)
+    monkeypatch.setattr(loaded, "load", load)
     monkeypatch.setattr(search, "load", load)
     (tmp_path / "own.txt").write_text("mine")
     with pytest.raises(ConfigError, match="holds something else"):
