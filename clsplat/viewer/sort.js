@@ -71,7 +71,8 @@ function sortInWorker() {
 class Sorter {
   // motion: {rows, stride, bends} of what moves
   constructor(positions, motion, near, done) {
-    const source = URL.createObjectURL(new Blob([`${presence}\n${way}\n(${sortInWorker})()`], {type: "text/javascript"}));
+    const code = `${presence}\n${way}\n(${sortInWorker})()`;
+    const source = URL.createObjectURL(new Blob([code], {type: "text/javascript"}));
     this.worker = new Worker(source);
     URL.revokeObjectURL(source);
     this.worker.postMessage({positions, motion}, [positions.buffer]);
