@@ -1,7 +1,7 @@
 // The splats from back to front, in a worker: two counting sorts of 16 bits order the depths exactly, as the bits of
 // positive floats are in the order of their values.  Splats before the near plane are left out.
 
-// The presence of splat i at a time dt after that at which it is most opaque; motion: {rows, stride, bends} of what moves.
+// The presence of splat i at a time dt after that at which it is most opaque; motion: {rows, stride, bends}.
 function presence({rows, stride}, i, dt) {
   const late = dt * Math.exp(-rows[i * stride + 4]);
   return Math.exp(-late * late / 2);
