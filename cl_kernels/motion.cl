@@ -18,9 +18,8 @@
  *
  * One item = LANES Gaussians.  No local memory.  Deterministic: each value has one writer. */
 #include "adam.h"
+#include "motion.h"
 
-#define MOTION_CENTRE 3u
-#define MOTION_DURATION 4u
 #define LOGIT_MAX 80.0f  // of e^o in float32
 
 /* Plane of the first component of coefficient b_k. */

@@ -4,9 +4,8 @@
  *   brevity   max(log(s_0 / s), 0): how much shorter it is there than s_0
  *
  * One item = LANES Gaussians; each adds to the gradient and writes one sum.  No local memory.  Deterministic. */
-#include "lanes.h"
+#include "motion.h"
 
-#define MOTION_DURATION 4u
 #define SPEED2_MIN 1.0e-20f  // (scene units by the scene's duration)^2, below which nothing moves
 
 /* grad_motion += weight d(travel)/d(v). */

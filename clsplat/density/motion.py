@@ -79,16 +79,9 @@ class PruneAbsent(Rule):
         motion = gaussians.get(MOTION)
         centres = motion[:, fields_of(motion.shape[1])["time_centre"]][:, 0]
         after = np.searchsorted(moments, centres).clip(1, max(len(moments) - 1, 1))
-        near = [presence_at(motion, moments[np.minimum(place, len(moments) - 1)]) for place in (after - 1, after)]
+        near = [presence(motion, moments[np.minimum(place, len(moments) - 1)]) for place in (after - 1, after)]
         most = opacities(gaussians.get("logit_opacity")[:, 0]) * np.maximum(*near)
         edit.choose(most < edit.at(self.opacity_below), copies=0, kept=0)
-
-
-def presence_at(motion: NDArray[np.float32], times: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the presence of each Gaussian at a time of its own, [N]."""
-    shifted = motion.astype(np.float64)
-    shifted[:, fields_of(motion.shape[1])["time_centre"]] -= times[:, None]
-    return presence(shifted, 0.0)
 
 
 def shared_in_time(logit: NDArray[np.float64]) -> NDArray[np.float64]:

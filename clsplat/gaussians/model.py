@@ -11,6 +11,7 @@ from clsplat.errors import DataError
 from clsplat.formats import motion as columns
 from clsplat.formats.ply import MAX_NUMBER
 from clsplat.formats.splats import (
+    LARGEST,
     MAX_DEGREE,
     MAX_EXPONENT,
     MAX_LOG,
@@ -104,7 +105,7 @@ class Model:
         tables: dict[str, Any] = dict(at_time(self.tables(), time))
         if lost := int(not_finite(tables).sum()):
             raise DataError(
-                f"at the time {time:g}, {lost:,} Gaussians are at no finite place; expected speeds below 1e15: "
+                f"at the time {time:g}, {lost:,} Gaussians are at no finite place; expected speeds below {LARGEST:g}: "
                 "`clsplat convert MODEL OTHER.ply` drops the others"
             )
         return replace(self, **tables, motion=None)

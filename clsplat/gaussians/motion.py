@@ -25,10 +25,10 @@ def still(count: int, width: int) -> NDArray[np.float32]:
     return table
 
 
-def presence(motion: NDArray[np.floating], time: float) -> NDArray[np.float64]:
-    """Return the factor of each opacity at a time, [N] in (0, 1]."""
+def presence(motion: NDArray[np.floating], time: float | NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the factor of each opacity at a time, or at a time of its own, [N]; it is [N] in (0, 1]."""
     fields, table = fields_of(motion.shape[1]), motion.astype(np.float64)
-    dt = time - table[:, fields["time_centre"]]
+    dt = np.reshape(time, (-1, 1)) - table[:, fields["time_centre"]]
     with np.errstate(over="ignore"):
         return np.exp(-0.5 * np.square(dt * np.exp(np.minimum(-table[:, fields["log_duration"]], LOGIT))))[:, 0]
 

@@ -1,0 +1,10 @@
+/* Planes of the table `motion`, [W,S], that every moving Gaussian has, whatever its polynomial: the time of its mean,
+ * and the logarithm of its duration.  The others are told in motion.cl, with the formulas. */
+#ifndef CLSPLAT_MOTION_H
+#define CLSPLAT_MOTION_H
+#include "lanes.h"
+
+#define MOTION_CENTRE 3u    // time of the mean
+#define MOTION_DURATION 4u  // log of the duration
+
+#endif
