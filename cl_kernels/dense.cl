@@ -8,8 +8,6 @@
 #include "adam.h"
 #include "layers.h"
 
-#define UPDATE_EPSILON 1.0e-8f  // of Adam: the default of its paper, which Mip-NeRF keeps
-
 /* One item = BLOCK outputs of BLOCK vectors of samples; the outputs of a tile follow each other. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void dense_forward(
@@ -44,16 +42,18 @@ void dense_forward(
             VSTORE(larger(sums[k * BLOCK + v], (VF)(lowest)), found + k * SAMPLES + v * COLUMNS * LANES);
 }
 
-/* Derivatives by the first derived_count inputs of a layer.  kept: 0, or 1 to add to what is there, before the gate.
+/* Derivatives by derived_count inputs of a layer: those in the rows of `inputs` from first_input on, whose weights begin
+ * at first_parameter.  kept: 0, or 1 to add to what is there, before the gate.
  * One item = BLOCK inputs of BLOCK vectors of samples. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void dense_backward(
     __global const float *restrict by_outputs,  // [T,output_rows,SAMPLES]
-    __global const float *restrict parameters,  // [P] as dense_forward
+    __global const float *restrict parameters,  // [P] at first_parameter: weights [derived_count,output_count]
     __global const float *restrict inputs,      // [T,input_rows,SAMPLES]
     __global float *restrict by_inputs,         // [T,derived_count,SAMPLES]
     const uint first_parameter,
     const uint input_rows,
+    const uint first_input,
     const uint derived_count,
     const uint output_rows,
     const uint output_count,
@@ -67,7 +67,7 @@ void dense_backward(
     const uint blocks = derived_count / BLOCK, column = i % COLUMNS * LANES;
     const uint input = i / COLUMNS % blocks * BLOCK, tile = i / (COLUMNS * blocks);
     __global float *found = by_inputs + (tile * derived_count + input) * SAMPLES + column;
-    __global const float *gate = inputs + (tile * input_rows + input) * SAMPLES + column;
+    __global const float *gate = inputs + (tile * input_rows + first_input + input) * SAMPLES + column;
     VF sums[BLOCK * BLOCK];
     for (uint k = 0; k < BLOCK; k++)
         for (uint v = 0; v < BLOCK; v++)
@@ -168,6 +168,7 @@ void dense_update(
     __global const float *restrict gradient,  // [P]
     const float rate,                         // learning rate / (1 - BETA1^t)
     const float correction2,                  // 1 / (1 - BETA2^t)
+    const float epsilon,                      // added to the root of the second moment
     const uint count)                         // P, a multiple of PARAMETER_LINE
 {
     const uint i = get_global_id(0) * LANES;
@@ -178,5 +179,5 @@ void dense_update(
     const VF v = BETA2 * VLOAD(moment2 + i) + (1.0f - BETA2) * (g * g);
     VSTORE(m, moment1 + i);
     VSTORE(v, moment2 + i);
-    VSTORE(VLOAD(parameters + i) - rate * m / (sqrt(v * correction2) + UPDATE_EPSILON), parameters + i);
+    VSTORE(VLOAD(parameters + i) - rate * m / (sqrt(v * correction2) + epsilon), parameters + i);
 }

@@ -1,21 +1,15 @@
 /* What a network reads of a sample: the integrated positional encoding of its conical frustum, and the encoding of the
  * direction that it is seen in (Barron et al. 2021).
  *
- * A frustum from t0 to t1 of a cone is a normal distribution (equations 7 and 8): with m = (t0 + t1) / 2,
- * h = (t1 - t0) / 2 and s = 3 m^2 + h^2
- *
- *   mean along the ray   m + 2 m h^2 / s
- *   variance along it    h^2 / 3 - 4/15 h^4 (12 m^2 - h^2) / s^2
- *   variance across it   r^2 (m^2 / 4 + 5/12 h^2 - 4/15 h^4 / s)
- *
- * and its features are the means of sin(2^l x) and cos(2^l x), which are those of the mean times exp(-4^l variance / 2)
- * (equations 13 and 14).  Angles are in turns, so that their whole part can be left out exactly.
+ * A frustum is a normal distribution (frustum.h), and its features are the means of sin(2^l x) and cos(2^l x), which are
+ * those of the mean times exp(-4^l variance / 2) (equations 13 and 14).  Angles are in turns, so that their whole part can
+ * be left out exactly.
  *
  * Features: sines of x, y, z for l = 0, 1, ...; then cosines; then zeros up to a multiple of BLOCK (layers.h).
  * One item = LANES samples of one ray.  No local memory. */
+#include "frustum.h"
 #include "layers.h"
 
-#define RAY_VALUES_READ 8  // of a ray, as rays.cl writes them
 #define FALL_MIN (-32.0f)  // e^x is 1e-14 there: left out, as gradients of such features have subnormal numbers
 #define TURN 0.159154943f  // 1 / (2 pi)
 
@@ -59,16 +53,12 @@ void encode_frustums(
         return;
     __global const float *cone = cones + first / samples * RAY_VALUES_READ;
     __global const float *t = edges + first / samples * (samples + 1) + first % samples;
-    const VF t0 = VLOAD(t), t1 = VLOAD(t + 1);
-    const VF m = 0.5f * (t0 + t1), h = 0.5f * (t1 - t0), m2 = m * m, h2 = h * h, s = 3.0f * m2 + h2;
-    const VF distance = m + 2.0f * m * h2 / s;
-    const VF along = h2 / 3.0f - (4.0f / 15.0f) * (h2 * h2) * (12.0f * m2 - h2) / (s * s);
-    const VF across = cone[6] * cone[6] * (0.25f * m2 + (5.0f / 12.0f) * h2 - (4.0f / 15.0f) * (h2 * h2) / s);
+    const frustum_t own = frustum_of(cone, VLOAD(t), VLOAD(t + 1));
     const uint at = feature_at(first, first_row, rows);
     for (uint axis = 0; axis < 3; axis++) {
         const float d = cone[3 + axis], d2 = d * d;
-        const VF turns = (cone[axis] + d * distance) * TURN;
-        VF fall = -0.5f * (d2 * along + (1.0f - d2 / (cone[7] * cone[7])) * across);
+        const VF turns = (cone[axis] + d * own.distance) * TURN;
+        VF fall = -0.5f * (d2 * own.along + (1.0f - d2 / (cone[7] * cone[7])) * own.across);
         float scale = 1.0f;
         for (uint l = 0; l < degrees; l++) {
             VF sine, cosine;

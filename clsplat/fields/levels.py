@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from clsplat.fields.encoding import Encoding, Samples
 from clsplat.fields.network import Network
 from clsplat.fields.shape import BLOCK, COLOUR_ROWS, LANES_MAX, SAMPLES, FieldShape
 from clsplat.opencl.device import Array
@@ -75,8 +76,8 @@ class Levels:
         self.workspace, self.shape, self.background = workspace, shape, background
         self.network = Network(workspace, shape)
         device = workspace.device
-        self._rays, self._encode = device.program("rays.cl"), device.program("encode.cl")
-        self._composite = device.program("composite.cl")
+        self.encoding = Encoding(workspace, shape, self.network)
+        self._rays, self._composite = device.program("rays.cl"), device.program("composite.cl")
 
     @property
     def rays_at_a_time(self) -> int:
@@ -145,7 +146,8 @@ class Levels:
             counted=rays.counted,
             rays=rays.count,
         )
-        self.network.backward(parameters, by_colours, by_densities, gradient)
+        by_grid = self.network.backward(parameters, by_colours, by_densities, gradient)
+        self.encoding.backward(by_grid, gradient)
 
     def place(self, level: Level, image: Array) -> None:
         """Put the colours of a level's rays into a picture, [3, rows, stride]."""
@@ -180,7 +182,7 @@ class Levels:
     def _level(self, parameters: Array, rays: Rays, edges: Array, name: str) -> Level:
         samples = edges.shape[1] - 1
         tiles = rays.count * samples // SAMPLES
-        self._encode_samples(rays, edges, samples, tiles)
+        self.encoding.forward(parameters, Samples(rays.cones, edges))
         raw_colours, raw_densities = self.network.forward(parameters, tiles)
         weights, left = (
             self.workspace.array(f"field {name} {what}", (rays.count, samples)) for what in ("weights", "left")
@@ -200,34 +202,6 @@ class Levels:
             rays=rays.count,
         )
         return Level(rays, samples, edges, raw_colours, raw_densities, weights, left, colours)
-
-    def _encode_samples(self, rays: Rays, edges: Array, samples: int, tiles: int) -> None:
-        shape, count = self.shape, rays.count * samples
-        shared: dict[str, Any] = {
-            "items": count // int(self.workspace.device.tuning["LANES"]),
-            "cones": rays.cones,
-            "samples": samples,
-            "count": count,
-        }
-        features, first = self.network.position(tiles)
-        self._encode.encode_frustums(
-            edges=edges,
-            features=features,
-            rows=features.shape[1],
-            first_row=first,
-            degrees=shape.degrees,
-            written=shape.position_rows,
-            **shared,
-        )
-        features, first = self.network.seen(tiles)
-        self._encode.encode_directions(
-            features=features,
-            rows=features.shape[1],
-            first_row=first,
-            degrees=shape.direction_degrees,
-            written=shape.direction_rows,
-            **shared,
-        )
 
 
 def _random(draw: Draw | None) -> dict[str, int]:

@@ -69,8 +69,11 @@ class Network:
         self._apply(self._colour, parameters, _Table(behind), colours, NO_LIMIT)
         return colours, densities
 
-    def backward(self, parameters: Array, by_colours: Array, by_densities: Array, gradient: Array) -> None:
-        """Add the derivatives by the parameters to `gradient`, [P], from those by the outputs of the last `forward`."""
+    def backward(self, parameters: Array, by_colours: Array, by_densities: Array, gradient: Array) -> Array:
+        """Add the derivatives by the parameters to `gradient`, [P], from those by the outputs of the last `forward`.
+
+        Returns those by the features of the grid, [tiles, grid_rows, SAMPLES], valid until the next call.
+        """
         tiles, width = by_colours.shape[0], self.shape.width
         last, seen = _Table(self._hidden(self.shape.depth - 1, tiles)), _Table(self.seen(tiles)[0])
         behind = _Table(self._table("conditioned", tiles, self.shape.colour_width))
@@ -87,11 +90,14 @@ class Network:
         for i in range(len(self._trunk), 0, -1):
             before, layer = _Table(self._hidden(i - 1, tiles)), self._trunk[i - 1]
             self._sum(layer, before, by_x)
+            if i - 1 == self.shape.skip:
+                self._derive_grid(layer, parameters, by_x, self.shape.width, kept=0)
             by_before = self._table(f"by hidden {i % 2}", tiles, width)
             self._derive(layer, parameters, by_x, before, by_before, RELU)
             by_x = by_before
         self._sum(self._first, _Table(*self.position(tiles)), by_x)
-        count = self.shape.parameters
+        by_grid = self._derive_grid(self._first, parameters, by_x, 0, kept=int(self.shape.skip is not None))
+        count = self.shape.of_network
         self._program.dense_sums(
             items=count // int(self.workspace.device.tuning["LANES"]),
             partials=self._partials(tiles),
@@ -99,6 +105,14 @@ class Network:
             chunks=-(-tiles // CHUNK),
             count=count,
         )
+        return by_grid
+
+    def _derive_grid(self, layer: Layer, parameters: Array, by_outputs: Array, row: int, kept: int) -> Array:
+        """Derive by the features of the grid, which a layer reads from a row on."""
+        tiles = by_outputs.shape[0]
+        position, by_grid = _Table(*self.position(tiles)), self._table("by grid", tiles, self.shape.grid_rows)
+        self._derive(layer, parameters, by_outputs, position, by_grid, NO_LIMIT, kept, row)
+        return by_grid
 
     def _hidden(self, i: int, tiles: int) -> Array:
         """The outputs of layer i of the trunk, with room for the encoded position where that joins them."""
@@ -109,8 +123,8 @@ class Network:
         return self.workspace.array(f"field {name}", (tiles, rows, SAMPLES))
 
     def _partials(self, tiles: int) -> Array:
-        """Sums of chunks, [chunks, P]; what no layer writes is zero, as new arrays are."""
-        return self.workspace.array("field partials", (-(-tiles // CHUNK), self.shape.parameters))
+        """Sums of chunks, [chunks, of_network]; what no layer writes is zero, as new arrays are."""
+        return self.workspace.array("field partials", (-(-tiles // CHUNK), self.shape.of_network))
 
     def _apply(self, layer: Layer, parameters: Array, inputs: _Table, outputs: Array, lowest: float) -> None:
         tiles = outputs.shape[0]
@@ -139,7 +153,9 @@ class Network:
         by_inputs: Array,
         lowest: float,
         kept: int = 0,
+        row: int = 0,
     ) -> None:
+        """Derive by inputs of a layer, whose weights begin at a row."""
         tiles, derived, output_rows = *by_inputs.shape[:2], by_outputs.shape[1]
         count = tiles * self._columns * (derived // BLOCK)
         self._program.dense_backward(
@@ -148,8 +164,9 @@ class Network:
             parameters=parameters,
             inputs=inputs.array,
             by_inputs=by_inputs,
-            first_parameter=layer.first,
+            first_parameter=layer.first + row * layer.columns,
             input_rows=inputs.rows,
+            first_input=inputs.first,
             derived_count=derived,
             output_rows=output_rows,
             output_count=layer.columns,
@@ -166,7 +183,7 @@ class Network:
         shared: dict[str, Any] = {
             "by_outputs": by_outputs,
             "partials": self._partials(tiles),
-            "parameter_count": self.shape.parameters,
+            "parameter_count": self.shape.of_network,
             "output_rows": output_rows,
             "output_count": layer.columns,
             "tiles": tiles,

@@ -1,12 +1,13 @@
 """The shape of a field: its network, its encodings and its samples, and where the network's parameters lie."""
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
+from clsplat.fields.grid import FIRST_MOST, GridShape
 from clsplat.opencl.program import constants
 from clsplat.settings import Settings
 
@@ -47,7 +48,7 @@ class Layer:
 
 
 class FieldShape(Settings):
-    """A field of Mip-NeRF (Barron et al. 2021): integrated positional encoding, a network that both levels share."""
+    """A field of Mip-NeRF (Barron et al. 2021): a network that both levels share reads positions and directions, encoded."""
 
     near: Annotated[float, Field(gt=0)] = 2.0
     """Depth at which the samples of a ray begin, scene units; 2 for the Blender scenes."""
@@ -65,8 +66,10 @@ class FieldShape(Settings):
     """Layer of the trunk, counted from 0, whose outputs the encoded position joins; without it, none."""
     colour_width: Features = 128
     """Outputs of the layer that reads the direction."""
-    degrees: Annotated[int, Field(ge=1, le=24)] = 16
-    """Frequencies of the position's encoding: 1, 2, 4, …"""
+    degrees: Annotated[int, Field(ge=0, le=24)] = 16
+    """Frequencies of the position's encoding: 1, 2, 4, …; none where a grid alone is read."""
+    grid: GridShape | None = None
+    """A grid of features that the network reads with the position's sines, or in their place; without it, none."""
     direction_degrees: Annotated[int, Field(ge=0, le=8)] = 4
     """Frequencies of the direction's encoding."""
 
@@ -76,12 +79,29 @@ class FieldShape(Settings):
             raise ValueError(f"expected 'far' beyond 'near', {self.near:g}; it is {self.far:g}")
         if self.skip is not None and self.skip >= self.depth - 1:
             raise ValueError(f"expected 'skip' below {self.depth - 1}, so that a layer follows, or none")
+        if not self.degrees and self.grid is None:
+            raise ValueError("expected 'degrees' above 0, or a 'grid': else the network reads no position")
         return self
+
+    @model_serializer(mode="wrap")
+    def _without_null(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Without a grid, the keys are those of files that knew none."""
+        return {key: value for key, value in handler(self).items() if key != "grid" or value is not None}
+
+    @property
+    def position_parts(self) -> list[int]:
+        """Features of the parts of the encoded position, each in whole blocks: grid, sines."""
+        return [self.grid_rows, 6 * self.degrees]
+
+    @property
+    def grid_rows(self) -> int:
+        """Rows of the grid, the first of the encoded position."""
+        return self.grid.features if self.grid else 0
 
     @property
     def position_rows(self) -> int:
         """Rows of the encoded position."""
-        return in_blocks(6 * self.degrees)
+        return sum(map(in_blocks, self.position_parts))
 
     @property
     def direction_rows(self) -> int:
@@ -91,10 +111,10 @@ class FieldShape(Settings):
     @property
     def layers(self) -> list[Layer]:
         """The layers in their order: the trunk, density, bottleneck, condition, colour."""
-        width, position, direction = self.width, 6 * self.degrees, 3 + 6 * self.direction_degrees
-        described = [("trunk 0", [position], width)]  # the parts of the inputs, each in whole blocks; the outputs
+        width, position, direction = self.width, self.position_parts, 3 + 6 * self.direction_degrees
+        described = [("trunk 0", position, width)]  # the parts of the inputs, each in whole blocks; the outputs
         for i in range(1, self.depth):
-            described.append((f"trunk {i}", [width, position] if i - 1 == self.skip else [width], width))
+            described.append((f"trunk {i}", [width, *position] if i - 1 == self.skip else [width], width))
         described += [("density", [width], DENSITIES), ("bottleneck", [width], width)]
         described += [("condition", [width, direction], self.colour_width)]
         described += [("colour", [self.colour_width], COLOURS)]
@@ -109,18 +129,24 @@ class FieldShape(Settings):
         return found
 
     @property
-    def parameters(self) -> int:
-        """Length of the table of parameters: that of all layers, in whole lines."""
+    def of_network(self) -> int:
+        """Parameters of all layers, in whole lines; those of the grid follow."""
         return -(-self.layers[-1].end // LINE) * LINE
+
+    @property
+    def parameters(self) -> int:
+        """Length of the table of parameters, in whole lines."""
+        return self.of_network + (-(-self.grid.learned // LINE) * LINE if self.grid else 0)
 
     @property
     def learned(self) -> int:
         """Parameters that are learned: those that do not fill blocks."""
-        return sum((len(layer.inputs) + 1) * layer.outputs for layer in self.layers)
+        of_grid = self.grid.learned if self.grid else 0
+        return sum((len(layer.inputs) + 1) * layer.outputs for layer in self.layers) + of_grid
 
     def first_parameters(self, seed: int) -> NDArray[np.float32]:
         """Return first parameters, [parameters]: weights uniform within the square root of 6 / (inputs + outputs)
-        (Glorot and Bengio 2010) and biases of 0, as in the released code."""
+        (Glorot and Bengio 2010) and biases of 0, as in the released code; a grid's numbers are nearly 0."""
         random, values = np.random.default_rng([seed, self.learned]), np.zeros(self.parameters, np.float32)
         for layer in self.layers:
             limit = np.sqrt(6 / (len(layer.inputs) + layer.outputs))
@@ -128,6 +154,9 @@ class FieldShape(Settings):
             drawn = random.uniform(-limit, limit, (len(layer.inputs), layer.outputs))
             weights[np.ix_(layer.inputs, range(layer.outputs))] = drawn
             values[layer.first : layer.first_bias] = weights.ravel()
+        if self.grid:
+            own = values[self.of_network : self.of_network + self.grid.learned]
+            own[:] = random.uniform(-FIRST_MOST, FIRST_MOST, len(own))
         return values
 
     def weights(self, parameters: NDArray[np.floating]) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:

@@ -16,7 +16,7 @@ from clsplat.stages.base import Scheduled
 from clsplat.stages.progress import report
 from clsplat.stages.training import Training
 from clsplat.training import checkpoint
-from clsplat.training.field import LearnedField, Shown
+from clsplat.training.field import LearnedField, Rate, Shown
 from clsplat.training.forecast import Forecast
 from clsplat.training.profile import clocks
 from clsplat.training.run import Run
@@ -37,7 +37,7 @@ class TrainField(Training):
     stage: Literal["train_field"] = "train_field"
     makes: ClassVar[frozenset[str]] = frozenset({"painter", "field"})
     takes: ClassVar[frozenset[str]] = frozenset({"model"})
-    training_keys: ClassVar[frozenset[str]] = frozenset({"rate", "coarse_weight"})
+    training_keys: ClassVar[frozenset[str]] = frozenset({"rate", "coarse_weight", "epsilon"})
     step_keys: ClassVar[frozenset[str]] = frozenset({"warm_up"})
     rehearsed: ClassVar[int] = 20  # all of its steps take the same time
 
@@ -57,6 +57,8 @@ class TrainField(Training):
     """Steps until the rate is that of `rate`, along a quarter of a sine."""
     warm_up_from: Annotated[float, Field(ge=0, le=1)] = 0.01
     """Share of the rate at the first step."""
+    epsilon: Annotated[float, Field(gt=0)] = 1e-8
+    """Added to the root of Adam's second moment; below it gradients are too small to count: a grid has such."""
     during: list[OneOf[Scheduled]] = Field([])
     """Stages that run every so many steps."""
     log_every: Annotated[int, Field(gt=0)] = 100
@@ -96,7 +98,7 @@ class TrainField(Training):
         for step in range(1, 1 + STEPS):
             shown = list(small._shown(run, pool, step))
             start, _ = clocks()
-            field.step(shown, self.coarse_weight, 0.0, run.seed, step)
+            field.step(shown, self.coarse_weight, Rate(0.0), run.seed, step)
             run.device.finish()
             seconds.append(clocks()[0] - start)
         return median(seconds) * self.rays / small.rays
@@ -121,7 +123,7 @@ class TrainField(Training):
         shown = list(self._shown(run, pool, step))
         with run.changing():
             run.step, run.stage_step = step, run.stage_step + 1
-            field.step(shown, self.coarse_weight, self.rate_at(step), run.seed, step)
+            field.step(shown, self.coarse_weight, Rate(self.rate_at(step), self.epsilon), run.seed, step)
             run.device.finish()  # the one wait of a step
             run.acted = 0
         run.device.timings.sampling = False

@@ -32,6 +32,14 @@ class Shown:
     weight: float  # of each ray: the area of what it stands for, px^2 of the full size
 
 
+@dataclass(frozen=True)
+class Rate:
+    """How far an update by Adam goes."""
+
+    rate: float
+    epsilon: float = 1e-8  # added to the root of the second moment: the default of Adam's paper, which Mip-NeRF keeps
+
+
 class LearnedField:
     """A field with Adam's moments, in tables that a checkpoint holds."""
 
@@ -73,14 +81,14 @@ class LearnedField:
             )
         return [name for name, counter in counters.items() if counter.get_item(0) > 0]
 
-    def step(self, shown: Sequence[Shown], coarse_weight: float, rate: float, seed: int, step: int) -> None:
+    def step(self, shown: Sequence[Shown], coarse_weight: float, rate: Rate, seed: int, step: int) -> None:
         """Do one update (Barron et al. 2021, section 3.3).
 
         The loss is that of the fine level and `coarse_weight` of that of the coarse one; each is the mean squared
         difference of the rays, weighted by what they stand for.
         """
         whole = CHANNELS * sum(one.rays * one.weight for one in shown)
-        self.rate = rate
+        self.rate = rate.rate
         self._gradient.fill(0)
         errors = self._errors(sum(one.rays for one in shown))
         self._scales, first = [(one.rays, one.weight / whole) for one in shown], 0
@@ -90,7 +98,7 @@ class LearnedField:
         self.updates += 1
         self.update(self._gradient, rate, self.updates)
 
-    def update(self, gradient: Array, rate: float, number: int) -> None:
+    def update(self, gradient: Array, rate: Rate, number: int) -> None:
         """Change the parameters by Adam, for the update `number`, from a gradient, [P]."""
         self._program.dense_update(
             items=self.field.shape.parameters // int(self._gradient.device.tuning["LANES"]),
@@ -98,8 +106,9 @@ class LearnedField:
             moment1=self._arrays["moment1"],
             moment2=self._arrays["moment2"],
             gradient=gradient,
-            rate=rate / (1 - self._beta1**number),
+            rate=rate.rate / (1 - self._beta1**number),
             correction2=1 / (1 - self._beta2**number),
+            epsilon=rate.epsilon,
             count=self.field.shape.parameters,
         )
 

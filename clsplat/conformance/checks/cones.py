@@ -11,8 +11,10 @@ from clsplat.conformance.check import Checks, Note
 from clsplat.conformance.checks.images import planes_of
 from clsplat.conformance.comparison import Figure, by_element, equal
 from clsplat.conformance.reference import cones as ref_cones
+from clsplat.conformance.reference import grid as ref_grid
 from clsplat.conformance.scenes import random_case
 from clsplat.fields.field import Field
+from clsplat.fields.grid import FEATURES
 from clsplat.fields.levels import Draw, Levels, Rays
 from clsplat.fields.shape import FieldShape
 from clsplat.opencl.device import Array, Device
@@ -37,6 +39,19 @@ EDGES = 2e-6  # of the distances, in shares of the farthest
 
 
 @dataclass(frozen=True)
+class GridLevel:
+    """A level of a grid, and where its entries lie among the parameters."""
+
+    level: ref_grid.Level
+    first: int
+
+    def of(self, parameters: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Its entries, [entries, FEATURES]."""
+        own = parameters[self.first : self.first + FEATURES * self.level.entries]
+        return own.reshape(-1, FEATURES).astype(np.float64)
+
+
+@dataclass(frozen=True)
 class Case:
     """Random parameters, and a camera before a random photograph."""
 
@@ -55,6 +70,9 @@ class Case:
         parameters = shape.first_parameters(int(rng.integers(100)))
         for layer in shape.layers:
             parameters[layer.first_bias : layer.first_bias + layer.outputs] = rng.normal(0, 0.3, layer.outputs)
+        if shape.grid:
+            own = parameters[shape.of_network : shape.of_network + shape.grid.learned]
+            own[:] = rng.normal(0, 0.5, len(own))
         scene = random_case(rng, 1, WIDTH, HEIGHT)
         camera, photograph = scene.device_camera(device), rng.random((3, HEIGHT, WIDTH)).astype(np.float32)
         field = Field(shape, device.upload(parameters), device.upload(BACKGROUND))
@@ -82,10 +100,24 @@ class Case:
     def encoded(self, edges: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Encoded positions and directions of samples, [S, features]."""
         means, variances = ref_cones.frustums(self.cones, edges.astype(np.float64))
-        position = ref_cones.encoded_frustums(means, variances, self.shape.degrees)
+        sines = ref_cones.encoded_frustums(means, variances, self.shape.degrees)
         direction = ref_cones.encoded_directions(self.cones, self.shape.direction_degrees)
-        samples = edges.shape[1] - 1
-        return position.reshape(-1, position.shape[-1]), np.repeat(direction, samples, axis=0)
+        of_grid = [own.level.forward(own.of(self.parameters), *self.places(edges)) for own in self.grid_levels()]
+        position = np.concatenate([*of_grid, sines.reshape(sines.shape[0] * sines.shape[1], sines.shape[2])], axis=1)
+        return position, np.repeat(direction, edges.shape[1] - 1, axis=0)
+
+    def places(self, edges: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Places of samples in the grid's cube, [S, 3], and their variances, [S]."""
+        assert self.shape.grid is not None
+        means, variances = (one.reshape(-1, 3) for one in ref_cones.frustums(self.cones, edges.astype(np.float64)))
+        return ref_grid.places(means, variances, np.array(self.shape.grid.corner), self.shape.grid.side)
+
+    def grid_levels(self) -> list[GridLevel]:
+        """The levels of the grid; none without one."""
+        table, first = self.shape.grid.table.tolist() if self.shape.grid else [], self.shape.of_network
+        return [
+            GridLevel(ref_grid.Level(cells, entries), first + FEATURES * before) for cells, before, entries, _ in table
+        ]
 
 
 def rows_of(table: Array, first: int, count: int) -> NDArray[Any]:

@@ -9,18 +9,21 @@ from numpy.typing import NDArray
 
 from clsplat.conformance.check import Checks, Note
 from clsplat.conformance.checks.cones import BACKGROUND, HEIGHT, RAYS, SHAPE, WIDTH, Case, rows_of
+from clsplat.conformance.checks.grids import GRID
 from clsplat.conformance.comparison import GRADIENT, SUM, Figure, by_element, by_norm, equal
 from clsplat.conformance.reference import field as ref_field
 from clsplat.fields.field import Field
+from clsplat.fields.grid import FEATURES
 from clsplat.fields.levels import Draw, Level, Target
 from clsplat.fields.shape import FieldShape
 from clsplat.opencl.device import Device
-from clsplat.training.field import LearnedField
+from clsplat.training.field import LearnedField, Rate
 
 CHECKS = Checks()
 CASES: list[tuple[int, dict[str, Any]]] = [
     *((count, {}) for count in RAYS),
     *((9, keys) for keys in ({"skip": None, "depth": 1}, {"degrees": 3}, {"skip": 0})),
+    *((9, {"grid": GRID, **keys}) for keys in ({}, {"skip": None, "depth": 1, "degrees": 0})),
 ]
 
 
@@ -34,6 +37,7 @@ def fields(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
         case = Case.of(device, rng, count, Draw(3, 4, 2), **keys)
         gradient = device.zeros(case.shape.parameters)
         errors, expected = device.zeros(2 + count), list[ref_field.Weights]()
+        by_entries = [np.zeros_like(own.of(case.parameters)) for own in case.grid_levels()]
         parameters = case.on_device
         for scale, level in zip((0.1, 1.0), case.levels.render(parameters, case.rays), strict=True):
             comparison = _Comparison.of(case, level, scale)
@@ -41,14 +45,23 @@ def fields(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
             case.levels.differentiate(parameters, level, Target(case.planes, scale, errors), gradient)
             squares = (comparison.differences[:count] ** 2).sum(axis=1)
             yield by_element("composite_backward", f"squares of {count} rays", errors.get()[2:], squares, SUM, 1e-3)
-            expected.append(comparison.by_weights(count))
+            by_weights, by_position = comparison.backward(count)
+            expected.append(by_weights)
+            for number, own in enumerate(case.grid_levels()):
+                by_features = by_position[:, FEATURES * number : FEATURES * (number + 1)]
+                by_entries[number] += own.level.backward(by_features, *case.places(level.edges.get()))
+        for number, (own, wanted) in enumerate(zip(case.grid_levels(), by_entries, strict=True)):
+            what = f"level {number} of the grid, {count} rays, skip {case.shape.skip}"
+            for name in ("dense_backward", "grid_backward"):
+                yield by_norm(name, what, own.of(gradient.get()), wanted, GRADIENT)
         yield from _gradient_figures(case.shape, gradient.get(), expected, f"{count} rays")
 
 
 def _gradient_figures(
     shape: FieldShape, gradient: NDArray[Any], expected: list[ref_field.Weights], what: str
 ) -> Iterator[Figure]:
-    used = np.zeros(shape.parameters, bool)
+    gradient = gradient[: shape.of_network]
+    used = np.zeros(shape.of_network, bool)
     for number, (layer, (weights, biases)) in enumerate(zip(shape.layers, shape.weights(gradient), strict=True)):
         of_weights, of_biases = (sum(level[number][part] for level in expected) for part in (0, 1))
         kernel = "composite_backward" if layer.name in ("density", "colour") else "dense_backward"
@@ -98,7 +111,7 @@ class _Comparison:
             yield by_element("composite_forward", f"{name}, {what}", table.get(), wanted, 1e-4, 1.0)
         yield by_element("composite_forward", what, self.level.colours.get(), self.composite.colours(), 1e-4, 1.0)
 
-    def by_weights(self, counted: int) -> ref_field.Weights:
+    def backward(self, counted: int) -> tuple[ref_field.Weights, NDArray[np.float64]]:
         by_colours = 2 * self.scale * self.differences
         by_colours[counted:] = 0
         by_raw, by_densities = self.composite.backward(by_colours)
@@ -123,11 +136,11 @@ def updates_of_fields(device: Device, rng: np.random.Generator) -> Iterator[Figu
     learned = LearnedField.first(SHAPE, 0, device.upload(BACKGROUND))
     count = SHAPE.parameters
     values, moment1, moment2 = SHAPE.first_parameters(0).astype(np.float64), np.zeros(count), np.zeros(count)
-    for number in range(1, 4):
+    for number, epsilon in enumerate((1e-8, 1e-8, 1e-15), 1):
         gradient = (rng.normal(size=count) * 10.0 ** rng.uniform(-10, 1, count)).astype(np.float32)
-        learned.update(device.upload(gradient), 0.01, number)
+        learned.update(device.upload(gradient), Rate(0.01, epsilon), number)
         own = gradient.astype(np.float64)
-        values, moment1, moment2 = ref_field.update(values, moment1, moment2, own, 0.01, number)
+        values, moment1, moment2 = ref_field.update(values, moment1, moment2, own, 0.01, number, epsilon)
     found = learned.tables()
     yield by_element("dense_update", "parameters", found["parameters"][:, 0], values, 1e-4, 0.01)
     yield by_element("dense_update", "first moments", found["moment1"][:, 0], moment1, 1e-4, 1e-12)

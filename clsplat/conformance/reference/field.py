@@ -34,20 +34,25 @@ class Network:
         inputs += [x, x, seen, hidden]
         return hidden @ colour[0] + colour[1], x @ density[0] + density[1], inputs
 
-    def backward(self, weights: Weights, inputs: Inputs, by_colours: Floats, by_densities: Floats) -> Weights:
-        """Derivatives by the weights, from those by the raw outputs."""
+    def backward(
+        self, weights: Weights, inputs: Inputs, by_colours: Floats, by_densities: Floats
+    ) -> tuple[Weights, Floats]:
+        """Derivatives by the weights, and by the encoded position, [S, features], from those by the raw outputs."""
         density, bottleneck, condition, colour = weights[self.depth :]
         width = bottleneck[0].shape[1]
         by_hidden = (by_colours @ colour[0].T) * (inputs[-1] > 0)
         by_bottleneck = (by_hidden @ condition[0].T)[:, :width]
         by_outputs = [by_densities, by_bottleneck, by_hidden, by_colours]
         by_x = by_densities @ density[0].T + by_bottleneck @ bottleneck[0].T
+        by_position = np.zeros_like(inputs[0])
         for i in reversed(range(self.depth)):
             after = inputs[i + 1]  # with the position, where it joins
+            if i == self.skip:
+                by_position += by_x[:, weights[i][0].shape[1] :]
             own = by_x[:, : weights[i][0].shape[1]] * (after[:, : weights[i][0].shape[1]] > 0)
             by_outputs.insert(0, own)
             by_x = own @ weights[i][0].T
-        return [(x.T @ y, y.sum(axis=0)) for x, y in zip(inputs, by_outputs, strict=True)]
+        return [(x.T @ y, y.sum(axis=0)) for x, y in zip(inputs, by_outputs, strict=True)], by_position + by_x
 
 
 @dataclass(frozen=True)
@@ -88,8 +93,14 @@ class Composite:
 
 
 def update(
-    values: Floats, moment1: Floats, moment2: Floats, gradient: Floats, rate: float, number: int
+    values: Floats,
+    moment1: Floats,
+    moment2: Floats,
+    gradient: Floats,
+    rate: float,
+    number: int,
+    epsilon: float = 1e-8,  # of Adam's paper
 ) -> tuple[Floats, Floats, Floats]:
-    """Adam (Kingma and Ba 2015) at its update `number`, with its paper's epsilon: values and both moments."""
+    """Adam (Kingma and Ba 2015) at its update `number`: values and both moments."""
     m, v = 0.9 * moment1 + 0.1 * gradient, 0.999 * moment2 + 0.001 * gradient**2
-    return values - rate * (m / (1 - 0.9**number)) / (np.sqrt(v / (1 - 0.999**number)) + 1e-8), m, v
+    return values - rate * (m / (1 - 0.9**number)) / (np.sqrt(v / (1 - 0.999**number)) + epsilon), m, v

@@ -1,0 +1,140 @@
+"""What the network of a field reads of samples, and derivatives by the numbers of its grid, on the device."""
+
+from dataclasses import dataclass
+from typing import Any
+
+from clsplat.fields.grid import FEATURES, GRID
+from clsplat.fields.network import Network
+from clsplat.fields.shape import SAMPLES, FieldShape, in_blocks
+from clsplat.opencl.device import Array, Device
+from clsplat.render.workspace import Workspace
+
+PLACE_ROWS = int(GRID["PLACE_ROWS"])
+PARTS = 64  # of a level for each unit of a GPU
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Rays, cut into samples."""
+
+    cones: Array  # [rays, RAY_VALUES]
+    edges: Array  # [rays, samples + 1]
+
+    @property
+    def of_ray(self) -> int:
+        return self.edges.shape[1] - 1
+
+    @property
+    def count(self) -> int:
+        return self.edges.shape[0] * self.of_ray
+
+    @property
+    def tiles(self) -> int:
+        return self.count // SAMPLES
+
+
+class Encoding:
+    """Puts the encodings of samples where the network reads them."""
+
+    def __init__(self, workspace: Workspace, shape: FieldShape, network: Network) -> None:
+        self.workspace, self.shape, self.network = workspace, shape, network
+        device = workspace.device
+        self._program, self._grid = device.program("encode.cl"), device.program("grid.cl")
+        self._lanes = int(device.tuning["LANES"])
+        self._levels = device.upload(shape.grid.table) if shape.grid else None
+        self.parts = parts_of_levels(device, shape.grid.levels) if shape.grid else 0
+
+    def forward(self, parameters: Array, samples: Samples) -> None:
+        """Write the encoded positions and directions."""
+        features, first = self.network.position(samples.tiles)
+        if self.shape.grid:
+            self._encode_places(parameters, samples, features, first)
+        if self.shape.degrees:
+            self._encode(
+                self._program.encode_frustums,
+                samples,
+                (features, first + self.shape.grid_rows),
+                self.shape.degrees,
+                in_blocks(6 * self.shape.degrees),
+                edges=samples.edges,
+            )
+        seen, degrees = self.network.seen(samples.tiles), self.shape.direction_degrees
+        self._encode(self._program.encode_directions, samples, seen, degrees, self.shape.direction_rows)
+
+    def backward(self, by_position: Array, gradient: Array) -> None:
+        """Add the derivatives by the grid's numbers to `gradient`, [P], from those by its features of the samples of the
+        last `forward`, [tiles, grid_rows, SAMPLES]."""
+        if not self.shape.grid:
+            return
+        tiles, rows = by_position.shape[:2]
+        count = self.shape.grid.levels * self.parts
+        self._grid.grid_backward(
+            groups=-(-count // int(self.workspace.device.tuning["TEAM"])),
+            places=self.places(tiles),
+            levels=self._levels,
+            by_features=by_position,
+            gradient=gradient,
+            first_parameter=self.shape.of_network,
+            rows=rows,
+            parts=self.parts,
+            samples=tiles * SAMPLES,
+            count=count,
+        )
+
+    def places(self, tiles: int) -> Array:
+        """Return the places of samples in the grid's cube, [tiles, PLACE_ROWS, SAMPLES], valid until the next `forward`."""
+        return self.workspace.array("field places", (tiles, PLACE_ROWS, SAMPLES))
+
+    def _encode_places(self, parameters: Array, samples: Samples, features: Array, first_row: int) -> None:
+        grid, places = self.shape.grid, self.places(samples.tiles)
+        assert grid is not None
+        self._grid.grid_places(
+            items=samples.count // self._lanes,
+            cones=samples.cones,
+            edges=samples.edges,
+            places=places,
+            **dict(zip(("corner_x", "corner_y", "corner_z"), grid.corner, strict=True)),
+            side=grid.side,
+            samples=samples.of_ray,
+            count=samples.count,
+        )
+        count = grid.levels * samples.count // self._lanes
+        self._grid.grid_forward(
+            items=count,
+            places=places,
+            levels=self._levels,
+            parameters=parameters,
+            features=features,
+            first_parameter=self.shape.of_network,
+            rows=features.shape[1],
+            first_row=first_row,
+            samples=samples.count,
+            count=count,
+        )
+
+    def _encode(
+        self, kernel: Any, samples: Samples, place: tuple[Array, int], degrees: int, written: int, **own: Array
+    ) -> None:
+        """Write sines; place: the table that they are in, and their first row there."""
+        features, first = place
+        kernel(
+            items=samples.count // self._lanes,
+            cones=samples.cones,
+            features=features,
+            samples=samples.of_ray,
+            degrees=degrees,
+            rows=features.shape[1],
+            first_row=first,
+            written=written,
+            count=samples.count,
+            **own,
+        )
+
+
+def parts_of_levels(device: Device, levels: int) -> int:
+    """Return in how many parts the entries of each level are summed: their sums do not depend on it.
+
+    Each part looks through all samples: so on a CPU they are as few as keep its cores busy.
+    """
+    wanted = 2 * device.info.units if int(device.tuning["TEAM"]) == 1 else PARTS * device.info.units
+    return max(1, wanted // levels)

@@ -1,0 +1,64 @@
+"""The shape of a grid of features: its levels, and where their entries lie."""
+
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from clsplat.opencl.program import constants
+from clsplat.settings import Settings
+
+GRID = constants("grid.cl")
+FEATURES, LEVEL_VALUES = int(GRID["GRID_FEATURES"]), int(GRID["LEVEL_VALUES"])
+FIRST_MOST = 1e-4  # size of the first numbers at most (Mueller et al. 2022, section 4)
+
+
+class GridShape(Settings):
+    """A grid of features in several resolutions (Mueller et al. 2022): at each corner of a level's cells 4 numbers, which are
+    learned; what is finer than a sample counts less (Barron et al. 2023, Zip-NeRF).  Outside of its cube it is zero."""
+
+    levels: Annotated[int, Field(ge=1, le=16)] = 8
+    """Resolutions, each finer than the one before by the same factor."""
+    coarsest: Annotated[int, Field(ge=1, le=4096)] = 16
+    """Cells along a side of the cube in the first level."""
+    finest: Annotated[int, Field(ge=1, le=4096)] = 256
+    """Cells along a side in the last one."""
+    entries: Annotated[int, Field(ge=16, le=1 << 22)] = 1 << 17
+    """Entries of a level at most, a power of 2; levels with more corners share them by a hash."""
+    corner: Annotated[list[float], Field(min_length=3, max_length=3)] = [-1.5, -1.5, -1.5]
+    """Corner of the cube with the least coordinates, scene units."""
+    side: Annotated[float, Field(gt=0)] = 3.0
+    """Side of the cube, scene units."""
+
+    @model_validator(mode="after")
+    def _in_order(self) -> "GridShape":
+        if self.finest < self.coarsest:
+            raise ValueError(f"expected 'finest' from {self.coarsest} on, as 'coarsest' is; it is {self.finest}")
+        if self.entries & (self.entries - 1):
+            raise ValueError(f"expected a power of 2 for 'entries'; {self.entries} is none")
+        return self
+
+    @property
+    def features(self) -> int:
+        """Features of a sample."""
+        return FEATURES * self.levels
+
+    @property
+    def table(self) -> NDArray[np.uint32]:
+        """What kernels read of each level, [levels, LEVEL_VALUES]: cells along a side, first entry, entries, and 1 where
+        corners share them."""
+        growth = (self.finest / self.coarsest) ** (1 / max(1, self.levels - 1))
+        found, first = [], 0
+        for level in range(self.levels):
+            cells = round(self.coarsest * growth**level)
+            corners = (cells + 1) ** 3
+            own = min(corners, self.entries)
+            found.append((cells, first, own, int(corners > own)))
+            first += own
+        return np.array(found, np.uint32)
+
+    @property
+    def learned(self) -> int:
+        """Numbers of all levels."""
+        return FEATURES * int(self.table[:, 2].sum())
