@@ -102,7 +102,7 @@ def test_the_gradient_of_a_field_is_that_of_finite_differences(rng, skip):
 
     found, inputs = composite()
     by_raw, by_densities = found.backward(2 * (found.colours() - wanted))
-    gradient = network.backward(weights, inputs, by_raw.reshape(-1, 3), by_densities.reshape(-1, 1))
+    gradient, _ = network.backward(weights, inputs, by_raw.reshape(-1, 3), by_densities.reshape(-1, 1))
     for own, expected in zip(weights, gradient, strict=True):
         for values, derivative in zip(own, expected, strict=True):
             numeric = np.zeros(values.shape)

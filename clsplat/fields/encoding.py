@@ -46,9 +46,10 @@ class Encoding:
 
     def forward(self, parameters: Array, samples: Samples) -> None:
         """Write the encoded positions and directions."""
-        features, first = self.network.position(samples.tiles)
         if self.shape.grid:
-            self._encode_places(parameters, samples, features, first)
+            self._place(samples)
+            self.read_grid(parameters, samples.tiles)
+        features, first = self.network.position(samples.tiles)
         if self.shape.degrees:
             self._encode(
                 self._program.encode_frustums,
@@ -85,31 +86,37 @@ class Encoding:
         """Return the places of samples in the grid's cube, [tiles, PLACE_ROWS, SAMPLES], valid until the next `forward`."""
         return self.workspace.array("field places", (tiles, PLACE_ROWS, SAMPLES))
 
-    def _encode_places(self, parameters: Array, samples: Samples, features: Array, first_row: int) -> None:
-        grid, places = self.shape.grid, self.places(samples.tiles)
+    def read_grid(self, parameters: Array, tiles: int) -> None:
+        """Write the features of the grid at the places of samples."""
+        grid, (features, first) = self.shape.grid, self.network.position(tiles)
         assert grid is not None
-        self._grid.grid_places(
-            items=samples.count // self._lanes,
-            cones=samples.cones,
-            edges=samples.edges,
-            places=places,
-            **dict(zip(("corner_x", "corner_y", "corner_z"), grid.corner, strict=True)),
-            side=grid.side,
-            samples=samples.of_ray,
-            count=samples.count,
-        )
-        count = grid.levels * samples.count // self._lanes
+        count = grid.levels * tiles * SAMPLES // self._lanes
         self._grid.grid_forward(
             items=count,
-            places=places,
+            places=self.places(tiles),
             levels=self._levels,
             parameters=parameters,
             features=features,
             first_parameter=self.shape.of_network,
             rows=features.shape[1],
-            first_row=first_row,
-            samples=samples.count,
+            first_row=first,
+            samples=tiles * SAMPLES,
             count=count,
+        )
+
+    def _place(self, samples: Samples) -> None:
+        """Write the places of samples."""
+        grid = self.shape.grid
+        assert grid is not None
+        self._grid.grid_places(
+            items=samples.count // self._lanes,
+            cones=samples.cones,
+            edges=samples.edges,
+            places=self.places(samples.tiles),
+            **dict(zip(("corner_x", "corner_y", "corner_z"), grid.corner, strict=True)),
+            side=grid.side,
+            samples=samples.of_ray,
+            count=samples.count,
         )
 
     def _encode(

@@ -1,0 +1,98 @@
+"""Runs that train a field whose network reads a grid: their bits, their files, and the recipe."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import clsplat
+from clsplat.errors import DataError
+from clsplat.fields.shape import FieldShape
+from clsplat.pipeline.loading import load
+from clsplat.stages.train_field import TrainField
+from clsplat.training import archive, checkpoint
+from tests.test_field_runs import ALONE, PIPELINE, SHAPE, bits
+from tests.test_training import ONE_CORE, train
+
+pytestmark = pytest.mark.slow
+
+GRID = "grid: {levels: 3, coarsest: 4, finest: 24, entries: 1024, corner: [-2, -2, -2], side: 4}"
+OWN = SHAPE.replace("skip: 0", f"skip: 0, degrees: 0, {GRID}")
+
+
+@pytest.fixture(scope="module")
+def pipeline(tmp_path_factory: pytest.TempPathFactory) -> str:
+    file = tmp_path_factory.mktemp("pipelines") / "grid.yaml"
+    file.write_text(PIPELINE.replace(SHAPE, OWN).replace("rate: 2.0e-3", "rate: 1.0e-2\n      epsilon: 1.0e-15"))
+    return str(file)
+
+
+@pytest.fixture(scope="module")
+def finished(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory, pipeline: str) -> Path:
+    out = tmp_path_factory.mktemp("runs") / "grid"
+    train(tiny_scene, out, pipeline=pipeline)
+    return out
+
+
+def test_the_numbers_of_a_grid_are_trained(finished):
+    field = clsplat.load_field(finished)
+    own = slice(field.shape.of_network, field.shape.of_network + field.shape.grid.learned)
+    moved = np.abs(field.parameters - field.shape.first_parameters(0))[own]
+    assert 0.05 < (moved > 1e-3).mean() < 0.95  # some lie where no sample is
+    assert json.loads((finished / "metrics.json").read_text())["parameters"] == field.shape.learned
+
+
+def test_a_grid_that_was_killed_ends_with_the_bits_of_one_that_was_not(finished, tiny_scene, tmp_path, pipeline):
+    out = tmp_path / "run"
+    shutil.copytree(finished, out)
+    (out / "checkpoints/step_000012.npz").unlink()
+    for name in ("metrics.json", "checksums.json"):
+        (out / name).unlink()
+    shutil.rmtree(out / "renders")
+    train(tiny_scene, out, pipeline=pipeline, resume=True)
+    assert bits(out) == bits(finished)
+
+
+def test_a_grid_has_the_bits_of_several_threads_with_one(finished, tiny_scene, tmp_path, pipeline):
+    command = [sys.executable, "-c", ALONE, tiny_scene, tmp_path / "run", pipeline]
+    subprocess.run(command, check=True, env={**os.environ, **ONE_CORE}, cwd=Path(__file__).parents[1])
+    assert bits(tmp_path / "run") == bits(finished)
+
+
+def test_the_file_of_a_grid_gives_the_figures_of_its_run(finished):
+    recorded = json.loads((finished / "metrics.json").read_text())
+    found = clsplat.evaluate(finished / "field.npz", downscales=[2])
+    assert found["test"]["2"] == recorded["test"]["2"]
+
+
+def test_a_file_whose_grid_has_another_shape_is_refused(finished, tmp_path):
+    notes, arrays = archive.read(finished / "field.npz")
+    notes["shape"]["grid"]["entries"] = 2048
+    with (tmp_path / "field.npz").open("wb") as file:
+        archive.write(file, notes, arrays.items())
+    with pytest.raises(DataError, match=r"parameters are not \[\d+, 1\]"):
+        clsplat.load_field(tmp_path / "field.npz")
+
+
+def test_fields_without_a_grid_write_the_keys_that_they_had(tiny_scene, tmp_path):
+    plain = tmp_path / "plain.yaml"
+    plain.write_text(PIPELINE.partition("  - evaluate: {split: test, downscales")[0] + "  - export_field\n")
+    train(tiny_scene, tmp_path / "run", "train_field.steps=1", pipeline=str(plain))
+    assert "grid" not in archive.read(tmp_path / "run/field.npz")[0]["shape"]
+    state, _ = checkpoint.load(checkpoint.saved(tmp_path / "run")[-1])
+    assert state.field is not None
+    assert state.field.grid is None
+
+
+def test_the_recipe_reads_a_grid_in_the_place_of_sines():
+    (stage, *_) = load("mip_grid").stages
+    assert isinstance(stage, TrainField)
+    assert stage.field.grid is not None
+    assert stage.field.degrees == 0
+    assert stage.field.grid.table[:, 3].max() == 1  # some levels are shared
+    assert FieldShape.model_validate(stage.field.model_dump()) == stage.field
