@@ -24,7 +24,11 @@ def test_the_gradient_of_a_grid_and_of_the_network_behind_it_is_that_of_finite_d
     """Through a network that reads the position twice, for samples inside and outside of the cube."""
     samples, network = 12, field.Network(2, 0)
     at, variances = rng.uniform(-0.2, 1.2, (samples, 3)), rng.uniform(1e-3, 1e-1, samples)
-    table, sines, direction = rng.normal(size=(level.entries, 2)), rng.normal(size=(samples, 3)), rng.normal(size=(samples, 2))
+    table, sines, direction = (
+        rng.normal(size=(level.entries, 2)),
+        rng.normal(size=(samples, 3)),
+        rng.normal(size=(samples, 2)),
+    )
     shapes = [(5, 4), (4 + 5, 4), (4, 1), (4, 4), (4 + 2, 4), (4, 3)]
     weights = [(rng.normal(0, 0.7, shape), rng.normal(0, 0.5, shape[1])) for shape in shapes]
     by_colours, by_densities = rng.normal(size=(samples, 3)), rng.normal(size=(samples, 1))

@@ -145,7 +145,11 @@ MORE = {  # that smaller pictures do not show
     "grid_forward, the weight of a level": ("grid.cl", "TWO_PI * size * size", "TWO_PI * size"),
     "grid_forward, outside of the cube": ("grid.cl", "(y <= 1.0f)", "(y <= 1.5f)"),
     "grid_backward, sums in parts": ("grid.cl", "entry[corner] - begin < size", "entry[corner] - begin <= size"),
-    "dense_backward, rows of a grid": ("dense.cl", "? VLOAD(found + k * SAMPLES + v * COLUMNS * LANES)", "? (VF)(0.0f)"),
+    "dense_backward, rows of a grid": (
+        "dense.cl",
+        "kept ? VLOAD(found",
+        "kept ? 0.0f * VLOAD(found",
+    ),
     "blend_forward simt, dim pixels": ("blend_simt.cl", "if (p.t > 0.0f)", "if (p.t > 0.01f)"),
     "pixel_loss, pixels that are equal": ("loss.cl", "difference < 0.0f ?", "difference <= 0.0f ?"),
     "scan_offsets simt, a sum that wraps": ("scan.cl", "sum | (0u - carry)", "sum"),

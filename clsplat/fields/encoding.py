@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Any
 
-from clsplat.fields.grid import FEATURES, GRID
+from clsplat.fields.grid import GRID
 from clsplat.fields.network import Network
 from clsplat.fields.shape import SAMPLES, FieldShape, in_blocks
 from clsplat.opencl.device import Array, Device
@@ -63,8 +63,10 @@ class Encoding:
         self._encode(self._program.encode_directions, samples, seen, degrees, self.shape.direction_rows)
 
     def backward(self, by_position: Array, gradient: Array) -> None:
-        """Add the derivatives by the grid's numbers to `gradient`, [P], from those by its features of the samples of the
-        last `forward`, [tiles, grid_rows, SAMPLES]."""
+        """Add the derivatives by the grid's numbers to `gradient`, [P].
+
+        by_position: those by its features of the samples of the last `forward`, [tiles, grid_rows, SAMPLES].
+        """
         if not self.shape.grid:
             return
         tiles, rows = by_position.shape[:2]
@@ -83,7 +85,7 @@ class Encoding:
         )
 
     def places(self, tiles: int) -> Array:
-        """Return the places of samples in the grid's cube, [tiles, PLACE_ROWS, SAMPLES], valid until the next `forward`."""
+        """Return the places of samples in the grid's cube, [tiles, PLACE_ROWS, SAMPLES], until the next `forward`."""
         return self.workspace.array("field places", (tiles, PLACE_ROWS, SAMPLES))
 
     def read_grid(self, parameters: Array, tiles: int) -> None:
@@ -108,12 +110,15 @@ class Encoding:
         """Write the places of samples."""
         grid = self.shape.grid
         assert grid is not None
+        x, y, z = grid.corner
         self._grid.grid_places(
             items=samples.count // self._lanes,
             cones=samples.cones,
             edges=samples.edges,
             places=self.places(samples.tiles),
-            **dict(zip(("corner_x", "corner_y", "corner_z"), grid.corner, strict=True)),
+            corner_x=x,
+            corner_y=y,
+            corner_z=z,
             side=grid.side,
             samples=samples.of_ray,
             count=samples.count,

@@ -10,13 +10,17 @@ from clsplat.opencl.program import constants
 from clsplat.settings import Settings
 
 GRID = constants("grid.cl")
-FEATURES, LEVEL_VALUES = int(GRID["GRID_FEATURES"]), int(GRID["LEVEL_VALUES"])
+FEATURES = int(GRID["GRID_FEATURES"])
 FIRST_MOST = 1e-4  # size of the first numbers at most (Mueller et al. 2022, section 4)
 
 
 class GridShape(Settings):
-    """A grid of features in several resolutions (Mueller et al. 2022): at each corner of a level's cells 4 numbers, which are
-    learned; what is finer than a sample counts less (Barron et al. 2023, Zip-NeRF).  Outside of its cube it is zero."""
+    """A grid of features in several resolutions (Mueller et al. 2022): each corner of a cell has 4 numbers, which are
+    learned.
+
+    What is finer than a sample counts less (Barron et al. 2023, Zip-NeRF, section 3.1).  Outside of its cube the
+    features are zero.
+    """
 
     levels: Annotated[int, Field(ge=1, le=16)] = 8
     """Resolutions, each finer than the one before by the same factor."""
@@ -26,7 +30,7 @@ class GridShape(Settings):
     """Cells along a side in the last one."""
     entries: Annotated[int, Field(ge=16, le=1 << 22)] = 1 << 17
     """Entries of a level at most, a power of 2; levels with more corners share them by a hash."""
-    corner: Annotated[list[float], Field(min_length=3, max_length=3)] = [-1.5, -1.5, -1.5]
+    corner: Annotated[list[float], Field(min_length=3, max_length=3)] = Field([-1.5, -1.5, -1.5])
     """Corner of the cube with the least coordinates, scene units."""
     side: Annotated[float, Field(gt=0)] = 3.0
     """Side of the cube, scene units."""
@@ -46,8 +50,8 @@ class GridShape(Settings):
 
     @property
     def table(self) -> NDArray[np.uint32]:
-        """What kernels read of each level, [levels, LEVEL_VALUES]: cells along a side, first entry, entries, and 1 where
-        corners share them."""
+        """What kernels read of each level, [levels, 4]: cells along a side, first entry, entries, and 1
+        where corners share them."""
         growth = (self.finest / self.coarsest) ** (1 / max(1, self.levels - 1))
         found, first = [], 0
         for level in range(self.levels):

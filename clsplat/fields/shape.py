@@ -48,7 +48,7 @@ class Layer:
 
 
 class FieldShape(Settings):
-    """A field of Mip-NeRF (Barron et al. 2021): a network that both levels share reads positions and directions, encoded."""
+    """A field of Mip-NeRF (Barron et al. 2021): a network, which both levels share, reads positions and directions."""
 
     near: Annotated[float, Field(gt=0)] = 2.0
     """Depth at which the samples of a ray begin, scene units; 2 for the Blender scenes."""

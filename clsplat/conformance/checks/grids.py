@@ -16,7 +16,14 @@ from clsplat.fields.shape import SAMPLES
 from clsplat.opencl.device import Device
 
 CHECKS = Checks()
-GRID: dict[str, Any] = {"levels": 3, "coarsest": 4, "finest": 19, "entries": 512, "corner": [-1.0, -1.1, -1.2], "side": 2.5}
+GRID: dict[str, Any] = {
+    "levels": 3,
+    "coarsest": 4,
+    "finest": 19,
+    "entries": 512,
+    "corner": [-1.0, -1.1, -1.2],
+    "side": 2.5,
+}
 CASES: list[tuple[int, tuple[float, float], dict[str, Any]]] = [  # tiles, places along an axis, keys of the grid
     *((tiles, (-0.1, 1.1), {}) for tiles in (1, 2, 17)),
     (2, (0.0, 1.0), {"levels": 1, "coarsest": 1, "finest": 1, "entries": 16}),  # one cell, all of its corners
@@ -49,6 +56,11 @@ def _places(rng: np.random.Generator, tiles: int, ends: tuple[float, float]) -> 
     return np.concatenate([faces, 10.0 ** rng.uniform(-9, 0, (tiles, 1, SAMPLES))], axis=1).astype(np.float32)
 
 
+def _by_sample(table: NDArray[np.float32]) -> NDArray[np.float64]:
+    """[tiles, rows, SAMPLES] -> [S, rows]."""
+    return table.transpose(0, 2, 1).reshape(-1, table.shape[1]).astype(np.float64)
+
+
 def _grid_figures(
     device: Device, rng: np.random.Generator, case: Case, places: NDArray[np.float32]
 ) -> Iterator[Figure]:
@@ -63,21 +75,21 @@ def _grid_figures(
     by_features[:, :, ::3] = 0  # samples without derivatives
     gradients = list[NDArray[np.float32]]()
     for parts in (encoding.parts, 1, 3):
-        encoding.parts, gradient = parts, device.zeros(shape.parameters)
-        encoding.backward(device.upload(by_features), gradient)
-        gradients.append(gradient.get())
+        encoding.parts, sums = parts, device.zeros(shape.parameters)
+        encoding.backward(device.upload(by_features), sums)
+        gradients.append(sums.get())
     found, *others = gradients
     for parts, gradient in zip((1, 3), others, strict=True):
         yield equal("grid_backward", f"sums in {parts} of its parts, {what}", gradient, found)
-    by_sample = by_features.transpose(0, 2, 1).reshape(-1, shape.grid_rows).astype(np.float64)
-    samples = places.transpose(0, 2, 1).reshape(-1, PLACE_ROWS).astype(np.float64)
-    at, variances = samples[:, :3], samples[:, 3]
+    by_sample = _by_sample(by_features)
+    at, variances = np.split(_by_sample(places), [3], axis=1)
+    variances = variances[:, 0]
     for number, own in enumerate(case.grid_levels()):
         rows = slice(FEATURES * number, FEATURES * (number + 1))
         wanted = own.level.forward(own.of(case.parameters), at, variances)
         yield by_element("grid_forward", f"level {number}, {what}", features[:, rows], wanted, 5e-5, 1.0)
-        wanted, gradient = own.level.backward(by_sample[:, rows], at, variances), own.of(found)
-        yield by_norm("grid_backward", f"level {number}, {what}", gradient, wanted, GRADIENT)
-        untouched = (wanted == 0).all(axis=1)
-        yield equal("grid_backward", f"entries without samples, level {number}, {what}", gradient[untouched], 0.0)
+        wanted, by_entries = own.level.backward(by_sample[:, rows], at, variances), own.of(found)
+        yield by_norm("grid_backward", f"level {number}, {what}", by_entries, wanted, GRADIENT)
+        untouched = np.all(wanted == 0, axis=1)
+        yield equal("grid_backward", f"entries without samples, level {number}, {what}", by_entries[untouched], 0.0)
     yield equal("grid_backward", f"parameters of the network, {what}", found[: shape.of_network], 0.0)

@@ -1,4 +1,7 @@
-"""A grid of features in several resolutions, and its derivatives, in float64 (Mueller et al. 2022; Barron et al. 2023)."""
+"""A grid of features in several resolutions, and its derivatives, in float64.
+
+Mueller et al. 2022 (instant-ngp); Barron et al. 2023 (Zip-NeRF).
+"""
 
 from dataclasses import dataclass
 
@@ -23,7 +26,7 @@ class Level:
     entries: int
 
     def weights(self, variances: Floats) -> Floats:
-        """How much of a level samples can tell, [S]: erf(1 / sqrt(8 v n^2)), nearly (section 3.1 of Barron et al. 2023)."""
+        """How much of a level samples can tell, [S]: nearly erf(1 / sqrt(8 v n^2)) (Barron et al. 2023)."""
         return np.sqrt(-np.expm1(-4 / np.pi / (8 * variances * self.cells**2)))
 
     def corners(self, at: Floats) -> tuple[NDArray[np.int64], Floats]:
@@ -51,6 +54,6 @@ class Level:
 
     def _inside(self, at: Floats, variances: Floats) -> tuple[NDArray[np.int64], Floats]:
         """The corners, with the weight of the level; without any outside of the cube."""
-        inside = ((at >= 0) & (at <= 1)).all(axis=1)
-        entries, shares = self.corners(np.where(inside[:, None], at, 0.5))
+        inside = np.all((at >= 0) & (at <= 1), axis=1)
+        entries, shares = self.corners(np.where(inside[..., None], at, 0.5))
         return entries, shares * (inside * self.weights(variances))[:, None]
