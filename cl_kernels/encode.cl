@@ -1,9 +1,9 @@
 /* What a network reads of a sample: the integrated positional encoding of its conical frustum, and the encoding of the
  * direction that it is seen in (Barron et al. 2021).
  *
- * A frustum is a normal distribution (frustum.h), and its features are the means of sin(2^l x) and cos(2^l x), which are
- * those of the mean times exp(-4^l variance / 2) (equations 13 and 14).  Angles are in turns, so that their whole part can
- * be left out exactly.
+ * A frustum is a normal distribution (frustum.h), and its features are the means of sin(2^l x) and cos(2^l x), which
+ * are those of the mean times exp(-4^l variance / 2) (equations 13 and 14).  Angles are in turns, so that their whole
+ * part can be left out exactly.
  *
  * Features: sines of x, y, z for l = 0, 1, ...; then cosines; then zeros up to a multiple of BLOCK (layers.h).
  * One item = LANES samples of one ray.  No local memory. */

@@ -1,5 +1,5 @@
-/* A grid of features in several resolutions, which a network reads in the place of sines (Mueller et al. 2022), each level
- * weighed by how much of a sample it can tell (Barron et al. 2023, "Zip-NeRF", section 3.1).
+/* A grid of features in several resolutions, which a network reads in the place of sines (Mueller et al. 2022), each
+ * level weighed by how much a sample can tell of it (Barron et al. 2023, "Zip-NeRF", section 3.1).
  *
  *   place    mean of a frustum (frustum.h) in a cube, u = (x - corner) / side, and v = variance / side^2: the mean of
  *            the variances along the three axes, as if it were a ball

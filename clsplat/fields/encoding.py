@@ -49,18 +49,32 @@ class Encoding:
         if self.shape.grid:
             self._place(samples)
             self.read_grid(parameters, samples.tiles)
-        features, first = self.network.position(samples.tiles)
-        if self.shape.degrees:
-            self._encode(
-                self._program.encode_frustums,
-                samples,
-                (features, first + self.shape.grid_rows),
-                self.shape.degrees,
-                in_blocks(6 * self.shape.degrees),
+        shape, (features, first) = self.shape, self.network.position(samples.tiles)
+        shared: dict[str, Any] = {
+            "items": samples.count // self._lanes,
+            "cones": samples.cones,
+            "samples": samples.of_ray,
+            "count": samples.count,
+        }
+        if shape.degrees:
+            self._program.encode_frustums(
                 edges=samples.edges,
+                features=features,
+                rows=features.shape[1],
+                first_row=first + shape.grid_rows,
+                degrees=shape.degrees,
+                written=in_blocks(6 * shape.degrees),
+                **shared,
             )
-        seen, degrees = self.network.seen(samples.tiles), self.shape.direction_degrees
-        self._encode(self._program.encode_directions, samples, seen, degrees, self.shape.direction_rows)
+        features, first = self.network.seen(samples.tiles)
+        self._program.encode_directions(
+            features=features,
+            rows=features.shape[1],
+            first_row=first,
+            degrees=shape.direction_degrees,
+            written=shape.direction_rows,
+            **shared,
+        )
 
     def backward(self, by_position: Array, gradient: Array) -> None:
         """Add the derivatives by the grid's numbers to `gradient`, [P].
@@ -122,24 +136,6 @@ class Encoding:
             side=grid.side,
             samples=samples.of_ray,
             count=samples.count,
-        )
-
-    def _encode(
-        self, kernel: Any, samples: Samples, place: tuple[Array, int], degrees: int, written: int, **own: Array
-    ) -> None:
-        """Write sines; place: the table that they are in, and their first row there."""
-        features, first = place
-        kernel(
-            items=samples.count // self._lanes,
-            cones=samples.cones,
-            features=features,
-            samples=samples.of_ray,
-            degrees=degrees,
-            rows=features.shape[1],
-            first_row=first,
-            written=written,
-            count=samples.count,
-            **own,
         )
 
 
