@@ -64,6 +64,8 @@ STAGES = {
     "resample_edges": "cones",
     "encode_frustums": "encode",
     "encode_directions": "encode",
+    "grid_places": "encode",
+    "grid_forward": "encode",
     "dense_forward": "network",
     "composite_forward": "colours of rays",
     "composite_backward": "colours of rays, backward",
@@ -71,6 +73,7 @@ STAGES = {
     "dense_weights": "network, weights",
     "dense_biases": "network, weights",
     "dense_sums": "network, weights",
+    "grid_backward": "grid backward",
     "dense_update": "update",
 }
 ORDER = tuple(dict.fromkeys(STAGES.values()))
