@@ -20,11 +20,12 @@ PREPARED = "prepared"
 COMPARISON = "compare.html"
 SEAMS = "seams"
 VIEW_COLOURS = "view_colours.json"
+VIEW_GRIDS = "view_colours.npy"
 VIEW_POSES = "view_poses.json"
 RESERVED = frozenset(
     {
         *(PIPELINE, METRICS, RECORDS, TRIAL, STATUS, LOG_FILE, NOTE, INPUTS, CHECKSUMS, LOCK),
-        *(CHECKPOINTS, UNDISTORTED, PREPARED, COMPARISON, SEAMS, "cameras.json", VIEW_COLOURS, VIEW_POSES),
+        *(CHECKPOINTS, UNDISTORTED, PREPARED, COMPARISON, SEAMS, "cameras.json", VIEW_COLOURS, VIEW_GRIDS, VIEW_POSES),
     }
 )
 BEFORE_A_RUN = frozenset({STATUS, LOG_FILE, LOCK, UNDISTORTED})  # written before pipeline.yaml

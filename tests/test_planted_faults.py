@@ -28,6 +28,13 @@ FAULTS = {  # kernel -> file, text, wrong text
     "sum_members": ("clusters.cl", "components + k, (int)p)", "components + k, (int)p / 2)"),
     "colours_forward": ("colours.cl", "br * r + bg * g + bb * b + b1, one", "br * r + bg * g + bb * b, one"),
     "colours_backward": ("colours.cl", "rg * passed_r + gg * passed_g", "rg * passed_r + gr * passed_g"),
+    "colour_grid_forward": ("colour_grid.cl", "a[9] * g + a[10] * b + a[11]), one", "a[9] * g + a[10] * b), one"),
+    "colour_grid_backward": ("colour_grid.cl", "a[5] * p[1] + a[9] * p[2]", "a[4] * p[1] + a[9] * p[2]"),
+    "colour_grid_row_sums": ("colour_grid.cl", "total[4 * c + 1] += part * g", "total[4 * c + 1] += part * b"),
+    "colour_grid_gather": ("colour_grid.cl", "total += weight > 0.0f ? weight * sums[y]", "total += weight > 0.0f ? sums[y]"),
+    "colour_grid_smoothness": ("colour_grid_table.cl", "(before - after)", "(before + after)"),
+    "colour_grid_update": ("colour_grid_table.cl", "by_grid[e] + by_smoothness[e]", "by_grid[e]"),
+    "colour_grid_centre": ("colour_grid_table.cl", "((float)places * (float)photographs)", "(float)places"),
     "sky_forward": ("sky.cl", "+ seen * colour", "- seen * colour"),
     "sky_matches": ("sky.cl", "apart <= 3.0f * difference", "apart <= difference"),
     "sky_cover": ("sky.cl", "-scale * (chosen * t)", "-scale * chosen"),
@@ -136,6 +143,9 @@ OPEN = "ANY((one.t > 0.0f) | (other.t > 0.0f))"
 MORE = {  # that smaller pictures do not show
     "colours_backward, what is cut": ("colours.cl", "+ g1 < 1.0f ? inside : zero", "+ g1 < 1.0f ? inside : inside"),
     "colours_backward, a sum of another": ("colours.cl", "total[9] += passed_b * g", "total[9] += passed_b * r"),
+    "colour_grid_backward, what is cut": ("colour_grid.cl", "(changed < 1.0f ? inside : zero)", "inside"),
+    "colour_grid_backward, through the luminance": ("colour_grid.cl", "(float)(nz - 1) * between", "between"),
+    "colour_grid_centre, one photograph": ("colour_grid_table.cl", "own[p * each + i] -= mean", "own[i] -= mean"),
     "blend_forward wide, dim pixels": (
         "blend_wide.cl",
         f"bool open = {OPEN}",

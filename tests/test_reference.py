@@ -711,6 +711,39 @@ def test_gradients_of_the_colours_of_a_photograph(rng):
     assert relative_error(ref.gain_gradient(*numbers, by_gains), numeric) < FD_TOLERANCE
 
 
+@pytest.mark.parametrize("nodes", [(3, 2, 4), (1, 4, 2), (2, 1, 1)])
+def test_gradients_of_a_grid_of_colours(rng, nodes):
+    """By the image, through the luminance too, by the grid, and of its smoothness; some pixels are cut."""
+    gradient, grid = rng.normal(size=(3, 5, 6)), rng.normal(0, 0.2, (3, 4, *nodes))
+    image = rng.uniform(-0.2, 1.3, gradient.shape)
+    assert 0.05 < np.mean(ref.gridded(image, grid) == 1) < 0.7
+    by_image, by_grid = ref.gridded_backward(image, grid, gradient)
+    for analytic, array in ((by_image, image), (by_grid, grid)):
+        numeric = five_point(lambda: (gradient * ref.gridded(image, grid)).sum(), array)
+        assert relative_error(analytic, numeric) < FD_TOLERANCE
+    value, slope = ref.grid_smoothness(grid)
+    assert value > 0
+    assert relative_error(slope, five_point(lambda: ref.grid_smoothness(grid)[0], grid)) < FD_TOLERANCE
+
+
+def test_a_grid_of_one_matrix_is_that_matrix_and_corners_of_a_grid_are_its_nodes(rng):
+    image, grid = rng.uniform(0, 1, (3, 6, 7)), rng.normal(0, 0.2, (3, 4, 1, 1, 1))
+    expected = ref.coloured(image, np.eye(3, 4) + grid[:, :, 0, 0, 0])
+    np.testing.assert_allclose(ref.gridded(image, np.tile(grid, (1, 1, 4, 3, 2))), expected)
+    grey = np.full((3, 1, 1), 1 / 3)  # the second of four levels, in the middle of the image
+    grid = rng.normal(0, 0.2, (3, 4, 4, 3, 3))
+    matrix = np.eye(3, 4) + grid[:, :, 1, 1, 1]
+    np.testing.assert_allclose(ref.gridded(grey, grid), ref.coloured(grey, matrix))
+
+
+def test_the_mean_of_grids_at_a_level_goes_and_what_differs_by_place_stays(rng):
+    vignette = np.zeros((4, 3, 4, 2, 3, 3))
+    vignette[..., 1, 1] = 0.3  # in the middle of all photographs
+    found = ref.centred_grids(vignette + rng.normal(size=(1, 3, 4, 2, 1, 1)))
+    np.testing.assert_allclose(found.mean(axis=(0, 4, 5)), 0, atol=1e-15)
+    np.testing.assert_allclose(found[..., 1, 1] - found[..., 0, 0], 0.3)
+
+
 def test_white_balance_keeps_the_luminance_of_its_gains():
     gains = np.log(np.diag(ref.gain_matrix(0.3, 0.1, -0.2)))
     assert gains @ [0.299, 0.587, 0.114] == pytest.approx(0.3)

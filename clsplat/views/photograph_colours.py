@@ -1,5 +1,6 @@
 """The colours of the photographs while a model is trained: between the rendered image and the losses."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -19,8 +20,32 @@ SUMS = int(constants("colours.cl")["SUMS"])
 NAMES = tuple(f"{y}{c}" for y in "rgb" for c in "rgb1")  # of the kernels' arguments
 
 
+class ViewColours(ABC):
+    """What a training step does with the colours of its photograph."""
+
+    @abstractmethod
+    def change(
+        self, workspace: Workspace, camera: DeviceCamera, image: Array, numbers: Mapping[str, float], view: int
+    ) -> tuple[Array, Callable[[], float]]:
+        """Return an image, [3 or 4, rows, stride], in the colours of a training view, by its number, and what returns
+        the loss of its numbers alone."""
+
+    @abstractmethod
+    def change_back(
+        self,
+        workspace: Workspace,
+        camera: DeviceCamera,
+        image: Array,
+        gradient: Array,
+        numbers: dict[str, float],
+        view: int,
+        step: int,
+    ) -> tuple[Array, Callable[[], None]]:
+        """Return the gradient by an image from that by what `change` made of it, and what changes the numbers."""
+
+
 @dataclass(frozen=True)
-class PhotographColours:
+class PhotographColours(ViewColours):
     """A model of colours, and the table with its numbers for each photograph."""
 
     model: ColourModel
@@ -31,6 +56,10 @@ class PhotographColours:
     def table(self) -> ViewTable:
         """The table of the numbers."""
         return ViewTable(TABLE, tuple(dict.fromkeys(self.views)), self.model.columns)
+
+    def begun(self, numbers: Mapping[str, float]) -> bool:
+        """Whether the numbers of a run hold the table."""
+        return self.table.begun(numbers)
 
     def begin(self, numbers: dict[str, float], log_gains: Mapping[str, Floats]) -> None:
         """Set the numbers before the first step.  log_gains: of red, green and blue by view, where known, [3]."""
@@ -43,6 +72,25 @@ class PhotographColours:
     def penalty(self, numbers: Mapping[str, float], view: int) -> float:
         """Return the loss of a view's numbers alone."""
         return self.model.penalty(self.table.row(numbers, self.views[view]))[0]
+
+    def change(
+        self, workspace: Workspace, camera: DeviceCamera, image: Array, numbers: Mapping[str, float], view: int
+    ) -> tuple[Array, Callable[[], float]]:
+        penalty = self.penalty(numbers, view)
+        return change_colours(workspace, camera, image, self.matrix(numbers, view)), lambda: penalty
+
+    def change_back(
+        self,
+        workspace: Workspace,
+        camera: DeviceCamera,
+        image: Array,
+        gradient: Array,
+        numbers: dict[str, float],
+        view: int,
+        step: int,
+    ) -> tuple[Array, Callable[[], None]]:
+        found, by_matrix = change_back(workspace, camera, image, self.matrix(numbers, view), gradient)
+        return found, lambda: self.learn(numbers, view, by_matrix(), step)
 
     def learn(self, numbers: dict[str, float], view: int, by_matrix: Floats, step: int) -> None:
         """Change the numbers of a view; by_matrix: derivatives of the losses by its matrix, [3, 4]."""

@@ -4,6 +4,7 @@ from clsplat.conformance.check import Check
 from clsplat.conformance.checks import (
     averages,
     blending,
+    colour_grids,
     colours,
     compression,
     cones,
@@ -38,6 +39,7 @@ KERNELS: list[Check] = [
     *depths.CHECKS.listed,
     *images.CHECKS.listed,
     *colours.CHECKS.listed,
+    *colour_grids.CHECKS.listed,
     *sky.CHECKS.listed,
     *transients.CHECKS.listed,
     *cones.CHECKS.listed,

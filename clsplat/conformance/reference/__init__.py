@@ -25,6 +25,7 @@ from clsplat.conformance.reference.blur import (
     blurred,
 )
 from clsplat.conformance.reference.clusters import member_sums, nearest_vectors, shared_means
+from clsplat.conformance.reference.colour_grid import centred_grids, grid_smoothness, gridded, gridded_backward
 from clsplat.conformance.reference.colours import coloured, coloured_backward, gain_gradient, gain_matrix
 from clsplat.conformance.reference.density import (
     ABSGS,
@@ -115,6 +116,7 @@ __all__ = [
     "blend_weights",
     "blurred",
     "brevity",
+    "centred_grids",
     "clamped_ray",
     "coloured",
     "coloured_backward",
@@ -128,6 +130,9 @@ __all__ = [
     "footprint",
     "gain_gradient",
     "gain_matrix",
+    "grid_smoothness",
+    "gridded",
+    "gridded_backward",
     "haar_filtered",
     "haar_gradient",
     "inverse_depth",

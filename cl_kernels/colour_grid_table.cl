@@ -1,0 +1,93 @@
+/* The grids of all photographs (colour_grid.cl): how smooth one is, its update, and their mean.
+ *
+ * Smoothness of a grid: for each axis the mean of the squared differences of neighbouring nodes, times a weight (the
+ * total variation of Wang et al. 2024).  Adam as in adam.h.  A grid is [ENTRIES,nz,ny,nx].  Deterministic. */
+#include "adam.h"
+#include "planes.h"
+
+#define ENTRIES 12  // of a matrix [E | b], row by row
+
+/* Derivatives of the smoothness of a photograph's grid, and its share of each value, which has the differences to the
+ * next nodes.  One item = one value. */
+__kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
+void colour_grid_smoothness(
+    __global const float *restrict values,    // [photographs,ENTRIES,nz,ny,nx]
+    __global float *restrict by_smoothness,   // [ENTRIES,nz,ny,nx]
+    __global float *restrict shares,          // [ENTRIES,nz,ny,nx]
+    const uint first,                         // value of the photograph
+    const uint nx,
+    const uint ny,
+    const uint nz,
+    const float weight_x,                     // weight / differences of the axis; 0 for one node
+    const float weight_y,
+    const float weight_z,
+    const uint count)                         // ENTRIES * nz * ny * nx
+{
+    const uint e = get_global_id(0);
+    if (e >= count)
+        return;
+    const uint nodes[3] = {nx, ny, nz}, steps[3] = {1, nx, nx * ny};
+    const float weights[3] = {weight_x, weight_y, weight_z};
+    float derivative = 0.0f, share = 0.0f;
+    for (uint axis = 0; axis < 3; axis++) {
+        const uint place = e / steps[axis] % nodes[axis];
+        const float own = values[first + e];
+        const float after = place + 1 < nodes[axis] ? values[first + e + steps[axis]] - own : 0.0f;
+        const float before = place > 0 ? own - values[first + e - steps[axis]] : 0.0f;
+        derivative += 2.0f * weights[axis] * (before - after);
+        share += weights[axis] * after * after;
+    }
+    by_smoothness[e] = derivative;
+    shares[e] = share;
+}
+
+/* One update of a photograph's grid by Adam.  One item = one value. */
+__kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
+void colour_grid_update(
+    __global const float *restrict by_grid,        // [ENTRIES,nz,ny,nx] derivatives of the losses
+    __global const float *restrict by_smoothness,  // [ENTRIES,nz,ny,nx]
+    __global float *restrict values,               // [photographs,ENTRIES,nz,ny,nx]
+    __global float *restrict moment1,              // [photographs,ENTRIES,nz,ny,nx]
+    __global float *restrict moment2,              // [photographs,ENTRIES,nz,ny,nx]
+    const uint first,                              // value of the photograph
+    const float rate,                              // learning rate / (1 - BETA1^t)
+    const float correction2,                       // 1 / (1 - BETA2^t)
+    const uint count)                              // ENTRIES * nz * ny * nx
+{
+    const uint e = get_global_id(0), at = first + e;
+    if (e >= count)
+        return;
+    const float g = by_grid[e] + by_smoothness[e];
+    const float m = BETA1 * moment1[at] + (1.0f - BETA1) * g;
+    const float v = BETA2 * moment2[at] + (1.0f - BETA2) * (g * g);
+    moment1[at] = m;
+    moment2[at] = v;
+    values[at] -= rate * m / (sqrt(v * correction2) + EPSILON);
+}
+
+/* Subtract from each entry at each level of luminance its mean over the photographs and the places: a colour that all
+ * photographs change alike, wherever it lies in them, is the model's.  One group of TEAM items = one entry at one
+ * level.  Local memory: TEAM * 4 bytes. */
+__kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
+void colour_grid_centre(
+    __global float *restrict values,  // [photographs,ENTRIES * nz,places]
+    const uint places,                // ny * nx
+    const uint photographs)
+{
+    __local float sums[TEAM];
+    const uint item = get_local_id(0), each = get_num_groups(0) * places;  // values of a photograph
+    __global float *own = values + get_group_id(0) * places;
+    float total = 0.0f;
+    for (uint p = item; p < photographs; p += TEAM) {
+        float sum = 0.0f;
+        for (uint i = 0; i < places; i++)
+            sum += own[p * each + i];
+        total += sum;
+    }
+    sums[item] = total;
+    barrier(CLK_LOCAL_MEM_FENCE);
+    const float mean = sum_items(sums) / ((float)places * (float)photographs);
+    for (uint p = item; p < photographs; p += TEAM)
+        for (uint i = 0; i < places; i++)
+            own[p * each + i] -= mean;
+}
