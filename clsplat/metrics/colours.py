@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.metrics.images import Mask, psnr
-from clsplat.views.colours import ColourModel
+from clsplat.views.colours import OwnColours
 
 LEAST = 1e-3  # slope of a regression, below which there is nothing to divide by
 
 
 def colour_figures(
-    image: NDArray[np.float32], photograph: NDArray[np.uint8], mask: Mask | None, model: ColourModel
+    image: NDArray[np.float32], photograph: NDArray[np.uint8], mask: Mask | None, model: OwnColours
 ) -> dict[str, float]:
     """Return `psnr_colour` and `psnr_affine`, dB, of an image as it was rendered and a photograph, [height, width, 3].
 
@@ -29,7 +29,7 @@ def colour_figures(
 
 
 def in_colours_of(
-    image: NDArray[np.float64], photograph: NDArray[np.uint8], counted: Mask, model: ColourModel
+    image: NDArray[np.float64], photograph: NDArray[np.uint8], counted: Mask, model: OwnColours
 ) -> NDArray[np.float64]:
     """Return the image with each half, left and right, in the colours that the other half of the photograph asks for.
 

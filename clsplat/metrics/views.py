@@ -19,7 +19,7 @@ from clsplat.render.camera import DeviceCamera
 from clsplat.render.painter import Painter
 from clsplat.render.workspace import Workspace
 from clsplat.scene.scene import View
-from clsplat.views.colours import ColourModel
+from clsplat.views.colours import OwnColours
 from clsplat.views.photographs import Photograph, Photographs, unpack
 
 LOG = logging.getLogger("clsplat")
@@ -85,7 +85,7 @@ def measure(
     photographs: Photographs,
     perceptual: Perceptual = PSNR_AND_SSIM,
     finite: bool = False,
-    colours: ColourModel | None = None,
+    colours: OwnColours | None = None,
     counted: Iterable[View] | None = None,
 ) -> list[ViewMetrics]:
     """Return the metrics of every view.

@@ -9,7 +9,7 @@ from pydantic import Field, field_validator
 
 from clsplat.density.statistics import SplatStats
 from clsplat.losses.base import ImageLoss, Loss, Penalty, ViewGradients, ViewLosses, require_symmetric
-from clsplat.names import VIEW_COLOURS, VIEW_POSES
+from clsplat.names import VIEW_POSES
 from clsplat.schedule import Probability
 from clsplat.settings import OneOf
 from clsplat.stages.base import Scheduled
@@ -57,7 +57,7 @@ class Optimize(Keeping):
     losses: list[OneOf[Loss]]
     """Losses and penalties; training minimises their sum."""
     colours: OneOf[Colours] | None = None
-    """Colours of each photograph, where exposures differ: `gain`, `affine`, `auto`; without it, those of the scene."""
+    """Colours of each photograph, where exposures differ: `gain`, `affine`, `grid`, `auto`; without it, the scene's."""
     poses: Poses | None = None
     """Places of the cameras that are learned with the model, where poses are not exact; without it, the dataset's."""
     transients: Transients | None = None
@@ -86,8 +86,8 @@ class Optimize(Keeping):
         super().check()
 
     def outputs(self, out: Path) -> list[Path]:
-        own = [*([out / VIEW_COLOURS] if self.colours else []), *([out / VIEW_POSES] if self.poses else [])]
-        return [*super().outputs(out), *own]
+        own = [*(self.colours.files if self.colours else ()), *([VIEW_POSES] if self.poses else [])]
+        return [*super().outputs(out), *(out / name for name in own)]
 
     def run(self, run: Run) -> None:
         for _ in self.iterate(run):

@@ -2,7 +2,7 @@
 
 from clsplat.gaussians.tables import Gaussians
 from clsplat.render.backdrops import Auto, Directions
-from clsplat.training import sky
+from clsplat.training import grids, sky
 from clsplat.training.kept import Tables, tables_of
 from clsplat.training.run import Run
 from clsplat.training.sky import FOLDER, LearnedSky
@@ -11,12 +11,17 @@ from clsplat.training.sky import FOLDER, LearnedSky
 def copied_of(run: Run) -> Tables:
     """Copy what the run's model needs to be rendered, and to be trained from anew, to the host."""
     own = run.sky.tables() if run.sky else {}
-    return {**tables_of(run.model), **{FOLDER + name: table for name, table in own.items()}}
+    behind = {FOLDER + name: table for name, table in own.items()}
+    of_colours = run.grids.tables(["values"]) if run.grids else {}
+    return {**tables_of(run.model), **behind, **{grids.FOLDER + name: table for name, table in of_colours.items()}}
 
 
 def put_back(run: Run, tables: Tables, degree: int) -> None:
     """Make what was copied the run's model."""
     own, of_gaussians = sky.split_tables(tables)
+    of_colours, of_gaussians = grids.split_tables(of_gaussians)
+    if of_colours and run.grids:
+        run.grids.set(of_colours)
     run.model = run.model_settings.model(Gaussians(run.device, of_gaussians), degree)
     restore_sky(run, own)
 

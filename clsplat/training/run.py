@@ -26,6 +26,7 @@ from clsplat.scene.scene import Scene
 from clsplat.settings import Settings
 from clsplat.training.adam import Adam
 from clsplat.training.field import LearnedField
+from clsplat.training.grids import GridTables, bytes_needed
 from clsplat.training.kept import Best, Tables
 from clsplat.training.memory import MemoryPlan, plan
 from clsplat.training.profile import clocks
@@ -65,6 +66,7 @@ class Run:
     adam: Adam | None = None
     stats: SplatStats | None = None
     sky: LearnedSky | None = None  # of the model, where it has one
+    grids: GridTables | None = None  # of the photographs' colours, where they have such
     learned_field: LearnedField | None = None  # in the place of a model
     step: int = 0  # updates done, or in progress
     cursor: int = 0  # stage in progress
@@ -139,8 +141,8 @@ class Run:
 
     def begin_again(self, best: Best) -> None:
         """Come to the beginning of the pipeline, to train again for the steps of the best model."""
-        self._model, self.adam, self.stats, self.sky, self.step, self.divisor = None, None, None, None, 0, 1.0
-        self.numbers, self.metrics, self.written, self.whole = {}, {}, {}, True
+        self._model = self.adam = self.stats = self.sky = self.grids = None
+        self.numbers, self.metrics, self.written, self.whole, self.step, self.divisor = {}, {}, {}, True, 0, 1.0
         self.best, self.best_tables = best, {}
         self.next_stage(0)
         self.divide(self.original.with_fold())
@@ -195,9 +197,9 @@ class Run:
     def memory_plan(self, components: Mapping[str, int] | None = None) -> MemoryPlan:
         """Return the plan of the device's memory for training with the present tables, or those of `components`."""
         components = components or self.model.gaussians.components
-        views = self.scene.split("train")
+        views, tile = self.scene.split("train"), int(self.device.tuning["TILE"])
         bytes_held = min(self.photographs.budget, sum(4 * view.camera.width * view.camera.height for view in views))
-        tile = int(self.device.tuning["TILE"])
+        bytes_held += bytes_needed(self.settings, views, tile)
         pixels = max((-(-v.camera.width // tile)) * (-(-v.camera.height // tile)) * tile**2 for v in views)
         pixel_sums = PIXEL_SUMS if self.stats is None else self.stats.pixel_sums
         return plan(self.device.info, components, bytes_held, pixels, pixel_sums)
@@ -240,9 +242,7 @@ class Run:
         """Return the numbers for rendering a model file as in training."""
         model = self.model
         return {
-            "near": model.near,
-            "screen_variance": model.screen_variance,
-            "compensate": model.compensate,
+            **{name: getattr(model, name) for name in ("near", "screen_variance", "compensate")},
             **({"pixel_box": model.pixel_box} if model.pixel_box else {}),
             "background": self.photographs.background_name,
             **({"sky": "directions"} if self.sky else {}),

@@ -29,7 +29,7 @@ from clsplat.training.sky import LearnedSky
 from clsplat.views.backgrounds import Backgrounds
 from clsplat.views.known_depths import PointDepths
 from clsplat.views.learned import LearnedTransform, learned_of, name_of
-from clsplat.views.photograph_colours import PhotographColours, change_back, change_colours
+from clsplat.views.photograph_colours import ViewColours
 from clsplat.views.photograph_poses import PhotographPoses
 from clsplat.views.photographs import Photograph, apply_mask
 from clsplat.views.texture import known_gradient
@@ -75,7 +75,7 @@ class Trainer:
     extent: float = 1.0  # scene units
     numbers: dict[str, float] = field(default_factory=dict)  # of a transform that learns, by name; a step changes them
     rows: Rows = "all"  # Gaussians that a step changes
-    colours: PhotographColours | None = None  # of the photographs, where they have colours of their own
+    colours: ViewColours | None = None  # of the photographs, where they have colours of their own
     transients: Transients | None = None  # which pixels are left out; None: none
     sky: LearnedSky | None = None  # of the model, where it has one
     dropout: Schedule = 0.0  # probability with which a step leaves a Gaussian out, by step
@@ -169,10 +169,8 @@ class Trainer:
         """The image in the colours of its photograph, where that has its own, and the loss of their numbers."""
         if self.colours is None or camera.view is None:
             return image, []
-        penalty = self.colours.penalty(self.numbers, camera.view)
-        matrix = self.colours.matrix(self.numbers, camera.view)
-        changed = change_colours(self.rasterizer.workspace, camera, image, matrix)
-        return changed, [LossValue("colours", lambda: penalty)]
+        changed, penalty = self.colours.change(self.rasterizer.workspace, camera, image, self.numbers, camera.view)
+        return changed, [LossValue("colours", penalty)]
 
     def _without_transients(self, planes: Planes, image: Array, step: int) -> tuple[Planes, list[Callable[[], None]]]:
         """The photograph without what the scene does not have, and what adds the view's residuals to the others."""
@@ -191,10 +189,11 @@ class Trainer:
         camera, number = comparison.camera, comparison.camera.view
         if colours is None or number is None:
             return gradient, learning
-        matrix = colours.matrix(self.numbers, number)
-        workspace = self.rasterizer.workspace
-        gradient, by_matrix = change_back(workspace, camera, view.frame.image, matrix, gradient)
-        return gradient, [*learning, lambda: colours.learn(self.numbers, number, by_matrix(), comparison.step)]
+        workspace, numbers = self.rasterizer.workspace, self.numbers
+        gradient, learn = colours.change_back(
+            workspace, camera, view.frame.image, gradient, numbers, number, comparison.step
+        )
+        return gradient, [*learning, learn]
 
     def _of_sky(self, view: ViewLosses, gradient: Array) -> list[Callable[[], None]]:
         """What changes the sky after the Gaussians.  gradient: by the image as it was rendered."""

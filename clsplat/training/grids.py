@@ -1,0 +1,55 @@
+"""The grids of the photographs in a run: their tables in a checkpoint, and their memory on the device."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.errors import DataError
+from clsplat.opencl.device import Device
+from clsplat.scene.view import View
+from clsplat.views.colours import Auto, Grid
+from clsplat.views.photograph_grids import ENTRIES, NAMES, Tables, bytes_of
+from clsplat.views.photograph_grids import GridTables as GridTables
+
+FOLDER = "grids/"  # before the names of their tables in a checkpoint
+
+
+def split_tables(tables: Mapping[str, NDArray[np.float32]]) -> tuple[Tables, Tables]:
+    """Divide the tables of a checkpoint into those of grids, by their own names, and the others."""
+    own = {name.removeprefix(FOLDER): table for name, table in tables.items() if name.startswith(FOLDER)}
+    return own, {name: table for name, table in tables.items() if not name.startswith(FOLDER)}
+
+
+def check_tables(tables: Tables) -> None:
+    """Raise DataError for tables that are not those of grids; there may be none, or the values alone."""
+    if not tables:
+        return
+    if tables.keys() not in (set(NAMES), {NAMES[0]}):
+        raise DataError("it has other grids than those of its own tables")
+    shape = tables[NAMES[0]].shape
+    for name, table in tables.items():
+        if table.dtype != np.float32 or table.ndim != 2 or table.shape != shape or not shape[1] or shape[1] % ENTRIES:
+            raise DataError(f"{name} of its grids is not [photographs, {ENTRIES} * matrices] of float32")
+        if not np.isfinite(table).all():
+            raise DataError(f"{name} of its grids holds values that are not finite")
+
+
+def restored(tables: Tables, device: Device) -> GridTables | None:
+    """Return the grids of a checkpoint's tables, by their own names; None without any."""
+    if not tables:
+        return None
+    found = GridTables(device, tables[NAMES[0]].shape)
+    found.set(tables)
+    return found
+
+
+def bytes_needed(settings: Any, views: Sequence[View], tile: int) -> int:
+    """Return what the grids of a pipeline's trainings take on the device, at most.  tile: px of its sides."""
+    kinds = [getattr(stage, "colours", None) for stage in getattr(settings, "stages", ())]
+    models = [kind.model if isinstance(kind, Auto) and kind.chosen != "off" else kind for kind in kinds]
+    sides = [(-(-view.camera.width // tile) * tile, -(-view.camera.height // tile) * tile) for view in views]
+    rows, pixels = max(height for _, height in sides), max(width * height for width, height in sides)
+    photographs = len({view.name for view in views})
+    return max((bytes_of(one.cells, photographs, rows, pixels) for one in models if isinstance(one, Grid)), default=0)
