@@ -47,6 +47,7 @@ FAMILIES = {  # by the name of the base; any other family gets a page of its own
     "Order": Family("views", "order", "order", listed=False),
     "PhotographTransform": Family("views", "transform", "transforms"),
     "Colours": Family("views", "colours of photographs", "colours", listed=False),
+    "OwnColours": Family("views", "colours of each photograph", "colours", listed=False),
     "ColourModel": Family("views", "model of colours", "colours", listed=False),
     "WorldFilter": Family("filters", "world filter", "world_filter", listed=False),
     "ScreenFilter": Family("filters", "screen filter", "screen_filter", listed=False),
