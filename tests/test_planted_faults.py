@@ -31,7 +31,7 @@ FAULTS = {  # kernel -> file, text, wrong text
     "colour_grid_forward": ("colour_grid.cl", "a[9] * g + a[10] * b + a[11]), one", "a[9] * g + a[10] * b), one"),
     "colour_grid_backward": ("colour_grid.cl", "a[5] * p[1] + a[9] * p[2]", "a[4] * p[1] + a[9] * p[2]"),
     "colour_grid_row_sums": ("colour_grid.cl", "total[4 * c + 1] += part * g", "total[4 * c + 1] += part * b"),
-    "colour_grid_gather": ("colour_grid.cl", "total += weight > 0.0f ? weight * sums[y]", "total += weight > 0.0f ? sums[y]"),
+    "colour_grid_gather": ("colour_grid.cl", "0.0f ? weight * sums[y]", "0.0f ? sums[y]"),
     "colour_grid_smoothness": ("colour_grid_table.cl", "(before - after)", "(before + after)"),
     "colour_grid_update": ("colour_grid_table.cl", "by_grid[e] + by_smoothness[e]", "by_grid[e]"),
     "colour_grid_centre": ("colour_grid_table.cl", "((float)places * (float)photographs)", "(float)places"),

@@ -1,4 +1,4 @@
-"""The colours of a photograph by place and luminance (colour_grid.cl, colour_grid_table.cl) against float64, and in a step."""
+"""The colours of a photograph by place and luminance (colour_grid.cl and its tables) against float64, and in a step."""
 
 from dataclasses import replace
 
