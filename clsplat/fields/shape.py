@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
-from clsplat.fields.grid import FIRST_MOST, GridShape
+from clsplat.fields.grid import FEATURES, FIRST_MOST, GridShape
 from clsplat.opencl.program import constants
 from clsplat.settings import Settings
 
@@ -16,6 +16,7 @@ BLOCK, SAMPLES, LINE = (int(LAYERS[name]) for name in ("BLOCK", "SAMPLES", "PARA
 COLOUR_ROWS = int(constants("composite.cl")["COLOUR_ROWS"])
 COLOURS, DENSITIES = 3, 1  # outputs of the network
 LANES_MAX = 16
+assert FEATURES == BLOCK  # of a level of a grid: so its rows are whole blocks
 Features = Annotated[int, Field(ge=BLOCK, le=1024, multiple_of=BLOCK)]
 
 
