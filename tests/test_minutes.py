@@ -127,9 +127,9 @@ def test_a_run_in_minutes_has_the_bits_of_the_pipeline_that_it_writes(
 ):
     """The steps are corrected while it trains, wherever the clock stands; files of the rehearsal are gone."""
     monkeypatch.setattr(minutes, "most_steps", lambda *given: 60)
-    out = clsplat.run("smoke", tiny_scene, tmp_path / "run", minutes=0.2)
+    out = clsplat.run("smoke", tiny_scene, tmp_path / "run", minutes=0.05)
     text = (out / "pipeline.yaml").read_text()
-    steps, known = re.search(r"# --minutes 0.2: (.+) steps, of which ([\d,]+) had shown what one takes", text).groups()
+    steps, known = re.search(r"# --minutes 0.05: (.+) steps, of which ([\d,]+) had shown what one takes", text).groups()
     steps, known = (int(number.replace(",", "")) for number in (steps, known))
     assert known < steps == load(str(out / "pipeline.yaml")).settings.training.steps
     assert "from here on the bits" not in (out / "log.txt").read_text()

@@ -39,6 +39,12 @@ def annotation_of(field: FieldInfo) -> Any:
 
 
 @lru_cache(maxsize=1024)
+def annotations(model: type[BaseModel]) -> dict[str, Any]:
+    """Return the annotations of a model's fields, with their marks, by name."""
+    return {name: annotation_of(field) for name, field in model.model_fields.items()}
+
+
+@lru_cache(maxsize=1024)
 def tags(model: type[BaseModel]) -> tuple[Any, ...]:
     """Return the names of the model in pipeline files; none when it is not a variant."""
     field = next((model.model_fields[name] for name in TAGS if name in model.model_fields), None)
@@ -56,12 +62,15 @@ def model_of(data: Any, annotation: Any) -> type[BaseModel] | None:
     """Return the model of plain data with its tag; None when it is not known."""
     allowed = models(annotation)
     if len(allowed) > 1 and isinstance(data, dict):
-        allowed = [model for model in allowed if any(data.get(name) in tags(model) for name in TAGS if name in data)]
+        named = [data[name] for name in TAGS if name in data]
+        allowed = [model for model in allowed for name in named if name in tags(model)]
     return allowed[0] if len(allowed) == 1 else None
 
 
 def with_tags(data: Any, annotation: Any) -> Any:
     """Return plain data with every bare name of a variant as {type: name}, and a stage as {stage: name, …}."""
+    if not isinstance(data, list | dict | str):
+        return data
     if isinstance(data, list):
         return [with_tags(item, inside_list(annotation)) for item in data]
     for mark in map(Variants, bases(annotation)):
@@ -72,6 +81,6 @@ def with_tags(data: Any, annotation: Any) -> Any:
             if name != "stage" and isinstance(fields, dict | None):
                 data = {"stage": name, **(fields or {})}
     if isinstance(data, dict) and (model := model_of(data, annotation)):
-        known = {key: annotation_of(field) for key, field in model.model_fields.items()}
+        known = annotations(model)
         return {key: with_tags(value, known.get(key)) for key, value in data.items()}
     return data

@@ -13,9 +13,9 @@ from typing import Any
 from pydantic import BaseModel
 
 from clsplat.errors import ConfigError, OverrideError, quoted, shortened
-from clsplat.pipeline.fields import annotation_of, inside_list, model_of, with_tags
+from clsplat.pipeline.fields import annotations, bases, inside_list, model_of, with_tags
 from clsplat.pipeline.yaml_file import Place, parse_value
-from clsplat.settings import TAGS
+from clsplat.settings import TAGS, Variants
 
 MAX_SUGGESTIONS = 3
 MAX_PARTS = 32  # of a place; real ones have up to ten
@@ -114,8 +114,7 @@ class _Node:
 
     def annotation(self, name: str) -> Any:
         """Return the annotation of a key; None where it is not known."""
-        field = self._fields.get(name)
-        return annotation_of(field) if field else None
+        return annotations(self.model).get(name) if self.model else None
 
     def _key(self, name: str) -> "_Node":
         annotation = self.annotation(name)
@@ -129,9 +128,14 @@ class _Node:
 
     def _stages(self) -> "list[_Node]":
         """The stages in the lists of a map."""
-        lists = [self._key(key) for key, value in self.data.items() if isinstance(value, list)]
+        lists = [self._key(key) for key, value in self.data.items() if isinstance(value, list) and self._may_hold(key)]
         items = [node._item(i) for node in lists for i in range(len(node.data))]
         return [item for item in items if isinstance(item.data, dict) and "stage" in item.data]
+
+    def _may_hold(self, key: str) -> bool:
+        """Whether a list may have stages in it: it is not known to be of other things."""
+        kinds = bases(inside_list(self.annotation(key)))
+        return self.annotation(key) is None or any(Variants(kind).tag == "stage" for kind in kinds)
 
     def _stage(self, name: str, text: str) -> "_Node | None":
         """The stage of that name, here or from the top inside another.  Raises OverrideError where several have it."""
