@@ -12,7 +12,7 @@ import clsplat
 from clsplat import terminal
 from clsplat.cli import app
 from clsplat.errors import ConfigError, DataError
-from tests.test_cli import clsplat as process
+from tests.commands import process
 
 pytestmark = pytest.mark.slow
 

@@ -12,7 +12,7 @@ import clsplat
 from clsplat.errors import DataError
 from clsplat.opencl import device
 from clsplat.runs.verify import verify
-from tests.test_cli import clsplat as command
+from tests.commands import clsplat as command
 
 pytestmark = pytest.mark.slow
 

@@ -3,29 +3,17 @@
 import json
 import re
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
+from tests.commands import clsplat, process
 from tests.onnx_writer import distance_network
 from tests.test_training import train
 
 pytestmark = pytest.mark.slow
-
-
-def clsplat(*arguments: str | Path, expect: int = 0) -> subprocess.CompletedProcess[str]:
-    """Run the command; check its exit code and that an error is one line without a traceback."""
-    command = [sys.executable, "-m", "clsplat", *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
-    assert done.returncode == expect, done.stderr
-    assert "Traceback" not in done.stderr
-    errors = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
-    assert len(errors) == (1 if expect else 0), done.stderr
-    return done
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +24,7 @@ def model(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_run_names_the_device_first_and_says_where_things_are(tiny_scene, tmp_path):
-    done = clsplat("run", "smoke", "--scene", tiny_scene, "--out", tmp_path / "run")
+    done = process("run", "smoke", "--scene", tiny_scene, "--out", tmp_path / "run")
     lines = done.stdout.splitlines()
     assert lines[0].startswith("device: ")
     assert "schedule" in lines[0]

@@ -20,8 +20,8 @@ from clsplat.pipeline.recipes import copy, manual, summaries, summary
 from clsplat.pipeline.settable import settable
 from clsplat.runs.status import run_status, status_text
 from clsplat.training.records import Records
+from tests.commands import clsplat, process
 from tests.statuses import write_status
-from tests.test_cli import clsplat
 from tests.test_training import train
 
 pytestmark = pytest.mark.slow
@@ -133,7 +133,7 @@ def test_json_is_all_that_stdout_holds(arguments, finished, tiny_scene, tmp_path
     places = {"RUN": str(finished), "SCENE": str(tiny_scene), "FILE": str(tmp_path / "x.yaml")}
     for name, place in places.items():
         arguments = arguments.replace(name, place)
-    assert json.loads(clsplat(*arguments.split()).stdout)
+    assert json.loads(process(*arguments.split()).stdout)
 
 
 def test_pipelines_lists_every_recipe_on_a_line():
@@ -209,7 +209,7 @@ def test_resume_goes_on_to_the_same_bits(finished, tmp_path):
     assert "made with other settings" in clsplat("resume", run, "--set", "seed=9", expect=2).stderr
 
 
-def test_a_plugin_may_stand_after_the_command(tmp_path):
+def test_a_plugin_may_stand_after_the_command(tmp_path, without_plugins):
     plugin = Path(__file__).parents[1] / "examples" / "opacity_entropy.py"
     assert plugin.is_file()
     for option in (["--plugin", str(tmp_path / "x.py")], [f"--plugin={tmp_path / 'x.py'}"]):

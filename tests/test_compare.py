@@ -23,8 +23,8 @@ from clsplat.scene.detect import read_scene
 from clsplat.scene.images import write_image
 from clsplat.scene.lens import Lens
 from clsplat.scene.view import load_image
+from tests.commands import clsplat
 from tests.html_page import HOSTILE, Page
-from tests.test_cli import clsplat
 
 pytestmark = pytest.mark.slow
 

@@ -7,7 +7,7 @@ import pytest
 
 from clsplat import cli
 from clsplat.errors import MESSAGE_LIMIT, QUOTE_LIMIT, DataError, OverrideError, amount, one_line, quoted, shortened
-from tests.test_cli import clsplat
+from tests.commands import clsplat
 
 VALUES = [
     "x" * 10**6,

@@ -48,9 +48,11 @@ SENSITIVE = {
 LEARNS = {"auto_opti3dgs", "auto_opti3dgs_7k"}
 ONE_THREAD = {"POCL_MAX_PTHREAD_COUNT": "1", "POCL_CPU_MAX_CU_COUNT": "1", "CL_CONFIG_CPU_TBB_NUM_WORKERS": "1"}
 ALONE = """
-import sys
+import functools, sys
 from pathlib import Path
+from clsplat.opencl import device, program
 from tests.test_every_recipe import short, train
+device.context_of, program.built = functools.cache(device.context_of), functools.cache(program.built)
 for name in sys.argv[3:]:
     train(short(name, Path(sys.argv[1])), Path(sys.argv[2]) / name)
 """

@@ -16,7 +16,7 @@ from clsplat import cli
 from clsplat.errors import ClsplatError, OutputError
 from clsplat.files import write_text
 from clsplat.opencl.device import Device
-from tests.test_cli import clsplat
+from tests.commands import process as clsplat
 
 pytestmark = pytest.mark.slow
 

@@ -25,8 +25,8 @@ from clsplat.scene.identity import Identity
 from clsplat.scene.scene import PointCloud, Scene
 from clsplat.scene.view import View
 from tests.colmap_writer import tiny_model
+from tests.commands import clsplat as command
 from tests.test_checkpoints import crafted
-from tests.test_cli import clsplat as command
 from tests.test_inspect import orbit, write
 from tests.test_training import digest, train
 

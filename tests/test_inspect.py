@@ -25,10 +25,10 @@ from clsplat.scene.lens import Lens
 from clsplat.scene.view import load_image, load_mask
 from clsplat.stages.init import require_ahead
 from tests.colmap_writer import CameraEntry, ColmapModel, ImageEntry, PointEntry, tiny_model, write_model, write_scene
+from tests.commands import clsplat
 from tests.data_sets import data_set
 from tests.formats.models import splats
 from tests.html_page import HOSTILE, Page
-from tests.test_cli import clsplat
 from tests.test_image_headers import with_exif
 from tests.test_training import train
 

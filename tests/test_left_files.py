@@ -22,7 +22,7 @@ from clsplat.settings import Settings
 from clsplat.training import checkpoint
 from data_tools.made import RECORD as RECORD_OF_A_TOOL
 from data_tools.made import Made
-from tests.test_cli import clsplat as command
+from tests.commands import clsplat as command
 
 pytestmark = pytest.mark.slow
 NONE = 99999999  # no process has this number

@@ -23,7 +23,7 @@ from clsplat.processes import Owner
 from clsplat.runs import folders
 from clsplat.runs.default_folder import free_folder
 from clsplat.training import status as writing
-from tests.test_cli import clsplat as command
+from tests.commands import clsplat as command
 
 pytestmark = pytest.mark.slow
 NONE = 99999999  # no process has this number

@@ -18,7 +18,7 @@ from clsplat.runs.source import Source
 from clsplat.stages.report import Report
 from clsplat.training.status import read_status
 from clsplat.tuning.tuning import Tuning
-from tests.test_cli import clsplat as command
+from tests.commands import clsplat as command
 
 pytestmark = pytest.mark.slow
 

@@ -13,7 +13,7 @@ from clsplat.errors import ClsplatError, ConfigError, DataError, InternalError, 
 from clsplat.pipeline.loading import load
 from clsplat.pipeline.matrix import load_experiment
 from clsplat.runs import experiment, runner, scenes
-from tests.test_cli import clsplat
+from tests.commands import clsplat
 from tests.test_matrix import SMALL, STAGES, names
 
 pytestmark = pytest.mark.slow

@@ -7,7 +7,7 @@ from clsplat.errors import MemoryLimitError
 from clsplat.gaussians.tables import Gradients
 from clsplat.training import memory
 from clsplat.training.memory import FRAME_GAUSSIAN, MemoryPlan
-from tests.test_cli import clsplat
+from tests.commands import clsplat
 from tests.test_training import train
 
 SMALL = MemoryPlan(

@@ -13,9 +13,9 @@ from jinja2 import UndefinedError
 import clsplat as package
 from clsplat.pages.page import TEMPLATES, charts, duration, embedded, render, require_end
 from clsplat.pages.svg import Line, curve
+from tests.commands import clsplat
 from tests.html_page import HOSTILE, Page
 from tests.refusals import refusal
-from tests.test_cli import clsplat
 
 SOURCES = sorted(Path(package.__file__).parent.rglob("*.py"))
 PAGES = ("report", "compare", "compress", "inspect", "notebook", "doctor", "store", "viewer", "live")

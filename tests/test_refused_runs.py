@@ -1,15 +1,14 @@
 """A refused run leaves no trace; --restart begins again and leaves the files of others."""
 
 import json
-import subprocess
-import sys
 
 import pytest
 
 import clsplat
 from clsplat.errors import ConfigError
 from clsplat.runs import single
-from tests.test_cli import clsplat as command
+from tests.commands import clsplat as command
+from tests.commands import ran
 
 pytestmark = pytest.mark.slow
 
@@ -26,20 +25,17 @@ def test_a_refused_run_leaves_no_folder(tiny_scene, tmp_path):
         "g": ["smoke", "--scene", tiny_scene, "--set", "init.source=ply"],
     }.items():
         out = tmp_path / name
-        done = subprocess.run(
-            [sys.executable, "-m", "clsplat", "run", *map(str, arguments), "--out", str(out)],
-            capture_output=True,
-            text=True,
-            check=False,
-        )
+        words = ["run", *arguments, "--out", out]
+        done = ran(*words)
+        assert "Traceback" not in done.stderr
         assert done.returncode in (2, 3, 4, 5), done.stderr
         assert not (tmp_path / name.split("/")[0]).exists(), name
-        described = subprocess.run([*done.args, "--dry-run"], capture_output=True, text=True, check=False)
+        described = ran(*words, "--dry-run")
         assert (described.returncode, described.stderr) == (done.returncode, done.stderr)
         if name not in ("a/b", "f"):  # before the device is opened, and after
             continue
         out.mkdir(parents=True)
-        again = subprocess.run(done.args, capture_output=True, text=True, check=False)
+        again = ran(*words)
         assert again.returncode == done.returncode
         status = json.loads((out / "status.json").read_text())
         assert (status["state"], status["exit_code"]) == ("failed", done.returncode)

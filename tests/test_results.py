@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 import clsplat
-from tests.test_cli import clsplat as command
+from tests.commands import clsplat as command
 
 pytestmark = pytest.mark.slow
 

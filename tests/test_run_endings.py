@@ -24,8 +24,8 @@ from clsplat.errors import (
 from clsplat.runs import experiment, opening
 from clsplat.runs.experiment import Job
 from clsplat.signals import stopping_on_signals
+from tests.commands import process as clsplat
 from tests.statuses import write_status
-from tests.test_cli import clsplat
 
 pytestmark = pytest.mark.slow
 

@@ -20,8 +20,8 @@ from clsplat.scene.quaternion import rotation_matrix
 from clsplat.scene.scene import PointCloud, make_scene
 from clsplat.scene.view import View
 from clsplat.stages.cameras import Cameras
+from tests.commands import clsplat as command
 from tests.data_sets import data_set
-from tests.test_cli import clsplat as command
 
 LENSES = {  # parameters after the focal lengths and the middle
     "SIMPLE_PINHOLE": (),

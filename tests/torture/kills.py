@@ -45,13 +45,13 @@ def kills(scene: Path, folder: Path, count: int, seed: int = 0) -> Iterator[Coun
     folder.mkdir(parents=True, exist_ok=True)
     chance, tally = random.Random(seed), Counter[str]()
     expected, seconds = {}, {}
-    for recipe in SETTINGS:
-        for out in (folder / recipe, folder / f"{recipe}-built"):  # the first one builds the kernels
+    while tally["killed"] < count:
+        recipe = list(SETTINGS)[tally["finished"] % len(SETTINGS)]
+        undisturbed = (folder / recipe, folder / f"{recipe}-built")  # the first one builds the kernels
+        for out in () if recipe in expected else undisturbed:
             start = time.perf_counter()
             Attempt(scene, out, recipe).wait()
             expected[recipe], seconds[recipe] = identity(out), time.perf_counter() - start
-    while tally["killed"] < count:
-        recipe = list(SETTINGS)[tally["finished"] % len(SETTINGS)]
         out = folder / f"{recipe}-{tally['finished']}"
         for _ in range(ATTEMPTS):
             left = partials(out)  # by earlier kills: the next one may come before they are swept

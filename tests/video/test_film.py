@@ -11,7 +11,7 @@ import clsplat
 from clsplat.errors import ConfigError, DataError, NumericError
 from clsplat.scene.images import read_image
 from clsplat.video.pictures import Canvas, depth_picture, letterboxed
-from tests.test_cli import clsplat as command
+from tests.commands import clsplat as command
 from tests.video.test_encoding import decoded
 
 pytestmark = pytest.mark.slow

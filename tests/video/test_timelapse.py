@@ -8,8 +8,8 @@ from clsplat.errors import ConfigError
 from clsplat.pipeline.loading import load
 from clsplat.scene.images import image_size, read_image
 from clsplat.video.encoding import frames_of
+from tests.commands import clsplat as command
 from tests.few_steps import FEW
-from tests.test_cli import clsplat as command
 from tests.test_training import digest, train
 
 pytestmark = pytest.mark.slow
