@@ -26,6 +26,8 @@ from clsplat.pipeline.loading import load
 from clsplat.render.camera import upload_camera
 from clsplat.runs.rehearsal import Rehearsal
 from clsplat.runs.source import require_model
+from clsplat.runs.steps_key import steps_key
+from clsplat.runs.summary import summary
 from clsplat.runs.verify import verify
 from clsplat.scene.camera import Camera
 from clsplat.scene.images import read_image
@@ -33,6 +35,7 @@ from clsplat.scene.view import View
 from clsplat.stages.train_field import TrainField
 from clsplat.training import archive, checkpoint
 from clsplat.views.order import ViewPool
+from tests.commands import clsplat as clsplat_command
 from tests.test_training import ONE_CORE, train
 
 pytestmark = pytest.mark.slow
@@ -111,6 +114,13 @@ def test_the_field_is_what_its_renders_show(finished, tiny_scene, pipeline):
     planes = run.painter().paint(upload_camera(run.device, view)).get()[:, :40, :40]
     (png,) = (finished / "renders").rglob(f"{Path(view.name).stem}.png")
     np.testing.assert_array_equal(read_image(png), np.rint(255 * planes.clip(0, 1)).astype(np.uint8).transpose(1, 2, 0))
+
+
+def test_a_field_is_trained_longer_by_its_steps(finished):
+    assert steps_key(finished) == "train_field.steps"
+    told = clsplat_command("resume", finished, "--steps", "14", "--dry-run").stdout
+    assert "14 steps" in told
+    assert f"`clsplat resume {finished} --steps 24` trains longer" in "\n".join(summary(finished))
 
 
 def test_training_makes_the_loss_smaller(tiny_scene, tmp_path, pipeline):

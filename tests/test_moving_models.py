@@ -102,6 +102,28 @@ def test_convert_writes_moments(tmp_path: Path):
             clsplat.convert(source, tmp_path / "frames", **wrong)
 
 
+def test_moments_of_a_model_that_stands_still_are_refused(tmp_path):
+    still = tmp_path / "still.ply"
+    moving_model().at(0.5).save(still)
+    for out, asked in (("out.spz", {"time": 0.5}), ("out", {"frames": 3})):
+        with pytest.raises(ConfigError, match="the model does not move; leave --time and --frames out"):
+            clsplat.convert(still, tmp_path / out, **asked)
+    assert [path.name for path in tmp_path.iterdir()] == ["still.ply"]
+
+
+def test_a_series_is_whole_or_not_there(tmp_path):
+    """Late in it all Gaussians are gone."""
+    model = moving_model()
+    motion = model.motion.copy()
+    motion[:, 3:5] = 0.0, np.log(0.01)
+    replace(model, motion=motion).save(tmp_path / "brief.ply")
+    with pytest.raises(DataError, match=r"--frames 3: the moment 0\.5: none of 40 .*; nothing was written"):
+        clsplat.convert(tmp_path / "brief.ply", tmp_path / "frames", frames=3)
+    with pytest.raises(DataError, match="nothing was written"):
+        clsplat.convert(tmp_path / "brief.ply", tmp_path / "frame.spz", frames=3)
+    assert not [path for path in tmp_path.rglob("*") if path.is_file() and path.name != "brief.ply"]
+
+
 def test_speeds_beyond_what_a_file_holds_are_refused_and_dropped(tmp_path):
     model = moving_model()
     motion = model.motion.copy()

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -9,12 +10,14 @@ import numpy as np
 import pytest
 
 from clsplat.cameras.table import write_cameras
+from clsplat.errors import DataError
 from clsplat.inspect.figures import figures
 from clsplat.inspect.inspection import Inspection
+from clsplat.scene.decoding import decode_all, require_whole
 from clsplat.scene.detect import read_scene
 from clsplat.scene.points import read_points_ply, write_points_ply
 from clsplat.scene.scene import PointCloud, Scene
-from clsplat.scene.times import by_camera, moments_of
+from clsplat.scene.times import Clock, by_camera, moments_of
 from clsplat.scene.times_file import write_times
 from data_tools.colmap_writer import write_model
 from data_tools.moments import write_moments
@@ -159,12 +162,35 @@ def test_a_mask_of_what_is_static_must_be_there(tmp_path):
 def test_times_of_points_are_written_and_read(tmp_path):
     points = PointCloud(np.eye(3, dtype=np.float32), np.full((3, 3), 0.2, np.float32), np.float32([0, 0.5, 1]))
     write_points_ply(tmp_path / "p.ply", points)
-    times = read_points_ply(tmp_path / "p.ply", lambda values: values / 2).times
+    times = read_points_ply(tmp_path / "p.ply", Clock(0, 2)).times
     assert times is not None
     assert times.tolist() == [0, 0.25, 0.5]
     assert read_points_ply(tmp_path / "p.ply").times is None, "a scene that does not move has no clock"
     assert points.joined(points).times.tolist() == [0, 0.5, 1] * 2
     assert points.joined(PointCloud(points.positions, points.colours)).times is None
+
+
+def test_times_of_points_in_another_unit_are_refused(tmp_path):
+    path = write(tmp_path / "a", **LENS, frames=timed(10, 20, 30))
+    seen = PointCloud(np.eye(3, dtype=np.float32), np.zeros((3, 3), np.float32), np.float32([10, 20, 30]))
+    write_points_ply(path / "points3d.ply", seen)
+    assert read_scene(path).points.times.tolist() == [0, 0.5, 1]
+    write_points_ply(path / "points3d.ply", replace(seen, times=np.float32([0, 0.5, 1])))
+    fault = refusal(read_scene, path)
+    assert "points3d.ply: its points have times from 0 to 1; expected the unit of the frames" in fault
+    assert "10 to 30" in fault
+    assert fault in [finding.text for finding in Inspection.of(path).findings]
+
+
+def test_a_damaged_mask_of_what_is_static_is_found_before_training(tmp_path):
+    table = timed(0, 1, 2)
+    for frame in table:
+        frame["static_path"] = "still.png"
+    path = write(tmp_path / "a", **LENS, frames=table)
+    cv2.imwrite(str(path / "still.png"), np.zeros((5, 7), np.uint8))
+    with pytest.raises(DataError, match=r"1 of 4 image files cannot be trained on: .*still.png"):
+        require_whole(path, decode_all(read_scene(path).views))
+    assert any("static mask" in finding.text for finding in Inspection.of(path).findings)
 
 
 def several_cameras(folder: Path, counts: dict[str, int], *posed: str) -> Path:
@@ -275,6 +301,11 @@ def test_a_colmap_folder_with_times_moves(tiny_colmap, tmp_path):
     assert times == pytest.approx(np.linspace(0, 1, len(names)))
     undistort_scene(tmp_path / "scene", tmp_path / "pinhole")
     assert [view.time for view in read_scene(tmp_path / "pinhole", 0).views] == pytest.approx(times)
+    place = tmp_path / "scene" / "images" / "times.json"
+    place.unlink()
+    place.symlink_to("nowhere.json")
+    assert "times.json" in refusal(read_scene, tmp_path / "scene"), "what is there is read, or refused"
+    place.unlink()
     write_times(tmp_path / "scene" / "images", {name: 5.0 for name in names[1:]})
     assert f"1 of {len(names)} frames have no `time`: {names[0]}" in refusal(read_scene, tmp_path / "scene")
 

@@ -28,5 +28,20 @@ def test_what_reads_places_at_rest_is_refused_beside_motion(override, what, reme
     load("splat_7k", [override])
 
 
+@pytest.mark.parametrize(
+    ("pipeline", "override", "bound"),
+    [
+        ("dynamic_7k", "optimize.rates.motion.turn=1e300", "at most 100"),
+        ("dynamic_7k", "optimize.rates.motion.velocity=-1", "at least 0"),
+        ("mip_nerf", "train_field.rays=1000000000000", "at most 1048576"),
+        ("mip_nerf", "train_field.field.far=1e300", "at most"),
+        ("mip_nerf", "train_field.field.near=1e-300", "at least"),
+    ],
+)
+def test_numbers_that_no_training_survives_are_refused(pipeline, override, bound):
+    with pytest.raises(ConfigError, match=bound):
+        load(pipeline, [override])
+
+
 def test_each_shipped_filter_and_rule_that_reads_no_places_goes_together_with_motion():
     load("dynamic_7k", ["model.screen_filter=mip", "densify.rules=[clone, split_saddle, prune_unimportant]"])

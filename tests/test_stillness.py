@@ -4,7 +4,9 @@ import cv2
 import numpy as np
 import pytest
 
+from clsplat.metrics.held_out import HELD_OUT, OTHERS, by_moment
 from clsplat.metrics.stillness import STILL, Stillness, means
+from clsplat.metrics.views import ViewMetrics, mean
 from clsplat.scene.camera import Camera
 from clsplat.scene.view import View
 
@@ -100,6 +102,18 @@ def test_a_camera_with_one_moment_takes_no_place_of_others_and_no_memory(rng, st
     assert Stillness([*places, *fixed]).held == 8
     _, figures = gathered([*moving[:MOMENTS], *fixed], [*renders, *renders], [*photographs, *photographs])
     assert figures == gathered(fixed, renders, photographs)[1] != {}
+
+
+def test_moments_that_no_view_in_training_has_are_measured_apart():
+    views = [moment(f"{i}", time) for i, time in enumerate((0, 0.5, 1))]
+    results = [ViewMetrics(view.name, 20.0 + i, 0.9) for i, view in enumerate(views)]
+    found = mean(by_moment(results, views, [views[0], views[2]]))
+    assert (found["psnr"], found[HELD_OUT], found[OTHERS]) == (21, 21, 21)
+    assert [result.still for result in by_moment(results, views, [views[0], views[2]])] == [
+        {OTHERS: 20.0}, {HELD_OUT: 21.0}, {OTHERS: 22.0},
+    ]  # fmt: skip
+    for trained in (views, [moment("x", 0.2)], [moment("y", None)]):
+        assert not {HELD_OUT, OTHERS} & set(mean(by_moment(results, views, trained)))
 
 
 def test_means_are_over_the_views_that_have_a_figure():

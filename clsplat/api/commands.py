@@ -79,6 +79,14 @@ def resume(
     return run_job(Job.resume(Path(folder), overrides(set), path_of(scene), values_of(path_of(on))), device, live)
 
 
+def steps_key(folder: Path) -> str:
+    """Return the key of the steps that a run trains, such as optimize.steps."""
+    from clsplat.runs.steps_key import steps_key
+
+    load_plugins()
+    return steps_key(folder)
+
+
 def status(folder: PathLike, html: PathLike | None = None) -> dict[str, Any]:
     """Return how far a run or a matrix is, from its files: what status.json holds, `last` report, `metrics` at the end.
 

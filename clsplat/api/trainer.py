@@ -16,6 +16,7 @@ from clsplat.errors import ClsplatError, ConfigError, DataError, Interrupted, Ou
 from clsplat.gaussians.model import Model
 from clsplat.losses.base import ViewLosses
 from clsplat.losses.host import HostFunction, HostLoss
+from clsplat.metrics.held_out import by_moment
 from clsplat.metrics.views import mean, measure
 from clsplat.names import CHECKSUMS, END_STATES
 from clsplat.opencl.device import Device
@@ -202,7 +203,9 @@ class Trainer:
         """
         run = self._run
         views = run.scene.downscaled(run.downscale).split(split)
-        return mean(measure(run.painter(), views, run.photographs.fresh())) if views else {"views": 0}
+        if not views:
+            return {"views": 0}
+        return mean(by_moment(measure(run.painter(), views, run.photographs.fresh()), views, run.scene.split("train")))
 
     def checkpoint(self) -> Path:
         """Save all that training needs to go on to the same bits, but for losses that were added; return the file.

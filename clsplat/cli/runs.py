@@ -75,7 +75,7 @@ def resume(
     device: DeviceOption = None,
     steps: Annotated[
         int | None,
-        typer.Option(min=1, metavar="N", help="Train to this step, further than before; as --set optimize.steps."),
+        typer.Option(min=1, metavar="N", help="Train to this step, further than before; as --set of its training."),
     ] = None,
     set_: SetOption = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Check everything and say what would run.")] = False,
@@ -83,7 +83,7 @@ def resume(
     on: OnOption = None,
 ) -> None:
     """Go on with a run from its newest checkpoint, or train one that is done for longer."""
-    changes = [*(set_ or ()), *([f"optimize.steps={steps}"] if steps is not None else [])]
+    changes = [*(set_ or ()), *([f"{commands.steps_key(folder)}={steps}"] if steps is not None else [])]
     if dry_run:
         file = folder / "pipeline.yaml"
         terminal.show(commands.describe_run(file, scene, folder, set=changes, device=device, start="resume", on=on))

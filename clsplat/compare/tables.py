@@ -13,6 +13,8 @@ METRICS = {  # name -> heading, digits, function that returns the better one
     "psnr": ("PSNR ↑", 2, max),
     "psnr_colour": ("PSNR in the photographs' colours ↑", 2, max),
     "psnr_affine": ("PSNR, colours fitted ↑", 2, max),
+    "psnr_held_out_moments": ("PSNR, held-out moments ↑", 2, max),
+    "psnr_other_moments": ("PSNR, other moments ↑", 2, max),
     "psnr_static": ("PSNR, static pixels ↑", 2, max),
     "flicker": ("flicker of static pixels, levels ↓", 2, min),
     "ssim": ("SSIM ↑", 4, max),

@@ -17,6 +17,7 @@ COLOUR_ROWS = int(constants("composite.cl")["COLOUR_ROWS"])
 COLOURS, DENSITIES = 3, 1  # outputs of the network
 LANES_MAX = 16
 assert FEATURES == BLOCK  # of a level of a grid: so its rows are whole blocks
+FARTHEST = 1e6  # scene units: the square of a depth divided by that of the least is within float32
 Features = Annotated[int, Field(ge=BLOCK, le=1024, multiple_of=BLOCK)]
 
 
@@ -51,9 +52,9 @@ class Layer:
 class FieldShape(Settings):
     """A field of Mip-NeRF (Barron et al. 2021): a network, which both levels share, reads positions and directions."""
 
-    near: Annotated[float, Field(gt=0)] = 2.0
+    near: Annotated[float, Field(ge=1e-6, le=FARTHEST)] = 2.0
     """Depth at which the samples of a ray begin, scene units; 2 for the Blender scenes."""
-    far: Annotated[float, Field(gt=0)] = 6.0
+    far: Annotated[float, Field(gt=0, le=FARTHEST)] = 6.0
     """Depth at which they end, scene units; 6 for the Blender scenes."""
     coarse_samples: Annotated[int, Field(ge=LANES_MAX, le=1024, multiple_of=LANES_MAX)] = 128
     """Samples of a ray in the coarse level."""

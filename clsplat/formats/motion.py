@@ -15,13 +15,20 @@ The number of columns says which there are: 5, 8 or 11, and 4 more with turns (F
 first 5; Spacetime Gaussians, Li et al. 2024, the polynomials and turns).
 """
 
+import math
 from collections.abc import Collection
 
 MOTION = "motion"
 FIELDS = {"velocity": 3, "time_centre": 1, "log_duration": 1, "acceleration": 3, "jerk": 3, "turn": 4}
 TURN = 4  # columns of the turn
 MAX_DEGREE = 3
+EXPECTED = "expected a number from 0, the first moment of the scene, to 1, its last"
 STILL = 12.0  # log of a duration: what is there always, exp(-1/2 exp(-24)) being 1 in float32
+
+
+def is_moment(time: float) -> bool:
+    """Return whether a number is a moment of a scene."""
+    return math.isfinite(time) and 0 <= time <= 1
 
 
 def width_of(degree: int, turns: bool) -> int:

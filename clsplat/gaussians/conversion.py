@@ -38,7 +38,7 @@ class Changes:
 
     def of(self, model: Model) -> Model:
         """Return the changed model.  Raises DataError where nothing is left, ConfigError for a transform too far."""
-        model = model if self.time is None else model.at(self.time)
+        model = model if self.time is None else _at(model, self.time)
         kept = model[model.opacities >= self.drop_below] if self.drop_below else model
         if self.transform is not None:
             scale = round(float(np.cbrt(np.linalg.det(self.transform[:3, :3]))), 12)
@@ -98,15 +98,20 @@ def convert(
     if not sources:
         raise ConfigError("convert: expected a model file to read, and one to write")
     codec = for_writing(out)
-    if any(_is_same(out, model_at(source)) for source in sources):
-        raise ConfigError(f"{out}: is one of the files that are read; give another name")
-    check_no_file_of_a_run(out)
+    check_place(sources, out)
     reading, writing = (options or Options()).of(sources, out)
     models = [load(source, reading) for source in sources]
     model = (changes or Changes()).of(merged(models, [str(source) for source in sources]))
     size = sum(bytes_of(model_at(source)) for source in sources)
     model.save(out, writing)
     return {"file": str(out), "format": codec.name, "gaussians": len(model), "bytes": bytes_of(out), "bytes_read": size}
+
+
+def check_place(sources: Sequence[Path], out: Path) -> None:
+    """Raise ConfigError where the file to write is one of those that are read, or belongs to a run."""
+    if any(_is_same(out, model_at(source)) for source in sources):
+        raise ConfigError(f"{out}: is one of the files that are read; give another name")
+    check_no_file_of_a_run(out)
 
 
 def merged(models: Sequence[Model], names: Sequence[str]) -> Model:
@@ -219,6 +224,16 @@ def checked_degree(degree: int | None) -> int | None:
     if degree is not None and not 0 <= degree <= MAX_DEGREE:
         raise ConfigError(f"--sh-degree {degree}: expected 0 to {MAX_DEGREE}")
     return degree
+
+
+def _at(model: Model, time: float) -> Model:
+    """A moment of a model that moves.  Raises ConfigError for one that does not, DataError where nothing is shown."""
+    if model.motion is None:
+        raise ConfigError("a moment was asked for, and the model does not move; leave --time and --frames out")
+    shown = model.at(time)
+    if not len(shown):
+        raise DataError(f"none of {len(model):,} Gaussians is shown at the time {time:g}; expected another moment")
+    return shown
 
 
 def _reads_axes(sources: Sequence[Path]) -> bool:

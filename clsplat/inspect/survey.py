@@ -181,6 +181,7 @@ def _photographs(views: Sequence[View], missing: set[Path]) -> PhotographFacts:
     decoded = decode_all(view for view in views if view.image_path not in missing)
     for view in views:
         files = {view.name: view.image_path, f"mask of {view.name}": view.mask_path}
+        files[f"static mask of {view.name}"] = view.static_path
         for name, file in files.items():
             if file in decoded:
                 _photograph(facts, view, name, file, decoded[file])

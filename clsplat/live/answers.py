@@ -2,11 +2,13 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, cast, get_args
 
 import numpy as np
 
 from clsplat.errors import DataError
+from clsplat.formats.motion import EXPECTED, is_moment
 from clsplat.live.desk import Desk, Shown
 from clsplat.live.orders import Order, Pace
 from clsplat.live.page import page
@@ -61,7 +63,10 @@ class Answers:
         return Answer.json(self._shown().scene)
 
     def _frame(self, request: Request) -> Answer:
-        """A picture through a camera: of `view`, or `camera` as written by camera.js; 204 when it is not ready yet."""
+        """A picture through a camera: of `view`, or `camera` as written by camera.js, at a `time` where one is given.
+
+        204 when it is not ready yet.
+        """
         desk, shown = self.desk, self._shown()
         pace = request.query.get("pace", "")
         if pace not in get_args(Pace):
@@ -70,6 +75,8 @@ class Answers:
             view = shown.views[request.number("view", 0, len(shown.views) - 1)]
         else:
             view = camera(request.query.get("camera", ""))
+            if "time" in request.query:
+                view = replace(view, time=moment(request.query["time"]))
         order = Order(request.number("page", 0, 1 << 40), view, cast(Pace, pace))
         if not desk.orders.ask(order, WAIT):
             raise Refused(503, "too many pictures are waited for")
@@ -99,6 +106,17 @@ class Answers:
         if self.desk.shown is None:
             raise Refused(503, "no scene yet")
         return self.desk.shown
+
+
+def moment(text: str) -> float:
+    """Return a moment of the scene.  Raises Refused."""
+    try:
+        found = float(text)
+    except ValueError:
+        found = math.nan
+    if not is_moment(found):
+        raise Refused(400, f"time: {EXPECTED}")
+    return found
 
 
 def camera(text: str) -> View:

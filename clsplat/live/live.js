@@ -45,7 +45,9 @@ class Live extends Walk {
     if (width < 8 || height < 8) return null;
     const {intrinsics} = framed(this.camera, width, height, false), lens = [...intrinsics, width, height];
     const camera = exact ? this.camera : {...this.camera, lens};
-    const key = exact ? `view=${this.at}` : `camera=${written(camera)}`, same = this.newest?.key === key;
+    if (exact) this.moment = this.info.views[this.at].time;
+    const then = this.moment === undefined ? "" : `&time=${this.moment}`; // that of the photograph last chosen
+    const key = exact ? `view=${this.at}` : `camera=${written(camera)}${then}`, same = this.newest?.key === key;
     const moving = performance.now() - this.changed < MOVING || this.controls.pointers.size > 0 && !same;
     if (moving) return same ? null : {key, camera, pace: "moving"};
     if (!same || this.newest.pace === "moving") return {key, camera, pace: "still"};

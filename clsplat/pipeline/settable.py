@@ -49,7 +49,7 @@ def _keys(model: BaseModel, prefix: str, addresses: dict[int, str]) -> Iterator[
             for i, item in enumerate(items):
                 yield from _keys(item, addresses.get(id(item), f"{prefix}{name}.{i}") + ".", addresses)
         else:
-            yield Key(prefix + name, plain[name], texts.get(name, ""))
+            yield Key(prefix + name, plain.get(name), texts.get(name, ""))
 
 
 def _addresses(settings: BaseModel) -> dict[int, str]:

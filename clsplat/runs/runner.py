@@ -87,7 +87,7 @@ def restore(pipeline: Pipeline, run: Run) -> Path | None:
         stage = pipeline.stages[run.cursor] if run.cursor < len(pipeline.stages) else None
         if isinstance(stage, Training) and stage.steps < run.stage_step:
             raise ConfigError(
-                f"{taken}: already at step {run.step}; optimize.steps={stage.steps} would end before it: give "
+                f"{taken}: already at step {run.step}; {stage.stage}.steps={stage.steps} would end before it: give "
                 f"{run.stage_step} or more, or begin anew: `clsplat run` with --restart or another --out"
             )
     for remark in remarks:

@@ -49,7 +49,5 @@ def _lines(folder: Path, metrics: dict[str, Any]) -> Iterator[str]:
         yield f"  time     {', '.join(long)}"
     page = next((files[stage] for stage in ("report", "viewer") if stage in files and files[stage].exists()), None)
     if page:
-        field = "parameters" in metrics  # whose steps have a key of their own
-        steps_of = "--set train_field.steps=" if field else "--steps "
-        longer = f"; `clsplat resume {folder} {steps_of}{2 * metrics['steps']}` trains longer"
+        longer = f"; `clsplat resume {folder} --steps {2 * metrics['steps']}` trains longer"
         yield f"next: open {page} in a browser{'' if kept and kept['refit'] else longer}"

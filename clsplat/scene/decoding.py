@@ -46,7 +46,7 @@ def decode_all(views: Iterable[View]) -> dict[Path, ImageFile]:
     """
     users: dict[Path, list[View]] = defaultdict(list)
     for view in views:
-        for file in (view.image_path, view.mask_path):
+        for file in (view.image_path, view.mask_path, view.static_path):
             if file is not None and file != NO_FILE:
                 users[file].append(view)
     found = {file: ImageFile() for file in users}

@@ -2,7 +2,6 @@
 
 import io
 import logging
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,6 +13,7 @@ from clsplat.files import atomic
 from clsplat.ply_header import PlyHeader, parse_ply_header
 from clsplat.reading import read_file
 from clsplat.scene.scene import Floats, PointCloud
+from clsplat.scene.times import Clock
 
 logger = logging.getLogger("clsplat")
 
@@ -39,25 +39,27 @@ class PointTable(NamedTuple):
         finite = (np.abs(self.positions) < MAX_VALUE).all(axis=1)
         return np.asarray(finite & (np.abs(self.times) < MAX_VALUE) if len(self.times) else finite)
 
-    def cloud(self, clock: Callable[[Floats], Floats] | None = None) -> PointCloud:
+    def cloud(self, clock: Clock | None = None) -> PointCloud:
         """Return the points that are finite; log the number of the others.
 
-        clock: takes times of the file to [0, 1]; without it the points have no times.
+        clock: of the frames; without it the points have no times.  Raises DataError for times of another unit.
         """
         kept = self.kept()
         if not kept.all():
             logger.warning("%s: dropped %s points that are not finite", self.file, f"{np.count_nonzero(~kept):,}")
         colours = np.asarray(self.rgb[kept], np.float32) / np.float32(255)
-        times = np.asarray(clock(self.times[kept]), np.float32) if clock and len(self.times) else None
+        moments = clock.of_points(self.file, self.times[kept]) if clock and len(self.times) else None
+        times = None if moments is None else np.asarray(moments, np.float32)
         return PointCloud(np.asarray(self.positions[kept], np.float32), colours, times)
 
 
-def read_points_ply(path: Path, clock: Callable[[Floats], Floats] | None = None) -> PointCloud:
+def read_points_ply(path: Path, clock: Clock | None = None) -> PointCloud:
     """Read x y z and red green blue (uchar) of the vertices of a PLY file, and `time` by a clock as PointTable.cloud.
 
     Other properties are ignored.
 
-    Raises DataError when the file is damaged, big-endian, or lacks these properties.
+    Raises DataError when the file is damaged, big-endian, or lacks these properties, and where times are of another
+    unit.
     """
     return read_ply_table(path).cloud(clock)
 

@@ -1,11 +1,10 @@
 """What a view says of its place: a pose with a rotation, and the moment of a scene that moves."""
 
-import math
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clsplat.errors import PoseError, quoted
+from clsplat.formats.motion import EXPECTED, is_moment
 
 Floats = NDArray[np.floating]
 ROTATION_TOLERANCE = 2e-3  # of R Rᵀ: files are read to 1e-3, and an inverse has a little more
@@ -35,9 +34,6 @@ def checked_time(name: str, time: float | None) -> float | None:
         return None
     if isinstance(time, bool) or not isinstance(time, int | float | np.floating | np.integer):
         raise PoseError(f"the time of {quoted(name)} is {quoted(time)}; expected a number from 0 to 1, or None")
-    if not (math.isfinite(time) and 0 <= time <= 1):
-        raise PoseError(
-            f"the time of {quoted(name)} is {float(time):g}; expected a number from 0, the first moment of the scene, "
-            "to 1, its last"
-        )
+    if not is_moment(time):
+        raise PoseError(f"the time of {quoted(name)} is {float(time):g}; {EXPECTED}")
     return float(time)

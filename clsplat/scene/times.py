@@ -18,6 +18,21 @@ class Clock:
     first: float
     last: float
 
+    def of_points(self, path: object, values: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Return the moments of points of a file as times in [0, 1], of the same shape.
+
+        Raises DataError where some lie farther outside of the scene's than a file of single precision may be wrong.
+        """
+        span, largest = self.last - self.first, max(abs(self.first), abs(self.last))
+        slack = max(1e-3 * span, float(np.finfo(np.float32).eps) * largest)
+        least, most = (float(values.min()), float(values.max())) if values.size else (self.first, self.last)
+        if least < self.first - slack or most > self.last + slack:
+            raise DataError(
+                f"{path}: its points have times from {least:g} to {most:g}; expected the unit of the frames, whose "
+                f"times are {self.first:g} to {self.last:g}: write the points again, or without the property `time`"
+            )
+        return self(values)
+
     def __call__(self, values: ArrayLike) -> NDArray[np.float64]:
         """Return moments as times in [0, 1], of the same shape; what lies outside is brought to the nearer end."""
         return np.clip((np.asarray(values, np.float64) - self.first) / (self.last - self.first), 0, 1)

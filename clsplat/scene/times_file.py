@@ -1,6 +1,7 @@
 """times.json in a folder of photographs: at which moment each of them was taken, in any unit."""
 
 import json
+import os
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -24,7 +25,7 @@ def write_times(folder: Path, times: Mapping[str, float]) -> None:
 def read_times(folder: Path) -> dict[str, float] | None:
     """Return the moments of the photographs below `folder` by name, None without a file.  Raises DataError."""
     path = folder / FILE
-    if not path.is_file():
+    if not os.path.lexists(path):  # what is there and is no file is refused when it is read
         return None
     table = read_json(path, "moments of photographs in JSON", limit=LARGEST)
     if not isinstance(table, dict):

@@ -123,6 +123,8 @@ def list_frames(parts: Parts, *names: str) -> None:
     if files and files[0]:
         place = parts.attempt(files[0].points_path)
         parts.points = parts.attempt(read_ply_table, place) if place else None
+        if parts.points and clock and len(parts.points.times):
+            parts.attempt(clock.of_points, place, parts.points.times[parts.points.kept()])
 
 
 def view_name(file_path: str) -> str:

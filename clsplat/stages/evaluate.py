@@ -7,6 +7,7 @@ from pydantic import AfterValidator, Field, field_validator
 
 from clsplat.errors import amount
 from clsplat.gaussians.model import load
+from clsplat.metrics.held_out import by_moment
 from clsplat.metrics.lpips import InputRange
 from clsplat.metrics.perceptual import Metric, Perceptual
 from clsplat.metrics.views import mean, measure
@@ -98,6 +99,7 @@ class Evaluate(Scheduled):
             results = measure(painter, views, photographs, perceptual, colours=colours_of(run), counted=counted)
             if not results:
                 continue
+            results = by_moment(results, views, run.scene.split("train"))
             for result in results:
                 run.records.add(run.model_step, "view", split=self.split, downscale=downscale, **result.line())
             averages = mean(results, perceptual)

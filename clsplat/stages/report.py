@@ -23,9 +23,11 @@ from clsplat.training.found import photographs_text, size_text
 from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
-MORE = {  # metrics/colours.py, metrics/stillness.py: name and unit
+MORE = {  # metrics/colours.py, metrics/stillness.py, metrics/held_out.py: name and unit
     "psnr_colour": ("PSNR in the photographs' colours", "dB"),
     "psnr_affine": ("PSNR with colours fitted", "dB"),
+    "psnr_held_out_moments": ("PSNR at held-out moments", "dB"),
+    "psnr_other_moments": ("PSNR at other moments", "dB"),
     "psnr_static": ("PSNR of static pixels", "dB"),
     "flicker": ("flicker of static pixels", "levels"),
     "flicker_photographs": ("flicker of the photographs there", "levels"),

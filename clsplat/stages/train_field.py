@@ -43,9 +43,9 @@ class TrainField(Training):
 
     field: FieldShape = FieldShape()
     """Network and samples."""
-    rays: Annotated[int, Field(gt=0)] = 4096
+    rays: Annotated[int, Field(gt=0, le=1 << 20)] = 4096
     """Rays of a step."""
-    photographs: Annotated[int, Field(gt=0)] = 1
+    photographs: Annotated[int, Field(gt=0, le=1 << 20)] = 1
     """Photographs that they are drawn from, as many from each."""
     order: OneOf[Order] = Uniform()
     """Which photographs a step trains on."""

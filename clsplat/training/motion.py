@@ -4,18 +4,19 @@ import math
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from clsplat.formats.motion import MOTION, fields_of
 from clsplat.gaussians.tables import Gaussians, Gradients, moment_tables
 from clsplat.opencl.device import Array
 from clsplat.opencl.program import constants
-from clsplat.schedule import Decay, NonNegative, at_step, divided
+from clsplat.schedule import Bounded, Decay, Schedule, at_step, divided
 from clsplat.settings import Settings
 
 LONGEST = 15.0  # log of a duration: nothing changes beyond it
 FAR = 3.0e38  # a bound beyond all values
 IN_EXTENTS = ("velocity", "acceleration", "jerk")
+Rate = Annotated[Schedule, AfterValidator(Bounded(0, most=100.0))]
 
 
 class MotionRates(Settings):
@@ -26,17 +27,17 @@ class MotionRates(Settings):
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"shortest"})
 
-    velocity: NonNegative = Decay(initial=1.0e-3, final=1.0e-5, over=30_000)
+    velocity: Rate = Decay(initial=1.0e-3, final=1.0e-5, over=30_000)
     """Of velocities, as shares of the scene's extent; they fall, as in FreeTimeGS."""
-    time_centre: NonNegative = 1.0e-3
+    time_centre: Rate = 1.0e-3
     """Of the times at which Gaussians are most opaque."""
-    log_duration: NonNegative = 1.0e-2
+    log_duration: Rate = 1.0e-2
     """Of the logarithms of durations."""
-    acceleration: NonNegative = Decay(initial=1.0e-3, final=1.0e-5, over=30_000)
+    acceleration: Rate = Decay(initial=1.0e-3, final=1.0e-5, over=30_000)
     """Of accelerations, as shares of the scene's extent."""
-    jerk: NonNegative = Decay(initial=1.0e-3, final=1.0e-5, over=30_000)
+    jerk: Rate = Decay(initial=1.0e-3, final=1.0e-5, over=30_000)
     """Of the coefficients of the third power of time, as shares of the scene's extent."""
-    turn: NonNegative = 1.0e-3
+    turn: Rate = 1.0e-3
     """Of the changes of quaternions by time."""
     shortest: Annotated[float, Field(ge=0, lt=1)] = 0.02
     """Shortest duration that an update leaves; what is shorter than a moment shows nothing between two of them."""

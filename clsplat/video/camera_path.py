@@ -20,6 +20,7 @@ from clsplat.cameras import inria
 from clsplat.cameras.lost import centre_lost, width_lost
 from clsplat.errors import ConfigError, DataError, quoted
 from clsplat.files import write_text
+from clsplat.formats.motion import is_moment
 from clsplat.reading import read_json
 from clsplat.scene.camera import Camera
 from clsplat.scene.nerfstudio import FILE as TRANSFORMS
@@ -75,7 +76,7 @@ def read(path: Path, scene: Path | None = None) -> CameraPath:
             raise DataError(f"{frame.where}: fov is {quoted(fov)}; expected degrees from 0.01 to 179")
         pose = pose_of(Frame(path.parent, frame.where, {"transform_matrix": _rows(own.get("camera_to_world"))}))
         time = frame.number("render_time")
-        if time is not None and not 0 <= time <= 1:
+        if time is not None and not is_moment(time):
             raise DataError(f"{frame.where}: render_time is {time:g}; expected 0 to 1: export the path again")
         views.append(View(f"frame_{i + 1:05d}", _camera(size, math.radians(fov)), move(pose), time=time))
     return CameraPath(views, rate, size)

@@ -1,12 +1,12 @@
 """The moments of a film's frames, for scenes that move."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from clsplat.errors import ConfigError, quoted
+from clsplat.formats.motion import is_moment
 from clsplat.scene.view import View
 
 Times = tuple[float, float]  # of the first and of the last frame, in [0, 1] of the scene
@@ -26,7 +26,7 @@ def times_of(given: "str | float | Sequence[float] | None") -> Times | None:
         found = [float(part) for part in parts]
     except (ValueError, TypeError):
         found = []
-    if len(found) not in (1, 2) or not all(math.isfinite(time) and 0 <= time <= 1 for time in found):
+    if len(found) not in (1, 2) or not all(map(is_moment, found)):
         raise ConfigError(f"the time {quoted(given)}: {EXPECTED}")
     return found[0], found[-1]
 

@@ -88,12 +88,12 @@ function framed(camera, width, height, exact, native = 1) {
 const written = camera => [camera.eye, quaternion(camera.rotation), camera.lens]
   .map(part => part.map(v => +v.toPrecision(8)).join(",")).join(";");
 
-// The camera of an address' part behind #; null where it is none.
+// The camera of an address' part behind #, and the moment where it has one; null where it is none.
 function read(text) {
   const parts = text.replace(/^#/, "").split(";").map(part => part.split(",").map(Number));
-  if (parts.length !== 3 || parts.some((part, i) => part.length !== [3, 4, 6][i])) return null;
+  if (![3, 4].includes(parts.length) || parts.some((part, i) => part.length !== [3, 4, 6, 1][i])) return null;
   if (!parts.flat().every(Number.isFinite)) return null;
-  const [eye, turn, lens] = parts;
+  const [eye, turn, lens, [moment] = []] = parts;
   if (size(turn) < 1e-6 || [lens[0], lens[1], lens[4], lens[5]].some(v => v <= 0)) return null;
-  return {eye, rotation: rotationOf(scaled(turn, 1 / size(turn))), lens};
+  return {eye, rotation: rotationOf(scaled(turn, 1 / size(turn))), lens, moment};
 }

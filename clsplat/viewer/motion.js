@@ -7,10 +7,14 @@ class Walk {
     this.pivot = info.pivot;
   }
 
-  // Take the camera of the address; return whether it holds one.
+  // Take the camera of the address, and its moment; return whether it holds one.
   adopt() {
     const camera = location.hash === this.hash ? null : read(location.hash);
     if (camera) this.move(camera);
+    if (camera && this.clock && camera.moment !== undefined) {
+      this.clock.stop();
+      this.clock.to(camera.moment);
+    }
     return !!camera;
   }
 
@@ -64,7 +68,7 @@ class Walk {
 
   // The camera is at rest: note it in the address.
   remember() {
-    const text = `#${written(this.camera)}`;
+    const text = `#${written(this.camera)}${this.clock ? `;${+this.moment.toFixed(4)}` : ""}`;
     if (text === location.hash) return;
     this.hash = text;
     try { history.replaceState(null, "", text); } catch { /* too often, or not allowed: the address stays */ }

@@ -10,6 +10,7 @@ const choices = (group, key, action) => find(group).addEventListener("click", ({
   if (target.dataset[key]) action(target.dataset[key]);
 });
 const thousands = number => number.toLocaleString("en");
+const TOLD = 4000; // ms
 
 class Panel {
   constructor(viewer) {
@@ -54,6 +55,13 @@ class Panel {
     this.viewer.frustums.shown = shown;
     press("cameras", "cameras", shown ? "shown" : "hidden");
     this.viewer.change();
+  }
+
+  // Say in the caption why there is no photograph any more, for a while.
+  tell(text) {
+    const caption = find("caption");
+    caption.textContent = text;
+    setTimeout(() => { if (caption.textContent === text) caption.textContent = ""; }, TOLD);
   }
 
   caption(view) {

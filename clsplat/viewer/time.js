@@ -27,7 +27,10 @@ class Clock {
   to(moment) {
     const {viewer} = this, shown = viewer.photographs.views[viewer.photographs.chosen];
     viewer.moment = Math.max(0, Math.min(1, moment));
-    if (shown && Math.abs((shown.time ?? viewer.moment) - viewer.moment) > 1e-6) viewer.move(viewer.camera);
+    if (shown && Math.abs((shown.time ?? viewer.moment) - viewer.moment) > 1e-6) {
+      viewer.move(viewer.camera);
+      viewer.panel.tell(`${shown.name} is of another moment`);
+    }
     this.show();
     viewer.change();
   }

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from clsplat.live.answers import Answers, camera
+from clsplat.live.answers import Answers, camera, moment
 from clsplat.live.desk import Desk
 from clsplat.live.requests import Answer, Refused, Request, host_name, read
 
@@ -118,6 +118,13 @@ def test_a_camera_is_what_the_page_has_written():
 def test_an_impossible_camera_is_refused(text):
     with pytest.raises(Refused, match="camera: expected"):
         camera(text)
+
+
+@pytest.mark.parametrize("text", ["", "x", "nan", "1.01", "-0.1"])
+def test_a_moment_is_from_0_to_1(text):
+    assert moment("0.35") == 0.35
+    with pytest.raises(Refused, match="time: expected a number from 0"):
+        moment(text)
 
 
 def test_a_page_that_was_not_told_of_the_end_does_not_count_as_told():
