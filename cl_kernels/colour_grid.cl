@@ -9,10 +9,9 @@
  * Planes are [channels,H',W'] with H', W' whole tiles, zero outside the image.  A grid is [ENTRIES,nz,ny,nx].  The
  * derivative by it is summed over the pixels of a row for each of its columns of nodes, then over the rows about each
  * node in their order: each sum has one place and is written once.  Deterministic. */
+#include "colour_grid.h"
 #include "planes.h"
 
-#define ENTRIES 12     // of a matrix [E | b], row by row
-#define MOST_NODES 16  // of an axis
 #define LUMINANCE_RED 0.299f    // BT.601
 #define LUMINANCE_GREEN 0.587f
 #define LUMINANCE_BLUE 0.114f

@@ -3,9 +3,8 @@
  * Smoothness of a grid: for each axis the mean of the squared differences of neighbouring nodes, times a weight (the
  * total variation of Wang et al. 2024).  Adam as in adam.h.  A grid is [ENTRIES,nz,ny,nx].  Deterministic. */
 #include "adam.h"
+#include "colour_grid.h"
 #include "planes.h"
-
-#define ENTRIES 12  // of a matrix [E | b], row by row
 
 /* Derivatives of the smoothness of a photograph's grid, and its share of each value, which has the differences to the
  * next nodes.  One item = one value. */

@@ -20,11 +20,11 @@ from clsplat.pipeline.loading import load
 from clsplat.render.workspace import Workspace
 from clsplat.runs.model_file import evaluate
 from clsplat.schedule import Decay, at_step
-from clsplat.training import checkpoint, grids, memory
+from clsplat.training import checkpoint, colour_grids, memory
 from clsplat.training.colours import colours_beside, photograph_colours
 from clsplat.training.run import Run
 from clsplat.views.colours import Auto, Gain, Grid
-from clsplat.views.photograph_grids import bytes_of
+from clsplat.views.grid_tables import bytes_of
 from tests.few_steps import FEW, killed
 from tests.test_training import ONE_CORE, digest, train
 
@@ -75,9 +75,9 @@ def test_a_resumed_run_ends_with_the_bits_of_one_that_was_not(with_grids, tiny_s
     files = [(folder / "view_colours.npy").read_bytes() for folder in (out, with_grids)]
     assert files[0] == files[1]
     _, tables = checkpoint.load(out / "checkpoints" / "step_000012.npz")
-    own, _ = grids.split_tables(tables)
+    own, _ = colour_grids.split_tables(tables)
     assert own.keys() == {"values", "moment1", "moment2"}
-    assert all((table == run.grids.tables()[name]).all() for name, table in own.items())
+    assert all((table == run.colour_grids.tables()[name]).all() for name, table in own.items())
     names = {view.name for view in run.scene.split("train")}
     assert sum(run.numbers[f"colours/{name}/updates"] for name in names) == 12
 
@@ -129,18 +129,21 @@ def test_the_best_model_is_left_with_the_grids_of_its_step(tiny_scene, tmp_path)
     run = train(tiny_scene, tmp_path / "run", *GRID, *kept, "optimize.evaluate.every=4", wild)
     assert run.best.found.step == 8, "the last steps ruin it"
     _, tables = checkpoint.load(tmp_path / "run" / "checkpoints" / "step_000008.npz")
-    expected = grids.split_tables(tables)[0]["values"].reshape(-1, 3, 4, 4, 2, 3).transpose(0, 3, 4, 5, 1, 2)
+    expected = colour_grids.split_tables(tables)[0]["values"].reshape(-1, 3, 4, 4, 2, 3).transpose(0, 3, 4, 5, 1, 2)
     found = np.load(tmp_path / "run" / "view_colours.npy")
     assert (found == expected + np.eye(3, 4, dtype=np.float32)).all()
 
 
 @pytest.mark.slow
-def test_a_training_goes_on_with_grids_of_its_size_and_begins_anew_with_others(ended):
+@pytest.mark.parametrize("cells", [[1, 1, 1], [2, 3, 4], [4, 3, 2], [6, 1, 4]])
+def test_a_training_goes_on_with_grids_of_its_cells_and_begins_anew_with_others(ended, cells):
+    """Also with as many of them."""
     run, colours = copy(ended), ended.settings.training.colours
-    assert photograph_colours(colours, run, 24).tables is ended.grids
-    other = photograph_colours(Grid(cells=[1, 1, 1]), run, 24)
-    assert other.tables is run.grids is not ended.grids
-    assert not run.grids.tables()["values"].any()
+    run.numbers = dict(ended.numbers)
+    assert photograph_colours(colours, run, 24).tables is ended.colour_grids
+    other = photograph_colours(Grid(cells=cells), run, 24)
+    assert other.tables is run.colour_grids is not ended.colour_grids
+    assert not run.colour_grids.tables()["values"].any()
     assert run.numbers[f"colours/{other.names[0]}/updates"] == 0 < ended.numbers[f"colours/{other.names[0]}/updates"]
 
 
@@ -176,10 +179,10 @@ def test_a_dry_run_checks_them(tiny_scene, tmp_path):
 
 
 def test_damaged_tables_are_refused():
-    good = {name: np.zeros((2, 24), np.float32) for name in ("values", "moment1", "moment2")}
-    grids.check_tables(good)
-    grids.check_tables({"values": good["values"]})
-    grids.check_tables({})
+    good = {name: np.zeros((2, 12, 2, 1, 1), np.float32) for name in ("values", "moment1", "moment2")}
+    colour_grids.check_tables(good)
+    colour_grids.check_tables({"values": good["values"]})
+    colour_grids.check_tables({})
     for damaged in (
         {"values": good["values"][:, :5]},
         {**good, "moment2": good["values"][:1]},
@@ -188,4 +191,4 @@ def test_damaged_tables_are_refused():
         {**good, "moment1": good["values"] + np.float32(np.nan)},
     ):
         with pytest.raises(DataError, match=r"of its grids|other grids"):
-            grids.check_tables(damaged)
+            colour_grids.check_tables(damaged)

@@ -19,8 +19,6 @@ from clsplat.render.rasterizer import Rasterizer
 from clsplat.training.adam import Adam, Rates
 from clsplat.training.trainer import Trainer
 from clsplat.views.colours import Gain, Grid, OwnColours
-from clsplat.views.photograph_colours import PhotographColours
-from clsplat.views.photograph_grids import GridTables, PhotographGrids, row_length
 from clsplat.views.photographs import Photograph
 
 VIEWS, STEPS = 8, 400
@@ -71,11 +69,7 @@ class Capture:
         gaussians, numbers = self.model.gaussians, dict[str, float]()
         gaussians.set("sh_base", self.colours + rng.normal(0, 0.3, self.colours.shape).astype(np.float32))
         names, rate = [str(number) for number in range(VIEWS)], model.rate_of(STEPS, VIEWS, False)
-        if isinstance(model, Grid):
-            tables = GridTables(self.rasterizer.device, (VIEWS, row_length(model.cells)))
-            colours = PhotographGrids(model, names, rate, tables)
-        else:
-            colours = PhotographColours(model, names, rate)
+        colours = model.of_views(names, self.rasterizer.device, None).with_rate(rate)
         colours.begin(numbers, {})
         parts = self.rasterizer, self.model, Adam(gaussians), SplatStats(gaussians, []), self.background
         trainer = Trainer(*parts, (L1(weight=0.8), Dssim(weight=0.2)), RATES, numbers=numbers, colours=colours)

@@ -35,6 +35,7 @@ from clsplat.schedule import Schedule
 from clsplat.signals import stopping_on_signals
 from clsplat.stages.optimize import Optimize
 from clsplat.training import checkpoint
+from clsplat.training.host_model import host_model
 from clsplat.training.rescue import saved_on_failure
 from clsplat.training.status import StatusFile
 
@@ -184,7 +185,7 @@ class Trainer:
     @property
     def model(self) -> Model:
         """A copy of the model as it is now; `model.baked()` makes a world filter part of its scales, as a run does."""
-        return self._run.host_model()
+        return host_model(self._run)
 
     def add_loss(self, function: HostFunction, weight: Schedule = 1.0) -> None:
         """Minimise also `function(image, photograph) -> (value, derivative by the image)`, in NumPy, from now on.

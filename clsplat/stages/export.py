@@ -14,6 +14,7 @@ from clsplat.gaussians.sky import sky_file
 from clsplat.gaussians.sky_splats import with_sky_splats
 from clsplat.reading import sha256
 from clsplat.stages.base import CADENCE, Scheduled, path_in_run
+from clsplat.training.host_model import host_model
 from clsplat.training.run import Run
 
 WRITTEN = tuple(ending for ending in endings() if ending.startswith("."))  # a folder of SOG is no file
@@ -53,7 +54,7 @@ class Export(Scheduled):
         return [path, path.with_name(f"{path.stem}_raw.ply"), sky_file(path)]
 
     def run(self, run: Run) -> None:
-        model = with_sky_splats(run.host_model()) if self.sky == "splats" else run.host_model()
+        model = with_sky_splats(host_model(run)) if self.sky == "splats" else host_model(run)
         path, raw, behind = self.outputs(run.out)
         if _name(behind, run) not in run.written:
             behind.unlink(missing_ok=True)

@@ -13,6 +13,7 @@ from clsplat.pages.page import require_end
 from clsplat.scene.scene import View
 from clsplat.scene.stand import Stand
 from clsplat.stages.base import Stage, path_in_run
+from clsplat.training.host_model import host_model
 from clsplat.training.run import Run
 from clsplat.viewer.packing import pack
 from clsplat.viewer.page import MAX_SIZE, Page
@@ -38,7 +39,7 @@ class Viewer(Stage):
     """MB of photographs; with more, every second, third, … is in the page."""
 
     def run(self, run: Run) -> None:
-        path, model = run.out / self.file, run.host_model()
+        path, model = run.out / self.file, host_model(run)
         shown = with_sky_splats(model)
         scene, name = run.scene.downscaled(run.downscale), run.photographs.background_name
 

@@ -2,7 +2,6 @@
 
 import json
 import logging
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,25 +10,18 @@ from numpy.typing import NDArray
 
 from clsplat.errors import DataError, NumericError, quoted
 from clsplat.files import atomic, write_text
-from clsplat.names import VIEW_COLOURS, VIEW_GRIDS
+from clsplat.names import VIEW_COLOURS
 from clsplat.reading import read_json
 from clsplat.scene.view import View
 from clsplat.settings import variants
 from clsplat.training.run import Run
-from clsplat.views.colours import IDENTITY, Auto, ColourModel, Colours, Floats, Grid, OwnColours
+from clsplat.views.colours import Auto, Colours, OwnColours
 from clsplat.views.exposures import UNKNOWN, Exposures, measured, noted
-from clsplat.views.photograph_colours import TABLE, PhotographColours, ViewColours
-from clsplat.views.photograph_grids import GridTables, PhotographGrids, row_length
 from clsplat.views.photographs import Mask
+from clsplat.views.view_colours import TABLE, ViewColours
 
 LOG = logging.getLogger("clsplat")
 KNOWN = "known exposures"  # in the numbers of a run: whether its colours began with exposures that were measured
-MEANING = "a colour c of the model, red, green and blue, is min(1, E c + b) in the photograph"
-GRID_MEANING = (
-    f"{MEANING}; [E | b] is the trilinear mean of the matrices about a pixel; file: matrices [photographs, luminance, "
-    "height, width, 3, 4], float32, the outer ones on the edges of the image, at black and at white of 0.299 red + "
-    "0.587 green + 0.114 blue; matrix: the mean of a photograph's"
-)
 GUESSED = 1.0  # dB by which figures in the photographs' colours are better, from which on the log says why
 
 
@@ -43,27 +35,16 @@ def photograph_colours(colours: Colours | None, run: Run, last: int) -> ViewColo
     if not isinstance(colours, OwnColours):
         return None
     views = [view.name for view in run.scene.split("train")]
-    found = _of_views(colours, run, views)
-    if not found.begun(run.numbers):
+    found = colours.of_views(views, run.device, run.colour_grids)
+    tables = found.device_tables
+    anew = tables is not None and tables is not run.colour_grids  # as those of the run are of other cells
+    run.colour_grids = tables or run.colour_grids
+    if anew or not found.begun(run.numbers):
         exposures = exposures_of(run)
         found.begin(run.numbers, exposures.log_gains)
         run.numbers[KNOWN] = float(bool(exposures.log_gains))
         LOG.info("colours of photographs: %s", exposures.text)
-    rate = colours.rate_of(last, len(set(views)), run.numbers.get(KNOWN, 1.0) > 0)
-    return replace(found, rate=rate)
-
-
-def _of_views(colours: OwnColours, run: Run, views: list[str]) -> PhotographColours | PhotographGrids:
-    """The colours of these views, with the tables of a run where they have such."""
-    if isinstance(colours, ColourModel):
-        return PhotographColours(colours, views, 0.0)
-    if not isinstance(colours, Grid):
-        raise TypeError(f"{type(colours).__name__}: expected a ColourModel or a Grid")
-    shape = len(set(views)), row_length(colours.cells)
-    if run.grids is None or run.grids.shape != shape:  # grids of another size begin anew
-        run.grids = GridTables(run.device, shape)
-        run.numbers = {name: value for name, value in run.numbers.items() if not name.endswith("/row")}
-    return PhotographGrids(colours, views, 0.0, run.grids)
+    return found.with_rate(colours.rate_of(last, len(set(views)), run.numbers.get(KNOWN, 1.0) > 0))
 
 
 def exposures_of(run: Run) -> Exposures:
@@ -106,55 +87,23 @@ def colours_of(run: Run) -> OwnColours | None:
 
 
 def write_view_colours(run: Run, colours: ViewColours | None) -> None:
-    """Write the colours of each training photograph into the run folder; log a line."""
-    if isinstance(colours, PhotographColours):
-        _write_matrices(run, colours)
-    elif isinstance(colours, PhotographGrids):
-        _write_grids(run, colours)
+    """Write the colours of each training photograph into the run folder; log a line.
 
-
-def _write_matrices(run: Run, colours: PhotographColours) -> None:
-    """The numbers of each photograph, and the matrix that they make."""
-    rows = {view: colours.table.row(run.numbers, view) for view in colours.table.views}
-    matrices = {view: colours.model.matrix(row) for view, row in rows.items()}
-    photographs = {
-        view: {
-            **dict(zip(colours.model.columns, map(float, row), strict=True)),
-            "matrix": matrices[view].tolist(),
-        }
-        for view, row in rows.items()
-    }
-    meaning = f"{MEANING}; matrix: the rows of [E | b]"
-    _write(run, colours.model, matrices, {"meaning": meaning, "photographs": photographs})
-
-
-def _write_grids(run: Run, colours: PhotographGrids) -> None:
-    """The grids in a file of NumPy's, and the row of each photograph in it."""
-    (nx, ny, nz), values = colours.model.cells, colours.tables.tables(["values"])["values"]
-    grids = values.reshape(-1, 3, 4, nz, ny, nx).transpose(0, 3, 4, 5, 1, 2) + IDENTITY.astype(np.float32)
-    names = list(dict.fromkeys(colours.views))
-    mean = {view: grid.mean(axis=(0, 1, 2), dtype=np.float64) for view, grid in zip(names, grids, strict=True)}
-    facts = {
-        "meaning": GRID_MEANING,
-        "cells": [nx, ny, nz],
-        "file": VIEW_GRIDS,
-        "photographs": {view: {"row": row, "matrix": mean[view].tolist()} for row, view in enumerate(names)},
-    }
-    _write(run, colours.model, mean, facts)
-    with atomic(run.out / VIEW_GRIDS) as file:
-        np.save(file, np.ascontiguousarray(grids, np.float32), allow_pickle=False)
-
-
-def _write(run: Run, model: OwnColours, matrices: dict[str, Floats], facts: dict[str, Any]) -> None:
-    """Write facts as JSON, and log a line.  Raises NumericError for matrices that are not finite."""
-    if wrong := next((view for view, matrix in matrices.items() if not np.isfinite(matrix).all()), None):
+    Raises NumericError for colours that are not finite.
+    """
+    if colours is None:
+        return
+    found = colours.written(run.numbers)
+    if wrong := next((view for view, matrix in found.matrices.items() if not np.isfinite(matrix).all()), None):
         raise NumericError(f"the colours of {quoted(wrong)} are not finite; lower optimize.colours.rate")
-    data = {"meaning": facts.pop("meaning"), "type": getattr(model, "type", type(model).__name__), **facts}
-    write_text(run.out / VIEW_COLOURS, json.dumps(data, indent=1) + "\n")
-    greens = [matrix[1, 1] for matrix in matrices.values()]
+    write_text(run.out / VIEW_COLOURS, json.dumps(found.facts, indent=1) + "\n")
+    for name, array in found.arrays.items():
+        with atomic(run.out / name) as file:
+            np.save(file, array, allow_pickle=False)
+    greens = [matrix[1, 1] for matrix in found.matrices.values()]
     LOG.info(
         "colours of %d photographs in %s: green is multiplied by %.2f to %.2f",
-        *(len(matrices), VIEW_COLOURS, min(greens), max(greens)),
+        *(len(greens), VIEW_COLOURS, min(greens), max(greens)),
     )
 
 

@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from clsplat.errors import DataError
 from clsplat.gaussians.model import WIDTHS
 from clsplat.gaussians.tables import INTERVAL2, PARAMETERS, DeviceModel
-from clsplat.training import grids, sky
+from clsplat.training import colour_grids, sky
 
 FOLDER = "best/"  # before the names of its tables in a checkpoint
 APART = 6.0  # dB: a model that is so much better where it was trained has learnt its photographs by heart (ours)
@@ -114,8 +114,8 @@ def check(best: Best | None, tables: Tables) -> None:
         return
     behind, tables = sky.split_tables(tables)
     sky.check_tables(behind)
-    of_colours, tables = grids.split_tables(tables)
-    grids.check_tables(of_colours)
+    of_colours, tables = colour_grids.split_tables(tables)
+    colour_grids.check_tables(of_colours)
     if missing := [name for name in (*PARAMETERS, "filter_variance") if name not in tables]:
         raise DataError(f"its best model lacks {', '.join(missing)}")
     count = len(tables["means"])

@@ -2,7 +2,7 @@
 
 from clsplat.gaussians.tables import Gaussians
 from clsplat.render.backdrops import Auto, Directions
-from clsplat.training import grids, sky
+from clsplat.training import colour_grids, sky
 from clsplat.training.kept import Tables, tables_of
 from clsplat.training.run import Run
 from clsplat.training.sky import FOLDER, LearnedSky
@@ -12,16 +12,17 @@ def copied_of(run: Run) -> Tables:
     """Copy what the run's model needs to be rendered, and to be trained from anew, to the host."""
     own = run.sky.tables() if run.sky else {}
     behind = {FOLDER + name: table for name, table in own.items()}
-    of_colours = run.grids.tables(["values"]) if run.grids else {}
-    return {**tables_of(run.model), **behind, **{grids.FOLDER + name: table for name, table in of_colours.items()}}
+    of_colours = run.colour_grids.tables(["values"]) if run.colour_grids else {}
+    photographs = {colour_grids.FOLDER + name: table for name, table in of_colours.items()}
+    return {**tables_of(run.model), **behind, **photographs}
 
 
 def put_back(run: Run, tables: Tables, degree: int) -> None:
     """Make what was copied the run's model."""
     own, of_gaussians = sky.split_tables(tables)
-    of_colours, of_gaussians = grids.split_tables(of_gaussians)
-    if of_colours and run.grids:
-        run.grids.set(of_colours)
+    of_colours, of_gaussians = colour_grids.split_tables(of_gaussians)
+    if of_colours and run.colour_grids:
+        run.colour_grids.set(of_colours)
     run.model = run.model_settings.model(Gaussians(run.device, of_gaussians), degree)
     restore_sky(run, own)
 

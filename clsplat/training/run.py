@@ -9,12 +9,10 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat import __version__
 from clsplat.density.statistics import SplatStats
 from clsplat.density.survey import Survey
 from clsplat.errors import ConfigError
 from clsplat.filters import FilterViews, ModelSettings, measure_intervals
-from clsplat.gaussians.model import Model, Rendering
 from clsplat.gaussians.tables import HIDDEN, INTERVAL2, DeviceModel
 from clsplat.losses.base import Loss
 from clsplat.opencl.device import Device
@@ -25,8 +23,8 @@ from clsplat.scene.identity import Identity
 from clsplat.scene.scene import Scene
 from clsplat.settings import Settings
 from clsplat.training.adam import Adam
+from clsplat.training.colour_grids import GridTables, bytes_needed
 from clsplat.training.field import LearnedField
-from clsplat.training.grids import GridTables, bytes_needed
 from clsplat.training.kept import Best, Tables
 from clsplat.training.memory import MemoryPlan, plan
 from clsplat.training.profile import clocks
@@ -66,7 +64,7 @@ class Run:
     adam: Adam | None = None
     stats: SplatStats | None = None
     sky: LearnedSky | None = None  # of the model, where it has one
-    grids: GridTables | None = None  # of the photographs' colours, where they have such
+    colour_grids: GridTables | None = None  # of the photographs' colours, where they have such
     learned_field: LearnedField | None = None  # in the place of a model
     step: int = 0  # updates done, or in progress
     cursor: int = 0  # stage in progress
@@ -141,9 +139,19 @@ class Run:
 
     def begin_again(self, best: Best) -> None:
         """Come to the beginning of the pipeline, to train again for the steps of the best model."""
-        self._model = self.adam = self.stats = self.sky = self.grids = None
-        self.numbers, self.metrics, self.written, self.whole, self.step, self.divisor = {}, {}, {}, True, 0, 1.0
-        self.best, self.best_tables = best, {}
+        self._model = None
+        self.adam = None
+        self.stats = None
+        self.sky = None
+        self.colour_grids = None
+        self.numbers = {}
+        self.metrics = {}
+        self.written = {}
+        self.whole = True
+        self.step = 0
+        self.divisor = 1.0
+        self.best = best
+        self.best_tables = {}
         self.next_stage(0)
         self.divide(self.original.with_fold())
 
@@ -229,22 +237,3 @@ class Run:
         views = self.scene.split("train")
         for view in self.status.counted(views, "photographs", len(views)):
             yield self.photographs.get(view).image()
-
-    def host_model(self) -> Model:
-        """Copy the model to the host, as it is trained: with a world filter that is not part of its scales."""
-        tables = {name: self.model.gaussians.get(name) for name in (*self.model.gaussians.trained, "filter_variance")}
-        if not tables["filter_variance"].any():
-            del tables["filter_variance"]
-        rendering = Rendering.of({"version": __version__, **self.rendering()}, "default")
-        return Model(**tables, rendering=rendering, sky=self.sky.sky.host() if self.sky else None)
-
-    def rendering(self) -> dict[str, Any]:
-        """Return the numbers for rendering a model file as in training."""
-        model = self.model
-        return {
-            **{name: getattr(model, name) for name in ("near", "screen_variance", "compensate")},
-            **({"pixel_box": model.pixel_box} if model.pixel_box else {}),
-            "background": self.photographs.background_name,
-            **({"sky": "directions"} if self.sky else {}),
-            "alpha": self.original.views[0].alpha,
-        }

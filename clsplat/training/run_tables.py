@@ -9,7 +9,7 @@ from clsplat.density.statistics import FOLDER as STATS_FOLDER
 from clsplat.density.statistics import SEEN, SplatStats
 from clsplat.errors import DataError
 from clsplat.gaussians.tables import Gaussians
-from clsplat.training import field, grids, kept, sky
+from clsplat.training import colour_grids, field, kept, sky
 from clsplat.training.adam import Adam
 from clsplat.training.archive import Arrays
 from clsplat.training.field import LearnedField
@@ -28,7 +28,8 @@ def tables_of(run: Run) -> Iterator[tuple[str, NDArray[np.float32]]]:
     gaussians = run.model.gaussians
     yield from ((_key(name), gaussians.get(name)) for name in gaussians.tables)
     yield from ((sky.FOLDER + name, table) for name, table in (run.sky.tables() if run.sky else {}).items())
-    yield from ((grids.FOLDER + name, table) for name, table in (run.grids.tables() if run.grids else {}).items())
+    of_colours = run.colour_grids.tables() if run.colour_grids else {}
+    yield from ((colour_grids.FOLDER + name, table) for name, table in of_colours.items())
     yield from ((kept.FOLDER + name, table) for name, table in run.best_tables.items())
 
 
@@ -50,8 +51,8 @@ def check(state: State, tables: Arrays) -> None:
     kept.check(state.best, best)
     behind, own = sky.split_tables(own)
     sky.check_tables(behind)
-    of_colours, own = grids.split_tables(own)
-    grids.check_tables(of_colours)
+    of_colours, own = colour_grids.split_tables(own)
+    colour_grids.check_tables(of_colours)
     check_tables(state, {name.removeprefix("gaussians/"): table for name, table in own.items()})
 
 
@@ -64,8 +65,8 @@ def restore(run: Run, state: State, tables: Arrays) -> None:
         return
     tables, run.best_tables = kept.split_tables(tables)
     behind, tables = sky.split_tables(tables)
-    of_colours, tables = grids.split_tables(tables)
-    run.grids = grids.restored(of_colours, run.device)
+    of_colours, tables = colour_grids.split_tables(tables)
+    run.colour_grids = colour_grids.restored(of_colours, run.device)
     gaussians = Gaussians(run.device, {name.removeprefix("gaussians/"): table for name, table in tables.items()})
     run.model = run.model_settings.model(gaussians, state.degree)
     if state.updates:

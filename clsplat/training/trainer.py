@@ -29,12 +29,12 @@ from clsplat.training.sky import LearnedSky
 from clsplat.views.backgrounds import Backgrounds
 from clsplat.views.known_depths import PointDepths
 from clsplat.views.learned import LearnedTransform, learned_of, name_of
-from clsplat.views.photograph_colours import ViewColours
 from clsplat.views.photograph_poses import PhotographPoses
 from clsplat.views.photographs import Photograph, apply_mask
 from clsplat.views.texture import known_gradient
 from clsplat.views.transforms import PhotographTransform, Planes
 from clsplat.views.transients import Transients, measure_residuals
+from clsplat.views.view_colours import ViewColours
 
 TEXTURE = int(constants("splat.h")["SUM_TEXTURE"])
 

@@ -1,47 +1,47 @@
 """The colours of the photographs while a model is trained: between the rendered image and the losses."""
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from clsplat.opencl.device import Array
+from clsplat.opencl.device import Array, Device
 from clsplat.opencl.program import constants
 from clsplat.render.camera import DeviceCamera
 from clsplat.render.workspace import Workspace
 from clsplat.schedule import Schedule, at_step
-from clsplat.views.colours import ColourModel, Floats
+from clsplat.views.grid_tables import GridTables
+from clsplat.views.own_colours import OwnColours
+from clsplat.views.view_colours import MEANING, TABLE, Floats, ViewColours, Written
 from clsplat.views.view_table import ViewTable
 
-TABLE = "colours"
 SUMS = int(constants("colours.cl")["SUMS"])
 NAMES = tuple(f"{y}{c}" for y in "rgb" for c in "rgb1")  # of the kernels' arguments
 
 
-class ViewColours(ABC):
-    """What a training step does with the colours of its photograph."""
+class ColourModel(OwnColours):
+    """Colours of which a photograph has one matrix for all its pixels."""
+
+    def of_views(self, views: Sequence[str], device: Device, tables: GridTables | None) -> ViewColours:
+        return PhotographColours(self, views, 0.0)
 
     @abstractmethod
-    def change(
-        self, workspace: Workspace, camera: DeviceCamera, image: Array, numbers: Mapping[str, float], view: int
-    ) -> tuple[Array, Callable[[], float]]:
-        """Return an image, [3 or 4, rows, stride], in the colours of a training view, by its number, and what returns
-        the loss of its numbers alone."""
+    def matrix(self, row: Floats) -> Floats:
+        """Return [E | b], [3, 4], of a photograph's numbers, [columns]."""
 
     @abstractmethod
-    def change_back(
-        self,
-        workspace: Workspace,
-        camera: DeviceCamera,
-        image: Array,
-        gradient: Array,
-        numbers: dict[str, float],
-        view: int,
-        step: int,
-    ) -> tuple[Array, Callable[[], None]]:
-        """Return the gradient by an image from that by what `change` made of it, and what changes the numbers."""
+    def gradient(self, row: Floats, by_matrix: Floats) -> Floats:
+        """Return derivatives by a photograph's numbers, [columns], from those by its matrix, [3, 4]."""
+
+    @abstractmethod
+    def of_gains(self, log_gains: Floats) -> Floats:
+        """Return the numbers, [columns], that come nearest to gains of red, green and blue: their logarithms, [3]."""
+
+    def penalty(self, row: Floats) -> tuple[float, Floats]:
+        """Return a loss of a photograph's numbers alone, and its derivatives."""
+        return 0.0, np.zeros_like(row)
 
 
 @dataclass(frozen=True)
@@ -57,13 +57,25 @@ class PhotographColours(ViewColours):
         """The table of the numbers."""
         return ViewTable(TABLE, tuple(dict.fromkeys(self.views)), self.model.columns)
 
+    def with_rate(self, rate: Schedule) -> "PhotographColours":
+        return replace(self, rate=rate)
+
     def begun(self, numbers: Mapping[str, float]) -> bool:
-        """Whether the numbers of a run hold the table."""
         return self.table.begun(numbers)
 
     def begin(self, numbers: dict[str, float], log_gains: Mapping[str, Floats]) -> None:
-        """Set the numbers before the first step.  log_gains: of red, green and blue by view, where known, [3]."""
         self.table.begin(numbers, {view: self.model.of_gains(gains) for view, gains in log_gains.items()})
+
+    def written(self, numbers: Mapping[str, float]) -> Written:
+        rows = {view: self.table.row(numbers, view) for view in self.table.views}
+        matrices = {view: self.model.matrix(row) for view, row in rows.items()}
+        photographs = {
+            view: {**dict(zip(self.model.columns, map(float, row), strict=True)), "matrix": matrices[view].tolist()}
+            for view, row in rows.items()
+        }
+        kind = getattr(self.model, "type", type(self.model).__name__)
+        meaning = f"{MEANING}; matrix: the rows of [E | b]"
+        return Written(matrices, {"meaning": meaning, "type": kind, "photographs": photographs})
 
     def matrix(self, numbers: Mapping[str, float], view: int) -> Floats:
         """Return the matrix of a training view by its number, [3, 4]."""

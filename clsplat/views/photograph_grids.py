@@ -1,71 +1,87 @@
-"""The grids of the photographs while a model is trained: colours by place and luminance (cl_kernels/colour_grid.cl)."""
+"""Colour grids: how a pipeline file names them, and what a training does with them (cl_kernels/colour_grid.cl)."""
 
-import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from pydantic import Field
 
+from clsplat.names import VIEW_COLOURS, VIEW_GRIDS
 from clsplat.opencl.device import Array, Device
 from clsplat.opencl.program import constants
 from clsplat.render.camera import DeviceCamera
 from clsplat.render.workspace import Workspace
-from clsplat.schedule import Schedule, at_step
+from clsplat.schedule import Decay, Points, Schedule, at_step
 from clsplat.views.adam import ADAM
-from clsplat.views.colours import Floats, Grid
-from clsplat.views.photograph_colours import TABLE, ViewColours
+from clsplat.views.grid_tables import ENTRIES, GridTables, bytes_of, row_length
+from clsplat.views.own_colours import OwnColours, RateOrAuto, fitted_gains
+from clsplat.views.view_colours import IDENTITY, LUMINANCE, MEANING, TABLE, Floats, ViewColours, Written
 
-ENTRIES = int(constants("colour_grid.cl")["ENTRIES"])
-NAMES = ("values", "moment1", "moment2")
-Tables = dict[str, NDArray[np.float32]]
-
-
-class GridTables:
-    """The grids of all photographs on the device, with Adam's moments: each [photographs, row]."""
-
-    def __init__(self, device: Device, shape: tuple[int, int]) -> None:
-        """The values are differences from no change, 0 at first.  shape: photographs, ENTRIES * nz * ny * nx."""
-        self.device, self.shape = device, shape
-        self.arrays: dict[str, Array] = {name: device.zeros(shape) for name in NAMES}
-
-    def set(self, tables: Mapping[str, NDArray[np.float32]]) -> None:
-        """Take tables of a checkpoint; those that it does not have become 0."""
-        for name, array in self.arrays.items():
-            array.set(np.ascontiguousarray(tables.get(name, np.zeros(self.shape, np.float32))))
-
-    def tables(self, names: Sequence[str] = NAMES) -> Tables:
-        """Copy tables to the host."""
-        return {name: self.arrays[name].get() for name in names}
-
-    def centre(self, levels: int) -> None:
-        """Subtract the mean over photographs and places at each of so many levels of luminance."""
-        photographs, row = self.shape
-        self.device.program("colour_grid_table.cl").colour_grid_centre(
-            groups=ENTRIES * levels,
-            values=self.arrays["values"],
-            places=row // (ENTRIES * levels),
-            photographs=photographs,
-        )
+WARM_UP = 1000  # steps in which the rate of grids grows from 1 % of itself (gsplat); a tenth of shorter trainings
+Nodes = Annotated[int, Field(ge=1, le=int(constants("colour_grid.h")["MOST_NODES"]))]
+GRID_MEANING = (
+    f"{MEANING}; [E | b] is the trilinear mean of the matrices about a pixel; file: matrices [photographs, luminance, "
+    "height, width, 3, 4], float32, the outer ones on the edges of the image, at black and at white of "
+    "{} red + {} green + {} blue; matrix: the mean of a photograph's"
+).format(*LUMINANCE)
 
 
-def row_length(cells: Sequence[int]) -> int:
-    """Return the values of one photograph."""
-    return ENTRIES * math.prod(cells)
+class Grid(OwnColours):
+    """Colours of each photograph by place and luminance: a bilateral grid of affine changes (Wang et al. 2024).
 
+    It follows what a phone does to parts of a photograph, local tone mapping, which the other kinds cannot.  It also
+    follows what the model should learn, so that held-out photographs are often worse with it: try `gain` first.  The
+    mean over photographs and places stays that of no change at each luminance; figures are in colours of `gain`.
+    """
 
-def bytes_of(cells: Sequence[int], photographs: int, rows: int, pixels: int) -> int:
-    """Return what grids take on the device.  rows, pixels: of the largest view, whole tiles."""
-    row, columns = row_length(cells), ENTRIES * cells[0] * cells[2]
-    return 4 * (len(NAMES) * photographs * row + 3 * row + columns * rows + 3 * pixels)
+    training_keys: ClassVar[frozenset[str]] = frozenset({"weight"})
+    columns: ClassVar[tuple[str, ...]] = ("row",)  # of its grid in the tables of a run
+
+    type: Literal["grid"] = "grid"
+    cells: Annotated[list[Nodes], Field(min_length=3, max_length=3)] = Field([4, 4, 4])
+    """Matrices along the width, the height and the luminance, 1 to 16 each.  Between them colours are trilinear; the
+    outer ones lie on the edges, at black and at white.  Published are [16, 16, 8]."""
+    rate: RateOrAuto = "auto"
+    """Learning rate of the matrices, by Adam, by step; auto: 2e-3 to 2e-5 (gsplat), where no tracks tell the exposures
+    that of `gain`; it grows from 1 % of itself in 1000 steps, or a tenth of fewer than 10 000.  At most 0.5."""
+    weight: Annotated[float, Field(ge=0)] = 10.0
+    """Factor of the loss that makes the grid of the photograph of a step smooth: the sum over the axes of the mean of
+    the squared differences of neighbours."""
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        return VIEW_COLOURS, VIEW_GRIDS
+
+    def of_views(self, views: Sequence[str], device: Device, tables: GridTables | None) -> ViewColours:
+        photographs = len(set(views))
+        if tables is None or not tables.fit(photographs, self.cells):
+            tables = GridTables(device, photographs, self.cells)
+        return PhotographGrids(self, views, 0.0, tables)
+
+    def device_bytes(self, photographs: int, rows: int, pixels: int) -> int:
+        return bytes_of(self.cells, photographs, rows, pixels)
+
+    def rate_of(self, steps: int, photographs: int, known: bool = True) -> Schedule:
+        if self.rate != "auto":
+            return self.rate
+        of_gains = super().rate_of(steps, photographs, known)
+        rate = Decay(initial=2e-3, final=2e-5, over=steps) if known else of_gains
+        warm_up = max(1, min(WARM_UP, steps // 10))
+        later = [warm_up + round((steps - warm_up) * share) for share in np.linspace(0, 1, 11)]
+        points = {step: [float(step), at_step(rate, step)] for step in later}
+        return Points(points=[[0.0, at_step(rate, 0) / 100], *points.values()])
+
+    def fitted(self, image: Floats, photograph: Floats) -> Floats:
+        """A grid that was fitted in one place says nothing of another: the colours are those of `gain`."""
+        return fitted_gains(image, photograph)
 
 
 @dataclass(frozen=True)
 class PhotographGrids(ViewColours):
     """The grids, and what the numbers of a run have of them: the row of each photograph and its updates."""
 
-    model: Grid
+    model: "Grid"
     views: Sequence[str]  # names of the training views, by number; one of several sizes has one row
     rate: Schedule
     tables: GridTables
@@ -75,19 +91,38 @@ class PhotographGrids(ViewColours):
         """The names of the photographs, by row."""
         return list(dict.fromkeys(self.views))
 
+    @property
+    def device_tables(self) -> GridTables:
+        return self.tables
+
+    def with_rate(self, rate: Schedule) -> "PhotographGrids":
+        return replace(self, rate=rate)
+
     def begun(self, numbers: Mapping[str, float]) -> bool:
-        """Whether the numbers of a run say that the tables are those of these photographs."""
         return all(numbers.get(f"{TABLE}/{view}/row") == row for row, view in enumerate(self.names))
 
     def begin(self, numbers: dict[str, float], log_gains: Mapping[str, Floats]) -> None:
-        """Set the tables before the first step.  log_gains: of red, green and blue by view, where known, [3]."""
         matrices = np.zeros((len(self.names), 3, 4))
         for row, view in enumerate(self.names):
             matrices[row, range(3), range(3)] = np.expm1(log_gains.get(view, np.zeros(3)))
             numbers |= {f"{TABLE}/{view}/row": float(row), f"{TABLE}/{view}/updates": 0.0}
-        values = np.repeat(matrices.reshape(len(matrices), ENTRIES), math.prod(self.model.cells), axis=1)
-        self.tables.set({"values": values.astype(np.float32)})
-        self.tables.centre(self.model.cells[2])
+        values = matrices.reshape(len(matrices), ENTRIES, 1, 1, 1).astype(np.float32)
+        self.tables.set({"values": np.broadcast_to(values, self.tables.shape)})
+        self.tables.centre()
+
+    def written(self, numbers: Mapping[str, float]) -> Written:
+        values = self.tables.tables(["values"])["values"]
+        grids = values.reshape(-1, 3, 4, *values.shape[2:]).transpose(0, 3, 4, 5, 1, 2) + IDENTITY.astype(np.float32)
+        means = {view: one.mean(axis=(0, 1, 2), dtype=np.float64) for view, one in zip(self.names, grids, strict=True)}
+        rows = {view: {"row": row, "matrix": means[view].tolist()} for row, view in enumerate(self.names)}
+        facts = {
+            "meaning": GRID_MEANING,
+            "type": self.model.type,
+            "cells": list(self.model.cells),
+            "file": VIEW_GRIDS,
+            "photographs": rows,
+        }
+        return Written(means, facts, {VIEW_GRIDS: np.ascontiguousarray(grids, np.float32)})
 
     def row(self, view: int) -> int:
         """Return the row of a training view by its number."""
@@ -185,7 +220,7 @@ class PhotographGrids(ViewColours):
             correction2=1 / (1 - ADAM["BETA2"] ** updates),
             count=row,
         )
-        self.tables.centre(self.model.cells[2])
+        self.tables.centre()
 
     def _arguments(self, camera: DeviceCamera, image: Array, view: int) -> dict[str, Any]:
         nx, ny, nz = self.model.cells

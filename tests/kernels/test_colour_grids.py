@@ -15,8 +15,9 @@ from clsplat.render.workspace import Workspace
 from clsplat.training.adam import Adam, Rates
 from clsplat.training.trainer import Trainer
 from clsplat.views.colours import Affine, Grid
+from clsplat.views.grid_tables import GridTables
 from clsplat.views.photograph_colours import PhotographColours
-from clsplat.views.photograph_grids import GridTables, PhotographGrids, row_length
+from clsplat.views.photograph_grids import PhotographGrids
 from clsplat.views.photographs import Photograph
 from tests.kernels.figures import hold
 
@@ -40,7 +41,7 @@ def test_smoothness_updates_and_the_mean(device, rng, nodes):
 
 def test_no_change_cuts_white_alone(device, rng):
     image = rng.uniform(-0.5, 1.5, (3, 18, 33)).astype(np.float32)
-    camera, tables = camera_of(device, 33, 18), GridTables(device, (1, row_length((4, 4, 4))))
+    camera, tables = camera_of(device, 33, 18), GridTables(device, 1, (4, 4, 4))
     grids = PhotographGrids(Grid(), ("a",), 0.01, tables)
     found, smoothness = grids.change(Workspace(device), camera, planes_of(device, camera, image), {}, 0)
     assert (found.get()[:, :18, :33] == np.minimum(image, 1)).all()
@@ -52,7 +53,7 @@ def test_an_image_of_one_luminance_reads_the_levels_about_it(device):
     camera, grids = camera_of(device, 20, 5), grids_of(device, np.random.default_rng(0), (2, 2, 3))
     values = np.zeros((3, 3, 4, 3, 2, 2), np.float32)
     values[1, range(3), 3] = np.array([0.1, 0.3, 0.2], np.float32)[:, None, None]  # added at each level
-    grids.tables.set({"values": values.reshape(3, -1)})
+    grids.tables.set({"values": values.reshape(grids.tables.shape)})
     for grey, expected in ((-0.2, 0.1), (0.0, 0.1), (0.25, 0.2), (0.5, 0.3), (0.6, 0.28)):
         planes = planes_of(device, camera, np.full((3, 5, 20), grey, np.float32))
         found = grids.change(Workspace(device), camera, planes, {}, 1)[0].get()[:, :5, :20]
@@ -70,7 +71,7 @@ class Case:
         parts = Rasterizer(device), model, Adam(model.gaussians), SplatStats(model.gaussians, [])
         behind = device.upload(np.array([0.2, 0.5, 0.9], np.float32))
         self.trainer = Trainer(*parts, behind, (L2(),), Rates(), numbers=self.numbers)
-        self.tables = GridTables(device, (2, row_length(nodes)))
+        self.tables = GridTables(device, 2, nodes)
         self.trainer.colours = PhotographGrids(Grid(cells=list(nodes), weight=0.1), ("a", "b"), 0.01, self.tables)
         self.trainer.colours.begin(self.numbers, {"b": np.array([0.3, 0.1, -0.2])})
         self.values = self.tables.tables()["values"]
@@ -78,7 +79,7 @@ class Case:
     def loss(self, at: int, change: float) -> float:
         """The loss with one value of the grid changed."""
         values = self.values.copy()
-        values[1, at] += change
+        values[1].reshape(-1)[at] += change
         self.tables.set({"values": values})
         return self.trainer.compare(self.photograph, 1).loss
 
@@ -87,12 +88,12 @@ class Case:
 def test_the_gradient_of_a_step_is_that_of_its_losses(device, rng, share):
     """By finite differences of the loss; l2 is smooth.  Adam's first moment is a tenth of the gradient."""
     case, step = Case(device, rng, share=share), 2e-3
-    places = rng.choice(case.values.shape[1], 24, replace=False)
+    places = rng.choice(case.values[1].size, 24, replace=False)
     numeric = [(case.loss(at, step) - case.loss(at, -step)) / (2 * step) for at in places]
     case.tables.set({"values": case.values})
     case.trainer.step(case.photograph, 1)
     found = case.tables.tables()
-    assert found["moment1"][1, places] == pytest.approx(0.1 * np.array(numeric), rel=0.02, abs=2e-6)
+    assert found["moment1"][1].ravel()[places] == pytest.approx(0.1 * np.array(numeric), rel=0.02, abs=2e-6)
     assert not found["moment1"][0].any(), "the other photograph has no update"
     assert case.numbers["colours/b/updates"] == 1
 
@@ -108,11 +109,11 @@ def test_the_mean_over_photographs_and_places_stays_at_no_change(device, rng):
 
 def test_one_matrix_is_the_affine_kind(device, rng):
     """Its image, and the derivatives by both."""
-    numbers, values = {}, rng.normal(0, 0.2, (2, 12)).astype(np.float32)
-    grids = PhotographGrids(Grid(cells=[1, 1, 1]), ("a", "b"), 0.01, GridTables(device, values.shape))
+    numbers, values = {}, rng.normal(0, 0.2, (2, 12, 1, 1, 1)).astype(np.float32)
+    grids = PhotographGrids(Grid(cells=[1, 1, 1]), ("a", "b"), 0.01, GridTables(device, 2, [1, 1, 1]))
     grids.tables.set({"values": values})
     affine = PhotographColours(Affine(weight=0), ("a", "b"), 0.01)
-    numbers.update(zip(affine.table.keys("b"), map(float, values[1]), strict=True))
+    numbers.update(zip(affine.table.keys("b"), map(float, values[1].ravel()), strict=True))
     camera, workspace = camera_of(device, 33, 18), Workspace(device)
     image, gradient = (planes_of(device, camera, rng.uniform(0, 1, (3, 18, 33))) for _ in range(2))
     found, expected = (one.change(workspace, camera, image, numbers, 1)[0].get() for one in (grids, affine))
@@ -131,7 +132,7 @@ def test_a_mask_hides_pixels_whatever_their_colours_become(device, rng):
     case = Case(device, rng, share=0.5)
     values = case.values.copy().reshape(2, 12, -1)
     values[1, [3, 7, 11]] = 0.2  # added to black
-    case.tables.set({"values": values.reshape(2, -1)})
+    case.tables.set({"values": values.reshape(case.tables.shape)})
     image = case.trainer.compare(case.photograph, 1).comparison.image.get()[:, :HEIGHT, :WIDTH]
     hidden = ~case.photograph.counted()
     assert (image[:, hidden] == 0).all()

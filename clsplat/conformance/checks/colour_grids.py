@@ -14,7 +14,8 @@ from clsplat.conformance.reference.colour_grid import changed_by_grid
 from clsplat.opencl.device import Device
 from clsplat.render.workspace import Workspace
 from clsplat.views.colours import LUMINANCE, Grid
-from clsplat.views.photograph_grids import GridTables, PhotographGrids, row_length
+from clsplat.views.grid_tables import GridTables, row_length
+from clsplat.views.photograph_grids import PhotographGrids
 
 CHECKS = Checks()
 MARGIN = 1e-3  # from white, from black and between two levels, where a derivative is that of one side
@@ -31,17 +32,14 @@ CASES = (  # width, height, nodes
 
 def grids_of(device: Device, rng: np.random.Generator, nodes: tuple[int, ...], weight: float = 1.0) -> PhotographGrids:
     """The second of three photographs has matrices about no change, and the others have others."""
-    values = rng.normal(0, 0.2, (3, row_length(nodes))).astype(np.float32)
-    model = Grid(cells=list(nodes), weight=weight)
-    tables = GridTables(device, values.shape)
-    tables.set({"values": values})
+    model, tables = Grid(cells=list(nodes), weight=weight), GridTables(device, 3, nodes)
+    tables.set({"values": rng.normal(0, 0.2, tables.shape).astype(np.float32)})
     return PhotographGrids(model, ("a", "b", "c"), 0.01, tables)
 
 
 def of_photograph(grids: PhotographGrids, values: NDArray[Any]) -> NDArray[Any]:
-    """Rows of grids, [..., row], as [..., 3, 4, nz, ny, nx] in double."""
-    nx, ny, nz = grids.model.cells
-    return values.reshape(*values.shape[:-1], 3, 4, nz, ny, nx).astype(np.float64)
+    """The grid of a photograph, of so many values, as [3, 4, nz, ny, nx] in double."""
+    return values.reshape(3, 4, *grids.tables.shape[2:]).astype(np.float64)
 
 
 def picture_of(rng: np.random.Generator, grid: NDArray[Any], width: int, height: int, channels: int) -> NDArray[Any]:
@@ -97,7 +95,7 @@ def table_figures(device: Device, rng: np.random.Generator, nodes: tuple[int, ..
     """Compare the smoothness of a grid, three updates of it, and what they leave of the others."""
     what, weight = f"{' x '.join(map(str, nodes))} matrices", 0.7
     grids, workspace, numbers = grids_of(device, rng, nodes, weight), Workspace(device), dict[str, float]()
-    expected = grids.tables.tables()["values"].astype(np.float64)
+    expected = grids.tables.tables()["values"].astype(np.float64).reshape(3, -1)
     moment1, moment2 = np.zeros((2, row_length(nodes)))
     camera = camera_of(device, 5, 3)
     image = planes_of(device, camera, np.zeros((3, 3, 5)))
@@ -129,8 +127,9 @@ def table_figures(device: Device, rng: np.random.Generator, nodes: tuple[int, ..
         grids.learn(workspace, numbers, 1, device.upload(gradient), step)
         whole = gradient.astype(np.float64) + by_smoothness
         expected[1], moment1, moment2 = ref.adam_step(expected[1], whole, moment1, moment2, step, rate)
-        expected = ref.centred_grids(of_photograph(grids, expected)).reshape(expected.shape)
-    tables = grids.tables.tables()
+        own = np.stack([of_photograph(grids, one) for one in expected])
+        expected = ref.centred_grids(own).reshape(expected.shape)
+    tables = {name: table.reshape(3, -1) for name, table in grids.tables.tables().items()}
     for kernel in ("colour_grid_update", "colour_grid_centre"):
         yield by_element(kernel, f"grids, {what}", tables["values"], expected, 2e-6, floor=1.0)
     for name, moment, bound in (("moment1", moment1, SUM), ("moment2", moment2, 3 * SUM)):
@@ -140,13 +139,13 @@ def table_figures(device: Device, rng: np.random.Generator, nodes: tuple[int, ..
 
 
 @CHECKS.add("colour_grid_forward", "colour_grid_backward", "colour_grid_row_sums", "colour_grid_gather")
-def grids(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def colour_grids(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
     for width, height, nodes in CASES:
         yield from grid_figures(device, rng, width, height, nodes)
     yield from grid_figures(device, rng, 33, 18, (4, 4, 4), channels=4)
 
 
 @CHECKS.add("colour_grid_smoothness", "colour_grid_update", "colour_grid_centre")
-def tables(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
+def colour_grid_tables(device: Device, rng: np.random.Generator) -> Iterator[Figure | Note]:
     for nodes in ((4, 4, 4), (1, 1, 1), (5, 1, 3)):
         yield from table_figures(device, rng, nodes)

@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 from clsplat.errors import DataError
 from clsplat.opencl.device import Device
 from clsplat.scene.view import View
-from clsplat.views.colours import Auto, Grid
-from clsplat.views.photograph_grids import ENTRIES, NAMES, Tables, bytes_of
-from clsplat.views.photograph_grids import GridTables as GridTables
+from clsplat.views.colours import Auto, OwnColours
+from clsplat.views.grid_tables import ENTRIES, NAMES, Tables
+from clsplat.views.grid_tables import GridTables as GridTables
 
-FOLDER = "grids/"  # before the names of their tables in a checkpoint
+FOLDER = "colour_grids/"  # before the names of their tables in a checkpoint
 
 
 def split_tables(tables: Mapping[str, NDArray[np.float32]]) -> tuple[Tables, Tables]:
@@ -30,8 +30,9 @@ def check_tables(tables: Tables) -> None:
         raise DataError("it has other grids than those of its own tables")
     shape = tables[NAMES[0]].shape
     for name, table in tables.items():
-        if table.dtype != np.float32 or table.ndim != 2 or table.shape != shape or not shape[1] or shape[1] % ENTRIES:
-            raise DataError(f"{name} of its grids is not [photographs, {ENTRIES} * matrices] of float32")
+        is_one = table.dtype == np.float32 and table.shape == shape and len(shape) == 5 and 0 not in shape
+        if not is_one or shape[1] != ENTRIES:
+            raise DataError(f"{name} of its grids is not [photographs, {ENTRIES}, nz, ny, nx] of float32")
         if not np.isfinite(table).all():
             raise DataError(f"{name} of its grids holds values that are not finite")
 
@@ -40,16 +41,18 @@ def restored(tables: Tables, device: Device) -> GridTables | None:
     """Return the grids of a checkpoint's tables, by their own names; None without any."""
     if not tables:
         return None
-    found = GridTables(device, tables[NAMES[0]].shape)
+    photographs, _, *cells = tables[NAMES[0]].shape
+    found = GridTables(device, photographs, cells[::-1])
     found.set(tables)
     return found
 
 
 def bytes_needed(settings: Any, views: Sequence[View], tile: int) -> int:
-    """Return what the grids of a pipeline's trainings take on the device, at most.  tile: px of its sides."""
+    """Return what the colours of a pipeline's trainings take on the device, at most.  tile: px of its sides."""
     kinds = [getattr(stage, "colours", None) for stage in getattr(settings, "stages", ())]
     models = [kind.model if isinstance(kind, Auto) and kind.chosen != "off" else kind for kind in kinds]
     sides = [(-(-view.camera.width // tile) * tile, -(-view.camera.height // tile) * tile) for view in views]
     rows, pixels = max(height for _, height in sides), max(width * height for width, height in sides)
     photographs = len({view.name for view in views})
-    return max((bytes_of(one.cells, photographs, rows, pixels) for one in models if isinstance(one, Grid)), default=0)
+    own = [one for one in models if isinstance(one, OwnColours)]
+    return max((one.device_bytes(photographs, rows, pixels) for one in own), default=0)
