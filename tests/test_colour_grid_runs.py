@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from clsplat import plugins
 from clsplat.api import commands
 from clsplat.conformance.checks.colour_grids import grids_of
 from clsplat.conformance.checks.images import camera_of, planes_of
@@ -19,6 +20,7 @@ from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import load
 from clsplat.render.workspace import Workspace
 from clsplat.runs.model_file import evaluate
+from clsplat.runs.summary import summary
 from clsplat.schedule import Decay, at_step
 from clsplat.training import checkpoint, colour_grids, memory
 from clsplat.training.colours import colours_beside, photograph_colours
@@ -28,6 +30,54 @@ from clsplat.views.grid_tables import bytes_of
 from tests.few_steps import FEW, killed
 from tests.test_training import ONE_CORE, digest, train
 
+PLAIN = '''
+from dataclasses import dataclass, replace
+from typing import ClassVar, Literal
+import numpy as np
+from clsplat.views.colours import IDENTITY, OwnColours
+from clsplat.views.view_colours import ViewColours, Written
+
+
+class Plain(OwnColours):
+    """Colours as they are."""
+
+    columns: ClassVar[tuple[str, ...]] = ("steps",)
+    type: Literal["plain"] = "plain"
+
+    def of_views(self, views, device, tables):
+        return Views(tuple(views), 0.0)
+
+    def fitted(self, image, photograph):
+        return IDENTITY
+
+
+@dataclass(frozen=True)
+class Views(ViewColours):
+    views: tuple[str, ...]
+    rate: object
+
+    def with_rate(self, rate):
+        return replace(self, rate=rate)
+
+    def begun(self, numbers):
+        return f"colours/{self.views[0]}/steps" in numbers
+
+    def begin(self, numbers, log_gains):
+        numbers |= {f"colours/{view}/steps": 0.0 for view in self.views}
+
+    def written(self, numbers):
+        steps = {view: numbers[f"colours/{view}/steps"] for view in self.views}
+        return Written(dict.fromkeys(self.views, IDENTITY), {"meaning": "none", "type": "plain", "photographs": steps})
+
+    def change(self, workspace, camera, image, numbers, view):
+        return image, lambda: 0.0
+
+    def change_back(self, workspace, camera, image, gradient, numbers, view, step):
+        def learn():
+            numbers[f"colours/{self.views[view]}/steps"] += 1
+
+        return gradient, learn
+'''
 GRID = (*FEW, "optimize.colours={type: grid, cells: [3, 2, 4]}")
 
 
@@ -120,6 +170,7 @@ def test_the_grids_lie_beside_the_model_and_figures_are_in_colours_of_gains(with
     assert measured["psnr_colour"] == pytest.approx(evaluate(with_grids)["test"]["1"]["psnr_colour"], abs=1e-6)
     assert colours_beside(with_grids / "point_cloud.ply") == Grid()
     assert digest(with_grids) != digest(few_steps)
+    assert f"  colours  {with_grids}/view_colours.json" in summary(with_grids)
 
 
 @pytest.mark.slow
@@ -192,3 +243,16 @@ def test_damaged_tables_are_refused():
     ):
         with pytest.raises(DataError, match=r"of its grids|other grids"):
             colour_grids.check_tables(damaged)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("without_plugins")
+def test_a_kind_of_a_plug_in_is_trained_with(tiny_scene, few_steps, tmp_path):
+    """It makes what a training has of it; one that changes nothing leaves the bits of none."""
+    (tmp_path / "mine.py").write_text(PLAIN)
+    plugins.load_file(tmp_path / "mine.py")
+    train(tiny_scene, tmp_path / "run", *FEW, "optimize.colours=plain")
+    data = json.loads((tmp_path / "run" / "view_colours.json").read_text())
+    assert data["type"] == "plain"
+    assert sum(data["photographs"].values()) == 12
+    assert digest(tmp_path / "run") == digest(few_steps)

@@ -5,12 +5,13 @@ from pathlib import Path
 from typing import Any
 
 from clsplat.errors import DataError
-from clsplat.names import METRICS
+from clsplat.names import METRICS, VIEW_COLOURS, VIEW_POSES
 from clsplat.reading import read_json
 from clsplat.training.found import photographs_text, size_text
 
 # of what these stages write; others give their own names
 TITLES = {"export": "model", "render": "renders", "optimize": "pictures"}
+OF_FILES = {VIEW_COLOURS: "colours", VIEW_POSES: "poses"}  # whichever stage writes them
 BEFORE_FILES = {"export": "point_cloud.ply", "render": "renders", "viewer": "viewer.html", "report": "report.html"}
 SHORTEST = 0.5  # seconds of a stage that is told
 
@@ -40,7 +41,7 @@ def _lines(folder: Path, metrics: dict[str, Any]) -> Iterator[str]:
     if scene := metrics.get("scene"):
         yield f"  scene    {scene}" + (f"; {placed}" if placed else "")
     files = {stage: folder / name for stage, name in metrics.get("files", BEFORE_FILES).items()}
-    told = {TITLES.get(stage, stage): file for stage, file in files.items() if file.exists()}
+    told = {OF_FILES.get(file.name) or TITLES.get(stage, stage): file for stage, file in files.items() if file.exists()}
     for name, file in told.items():
         yield f"  {name:<{max(8, *map(len, told))}} {file}"
     steps = {name: found.get("seconds", 0) for name, found in metrics.get("preparation", {}).items()}
