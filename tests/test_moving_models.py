@@ -97,9 +97,20 @@ def test_convert_writes_moments(tmp_path: Path):
     np.testing.assert_array_equal(load(tmp_path / "frames" / "0001.ply").means, model.at(0.5).means)
     done = clsplat.convert(source, tmp_path / "frame.compressed.ply", frames=2)
     assert [Path(name).name for name in done["files"]] == ["frame_0000.compressed.ply", "frame_0001.compressed.ply"]
+    assert len(clsplat.convert(source, tmp_path / "frames", frames=3)["files"]) == 3  # the same ones again
+    with pytest.raises(ConfigError, match=r"0002\.ply: is not of 2 frames"):
+        clsplat.convert(source, tmp_path / "frames", frames=2)
     for wrong in ({"time": 2.0}, {"frames": 1}, {"frames": 3, "time": 0.5}):
         with pytest.raises(ConfigError, match="expected"):
             clsplat.convert(source, tmp_path / "frames", **wrong)
+
+
+def test_a_series_tells_once_what_its_format_does_not_keep(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    model = moving_model()
+    replace(model, rendering=replace(model.rendering, background="white")).save(tmp_path / "moving.ply")
+    clsplat.convert(tmp_path / "moving.ply", tmp_path / "frame.spz", frames=3)
+    (told,) = [one.getMessage() for one in caplog.records if "does not keep" in one.getMessage()]
+    assert told.startswith(str(tmp_path / "frame_0000.spz"))
 
 
 def test_moments_of_a_model_that_stands_still_are_refused(tmp_path):

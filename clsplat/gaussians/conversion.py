@@ -97,14 +97,22 @@ def convert(
     """
     if not sources:
         raise ConfigError("convert: expected a model file to read, and one to write")
-    codec = for_writing(out)
     check_place(sources, out)
     reading, writing = (options or Options()).of(sources, out)
-    models = [load(source, reading) for source in sources]
-    model = (changes or Changes()).of(merged(models, [str(source) for source in sources]))
+    return written(sources, (changes or Changes()).of(read(sources, reading)), out, writing)
+
+
+def read(sources: Sequence[Path], reading: Reading) -> Model:
+    """Return one model of all Gaussians of model files or run folders.  Raises DataError."""
+    return merged([load(source, reading) for source in sources], [str(source) for source in sources])
+
+
+def written(sources: Sequence[Path], model: Model, out: Path, writing: Writing) -> dict[str, Any]:
+    """Write a model that was read from sources, and return what `convert` does.  Raises OutputError."""
     size = sum(bytes_of(model_at(source)) for source in sources)
     model.save(out, writing)
-    return {"file": str(out), "format": codec.name, "gaussians": len(model), "bytes": bytes_of(out), "bytes_read": size}
+    kind = for_writing(out).name
+    return {"file": str(out), "format": kind, "gaussians": len(model), "bytes": bytes_of(out), "bytes_read": size}
 
 
 def check_place(sources: Sequence[Path], out: Path) -> None:

@@ -1,16 +1,17 @@
 """A moving model as files that stand still: one of a moment, or one of each of many moments."""
 
 import os
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from clsplat.errors import ConfigError, DataError, one_line
-from clsplat.files import make_folder, scratch_folder, told_as
+from clsplat.errors import ConfigError, DataError
+from clsplat.files import told_as
 from clsplat.formats.motion import EXPECTED, is_moment
 from clsplat.formats.table import for_writing, named
-from clsplat.gaussians.conversion import Changes, Options, check_place, convert
+from clsplat.gaussians.conversion import Changes, Options, check_place, read, written
 
 MOST = 10_000  # files
 
@@ -35,23 +36,23 @@ def convert_frames(
         raise ConfigError(f"--frames {frames}: expected 2 to {MOST:,} moments; `--time T` writes one")
     if changes.time is not None:
         raise ConfigError("--frames and --time: expected one of them")
-    places = [_numbered(out, number, len(str(frames - 1))) for number in range(frames)]
+    folder, begin, end = _name_of(out)
+    digits = max(4, len(str(frames - 1)))
+    places = [folder / f"{begin}{number:0{digits}}{end}" for number in range(frames)]
     for place in places:
         check_place(sources, place)
-    done = []
-    folder = places[0].parent
-    with scratch_folder(folder / "frames" if folder.is_dir() else folder) as scratch:  # all of them, or none
-        for number, place in enumerate(places):
-            time = number / (frames - 1)
-            try:
-                done.append(convert(sources, scratch / place.name, replace(changes, time=time), options))
-            except DataError as error:
-                what = one_line(error).replace(str(scratch), str(folder))
-                raise DataError(f"--frames {frames}: the moment {time:g}: {what}; nothing was written") from error
-        make_folder(folder)
-        for place in places:
-            with told_as(place):
-                os.replace(scratch / place.name, place)
+    _require_no_others(folder, re.compile(re.escape(begin) + r"\d{4,}" + re.escape(end)), places)
+    reading, writing = options.of(sources, places[0])
+    model = read(sources, reading)
+    moments = [replace(changes, time=number / (frames - 1)) for number in range(frames)]
+    for moment in moments:  # before anything is written
+        try:
+            moment.of(model)
+        except DataError as error:
+            raise DataError(f"--frames {frames}: the moment {moment.time:g}: {error}; nothing was written") from error
+    done: list[dict[str, Any]] = []
+    for place, moment in zip(places, moments, strict=True):
+        done.append(written(sources, moment.of(model), place, replace(writing, quiet=bool(done))))
     return {
         **done[0],
         "file": str(out),
@@ -61,13 +62,23 @@ def convert_frames(
     }
 
 
-def _numbered(out: Path, number: int, digits: int) -> Path:
-    """The file of a moment."""
-    count = f"{number:0{max(4, digits)}}"
-    if (codec := named(out)) is None and out.suffix == "":
-        return out / f"{count}.ply"
+def _require_no_others(folder: Path, names: re.Pattern[str], places: Sequence[Path]) -> None:
+    """Raise ConfigError where a folder has frames of another series, which a player would take for this one's."""
+    own = {place.name for place in places}
+    with told_as(folder):
+        there = sorted(os.listdir(folder)) if folder.is_dir() else []
+    if others := [name for name in there if names.fullmatch(name) and name not in own]:
+        raise ConfigError(
+            f"{folder / others[0]}: is not of {len(places):,} frames, and would be taken for one; give a new name"
+        )
+
+
+def _name_of(out: Path) -> tuple[Path, str, str]:
+    """The folder of frames, and what stands before and after the number in their names."""
+    if named(out) is None and out.suffix == "":
+        return out, "", ".ply"
     codec = for_writing(out)
     ending = next((end for end in sorted(codec.endings, key=len, reverse=True) if out.name.lower().endswith(end)), "")
     if not ending.startswith("."):
         raise ConfigError(f"{out}: --frames adds a number to a name; expected a folder, or a name such as frame.spz")
-    return out.with_name(f"{out.name[: -len(ending)]}_{count}{out.name[-len(ending) :]}")
+    return out.parent, f"{out.name[: -len(ending)]}_", out.name[-len(ending) :]
