@@ -6,16 +6,18 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import clsplat
-from clsplat.errors import DataError
+from clsplat.errors import DataError, MemoryLimitError
 from clsplat.fields.shape import FieldShape
 from clsplat.pipeline.loading import load
 from clsplat.stages.train_field import TrainField
 from clsplat.training import archive, checkpoint
+from clsplat.training.field_memory import field_plan
 from tests.test_field_runs import ALONE, PIPELINE, SHAPE, bits
 from tests.test_training import ONE_CORE, train
 
@@ -96,3 +98,24 @@ def test_the_recipe_reads_a_grid_in_the_place_of_sines():
     assert stage.field.degrees == 0
     assert stage.field.grid.table[:, 3].max() == 1  # some levels are shared
     assert FieldShape.model_validate(stage.field.model_dump()) == stage.field
+
+
+def test_a_field_that_does_not_fit_is_refused_before_it_is_made(tiny_scene, pipeline):
+    large = {"levels": 16, "coarsest": 2048, "finest": 4096, "entries": 1 << 22}
+    changes = [f"train_field.field.grid.{name}={value}" for name, value in large.items()]
+    limits = SimpleNamespace(memory=4 << 30, allocation=4 << 30)
+    run = SimpleNamespace(
+        scene=clsplat.read_scene(tiny_scene),
+        photographs=SimpleNamespace(budget=1 << 30),
+        device=SimpleNamespace(info=limits),
+    )
+    with pytest.raises(MemoryLimitError, match=r"4 tables of 1,024 MiB.*take fewer levels or entries of the grid"):
+        load(pipeline, changes).stages[0].check_in(run)
+    load(pipeline).stages[0].check_in(run)
+
+
+def test_the_plan_of_a_field_is_near_what_it_takes(finished):
+    """Pictures of the evaluation are not in it."""
+    field = clsplat.load_field(finished).shape
+    taken = json.loads((finished / "metrics.json").read_text())["device_memory"]
+    assert 0.4 * taken < field_plan(field, 0).needed < 1.5 * taken

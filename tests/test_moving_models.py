@@ -9,7 +9,7 @@ import pytest
 import clsplat
 from clsplat.errors import ConfigError, DataError
 from clsplat.formats.motion import MOTION, STILL, WIDTHS, columns_of, width_of
-from clsplat.gaussians.conversion import merged
+from clsplat.gaussians.merging import merged
 from clsplat.gaussians.model import Model, load
 from clsplat.gaussians.motion import presence, still
 

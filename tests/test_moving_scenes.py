@@ -170,11 +170,15 @@ def test_times_of_points_are_written_and_read(tmp_path):
     assert points.joined(PointCloud(points.positions, points.colours)).times is None
 
 
-def test_times_of_points_in_another_unit_are_refused(tmp_path):
+def test_times_of_points_in_another_unit_are_refused(tmp_path, caplog):
     path = write(tmp_path / "a", **LENS, frames=timed(10, 20, 30))
     seen = PointCloud(np.eye(3, dtype=np.float32), np.zeros((3, 3), np.float32), np.float32([10, 20, 30]))
     write_points_ply(path / "points3d.ply", seen)
     assert read_scene(path).points.times.tolist() == [0, 0.5, 1]
+    with caplog.at_level("WARNING"):
+        write_points_ply(path / "points3d.ply", replace(seen, times=np.float32([10, 10.05, 10.1])))
+        read_scene(path)
+    assert "points3d.ply: its points have times from 10 to 10.1" in caplog.text.replace("00000381", "")
     write_points_ply(path / "points3d.ply", replace(seen, times=np.float32([0, 0.5, 1])))
     fault = refusal(read_scene, path)
     assert "points3d.ply: its points have times from 0 to 1; expected the unit of the frames" in fault

@@ -109,7 +109,7 @@ def test_moments_that_no_view_in_training_has_are_measured_apart():
     results = [ViewMetrics(view.name, 20.0 + i, 0.9) for i, view in enumerate(views)]
     found = mean(by_moment(results, views, [views[0], views[2]]))
     assert (found["psnr"], found[HELD_OUT], found[OTHERS]) == (21, 21, 21)
-    assert [result.still for result in by_moment(results, views, [views[0], views[2]])] == [
+    assert [result.moments for result in by_moment(results, views, [views[0], views[2]])] == [
         {OTHERS: 20.0}, {HELD_OUT: 21.0}, {OTHERS: 22.0},
     ]  # fmt: skip
     for trained in (views, [moment("x", 0.2)], [moment("y", None)]):

@@ -75,7 +75,11 @@ def resume(
     device: DeviceOption = None,
     steps: Annotated[
         int | None,
-        typer.Option(min=1, metavar="N", help="Train to this step, further than before; as --set of its training."),
+        typer.Option(
+            min=1,
+            metavar="N",
+            help="Train to this step, further than before: optimize.steps, or train_field.steps.",
+        ),
     ] = None,
     set_: SetOption = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Check everything and say what would run.")] = False,

@@ -10,7 +10,7 @@ from clsplat.opencl.device import Array, Device
 from clsplat.render.workspace import Workspace
 
 PLACE_ROWS = int(GRID["PLACE_ROWS"])
-PARTS = 64  # of a level for each unit of a GPU
+PARTS = 64  # of all levels together, for each unit of a GPU
 
 
 @dataclass(frozen=True)

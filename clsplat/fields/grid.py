@@ -11,6 +11,8 @@ from clsplat.settings import Settings
 
 GRID = constants("grid.cl")
 FEATURES = int(GRID["GRID_FEATURES"])
+FARTHEST = 1e6  # scene units: the square of a depth divided by that of the least is within float32
+Coordinate = Annotated[float, Field(ge=-FARTHEST, le=FARTHEST)]
 FIRST_MOST = 1e-4  # size of the first numbers at most (Mueller et al. 2022, section 4)
 
 
@@ -27,18 +29,20 @@ class GridShape(Settings):
     coarsest: Annotated[int, Field(ge=1, le=4096)] = 16
     """Cells along a side of the cube in the first level."""
     finest: Annotated[int, Field(ge=1, le=4096)] = 256
-    """Cells along a side in the last one."""
+    """Cells along a side in the last one; where there is one level, that of `coarsest`."""
     entries: Annotated[int, Field(ge=16, le=1 << 22)] = 1 << 17
     """Entries of a level at most, a power of 2; levels with more corners share them by a hash."""
-    corner: Annotated[list[float], Field(min_length=3, max_length=3)] = Field([-1.5, -1.5, -1.5])
+    corner: Annotated[list[Coordinate], Field(min_length=3, max_length=3)] = Field([-1.5, -1.5, -1.5])
     """Corner of the cube with the least coordinates, scene units."""
-    side: Annotated[float, Field(gt=0)] = 3.0
+    side: Annotated[float, Field(ge=1e-6, le=FARTHEST)] = 3.0
     """Side of the cube, scene units."""
 
     @model_validator(mode="after")
     def _in_order(self) -> "GridShape":
         if self.finest < self.coarsest:
             raise ValueError(f"expected 'finest' from {self.coarsest} on, as 'coarsest' is; it is {self.finest}")
+        if self.levels == 1 and self.finest != self.coarsest:
+            raise ValueError("expected one number for 'coarsest' and 'finest' of one level, or 2 levels at least")
         if self.entries & (self.entries - 1):
             raise ValueError(f"expected a power of 2 for 'entries'; {self.entries} is none")
         return self

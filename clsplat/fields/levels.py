@@ -82,7 +82,7 @@ class Levels:
     @property
     def rays_at_a_time(self) -> int:
         """Rays of one pass."""
-        return max(RAYS, PASS_SAMPLES // max(self.shape.coarse_samples, self.shape.fine_samples) // RAYS * RAYS)
+        return rays_at_a_time(self.shape)
 
     def drawn(self, camera: DeviceCamera, draw: Draw, count: int) -> Rays:
         """Return rays of random pixels."""
@@ -202,6 +202,11 @@ class Levels:
             rays=rays.count,
         )
         return Level(rays, samples, edges, raw_colours, raw_densities, weights, left, colours)
+
+
+def rays_at_a_time(shape: FieldShape) -> int:
+    """Return the rays of one pass."""
+    return max(RAYS, PASS_SAMPLES // max(shape.coarse_samples, shape.fine_samples) // RAYS * RAYS)
 
 
 def _random(draw: Draw | None) -> dict[str, int]:

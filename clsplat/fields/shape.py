@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
-from clsplat.fields.grid import FEATURES, FIRST_MOST, GridShape
+from clsplat.fields.grid import FARTHEST, FEATURES, FIRST_MOST, GridShape
 from clsplat.opencl.program import constants
 from clsplat.settings import Settings
 
@@ -17,7 +17,6 @@ COLOUR_ROWS = int(constants("composite.cl")["COLOUR_ROWS"])
 COLOURS, DENSITIES = 3, 1  # outputs of the network
 LANES_MAX = 16
 assert FEATURES == BLOCK  # of a level of a grid: so its rows are whole blocks
-FARTHEST = 1e6  # scene units: the square of a depth divided by that of the least is within float32
 Features = Annotated[int, Field(ge=BLOCK, le=1024, multiple_of=BLOCK)]
 
 

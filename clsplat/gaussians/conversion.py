@@ -1,6 +1,5 @@
 """Model files into one of another format: merged, moved, cropped, and with fewer Gaussians or harmonics."""
 
-import logging
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -15,13 +14,11 @@ from clsplat.formats.model_files import bytes_of
 from clsplat.formats.ply import MAX_NUMBER
 from clsplat.formats.splats import MAX_DEGREE, Quality, Reading, Writing, with_degree
 from clsplat.formats.table import detect, for_writing
+from clsplat.gaussians.merging import merged
 from clsplat.gaussians.model import Model, load
-from clsplat.gaussians.motion import alike
 from clsplat.gaussians.run_model import model_at
 from clsplat.results import check_no_file_of_a_run
 
-LOG = logging.getLogger("clsplat")
-KEPT = ("near", "screen_variance", "background", "alpha")  # of the first model that is merged
 WORDS = ("scale", "rotate", "translate")
 AXES, QUALITIES = ("spz", "ply"), ("small", "balanced", "high")
 
@@ -120,38 +117,6 @@ def check_place(sources: Sequence[Path], out: Path) -> None:
     if any(_is_same(out, model_at(source)) for source in sources):
         raise ConfigError(f"{out}: is one of the files that are read; give another name")
     check_no_file_of_a_run(out)
-
-
-def merged(models: Sequence[Model], names: Sequence[str]) -> Model:
-    """Return one model of all Gaussians, with the numbers of the first for rendering and the largest SH degree.
-
-    Where one has a world filter and another has none, it is baked; where some move, the others stand still.  Raises
-    DataError where some are mip models and others are not, or of the pixel's box, for one filter serves all, and where
-    they move in different ways.
-    """
-    first = models[0]
-    if len(models) == 1:
-        return first
-    for model, name in zip(models, names, strict=True):
-        kinds = [_kind(m) for m in (first, model)]
-        if kinds[0] != kinds[1]:
-            raise DataError(f"{name}: is {kinds[1]}, {names[0]} is {kinds[0]}; expected the same: one filter draws all")
-        own, kept = model.rendering.comment(), first.rendering.comment()
-        if other := [f"{one} = {own.get(one, 'not given')}" for one in KEPT if own.get(one) != kept.get(one)]:
-            LOG.warning("%s: has %s; what %s says is kept", name, ", ".join(other), names[0])
-    if any(model.filter_variance is None for model in models):
-        models = [model.baked() for model in models]
-    degree = max(model.sh_degree for model in models)
-    tables = alike([with_degree(model.tables(), degree) for model in models], names)
-    merged: dict[str, Any] = {n: np.concatenate([t[n] for t in tables]) for n in tables[0]}
-    return Model(**merged, rendering=first.rendering, sky=first.sky)
-
-
-def _kind(model: Model) -> str:
-    """Say whether a model is a mip model."""
-    if model.rendering.pixel_box:
-        return "one of the pixel's box"
-    return "a mip model" if model.rendering.compensate else "none"
 
 
 def transform_of(text: str) -> NDArray[np.float64]:

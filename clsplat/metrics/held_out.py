@@ -19,4 +19,4 @@ def by_moment(results: Sequence[ViewMetrics], views: Sequence[View], trained: Se
     kinds = {name: OTHERS if time in known else HELD_OUT for name, time in times.items() if time is not None}
     if not known or {kinds.get(result.view) for result in results} != {HELD_OUT, OTHERS}:
         return list(results)
-    return [replace(result, still={kinds[result.view]: result.psnr, **result.still}) for result in results]
+    return [replace(result, moments={kinds[result.view]: result.psnr}) for result in results]

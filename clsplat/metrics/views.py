@@ -36,6 +36,7 @@ class ViewMetrics:
     perceptual: dict[str, float | None] = field(default_factory=dict)
     colours: dict[str, float] = field(default_factory=dict)  # dB, by name, where photographs have colours of their own
     still: dict[str, float] = field(default_factory=dict)  # of static pixels, where the scene moves: stillness.py
+    moments: dict[str, float] = field(default_factory=dict)  # dB, by whether the moment is held out: held_out.py
 
     def line(self) -> dict[str, Any]:
         """Return the figures as in a line of metrics.jsonl."""
@@ -44,6 +45,7 @@ class ViewMetrics:
             "psnr": self.psnr,
             "ssim": self.ssim,
             **self.colours,
+            **self.moments,
             **self.still,
             **self.perceptual,
         }
@@ -127,6 +129,7 @@ def mean(results: Sequence[ViewMetrics], perceptual: Perceptual = PSNR_AND_SSIM)
         "psnr": float(np.mean([r.psnr for r in results])),
         "ssim": float(np.mean([r.ssim for r in results])),
         **{name: float(np.mean([r.colours[name] for r in results])) for name in results[0].colours},
+        **means([r.moments for r in results]),
         **means([r.still for r in results]),
         **perceptual.mean([r.perceptual for r in results]),
         "views": len(results),

@@ -23,7 +23,7 @@ def steps_key(folder: Path) -> str:
     stages = data.get("stages") if isinstance(data, dict) else None
     known = variants(Stage)
     for stage in stages if isinstance(stages, list) else ():
-        name = next(iter(stage), "") if isinstance(stage, dict) else stage
+        name = stage.get("stage", next(iter(stage), "")) if isinstance(stage, dict) else stage
         if isinstance(name, str) and issubclass(known.get(name, Stage), Training):
             return f"{name}.steps"
     return f"{Optimize.model_fields['stage'].default}.steps"

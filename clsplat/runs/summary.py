@@ -10,7 +10,7 @@ from clsplat.reading import read_json
 from clsplat.training.found import photographs_text, size_text
 
 # of what these stages write; others give their own names
-TITLES = {"export": "model", "render": "renders", "optimize": "pictures"}
+TITLES = {"export": "model", "export_field": "field", "render": "renders", "optimize": "pictures"}
 OF_FILES = {VIEW_COLOURS: "colours", VIEW_POSES: "poses"}  # whichever stage writes them
 BEFORE_FILES = {"export": "point_cloud.ply", "render": "renders", "viewer": "viewer.html", "report": "report.html"}
 SHORTEST = 0.5  # seconds of a stage that is told

@@ -1,5 +1,6 @@
 """The moments of a scene that moves: from the numbers of its files to [0, 1], and back to who saw them."""
 
+import logging
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -9,6 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from clsplat.errors import DataError, first_few
 from clsplat.scene.view import View
+
+LOG = logging.getLogger("clsplat")
+LEAST_SPAN = 0.01  # of the frames' times: points of several moments within less are perhaps of another unit
 
 
 @dataclass(frozen=True)
@@ -28,8 +32,14 @@ class Clock:
         least, most = (float(values.min()), float(values.max())) if values.size else (self.first, self.last)
         if least < self.first - slack or most > self.last + slack:
             raise DataError(
-                f"{path}: its points have times from {least:g} to {most:g}; expected the unit of the frames, whose "
-                f"times are {self.first:g} to {self.last:g}: write the points again, or without the property `time`"
+                f"{path}: its points have times from {least:.9g} to {most:.9g}; expected the unit of the frames, whose "
+                f"times are {self.first:.9g} to {self.last:.9g}: write the points again, or without the property `time`"
+            )
+        if 0 < most - least < LEAST_SPAN * span:
+            LOG.warning(
+                "%s: its points have times from %.9g to %.9g, a small part of those of the frames, %.9g to %.9g: "
+                "if their unit is another, write them again, or without the property `time`",
+                *(path, least, most, self.first, self.last),
             )
         return self(values)
 

@@ -16,7 +16,8 @@ from clsplat.stages.base import Scheduled
 from clsplat.stages.progress import report
 from clsplat.stages.training import Training
 from clsplat.training import checkpoint
-from clsplat.training.field import LearnedField, Rate, Shown
+from clsplat.training.field import AdamStep, LearnedField, Shown
+from clsplat.training.field_memory import field_plan
 from clsplat.training.forecast import Forecast
 from clsplat.training.profile import clocks
 from clsplat.training.run import Run
@@ -72,7 +73,14 @@ class TrainField(Training):
             raise ValueError("expected stages in 'during' that edit no Gaussians: a field has none")
         return self
 
+    def check_in(self, run: Run) -> None:
+        """Raise MemoryLimitError for a field that does not fit, before it is made."""
+        views = run.scene.split("train")
+        held = min(run.photographs.budget, sum(4 * view.camera.width * view.camera.height for view in views))
+        field_plan(self.field, held).check(run.device.info)
+
     def run(self, run: Run) -> None:
+        self.check_in(run)
         field = run.learned_field = self._begun(run)
         last = run.step - run.stage_step + self.steps
         pool, forecast = ViewPool(run.scene.split("train"), run.seed), Forecast.of(run.step, last, [])
@@ -98,7 +106,7 @@ class TrainField(Training):
         for step in range(1, 1 + STEPS):
             shown = list(small._shown(run, pool, step))
             start, _ = clocks()
-            field.step(shown, self.coarse_weight, Rate(0.0), run.seed, step)
+            field.step(shown, self.coarse_weight, AdamStep(0.0), run.seed, step)
             run.device.finish()
             seconds.append(clocks()[0] - start)
         return median(seconds) * self.rays / small.rays
@@ -123,7 +131,7 @@ class TrainField(Training):
         shown = list(self._shown(run, pool, step))
         with run.changing():
             run.step, run.stage_step = step, run.stage_step + 1
-            field.step(shown, self.coarse_weight, Rate(self.rate_at(step), self.epsilon), run.seed, step)
+            field.step(shown, self.coarse_weight, AdamStep(self.rate_at(step), self.epsilon), run.seed, step)
             run.device.finish()  # the one wait of a step
             run.acted = 0
         run.device.timings.sampling = False

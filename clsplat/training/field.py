@@ -33,7 +33,7 @@ class Shown:
 
 
 @dataclass(frozen=True)
-class Rate:
+class AdamStep:
     """How far an update by Adam goes."""
 
     rate: float
@@ -81,14 +81,14 @@ class LearnedField:
             )
         return [name for name, counter in counters.items() if counter.get_item(0) > 0]
 
-    def step(self, shown: Sequence[Shown], coarse_weight: float, rate: Rate, seed: int, step: int) -> None:
+    def step(self, shown: Sequence[Shown], coarse_weight: float, adam: AdamStep, seed: int, step: int) -> None:
         """Do one update (Barron et al. 2021, section 3.3).
 
         The loss is that of the fine level and `coarse_weight` of that of the coarse one; each is the mean squared
         difference of the rays, weighted by what they stand for.
         """
         whole = CHANNELS * sum(one.rays * one.weight for one in shown)
-        self.rate = rate.rate
+        self.rate = adam.rate
         self._gradient.fill(0)
         errors = self._errors(sum(one.rays for one in shown))
         self._scales, first = [(one.rays, one.weight / whole) for one in shown], 0
@@ -96,9 +96,9 @@ class LearnedField:
             self._differentiate(one, one.weight / whole, coarse_weight, Draw(seed, step, first), errors)
             first += one.rays
         self.updates += 1
-        self.update(self._gradient, rate, self.updates)
+        self.update(self._gradient, adam, self.updates)
 
-    def update(self, gradient: Array, rate: Rate, number: int) -> None:
+    def update(self, gradient: Array, adam: AdamStep, number: int) -> None:
         """Change the parameters by Adam, for the update `number`, from a gradient, [P]."""
         self._program.dense_update(
             items=self.field.shape.parameters // int(self._gradient.device.tuning["LANES"]),
@@ -106,9 +106,9 @@ class LearnedField:
             moment1=self._arrays["moment1"],
             moment2=self._arrays["moment2"],
             gradient=gradient,
-            rate=rate.rate / (1 - self._beta1**number),
+            rate=adam.rate / (1 - self._beta1**number),
             correction2=1 / (1 - self._beta2**number),
-            epsilon=rate.epsilon,
+            epsilon=adam.epsilon,
             count=self.field.shape.parameters,
         )
 

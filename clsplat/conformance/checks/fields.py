@@ -17,7 +17,7 @@ from clsplat.fields.grid import FEATURES
 from clsplat.fields.levels import Draw, Level, Target
 from clsplat.fields.shape import FieldShape
 from clsplat.opencl.device import Device
-from clsplat.training.field import LearnedField, Rate
+from clsplat.training.field import AdamStep, LearnedField
 
 CHECKS = Checks()
 CASES: list[tuple[int, dict[str, Any]]] = [
@@ -138,7 +138,7 @@ def updates_of_fields(device: Device, rng: np.random.Generator) -> Iterator[Figu
     values, moment1, moment2 = SHAPE.first_parameters(0).astype(np.float64), np.zeros(count), np.zeros(count)
     for number, epsilon in enumerate((1e-8, 1e-8, 1e-15), 1):
         gradient = (rng.normal(size=count) * 10.0 ** rng.uniform(-10, 1, count)).astype(np.float32)
-        learned.update(device.upload(gradient), Rate(0.01, epsilon), number)
+        learned.update(device.upload(gradient), AdamStep(0.01, epsilon), number)
         own = gradient.astype(np.float64)
         values, moment1, moment2 = ref_field.update(values, moment1, moment2, own, 0.01, number, epsilon)
     found = learned.tables()
