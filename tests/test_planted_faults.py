@@ -94,7 +94,7 @@ FAULTS = {  # kernel -> file, text, wrong text
     "mean_opacity": ("penalty.cl", "opacity * (1.0f - opacity)", "opacity * (1.0f + opacity)"),
     "draw_pixels": ("rays.cl", "RANDOM_PIXELS, 0), (uint2)(seed, 0)).x", "RANDOM_PIXELS, 0), (uint2)(seed, 0)).y"),
     "cast_rays": ("rays.cl", "cone[6] = CONE_RADIUS / camera", "cone[6] = 0.5f / camera"),
-    "spread_edges": ("rays.cl", "own[k] = near + width * place", "own[k] = near + width * (float)k"),
+    "spread_edges": ("rays.cl", "own[k] = near + width * place", "own[k] = near - width * place"),
     "resample_edges": ("rays.cl", "0.5f * (low + high) + BLUR_PADDING", "0.5f * (low + high)"),
     "encode_frustums": ("frustum.h", "(12.0f * m2 - h2)", "(12.0f * m2 + h2)"),
     "encode_directions": ("encode.cl", "cone[3 + axis] / cone[7]", "cone[3 + axis]"),
