@@ -1,4 +1,5 @@
-/* The sizes of the grids of the photographs' colours (colour_grid.cl, colour_grid_table.cl). */
+/* The sizes of the grids of the photographs' colours, which colour_grid.cl reads and colour_grid_table.cl updates: each
+ * of at most MOST_NODES nodes along an axis has the ENTRIES of a matrix [E | b]. */
 #ifndef CLSPLAT_COLOUR_GRID_H
 #define CLSPLAT_COLOUR_GRID_H
 

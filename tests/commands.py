@@ -17,7 +17,7 @@ LOG = logging.getLogger("clsplat")
 
 
 def ran(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    """Run the command."""
+    """Run the command.  What a plug-in registers stays for later tests: use `without_plugins`, or `process`."""
     out, err = (io.TextIOWrapper(io.BytesIO(), encoding="utf-8", write_through=True) for _ in range(2))
     words, handlers, level = ["clsplat", *map(str, arguments)], list(LOG.handlers), LOG.level
     with mock.patch.object(sys, "argv", words), contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):

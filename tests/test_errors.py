@@ -7,7 +7,7 @@ import pytest
 
 from clsplat import cli
 from clsplat.errors import MESSAGE_LIMIT, QUOTE_LIMIT, DataError, OverrideError, amount, one_line, quoted, shortened
-from tests.commands import clsplat
+from tests.commands import process
 
 VALUES = [
     "x" * 10**6,
@@ -73,7 +73,7 @@ def test_a_plug_in_that_exits_is_an_error_of_the_plug_in(tmp_path):
         "    def matches(self, path): return True\n"
         "    def read(self, path, holdout): sys.exit(0)\n"
     )
-    done = clsplat("--plugin", tmp_path / "quits.py", "inspect", tmp_path / "scene", expect=2)
+    done = process("--plugin", tmp_path / "quits.py", "inspect", tmp_path / "scene", expect=2)
     assert f"{tmp_path / 'quits.py'}:6: SystemExit: 0" in done.stderr
 
 
