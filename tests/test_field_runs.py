@@ -143,21 +143,30 @@ def test_photographs_of_all_sizes_count_alike(finished, tiny_scene, pipeline):
     assert {(one.rays, one.weight) for one in shown} == {(32, 1600)}
 
 
-def test_a_run_that_was_killed_ends_with_the_bits_of_one_that_was_not(finished, tiny_scene, tmp_path, pipeline):
-    out = tmp_path / "run"
+def resumed(finished: Path, scene: Path, out: Path, pipeline: str) -> Path:
+    """A run that was killed before its last checkpoint, and has gone on to its end."""
     shutil.copytree(finished, out)
     (out / "checkpoints/step_000012.npz").unlink()
     for name in ("metrics.json", "checksums.json"):
         (out / name).unlink()
     shutil.rmtree(out / "renders")
-    train(tiny_scene, out, pipeline=pipeline, resume=True)
-    assert bits(out) == bits(finished)
+    train(scene, out, pipeline=pipeline, resume=True)
+    return out
+
+
+def alone(scene: Path, out: Path, pipeline: str) -> Path:
+    """A run with one thread."""
+    command = [sys.executable, "-c", ALONE, scene, out, pipeline]
+    subprocess.run(command, check=True, env={**os.environ, **ONE_CORE}, cwd=Path(__file__).parents[1])
+    return out
+
+
+def test_a_run_that_was_killed_ends_with_the_bits_of_one_that_was_not(finished, tiny_scene, tmp_path, pipeline):
+    assert bits(resumed(finished, tiny_scene, tmp_path / "run", pipeline)) == bits(finished)
 
 
 def test_one_thread_gives_the_bits_of_several(finished, tiny_scene, tmp_path, pipeline):
-    command = [sys.executable, "-c", ALONE, tiny_scene, tmp_path / "run", pipeline]
-    subprocess.run(command, check=True, env={**os.environ, **ONE_CORE}, cwd=Path(__file__).parents[1])
-    assert bits(tmp_path / "run") == bits(finished)
+    assert bits(alone(tiny_scene, tmp_path / "run", pipeline)) == bits(finished)
 
 
 def test_a_field_stands_beside_gaussians_in_a_comparison(finished, few_steps, tmp_path):

@@ -1,10 +1,6 @@
 """Runs that train a field whose network reads a grid: their bits, their files, and the recipe."""
 
 import json
-import os
-import shutil
-import subprocess
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -18,8 +14,8 @@ from clsplat.pipeline.loading import load
 from clsplat.stages.train_field import TrainField
 from clsplat.training import archive, checkpoint
 from clsplat.training.field_memory import field_plan
-from tests.test_field_runs import ALONE, PIPELINE, SHAPE, bits
-from tests.test_training import ONE_CORE, train
+from tests.test_field_runs import PIPELINE, SHAPE, alone, bits, resumed
+from tests.test_training import train
 
 pytestmark = pytest.mark.slow
 
@@ -50,20 +46,11 @@ def test_the_numbers_of_a_grid_are_trained(finished):
 
 
 def test_a_grid_that_was_killed_ends_with_the_bits_of_one_that_was_not(finished, tiny_scene, tmp_path, pipeline):
-    out = tmp_path / "run"
-    shutil.copytree(finished, out)
-    (out / "checkpoints/step_000012.npz").unlink()
-    for name in ("metrics.json", "checksums.json"):
-        (out / name).unlink()
-    shutil.rmtree(out / "renders")
-    train(tiny_scene, out, pipeline=pipeline, resume=True)
-    assert bits(out) == bits(finished)
+    assert bits(resumed(finished, tiny_scene, tmp_path / "run", pipeline)) == bits(finished)
 
 
 def test_a_grid_has_the_bits_of_several_threads_with_one(finished, tiny_scene, tmp_path, pipeline):
-    command = [sys.executable, "-c", ALONE, tiny_scene, tmp_path / "run", pipeline]
-    subprocess.run(command, check=True, env={**os.environ, **ONE_CORE}, cwd=Path(__file__).parents[1])
-    assert bits(tmp_path / "run") == bits(finished)
+    assert bits(alone(tiny_scene, tmp_path / "run", pipeline)) == bits(finished)
 
 
 def test_the_file_of_a_grid_gives_the_figures_of_its_run(finished):

@@ -104,25 +104,11 @@ def table_figures(device: Device, rng: np.random.Generator, nodes: tuple[int, ..
         _, value = grids.change(workspace, camera, image, numbers, 1)
         by_smoothness = workspace.array("grid smoothness", row_length(nodes)).get()
         smooth, slope = ref.grid_smoothness(of_photograph(grids, expected[1]))
-        yield by_element(
-            "colour_grid_smoothness",
-            f"value, {what}",
-            np.array([value()]),
-            np.array([weight * smooth]),
-            SUM,
-            floor=1e-2,
-        )
-        largest = max(weight * float(np.abs(slope).max()), 1e-6)
-        yield by_element(
-            *(
-                "colour_grid_smoothness",
-                f"derivatives, {what}",
-                of_photograph(grids, by_smoothness),
-                weight * slope,
-                2e-5,
-            ),
-            floor=largest,
-        )
+        found, wanted, kernel = np.array([value()]), np.array([weight * smooth]), "colour_grid_smoothness"
+        yield by_element(kernel, f"value, {what}", found, wanted, SUM, floor=1e-2)
+        found, wanted = of_photograph(grids, by_smoothness), weight * slope
+        largest = max(float(np.abs(wanted).max()), 1e-6)
+        yield by_element(kernel, f"derivatives, {what}", found, wanted, 2e-5, floor=largest)
         gradient = rng.normal(0, 0.1, row_length(nodes)).astype(np.float32)
         grids.learn(workspace, numbers, 1, device.upload(gradient), step)
         whole = gradient.astype(np.float64) + by_smoothness
