@@ -31,6 +31,7 @@ ROWS = (  # from the top down; a module imports only from lower rows, or from it
     {"formats"},
     {"opencl", "pages"},
     {
+        "cadence",
         "caches",
         "cores",
         "errors",

@@ -1,14 +1,19 @@
 """A pipeline in another number of steps: places, lengths and cadences of its training are multiplied.
 
-So each edit that has an end is made as often, at about the same share of the training.  What is learned in so many
-updates, such as a filter, has a rate that falls as much as their number grows.
+All of them are places on one axis that is stretched, by one factor: what acts does so as often, in the same order, and
+what acts at one step still does.  Cadences need not be whole for that.  Only where steps become so few that two acts
+fall on one step do they act there in the order of the list.  What is learned in so many updates, such as a filter, has
+a rate that falls as much as their number grows.
 """
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from fractions import Fraction
+from itertools import pairwise
 from typing import Any, TypeVar
 
+from clsplat.cadence import acts, places
 from clsplat.pipeline.choices import CaptureChoice
 from clsplat.pipeline.file import PipelineFile
 from clsplat.schedule import divided
@@ -21,15 +26,62 @@ from clsplat.stages.training import Training
 Value = TypeVar("Value")
 Kind = TypeVar("Kind", bound=Training)
 MOST = 2**63 - 1  # that a file can hold
+PARTS = 10**6  # of a step: cadences are multiples of one, exact as a file holds them
+
+
+@dataclass(frozen=True)
+class Axis:
+    """The steps of a training, stretched: what was at a step x is at the whole step at or below x times a factor."""
+
+    exact: Fraction
+    """Of the number of steps."""
+    factor: Fraction
+    """Of all places: the next multiple of 1 / PARTS."""
+
+    @classmethod
+    def by(cls, factor: float | Fraction) -> "Axis":
+        """Return the axis of a factor; of a float it is the number that is written so."""
+        exact = factor if isinstance(factor, Fraction) else Fraction(str(factor))
+        return cls(exact, Fraction(math.ceil(exact * PARTS), PARTS))
+
+    def at(self, step: int) -> int:
+        """Return where a step comes to be."""
+        return min(math.floor(step * self.factor), MOST)
+
+    def every(self, every: float) -> float:
+        """Return a cadence; what acts at each step acts at each, as does what would act more often."""
+        stretched = Fraction(str(every)) * self.factor
+        if every == 1 or stretched <= 1:
+            return 1
+        return int(stretched) if stretched.denominator == 1 else float(stretched)
+
+    def start(self, start: int, every: float) -> int:
+        """Return the step after which what acted after `start` acts: before its first act."""
+        return max(0, min(self.at(start), self._act(every, acts(every, start) + 1) - 1))
+
+    def stop(self, stop: int, every: float) -> int:
+        """Return the step before which what acted before `stop` acts: behind its last act."""
+        number = acts(every, stop - 1)
+        return min(max(self._act(every, number) + 1, min(self.at(stop), self._act(every, number + 1))), MOST)
+
+    def until(self, until: int, every: float) -> int:
+        """Return the step up to which acts follow, the last of them at it or next behind it: behind those before."""
+        number = acts(every, until - 1)
+        return max(1, min(max(self._act(every, number) + 1, self.at(until)), self._act(every, number + 1)))
+
+    def _act(self, every: float, number: int) -> int:
+        return math.floor(number * Fraction(str(every)) * self.factor)
 
 
 def with_steps(settings: PipelineFile, steps: int, done: int) -> PipelineFile:
-    """Return settings whose training has so many steps, of which those that are done are the same; stages that have not
-    begun do so at the same share of the others."""
+    """Return settings whose training has so many steps, of which those that are done are the same; so are those up to the
+    last edit, where it has more.  Stages that have not begun there do so at the same share of the steps that follow."""
 
     def changed(training: Training) -> Training:
-        left = (steps - done) / (training.steps - done)
-        during = [_moved(stage, done, left) for stage in training.during]
+        last = last_edit(training)
+        fixed = max(done, last) if last < min(steps, training.steps) else done
+        left = (steps - fixed) / (training.steps - fixed)
+        during = [_moved(stage, fixed, left) for stage in training.during]
         return training.model_copy(update={"steps": steps, "during": during})
 
     return of_trainings(settings, Training, changed)
@@ -44,17 +96,33 @@ def last_edit(training: Training) -> int:
     return max([0, *stops, *([int(training.views.last_change)] if isinstance(training, Optimize) else [])])
 
 
+def fewest_steps(training: Training) -> int:
+    """Return the fewest steps in which a training can be stretched such that no two of its edits fall on one step."""
+    found = {
+        step
+        for stage in training.during
+        if stage.edits and stage.every is not None and stage.every != 1
+        for step in places(stage.every, stage.start, min(stage.stop or MOST, training.steps))
+    }
+    if isinstance(training, Optimize):
+        found |= set(training.views.changes)
+    found |= {rule.start for stage in training.during if isinstance(stage, Densify) for rule in stage.rules}
+    apart = min((later - step for step, later in pairwise(sorted(found - {0}))), default=training.steps)
+    return -(-training.steps // apart)
+
+
 def in_steps(settings: PipelineFile, steps: int) -> PipelineFile:
     """Return settings stretched so that the first training has so many steps.  Raises ConfigError when none trains."""
     return stretched(settings, Fraction(steps, settings.training.steps))
 
 
-def _moved(stage: Scheduled, done: int, left: float) -> Scheduled:
-    if stage.start <= done:
+def _moved(stage: Scheduled, fixed: int, left: float) -> Scheduled:
+    """A stage that begins after a step that is fixed, with `left` times its steps from there on."""
+    if stage.start <= fixed:
         return stage
     every = max(1, math.floor((stage.every or 1) * left))
     start, stop = (
-        place if place is None else done + math.floor((place - done) * left) for place in (stage.start, stage.stop)
+        step if step is None else fixed + math.floor((step - fixed) * left) for step in (stage.start, stage.stop)
     )
     return stage.model_copy(update={"every": every, "start": start, "stop": stop})
 
@@ -67,16 +135,16 @@ def of_trainings(settings: PipelineFile, kind: type[Kind], changed: Callable[[Ki
 
 def stretched(value: Value, factor: float | Fraction) -> Value:
     """Return settings for `factor` times as many steps; each class names in `step_keys` what that changes."""
-    return _stretched(value, factor)  # type: ignore[no-any-return]
+    return _stretched(value, Axis.by(factor))  # type: ignore[no-any-return]
 
 
-def _stretched(value: Any, factor: float | Fraction) -> Any:
+def _stretched(value: Any, axis: Axis) -> Any:
     if isinstance(value, list):
         is_points = bool(value) and all(isinstance(item, list) for item in value)
-        return _points(value, factor) if is_points else [_stretched(item, factor) for item in value]
+        return _points(value, axis) if is_points else [_stretched(item, axis) for item in value]
     if isinstance(value, CaptureChoice):  # whose rows begin with what is measured, and not with steps
-        rows = [[bound, *(_stretched(one, factor) for one in row)] for bound, *row in value.values]
-        given = {key: _stretched(one, factor) for key, one in value.given.items()}
+        rows = [[bound, *(_stretched(one, axis) for one in row)] for bound, *row in value.values]
+        given = {key: _stretched(one, axis) for key, one in value.given.items()}
         return value.model_copy(update={"values": rows, "given": given})
     if not isinstance(value, Settings):
         return value
@@ -84,32 +152,27 @@ def _stretched(value: Any, factor: float | Fraction) -> Any:
     keys = {key for base in type(value).__mro__ if issubclass(base, Settings) for key in base.step_keys}
     every = fields["every"] if "every" in keys else None
     changed = {
-        name: _steps(name, field, factor, every) if name in keys else _stretched(field, factor)
+        name: _steps(name, field, axis, every) if name in keys else _stretched(field, axis)
         for name, field in fields.items()
     }
-    changed |= {name: divided(changed[name], float(factor)) for name in type(value).rate_keys if factor != 1}
+    changed |= {name: divided(changed[name], float(axis.exact)) for name in type(value).rate_keys if axis.exact != 1}
     return value.model_copy(update={name: new for name, new in changed.items() if new is not fields[name]})
 
 
-def _steps(name: str, steps: Any, factor: float | Fraction, every: Any = None) -> Any:
-    """A number of steps; one that begins or ends what acts at multiples of `every` does so at the same of them."""
-    if not isinstance(steps, int) or steps == 0:
+def _steps(name: str, steps: Any, axis: Axis, every: Any) -> Any:
+    """A number of steps; one that begins or ends what acts at multiples of `every` does so between the same of them."""
+    if not isinstance(steps, int | float) or steps == 0:
         return steps
     if name == "every":
-        return _cadence(steps, factor)
-    if name not in ("start", "stop") or not isinstance(every, int) or every == 1:
-        return max(1, min(math.floor(steps * factor), MOST))
-    after = name == "stop"  # what acts at a step before it is what acts up to the step before it
-    number, rest = divmod(steps - after, every)
-    cadence = _cadence(every, factor)
-    return min(number * cadence + min(math.floor(rest * factor), cadence - 1) + after, MOST)
+        return axis.every(steps)
+    if name == "steps":
+        return max(1, math.floor(steps * axis.exact))
+    limits = {"start": axis.start, "stop": axis.stop, "until": axis.until}
+    if name in limits and every not in (None, 1):
+        return limits[name](int(steps), every)
+    return max(1, axis.at(int(steps)))
 
 
-def _cadence(every: int, factor: float | Fraction) -> int:
-    """What acts at each step acts at each."""
-    return every if every == 1 else max(1, math.floor(every * factor))
-
-
-def _points(points: list[list[float]], factor: float | Fraction) -> list[list[float]]:
+def _points(points: list[list[float]], axis: Axis) -> list[list[float]]:
     """Points of a schedule; of two that fall together the later one stays."""
-    return [list(point) for point in {math.floor(step * factor): value for step, value in points}.items()]
+    return [list(point) for point in {math.floor(step * axis.factor): value for step, value in points}.items()]

@@ -9,6 +9,7 @@ from typing import Annotated, Any, ClassVar, get_args
 
 from pydantic import AfterValidator, Field
 
+from clsplat.cadence import Every, is_act
 from clsplat.names import fault_of_output
 from clsplat.settings import Settings
 from clsplat.training.run import Run
@@ -90,15 +91,16 @@ class Stage(Settings):
 class Scheduled(Stage):
     """A stage that may stand inside `optimize.during`, where it runs at a cadence.
 
-    It runs at every step that is a multiple of `every`, after `start` and before `stop`.
+    It runs at every step that is a multiple of `every`, after `start` and before `stop`; of a number that is not whole,
+    at the whole steps at or below its multiples.
     """
 
     training_keys: ClassVar[frozenset[str]] = CADENCE
     step_keys: ClassVar[frozenset[str]] = CADENCE
     ends: ClassVar[bool] = False  # whether it runs after the last step of the training too
 
-    every: Annotated[int, Field(gt=0)] | None = None
-    """Steps from one run of the stage to the next; inside `during` only."""
+    every: Every | None = None
+    """Steps from one run of the stage to the next, which need not be whole; inside `during` only."""
     start: Annotated[int, Field(ge=0)] = 0
     """Global step after which the stage runs."""
     stop: Annotated[int, Field(gt=0)] | None = None
@@ -109,7 +111,7 @@ class Scheduled(Stage):
 
     def due(self, step: int, is_last: bool = False) -> bool:
         """Return whether the stage runs at a global step, counted from 1; `is_last` of the training."""
-        if self.every is None or (step % self.every != 0 and not (is_last and self.ends)):
+        if self.every is None or not (is_act(self.every, step) or (is_last and self.ends)):
             return False
         return step > self.start and (self.stop is None or step < self.stop)
 

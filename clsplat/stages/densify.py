@@ -8,6 +8,7 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
+from clsplat.cadence import places
 from clsplat.density.box import Box
 from clsplat.density.budget import Budget, Moment
 from clsplat.density.control import densify
@@ -110,6 +111,6 @@ class Densify(Scheduled):
             sizes = [view.camera.width * view.camera.height for view in views]
             yield max(1, int(self.per_pixel * float(np.median(sizes))))
         if self.budget and self.every and self.stop:
-            left = len(range(run.step, self.stop, self.every))
+            left = len(places(self.every, run.step - 1, self.stop))
             moment = Moment(run.step / self.stop, left, run.divisor)
             yield self.budget.limit(edit, moment, run.numbers)

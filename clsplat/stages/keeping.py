@@ -6,6 +6,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
+from clsplat.cadence import place
 from clsplat.errors import ConfigError
 from clsplat.stages.base import Scheduled
 from clsplat.stages.evaluate import Evaluate
@@ -67,7 +68,7 @@ class Keeping(Training):
         if self.patience is None:
             return self.steps
         every = self.measuring(getattr(self, "during", ()))[-1].every or self.steps
-        return min(self.steps, (1 + self.patience) * every) + (every if self.refit else 0)
+        return min(self.steps, place(every, 1 + self.patience)) + (place(every, 1) if self.refit else 0)
 
     def in_turn(self, during: Sequence[Scheduled]) -> list[Scheduled]:
         """Return all stages of `during` in the order in which they act: first the measurements of `keep: best`, since

@@ -11,6 +11,7 @@ import scipy
 from numpy.typing import NDArray
 from pydantic import Field
 
+from clsplat.cadence import Every, acts, place
 from clsplat.schedule import Points
 from clsplat.settings import Settings
 
@@ -88,10 +89,17 @@ class DetailDivisor(Settings):
     """Global step at which the photographs have their full size, at the latest; up to a million."""
     largest: Annotated[float, Field(ge=1)] = 8
     """Largest divisor."""
-    every: Annotated[int, Field(gt=0)] = 100
-    """Steps from one change to the next, as those between edits; it stays as it is up to `start`."""
+    every: Every = 100
+    """Steps from one change to the next, as those between edits, which need not be whole; the size stays as it is up to
+    `start`."""
     start: Annotated[int, Field(ge=0)] = 500
     """Global step after which it changes."""
+
+    @property
+    def changes(self) -> list[int]:
+        """The steps before those at which the size may change; at the last one it is the full size."""
+        first, last = acts(self.every, self.start) + 1, acts(self.every, self.until - 1) + 1
+        return [place(self.every, number) for number in range(first, last + 1)]
 
     def of(self, photographs: Iterable[NDArray[np.uint8]]) -> Points:
         """Return the divisors of training photographs, each [height, width, 3], by step."""
@@ -102,11 +110,10 @@ class DetailDivisor(Settings):
             pixels = np.interp(places, steps, divisors**-2.0)
             return np.where(places < self.until, np.floor(pixels**-0.5 + 1e-9), 1.0)
 
-        changes = range(self.every * (self.start // self.every + 1), self.until + self.every, self.every)
-        places = np.array([1.0, *changes])
-        sizes = at(places)
+        tried = np.array([1.0, *self.changes])
+        sizes = at(tried)
         differs = np.flatnonzero(np.diff(sizes)) + 1
-        points = [[0.0, float(sizes[0])], *([float(places[i]) + 1, float(sizes[i])] for i in differs)]
+        points = [[0.0, float(sizes[0])], *([float(tried[i]) + 1, float(sizes[i])] for i in differs)]
         return Points(points=points, between="steps")
 
 

@@ -53,13 +53,18 @@ class ViewSettings(Settings):
         return at_step(self.resolution, step)
 
     @property
-    def last_change(self) -> float:
-        """The global step of the last change of the size, at the latest; 0 where it does not change."""
+    def changes(self) -> list[float]:
+        """The global steps between which the size stays, or changes evenly; none where it does not change."""
         resolution = self.resolution
         if isinstance(resolution, DetailDivisor):
-            return resolution.until
+            return [float(step) for step in resolution.changes]
         points = resolution.points if isinstance(resolution, Points) else resolution
-        return points[-1][0] if isinstance(points, list) else 0.0
+        return [step for step, _ in points] if isinstance(points, list) else []
+
+    @property
+    def last_change(self) -> float:
+        """The global step of the last change of the size, at the latest; 0 where it does not change."""
+        return self.resolution.until if isinstance(self.resolution, DetailDivisor) else max([0.0, *self.changes])
 
     def full_size(self, last: int) -> int:
         """Return the first step up to `last` whose photographs are larger than 1/2 of their size."""
