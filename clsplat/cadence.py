@@ -1,7 +1,8 @@
 """The steps at which something acts every so many of them.
 
-Act number k = 1, 2, … is at the whole step at or below k times `every`.  So one that is not whole keeps its pace: 2.5 acts at
-steps 2, 5, 7, 10, …  Cadences that are multiplied by one number keep the order of their acts, and those at one step.
+Act number k = 1, 2, … is at the whole step at or below k times `every`.  So one that is not whole keeps its pace: 2.5
+acts at steps 2, 5, 7, 10, …  Cadences that are multiplied by one number keep the order of their acts, and those at one
+step.
 """
 
 from fractions import Fraction

@@ -74,8 +74,11 @@ class Axis:
 
 
 def with_steps(settings: PipelineFile, steps: int, done: int) -> PipelineFile:
-    """Return settings whose training has so many steps, of which those that are done are the same; so are those up to the
-    last edit, where it has more.  Stages that have not begun there do so at the same share of the steps that follow."""
+    """Return settings whose training has so many steps, of which those that are done are the same.
+
+    So are those up to the last edit, where it has more.  Stages that have not begun there do so at the same share of
+    the steps that follow.
+    """
 
     def changed(training: Training) -> Training:
         last = last_edit(training)

@@ -101,12 +101,23 @@ def rehearse(pipeline: Pipeline, run: Run, factor: Fraction, limit: Limit) -> Re
             run_stages(short, one)
         after = time.perf_counter() - watch.trained
         growth = [line["step"] for line in one.records.read("densify") if any(line["grown"].values())]
-    is_whole, inner = watch.done == training.steps, {stage.stage for stage in training.during}
-    during = sum(s * (training.steps / watch.done if name in inner else 1) for name, s in watch.spent.items())
+    is_whole, full = watch.done == training.steps, pipeline.settings.training
+    during = sum(s * _times(name, full, training, watch.done) for name, s in watch.spent.items())
     parts = math.ceil(training.steps / training.log_every)
     course = [*watch.course, *[watch.course[-1]] * (parts - len(watch.course))]
     known = max(growth, default=0) / training.steps if is_whole else 1.0
     return Rehearsal(training.steps, course, during, after, known)
+
+
+def _times(name: str, full: Training, short: Training, done: int) -> float:
+    """How often stages of a name act in a training for each time that they did in the steps of a short one that are
+    done; 1 for those that act at each step, or before the training."""
+    found = [stage for stage in full.during if stage.stage == name]
+    if any(stage.every == 1 for stage in found):
+        return 1.0
+    wanted = sum(stage.due(step) for stage in found for step in range(1, full.steps + 1))
+    acted = sum(stage.due(step) for stage in short.during if stage.stage == name for step in range(1, done + 1))
+    return wanted / acted if acted else 1.0
 
 
 def new_run(run: Run, pipeline: Pipeline, **changes: Any) -> Run:
