@@ -22,6 +22,7 @@ from clsplat.training.status import StatusFile
 
 LOG = logging.getLogger("clsplat")
 REPORTS = 20  # of a rehearsal; each gives the median time of its steps, without what is done once
+TELLING = 3  # of them, at least, that tell what a step takes
 LONGEST = 0.2  # of the whole time, that the steps of a rehearsal may take: then the rest is taken to be like the last
 
 
@@ -66,7 +67,8 @@ class Watch:
 
     def look(self) -> None:
         """Raise ConfigError where what has been done so far, done again with the fewest steps, ends too late."""
-        again = sum(self._spent().values()) + self.limit.fewest * (self.course[-1] if self.course else 0.0)
+        each = min(self.course[-2:]) if len(self.course) > 1 else 0.0  # one may be of a step that builds kernels
+        again = sum(self._spent().values()) + self.limit.fewest * each
         self.limit.require(time.perf_counter() + again)
 
     def show(self, progress: Progress) -> None:
@@ -76,7 +78,8 @@ class Watch:
         self.course.append(progress.milliseconds / 1e3)
         self.look()
         steps = self.trained - self.began - sum(self.spent.values())
-        if progress.step < progress.steps and steps > LONGEST * 60 * self.limit.minutes:
+        tells = len(self.course) >= TELLING and progress.step < progress.steps
+        if tells and steps > LONGEST * 60 * self.limit.minutes:
             raise _Enough
 
     def _spent(self) -> dict[str, float]:
