@@ -82,7 +82,7 @@ def test_acts_of_a_cadence_that_is_not_whole_are_at_the_steps_at_or_below_its_mu
 def test_a_cadence_below_a_step_is_refused():
     with pytest.raises(ConfigError, match="expected a number of steps of at least 1, which need not be whole"):
         load("splat_7k", ["densify.every=0.5"])
-    assert load("splat_7k", ["densify.every=2.94"]).recipe.training.during[1].every == 2.94
+    assert load("splat_7k", ["densify.every=2.94"]).settings.training.during[1].every == 2.94
 
 
 @pytest.mark.parametrize("name", TRAINING)

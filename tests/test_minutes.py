@@ -14,7 +14,6 @@ import pytest
 import clsplat
 from clsplat.errors import ConfigError, Interrupted
 from clsplat.pipeline.loading import Pipeline, load
-from clsplat.pipeline.stretching import with_steps
 from clsplat.runs import minutes, single
 from clsplat.runs import rehearsal as rehearsals
 from clsplat.runs.minutes import pipeline_for
@@ -129,13 +128,31 @@ def short_rehearsals(monkeypatch):
 def test_a_run_in_minutes_has_the_bits_of_the_pipeline_that_it_writes(
     tiny_scene, tmp_path, monkeypatch, short_rehearsals
 ):
-    """The steps are corrected while it trains, wherever the clock stands; files of the rehearsal are gone."""
+    """The steps are corrected while it trains, wherever the clock stands, and not again where it is stopped later and
+    goes on; files of the rehearsal are gone."""
     monkeypatch.setattr(minutes, "most_steps", lambda *given: 60)
-    out = clsplat.run("smoke", tiny_scene, tmp_path / "run", minutes=0.05)
+
+    def stop(checked: Pipeline, run: Run, start: str, show: minutes.Show) -> None:
+        def shown(progress: Progress) -> None:
+            show(progress)
+            run.interrupted |= start == "resume" and progress.step >= progress.steps - 10
+
+        execute(checked, run, start, shown)
+
+    execute = single.runner.execute
+    monkeypatch.setattr(single.runner, "execute", stop)
+    out = tmp_path / "run"
+    with pytest.raises(Interrupted):
+        clsplat.run("smoke", tiny_scene, out, minutes=0.05)
+    monkeypatch.setattr(single.runner, "execute", execute)
     text = (out / "pipeline.yaml").read_text()
     steps, known = re.search(r"# --minutes 0.05: (.+) steps, of which ([\d,]+) had shown what one takes", text).groups()
     steps, known = (int(number.replace(",", "")) for number in (steps, known))
     assert known < steps == load(str(out / "pipeline.yaml")).settings.training.steps
+    clsplat.resume(out)
+    assert [line for line in (out / "pipeline.yaml").read_text().splitlines() if line[0] != "#"] == [
+        line for line in text.splitlines() if line[0] != "#"
+    ]
     assert "from here on the bits" not in (out / "log.txt").read_text()
     again = clsplat.run(out / "pipeline.yaml", out=tmp_path / "again")
     assert digest(out) == digest(again)
@@ -194,35 +211,6 @@ def test_a_training_is_not_cut_to_fewer_steps_than_keep_its_edits_apart():
     with pytest.raises(ConfigError, match=r"expected 1\.1 or more .* 340 steps fit"):
         pipeline_for(load("fast"), [rehearsal(200, 0.02)], seconds=11.0, minutes=1.0)
     assert pipeline_for(load("fast"), [rehearsal(200, 0.02)], seconds=12.0, minutes=1.0).settings.training.steps == 350
-
-
-@pytest.mark.slow
-def test_a_run_in_minutes_that_is_interrupted_later_ends_with_the_same_bits(
-    tiny_scene, tmp_path, monkeypatch, short_rehearsals
-):
-    """What was chosen stands in its pipeline alone: a run that goes on looks at no clock."""
-    monkeypatch.setattr(minutes, "most_steps", lambda *given: 60)
-    folders = [tmp_path / name for name in ("whole", "stopped")]
-    whole = clsplat.run("smoke", tiny_scene, folders[0], minutes=0.2)
-    chosen = (whole / "pipeline.yaml").read_text()
-    steps = load(str(whole / "pipeline.yaml")).settings.training.steps
-    monkeypatch.setattr(minutes, "with_steps", lambda settings, number, done: with_steps(settings, steps, done))
-
-    def stop(checked: Pipeline, run: Run, start: str, show: minutes.Show) -> None:
-        def shown(progress: Progress) -> None:
-            show(progress)
-            run.interrupted |= start == "resume" and progress.step >= steps - 10
-
-        execute(checked, run, start, shown)
-
-    execute = single.runner.execute
-    monkeypatch.setattr(single.runner, "execute", stop)
-    with pytest.raises(Interrupted):
-        clsplat.run("smoke", tiny_scene, folders[1], minutes=0.2)
-    monkeypatch.setattr(single.runner, "execute", execute)
-    assert chosen.splitlines()[2:] == (folders[1] / "pipeline.yaml").read_text().splitlines()[2:]
-    clsplat.resume(folders[1])
-    assert digest(folders[1]) == digest(whole)
 
 
 def test_what_cannot_be_fitted_is_refused(tiny_scene, tmp_path, few_steps):

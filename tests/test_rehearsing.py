@@ -10,6 +10,7 @@ from clsplat.pipeline.loading import load
 from clsplat.pipeline.stretching import in_steps
 from clsplat.runs import minutes, rehearsing
 from clsplat.runs import rehearsal as rehearsals
+from clsplat.runs.rehearsal import Rehearsal
 from clsplat.runs.rehearsing import Limit
 from clsplat.training.run import Progress
 
@@ -80,12 +81,17 @@ def test_a_rehearsal_whose_steps_are_ended_runs_the_other_stages_and_goes_on_as_
     tiny_scene, tmp_path, monkeypatch
 ):
     """It is not known when its growth ends: the number is corrected twice.  Edits that did not come are counted."""
-    found = []
+    found: list[Rehearsal] = []
+
+    def stop(rehearsals: list[Rehearsal], seconds: float) -> int:
+        found.extend(rehearsals)
+        raise ConfigError("seen")
+
     monkeypatch.setattr(rehearsing, "LONGEST", 0.0)
     monkeypatch.setattr(minutes, "FIRST", 10)
-    monkeypatch.setattr(minutes, "SHARE", 1e-9)
-    monkeypatch.setattr(minutes, "most_steps", lambda rehearsals, seconds: found.extend(rehearsals) or 50)
-    clsplat.run("smoke", tiny_scene, tmp_path / "run", minutes=1.0)
+    monkeypatch.setattr(minutes, "most_steps", stop)
+    with pytest.raises(ConfigError, match="seen"):
+        clsplat.run("smoke", tiny_scene, tmp_path / "run", minutes=1.0)
     (rehearsal,) = found
     assert (rehearsal.steps, len(rehearsal.course), rehearsal.growth) == (10, 10, 1.0)
     assert len({*rehearsal.course[2:]}) == 1

@@ -108,7 +108,7 @@ def fewest_steps(training: Training) -> int:
         for step in places(stage.every, stage.start, min(stage.stop or MOST, training.steps))
     }
     if isinstance(training, Optimize):
-        found |= set(training.views.changes)
+        found |= {int(step) for step in training.views.changes}
     found |= {rule.start for stage in training.during if isinstance(stage, Densify) for rule in stage.rules}
     apart = min((later - step for step, later in pairwise(sorted(found - {0}))), default=training.steps)
     return -(-training.steps // apart)
