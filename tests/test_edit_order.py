@@ -35,7 +35,7 @@ def known(name: str) -> tuple[PipelineFile, list[tuple[int, int]]]:
 
 
 @pytest.mark.parametrize("name", TRAINING)
-@settings(max_examples=6)
+@settings(max_examples=3)
 @given(data=st.data())
 def test_edits_keep_their_order_and_stay_apart_in_any_number_of_steps(name, data):
     """As many of each kind, in the same order; those at one step stay at one, no others come to be."""
@@ -48,7 +48,7 @@ def test_edits_keep_their_order_and_stay_apart_in_any_number_of_steps(name, data
 
 
 @pytest.mark.parametrize("name", ["fast", "splat", "dash", "mini", "smoke"])
-@settings(max_examples=5)
+@settings(max_examples=3)
 @given(data=st.data())
 def test_in_fewer_steps_edits_fall_together_but_none_before_another(name, data):
     recipe, old = known(name)
@@ -86,7 +86,7 @@ def test_a_cadence_below_a_step_is_refused():
 
 
 @pytest.mark.parametrize("name", TRAINING)
-@settings(max_examples=5)
+@settings(max_examples=3)
 @given(data=st.data())
 def test_a_number_of_steps_that_is_corrected_leaves_all_up_to_the_last_edit_as_it_is(name, data):
     """Whatever begins behind the last edit, such as an average, still does."""
