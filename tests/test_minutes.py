@@ -207,10 +207,11 @@ def test_a_rehearsal_leaves_no_trace_in_the_run(tiny_scene, tmp_path, monkeypatc
 
 
 def test_a_training_is_not_cut_to_fewer_steps_than_keep_its_edits_apart():
-    """The 340 of fast take 5 + 6.8 s, which 11 s are too few for."""
-    with pytest.raises(ConfigError, match=r"expected 1\.1 or more .* 340 steps fit"):
-        pipeline_for(load("fast"), [rehearsal(200, 0.02)], seconds=11.0, minutes=1.0)
-    assert pipeline_for(load("fast"), [rehearsal(200, 0.02)], seconds=12.0, minutes=1.0).settings.training.steps == 350
+    """The 300 of splat take 5 + 6 s."""
+    found = [rehearsal(200, 0.02)]
+    with pytest.raises(ConfigError, match=r"expected 1\.1 or more .* 300 steps fit"):
+        pipeline_for(load("splat"), found, seconds=10.9, minutes=1.0)
+    assert pipeline_for(load("splat"), found, seconds=12.0, minutes=1.0).settings.training.steps == 350
 
 
 def test_what_cannot_be_fitted_is_refused(tiny_scene, tmp_path, few_steps):
