@@ -66,7 +66,8 @@ static inline void grid_of_row(
     const uint above = min((uint)place, ny - 1), below = min(above + 1, ny - 1);
     const float share = place - (float)above;
     for (uint e = get_local_id(0); e < ENTRIES * nz * nx; e += TEAM) {
-        __global const float *column = grid + e / nx * ny * nx + e % nx;
+        const uint level = e / nx;
+        __global const float *column = grid + level * (ny - 1) * nx + e;
         found[e] = (1.0f - share) * column[above * nx] + share * column[below * nx];
     }
     barrier(CLK_LOCAL_MEM_FENCE);
@@ -233,10 +234,10 @@ void colour_grid_gather(
     const uint rows,                          // H'
     const uint count)                         // ENTRIES * nz * ny * nx
 {
-    const uint e = get_global_id(0), j = e / nx % ny;
+    const uint e = get_global_id(0), line = e / nx, level = line / ny, i = e - line * nx, j = line - level * ny;
     if (e >= count)
         return;
-    __global const float *sums = row_sums + (e / nx / ny * nx + e % nx) * rows;
+    __global const float *sums = row_sums + (level * nx + i) * rows;
     float total = 0.0f;
     for (uint y = begin_of_node(j, ny, height); y < min(end_of_node(j, ny, height), height); y++) {
         const float weight = 1.0f - fabs(((float)y + 0.5f) * per_row - (float)j);
