@@ -75,8 +75,8 @@ class TrainField(Training):
         return self
 
     def check_in(self, run: Run) -> None:
-        """Before a field is made, raise ConfigError for a grid that the scene does not touch, and MemoryLimitError for a field
-        that does not fit."""
+        """Raise ConfigError for a grid that the scene does not touch, and MemoryLimitError for a field that does not fit,
+        before it is made."""
         require_seen(self.field, run.scene)
         views = run.scene.split("train")
         held = min(run.photographs.budget, sum(4 * view.camera.width * view.camera.height for view in views))
