@@ -75,7 +75,7 @@ class TrainField(Training):
         return self
 
     def check_in(self, run: Run) -> None:
-        """Raise ConfigError for a grid that the scene does not touch, and MemoryLimitError for a field that does not fit,
+        """Raise ConfigError for a grid that the scene does not touch, MemoryLimitError for a field that does not fit,
         before it is made."""
         require_seen(self.field, run.scene)
         views = run.scene.split("train")
