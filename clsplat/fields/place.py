@@ -19,9 +19,9 @@ UNIT = np.array(list(itertools.product((0.0, 1.0), repeat=3)))  # the corners of
 def require_seen(shape: FieldShape, scene: Scene) -> None:
     """Raise ConfigError for a cube that no training view sees between near and far, or that holds no point of a scene
     with points."""
-    if shape.grid is None:
-        return
     cube, views, points = shape.grid, scene.split("train"), scene.points
+    if cube is None or not views:
+        return
     corner, side = np.array(cube.corner), cube.side
     if not any(_meet(corner + side * UNIT, _corners(view, shape.near, shape.far)) for view in views):
         fault = f"no training view sees it at depths from {shape.near:g} to {shape.far:g}"
