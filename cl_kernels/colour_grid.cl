@@ -73,22 +73,27 @@ static inline void grid_of_row(
     barrier(CLK_LOCAL_MEM_FENCE);
 }
 
-/* The matrices of LANES pixels from x on, `a`, and their derivatives by the level, `slopes`: of the grid of their row. */
+/* The matrices of LANES pixels from x on, `a`, by the grid of their row, and their derivatives by the level, `slopes`,
+ * which may be 0 where a call does not ask for them. */
 static inline void matrices_of(
     __local const float *grid, const uint nx, const uint nz, const uint x, const float per_column, const VF level, VF *a,
     VF *slopes)
 {
     const VF place = places_of(x, per_column);
     const uint last = min((uint)(((float)(x + LANES) - 0.5f) * per_column) + 1, nx - 1);
-    for (uint n = 0; n < ENTRIES; n++)
-        a[n] = slopes[n] = (VF)(0.0f);
+    for (uint n = 0; n < ENTRIES; n++) {
+        a[n] = (VF)(0.0f);
+        if (slopes)
+            slopes[n] = (VF)(0.0f);
+    }
     for (uint i = (uint)(((float)x + 0.5f) * per_column); i <= last; i++)
         for (uint k = 0; k < nz; k++) {
             const VF near = hat(place - (float)i);
             const VF weight = near * hat(level - (float)k), slope = near * hat_slope(level - (float)k);
             for (uint n = 0; n < ENTRIES; n++) {
                 a[n] += weight * grid[(n * nz + k) * nx + i];
-                slopes[n] += slope * grid[(n * nz + k) * nx + i];
+                if (slopes)
+                    slopes[n] += slope * grid[(n * nz + k) * nx + i];
             }
         }
 }
@@ -118,8 +123,8 @@ void colour_grid_forward(
         const uint at = y * stride + x;
         const VF r = VLOAD(image + at), g = VLOAD(image + plane + at), b = VLOAD(image + 2 * plane + at);
         const VF inside = inside_row(x, columns), level = level_of(luminance_of(r, g, b), nz), one = (VF)(1.0f);
-        VF a[ENTRIES], slopes[ENTRIES];
-        matrices_of(grid, nx, nz, x, per_column, level, a, slopes);
+        VF a[ENTRIES];
+        matrices_of(grid, nx, nz, x, per_column, level, a, 0);
         VSTORE(inside * smaller(r + (a[0] * r + a[1] * g + a[2] * b + a[3]), one), coloured + at);
         VSTORE(inside * smaller(g + (a[4] * r + a[5] * g + a[6] * b + a[7]), one), coloured + plane + at);
         VSTORE(inside * smaller(b + (a[8] * r + a[9] * g + a[10] * b + a[11]), one), coloured + 2 * plane + at);
