@@ -116,7 +116,10 @@ def test_a_field_that_does_not_fit_is_refused_before_it_is_made(tiny_scene, pipe
 def test_a_cube_that_no_photograph_shows_is_refused_before_a_field_is_made(tiny_scene, pipeline):
     scene = clsplat.read_scene(tiny_scene)
     for changes, fault in (
-        (["corner=[50, 50, 50]"], r"from \(50, 50, 50\) to \(54, 54, 54\), scene units, and no training view sees it"),
+        (
+            ["corner=[50, 50, 50]"],
+            r"from \(50, 50, 50\) to \(54, 54, 54\), scene units, and no training view sees it at depths from 0.5 to 9",
+        ),
         (["corner=[1.5, 1.5, 1.5]", "side=0.1"], r"none of the scene's [\d,]+ points lies in it"),
     ):
         stage = load(pipeline, [f"train_field.field.grid.{change}" for change in changes]).stages[0]

@@ -63,4 +63,4 @@ def _meet(cube: Floats, frustum: Floats) -> bool:
 
 
 def _told(point: Floats) -> str:
-    return f"({', '.join(f'{value:.4g}' for value in point)})"
+    return f"({', '.join(f'{round(float(value), 6) + 0.0:.4g}' for value in point)})"
