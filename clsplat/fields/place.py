@@ -62,5 +62,5 @@ def _meet(cube: Floats, frustum: Floats) -> bool:
     return not bool(apart.any())
 
 
-def _told(point: Floats) -> str:
+def _told(point: NDArray[np.floating]) -> str:
     return f"({', '.join(f'{round(float(value), 6) + 0.0:.4g}' for value in point)})"
