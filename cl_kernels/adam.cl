@@ -31,7 +31,8 @@ void adam_step(
     if (!ANY(updated))
         return;
     const uint at = get_global_id(1) * stride + i;
-    adam_update(values + at, moment1 + at, moment2 + at, VLOAD(gradient + at), updated, rate, correction2);
+    adam_update(values + at, moment1 + at, moment2 + at, VLOAD(gradient + at), updated, rate, correction2,
+                EPSILON);
 }
 
 /* Update one plane of a block.  first, gradient, g, updated: [VECTORS]. */
@@ -41,7 +42,7 @@ static inline void update_plane(__global float *values, __global float *moment1,
 {
     for (uint v = 0; v < vectors; v++)
         adam_update(values + first[v], moment1 + first[v], moment2 + first[v],
-                    g[v].touched ? gradient[v] : (VF)(0.0f), updated[v], rate, correction2);
+                    g[v].touched ? gradient[v] : (VF)(0.0f), updated[v], rate, correction2, EPSILON);
 }
 
 /* Update plane `plane` of a table, with the member `member` of the block's gradients. */

@@ -7,19 +7,20 @@
 
 #define BETA1 0.9f
 #define BETA2 0.999f
-#define EPSILON 1.0e-15f
+#define EPSILON 1.0e-15f  // of 3DGS
+#define ALL_LANES ((VI)(-1))
 
 /* One update of LANES values; those that are not `updated` keep their bits.  rate: learning rate / (1 - BETA1^t);
- * correction2: 1 / (1 - BETA2^t). */
+ * correction2: 1 / (1 - BETA2^t); epsilon: added to the root. */
 static inline void adam_update(__global float *values, __global float *moment1, __global float *moment2, const VF g,
-                               const VI updated, const float rate, const float correction2)
+                               const VI updated, const float rate, const float correction2, const float epsilon)
 {
     const VF value = VLOAD(values), m_before = VLOAD(moment1), v_before = VLOAD(moment2);
     const VF m = BETA1 * m_before + (1.0f - BETA1) * g;
     const VF v = BETA2 * v_before + (1.0f - BETA2) * (g * g);
     VSTORE((updated ? m : m_before), moment1);
     VSTORE((updated ? v : v_before), moment2);
-    VSTORE((updated ? value - rate * m / (sqrt(v * correction2) + EPSILON) : value), values);
+    VSTORE((updated ? value - rate * m / (sqrt(v * correction2) + epsilon) : value), values);
 }
 
 #endif

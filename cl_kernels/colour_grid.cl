@@ -66,10 +66,36 @@ static inline void grid_of_row(
     const uint above = min((uint)place, ny - 1), below = min(above + 1, ny - 1);
     const float share = place - (float)above;
     for (uint e = get_local_id(0); e < ENTRIES * nz * nx; e += TEAM) {
-        __global const float *column = grid + e / nx * ny * nx + e % nx;
+        const uint level = e / nx;
+        __global const float *column = grid + level * (ny - 1) * nx + e;
         found[e] = (1.0f - share) * column[above * nx] + share * column[below * nx];
     }
     barrier(CLK_LOCAL_MEM_FENCE);
+}
+
+/* The matrices of LANES pixels from x on, `a`, by the grid of their row, and their derivatives by the level, `slopes`,
+ * which may be 0 where a call does not ask for them. */
+static inline void matrices_of(
+    __local const float *grid, const uint nx, const uint nz, const uint x, const float per_column, const VF level, VF *a,
+    VF *slopes)
+{
+    const VF place = places_of(x, per_column);
+    const uint last = min((uint)(((float)(x + LANES) - 0.5f) * per_column) + 1, nx - 1);
+    for (uint n = 0; n < ENTRIES; n++) {
+        a[n] = (VF)(0.0f);
+        if (slopes)
+            slopes[n] = (VF)(0.0f);
+    }
+    for (uint i = (uint)(((float)x + 0.5f) * per_column); i <= last; i++)
+        for (uint k = 0; k < nz; k++) {
+            const VF near = hat(place - (float)i);
+            const VF weight = near * hat(level - (float)k), slope = near * hat_slope(level - (float)k);
+            for (uint n = 0; n < ENTRIES; n++) {
+                a[n] += weight * grid[(n * nz + k) * nx + i];
+                if (slopes)
+                    slopes[n] += slope * grid[(n * nz + k) * nx + i];
+            }
+        }
 }
 
 /* Change the colours.  One group of TEAM items = one row.  Local memory: ENTRIES * MOST_NODES^2 * 4 bytes. */
@@ -96,18 +122,9 @@ void colour_grid_forward(
     for (uint x = get_local_id(0) * LANES; x < stride; x += TEAM * LANES) {
         const uint at = y * stride + x;
         const VF r = VLOAD(image + at), g = VLOAD(image + plane + at), b = VLOAD(image + 2 * plane + at);
-        const VF inside = inside_row(x, columns), place = places_of(x, per_column);
-        const VF level = level_of(luminance_of(r, g, b), nz), one = (VF)(1.0f);
-        const uint last = min((uint)(((float)(x + LANES) - 0.5f) * per_column) + 1, nx - 1);
+        const VF inside = inside_row(x, columns), level = level_of(luminance_of(r, g, b), nz), one = (VF)(1.0f);
         VF a[ENTRIES];
-        for (uint n = 0; n < ENTRIES; n++)
-            a[n] = (VF)(0.0f);
-        for (uint i = (uint)(((float)x + 0.5f) * per_column); i <= last; i++)
-            for (uint k = 0; k < nz; k++) {
-                const VF weight = hat(place - (float)i) * hat(level - (float)k);
-                for (uint n = 0; n < ENTRIES; n++)
-                    a[n] += weight * grid[(n * nz + k) * nx + i];
-            }
+        matrices_of(grid, nx, nz, x, per_column, level, a, 0);
         VSTORE(inside * smaller(r + (a[0] * r + a[1] * g + a[2] * b + a[3]), one), coloured + at);
         VSTORE(inside * smaller(g + (a[4] * r + a[5] * g + a[6] * b + a[7]), one), coloured + plane + at);
         VSTORE(inside * smaller(b + (a[8] * r + a[9] * g + a[10] * b + a[11]), one), coloured + 2 * plane + at);
@@ -143,21 +160,10 @@ void colour_grid_backward(
     for (uint x = get_local_id(0) * LANES; x < stride; x += TEAM * LANES) {
         const uint at = y * stride + x;
         const VF r = VLOAD(image + at), g = VLOAD(image + plane + at), b = VLOAD(image + 2 * plane + at);
-        const VF inside = inside_row(x, columns), place = places_of(x, per_column), zero = (VF)(0.0f);
+        const VF inside = inside_row(x, columns), zero = (VF)(0.0f);
         const VF luminance = luminance_of(r, g, b), level = level_of(luminance, nz);
-        const uint last = min((uint)(((float)(x + LANES) - 0.5f) * per_column) + 1, nx - 1);
-        VF a[ENTRIES], s[ENTRIES];  // the matrix, and its derivative by the level
-        for (uint n = 0; n < ENTRIES; n++)
-            a[n] = s[n] = zero;
-        for (uint i = (uint)(((float)x + 0.5f) * per_column); i <= last; i++)
-            for (uint k = 0; k < nz; k++) {
-                const VF near = hat(place - (float)i);
-                const VF weight = near * hat(level - (float)k), slope = near * hat_slope(level - (float)k);
-                for (uint n = 0; n < ENTRIES; n++) {
-                    a[n] += weight * grid[(n * nz + k) * nx + i];
-                    s[n] += slope * grid[(n * nz + k) * nx + i];
-                }
-            }
+        VF a[ENTRIES], s[ENTRIES];
+        matrices_of(grid, nx, nz, x, per_column, level, a, s);
         VF p[3], by_level = zero;
         for (uint c = 0; c < 3; c++) {
             const VF own = c == 0 ? r : c == 1 ? g : b;
@@ -233,10 +239,10 @@ void colour_grid_gather(
     const uint rows,                          // H'
     const uint count)                         // ENTRIES * nz * ny * nx
 {
-    const uint e = get_global_id(0), j = e / nx % ny;
+    const uint e = get_global_id(0), line = e / nx, level = line / ny, i = e - line * nx, j = line - level * ny;
     if (e >= count)
         return;
-    __global const float *sums = row_sums + (e / nx / ny * nx + e % nx) * rows;
+    __global const float *sums = row_sums + (level * nx + i) * rows;
     float total = 0.0f;
     for (uint y = begin_of_node(j, ny, height); y < min(end_of_node(j, ny, height), height); y++) {
         const float weight = 1.0f - fabs(((float)y + 0.5f) * per_row - (float)j);

@@ -1,7 +1,10 @@
 /* The grids of all photographs (colour_grid.cl): how smooth one is, its update, and their mean.
  *
  * Smoothness of a grid: for each axis the mean of the squared differences of neighbouring nodes, times a weight (the
- * total variation of Wang et al. 2024).  Adam as in adam.h.  A grid is [ENTRIES,nz,ny,nx].  Deterministic. */
+ * total variation of Wang et al. 2024).  A grid is [ENTRIES,nz,ny,nx], which is not always a multiple of a vector: an
+ * item has one value.  Deterministic. */
+#undef LANES
+#define LANES 1
 #include "adam.h"
 #include "colour_grid.h"
 #include "planes.h"
@@ -56,12 +59,8 @@ void colour_grid_update(
     const uint e = get_global_id(0), at = first + e;
     if (e >= count)
         return;
-    const float g = by_grid[e] + by_smoothness[e];
-    const float m = BETA1 * moment1[at] + (1.0f - BETA1) * g;
-    const float v = BETA2 * moment2[at] + (1.0f - BETA2) * (g * g);
-    moment1[at] = m;
-    moment2[at] = v;
-    values[at] -= rate * m / (sqrt(v * correction2) + EPSILON);
+    adam_update(values + at, moment1 + at, moment2 + at, by_grid[e] + by_smoothness[e], ALL_LANES, rate, correction2,
+                EPSILON);
 }
 
 /* Subtract from each entry at each level of luminance its mean over the photographs and the places: a colour that all

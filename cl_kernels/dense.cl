@@ -159,7 +159,7 @@ void dense_sums(
     VSTORE(sum, gradient + i);
 }
 
-/* Adam (Kingma and Ba 2015).  One item = LANES parameters. */
+/* One update by Adam.  One item = LANES parameters. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void dense_update(
     __global float *restrict parameters,      // [P]
@@ -174,10 +174,5 @@ void dense_update(
     const uint i = get_global_id(0) * LANES;
     if (i >= count)
         return;
-    const VF g = VLOAD(gradient + i);
-    const VF m = BETA1 * VLOAD(moment1 + i) + (1.0f - BETA1) * g;
-    const VF v = BETA2 * VLOAD(moment2 + i) + (1.0f - BETA2) * (g * g);
-    VSTORE(m, moment1 + i);
-    VSTORE(v, moment2 + i);
-    VSTORE(VLOAD(parameters + i) - rate * m / (sqrt(v * correction2) + epsilon), parameters + i);
+    adam_update(parameters + i, moment1 + i, moment2 + i, VLOAD(gradient + i), ALL_LANES, rate, correction2, epsilon);
 }

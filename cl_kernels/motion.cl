@@ -188,7 +188,7 @@ void motion_step(
     if (!ANY(updated))
         return;
     const uint at = (first + get_global_id(1)) * stride + i;
-    adam_update(motion + at, moment1 + at, moment2 + at, VLOAD(gradient + at), updated, rate, correction2);
+    adam_update(motion + at, moment1 + at, moment2 + at, VLOAD(gradient + at), updated, rate, correction2, EPSILON);
     const VF value = VLOAD(motion + at);
     VSTORE((updated ? smaller(larger(value, (VF)(lowest)), (VF)(highest)) : value), motion + at);
 }

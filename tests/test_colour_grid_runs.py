@@ -22,7 +22,7 @@ from clsplat.render.workspace import Workspace
 from clsplat.runs.model_file import evaluate
 from clsplat.runs.summary import summary
 from clsplat.schedule import Decay, at_step
-from clsplat.training import checkpoint, colour_grids, memory
+from clsplat.training import archive, checkpoint, colour_grids, memory
 from clsplat.training.colours import colours_beside, photograph_colours
 from clsplat.training.run import Run
 from clsplat.views.colours import Auto, Gain, Grid
@@ -243,6 +243,17 @@ def test_damaged_tables_are_refused():
     ):
         with pytest.raises(DataError, match=r"of its grids|other grids"):
             colour_grids.check_tables(damaged)
+
+
+@pytest.mark.slow
+def test_a_checkpoint_that_lost_its_grids_is_refused(with_grids, tmp_path):
+    notes, tables = archive.read(with_grids / "checkpoints" / "step_000012.npz")
+    left = {name: table for name, table in tables.items() if not name.startswith(colour_grids.FOLDER)}
+    assert len(left) == len(tables) - 3
+    with (tmp_path / "step_000012.npz").open("wb") as file:
+        archive.write(file, notes, left.items())
+    with pytest.raises(DataError, match="it lacks the grids of the colours of 8 photographs"):
+        checkpoint.load(tmp_path / "step_000012.npz")
 
 
 @pytest.mark.slow

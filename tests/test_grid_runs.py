@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import clsplat
-from clsplat.errors import DataError, MemoryLimitError
+from clsplat.errors import ConfigError, DataError, MemoryLimitError
 from clsplat.fields.shape import FieldShape
 from clsplat.pipeline.loading import load
 from clsplat.stages.train_field import TrainField
@@ -68,6 +68,18 @@ def test_a_file_whose_grid_has_another_shape_is_refused(finished, tmp_path):
         clsplat.load_field(tmp_path / "field.npz")
 
 
+@pytest.mark.parametrize("missing", ["grid.side", "grid.levels", "width"])
+def test_a_file_without_a_key_of_its_shape_is_refused(finished, tmp_path, missing):
+    """Defaults may change."""
+    notes, arrays = archive.read(finished / "field.npz")
+    own, _, key = missing.rpartition(".")
+    del (notes["shape"][own] if own else notes["shape"])[key]
+    with (tmp_path / "field.npz").open("wb") as file:
+        archive.write(file, notes, arrays.items())
+    with pytest.raises(DataError, match=rf"it lacks {missing}; expected a file of the stage export_field"):
+        clsplat.load_field(tmp_path / "field.npz")
+
+
 def test_fields_without_a_grid_write_the_keys_that_they_had(tiny_scene, tmp_path):
     plain = tmp_path / "plain.yaml"
     plain.write_text(PIPELINE.partition("  - evaluate: {split: test, downscales")[0] + "  - export_field\n")
@@ -99,6 +111,20 @@ def test_a_field_that_does_not_fit_is_refused_before_it_is_made(tiny_scene, pipe
     with pytest.raises(MemoryLimitError, match=r"4 tables of 1,024 MiB.*take fewer levels or entries of the grid"):
         load(pipeline, changes).stages[0].check_in(run)
     load(pipeline).stages[0].check_in(run)
+
+
+def test_a_cube_that_no_photograph_shows_is_refused_before_a_field_is_made(tiny_scene, pipeline):
+    scene = clsplat.read_scene(tiny_scene)
+    for changes, fault in (
+        (
+            ["corner=[50, 50, 50]"],
+            r"from \(50, 50, 50\) to \(54, 54, 54\), scene units, and no training view sees it at depths from 0.5 to 9",
+        ),
+        (["corner=[1.5, 1.5, 1.5]", "side=0.1"], r"none of the scene's [\d,]+ points lies in it"),
+    ):
+        stage = load(pipeline, [f"train_field.field.grid.{change}" for change in changes]).stages[0]
+        with pytest.raises(ConfigError, match=rf"{fault} \(.*tiny\); expected one about .*: set `corner` and `side`"):
+            stage.check_in(SimpleNamespace(scene=scene))
 
 
 def test_the_plan_of_a_field_is_near_what_it_takes(finished):

@@ -1,5 +1,8 @@
 """Models that move: their file, a moment of them, and what refuses to lose the motion."""
 
+import errno
+import itertools
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -7,11 +10,12 @@ import numpy as np
 import pytest
 
 import clsplat
-from clsplat.errors import ConfigError, DataError
+from clsplat.errors import ConfigError, DataError, OutputError
 from clsplat.formats.motion import MOTION, STILL, WIDTHS, columns_of, width_of
 from clsplat.gaussians.merging import merged
 from clsplat.gaussians.model import Model, load
 from clsplat.gaussians.motion import presence, still
+from clsplat.gaussians.sky import Sky
 
 
 def moving_model(width: int = 5, count: int = 40) -> Model:
@@ -133,6 +137,29 @@ def test_a_series_is_whole_or_not_there(tmp_path):
     with pytest.raises(DataError, match="nothing was written"):
         clsplat.convert(tmp_path / "brief.ply", tmp_path / "frame.spz", frames=3)
     assert not [path for path in tmp_path.rglob("*") if path.is_file() and path.name != "brief.ply"]
+
+
+@pytest.mark.parametrize("before", [False, True])
+def test_a_disk_that_fills_leaves_no_part_of_a_series(before, tmp_path, monkeypatch):
+    model, out = moving_model(), tmp_path / "frames"
+    replace(model, sky=Sky(np.full((64, 3), 0.5, np.float32))).save(tmp_path / "moving.ply")
+    if before:
+        model.save(tmp_path / "other.ply")
+        clsplat.convert(tmp_path / "other.ply", out, frames=4)
+    had = {path: path.read_bytes() for path in out.rglob("*")}
+    real, calls = os.fsync, itertools.count()
+    monkeypatch.setattr(os, "fsync", lambda number: real(number) if next(calls) < 9 else full())
+    with pytest.raises(OutputError, match=r"frames/\d{4}.*: cannot be written \(No space left on device\)"):
+        clsplat.convert(tmp_path / "moving.ply", out, frames=4)
+    assert {path: path.read_bytes() for path in out.rglob("*")} == had
+    assert out.exists() == before
+    monkeypatch.undo()
+    assert len(clsplat.convert(tmp_path / "moving.ply", out, frames=4)["files"]) == 4
+    assert sorted(path.name for path in out.iterdir())[:3] == ["0000.ply", "0000_sky.json", "0001.ply"]
+
+
+def full() -> None:
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 def test_speeds_beyond_what_a_file_holds_are_refused_and_dropped(tmp_path):

@@ -103,7 +103,7 @@ FAULTS = {  # kernel -> file, text, wrong text
     "dense_weights": ("dense.cl", "? tiles - first : CHUNK", "? tiles - first : CHUNK - 1"),
     "dense_biases": ("dense.cl", "sum += VLOAD(by_outputs", "sum = VLOAD(by_outputs"),
     "dense_sums": ("dense.cl", "sum += VLOAD(partials", "sum = VLOAD(partials"),
-    "dense_update": ("dense.cl", "+ epsilon)", "+ 1.0e-15f)"),
+    "dense_update": ("dense.cl", "correction2, epsilon)", "correction2, 1.0e-15f)"),
     "grid_places": ("grid.cl", "+ 2.0f * f.across)", "+ f.across)"),
     "grid_forward": ("grid.cl", "(down ? dy : 1.0f - dy)", "(down ? dy : 1.0f - dx)"),
     "grid_backward": ("grid.cl", "own.z == 0.0f && own.w == 0.0f))", "own.z == 0.0f || own.w > 0.0f))"),

@@ -106,14 +106,13 @@ def test_a_camera_with_one_moment_takes_no_place_of_others_and_no_memory(rng, st
 
 def test_moments_that_no_view_in_training_has_are_measured_apart():
     views = [moment(f"{i}", time) for i, time in enumerate((0, 0.5, 1))]
-    results = [ViewMetrics(view.name, 20.0 + i, 0.9) for i, view in enumerate(views)]
-    found = mean(by_moment(results, views, [views[0], views[2]]))
+    psnr = {view.name: 20.0 + i for i, view in enumerate(views)}
+    moments = by_moment(psnr, views, [views[0], views[2]])
+    assert moments == {"0": {OTHERS: 20.0}, "1": {HELD_OUT: 21.0}, "2": {OTHERS: 22.0}}
+    found = mean([ViewMetrics(name, value, 0.9, moments=moments[name]) for name, value in psnr.items()])
     assert (found["psnr"], found[HELD_OUT], found[OTHERS]) == (21, 21, 21)
-    assert [result.moments for result in by_moment(results, views, [views[0], views[2]])] == [
-        {OTHERS: 20.0}, {HELD_OUT: 21.0}, {OTHERS: 22.0},
-    ]  # fmt: skip
-    for trained in (views, [moment("x", 0.2)], [moment("y", None)]):
-        assert not {HELD_OUT, OTHERS} & set(mean(by_moment(results, views, trained)))
+    for trained in (views, [moment("x", 0.2)], [moment("y", None)], []):
+        assert not by_moment(psnr, views, trained)
 
 
 def test_means_are_over_the_views_that_have_a_figure():

@@ -16,7 +16,6 @@ from clsplat.errors import ClsplatError, ConfigError, DataError, Interrupted, Ou
 from clsplat.gaussians.model import Model
 from clsplat.losses.base import ViewLosses
 from clsplat.losses.host import HostFunction, HostLoss
-from clsplat.metrics.held_out import by_moment
 from clsplat.metrics.views import mean, measure
 from clsplat.names import CHECKSUMS, END_STATES
 from clsplat.opencl.device import Device
@@ -206,7 +205,7 @@ class Trainer:
         views = run.scene.downscaled(run.downscale).split(split)
         if not views:
             return {"views": 0}
-        return mean(by_moment(measure(run.painter(), views, run.photographs.fresh()), views, run.scene.split("train")))
+        return mean(measure(run.painter(), views, run.photographs.fresh(), trained=run.scene.split("train")))
 
     def checkpoint(self) -> Path:
         """Save all that training needs to go on to the same bits, but for losses that were added; return the file.

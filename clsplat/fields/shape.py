@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
+from pydantic import BeforeValidator, Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from clsplat.fields.grid import FARTHEST, FEATURES, FIRST_MOST, GridShape
 from clsplat.opencl.program import constants
@@ -169,3 +169,19 @@ class FieldShape(Settings):
             biases = parameters[layer.first_bias : layer.first_bias + layer.outputs]
             found.append((own.astype(np.float64), biases.astype(np.float64)))
         return found
+
+
+def _with_all_keys(value: Any) -> Any:
+    """A shape as a file has it.  Raises ValueError where a key is missing: defaults may be others than when it was
+    written.  One without a grid has no such key."""
+    written = value if isinstance(value, dict) else {}
+    grid = written.get("grid")
+    missing = [name for name in FieldShape.model_fields if written and name not in {*written, "grid"}]
+    if isinstance(grid, dict):
+        missing += [f"grid.{name}" for name in GridShape.model_fields if name not in grid]
+    if missing:
+        raise ValueError(f"expected the keys of the field that was trained; it lacks {', '.join(missing)}")
+    return value
+
+
+WrittenShape = Annotated[FieldShape, BeforeValidator(_with_all_keys)]  # in a file

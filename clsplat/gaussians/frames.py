@@ -2,16 +2,19 @@
 
 import os
 import re
-from collections.abc import Sequence
+import shutil
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from clsplat.errors import ConfigError, DataError
-from clsplat.files import told_as
+from clsplat.files import is_there, scratch_folder, told_as
 from clsplat.formats.motion import EXPECTED, is_moment
 from clsplat.formats.table import for_writing, named
 from clsplat.gaussians.conversion import Changes, Options, check_place, read, written
+from clsplat.gaussians.sky import sky_file
 
 MOST = 10_000  # files
 
@@ -51,8 +54,9 @@ def convert_frames(
         except DataError as error:
             raise DataError(f"--frames {frames}: the moment {moment.time:g}: {error}; nothing was written") from error
     done: list[dict[str, Any]] = []
-    for place, moment in zip(places, moments, strict=True):
-        done.append(written(sources, moment.of(model), place, replace(writing, quiet=bool(done))))
+    with _all_or_as_before([*places, *map(sky_file, places)]):
+        for place, moment in zip(places, moments, strict=True):
+            done.append(written(sources, moment.of(model), place, replace(writing, quiet=bool(done))))
     return {
         **done[0],
         "file": str(out),
@@ -60,6 +64,42 @@ def convert_frames(
         "gaussians": max(one["gaussians"] for one in done),
         "bytes": sum(one["bytes"] for one in done),
     }
+
+
+@contextmanager
+def _all_or_as_before(places: Sequence[Path]) -> Iterator[None]:
+    """Where the block fails, as on a disk that fills, give places in one folder what they had; a new folder goes.
+
+    Raises OutputError.
+    """
+    folder = places[0].parent
+    was_there = is_there(folder)
+    try:
+        with scratch_folder(folder / "series") as kept, told_as(folder):
+            before = [place for place in places if place.is_file()]
+            for place in before:
+                _keep(place, kept / place.name)
+            try:
+                yield
+            except BaseException:
+                for place in places:
+                    if place in before:
+                        os.replace(kept / place.name, place)
+                    elif place.is_file():
+                        place.unlink()
+                raise
+    finally:
+        if not was_there:
+            with suppress(OSError):  # it is not empty
+                folder.rmdir()
+
+
+def _keep(place: Path, other: Path) -> None:
+    """Give a file, which is replaced and not changed, another name; where a disk has no links, copy it."""
+    try:
+        os.link(place, other)
+    except OSError:
+        shutil.copy2(place, other)
 
 
 def _require_no_others(folder: Path, names: re.Pattern[str], places: Sequence[Path]) -> None:

@@ -12,6 +12,7 @@ from clsplat.errors import DataError, NumericError
 from clsplat.losses.base import Comparison
 from clsplat.losses.image import ssim_maps
 from clsplat.metrics.colours import colour_figures
+from clsplat.metrics.held_out import by_moment
 from clsplat.metrics.images import psnr, ssim, to_8_bits
 from clsplat.metrics.perceptual import Image, Perceptual
 from clsplat.metrics.stillness import Stillness, means
@@ -89,12 +90,13 @@ def measure(
     finite: bool = False,
     colours: OwnColours | None = None,
     counted: Iterable[View] | None = None,
+    trained: Sequence[View] = (),
 ) -> list[ViewMetrics]:
     """Return the metrics of every view.
 
     Masked pixels are black in both images; PSNR and SSIM are means over the other pixels.
     colours: the photographs' in training, for figures in their colours beside PSNR; counted: the views, of somebody who
-    counts them.
+    counts them; trained: the views that were trained on, for the figures of moments of a scene that moves.
     With `finite`, NumericError is raised for a picture that is not finite, which counts as black otherwise.
     """
     results, stillness = list[ViewMetrics](), Stillness(views)
@@ -117,8 +119,11 @@ def measure(
             similarity = ssim(rendered, image, mask)
         more = perceptual.measure(rendered, image)
         results.append(ViewMetrics(view.name, psnr(rendered, image, mask), similarity, more, own, still))
-    flicker = stillness.figures()
-    return [replace(result, still={**result.still, **flicker.get(result.view, {})}) for result in results]
+    flicker, moments = stillness.figures(), by_moment({one.view: one.psnr for one in results}, views, trained)
+    return [
+        replace(one, still={**one.still, **flicker.get(one.view, {})}, moments=moments.get(one.view, {}))
+        for one in results
+    ]
 
 
 def mean(results: Sequence[ViewMetrics], perceptual: Perceptual = PSNR_AND_SSIM) -> dict[str, Any]:

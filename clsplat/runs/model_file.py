@@ -10,7 +10,6 @@ from typing import Any
 from clsplat.conformance.quick import open_correct
 from clsplat.errors import ConfigError, DataError
 from clsplat.gaussians.model import Model
-from clsplat.metrics.held_out import by_moment
 from clsplat.metrics.lpips import InputRange
 from clsplat.metrics.perceptual import Perceptual, metric_names
 from clsplat.metrics.views import PSNR_AND_SSIM, mean, measure
@@ -90,8 +89,12 @@ class ModelFile:
             for split in ("test", "train"):
                 if scene.split(split):
                     views = scene.split(split)
-                    results = measure(self.painter, views, photographs, perceptual, finite=True, colours=self.colours)
-                    results = by_moment(results, views, scene.split("train"))
+                    results = measure(
+                        *(self.painter, views, photographs, perceptual),
+                        finite=True,
+                        colours=self.colours,
+                        trained=scene.split("train"),
+                    )
                     metrics[split][f"{downscale:g}"] = mean(results, perceptual)
         return {**metrics, **size_of(self.loaded), "device": self.device.text}
 

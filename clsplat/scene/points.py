@@ -18,6 +18,7 @@ from clsplat.scene.times import Clock
 logger = logging.getLogger("clsplat")
 
 MAX_VALUE = 1e15  # of any number in a dataset: the squares of much larger ones overflow float32
+BELOW_MAX = f"a number between -{MAX_VALUE:g} and {MAX_VALUE:g}"
 RGB = ("red", "green", "blue")
 TIME = "time"  # of a point, in the unit of the frames' times
 POINT = np.dtype([(name, "<f4") for name in "xyz"] + [(name, "u1") for name in RGB])

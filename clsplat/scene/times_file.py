@@ -9,7 +9,7 @@ from pathlib import Path
 from clsplat.errors import DataError, quoted
 from clsplat.files import write_text
 from clsplat.reading import read_json
-from clsplat.scene.points import MAX_VALUE
+from clsplat.scene.points import BELOW_MAX, MAX_VALUE
 from clsplat.scene.times import clock_of
 from clsplat.scene.view import View
 
@@ -32,7 +32,10 @@ def read_times(folder: Path) -> dict[str, float] | None:
         raise DataError(f"{path}: expected a table with a number for each photograph, by name")
     for name, value in table.items():
         if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < MAX_VALUE:
-            raise DataError(f"{path}: the time of {quoted(name)} is {quoted(value)}; expected a finite number")
+            raise DataError(
+                f"{path}: the time of {quoted(name)} is {quoted(value)}; expected {BELOW_MAX}: write all times in "
+                "another unit"
+            )
     return {name: float(value) for name, value in table.items()}
 
 

@@ -13,7 +13,7 @@ from clsplat.scene.camera import MAX_SIDE, MIN_FOCAL
 from clsplat.scene.images import Missing, image_size, inside, present, read_header, require_files
 from clsplat.scene.lens import Lens, shared
 from clsplat.scene.parts import Parts
-from clsplat.scene.points import MAX_VALUE, read_ply_table, read_points_ply
+from clsplat.scene.points import BELOW_MAX, MAX_VALUE, read_ply_table, read_points_ply
 from clsplat.scene.scene import Camera, Floats, PointCloud, View
 from clsplat.scene.times import Clock, clock_of
 
@@ -40,12 +40,12 @@ class Frame:
         return self._own[key] if key in self._own else self._common.get(key)
 
     def number(self, key: str) -> float | None:
-        """Return a finite number, or None where there is none.  Raises DataError for anything else."""
+        """Return a number below MAX_VALUE in size, or None where there is none.  Raises DataError for anything else."""
         value = self.value(key)
         if value is None:
             return None
         if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < MAX_VALUE:
-            raise DataError(f"{self.where}: {key} is {quoted(value)}; expected a finite number: export the file again")
+            raise DataError(f"{self.where}: {key} is {quoted(value)}; expected {BELOW_MAX}: export the file again")
         return float(value)
 
     def file(self, key: str, suffix: str = "") -> Path | None:

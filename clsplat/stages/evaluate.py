@@ -7,7 +7,6 @@ from pydantic import AfterValidator, Field, field_validator
 
 from clsplat.errors import amount
 from clsplat.gaussians.model import load
-from clsplat.metrics.held_out import by_moment
 from clsplat.metrics.lpips import InputRange
 from clsplat.metrics.perceptual import Metric, Perceptual
 from clsplat.metrics.views import mean, measure
@@ -96,10 +95,12 @@ class Evaluate(Scheduled):
             views = some_of(found, self.most or len(found))
             photographs = run.photographs if downscale in run.scene.downscales else run.photographs.fresh()
             counted = run.status.counted(run.until_interrupted(views), "views", len(views))
-            results = measure(painter, views, photographs, perceptual, colours=colours_of(run), counted=counted)
+            trained, colours = run.scene.split("train"), colours_of(run)
+            results = measure(
+                painter, views, photographs, perceptual, colours=colours, counted=counted, trained=trained
+            )
             if not results:
                 continue
-            results = by_moment(results, views, run.scene.split("train"))
             for result in results:
                 run.records.add(run.model_step, "view", split=self.split, downscale=downscale, **result.line())
             averages = mean(results, perceptual)

@@ -9,6 +9,7 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field, model_validator
 
 from clsplat.errors import ConfigError, NotFiniteError
+from clsplat.fields.place import require_seen
 from clsplat.fields.shape import FieldShape
 from clsplat.schedule import Decay, NonNegative, at_step
 from clsplat.settings import OneOf
@@ -74,7 +75,9 @@ class TrainField(Training):
         return self
 
     def check_in(self, run: Run) -> None:
-        """Raise MemoryLimitError for a field that does not fit, before it is made."""
+        """Raise ConfigError for a grid that the scene does not touch, MemoryLimitError for a field that does not fit,
+        before it is made."""
+        require_seen(self.field, run.scene)
         views = run.scene.split("train")
         held = min(run.photographs.budget, sum(4 * view.camera.width * view.camera.height for view in views))
         field_plan(self.field, held).check(run.device.info)

@@ -12,6 +12,7 @@ from clsplat.scene.view import View
 from clsplat.views.colours import Auto, OwnColours
 from clsplat.views.grid_tables import ENTRIES, NAMES, Tables
 from clsplat.views.grid_tables import GridTables as GridTables
+from clsplat.views.view_colours import TABLE
 
 FOLDER = "colour_grids/"  # before the names of their tables in a checkpoint
 
@@ -35,6 +36,13 @@ def check_tables(tables: Tables) -> None:
             raise DataError(f"{name} of its grids is not [photographs, {ENTRIES}, nz, ny, nx] of float32")
         if not np.isfinite(table).all():
             raise DataError(f"{name} of its grids holds values that are not finite")
+
+
+def require_tables(tables: Tables, numbers: Mapping[str, float]) -> None:
+    """Raise DataError where the numbers of a run name rows of grids that there are not."""
+    named = [key for key in numbers if key.startswith(f"{TABLE}/") and key.endswith("/row")]
+    if named and not tables:
+        raise DataError(f"it lacks the grids of the colours of {len(named)} photographs")
 
 
 def restored(tables: Tables, device: Device) -> GridTables | None:

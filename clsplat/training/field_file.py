@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from clsplat import __version__
 from clsplat.errors import DataError, one_line, quoted, shortened
 from clsplat.fields.field import Field
-from clsplat.fields.shape import FieldShape
+from clsplat.fields.shape import FieldShape, WrittenShape
 from clsplat.files import atomic, is_there
 from clsplat.gaussians.model import Rendering
 from clsplat.gaussians.run_model import file_of_run
@@ -37,7 +37,7 @@ class Notes(BaseModel):
 
     format: Literal[1]
     version: str
-    shape: FieldShape
+    shape: WrittenShape
     background: Literal["black", "white"]
     alpha: Literal["transparency", "mask"]
 

@@ -116,6 +116,7 @@ def check(best: Best | None, tables: Tables) -> None:
     sky.check_tables(behind)
     of_colours, tables = colour_grids.split_tables(tables)
     colour_grids.check_tables(of_colours)
+    colour_grids.require_tables(of_colours, best.numbers)
     if missing := [name for name in (*PARAMETERS, "filter_variance") if name not in tables]:
         raise DataError(f"its best model lacks {', '.join(missing)}")
     count = len(tables["means"])

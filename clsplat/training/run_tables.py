@@ -53,6 +53,7 @@ def check(state: State, tables: Arrays) -> None:
     sky.check_tables(behind)
     of_colours, own = colour_grids.split_tables(own)
     colour_grids.check_tables(of_colours)
+    colour_grids.require_tables(of_colours, state.numbers)
     check_tables(state, {name.removeprefix("gaussians/"): table for name, table in own.items()})
 
 
