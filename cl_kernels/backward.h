@@ -118,17 +118,20 @@ static inline void colour_backward(
 }
 
 /* The weight of each basis function in the derivative by direction, c_k . g, for the vectors from each of `first` on:
- * plane by plane, so that memory is read in runs. */
+ * plane by plane, so that memory is read in runs.  unseen: a bit for each vector in which nothing was drawn; its
+ * harmonics are not read. */
 static inline void weigh_harmonics(
     __global const float *sh_rest,  // [(K-1)*3,S] coefficient-major
-    const gradient_t *g, const uint vectors, const uint degree, const uint stride, const uint *first, VF (*weights)[16])
+    const gradient_t *g, const uint vectors, const uint unseen, const uint degree, const uint stride, const uint *first,
+    VF (*weights)[16])
 {
     for (uint k = 1; k < (degree + 1) * (degree + 1); k++) {
         for (uint v = 0; v < vectors; v++)
             weights[v][k] = (VF)(0.0f);
         for (uint channel = 0; channel < 3; channel++)
             for (uint v = 0; v < vectors; v++)
-                weights[v][k] += VLOAD(sh_rest + ((k - 1) * 3 + channel) * stride + first[v]) * g[v].colour[channel];
+                if (!((unseen >> v) & 1))
+                    weights[v][k] += VLOAD(sh_rest + ((k - 1) * 3 + channel) * stride + first[v]) * g[v].colour[channel];
     }
 }
 

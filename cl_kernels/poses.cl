@@ -67,7 +67,7 @@ void pose_gradient(
         gradient_t g;
         VF weights[1][16], terms[POSE_SUMS];
         colour_backward(splats, pixel_sums, stride, count, i, &g);
-        weigh_harmonics(sh_rest, &g, 1, degree, stride, &i, weights);
+        weigh_harmonics(sh_rest, &g, 1, !ANY(g.touched), degree, stride, &i, weights);
         gradient_of(means, quats, log_scales, logit_opacity, filter_variance, camera, pixel_sums, weights[0],
                     near_plane, screen_variance, compensate, degree, stride, i, &g);
         pose_terms(means, quats, camera, &g, weights[0], degree, stride, i, terms);

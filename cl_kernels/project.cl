@@ -181,7 +181,7 @@ void project_backward(
     gradient_t g;
     VF weights[1][16];
     colour_backward(splats, pixel_sums, stride, count, i, &g);
-    weigh_harmonics(sh_rest, &g, 1, degree, stride, &i, weights);
+    weigh_harmonics(sh_rest, &g, 1, !ANY(g.touched), degree, stride, &i, weights);
     gradient_of(means, quats, log_scales, logit_opacity, filter_variance, camera, pixel_sums, weights[0], near_plane,
                 screen_variance, compensate, degree, stride, i, &g);
     store_planes(grad_means, g.means, g.touched, 3, stride, i);

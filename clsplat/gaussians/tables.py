@@ -11,7 +11,7 @@ Adam's moments and statistics are all tables, so that their rows always move tog
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,9 +21,13 @@ from clsplat.formats.splats import PARAMETERS as PARAMETERS
 from clsplat.formats.splats import SH_C0 as SH_C0
 from clsplat.formats.splats import degree_of
 from clsplat.formats.splats import sh_coefficients as sh_coefficients
+from clsplat.gaussians.gradients import Gradients as Gradients
 from clsplat.gaussians.rows import checked_rows
 from clsplat.gaussians.sky import DeviceSky
 from clsplat.opencl.device import Array, Device
+
+if TYPE_CHECKING:
+    from clsplat.gaussians.deferred import Deferred
 
 HIDDEN = "hidden"  # which training views leave a Gaussian out; see left_out.py
 INTERVAL2 = "sampling_interval2"  # scene units², the smallest over training views; exists only where it is read
@@ -50,6 +54,7 @@ class Gaussians:
         self.capacity = _aligned(self.count)
         self.sh_degree = degree_of(parameters["sh_rest"].shape[1])
         self.tables: dict[str, Table] = {}
+        self.deferred: Deferred | None = None  # updates that rows wait for
         for name in PARAMETERS:
             self.add(name, parameters[name].shape[1])
             self.set(name, parameters[name])
@@ -61,7 +66,13 @@ class Gaussians:
         self._rows = device.program("gather.cl")
 
     def __getitem__(self, name: str) -> Array:
-        return self.tables[name].array
+        return self._settled(name).array
+
+    def _settled(self, name: str) -> Table:
+        """A table whose rows wait for no update."""
+        if self.deferred and name in self.deferred.names:
+            self.deferred.flush()
+        return self.tables[name]
 
     @property
     def components(self) -> dict[str, int]:
@@ -74,12 +85,12 @@ class Gaussians:
 
     def get(self, name: str) -> NDArray[np.float32]:
         """Copy a table to the host, [N, components]."""
-        planes = self.tables[name].array.get()
+        planes = self._settled(name).array.get()
         return np.ascontiguousarray(planes[:, : self.count].T)
 
     def set(self, name: str, values: NDArray[Any]) -> None:
         """Copy [N, components] from the host into a table."""
-        table = self.tables[name]
+        table = self._settled(name)
         if values.shape != (self.count, table.components):
             raise ValueError(f"{name}: expected {(self.count, table.components)}, got {values.shape}")
         planes = np.zeros((table.components, self.capacity), np.float32)
@@ -91,7 +102,7 @@ class Gaussians:
 
         rows: [n] integers, as in `checked_rows`.  Raises ValueError for other rows and for values of another shape.
         """
-        table, rows = self.tables[name], checked_rows(rows, self.count)
+        table, rows = self._settled(name), checked_rows(rows, self.count)
         if values.shape != (len(rows), table.components):
             raise ValueError(f"{name}: expected {(len(rows), table.components)}, got {values.shape}")
         self._rows.set_rows(
@@ -111,7 +122,7 @@ class Gaussians:
         """
         uploaded = self.device.upload(checked_rows(rows, self.count))
         for name in names:
-            table = self.tables[name]
+            table = self._settled(name)
             self._rows.zero_rows(
                 items=(len(rows), table.components),
                 rows=uploaded,
@@ -170,7 +181,7 @@ class Gaussians:
             widest = max(table.components for table in self.tables.values()) * np.dtype(np.float32).itemsize
             roomy = min(int(self.capacity * GROWTH), self.device.info.allocation // widest - ALIGNMENT)
             capacity = _aligned(max(count, roomy))
-        for table in self.tables.values():
+        for table in map(self._settled, self.tables):
             moved = self.device.zeros((table.components, capacity))
             self._rows.gather_rows(
                 items=(count, table.components),
@@ -185,27 +196,6 @@ class Gaussians:
             )
             table.array = moved
         self.count, self.capacity = count, capacity
-
-
-class Gradients:
-    """Derivatives of the loss by each parameter, with the shapes of the parameters."""
-
-    def __init__(self, gaussians: Gaussians) -> None:
-        shapes = {name: (gaussians.tables[name].components, gaussians.capacity) for name in gaussians.trained}
-        self.arrays = {name: gaussians.device.zeros(shape) for name, shape in shapes.items()}
-        self.mean2d = gaussians.device.zeros((2, gaussians.capacity))  # px⁻¹, for density statistics
-
-    def __getitem__(self, name: str) -> Array:
-        return self.arrays[name]
-
-    def fits(self, gaussians: Gaussians) -> bool:
-        """Return whether the shapes are those of the parameters of these Gaussians."""
-        shapes = {name: (gaussians.tables[name].components, gaussians.capacity) for name in gaussians.trained}
-        return {name: array.shape for name, array in self.arrays.items()} == shapes
-
-    def arguments(self) -> dict[str, Any]:
-        """Return those of the projection by the names of its kernels' arguments."""
-        return {**{f"grad_{name}": self.arrays[name] for name in PARAMETERS}, "grad_mean2d": self.mean2d}
 
 
 @dataclass(frozen=True)

@@ -51,7 +51,8 @@ class Optimize(Keeping):
     rates: Rates = Rates()
     """Learning rates."""
     update: Rows = "all"
-    """Gaussians that a step changes: `all`, or `seen`: those that the view culls keep their parameters and moments."""
+    """Gaussians that a step changes: `all`, or `seen`: those that the view culls keep their parameters and moments.
+    `deferred`: all, with the same bits; `sh_rest` of those that are culled has its updates when a view sees them."""
     views: ViewSettings = ViewSettings()
     """View, size and photograph of each step."""
     losses: list[OneOf[Loss]]
