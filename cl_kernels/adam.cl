@@ -11,7 +11,7 @@
 #include "adam.h"
 #include "backward.h"
 
-/* One update of one table.  Dimension 1 is the plane. */
+/* One update of one table.  Dimension 1 is the plane.  With SH_SLOTS the table is one of those in slots.h. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void adam_step(
     __global float *restrict values,          // [components,S]
@@ -19,10 +19,12 @@ void adam_step(
     __global float *restrict moment1,         // [components,S]
     __global float *restrict moment2,         // [components,S]
     __global const uint *restrict depth_key,  // [S] of the view: all ones when culled
+    __global const uint *restrict sh_slot,    // [S/LANES] slots.h
     const float rate,                         // learning rate / (1 - BETA1^t)
     const float correction2,                  // 1 / (1 - BETA2^t)
     const uint every,
     const uint undrawn,
+    const uint sh_block,                      // values of a block in a slot
     const uint stride,
     const uint count)
 {
@@ -34,7 +36,7 @@ void adam_step(
     if (!ANY(seen | (VI)((int)first)))
         return;
     const VI updated = seen | (VI)((int)every);
-    const uint at = get_global_id(1) * stride + i;
+    const uint at = get_global_id(1) * SH_STRIDE(stride) + sh_first(sh_slot, sh_block, i);
     adam_update(values + at, moment1 + at, moment2 + at, VLOAD(gradient + at), updated, rate, correction2);
 }
 
@@ -50,8 +52,8 @@ static inline void update_plane(__global float *values, __global float *moment1,
 }
 
 /* Update plane `plane` of a table, with the member `member` of the block's gradients. */
-#define UPDATE(table, plane, member) UPDATE_BUT(0, table, plane, member)
-#define UPDATE_BUT(waiting, table, plane, member)                                                             \
+#define UPDATE(table, plane, member) UPDATE_BUT(0, first, stride, table, plane, member)
+#define UPDATE_BUT(waiting, first, stride, table, plane, member)                                              \
     do {                                                                                                      \
         const uint at = (plane) * stride;                                                                     \
         VF gradient[VECTORS];                                                                                 \
@@ -72,7 +74,8 @@ void update_gaussians(
     __global float *restrict log_scales,             // [3,S] log of scene units
     __global float *restrict logit_opacity,          // [S]
     __global float *restrict sh_base,                // [3,S]
-    __global float *restrict sh_rest,                // [(K-1)*3,S] coefficient-major
+    __global float *restrict sh_rest,                // [(K-1)*3,S] coefficient-major, or slots (slots.h)
+    __global const uint *restrict sh_slot,           // [S/LANES] slots.h
     __global float *restrict means_moment1,          // [3,S]
     __global float *restrict means_moment2,          // [3,S]
     __global float *restrict quats_moment1,          // [4,S]
@@ -83,8 +86,8 @@ void update_gaussians(
     __global float *restrict logit_opacity_moment2,  // [S]
     __global float *restrict sh_base_moment1,        // [3,S]
     __global float *restrict sh_base_moment2,        // [3,S]
-    __global float *restrict sh_rest_moment1,        // [(K-1)*3,S]
-    __global float *restrict sh_rest_moment2,        // [(K-1)*3,S]
+    __global float *restrict sh_rest_moment1,        // as sh_rest
+    __global float *restrict sh_rest_moment2,        // as sh_rest
     __global const float *restrict filter_variance,  // [S] scene units^2
     __constant camera_t *restrict camera,            // [1]
     __global const float *restrict splats,           // [N,RECORD] see splat.h
@@ -109,6 +112,7 @@ void update_gaussians(
     const uint sh_rest_degree,                       // up to which bands are updated: 0 or `degree`
     const uint every,
     const uint undrawn,
+    const uint sh_block,                             // values of a block in a slot
     const uint stride,
     const uint count)
 {
@@ -135,7 +139,14 @@ void update_gaussians(
     if (kept == 0)
         return;
     const uint vectors = kept < VECTORS ? kept : VECTORS;  // where VECTORS is 1, compilers see that it is 1 here
-    weigh_harmonics(sh_rest, g, vectors, unseen, degree, stride, first, weights);
+#if SH_SLOTS
+    uint rest[VECTORS];
+    for (uint v = 0; v < vectors; v++)
+        rest[v] = sh_first(sh_slot, sh_block, first[v]);
+#else
+    const uint *rest = first;
+#endif
+    weigh_harmonics(sh_rest, g, vectors, unseen, degree, stride, rest, weights);
     for (uint v = 0; v < vectors; v++) {
         const uint at = first[v];
         gradient_of(means, quats, log_scales, logit_opacity, filter_variance, camera, pixel_sums, weights[v],
@@ -154,5 +165,6 @@ void update_gaussians(
         UPDATE(sh_base, channel, basis[0] * g[v].colour[channel]);
     for (uint k = 1; k < (sh_rest_degree + 1) * (sh_rest_degree + 1); k++)
         for (uint channel = 0; channel < 3; channel++)
-            UPDATE_BUT(unseen & ~undrawn, sh_rest, (k - 1) * 3 + channel, basis[k] * g[v].colour[channel]);
+            UPDATE_BUT(unseen & ~undrawn, rest, SH_STRIDE(stride), sh_rest, (k - 1) * 3 + channel,
+                       basis[k] * g[v].colour[channel]);
 }

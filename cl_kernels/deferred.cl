@@ -7,20 +7,23 @@
  *
  * One item = a block of LANES Gaussians.  No local memory.  Deterministic: each value has one writer. */
 #include "adam.h"
+#include "slots.h"
 
 /* Do the updates of the list that wait, for the blocks in which the view sees a Gaussian.  `every`: all ones where all
  * blocks are updated. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void replay_updates(
-    __global float *restrict values,          // [components,S]
-    __global float *restrict moment1,         // [components,S]
-    __global float *restrict moment2,         // [components,S]
+    __global float *restrict values,          // [components,S], or slots (slots.h)
+    __global float *restrict moment1,         // as values
+    __global float *restrict moment2,         // as values
+    __global const uint *restrict sh_slot,    // [S/LANES] slots.h
     __global const uint *restrict depth_key,  // [S] of the view: all ones when culled; one vector where `every`
     __global const float *restrict factors,   // [updates,2]
     __global uint *restrict done,             // [S/LANES] updates of the list that the rows of a block have
     const uint every,
     const uint updates,
     const uint components,
+    const uint sh_block,                      // values of a block in a slot
     const uint stride,
     const uint count)
 {
@@ -28,13 +31,13 @@ void replay_updates(
     if (i >= count)
         return;
     const VI seen = (VLOAD_INT(depth_key + (i & ~every)) != -1) | (VI)((int)every);
-    if (!ANY(seen))
+    if (!ANY(seen) || !sh_held(sh_slot, i))
         return;
-    const uint first = done[block];
+    const uint first = done[block], rest = sh_first(sh_slot, sh_block, i);
     if (first >= updates)
         return;
     for (uint k = 0; k < components; k++) {
-        const uint at = k * stride + i;
+        const uint at = k * SH_STRIDE(stride) + rest;
         VF value = VLOAD(values + at), m = VLOAD(moment1 + at), v = VLOAD(moment2 + at);
         for (uint u = first; u < updates; u++)
             adam_values(&value, &m, &v, (VF)(0.0f), factors[2 * u], factors[2 * u + 1]);

@@ -10,7 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from clsplat.gaussians.tables import Gaussians, moment_tables, sh_coefficients
+from clsplat.gaussians.moments import HARMONICS
+from clsplat.gaussians.on_host import defines_of, slots_of
+from clsplat.gaussians.tables import Gaussians, sh_coefficients
 from clsplat.opencl.device import Array
 
 LONGEST = 32  # updates that wait at most; then all rows have theirs, in one pass over the tables
@@ -22,7 +24,7 @@ class Deferred:
     Whoever reads the tables otherwise than by the rows that a view sees calls `flush` first, as `Gaussians` does.
     """
 
-    names = ("sh_rest", *moment_tables("sh_rest"))
+    names = HARMONICS
 
     def __init__(self, gaussians: Gaussians, longest: int = LONGEST) -> None:
         """longest: updates that wait at most; results do not depend on it."""
@@ -30,7 +32,6 @@ class Deferred:
         self.gaussians, self.longest = gaussians, longest
         self.updates = 0  # in the list
         self._degree = 0  # of the harmonics, when they were noted
-        self._program = device.program("deferred.cl")
         self._lanes = int(device.tuning["LANES"])
         self._factors = device.zeros((longest, 2))
         self._all = device.zeros(self._lanes, np.uint32)  # in the place of the keys of a view
@@ -52,7 +53,9 @@ class Deferred:
     def flush(self) -> None:
         """Do what waits for all rows."""
         if self.updates:
-            self._replay(self._all, every=0xFFFFFFFF)
+            on_host = self.gaussians.on_host
+            for _ in on_host.parts() if on_host else [None]:
+                self._replay(self._all, every=0xFFFFFFFF)
             self._done.fill(0)
             self.updates = 0
 
@@ -72,7 +75,7 @@ class Deferred:
 
         They must have been brought up to date by `catch_up`, with the same keys.
         """
-        self._program.note_update(
+        self.gaussians.device.program("deferred.cl").note_update(
             items=-(-self.gaussians.count // self._lanes),
             depth_key=depth_key,
             factors=self._factors,
@@ -87,9 +90,11 @@ class Deferred:
     def _replay(self, depth_key: Array, every: int) -> None:
         values, moment1, moment2 = (self.array(name) for name in self.names)
         arguments: dict[str, Any] = {"values": values, "moment1": moment1, "moment2": moment2}
-        self._program.replay_updates(
+        on_host = self.gaussians.on_host
+        self.gaussians.device.program("deferred.cl", **defines_of(self.gaussians)).replay_updates(
             items=-(-self.gaussians.count // self._lanes),
             **arguments,
+            **slots_of(self.gaussians),
             depth_key=depth_key,
             factors=self._factors,
             done=self._done,
@@ -99,3 +104,5 @@ class Deferred:
             stride=self.gaussians.capacity,
             count=self.gaussians.count,
         )
+        if on_host:
+            on_host.begin_to_fetch()

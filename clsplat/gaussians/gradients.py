@@ -15,8 +15,7 @@ class Gradients:
     """Derivatives of the loss by each parameter, with the shapes of the parameters."""
 
     def __init__(self, gaussians: "Gaussians") -> None:
-        shapes = {name: (gaussians.tables[name].components, gaussians.capacity) for name in gaussians.trained}
-        self.arrays = {name: gaussians.device.zeros(shape) for name, shape in shapes.items()}
+        self.arrays = {name: gaussians.device.zeros(shape) for name, shape in _shapes(gaussians).items()}
         self._withheld: tuple[str, ...] = ()
         self.mean2d = gaussians.device.zeros((2, gaussians.capacity))  # px⁻¹, for density statistics
 
@@ -36,9 +35,13 @@ class Gradients:
 
     def fits(self, gaussians: "Gaussians") -> bool:
         """Return whether the shapes are those of the parameters of these Gaussians."""
-        shapes = {name: (gaussians.tables[name].components, gaussians.capacity) for name in gaussians.trained}
-        return {name: array.shape for name, array in self.arrays.items()} == shapes
+        return {name: array.shape for name, array in self.arrays.items()} == _shapes(gaussians)
 
     def arguments(self) -> dict[str, Any]:
         """Return those of the projection by the names of its kernels' arguments."""
         return {**{f"grad_{name}": self.arrays[name] for name in PARAMETERS}, "grad_mean2d": self.mean2d}
+
+
+def _shapes(gaussians: "Gaussians") -> dict[str, tuple[int, ...]]:
+    """By the names of what is trained; what lies on the host has the shape of its slots."""
+    return {name: gaussians.tables[name].array.shape for name in gaussians.trained}

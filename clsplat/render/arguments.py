@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from clsplat.gaussians.on_host import slots_of
 from clsplat.gaussians.tables import DeviceModel
 from clsplat.render.camera import DeviceCamera
 
@@ -20,6 +21,7 @@ def shape_arguments(model: DeviceModel, camera: DeviceCamera) -> dict[str, Any]:
         "screen_variance": 0.0 if model.pixel_box else model.screen_variance,
         "compensate": 0.0 if model.pixel_box else model.compensate,
         "degree": model.degree,
+        **slots_of(gaussians),
         "stride": gaussians.capacity,
         "count": gaussians.count,
     }

@@ -41,10 +41,17 @@ def project(
 
 
 def catch_up(workspace: Workspace, model: DeviceModel, camera: DeviceCamera) -> None:
-    """Do the updates that Gaussians in the view wait for: a projection without harmonics says which those are."""
-    deferred = model.gaussians.deferred
-    if deferred and deferred.updates:
+    """Do the updates that Gaussians in the view wait for, and fetch from the host what lies there.
+
+    A projection without harmonics says which Gaussians those are.
+    """
+    deferred, on_host = model.gaussians.deferred, model.gaussians.on_host
+    if on_host or (deferred and deferred.updates):
         splats = workspace.array("splats", (model.gaussians.count, RECORD))
         radius = workspace.array("radius", model.gaussians.capacity)
         no_band = Band(camera.tiles_x, camera.tiles_y, 0, 0)
-        deferred.catch_up(project(workspace, replace(model, degree=0), camera, no_band, splats, radius).depth_key)
+        depth_key = project(workspace, replace(model, degree=0), camera, no_band, splats, radius).depth_key
+        if on_host:
+            on_host.bring(depth_key)
+        if deferred:
+            deferred.catch_up(depth_key)

@@ -3,11 +3,13 @@
 from collections.abc import Collection
 from typing import Annotated, Any, ClassVar, Literal
 
+import numpy as np
 from pydantic import Field
 
 from clsplat.errors import ConfigError
 from clsplat.formats.motion import MOTION
 from clsplat.gaussians.deferred import Deferred
+from clsplat.gaussians.on_host import defines_of, slots_of
 from clsplat.gaussians.tables import PARAMETERS, DeviceModel, Gaussians, Gradients, moment_tables, sh_coefficients
 from clsplat.opencl.device import Array
 from clsplat.opencl.program import constants
@@ -126,6 +128,7 @@ class Adam:
         Returns the gradient of the projected means, [2, S] px⁻¹.
         """
         gaussians = self.gaussians
+        rows = self._possible(rows)
         grad_mean2d = gaussians.device.empty((2, gaussians.capacity))
         arguments: dict[str, Any] = {"sh_base": gaussians["sh_base"]}
         deferred = self._deferred(rows, model, rates)
@@ -146,8 +149,7 @@ class Adam:
             pixel_sums=pixel_sums,
             grad_mean2d=grad_mean2d,
         )
-        if deferred:
-            deferred.note(frame.depth_key, (arguments["sh_rest_rate"], arguments["sh_rest_correction2"]))
+        self._end(deferred, frame, arguments["sh_rest_rate"], arguments["sh_rest_correction2"])
         return grad_mean2d
 
     def step(
@@ -163,7 +165,7 @@ class Adam:
 
         Bands above the active SH degree are left out: their gradients and moments are zero.
         """
-        gaussians = self.gaussians
+        gaussians, rows = self.gaussians, self._possible(rows)
         deferred = None if "sh_rest" in without else self._deferred(rows, model, rates)
         for name in PARAMETERS:
             if name in without or (name == "sh_rest" and not rates[name]):
@@ -173,7 +175,8 @@ class Adam:
                 components = 3 * (sh_coefficients(model.degree) - 1)
             values, moment1, moment2 = (gaussians.tables[table].array for table in (name, *moment_tables(name)))
             rate, correction2 = self._factors(name, rates)
-            gaussians.device.program("adam.cl").adam_step(
+            in_slots = defines_of(gaussians) if name == "sh_rest" else {}
+            gaussians.device.program("adam.cl", **in_slots).adam_step(
                 items=(-(-gaussians.count // self._lanes), components),
                 values=values,
                 gradient=gradients[name],
@@ -184,11 +187,12 @@ class Adam:
                 correction2=correction2,
                 every=_EVERY[rows],
                 undrawn=_UNDRAWN[rows] if name == "sh_rest" else _UNDRAWN["all"],
+                **slots_of(gaussians),
                 stride=gaussians.capacity,
                 count=gaussians.count,
             )
-            if deferred and name == "sh_rest":
-                deferred.note(frame.depth_key, (rate, correction2))
+            if name == "sh_rest":
+                self._end(deferred, frame, rate, correction2)
         if gaussians.moves and MOTION not in without:
             self.updates[MOTION] += 1
             update_motion(gaussians, gradients, frame.depth_key, rates, self.updates[MOTION], _EVERY[rows])
@@ -206,6 +210,17 @@ class Adam:
         gaussians.deferred.before(model.degree)
         return gaussians.deferred
 
+    def _possible(self, rows: Rows) -> Rows:
+        """Harmonics on the host are updated where a view sees them: of `all`, the others later."""
+        return "deferred" if rows == "all" and self.gaussians.on_host else rows
+
+    def _end(self, deferred: Deferred | None, frame: Frame, rate: float, correction2: float) -> None:
+        """Note the update of `sh_rest` that the rows in the view have had."""
+        if deferred:
+            deferred.note(frame.depth_key, (rate, correction2))
+        if self.gaussians.on_host:
+            self.gaussians.on_host.begin_to_fetch()
+
     def _factors(self, name: str, rates: dict[str, float]) -> tuple[float, float]:
         """Rate and second factor of a parameter's next update, with the bias correction of the moments."""
         self.updates[name] += name != "sh_rest" or rates[name] != 0  # see Rates.sh_rest
@@ -214,5 +229,4 @@ class Adam:
 
     def forget(self, name: str) -> None:
         """Set the moments of one parameter to zero."""
-        for moment in moment_tables(name):
-            self.gaussians[moment].fill(0)
+        self.gaussians.zero_rows(moment_tables(name), np.arange(self.gaussians.count))
