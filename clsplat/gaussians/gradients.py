@@ -22,8 +22,8 @@ class Gradients:
     def __getitem__(self, name: str) -> Array:
         if name in self._withheld:
             raise ConfigError(
-                f"update: deferred: a penalty on {name} changes Gaussians that the view does not see; expected "
-                "penalties on other parameters, or `update: all`"
+                f"a penalty on {name} changes Gaussians that the view does not see, whose updates wait; expected "
+                "penalties on other parameters, or `update: all` with `rasterizer.harmonics: device`"
             )
         return self.arrays[name]
 

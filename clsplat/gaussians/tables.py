@@ -207,7 +207,7 @@ class Gaussians:
             widest = max(table.components for table in self.tables.values()) * np.dtype(np.float32).itemsize
             roomy = min(int(self.capacity * GROWTH), self.device.info.allocation // widest - ALIGNMENT)
             capacity = _aligned(max(count, roomy))
-        on_host = self.on_host.rearranged(source.get(), fresh.get()) if self.on_host else {}
+        on_host = self.on_host.rearranged(source.get()[:count], fresh.get()[:count]) if self.on_host else {}
         for table in (table for name, table in self.tables.items() if name not in on_host):
             moved = self.device.zeros((table.components, capacity))
             self._rows.gather_rows(

@@ -241,7 +241,8 @@ class Trainer:
         if not (penalties or stale or self.model.gaussians.moves or view.frame.content == "inverse_depth"):
             return self.adam.update(self.model, view.frame, view.pixel_sums, rates, self.rows)
         gradients = self.rasterizer.gradients(self.model, view.frame, view.pixel_sums)
-        open_ones = gradients.without_deferred() if self.rows == "deferred" else gradients
+        waits = self.rows == "deferred" or self.model.gaussians.on_host
+        open_ones = gradients.without_deferred() if waits else gradients
         inputs = PenaltyInputs(self.rasterizer.workspace, self.model.gaussians, open_ones, self.extent, step)
         self.rasterizer.device.timings.section = "loss"
         view.losses.extend(returned(penalty, penalty.add(inputs)) for penalty in penalties)

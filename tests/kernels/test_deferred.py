@@ -23,9 +23,19 @@ def hide(model: DeviceModel, case: Case, step: int) -> None:
     model.gaussians.set("means", means)
 
 
-def bits_after(device: Device, case: Case, rows: Rows, sh_rest: object = 1e-4, from_memory: bool = False, edit=None):
+def bits_after(
+    device: Device,
+    case: Case,
+    rows: Rows,
+    sh_rest: object = 1e-4,
+    from_memory: bool = False,
+    edit=None,
+    on_host: bool = False,
+):
     """All tables, as whole numbers, after nine steps of a model of which each step sees others."""
     rasterizer, model = Rasterizer(device, "radix"), case.model(device)
+    if on_host:
+        model.gaussians.move_to_host()
     camera, adam = case.device_camera(device), Adam(model.gaussians)
     weights = np.random.default_rng(5).normal(size=(3, camera.rows, camera.stride)).astype(np.float32)
     for step in range(1, 10):
@@ -134,5 +144,38 @@ def test_rows_that_no_view_sees_wait(device, rng):
 def test_a_penalty_on_harmonics_that_wait_is_refused(device, rng):
     gradients = Gradients(random_case(rng, 5).model(device).gaussians)
     assert gradients.without_deferred()["means"] is gradients["means"]
-    with pytest.raises(ConfigError, match="`update: all`"):
+    with pytest.raises(ConfigError, match="`update: all` with"):
         gradients.without_deferred()["sh_rest"]
+
+
+@pytest.mark.parametrize("from_memory", [False, True])
+@pytest.mark.parametrize("rows", ["all", "seen"])
+@pytest.mark.parametrize(("count", "degree"), [(0, 3), (1, 3), (17, 2), (64, 0), (65, 3), (300, 3)])
+def test_the_bits_do_not_depend_on_where_harmonics_lie(device, rng, count, degree, rows, from_memory):
+    case = behind_each_fifth(with_world_filter(random_case(rng, count, degree=degree), rng))
+    on_device = bits_after(device, case, rows, from_memory=from_memory)
+    on_host = bits_after(device, case, rows, from_memory=from_memory, on_host=True)
+    for name, table in on_device.items():
+        np.testing.assert_array_equal(on_host[name], table, err_msg=name)
+
+
+@pytest.mark.parametrize("edit", [raise_degree, move_rows, write_rows, drop_bands])
+def test_who_changes_rows_finds_them_on_the_host(device, rng, edit):
+    case = behind_each_fifth(random_case(rng, 100))
+    on_device = bits_after(device, case, "all", edit=edit)
+    for name, table in bits_after(device, case, "all", edit=edit, on_host=True).items():
+        np.testing.assert_array_equal(table, on_device[name], err_msg=name)
+
+
+def test_whoever_needs_all_rows_on_the_device_is_told_that_they_lie_on_the_host(device, rng):
+    model = random_case(rng, 20).model(device)
+    before = model.gaussians.get("sh_rest")
+    model.gaussians.move_to_host()
+    model.gaussians.move_to_host()
+    np.testing.assert_array_equal(model.gaussians.get("sh_rest"), before)
+    with pytest.raises(ConfigError, match="lies in the memory of the host"):
+        model.gaussians["sh_rest"]
+    before[3, 7] = np.nan
+    assert model.gaussians.not_finite() == []
+    model.gaussians.set("sh_rest", before)
+    assert model.gaussians.not_finite() == ["sh_rest"]
