@@ -149,6 +149,12 @@ void update_gaussians(
     weigh_harmonics(sh_rest, g, vectors, unseen, degree, stride, rest, weights);
     for (uint v = 0; v < vectors; v++) {
         const uint at = first[v];
+        if ((unseen >> v) & 1) {
+            no_gradient(g + v);
+            for (uint k = 0; k < 2; k++)
+                VSTORE((VF)(0.0f), grad_mean2d + k * stride + at);
+            continue;
+        }
         gradient_of(means, quats, log_scales, logit_opacity, filter_variance, camera, pixel_sums, weights[v],
                     near_plane, screen_variance, compensate, degree, stride, at, g + v);
         for (uint k = 0; k < 2; k++)

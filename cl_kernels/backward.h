@@ -136,6 +136,21 @@ static inline void weigh_harmonics(
     }
 }
 
+/* The gradients of Gaussians of which none was drawn. */
+static inline void no_gradient(gradient_t *g)
+{
+    const VF zero = (VF)(0.0f);
+    for (uint k = 0; k < 2; k++)
+        g->mean2d[k] = zero;
+    for (uint k = 0; k < 3; k++)
+        g->means[k] = g->log_scales[k] = zero;
+    for (uint k = 0; k < 4; k++)
+        g->quats[k] = zero;
+    for (uint k = 0; k < 16; k++)
+        g->basis[k] = zero;
+    g->logit_opacity = zero;
+}
+
 /* The other gradients, from those of the colours and from the weights of the harmonics. */
 static inline void gradient_of(
     __global const float *means,            // [3,S] scene units

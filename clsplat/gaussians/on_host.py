@@ -44,7 +44,7 @@ class OnHost:
     @property
     def block(self) -> int:
         """Values of a block of the harmonics in its slot."""
-        return self.tables["sh_rest"].shape[1] * self.lanes
+        return int(self.tables["sh_rest"].shape[1]) * self.lanes
 
     def add(self, name: str, components: int) -> Array:
         """Attach a table of zeros; return its slots."""
