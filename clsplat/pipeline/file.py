@@ -94,6 +94,8 @@ class SceneSettings(Settings):
 class RasterizerSettings(Settings):
     """How the device renders; results do not depend on it."""
 
+    output_keys: ClassVar[frozenset[str]] = frozenset({"harmonics"})
+
     schedule: Schedule = "auto"
     """Schedule of blending: wide for CPUs, simt for GPUs."""
     sort: Sort = "auto"
