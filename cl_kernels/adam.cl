@@ -86,8 +86,8 @@ void update_gaussians(
     __global float *restrict logit_opacity_moment2,  // [S]
     __global float *restrict sh_base_moment1,        // [3,S]
     __global float *restrict sh_base_moment2,        // [3,S]
-    __global float *restrict sh_rest_moment1,        // as sh_rest
-    __global float *restrict sh_rest_moment2,        // as sh_rest
+    __global float *restrict sh_rest_moment1,        // [(K-1)*3,S] as sh_rest
+    __global float *restrict sh_rest_moment2,        // [(K-1)*3,S] as sh_rest
     __global const float *restrict filter_variance,  // [S] scene units^2
     __constant camera_t *restrict camera,            // [1]
     __global const float *restrict splats,           // [N,RECORD] see splat.h

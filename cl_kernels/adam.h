@@ -9,7 +9,8 @@
 #define BETA2 0.999f
 #define EPSILON 1.0e-15f
 
-/* One update of LANES values and their moments.  rate: learning rate / (1 - BETA1^t); correction2: 1 / (1 - BETA2^t). */
+/* One update of LANES values and their moments.  rate: learning rate / (1 - BETA1^t);
+ * correction2: 1 / (1 - BETA2^t). */
 static inline void adam_values(VF *value, VF *moment1, VF *moment2, const VF g, const float rate,
                                const float correction2)
 {

@@ -119,8 +119,8 @@ static inline void colour_backward(
 }
 
 /* The weight of each basis function in the derivative by direction, c_k . g, for the vectors whose harmonics begin
- * at each of `first`: plane by plane, so that memory is read in runs.  unseen: a bit for each vector in which nothing was
- * drawn; its harmonics are not read. */
+ * at each of `first`: plane by plane, so that memory is read in runs.  unseen: a bit for each vector in which nothing
+ * was drawn; its harmonics are not read. */
 static inline void weigh_harmonics(
     __global const float *sh_rest,  // coefficient-major, see slots.h
     const gradient_t *g, const uint vectors, const uint unseen, const uint degree, const uint stride, const uint *first,
@@ -132,7 +132,8 @@ static inline void weigh_harmonics(
         for (uint channel = 0; channel < 3; channel++)
             for (uint v = 0; v < vectors; v++)
                 if (!((unseen >> v) & 1))
-                    weights[v][k] += VLOAD(sh_rest + ((k - 1) * 3 + channel) * SH_STRIDE(stride) + first[v]) * g[v].colour[channel];
+                    weights[v][k] += VLOAD(sh_rest + ((k - 1) * 3 + channel) * SH_STRIDE(stride) + first[v]) *
+                                     g[v].colour[channel];
     }
 }
 

@@ -14,8 +14,8 @@
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void replay_updates(
     __global float *restrict values,          // [components,S], or slots (slots.h)
-    __global float *restrict moment1,         // as values
-    __global float *restrict moment2,         // as values
+    __global float *restrict moment1,         // [components,S] as values
+    __global float *restrict moment2,         // [components,S] as values
     __global const uint *restrict sh_slot,    // [S/LANES] slots.h
     __global const uint *restrict depth_key,  // [S] of the view: all ones when culled; one vector where `every`
     __global const float *restrict factors,   // [updates,2]

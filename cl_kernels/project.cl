@@ -170,7 +170,7 @@ void project_backward(
     __global float *restrict grad_log_scales,        // [3,S]
     __global float *restrict grad_logit_opacity,     // [S]
     __global float *restrict grad_sh_base,           // [3,S]
-    __global float *restrict grad_sh_rest,           // as sh_rest, bands up to `degree` only
+    __global float *restrict grad_sh_rest,           // [(K-1)*3,S] as sh_rest, bands up to `degree` only
     __global float *restrict grad_mean2d,            // [2,S] px^-1
     const float near_plane,                          // scene units
     const float screen_variance,                     // px^2
