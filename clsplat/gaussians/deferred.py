@@ -6,7 +6,7 @@ bits are those of updates at once.  81 % of the numbers of a Gaussian of degree 
 and opacities decide what is seen, and move on by their moments while they are not.
 """
 
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -24,7 +24,7 @@ class Deferred:
     Whoever reads the tables otherwise than by the rows that a view sees calls `flush` first, as `Gaussians` does.
     """
 
-    names = HARMONICS
+    names: ClassVar[tuple[str, ...]] = HARMONICS
 
     def __init__(self, gaussians: Gaussians, longest: int = LONGEST) -> None:
         """longest: updates that wait at most; results do not depend on it."""

@@ -1,16 +1,12 @@
 """Which parameters of Gaussians are numbers."""
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from clsplat.gaussians.moments import moment_tables
-
-if TYPE_CHECKING:
-    from clsplat.gaussians.tables import Gaussians
+from clsplat.gaussians.struct import Struct
 
 
-def not_finite(gaussians: "Gaussians") -> list[str]:
+def not_finite(gaussians: Struct) -> list[str]:
     """Return the names of the parameters that hold NaN or infinity, or whose moments do."""
     device, found = gaussians.device, set()
     counters = {name: device.zeros(1, np.uint32) for name in gaussians.trained}

@@ -1,20 +1,18 @@
 """Derivatives of a loss by the parameters of Gaussians, in device memory."""
 
 import copy
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from clsplat.errors import ConfigError
 from clsplat.formats.splats import PARAMETERS
+from clsplat.gaussians.struct import Struct
 from clsplat.opencl.device import Array
-
-if TYPE_CHECKING:
-    from clsplat.gaussians.tables import Gaussians
 
 
 class Gradients:
     """Derivatives of the loss by each parameter, with the shapes of the parameters."""
 
-    def __init__(self, gaussians: "Gaussians") -> None:
+    def __init__(self, gaussians: Struct) -> None:
         self.arrays = {name: gaussians.device.zeros(shape) for name, shape in _shapes(gaussians).items()}
         self._withheld: tuple[str, ...] = ()
         self.mean2d = gaussians.device.zeros((2, gaussians.capacity))  # px⁻¹, for density statistics
@@ -33,7 +31,7 @@ class Gradients:
         other._withheld = ("sh_rest",)
         return other
 
-    def fits(self, gaussians: "Gaussians") -> bool:
+    def fits(self, gaussians: Struct) -> bool:
         """Return whether the shapes are those of the parameters of these Gaussians."""
         return {name: array.shape for name, array in self.arrays.items()} == _shapes(gaussians)
 
@@ -42,6 +40,6 @@ class Gradients:
         return {**{f"grad_{name}": self.arrays[name] for name in PARAMETERS}, "grad_mean2d": self.mean2d}
 
 
-def _shapes(gaussians: "Gaussians") -> dict[str, tuple[int, ...]]:
+def _shapes(gaussians: Struct) -> dict[str, tuple[int, ...]]:
     """By the names of what is trained; what lies on the host has the shape of its slots."""
     return {name: gaussians.tables[name].array.shape for name in gaussians.trained}

@@ -6,15 +6,13 @@ when another comes.
 """
 
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.gaussians.struct import Struct
 from clsplat.opencl.device import Array
-
-if TYPE_CHECKING:
-    from clsplat.gaussians.tables import Gaussians
 
 NO_SLOT = 0xFFFFFFFF  # slots.h
 GROWTH = 1.25  # of the slots, where a view sees more
@@ -24,7 +22,7 @@ FEWEST = 4096  # rows in the slots, as many as are sent at a time where all rows
 class OnHost:
     """Tables of a Gaussians struct that lie on the host, [blocks, components, LANES] each; blocks: of LANES rows."""
 
-    def __init__(self, gaussians: "Gaussians") -> None:
+    def __init__(self, gaussians: Struct) -> None:
         """gaussians: they change `tables`, where each of these is its slots."""
         self.gaussians, self.device = gaussians, gaussians.device
         self.lanes = int(self.device.tuning["LANES"])
@@ -136,13 +134,13 @@ class OnHost:
         self.held, self.slot = np.zeros(0, np.int64), self._no_slots()
 
 
-def slots_of(gaussians: "Gaussians") -> dict[str, Any]:
+def slots_of(gaussians: Struct) -> dict[str, Any]:
     """Return the arguments of kernels that say where the harmonics lie (cl_kernels/slots.h)."""
     if gaussians.on_host:
         return {"sh_slot": gaussians.on_host.slot, "sh_block": gaussians.on_host.block}
     return {"sh_slot": gaussians.no_slot, "sh_block": 0}
 
 
-def defines_of(gaussians: "Gaussians") -> dict[str, int]:
+def defines_of(gaussians: Struct) -> dict[str, int]:
     """Return what chooses the programs that find the harmonics there."""
     return {"SH_SLOTS": 1} if gaussians.on_host else {}

@@ -11,7 +11,7 @@ Adam's moments and statistics are all tables, so that their rows always move tog
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,10 +30,8 @@ from clsplat.gaussians.moments import moment_tables as moment_tables
 from clsplat.gaussians.on_host import OnHost, defines_of
 from clsplat.gaussians.rows import checked_rows
 from clsplat.gaussians.sky import DeviceSky
+from clsplat.gaussians.struct import Waiting
 from clsplat.opencl.device import Array, Device
-
-if TYPE_CHECKING:
-    from clsplat.gaussians.deferred import Deferred
 
 HIDDEN = "hidden"  # which training views leave a Gaussian out; see left_out.py
 INTERVAL2 = "sampling_interval2"  # scene units², the smallest over training views; exists only where it is read
@@ -60,7 +58,7 @@ class Gaussians:
         self.capacity = _aligned(self.count)
         self.sh_degree = degree_of(parameters["sh_rest"].shape[1])
         self.tables: dict[str, Table] = {}
-        self.deferred: Deferred | None = None  # updates that rows wait for
+        self.deferred: Waiting | None = None  # updates that rows wait for
         self.on_host: OnHost | None = None  # tables that lie on the host
         self.no_slot = device.zeros(1, np.uint32)
         for name in PARAMETERS:

@@ -10,6 +10,7 @@ from clsplat.errors import ConfigError
 from clsplat.formats.motion import MOTION
 from clsplat.gaussians.deferred import Deferred
 from clsplat.gaussians.on_host import defines_of, slots_of
+from clsplat.gaussians.struct import Waiting
 from clsplat.gaussians.tables import PARAMETERS, DeviceModel, Gaussians, Gradients, moment_tables, sh_coefficients
 from clsplat.opencl.device import Array
 from clsplat.opencl.program import constants
@@ -197,7 +198,7 @@ class Adam:
             self.updates[MOTION] += 1
             update_motion(gaussians, gradients, frame.depth_key, rates, self.updates[MOTION], _EVERY[rows])
 
-    def _deferred(self, rows: Rows, model: DeviceModel, rates: dict[str, float]) -> Deferred | None:
+    def _deferred(self, rows: Rows, model: DeviceModel, rates: dict[str, float]) -> Waiting | None:
         """What notes the next update of `sh_rest`; None where all rows have it at once, or none has it."""
         gaussians = self.gaussians
         if rows != "deferred":
@@ -214,7 +215,7 @@ class Adam:
         """Harmonics on the host are updated where a view sees them: of `all`, the others later."""
         return "deferred" if rows == "all" and self.gaussians.on_host else rows
 
-    def _end(self, deferred: Deferred | None, frame: Frame, rate: float, correction2: float) -> None:
+    def _end(self, deferred: Waiting | None, frame: Frame, rate: float, correction2: float) -> None:
         """Note the update of `sh_rest` that the rows in the view have had."""
         if deferred:
             deferred.note(frame.depth_key, (rate, correction2))
