@@ -4,12 +4,14 @@
  * writing and reading 59 values for each Gaussian; it gives the same bits as project_backward and adam_step.
  *
  * `every` is all ones where each Gaussian is updated, and 0 where those that were culled keep values and moments.
+ * `undrawn` is all ones where vectors without a Gaussian in the view are updated at once, and 0 where their harmonics
+ * wait (deferred.cl).
  *
  * One item = LANES Gaussians.  No local memory.  Deterministic: each value has one writer. */
 #include "adam.h"
 #include "backward.h"
 
-/* One update of one table.  Dimension 1 is the plane. */
+/* One update of one table.  Dimension 1 is the plane.  With SH_SLOTS the table is one of those in slots.h. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void adam_step(
     __global float *restrict values,          // [components,S]
@@ -17,43 +19,49 @@ void adam_step(
     __global float *restrict moment1,         // [components,S]
     __global float *restrict moment2,         // [components,S]
     __global const uint *restrict depth_key,  // [S] of the view: all ones when culled
+    __global const uint *restrict sh_slot,    // [S/LANES] slots.h
     const float rate,                         // learning rate / (1 - BETA1^t)
     const float correction2,                  // 1 / (1 - BETA2^t)
     const uint every,
+    const uint undrawn,
+    const uint sh_block,                      // values of a block in a slot
     const uint stride,
     const uint count)
 {
-    const uint i = get_global_id(0) * LANES;
+    const uint i = get_global_id(0) * LANES, first = every & undrawn;
     if (i >= count)
         return;
     /* where each is updated, all items read the first keys, which costs nothing */
-    const VI updated = (VLOAD_INT(depth_key + (i & ~every)) != -1) | (VI)((int)every);
-    if (!ANY(updated))
+    const VI seen = VLOAD_INT(depth_key + (i & ~first)) != -1;
+    if (!ANY(seen | (VI)((int)first)))
         return;
-    const uint at = get_global_id(1) * stride + i;
+    const VI updated = seen | (VI)((int)every);
+    const uint at = get_global_id(1) * SH_STRIDE(stride) + sh_first(sh_slot, sh_block, i);
     adam_update(values + at, moment1 + at, moment2 + at, VLOAD(gradient + at), updated, rate, correction2,
                 EPSILON);
 }
 
-/* Update one plane of a block.  first, gradient, g, updated: [VECTORS]. */
+/* Update one plane of a block.  first, gradient, g, updated: [VECTORS]; waiting: a bit for each vector that is left. */
 static inline void update_plane(__global float *values, __global float *moment1, __global float *moment2,
                                 const uint *first, const VF *gradient, const gradient_t *g, const VI *updated,
-                                const uint vectors, const float rate, const float correction2)
+                                const uint vectors, const uint waiting, const float rate, const float correction2)
 {
     for (uint v = 0; v < vectors; v++)
-        adam_update(values + first[v], moment1 + first[v], moment2 + first[v],
-                    g[v].touched ? gradient[v] : (VF)(0.0f), updated[v], rate, correction2, EPSILON);
+        if (!((waiting >> v) & 1))
+            adam_update(values + first[v], moment1 + first[v], moment2 + first[v],
+                        g[v].touched ? gradient[v] : (VF)(0.0f), updated[v], rate, correction2, EPSILON);
 }
 
 /* Update plane `plane` of a table, with the member `member` of the block's gradients. */
-#define UPDATE(table, plane, member)                                                                          \
+#define UPDATE(table, plane, member) UPDATE_BUT(0, first, stride, table, plane, member)
+#define UPDATE_BUT(waiting, first, stride, table, plane, member)                                              \
     do {                                                                                                      \
         const uint at = (plane) * stride;                                                                     \
         VF gradient[VECTORS];                                                                                 \
         for (uint v = 0; v < vectors; v++)                                                                    \
             gradient[v] = g[v].member;                                                                        \
         update_plane(table + at, table##_moment1 + at, table##_moment2 + at, first, gradient, g, updated,     \
-                     vectors, table##_rate, table##_correction2);                                             \
+                     vectors, waiting, table##_rate, table##_correction2);                                    \
     } while (0)
 
 /* The update of all tables from the sums over pixels.  Rates are divided by 1 - BETA1^t.
@@ -67,7 +75,8 @@ void update_gaussians(
     __global float *restrict log_scales,             // [3,S] log of scene units
     __global float *restrict logit_opacity,          // [S]
     __global float *restrict sh_base,                // [3,S]
-    __global float *restrict sh_rest,                // [(K-1)*3,S] coefficient-major
+    __global float *restrict sh_rest,                // [(K-1)*3,S] coefficient-major, or slots (slots.h)
+    __global const uint *restrict sh_slot,           // [S/LANES] slots.h
     __global float *restrict means_moment1,          // [3,S]
     __global float *restrict means_moment2,          // [3,S]
     __global float *restrict quats_moment1,          // [4,S]
@@ -78,8 +87,8 @@ void update_gaussians(
     __global float *restrict logit_opacity_moment2,  // [S]
     __global float *restrict sh_base_moment1,        // [3,S]
     __global float *restrict sh_base_moment2,        // [3,S]
-    __global float *restrict sh_rest_moment1,        // [(K-1)*3,S]
-    __global float *restrict sh_rest_moment2,        // [(K-1)*3,S]
+    __global float *restrict sh_rest_moment1,        // [(K-1)*3,S] as sh_rest
+    __global float *restrict sh_rest_moment2,        // [(K-1)*3,S] as sh_rest
     __global const float *restrict filter_variance,  // [S] scene units^2
     __constant camera_t *restrict camera,            // [1]
     __global const float *restrict splats,           // [N,RECORD] see splat.h
@@ -103,13 +112,15 @@ void update_gaussians(
     const uint degree,
     const uint sh_rest_degree,                       // up to which bands are updated: 0 or `degree`
     const uint every,
+    const uint undrawn,
+    const uint sh_block,                             // values of a block in a slot
     const uint stride,
     const uint count)
 {
     const uint i = get_global_id(0) * LANES * VECTORS;
     if (i >= count)
         return;
-    uint first[VECTORS], kept = 0;
+    uint first[VECTORS], kept = 0, unseen = 0;
     gradient_t g[VECTORS];
     VI updated[VECTORS];
     VF weights[VECTORS][16];
@@ -119,6 +130,7 @@ void update_gaussians(
         first[kept] = at;
         updated[kept] = g[kept].touched | (VI)((int)every);
         if (ANY(updated[kept])) {
+            unseen |= (ANY(g[kept].touched) ? 0u : 1u) << kept;
             kept++;
         } else {
             for (uint k = 0; k < 2; k++)
@@ -128,9 +140,22 @@ void update_gaussians(
     if (kept == 0)
         return;
     const uint vectors = kept < VECTORS ? kept : VECTORS;  // where VECTORS is 1, compilers see that it is 1 here
-    weigh_harmonics(sh_rest, g, vectors, degree, stride, first, weights);
+#if SH_SLOTS
+    uint rest[VECTORS];
+    for (uint v = 0; v < vectors; v++)
+        rest[v] = sh_first(sh_slot, sh_block, first[v]);
+#else
+    const uint *rest = first;
+#endif
+    weigh_harmonics(sh_rest, g, vectors, unseen, degree, stride, rest, weights);
     for (uint v = 0; v < vectors; v++) {
         const uint at = first[v];
+        if ((unseen >> v) & 1) {
+            no_gradient(g + v);
+            for (uint k = 0; k < 2; k++)
+                VSTORE((VF)(0.0f), grad_mean2d + k * stride + at);
+            continue;
+        }
         gradient_of(means, quats, log_scales, logit_opacity, filter_variance, camera, pixel_sums, weights[v],
                     near_plane, screen_variance, compensate, degree, stride, at, g + v);
         for (uint k = 0; k < 2; k++)
@@ -147,5 +172,6 @@ void update_gaussians(
         UPDATE(sh_base, channel, basis[0] * g[v].colour[channel]);
     for (uint k = 1; k < (sh_rest_degree + 1) * (sh_rest_degree + 1); k++)
         for (uint channel = 0; channel < 3; channel++)
-            UPDATE(sh_rest, (k - 1) * 3 + channel, basis[k] * g[v].colour[channel]);
+            UPDATE_BUT(unseen & ~undrawn, rest, SH_STRIDE(stride), sh_rest, (k - 1) * 3 + channel,
+                       basis[k] * g[v].colour[channel]);
 }

@@ -10,17 +10,28 @@
 #define EPSILON 1.0e-15f  // of 3DGS
 #define ALL_LANES ((VI)(-1))
 
-/* One update of LANES values; those that are not `updated` keep their bits.  rate: learning rate / (1 - BETA1^t);
+/* One update of LANES values and their moments.  rate: learning rate / (1 - BETA1^t);
  * correction2: 1 / (1 - BETA2^t); epsilon: added to the root. */
+static inline void adam_values(VF *value, VF *moment1, VF *moment2, const VF g, const float rate,
+                               const float correction2, const float epsilon)
+{
+    const VF m = BETA1 * *moment1 + (1.0f - BETA1) * g;
+    const VF v = BETA2 * *moment2 + (1.0f - BETA2) * (g * g);
+    *moment1 = m;
+    *moment2 = v;
+    *value = *value - rate * m / (sqrt(v * correction2) + epsilon);
+}
+
+/* One update of LANES values in memory; those that are not `updated` keep their bits. */
 static inline void adam_update(__global float *values, __global float *moment1, __global float *moment2, const VF g,
                                const VI updated, const float rate, const float correction2, const float epsilon)
 {
-    const VF value = VLOAD(values), m_before = VLOAD(moment1), v_before = VLOAD(moment2);
-    const VF m = BETA1 * m_before + (1.0f - BETA1) * g;
-    const VF v = BETA2 * v_before + (1.0f - BETA2) * (g * g);
+    const VF before = VLOAD(values), m_before = VLOAD(moment1), v_before = VLOAD(moment2);
+    VF value = before, m = m_before, v = v_before;
+    adam_values(&value, &m, &v, g, rate, correction2, epsilon);
     VSTORE((updated ? m : m_before), moment1);
     VSTORE((updated ? v : v_before), moment2);
-    VSTORE((updated ? value - rate * m / (sqrt(v * correction2) + epsilon) : value), values);
+    VSTORE((updated ? value : before), values);
 }
 
 #endif

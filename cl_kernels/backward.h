@@ -5,6 +5,7 @@
 #define CLSPLAT_BACKWARD_H
 #include "gaussian.h"
 #include "harmonics.h"
+#include "slots.h"
 #include "splat.h"
 
 /* Unit direction from the camera to LANES Gaussians; returns 1 / distance. */
@@ -117,19 +118,38 @@ static inline void colour_backward(
                                  ? VLOAD(pixel_sums + (SUM_RED + channel) * stride + i) : (VF)(0.0f);
 }
 
-/* The weight of each basis function in the derivative by direction, c_k . g, for the vectors from each of `first` on:
- * plane by plane, so that memory is read in runs. */
+/* The weight of each basis function in the derivative by direction, c_k . g, for the vectors whose harmonics begin
+ * at each of `first`: plane by plane, so that memory is read in runs.  unseen: a bit for each vector in which nothing
+ * was drawn; its harmonics are not read. */
 static inline void weigh_harmonics(
-    __global const float *sh_rest,  // [(K-1)*3,S] coefficient-major
-    const gradient_t *g, const uint vectors, const uint degree, const uint stride, const uint *first, VF (*weights)[16])
+    __global const float *sh_rest,  // coefficient-major, see slots.h
+    const gradient_t *g, const uint vectors, const uint unseen, const uint degree, const uint stride, const uint *first,
+    VF (*weights)[16])
 {
     for (uint k = 1; k < (degree + 1) * (degree + 1); k++) {
         for (uint v = 0; v < vectors; v++)
             weights[v][k] = (VF)(0.0f);
         for (uint channel = 0; channel < 3; channel++)
             for (uint v = 0; v < vectors; v++)
-                weights[v][k] += VLOAD(sh_rest + ((k - 1) * 3 + channel) * stride + first[v]) * g[v].colour[channel];
+                if (!((unseen >> v) & 1))
+                    weights[v][k] += VLOAD(sh_rest + ((k - 1) * 3 + channel) * SH_STRIDE(stride) + first[v]) *
+                                     g[v].colour[channel];
     }
+}
+
+/* The gradients of Gaussians of which none was drawn. */
+static inline void no_gradient(gradient_t *g)
+{
+    const VF zero = (VF)(0.0f);
+    for (uint k = 0; k < 2; k++)
+        g->mean2d[k] = zero;
+    for (uint k = 0; k < 3; k++)
+        g->means[k] = g->log_scales[k] = zero;
+    for (uint k = 0; k < 4; k++)
+        g->quats[k] = zero;
+    for (uint k = 0; k < 16; k++)
+        g->basis[k] = zero;
+    g->logit_opacity = zero;
 }
 
 /* The other gradients, from those of the colours and from the weights of the harmonics. */

@@ -39,6 +39,9 @@
 #ifndef PIXEL_BOX
 #define PIXEL_BOX 0  // 1: a splat is integrated over the box of each pixel (pixel_box.h)
 #endif
+#ifndef SH_SLOTS
+#define SH_SLOTS 0  // 1: harmonics lie in slots that the host fills for each view (slots.h)
+#endif
 #ifndef WEIGHT_ENTROPY
 #define WEIGHT_ENTROPY 0  // 1: the image has a fourth plane, the entropy of the blend weights (splat.h)
 #endif

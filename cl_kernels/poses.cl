@@ -46,7 +46,8 @@ void pose_gradient(
     __global const float *restrict quats,            // [4,S] unnormalised
     __global const float *restrict log_scales,       // [3,S] log of scene units
     __global const float *restrict logit_opacity,    // [S]
-    __global const float *restrict sh_rest,          // [(K-1)*3,S] coefficient-major
+    __global const float *restrict sh_rest,          // [(K-1)*3,S] coefficient-major, or slots (slots.h)
+    __global const uint *restrict sh_slot,           // [S/LANES] slots.h
     __global const float *restrict filter_variance,  // [S] scene units^2
     __constant camera_t *restrict camera,            // [1]
     __global const float *restrict splats,           // [N,RECORD] see splat.h
@@ -56,6 +57,7 @@ void pose_gradient(
     const float screen_variance,                     // px^2
     const float compensate,                          // 0 or 1
     const uint degree,
+    const uint sh_block,                             // values of a block in a slot
     const uint stride,
     const uint count)
 {
@@ -66,8 +68,9 @@ void pose_gradient(
     if (i < count) {
         gradient_t g;
         VF weights[1][16], terms[POSE_SUMS];
+        const uint rest = sh_first(sh_slot, sh_block, i);
         colour_backward(splats, pixel_sums, stride, count, i, &g);
-        weigh_harmonics(sh_rest, &g, 1, degree, stride, &i, weights);
+        weigh_harmonics(sh_rest, &g, 1, !ANY(g.touched), degree, stride, &rest, weights);
         gradient_of(means, quats, log_scales, logit_opacity, filter_variance, camera, pixel_sums, weights[0],
                     near_plane, screen_variance, compensate, degree, stride, i, &g);
         pose_terms(means, quats, camera, &g, weights[0], degree, stride, i, terms);

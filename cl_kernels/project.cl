@@ -11,11 +11,11 @@
 #include "tiles.h"
 
 static inline void add_band(const uint first, const uint last, const VF *basis, __global const float *sh_rest,
-                            const uint stride, const uint i, VF *colour)
+                            const uint stride, const uint first_value, VF *colour)
 {
     for (uint k = first; k < last; k++)
         for (uint channel = 0; channel < 3; channel++)
-            colour[channel] += basis[k] * VLOAD(sh_rest + ((k - 1) * 3 + channel) * stride + i);
+            colour[channel] += basis[k] * VLOAD(sh_rest + ((k - 1) * 3 + channel) * SH_STRIDE(stride) + first_value);
 }
 
 /* Write the records of LANES splats: zero where not visible. */
@@ -47,7 +47,8 @@ void project_forward(
     __global const float *restrict log_scales,       // [3,S] log of scene units
     __global const float *restrict logit_opacity,    // [S]
     __global const float *restrict sh_base,          // [3,S]
-    __global const float *restrict sh_rest,          // [(K-1)*3,S] coefficient-major
+    __global const float *restrict sh_rest,          // [(K-1)*3,S] coefficient-major, or slots (slots.h)
+    __global const uint *restrict sh_slot,           // [S/LANES] slots.h
     __global const float *restrict filter_variance,  // [S] scene units^2
     __global const float *restrict hidden,           // [planes,S] whole numbers: bits of the views that leave it out
     __constant camera_t *restrict camera,            // [1]
@@ -66,6 +67,7 @@ void project_forward(
     const uint hidden_plane,                         // that has the view
     const uint hidden_bit,                           // of the view; 0: no Gaussian is left out
     const uint degree,
+    const uint sh_block,                             // values of a block in a slot
     const uint stride,
     const uint count)
 {
@@ -111,12 +113,13 @@ void project_forward(
         harmonics_basis(degree, d[0], d[1], d[2], basis);
         for (uint channel = 0; channel < 3; channel++)
             colour[channel] += basis[0] * VLOAD(sh_base + channel * stride + i);
+        const uint rest = sh_first(sh_slot, sh_block, i);
         if (degree > 0)
-            add_band(1, 4, basis, sh_rest, stride, i, colour);
+            add_band(1, 4, basis, sh_rest, stride, rest, colour);
         if (degree > 1)
-            add_band(4, 9, basis, sh_rest, stride, i, colour);
+            add_band(4, 9, basis, sh_rest, stride, rest, colour);
         if (degree > 2)
-            add_band(9, 16, basis, sh_rest, stride, i, colour);
+            add_band(9, 16, basis, sh_rest, stride, rest, colour);
     }
 
     const VF zero = (VF)(0.0f);
@@ -156,7 +159,8 @@ void project_backward(
     __global const float *restrict quats,            // [4,S] unnormalised
     __global const float *restrict log_scales,       // [3,S] log of scene units
     __global const float *restrict logit_opacity,    // [S]
-    __global const float *restrict sh_rest,          // [(K-1)*3,S] coefficient-major
+    __global const float *restrict sh_rest,          // [(K-1)*3,S] coefficient-major, or slots (slots.h)
+    __global const uint *restrict sh_slot,           // [S/LANES] slots.h
     __global const float *restrict filter_variance,  // [S] scene units^2
     __constant camera_t *restrict camera,            // [1]
     __global const float *restrict splats,           // [N,RECORD] see splat.h
@@ -166,12 +170,13 @@ void project_backward(
     __global float *restrict grad_log_scales,        // [3,S]
     __global float *restrict grad_logit_opacity,     // [S]
     __global float *restrict grad_sh_base,           // [3,S]
-    __global float *restrict grad_sh_rest,           // [(K-1)*3,S] bands up to `degree` only
+    __global float *restrict grad_sh_rest,           // [(K-1)*3,S] as sh_rest, bands up to `degree` only
     __global float *restrict grad_mean2d,            // [2,S] px^-1
     const float near_plane,                          // scene units
     const float screen_variance,                     // px^2
     const float compensate,                          // 0 or 1
     const uint degree,
+    const uint sh_block,                             // values of a block in a slot
     const uint stride,
     const uint count)
 {
@@ -180,8 +185,9 @@ void project_backward(
         return;
     gradient_t g;
     VF weights[1][16];
+    const uint rest = sh_first(sh_slot, sh_block, i);
     colour_backward(splats, pixel_sums, stride, count, i, &g);
-    weigh_harmonics(sh_rest, &g, 1, degree, stride, &i, weights);
+    weigh_harmonics(sh_rest, &g, 1, !ANY(g.touched), degree, stride, &rest, weights);
     gradient_of(means, quats, log_scales, logit_opacity, filter_variance, camera, pixel_sums, weights[0], near_plane,
                 screen_variance, compensate, degree, stride, i, &g);
     store_planes(grad_means, g.means, g.touched, 3, stride, i);
@@ -191,7 +197,10 @@ void project_backward(
     store_planes(grad_mean2d, g.mean2d, g.touched, 2, stride, i);
     for (uint k = 0; k < (degree + 1) * (degree + 1); k++) {
         const VF coefficients[3] = {g.basis[k] * g.colour[0], g.basis[k] * g.colour[1], g.basis[k] * g.colour[2]};
-        __global float *planes = k == 0 ? grad_sh_base : grad_sh_rest + (k - 1) * 3 * stride;
-        store_planes(planes, coefficients, g.touched, 3, stride, i);
+        if (k == 0)
+            store_planes(grad_sh_base, coefficients, g.touched, 3, stride, i);
+        else if (sh_held(sh_slot, i))
+            store_planes(grad_sh_rest + (k - 1) * 3 * SH_STRIDE(stride), coefficients, g.touched, 3, SH_STRIDE(stride),
+                         rest);
     }
 }

@@ -17,6 +17,8 @@ pytestmark = pytest.mark.slow  # most programs are built anew
 
 FAULTS = {  # kernel -> file, text, wrong text
     "adam_step": ("adam.h", "EPSILON 1.0e-15f", "EPSILON 1.0e-5f"),
+    "replay_updates": ("deferred.cl", "u = first; u < updates", "u = first + 1; u < updates"),
+    "note_update": ("deferred.cl", "done[block] = update + 1", "done[block] = update"),
     "update_gaussians": ("adam.cl", "basis[0] * g[v].colour", "basis[1] * g[v].colour"),
     "blend_forward wide": ("blend_wide.cl", "(p.blue + t * background[2])", "(p.blue + t * background[1])"),
     "blend_backward wide": ("blend_wide.cl", "p.blue * VLOAD(image + 2 * plane", "p.blue * VLOAD(image + plane"),
@@ -184,7 +186,10 @@ OPTIONAL = {  # in what few runs compute: doctor notices them, the check before 
     "project_forward, the views of another plane": ("project.cl", "hidden_plane * stride + i", "i"),
     "project_forward, opacities beside what is dropped": ("project.cl", " * opacity_factor", ""),
     "draw_left_out, what the view hides": ("dropout.cl", "drawn || bits", "drawn"),
-    "adam_step, rows not seen": ("adam.cl", "!= -1) | (VI)((int)every)", "!= 0) | (VI)((int)every)"),
+    "adam_step, rows not seen": ("adam.cl", "(i & ~first)) != -1", "(i & ~first)) != 0"),
+    "adam_step, rows that wait": ("adam.cl", "first = every & undrawn", "first = every"),
+    "replay_updates, factors": ("deferred.cl", "factors[2 * u], factors", "factors[0], factors"),
+    "note_update, factors": ("deferred.cl", "[2 * update] = rate", "[2 * update] = correction2"),
     "motion_step, rows not seen": ("motion.cl", "!= -1) | (VI)((int)every)", "!= 0) | (VI)((int)every)"),
     "update_gaussians, rows not seen": ("adam.cl", "].touched | (VI)((int)every)", "].touched | (VI)(-1)"),
     "update_gaussians, moments not seen": ("adam.h", "(updated ? v : v_before)", "v"),

@@ -1,10 +1,13 @@
 """The splat PLY: exact round trips, tolerant reading, refusals in one sentence."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
 from clsplat.conformance.scenes import random_case
 from clsplat.errors import DataError, OutputError
+from clsplat.formats import ply
 from clsplat.formats.ply import write_ply
 from clsplat.formats.table import read as read_ply
 from clsplat.gaussians.model import Rendering, load
@@ -180,3 +183,39 @@ def test_writing_is_all_or_nothing(tmp_path, rng):
         write_ply(tmp_path / "file" / "model.ply", parameters(rng), {})
     assert (tmp_path / "file").read_text() == "in the way"
     assert list(tmp_path.iterdir()) == [tmp_path / "file"]
+
+
+def a_model(count: int, degree: int = 3) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(count)
+    widths = {"means": 3, "quats": 4, "log_scales": 3, "logit_opacity": 1, "sh_base": 3}
+    widths |= {"sh_rest": 3 * ((degree + 1) ** 2 - 1), "filter_variance": 1, "motion": 5}
+    return {name: rng.random((count, width), dtype=np.float32) for name, width in widths.items()}
+
+
+@pytest.mark.parametrize("count", [0, 1, 15, 16, 17, 33])
+def test_rows_are_written_and_read_some_at_a_time(count, tmp_path, monkeypatch):
+    """The same bytes, and the same tables."""
+    model = a_model(count)
+    whole = ply.write_ply(tmp_path / "whole.ply", model, {})
+    monkeypatch.setattr(ply, "ROWS", 16)
+    assert ply.write_ply(tmp_path / "parts.ply", model, {}) == whole
+    in_parts = ply.read_ply(tmp_path / "parts.ply").parameters
+    monkeypatch.undo()
+    for name, table in ply.read_ply(tmp_path / "whole.ply").parameters.items():
+        np.testing.assert_array_equal(in_parts[name], table)
+        assert in_parts[name].dtype == table.dtype
+
+
+def test_a_model_lies_in_memory_once(tmp_path, monkeypatch):
+    monkeypatch.setattr(ply, "ROWS", 1000)
+    model = a_model(40_000, degree=1)
+    size = sum(table.nbytes for table in model.values())
+    tracemalloc.start()
+    try:
+        ply.write_ply(tmp_path / "model.ply", model, {})
+        assert tracemalloc.get_traced_memory()[1] < 0.2 * size
+        tracemalloc.reset_peak()
+        ply.read_ply(tmp_path / "model.ply")
+        assert tracemalloc.get_traced_memory()[1] < 1.3 * size
+    finally:
+        tracemalloc.stop()

@@ -13,7 +13,7 @@ import json
 import os
 import re
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,6 +38,7 @@ RENDERING, MODE = "clsplat ", "SplatRenderMode: "  # comments
 MIP = re.compile(r"SplatRenderMode\s*:\s*mip|postshot\.anti_aliasing\s*=\s*1", re.IGNORECASE)  # of all programs
 FILTER = "filter_3D"
 NUMBERS = ("near", "screen_variance", "compensate", "pixel_box")  # of the comment
+ROWS = 65_536  # in memory twice, as they are read and written
 MAX_NUMBER = 1e15  # as of any number in a dataset
 _COLUMNS = {
     "means": ("x", "y", "z"),
@@ -60,7 +61,7 @@ def read_ply(path: Path) -> SplatFile:
         rendering, size = comment_of(path, header), header.count * header.dtype.itemsize
         require_held(path, file.seek(0, os.SEEK_END), header.start + size, f"{header.count} splats")
         file.seek(header.start)
-        parameters = _parameters(path, np.frombuffer(file.read(size), header.dtype))
+        parameters = _read(path, file, header)
     return SplatFile(parameters, rendering, "mip" if "filter_variance" in parameters else mode_of(header))
 
 
@@ -70,33 +71,35 @@ def write_ply(path: Path, parameters: Parameters, rendering: dict[str, Any]) -> 
     `rendering` becomes a comment in JSON; with `compensate` in it, the file's mode is mip.  Raises OutputError.
     """
     count = len(parameters["means"])
-    coefficients = 1 + parameters["sh_rest"].shape[1] // 3
-    rest = swapped(parameters["sh_rest"], coefficients - 1, 3)
+    names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+    names += [f"f_rest_{i}" for i in range(parameters["sh_rest"].shape[1])]
+    names += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+    names += [FILTER] if "filter_variance" in parameters else []
+    names += columns_of(parameters[MOTION].shape[1]) if MOTION in parameters else ()
+    header = ["ply", "format binary_little_endian 1.0", *comments(rendering)]
+    header += [f"element vertex {count}", *(f"property float {name}" for name in names), "end_header"]
+    with written(path) as file:
+        file.write(("\n".join(header) + "\n").encode())
+        for first in range(0, count, ROWS):
+            file.write(_body({name: table[first : first + ROWS] for name, table in parameters.items()}))
+    return file.sha256
+
+
+def _body(parameters: Parameters) -> bytes:
+    """The rows of a file."""
+    count, rest = parameters["sh_rest"].shape
     blocks = [
         parameters["means"],
         np.zeros((count, 3), np.float32),
         parameters["sh_base"],
-        rest,
+        swapped(parameters["sh_rest"], rest // 3, 3),
         parameters["logit_opacity"],
         parameters["log_scales"],
         parameters["quats"],
     ]
-    names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
-    names += [f"f_rest_{i}" for i in range(rest.shape[1])]
-    names += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
-    if "filter_variance" in parameters:
-        blocks.append(np.sqrt(parameters["filter_variance"]))
-        names.append(FILTER)
-    if MOTION in parameters:
-        blocks.append(parameters[MOTION])
-        names += columns_of(parameters[MOTION].shape[1])
-    header = ["ply", "format binary_little_endian 1.0", *comments(rendering)]
-    header += [f"element vertex {count}", *(f"property float {name}" for name in names), "end_header"]
-    body = np.ascontiguousarray(np.concatenate(blocks, axis=1), "<f4")
-    with written(path) as file:
-        file.write(("\n".join(header) + "\n").encode())
-        file.write(body.tobytes())
-    return file.sha256
+    blocks += [np.sqrt(parameters["filter_variance"])] if "filter_variance" in parameters else []
+    blocks += [parameters[MOTION]] if MOTION in parameters else []
+    return np.ascontiguousarray(np.concatenate(blocks, axis=1), "<f4").tobytes()
 
 
 def comments(rendering: dict[str, Any]) -> list[str]:
@@ -136,6 +139,19 @@ def checked_numbers(path: Path, values: dict[str, Any]) -> dict[str, Any]:
             f"{path}: its comment holds what no JSON holds ({quoted(error)}); export it again, or correct it"
         ) from error
     return values
+
+
+def _read(path: Path, file: BinaryIO, header: PlyHeader) -> Parameters:
+    """The tables of a file that stands at its first row, read some rows at a time."""
+    tables: Parameters = {}
+    for first in range(0, max(header.count, 1), ROWS):
+        rows = min(ROWS, header.count - first)
+        part = _parameters(path, np.frombuffer(file.read(rows * header.dtype.itemsize), header.dtype))
+        if not tables:
+            tables = {name: np.empty((header.count, table.shape[1]), table.dtype) for name, table in part.items()}
+        for name, table in part.items():
+            tables[name][first : first + rows] = table
+    return tables
 
 
 def _parameters(path: Path, vertices: NDArray[Any]) -> Parameters:

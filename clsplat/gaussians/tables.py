@@ -16,13 +16,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.errors import ConfigError
 from clsplat.formats.motion import MOTION
 from clsplat.formats.splats import PARAMETERS as PARAMETERS
 from clsplat.formats.splats import SH_C0 as SH_C0
 from clsplat.formats.splats import degree_of
 from clsplat.formats.splats import sh_coefficients as sh_coefficients
+from clsplat.gaussians.dropout import Dropout as Dropout
+from clsplat.gaussians.finite import not_finite
+from clsplat.gaussians.gradients import Gradients as Gradients
+from clsplat.gaussians.moments import HARMONICS
+from clsplat.gaussians.moments import moment_tables as moment_tables
+from clsplat.gaussians.on_host import OnHost, defines_of
 from clsplat.gaussians.rows import checked_rows
 from clsplat.gaussians.sky import DeviceSky
+from clsplat.gaussians.struct import Waiting
 from clsplat.opencl.device import Array, Device
 
 HIDDEN = "hidden"  # which training views leave a Gaussian out; see left_out.py
@@ -50,6 +58,9 @@ class Gaussians:
         self.capacity = _aligned(self.count)
         self.sh_degree = degree_of(parameters["sh_rest"].shape[1])
         self.tables: dict[str, Table] = {}
+        self.deferred: Waiting | None = None  # updates that rows wait for
+        self.on_host: OnHost | None = None  # tables that lie on the host
+        self.no_slot = device.zeros(1, np.uint32)
         for name in PARAMETERS:
             self.add(name, parameters[name].shape[1])
             self.set(name, parameters[name])
@@ -61,7 +72,15 @@ class Gaussians:
         self._rows = device.program("gather.cl")
 
     def __getitem__(self, name: str) -> Array:
-        return self.tables[name].array
+        if self.on_host and name in self.on_host:
+            raise ConfigError(f"{name} lies in the memory of the host; expected `rasterizer.harmonics: device`")
+        return self._settled(name).array
+
+    def _settled(self, name: str) -> Table:
+        """A table whose rows wait for no update."""
+        if self.deferred and name in self.deferred.names:
+            self.deferred.flush()
+        return self.tables[name]
 
     @property
     def components(self) -> dict[str, int]:
@@ -70,18 +89,38 @@ class Gaussians:
 
     def add(self, name: str, components: int, zero_fresh: bool = False) -> None:
         """Attach a table of zeros."""
-        self.tables[name] = Table(self.device.zeros((components, self.capacity)), components, zero_fresh)
+        if self.on_host and name in HARMONICS:
+            array = self.on_host.add(name, components)
+        else:
+            array = self.device.zeros((components, self.capacity))
+        self.tables[name] = Table(array, components, zero_fresh)
+
+    def move_to_host(self) -> None:
+        """Keep the harmonics above band 0 and their moments on the host; the device has those that a view sees."""
+        if self.on_host:
+            return
+        present = {name: self.get(name) for name in HARMONICS if name in self.tables}
+        self.on_host = OnHost(self)
+        for name, values in present.items():
+            self.add(name, values.shape[1], self.tables[name].zero_fresh)
+            self.set(name, values)
 
     def get(self, name: str) -> NDArray[np.float32]:
         """Copy a table to the host, [N, components]."""
-        planes = self.tables[name].array.get()
+        table = self._settled(name)
+        if self.on_host and name in self.on_host:
+            return self.on_host.get(name)
+        planes = table.array.get()
         return np.ascontiguousarray(planes[:, : self.count].T)
 
     def set(self, name: str, values: NDArray[Any]) -> None:
         """Copy [N, components] from the host into a table."""
-        table = self.tables[name]
+        table = self._settled(name)
         if values.shape != (self.count, table.components):
             raise ValueError(f"{name}: expected {(self.count, table.components)}, got {values.shape}")
+        if self.on_host and name in self.on_host:
+            self.on_host.set(name, values)
+            return
         planes = np.zeros((table.components, self.capacity), np.float32)
         planes[:, : self.count] = values.T
         table.array.set(planes)
@@ -91,9 +130,12 @@ class Gaussians:
 
         rows: [n] integers, as in `checked_rows`.  Raises ValueError for other rows and for values of another shape.
         """
-        table, rows = self.tables[name], checked_rows(rows, self.count)
+        table, rows = self._settled(name), checked_rows(rows, self.count)
         if values.shape != (len(rows), table.components):
             raise ValueError(f"{name}: expected {(len(rows), table.components)}, got {values.shape}")
+        if self.on_host and name in self.on_host:
+            self.on_host.set_rows(name, rows, values)
+            return
         self._rows.set_rows(
             items=(len(rows), table.components),
             rows=self.device.upload(rows),
@@ -111,7 +153,10 @@ class Gaussians:
         """
         uploaded = self.device.upload(checked_rows(rows, self.count))
         for name in names:
-            table = self.tables[name]
+            table = self._settled(name)
+            if self.on_host and name in self.on_host:
+                self.on_host.set_rows(name, rows, np.zeros((len(rows), table.components), np.float32))
+                continue
             self._rows.zero_rows(
                 items=(len(rows), table.components),
                 rows=uploaded,
@@ -125,7 +170,7 @@ class Gaussians:
         if degree >= self.sh_degree:
             return
         self.sh_degree, components = degree, 3 * (sh_coefficients(degree) - 1)
-        for name in self.tables.keys() & {"sh_rest", *moment_tables("sh_rest")}:
+        for name in self.tables.keys() & set(HARMONICS):
             kept = self.get(name)[:, :components]
             self.add(name, components, self.tables[name].zero_fresh)
             self.set(name, kept)
@@ -147,18 +192,7 @@ class Gaussians:
 
     def not_finite(self) -> list[str]:
         """Return the names of the parameters that hold NaN or infinity, or whose moments do."""
-        program = self.device.program("check.cl")
-        counters = {name: self.device.zeros(1, np.uint32) for name in self.trained}
-        for name, counter in counters.items():
-            for table in self.tables.keys() & {name, *moment_tables(name)}:
-                program.count_not_finite(
-                    items=(self.count, self.tables[table].components),
-                    values=self[table],
-                    counter=counter,
-                    stride=self.capacity,
-                    count=self.count,
-                )
-        return [name for name, counter in counters.items() if counter.get_item(0) > 0]
+        return not_finite(self)
 
     def rearrange(self, source: Array, fresh: Array, count: int) -> None:
         """Make row i of every table its row source[i]; set fresh rows of moments and statistics to zero.
@@ -166,11 +200,13 @@ class Gaussians:
         source, fresh: [count] uint32.  The only operation that changes the number of Gaussians.
         """
         capacity = self.capacity
+        self._settled("sh_rest")
         if count > capacity:
             widest = max(table.components for table in self.tables.values()) * np.dtype(np.float32).itemsize
             roomy = min(int(self.capacity * GROWTH), self.device.info.allocation // widest - ALIGNMENT)
             capacity = _aligned(max(count, roomy))
-        for table in self.tables.values():
+        on_host = self.on_host.rearranged(source.get()[:count], fresh.get()[:count]) if self.on_host else {}
+        for table in (table for name, table in self.tables.items() if name not in on_host):
             moved = self.device.zeros((table.components, capacity))
             self._rows.gather_rows(
                 items=(count, table.components),
@@ -185,41 +221,8 @@ class Gaussians:
             )
             table.array = moved
         self.count, self.capacity = count, capacity
-
-
-class Gradients:
-    """Derivatives of the loss by each parameter, with the shapes of the parameters."""
-
-    def __init__(self, gaussians: Gaussians) -> None:
-        shapes = {name: (gaussians.tables[name].components, gaussians.capacity) for name in gaussians.trained}
-        self.arrays = {name: gaussians.device.zeros(shape) for name, shape in shapes.items()}
-        self.mean2d = gaussians.device.zeros((2, gaussians.capacity))  # px⁻¹, for density statistics
-
-    def __getitem__(self, name: str) -> Array:
-        return self.arrays[name]
-
-    def fits(self, gaussians: Gaussians) -> bool:
-        """Return whether the shapes are those of the parameters of these Gaussians."""
-        shapes = {name: (gaussians.tables[name].components, gaussians.capacity) for name in gaussians.trained}
-        return {name: array.shape for name, array in self.arrays.items()} == shapes
-
-    def arguments(self) -> dict[str, Any]:
-        """Return those of the projection by the names of its kernels' arguments."""
-        return {**{f"grad_{name}": self.arrays[name] for name in PARAMETERS}, "grad_mean2d": self.mean2d}
-
-
-@dataclass(frozen=True)
-class Dropout:
-    """What one step leaves out: each Gaussian with a probability below 1, by (seed, step, row)."""
-
-    probability: float
-    seed: int
-    step: int  # global
-
-    @property
-    def opacity_factor(self) -> float:
-        """Factor of the opacities of the others, which keeps the mean opacity of a Gaussian (Park et al. 2025)."""
-        return 1 / (1 - self.probability)
+        for name, values in on_host.items():
+            self.set(name, values)
 
 
 @dataclass
@@ -238,12 +241,7 @@ class DeviceModel:
     @property
     def defines(self) -> dict[str, int]:
         """What chooses the programs that project, list and blend these splats."""
-        return {"PIXEL_BOX": 1} if self.pixel_box else {}
-
-
-def moment_tables(parameter: str) -> tuple[str, str]:
-    """Return the names of the tables that hold Adam's two moments of a parameter."""
-    return f"adam/{parameter}/moment1", f"adam/{parameter}/moment2"
+        return ({"PIXEL_BOX": 1} if self.pixel_box else {}) | defines_of(self.gaussians)
 
 
 def _aligned(count: int) -> int:

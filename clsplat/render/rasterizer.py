@@ -1,25 +1,25 @@
 """Render Gaussians to an image, and compute their gradients from the image's."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Literal
 
 import numpy as np
 
 from clsplat.errors import MemoryLimitError
-from clsplat.gaussians.left_out import left_out_arguments
 from clsplat.gaussians.tables import DeviceModel, Gradients
 from clsplat.opencl.device import Array, Device
 from clsplat.opencl.program import Program, constants
 from clsplat.render.arguments import shape_arguments
 from clsplat.render.camera import DeviceCamera
 from clsplat.render.motion import at_moment, to_centres
+from clsplat.render.projection import RECORD as RECORD
+from clsplat.render.projection import catch_up, project
 from clsplat.render.records import add_inverse_depth_gradient, sum_inverse_depths, sum_records
 from clsplat.render.sky import Skies
-from clsplat.render.tiles import Band, Footprints, Sort, TileLists, Tiler, TooManyPairs
+from clsplat.render.tiles import Band, Sort, TileLists, Tiler, TooManyPairs
 from clsplat.render.workspace import Workspace
 
-RECORD = int(constants()["RECORD"])
 PIXEL_SUMS = int(constants()["PIXEL_SUMS"])
 MAX_PAIRS = 2**31  # more than fit in memory, and few enough for sums of 32 bits: no other limit
 Content = Literal["colour", "depth", "entropy", "inverse_depth"]
@@ -80,6 +80,7 @@ class Rasterizer:
         """
         sky = model.sky if content != "depth" else None
         model = at_moment(self.workspace, model, camera)
+        catch_up(self.workspace, model, camera)
         while True:
             try:
                 frame = self._forward(model, camera, self._black if sky else background, content)
@@ -149,18 +150,7 @@ class Rasterizer:
     ) -> TileLists:
         gaussians = model.gaussians
         count, stride = gaussians.count, gaussians.capacity
-        footprints = Footprints(*(self.workspace.array(field.name, stride, np.uint32) for field in fields(Footprints)))
-        self.device.program("project.cl", **model.defines).project_forward(
-            items=-(-count // self._lanes),
-            **shape_arguments(model, camera),
-            sh_base=gaussians["sh_base"],
-            **left_out_arguments(model, camera.view, self.workspace.array("left_out", stride)),
-            splats=splats,
-            **vars(footprints),
-            radius=radius,
-            row_begin=band.row_begin,
-            row_end=band.row_end,
-        )
+        footprints = project(self.workspace, model, camera, band, splats, radius)
         if content == "depth":
             self.device.program("depth.cl").paint_depth(
                 items=count, means=gaussians["means"], camera=camera.array, splats=splats, stride=stride, count=count

@@ -17,7 +17,9 @@ from clsplat.runs.runner import restore
 from clsplat.runs.scenes import ReadScene, read_run_scene
 from clsplat.stages.base import Scheduled, Stage
 from clsplat.stages.evaluate import Evaluate
+from clsplat.stages.init import Init
 from clsplat.stages.training import Training
+from clsplat.training.memory import first_tables
 from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
@@ -62,6 +64,7 @@ def describe(
             stage.check_in(run)
     lines += [f"  {one.told}" for one in pipeline.settings.choices]
     lines += [f"  {stage.stage:<14} {_detail(stage, run)}".rstrip() for stage in pipeline.stages]
+    lines += _on_host(pipeline, run) if run else []
     if expect and start != "resume":
         lines += expect(pipeline, planned, out, opened, run)
     return f"{verdict} in {out}:\n" + "\n".join(lines)
@@ -71,6 +74,17 @@ def tell_of_waiting(out: Path) -> None:
     """Raise OutputError where a run in `out` would be refused as it is in use; say where it would wait to know."""
     if not lock.check_free(out):
         LOG.info("%s: was in use elsewhere just now; the run would wait for its heartbeat, a minute at most", out)
+
+
+def _on_host(pipeline: Pipeline, run: Run) -> list[str]:
+    """The plan of memory, where the harmonics will lie on the host."""
+    first = next((stage for stage in pipeline.stages if isinstance(stage, Init)), None)
+    if first is None:
+        return []
+    motion, count = run.model_settings.time, first.expected_count(run.scene)
+    planned = run.memory_plan(first_tables(run.model_settings.sh_degree, motion.width if motion else 0))
+    planned = planned.beginning_with(count)
+    return [f"  {planned.text(count)}"] if planned.host else []
 
 
 def _detail(stage: Stage, run: Run | None) -> str:

@@ -19,6 +19,7 @@ class AddToAverage(Scheduled):
     needs: ClassVar[frozenset[str]] = frozenset({"model"})
     makes: ClassVar[frozenset[str]] = frozenset({"average"})
     edits: ClassVar[bool] = True
+    reads_harmonics: ClassVar[bool] = True
 
     def attach(self, run: Run) -> None:
         average.attach(run.model.gaussians)

@@ -51,6 +51,7 @@ class Stage(Settings):
     makes: ClassVar[frozenset[str]] = frozenset()  # parts that exist afterwards
     takes: ClassVar[frozenset[str]] = frozenset()  # parts that do not exist afterwards
     edits: ClassVar[bool] = False  # changes the model; inside `during` it acts between two steps
+    reads_harmonics: ClassVar[bool] = False  # of all Gaussians, with a kernel
 
     stage: str
     """Name of the stage."""

@@ -8,6 +8,7 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field, field_validator
 
 from clsplat.density.statistics import SplatStats
+from clsplat.errors import ConfigError
 from clsplat.losses.base import ImageLoss, Loss, Penalty, ViewGradients, ViewLosses, require_symmetric
 from clsplat.names import VIEW_POSES
 from clsplat.schedule import Probability
@@ -21,6 +22,7 @@ from clsplat.training.backgrounds import Behind, drawn_backgrounds
 from clsplat.training.colours import photograph_colours, write_view_colours
 from clsplat.training.depths import known_depths
 from clsplat.training.forecast import Forecast
+from clsplat.training.placing import place_harmonics
 from clsplat.training.poses import photograph_poses, write_view_poses
 from clsplat.training.profile import clocks
 from clsplat.training.rescue import finite_values
@@ -51,7 +53,8 @@ class Optimize(Keeping):
     rates: Rates = Rates()
     """Learning rates."""
     update: Rows = "all"
-    """Gaussians that a step changes: `all`, or `seen`: those that the view culls keep their parameters and moments."""
+    """Gaussians that a step changes: `all`, or `seen`: those that the view culls keep their parameters and moments.
+    `deferred`: all, with the same bits; `sh_rest` of those that are culled has its updates when a view sees them."""
     views: ViewSettings = ViewSettings()
     """View, size and photograph of each step."""
     losses: list[OneOf[Loss]]
@@ -141,6 +144,8 @@ class Optimize(Keeping):
     def _trainer(self, run: Run, views: ViewSettings, last: int) -> Trainer:
         """Attach moments, statistics and tables to the run's Gaussians; a resumed run has them."""
         gaussians, photographs = run.model.gaussians, run.photographs
+        if place_harmonics(run):
+            self._require_rows()
         run.adam = run.adam or Adam(gaussians)
         run.stats = SplatStats(gaussians, self.statistics, len(run.scene.split("train")))
         for name in sorted(self.tables - gaussians.tables.keys()):
@@ -155,6 +160,15 @@ class Optimize(Keeping):
         behind, depths = drawn_backgrounds(self.background, run), known_depths(self.losses, run, poses)
         trained = self.losses, rates, run.scene.extent, run.numbers, self.update
         return Trainer(*parts, *trained, *own, poses=poses, backgrounds=behind, depths=depths)
+
+    def _require_rows(self) -> None:
+        """Raise ConfigError where a stage needs the harmonics of all Gaussians on the device."""
+        if found := next((stage for stage in self.during if stage.reads_harmonics), None):
+            raise ConfigError(
+                f"{found.stage}: changes the harmonics of all Gaussians on the device, and they lie on the host; "
+                "expected `rasterizer.harmonics: device`, with fewer Gaussians where it does not hold them, or no such "
+                "stage"
+            )
 
     def _edit(self, run: Run, views: ViewSettings) -> None:
         """Run the edits that were due at the step before."""

@@ -70,6 +70,7 @@ class SharePalette(Scheduled):
     stage: Literal["share_palette"] = "share_palette"
     needs: ClassVar[frozenset[str]] = frozenset({"model", "palette"})
     edits: ClassVar[bool] = True
+    reads_harmonics: ClassVar[bool] = True
 
     def run(self, run: Run) -> None:
         if run.model.gaussians.sh_degree:

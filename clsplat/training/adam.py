@@ -3,10 +3,14 @@
 from collections.abc import Collection
 from typing import Annotated, Any, ClassVar, Literal
 
+import numpy as np
 from pydantic import Field
 
 from clsplat.errors import ConfigError
 from clsplat.formats.motion import MOTION
+from clsplat.gaussians.deferred import Deferred
+from clsplat.gaussians.on_host import defines_of, slots_of
+from clsplat.gaussians.struct import Waiting
 from clsplat.gaussians.tables import PARAMETERS, DeviceModel, Gaussians, Gradients, moment_tables, sh_coefficients
 from clsplat.opencl.device import Array
 from clsplat.opencl.program import constants
@@ -90,8 +94,9 @@ class Rates(Settings):
         return {**rates, "means": rates["means"] * extent, **self.motion.at(step, extent)}
 
 
-Rows = Literal["all", "seen"]  # Gaussians that an update changes
-_EVERY = {"all": 0xFFFFFFFF, "seen": 0}
+Rows = Literal["all", "seen", "deferred"]  # Gaussians that an update changes; deferred: all, some later
+_EVERY = {"all": 0xFFFFFFFF, "seen": 0, "deferred": 0xFFFFFFFF}
+_UNDRAWN = {"all": 0xFFFFFFFF, "seen": 0xFFFFFFFF, "deferred": 0}
 
 
 class Adam:
@@ -101,6 +106,8 @@ class Adam:
     fainter than 1/255) keeps its parameters and both moments, whatever penalties give it.  The correction of the
     moments' bias counts the updates of a parameter, in `seen` too, where a row may have had fewer; published kernels
     (Taming 3DGS) leave the correction out.
+
+    Of the rows `deferred`, `sh_rest` has its updates when a view sees it: the bits are those of `all`.
     """
 
     def __init__(self, gaussians: Gaussians) -> None:
@@ -122,12 +129,14 @@ class Adam:
         Returns the gradient of the projected means, [2, S] px⁻¹.
         """
         gaussians = self.gaussians
+        rows = self._possible(rows)
         grad_mean2d = gaussians.device.empty((2, gaussians.capacity))
         arguments: dict[str, Any] = {"sh_base": gaussians["sh_base"]}
+        deferred = self._deferred(rows, model, rates)
         for name in PARAMETERS:
-            moment1, moment2 = moment_tables(name)
+            moment1, moment2 = (gaussians.tables[table].array for table in moment_tables(name))
             rate, correction2 = self._factors(name, rates)
-            arguments |= {f"{name}_moment1": gaussians[moment1], f"{name}_moment2": gaussians[moment2]}
+            arguments |= {f"{name}_moment1": moment1, f"{name}_moment2": moment2}
             arguments |= {f"{name}_rate": rate, f"{name}_correction2": correction2}
         program = gaussians.device.program("adam.cl", **model.defines)
         program.update_gaussians(
@@ -136,10 +145,12 @@ class Adam:
             **arguments,
             sh_rest_degree=model.degree if rates["sh_rest"] else 0,
             every=_EVERY[rows],
+            undrawn=_UNDRAWN[rows],
             splats=frame.splats,
             pixel_sums=pixel_sums,
             grad_mean2d=grad_mean2d,
         )
+        self._end(deferred, frame, arguments["sh_rest_rate"], arguments["sh_rest_correction2"])
         return grad_mean2d
 
     def step(
@@ -155,32 +166,61 @@ class Adam:
 
         Bands above the active SH degree are left out: their gradients and moments are zero.
         """
-        gaussians = self.gaussians
+        gaussians, rows = self.gaussians, self._possible(rows)
+        deferred = None if "sh_rest" in without else self._deferred(rows, model, rates)
         for name in PARAMETERS:
             if name in without or (name == "sh_rest" and not rates[name]):
                 continue
             components = gaussians.tables[name].components
             if name == "sh_rest":
                 components = 3 * (sh_coefficients(model.degree) - 1)
-            moment1, moment2 = moment_tables(name)
+            values, moment1, moment2 = (gaussians.tables[table].array for table in (name, *moment_tables(name)))
             rate, correction2 = self._factors(name, rates)
-            gaussians.device.program("adam.cl").adam_step(
+            in_slots = defines_of(gaussians) if name == "sh_rest" else {}
+            gaussians.device.program("adam.cl", **in_slots).adam_step(
                 items=(-(-gaussians.count // self._lanes), components),
-                values=gaussians[name],
+                values=values,
                 gradient=gradients[name],
-                moment1=gaussians[moment1],
-                moment2=gaussians[moment2],
+                moment1=moment1,
+                moment2=moment2,
                 depth_key=frame.depth_key,
                 rate=rate,
                 correction2=correction2,
                 every=_EVERY[rows],
+                undrawn=_UNDRAWN[rows] if name == "sh_rest" else _UNDRAWN["all"],
+                **slots_of(gaussians),
                 stride=gaussians.capacity,
                 count=gaussians.count,
             )
-
+            if name == "sh_rest":
+                self._end(deferred, frame, rate, correction2)
         if gaussians.moves and MOTION not in without:
             self.updates[MOTION] += 1
             update_motion(gaussians, gradients, frame.depth_key, rates, self.updates[MOTION], _EVERY[rows])
+
+    def _deferred(self, rows: Rows, model: DeviceModel, rates: dict[str, float]) -> Waiting | None:
+        """What notes the next update of `sh_rest`; None where all rows have it at once, or none has it."""
+        gaussians = self.gaussians
+        if rows != "deferred":
+            if gaussians.deferred:
+                gaussians.deferred.flush()
+            return None
+        if model.degree == 0 or not rates["sh_rest"]:
+            return None
+        gaussians.deferred = gaussians.deferred or Deferred(gaussians)
+        gaussians.deferred.before(model.degree)
+        return gaussians.deferred
+
+    def _possible(self, rows: Rows) -> Rows:
+        """Harmonics on the host are updated where a view sees them: of `all`, the others later."""
+        return "deferred" if rows == "all" and self.gaussians.on_host else rows
+
+    def _end(self, deferred: Waiting | None, frame: Frame, rate: float, correction2: float) -> None:
+        """Note the update of `sh_rest` that the rows in the view have had."""
+        if deferred:
+            deferred.note(frame.depth_key, (rate, correction2))
+        if self.gaussians.on_host:
+            self.gaussians.on_host.begin_to_fetch()
 
     def _factors(self, name: str, rates: dict[str, float]) -> tuple[float, float]:
         """Rate and second factor of a parameter's next update, with the bias correction of the moments."""
@@ -190,5 +230,4 @@ class Adam:
 
     def forget(self, name: str) -> None:
         """Set the moments of one parameter to zero."""
-        for moment in moment_tables(name):
-            self.gaussians[moment].fill(0)
+        self.gaussians.zero_rows(moment_tables(name), np.arange(self.gaussians.count))

@@ -3,15 +3,18 @@
 Bytes are those of the tables for each Gaussian, and those of a frame for each Gaussian, each pair and each pixel.
 """
 
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, replace
+from typing import Literal, Protocol
 
 from clsplat.errors import MemoryLimitError
 from clsplat.formats.motion import MOTION
+from clsplat.gaussians.moments import HARMONICS
 from clsplat.gaussians.tables import ALIGNMENT, GROWTH, PARAMETERS, moment_tables, sh_coefficients
 from clsplat.render.rasterizer import PIXEL_SUMS, RECORD
 
+SEEN_SHARE = 0.5  # of the Gaussians, in one view, an estimate; their harmonics come to the device
 PAIRS_PER_GAUSSIAN = 5  # (tile, Gaussian) pairs, an estimate; trained scenes have 1.5 to 4
 FRAME_GAUSSIAN = 4 * (RECORD + 2 + 5 + 7)  # records, mean2d; keys and radius; sorting by depth
 MOVED = 4 * (3 + 4 + 1)  # means, quaternions and logits of a moment
@@ -20,6 +23,17 @@ FRAME_PIXEL = 4 * (4 * 3 + 3 + 9 + 2 * 3 + 2 * 3 + 2 + 2)
 # image, photograph, gradient, second render; transmittance, texture, mask; SSIM's derivatives; a photograph that is
 # changed and its gradient, or the sums of a blur; the image in the colours of its photograph and its gradient; the
 # entropy of weights and its gradient; residuals, and the mask that leaves out the large ones
+
+
+Where = Literal["auto", "device", "host"]
+
+
+@dataclass(frozen=True)
+class Placement:
+    """What a training may take of a device, and where its harmonics above band 0 lie."""
+
+    budget: int | None = None  # bytes of the device; None: all
+    harmonics: Where = "auto"  # the device's memory, and the host's where that does not hold the training
 
 
 @dataclass(frozen=True)
@@ -32,6 +46,8 @@ class MemoryPlan:
     largest_table: int  # for each Gaussian, in the largest single buffer
     memory: int  # of the device
     allocation: int  # of a single buffer
+    host: int = 0  # for each Gaussian, in the memory of the host
+    instead: "MemoryPlan | None" = None  # where this one does not hold what a training begins with
 
     def needed(self, gaussians: int) -> int:
         """Return the bytes for a number of Gaussians, with room to grow and one table being moved."""
@@ -51,17 +67,23 @@ class MemoryPlan:
     def text(self, gaussians: int) -> str:
         """Return one line: the memory needed now, and the number of Gaussians that fit."""
         mib = 2**20
+        on_host = f"; harmonics on the host, in {gaussians * self.host / mib:,.0f} MiB of it" if self.host else ""
         return (
             f"memory: {self.needed(gaussians) / mib:,.0f} MiB for {gaussians:,} Gaussians ({self.gaussian} bytes each "
             f"and {self.pair} a pair, photographs and planes {self.fixed / mib:,.0f} MiB); {self.limit:,} fit in "
-            f"{self.memory / mib:,.0f} MiB with buffers up to {self.allocation / mib:,.0f} MiB"
+            f"{self.memory / mib:,.0f} MiB with buffers up to {self.allocation / mib:,.0f} MiB{on_host}"
         )
 
+    def beginning_with(self, gaussians: int) -> "MemoryPlan":
+        """Return the plan of a training that begins with so many: `instead` where this one does not hold them."""
+        return self.instead if self.instead and gaussians > self.limit else self
+
     def check(self, gaussians: int) -> None:
-        """Raise MemoryLimitError when that many Gaussians do not fit."""
-        if gaussians > self.limit:
+        """Raise MemoryLimitError when a training that begins with so many Gaussians does not fit."""
+        plan = self.beginning_with(gaussians)
+        if gaussians > plan.limit:
             raise MemoryLimitError(
-                f"{self.text(gaussians)}: start from fewer points, use smaller images (scene.downscale) or fewer "
+                f"{plan.text(gaussians)}: start from fewer points, use smaller images (scene.downscale) or fewer "
                 "of them on the device (scene.image_budget)"
             )
 
@@ -89,16 +111,30 @@ class Limits(Protocol):
 
 
 def plan(
-    limits: Limits, components: Mapping[str, int], photographs: int, pixels: int, pixel_sums: int = PIXEL_SUMS
+    limits: Limits,
+    components: Mapping[str, int],
+    photographs: int,
+    pixels: int,
+    pixel_sums: int = PIXEL_SUMS,
+    placement: Placement | None = None,
 ) -> MemoryPlan:
     """Return the plan for Gaussians with tables of these components, by name.
 
     photographs: their bytes on the device; pixels: of the largest view, whole tiles; pixel_sums: sums over pixels that
-    the backward pass computes for each Gaussian.
+    the backward pass computes for each Gaussian; placement: without it, the default.
     """
-    sizes = [4 * width for width in components.values()]
-    gradients = sum(4 * components[name] for name in PARAMETERS) + 8  # for penalties and edits
+    placement = placement or Placement()
+    if placement.harmonics == "auto":
+        both = [replace(placement, harmonics=where) for where in ("device", "host")]
+        on_device, on_host = (plan(limits, components, photographs, pixels, pixel_sums, one) for one in both)
+        return replace(on_device, instead=on_host)
+    shares = dict.fromkeys(HARMONICS, SEEN_SHARE) if placement.harmonics == "host" else {}
+    held = {name: math.ceil(4 * width * shares.get(name, 1)) for name, width in components.items()}
+    sizes = list(held.values())
+    gradients = sum(held[name] for name in PARAMETERS) + 8  # for penalties and edits
     moving = 4 * components[MOTION] + MOVED if MOTION in components else 0
     gaussian = sum(sizes) + FRAME_GAUSSIAN + 4 * pixel_sums + gradients + moving
     fixed = photographs + FRAME_PIXEL * pixels
-    return MemoryPlan(gaussian, FRAME_PAIR, fixed, max(sizes), limits.memory, limits.allocation)
+    memory = limits.memory if placement.budget is None else min(limits.memory, placement.budget)
+    host = sum(4 * components.get(name, 0) for name in shares)
+    return MemoryPlan(gaussian, FRAME_PAIR, fixed, max(sizes), memory, limits.allocation, host)

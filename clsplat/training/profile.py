@@ -43,6 +43,8 @@ STAGES = {
     "pose_gradient": "update",
     "adam_step": "update",
     "update_gaussians": "update",
+    "replay_updates": "update",
+    "note_update": "update",
     "count_seen": "statistics",
     "accumulate_norm": "statistics",
     "accumulate_error": "statistics",

@@ -241,7 +241,9 @@ class Trainer:
         if not (penalties or stale or self.model.gaussians.moves or view.frame.content == "inverse_depth"):
             return self.adam.update(self.model, view.frame, view.pixel_sums, rates, self.rows)
         gradients = self.rasterizer.gradients(self.model, view.frame, view.pixel_sums)
-        inputs = PenaltyInputs(self.rasterizer.workspace, self.model.gaussians, gradients, self.extent, step)
+        waits = self.rows == "deferred" or self.model.gaussians.on_host
+        open_ones = gradients.without_deferred() if waits else gradients
+        inputs = PenaltyInputs(self.rasterizer.workspace, self.model.gaussians, open_ones, self.extent, step)
         self.rasterizer.device.timings.section = "loss"
         view.losses.extend(returned(penalty, penalty.add(inputs)) for penalty in penalties)
         self.adam.step(self.model, view.frame, gradients, rates, stale, self.rows)

@@ -1,0 +1,155 @@
+"""Runs whose harmonics are updated when a view sees them, on the device and on the host: the bits of one at once."""
+
+import shutil
+
+import numpy as np
+import pytest
+
+from clsplat.errors import ConfigError, MemoryLimitError
+from clsplat.formats.ply import write_ply
+from clsplat.formats.table import read as read_ply
+from clsplat.losses.base import LossValue, Penalty
+from clsplat.runs import folders, opening, runner
+from clsplat.runs.description import describe
+from clsplat.training import checkpoint
+from clsplat.training.memory import Placement, plan
+from tests.few_steps import FEW
+from tests.test_training import digest, load, train
+
+pytestmark = pytest.mark.slow
+
+DEFERRED, HOST = "optimize.update=deferred", "rasterizer.harmonics=host"
+WAYS = {"deferred": (DEFERRED,), "host": (HOST,), "both": (DEFERRED, HOST)}
+
+
+@pytest.fixture(scope="module")
+def spread(few_steps, tmp_path_factory):
+    """Settings of a run from Gaussians of which each view sees a part, with growth, harmonics and their decay."""
+    model = read_ply(few_steps / "point_cloud.ply").parameters
+    model, count = {name: table[:2000] for name, table in model.items()}, 2000
+    model["means"][::2] *= 6
+    rng = np.random.default_rng(0)
+    model["sh_rest"] = rng.normal(0, 0.05, (count, 45)).astype(np.float32)
+    file = tmp_path_factory.mktemp("spread") / "spread.ply"
+    write_ply(file, model, {})
+    return "init.source=model", f"init.file='{file}'", *FEW, "optimize.checkpoint.keep=9"
+
+
+@pytest.fixture(scope="module")
+def at_once(spread, tiny_scene, tmp_path_factory):
+    out = tmp_path_factory.mktemp("runs") / "at_once"
+    train(tiny_scene, out, *spread)
+    return out
+
+
+def tables(out, step):
+    return checkpoint.load(out / "checkpoints" / f"step_{step:06d}.npz")[1]
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_the_bits_are_those_of_updates_at_once(way, spread, at_once, tiny_scene, tmp_path):
+    """In the file, and in each checkpoint with the moments; Gaussians have been added; a run resumes."""
+    out = train(tiny_scene, tmp_path / "run", *spread, *WAYS[way]).out
+    for step in (4, 8, 12):
+        expected = tables(at_once, step)
+        for name, table in tables(out, step).items():
+            np.testing.assert_array_equal(table.view(np.uint32), expected[name].view(np.uint32), err_msg=name)
+    assert len(tables(out, 12)["gaussians/means"]) > len(tables(out, 4)["gaussians/means"])
+    for name in ("step_000012.npz", "step_000008.npz"):
+        (out / "checkpoints" / name).unlink()
+    (out / "point_cloud.ply").unlink()
+    train(tiny_scene, out, *spread, *WAYS[way], resume=True)
+    assert digest(out) == digest(at_once)
+
+
+def test_a_run_goes_on_with_its_harmonics_elsewhere(spread, at_once, tiny_scene, tmp_path):
+    out = tmp_path / "run"
+    shutil.copytree(at_once, out)
+    for path in (*sorted((out / "checkpoints").iterdir())[1:], out / "point_cloud.ply"):
+        path.unlink()
+    train(tiny_scene, out, *spread, HOST, resume=True)
+    assert digest(out) == digest(at_once)
+
+
+def test_the_harmonics_lie_where_the_plan_says(spread, tiny_scene, tmp_path):
+    """A budget between the two plans: to the host by itself, which is said before, in the dry run too."""
+    run = train(tiny_scene, tmp_path / "first", *spread, "optimize.steps=1")
+    count, own = run.model.gaussians.count, run.memory_plan()
+    assert run.model.gaussians.on_host is None
+    assert own.instead.needed(count) < own.needed(count)
+    between = (own.instead.needed(count) + own.needed(count)) // 2
+    pixels = max(view.camera.width * view.camera.height for view in run.scene.views)
+    assert pixels < own.fixed < between
+    run.placement = Placement(budget=between)
+    tight = run.memory_plan()
+    assert tight.limit < count <= tight.instead.limit
+    assert tight.beginning_with(count) is tight.instead
+    assert "harmonics on the host" in tight.instead.text(count)
+    assert "harmonics on the host" not in tight.text(count)
+    tight.check(count)
+    run.placement = Placement(budget=between, harmonics="device")
+    with pytest.raises(MemoryLimitError):
+        run.memory_plan().check(count)
+
+
+def test_a_run_beyond_the_budget_trains_to_the_same_bits(spread, at_once, tiny_scene, tmp_path, monkeypatch, caplog):
+    """The plan that does not hold it on the device is of a budget that lies between the two."""
+    count = len(tables(at_once, 4)["gaussians/means"])
+
+    def tight(limits, components, photographs, pixels, pixel_sums, placement):
+        both = [plan(limits, components, 0, 0, pixel_sums, Placement(None, where)) for where in ("device", "host")]
+        budget = sum(one.needed(count) for one in both) // 2
+        return plan(limits, components, 0, 0, pixel_sums, Placement(budget, placement.harmonics))
+
+    monkeypatch.setattr("clsplat.training.run.plan", tight)
+    still = ("optimize.densify.every=99",)
+    caplog.set_level("INFO", "clsplat")
+    run = train(tiny_scene, tmp_path / "run", *spread, *still)
+    assert run.model.gaussians.on_host
+    assert "the harmonics lie on the host" in caplog.text
+    assert "harmonics on the host, in" in caplog.text
+    monkeypatch.undo()
+    train(tiny_scene, tmp_path / "device", *spread, *still)
+    assert digest(run.out) == digest(tmp_path / "device")
+
+
+def test_a_dry_run_says_that_the_harmonics_will_lie_on_the_host(tiny_scene, tmp_path):
+    own = [f"scene.path='{tiny_scene}'", HOST]
+    text = describe(load("smoke", own), tmp_path / "run", None, "new")
+    assert "harmonics on the host, in" in text
+    assert "on the host" not in describe(load("smoke", own[:1]), tmp_path / "run", None, "new")
+
+
+def test_the_device_holds_less_where_harmonics_lie_on_the_host(spread, tiny_scene, tmp_path):
+    """Of the tables that lie there it has what the view sees."""
+    run = train(tiny_scene, tmp_path / "run", *spread, HOST)
+    gaussians = run.model.gaussians
+    held = {name: table.array.nbytes for name, table in gaussians.tables.items()}
+    assert set(gaussians.on_host.tables) == {"sh_rest", "adam/sh_rest/moment1", "adam/sh_rest/moment2"}
+    assert held["sh_rest"] == gaussians.on_host.block * 4 * gaussians.tables["sh_rest"].array.shape[0]
+    assert 0 < len(gaussians.on_host.held) <= gaussians.tables["sh_rest"].array.shape[0]
+
+
+def test_what_needs_all_harmonics_on_the_device_is_refused(spread, tiny_scene, tmp_path):
+    during = "optimize.during=[{add_to_average: {every: 2}}]"
+    with pytest.raises(ConfigError, match="add_to_average: changes the harmonics of all"):
+        train(tiny_scene, tmp_path / "run", *spread[:2], "optimize.steps=4", during, HOST)
+
+
+class OnHarmonics(Penalty):
+    """A penalty on what waits."""
+
+    def add(self, inputs):
+        inputs.gradients["sh_rest"].fill(0)
+        return LossValue("harmonics", lambda: 0.0)
+
+
+def test_a_penalty_on_harmonics_is_refused(few_steps, tiny_scene, tmp_path):
+    out = tmp_path / "run"
+    shutil.copytree(few_steps, out)
+    checked = load("smoke", [f"scene.path='{tiny_scene}'", *FEW, DEFERRED])
+    with folders.opened(out, "restart", step=0) as status:
+        run = opening.open_run(checked, out, None, "restart", status)
+        run.losses.append(OnHarmonics(weight=1.0))
+        with pytest.raises(ConfigError, match="a penalty on sh_rest"):
+            runner.execute(checked, run, "restart", lambda progress: None)
