@@ -38,6 +38,10 @@ CRAFTED = {
     "no step": lambda notes, arrays: notes.pop("step"),
     "a word": lambda notes, arrays: notes.update(stage_step="4"),
     "degree": lambda notes, arrays: notes.update(degree=7),
+    "too few harmonics": lambda notes, arrays: (
+        notes.update(degree=3),
+        arrays.update({name: array[:, :9] for name, array in arrays.items() if "sh_rest" in name}),
+    ),
     "updates": lambda notes, arrays: notes.update(updates={"means": 1}),
     "no table": lambda notes, arrays: arrays.pop("gaussians/quats"),
     "no moment": lambda notes, arrays: arrays.pop("adam/quats/moment1"),

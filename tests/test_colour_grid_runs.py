@@ -252,8 +252,16 @@ def test_a_checkpoint_that_lost_its_grids_is_refused(with_grids, tmp_path):
     assert len(left) == len(tables) - 3
     with (tmp_path / "step_000012.npz").open("wb") as file:
         archive.write(file, notes, left.items())
-    with pytest.raises(DataError, match="it lacks the grids of the colours of 8 photographs"):
+    with pytest.raises(DataError, match="it has grids of the colours of 0 photographs, and its numbers name 8 rows"):
         checkpoint.load(tmp_path / "step_000012.npz")
+    own, _ = colour_grids.split_tables(tables)
+    rows = {f"colours/{name}/row": float(row) for row, name in enumerate("abcdefgh")}
+    colour_grids.require_tables(own, rows)
+    for damage in ({"colours/h/row": 6.0}, {"colours/h/row": 500.0}, {"colours/a/row": 0.5}):
+        with pytest.raises(DataError, match="grids of the colours of 8 photographs"):
+            colour_grids.require_tables(own, rows | damage)
+    with pytest.raises(DataError, match="its numbers name 0 rows"):
+        colour_grids.require_tables(own, {})
 
 
 @pytest.mark.slow

@@ -1,6 +1,7 @@
 """Runs whose harmonics are updated when a view sees them, on the device and on the host: the bits of one at once."""
 
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +13,6 @@ from clsplat.losses.base import LossValue, Penalty
 from clsplat.runs import folders, opening, runner
 from clsplat.runs.description import describe
 from clsplat.training import checkpoint
-from clsplat.training.memory import Placement, plan
 from tests.few_steps import FEW
 from tests.test_training import digest, load, train
 
@@ -71,46 +71,23 @@ def test_a_run_goes_on_with_its_harmonics_elsewhere(spread, at_once, tiny_scene,
     assert digest(out) == digest(at_once)
 
 
-def test_the_harmonics_lie_where_the_plan_says(spread, tiny_scene, tmp_path):
-    """A budget between the two plans: to the host by itself, which is said before, in the dry run too."""
+def test_a_plan_beyond_the_device_names_the_host(spread, tiny_scene, tmp_path):
+    """The harmonics stay where the settings say; the plan of the host needs less of the device."""
     run = train(tiny_scene, tmp_path / "first", *spread, "optimize.steps=1")
     count, own = run.model.gaussians.count, run.memory_plan()
     assert run.model.gaussians.on_host is None
-    assert own.instead.needed(count) < own.needed(count)
-    between = (own.instead.needed(count) + own.needed(count)) // 2
-    pixels = max(view.camera.width * view.camera.height for view in run.scene.views)
-    assert pixels < own.fixed < between
-    run.placement = Placement(budget=between)
-    tight = run.memory_plan()
-    assert tight.limit < count <= tight.instead.limit
-    assert tight.beginning_with(count) is tight.instead
-    assert "harmonics on the host" in tight.instead.text(count)
-    assert "harmonics on the host" not in tight.text(count)
-    tight.check(count)
-    run.placement = Placement(budget=between, harmonics="device")
-    with pytest.raises(MemoryLimitError):
-        run.memory_plan().check(count)
-
-
-def test_a_run_beyond_the_budget_trains_to_the_same_bits(spread, at_once, tiny_scene, tmp_path, monkeypatch, caplog):
-    """The plan that does not hold it on the device is of a budget that lies between the two."""
-    count = len(tables(at_once, 4)["gaussians/means"])
-
-    def tight(limits, components, photographs, pixels, pixel_sums, placement):
-        both = [plan(limits, components, 0, 0, pixel_sums, Placement(None, where)) for where in ("device", "host")]
-        budget = sum(one.needed(count) for one in both) // 2
-        return plan(limits, components, 0, 0, pixel_sums, Placement(budget, placement.harmonics))
-
-    monkeypatch.setattr("clsplat.training.run.plan", tight)
-    still = ("optimize.densify.every=99",)
-    caplog.set_level("INFO", "clsplat")
-    run = train(tiny_scene, tmp_path / "run", *spread, *still)
-    assert run.model.gaussians.on_host
-    assert "the harmonics lie on the host" in caplog.text
-    assert "harmonics on the host, in" in caplog.text
-    monkeypatch.undo()
-    train(tiny_scene, tmp_path / "device", *spread, *still)
-    assert digest(run.out) == digest(tmp_path / "device")
+    run.harmonics = "host"
+    other = run.memory_plan()
+    between = (other.needed(count) + own.needed(count)) // 2
+    assert other.needed(count) < between < own.needed(count)
+    assert "harmonics on the host" in other.text(count)
+    assert "harmonics on the host" not in own.text(count)
+    replace(other, memory=between).check(count)
+    with pytest.raises(MemoryLimitError, match=r"rasterizer\.harmonics=host"):
+        replace(own, memory=between).check(count)
+    with pytest.raises(MemoryLimitError) as refused:
+        replace(other, memory=0).check(count)
+    assert "rasterizer.harmonics" not in str(refused.value)
 
 
 def test_a_dry_run_says_that_the_harmonics_will_lie_on_the_host(tiny_scene, tmp_path):
@@ -120,8 +97,8 @@ def test_a_dry_run_says_that_the_harmonics_will_lie_on_the_host(tiny_scene, tmp_
     assert "on the host" not in describe(load("smoke", own[:1]), tmp_path / "run", None, "new")
 
 
-def test_the_device_holds_less_where_harmonics_lie_on_the_host(spread, tiny_scene, tmp_path):
-    """Of the tables that lie there it has what the view sees."""
+def test_the_device_holds_what_a_view_sees_where_harmonics_lie_on_the_host(spread, tiny_scene, tmp_path):
+    """Half of these Gaussians are far apart: the last view sees some of the blocks."""
     run = train(tiny_scene, tmp_path / "run", *spread, HOST)
     gaussians = run.model.gaussians
     held = {name: table.array.nbytes for name, table in gaussians.tables.items()}
@@ -130,10 +107,22 @@ def test_the_device_holds_less_where_harmonics_lie_on_the_host(spread, tiny_scen
     assert 0 < len(gaussians.on_host.held) <= gaussians.tables["sh_rest"].array.shape[0]
 
 
-def test_what_needs_all_harmonics_on_the_device_is_refused(spread, tiny_scene, tmp_path):
-    during = "optimize.during=[{add_to_average: {every: 2}}]"
-    with pytest.raises(ConfigError, match="add_to_average: changes the harmonics of all"):
-        train(tiny_scene, tmp_path / "run", *spread[:2], "optimize.steps=4", during, HOST)
+def test_what_needs_all_harmonics_on_the_device_is_refused_before(tiny_scene):
+    own = f"scene.path='{tiny_scene}'", "optimize.during=[{add_to_average: {every: 2}}]"
+    assert load("smoke", own)
+    with pytest.raises(ConfigError, match=r"stages\[1\] optimize: add_to_average changes the harmonics of all"):
+        load("smoke", [*own, HOST])
+
+
+def test_harmonics_on_the_host_are_left_out(spread, tiny_scene, tmp_path):
+    """After the training, where no band is left, and in it, as on the device."""
+    during = "optimize.during=[{reduce_sh: {degree: 1, every: 4, stop: 5}}, {reduce_sh: {degree: 0, every: 8}}]"
+    found = [
+        train(tiny_scene, tmp_path / way, *spread[:2], "optimize.steps=10", during, f"rasterizer.harmonics={way}")
+        for way in ("device", "host")
+    ]
+    assert [run.model.gaussians.sh_degree for run in found] == [0, 0]
+    assert digest(found[0].out) == digest(found[1].out)
 
 
 class OnHarmonics(Penalty):

@@ -47,6 +47,18 @@ def test_edits_keep_their_order_and_stay_apart_in_any_number_of_steps(name, data
         assert (before[0][0] == before[1][0]) == (after[0][0] == after[1][0]), (before, after)
 
 
+@pytest.mark.parametrize("name", ["fast", "splat_7k", "dash_7k", "mini_7k", "smoke"])
+@settings(max_examples=3)
+@given(data=st.data())
+def test_a_pipeline_that_was_stretched_is_stretched_again_with_the_edits_that_it_had(name, data):
+    """Also that of a run in minutes, whose cadences are not whole."""
+    recipe, old = known(name)
+    fewest, steps = fewest_steps(recipe.training), recipe.training.steps
+    between = in_steps(recipe, data.draw(st.integers(fewest, 2 * steps)))
+    new = edits(in_steps(between, data.draw(st.integers(fewest, 2 * steps))).training, recipe.training)
+    assert [place for _, place in new] == [place for _, place in old]
+
+
 @pytest.mark.parametrize("name", ["fast", "splat", "dash", "mini", "smoke"])
 @settings(max_examples=3)
 @given(data=st.data())

@@ -153,6 +153,7 @@ def test_what_is_learned_in_so_many_updates_has_a_rate_that_falls_as_much():
 def test_never_stays_a_number_that_a_file_holds():
     never = load("splat_7k", [f"densify.stop={2**63 - 1}"]).settings
     assert stretched(never, 3.0).training.during[1].stop == 2**63 - 1
+    assert stretched(load("splat_7k", ["densify.every=9e18"]).settings, 3.0).training.during[1].every == 2**63 - 1
 
 
 def test_points_that_fall_together_become_one():

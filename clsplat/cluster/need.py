@@ -4,7 +4,7 @@ It is known before any run: how many Gaussians a training begins with, and where
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from clsplat.pipeline.loading import Pipeline
 from clsplat.scene.scene import Scene
@@ -13,7 +13,7 @@ from clsplat.stages.base import Stage
 from clsplat.stages.densify import Densify
 from clsplat.stages.init import Init
 from clsplat.stages.optimize import Optimize
-from clsplat.training.memory import Limits, MemoryPlan, Placement, first_tables, plan
+from clsplat.training.memory import Limits, MemoryPlan, Where, first_tables, plan
 from clsplat.views.photographs import BUDGET_SHARE
 
 TILE = 16  # px a side, the larger of those that devices take
@@ -30,7 +30,7 @@ class Need:
     first: int  # Gaussians that it begins with
     most: int  # Gaussians at which its growth ends; where nothing says so, those that it begins with
     motion: int = 0  # columns of the motion; 0 where nothing moves
-    placement: Placement = field(default_factory=Placement)
+    harmonics: Where = "device"
 
     @classmethod
     def of(cls, pipeline: Pipeline, scene: Scene) -> "Need | None":
@@ -54,15 +54,14 @@ class Need:
             begins,
             max(begins, int(max(ends, default=0))),
             settings.model.time.width if settings.model.time else 0,
-            settings.rasterizer.placement(),
+            settings.rasterizer.harmonics,
         )
 
     def plan(self, limits: Limits) -> MemoryPlan:
         """Return the plan of its training on a device."""
         budget = int(limits.memory * BUDGET_SHARE) if self.budget is None else self.budget
         tables, photographs = first_tables(self.degree, self.motion), min(budget, self.photographs)
-        whole = plan(limits, tables, photographs, self.pixels, placement=self.placement)
-        return whole.beginning_with(self.first)
+        return plan(limits, tables, photographs, self.pixels, harmonics=self.harmonics)
 
     def limit_on(self, limits: Limits) -> int:
         """Return the largest number of Gaussians that a device holds."""

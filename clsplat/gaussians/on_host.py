@@ -55,7 +55,8 @@ class OnHost:
         """Return a table, [N, components]."""
         self.put_back()
         table = self.tables[name]
-        return np.ascontiguousarray(table.transpose(0, 2, 1).reshape(-1, table.shape[1])[: self.gaussians.count])
+        rows = table.transpose(0, 2, 1).reshape(self._blocks * self.lanes, table.shape[1])
+        return np.ascontiguousarray(rows[: self.gaussians.count])
 
     def set(self, name: str, values: NDArray[np.float32]) -> None:
         """Replace a table by [N, components]."""
@@ -64,7 +65,7 @@ class OnHost:
         count, components = values.shape
         rows = np.zeros((self._blocks * self.lanes, components), np.float32)
         rows[:count] = values
-        self.tables[name] = np.ascontiguousarray(rows.reshape(-1, self.lanes, components).transpose(0, 2, 1))
+        self.tables[name] = np.ascontiguousarray(rows.reshape(self._blocks, self.lanes, components).transpose(0, 2, 1))
 
     def bring(self, depth_key: Array) -> None:
         """Send the blocks of rows that a view sees.  depth_key: [S], all ones where it culls.  Waits for the device."""

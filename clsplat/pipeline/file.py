@@ -29,7 +29,7 @@ from clsplat.settings import OneOf, ReadPath, Settings
 from clsplat.stages.base import Stage
 from clsplat.stages.optimize import Optimize
 from clsplat.stages.training import Training
-from clsplat.training.memory import Placement, Where
+from clsplat.training.memory import Where
 
 
 class SceneSettings(Settings):
@@ -92,7 +92,7 @@ class SceneSettings(Settings):
 
 
 class RasterizerSettings(Settings):
-    """How the device renders; results do not depend on it."""
+    """How the device renders; results do not depend on it, but for where its memory ends growth."""
 
     output_keys: ClassVar[frozenset[str]] = frozenset({"harmonics"})
 
@@ -102,18 +102,11 @@ class RasterizerSettings(Settings):
     """Algorithm that orders splats by tile and depth; auto: the faster one on the first frame."""
     pair_budget: Annotated[int, Field(gt=0)] | None = None
     """MiB of gradient records at a time; without it, the largest buffer of the device."""
-    memory_budget: Annotated[int, Field(gt=0)] | None = None
-    """MiB of the device's memory that a training may take, by its plan; without it, all."""
-    harmonics: Where = "auto"
+    harmonics: Where = "device"
     """Memory of the harmonics above band 0 and of Adam's moments of them, in training.  `host`: each step sends those
-    of its view to the device and fetches them; what other views see is updated later (`optimize.update: deferred`).
-    `auto`: the device, and the host where the plan says that the device does not hold what the training begins with."""
+    of its view to the device and fetches them; what other views see is updated later (`optimize.update: deferred`)."""
     launch_tiles: Annotated[int, Field(ge=0)] = 0
     """Number of tiles of one launch, for devices whose display limits its time; 0: all."""
-
-    def placement(self) -> Placement:
-        """Return what a training may take of the device."""
-        return Placement(None if self.memory_budget is None else self.memory_budget << 20, self.harmonics)
 
     def budget(self) -> Budget | None:
         """Return the rasterizer's limits on memory and launches; None for the defaults."""

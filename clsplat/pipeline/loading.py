@@ -19,6 +19,7 @@ from clsplat.pipeline.explanation import explain, first_fault, place_text
 from clsplat.pipeline.file import STAGE_LISTS, PipelineFile
 from clsplat.pipeline.files import find
 from clsplat.pipeline.moving import check_moving
+from clsplat.pipeline.on_host import check_on_host
 from clsplat.pipeline.overrides import NoSuchKey, apply, split, suggestion
 from clsplat.pipeline.renamed import with_new_names
 from clsplat.pipeline.settable import CADENCE, settable
@@ -114,6 +115,7 @@ def _validated(data: dict[str, Any], path: Path, document: Document) -> Pipeline
         check_keeping(settings)
         check_choices(settings)
         check_moving(settings)
+        check_on_host(settings)
     except ConfigError as error:
         raise ConfigError(f"{path}: {one_line(error)}") from error
     return settings.model_copy(update={"plugins": plugins.used_by(_kinds(settings))})

@@ -53,11 +53,13 @@ class Axis:
         stretched = Fraction(str(every)) * self.factor
         if every == 1 or stretched <= 1:
             return 1
-        return int(stretched) if stretched.denominator == 1 else float(stretched)
+        return int(min(stretched, MOST)) if stretched.denominator == 1 else float(min(stretched, MOST))
 
     def start(self, start: int, every: float) -> int:
-        """Return the step after which what acted after `start` acts: before its first act."""
-        return max(0, min(self.at(start), self._act(every, acts(every, start) + 1) - 1))
+        """Return the step after which what acted after `start` acts: before its first act, and from the last
+        one that is left out on."""
+        number = acts(every, start)
+        return max(0, min(max(self.at(start), self._act(every, number)), self._act(every, number + 1) - 1))
 
     def stop(self, stop: int, every: float) -> int:
         """Return the step before which what acted before `stop` acts: behind its last act."""

@@ -83,7 +83,6 @@ def _on_host(pipeline: Pipeline, run: Run) -> list[str]:
         return []
     motion, count = run.model_settings.time, first.expected_count(run.scene)
     planned = run.memory_plan(first_tables(run.model_settings.sh_degree, motion.width if motion else 0))
-    planned = planned.beginning_with(count)
     return [f"  {planned.text(count)}"] if planned.host else []
 
 

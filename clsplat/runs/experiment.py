@@ -1,7 +1,6 @@
 """Running a pipeline, or the cells of a matrix one after the other and comparing them."""
 
 import logging
-import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -32,6 +31,7 @@ from clsplat.runs.source import overrides_of
 from clsplat.training.status import StatusFile
 
 LOG = logging.getLogger("clsplat")
+MOST_MINUTES = 525_600  # a year
 
 
 @dataclass(frozen=True)
@@ -101,8 +101,8 @@ class Job:
         live: the port of a live preview, 0 for any; None: there is none.  minutes: that it takes, from when its
         photographs are read, in as many steps as fit.
         """
-        if minutes is not None and not 0 < minutes < math.inf:
-            raise ConfigError(f"--minutes {minutes:g}: expected a number of minutes above 0")
+        if minutes is not None and not 0 < minutes <= MOST_MINUTES:
+            raise ConfigError(f"--minutes {minutes:g}: expected a number of minutes above 0, up to {MOST_MINUTES:,}")
         if minutes is not None and isinstance(self.work, Experiment):
             raise ConfigError(
                 "--minutes: expected a single run; a matrix has several: give optimize.steps in its cells"

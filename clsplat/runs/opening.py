@@ -105,7 +105,7 @@ def make_run(pipeline: Pipeline, scene: RunScene, device: Device, out: Path, sta
         settings=settings,
         pipeline=pipeline.resolved(),
         rasterizer=Rasterizer(device, settings.rasterizer.sort, settings.rasterizer.budget()),
-        placement=settings.rasterizer.placement(),
+        harmonics=settings.rasterizer.harmonics,
         photographs=Photographs(device, scene.background, budget, undistorted_folder(out)),
         status=status,
         model_settings=settings.model,

@@ -76,12 +76,13 @@ class Densify(Scheduled):
             return
         scale = SceneScale(run.scene.extent, run.texture_quantile)
         edit = Edit(run.model.gaussians, run.stats, scale, run.step, run.seed, run.survey())
-        fits = run.memory_plan().limit
+        fits = (plan := run.memory_plan()).limit
         limit = min([fits, *self._limits(run, edit)])
         change = densify(edit, self.rules, run.rasterizer.tiler, limit, self.inside)
         run.refresh_filter()
         if change.after == fits:
-            most = f"{fits:,} Gaussians, the most that fit in the device's memory; with smaller photographs more do"
+            more = "smaller photographs" if plan.host else "smaller photographs, or rasterizer.harmonics=host,"
+            most = f"{fits:,} Gaussians, the most that fit in the device's memory; with {more} more do"
             LOG.warning("step %d: growth stops at %s", run.step, most)
         run.records.add(run.step, "densify", **asdict(change))
         LOG.debug("step %d: %s -> %s", run.step, f"{change.before:,}", amount(change.after, "Gaussian"))

@@ -8,7 +8,6 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field, field_validator
 
 from clsplat.density.statistics import SplatStats
-from clsplat.errors import ConfigError
 from clsplat.losses.base import ImageLoss, Loss, Penalty, ViewGradients, ViewLosses, require_symmetric
 from clsplat.names import VIEW_POSES
 from clsplat.schedule import Probability
@@ -144,8 +143,7 @@ class Optimize(Keeping):
     def _trainer(self, run: Run, views: ViewSettings, last: int) -> Trainer:
         """Attach moments, statistics and tables to the run's Gaussians; a resumed run has them."""
         gaussians, photographs = run.model.gaussians, run.photographs
-        if place_harmonics(run):
-            self._require_rows()
+        place_harmonics(run)
         run.adam = run.adam or Adam(gaussians)
         run.stats = SplatStats(gaussians, self.statistics, len(run.scene.split("train")))
         for name in sorted(self.tables - gaussians.tables.keys()):
@@ -160,15 +158,6 @@ class Optimize(Keeping):
         behind, depths = drawn_backgrounds(self.background, run), known_depths(self.losses, run, poses)
         trained = self.losses, rates, run.scene.extent, run.numbers, self.update
         return Trainer(*parts, *trained, *own, poses=poses, backgrounds=behind, depths=depths)
-
-    def _require_rows(self) -> None:
-        """Raise ConfigError where a stage needs the harmonics of all Gaussians on the device."""
-        if found := next((stage for stage in self.during if stage.reads_harmonics), None):
-            raise ConfigError(
-                f"{found.stage}: changes the harmonics of all Gaussians on the device, and they lie on the host; "
-                "expected `rasterizer.harmonics: device`, with fewer Gaussians where it does not hold them, or no such "
-                "stage"
-            )
 
     def _edit(self, run: Run, views: ViewSettings) -> None:
         """Run the edits that were due at the step before."""

@@ -39,10 +39,11 @@ def check_tables(tables: Tables) -> None:
 
 
 def require_tables(tables: Tables, numbers: Mapping[str, float]) -> None:
-    """Raise DataError where the numbers of a run name rows of grids that there are not."""
-    named = [key for key in numbers if key.startswith(f"{TABLE}/") and key.endswith("/row")]
-    if named and not tables:
-        raise DataError(f"it lacks the grids of the colours of {len(named)} photographs")
+    """Raise DataError where the rows that the numbers of a run name are not those of its grids."""
+    named = sorted(row for key, row in numbers.items() if key.startswith(f"{TABLE}/") and key.endswith("/row"))
+    held = len(tables[NAMES[0]]) if tables else 0
+    if named != list(range(held)):
+        raise DataError(f"it has grids of the colours of {held} photographs, and its numbers name {len(named)} rows")
 
 
 def restored(tables: Tables, device: Device) -> GridTables | None:

@@ -5,7 +5,7 @@ Bytes are those of the tables for each Gaussian, and those of a frame for each G
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal, Protocol
 
 from clsplat.errors import MemoryLimitError
@@ -25,15 +25,7 @@ FRAME_PIXEL = 4 * (4 * 3 + 3 + 9 + 2 * 3 + 2 * 3 + 2 + 2)
 # entropy of weights and its gradient; residuals, and the mask that leaves out the large ones
 
 
-Where = Literal["auto", "device", "host"]
-
-
-@dataclass(frozen=True)
-class Placement:
-    """What a training may take of a device, and where its harmonics above band 0 lie."""
-
-    budget: int | None = None  # bytes of the device; None: all
-    harmonics: Where = "auto"  # the device's memory, and the host's where that does not hold the training
+Where = Literal["device", "host"]
 
 
 @dataclass(frozen=True)
@@ -47,7 +39,6 @@ class MemoryPlan:
     memory: int  # of the device
     allocation: int  # of a single buffer
     host: int = 0  # for each Gaussian, in the memory of the host
-    instead: "MemoryPlan | None" = None  # where this one does not hold what a training begins with
 
     def needed(self, gaussians: int) -> int:
         """Return the bytes for a number of Gaussians, with room to grow and one table being moved."""
@@ -74,17 +65,13 @@ class MemoryPlan:
             f"{self.memory / mib:,.0f} MiB with buffers up to {self.allocation / mib:,.0f} MiB{on_host}"
         )
 
-    def beginning_with(self, gaussians: int) -> "MemoryPlan":
-        """Return the plan of a training that begins with so many: `instead` where this one does not hold them."""
-        return self.instead if self.instead and gaussians > self.limit else self
-
     def check(self, gaussians: int) -> None:
-        """Raise MemoryLimitError when a training that begins with so many Gaussians does not fit."""
-        plan = self.beginning_with(gaussians)
-        if gaussians > plan.limit:
+        """Raise MemoryLimitError when that many Gaussians do not fit."""
+        if gaussians > self.limit:
+            more = "" if self.host else ", or keep harmonics on the host (rasterizer.harmonics=host)"
             raise MemoryLimitError(
-                f"{plan.text(gaussians)}: start from fewer points, use smaller images (scene.downscale) or fewer "
-                "of them on the device (scene.image_budget)"
+                f"{self.text(gaussians)}: start from fewer points, use smaller images (scene.downscale) or fewer "
+                f"of them on the device (scene.image_budget){more}"
             )
 
 
@@ -116,25 +103,19 @@ def plan(
     photographs: int,
     pixels: int,
     pixel_sums: int = PIXEL_SUMS,
-    placement: Placement | None = None,
+    harmonics: Where = "device",
 ) -> MemoryPlan:
     """Return the plan for Gaussians with tables of these components, by name.
 
     photographs: their bytes on the device; pixels: of the largest view, whole tiles; pixel_sums: sums over pixels that
-    the backward pass computes for each Gaussian; placement: without it, the default.
+    the backward pass computes for each Gaussian; harmonics: the memory in which those above band 0 lie.
     """
-    placement = placement or Placement()
-    if placement.harmonics == "auto":
-        both = [replace(placement, harmonics=where) for where in ("device", "host")]
-        on_device, on_host = (plan(limits, components, photographs, pixels, pixel_sums, one) for one in both)
-        return replace(on_device, instead=on_host)
-    shares = dict.fromkeys(HARMONICS, SEEN_SHARE) if placement.harmonics == "host" else {}
+    shares = dict.fromkeys(HARMONICS, SEEN_SHARE) if harmonics == "host" else {}
     held = {name: math.ceil(4 * width * shares.get(name, 1)) for name, width in components.items()}
     sizes = list(held.values())
     gradients = sum(held[name] for name in PARAMETERS) + 8  # for penalties and edits
     moving = 4 * components[MOTION] + MOVED if MOTION in components else 0
     gaussian = sum(sizes) + FRAME_GAUSSIAN + 4 * pixel_sums + gradients + moving
     fixed = photographs + FRAME_PIXEL * pixels
-    memory = limits.memory if placement.budget is None else min(limits.memory, placement.budget)
     host = sum(4 * components.get(name, 0) for name in shares)
-    return MemoryPlan(gaussian, FRAME_PAIR, fixed, max(sizes), memory, limits.allocation, host)
+    return MemoryPlan(gaussian, FRAME_PAIR, fixed, max(sizes), limits.memory, limits.allocation, host)

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -26,7 +26,7 @@ from clsplat.training.adam import Adam
 from clsplat.training.colour_grids import GridTables, bytes_needed
 from clsplat.training.field import LearnedField
 from clsplat.training.kept import Best, Tables
-from clsplat.training.memory import MemoryPlan, Placement, plan
+from clsplat.training.memory import MemoryPlan, Where, plan
 from clsplat.training.profile import clocks
 from clsplat.training.progress import Progress as Progress
 from clsplat.training.progress import Stopped as Stopped
@@ -56,7 +56,7 @@ class Run:
     photographs: Photographs
     status: StatusFile
     model_settings: ModelSettings
-    placement: Placement = field(default_factory=Placement)  # in the device's memory and the host's
+    harmonics: Where = "device"  # the memory in which those above band 0 lie while they are trained
     identity: Identity | None = None  # of the original scene and its photographs
     read: dict[str, str] = field(default_factory=dict)  # hashes of the files that settings name, by their text
     prepared: dict[str, str] | None = None  # hash of the inputs of `prepare:`, and the folder of its result
@@ -211,9 +211,7 @@ class Run:
         bytes_held += bytes_needed(self.settings, views, tile)
         pixels = max((-(-v.camera.width // tile)) * (-(-v.camera.height // tile)) * tile**2 for v in views)
         pixel_sums = PIXEL_SUMS if self.stats is None else self.stats.pixel_sums
-        lies_there = self._model is not None and self._model.gaussians.on_host is not None
-        placement = replace(self.placement, harmonics="host") if lies_there else self.placement
-        return plan(self.device.info, components, bytes_held, pixels, pixel_sums, placement)
+        return plan(self.device.info, components, bytes_held, pixels, pixel_sums, self.harmonics)
 
     def refresh_filter(self) -> None:
         """Update the world filter and the sampling intervals to the present Gaussians."""

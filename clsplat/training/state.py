@@ -9,7 +9,7 @@ from clsplat.errors import DataError
 from clsplat.fields.shape import WrittenShape
 from clsplat.formats.motion import MOTION
 from clsplat.gaussians.model import WIDTHS
-from clsplat.gaussians.tables import PARAMETERS, moment_tables
+from clsplat.gaussians.tables import PARAMETERS, moment_tables, sh_coefficients
 from clsplat.training.archive import Arrays
 from clsplat.training.kept import Best
 
@@ -65,6 +65,8 @@ def check_tables(state: State, tables: Arrays) -> None:
     for name in trained:
         if tables[name].shape[1] not in WIDTHS[name]:
             raise DataError(f"{name} has {tables[name].shape[1]} components")
+        if name == "sh_rest" and tables[name].shape[1] < 3 * (sh_coefficients(state.degree) - 1):
+            raise DataError(f"{name} has {tables[name].shape[1]} components, too few for degree {state.degree}")
         moments = [moment for moment in moment_tables(name) if moment in tables]
         if broken := [key for key in (name, *moments) if not np.isfinite(tables[key]).all()]:
             raise DataError(f"{broken[0]} holds values that are not finite")

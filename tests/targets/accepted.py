@@ -4,8 +4,8 @@ from collections.abc import Iterable
 
 ACCEPTED = {
     "tgllp: blend_wide.cl (wide, PIXEL_BOX 1) does not compile: ocloc ended with -6": "no GPU takes *wide* by itself",
-    "pvc project_backward (PIXEL_BOX 1) spills registers (40)": "the recipes `box` and `box_7k` alone",
-    "pvc project_backward (PIXEL_BOX 1, TILE 8) spills registers (40)": "the recipes `box` and `box_7k` alone",
+    "pvc project_backward (PIXEL_BOX 1) spills registers (41)": "the recipes `box` and `box_7k` alone",
+    "pvc project_backward (PIXEL_BOX 1, TILE 8) spills registers (41)": "the recipes `box` and `box_7k` alone",
 }
 
 
