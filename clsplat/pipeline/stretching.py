@@ -53,7 +53,8 @@ class Axis:
         stretched = Fraction(str(every)) * self.factor
         if every == 1 or stretched <= 1:
             return 1
-        return int(min(stretched, MOST)) if stretched.denominator == 1 else float(min(stretched, MOST))
+        bounded = min(stretched, Fraction(MOST))
+        return int(bounded) if bounded.denominator == 1 else float(bounded)
 
     def start(self, start: int, every: float) -> int:
         """Return the step after which what acted after `start` acts: before its first act, and from the last
