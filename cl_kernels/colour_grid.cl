@@ -76,8 +76,8 @@ static inline void grid_of_row(
 /* The matrices of LANES pixels from x on, `a`, by the grid of their row, and their derivatives by the level, `slopes`,
  * which may be 0 where a call does not ask for them. */
 static inline void matrices_of(
-    __local const float *grid, const uint nx, const uint nz, const uint x, const float per_column, const VF level, VF *a,
-    VF *slopes)
+    __local const float *grid, const uint nx, const uint nz, const uint x, const float per_column, const VF level,
+    VF *a, VF *slopes)
 {
     const VF place = places_of(x, per_column);
     const uint last = min((uint)(((float)(x + LANES) - 0.5f) * per_column) + 1, nx - 1);

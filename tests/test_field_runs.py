@@ -266,13 +266,15 @@ def test_a_field_before_another_background_is_lighter_by_what_it_does_not_cover(
         ({"format": 2}, "is of format '2'"),
         ({"shape": {"width": 64}}, r"parameters are not \[\d+, 1\] of float32"),
         ({"background": "pink"}, "background of its notes: "),
+        ({"shape": {"width": None}}, "shape.width of its notes: "),
         ({"shape": {"width": 63}}, r"shape\.width of its notes: .*multiple of 4"),
     ],
 )
 def test_a_file_that_holds_no_such_field_is_refused_in_one_line(finished, tmp_path, change, complaint):
     notes, arrays = archive.read(finished / "field.npz")
+    changed = {key: {**notes[key], **value} if isinstance(value, dict) else value for key, value in change.items()}
     with (tmp_path / "field.npz").open("wb") as file:
-        archive.write(file, {**notes, **change}, arrays.items())
+        archive.write(file, {**notes, **changed}, arrays.items())
     with pytest.raises(DataError, match=f"field.npz: {complaint}.*; expected a file of the stage export_field, whole"):
         clsplat.load_field(tmp_path / "field.npz")
 
