@@ -27,6 +27,17 @@ _level: ContextVar[int] = ContextVar("level", default=logging.INFO)  # of the li
 
 
 @contextmanager
+def only(level: int) -> Iterator[None]:
+    """Leave out what the block tells below a level of `logging`: who calls it says the same in other words."""
+    before = LOG.level
+    LOG.setLevel(level)
+    try:
+        yield
+    finally:
+        LOG.setLevel(before)
+
+
+@contextmanager
 def heard_by(listener: Listener) -> Iterator[None]:
     """Call `listener` for each step of the work in this block, beside those of blocks around it.
 

@@ -3,10 +3,10 @@
 import logging
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 from clsplat.errors import DataError
+from clsplat.progress import only
 from clsplat.scene.detect import read_scene, reader_of
 from clsplat.scene.images import is_image
 from clsplat.scene.parts import Parts
@@ -18,7 +18,7 @@ LOG = logging.getLogger("clsplat")
 def read_parts(path: Path) -> Parts:
     """Read a dataset as read_scene does, but every piece on its own.  Raises DataError when there is no such folder."""
     parts = Parts(path)
-    with _silent():
+    with only(logging.ERROR):
         try:
             parts.scene = read_scene(path)
             if parts.scene.points:
@@ -46,14 +46,3 @@ def image_files(folder: Path, deep: bool) -> Iterator[Path]:
     for place, folders, names in os.walk(folder):
         folders[:] = sorted(f for f in folders if not f.startswith(".")) if deep else []
         yield from (Path(place) / n for n in sorted(names) if is_image(Path(n)) and not n.startswith("."))
-
-
-@contextmanager
-def _silent() -> Iterator[None]:
-    """Suppress the messages of the readers: the findings contain them."""
-    before = LOG.level
-    LOG.setLevel(logging.ERROR)
-    try:
-        yield
-    finally:
-        LOG.setLevel(before)

@@ -10,7 +10,7 @@ import math
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
@@ -22,6 +22,7 @@ from clsplat.pipeline.choosing import choose
 from clsplat.pipeline.file import PipelineFile
 from clsplat.pipeline.loading import Pipeline, prepared_folder
 from clsplat.prepare.cache import Planned
+from clsplat.progress import only
 from clsplat.scene.images import image_size
 from clsplat.scene.scene import every_nth
 from clsplat.stages.densify import Densify
@@ -116,7 +117,7 @@ def _of_preparation(planned: Sequence[Planned], folder: Path, names: Sequence[st
 def _tried(planned: Sequence[Planned], folder: Path, names: Sequence[str]) -> dict[str, float]:
     """What the first steps take for some photographs that follow each other, s, by step.  Raises ClsplatError."""
     first, found = (len(names) - TRIED) // 2, dict[str, float]()
-    with tempfile.TemporaryDirectory() as made, _quiet():
+    with tempfile.TemporaryDirectory() as made, only(logging.ERROR):
         source = Path(made, "photographs")
         for name in names[first : first + TRIED]:
             (source / name).parent.mkdir(parents=True, exist_ok=True)
@@ -212,14 +213,3 @@ def _minutes(seconds: tuple[float, float]) -> str:
 
 def _range(low: str, high: str) -> str:
     return low if low == high else f"{low} to {high}"
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Leave out what a trial tells of three photographs."""
-    level = LOG.level
-    LOG.setLevel(logging.ERROR)
-    try:
-        yield
-    finally:
-        LOG.setLevel(level)

@@ -3,8 +3,6 @@
 import logging
 import math
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import Any
@@ -14,6 +12,7 @@ from clsplat.files import scratch_folder
 from clsplat.pipeline.file import PipelineFile
 from clsplat.pipeline.loading import Pipeline
 from clsplat.pipeline.stretching import of_trainings, stretched
+from clsplat.progress import only
 from clsplat.runs.rehearsal import Rehearsal
 from clsplat.runs.runner import run_stages
 from clsplat.stages.training import Training
@@ -93,7 +92,7 @@ def rehearse(pipeline: Pipeline, run: Run, factor: Fraction, limit: Limit) -> Re
     """
     short = replace(pipeline, settings=reporting(stretched(pipeline.settings, factor)))
     training = short.settings.training
-    with scratch_folder(run.out / "rehearsal") as out, _only_warnings():
+    with scratch_folder(run.out / "rehearsal") as out, only(logging.WARNING):
         watch = Watch(limit, run, StatusFile(out), training.stage)
         one = new_run(run, short, out=out, status=watch.status, show=watch.show, between=watch.look)
         one.records.start()
@@ -136,14 +135,3 @@ def reporting(settings: PipelineFile) -> PipelineFile:
         return training.model_copy(update={"log_every": min(training.log_every, -(-training.steps // REPORTS))})
 
     return of_trainings(settings, Training, often)
-
-
-@contextmanager
-def _only_warnings() -> Iterator[None]:
-    """Leave out what a rehearsal tells of itself."""
-    level = LOG.level
-    LOG.setLevel(logging.WARNING)
-    try:
-        yield
-    finally:
-        LOG.setLevel(level)
