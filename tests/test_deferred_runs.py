@@ -10,8 +10,11 @@ from clsplat.errors import ConfigError, MemoryLimitError
 from clsplat.formats.ply import write_ply
 from clsplat.formats.table import read as read_ply
 from clsplat.losses.base import LossValue, Penalty
+from clsplat.opencl.device import Device
+from clsplat.pipeline.yaml_file import read_yaml
 from clsplat.runs import folders, opening, runner
 from clsplat.runs.description import describe
+from clsplat.runs.single import run_pipeline
 from clsplat.training import checkpoint
 from tests.few_steps import FEW
 from tests.test_training import digest, load, train
@@ -88,6 +91,27 @@ def test_a_plan_beyond_the_device_names_the_host(spread, tiny_scene, tmp_path):
     with pytest.raises(MemoryLimitError) as refused:
         replace(other, memory=0).check(count)
     assert "rasterizer.harmonics" not in str(refused.value)
+
+
+def test_the_plan_of_memory_chooses_the_host_once(spread, at_once, tiny_scene, tmp_path, info, caplog):
+    """The choice is in the pipeline of the run, which goes on with it where the device holds more by now."""
+    out, own = tmp_path / "run", (f"scene.path='{tiny_scene}'", *spread, "densify.max_gaussians=6000")
+    first = train(tiny_scene, tmp_path / "first", *spread, "optimize.steps=1")
+    first.harmonics = "device"
+    small = replace(info, memory=first.memory_plan().needed(5000), unified=False)
+    with caplog.at_level("INFO", "clsplat"):
+        run_pipeline(load("smoke", own), out, Device(small), "new")
+    (told,) = [one.message for one in caplog.records if one.message.startswith("rasterizer.harmonics: host, since")]
+    assert "of 6,000 that are planned" in told
+    chosen = read_yaml(out / "pipeline.yaml").data["rasterizer"]["harmonics"]
+    assert (chosen["chosen"], chosen["reason"] in told) == ("host", True)
+    assert digest(out) == digest(at_once)
+    for name in ("checkpoints/step_000012.npz", "point_cloud.ply"):
+        (out / name).unlink()
+    caplog.clear()
+    run_pipeline(load(str(out / "pipeline.yaml")), out, Device(replace(small, memory=8 << 30)), "resume")
+    assert "the harmonics lie on the host" in caplog.text
+    assert digest(out) == digest(at_once)
 
 
 def test_a_dry_run_says_that_the_harmonics_will_lie_on_the_host(tiny_scene, tmp_path):

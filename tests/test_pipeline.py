@@ -196,6 +196,7 @@ DIFFERENCES = {
         *("densify.rules.split.statistic", "densify.rules.split.gradient_above"),
         *LIMITED,
     },
+    ("absgs", "absgs_7k"): TWIN | {"reset_opacity~2.stop"},
     ("splat", "fastgs"): FASTGS,
     ("fastgs", "fastgs_7k"): TWIN | {"densify~2.every", "densify~2.start", "reset_opacity~2.stop"},
     ("splat", "taming"): {

@@ -70,6 +70,7 @@ class Place:
     cores: tuple[int, ...] = ()  # of a CPU that several runs share; none: all
     memory: int = sys.maxsize  # bytes that a run may take
     allocation: int = sys.maxsize  # bytes, largest single buffer
+    unified: bool = False  # its memory is the host's
 
 
 def place_of(address: str, worker: dict[str, Any]) -> Place | None:
@@ -78,9 +79,9 @@ def place_of(address: str, worker: dict[str, Any]) -> Place | None:
         values = json.loads(str(worker["metrics"][TOLD]))
         if values["code"] != code_digest():
             return None
-        return Place(
-            address, str(values["device"]), str(values["bits"]), str(values["host"]), (), *map(int, values["limits"])
-        )
+        device, bits, text = (str(values[name]) for name in ("device", "bits", "host"))
+        memory, allocation = map(int, values["limits"])
+        return Place(address, device, bits, text, (), memory, allocation, bool(values["unified"]))
     except (ValueError, KeyError, TypeError):
         return None
 
@@ -104,6 +105,7 @@ def places(worker: str, devices: list[str] | None = None, packing: Packing = 1) 
             info.text,
             memory=memory_of_each(info, len(parts)),
             allocation=info.allocation,
+            unified=info.unified,
         )
         found += [replace(own, cores=part) for part in parts]
     return found

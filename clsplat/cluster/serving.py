@@ -47,6 +47,7 @@ async def _serve(execution: Execution, found: Sequence[Place], stop: threading.E
             "device": place.device,
             "bits": place.bits,
             "limits": [place.memory, place.allocation],
+            "unified": place.unified,
             "code": code_digest(),
         }
         for place in found

@@ -6,7 +6,7 @@ from clsplat.pipeline.file import PipelineFile
 
 def check_on_host(settings: PipelineFile) -> None:
     """Raise ConfigError where a stage needs all harmonics on the device, and they lie on the host."""
-    if settings.rasterizer.harmonics == "device":
+    if settings.rasterizer.harmonics.in_use == "device":
         return
     for i, outer in enumerate(settings.stages):
         for stage in getattr(outer, "during", ()):

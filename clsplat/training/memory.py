@@ -96,6 +96,10 @@ class Limits(Protocol):
     def allocation(self) -> int:
         """Bytes of a single buffer."""
 
+    @property
+    def unified(self) -> bool:
+        """Whether it is the host's memory."""
+
 
 def plan(
     limits: Limits,

@@ -1,10 +1,10 @@
-"""The memory that a cell needs, by the plan of training, and whether a device holds it.
+"""The memory that a run needs, by the plan of training, and whether a device holds it.
 
 It is known before any run: how many Gaussians a training begins with, and where its growth ends at the latest.
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from clsplat.pipeline.loading import Pipeline
 from clsplat.scene.scene import Scene
@@ -13,6 +13,7 @@ from clsplat.stages.base import Stage
 from clsplat.stages.densify import Densify
 from clsplat.stages.init import Init
 from clsplat.stages.optimize import Optimize
+from clsplat.training.harmonics_memory import HarmonicsMemory, PlannedHarmonics
 from clsplat.training.memory import Limits, MemoryPlan, Where, first_tables, plan
 from clsplat.views.photographs import BUDGET_SHARE
 
@@ -21,7 +22,7 @@ TILE = 16  # px a side, the larger of those that devices take
 
 @dataclass(frozen=True)
 class Need:
-    """What the training of a cell takes on a device."""
+    """What the training of a run takes on a device."""
 
     degree: int  # of spherical harmonics
     photographs: int  # bytes of all that are trained on
@@ -30,7 +31,8 @@ class Need:
     first: int  # Gaussians that it begins with
     most: int  # Gaussians at which its growth ends; where nothing says so, those that it begins with
     motion: int = 0  # columns of the motion; 0 where nothing moves
-    harmonics: Where = "device"
+    harmonics: HarmonicsMemory = field(default_factory=PlannedHarmonics)
+    reader: str = ""  # of all harmonics on the device, a stage; empty: none is
 
     @classmethod
     def of(cls, pipeline: Pipeline, scene: Scene) -> "Need | None":
@@ -55,13 +57,29 @@ class Need:
             max(begins, int(max(ends, default=0))),
             settings.model.time.width if settings.model.time else 0,
             settings.rasterizer.harmonics,
+            next((stage.stage for one in trainings for stage in one.during if stage.reads_harmonics), ""),
         )
+
+    def memory_of_harmonics(self, limits: Limits) -> tuple[Where, str]:
+        """Return where they lie on a device that is new to the run, and why."""
+        if not isinstance(self.harmonics, PlannedHarmonics) or self.harmonics.chosen:
+            return self.harmonics.in_use, ""
+        held = self._plan(limits, "device").limit
+        why = f"the device holds {held:,} Gaussians with all of theirs, of {self.most:,} that are planned"
+        if held >= self.most:
+            return "device", why
+        if limits.unified:
+            return "device", f"{why}, and its memory is the host's"
+        return ("device", f"{why}, and {self.reader} needs them there") if self.reader else ("host", why)
 
     def plan(self, limits: Limits) -> MemoryPlan:
         """Return the plan of its training on a device."""
+        return self._plan(limits, self.memory_of_harmonics(limits)[0])
+
+    def _plan(self, limits: Limits, harmonics: Where) -> MemoryPlan:
         budget = int(limits.memory * BUDGET_SHARE) if self.budget is None else self.budget
         tables, photographs = first_tables(self.degree, self.motion), min(budget, self.photographs)
-        return plan(limits, tables, photographs, self.pixels, harmonics=self.harmonics)
+        return plan(limits, tables, photographs, self.pixels, harmonics=harmonics)
 
     def limit_on(self, limits: Limits) -> int:
         """Return the largest number of Gaussians that a device holds."""
