@@ -9,11 +9,13 @@ import pytest
 from typer.testing import CliRunner
 
 import clsplat
+from clsplat.blocks.blocks import Blocks, Plan
 from clsplat.cli import app
 from clsplat.density.box import Box
 from clsplat.errors import ClsplatError, ConfigError, DataError, NoneInsideError
 from clsplat.pipeline.loading import load
 from clsplat.scene.detect import read_scene
+from clsplat.schedule import values_of
 from clsplat.tuning import tuning
 from data_tools.multiscale import write_multiscale
 
@@ -92,6 +94,22 @@ def test_a_block_trains_its_views_with_the_extent_of_the_whole_and_grows_in_its_
         assert densify.inside.model_dump() == block["growth"]
         model = clsplat.load(out / block["name"])
         assert boxes(found)[int(block["name"][-2:])].holds(model.means).all()
+
+
+@pytest.mark.parametrize("most", [100, [[0, 50], [8, 100]]])
+def test_a_number_of_gaussians_is_shared_by_pairs(most, tiny_scene, few_steps, tmp_path):
+    """What a block sees outside its cell comes on top."""
+    limited = f"densify.max_gaussians={json.dumps(most)}"
+    work = Blocks(tiny_scene, tmp_path, Plan(coarse=str(few_steps), blocks=COUNT, overrides=[*SHORT, limited]), None)
+    partition = work.partition()
+    parts, outside = [], []
+    for block in partition.blocks:
+        (densify,) = [one for one in work.of_block(block, partition).settings.training.during if one.stage == "densify"]
+        parts.append(max(values_of(densify.max_gaussians)))
+        outside.append(int(block.start.sum()) - block.gaussians)
+        assert len(values_of(densify.max_gaussians)) == (1 if most == 100 else 2)
+    assert sum(parts) == pytest.approx(100 + sum(outside))
+    assert min(outside) > 0
 
 
 def test_the_merged_run_is_measured_with_all_views(trained):

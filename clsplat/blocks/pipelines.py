@@ -13,6 +13,7 @@ from clsplat.pipeline.file import PipelineFile
 from clsplat.pipeline.loading import Pipeline, checked
 from clsplat.pipeline.stretching import of_trainings, stretched
 from clsplat.pipeline.yaml_file import Document
+from clsplat.schedule import divided, values_of
 from clsplat.stages.base import Stage
 from clsplat.stages.densify import Densify
 from clsplat.stages.init import MODEL_SOURCES, Init
@@ -48,9 +49,8 @@ def of_block(pipeline: Pipeline, block: Block, start: Path, extent: float, share
 
     extent: of the whole scene; share: of the pipeline's steps that are trained, with the rates of `_shared`.
     """
-    data, last = pipeline.resolved(), _last(pipeline)
-    growth, cell = block.cell.grown(GROWTH).model_dump(), block.cell.box.model_dump()
-    stages = [_growing(stage, growth) for stage in _starting(data["stages"][:last], start)]
+    data, last, cell = pipeline.resolved(), _last(pipeline), block.cell.box.model_dump()
+    stages = [_growing(stage, block) for stage in _starting(data["stages"][:last], start)]
     names = [view["name"] for view in block.views]
     scene = {**data["scene"], "holdout": 0, "train": {"names": names}, "extent": extent}
     changed = {**data, "name": f"{pipeline.settings.name}_{block.name}", "scene": scene}
@@ -112,11 +112,25 @@ def _starting(stages: list[Any], file: Path) -> list[Any]:
     return [{"init": {**first["init"], "file": str(file.resolve())}}, *others]
 
 
-def _growing(stage: dict[str, Any], inside: dict[str, Any]) -> dict[str, Any]:
-    """A stage of a resolved file with this box where it lets Gaussians grow."""
+def _growing(stage: dict[str, Any], block: Block) -> dict[str, Any]:
+    """A stage of a resolved file that lets Gaussians grow in a block alone, up to its part of their number."""
     ((name, fields),) = stage.items()
     if name == "densify":
-        return {name: {**fields, "inside": inside}}
+        limited = _limited(Densify.model_validate(fields), block).model_dump(mode="json")
+        return {name: {key: limited[key] for key in fields}}
     if "during" in fields:
-        return {name: {**fields, "during": [_growing(inner, inside) for inner in fields["during"]]}}
+        return {name: {**fields, "during": [_growing(inner, block) for inner in fields["during"]]}}
     return stage
+
+
+def _limited(densify: Densify, block: Block) -> Densify:
+    """The stage in a block: `max_gaussians` becomes its share by pairs, and what it sees outside its cell.
+
+    A number that changes by step is multiplied as its largest value is.
+    """
+    changed: dict[str, Any] = {"inside": block.cell.grown(GROWTH)}
+    if densify.max_gaussians is not None:
+        most = max(values_of(densify.max_gaussians))
+        part = block.pairs * most + int(block.start.sum()) - block.gaussians
+        changed["max_gaussians"] = divided(densify.max_gaussians, most / part)
+    return densify.model_copy(update=changed)
