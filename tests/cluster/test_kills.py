@@ -32,8 +32,10 @@ def expected(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> dict
     return undisturbed(Sweep(folder, tiny_scene, CELLS, "inline"), folder / "out")
 
 
-def left_behind() -> "list[psutil.Process]":
-    return [one for one in psutil.process_iter(["cmdline"]) if "--attended" in (one.info["cmdline"] or [])]
+def left_behind(folder: Path) -> "list[psutil.Process]":
+    """Runs of a sweep in a folder that are still there, whoever began them."""
+    words = [(one, one.info["cmdline"] or []) for one in psutil.process_iter(["cmdline"])]
+    return [one for one, own in words if "--attended" in own and any(str(folder) in word for word in own)]
 
 
 def test_kills_of_workers_runs_and_drivers_lose_nothing(tiny_scene, tmp_path, expected):
@@ -57,7 +59,7 @@ def test_kills_of_workers_runs_and_drivers_lose_nothing(tiny_scene, tmp_path, ex
     assert killed >= KILLS, "there were too few checkpoints to wait for"
     assert sweep.events("publish") == CELLS
     assert sweep.events("start") > CELLS
-    until(lambda: not left_behind(), 90)
+    until(lambda: not left_behind(tmp_path), 90)
     print(f"{killed} kills, {sweep.events('start')} starts, {sweep.events('publish')} published, hashes as undisturbed")
 
 
@@ -89,7 +91,7 @@ def test_a_signal_saves_and_the_same_command_goes_on_elsewhere(tiny_scene, tmp_p
     errors = process.communicate()[1]
     assert process.returncode == 130
     assert "Traceback" not in errors
-    assert not left_behind()
+    assert not left_behind(tmp_path)
     moved = sweep.store.root.rename(tmp_path / "elsewhere")  # as another mount point would
     sweep.file.write_text(sweep.file.read_text().replace(str(sweep.store.root), str(moved)))
     process = sweep.start()
@@ -149,7 +151,7 @@ def test_a_scheduler_that_is_killed_ends_a_sweep_which_goes_on_with_another(tiny
         errors = processes[1].communicate(timeout=200)[1]
         assert processes[1].returncode == 4, errors
         assert "the scheduler ended; start it, and run the sweep again with --resume" in errors
-    until(lambda: not left_behind(), 90)
+    until(lambda: not left_behind(tmp_path), 90)
     with scheduler(port, processes):
         processes += [offer(port), sweep.start()]
         errors = processes[-1].communicate()[1]
