@@ -52,7 +52,6 @@ FAMILIES = {  # by the name of the base; any other family gets a page of its own
     "WorldFilter": Family("filters", "world filter", "world_filter", listed=False),
     "ScreenFilter": Family("filters", "screen filter", "screen_filter", listed=False),
     "Backdrop": Family("filters", "background", "background", listed=False),
-    "HarmonicsMemory": Family("memory", "memory of harmonics", "harmonics", listed=False),
     "Step": Family("prepare", "prepare step", "prepare"),
 }
 

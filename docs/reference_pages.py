@@ -19,7 +19,6 @@ HEADINGS = {
     "prepare": "Prepare steps",
     "views": "Orders, transforms and colours",
     "filters": "Filters and backgrounds",
-    "memory": "Memory of harmonics",
 }
 INTRODUCTIONS = {
     "stages": "A pipeline is a list of stages. Those that can stand in `during` run every so many steps of training.",
@@ -30,7 +29,6 @@ INTRODUCTIONS = {
     "views": "What a training step compares with: the keys `order` and `transforms` of `optimize.views`, and "
     "`optimize.colours`.",
     "filters": "Keys of `model`: the two low-pass filters, one in the scene and one on the screen, and the background.",
-    "memory": "The key `rasterizer.harmonics`: where the harmonics above band 0 lie in training.",
     "prepare": "`prepare` is a list: what makes a scene of photographs, once, on the host.",
 }
 WORDS = {"integer": "whole number", "string": "text", "boolean": "true or false", "null": "none", "object": "keys"}

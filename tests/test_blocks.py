@@ -9,7 +9,6 @@ import pytest
 from typer.testing import CliRunner
 
 import clsplat
-from clsplat.blocks.blocks import Blocks, Plan
 from clsplat.cli import app
 from clsplat.density.box import Box
 from clsplat.errors import ClsplatError, ConfigError, DataError, NoneInsideError
@@ -96,20 +95,17 @@ def test_a_block_trains_its_views_with_the_extent_of_the_whole_and_grows_in_its_
         assert boxes(found)[int(block["name"][-2:])].holds(model.means).all()
 
 
-@pytest.mark.parametrize("most", [100, [[0, 50], [8, 100]]])
+@pytest.mark.parametrize("most", [16_000, "[[0, 15000], [8, 16000]]"])
 def test_a_number_of_gaussians_is_shared_by_pairs(most, tiny_scene, few_steps, tmp_path):
-    """What a block sees outside its cell comes on top."""
-    limited = f"densify.max_gaussians={json.dumps(most)}"
-    work = Blocks(tiny_scene, tmp_path, Plan(coarse=str(few_steps), blocks=COUNT, overrides=[*SHORT, limited]), None)
-    partition = work.partition()
-    parts, outside = [], []
-    for block in partition.blocks:
-        (densify,) = [one for one in work.of_block(block, partition).settings.training.during if one.stage == "densify"]
-        parts.append(max(values_of(densify.max_gaussians)))
-        outside.append(int(block.start.sum()) - block.gaussians)
-        assert len(values_of(densify.max_gaussians)) == (1 if most == 100 else 2)
-    assert sum(parts) == pytest.approx(100 + sum(outside))
-    assert min(outside) > 0
+    """All blocks grow to their parts; many of the Gaussians outside are pruned meanwhile, and leave no room."""
+    rules = "[{type: clone, gradient_above: 1.0e-7, size_below: 0.05}, {type: prune_faint, opacity_below: 0.11}]"
+    grows = f"densify.rules={rules}", f"densify.max_gaussians={most}", "densify.every=4", "densify.start=3"
+    found = train(tiny_scene, few_steps, tmp_path / "out", *grows, blocks=COUNT)
+    assert 14_000 < found["metrics"]["gaussians"] <= 16_000
+    for block in found["blocks"]:
+        settings = load(str(tmp_path / "out" / block["name"] / "pipeline.yaml")).settings
+        (densify,) = [stage for stage in settings.training.during if stage.stage == "densify"]
+        assert max(values_of(densify.max_gaussians)) == pytest.approx(block["pairs"] * 16_000)
 
 
 def test_the_merged_run_is_measured_with_all_views(trained):

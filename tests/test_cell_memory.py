@@ -8,15 +8,14 @@ import pytest
 from clsplat.cluster.batch import wanted_cell
 from clsplat.cluster.drive import Drive
 from clsplat.cluster.fingerprint import Scenes
+from clsplat.cluster.need import Need
 from clsplat.cluster.probe import Place
 from clsplat.cluster.store import Store
 from clsplat.cluster.task import Outcome, run_cell
 from clsplat.pipeline import matrix
 from clsplat.pipeline.loading import load
-from clsplat.runs.need import Need
 from clsplat.scene.detect import read_scene
 from clsplat.stages.init import Init
-from clsplat.training.harmonics_memory import HostHarmonics, PlannedHarmonics
 from clsplat.training.memory import plan
 from tests.test_sweep_cells import WRITES, Fake, command, wanted
 
@@ -99,30 +98,17 @@ def test_the_need_of_what_moves_is_the_plan_that_its_first_stage_requires(tiny_s
     pipeline = load("dynamic_7k", ["init.source=random", "init.count=700"])
     need, limits, asked = Need.of(pipeline, read_scene(tiny_scene)), held(10**5, "a"), []
 
-    def memory_plan(tables):
-        asked.append(plan(limits, tables, need.photographs, need.pixels))
+    def memory_plan(tables, harmonics):
+        asked.append(plan(limits, tables, need.photographs, need.pixels, harmonics=harmonics))
         return asked[-1]
 
     run = SimpleNamespace(model_settings=pipeline.settings.model, memory_plan=memory_plan)
+    run.harmonics, run.device = need.harmonics, SimpleNamespace(info=limits)
     Init._require_memory(run, 700)
     assert asked == [need.plan(limits)]
 
 
-def test_the_harmonics_lie_on_the_host_where_the_device_does_not_hold_the_end_of_growth():
-    small, large = held(20_000, "small"), held(200_000, "large")
-    assert NEED.memory_of_harmonics(large)[0] == "device"
-    where, why = NEED.memory_of_harmonics(small)
-    assert where == "host"
-    assert "of 100,000 that are planned" in why
-    assert NEED.plan(small).host > 0 == NEED.plan(large).host
-    assert NEED.limit_on(small) > replace(NEED, harmonics=PlannedHarmonics(chosen="device")).limit_on(small)
-
-
-def test_the_harmonics_stay_where_the_host_is_no_help():
-    """Its memory is the device's, a stage needs them on the device, or the settings say where they lie."""
-    small, large = held(20_000, "small"), held(200_000, "large")
-    where, why = NEED.memory_of_harmonics(replace(small, unified=True))
-    assert (where, why.endswith("its memory is the host's")) == ("device", True)
-    where, why = replace(NEED, reader="add_to_average").memory_of_harmonics(small)
-    assert (where, why.endswith("add_to_average needs them there")) == ("device", True)
-    assert replace(NEED, harmonics=HostHarmonics()).memory_of_harmonics(large) == ("host", "")
+def test_a_cell_whose_harmonics_may_move_to_the_host_needs_less_of_a_device_that_has_its_own_memory():
+    apart, open_one = held(10_000, "a"), replace(NEED, harmonics="auto")
+    assert open_one.limit_on(apart) > NEED.limit_on(apart)
+    assert open_one.limit_on(replace(apart, unified=True)) == NEED.limit_on(apart)

@@ -11,11 +11,13 @@ from clsplat.formats.ply import write_ply
 from clsplat.formats.table import read as read_ply
 from clsplat.losses.base import LossValue, Penalty
 from clsplat.opencl.device import Device
+from clsplat.pipeline.on_host import harmonics_of
 from clsplat.pipeline.yaml_file import read_yaml
 from clsplat.runs import folders, opening, runner
 from clsplat.runs.description import describe
 from clsplat.runs.single import run_pipeline
 from clsplat.training import checkpoint
+from clsplat.training.memory import last_place
 from tests.few_steps import FEW
 from tests.test_training import digest, load, train
 
@@ -79,8 +81,7 @@ def test_a_plan_beyond_the_device_names_the_host(spread, tiny_scene, tmp_path):
     run = train(tiny_scene, tmp_path / "first", *spread, "optimize.steps=1")
     count, own = run.model.gaussians.count, run.memory_plan()
     assert run.model.gaussians.on_host is None
-    run.harmonics = "host"
-    other = run.memory_plan()
+    other = run.memory_plan(harmonics="host")
     between = (other.needed(count) + own.needed(count)) // 2
     assert other.needed(count) < between < own.needed(count)
     assert "harmonics on the host" in other.text(count)
@@ -93,25 +94,52 @@ def test_a_plan_beyond_the_device_names_the_host(spread, tiny_scene, tmp_path):
     assert "rasterizer.harmonics" not in str(refused.value)
 
 
-def test_the_plan_of_memory_chooses_the_host_once(spread, at_once, tiny_scene, tmp_path, info, caplog):
-    """The choice is in the pipeline of the run, which goes on with it where the device holds more by now."""
-    out, own = tmp_path / "run", (f"scene.path='{tiny_scene}'", *spread, "densify.max_gaussians=6000")
-    first = train(tiny_scene, tmp_path / "first", *spread, "optimize.steps=1")
-    first.harmonics = "device"
-    small = replace(info, memory=first.memory_plan().needed(5000), unified=False)
+@pytest.fixture(scope="module")
+def small(spread, tiny_scene, info, tmp_path_factory):
+    """Devices with memory of their own that hold about so many Gaussians in these runs."""
+    plan = train(tiny_scene, tmp_path_factory.mktemp("runs") / "first", *spread, "optimize.steps=1").memory_plan()
+    return lambda held: replace(info, memory=plan.needed(held), unified=False)
+
+
+def test_the_harmonics_move_to_the_host_where_the_device_is_full(spread, at_once, tiny_scene, tmp_path, small, caplog):
+    """2,000 Gaussians become more than 4,000; a resumed run moves them where it needs to, whatever it did before."""
+    out, own, device = tmp_path / "run", [f"scene.path='{tiny_scene}'", *spread], small(4400)
     with caplog.at_level("INFO", "clsplat"):
-        run_pipeline(load("smoke", own), out, Device(small), "new")
-    (told,) = [one.message for one in caplog.records if one.message.startswith("rasterizer.harmonics: host, since")]
-    assert "of 6,000 that are planned" in told
-    chosen = read_yaml(out / "pipeline.yaml").data["rasterizer"]["harmonics"]
-    assert (chosen["chosen"], chosen["reason"] in told) == ("host", True)
+        run_pipeline(load("smoke", own), out, Device(device), "new")
+    (told,) = [one.message for one in caplog.records if "the harmonics lie on the host, as" in one.message]
+    assert not told.startswith("step 0: ")
     assert digest(out) == digest(at_once)
-    for name in ("checkpoints/step_000012.npz", "point_cloud.ply"):
-        (out / name).unlink()
-    caplog.clear()
-    run_pipeline(load(str(out / "pipeline.yaml")), out, Device(replace(small, memory=8 << 30)), "resume")
-    assert "the harmonics lie on the host" in caplog.text
-    assert digest(out) == digest(at_once)
+    for memory in (device.memory, 8 << 30):
+        for name in ("checkpoints/step_000012.npz", "checkpoints/step_000008.npz", "point_cloud.ply"):
+            (out / name).unlink()
+        run_pipeline(load("smoke", own), out, Device(replace(device, memory=memory)), "resume")
+        assert digest(out) == digest(at_once)
+    assert read_yaml(out / "pipeline.yaml").data["rasterizer"]["harmonics"] == "auto"
+
+
+def test_what_the_device_does_not_hold_at_first_begins_on_the_host(spread, tiny_scene, tmp_path, small, caplog):
+    """Growth ends where the memory does, as where the settings say it."""
+    for name, more in (("auto", ()), ("host", (HOST,))):
+        with caplog.at_level("INFO", "clsplat"):
+            own = [f"scene.path='{tiny_scene}'", *spread, *more]
+            run_pipeline(load("smoke", own), tmp_path / name, Device(small(1900)), "new")
+    told = [one.message for one in caplog.records if "the harmonics lie on the host" in one.message]
+    assert [one.startswith("step 0: ") for one in told] == [True, True]
+    assert ["as the device holds 1," in one for one in told] == [True, False]
+    assert digest(tmp_path / "auto") == digest(tmp_path / "host")
+
+
+def test_harmonics_stay_where_the_host_is_no_help(tiny_scene, info):
+    """A stage needs them on the device, there are none, or the device's memory is the host's."""
+    own = f"scene.path='{tiny_scene}'"
+    average = "optimize.during=[{add_to_average: {every: 2}}]"
+    assert [harmonics_of(load("smoke", [own, *more]).settings) for more in ([], [average], ["model.sh_degree=0"])] == [
+        *("auto", "device", "device")
+    ]
+    apart, shared = (replace(info, unified=unified) for unified in (False, True))
+    assert [last_place("auto", apart), last_place("auto", shared), last_place("host", shared)] == [
+        *("host", "device", "host")
+    ]
 
 
 def test_a_dry_run_says_that_the_harmonics_will_lie_on_the_host(tiny_scene, tmp_path):

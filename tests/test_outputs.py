@@ -18,8 +18,7 @@ from clsplat.stages.base import Stage, path_in_run
 from clsplat.training.run import Run
 
 READ = {  # text that is read, or compared, and never the name of something that is written
-    "Auto.reason", "PlannedHarmonics.reason", "CaptureChoice.given", "CaptureChoice.reason",
-    "CaptureChoice.since", "CaptureChoice.keys",
+    "Auto.reason", "CaptureChoice.given", "CaptureChoice.reason", "CaptureChoice.since", "CaptureChoice.keys",
     "SceneSettings.path", "Init.file", "Evaluate.file", "Evaluate.lpips", "Matrix.pipelines", "Matrix.scenes",
     "InverseDepth.folder",
     "Matrix.set", "Matrix.options", "PipelineFile.plugins", "Snapshot.view", "Snapshot.size", "Timelapse.folder",

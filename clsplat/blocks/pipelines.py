@@ -13,7 +13,7 @@ from clsplat.pipeline.file import PipelineFile
 from clsplat.pipeline.loading import Pipeline, checked
 from clsplat.pipeline.stretching import of_trainings, stretched
 from clsplat.pipeline.yaml_file import Document
-from clsplat.schedule import divided, values_of
+from clsplat.schedule import divided
 from clsplat.stages.base import Stage
 from clsplat.stages.densify import Densify
 from clsplat.stages.init import MODEL_SOURCES, Init
@@ -124,13 +124,8 @@ def _growing(stage: dict[str, Any], block: Block) -> dict[str, Any]:
 
 
 def _limited(densify: Densify, block: Block) -> Densify:
-    """The stage in a block: `max_gaussians` becomes its share by pairs, and what it sees outside its cell.
-
-    A number that changes by step is multiplied as its largest value is.
-    """
+    """The stage in a block: Gaussians grow in its cell, and `max_gaussians` is its share by pairs."""
     changed: dict[str, Any] = {"inside": block.cell.grown(GROWTH)}
     if densify.max_gaussians is not None:
-        most = max(values_of(densify.max_gaussians))
-        part = block.pairs * most + int(block.start.sum()) - block.gaussians
-        changed["max_gaussians"] = divided(densify.max_gaussians, most / part)
+        changed["max_gaussians"] = divided(densify.max_gaussians, 1 / block.pairs)
     return densify.model_copy(update=changed)

@@ -12,6 +12,7 @@ from clsplat.cluster.cell import Cell
 from clsplat.cluster.drive import Drive, Wanted
 from clsplat.cluster.engine import Engine, Inline
 from clsplat.cluster.fingerprint import Scenes
+from clsplat.cluster.need import Need
 from clsplat.cluster.placing import is_placed, place_copy
 from clsplat.cluster.probe import places
 from clsplat.cluster.progress import Watched
@@ -23,7 +24,6 @@ from clsplat.pipeline.execution import Execution
 from clsplat.pipeline.loading import Pipeline
 from clsplat.prepare.cache import plan, prepare
 from clsplat.runs.failures import Failures
-from clsplat.runs.need import Need
 from clsplat.signals import stop_at_once, stopping_on_signals
 from clsplat.stages.training import Training
 

@@ -9,11 +9,11 @@ from dataclasses import dataclass, field, replace
 from clsplat.cluster.cell import Cell
 from clsplat.cluster.engine import Engine, Lost, Ticket
 from clsplat.cluster.folder import Different
+from clsplat.cluster.need import Need
 from clsplat.cluster.probe import Place
 from clsplat.cluster.store import Store
 from clsplat.cluster.task import Outcome, Terms
 from clsplat.errors import DeviceError, Interrupted, MemoryLimitError, amount, first_few
-from clsplat.runs.need import Need
 
 LOG = logging.getLogger("clsplat")
 LOOK = 0.05  # seconds between two looks at what runs

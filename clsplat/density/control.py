@@ -1,6 +1,6 @@
 """Apply density rules, as one edit; reset or lower opacities (Kerbl et al. 2023, section 5); move means at random."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,12 +23,18 @@ class Change:
 
 
 def densify(
-    edit: Edit, rules: Sequence[Rule], tiler: Tiler, limit: int | None = None, inside: Box | None = None
+    edit: Edit,
+    rules: Sequence[Rule],
+    tiler: Tiler,
+    limit: int | None = None,
+    inside: Box | None = None,
+    make_room: Callable[[int], None] = lambda count: None,
 ) -> Change:
     """Apply the rules in their order, as one rearrangement of all tables, and set the statistics to zero.
 
     inside: the part of space in which Gaussians grow.  Growth stops at `limit` Gaussians: those with the largest mean
-    of the first column grow first.  Rules read in `edit.room` how many they may add.
+    of the first column grow first.  Rules read in `edit.room` how many they may add.  make_room: is told how many
+    there will be, before any is added.
     """
     edit.max_rows = limit
     gaussians = edit.gaussians
@@ -51,6 +57,7 @@ def densify(
         name = getattr(rule, "type", "rule")
         causes[name] = causes.get(name, 0) + int((decided_by == number).sum())
         grown[name] = grown.get(name, 0) + int(((decided_by == number) & (rows > 1)).sum())
+    make_room(int(rows.sum(dtype=np.int64)))
     apply_edit(edit, tiler)
     edit.stats.clear()
     return Change(before, gaussians.count, causes, grown)

@@ -29,7 +29,7 @@ from clsplat.settings import OneOf, ReadPath, Settings
 from clsplat.stages.base import Stage
 from clsplat.stages.optimize import Optimize
 from clsplat.stages.training import Training
-from clsplat.training.harmonics_memory import HarmonicsMemory, PlannedHarmonics
+from clsplat.training.memory import Harmonics
 
 
 class SceneSettings(Settings):
@@ -102,9 +102,10 @@ class RasterizerSettings(Settings):
     """Algorithm that orders splats by tile and depth; auto: the faster one on the first frame."""
     pair_budget: Annotated[int, Field(gt=0)] | None = None
     """MiB of gradient records at a time; without it, the largest buffer of the device."""
-    harmonics: OneOf[HarmonicsMemory] = PlannedHarmonics()
-    """Memory of the harmonics above band 0 and of Adam's moments of them, in training: `device`, `host`, or `auto`, by
-    the plan of memory."""
+    harmonics: Harmonics = "auto"
+    """Memory of the harmonics above band 0 and of Adam's moments of them, in training.  `host`: each step sends those
+    of its view to the device and fetches them; what other views see is updated later (`optimize.update: deferred`).
+    `auto`: the device, until it does not hold as many Gaussians as there are to be, and the host from then on."""
     launch_tiles: Annotated[int, Field(ge=0)] = 0
     """Number of tiles of one launch, for devices whose display limits its time; 0: all."""
 

@@ -6,12 +6,11 @@ from dataclasses import replace
 from clsplat.pipeline.choosing import choose
 from clsplat.pipeline.file import PipelineFile
 from clsplat.pipeline.loading import Pipeline
+from clsplat.pipeline.on_host import harmonics_of
 from clsplat.pipeline.stretching import of_trainings
-from clsplat.runs.need import Need
 from clsplat.scene.capture import measured
 from clsplat.stages.optimize import Optimize
 from clsplat.training.colours import settled
-from clsplat.training.harmonics_memory import PlannedHarmonics
 from clsplat.training.run import Run
 from clsplat.training.skies import settled as settled_sky
 from clsplat.views.colours import Auto
@@ -26,7 +25,7 @@ def settle(pipeline: Pipeline, run: Run) -> Pipeline:
     Choices that are made already stay.
     """
     with run.status.stage("choose"):
-        return _taken(_with_harmonics(_with_colours(_by_capture(pipeline, run), run), run), run)
+        return _taken(_with_colours(_by_capture(pipeline, run), run), run)
 
 
 def _by_capture(pipeline: Pipeline, run: Run) -> Pipeline:
@@ -45,7 +44,7 @@ def _by_capture(pipeline: Pipeline, run: Run) -> Pipeline:
 def _taken(pipeline: Pipeline, run: Run) -> Pipeline:
     """The same; the run has its settings."""
     run.settings, run.pipeline, run.model_settings = pipeline.settings, pipeline.resolved(), pipeline.settings.model
-    run.harmonics = pipeline.settings.rasterizer.harmonics.in_use
+    run.harmonics = harmonics_of(pipeline.settings)
     return pipeline
 
 
@@ -72,16 +71,3 @@ def _with_sky(settings: PipelineFile, run: Run) -> PipelineFile:
     if background is settings.model.background:
         return settings
     return settings.model_copy(update={"model": settings.model.model_copy(update={"background": background})})
-
-
-def _with_harmonics(pipeline: Pipeline, run: Run) -> Pipeline:
-    """The pipeline with the memory of the harmonics that the plan of memory chooses."""
-    asked, rasterizer = pipeline.settings.rasterizer.harmonics, pipeline.settings.rasterizer
-    if not isinstance(asked, PlannedHarmonics) or asked.chosen or not (need := Need.of(pipeline, run.original)):
-        return pipeline
-    chosen, reason = need.memory_of_harmonics(run.device.info)
-    if chosen == "host":
-        LOG.info("rasterizer.harmonics: host, since %s", reason)
-    harmonics = asked.model_copy(update={"chosen": chosen, "reason": reason})
-    settled = rasterizer.model_copy(update={"harmonics": harmonics})
-    return replace(pipeline, settings=pipeline.settings.model_copy(update={"rasterizer": settled}))

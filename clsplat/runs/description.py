@@ -19,7 +19,7 @@ from clsplat.stages.base import Scheduled, Stage
 from clsplat.stages.evaluate import Evaluate
 from clsplat.stages.init import Init
 from clsplat.stages.training import Training
-from clsplat.training.memory import first_tables
+from clsplat.training.memory import first_tables, last_place
 from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
@@ -82,7 +82,10 @@ def _on_host(pipeline: Pipeline, run: Run) -> list[str]:
     if first is None:
         return []
     motion, count = run.model_settings.time, first.expected_count(run.scene)
-    planned = run.memory_plan(first_tables(run.model_settings.sh_degree, motion.width if motion else 0))
+    tables = first_tables(run.model_settings.sh_degree, motion.width if motion else 0)
+    if run.harmonics == "auto" and count <= run.memory_plan(tables, "device").limit:
+        return []
+    planned = run.memory_plan(tables, last_place(run.harmonics, run.device.info))
     return [f"  {planned.text(count)}"] if planned.host else []
 
 

@@ -7,6 +7,7 @@ from clsplat.errors import ConfigError
 from clsplat.names import UNDISTORTED
 from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import Pipeline, prepared_folder
+from clsplat.pipeline.on_host import harmonics_of
 from clsplat.pipeline.places import contents
 from clsplat.prepare.cache import Planned, note, noted, prepare
 from clsplat.prepare.facts import facts
@@ -105,7 +106,7 @@ def make_run(pipeline: Pipeline, scene: RunScene, device: Device, out: Path, sta
         settings=settings,
         pipeline=pipeline.resolved(),
         rasterizer=Rasterizer(device, settings.rasterizer.sort, settings.rasterizer.budget()),
-        harmonics=settings.rasterizer.harmonics.in_use,
+        harmonics=harmonics_of(settings),
         photographs=Photographs(device, scene.background, budget, undistorted_folder(out)),
         status=status,
         model_settings=settings.model,

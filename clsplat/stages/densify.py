@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Collection, Iterator
 from dataclasses import asdict
+from functools import partial
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
@@ -18,6 +19,8 @@ from clsplat.errors import NumericError, amount
 from clsplat.schedule import AtLeastOne
 from clsplat.settings import OneOf
 from clsplat.stages.base import Scheduled
+from clsplat.training.memory import last_place
+from clsplat.training.placing import make_room
 from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
@@ -35,7 +38,8 @@ class Densify(Scheduled):
     rules: list[OneOf[Rule]]
     """Which Gaussians grow or are removed; the first growing rule decides, pruning rules override growth."""
     max_gaussians: AtLeastOne | None = None
-    """Number of Gaussians at which growth stops, by step; without it, as many as fit in memory.  Pruning continues."""
+    """Number of Gaussians at which growth stops, by step; without it, as many as fit in memory.  Pruning continues.
+    With `inside` it is the number of those in there."""
     per_pixel: Annotated[float, Field(gt=0)] | None = None
     """Number of Gaussians at which growth stops, for each pixel of a training photograph (the median of them); without
     it, no such number.  Pruning continues."""
@@ -76,12 +80,14 @@ class Densify(Scheduled):
             return
         scale = SceneScale(run.scene.extent, run.texture_quantile)
         edit = Edit(run.model.gaussians, run.stats, scale, run.step, run.seed, run.survey())
-        fits = (plan := run.memory_plan()).limit
+        place = last_place(run.harmonics, run.device.info)
+        fits = run.memory_plan(harmonics=place).limit
         limit = min([fits, *self._limits(run, edit)])
-        change = densify(edit, self.rules, run.rasterizer.tiler, limit, self.inside)
+        room = partial(make_room, run)
+        change = densify(edit, self.rules, run.rasterizer.tiler, limit, self.inside, room)
         run.refresh_filter()
         if change.after == fits:
-            more = "smaller photographs" if plan.host else "smaller photographs, or rasterizer.harmonics=host,"
+            more = "smaller photographs" + ("" if place == "host" else ", or rasterizer.harmonics=host,")
             most = f"{fits:,} Gaussians, the most that fit in the device's memory; with {more} more do"
             LOG.warning("step %d: growth stops at %s", run.step, most)
         run.records.add(run.step, "densify", **asdict(change))
@@ -101,12 +107,18 @@ class Densify(Scheduled):
             LOG.info("step %d: growth ends: the model was best at step %d", run.step, best.found.step)
         return best.growth_ended is not None
 
+    def _outside(self, edit: Edit) -> int:
+        """The Gaussians outside the part of space in which they grow."""
+        if self.inside is None:
+            return 0
+        return int((~self.inside.holds(edit.gaussians.get("means"))).sum())
+
     def _limits(self, run: Run, edit: Edit) -> Iterator[int]:
         """The numbers of Gaussians at which the settings stop growth."""
         if self._has_grown(run):
             yield 0
         if self.max_gaussians is not None:
-            yield int(edit.at(self.max_gaussians))
+            yield int(edit.at(self.max_gaussians)) + self._outside(edit)
         if self.per_pixel is not None:
             views = [view for view in run.scene.split("train") if view.downscale == run.downscale]
             sizes = [view.camera.width * view.camera.height for view in views]

@@ -23,7 +23,7 @@ from clsplat.scene.view import load_image, load_rgba
 from clsplat.settings import ReadPath
 from clsplat.stages.base import Stage
 from clsplat.stages.first_motion import moving, require_times, with_motion
-from clsplat.training.memory import first_tables
+from clsplat.training.memory import first_tables, last_place
 from clsplat.training.run import Run
 from clsplat.training.skies import begin_sky
 
@@ -162,7 +162,8 @@ class Init(Stage):
     def _require_memory(run: Run, count: int) -> None:
         """Raise MemoryLimitError where so many Gaussians do not fit."""
         motion = run.model_settings.time
-        run.memory_plan(first_tables(run.model_settings.sh_degree, motion.width if motion else 0)).check(count)
+        tables = first_tables(run.model_settings.sh_degree, motion.width if motion else 0)
+        run.memory_plan(tables, last_place(run.harmonics, run.device.info)).check(count)
 
     def _random(self, run: Run) -> PointCloud:
         """Random points, where so many Gaussians fit.  Raises MemoryLimitError before any is made."""

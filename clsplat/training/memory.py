@@ -26,6 +26,7 @@ FRAME_PIXEL = 4 * (4 * 3 + 3 + 9 + 2 * 3 + 2 * 3 + 2 + 2)
 
 
 Where = Literal["device", "host"]
+Harmonics = Literal["auto", "device", "host"]  # memory of those above band 0; auto: the host where the device is full
 
 
 @dataclass(frozen=True)
@@ -75,16 +76,6 @@ class MemoryPlan:
             )
 
 
-def first_tables(degree: int, motion: int = 0) -> dict[str, int]:
-    """Return the components of the tables that training has at least, by name: parameters and their moments.
-
-    motion: the columns of the motion; 0 where nothing moves.
-    """
-    widths = (3, 4, 3, 1, 3, 3 * (sh_coefficients(degree) - 1))
-    parameters = dict(zip(PARAMETERS, widths, strict=True)) | ({MOTION: motion} if motion else {})
-    return parameters | {table: width for name, width in parameters.items() for table in moment_tables(name)}
-
-
 class Limits(Protocol):
     """What a device holds."""
 
@@ -99,6 +90,21 @@ class Limits(Protocol):
     @property
     def unified(self) -> bool:
         """Whether it is the host's memory."""
+
+
+def last_place(harmonics: Harmonics, limits: Limits) -> Where:
+    """Return where harmonics may lie at last.  A device whose memory is the host's has nothing to move them to."""
+    return "host" if harmonics == "host" or (harmonics == "auto" and not limits.unified) else "device"
+
+
+def first_tables(degree: int, motion: int = 0) -> dict[str, int]:
+    """Return the components of the tables that training has at least, by name: parameters and their moments.
+
+    motion: the columns of the motion; 0 where nothing moves.
+    """
+    widths = (3, 4, 3, 1, 3, 3 * (sh_coefficients(degree) - 1))
+    parameters = dict(zip(PARAMETERS, widths, strict=True)) | ({MOTION: motion} if motion else {})
+    return parameters | {table: width for name, width in parameters.items() for table in moment_tables(name)}
 
 
 def plan(

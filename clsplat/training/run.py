@@ -26,7 +26,7 @@ from clsplat.training.adam import Adam
 from clsplat.training.colour_grids import GridTables, bytes_needed
 from clsplat.training.field import LearnedField
 from clsplat.training.kept import Best, Tables
-from clsplat.training.memory import MemoryPlan, Where, plan
+from clsplat.training.memory import Harmonics, MemoryPlan, Where, plan
 from clsplat.training.profile import clocks
 from clsplat.training.progress import Progress as Progress
 from clsplat.training.progress import Stopped as Stopped
@@ -56,7 +56,7 @@ class Run:
     photographs: Photographs
     status: StatusFile
     model_settings: ModelSettings
-    harmonics: Where = "device"  # the memory in which those above band 0 lie while they are trained
+    harmonics: Harmonics = "device"  # the memory in which those above band 0 lie while they are trained
     identity: Identity | None = None  # of the original scene and its photographs
     read: dict[str, str] = field(default_factory=dict)  # hashes of the files that settings name, by their text
     prepared: dict[str, str] | None = None  # hash of the inputs of `prepare:`, and the folder of its result
@@ -203,15 +203,20 @@ class Run:
         """The smallest divisor of the photographs' size in training."""
         return self.scene.downscales[0]
 
-    def memory_plan(self, components: Mapping[str, int] | None = None) -> MemoryPlan:
-        """Return the plan of the device's memory for training with the present tables, or those of `components`."""
+    def memory_plan(self, components: Mapping[str, int] | None = None, harmonics: Where | None = None) -> MemoryPlan:
+        """Return the plan of the device's memory for training with the present tables, or those of `components`.
+
+        harmonics: where they lie; None: where they are now.
+        """
+        if harmonics is None:
+            harmonics = "host" if self.model.gaussians.on_host else "device"
         components = components or self.model.gaussians.components
         views, tile = self.scene.split("train"), int(self.device.tuning["TILE"])
         bytes_held = min(self.photographs.budget, sum(4 * view.camera.width * view.camera.height for view in views))
         bytes_held += bytes_needed(self.settings, views, tile)
         pixels = max((-(-v.camera.width // tile)) * (-(-v.camera.height // tile)) * tile**2 for v in views)
         pixel_sums = PIXEL_SUMS if self.stats is None else self.stats.pixel_sums
-        return plan(self.device.info, components, bytes_held, pixels, pixel_sums, self.harmonics)
+        return plan(self.device.info, components, bytes_held, pixels, pixel_sums, harmonics)
 
     def refresh_filter(self) -> None:
         """Update the world filter and the sampling intervals to the present Gaussians."""

@@ -14,7 +14,7 @@ from clsplat.training.adam import Adam
 from clsplat.training.archive import Arrays
 from clsplat.training.field import LearnedField
 from clsplat.training.kept_tables import restore_sky
-from clsplat.training.placing import place_harmonics
+from clsplat.training.placing import make_room
 from clsplat.training.run import Run
 from clsplat.training.state import State, check_tables
 
@@ -72,7 +72,7 @@ def restore(run: Run, state: State, tables: Arrays) -> None:
     gaussians = Gaussians(run.device, {name.removeprefix("gaussians/"): table for name, table in tables.items()})
     run.model = run.model_settings.model(gaussians, state.degree)
     if state.updates:
-        place_harmonics(run)
+        make_room(run, gaussians.count)
         run.adam = Adam(gaussians)
         run.adam.updates = state.updates
         columns = [name for name in tables if name.startswith(STATS_FOLDER) and name != SEEN]

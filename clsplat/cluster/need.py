@@ -1,20 +1,20 @@
-"""The memory that a run needs, by the plan of training, and whether a device holds it.
+"""The memory that a cell needs, by the plan of training, and whether a device holds it.
 
 It is known before any run: how many Gaussians a training begins with, and where its growth ends at the latest.
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from clsplat.pipeline.loading import Pipeline
+from clsplat.pipeline.on_host import harmonics_of
 from clsplat.scene.scene import Scene
 from clsplat.schedule import at_step
 from clsplat.stages.base import Stage
 from clsplat.stages.densify import Densify
 from clsplat.stages.init import Init
 from clsplat.stages.optimize import Optimize
-from clsplat.training.harmonics_memory import HarmonicsMemory, PlannedHarmonics
-from clsplat.training.memory import Limits, MemoryPlan, Where, first_tables, plan
+from clsplat.training.memory import Harmonics, Limits, MemoryPlan, first_tables, last_place, plan
 from clsplat.views.photographs import BUDGET_SHARE
 
 TILE = 16  # px a side, the larger of those that devices take
@@ -22,7 +22,7 @@ TILE = 16  # px a side, the larger of those that devices take
 
 @dataclass(frozen=True)
 class Need:
-    """What the training of a run takes on a device."""
+    """What the training of a cell takes on a device."""
 
     degree: int  # of spherical harmonics
     photographs: int  # bytes of all that are trained on
@@ -31,8 +31,7 @@ class Need:
     first: int  # Gaussians that it begins with
     most: int  # Gaussians at which its growth ends; where nothing says so, those that it begins with
     motion: int = 0  # columns of the motion; 0 where nothing moves
-    harmonics: HarmonicsMemory = field(default_factory=PlannedHarmonics)
-    reader: str = ""  # of all harmonics on the device, a stage; empty: none is
+    harmonics: Harmonics = "device"
 
     @classmethod
     def of(cls, pipeline: Pipeline, scene: Scene) -> "Need | None":
@@ -56,30 +55,14 @@ class Need:
             begins,
             max(begins, int(max(ends, default=0))),
             settings.model.time.width if settings.model.time else 0,
-            settings.rasterizer.harmonics,
-            next((stage.stage for one in trainings for stage in one.during if stage.reads_harmonics), ""),
+            harmonics_of(settings),
         )
-
-    def memory_of_harmonics(self, limits: Limits) -> tuple[Where, str]:
-        """Return where they lie on a device that is new to the run, and why."""
-        if not isinstance(self.harmonics, PlannedHarmonics) or self.harmonics.chosen:
-            return self.harmonics.in_use, ""
-        held = self._plan(limits, "device").limit
-        why = f"the device holds {held:,} Gaussians with all of theirs, of {self.most:,} that are planned"
-        if held >= self.most:
-            return "device", why
-        if limits.unified:
-            return "device", f"{why}, and its memory is the host's"
-        return ("device", f"{why}, and {self.reader} needs them there") if self.reader else ("host", why)
 
     def plan(self, limits: Limits) -> MemoryPlan:
         """Return the plan of its training on a device."""
-        return self._plan(limits, self.memory_of_harmonics(limits)[0])
-
-    def _plan(self, limits: Limits, harmonics: Where) -> MemoryPlan:
         budget = int(limits.memory * BUDGET_SHARE) if self.budget is None else self.budget
         tables, photographs = first_tables(self.degree, self.motion), min(budget, self.photographs)
-        return plan(limits, tables, photographs, self.pixels, harmonics=harmonics)
+        return plan(limits, tables, photographs, self.pixels, harmonics=last_place(self.harmonics, limits))
 
     def limit_on(self, limits: Limits) -> int:
         """Return the largest number of Gaussians that a device holds."""
