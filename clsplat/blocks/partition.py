@@ -24,7 +24,7 @@ from clsplat.views.photographs import BUDGET_SHARE, Photographs
 
 LOG = logging.getLogger("clsplat")
 Bits = NDArray[np.bool_]
-NEAR_CELL, GROWTH = 0.2, 0.05  # shares of a cell's size by which it is grown: for cameras, and for growth of Gaussians
+NEAR_CELL, GROWTH = 0.2, 0.2  # shares of a cell's size by which it is grown: for cameras, and for growth of Gaussians
 SIGHT = 0.05  # share of a view's pixels
 
 

@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.blocks.cells import Cell
-from clsplat.blocks.partition import GROWTH
 from clsplat.files import atomic
 from clsplat.gaussians.model import Model
 from clsplat.names import SEAMS
@@ -19,6 +18,7 @@ from clsplat.scene.scene import Scene
 from clsplat.scene.view import View
 from clsplat.stages.render import image_path
 
+NEAR_FACE = 0.05  # of a cell's size: what lies so near a face is at a border
 COVERED = 0.5  # of a pixel, from which on its depth counts
 Floats = NDArray[np.floating]
 
@@ -51,7 +51,7 @@ def places(view: View, depth: Floats) -> Floats:
 def is_near(points: Floats, cells: list[Cell]) -> NDArray[np.bool_]:
     """Return which points, [N, 3], lie near a face of the cell that holds them, [N].
 
-    Near is `GROWTH` of the cell's size along the axis: twice as far as growth goes beyond a face.
+    Near is `NEAR_FACE` of the cell's size along the axis: half as far as growth goes beyond a face.
     """
     near = np.zeros(len(points), bool)
     for cell in cells:
@@ -59,5 +59,5 @@ def is_near(points: Floats, cells: list[Cell]) -> NDArray[np.bool_]:
         for axis in range(3):
             for bound in (box.low[axis], box.high[axis]):
                 if bound is not None:
-                    near |= held & (np.abs(points[:, axis] - bound) < GROWTH * cell.size[axis])
+                    near |= held & (np.abs(points[:, axis] - bound) < NEAR_FACE * cell.size[axis])
     return near

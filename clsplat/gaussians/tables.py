@@ -36,7 +36,7 @@ from clsplat.opencl.device import Array, Device
 HIDDEN = "hidden"  # which training views leave a Gaussian out; see left_out.py
 INTERVAL2 = "sampling_interval2"  # scene units², the smallest over training views; exists only where it is read
 ALIGNMENT = 64  # capacity is a multiple of this: wide kernels need no tail
-GROWTH = 1.5
+GROWTH = 1.125  # of the capacity: every edit moves all tables in any case
 
 
 @dataclass
