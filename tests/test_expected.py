@@ -129,5 +129,5 @@ def test_patience_says_how_early_a_training_may_end(keys, fewest):
 def test_a_step_is_timed_on_a_made_scene(device: Device):
     """Of few Gaussians, and beyond those that are measured on the line through two numbers of them."""
     settings = load("smoke").settings
-    few, many = module._steps(device, (70, 50), (100, 1000), settings)
+    few, many = module.step_seconds(device, (70, 50), (100, 1000), settings)
     assert 0 < few <= many

@@ -176,7 +176,7 @@ def test_without_a_store_the_cells_run_as_they_did(file, tmp_path, monkeypatch):
         ),
         ("engine: dask://far:1", "expected tls:// for another machine, or insecure: true"),
         ("engine: tls://far:1", "tls://far:1: expected tls: "),
-        ("engine: ray", "x.yaml:3: execution.engine: expected text that matches"),
+        ("engine: ray", "x.yaml:3: execution.engine: expected inline, local, slurm, or the address of a scheduler"),
     ],
 )
 def test_a_wrong_execution_is_refused_with_its_line(tmp_path, text, words):
@@ -202,7 +202,7 @@ def test_the_schema_of_pipeline_files_has_the_keys_of_execution():
         ({"engine": "dask://far:1"}, r"expected tls:// for another machine, or insecure: true \(--insecure\)"),
         ({"engine": "tls://far:1"}, r"\(--tls-ca, --tls-cert and --tls-key\)"),
         ({"engine": "tls://far:1", "tls": {"ca": "a", "key": "b"}}, "^--tls-cert: 'cert' is missing"),
-        ({"engine": "far"}, "^--scheduler: expected text that matches"),
+        ({"engine": "tcp://10.0.0.1:8786"}, r"^--scheduler: .*dask://HOST:PORT \(where Dask says tcp://\)"),
     ],
 )
 def test_a_wrong_option_of_a_worker_is_named(given, words):

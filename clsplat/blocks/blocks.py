@@ -15,6 +15,7 @@ from clsplat.blocks.folder import COARSE, MERGED, RECORD
 from clsplat.blocks.partition import SIGHT, Block, Partition, Partitioner
 from clsplat.blocks.pipelines import of_block, of_coarse, of_merged, require_divisible, without_start
 from clsplat.blocks.seams import write_seams
+from clsplat.blocks.times import block_seconds
 from clsplat.cluster.batch import Batch
 from clsplat.cluster.store import Store
 from clsplat.conformance.quick import open_correct
@@ -111,6 +112,13 @@ class Blocks:
         found.write(self.out)
         return found
 
+    def plan_of(self, partition: Partition) -> dict[str, Any]:
+        """Return the manifest with the time that the training of each block takes, from some steps of it."""
+        pipelines = {block.name: self.of_block(block, partition) for block in partition.blocks}
+        sizes = sorted((view.camera.width, view.camera.height) for view in self.scene.scene.split("train"))
+        found, times = partition.data(), block_seconds(partition.blocks, pipelines, sizes[len(sizes) // 2], self.device)
+        return {**found, "blocks": [{**block, "seconds": times[block["name"]]} for block in found["blocks"]]}
+
     def of_block(self, block: Block, partition: Partition) -> Pipeline:
         """Return the pipeline of a block."""
         share = Fraction(len(block.views), partition.views) if self.plan.steps == "shared" else Fraction(1)
@@ -195,7 +203,7 @@ def train_in_blocks(
     with claimed(out, work.question(), RECORD, "a scene in blocks", "another --out"):
         partition = work.partition()
         if only_plan:
-            return {**partition.data(), "run": None}
+            return {**work.plan_of(partition), "run": None}
         run = work.finish(work.merge(work.train(partition)), partition)
     return {**partition.data(), "run": str(run), "metrics": read_json(run / METRICS)}
 

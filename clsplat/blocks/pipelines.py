@@ -35,6 +35,10 @@ def require_divisible(pipeline: Pipeline) -> None:
         "scene.extent": (settings.scene.extent, "blocks have that of the whole scene; leave it out"),
         "optimize.colours": (any(stage.colours for stage in trainings), "those of blocks would differ; leave it out"),
         "optimize.poses": (any(stage.poses for stage in trainings), "those of blocks would differ; leave it out"),
+        "densify.budget": (
+            any(getattr(one.budget, "gaussians", None) for one in _densities(pipeline.stages)),
+            "it counts the Gaussians of the whole; give densify.max_gaussians, which blocks share",
+        ),
         "densify.inside": (any(one.inside for one in _densities(pipeline.stages)), "blocks set it; leave it out"),
     }
     for key, (is_set, remedy) in faults.items():
@@ -124,8 +128,9 @@ def _growing(stage: dict[str, Any], block: Block) -> dict[str, Any]:
 
 
 def _limited(densify: Densify, block: Block) -> Densify:
-    """The stage in a block: Gaussians grow in its cell, and `max_gaussians` is its share by pairs."""
+    """The stage in a block: Gaussians grow in its cell, up to its share, by pairs, of the number of the whole."""
     changed: dict[str, Any] = {"inside": block.cell.grown(GROWTH)}
-    if densify.max_gaussians is not None:
-        changed["max_gaussians"] = divided(densify.max_gaussians, 1 / block.pairs)
+    for key in ("max_gaussians", "per_pixel"):
+        if (most := getattr(densify, key)) is not None:
+            changed[key] = divided(most, 1 / block.pairs)
     return densify.model_copy(update=changed)

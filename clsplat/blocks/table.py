@@ -4,15 +4,25 @@ from typing import Any
 
 from clsplat.errors import one_line
 from clsplat.pages.columns import columns
+from clsplat.runs.expected import minutes_text
 from clsplat.runs.status import status_text
 
 HEADINGS = ("block", "owns", "starts from", "views", "of these by place", "pairs", "MiB")
+TIME = "time of training"
 
 
 def table(found: dict[str, Any]) -> str:
-    """Return a manifest as lines of text; MiB are those on the device at the beginning of a training."""
+    """Return a manifest as lines of text; MiB are those on the device at the beginning of a training.
+
+    The time of a block goes from that of no growth to that of the most Gaussians.
+    """
     whole = ["whole", *[f"{found['gaussians']:,}"] * 2, str(found["views"]), "", "100 %", _mib(found["memory"])]
-    return columns([HEADINGS, *map(_cells, found["blocks"]), whole])
+    times = [one["seconds"] for one in found["blocks"] if "seconds" in one]
+    if not times:
+        return columns([HEADINGS, *map(_cells, found["blocks"]), whole])
+    rows = [[*_cells(block), minutes_text(seconds)] for block, seconds in zip(found["blocks"], times, strict=True)]
+    low, high = (sum(ends) for ends in zip(*times, strict=True))
+    return columns([[*HEADINGS, TIME], *rows, [*whole, f"{minutes_text((low, high))}, one after the other"]])
 
 
 def status_table(found: dict[str, Any]) -> str:

@@ -1,9 +1,10 @@
 """How the cells of a matrix are run: the keys of `execution:`, or of a file that `--on` names."""
 
+import re
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, ValidationError, field_validator, model_validator
+from pydantic import BeforeValidator, Field, ValidationError, field_validator, model_validator
 
 from clsplat.errors import ConfigError
 from clsplat.pipeline.explanation import explain, first_fault
@@ -11,6 +12,7 @@ from clsplat.pipeline.yaml_file import read_yaml
 from clsplat.settings import ReadPath, Settings
 
 STORE = "runs/store"
+ENGINE = r"^(inline|local|slurm|(dask|tls)://[^/:\s]+:\d{1,5})$"
 LOOPBACK = ("127.0.0.1", "localhost")
 OF_A_STORE = ("devices", "placement", "retries")  # keys that only cells of a store obey
 
@@ -54,10 +56,17 @@ class Slurm(Settings):
     """Network interface by which nodes reach this machine, such as ib0; without it, that of its name."""
 
 
+def _engine(value: Any) -> Any:
+    if isinstance(value, str) and not re.fullmatch(ENGINE, value):
+        scheduler = "dask://HOST:PORT (where Dask says tcp://) or tls://HOST:PORT"
+        raise ValueError(f"expected inline, local, slurm, or the address of a scheduler, {scheduler}")
+    return value
+
+
 class Execution(Settings):
     """Where the cells of a matrix run, and where they are kept."""
 
-    engine: Annotated[str, Field(pattern=r"^(inline|local|slurm|(dask|tls)://[^/:\s]+:\d{1,5})$")] = "inline"
+    engine: Annotated[str, BeforeValidator(_engine), Field(pattern=ENGINE)] = "inline"
     """inline: one after the other in this process; local: one process a device of this machine; slurm: jobs that this
     process submits; dask://HOST:PORT or tls://HOST:PORT: the devices that `clsplat worker` offers to that scheduler."""
     store: ReadPath | None = None

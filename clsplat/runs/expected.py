@@ -51,7 +51,7 @@ class Expected:
     @property
     def text(self) -> str:
         """The part in one line."""
-        return f"  {self.name:<14} {_minutes(self.seconds)}: {self.why}"
+        return f"  {self.name:<14} {minutes_text(self.seconds)}: {self.why}"
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ def expected(pipeline: Pipeline, planned: Sequence[Planned], out: Path, device: 
         return []
     low, high = (sum(one.seconds[end] for one in parts) for end in (0, 1))
     told = "without measurements, pictures and pages; by what small parts take on this machine as it is now"
-    return [f"expected: {_minutes((low, high))}, {told}", *(one.text for one in parts)]
+    return [f"expected: {minutes_text((low, high))}, {told}", *(one.text for one in parts)]
 
 
 def _photographs(pipeline: Pipeline, planned: Sequence[Planned], out: Path) -> list[str]:
@@ -165,8 +165,8 @@ def _trainings(settings: PipelineFile) -> list[Optimize]:
 def _of_training(training: Optimize, settings: PipelineFile, capture: Capture, device: Device) -> Expected:
     """A training: between its fewest steps with the Gaussians of its start, and its most with the most of them."""
     pixels = capture.size[0] * capture.size[1]
-    most = max(capture.gaussians, int(_densest(training) * pixels))
-    each = _steps(device, capture.size, (capture.gaussians, most), settings)
+    most = max(capture.gaussians, int(densest(training) * pixels))
+    each = step_seconds(device, capture.size, (capture.gaussians, most), settings)
     steps = training.fewest_steps, training.steps * (2 if training.refit else 1)
     of_steps, of_counts = (_range(*(f"{end:,}" for end in ends)) for ends in (steps, (capture.gaussians, most)))
     times, size = _range(*(f"{1e3 * one:.0f}" for one in each)), "{}x{}".format(*capture.size)
@@ -181,16 +181,19 @@ def _of_field(training: TrainField, run: Run) -> Expected:
     return Expected(training.stage, (training.steps * each, training.steps * each), why)
 
 
-def _densest(training: Optimize) -> float:
-    """The most Gaussians for each pixel that a training may have: what its settings say, or what captures end at."""
+def densest(training: Optimize) -> float:
+    """Return the most Gaussians for each pixel that a training may have: by its settings, or what captures end at."""
     growing = [stage for stage in training.during if isinstance(stage, Densify)]
     return min([one.per_pixel or DENSEST for one in growing], default=0.0)
 
 
-def _steps(device: Device, size: tuple[int, int], counts: tuple[int, int], settings: PipelineFile) -> list[float]:
-    """The times of training steps with so many Gaussians, s: by those of two made scenes, on a line."""
-    few = min(counts[0], MEASURED[0])
-    many = max(2 * few, min(counts[1], MEASURED[1]))
+def step_seconds(device: Device, size: tuple[int, int], counts: Sequence[int], settings: PipelineFile) -> list[float]:
+    """Return the time of a training step for each number of Gaussians, s: by those of two made scenes, on a line.
+
+    size: of a photograph, px.  The device is used for some seconds.
+    """
+    few = min(*counts, MEASURED[0])
+    many = max(2 * few, min(max(counts), MEASURED[1]))
     base, grown = (_step(device, size, count, settings) for count in (few, many))
     more = max(0.0, grown - base) / (many - few)
     return [base + more * (count - few) for count in counts]
@@ -206,7 +209,8 @@ def _step(device: Device, size: tuple[int, int], count: int, settings: PipelineF
     return median(one.clock) / 1e3
 
 
-def _minutes(seconds: tuple[float, float]) -> str:
+def minutes_text(seconds: Sequence[float]) -> str:
+    """Return two times, s, as a range of minutes."""
     ends = [max(0.1, one / 60) for one in seconds]
     return _range(*(f"{one:.0f}" if one >= 10 else f"{one:.1f}" for one in ends)) + " min"
 

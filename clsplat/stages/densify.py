@@ -42,7 +42,7 @@ class Densify(Scheduled):
     With `inside` it is the number of those in there."""
     per_pixel: Annotated[float, Field(gt=0)] | None = None
     """Number of Gaussians at which growth stops, for each pixel of a training photograph (the median of them); without
-    it, no such number.  Pruning continues."""
+    it, no such number.  Pruning continues.  `inside` as above."""
     budget: OneOf[Budget] | None = None
     """Number of Gaussians at which the growth of an edit stops, from the course of the training; needs `stop`."""
 
@@ -122,7 +122,7 @@ class Densify(Scheduled):
         if self.per_pixel is not None:
             views = [view for view in run.scene.split("train") if view.downscale == run.downscale]
             sizes = [view.camera.width * view.camera.height for view in views]
-            yield max(1, int(self.per_pixel * float(np.median(sizes))))
+            yield max(1, int(self.per_pixel * float(np.median(sizes)))) + self._outside(edit)
         if self.budget and self.every and self.stop:
             left = len(places(self.every, run.step - 1, self.stop))
             moment = Moment(run.step / self.stop, left, run.divisor)
