@@ -19,8 +19,7 @@ from clsplat.errors import NumericError, amount
 from clsplat.schedule import AtLeastOne
 from clsplat.settings import OneOf
 from clsplat.stages.base import Scheduled
-from clsplat.training.memory import last_place
-from clsplat.training.placing import make_room
+from clsplat.training.placing import make_room, most_gaussians
 from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
@@ -80,14 +79,13 @@ class Densify(Scheduled):
             return
         scale = SceneScale(run.scene.extent, run.texture_quantile)
         edit = Edit(run.model.gaussians, run.stats, scale, run.step, run.seed, run.survey())
-        place = last_place(run.harmonics, run.device.info)
-        fits = run.memory_plan(harmonics=place).limit
+        fits = most_gaussians(run)
         limit = min([fits, *self._limits(run, edit)])
         room = partial(make_room, run)
         change = densify(edit, self.rules, run.rasterizer.tiler, limit, self.inside, room)
         run.refresh_filter()
         if change.after == fits:
-            more = "smaller photographs" + ("" if place == "host" else ", or rasterizer.harmonics=host,")
+            more = "smaller photographs" + (", or rasterizer.harmonics=host," if run.harmonics == "device" else "")
             most = f"{fits:,} Gaussians, the most that fit in the device's memory; with {more} more do"
             LOG.warning("step %d: growth stops at %s", run.step, most)
         run.records.add(run.step, "densify", **asdict(change))

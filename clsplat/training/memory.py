@@ -114,13 +114,15 @@ def plan(
     pixels: int,
     pixel_sums: int = PIXEL_SUMS,
     harmonics: Where = "device",
+    seen: float = SEEN_SHARE,
 ) -> MemoryPlan:
     """Return the plan for Gaussians with tables of these components, by name.
 
     photographs: their bytes on the device; pixels: of the largest view, whole tiles; pixel_sums: sums over pixels that
-    the backward pass computes for each Gaussian; harmonics: the memory in which those above band 0 lie.
+    the backward pass computes for each Gaussian; harmonics: the memory in which those above band 0 lie; seen: share of
+    the Gaussians whose harmonics a view brings to the device.
     """
-    shares = dict.fromkeys(HARMONICS, SEEN_SHARE) if harmonics == "host" else {}
+    shares = dict.fromkeys(HARMONICS, seen) if harmonics == "host" else {}
     held = {name: math.ceil(4 * width * shares.get(name, 1)) for name, width in components.items()}
     sizes = list(held.values())
     gradients = sum(held[name] for name in PARAMETERS) + 8  # for penalties and edits

@@ -2,11 +2,39 @@
 
 import logging
 
+from clsplat.gaussians.on_host import GROWTH, NO_SLOT
 from clsplat.gaussians.tables import moment_tables
 from clsplat.training.memory import last_place
 from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
+NEAR = 2  # times as many Gaussians: an edit makes few more of them
+VIEWS = 16  # that are looked at
+
+
+def most_gaussians(run: Run) -> int:
+    """Return how many Gaussians the device holds at most, with the harmonics where they may lie at last.
+
+    With `auto` it depends on the Gaussians alone, and not on where their harmonics are: what some training views see of
+    them must leave more room on the host.
+    """
+    place = last_place(run.harmonics, run.device.info)
+    if run.harmonics != "auto" or place == "device":
+        return run.memory_plan(harmonics=place).limit
+    held = run.memory_plan(harmonics="device").limit
+    if NEAR * run.model.gaussians.count <= held:
+        return held
+    return max(held, run.memory_plan(harmonics="host", seen=_seen(run)).limit)
+
+
+def _seen(run: Run) -> float:
+    """The largest share of the blocks of rows that one of some training views sees, with room for more."""
+    survey, gaussians = run.survey(), run.model.gaussians
+    lanes, most = int(run.device.tuning["LANES"]), 0.0
+    for look in survey.looks(survey.drawn(VIEWS)):
+        keys = look.frame.depth_key.get()[: gaussians.count // lanes * lanes]
+        most = max(most, float((keys != NO_SLOT).reshape(-1, lanes).any(axis=1).mean()))
+    return GROWTH * most
 
 
 def make_room(run: Run, count: int) -> None:

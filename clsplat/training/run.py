@@ -26,7 +26,7 @@ from clsplat.training.adam import Adam
 from clsplat.training.colour_grids import GridTables, bytes_needed
 from clsplat.training.field import LearnedField
 from clsplat.training.kept import Best, Tables
-from clsplat.training.memory import Harmonics, MemoryPlan, Where, plan
+from clsplat.training.memory import SEEN_SHARE, Harmonics, MemoryPlan, Where, plan
 from clsplat.training.profile import clocks
 from clsplat.training.progress import Progress as Progress
 from clsplat.training.progress import Stopped as Stopped
@@ -203,10 +203,15 @@ class Run:
         """The smallest divisor of the photographs' size in training."""
         return self.scene.downscales[0]
 
-    def memory_plan(self, components: Mapping[str, int] | None = None, harmonics: Where | None = None) -> MemoryPlan:
+    def memory_plan(
+        self,
+        components: Mapping[str, int] | None = None,
+        harmonics: Where | None = None,
+        seen: float = SEEN_SHARE,
+    ) -> MemoryPlan:
         """Return the plan of the device's memory for training with the present tables, or those of `components`.
 
-        harmonics: where they lie; None: where they are now.
+        harmonics: where they lie; None: where they are now; seen: as for `plan`.
         """
         if harmonics is None:
             harmonics = "host" if self.model.gaussians.on_host else "device"
@@ -216,7 +221,7 @@ class Run:
         bytes_held += bytes_needed(self.settings, views, tile)
         pixels = max((-(-v.camera.width // tile)) * (-(-v.camera.height // tile)) * tile**2 for v in views)
         pixel_sums = PIXEL_SUMS if self.stats is None else self.stats.pixel_sums
-        return plan(self.device.info, components, bytes_held, pixels, pixel_sums, harmonics)
+        return plan(self.device.info, components, bytes_held, pixels, pixel_sums, harmonics, seen)
 
     def refresh_filter(self) -> None:
         """Update the world filter and the sampling intervals to the present Gaussians."""
