@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from clsplat import errors as errors
     from clsplat import metrics as metrics
+    from clsplat.api.blocks import plan_in_blocks as plan_in_blocks
     from clsplat.api.blocks import train_in_blocks as train_in_blocks
     from clsplat.api.commands import check as check
     from clsplat.api.commands import copy_pipeline as copy_pipeline
@@ -76,7 +77,7 @@ _ROOMS = {  # where the names come from, which `import clsplat` does not import
     "clsplat.api.converting": "convert",
     "clsplat.api.commands": "check copy_pipeline describe_run evaluate pipeline_schema"
     " pipelines resume run status status_schema",
-    "clsplat.api.blocks": "train_in_blocks",
+    "clsplat.api.blocks": "plan_in_blocks train_in_blocks",
     "clsplat.api.compression": "compress_model write_levels",
     "clsplat.api.device": "Device",
     "clsplat.api.pages": "compare_runs view",

@@ -306,6 +306,17 @@ def test_options_out_of_bounds_are_refused(option, value, tiny_scene, few_steps,
         train(tiny_scene, few_steps, tmp_path / "out", **{option: value})
 
 
+def test_inspect_shows_a_plan_by_the_points_before_anything_is_trained(tiny_scene, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    shown = CliRunner().invoke(app, ["inspect", str(tiny_scene), "--blocks", "2", "--json"])
+    assert shown.exit_code == 0, shown.output
+    found = json.loads(shown.stdout)
+    assert [block["name"] for block in found["blocks"]] == ["block_00", "block_01"]
+    assert found["gaussians"] == len(read_scene(tiny_scene).points)
+    assert all(0 < low <= high for low, high in (block["seconds"] for block in found["blocks"]))
+    assert not list(tmp_path.iterdir())
+
+
 def test_the_command_shows_the_plan(tiny_scene, few_steps, tmp_path):
     arguments = ["blocks", "--scene", str(tiny_scene), "--coarse", str(few_steps), "--out", str(tmp_path / "out")]
     shown = CliRunner().invoke(app, [*arguments, "--plan", "--blocks", "2"])

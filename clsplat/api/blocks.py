@@ -11,6 +11,18 @@ if TYPE_CHECKING:  # the command line starts without OpenCL
     from clsplat.opencl.device import Device
 
 
+def plan_in_blocks(
+    scene: PathLike, pipeline: str = "blocks", *, blocks: int = 4, device: "str | Device | None" = None
+) -> dict[str, Any]:
+    """Return how a scene would be cut by its points, before anything is trained: what partition.json holds, and the
+    time of each block, `seconds`, from some steps on the device.  Nothing is kept.
+    """
+    from clsplat.blocks.outlook import plan_blocks
+
+    load_plugins()
+    return plan_blocks(Path(scene), blocks, pipeline, device)
+
+
 def train_in_blocks(
     scene: PathLike,
     out: PathLike = "runs/blocks",

@@ -7,6 +7,7 @@ import typer
 
 from clsplat import streams, terminal
 from clsplat.api import tools
+from clsplat.api.blocks import plan_in_blocks
 from clsplat.cli.app import DeviceOption, JsonOption, command
 from clsplat.errors import ConfigError, DataError, DeviceError
 
@@ -50,19 +51,42 @@ def doctor(
         raise DeviceError(f"{report.info.text}: {report.verdict.text}")
 
 
-@command("inspect", "clsplat inspect my_scene", "clsplat inspect my_scene --html scene.html")
+@command(
+    "inspect",
+    "clsplat inspect my_scene",
+    "clsplat inspect my_scene --html scene.html",
+    "clsplat inspect my_city --blocks 9",
+)
 def inspect(
     scene: Annotated[Path, typer.Argument(metavar="SCENE", help="A COLMAP, Blender or nerfstudio folder, or a run's.")],
     as_json: JsonOption = False,
     page: Annotated[
         Path | None, typer.Option("--html", metavar="FILE", help="Write a page with the cameras and points in 3D.")
     ] = None,
+    count: Annotated[
+        int | None,
+        typer.Option("--blocks", metavar="N", help="Only show how its points would be cut: views, memory, time."),
+    ] = None,
+    device: DeviceOption = None,
 ) -> None:
     """Tell whether a dataset will train, and what is wrong with it; exit 3 when it cannot train."""
+    from clsplat.blocks.table import table
     from clsplat.inspect.table import show
 
+    if count is None and device is not None:
+        raise ConfigError("inspect: --device is for --blocks, which times some steps; leave it out")
+    if count is not None and page is not None:
+        raise ConfigError("inspect: --blocks shows a table; leave --html out")
     if as_json:
         terminal.keep_stdout_for_json()
+    if count is not None:
+        found = plan_in_blocks(scene, blocks=count, device=device)
+        if as_json:
+            terminal.show_json(found)
+        else:
+            terminal.show(table(found))
+            terminal.remark("by the dataset's points; `clsplat blocks --plan` cuts by a coarse model, which it trains")
+        return
     inspection = tools.inspect_scene(scene, page)
     if as_json:
         terminal.show_json(inspection.data())
