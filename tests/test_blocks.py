@@ -279,6 +279,11 @@ def test_the_coarse_model_is_trained_where_none_is_given(tiny_scene, tmp_path):
         ("optimize.colours={type: gain}", "optimize.colours is not for blocks: those of blocks would differ"),
         ("scene.validation=4", "scene.validation is not for blocks: a block has no views to choose by"),
         ("densify.inside={low: [0, null, null]}", "densify.inside is not for blocks: blocks set it; leave it out"),
+        (
+            "densify.budget={type: parabola, gaussians: 900}",
+            "densify.budget is not for blocks: it counts the",
+        ),
+        ("densify.per_pixel=0.1", "densify.per_pixel is not for blocks: photographs of blocks differ"),
         ("init.source=random", "expected `init: {source: model}` first, and a stage 'optimize'"),
     ],
 )
@@ -306,6 +311,14 @@ def test_options_out_of_bounds_are_refused(option, value, tiny_scene, few_steps,
         train(tiny_scene, few_steps, tmp_path / "out", **{option: value})
 
 
+def test_a_plan_by_points_needs_points(tiny_scene, tmp_path):
+    shutil.copytree(tiny_scene, tmp_path / "scene")
+    (tmp_path / "scene" / "points3d.ply").unlink()
+    refused = CliRunner().invoke(app, ["inspect", str(tmp_path / "scene"), "--blocks", "2"])
+    assert isinstance(refused.exception, DataError)
+    assert "has no points to cut by; `clsplat blocks --plan` trains a coarse model first" in str(refused.exception)
+
+
 def test_inspect_shows_a_plan_by_the_points_before_anything_is_trained(tiny_scene, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     shown = CliRunner().invoke(app, ["inspect", str(tiny_scene), "--blocks", "2", "--json"])
@@ -323,7 +336,7 @@ def test_the_command_shows_the_plan(tiny_scene, few_steps, tmp_path):
     assert shown.exit_code == 0, shown.output
     names = [line.split()[0] for line in shown.stdout.splitlines() if "%" in line]
     assert names == ["block_00", "block_01", "whole"]
-    assert "time of training" in shown.stdout
+    assert "time, by growth" in shown.stdout
     assert all(re.search(r"\d min", line) for line in shown.stdout.splitlines() if "%" in line)
     refused = CliRunner().invoke(app, [*arguments, "--plan", "--blocks", "3"])
     assert "holds a scene in blocks that differs in blocks" in str(refused.exception)

@@ -104,6 +104,7 @@ def test_the_need_of_what_moves_is_the_plan_that_its_first_stage_requires(tiny_s
 
     run = SimpleNamespace(model_settings=pipeline.settings.model, memory_plan=memory_plan)
     run.harmonics, run.device = need.harmonics, SimpleNamespace(info=limits)
+    run.pipeline = pipeline.resolved()
     Init._require_memory(run, 700)
     assert asked == [need.plan(limits)]
 

@@ -28,17 +28,20 @@ DEFERRED, HOST = "optimize.update=deferred", "rasterizer.harmonics=host"
 WAYS = {"deferred": (DEFERRED,), "host": (HOST,), "both": (DEFERRED, HOST)}
 
 
-@pytest.fixture(scope="module")
-def spread(few_steps, tmp_path_factory):
-    """Settings of a run from Gaussians of which each view sees a part, with growth, harmonics and their decay."""
+def spread_of(few_steps, file, near):
+    """Settings of a run from 2,000 Gaussians, of which views see so many, with growth and harmonics."""
     model = read_ply(few_steps / "point_cloud.ply").parameters
     model, count = {name: table[:2000] for name, table in model.items()}, 2000
-    model["means"][500:, 2] += 500
+    model["means"][near:, 2] += 500
     rng = np.random.default_rng(0)
     model["sh_rest"] = rng.normal(0, 0.05, (count, 45)).astype(np.float32)
-    file = tmp_path_factory.mktemp("spread") / "spread.ply"
     write_ply(file, model, {})
     return "init.source=model", f"init.file='{file}'", *FEW, "optimize.checkpoint.keep=9"
+
+
+@pytest.fixture(scope="module")
+def spread(few_steps, tmp_path_factory):
+    return spread_of(few_steps, tmp_path_factory.mktemp("spread") / "spread.ply", 500)
 
 
 @pytest.fixture(scope="module")
@@ -88,11 +91,21 @@ def test_a_plan_beyond_the_device_names_the_host(spread, tiny_scene, tmp_path):
     assert "harmonics on the host" in other.text(count)
     assert "harmonics on the host" not in own.text(count)
     replace(other, memory=between).check(count)
-    with pytest.raises(MemoryLimitError, match=r"rasterizer\.harmonics=host"):
-        replace(own, memory=between).check(count)
+    with pytest.raises(MemoryLimitError, match=r"rasterizer\.harmonics=auto"):
+        replace(own, memory=between).check(count, ", or rasterizer.harmonics=auto")
     with pytest.raises(MemoryLimitError) as refused:
         replace(other, memory=0).check(count)
     assert "rasterizer.harmonics" not in str(refused.value)
+
+
+@pytest.mark.parametrize(("more", "told"), [(("rasterizer.harmonics=device",), True), ((), False)])
+def test_what_makes_room_is_told_where_it_helps(more, told, tiny_scene, tmp_path, small):
+    """Where views see all Gaussians a training is refused before its first step, and the host is no remedy."""
+    own = [f"scene.path='{tiny_scene}'", *FEW, *more]
+    with pytest.raises(MemoryLimitError) as refused:
+        run_pipeline(load("smoke", own), tmp_path / "run", Device(small(7700)), "new")
+    assert ("rasterizer.harmonics=auto" in str(refused.value)) == told
+    assert "for 7,995 Gaussians" in str(refused.value)
 
 
 @pytest.fixture(scope="module")
@@ -116,6 +129,26 @@ def test_the_harmonics_move_to_the_host_where_the_device_is_full(spread, at_once
         run_pipeline(load("smoke", own), out, Device(replace(device, memory=memory)), "resume")
         assert digest(out) == digest(at_once)
     assert read_yaml(out / "pipeline.yaml").data["rasterizer"]["harmonics"] == "auto"
+
+
+def test_a_run_that_sees_few_goes_on_from_every_checkpoint(few_steps, tiny_scene, tmp_path, small):
+    """Growth ends above what the estimate of the host allows, and below what the views that were looked at do."""
+    own = [f"scene.path='{tiny_scene}'", *spread_of(few_steps, tmp_path / "few.ply", 200), "optimize.steps=16"]
+    device, out = small(2050), tmp_path / "run"
+    run_pipeline(load("smoke", own), out, Device(device), "new")
+    expected = digest(out)
+    with folders.opened(out, "resume", step=0) as status:
+        run = opening.open_run(load("smoke", own), out, Device(device), "resume", status)
+        checkpoint.restore(run)
+    assert run.model.gaussians.on_host is not None
+    assert run.model.gaussians.count > run.memory_plan(harmonics="host").limit
+    for step in (12, 8, 4):
+        for file in (out / "checkpoints").iterdir():
+            if int(file.stem[-6:]) > step:
+                file.unlink()
+        (out / "point_cloud.ply").unlink()
+        run_pipeline(load("smoke", own), out, Device(device), "resume")
+        assert digest(out) == expected
 
 
 def test_what_the_device_does_not_hold_at_first_begins_on_the_host(spread, tiny_scene, tmp_path, small, caplog):

@@ -37,7 +37,7 @@ def cells(means: NDArray[np.floating], weights: Floats, count: int) -> list[Cell
     A cell of several shares is cut across its longest side.  Raises DataError where so many are not to be had.
     """
     if not len(means):
-        raise DataError("the coarse model holds no Gaussians; expected one at least")
+        raise DataError("the model holds no Gaussians; expected one at least")
     weights = weights if weights.any() else np.ones(len(means))
     return _cut(means.astype(np.float64), weights, Box(), count)
 
@@ -74,7 +74,7 @@ def _cut(means: Floats, weights: Floats, box: Box, count: int) -> list[Cell]:
     below = means[:, axis] < place
     if below.all() or not below.any() or not (weights[below].any() and weights[~below].any()):
         raise DataError(
-            f"the coarse model cannot be cut: {amount(len(means), 'Gaussian')} for {count} blocks; give fewer --blocks"
+            f"the model cannot be cut: {amount(len(means), 'Gaussian')} for {count} blocks; give fewer --blocks"
         )
     parts = ((below, "high", first), (~below, "low", count - first))
     return [

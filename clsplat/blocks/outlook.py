@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from clsplat.blocks.blocks import Blocks, Plan
-from clsplat.errors import DataError
+from clsplat.errors import DataError, amount
 from clsplat.gaussians.model import NUMBERS, Model
 from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import load
@@ -35,4 +35,7 @@ def plan_blocks(
         tables = from_points(points, OPACITY, settings.model.sh_degree)
         Model(**tables, rendering=NUMBERS, sky=None).save(model)
         work = Blocks(scene, Path(made), Plan(pipeline, str(model), blocks), device)
-        return work.plan_of(work.partition())
+        try:
+            return work.plan_of(work.partition())
+        except DataError as error:
+            raise DataError(f"{scene}, by its {amount(len(points), 'point')}: {error}") from error

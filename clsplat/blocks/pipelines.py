@@ -13,7 +13,7 @@ from clsplat.pipeline.file import PipelineFile
 from clsplat.pipeline.loading import Pipeline, checked
 from clsplat.pipeline.stretching import of_trainings, stretched
 from clsplat.pipeline.yaml_file import Document
-from clsplat.schedule import divided
+from clsplat.schedule import divided, values_of
 from clsplat.stages.base import Stage
 from clsplat.stages.densify import Densify
 from clsplat.stages.init import MODEL_SOURCES, Init
@@ -38,6 +38,10 @@ def require_divisible(pipeline: Pipeline) -> None:
         "densify.budget": (
             any(getattr(one.budget, "gaussians", None) for one in _densities(pipeline.stages)),
             "it counts the Gaussians of the whole; give densify.max_gaussians, which blocks share",
+        ),
+        "densify.per_pixel": (
+            any(one.per_pixel for one in _densities(pipeline.stages)),
+            "photographs of blocks differ; give densify.max_gaussians, which blocks share",
         ),
         "densify.inside": (any(one.inside for one in _densities(pipeline.stages)), "blocks set it; leave it out"),
     }
@@ -130,7 +134,9 @@ def _growing(stage: dict[str, Any], block: Block) -> dict[str, Any]:
 def _limited(densify: Densify, block: Block) -> Densify:
     """The stage in a block: Gaussians grow in its cell, up to its share, by pairs, of the number of the whole."""
     changed: dict[str, Any] = {"inside": block.cell.grown(GROWTH)}
-    for key in ("max_gaussians", "per_pixel"):
-        if (most := getattr(densify, key)) is not None:
-            changed[key] = divided(most, 1 / block.pairs)
+    if densify.max_gaussians is not None:
+        changed["max_gaussians"] = divided(densify.max_gaussians, 1 / block.pairs)
+        if min(values_of(changed["max_gaussians"])) < 1:
+            told = f"densify.max_gaussians: {block.name} has none of so few Gaussians"
+            raise ConfigError(f"{told}; expected more of them, or fewer --blocks")
     return densify.model_copy(update=changed)

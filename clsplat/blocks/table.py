@@ -7,8 +7,9 @@ from clsplat.pages.columns import columns
 from clsplat.runs.expected import minutes_text
 from clsplat.runs.status import status_text
 
-HEADINGS = ("block", "owns", "starts from", "views", "of these by place", "pairs", "MiB")
-TIME = "time of training"
+HEADINGS = ("block", "owns", "starts from", "views", "of these by place", "pairs", "MiB at first")
+GUESS = "memory and time are those of the beginning, up to the time with the most Gaussians; how many grow is a guess"
+TIME = "time, by growth"
 
 
 def table(found: dict[str, Any]) -> str:

@@ -5,9 +5,7 @@ from collections.abc import Mapping, Sequence
 from clsplat.blocks.partition import Block
 from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import Pipeline
-from clsplat.runs.expected import densest, step_seconds
-from clsplat.schedule import values_of
-from clsplat.stages.densify import Densify
+from clsplat.runs.expected import DENSEST, most_of, step_seconds
 from clsplat.stages.optimize import Optimize
 
 
@@ -28,11 +26,9 @@ def block_seconds(
 
 def _counts(block: Block, pipeline: Pipeline, size: tuple[int, int]) -> tuple[int, int]:
     """The Gaussians that a block starts from, and the most that it may come to; without a setting that is a guess."""
-    first, trainings = int(block.start.sum()), _trainings(pipeline)
-    growing = [one for training in trainings for one in training.during if isinstance(one, Densify)]
-    limits = [max(values_of(one.max_gaussians)) for one in growing if one.max_gaussians is not None]
-    own = max(limits) if limits else max(densest(training) for training in trainings) * size[0] * size[1]
-    return first, max(first, int(own) + first - block.gaussians)
+    first, pixels = int(block.start.sum()), size[0] * size[1]
+    own = [most_of(training, pixels) or block.pairs * DENSEST * pixels for training in _trainings(pipeline)]
+    return first, max(first, int(max(own)) + first - block.gaussians)
 
 
 def _trainings(pipeline: Pipeline) -> list[Optimize]:

@@ -51,6 +51,12 @@ def doctor(
         raise DeviceError(f"{report.info.text}: {report.verdict.text}")
 
 
+BY_POINTS = (
+    "cut by the dataset's points, for the pipeline blocks; `clsplat blocks --plan` takes other pipelines and settings, "
+    "and cuts by a coarse model, which it trains"
+)
+
+
 @command(
     "inspect",
     "clsplat inspect my_scene",
@@ -70,7 +76,7 @@ def inspect(
     device: DeviceOption = None,
 ) -> None:
     """Tell whether a dataset will train, and what is wrong with it; exit 3 when it cannot train."""
-    from clsplat.blocks.table import table
+    from clsplat.blocks.table import GUESS, table
     from clsplat.inspect.table import show
 
     if count is None and device is not None:
@@ -85,7 +91,7 @@ def inspect(
             terminal.show_json(found)
         else:
             terminal.show(table(found))
-            terminal.remark("by the dataset's points; `clsplat blocks --plan` cuts by a coarse model, which it trains")
+            terminal.remark(f"{GUESS}\n{BY_POINTS}")
         return
     inspection = tools.inspect_scene(scene, page)
     if as_json:

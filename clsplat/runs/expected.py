@@ -25,6 +25,7 @@ from clsplat.prepare.cache import Planned
 from clsplat.progress import only
 from clsplat.scene.images import image_size
 from clsplat.scene.scene import every_nth
+from clsplat.schedule import values_of
 from clsplat.stages.densify import Densify
 from clsplat.stages.optimize import Optimize
 from clsplat.stages.train_field import TrainField
@@ -165,7 +166,7 @@ def _trainings(settings: PipelineFile) -> list[Optimize]:
 def _of_training(training: Optimize, settings: PipelineFile, capture: Capture, device: Device) -> Expected:
     """A training: between its fewest steps with the Gaussians of its start, and its most with the most of them."""
     pixels = capture.size[0] * capture.size[1]
-    most = max(capture.gaussians, int(densest(training) * pixels))
+    most = max(capture.gaussians, int(most_of(training, pixels) or DENSEST * pixels))
     each = step_seconds(device, capture.size, (capture.gaussians, most), settings)
     steps = training.fewest_steps, training.steps * (2 if training.refit else 1)
     of_steps, of_counts = (_range(*(f"{end:,}" for end in ends)) for ends in (steps, (capture.gaussians, most)))
@@ -181,10 +182,14 @@ def _of_field(training: TrainField, run: Run) -> Expected:
     return Expected(training.stage, (training.steps * each, training.steps * each), why)
 
 
-def densest(training: Optimize) -> float:
-    """Return the most Gaussians for each pixel that a training may have: by its settings, or what captures end at."""
+def most_of(training: Optimize, pixels: int) -> float | None:
+    """Return the number of Gaussians at which a training ends growth, by its settings; None where they do not say it.
+
+    pixels: of a photograph.
+    """
     growing = [stage for stage in training.during if isinstance(stage, Densify)]
-    return min([one.per_pixel or DENSEST for one in growing], default=0.0)
+    limits = [max(values_of(one.max_gaussians)) for one in growing if one.max_gaussians is not None]
+    return min([*limits, *(one.per_pixel * pixels for one in growing if one.per_pixel)], default=None)
 
 
 def step_seconds(device: Device, size: tuple[int, int], counts: Sequence[int], settings: PipelineFile) -> list[float]:

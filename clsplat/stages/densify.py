@@ -1,6 +1,7 @@
 """Density control at a cadence."""
 
 import logging
+import math
 from collections.abc import Collection, Iterator
 from dataclasses import asdict
 from functools import partial
@@ -19,7 +20,7 @@ from clsplat.errors import NumericError, amount
 from clsplat.schedule import AtLeastOne
 from clsplat.settings import OneOf
 from clsplat.stages.base import Scheduled
-from clsplat.training.placing import make_room, most_gaussians
+from clsplat.training.placing import make_room, more_room, most_gaussians
 from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
@@ -79,13 +80,14 @@ class Densify(Scheduled):
             return
         scale = SceneScale(run.scene.extent, run.texture_quantile)
         edit = Edit(run.model.gaussians, run.stats, scale, run.step, run.seed, run.survey())
-        fits = most_gaussians(run)
-        limit = min([fits, *self._limits(run, edit)])
+        asked = min(self._limits(run, edit), default=math.inf)
+        fits = most_gaussians(run, asked)
+        limit = int(min(fits, asked))
         room = partial(make_room, run)
         change = densify(edit, self.rules, run.rasterizer.tiler, limit, self.inside, room)
         run.refresh_filter()
         if change.after == fits:
-            more = "smaller photographs" + (", or rasterizer.harmonics=host," if run.harmonics == "device" else "")
+            more = f"smaller photographs{more_room(run)}"
             most = f"{fits:,} Gaussians, the most that fit in the device's memory; with {more} more do"
             LOG.warning("step %d: growth stops at %s", run.step, most)
         run.records.add(run.step, "densify", **asdict(change))

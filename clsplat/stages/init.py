@@ -24,6 +24,7 @@ from clsplat.settings import ReadPath
 from clsplat.stages.base import Stage
 from clsplat.stages.first_motion import moving, require_times, with_motion
 from clsplat.training.memory import first_tables, last_place
+from clsplat.training.placing import more_room
 from clsplat.training.run import Run
 from clsplat.training.skies import begin_sky
 
@@ -163,7 +164,7 @@ class Init(Stage):
         """Raise MemoryLimitError where so many Gaussians do not fit."""
         motion = run.model_settings.time
         tables = first_tables(run.model_settings.sh_degree, motion.width if motion else 0)
-        run.memory_plan(tables, last_place(run.harmonics, run.device.info)).check(count)
+        run.memory_plan(tables, last_place(run.harmonics, run.device.info)).check(count, more_room(run))
 
     def _random(self, run: Run) -> PointCloud:
         """Random points, where so many Gaussians fit.  Raises MemoryLimitError before any is made."""

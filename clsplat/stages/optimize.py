@@ -21,7 +21,7 @@ from clsplat.training.backgrounds import Behind, drawn_backgrounds
 from clsplat.training.colours import photograph_colours, write_view_colours
 from clsplat.training.depths import known_depths
 from clsplat.training.forecast import Forecast
-from clsplat.training.placing import make_room
+from clsplat.training.placing import more_room, place_harmonics
 from clsplat.training.poses import photograph_poses, write_view_poses
 from clsplat.training.profile import clocks
 from clsplat.training.rescue import finite_values
@@ -101,8 +101,9 @@ class Optimize(Keeping):
         views = self.views.settled(run.training_images)
         last_step = run.step - run.stage_step + self.steps
         trainer, sampler = self._trainer(run, views, last_step), Sampler(run.scene.split("train"), views, run.seed)
-        make_room(run, count := run.model.gaussians.count)
-        (memory := run.memory_plan()).check(count)
+        memory, count = run.memory_plan(), run.model.gaussians.count
+        if run.harmonics != "auto" or memory.host == 0:  # else it was looked at before they moved
+            memory.check(count, more_room(run))
         LOG.info(memory.text(count))
         forecast = Forecast.of(run.step, last_step, [stage.due for stage in self._density])
         seconds: list[float] = []  # of the steps since the last report
@@ -144,14 +145,14 @@ class Optimize(Keeping):
     def _trainer(self, run: Run, views: ViewSettings, last: int) -> Trainer:
         """Attach moments, statistics and tables to the run's Gaussians; a resumed run has them."""
         gaussians, photographs = run.model.gaussians, run.photographs
-        make_room(run, gaussians.count)
-        run.adam = run.adam or Adam(gaussians)
         run.stats = SplatStats(gaussians, self.statistics, len(run.scene.split("train")))
         for name in sorted(self.tables - gaussians.tables.keys()):
             gaussians.add(name, 1)
             run.refresh_filter()
         for stage in self.during:
             stage.attach(run)
+        place_harmonics(run)
+        run.adam = run.adam or Adam(gaussians)
         parts = run.rasterizer, run.model, run.adam, run.stats, photographs.background
         rates, colours = self.rates.settled(views.full_size(last)), photograph_colours(self.colours, run, last)
         poses = photograph_poses(self.poses, run, last)

@@ -66,10 +66,9 @@ class MemoryPlan:
             f"{self.memory / mib:,.0f} MiB with buffers up to {self.allocation / mib:,.0f} MiB{on_host}"
         )
 
-    def check(self, gaussians: int) -> None:
-        """Raise MemoryLimitError when that many Gaussians do not fit."""
+    def check(self, gaussians: int, more: str = "") -> None:
+        """Raise MemoryLimitError when that many Gaussians do not fit.  more: what else helps, behind the others."""
         if gaussians > self.limit:
-            more = "" if self.host else ", or keep harmonics on the host (rasterizer.harmonics=host)"
             raise MemoryLimitError(
                 f"{self.text(gaussians)}: start from fewer points, use smaller images (scene.downscale) or fewer "
                 f"of them on the device (scene.image_budget){more}"
