@@ -381,3 +381,19 @@ def test_the_command(make_run, tmp_path):
     assert "tiny" in (tmp_path / "c.html").read_text()
     clsplat("compare", tmp_path / "nowhere", "--out", tmp_path / "d.html", expect=3)
     clsplat("compare", expect=2)
+
+
+def test_many_runs_have_a_line_for_each_variant(make_run, tmp_path):
+    """The mean of its seeds, so that the legend leaves room for the lines."""
+    make_run("first"), make_run("other", "optimize.log_every=6")
+    runs = []
+    for name in ("first", "other"):
+        for seed in range(5):
+            runs.append(tmp_path / f"{name}_{seed}")
+            shutil.copytree(tmp_path / name, runs[-1])
+    page = page_of(tmp_path, *runs)
+    legend = re.findall(r">([A-Z][^<]*)</tspan>", page)
+    assert set(legend) == {"A", "B"}
+    assert "training PSNR over steps, mean of 5 views, dB (means)" in page
+    number = page.index("Gaussians over steps (means)")
+    assert page[number : page.index("</svg>", number)].count("<polyline") == 2

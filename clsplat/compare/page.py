@@ -2,10 +2,9 @@
 
 import logging
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from statistics import fmean
 from urllib.parse import quote
 
 from markupsafe import Markup
@@ -13,15 +12,14 @@ from markupsafe import Markup
 from clsplat.compare import tables
 from clsplat.compare.comparison import Comparison, Row, Variant
 from clsplat.compare.crops import Crop, find_crops
+from clsplat.compare.curves import curves
 from clsplat.compare.published import PublishedTable
-from clsplat.compare.run_folder import Points, RunFolder
+from clsplat.compare.run_folder import RunFolder
 from clsplat.compare.seams import Seams, find_seams
 from clsplat.errors import ConfigError, DataError, amount
 from clsplat.files import write_text
-from clsplat.pages.page import charts, embedded, render
-from clsplat.pages.svg import Line, curve
+from clsplat.pages.page import embedded, render
 from clsplat.pipeline.file import SceneSettings
-from clsplat.training.forecast import VIEWS, over_views
 
 LOG = logging.getLogger("clsplat")
 MAX_NAMES = 4  # of pipelines, in the title
@@ -131,7 +129,7 @@ def _section(name: str, rows: Sequence[Row]) -> SceneSection:
         remarks=list(tables.differing_conditions(rows)),
         main=tables.main_table(rows),
         other=tables.other_table(rows),
-        curves=_curves(rows),
+        curves=curves(rows),
         crops=[_figure(crop) for crop in crops],
         no_crops=no_crops,
         seams=_seam_figure(seams, rows) if seams else None,
@@ -144,65 +142,6 @@ def _sizes(scene: SceneSettings) -> list[str]:
     if first == "full size" and not more:
         return []
     return [f"sizes are shares of the photographs' own; trained at {', '.join([first, *more])}"]
-
-
-def _curves(rows: Sequence[Row]) -> list[Markup]:
-    """PSNR and Gaussians over steps, a line for each run; then quality over image sizes."""
-
-    downscale = rows[0].runs[0].scene.downscale
-
-    def lines(points_of: Callable[[RunFolder], Points]) -> list[Line]:
-        return [
-            Line(points, name, row.variant.colour, i)
-            for row in rows
-            for i, (run, name) in enumerate(zip(row.runs, _names(row), strict=True))
-            if len(dict(points := points_of(run))) > 1  # steps: one is no line
-        ]
-
-    def tested(run: RunFolder) -> Points:
-        return run.points("evaluate", "psnr", split="test", downscale=downscale)
-
-    def trained(run: RunFolder) -> Points:
-        points = run.points("train", "psnr")
-        return list(zip([step for step, _ in points], over_views([psnr for _, psnr in points]), strict=True))
-
-    drawings = [
-        curve("test PSNR over steps, dB", lines(tested)),
-        curve("test PSNR over CPU seconds of training, dB", lines(lambda run: run.by_cpu_seconds(tested(run)))),
-        curve(f"training PSNR over steps, mean of {VIEWS} views, dB", lines(trained)),
-        curve("Gaussians over steps", lines(lambda run: run.points("train", "gaussians"))),
-    ]
-    return charts(drawings + _size_charts(rows, "test") + _size_charts(rows, "train"))
-
-
-def _names(row: Row) -> list[str]:
-    """The names of a row's lines where it has several runs: their seeds, or the folders of runs with one seed."""
-    runs = row.runs
-    if len(runs) == 1:
-        return [""]
-    choices = (
-        [f"seed {run.metrics.seed}" for run in runs],
-        [run.path.resolve().name for run in runs],
-        [str(run.path) for run in runs],
-    )
-    names = next((names for names in choices if len(set(names)) == len(runs)), choices[-1])
-    return [f"{row.variant.letter} {name}" for name in names]
-
-
-def _size_charts(rows: Sequence[Row], split: str) -> list[str]:
-    """PSNR and SSIM over image sizes, a line for each variant."""
-    sizes = tables.downscales(rows, split)
-    if len(sizes) < 2:
-        return []
-    ticks = {float(i): "full size" if size == "1" else f"1/{size}" for i, size in enumerate(sizes)}
-    drawings = []
-    for metric, title in (("psnr", f"{split} PSNR by image size, dB"), ("ssim", f"{split} SSIM by image size")):
-        lines = []
-        for row in rows:
-            found = [(float(i), row.figures(split, size, metric)) for i, size in enumerate(sizes)]
-            lines.append(Line([(i, fmean(values)) for i, values in found if values], colour=row.variant.colour))
-        drawings.append(curve(title, lines, ticks=ticks))
-    return drawings
 
 
 def _pictures(rows: Sequence[Row]) -> tuple[list[Crop], str, Seams | None]:
