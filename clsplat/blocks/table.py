@@ -23,7 +23,8 @@ def table(found: dict[str, Any]) -> str:
         return columns([HEADINGS, *map(_cells, found["blocks"]), whole])
     rows = [[*_cells(block), minutes_text(seconds)] for block, seconds in zip(found["blocks"], times, strict=True)]
     low, high = (sum(ends) for ends in zip(*times, strict=True))
-    return columns([[*HEADINGS, TIME], *rows, [*whole, f"{minutes_text((low, high))}, one after the other"]])
+    total = [*whole, f"{minutes_text((low, high))}, one after the other"]
+    return f"{columns([[*HEADINGS, TIME], *rows, total])}\n{GUESS}"
 
 
 def status_table(found: dict[str, Any]) -> str:

@@ -50,7 +50,7 @@ def blocks(
     device: DeviceOption = None,
 ) -> None:
     """Train a large scene in blocks that fit the device, one after the other or on several, and merge them."""
-    from clsplat.blocks.table import GUESS, table
+    from clsplat.blocks.table import table
 
     if as_json:
         terminal.keep_stdout_for_json()
@@ -73,6 +73,6 @@ def blocks(
         return
     terminal.show(table(found))
     if plan:
-        terminal.remark(f"{GUESS}\n{out}/partition.json: the plan; the same command without --plan trains the blocks")
+        terminal.remark(f"{out}/partition.json: the plan; the same command without --plan trains the blocks")
     else:
         terminal.remark(f"{found['run']}: {found['metrics']['gaussians']:,} Gaussians; `clsplat view {found['run']}`")

@@ -76,7 +76,7 @@ def inspect(
     device: DeviceOption = None,
 ) -> None:
     """Tell whether a dataset will train, and what is wrong with it; exit 3 when it cannot train."""
-    from clsplat.blocks.table import GUESS, table
+    from clsplat.blocks.table import table
     from clsplat.inspect.table import show
 
     if count is None and device is not None:
@@ -91,7 +91,7 @@ def inspect(
             terminal.show_json(found)
         else:
             terminal.show(table(found))
-            terminal.remark(f"{GUESS}\n{BY_POINTS}")
+            terminal.remark(BY_POINTS)
         return
     inspection = tools.inspect_scene(scene, page)
     if as_json:
