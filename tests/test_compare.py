@@ -385,7 +385,8 @@ def test_the_command(make_run, tmp_path):
 
 def test_many_runs_have_a_line_for_each_variant(make_run, tmp_path):
     """The mean of its seeds, so that the legend leaves room for the lines."""
-    make_run("first"), make_run("other", "optimize.log_every=6")
+    make_run("first")
+    make_run("other", "optimize.log_every=6")
     runs = []
     for name in ("first", "other"):
         for seed in range(5):

@@ -17,23 +17,18 @@ MOST_LINES = len(COLOURS)  # that are told apart one by one
 
 def curves(rows: Sequence[Row]) -> list[Markup]:
     """PSNR and Gaussians over steps, a line for each run, or, of many, for each variant; then quality over sizes."""
-
     downscale = rows[0].runs[0].scene.downscale
     are_many = sum(len(row.runs) for row in rows) > MOST_LINES
     means = " (means)" if are_many and any(len(row.runs) > 1 for row in rows) else ""
 
     def lines(points_of: Callable[[RunFolder], Points]) -> list[Line]:
         if are_many:
-            found = [
-                Line(
-                    _mean([points_of(run) for run in row.runs]),
-                    row.variant.letter,
-                    row.variant.colour,
-                    i // len(COLOURS),
-                )
-                for i, row in enumerate(rows)
+            of_rows = [_mean([points_of(run) for run in row.runs]) for row in rows]
+            return [
+                Line(points, row.variant.letter, row.variant.colour, i // len(COLOURS))
+                for i, (row, points) in enumerate(zip(rows, of_rows, strict=True))
+                if len(dict(points)) > 1
             ]
-            return [line for line in found if len(dict(line.points)) > 1]
         return [
             Line(points, name, row.variant.colour, i)
             for row in rows

@@ -1,4 +1,4 @@
-"""What does not go together with harmonics on the host."""
+"""Whether the harmonics of a pipeline may lie on the host, and what does not go together with that."""
 
 from clsplat.errors import ConfigError
 from clsplat.pipeline.file import PipelineFile
