@@ -177,6 +177,10 @@ def test_without_a_store_the_cells_run_as_they_did(file, tmp_path, monkeypatch):
         ("engine: dask://far:1", "expected tls:// for another machine, or insecure: true"),
         ("engine: tls://far:1", "tls://far:1: expected tls: "),
         ("engine: ray", "x.yaml:3: execution.engine: expected inline, local, slurm, or the address of a scheduler"),
+        (
+            "engine: dask://h:99999",
+            "x.yaml:3: execution.engine: expected inline, local, slurm, or the address of a scheduler",
+        ),
     ],
 )
 def test_a_wrong_execution_is_refused_with_its_line(tmp_path, text, words):

@@ -12,7 +12,8 @@ from clsplat.pipeline.yaml_file import read_yaml
 from clsplat.settings import ReadPath, Settings
 
 STORE = "runs/store"
-ENGINE = r"^(inline|local|slurm|(dask|tls)://[^/:\s]+:\d{1,5})$"
+ENGINE = r"^(inline|local|slurm|(dask|tls)://[^/:\s]+:(\d{1,5}))$"
+LAST_PORT = 65_535
 LOOPBACK = ("127.0.0.1", "localhost")
 OF_A_STORE = ("devices", "placement", "retries")  # keys that only cells of a store obey
 
@@ -57,7 +58,8 @@ class Slurm(Settings):
 
 
 def _engine(value: Any) -> Any:
-    if isinstance(value, str) and not re.fullmatch(ENGINE, value):
+    found = re.fullmatch(ENGINE, value) if isinstance(value, str) else None
+    if isinstance(value, str) and (found is None or int(found[3] or 0) > LAST_PORT):
         scheduler = "dask://HOST:PORT (where Dask says tcp://) or tls://HOST:PORT"
         raise ValueError(f"expected inline, local, slurm, or the address of a scheduler, {scheduler}")
     return value
