@@ -23,9 +23,10 @@ static inline VF view_direction(
     return inverse;
 }
 
-/* Gradients of the mean, quaternion and log-scales from the sums over pixels of a Gaussian. */
-static inline void shape_backward(const shape_t *s, __constant camera_t *camera, const VF *m,
-                                  const float compensate, VF *grad_mean2d, VF *grad_mean, VF *grad_quat, VF *grad_scale)
+/* Gradients of the mean, quaternion and log-scales from the sums over pixels of a Gaussian, and that by a factor of both
+ * focal lengths.  A clamped ray is a limit / focal length (RAY_MARGIN): its element of J does not change with it. */
+static inline void shape_backward(const shape_t *s, __constant camera_t *camera, const VF *m, const float compensate,
+                                  VF *grad_mean2d, VF *grad_mean, VF *grad_quat, VF *grad_scale, VF *grad_focal)
 {
     __constant const float *w = camera->world_to_camera;
 #if PIXEL_BOX
@@ -92,6 +93,7 @@ static inline void shape_backward(const shape_t *s, __constant camera_t *camera,
         grad_mean[k] = w[k] * gx + w[4 + k] * gy + w[8 + k] * gz;
     grad_mean2d[0] = gu;
     grad_mean2d[1] = gv;
+    *grad_focal = jx * (s->x * gu + j00) + jy * (s->y * gv + j11) + s->ray_x * ray_x + s->ray_y * ray_y;
 }
 
 /* Gradients of everything but the coefficients of harmonics: those are basis[k] * colour[channel]. */
@@ -99,6 +101,7 @@ typedef struct {
     VI touched;      // the Gaussian was drawn; where not, all gradients are zero and these values invalid
     VF mean2d[2];    // px^-1
     VF means[3], quats[4], log_scales[3], logit_opacity;
+    VF focal;        // of the logarithm of both focal lengths
     VF basis[16], colour[3];
 } gradient_t;
 
@@ -149,7 +152,7 @@ static inline void no_gradient(gradient_t *g)
         g->quats[k] = zero;
     for (uint k = 0; k < 16; k++)
         g->basis[k] = zero;
-    g->logit_opacity = zero;
+    g->logit_opacity = g->focal = zero;
 }
 
 /* The other gradients, from those of the colours and from the weights of the harmonics. */
@@ -170,7 +173,7 @@ static inline void gradient_of(
     VF m[PIXEL_SUMS];
     for (uint k = 0; k < PIXEL_SUMS; k++)
         m[k] = VLOAD(pixel_sums + k * stride + i);
-    shape_backward(&s, camera, m, compensate, g->mean2d, g->means, g->quats, g->log_scales);
+    shape_backward(&s, camera, m, compensate, g->mean2d, g->means, g->quats, g->log_scales, &g->focal);
     VF d[3], gd[3] = {0.0f, 0.0f, 0.0f};
     const VF inverse_distance = view_direction(means, camera, stride, i, d);
     harmonics_basis(degree, d[0], d[1], d[2], g->basis);

@@ -1,4 +1,4 @@
-/* The derivatives of the losses by the place of a camera, as sums over Gaussians.
+/* The derivatives of the losses by the place and the focal length of a camera, as sums over Gaussians.
  *
  * To move a camera is to move all Gaussians the other way: turning it by -w about its centre c turns means, quaternions
  * and directions of view by w.  What a Gaussian shows in a direction does not turn with them: the derivative by the
@@ -7,6 +7,7 @@
  *
  *   shift   sum dL/dp
  *   turn    sum (p - c) x dL/dp - d x dL/dd + 1/2 (a g_v - g_a v + v x g_v)
+ *   focal   sum of dL/dln f, where both focal lengths are multiplied by f (backward.h)
  *
  * dL/dq has no part along q, so that the length of q does not matter.  The world filter is round: it does not turn.
  *
@@ -15,7 +16,7 @@
 #include "backward.h"
 
 #define POSE_GROUP 32  // items per work-group
-#define POSE_SUMS 6    // shift, turn
+#define POSE_SUMS 7    // shift, turn, focal
 
 /* The terms of LANES Gaussians; zero where they were not drawn. */
 static inline void pose_terms(
@@ -37,6 +38,7 @@ static inline void pose_terms(
         terms[k] = g->touched ? g->means[k] : (VF)(0.0f);
         terms[3 + k] = g->touched ? moved + 0.5f * turned : (VF)(0.0f);
     }
+    terms[6] = g->touched ? g->focal : (VF)(0.0f);
 }
 
 /* The sums of each group, from the sums over pixels of each Gaussian. */

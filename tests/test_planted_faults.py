@@ -166,6 +166,7 @@ MORE = {  # that smaller pictures do not show
     "pixel_loss, pixels that are equal": ("loss.cl", "difference < 0.0f ?", "difference <= 0.0f ?"),
     "scan_offsets simt, a sum that wraps": ("scan.cl", "sum | (0u - carry)", "sum"),
     "pose_gradient, the shape": ("poses.cl", "moved + 0.5f * turned", "moved + turned"),
+    "pose_gradient, the focal length": ("backward.h", "+ s->ray_x * ray_x + s->ray_y", "- s->ray_x * ray_x + s->ray_y"),
     "emit_large simt, one row an item": ("large.cl", "each = (rows + TEAM - 1) / TEAM", "each = 1"),
     "emit_large simt, the same rows": ("large.cl", "begin = get_local_id(0) * each", "begin = get_local_id(0)"),
     "emit_large simt, a tile outside": ("large.cl", "pair_tile[place] = last;", "pair_tile[place] = last + 12345;"),

@@ -44,8 +44,8 @@ def test_derivatives_by_a_pose_are_those_of_the_image(screen, outside):
     gaussians.filter_variance = np.full(4, 0.01)
     weights = rng.normal(0, 1, (3, camera.height, camera.width))
 
-    def value(shift: np.ndarray, turn: np.ndarray) -> float:
-        at = ref.moved_camera(camera, shift, turn)
+    def value(shift: np.ndarray, turn: np.ndarray, zoom: float = 0.0) -> float:
+        at = ref.moved_camera(camera, shift, turn, zoom)
         frame = ref.render(gaussians, at, BACKGROUND, degree, thresholds=ref.SMOOTH, **screen)
         return float(np.sum(weights * frame.image))
 
@@ -53,9 +53,10 @@ def test_derivatives_by_a_pose_are_those_of_the_image(screen, outside):
     of_splats = ref.blend_backward(splats, camera.width, camera.height, BACKGROUND, weights, ref.SMOOTH)
     upstream = of_splats.mean2d, of_splats.conic, of_splats.opacity, of_splats.colour
     numbers = screen["variance"], screen.get("compensate", 0.0)
-    shift, turn = ref.pose_gradient(gaussians, camera, degree, *numbers, splats, *upstream)
+    shift, turn, zoom = ref.pose_gradient(gaussians, camera, degree, *numbers, splats, *upstream)
     assert shift == pytest.approx(numeric(lambda change: value(change, np.zeros(3))), rel=1e-6)
     assert turn == pytest.approx(numeric(lambda change: value(np.zeros(3), change)), rel=1e-6)
+    assert zoom == pytest.approx(numeric(lambda change: value(np.zeros(3), np.zeros(3), change[0]))[:1], rel=1e-6)
 
 
 @pytest.mark.parametrize("depth", [0.0, 2.5])

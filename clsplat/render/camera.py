@@ -60,11 +60,23 @@ class DeviceCamera:
         return {"width": self.width, "height": self.height, "rows": self.rows, "stride": self.stride}
 
 
-def moved_camera(camera: DeviceCamera, world_to_camera: NDArray[np.floating]) -> DeviceCamera:
-    """Return a camera with another pose, [3, 4]; the lens and the planes stay."""
+def moved_camera(camera: DeviceCamera, world_to_camera: NDArray[np.floating], zoom: float = 1.0) -> DeviceCamera:
+    """Return a camera with another pose, [3, 4], and focal lengths times `zoom`; the planes stay."""
     values = camera.values.copy()
+    for name in ("fx", "fy"):
+        values[name] = float(values[name]) * zoom
+    for name in ("ray_x_min", "ray_x_max", "ray_y_min", "ray_y_max"):  # tangents
+        values[name] = float(values[name]) / zoom
     values["world_to_camera"] = world_to_camera.ravel()
     values["position"] = -world_to_camera[:, :3].T @ world_to_camera[:, 3]
+    return replace(camera, array=camera.array.device.upload(values.reshape(1)), values=values)
+
+
+def placed_camera(camera: DeviceCamera, view: View) -> DeviceCamera:
+    """Return the camera of a view of the same size as one that is on the device: that one, where it has its values."""
+    values = camera_values(view, camera.tile)
+    if values == camera.values:
+        return camera
     return replace(camera, array=camera.array.device.upload(values.reshape(1)), values=values)
 
 

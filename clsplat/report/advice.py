@@ -28,7 +28,7 @@ UNEVEN = 3.0  # times the median gap
 
 def advice(run: Run) -> list[str]:
     """Return sentences, or none where nothing stands out.  Renders at most MOST training views."""
-    views = refined(run.numbers, run.scene).downscaled(run.downscale).split("train")
+    views = refined(run.numbers, run.original).downscaled(run.downscale).split("train")
     chosen = some_of(views, MOST)
     counted = run.status.counted(run.until_interrupted(chosen), "views", len(chosen))
     found = measure(run.painter(), chosen, run.photographs, colours=Gain(), counted=counted)

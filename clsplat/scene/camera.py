@@ -1,7 +1,7 @@
 """The pinhole camera of all rendering."""
 
 import math
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, replace
 from numbers import Integral
 
 MAX_SIDE = 4096 * 8  # px: the tiles that cl_kernels/tiles.h can name, of the smallest size that a device has
@@ -35,6 +35,10 @@ class Camera:
                 f"{self.cx}, {self.cy}; expected a positive size, positive focal lengths and finite numbers"
             )
         return self
+
+    def zoomed(self, factor: float) -> "Camera":
+        """Return the camera with both focal lengths times a factor."""
+        return self if factor == 1 else replace(self, fx=factor * self.fx, fy=factor * self.fy)
 
     def resized(self, width: int, height: int) -> "Camera":
         """Return the camera of the same photograph resampled to another size."""

@@ -32,7 +32,7 @@ class Render(Stage):
 
     def _views(self, run: Run) -> dict[Path, View]:
         """The views of the split, by the file of their render."""
-        views = refined(run.numbers, run.scene).downscaled(run.downscale).split(self.split)
+        views = refined(run.numbers, run.original).downscaled(run.downscale).split(self.split)
         return dict(zip(image_paths(run.out / self.folder, [view.name for view in views]), views, strict=True))
 
     def run(self, run: Run) -> None:

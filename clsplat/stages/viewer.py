@@ -14,6 +14,7 @@ from clsplat.scene.scene import View
 from clsplat.scene.stand import Stand
 from clsplat.stages.base import Stage, path_in_run
 from clsplat.training.host_model import host_model
+from clsplat.training.poses import refined
 from clsplat.training.run import Run
 from clsplat.viewer.packing import pack
 from clsplat.viewer.page import MAX_SIZE, Page
@@ -41,7 +42,7 @@ class Viewer(Stage):
     def run(self, run: Run) -> None:
         path, model = run.out / self.file, host_model(run)
         shown = with_sky_splats(model)
-        scene, name = run.scene.downscaled(run.downscale), run.photographs.background_name
+        scene, name = refined(run.numbers, run.original).downscaled(run.downscale), run.photographs.background_name
 
         def read(view: View) -> NDArray[np.uint8]:
             return run.photographs.get(view).image()

@@ -1,4 +1,4 @@
-"""The places of the photographs' cameras while a model is trained, and their derivatives."""
+"""The places and focal lengths of the photographs' cameras while a model is trained, and their derivatives."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -15,6 +15,7 @@ from clsplat.render.rasterizer import Frame
 from clsplat.render.workspace import Workspace
 from clsplat.scene.view import View
 from clsplat.schedule import Schedule, at_step
+from clsplat.views.focal_lengths import FocalLengths
 from clsplat.views.photographs import Photograph
 from clsplat.views.poses import Floats, Move
 from clsplat.views.view_table import ViewTable
@@ -31,6 +32,7 @@ class PhotographPoses:
     start: int = 0  # global step after which they are learned
     turn_rate: Schedule = 0.0  # rad
     shift_rate: Schedule = 0.0  # shares of the depth
+    focals: FocalLengths = FocalLengths({})
 
     @cached_property
     def tables(self) -> tuple[ViewTable, ViewTable]:
@@ -64,12 +66,13 @@ class PhotographPoses:
         number = photograph.camera.view
         if number is None or step <= self.start:
             return photograph
-        return replace(photograph, camera=moved_camera(photograph.camera, self.pose(numbers, number)))
+        zoom = self.focals.factor(numbers, self.views[number].name)
+        return replace(photograph, camera=moved_camera(photograph.camera, self.pose(numbers, number), zoom))
 
     def learning(
         self, workspace: Workspace, model: DeviceModel, frame: Frame, pixel_sums: Array, step: int
     ) -> Callable[[dict[str, float]], None] | None:
-        """Begin the derivatives by the pose of a frame; return what changes the numbers, or None where they stay."""
+        """Begin the derivatives by the camera of a frame; return what changes the numbers, or None where they stay."""
         number = frame.camera.view
         if number is None or step <= self.start:
             return None
@@ -79,14 +82,16 @@ class PhotographPoses:
     def _learn(self, numbers: dict[str, float], number: int, sums: Floats, step: int) -> None:
         name, (turns, shifts) = self.views[number].name, self.tables
         move = self.move(numbers, name)
-        by_turn, by_shift = move.gradients(self.pose(numbers, number), sums[:3], sums[3:])
+        by_turn, by_shift = move.gradients(self.pose(numbers, number), sums[:3], sums[3:6])
         turns.update(numbers, name, by_turn, at_step(self.turn_rate, step))
         shifts.update(numbers, name, by_shift, move.depth * at_step(self.shift_rate, step))
+        self.focals.update(numbers, name, float(sums[6]), step)
 
 
 def pose_gradient(workspace: Workspace, model: DeviceModel, frame: Frame, pixel_sums: Array) -> Callable[[], Floats]:
     """Return a wait for the derivatives of the losses by a shift of all Gaussians and by a turn of them about the
-    camera, [6], in the axes of the world, from a frame's sums over pixels, [PIXEL_SUMS, S]."""
+    camera, in the axes of the world, and by the logarithm of a factor of its focal lengths, [7], from a frame's sums
+    over pixels, [PIXEL_SUMS, S]."""
     device = workspace.device
     items = -(-model.gaussians.count // int(device.tuning["LANES"]))
     sums = workspace.array("pose sums", (SUMS, -(-items // GROUP)))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from clsplat.errors import DataError
 from clsplat.opencl.device import Array, Device
-from clsplat.render.camera import DeviceCamera, moved_camera, upload_camera
+from clsplat.render.camera import DeviceCamera, placed_camera, upload_camera
 from clsplat.render.workspace import Workspace
 from clsplat.scene.photographs import load_photograph
 from clsplat.scene.scene import Background, View
@@ -133,12 +133,9 @@ class Photographs:
         return photograph
 
     def placed(self, view: View) -> Photograph:
-        """Return the photograph of a view whose pose may be another one than before."""
+        """Return the photograph of a view whose pose and focal lengths may be others than before."""
         photograph = self.get(view)
-        pose = np.asarray(view.world_to_camera, np.float32).ravel()
-        if (photograph.camera.values["world_to_camera"] == pose).all():
-            return photograph
-        return replace(photograph, camera=moved_camera(photograph.camera, view.world_to_camera))
+        return replace(photograph, camera=placed_camera(photograph.camera, view))
 
     def of_sizes(self, view: View, original: View, number: int | None = None) -> Photograph:
         """Return the photograph of a view, or of the larger `original` where a mask leaves nothing of the smaller one.

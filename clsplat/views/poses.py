@@ -1,4 +1,4 @@
-"""How the places of the cameras are learned with the model, and how a pipeline file says so."""
+"""How the places and focal lengths of the cameras are learned with the model, and how a pipeline file says so."""
 
 import math
 from dataclasses import dataclass
@@ -17,6 +17,7 @@ RATE, MOST = 2e-4, 2e-3  # learning rates at the start
 FALL = 100  # from the first rate to the last
 TURN_SHARE = 0.3  # ours: what a turn about that point does in the image is little, and so mostly noise
 REACH = 0.01  # shares of the depth: what a photograph's visits must be enough for
+FOCAL_RATE, FOCAL_MOST, FOCAL_REACH = 1e-4, 1e-3, 0.03  # the same of the logarithm of a camera's focal lengths
 
 
 class Poses(Settings):
@@ -28,11 +29,15 @@ class Poses(Settings):
     would be the same to every loss if the Gaussians moved too.  The world filter, rules that compare the model with
     photographs, and the extent are those of the dataset's cameras.  A sky cannot be learned with it.
 
+    With `focal`, photographs that share a camera in the dataset share a factor of both of its focal lengths.  It has no
+    mean to subtract: a single camera may change.  What stays with poses stays with it too, and so does the principal
+    point.  Where cameras walk ahead, a focal length is little else than depth: leave it then.
+
     It is for poses of a phone's tracking, or where structure from motion left errors of more than a pixel.  Poses of
     structure from motion are mostly better than what training makes of them.
     """
 
-    training_keys: ClassVar[frozenset[str]] = frozenset({"turn", "shift", "start"})
+    training_keys: ClassVar[frozenset[str]] = frozenset({"turn", "shift", "focal", "start"})
     step_keys: ClassVar[frozenset[str]] = frozenset({"start"})
 
     turn: Annotated[Literal["auto"] | NonNegative, explained(", or auto")] = "auto"
@@ -40,19 +45,30 @@ class Poses(Settings):
     shift: Annotated[Literal["auto"] | NonNegative, explained(", or auto")] = "auto"
     """Learning rate of the shifts as a share of that depth, by step; auto: 2e-4 to 2e-6, where photographs are seldom
     visited as large as a shift of 0.01 needs, up to 2e-3."""
+    focal: Annotated[Literal["auto"] | NonNegative, explained(", or auto")] = 0.0
+    """Learning rate of the logarithms of focal lengths, by step; 0: they stay.  auto: 1e-4 to 1e-6, where cameras are
+    seldom visited as large as a change of 3 % needs, up to 1e-3."""
     start: Annotated[int, Field(ge=0)] = 500
     """Global step after which poses are learned: before it the model is a blur, which tells nothing of them."""
 
     def rates(self, last: int, photographs: int) -> tuple[Schedule, Schedule]:
         """Return the learning rates by step of rotations and shifts, of a training up to a step of so many
         photographs."""
-        steps = max(last - self.start, 1)
-        visits = steps / photographs
-        needed = REACH * math.log(FALL) * FALL / (FALL - 1) / visits  # the sum of rates that fall so far is REACH
-        initial = min(max(RATE, needed), MOST)
-        shift = Decay(initial=initial, final=initial / FALL, over=steps, start=self.start)
+        shift = self._falling(last, photographs, REACH, (RATE, MOST))
         turn = shift.divided(1 / TURN_SHARE)
         return (turn if self.turn == "auto" else self.turn), (shift if self.shift == "auto" else self.shift)
+
+    def focal_rate(self, last: int, cameras: int) -> Schedule:
+        """Return the learning rate by step of focal lengths, of a training up to a step of so many cameras."""
+        return self._falling(last, cameras, FOCAL_REACH, (FOCAL_RATE, FOCAL_MOST)) if self.focal == "auto" else self.focal
+
+    def _falling(self, last: int, rows: int, reach: float, bounds: tuple[float, float]) -> Decay:
+        """A rate that falls, and whose sum over the visits of one of so many rows is `reach`, within bounds."""
+        steps = max(last - self.start, 1)
+        visits = steps / rows
+        needed = reach * math.log(FALL) * FALL / (FALL - 1) / visits
+        initial = min(max(bounds[0], needed), bounds[1])
+        return Decay(initial=initial, final=initial / FALL, over=steps, start=self.start)
 
 
 @dataclass(frozen=True)

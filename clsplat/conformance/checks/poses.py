@@ -1,4 +1,4 @@
-"""poses.cl: derivatives by the place of a camera."""
+"""poses.cl: derivatives by the place and the focal length of a camera."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -32,9 +32,10 @@ def pose_figures(device: Device, case: Case, rng: np.random.Generator, what: str
     upstream = grad_mean2d, grad_conic, by_opacity, m[:, 6:9]
     numbers = case.degree, case.variance, case.compensate
     expected = ref.pose_gradient(case.gaussians(), case.camera(), *numbers, truth, *upstream)
-    for name, value, exact in zip(("shift", "turn"), (found[:3], found[3:]), expected, strict=True):
-        in_camera = case.camera().rotation @ value
-        yield by_norm("pose_gradient", f"derivative by the {name}, {what}", in_camera[None], exact[None], CONIC)
+    turn = case.camera().rotation
+    values = {"shift": turn @ found[:3], "turn": turn @ found[3:6], "focal length": found[6:]}
+    for (name, value), exact in zip(values.items(), expected, strict=True):
+        yield by_norm("pose_gradient", f"derivative by the {name}, {what}", value[None], exact[None], CONIC)
 
 
 @CHECKS.add("pose_gradient")
