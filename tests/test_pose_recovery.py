@@ -1,8 +1,9 @@
-"""Jittered cameras are found again: photographs of a model that is known, from places that are known."""
+"""Jittered cameras, and wrong focal lengths, are found again: photographs of a known model from known places."""
 
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
 from clsplat.conformance.scenes import random_case
@@ -17,12 +18,12 @@ from clsplat.scene.view import View
 from clsplat.schedule import Decay
 from clsplat.training.adam import Adam, Rates
 from clsplat.training.trainer import Trainer
+from clsplat.views.focal_lengths import FocalLengths
 from clsplat.views.photograph_poses import PhotographPoses
 from clsplat.views.photographs import Photograph
 from clsplat.views.poses import Move, Poses
 
 VIEWS, STEPS, ANGLE, DEPTH = 6, 900, np.radians(0.3), 3.0
-RATE = Decay(initial=2e-3, final=2e-5, over=STEPS)
 STILL = Rates(means=0, quats=0, log_scales=0, logit_opacity=0, sh_base=0, sh_rest=0)  # cameras alone are unknown
 
 
@@ -36,8 +37,13 @@ def errors(truth: list[View], found: list[np.ndarray]) -> tuple[float, float]:
     return max(angles), float(np.linalg.norm(centres, axis=1).max())
 
 
-def learned(rng: np.random.Generator, info, jitter: float) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Errors of cameras before and after they are learned; jitter: 1 for 0.3 degrees and 0.3 % of the depth."""
+def learned(
+    rng: np.random.Generator, info, jitter: float, zoom: float = 1.0, steps: int = STEPS
+) -> tuple[tuple[float, float], tuple[float, float], float]:
+    """Errors of cameras before and after they are learned, and of the focal length after it as a factor.
+
+    jitter: 1 for 0.3 degrees and 0.3 % of the depth; zoom: of the given focal length.
+    """
     case, device = random_case(rng, 200, 96, 72), Device(info)
     model, rasterizer = case.model(device), Rasterizer(device)
     background, photographs = device.upload(np.full(3, 0.3, np.float32)), list[Photograph]()
@@ -49,7 +55,7 @@ def learned(rng: np.random.Generator, info, jitter: float) -> tuple[tuple[float,
     turns, shifts = jitter * rng.normal(size=(2, VIEWS, 3)) * np.array([[[ANGLE]], [[0.003 * DEPTH]]])
     turns, shifts = turns - turns.mean(axis=0), shifts - shifts.mean(axis=0)
     views = [
-        replace(view, world_to_camera=Move(turn, shift, 0).of(view.world_to_camera))
+        replace(view, world_to_camera=Move(turn, shift, 0).of(view.world_to_camera), camera=view.camera.zoomed(zoom))
         for view, turn, shift in zip(truth, turns, shifts, strict=True)
     ]
     for number, (view, given) in enumerate(zip(truth, views, strict=True)):
@@ -57,18 +63,22 @@ def learned(rng: np.random.Generator, info, jitter: float) -> tuple[tuple[float,
         pixels = np.ascontiguousarray(np.rint(255 * values).astype(np.uint8).transpose(2, 0, 1))
         photographs.append(Photograph(replace(upload_camera(device, given), view=number), device.upload(pixels)))
     numbers = dict[str, float]()
-    poses = PhotographPoses(views, 0, *Poses(start=0, turn=RATE, shift=RATE).rates(STEPS, VIEWS))
+    rate = Decay(initial=2e-3, final=2e-5, over=steps)
+    settings = Poses(start=0, turn=rate, shift=rate, focal="auto")
+    focals = FocalLengths.of(views, settings.focal_rate(steps, 1))
+    poses = PhotographPoses(views, 0, *settings.rates(steps, VIEWS), focals)
     poses.begin(numbers, dict.fromkeys((view.name for view in views), DEPTH))
     parts = rasterizer, model, Adam(model.gaussians), SplatStats(model.gaussians, []), background
     trainer = Trainer(*parts, (L1(weight=0.8), Dssim(weight=0.2)), STILL, numbers=numbers, poses=poses)
-    for step in range(1, STEPS + 1):
+    for step in range(1, steps + 1):
         trainer.step(photographs[step % VIEWS], step)
     given = [view.world_to_camera for view in views]
-    return errors(truth, given), errors(truth, [poses.pose(numbers, number) for number in range(VIEWS)])
+    found = [poses.pose(numbers, number) for number in range(VIEWS)]
+    return errors(truth, given), errors(truth, found), zoom * poses.focals.factor(numbers, views[-1].name)
 
 
 def test_jittered_cameras_are_found_again(rng, info):
-    before, after = learned(rng, info, 1.0)
+    before, after, _ = learned(rng, info, 1.0)
     print(np.degrees(before[0]), np.degrees(after[0]), before[1], after[1])
     assert np.degrees(before[0]) > 0.4
     assert after[0] < before[0] / 5
@@ -76,8 +86,17 @@ def test_jittered_cameras_are_found_again(rng, info):
 
 
 def test_exact_cameras_stay(rng, info):
-    before, after = learned(rng, info, 0.0)
-    print(np.degrees(after[0]), after[1])
+    before, after, factor = learned(rng, info, 0.0)
+    print(np.degrees(after[0]), after[1], factor)
     assert before[0] < 1e-9
     assert np.degrees(after[0]) < 0.02
     assert after[1] < 0.001 * DEPTH
+    assert factor == pytest.approx(1, abs=1e-4)
+
+
+def test_a_wrong_focal_length_is_found_again_beside_poses(rng, info):
+    before, after, factor = learned(rng, info, 1.0, 0.98, steps=STEPS // 3)
+    print(factor, np.degrees(after[0]), after[1])
+    assert factor == pytest.approx(1, abs=0.001)
+    assert after[0] < before[0] / 5
+    assert after[1] < before[1] / 5

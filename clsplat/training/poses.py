@@ -1,4 +1,4 @@
-"""The places of the cameras in a run: where a training begins and ends, and where it is measured."""
+"""The places and focal lengths of the cameras in a run: where a training begins and ends, and where it is measured."""
 
 import json
 import logging
@@ -10,13 +10,15 @@ from typing import Any
 
 import numpy as np
 
-from clsplat.errors import ConfigError, DataError, PoseError, quoted
+from clsplat.errors import ConfigError, DataError, PoseError, amount, quoted
 from clsplat.files import write_text
 from clsplat.names import VIEW_POSES
 from clsplat.reading import read_json
 from clsplat.scene.scene import Scene
 from clsplat.scene.view import View
+from clsplat.scene.zoom import zooms
 from clsplat.training.run import Run
+from clsplat.views.focal_lengths import FocalLengths
 from clsplat.views.photograph_poses import PhotographPoses
 from clsplat.views.poses import Floats, Poses
 
@@ -28,11 +30,12 @@ def photograph_poses(poses: Poses | None, run: Run, last: int) -> PhotographPose
     """Return the poses of a training whose last global step is given, or None where they are the dataset's:
     those that a training before has learned stay.
 
-    The numbers of a run that begins are set; a resumed run has them.  Raises ConfigError where the model has a sky.
+    The numbers of a run that begins are set; a resumed run has them.  Raises ConfigError where the model has a sky,
+    DataError where a lens has no form with another focal length.
     """
-    views = run.scene.split("train")
+    views, focals = run.scene.split("train"), FocalLengths.of(run.original.views)
     if poses is None:
-        learned = PhotographPoses(views)  # by a training before, whose model this one goes on with
+        learned = PhotographPoses(views, focals=focals)  # by a training before, whose model this one goes on with
         return learned if learned.begun(run.numbers) else None
     if run.sky:
         raise ConfigError(
@@ -40,10 +43,22 @@ def photograph_poses(poses: Poses | None, run: Run, last: int) -> PhotographPose
             "or model.background"
         )
     rates = poses.rates(last, len({view.name for view in views}))
-    found = PhotographPoses(views, poses.start, *rates)
+    cameras = len({focals.cameras[view.name] for view in views})
+    found = PhotographPoses(views, poses.start, *rates, replace(focals, rate=poses.focal_rate(last, cameras)))
+    if found.focals.rate:
+        _require_zoom(run.original)
     if not found.begun(run.numbers):
         found.begin(run.numbers, {view.name: depth_of(view, run.scene) for view in views})
     return found
+
+
+def _require_zoom(scene: Scene) -> None:
+    for view in scene.views:
+        if view.lens is not None and not zooms(view.lens):
+            raise DataError(
+                f"{scene.path}: optimize.poses.focal: the lens of {quoted(view.name)}, {view.lens.model}, cannot be "
+                "written with another focal length; `clsplat data undistort` first, or leave out poses.focal"
+            )
 
 
 def depth_of(view: View, scene: Scene) -> float:
@@ -58,12 +73,13 @@ def depth_of(view: View, scene: Scene) -> float:
 
 
 def refined(numbers: Mapping[str, float], scene: Scene) -> Scene:
-    """Return a scene with the poses that a run has learned; the same one where it has learned none.
+    """Return the scene of a run, at its full size, with what it has learned of cameras; the same one where it has
+    learned nothing.  Views that were not trained on have the focal lengths of their camera.
 
     The other cameras are moved as those of the training views are as a whole: about their mean, by the scale between
     the centres before and after.  Their rotations stay, as the mean of the learned ones does.
     """
-    training = PhotographPoses(scene.split("train"))
+    training, focals = PhotographPoses(scene.split("train")), FocalLengths.of(scene.views)
     if not training.views or not training.begun(numbers):
         return scene
     learned = {view.name: training.pose(numbers, number) for number, view in enumerate(training.views)}
@@ -80,7 +96,11 @@ def refined(numbers: Mapping[str, float], scene: Scene) -> Scene:
         rotation = view.world_to_camera[:, :3]
         return np.column_stack([rotation, -rotation @ (moved_middle + scale * (view.position - middle))])
 
-    return replace(scene, views=tuple(replace(view, world_to_camera=pose(view)) for view in scene.views))
+    def found(view: View) -> View:
+        camera = view.camera.zoomed(focals.factor(numbers, view.name))
+        return replace(view, world_to_camera=pose(view), camera=camera)
+
+    return replace(scene, views=tuple(map(found, scene.views)))
 
 
 def _centre(pose: Floats) -> Floats:
@@ -92,11 +112,17 @@ def write_view_poses(run: Run, poses: PhotographPoses | None) -> None:
     if poses is None:
         return
     views, names = refined(run.numbers, run.original).views, {view.name for view in poses.views}
+    cameras = poses.focals.learned(run.numbers)
     data = {
         "meaning": "poses in which the model shows each photograph, rows of [R | t] from the world to the camera; "
-        "learned: those of training photographs; others have moved with them as a whole",
+        "learned: those of training photographs; others have moved with them as a whole"
+        + ("; focal_lengths: in x and y, px, at the full size of the undistorted photographs" if cameras else ""),
         "photographs": {
-            view.name: {"learned": view.name in names, "world_to_camera": view.world_to_camera.tolist()}
+            view.name: {
+                "learned": view.name in names,
+                "world_to_camera": view.world_to_camera.tolist(),
+                **({"focal_lengths": [view.camera.fx, view.camera.fy]} if cameras else {}),
+            }
             for view in views
         },
     }
@@ -108,10 +134,18 @@ def write_view_poses(run: Run, poses: PhotographPoses | None) -> None:
         *(len(names), VIEW_POSES, math.degrees(max(turns)), max(shifts)),
         *(math.degrees(float(np.median(turns))), float(np.median(shifts))),
     )
+    if cameras:
+        factors = [poses.focals.factor(run.numbers, camera) for camera in cameras]
+        LOG.info("focal lengths of %s: times %s", amount(len(cameras), "camera"), _range(min(factors), max(factors)))
+
+
+def _range(low: float, high: float) -> str:
+    return f"{low:.4f}" if low == high else f"{low:.4f} to {high:.4f}"
 
 
 def poses_beside(model: Path, scene: Scene) -> Scene:
-    """Return a scene with the poses that lie beside a model file; the same one without such a table.
+    """Return a scene, at its full size, with the poses and focal lengths that lie beside a model file; the same one
+    without such a table.
 
     Raises DataError where the table is damaged.
     """
@@ -130,9 +164,11 @@ def _with_pose(path: Path, view: View, row: Any) -> View:
     if row is None:
         return view
     try:
-        return replace(view, world_to_camera=np.array(row["world_to_camera"], np.float64))
-    except (KeyError, TypeError, ValueError, PoseError) as error:
+        fx, fy = map(float, row.get("focal_lengths", (view.camera.fx, view.camera.fy)))
+        camera = replace(view.camera, fx=fx, fy=fy).check()
+        return replace(view, world_to_camera=np.array(row["world_to_camera"], np.float64), camera=camera)
+    except (AttributeError, KeyError, TypeError, ValueError, PoseError) as error:
         raise DataError(
-            f"{path}: {quoted(view.name)} has no pose of 3 rows of 4 numbers with a rotation; train again, or remove "
-            "the file"
+            f"{path}: {quoted(view.name)} has no pose of 3 rows of 4 numbers with a rotation, or no two positive focal "
+            "lengths; train again, or remove the file"
         ) from error

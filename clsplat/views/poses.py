@@ -60,7 +60,9 @@ class Poses(Settings):
 
     def focal_rate(self, last: int, cameras: int) -> Schedule:
         """Return the learning rate by step of focal lengths, of a training up to a step of so many cameras."""
-        return self._falling(last, cameras, FOCAL_REACH, (FOCAL_RATE, FOCAL_MOST)) if self.focal == "auto" else self.focal
+        return (
+            self._falling(last, cameras, FOCAL_REACH, (FOCAL_RATE, FOCAL_MOST)) if self.focal == "auto" else self.focal
+        )
 
     def _falling(self, last: int, rows: int, reach: float, bounds: tuple[float, float]) -> Decay:
         """A rate that falls, and whose sum over the visits of one of so many rows is `reach`, within bounds."""
