@@ -49,9 +49,7 @@ def undistort_scene(source: Path, out: Path, long_side: int | None = None, blank
     write_exposures(out / "images", dict(zip(names, camera_exposures(scene.views), strict=True)))
     if times := {name: view.time for view, name in zip(scene.views, names, strict=True) if view.time is not None}:
         write_times(out / "images", times)
-    tracks = scene.tracks and replace(
-        scene.tracks, seen={name: scene.tracks.seen[view.name] for view, name in zip(scene.views, names, strict=True)}
-    )
+    tracks = scene.tracks and scene.tracks.renamed({v.name: name for v, name in zip(scene.views, names, strict=True)})
     write_model(out / "sparse" / "0", views, scene.points, tracks)
     return len(views)
 

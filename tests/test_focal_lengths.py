@@ -53,7 +53,7 @@ def test_a_lens_with_another_focal_length_undistorts_to_the_same_pixels(model):
 
 def test_a_fisheye_has_no_other_focal_length():
     assert zoomed(FISHEYE, 1.0) is FISHEYE
-    with pytest.raises(DataError, match="OPENCV_FISHEYE has no form with another focal length.*undistort"):
+    with pytest.raises(DataError, match=r"OPENCV_FISHEYE has no form with another focal length.*undistort"):
         zoomed(FISHEYE, 1.01)
 
 

@@ -110,8 +110,8 @@ def test_observations_and_errors_of_a_real_model():
     theirs = pycolmap.Reconstruction(data_set("kitchen") / "sparse" / "0")
     assert facts.seen == {image.name: image.num_points3D for image in theirs.images.values()}
     errors = [point.error for point in theirs.points3D.values()]
-    assert facts.points.error_mean == pytest.approx(np.mean(errors))
-    assert facts.points.error_90 == pytest.approx(np.quantile(errors, 0.9))
+    assert facts.points.error_mean == pytest.approx(np.mean(errors), rel=0.005)  # cameras were rounded afterwards
+    assert facts.points.error_90 == pytest.approx(np.quantile(errors, 0.9), rel=0.005)
 
 
 @pytest.mark.parametrize("kind", ["bin", "txt"])
@@ -368,11 +368,11 @@ def test_points_that_are_not_finite_or_very_far(tmp_path):
 
 
 def test_views_that_see_few_points(scene):
-    """The writer leaves 2D points unconnected; here those of all images but one are connected."""
+    """The writer leaves 2D points unconnected; here those of all images but one are connected, at no known place."""
     lines = ["# images"]
     for i, image in enumerate(orbit().images):
         pose = " ".join(map(str, [*image.quaternion, *image.translation]))
-        lines += [f"{i + 1} {pose} 1 {image.name}", " ".join(["1.5 2.5 7"] * (5 if i == 3 else 50) + ["3 4 -1"] * 90)]
+        lines += [f"{i + 1} {pose} 1 {image.name}", " ".join(["nan nan 7"] * (5 if i == 3 else 50) + ["3 4 -1"] * 90)]
     for file in (scene / "sparse" / "0").iterdir():
         file.unlink()
     write_model(scene / "sparse" / "0", orbit(), "txt")

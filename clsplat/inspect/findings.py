@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 from clsplat.errors import amount, shortened
-from clsplat.inspect.survey import MAX_DISTANCE, MIN_SEEN, CameraFacts, Facts, PointFacts
+from clsplat.inspect.points import MAX_DISTANCE, PointFacts
+from clsplat.inspect.survey import MIN_SEEN, CameraFacts, Facts
 
 Level = Literal["error", "warning", "note"]
 LEVELS: tuple[Level, ...] = ("error", "warning", "note")
@@ -15,6 +16,7 @@ MIN_VIEWS = 10  # for training
 MIN_POINTS = 100
 MAX_SHARE_LEFT_OUT = 0.1  # share of the photographs that a model may leave out without a warning
 MAX_ERROR = 2.0  # px of mean reprojection error; COLMAP drops observations above 4
+POSES_ERROR, POSES = 1.0, "optimize.poses={start: 500}"  # px from which pipelines/photos.yaml learns poses
 MAX_SHARE_BEHIND, MIN_SHARE_IN_TWO = 0.1, 0.5  # shares of points
 MIN_SHARE_KEPT = 0.6  # share of a photograph
 FOCAL_RANGE = (0.2, 20.0)  # focal length by image width: 136 to 3 degrees
@@ -200,9 +202,13 @@ def _points(facts: Facts) -> Iterator[Finding]:
         yield Finding("note", fault, "usually sky or wrong matches; they become very large Gaussians")
     if not facts.refusal:
         yield from _coverage(points)
-    if points.error_mean is not None and points.error_mean > MAX_ERROR:
-        fault = f"the mean reprojection error of the points is {points.error_mean:.2f} px"
-        yield Finding("warning", fault, "renders will be blurred; run bundle adjustment (colmap bundle_adjuster)")
+    if points.error_mean is not None and points.error_mean > POSES_ERROR:
+        fault = f"the mean reprojection error of the points is {points.error_mean:.2f} px at the full size"
+        remedy = (
+            "renders will be blurred; run bundle adjustment (colmap bundle_adjuster), or learn the cameras too: "
+            f'--set "{POSES}", as `photos` does by itself above {POSES_ERROR:g} px at the size of training'
+        )
+        yield Finding("warning" if points.error_mean > MAX_ERROR else "note", fault, remedy)
 
 
 def _coverage(points: PointFacts) -> Iterator[Finding]:

@@ -7,19 +7,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from clsplat.inspect.looks import LookFacts, looks_of
+from clsplat.inspect.points import PointFacts, points_of
 from clsplat.scene.decoding import ImageFile, decode_all
 from clsplat.scene.lens import BORDER_POINTS, Lens
 from clsplat.scene.parts import Parts
-from clsplat.scene.points import MAX_VALUE
 from clsplat.scene.scene import View, camera_extent, strayed
 from clsplat.scene.times import by_camera, moments_of
 from clsplat.scene.view import fits
 
-SAMPLE_SIZE = 20_000  # points that coverage is measured on
-MAX_DISTANCE = 100.0  # camera extents from the middle of the cameras: photographs resolve nothing beyond
 MIN_SEEN = 30  # points; COLMAP itself registers no image with fewer inliers
 
 
@@ -35,19 +32,6 @@ class CameraFacts:
     distortion: float | None  # px: the largest displacement by the lens at the border; None where it overflows
     kept: float  # share of the photograph that is left when it is undistorted
     centred: bool  # whether the principal point lies in the photograph
-
-
-@dataclass(frozen=True)
-class PointFacts:
-    """The sparse points.  Shares are of a sample of SAMPLE_SIZE points, evenly spaced in the file."""
-
-    count: int
-    not_finite: int
-    distant: int  # beyond MAX_DISTANCE camera extents
-    error_mean: float | None  # px
-    error_90: float | None  # px; 90 % of the points have less
-    in_two: float | None  # share that lies in the image of at least two views, hidden or not
-    behind: float | None  # share that lies behind all cameras
 
 
 @dataclass(frozen=True)
@@ -121,7 +105,7 @@ def survey(parts: Parts) -> Facts:
         cameras=_cameras(parts),
         photos=_photographs(views, set(missing)),
         looks=looks_of(parts, set(missing)),
-        points=_points(parts, extent, centres) if parts.points else None,
+        points=points_of(parts, extent, centres) if parts.points else None,
         seen=parts.observed if any(parts.observed.values()) else {},
         extent=extent,
         strayed=[view.name for view, far in zip(views, strayed(views), strict=True) if far] if views else [],
@@ -205,40 +189,3 @@ def _photograph(facts: PhotographFacts, view: View, name: str, path: Path, file:
             facts.exif_turned.append(name)
         if (file.size[::-1] if turned else file.size) != (camera.width, camera.height):
             facts.larger.append(name)
-
-
-def _points(parts: Parts, extent: float | None, centres: NDArray[np.floating]) -> PointFacts:
-    assert parts.points is not None
-    positions = parts.points.positions
-    finite = (np.abs(positions) < MAX_VALUE).all(axis=1)
-    error = parts.points.error[finite] if len(parts.points.error) else np.empty(0)
-    known = error[np.isfinite(error) & (error > 0)]
-    if len(np.unique(known)) < 2:  # a placeholder
-        known = np.empty(0)
-    good = positions[finite].astype(np.float64)
-    distance = np.linalg.norm(good - np.median(centres, axis=0), axis=1) if len(centres) else np.empty(0)
-    sample = good[:: max(1, -(-len(good) // SAMPLE_SIZE))]
-    in_two, behind = _coverage(sample, parts.views) if len(sample) and parts.views else (None, None)
-    return PointFacts(
-        count=len(positions),
-        not_finite=int(np.count_nonzero(~finite)),
-        distant=int(np.count_nonzero(distance > MAX_DISTANCE * extent)) if extent else 0,
-        error_mean=float(known.mean()) if len(known) else None,
-        error_90=float(np.quantile(known, 0.9)) if len(known) else None,
-        in_two=in_two,
-        behind=behind,
-    )
-
-
-def _coverage(points: NDArray[np.float64], views: Sequence[View]) -> tuple[float, float]:
-    """Shares of points [M, 3] that project into at least two views, and that lie behind all of them."""
-    inside, ahead = np.zeros(len(points), int), np.zeros(len(points), bool)
-    for view in views:
-        camera = view.camera
-        x, y, z = view.world_to_camera[:, :3] @ points.T + view.world_to_camera[:, 3:]
-        front = z > 0
-        depth = np.where(front, z, 1)
-        u, v = camera.fx * x / depth + camera.cx, camera.fy * y / depth + camera.cy
-        inside += front & (u >= 0) & (u <= camera.width) & (v >= 0) & (v <= camera.height)
-        ahead |= front
-    return float((inside >= min(2, len(views))).mean()), float((~ahead).mean())

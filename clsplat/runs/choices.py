@@ -8,6 +8,7 @@ from clsplat.pipeline.file import PipelineFile
 from clsplat.pipeline.loading import Pipeline
 from clsplat.pipeline.on_host import harmonics_of
 from clsplat.pipeline.stretching import of_trainings
+from clsplat.render.backdrops import Auto as AutoSky
 from clsplat.scene.capture import measured
 from clsplat.stages.optimize import Optimize
 from clsplat.training.colours import settled
@@ -15,6 +16,7 @@ from clsplat.training.run import Run
 from clsplat.training.skies import settled as settled_sky
 from clsplat.views.colours import Auto
 
+WITH_POSES = "optimize.poses are learned, which a sky does not go with"
 LOG = logging.getLogger("clsplat")
 
 
@@ -66,8 +68,13 @@ def _with_colours(pipeline: Pipeline, run: Run) -> Pipeline:
 
 
 def _with_sky(settings: PipelineFile, run: Run) -> PipelineFile:
-    """Settings with the choice of a sky, where it is open."""
-    background = settled_sky(settings.model.background, run)
+    """Settings with the choice of a sky, where it is open: none where poses are learned, which it does not go with."""
+    background = settings.model.background
+    poses = any(isinstance(one, Optimize) and one.poses for one in settings.stages)
+    if poses and isinstance(background, AutoSky) and background.chosen is None:
+        background = background.model_copy(update={"chosen": "off", "reason": WITH_POSES})
+        LOG.info("model.background: off, since %s", WITH_POSES)
+    background = settled_sky(background, run)
     if background is settings.model.background:
         return settings
     return settings.model_copy(update={"model": settings.model.model_copy(update={"background": background})})

@@ -5,25 +5,29 @@ from typing import Literal
 
 import numpy as np
 
+from clsplat.scene.reprojection import reprojection_errors
 from clsplat.scene.scene import Scene
 
-Measure = Literal["photographs", "photographs_per_point", "pixels", "points"]
+Measure = Literal["photographs", "photographs_per_point", "pixels", "points", "reprojection_error"]
 UNITS: dict[Measure, str] = {
     "photographs": "training photographs",
     "photographs_per_point": "training photographs show a point, in the mean",
     "pixels": "pixels has a training photograph, in the median",
     "points": "points",
+    "reprojection_error": "px are between a point and where photographs show it, in the mean at the size of training",
 }
 
 
 def measured(scene: Scene) -> dict[Measure, float]:
     """Return the measures that a scene, as it is trained on, has; views for validation count as training views."""
     views = {view.name: view for view in reversed(scene.with_fold().split("train"))}  # the largest size of each
+    errors = reprojection_errors(scene.tracks, views.values())
     found: dict[Measure, float | None] = {
         "photographs": len(views),
         "photographs_per_point": _photographs_per_point(scene, views),
         "pixels": float(np.median([view.camera.width * view.camera.height for view in views.values()])),
         "points": len(scene.points) if scene.points else None,
+        "reprojection_error": None if errors is None else float(errors.mean()),
     }
     return {measure: value for measure, value in found.items() if value is not None}
 

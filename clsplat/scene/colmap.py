@@ -18,6 +18,7 @@ from clsplat.scene.parts import Parts
 from clsplat.scene.points import MAX_VALUE, PointTable
 from clsplat.scene.quaternion import pose_matrix
 from clsplat.scene.readers import Reader
+from clsplat.scene.reprojection import misses
 from clsplat.scene.scene import PointCloud, Scene, View, every_nth, make_scene
 from clsplat.scene.times_file import timed
 from clsplat.scene.tracks import Tracks
@@ -48,7 +49,7 @@ class ColmapReader(Reader):
         there = present(path, [view.image_path for view in views], self.missing)
         views = timed([view for view, found in zip(views, there, strict=True) if found], folder)
         table = read_point_table(model)
-        points, tracks = (table.cloud(), tracks_of(images, table)) if table else (None, None)
+        points, tracks = (table.cloud(), tracks_of(images, table, views)) if table else (None, None)
         scene = make_scene(path, views, every_nth([view.name for view in views], holdout), points)
         return replace(scene, tracks=tracks)
 
@@ -76,16 +77,20 @@ def camera_views(path: Path) -> tuple[list[View], PointCloud | None]:
     return [view_of(image, cameras, folder) for image in images], table.cloud() if table else None
 
 
-def tracks_of(images: Sequence[ImageRecord], table: PointTable) -> Tracks | None:
-    """Return which points each image shows, or None where no image names one."""
+def tracks_of(images: Sequence[ImageRecord], table: PointTable, views: Sequence[View] = ()) -> Tracks | None:
+    """Return which points each image shows, or None where no image names one; of `views` how far from their places."""
     kept = table.kept()
     positions, ids = table.positions[kept], table.ids[kept]
     order = np.argsort(ids, kind="stable")
-    seen = {}
+    seen, missed, by_name = {}, {}, {view.name: view for view in views}
     for image in images:
-        place = np.minimum(np.searchsorted(ids[order], named := np.unique(image.points)), max(len(ids) - 1, 0))
-        seen[image.name] = order[place][ids[order][place] == named] if len(ids) else np.empty(0, np.int64)
-    return Tracks(positions, seen) if any(map(len, seen.values())) else None
+        named, first = np.unique(image.points, return_index=True)
+        place = np.minimum(np.searchsorted(ids[order], named), max(len(ids) - 1, 0))
+        known = ids[order][place] == named if len(ids) else np.zeros(len(named), bool)
+        rows = seen[image.name] = order[place[known]] if len(ids) else np.empty(0, np.int64)
+        if len(rows) and len(image.places) and image.name in by_name:
+            missed[image.name] = misses(by_name[image.name], positions[rows], image.places[first[known]])
+    return Tracks(positions, seen, missed) if any(map(len, seen.values())) else None
 
 
 def find_models(path: Path) -> list[Path]:

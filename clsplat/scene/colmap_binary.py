@@ -77,8 +77,9 @@ def images_binary(path: Path) -> Iterator[ImageRecord]:
         name = file.text("an image name")
         count = file.count(POINT2D.itemsize, "2D points")
         start = file.skip(POINT2D.itemsize * count, "2D points")
-        points = np.frombuffer(file.data, POINT2D, count, start)["point"]
-        yield ImageRecord(where, name, camera, tuple(pose[:4]), tuple(pose[4:]), points[points >= 0])
+        found = np.frombuffer(file.data, POINT2D, count, start)
+        found = found[found["point"] >= 0]
+        yield ImageRecord(where, name, camera, tuple(pose[:4]), tuple(pose[4:]), found["point"], found["xy"])
     file.finish()
 
 

@@ -31,7 +31,7 @@ class CameraRecord(NamedTuple):
 class ImageRecord(NamedTuple):
     """A line of `images`: quaternion (w, x, y, z) and translation, world to camera.
 
-    `points` are the ids of the 3D points that its 2D points show.
+    `points` are the ids of the 3D points that its 2D points show, `places` where, [K, 2] px.
     """
 
     where: str
@@ -40,6 +40,7 @@ class ImageRecord(NamedTuple):
     quaternion: tuple[float, ...]
     translation: tuple[float, ...]
     points: NDArray[np.int64] = np.empty(0, np.int64)
+    places: NDArray[np.float64] = np.empty((0, 2))
 
     @property
     def observed(self) -> int:

@@ -1,5 +1,6 @@
 """Read the text files of a COLMAP model."""
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -33,7 +34,7 @@ def images_text(path: Path) -> Iterator[ImageRecord]:
     image: ImageRecord | None = None  # the line of its points may follow
     for where, line in _lines(path):
         if image and _is_points2d(line):
-            yield image._replace(points=_ids(line))
+            yield image._replace(**dict(zip(("points", "places"), _points2d(line), strict=True)))
             image = None
         elif line:
             if image:
@@ -50,9 +51,20 @@ def _is_points2d(line: str) -> bool:
     return len(words) % 3 == 0 and (not words or words[-1].lstrip("-").isdecimal())
 
 
-def _ids(line: str) -> NDArray[np.int64]:
-    """The ids of the 3D points in a line of 2D points."""
-    return np.array([_id(word) for word in line.split()[2::3] if word.isdecimal()], np.int64)
+def _points2d(line: str) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """The ids of the 3D points in a line of 2D points, and their places, [K, 2] px."""
+    words = line.split()
+    named = [i for i in range(2, len(words), 3) if words[i].isdecimal()]
+    places = [(_number(words[i - 2]), _number(words[i - 1])) for i in named]
+    return np.array([_id(words[i]) for i in named], np.int64), np.array(places, np.float64).reshape(-1, 2)
+
+
+def _number(word: str) -> float:
+    """A coordinate of a 2D point; NaN where it is none, as nothing but its error is known by it."""
+    try:
+        return float(word)
+    except ValueError:
+        return math.nan
 
 
 def points_text(path: Path) -> PointTable:

@@ -1,7 +1,7 @@
 """Lenses whose focal length is another one than was calibrated: the photograph that they undistort stays the same.
 
-A lens of focal length f moves normalised coordinates u to D(u), and the pinhole camera of the undistorted photograph has
-the same f.  Where that camera has s f, the lens of s f with D'(u) = D(s u) / s undistorts to the same pixels: a
+A lens of focal length f moves normalised coordinates u to D(u), and the pinhole camera of the undistorted photograph
+has the same f.  Where that camera has s f, the lens of s f with D'(u) = D(s u) / s undistorts to the same pixels: a
 coefficient of a polynomial term of degree n + 1 is multiplied by s^n.
 """
 

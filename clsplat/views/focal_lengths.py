@@ -44,3 +44,6 @@ class FocalLengths:
         if rate := at_step(self.rate, step):
             key = self._key(view)
             adam_step(numbers, {key: numbers.get(key, 0.0)}, {key: derivative}, rate)
+
+
+NO_FOCALS = FocalLengths({})

@@ -15,7 +15,7 @@ from clsplat.render.rasterizer import Frame
 from clsplat.render.workspace import Workspace
 from clsplat.scene.view import View
 from clsplat.schedule import Schedule, at_step
-from clsplat.views.focal_lengths import FocalLengths
+from clsplat.views.focal_lengths import NO_FOCALS, FocalLengths
 from clsplat.views.photographs import Photograph
 from clsplat.views.poses import Floats, Move
 from clsplat.views.view_table import ViewTable
@@ -32,7 +32,7 @@ class PhotographPoses:
     start: int = 0  # global step after which they are learned
     turn_rate: Schedule = 0.0  # rad
     shift_rate: Schedule = 0.0  # shares of the depth
-    focals: FocalLengths = FocalLengths({})
+    focals: FocalLengths = NO_FOCALS
 
     @cached_property
     def tables(self) -> tuple[ViewTable, ViewTable]:
