@@ -33,7 +33,7 @@ def points_of(parts: Parts, extent: float | None, centres: NDArray[np.floating])
     assert parts.points is not None
     positions = parts.points.positions
     finite = (np.abs(positions) < MAX_VALUE).all(axis=1)
-    known = _errors(parts, finite)
+    known = _errors(parts, np.asarray(finite))
     good = positions[finite].astype(np.float64)
     distance = np.linalg.norm(good - np.median(centres, axis=0), axis=1) if len(centres) else np.empty(0)
     sample = good[:: max(1, -(-len(good) // SAMPLE_SIZE))]

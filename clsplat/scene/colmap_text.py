@@ -34,7 +34,8 @@ def images_text(path: Path) -> Iterator[ImageRecord]:
     image: ImageRecord | None = None  # the line of its points may follow
     for where, line in _lines(path):
         if image and _is_points2d(line):
-            yield image._replace(**dict(zip(("points", "places"), _points2d(line), strict=True)))
+            points, places = _points2d(line)
+            yield image._replace(points=points, places=places)
             image = None
         elif line:
             if image:

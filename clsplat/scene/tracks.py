@@ -18,5 +18,5 @@ class Tracks:
 
     def renamed(self, names: Mapping[str, str]) -> "Tracks":
         """Return the tracks of some views under other names, by their old ones."""
-        seen, misses = ({names[old]: rows[old] for old in names if old in rows} for rows in (self.seen, self.misses))
-        return Tracks(self.positions, seen, misses)
+        seen = {names[old]: rows for old, rows in self.seen.items() if old in names}
+        return Tracks(self.positions, seen, {names[old]: one for old, one in self.misses.items() if old in names})
