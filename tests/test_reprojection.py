@@ -26,6 +26,7 @@ from tests.test_lens import STRONG
 from tests.yards import Yard
 
 VECTOR = np.array([1.2, -0.9])  # px, 1.5 long
+OFFSET = np.array([0.1, 0.2, 0.3])
 
 
 def missing(folder: Path, vector: np.ndarray, rng: np.random.Generator, exact: tuple[str, ...] = ()) -> Path:
@@ -46,9 +47,9 @@ def shown(view: View, positions: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("lens", [None, STRONG])
 def test_distances_are_from_where_the_camera_shows_a_point(rng, lens):
-    view = View("a.png", STRONG.pinhole, np.column_stack([np.eye(3), [0.1, 0.2, 0.3]]), lens=lens)
+    view = View("a.png", STRONG.pinhole, np.column_stack([np.eye(3), OFFSET]), lens=lens)
     points = np.column_stack([*rng.uniform(-0.4, 0.4, (2, 7)), np.full(7, 2.0)])
-    seen, camera = points + [0.1, 0.2, 0.3], view.camera
+    seen, camera = points + OFFSET, view.camera
     straight = seen[:, :2] / seen[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
     places = lens.project(seen) if lens else straight
     points[3, 2] = -5
