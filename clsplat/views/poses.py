@@ -17,7 +17,8 @@ RATE, MOST = 2e-4, 2e-3  # learning rates at the start
 FALL = 100  # from the first rate to the last
 TURN_SHARE = 0.3  # ours: what a turn about that point does in the image is little, and so mostly noise
 REACH = 0.01  # shares of the depth: what a photograph's visits must be enough for
-FOCAL_RATE, FOCAL_MOST, FOCAL_REACH = 1e-4, 1e-3, 0.03  # the same of the logarithm of a camera's focal lengths
+FOCAL_RATE, FOCAL_MOST = 1e-4, 1e-3  # the same of the logarithms of focal lengths
+FOCAL_REACH = 0.2  # of them: noise takes most of the way to a change of a few hundredths
 
 
 class Poses(Settings):
@@ -47,7 +48,7 @@ class Poses(Settings):
     visited as large as a shift of 0.01 needs, up to 2e-3."""
     focal: Annotated[Literal["auto"] | NonNegative, explained(", or auto")] = 0.0
     """Learning rate of the logarithms of focal lengths, by step; 0: they stay.  auto: 1e-4 to 1e-6, where cameras are
-    seldom visited as large as a change of 3 % needs, up to 1e-3."""
+    seldom visited so large that the rates of a camera's visits add up to 0.2, up to 1e-3."""
     start: Annotated[int, Field(ge=0)] = 500
     """Global step after which poses are learned: before it the model is a blur, which tells nothing of them."""
 
