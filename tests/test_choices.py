@@ -226,7 +226,7 @@ def test_the_recipe_for_photographs_chooses_by_their_number(photographs, dropout
     assert training.refit is (keep == "best")
     assert (chosen.model.background is not None) == (keep == "best"), "what is far away"
     (growing,) = [stage for stage in training.during if isinstance(stage, Densify)]
-    assert growing.per_pixel == {4: 0.3, 20: None, 25: None, 43: None}[photographs]
+    assert growing.per_pixel == {4: 0.3, 20: 0.6, 25: 0.6, 43: None}[photographs]
     plain = load("splat_7k").settings
     many = choose(settings, {"photographs": 200})
     assert (many.training, many.model) == (plain.training, plain.model), "nothing is lost where there are many"
