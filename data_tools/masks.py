@@ -11,6 +11,7 @@ from clsplat.progress import Count
 from clsplat.scene.colmap import ColmapReader, image_folder
 from clsplat.scene.detect import read_scene, reader_of
 from clsplat.scene.images import read_image, write_image
+from clsplat.scene.masks import mask_file
 from clsplat.scene.scene import View
 from clsplat.scene.view import load_mask
 from data_tools.made import Made, hash_of
@@ -29,7 +30,7 @@ def write_masks(scene: Path, folder: Path | None = None, out: Path | None = None
     """
     views = read_scene(scene, holdout=0).views
     target = out or _place(scene)
-    sources = [None if folder is None else _file(folder, view.name) for view in views]
+    sources = [None if folder is None else mask_file(folder, view.name) for view in views]
     missing = [view.name for view, source in zip(views, sources, strict=True) if folder and source is None]
     if missing:
         raise DataError(
@@ -54,14 +55,9 @@ def _place(scene: Path) -> Path:
     if reader is not None and not isinstance(reader, ColmapReader):
         raise DataError(
             f"{scene}: {reader.name} scenes have no folder of masks; train with `--set scene.alpha=mask` to take the "
-            "alpha as mask, or give --out, and name each mask as the `mask_path` of its frame"
+            "alpha as mask, or give --out, and train with that folder as `--set scene.masks=FOLDER`"
         )
     return image_folder(scene).with_name("masks")
-
-
-def _file(folder: Path, name: str) -> Path | None:
-    files = (folder / f"{name}.png", (folder / name).with_suffix(".png"))
-    return next((file for file in files if file.is_file()), None)
 
 
 def _from_alpha(view: View, threshold: float) -> NDArray[np.bool_]:

@@ -20,7 +20,7 @@ from clsplat.training.run import Run
 READ = {  # text that is read, or compared, and never the name of something that is written
     "Auto.reason", "CaptureChoice.given", "CaptureChoice.reason", "CaptureChoice.since", "CaptureChoice.keys",
     "SceneSettings.path", "Init.file", "Evaluate.file", "Evaluate.lpips", "Matrix.pipelines", "Matrix.scenes",
-    "InverseDepth.folder",
+    "SceneSettings.masks", "InverseDepth.folder",
     "Matrix.set", "Matrix.options", "PipelineFile.plugins", "Snapshot.view", "Snapshot.size", "Timelapse.folder",
     "Video.path", "Video.size", "Choice.names", "Choice.file", "Execution.engine",
     "Execution.devices", "Tls.ca", "Tls.cert", "Tls.key",

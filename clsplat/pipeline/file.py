@@ -23,6 +23,7 @@ from clsplat.render.tiles import Sort
 from clsplat.scene.choice import Choice, Chosen, ChosenOrAuto
 from clsplat.scene.detect import read_scene
 from clsplat.scene.images import Missing
+from clsplat.scene.masks import with_masks
 from clsplat.scene.scene import HOLDOUT, Alpha, Background, Scene
 from clsplat.scene.split import Split
 from clsplat.settings import OneOf, ReadPath, Settings
@@ -45,6 +46,9 @@ class SceneSettings(Settings):
     """Number of sizes in training: at `downscale`, and at twice, four times, … that."""
     alpha: Alpha = "transparency"
     """Fourth channel of photographs: blended with the background, or a mask of the pixels that count."""
+    masks: ReadPath | None = None
+    """Folder of masks that something else has made, instead of the dataset's own: `a.png` or `a.jpg.png` of the
+    photograph a.jpg, of its size, white in pixels that count.  A photograph without one counts whole."""
     background: Literal["auto", "black", "white"] = "auto"
     """Colour behind the scene; auto: white for Blender scenes, else black."""
     image_budget: Annotated[int, Field(gt=0)] | None = None
@@ -81,13 +85,17 @@ class SceneSettings(Settings):
         lists = None if self.path is None else Path(self.path)
         return Split(self.holdout, self.train, self.validation, self.missing, lists)
 
+    def masked(self, scene: Scene) -> Scene:
+        """Return a scene with its masks as set.  Raises DataError where the folder has none of them."""
+        return with_masks(scene, None if self.masks is None else Path(self.masks))
+
     def read(self, folder: Path) -> tuple[Scene, Background]:
         """Return the scene of a folder with these settings, and its background.  Raises DataError."""
         return self.applied(read_scene(folder, self.split))
 
     def applied(self, scene: Scene) -> tuple[Scene, Background]:
-        """Return a scene with these settings for alpha and extent, and its background."""
-        found = replace(scene.with_alpha(self.alpha), extent=self.extent or scene.extent)
+        """Return a scene with these settings for alpha, masks and extent, and its background.  Raises DataError."""
+        found = replace(self.masked(scene).with_alpha(self.alpha), extent=self.extent or scene.extent)
         return found, scene.background if self.background == "auto" else self.background
 
 

@@ -64,7 +64,8 @@ class Source:
 
     def scene(self, model: Model | FieldModel) -> Scene:
         """Read the photographs as the model was trained on, at their full size."""
-        return read_scene(self.folder, self.settings.split).with_alpha(self.alpha or model.rendering.alpha)
+        found = self.settings.masked(read_scene(self.folder, self.settings.split))
+        return found.with_alpha(self.alpha or model.rendering.alpha)
 
 
 def require_model(path: Path) -> None:

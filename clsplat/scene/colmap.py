@@ -1,7 +1,6 @@
 """Read COLMAP folders: choose the model, find the photographs, make pinhole cameras."""
 
 import logging
-import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +13,7 @@ from clsplat.scene.colmap_files import find_file, read_cameras, read_images, rea
 from clsplat.scene.colmap_records import REMEDY, CameraRecord, ImageRecord
 from clsplat.scene.images import inside, present
 from clsplat.scene.lens import MODELS, Lens, shared
+from clsplat.scene.masks import mask_file
 from clsplat.scene.parts import Parts
 from clsplat.scene.points import MAX_VALUE, PointTable
 from clsplat.scene.quaternion import pose_matrix
@@ -131,13 +131,7 @@ def view_of(image: ImageRecord, cameras: dict[int, CameraRecord], folder: Path) 
         ) from error
     lens = shared(_lens(image.camera, cameras[image.camera]))
     camera, distortion = (lens.pinhole, lens) if lens.distorts else (lens.camera, None)
-    return View(image.name, camera, pose, image_path, _mask(folder.with_name("masks"), image.name), lens=distortion)
-
-
-def _mask(folder: Path, name: str) -> Path | None:
-    """The mask of an image: its name with .png appended (COLMAP), or in place of its suffix."""
-    files = (folder / f"{name}.png", (folder / name).with_suffix(".png"))
-    return next((file for file in files if os.path.isfile(file)), None)  # never raises
+    return View(image.name, camera, pose, image_path, mask_file(folder.with_name("masks"), image.name), lens=distortion)
 
 
 def _lens(number: int, camera: CameraRecord) -> Lens:
