@@ -135,6 +135,8 @@ FAULTS = {  # kernel -> file, text, wrong text
     "sort_tiles": ("sort_bitonic.cl", "key > other ||", "key < other ||"),
     "radix_count": ("sort_radix.cl", "blocks + block] = sum;", "blocks + block] = sum / 2;"),
     "radix_scatter": ("sort_radix.cl", "first_pass ? i : values[i]", "i"),
+    "lay_over": ("layer.cl", "total += inside * (1.0f - t)", "total += 1.0f - t"),
+    "look_behind": ("layer.cl", "t * VLOAD(values)", "VLOAD(values)"),
     "measure_residuals": ("transients.cl", "(red + green + blue)", "(red + green + green)"),
     "mask_transients": ("transients.cl", "2 * below >= counted", "2 * below > counted"),
     "image_gradient": ("texture.cl", "0.587f * VLOAD", "0.578f * VLOAD"),

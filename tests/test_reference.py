@@ -762,6 +762,16 @@ def test_gradients_of_a_sky(rng):
     assert relative_error(by_left, numeric) < FD_TOLERANCE
 
 
+def test_gradients_of_a_layer_before_an_image(rng):
+    """By the image behind it, and of the loss of what it covers."""
+    layer, image, gradient = rng.random((3, 6, 7)), rng.random((4, 6, 7)), rng.normal(size=(4, 6, 7))
+    left = rng.random((6, 7))
+    numeric = five_point(lambda: (gradient * ref.laid_over(layer, left, image)).sum(), image)
+    assert relative_error(ref.gradient_behind(left, gradient), numeric) < FD_TOLERANCE
+    numeric = five_point(lambda: ref.layer_cover(left, 0.3)[0], left)
+    assert relative_error(ref.layer_cover(left, 0.3)[1], numeric) < FD_TOLERANCE
+
+
 def test_a_sky_has_no_seam(rng):
     """Neighbouring directions have neighbouring colours everywhere, and a colour of all texels is that of the sky."""
     texels, directions = rng.random((9, 9, 3)), rng.normal(size=(40, 50, 3))

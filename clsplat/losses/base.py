@@ -9,6 +9,7 @@ from clsplat.errors import ConfigError
 from clsplat.gaussians.tables import Gaussians, Gradients
 from clsplat.opencl.device import Array
 from clsplat.render.camera import DeviceCamera
+from clsplat.render.layer import Layer
 from clsplat.render.rasterizer import Content, Frame
 from clsplat.render.workspace import Workspace
 from clsplat.schedule import Schedule
@@ -74,6 +75,12 @@ class ViewLosses:
     losses: list[LossValue]
     learning: Sequence[Callable[[], None]] = field(default=(), kw_only=True)  # each changes numbers that are learned
     behind: Array | None = field(default=None, kw_only=True)  # T dL/dT, [rows, stride], of what the splats leave
+    layer: Layer | None = field(default=None, kw_only=True)  # before the model's image, of the photograph alone
+
+    @property
+    def rendered(self) -> Array:
+        """The image before the photograph's colours, [3 or 4, rows, stride]: of the model, and of a layer before it."""
+        return self.layer.image if self.layer else self.frame.image
 
     @property
     def loss(self) -> float:

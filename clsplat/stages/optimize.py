@@ -20,6 +20,7 @@ from clsplat.training.adam import Adam, Rates, Rows
 from clsplat.training.backgrounds import Behind, drawn_backgrounds
 from clsplat.training.colours import photograph_colours, write_view_colours
 from clsplat.training.depths import known_depths
+from clsplat.training.distractors import photograph_distractors
 from clsplat.training.forecast import Forecast
 from clsplat.training.placing import more_room, place_harmonics
 from clsplat.training.poses import photograph_poses, write_view_poses
@@ -29,6 +30,7 @@ from clsplat.training.run import Run
 from clsplat.training.skipping import Skip, Visit
 from clsplat.training.trainer import Trainer
 from clsplat.views.colours import Colours
+from clsplat.views.distractors import Distractors
 from clsplat.views.poses import Poses
 from clsplat.views.sampling import Sampler, ViewSettings
 from clsplat.views.transients import Transients
@@ -64,6 +66,8 @@ class Optimize(Keeping):
     """Places of the cameras that are learned with the model, where poses are not exact; without it, the dataset's."""
     transients: Transients | None = None
     """Pixels that are left out, where photographs show what the scene does not have; without it, none."""
+    distractors: Distractors | None = None
+    """Gaussians that each photograph has for itself, for what the scene does not have; without it, none."""
     dropout: Probability = 0.0
     """Probability with which a step leaves a Gaussian out, by step, 0.9 at most; for few photographs.  The opacities of
     the others are divided by 1 less it (DropGaussian, Park et al. 2025).  Pictures and measurements leave none out."""
@@ -159,7 +163,8 @@ class Optimize(Keeping):
         own = colours, self.transients, run.sky, self.dropout, run.seed
         behind, depths = drawn_backgrounds(self.background, run), known_depths(self.losses, run, poses)
         trained = self.losses, rates, run.scene.extent, run.numbers, self.update
-        return Trainer(*parts, *trained, *own, poses=poses, backgrounds=behind, depths=depths)
+        layers = photograph_distractors(self.distractors, run)
+        return Trainer(*parts, *trained, *own, poses=poses, backgrounds=behind, depths=depths, distractors=layers)
 
     def _edit(self, run: Run, views: ViewSettings) -> None:
         """Run the edits that were due at the step before."""

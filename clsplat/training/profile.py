@@ -25,6 +25,8 @@ STAGES = {
     "ssim_maps": "loss",
     "ssim_gradient": "loss",
     "weight_entropy": "loss",
+    "lay_over": "blend",
+    "look_behind": "blend backward",
     "sky_matches": "loss",
     "sky_cover": "loss",
     "sky_forward": "blend",

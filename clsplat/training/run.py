@@ -27,6 +27,7 @@ from clsplat.training.colour_grids import GridTables, bytes_needed
 from clsplat.training.field import LearnedField
 from clsplat.training.kept import Best, Tables
 from clsplat.training.memory import SEEN_SHARE, Harmonics, MemoryPlan, Where, plan
+from clsplat.training.own_gaussians import OwnGaussians, distractor_bytes
 from clsplat.training.profile import clocks
 from clsplat.training.progress import Progress as Progress
 from clsplat.training.progress import Stopped as Stopped
@@ -66,6 +67,7 @@ class Run:
     stats: SplatStats | None = None
     sky: LearnedSky | None = None  # of the model, where it has one
     colour_grids: GridTables | None = None  # of the photographs' colours, where they have such
+    distractors: OwnGaussians | None = None  # of the photographs, while a training has such
     learned_field: LearnedField | None = None  # in the place of a model
     step: int = 0  # updates done, or in progress
     cursor: int = 0  # stage in progress
@@ -123,7 +125,7 @@ class Run:
 
     def next_stage(self, cursor: int) -> None:
         """Come to the beginning of a stage."""
-        self.cursor, self.stage_step, self.acted, self.edited = cursor, 0, 0, False
+        self.cursor, self.stage_step, self.acted, self.edited, self.distractors = cursor, 0, 0, False, None
         if self._model is not None:
             self.model.gaussians.tables.pop(HIDDEN, None)  # which a training has for itself
 
@@ -141,10 +143,7 @@ class Run:
     def begin_again(self, best: Best) -> None:
         """Come to the beginning of the pipeline, to train again for the steps of the best model."""
         self._model = None
-        self.adam = None
-        self.stats = None
-        self.sky = None
-        self.colour_grids = None
+        self.adam = self.stats = self.sky = self.colour_grids = None
         self.numbers = {}
         self.metrics = {}
         self.written = {}
@@ -218,7 +217,7 @@ class Run:
         components = components or self.model.gaussians.components
         views, tile = self.scene.split("train"), int(self.device.tuning["TILE"])
         bytes_held = min(self.photographs.budget, sum(4 * view.camera.width * view.camera.height for view in views))
-        bytes_held += bytes_needed(self.settings, views, tile)
+        bytes_held += bytes_needed(self.settings, views, tile) + distractor_bytes(self.settings, views, tile)
         pixels = max((-(-v.camera.width // tile)) * (-(-v.camera.height // tile)) * tile**2 for v in views)
         pixel_sums = PIXEL_SUMS if self.stats is None else self.stats.pixel_sums
         return plan(self.device.info, components, bytes_held, pixels, pixel_sums, harmonics, seen)

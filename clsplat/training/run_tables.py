@@ -9,7 +9,7 @@ from clsplat.density.statistics import FOLDER as STATS_FOLDER
 from clsplat.density.statistics import SEEN, SplatStats
 from clsplat.errors import DataError
 from clsplat.gaussians.tables import Gaussians
-from clsplat.training import colour_grids, field, kept, sky
+from clsplat.training import colour_grids, field, kept, own_gaussians, sky
 from clsplat.training.adam import Adam
 from clsplat.training.archive import Arrays
 from clsplat.training.field import LearnedField
@@ -31,6 +31,8 @@ def tables_of(run: Run) -> Iterator[tuple[str, NDArray[np.float32]]]:
     yield from ((sky.FOLDER + name, table) for name, table in (run.sky.tables() if run.sky else {}).items())
     of_colours = run.colour_grids.tables() if run.colour_grids else {}
     yield from ((colour_grids.FOLDER + name, table) for name, table in of_colours.items())
+    of_photographs = run.distractors.tables() if run.distractors else {}
+    yield from ((own_gaussians.FOLDER + name, table) for name, table in of_photographs.items())
     yield from ((kept.FOLDER + name, table) for name, table in run.best_tables.items())
 
 
@@ -55,6 +57,8 @@ def check(state: State, tables: Arrays) -> None:
     of_colours, own = colour_grids.split_tables(own)
     colour_grids.check_tables(of_colours)
     colour_grids.require_tables(of_colours, state.numbers)
+    of_photographs, own = own_gaussians.split_tables(own)
+    own_gaussians.check_tables(of_photographs)
     check_tables(state, {name.removeprefix("gaussians/"): table for name, table in own.items()})
 
 
@@ -69,6 +73,8 @@ def restore(run: Run, state: State, tables: Arrays) -> None:
     behind, tables = sky.split_tables(tables)
     of_colours, tables = colour_grids.split_tables(tables)
     run.colour_grids = colour_grids.restored(of_colours, run.device)
+    of_photographs, tables = own_gaussians.split_tables(tables)
+    run.distractors = own_gaussians.restored(of_photographs, run.device)
     gaussians = Gaussians(run.device, {name.removeprefix("gaussians/"): table for name, table in tables.items()})
     run.model = run.model_settings.model(gaussians, state.degree)
     if state.updates:

@@ -25,6 +25,7 @@ from clsplat.render.camera import DeviceCamera
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.schedule import Schedule, at_step
 from clsplat.training.adam import Adam, Rates, Rows
+from clsplat.training.own_gaussians import PhotographDistractors
 from clsplat.training.sky import LearnedSky
 from clsplat.views.backgrounds import Backgrounds
 from clsplat.views.known_depths import PointDepths
@@ -33,7 +34,7 @@ from clsplat.views.photograph_poses import PhotographPoses
 from clsplat.views.photographs import Photograph, apply_mask
 from clsplat.views.texture import known_gradient
 from clsplat.views.transforms import PhotographTransform, Planes
-from clsplat.views.transients import Transients, measure_residuals
+from clsplat.views.transients import Transients, without_transients
 from clsplat.views.view_colours import ViewColours
 
 TEXTURE = int(constants("splat.h")["SUM_TEXTURE"])
@@ -83,6 +84,7 @@ class Trainer:
     poses: PhotographPoses | None = None  # of the cameras, where they are learned
     backgrounds: Backgrounds | None = None  # by step, in the place of `background`
     depths: PointDepths | None = None  # that are known, where a loss reads them
+    distractors: PhotographDistractors | None = None  # of the photographs, where they have Gaussians of their own
 
     def step(
         self,
@@ -123,8 +125,12 @@ class Trainer:
         timings.section = "loss"
         planes = photograph.planes(workspace, transforms, step, self.numbers, (self.background, background))
         gradient = workspace.array("grad_image", frame.image.shape)
-        image, own = self._coloured(camera, frame.image)
-        planes, learning = self._without_transients(planes, image, step)
+        layer = self.distractors.before(self.model, camera, frame.image, step) if self.distractors else None
+        image, own = self._coloured(camera, layer.image if layer else frame.image)
+        own += [LossValue("distractors", layer.loss)] if layer else []
+        learning: list[Callable[[], None]] = []
+        if self.transients:
+            planes, learning = without_transients(self.transients, planes, image, self.numbers, step)
         comparison = Comparison(workspace, camera, image, planes.colours, gradient, planes.mask, step)
         comparison.depths = self.depths.at(camera) if self.depths else None
         if content != "colour":  # losses of colours overwrite three planes alone
@@ -141,7 +147,7 @@ class Trainer:
             behind, value = cover
             own.append(value)
         losses = [*values, *of_transform, *own]
-        return ViewLosses(frame, comparison, losses, learning=[*learning, *learn], behind=behind)
+        return ViewLosses(frame, comparison, losses, learning=[*learning, *learn], behind=behind, layer=layer)
 
     def backward(self, view: ViewLosses) -> ViewGradients:
         """Return the derivative of the losses that `compare` returned, as sums over pixels."""
@@ -150,6 +156,8 @@ class Trainer:
         if mask is not None:
             apply_mask(workspace, camera, gradient, mask)
         gradient, learning = self._uncoloured(view, gradient)
+        if self.distractors and view.layer and comparison.camera.view is not None:
+            learning = [self.distractors.learning(view.layer, gradient, comparison.camera.view), *learning]
         learning = [*self._of_sky(view, gradient), *learning]
         count = self.stats.pixel_sums
         self.rasterizer.device.timings.section = "statistics"
@@ -172,17 +180,6 @@ class Trainer:
         changed, penalty = self.colours.change(self.rasterizer.workspace, camera, image, self.numbers, camera.view)
         return changed, [LossValue("colours", penalty)]
 
-    def _without_transients(self, planes: Planes, image: Array, step: int) -> tuple[Planes, list[Callable[[], None]]]:
-        """The photograph without what the scene does not have, and what adds the view's residuals to the others."""
-        if (transients := self.transients) is None:
-            return planes, []
-        workspace, camera = planes.workspace, planes.camera
-        residuals, counts = measure_residuals(workspace, camera, image, planes.colours, planes.mask)
-        threshold = transients.threshold(self.numbers, step)
-        if threshold is not None:
-            planes = replace(planes, mask=transients.mask(workspace, camera, residuals, threshold))
-        return planes, [lambda: transients.learn(self.numbers, counts())]
-
     def _uncoloured(self, view: ViewLosses, gradient: Array) -> tuple[Array, Sequence[Callable[[], None]]]:
         """The gradient by the image as it was rendered, and what changes the numbers of transforms and photographs."""
         colours, comparison, learning = self.colours, view.comparison, view.learning
@@ -191,7 +188,7 @@ class Trainer:
             return gradient, learning
         workspace, numbers = self.rasterizer.workspace, self.numbers
         gradient, learn = colours.change_back(
-            workspace, camera, view.frame.image, gradient, numbers, number, comparison.step
+            workspace, camera, view.rendered, gradient, numbers, number, comparison.step
         )
         return gradient, [*learning, learn]
 

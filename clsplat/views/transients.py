@@ -4,6 +4,7 @@ Found by their residuals alone (SpotLessSplats, Sabour et al. 2024, without its 
 """
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Annotated, ClassVar
 
 import numpy as np
@@ -15,6 +16,7 @@ from clsplat.opencl.program import constants
 from clsplat.render.camera import DeviceCamera
 from clsplat.render.workspace import Workspace
 from clsplat.settings import Settings
+from clsplat.views.transforms import Planes
 
 _NAMES = constants("transients.cl")
 BINS, FIRST_BIN, BIN_SHIFT = (int(_NAMES[name]) for name in ("BINS", "FIRST_BIN", "BIN_SHIFT"))
@@ -68,6 +70,18 @@ class Transients(Settings):
 def _upper(bin_number: int) -> float:
     """The least residual above a bin: its upper bits are those of the next one."""
     return float(np.array(FIRST_BIN + bin_number + 1 << BIN_SHIFT, np.int32).view(np.float32))
+
+
+def without_transients(
+    transients: Transients, planes: Planes, image: Array, numbers: dict[str, float], step: int
+) -> tuple[Planes, list[Callable[[], None]]]:
+    """Return a photograph without what the scene does not have, and what adds its residuals to the distribution."""
+    workspace, camera = planes.workspace, planes.camera
+    residuals, counts = measure_residuals(workspace, camera, image, planes.colours, planes.mask)
+    threshold = transients.threshold(numbers, step)
+    if threshold is not None:
+        planes = replace(planes, mask=transients.mask(workspace, camera, residuals, threshold))
+    return planes, [lambda: transients.learn(numbers, counts())]
 
 
 def measure_residuals(

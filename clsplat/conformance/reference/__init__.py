@@ -58,6 +58,7 @@ from clsplat.conformance.reference.kinds import (
     Splats,
     Thresholds,
 )
+from clsplat.conformance.reference.layer import gradient_behind, laid_over, layer_cover
 from clsplat.conformance.reference.losses import (
     dssim,
     l1,
@@ -130,6 +131,7 @@ __all__ = [
     "footprint",
     "gain_gradient",
     "gain_matrix",
+    "gradient_behind",
     "grid_smoothness",
     "gridded",
     "gridded_backward",
@@ -140,6 +142,8 @@ __all__ = [
     "inverse_depth_loss",
     "l1",
     "l2",
+    "laid_over",
+    "layer_cover",
     "margin",
     "mean_gradient",
     "mean_jacobian",

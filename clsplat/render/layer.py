@@ -1,0 +1,55 @@
+"""A layer of splats of its own before an image: the colours of both, and the gradients of each."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from clsplat.opencl.device import Array
+from clsplat.render.rasterizer import Frame
+from clsplat.render.workspace import Workspace
+
+
+@dataclass(frozen=True)
+class Layer:
+    """A layer and the image behind it; valid until the next layer."""
+
+    frame: Frame  # of the layer alone, before black
+    image: Array  # [3 or 4, rows, stride] of both
+    behind: Array  # [1, rows, stride] T dL/dT of the loss of what the layer covers
+    loss: Callable[[], float]  # its value; waits for the device
+
+
+def lay_over(workspace: Workspace, frame: Frame, image: Array, scale: float) -> Layer:
+    """Return a layer, rendered before black, with the image behind it, [3 or 4, rows, stride].
+
+    scale: factor of the loss of what the layer covers, the sum of 1 - T over pixels.
+    """
+    camera = frame.camera
+    both, sums = workspace.array("image and layer", image.shape), workspace.array("layer sums", camera.rows)
+    behind = workspace.array("behind a layer", (1, camera.rows, camera.stride))
+    workspace.device.program("layer.cl").lay_over(
+        groups=(1, camera.rows),
+        layer=frame.image,
+        transmittance=frame.transmittance,
+        image=image,
+        both=both,
+        behind=behind,
+        row_sums=sums,
+        scale=scale,
+        channels=image.shape[0],
+        **camera.plane_arguments(),
+    )
+    return Layer(frame, both, behind, lambda: scale * float(np.asarray(sums.get()).sum(dtype=np.float64)))
+
+
+def look_behind(workspace: Workspace, frame: Frame, gradient: Array) -> None:
+    """Make the gradient by the colours of both, [3 or 4, rows, stride], that by the image behind, in place."""
+    camera = frame.camera
+    workspace.device.program("layer.cl").look_behind(
+        groups=(1, camera.rows),
+        transmittance=frame.transmittance,
+        gradient=gradient,
+        rows=camera.rows,
+        stride=camera.stride,
+    )
