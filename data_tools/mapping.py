@@ -21,6 +21,7 @@ from data_tools.names import DATABASE, IMAGES, MODEL
 from data_tools.pycolmap_import import require_pycolmap
 from data_tools.reasons import Matched, diagnosis, reasons
 from data_tools.told import warn_of
+from data_tools.tracks import PAIR, with_pairs
 from data_tools.turning import only_turned
 
 LOG = logging.getLogger("clsplat")
@@ -57,11 +58,12 @@ MOST = 1 + len(LATER)  # attempts
 
 
 def map_cameras(
-    source: Path, out: Path, mapper: Mapper = "incremental", threads: int = 1, attempts: int = MOST
+    source: Path, out: Path, mapper: Mapper = "incremental", threads: int = 1, attempts: int = MOST, fewest: int = 3
 ) -> dict[str, Any]:
     """Place cameras and points, in so many attempts at most; keep the largest model as sparse/0, tell of the others.
 
     `mapper: global` is faster for many photographs; more than one thread is faster and not repeatable to the bit.
+    fewest: photographs that show a point, 2 or 3.
     Raises DataError, with the likely reason, when no attempt gives a model of three images.
     """
     pycolmap = require_pycolmap()
@@ -93,6 +95,8 @@ def map_cameras(
         raise DataError(f"{source / IMAGES}: the {len(names)} photographs could not be placed: {diagnosis(matched)}")
     if used.dense:
         matched = Matched.of(pycolmap, out / DENSE, source / IMAGES)
+    if fewest == PAIR:
+        models[0] = with_pairs(models[0], out / DENSE if used.dense else source / DATABASE, out, threads)
     figures = {**_written(models, out, names), "attempt": used.told}
     figures["reasons"] = reasons(matched, [_names(model) for model in models])
     for left in out.glob(".*"):

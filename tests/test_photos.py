@@ -27,6 +27,7 @@ from data_tools.features import Sought, find_features
 from data_tools.gather import list_photographs
 from data_tools.mapping import map_cameras
 from data_tools.matching import Pairing, match_features
+from data_tools.tracks import with_pairs
 from data_tools.undistort import undistort_scene
 from data_tools.vocabulary import alike
 from tests.colmap_writer import CameraEntry, ColmapModel, ImageEntry, PointEntry
@@ -92,6 +93,32 @@ def test_the_same_photographs_give_the_same_cameras(photos, placed, tmp_path):
     again = place(photos, tmp_path)
     for name in ("cameras.bin", "images.bin", "points3D.bin"):
         assert (again / "sparse" / "0" / name).read_bytes() == (placed / "sparse" / "0" / name).read_bytes(), name
+
+
+def test_points_that_two_photographs_show(placed, tmp_path):
+    """The cameras stay, and the points of three photographs; those of pairs come with them."""
+    map_cameras(placed.with_name("matches"), tmp_path, fewest=2)
+    model, before = read_model(tmp_path / "sparse" / "0"), read_model(placed / "sparse" / "0")
+    assert not list(tmp_path.glob(".*"))
+    for number, image in before.images.items():
+        assert np.array_equal(model.images[number].cam_from_world().matrix(), image.cam_from_world().matrix())
+    views = np.array([point.track.length() for point in model.points3D.values()])
+    errors = np.array([point.error for point in model.points3D.values()])
+    known = sum(point.track.length() > 2 for point in before.points3D.values())
+    assert views.min() == 2
+    assert abs((views > 2).sum() - known) < 0.02 * known
+    assert (views == 2).sum() > 0.5 * known
+    assert errors[views == 2].max() <= 1.0
+    once, again = (
+        with_pairs(read_model(placed / "sparse" / "0"), placed.with_name("matches") / "database.db", tmp_path)
+        for _ in range(2)
+    )
+    points = [{number: point.xyz.tobytes() for number, point in found.points3D.items()} for found in (once, again)]
+    assert points[0] == points[1]
+
+
+def read_model(folder: Path):
+    return pytest.importorskip("pycolmap").Reconstruction(str(folder))
 
 
 @pytest.mark.parametrize("matching", ["sequential", "vocabulary"])

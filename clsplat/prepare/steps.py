@@ -141,9 +141,11 @@ class MapCameras(Step):
     """Number of threads; more than one are faster, and the result does not repeat to the bit."""
     attempts: Annotated[int, Field(ge=1, le=MOST)] = MOST
     """Largest number of attempts; 1: none but the first.  Further ones match as `match_features` does."""
+    fewest_views: Literal[2, 3] = 3
+    """Number of photographs that must show a point; with 2 there are two to three times as many points."""
 
     def make(self, source: Path, out: Path, without: Path) -> dict[str, Any]:
-        return map_cameras(source, out, self.mapper, self.threads, self.attempts)
+        return map_cameras(source, out, self.mapper, self.threads, self.attempts, self.fewest_views)
 
     def told(self, figures: dict[str, Any]) -> str:
         return photographs_text({self.stage: figures})
