@@ -21,7 +21,7 @@ from data_tools.names import DATABASE, IMAGES, MODEL
 from data_tools.pycolmap_import import require_pycolmap
 from data_tools.reasons import Matched, diagnosis, reasons
 from data_tools.told import warn_of
-from data_tools.tracks import PAIR, with_pairs
+from data_tools.triangulation import PAIR, with_pairs
 from data_tools.turning import only_turned
 
 LOG = logging.getLogger("clsplat")

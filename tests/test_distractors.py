@@ -156,6 +156,8 @@ def test_they_go_with_other_parts_of_a_training(tiny_scene, tmp_path, others):
     run = train(tiny_scene, tmp_path / "run", *ON, *others)
     assert run.distractors is None
     assert not run.not_finite()
+    tables = checkpoint.load(checkpoint.saved(tmp_path / "run")[-1])[1]
+    assert own_gaussians.split_tables(tables)[0]["updates"].sum() == 12 - 4
 
 
 def test_tables_that_are_not_theirs_are_refused(device, rng):

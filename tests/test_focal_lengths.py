@@ -20,7 +20,7 @@ from clsplat.scene.scene import Scene
 from clsplat.scene.view import View
 from clsplat.scene.zoom import DEGREES, zoomed
 from clsplat.schedule import at_step
-from clsplat.training.poses import photograph_poses, poses_beside, refined
+from clsplat.training.poses import photograph_poses, poses_beside, refined, require_zoom
 from clsplat.views.focal_lengths import FocalLengths
 from clsplat.views.poses import Poses
 from tests.few_steps import FEW, killed
@@ -55,6 +55,12 @@ def test_a_fisheye_has_no_other_focal_length():
     assert zoomed(FISHEYE, 1.0) is FISHEYE
     with pytest.raises(DataError, match=r"OPENCV_FISHEYE has no form with another focal length.*undistort"):
         zoomed(FISHEYE, 1.01)
+
+
+def test_a_training_does_not_learn_a_focal_length_that_cannot_be_written(tiny_scene):
+    scene = read_scene(tiny_scene)
+    with pytest.raises(DataError, match=r"optimize\.poses\.focal: the lens of .*OPENCV_FISHEYE.*undistort"):
+        require_zoom(replace(scene, views=(replace(scene.views[0], lens=FISHEYE),)))
 
 
 def test_views_are_written_with_the_lens_of_their_focal_length(tmp_path):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from clsplat.cluster.fingerprint import Scenes
-from clsplat.errors import DataError
+from clsplat.errors import ConfigError, DataError
 from clsplat.pipeline.file import SceneSettings
 from clsplat.pipeline.loading import load
 from clsplat.runs.model_file import ModelFile
@@ -66,16 +66,19 @@ def test_masks_of_frames_lie_in_folders_of_cameras(tmp_path):
     assert len({view.mask_path for view in views}) == 6
 
 
-def test_they_stand_in_place_of_those_of_the_dataset(tmp_path):
+def test_they_do_not_replace_those_of_the_dataset(tmp_path):
+    """Which may say what no photograph shows, as those of undistortion do."""
     scene = write(tmp_path / "scene", tiny_model())
-    own = masks_of(scene, scene / "masks")
-    names = [view.name for view in read_scene(scene).views]
-    assert all(view.mask_path.is_relative_to(own) for view in read_scene(scene).views)
-    elsewhere = masks_of(scene, tmp_path / "elsewhere")
-    (elsewhere / names[0]).with_suffix(".png").unlink()
-    paths = [view.mask_path for view in applied(scene, elsewhere).views]
-    assert paths[0] is None
-    assert all(path.is_relative_to(elsewhere) for path in paths[1:])
+    masks_of(scene, scene / "masks")
+    told = refusal(applied, scene, masks_of(scene, tmp_path / "elsewhere"))
+    assert told.startswith(f"{scene}: has masks of its own, such as {scene / 'masks'}")
+    assert "leave scene.masks out" in told
+
+
+def test_photographs_that_are_prepared_have_other_shapes(tmp_path):
+    pipeline = load("photos", [f"scene.path='{tmp_path}'", f"scene.masks='{tmp_path}'"])
+    with pytest.raises(ConfigError, match=r"scene\.masks: prepared photographs have another shape"):
+        pipeline.preparation(tmp_path / "run")
 
 
 def test_a_photograph_without_a_mask_counts_whole_and_is_named(tiny_scene, tmp_path, caplog):

@@ -27,7 +27,7 @@ from data_tools.features import Sought, find_features
 from data_tools.gather import list_photographs
 from data_tools.mapping import map_cameras
 from data_tools.matching import Pairing, match_features
-from data_tools.tracks import with_pairs
+from data_tools.triangulation import with_pairs
 from data_tools.undistort import undistort_scene
 from data_tools.vocabulary import alike
 from tests.colmap_writer import CameraEntry, ColmapModel, ImageEntry, PointEntry

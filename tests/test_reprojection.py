@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from clsplat.inspect.findings import POSES, POSES_ERROR
 from clsplat.inspect.inspection import Inspection
 from clsplat.pipeline.choosing import choose
 from clsplat.pipeline.loading import load
@@ -116,6 +117,12 @@ def test_inspect_says_what_to_set(tmp_path, rng, length, level):
     found = [one for one in inspection.findings if "reprojection" in one.fault]
     assert [one.level for one in found] == ([] if level is None else [level])
     assert all('--set "optimize.poses={start: 500}"' in one.remedy for one in found)
+
+
+def test_inspect_says_what_the_recipe_for_photographs_does():
+    (of_poses,) = [one for one in load("photos").settings.choices if "optimize.poses" in one.keys]
+    bound, value, _ = of_poses.values[1]
+    assert (bound, f"optimize.poses={{start: {value['start']}}}") == (POSES_ERROR, POSES)
 
 
 @pytest.mark.slow

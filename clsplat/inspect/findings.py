@@ -202,11 +202,11 @@ def _points(facts: Facts) -> Iterator[Finding]:
         yield Finding("note", fault, "usually sky or wrong matches; they become very large Gaussians")
     if not facts.refusal:
         yield from _coverage(points)
-    if points.error_mean is not None and points.error_mean > POSES_ERROR:
+    if points.error_mean is not None and points.error_mean >= POSES_ERROR:
         fault = f"the mean reprojection error of the points is {points.error_mean:.2f} px at the full size"
         remedy = (
             "renders will be blurred; run bundle adjustment (colmap bundle_adjuster), or learn the cameras too: "
-            f'--set "{POSES}", as `photos` does by itself above {POSES_ERROR:g} px at the size of training'
+            f'--set "{POSES}", as `photos` does by itself from {POSES_ERROR:g} px on at the size of training'
         )
         yield Finding("warning" if points.error_mean > MAX_ERROR else "note", fault, remedy)
 

@@ -47,8 +47,8 @@ class SceneSettings(Settings):
     alpha: Alpha = "transparency"
     """Fourth channel of photographs: blended with the background, or a mask of the pixels that count."""
     masks: ReadPath | None = None
-    """Folder of masks that something else has made, instead of the dataset's own: `a.png` or `a.jpg.png` of the
-    photograph a.jpg, of its size, white in pixels that count.  A photograph without one counts whole."""
+    """Folder of masks that something else has made, for a dataset without: `a.png` or `a.jpg.png` of the photograph
+    a.jpg, of its size, white in pixels that count.  A photograph without one counts whole."""
     background: Literal["auto", "black", "white"] = "auto"
     """Colour behind the scene; auto: white for Blender scenes, else black."""
     image_budget: Annotated[int, Field(gt=0)] | None = None

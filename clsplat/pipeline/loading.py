@@ -51,9 +51,15 @@ class Pipeline:
         return list(self.settings.stages)
 
     def preparation(self, out: Path) -> list[Planned]:
-        """Return the steps before a run in `out`, with the reasons to run them.  Raises DataError."""
-        settings = self.settings
-        return plan(settings.prepare, settings.scene.folder, prepared_folder(out)) if settings.prepare else []
+        """Return the steps before a run in `out`, with the reasons to run them.  Raises DataError or ConfigError."""
+        settings, folder = self.settings, prepared_folder(out)
+        if settings.prepare and settings.scene.masks is not None:
+            raise ConfigError(
+                "scene.masks: prepared photographs have another shape than those of "
+                f"{settings.scene.folder}; expected a scene with cameras: run without scene.masks first, then give the "
+                f"result in {folder} as --scene, with masks of its images"
+            )
+        return plan(settings.prepare, settings.scene.folder, folder) if settings.prepare else []
 
     def resolved(self) -> dict[str, Any]:
         """Return every setting with its value, as plain data in the shape of a file."""

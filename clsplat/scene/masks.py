@@ -17,13 +17,19 @@ def mask_file(folder: Path, name: str) -> Path | None:
 
 
 def with_masks(scene: Scene, folder: Path | None) -> Scene:
-    """Return the scene with the masks in a folder instead of its own; without a folder, the scene.
+    """Return the scene with the masks in a folder; without a folder, the scene.
 
-    A photograph without a mask counts whole.  Raises DataError where there is no such folder, and where no photograph
-    has a mask.
+    A photograph without a mask counts whole.  Raises DataError where there is no such folder, where no photograph has a
+    mask there, and where the dataset has masks already.
     """
     if folder is None:
         return scene
+    own = next((view.mask_path for view in scene.views if view.mask_path), None)
+    if own is not None:
+        raise DataError(
+            f"{scene.path}: has masks of its own, such as {own}; expected a dataset without any beside scene.masks: "
+            "leave scene.masks out, or take those of the dataset away"
+        )
     views = tuple(replace(view, mask_path=mask_file(folder, view.name)) for view in scene.views)
     count, missing = len(views), [view.name for view in views if view.mask_path is None]
     if len(missing) == count:

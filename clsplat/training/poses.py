@@ -46,13 +46,14 @@ def photograph_poses(poses: Poses | None, run: Run, last: int) -> PhotographPose
     cameras = len({focals.cameras[view.name] for view in views})
     found = PhotographPoses(views, poses.start, *rates, replace(focals, rate=poses.focal_rate(last, cameras)))
     if found.focals.rate:
-        _require_zoom(run.original)
+        require_zoom(run.original)
     if not found.begun(run.numbers):
         found.begin(run.numbers, {view.name: depth_of(view, run.scene) for view in views})
     return found
 
 
-def _require_zoom(scene: Scene) -> None:
+def require_zoom(scene: Scene) -> None:
+    """Raise DataError where a view has a lens that cannot be written with another focal length."""
     for view in scene.views:
         if view.lens is not None and not zooms(view.lens):
             raise DataError(

@@ -1,5 +1,6 @@
 """Points that two photographs show, beside those that more do: COLMAP leaves pairs out of its models."""
 
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +9,7 @@ from data_tools.names import IMAGES
 from data_tools.pycolmap_import import require_pycolmap
 
 PAIR = 2  # photographs
-ERROR = 1.0  # px; two photographs alone agree on some point of a line, whatever they match
+ERROR = 1.0  # px of the features' size, the mean of both: any two places that match lie near the rays of some point
 ANGLE = 1.5  # degrees between two rays; as COLMAP asks of all points
 
 
@@ -24,11 +25,9 @@ def with_pairs(model: Any, database: Path, out: Path, threads: int = 1) -> Any:
     options.triangulation.ignore_two_view_tracks = False
     options.triangulation.min_angle = options.mapper.filter_min_tri_angle = ANGLE
     pycolmap.set_random_seed(0)
-    work = out / ".tracks"
-    work.mkdir(exist_ok=True)
-    with explained(out / IMAGES, "triangulate the points"):
+    with tempfile.TemporaryDirectory(dir=out) as work, explained(out / IMAGES, "triangulate the points"):
         found = pycolmap.triangulate_points(
-            model, str(database), str(out / IMAGES), str(work), clear_points=True, options=options
+            model, str(database), str(out / IMAGES), work, clear_points=True, options=options
         )
     for number in [number for number, point in found.points3D.items() if _is_loose(point)]:
         found.delete_point3D(number)
