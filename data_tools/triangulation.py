@@ -35,4 +35,4 @@ def with_pairs(model: Any, database: Path, out: Path, threads: int = 1) -> Any:
 
 
 def _is_loose(point: Any) -> bool:
-    return point.track.length() == PAIR and point.error > ERROR
+    return bool(point.track.length() == PAIR and point.error > ERROR)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from clsplat.errors import DataError
+from clsplat.render.camera import upload_camera
 from clsplat.scene.detect import read_scene
 from clsplat.views.photographs import Photographs
 
@@ -33,6 +34,19 @@ def test_photographs_keep_to_the_budget(device, tiny_scene, kept):
         for view in views:
             np.testing.assert_array_equal(tight.get(view).image(), plenty.get(view).image())
             assert sum(held.nbytes for held in tight._held.values()) <= max(kept, 1) * size
+
+
+@pytest.mark.parametrize("kept", [0, 100])
+def test_a_photograph_has_the_camera_of_the_view_that_is_asked_for(device, tiny_scene, kept):
+    """Whatever camera the same photograph had before: one of a measurement, in a training that learns cameras."""
+    view = read_scene(tiny_scene).views[0]
+    other = replace(view, camera=view.camera.zoomed(0.9), world_to_camera=view.world_to_camera + [0, 0, 0, 0.1])
+    photographs = Photographs(device, "white", budget=kept << 20)
+    for one in (other, view, other):
+        expected = upload_camera(device, one)
+        for camera in (photographs.get(one).camera, photographs.camera(one)):
+            assert camera.values == expected.values
+            np.testing.assert_array_equal(camera.array.get(), expected.array.get())
 
 
 def test_a_damaged_photograph_read_ahead_is_reported_when_it_is_asked_for(device, tiny_scene, tmp_path):

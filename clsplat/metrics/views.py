@@ -101,7 +101,7 @@ def measure(
     """
     results, stillness = list[ViewMetrics](), Stillness(views)
     for view in views if counted is None else counted:
-        photograph = photographs.placed(view)
+        photograph = photographs.get(view)
         if photograph.empty:
             LOG.warning("%s: not measured, since its mask leaves out every pixel; look at the mask", view.name)
             continue

@@ -14,10 +14,12 @@ EXACT = 1e-3  # px: below it places were computed from the cameras, and tell not
 
 def misses(view: View, positions: NDArray[np.floating], places: Floats) -> Floats:
     """Return the vectors, [K, 2] px, from where a view at its full size shows positions, [K, 3], to places, [K, 2] px
-    of the photograph as it was taken; NaN behind the camera."""
+    of the photograph as it was taken; NaN behind the camera, and for places far outside the photograph."""
     points = np.einsum("ij,nj->ni", view.world_to_camera[:, :3], positions) + view.world_to_camera[:, 3]
-    points[~(points[:, 2] > 0)] = np.nan
-    camera = view.camera
+    camera, taken = view.camera, view.lens or view.camera
+    size = np.array([taken.width, taken.height])
+    near = (np.abs(places - size / 2) <= size).all(axis=1)  # a place of a damaged file says nothing of cameras
+    points[~(near & (points[:, 2] > 0))] = np.nan
     with np.errstate(all="ignore"):
         if view.lens is not None:
             return np.asarray(places - view.lens.project(points))

@@ -23,7 +23,7 @@ from clsplat.training.depths import known_depths
 from clsplat.training.distractors import photograph_distractors
 from clsplat.training.forecast import Forecast
 from clsplat.training.placing import more_room, place_harmonics
-from clsplat.training.poses import photograph_poses, write_view_poses
+from clsplat.training.poses import photograph_poses, require_zoom, write_view_poses
 from clsplat.training.profile import clocks
 from clsplat.training.rescue import finite_values
 from clsplat.training.run import Run
@@ -98,6 +98,10 @@ class Optimize(Keeping):
     def run(self, run: Run) -> None:
         for _ in self.iterate(run):
             pass
+
+    def check_in(self, run: Run) -> None:
+        if self.poses and self.poses.focal:
+            require_zoom(run.original)
 
     def iterate(self, run: Run) -> Iterator[ViewLosses]:
         """Train step by step; what a step yields, ViewGradients unless it is skipped, is valid until the next."""

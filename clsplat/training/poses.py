@@ -23,6 +23,7 @@ from clsplat.views.photograph_poses import PhotographPoses
 from clsplat.views.poses import Floats, Poses
 
 FEWEST, POINTS = 10, 10_000  # of the points that tell a depth
+MOST_ZOOM = 10.0  # times a focal length, or a tenth: far beyond what is learned of one
 LOG = logging.getLogger("clsplat")
 
 
@@ -166,10 +167,12 @@ def _with_pose(path: Path, view: View, row: Any) -> View:
         return view
     try:
         fx, fy = map(float, row.get("focal_lengths", (view.camera.fx, view.camera.fy)))
+        if not all(1 / MOST_ZOOM <= zoom <= MOST_ZOOM for zoom in (fx / view.camera.fx, fy / view.camera.fy)):
+            raise ValueError("no focal lengths of this camera")
         camera = replace(view.camera, fx=fx, fy=fy).check()
         return replace(view, world_to_camera=np.array(row["world_to_camera"], np.float64), camera=camera)
     except (AttributeError, KeyError, TypeError, ValueError, PoseError) as error:
         raise DataError(
-            f"{path}: {quoted(view.name)} has no pose of 3 rows of 4 numbers with a rotation, or no two positive focal "
-            "lengths; train again, or remove the file"
+            f"{path}: {quoted(view.name)} has no pose of 3 rows of 4 numbers with a rotation, or no two focal lengths "
+            f"within {MOST_ZOOM:g} times those of its camera; train again, or remove the file"
         ) from error

@@ -116,10 +116,13 @@ class Photographs:
     def camera(self, view: View) -> DeviceCamera:
         """Return the camera of a view."""
         held = self._held.get(_key(view))
-        return held.camera if held else upload_camera(self.device, view)
+        return placed_camera(held.camera, view) if held else upload_camera(self.device, view)
 
     def get(self, view: View) -> Photograph:
-        """Return the photograph of a view.  Raises DataError when its file cannot be read."""
+        """Return the photograph of a view, with the camera that the view has now.
+
+        Raises DataError when its file cannot be read.
+        """
         key = _key(view)
         photograph = self._held.pop(key, None)
         if photograph is None:
@@ -129,13 +132,10 @@ class Photographs:
             mask_on_device, empty = (self.device.upload(mask), not mask.any()) if len(mask) else (None, False)
             transparency = None if shows is None else self.device.upload(shows)
             photograph = Photograph(self.camera(view), self.device.upload(colours), mask_on_device, empty, transparency)
+        elif (camera := placed_camera(photograph.camera, view)) is not photograph.camera:
+            photograph = replace(photograph, camera=camera)
         self._held[key] = photograph
         return photograph
-
-    def placed(self, view: View) -> Photograph:
-        """Return the photograph of a view whose pose and focal lengths may be others than before."""
-        photograph = self.get(view)
-        return replace(photograph, camera=placed_camera(photograph.camera, view))
 
     def of_sizes(self, view: View, original: View, number: int | None = None) -> Photograph:
         """Return the photograph of a view, or of the larger `original` where a mask leaves nothing of the smaller one.

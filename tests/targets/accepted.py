@@ -4,8 +4,10 @@ from collections.abc import Iterable
 
 ACCEPTED = {
     "tgllp: blend_wide.cl (wide, PIXEL_BOX 1) does not compile: ocloc ended with -6": "no GPU takes *wide* by itself",
-    "pvc project_backward (PIXEL_BOX 1) spills registers (41)": "the recipes `box` and `box_7k` alone",
-    "pvc project_backward (PIXEL_BOX 1, TILE 8) spills registers (41)": "the recipes `box` and `box_7k` alone",
+    "pvc project_backward spills registers (26)": "training on Ponte Vecchio",
+    "pvc project_backward (TILE 8) spills registers (26)": "the same",
+    "pvc project_backward (PIXEL_BOX 1) spills registers (12)": "the recipes `box` and `box_7k` alone",
+    "pvc project_backward (PIXEL_BOX 1, TILE 8) spills registers (12)": "the recipes `box` and `box_7k` alone",
 }
 
 
