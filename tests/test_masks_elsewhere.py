@@ -75,6 +75,14 @@ def test_they_do_not_replace_those_of_the_dataset(tmp_path):
     assert "leave scene.masks out" in told
 
 
+def test_the_folder_is_found_from_elsewhere(tiny_scene, tmp_path, monkeypatch):
+    masks_of(tiny_scene, tmp_path / "masks")
+    monkeypatch.chdir(tmp_path)
+    settings = SceneSettings(path=str(tiny_scene), masks="masks")
+    monkeypatch.chdir("/")
+    assert settings.read(tiny_scene)[0].views[0].mask_path.is_relative_to(tmp_path / "masks")
+
+
 def test_photographs_that_are_prepared_have_other_shapes(tmp_path):
     pipeline = load("photos", [f"scene.path='{tmp_path}'", f"scene.masks='{tmp_path}'"])
     with pytest.raises(ConfigError, match=r"scene\.masks: prepared photographs have another shape"):

@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Field, field_validator
 
 from clsplat.errors import ConfigError
 from clsplat.filters import ModelSettings
@@ -66,6 +66,12 @@ class SceneSettings(Settings):
     cameras.  A part of a scene is trained with that of the whole."""
     missing: Missing = "refuse"
     """Photographs that the dataset names and does not have: an error, or `skip`: the scene is read without them."""
+
+    @field_validator("masks")
+    @classmethod
+    def _from_any_folder(cls, masks: str | None) -> str | None:
+        """A run is measured from other working folders than that where it began."""
+        return masks and str(Path(masks).absolute())
 
     @property
     def downscales(self) -> tuple[float, ...]:
