@@ -40,7 +40,9 @@ def test_photographs_keep_to_the_budget(device, tiny_scene, kept):
 def test_a_photograph_has_the_camera_of_the_view_that_is_asked_for(device, tiny_scene, kept):
     """Whatever camera the same photograph had before: one of a measurement, in a training that learns cameras."""
     view = read_scene(tiny_scene).views[0]
-    other = replace(view, camera=view.camera.zoomed(0.9), world_to_camera=view.world_to_camera + [0, 0, 0, 0.1])
+    other = replace(
+        view, camera=view.camera.zoomed(0.9), world_to_camera=view.world_to_camera + np.float64([0, 0, 0, 0.1])
+    )
     photographs = Photographs(device, "white", budget=kept << 20)
     for one in (other, view, other):
         expected = upload_camera(device, one)

@@ -34,9 +34,9 @@ def with_masks(scene: Scene, folder: Path | None) -> Scene:
     count, missing = len(views), [view.name for view in views if view.mask_path is None]
     if len(missing) == count:
         fault = f"holds no mask of a photograph of {scene.path}" if folder.is_dir() else "no such folder"
-        long, short = _candidates(folder, missing[0])
+        names = " or ".join(str(file) for file in dict.fromkeys(reversed(_candidates(folder, missing[0]))))
         raise DataError(
-            f"{folder}: {fault}; expected {short} or {long} for the first of {count}, white in pixels "
+            f"{folder}: {fault}; expected {names} for the first of {count}, white in pixels "
             "that count: name the files so, or give another folder as scene.masks"
         )
     if missing:
