@@ -24,7 +24,7 @@ static inline VF view_direction(
 }
 
 /* Gradients of the mean, quaternion and log-scales from the sums over pixels of a Gaussian, and that by a factor
- * of both focal lengths.  A clamped ray is a limit / focal length (RAY_MARGIN): its element of J does not change with it. */
+ * of both focal lengths.  A clamped ray is a limit / focal length (RAY_MARGIN): its element of J does not change. */
 static inline void shape_backward(const shape_t *s, __constant camera_t *camera, const VF *m, const float compensate,
                                   VF *grad_mean2d, VF *grad_mean, VF *grad_quat, VF *grad_scale, VF *grad_focal)
 {
