@@ -125,7 +125,7 @@ def test_a_resumed_run_ends_with_the_bits_of_one_that_was_not(with_grids, tiny_s
     files = [(folder / "view_colours.npy").read_bytes() for folder in (out, with_grids)]
     assert files[0] == files[1]
     _, tables = checkpoint.load(out / "checkpoints" / "step_000012.npz")
-    own, _ = colour_grids.split_tables(tables)
+    own, _ = archive.split(tables, colour_grids.FOLDER)
     assert own.keys() == {"values", "moment1", "moment2"}
     assert all((table == run.colour_grids.tables()[name]).all() for name, table in own.items())
     names = {view.name for view in run.scene.split("train")}
@@ -180,7 +180,8 @@ def test_the_best_model_is_left_with_the_grids_of_its_step(tiny_scene, tmp_path)
     run = train(tiny_scene, tmp_path / "run", *GRID, *kept, "optimize.evaluate.every=4", wild)
     assert run.best.found.step == 8, "the last steps ruin it"
     _, tables = checkpoint.load(tmp_path / "run" / "checkpoints" / "step_000008.npz")
-    expected = colour_grids.split_tables(tables)[0]["values"].reshape(-1, 3, 4, 4, 2, 3).transpose(0, 3, 4, 5, 1, 2)
+    own, _ = archive.split(tables, colour_grids.FOLDER)
+    expected = own["values"].reshape(-1, 3, 4, 4, 2, 3).transpose(0, 3, 4, 5, 1, 2)
     found = np.load(tmp_path / "run" / "view_colours.npy")
     assert (found == expected + np.eye(3, 4, dtype=np.float32)).all()
 
@@ -254,7 +255,7 @@ def test_a_checkpoint_that_lost_its_grids_is_refused(with_grids, tmp_path):
         archive.write(file, notes, left.items())
     with pytest.raises(DataError, match="it has grids of the colours of 0 photographs, and its numbers name 8 rows"):
         checkpoint.load(tmp_path / "step_000012.npz")
-    own, _ = colour_grids.split_tables(tables)
+    own, _ = archive.split(tables, colour_grids.FOLDER)
     rows = {f"colours/{name}/row": float(row) for row, name in enumerate("abcdefgh")}
     colour_grids.require_tables(own, rows)
     for damage in ({"colours/h/row": 6.0}, {"colours/h/row": 500.0}, {"colours/a/row": 0.5}):

@@ -14,6 +14,7 @@ from clsplat.formats.table import read as read_model
 from clsplat.gaussians.tables import DeviceModel, Gaussians
 from clsplat.render.rasterizer import PIXEL_SUMS, Rasterizer
 from clsplat.training import checkpoint, own_gaussians
+from clsplat.training.archive import split
 from clsplat.training.own_gaussians import NEAR, OwnGaussians, PhotographDistractors, first_tables
 from clsplat.views.distractors import Distractors
 from tests.few_steps import FEW, killed
@@ -136,11 +137,11 @@ def test_no_file_and_no_measurement_has_them_and_a_resumed_run_has_the_same_bits
     assert digest(tmp_path / "killed") == expected
     assert again.distractors is None
     (one, two) = (checkpoint.load(checkpoint.saved(tmp_path / name)[-1])[1] for name in ("one", "killed"))
-    own = own_gaussians.split_tables(one)[0]
+    own = split(one, own_gaussians.FOLDER)[0]
     assert own["means"].shape == (8 * 30, 3)
     assert own["updates"].sum() == 12 - 4
     for name, table in own.items():
-        np.testing.assert_array_equal(table, own_gaussians.split_tables(two)[0][name])
+        np.testing.assert_array_equal(table, split(two, own_gaussians.FOLDER)[0][name])
 
 
 @pytest.mark.slow
@@ -157,7 +158,7 @@ def test_they_go_with_other_parts_of_a_training(tiny_scene, tmp_path, others):
     assert run.distractors is None
     assert not run.not_finite()
     tables = checkpoint.load(checkpoint.saved(tmp_path / "run")[-1])[1]
-    assert own_gaussians.split_tables(tables)[0]["updates"].sum() == 12 - 4
+    assert split(tables, own_gaussians.FOLDER)[0]["updates"].sum() == 12 - 4
 
 
 def test_tables_that_are_not_theirs_are_refused(device, rng):

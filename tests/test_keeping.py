@@ -20,6 +20,7 @@ from clsplat.runs.experiment import Job
 from clsplat.runs.refitting import as_trained
 from clsplat.runs.summary import summary
 from clsplat.training import checkpoint, kept
+from clsplat.training.archive import split
 from clsplat.training.kept import Best, Measured
 from tests.test_training import digest, train
 
@@ -349,7 +350,7 @@ FOUND = Best(found=NOW, degree=0, metrics={}, evaluations=1, since=0, apart=None
 
 def test_a_checkpoint_without_its_best_model_is_damaged(best):
     state, tables = checkpoint.load(best / "checkpoints" / "step_000020.npz")
-    _, own = kept.split_tables(tables)
+    own, _ = split(tables, kept.FOLDER)
     assert state.best is not None
     assert state.best.found.step == BEST
     kept.check(state.best, own)
@@ -362,7 +363,7 @@ def test_a_checkpoint_without_its_best_model_is_damaged(best):
             kept.check(state.best, wrong)
     with pytest.raises(DataError, match="says nothing of"):
         kept.check(None, own)
-    assert set(kept.split_tables(checkpoint.load(best / "checkpoints" / "step_000002.npz")[1])[1]) == set()
+    assert split(checkpoint.load(best / "checkpoints" / "step_000002.npz")[1], kept.FOLDER)[0] == {}
 
 
 # ---- in words

@@ -22,7 +22,8 @@ from clsplat.runs.found import has_ended
 from clsplat.runs.model_file import evaluate
 from clsplat.runs.single import run_pipeline
 from clsplat.training import checkpoint
-from clsplat.training.sky import check_tables, split_tables
+from clsplat.training.archive import split
+from clsplat.training.sky import FOLDER, check_tables
 from clsplat.views.sky_share import looked_at, panorama
 from tests.few_steps import FEW
 from tests.test_training import digest, train
@@ -243,7 +244,7 @@ def test_a_damaged_sky_is_refused(tmp_path, damage):
 
 def test_a_damaged_sky_in_a_checkpoint_is_refused(with_sky):
     _, tables = checkpoint.archive.read(with_sky / "checkpoints" / "step_000012.npz")
-    behind, _ = split_tables(tables)
+    behind, _ = split(tables, FOLDER)
     check_tables(behind)
     for name, table in {"texels": behind["texels"][:-1], "biases": behind["moment1"]}.items():
         with pytest.raises(DataError, match=f"{name} of its sky"):

@@ -12,7 +12,7 @@ import hashlib
 import io
 import json
 import zipfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -65,6 +65,12 @@ def read(path: Path) -> tuple[Notes, Arrays]:
         if isinstance(error, OSError) and error.errno == errno.EIO:
             raise DataError(f"the disk cannot read it: {error.strerror}") from error
         raise DataError("is empty" if empty else f"differs from its checksum ({reason})") from error
+
+
+def split(arrays: Mapping[str, NDArray[np.float32]], folder: str) -> tuple[Arrays, Arrays]:
+    """Divide arrays into those whose names begin with `folder`, by the rest of their names, and the others."""
+    own = {name.removeprefix(folder): array for name, array in arrays.items() if name.startswith(folder)}
+    return own, {name: array for name, array in arrays.items() if not name.startswith(folder)}
 
 
 def _add(archive: zipfile.ZipFile, name: str, array: NDArray[Any]) -> str:

@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from clsplat.errors import DataError
 from clsplat.opencl.device import Device
@@ -15,12 +14,6 @@ from clsplat.views.grid_tables import GridTables as GridTables
 from clsplat.views.view_colours import TABLE
 
 FOLDER = "colour_grids/"  # before the names of their tables in a checkpoint
-
-
-def split_tables(tables: Mapping[str, NDArray[np.float32]]) -> tuple[Tables, Tables]:
-    """Divide the tables of a checkpoint into those of grids, by their own names, and the others."""
-    own = {name.removeprefix(FOLDER): table for name, table in tables.items() if name.startswith(FOLDER)}
-    return own, {name: table for name, table in tables.items() if not name.startswith(FOLDER)}
 
 
 def check_tables(tables: Tables) -> None:

@@ -144,12 +144,6 @@ class LearnedField:
                 levels.differentiate(self.field.parameters, level, target, self._gradient)
 
 
-def split_tables(tables: Mapping[str, NDArray[np.float32]]) -> tuple[Tables, Tables]:
-    """Divide the tables of a checkpoint into those of a field, by their own names, and the others."""
-    own = {name.removeprefix(FOLDER): table for name, table in tables.items() if name.startswith(FOLDER)}
-    return own, {name: table for name, table in tables.items() if not name.startswith(FOLDER)}
-
-
 def check_tables(shape: FieldShape, tables: Tables, others: Tables) -> None:
     """Raise DataError for tables that are not those of a field of a shape."""
     if others:

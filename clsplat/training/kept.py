@@ -10,6 +10,7 @@ from clsplat.errors import DataError
 from clsplat.gaussians.model import WIDTHS
 from clsplat.gaussians.tables import INTERVAL2, PARAMETERS, DeviceModel
 from clsplat.training import colour_grids, sky
+from clsplat.training.archive import split
 
 FOLDER = "best/"  # before the names of its tables in a checkpoint
 APART = 6.0  # dB: a model that is so much better where it was trained has learnt its photographs by heart (ours)
@@ -100,21 +101,15 @@ def tables_of(model: DeviceModel) -> Tables:
     return {name: gaussians.get(name) for name in names}
 
 
-def split_tables(tables: Tables) -> tuple[Tables, Tables]:
-    """Divide the tables of a checkpoint into those of the run and those of its best model, with their own names."""
-    best = {name.removeprefix(FOLDER): table for name, table in tables.items() if name.startswith(FOLDER)}
-    return {name: table for name, table in tables.items() if not name.startswith(FOLDER)}, best
-
-
 def check(best: Best | None, tables: Tables) -> None:
     """Raise DataError for tables that are not those of a best model."""
     if best is None or best.taken is not None:
         if tables:
             raise DataError("it holds a best model that it says nothing of")
         return
-    behind, tables = sky.split_tables(tables)
+    behind, tables = split(tables, sky.FOLDER)
     sky.check_tables(behind)
-    of_colours, tables = colour_grids.split_tables(tables)
+    of_colours, tables = split(tables, colour_grids.FOLDER)
     colour_grids.check_tables(of_colours)
     colour_grids.require_tables(of_colours, best.numbers)
     if missing := [name for name in (*PARAMETERS, "filter_variance") if name not in tables]:

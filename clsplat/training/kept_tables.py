@@ -3,6 +3,7 @@
 from clsplat.gaussians.tables import Gaussians
 from clsplat.render.backdrops import Auto, Directions
 from clsplat.training import colour_grids, sky
+from clsplat.training.archive import split
 from clsplat.training.kept import Tables, tables_of
 from clsplat.training.run import Run
 from clsplat.training.sky import FOLDER, LearnedSky
@@ -19,8 +20,8 @@ def copied_of(run: Run) -> Tables:
 
 def put_back(run: Run, tables: Tables, degree: int) -> None:
     """Make what was copied the run's model."""
-    own, of_gaussians = sky.split_tables(tables)
-    of_colours, of_gaussians = colour_grids.split_tables(of_gaussians)
+    own, of_gaussians = split(tables, sky.FOLDER)
+    of_colours, of_gaussians = split(of_gaussians, colour_grids.FOLDER)
     if of_colours and run.colour_grids:
         run.colour_grids.set(of_colours)
     run.model = run.model_settings.model(Gaussians(run.device, of_gaussians), degree)

@@ -125,12 +125,6 @@ def _adam(device: Device, tables: Mapping[str, NDArray[np.float32]], number: int
     return adam
 
 
-def split_tables(tables: Mapping[str, NDArray[np.float32]]) -> tuple[Tables, Tables]:
-    """Divide the tables of a checkpoint into those of distractors, by their own names, and the others."""
-    own = {name.removeprefix(FOLDER): table for name, table in tables.items() if name.startswith(FOLDER)}
-    return own, {name: table for name, table in tables.items() if not name.startswith(FOLDER)}
-
-
 def check_tables(tables: Mapping[str, NDArray[np.float32]]) -> None:
     """Raise DataError for tables that are not those of distractors; there may be none."""
     if not tables:

@@ -11,7 +11,7 @@ from clsplat.errors import DataError
 from clsplat.gaussians.tables import Gaussians
 from clsplat.training import colour_grids, field, kept, own_gaussians, sky
 from clsplat.training.adam import Adam
-from clsplat.training.archive import Arrays
+from clsplat.training.archive import Arrays, split
 from clsplat.training.field import LearnedField
 from clsplat.training.kept_tables import restore_sky
 from clsplat.training.placing import make_room
@@ -48,16 +48,16 @@ def check(state: State, tables: Arrays) -> None:
     if state.field:
         if state.updates.keys() != {UPDATES}:
             raise DataError("it counts updates of other parameters than those of its field")
-        field.check_tables(state.field, *field.split_tables(tables))
+        field.check_tables(state.field, *split(tables, field.FOLDER))
         return
-    own, best = kept.split_tables(tables)
+    best, own = split(tables, kept.FOLDER)
     kept.check(state.best, best)
-    behind, own = sky.split_tables(own)
+    behind, own = split(own, sky.FOLDER)
     sky.check_tables(behind)
-    of_colours, own = colour_grids.split_tables(own)
+    of_colours, own = split(own, colour_grids.FOLDER)
     colour_grids.check_tables(of_colours)
     colour_grids.require_tables(of_colours, state.numbers)
-    of_photographs, own = own_gaussians.split_tables(own)
+    of_photographs, own = split(own, own_gaussians.FOLDER)
     own_gaussians.check_tables(of_photographs)
     check_tables(state, {name.removeprefix("gaussians/"): table for name, table in own.items()})
 
@@ -65,15 +65,15 @@ def check(state: State, tables: Arrays) -> None:
 def restore(run: Run, state: State, tables: Arrays) -> None:
     """Put the tables of a state into a run."""
     if state.field:
-        own, _ = field.split_tables(tables)
+        own, _ = split(tables, field.FOLDER)
         run.learned_field = LearnedField.of_tables(state.field, own, run.photographs.background)
         run.learned_field.updates = state.updates[UPDATES]
         return
-    tables, run.best_tables = kept.split_tables(tables)
-    behind, tables = sky.split_tables(tables)
-    of_colours, tables = colour_grids.split_tables(tables)
+    run.best_tables, tables = split(tables, kept.FOLDER)
+    behind, tables = split(tables, sky.FOLDER)
+    of_colours, tables = split(tables, colour_grids.FOLDER)
     run.colour_grids = colour_grids.restored(of_colours, run.device)
-    of_photographs, tables = own_gaussians.split_tables(tables)
+    of_photographs, tables = split(tables, own_gaussians.FOLDER)
     run.distractors = own_gaussians.restored(of_photographs, run.device)
     gaussians = Gaussians(run.device, {name.removeprefix("gaussians/"): table for name, table in tables.items()})
     run.model = run.model_settings.model(gaussians, state.degree)

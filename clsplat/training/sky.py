@@ -69,12 +69,6 @@ class LearnedSky:
         rasterizer.skies.update(self.sky, frame.camera, by_texels, self._arrays, rate)
 
 
-def split_tables(tables: Mapping[str, NDArray[np.float32]]) -> tuple[Tables, Tables]:
-    """Divide the tables of a checkpoint into those of the sky, by their own names, and the others."""
-    own = {name.removeprefix(FOLDER): table for name, table in tables.items() if name.startswith(FOLDER)}
-    return own, {name: table for name, table in tables.items() if not name.startswith(FOLDER)}
-
-
 def check_tables(tables: Tables) -> None:
     """Raise DataError for tables that are not those of a sky; there may be none."""
     if not tables:
