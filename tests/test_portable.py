@@ -60,12 +60,15 @@ os.readlink, os.stat, os.listdir = outside(os.readlink), outside(os.stat), outsi
 SYSTEMS = {"without POSIX": WITHOUT_POSIX.format(modules=sorted(POSIX_ONLY - {"posix"})), "like macOS": LIKE_MACOS}
 
 
+def lacking(folder: Path, *systems: str) -> dict[str, str]:
+    """The environment of processes on such systems; `folder` is for what changes them."""
+    (folder / "sitecustomize.py").write_text("".join(systems))
+    return {**os.environ, "PYTHONPATH": os.pathsep.join([str(folder), str(ROOT)])}
+
+
 @pytest.fixture(scope="module", params=SYSTEMS)
 def system(request, tmp_path_factory) -> dict[str, str]:
-    """The environment of processes on such a system."""
-    folder = tmp_path_factory.mktemp("system")
-    (folder / "sitecustomize.py").write_text(SYSTEMS[request.param])
-    return {**os.environ, "PYTHONPATH": os.pathsep.join([str(folder), str(ROOT)])}
+    return lacking(tmp_path_factory.mktemp("system"), SYSTEMS[request.param])
 
 
 def command(environment: dict[str, str], *arguments: str | Path, expect: int = 0, text: bool = True):
@@ -76,8 +79,9 @@ def command(environment: dict[str, str], *arguments: str | Path, expect: int = 0
     return done
 
 
-def test_every_test_is_found(system):
-    command(system, "pytest", "--collect-only", "-qq", "-p", "no:cacheprovider", ROOT / "tests")
+def test_every_test_is_found(tmp_path):
+    both = lacking(tmp_path, *SYSTEMS.values())
+    command(both, "pytest", "--collect-only", "-qq", "-p", "no:cacheprovider", ROOT / "tests")
 
 
 def test_a_scene_is_made_trained_and_resumed(system, tmp_path):

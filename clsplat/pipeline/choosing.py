@@ -95,9 +95,9 @@ def held(data: dict[str, Any], places: Sequence[Place]) -> dict[Place, tuple[int
         if len(choice["keys"]) < 2:
             continue
         for key in choice["keys"]:
-            touching = {place for place in places if _touch(place, _place(data, key))}
-            if touching == {_place(data, key)}:
-                found[touching.pop()] = number, key
+            own = _place(data, key)
+            if {place for place in places if _touch(place, own)} == {own}:
+                found[own] = number, key
     return found
 
 
@@ -146,7 +146,8 @@ def without_overridden(data: dict[str, Any], places: Collection[Place]) -> dict[
         return data
     left = list(choices)
     for number, choice in _choices(data):
-        kept = [not any(_touch(_place(data, key), place) for place in places) for key in choice["keys"]]
+        own = [_place(data, key) for key in choice["keys"]]
+        kept = [not any(_touch(one, place) for place in places) for one in own]
         if not all(kept):
             left[number] = _columns(choice, kept)
     return {**data, "choices": [one for one in left if one is not None]}
