@@ -10,7 +10,7 @@ from tests.test_every_recipe import short, train
 
 pytestmark = pytest.mark.slow
 
-FAMILIES = {"absgs", "auto", "auto_opti3dgs", "dash", "fast", "fastgs", "gdgs", "mcmc", "mini"}
+FAMILIES = {"absgs", "auto", "auto_opti3dgs", "dash", "fast", "fast_30k", "fastgs", "gdgs", "mcmc", "mini"}
 FAMILIES |= {"opti3dgs", "speedy", "steep", "taming"}
 GROWTH = sorted(name for name in shipped() if name.removesuffix("_7k") in FAMILIES)
 EWA = ["model.screen_filter={type: ewa, variance: 0.3}"]

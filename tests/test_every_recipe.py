@@ -37,7 +37,7 @@ RECIPES = [
 ]
 LOOKS_AT_VIEWS = {"fastgs_7k", "speedy_7k", "mini_7k", "taming_7k"}
 ACTS = {  # what decides in a family of recipes; `clone` in all others
-    "auto": "clone split prune_spare", "fast": "clone prune_useless",
+    "auto": "clone split prune_spare", "fast": "clone prune_useless", "fast_30k": "clone prune_useless",
     "fastgs": "split prune_inaccurate", "gdgs": "clone_crowded", "mcmc": "relocate",
     "micro_splatting": "split_textured", "micro_splatting_v2": "merge_neighbours prune_unimportant",
     "mini": "clone prune_useless", "speedy": "prune_least", "steep": "split_saddle",
