@@ -87,6 +87,8 @@ def test_an_override_takes_the_place_of_a_choice(tmp_path, override, left):
         (DEGREE.replace("[0, 0]", "[1, 0]"), "the first one from 0"),
         (DEGREE.replace("photographs", "moons"), "photographs_per_point"),
         (f"{DEGREE}, {DEGREE}", "chosen twice"),
+        (DEGREE.replace("[8, 1]", "[8, {times: 0}]"), "with a number above 0, got"),
+        (DEGREE.replace("[8, 1]", "[8, {times: half}]"), "with a number above 0, got"),
         (
             DEGREE.replace("model.sh_degree", "optimize.patience").replace("[0, 0]", "[0, 4]"),
             "'patience' is for 'keep: best'",
@@ -121,6 +123,34 @@ def test_what_is_measured_of_a_scene(tiny_scene):
     sizes = measured(scene.downscaled(1, 2))
     assert (sizes["photographs"], sizes["pixels"]) == (count, 1600), "each photograph counts once"
     assert "photographs_per_point" not in sizes
+
+
+def test_the_nearest_points_are_those_before_any_training_photograph(tiny_scene):
+    """Of a photograph, the depth that a hundredth of its points fall below; those behind a camera do not count."""
+    scene = read_scene(tiny_scene)
+    trained, tested = scene.split("train")[:2], scene.split("test")[0]
+    depths = [np.r_[0.01, -3, np.full(300, 5.0)], np.array([-1.0, 2.5]), np.array([0.5])]
+    positions, seen = [], {}
+    for view, own in zip((*trained, tested), depths, strict=True):
+        to_world = np.linalg.inv(np.vstack([view.world_to_camera, [0, 0, 0, 1]]))
+        seen[view.name] = np.arange(len(own)) + sum(map(len, positions))
+        positions.append(np.column_stack([0 * own, 0 * own, own, own**0]) @ to_world[:3].T)
+    tracks = Tracks(np.concatenate(positions), seen)
+    assert measured(replace(scene, tracks=tracks))["nearest_points"] == pytest.approx(2.5)
+    first = replace(tracks, seen={trained[0].name: seen[trained[0].name]})
+    assert measured(replace(scene, tracks=first))["nearest_points"] == pytest.approx(5)
+    behind = replace(tracks, seen={trained[1].name: seen[trained[1].name][:1]})
+    assert "nearest_points" not in measured(replace(scene, tracks=behind))
+    assert "nearest_points" not in measured(scene)
+
+
+@pytest.mark.parametrize(("nearest", "near"), [(None, 0.2), (0.27, 0.2), (0.4, 0.2), (4.8634, 2.43), (130.0, 65)])
+def test_photographs_of_what_is_far_away_draw_nothing_near(nearest, near):
+    settings = load("photos").settings
+    chosen = choose(settings, {"photographs": 9} | ({"nearest_points": nearest} if nearest else {}))
+    assert chosen.model.near == near
+    assert load("photos", ["model.near=0.3"]).settings.model.near == 0.3
+    assert [one.keys for one in load("photos", ["model.near=0.3"]).settings.choices if "model.near" in one.keys] == []
 
 
 def test_a_run_writes_what_it_chose_and_repeats_without_choosing(tiny_scene, tmp_path):
