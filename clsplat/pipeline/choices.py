@@ -1,7 +1,6 @@
 """Choices that a run makes by its photographs, and what it writes of them into its pipeline file."""
 
 import json
-import math
 from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, Field, model_validator
@@ -37,9 +36,7 @@ class CaptureChoice(Settings):
     by: Measure
     """What is measured."""
     values: Annotated[list[Row], AfterValidator(_ascending)]
-    """Rows [from, a value of each key]: those of the last row whose bound the measure reaches.
-
-    `{times: 0.5}` is half of the measure."""
+    """Rows [from, a value of each key]: those of the last row whose bound the measure reaches."""
     since: str | list[str]
     """Why these values, in a few words: of all rows, or of each."""
     given: dict[str, Any] = Field({})
@@ -59,8 +56,6 @@ class CaptureChoice(Settings):
             raise ValueError(f"since: expected words, or words for each of {len(self.values)} rows")
         if wrong_key := next((key for key in self.given if key not in self.keys), None):
             raise ValueError(f"given: expected some of {', '.join(self.keys)}, got {wrong_key}")
-        for value in (value for row in self.values for value in row[1:]):
-            _times(value)
         return self
 
     def of(self, measures: dict[Measure, float], before: list[Any], others: Others = "row") -> "CaptureChoice":
@@ -73,7 +68,7 @@ class CaptureChoice(Settings):
             reason, chosen = f"the dataset does not tell {self.by}", before
         else:
             at = max(number for number, row in enumerate(self.values) if found >= row[0])
-            chosen = [_at_measure(value, found) for value in self.values[at][1:]]
+            chosen = self.values[at][1:]
             reason = f"{found:,.4g} {UNITS[self.by]}; {self.since if isinstance(self.since, str) else self.since[at]}"
         if self.given:
             keys = ", ".join(self.given)
@@ -99,22 +94,6 @@ class CaptureChoice(Settings):
     def undone(self) -> "CaptureChoice":
         """Return it before a choice."""
         return self.model_copy(update={"chosen": None, "instead_of": None, "reason": ""})
-
-
-def _at_measure(value: Any, found: float) -> Any:
-    """A value of a row; of `{times: NUMBER}` so many times the measure, in three digits."""
-    times = _times(value)
-    return value if times is None else float(f"{times * found:.3g}")
-
-
-def _times(value: Any) -> float | None:
-    """The number of `{times: NUMBER}`; None of any other value.  Raises ValueError."""
-    if not isinstance(value, dict) or value.keys() != {"times"}:
-        return None
-    times = value["times"]
-    if isinstance(times, bool) or not isinstance(times, int | float) or not 0 < times < math.inf:
-        raise ValueError(f"values: expected {{times: NUMBER}} with a number above 0, got {value}")
-    return float(times)
 
 
 def without_choices(data: Any) -> Any:

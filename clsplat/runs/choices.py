@@ -9,7 +9,7 @@ from clsplat.pipeline.loading import Pipeline
 from clsplat.pipeline.on_host import harmonics_of
 from clsplat.pipeline.stretching import of_trainings
 from clsplat.render.backdrops import Auto as AutoSky
-from clsplat.scene.capture import measured
+from clsplat.scene.capture import measured, nearest_points
 from clsplat.stages.optimize import Optimize
 from clsplat.training.colours import settled
 from clsplat.training.run import Run
@@ -27,7 +27,18 @@ def settle(pipeline: Pipeline, run: Run) -> Pipeline:
     Choices that are made already stay.
     """
     with run.status.stage("choose"):
+        if any(isinstance(stage, Optimize) for stage in pipeline.stages):
+            _warn_of_near(pipeline.settings.model.near, nearest_points(run.scene))
         return _taken(_with_colours(_by_capture(pipeline, run), run), run)
+
+
+def _warn_of_near(near: float, nearest: float | None) -> None:
+    if nearest is not None and nearest < near:
+        LOG.warning(
+            "nothing is drawn nearer than model.near=%g scene units, and the points of a training photograph begin at "
+            "%.3g: add --set model.near=%.2g",
+            *(near, nearest, nearest / 2),
+        )
 
 
 def _by_capture(pipeline: Pipeline, run: Run) -> Pipeline:

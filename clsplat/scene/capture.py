@@ -1,22 +1,20 @@
 """What is measured of a capture before training, for the choices that follow from it."""
 
-from collections.abc import Container, Iterable
+from collections.abc import Container
 from typing import Literal
 
 import numpy as np
 
 from clsplat.scene.reprojection import reprojection_errors
 from clsplat.scene.scene import Scene
-from clsplat.scene.view import View
 
-Measure = Literal["photographs", "photographs_per_point", "pixels", "points", "nearest_points", "reprojection_error"]
+Measure = Literal["photographs", "photographs_per_point", "pixels", "points", "reprojection_error"]
 NEAREST = 0.01  # share of the points of a photograph that may lie nearer: some of them are mistaken
 UNITS: dict[Measure, str] = {
     "photographs": "training photographs",
     "photographs_per_point": "training photographs show a point, in the mean",
     "pixels": "pixels has a training photograph, in the median",
     "points": "points",
-    "nearest_points": "scene units before a training photograph lie the nearest of its points, at the least",
     "reprojection_error": "px are between a point and where photographs show it, in the mean at the size of training",
 }
 
@@ -30,17 +28,19 @@ def measured(scene: Scene) -> dict[Measure, float]:
         "photographs_per_point": _photographs_per_point(scene, views),
         "pixels": float(np.median([view.camera.width * view.camera.height for view in views.values()])),
         "points": len(scene.points) if scene.points else None,
-        "nearest_points": _nearest_points(scene, views.values()),
         "reprojection_error": None if errors is None else float(errors.mean()),
     }
     return {measure: value for measure, value in found.items() if value is not None}
 
 
-def _nearest_points(scene: Scene, views: Iterable[View]) -> float | None:
-    """The least of the depths, scene units, that a hundredth of the points of a view fall below."""
+def nearest_points(scene: Scene) -> float | None:
+    """Return the least of the depths, scene units, that a hundredth of the points of a training view fall below.
+
+    None where the dataset does not tell which points its photographs show.
+    """
     if scene.tracks is None:
         return None
-    shown = [(view, scene.tracks.positions[scene.tracks.seen.get(view.name, [])]) for view in views]
+    shown = [(view, scene.tracks.positions[scene.tracks.seen.get(view.name, [])]) for view in scene.split("train")]
     depths = [points @ view.world_to_camera[2, :3] + view.world_to_camera[2, 3] for view, points in shown]
     nearest = [float(np.quantile(ahead, NEAREST)) for one in depths if len(ahead := one[one > 0])]
     return min(nearest, default=None)
