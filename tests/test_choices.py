@@ -128,15 +128,18 @@ def test_the_nearest_points_are_those_before_any_training_photograph(tiny_scene)
     """Of a photograph, the depth that a hundredth of its points fall below; those behind a camera do not count."""
     scene = read_scene(tiny_scene)
     trained, tested = scene.split("train")[:2], scene.split("test")[0]
-    depths = [np.r_[-3.0, 1:102], np.array([-1, 1.5]), np.array([0.5])]
+    depths = [np.r_[-3.0, 1:102], np.array([-1, 1.5, 9, 9]), np.array([0.5])]
     positions, seen = [], {}
     for view, own in zip((*trained, tested), depths, strict=True):
         to_world = np.linalg.inv(np.vstack([view.world_to_camera, [0, 0, 0, 1]]))
         seen[view.name] = np.arange(len(own)) + sum(map(len, positions))
         positions.append(np.column_stack([0 * own, 0 * own, own, own**0]) @ to_world[:3].T)
 
+    points = np.concatenate(positions)
+    points[seen[trained[1].name][2:]] = [[np.inf], [np.nan]]  # of a damaged file
+
     def nearest(*views):
-        tracks = Tracks(np.concatenate(positions), {view.name: seen[view.name] for view in views})
+        tracks = Tracks(points, {view.name: seen[view.name] for view in views})
         return nearest_points(replace(scene, tracks=tracks))
 
     assert nearest(*trained, tested) == pytest.approx(1.5)

@@ -41,8 +41,9 @@ def nearest_points(scene: Scene) -> float | None:
     if scene.tracks is None:
         return None
     shown = [(view, scene.tracks.positions[scene.tracks.seen.get(view.name, [])]) for view in scene.split("train")]
-    depths = [points @ view.world_to_camera[2, :3] + view.world_to_camera[2, 3] for view, points in shown]
-    nearest = [float(np.quantile(ahead, NEAREST)) for one in depths if len(ahead := one[one > 0])]
+    with np.errstate(all="ignore"):  # points of a damaged file
+        depths = [points @ view.world_to_camera[2, :3] + view.world_to_camera[2, 3] for view, points in shown]
+    nearest = [float(np.quantile(ahead, NEAREST)) for one in depths if len(ahead := one[(one > 0) & (one < np.inf)])]
     return min(nearest, default=None)
 
 

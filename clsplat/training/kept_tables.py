@@ -6,13 +6,13 @@ from clsplat.training import colour_grids, sky
 from clsplat.training.archive import split
 from clsplat.training.kept import Tables, tables_of
 from clsplat.training.run import Run
-from clsplat.training.sky import FOLDER, LearnedSky
+from clsplat.training.sky import LearnedSky
 
 
 def copied_of(run: Run) -> Tables:
     """Copy what the run's model needs to be rendered, and to be trained from anew, to the host."""
     own = run.sky.tables() if run.sky else {}
-    behind = {FOLDER + name: table for name, table in own.items()}
+    behind = {sky.FOLDER + name: table for name, table in own.items()}
     of_colours = run.colour_grids.tables(["values"]) if run.colour_grids else {}
     photographs = {colour_grids.FOLDER + name: table for name, table in of_colours.items()}
     return {**tables_of(run.model), **behind, **photographs}
