@@ -27,9 +27,10 @@ def settle(pipeline: Pipeline, run: Run) -> Pipeline:
     Choices that are made already stay.
     """
     with run.status.stage("choose"):
+        settled_pipeline = _taken(_with_colours(_by_capture(pipeline, run), run), run)
         if any(isinstance(stage, Optimize) for stage in pipeline.stages):
-            _warn_of_near(pipeline.settings.model.near, nearest_points(run.scene))
-        return _taken(_with_colours(_by_capture(pipeline, run), run), run)
+            _warn_of_near(settled_pipeline.settings.model.near, nearest_points(run.scene))
+        return settled_pipeline
 
 
 def _warn_of_near(near: float, nearest: float | None) -> None:
