@@ -20,7 +20,7 @@ from tests.test_training import digest
 
 pytestmark = pytest.mark.slow
 TINY = ("optimize.steps=4", "init.count=20", "checkpoint.every=2", "optimize.log_every=2", "optimize.evaluate.every=3")
-CASES = 10**9 if "CLSPLAT_FUZZ" in os.environ else 3  # of each kind and error; `make torture` tries every write
+CASES = 10**9 if "CLSPLAT_FUZZ" in os.environ else 4  # of each kind and error; `make torture` tries every write
 
 
 class Faults:
