@@ -125,7 +125,7 @@ def test_what_is_measured_of_a_scene(tiny_scene):
 
 
 def test_the_nearest_points_are_those_before_any_training_photograph(tiny_scene):
-    """Of a photograph, the depth that a hundredth of its points fall below; those behind a camera do not count."""
+    """The depth that a hundredth of what they show is nearer than; what lies behind a camera does not count."""
     scene = read_scene(tiny_scene)
     trained, tested = scene.split("train")[:2], scene.split("test")[0]
     depths = [np.r_[-3.0, 1:102], np.array([-1, 1.5, 9, 9]), np.array([0.5])]
@@ -142,7 +142,7 @@ def test_the_nearest_points_are_those_before_any_training_photograph(tiny_scene)
         tracks = Tracks(points, {view.name: seen[view.name] for view in views})
         return nearest_points(replace(scene, tracks=tracks))
 
-    assert nearest(*trained, tested) == pytest.approx(1.5)
+    assert nearest(*trained, tested) == pytest.approx(1.505), "of 102 points; one shows one alone"
     assert nearest(trained[0]) == pytest.approx(2), "one in a hundred may be mistaken"
     assert nearest(tested) is None
     assert nearest_points(scene) is None
@@ -156,7 +156,7 @@ def test_a_run_warns_where_points_lie_before_the_near_plane(tmp_path, rng, caplo
     warnings = [record.message for record in caplog.records if record.levelname == "WARNING"]
     told = [message for message in warnings if "model.near" in message]
     assert len(told) == warned
-    assert all(f"model.near={near} scene units" in one and "add --set model.near=" in one for one in told)
+    assert all(f"model.near={near} scene units" in one and "set model.near to " in one for one in told)
 
 
 def test_a_run_writes_what_it_chose_and_repeats_without_choosing(tiny_scene, tmp_path):

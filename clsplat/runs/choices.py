@@ -34,10 +34,11 @@ def settle(pipeline: Pipeline, run: Run) -> Pipeline:
 
 
 def _warn_of_near(near: float, nearest: float | None) -> None:
+    """Warn where points begin before the near plane; both in scene units."""
     if nearest is not None and nearest < near:
         LOG.warning(
-            "nothing is drawn nearer than model.near=%g scene units, and the points of a training photograph begin at "
-            "%.3g: add --set model.near=%.2g",
+            "nothing is drawn nearer than model.near=%g scene units, and the points of the training photographs "
+            "begin at %.3g: set model.near to %.2g",
             *(near, nearest, nearest / 2),
         )
 

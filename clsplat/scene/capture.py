@@ -9,7 +9,7 @@ from clsplat.scene.reprojection import reprojection_errors
 from clsplat.scene.scene import Scene
 
 Measure = Literal["photographs", "photographs_per_point", "pixels", "points", "reprojection_error"]
-NEAREST = 0.01  # share of the points of a photograph that may lie nearer: some of them are mistaken
+NEAREST = 0.01  # share of the points that photographs show which may lie nearer: some of them are mistaken
 UNITS: dict[Measure, str] = {
     "photographs": "training photographs",
     "photographs_per_point": "training photographs show a point, in the mean",
@@ -34,17 +34,20 @@ def measured(scene: Scene) -> dict[Measure, float]:
 
 
 def nearest_points(scene: Scene) -> float | None:
-    """Return the least of the depths, scene units, that a hundredth of the points of a training view fall below.
+    """Return the depth, scene units, that a hundredth of all points that training views show are nearer than.
 
-    None where the dataset does not tell which points its photographs show.
+    Views for validation count as training views.  None where the dataset does not tell which points views show.
     """
     if scene.tracks is None:
         return None
-    shown = [(view, scene.tracks.positions[scene.tracks.seen.get(view.name, [])]) for view in scene.split("train")]
+    shown = [
+        (view, scene.tracks.positions[scene.tracks.seen.get(view.name, [])])
+        for view in scene.with_fold().split("train")
+    ]
     with np.errstate(all="ignore"):  # points of a damaged file
         depths = [points @ view.world_to_camera[2, :3] + view.world_to_camera[2, 3] for view, points in shown]
-    nearest = [float(np.quantile(ahead, NEAREST)) for one in depths if len(ahead := one[(one > 0) & (one < np.inf)])]
-    return min(nearest, default=None)
+    ahead = [one[(one > 0) & (one < np.inf)] for one in depths]
+    return float(np.quantile(np.concatenate(ahead), NEAREST)) if any(map(len, ahead)) else None
 
 
 def _photographs_per_point(scene: Scene, names: Container[str]) -> float | None:
