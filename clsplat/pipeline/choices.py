@@ -1,24 +1,22 @@
 """Choices that a run makes by its photographs, and what it writes of them into its pipeline file."""
 
 import json
+import math
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import Field, model_validator
 
 from clsplat.scene.capture import UNITS, Measure
 from clsplat.settings import Settings
 
 WRITTEN = ("chosen", "reason")  # keys of a choice
 Others = Literal["row", "file"]
-Row = Annotated[list[Any], Field(min_length=2)]  # the least measure, then the value of each key
+Row = Annotated[list[Any], Field(min_length=2)]  # the least measure, or of each measure, then the value of each key
+Measures = dict[Measure, float]
 
 
-def _ascending(rows: list[Row]) -> list[Row]:
-    bounds = [row[0] for row in rows]
-    numbers = all(isinstance(bound, int | float) and not isinstance(bound, bool) for bound in bounds)
-    if not rows or not numbers or bounds != sorted(set(bounds)) or bounds[0] != 0:
-        raise ValueError("expected rows [from, values…], the first one from 0, with growing numbers")
-    return rows
+def _is_number(bound: Any) -> bool:
+    return isinstance(bound, int | float) and not isinstance(bound, bool)
 
 
 class CaptureChoice(Settings):
@@ -33,10 +31,11 @@ class CaptureChoice(Settings):
 
     keys: Annotated[list[str], Field(min_length=1)]
     """Places of the settings, as in `--set`: keys of the model, of stages, or `scene.validation`."""
-    by: Measure
-    """What is measured."""
-    values: Annotated[list[Row], AfterValidator(_ascending)]
-    """Rows [from, a value of each key]: those of the last row whose bound the measure reaches."""
+    by: Measure | Annotated[list[Measure], Field(min_length=2)]
+    """What is measured; a list of several, whose bounds in each row are a list too."""
+    values: list[Row]
+    """Rows [from, a value of each key]: those of the last row all of whose bounds the measures reach.  Of several
+    measures, one that the dataset does not have reaches 0 alone."""
     since: str | list[str]
     """Why these values, in a few words: of all rows, or of each."""
     given: dict[str, Any] = Field({})
@@ -49,6 +48,19 @@ class CaptureChoice(Settings):
     """Written by a run: what was measured."""
 
     @model_validator(mode="after")
+    def _in_order(self) -> "CaptureChoice":
+        several = isinstance(self.by, list)
+        if len(set(self.measures)) < len(self.measures):
+            raise ValueError("expected measures, each once, in 'by'")
+        if any(isinstance(row[0], list) != several for row in self.values):
+            raise ValueError(f"expected rows [{'[from, …]' if several else 'from'}, values…], as 'by' is")
+        bounds = [self.bounds(row) for row in self.values]
+        shaped = all(len(row) == len(self.measures) and all(map(_is_number, row)) for row in bounds)
+        if not bounds or not shaped or bounds != sorted(set(bounds)) or any(bounds[0]):
+            raise ValueError("expected rows [from, values…], the first one from 0, with growing numbers")
+        return self
+
+    @model_validator(mode="after")
     def _of_each_key(self) -> "CaptureChoice":
         if wrong := next((row for row in self.values if len(row) != 1 + len(self.keys)), None):
             raise ValueError(f"values: expected [from, {', '.join(self.keys)}], got {len(wrong)} of them")
@@ -58,21 +70,40 @@ class CaptureChoice(Settings):
             raise ValueError(f"given: expected some of {', '.join(self.keys)}, got {wrong_key}")
         return self
 
-    def of(self, measures: dict[Measure, float], before: list[Any], others: Others = "row") -> "CaptureChoice":
+    @property
+    def measures(self) -> list[Measure]:
+        """What is measured."""
+        return self.by if isinstance(self.by, list) else [self.by]
+
+    def bounds(self, row: Row) -> tuple[float, ...]:
+        """The bound of each measure in a row."""
+        return tuple(row[0]) if isinstance(self.by, list) else (row[0],)
+
+    def row(self, measures: Measures) -> int:
+        """Return the number of the row that measures reach; one that is missing counts as 0."""
+        found = [measures.get(name, 0) for name in self.measures]
+        reached = [all(map(float.__ge__, map(float, found), map(float, self.bounds(row)))) for row in self.values]
+        return max(number for number, one in enumerate(reached) if one)
+
+    def depends(self, measure: Measure, measures: Measures) -> bool:
+        """Whether the row depends on one more measure, beside those that are known."""
+        return len({self.row({**measures, measure: value}) for value in (0.0, math.inf)}) > 1
+
+    def of(self, measures: Measures, before: list[Any], others: Others = "row") -> "CaptureChoice":
         """Return it with what follows from the measures; before: the values that are replaced.
 
         others: whether what stands beside `given` values is of the row that the measure reaches, or of the file.
         """
-        found = measures.get(self.by)
-        if found is None:
-            reason, chosen = f"the dataset does not tell {self.by}", before
+        found = [f"{measures[name]:,.4g} {UNITS[name]}" for name in self.measures if name in measures]
+        if not found:
+            reason, chosen = f"the dataset does not tell {', '.join(self.measures)}", before
         else:
-            at = max(number for number, row in enumerate(self.values) if found >= row[0])
+            at = self.row(measures)
             chosen = self.values[at][1:]
-            reason = f"{found:,.4g} {UNITS[self.by]}; {self.since if isinstance(self.since, str) else self.since[at]}"
+            reason = f"{', '.join(found)}; {self.since if isinstance(self.since, str) else self.since[at]}"
         if self.given:
             keys = ", ".join(self.given)
-            alone = others == "file" and found is not None
+            alone = others == "file" and bool(found)
             reason += f"; {keys} as set" + (", with which the rest does not go together" if alone else "")
             beside = before if alone else chosen
             chosen = [self.given.get(key, value) for key, value in zip(self.keys, beside, strict=True)]
@@ -87,7 +118,7 @@ class CaptureChoice(Settings):
     def told(self) -> str:
         """What was chosen, and why; before that, by what it will be."""
         if not self.reason:
-            return f"{', '.join(self.keys)}: by {self.by}"
+            return f"{', '.join(self.keys)}: by {', '.join(self.measures)}"
         values = ", ".join(f"{key}={json.dumps(value)}" for key, value in self.settings)
         return f"{values}, since {self.reason}"
 

@@ -186,13 +186,13 @@ def check_choices(settings: PipelineFile) -> None:
             raise ConfigError(f"{what} is chosen twice; expected one choice for each place")
         places.append(place)
     still_open, faults = undone(settings), list[ConfigError]()
-    bounds = sorted({(one.by, bound) for one in settings.choices for bound, *_ in one.values})
-    for by, bound in bounds:
+    rows = {tuple(zip(one.measures, one.bounds(row), strict=True)) for one in settings.choices for row in one.values}
+    for row in sorted(rows):
         try:
-            choose(still_open, {by: bound})
+            choose(still_open, dict(row))
         except ConfigError as error:
             faults.append(error)
-    if faults and (len(faults) == len(bounds) or not any(one.given for one in settings.choices)):
+    if faults and (len(faults) == len(rows) or not any(one.given for one in settings.choices)):
         raise faults[0]
 
 

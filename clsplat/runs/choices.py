@@ -14,6 +14,7 @@ from clsplat.stages.optimize import Optimize
 from clsplat.training.colours import settled
 from clsplat.training.run import Run
 from clsplat.training.skies import settled as settled_sky
+from clsplat.training.skies import share_with_sky
 from clsplat.views.colours import Auto
 
 WITH_POSES = "optimize.poses are learned, which a sky does not go with"
@@ -45,9 +46,13 @@ def _warn_of_near(near: float, nearest: float | None) -> None:
 
 def _by_capture(pipeline: Pipeline, run: Run) -> Pipeline:
     """The pipeline with what its `choices` choose."""
-    if not any(not one.reason for one in pipeline.settings.choices):
+    still_open = [one for one in pipeline.settings.choices if not one.reason]
+    if not still_open:
         return pipeline
-    chosen = replace(pipeline, settings=choose(pipeline.settings, measured(run.scene)))
+    measures = measured(run.scene)
+    if any(one.depends("sky", measures) for one in still_open) and (share := share_with_sky(run)) is not None:
+        measures["sky"] = share
+    chosen = replace(pipeline, settings=choose(pipeline.settings, measures))
     if chosen.settings.scene.validation != pipeline.settings.scene.validation:
         run.divide(chosen.settings.scene.split.with_validation(run.original.with_fold()))
         run.identity = run.identity and run.identity.divided(run.original)  # as of a run that begins with that split

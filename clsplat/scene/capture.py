@@ -8,7 +8,7 @@ import numpy as np
 from clsplat.scene.reprojection import reprojection_errors
 from clsplat.scene.scene import Scene
 
-Measure = Literal["photographs", "photographs_per_point", "pixels", "points", "reprojection_error"]
+Measure = Literal["photographs", "photographs_per_point", "pixels", "points", "reprojection_error", "sky"]
 NEAREST = 0.01  # share of the points that photographs show which may lie nearer: some of them are mistaken
 UNITS: dict[Measure, str] = {
     "photographs": "training photographs",
@@ -16,11 +16,15 @@ UNITS: dict[Measure, str] = {
     "pixels": "pixels has a training photograph, in the median",
     "points": "points",
     "reprojection_error": "px are between a point and where photographs show it, in the mean at the size of training",
+    "sky": "of the training photographs show a sky",
 }
 
 
 def measured(scene: Scene) -> dict[Measure, float]:
-    """Return the measures that a scene, as it is trained on, has; views for validation count as training views."""
+    """Return the measures that a scene, as it is trained on, has; views for validation count as training views.
+
+    `sky` is not among them: it needs the photographs.
+    """
     views = {view.name: view for view in reversed(scene.with_fold().split("train"))}  # the largest size of each
     errors = reprojection_errors(scene.tracks, views.values())
     found: dict[Measure, float | None] = {

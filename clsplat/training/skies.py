@@ -47,15 +47,34 @@ def settled(background: Backdrop | None, run: Run) -> Backdrop | None:
     return background.model_copy(update={"chosen": chosen, "reason": reason})
 
 
+def share_with_sky(run: Run) -> float | None:
+    """Return the share of the training photographs that show a sky; None where that is not known."""
+    if _unknown(run):
+        return None
+    seen = _seen(run)
+    return _number(seen, Auto().share) / len(seen)
+
+
+def _unknown(run: Run) -> str:
+    """Why photographs do not tell whether they show a sky; empty where they do."""
+    if run.scene.points is None:
+        return "the dataset has no points, and what is far from them is not known"
+    first = run.scene.split("train")[0]
+    transparent = first.alpha == "transparency" and read_image(first.image_path).shape[2] == 4
+    return "the photographs have transparency" if transparent else ""
+
+
+def _number(seen: list[Seen], share: float) -> int:
+    """How many photographs show the sky in such a share of their upper third, or more."""
+    return sum(one.share >= share for one in seen)
+
+
 def _choice(background: Auto, run: Run) -> tuple[Literal["on", "off"], str]:
     """Whether there is a sky, and why."""
-    if run.scene.points is None:
-        return "off", "the dataset has no points, and what is far from them is not known"
-    first = run.scene.split("train")[0]
-    if first.alpha == "transparency" and read_image(first.image_path).shape[2] == 4:
-        return "off", "the photographs have transparency"
+    if why := _unknown(run):
+        return "off", why
     seen = _seen(run)
-    number = sum(one.share >= background.share for one in seen)
+    number = _number(seen, background.share)
     text = (
         f"{number} of {len(seen)} photographs show bright or blue regions without points in {background.share:.0%} or "
         "more of their upper third"
