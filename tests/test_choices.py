@@ -243,26 +243,85 @@ def test_each_row_may_have_its_reason():
         load("smoke", [f"choices=[{reasons.replace('[none, few, many]', '[none, few]')}]"])
 
 
-def test_photos_in_a_time_says_what_to_set_and_takes_it():
-    chosen = choose(load("photos").settings, {"photographs": 20})
+def test_a_choice_with_a_refit_says_what_to_set_for_a_time():
+    keys = "scene.validation, optimize.keep, optimize.patience, optimize.refit"
+    values = "[[0, auto, best, 4, true], [40, 0, last, null, false]]"
+    few = f"choices=[{{keys: [{keys}], by: photographs, values: {values}, since: few}}]"
+    chosen = choose(load("splat_7k", [few]).settings, {"photographs": 20})
     with pytest.raises(ConfigError, match=r"chosen by 20 training photographs; .*add --set optimize\.refit=false"):
-        minutes.rehearsals_of(replace(load("photos"), settings=chosen), None, 1.0)
-    once = choose(load("photos", ["optimize.refit=false"]).settings, {"photographs": 20}).training
+        minutes.rehearsals_of(replace(load("splat_7k"), settings=chosen), None, 1.0)
+    once = choose(load("splat_7k", [few, "optimize.refit=false"]).settings, {"photographs": 20}).training
     assert (once.refit, once.keep, once.patience) == (False, "best", 4)
 
 
 @pytest.mark.parametrize(
-    ("photographs", "dropout", "keep"), [(4, 0.2, "last"), (20, 0.2, "best"), (25, 0, "best"), (43, 0, "last")]
+    ("photographs", "sky", "dropout", "most"),
+    [(4, None, 0.2, 0.6), (11, 0.24, 0.2, 0.6), (11, 0.25, 0.2, 0.3), (25, 0.5, 0.2, 0.1), (39, 1, 0.2, 0.1)]
+    + [(40, None, 0, None), (43, 1, 0, None)],
 )
-def test_the_recipe_for_photographs_chooses_by_their_number(photographs, dropout, keep):
+def test_the_recipe_for_photographs_chooses_by_their_number_and_by_the_sky(photographs, sky, dropout, most):
     settings = load("photos").settings
-    chosen = choose(settings, {"photographs": photographs})
+    chosen = choose(settings, {"photographs": photographs, **({} if sky is None else {"sky": sky})})
     training = chosen.training
-    assert (at_step(training.dropout, 7000), training.keep) == (dropout, keep)
-    assert training.refit is (keep == "best")
-    assert (chosen.model.background is not None) == (keep == "best"), "what is far away"
-    (growing,) = [stage for stage in training.during if isinstance(stage, Densify)]
-    assert growing.per_pixel == {4: 0.3, 20: 0.6, 25: 0.6, 43: None}[photographs]
-    plain = load("splat_7k").settings
-    many = choose(settings, {"photographs": 200})
-    assert (many.training, many.model) == (plain.training, plain.model), "nothing is lost where there are many"
+    assert at_step(training.dropout, training.steps) == dropout
+    assert (training.keep, chosen.scene.validation) == ("last", 0)
+    assert (chosen.model.background is not None) == (12 <= photographs < 40), "what is far away"
+    growing = [stage for stage in training.during if isinstance(stage, Densify)]
+    assert [one.per_pixel for one in growing] == [most, None]
+    many, fast = choose(settings, {"photographs": 200, "sky": 1}), load("fast").settings
+    assert (many.stages, many.model) == (fast.stages, fast.model), "nothing is lost where there are many"
+
+
+SKY = "{keys: [model.sh_degree], by: [photographs, sky], values: [[[0, 0], 0], [[0, 0.5], 1], [[20, 0], 2]], since: x}"
+
+
+def test_of_several_measures_the_last_row_decides_whose_bounds_all_reach():
+    settings = load("smoke", [f"choices=[{SKY}]"]).settings
+    for measures, degree in (
+        ({"photographs": 4}, 0),
+        ({"photographs": 4, "sky": 0.4}, 0),
+        ({"photographs": 4, "sky": 0.5}, 1),
+        ({"sky": 1}, 1),
+        ({"photographs": 20}, 2),
+        ({"photographs": 90, "sky": 1}, 2),
+    ):
+        assert choose(settings, dict(measures)).model.sh_degree == degree
+    (told,) = choose(settings, {"photographs": 4, "sky": 0.5}).choices
+    assert told.reason == "4 training photographs, 0.5 of the training photographs show a sky; x"
+    (told,) = choose(settings, {"points": 4}).choices
+    assert (told.reason, told.chosen) == ("the dataset does not tell photographs, sky", [settings.model.sh_degree])
+
+
+def test_a_measure_is_asked_for_where_a_row_depends_on_it():
+    (one,) = load("smoke", [f"choices=[{SKY}]"]).settings.choices
+    assert one.depends("sky", {"photographs": 19})
+    assert not one.depends("sky", {"photographs": 20})
+    assert not one.depends("points", {"photographs": 19})
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "complaint"),
+    [
+        ("[[0, 0], 0]", "[0, 0]", "as 'by' is"),
+        ("[photographs, sky]", "sky", "as 'by' is"),
+        ("[[0, 0.5], 1]", "[[0], 1]", "the first one from 0"),
+        ("[[0, 0.5], 1]", "[[0, 0], 1]", "growing numbers"),
+        ("[[0, 0.5], 1]", "[[0, null], 1]", "growing numbers"),
+        ("[[20, 0], 2]", "[[0, 0.4], 2]", "growing numbers"),
+        ("[photographs, sky]", "[sky]", "got \\['sky'\\]"),
+        ("[photographs, sky]", "[sky, sky]", "each once"),
+    ],
+)
+def test_rows_of_several_measures_have_a_bound_of_each(old, new, complaint):
+    with pytest.raises(ConfigError, match=complaint):
+        load("smoke", [f"choices=[{SKY.replace(old, new)}]"])
+
+
+@pytest.mark.parametrize(("by", "measured_sky"), [("[photographs, sky]", True), ("photographs", False)])
+def test_a_run_looks_for_a_sky_where_a_choice_asks(tmp_path, rng, caplog, by, measured_sky):
+    Yard(rng).write(tmp_path / "yard")
+    rows = "[[0, 0], 0], [[0, 0.5], 1]" if measured_sky else "[0, 0], [100, 1]"
+    choice = f"choices=[{{keys: [model.sh_degree], by: {by}, values: [{rows}], since: far}}]"
+    asked = load("smoke", [f"scene.path='{tmp_path / 'yard'}'", choice])
+    text = describe(asked, tmp_path / "run", None, "new")
+    assert ("of the training photographs show a sky" in text) is measured_sky

@@ -104,7 +104,7 @@ def test_the_recipe_for_photographs_learns_poses_from_a_pixel_on(error, learned)
     assert chosen.training.poses == (Poses(start=500) if learned else None)
     assert isinstance(chosen.training.colours, Auto) is learned
     if not learned:
-        assert chosen.training == load("splat_7k").settings.training
+        assert chosen.training == load("fast").settings.training
     (told,) = [one.told for one in chosen.choices if "optimize.poses" in one.keys]
     assert f"{error:g} px are between a point and where photographs show it" in told
     without = choose(settings, {"photographs": 60})
