@@ -84,7 +84,8 @@ def test_an_override_takes_the_place_of_a_choice(tmp_path, override, left):
     [
         (DEGREE.replace("sh_degree", "sh_degre"), "sh_degre"),
         (DEGREE.replace("[8, 1]", "[8, 9]"), "at 8 photographs: model.sh_degree: "),
-        (DEGREE.replace("[8, 1]", "[8, 1], [8, 2]"), "growing numbers"),
+        (DEGREE.replace("[8, 1]", "[8, 1], [8, 2]"), "growing finite numbers"),
+        (DEGREE.replace("[8, 1]", "[.nan, 1]"), "growing finite numbers"),
         (DEGREE.replace("[0, 0]", "[1, 0]"), "the first one from 0"),
         (DEGREE.replace("photographs", "moons"), "photographs_per_point"),
         (f"{DEGREE}, {DEGREE}", "chosen twice"),
@@ -256,8 +257,15 @@ def test_a_choice_with_a_refit_says_what_to_set_for_a_time():
 
 @pytest.mark.parametrize(
     ("photographs", "sky", "dropout", "most"),
-    [(4, None, 0.2, 0.6), (11, 0.24, 0.2, 0.6), (11, 0.25, 0.2, 0.3), (25, 0.5, 0.2, 0.1), (39, 1, 0.2, 0.1)]
-    + [(40, None, 0, None), (43, 1, 0, None)],
+    [
+        (4, None, 0.2, 0.6),
+        (11, 0.24, 0.2, 0.6),
+        (11, 0.25, 0.2, 0.3),
+        (25, 0.5, 0.2, 0.1),
+        (39, 1, 0.2, 0.1),
+        (40, None, 0, None),
+        (43, 1, 0, None),
+    ],
 )
 def test_the_recipe_for_photographs_chooses_by_their_number_and_by_the_sky(photographs, sky, dropout, most):
     settings = load("photos").settings
@@ -287,7 +295,7 @@ def test_of_several_measures_the_last_row_decides_whose_bounds_all_reach():
     ):
         assert choose(settings, dict(measures)).model.sh_degree == degree
     (told,) = choose(settings, {"photographs": 4, "sky": 0.5}).choices
-    assert told.reason == "4 training photographs, 0.5 of the training photographs show a sky; x"
+    assert told.reason == "4 training photographs, 50% of the training photographs show a sky; x"
     (told,) = choose(settings, {"points": 4}).choices
     assert (told.reason, told.chosen) == ("the dataset does not tell photographs, sky", [settings.model.sh_degree])
 
@@ -304,10 +312,11 @@ def test_a_measure_is_asked_for_where_a_row_depends_on_it():
     [
         ("[[0, 0], 0]", "[0, 0]", "as 'by' is"),
         ("[photographs, sky]", "sky", "as 'by' is"),
-        ("[[0, 0.5], 1]", "[[0], 1]", "the first one from 0"),
-        ("[[0, 0.5], 1]", "[[0, 0], 1]", "growing numbers"),
-        ("[[0, 0.5], 1]", "[[0, null], 1]", "growing numbers"),
-        ("[[20, 0], 2]", "[[0, 0.4], 2]", "growing numbers"),
+        ("[[0, 0.5], 1]", "[[0], 1]", "a bound of each of photographs, sky, got 1"),
+        ("[[0, 0.5], 1]", "[[0, .nan], 1]", "finite numbers"),
+        ("[[0, 0.5], 1]", "[[0, 0], 1]", "growing finite numbers"),
+        ("[[0, 0.5], 1]", "[[0, null], 1]", "growing finite numbers"),
+        ("[[20, 0], 2]", "[[0, 0.4], 2]", "growing finite numbers"),
         ("[photographs, sky]", "[sky]", "got \\['sky'\\]"),
         ("[photographs, sky]", "[sky, sky]", "each once"),
     ],
@@ -317,11 +326,33 @@ def test_rows_of_several_measures_have_a_bound_of_each(old, new, complaint):
         load("smoke", [f"choices=[{SKY.replace(old, new)}]"])
 
 
-@pytest.mark.parametrize(("by", "measured_sky"), [("[photographs, sky]", True), ("photographs", False)])
-def test_a_run_looks_for_a_sky_where_a_choice_asks(tmp_path, rng, caplog, by, measured_sky):
-    Yard(rng).write(tmp_path / "yard")
-    rows = "[[0, 0], 0], [[0, 0.5], 1]" if measured_sky else "[0, 0], [100, 1]"
-    choice = f"choices=[{{keys: [model.sh_degree], by: {by}, values: [{rows}], since: far}}]"
-    asked = load("smoke", [f"scene.path='{tmp_path / 'yard'}'", choice])
-    text = describe(asked, tmp_path / "run", None, "new")
-    assert ("of the training photographs show a sky" in text) is measured_sky
+@pytest.mark.parametrize(
+    ("clear", "told"), [(True, "10 training photographs, 100%"), (False, "10 training photographs, 0%")]
+)
+def test_a_run_looks_for_a_sky_where_a_choice_asks(tmp_path, rng, clear, told):
+    """Also at the photographs that are kept out to choose by."""
+    asked = load("smoke", [f"scene.path='{Yard(rng, clear=clear).write(tmp_path / 'yard')}'", f"choices=[{SKY}]"])
+    assert f"{told} of the training photographs show a sky" in describe(asked, tmp_path / "run", None, "new")
+    kept_out = load("smoke", [f"scene.path='{tmp_path / 'yard'}'", f"choices=[{SKY}]", "scene.validation=auto"])
+    assert f"{told} of the training photographs show a sky" in describe(kept_out, tmp_path / "run", None, "new")
+
+
+def test_a_run_does_not_look_for_a_sky_in_vain(tmp_path, rng, monkeypatch):
+    monkeypatch.setattr("clsplat.runs.choices.share_with_sky", lambda run: pytest.fail("looked for a sky"))
+    many = SKY.replace("[20, 0]", "[9, 0]")
+    asked = load("smoke", [f"scene.path='{Yard(rng).write(tmp_path / 'yard')}'", f"choices=[{many}]"])
+    assert "since 10 training photographs; x" in describe(asked, tmp_path / "run", None, "new")
+
+
+def test_transparent_photographs_do_not_tell_of_a_sky(tiny_scene, tmp_path):
+    asked = load("smoke", [f"scene.path='{tiny_scene}'", f"choices=[{SKY}]"])
+    assert "since 8 training photographs; x" in describe(asked, tmp_path / "run", None, "new")
+
+
+def test_a_limit_of_growth_is_beside_rules_that_grow(tmp_path):
+    """A choice for the first densify of a copy that has lost an earlier part would reach the wrong one."""
+    copied = load("photos").path.read_text()
+    edited = "\n".join(line for line in copied.splitlines() if "raise_sh" not in line)
+    (tmp_path / "own.yaml").write_text(edited)
+    with pytest.raises(ConfigError, match="no rule here grows"):
+        load(str(tmp_path / "own.yaml"))

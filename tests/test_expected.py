@@ -75,8 +75,13 @@ def test_parts_are_continued_by_the_number_of_their_pieces(photos, monkeypatch):
 
 def test_the_number_of_photographs_tells_the_growth_that_would_be_chosen(photos, monkeypatch):
     """Whether they show a sky is not known before they are prepared."""
+    for path in photos.iterdir():
+        cv2.imwrite(str(path), np.zeros((120, 160, 3), np.uint8))
     lines = expected("photos", photos, monkeypatch)
-    assert "3,400 steps of 5 ms, with 5,000 Gaussians at 80x60 px" in lines[-1], "0.6 a pixel are fewer"
+    assert "with 5,000 to 11,520 Gaussians at 160x120 px" in lines[-1], "0.6 for each pixel"
+    for number in range(COUNT, 2 * COUNT + 1):
+        cv2.imwrite(str(photos / f"{number:02d}.png"), np.zeros((120, 160, 3), np.uint8))
+    assert "11,520" not in expected("photos", photos, monkeypatch)[-1]
 
 
 def test_what_is_there_already_takes_no_time(tiny_scene, tmp_path):

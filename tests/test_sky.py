@@ -24,7 +24,7 @@ from clsplat.runs.single import run_pipeline
 from clsplat.training import checkpoint
 from clsplat.training.archive import split
 from clsplat.training.sky import FOLDER, check_tables
-from clsplat.views.sky_share import looked_at, panorama
+from clsplat.views.sky_share import Seen, looked_at, panorama
 from tests.few_steps import FEW
 from tests.test_training import digest, train
 from tests.yards import Yard, painted
@@ -88,6 +88,13 @@ def evaluate_without(out: Path, model) -> float:
     found = [np.rint(255 * np.clip(renderer.render(view, 0.0).image, 0, 1)).astype(np.uint8) for view in views]
     photographs = [np.rint(255 * view.photograph()).astype(np.uint8) for view in views]
     return float(np.mean([psnr(a, b) for a, b in zip(found, photographs, strict=True)]))
+
+
+def test_a_background_all_round_is_no_sky(yard):
+    mask = np.ones((9, 4), bool)
+    assert Seen(yard[0].views[0], np.zeros((9, 4, 3), np.uint8), mask).share == 0
+    mask[7:] = False
+    assert Seen(yard[0].views[0], np.zeros((9, 4, 3), np.uint8), mask).share == 1, "less than half of it"
 
 
 def test_a_choice_is_written_with_its_reason(learned):

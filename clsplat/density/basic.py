@@ -88,6 +88,7 @@ class PruneFaint(Rule):
     """Remove Gaussians that are almost transparent."""
 
     type: Literal["prune_faint"] = "prune_faint"
+    grows: ClassVar[bool] = False
     training_keys: ClassVar[frozenset[str]] = frozenset({"opacity_below"})
 
     opacity_below: Positive = 0.005
@@ -101,6 +102,7 @@ class PruneLarge(Rule):
     """Remove Gaussians that are large in the scene."""
 
     type: Literal["prune_large"] = "prune_large"
+    grows: ClassVar[bool] = False
     training_keys: ClassVar[frozenset[str]] = frozenset({"size_above"})
 
     size_above: Positive = 0.1

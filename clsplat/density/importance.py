@@ -34,6 +34,7 @@ class PruneUseless(Rule):
     """
 
     type: Literal["prune_useless"] = "prune_useless"
+    grows: ClassVar[bool] = False
     training_keys: ClassVar[frozenset[str]] = frozenset({"of_view", "of_all", "views", "views_below"})
 
     of_view: Share = 0.99

@@ -67,6 +67,7 @@ class PruneAbsent(Rule):
     """Remove Gaussians that are almost transparent at each moment of the training views."""
 
     type: Literal["prune_absent"] = "prune_absent"
+    grows: ClassVar[bool] = False
     training_keys: ClassVar[frozenset[str]] = frozenset({"opacity_below"})
 
     opacity_below: Positive = 0.005

@@ -35,6 +35,7 @@ def largest(candidates: Mask, score: NDArray[np.floating], limit: int) -> Mask:
 class SampledPruning(Rule):
     """Base of rules that remove a share of the faint and the large Gaussians, which is drawn."""
 
+    grows: ClassVar[bool] = False
     training_keys: ClassVar[frozenset[str]] = frozenset({"share", "opacity_below", "size_above"})
 
     share: Share = 0.5

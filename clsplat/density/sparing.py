@@ -57,6 +57,7 @@ class PruneSpare(Rule):
     """
 
     type: Literal["prune_spare"] = "prune_spare"
+    grows: ClassVar[bool] = False
     training_keys: ClassVar[frozenset[str]] = frozenset({"error_rise", "views"})
 
     error_rise: Positive = 0.01

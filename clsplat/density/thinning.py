@@ -21,6 +21,7 @@ class PruneUnimportant(Rule):
     """Remove a share of all Gaussians: those with the smallest opacity times geometric mean scale."""
 
     type: Literal["prune_unimportant"] = "prune_unimportant"
+    grows: ClassVar[bool] = False
     training_keys: ClassVar[frozenset[str]] = frozenset({"share"})
 
     share: Share = 0.05
@@ -44,6 +45,7 @@ class MergeNeighbours(Rule):
     """
 
     type: Literal["merge_neighbours"] = "merge_neighbours"
+    grows: ClassVar[bool] = False
     reads_means: ClassVar[bool] = True
     training_keys: ClassVar[frozenset[str]] = frozenset({"distance_below", "colour_below"})
 

@@ -6,7 +6,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
-from clsplat.scene.capture import UNITS, Measure
+from clsplat.scene.capture import TOLD, Measure
 from clsplat.settings import Settings
 
 WRITTEN = ("chosen", "reason")  # keys of a choice
@@ -16,7 +16,7 @@ Measures = dict[Measure, float]
 
 
 def _is_number(bound: Any) -> bool:
-    return isinstance(bound, int | float) and not isinstance(bound, bool)
+    return isinstance(bound, int | float) and not isinstance(bound, bool) and math.isfinite(bound)
 
 
 class CaptureChoice(Settings):
@@ -55,9 +55,13 @@ class CaptureChoice(Settings):
         if any(isinstance(row[0], list) != several for row in self.values):
             raise ValueError(f"expected rows [{'[from, …]' if several else 'from'}, values…], as 'by' is")
         bounds = [self.bounds(row) for row in self.values]
-        shaped = all(len(row) == len(self.measures) and all(map(_is_number, row)) for row in bounds)
+        if wrong := next((row for row in bounds if len(row) != len(self.measures)), None):
+            raise ValueError(
+                f"values: expected a bound of each of {', '.join(self.measures)}, got {len(wrong)} of them"
+            )
+        shaped = all(_is_number(bound) for row in bounds for bound in row)
         if not bounds or not shaped or bounds != sorted(set(bounds)) or any(bounds[0]):
-            raise ValueError("expected rows [from, values…], the first one from 0, with growing numbers")
+            raise ValueError("expected rows [from, values…], the first one from 0, with growing finite numbers")
         return self
 
     @model_validator(mode="after")
@@ -94,7 +98,7 @@ class CaptureChoice(Settings):
 
         others: whether what stands beside `given` values is of the row that the measure reaches, or of the file.
         """
-        found = [f"{measures[name]:,.4g} {UNITS[name]}" for name in self.measures if name in measures]
+        found = [TOLD[name].format(measures[name]) for name in self.measures if name in measures]
         if not found:
             reason, chosen = f"the dataset does not tell {', '.join(self.measures)}", before
         else:

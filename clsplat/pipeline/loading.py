@@ -209,7 +209,7 @@ def _late(stages: Sequence[Stage], need: str) -> str:
         for inner in training.during if isinstance(training, Training) else ():
             if need in inner.makes:
                 cadence = f"{inner.stage} makes at every {inner.every} steps after step {inner.start}"
-                return f"{cadence}; the training ends before: set its start and its every"
+                return f"{cadence}; the training ends before: set its start and its every, or use --minutes"
     return ""
 
 

@@ -6,7 +6,10 @@ from clsplat.training.forecast import over_views
 from clsplat.training.kept import Measured
 from clsplat.training.run import Run
 
-REMEDY = "`scene.validation: auto` with `optimize.keep: best` keeps the model that is best elsewhere."
+REMEDY = (
+    "`scene.validation: auto` with `optimize.keep: best`, in a pipeline without `take_average`, keeps the model that "
+    "is best elsewhere."
+)
 
 
 def parting(run: Run) -> str:

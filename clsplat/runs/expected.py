@@ -27,6 +27,7 @@ from clsplat.scene.images import image_size
 from clsplat.scene.scene import every_nth
 from clsplat.schedule import values_of
 from clsplat.stages.densify import Densify
+from clsplat.stages.init import Init
 from clsplat.stages.optimize import Optimize
 from clsplat.stages.train_field import TrainField
 from clsplat.training.run import Run
@@ -139,8 +140,8 @@ def _capture(pipeline: Pipeline, planned: Sequence[Planned], names: Sequence[str
     if run is not None:
         views = run.scene.with_fold().split("train")
         cameras = sorted(((one.camera.width, one.camera.height) for one in views), key=lambda size: size[0] * size[1])
-        points = len(run.scene.points) if run.scene.points else FEWEST
-        return Capture(len(views), cameras[len(cameras) // 2], points)
+        begins = [one.expected_count(run.scene) for one in pipeline.settings.stages if isinstance(one, Init)]
+        return Capture(len(views), cameras[len(cameras) // 2], begins[0] if begins else FEWEST)
     scene = pipeline.settings.scene
     if (found := _size(scene.folder, names)) is None:
         return None

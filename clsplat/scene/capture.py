@@ -10,13 +10,14 @@ from clsplat.scene.scene import Scene
 
 Measure = Literal["photographs", "photographs_per_point", "pixels", "points", "reprojection_error", "sky"]
 NEAREST = 0.01  # share of the points that photographs show which may lie nearer: some of them are mistaken
-UNITS: dict[Measure, str] = {
-    "photographs": "training photographs",
-    "photographs_per_point": "training photographs show a point, in the mean",
-    "pixels": "pixels has a training photograph, in the median",
-    "points": "points",
-    "reprojection_error": "px are between a point and where photographs show it, in the mean at the size of training",
-    "sky": "of the training photographs show a sky",
+TOLD: dict[Measure, str] = {
+    "photographs": "{:,.4g} training photographs",
+    "photographs_per_point": "{:,.4g} training photographs show a point, in the mean",
+    "pixels": "{:,.4g} pixels has a training photograph, in the median",
+    "points": "{:,.4g} points",
+    "reprojection_error": "{:,.4g} px are between a point and where photographs show it, in the mean at the size of "
+    "training",
+    "sky": "{:.0%} of the training photographs show a sky",
 }
 
 

@@ -72,6 +72,14 @@ class Densify(Scheduled):
             raise ValueError("'budget' needs 'stop', the step at which it is reached")
         return self
 
+    @model_validator(mode="after")
+    def _with_growth(self) -> "Densify":
+        if self.per_pixel is not None and not any(rule.grows for rule in self.rules):
+            raise ValueError(
+                "'per_pixel' ends growth, and no rule here grows; expected it beside rules that clone or split"
+            )
+        return self
+
     def stale(self, run: Run) -> Collection[str]:
         return run.model.gaussians.trained
 

@@ -107,8 +107,13 @@ class Init(Stage):
         if source in MODEL_SOURCES:
             return len(self._read()["means"])
         if source == "points":
-            return 0 if scene.points is None else len(scene.points)
+            return (0 if scene.points is None else len(scene.points)) + self.swept * self._is_joined(scene)
         return self.swept if source == "sweep" else self.count
+
+    def _is_joined(self, scene: Scene) -> bool:
+        """Whether points of a sweep join those of the scene."""
+        few = scene.points is not None and len(scene.points) < self.fewest
+        return self.source == "auto" and few and not has_alpha(scene)
 
     def _origin(self, source: str, scene: Scene) -> str:
         names = {
@@ -137,7 +142,7 @@ class Init(Stage):
         points = found[source](run) if source in found else None
         if points is None:
             points, source = self._random(run), "random"
-        if source == "points" and self.source == "auto" and len(points) < self.fewest and not has_alpha(run.scene):
+        if source == "points" and self._is_joined(run.scene):
             points, source = points.joined(self._sweep(run)), "both"
         self._require_memory(run, len(points))
         parameters = from_points(points, self.opacity, degree, self.scale)

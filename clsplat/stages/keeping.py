@@ -47,7 +47,10 @@ class Keeping(Training):
         if self.keep != "best" and any(getattr(stage, "patience", None) for stage in inner):
             raise ValueError("'densify.patience' is for 'keep: best'; give both or neither")
         if self.keep == "best" and any("average" in stage.makes for stage in inner):
-            raise ValueError("'keep: best' leaves the model of one step, and not the average of several; choose one")
+            raise ValueError(
+                "'keep: best' leaves the model of one step, and not the average of several; choose one, or a pipeline "
+                "without 'add_to_average' and 'take_average', such as splat_7k"
+            )
         return self
 
     def measuring(self, during: Sequence[Scheduled]) -> list[Evaluate]:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from clsplat.gaussians.sky import Sky
 from clsplat.render.backdrops import Auto, Backdrop, Directions
 from clsplat.scene.images import read_image
-from clsplat.scene.scene import View
+from clsplat.scene.scene import Scene, View
 from clsplat.training.run import Run
 from clsplat.training.sky import LearnedSky
 from clsplat.views.sky_share import Seen, looked_at, panorama
@@ -48,10 +48,13 @@ def settled(background: Backdrop | None, run: Run) -> Backdrop | None:
 
 
 def share_with_sky(run: Run) -> float | None:
-    """Return the share of the training photographs that show a sky; None where that is not known."""
+    """Return the share of the training photographs that show a sky; None where that is not known.
+
+    Views for validation count as training views.
+    """
     if _unknown(run):
         return None
-    seen = _seen(run)
+    seen = list(looked_at(run.scene, _photographs(run, run.scene.with_fold())))
     return _number(seen, Auto().share) / len(seen)
 
 
@@ -95,11 +98,11 @@ def _first(run: Run, side: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]
 
 def _seen(run: Run) -> list[Seen]:
     """What each training photograph shows of the sky."""
-    return list(looked_at(run.scene, _photographs(run)))
+    return list(looked_at(run.scene, _photographs(run, run.scene)))
 
 
-def _photographs(run: Run) -> Iterator[tuple[View, NDArray[np.uint8]]]:
-    """The training photographs at the first size that they have, [height, width, 3]."""
-    views = list({view.name: view for view in reversed(run.scene.split("train"))}.values())[::-1]
+def _photographs(run: Run, scene: Scene) -> Iterator[tuple[View, NDArray[np.uint8]]]:
+    """The training photographs of a scene at the first size that they have, [height, width, 3]."""
+    views = list({view.name: view for view in reversed(scene.split("train"))}.values())[::-1]
     for view in run.status.counted(views, "photographs", len(views)):
         yield view, run.photographs.get(view).image()

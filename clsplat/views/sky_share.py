@@ -17,6 +17,7 @@ BLUE = 0.03  # by how much blue is above red
 DARKEST_BLUE = 0.3
 EVEN = 0.04  # standard deviation of the brightness in a square of 3 px
 UPPER = 1 / 3
+ALL_ROUND = 0.5  # of the share in the upper third: from here on in the lower third too, a background and no sky
 BEYOND = 2  # texels about those that photographs show as sky: its edge was left out, with what is near points
 Image = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
@@ -32,8 +33,10 @@ class Seen:
 
     @property
     def share(self) -> float:
-        """The share of its upper third that shows the sky."""
-        return float(self.mask[: max(1, round(len(self.mask) * UPPER))].mean())
+        """The share of its upper third that shows the sky; 0 where it shows below too, as behind an object on white."""
+        rows = max(1, round(len(self.mask) * UPPER))
+        above, below = float(self.mask[:rows].mean()), float(self.mask[-rows:].mean())
+        return above if below < ALL_ROUND * above else 0.0
 
     @property
     def directions(self) -> NDArray[np.float64]:
