@@ -16,7 +16,7 @@ Measures = dict[Measure, float]
 
 
 def _is_number(bound: Any) -> bool:
-    return isinstance(bound, int | float) and not isinstance(bound, bool) and math.isfinite(bound)
+    return isinstance(bound, int | float) and not isinstance(bound, bool) and abs(bound) < math.inf
 
 
 class CaptureChoice(Settings):
@@ -86,8 +86,8 @@ class CaptureChoice(Settings):
     def row(self, measures: Measures) -> int:
         """Return the number of the row that measures reach; one that is missing counts as 0."""
         found = [measures.get(name, 0) for name in self.measures]
-        reached = [all(map(float.__ge__, map(float, found), map(float, self.bounds(row)))) for row in self.values]
-        return max(number for number, one in enumerate(reached) if one)
+        bounds = [zip(found, self.bounds(row), strict=True) for row in self.values]
+        return max(number for number, row in enumerate(bounds) if all(value >= bound for value, bound in row))
 
     def depends(self, measure: Measure, measures: Measures) -> bool:
         """Whether the row depends on one more measure, beside those that are known."""
