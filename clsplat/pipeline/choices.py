@@ -6,13 +6,12 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
-from clsplat.scene.capture import TOLD, Measure
+from clsplat.scene.capture import TOLD, Measure, Measures
 from clsplat.settings import Settings
 
 WRITTEN = ("chosen", "reason")  # keys of a choice
 Others = Literal["row", "file"]
 Row = Annotated[list[Any], Field(min_length=2)]  # the least measure, or of each measure, then the value of each key
-Measures = dict[Measure, float]
 
 
 def _is_number(bound: Any) -> bool:

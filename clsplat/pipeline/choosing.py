@@ -15,13 +15,13 @@ from clsplat.pipeline.file import PipelineFile
 from clsplat.pipeline.overrides import apply, split, value_at
 from clsplat.pipeline.renamed import with_new_names
 from clsplat.pipeline.yaml_file import Place
-from clsplat.scene.capture import Measure
+from clsplat.scene.capture import Measures
 from clsplat.stages.optimize import Optimize
 
 LATE = ("model", "stages")  # parts of a pipeline that are used after the photographs are read
 
 
-def choose(settings: PipelineFile, measures: dict[Measure, float]) -> PipelineFile:
+def choose(settings: PipelineFile, measures: Measures) -> PipelineFile:
     """Return the settings with the values that follow from the measures; choices that are made stay.
 
     Where those of a row do not go together with what `--set` gave for one of them, the file's stay.
@@ -43,7 +43,7 @@ def choose(settings: PipelineFile, measures: dict[Measure, float]) -> PipelineFi
         return _checked(lambda: made("file"), measures)
 
 
-def _checked(made: Callable[[], PipelineFile], measures: dict[Measure, float]) -> PipelineFile:
+def _checked(made: Callable[[], PipelineFile], measures: Measures) -> PipelineFile:
     """Settings that go together.  Raises ConfigError."""
     measured = ", ".join(f"{value:,.4g} {measure}" for measure, value in measures.items())
     try:

@@ -9,6 +9,7 @@ from clsplat.scene.reprojection import reprojection_errors
 from clsplat.scene.scene import Scene
 
 Measure = Literal["photographs", "photographs_per_point", "pixels", "points", "reprojection_error", "sky"]
+Measures = dict[Measure, float]
 NEAREST = 0.01  # share of the points that photographs show which may lie nearer: some of them are mistaken
 TOLD: dict[Measure, str] = {
     "photographs": "{:,.4g} training photographs",
@@ -21,7 +22,7 @@ TOLD: dict[Measure, str] = {
 }
 
 
-def measured(scene: Scene) -> dict[Measure, float]:
+def measured(scene: Scene) -> Measures:
     """Return the measures that a scene, as it is trained on, has; views for validation count as training views.
 
     `sky` is not among them: it needs the photographs.

@@ -54,7 +54,7 @@ def share_with_sky(run: Run) -> float | None:
     """
     if _unknown(run):
         return None
-    seen = list(looked_at(run.scene, _photographs(run, run.scene.with_fold())))
+    seen = _seen(run, run.scene.with_fold())
     return _number(seen, Auto().share) / len(seen)
 
 
@@ -76,7 +76,7 @@ def _choice(background: Auto, run: Run) -> tuple[Literal["on", "off"], str]:
     """Whether there is a sky, and why."""
     if why := _unknown(run):
         return "off", why
-    seen = _seen(run)
+    seen = _seen(run, run.scene)
     number = _number(seen, background.share)
     text = (
         f"{number} of {len(seen)} photographs show bright or blue regions without points in {background.share:.0%} or "
@@ -89,16 +89,16 @@ def _choice(background: Auto, run: Run) -> tuple[Literal["on", "off"], str]:
 def _first(run: Run, side: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """The first colours of the map and which are learned; all, from the mean of the upper thirds of photographs, where
     none shows a sky."""
-    seen = _seen(run)
+    seen = _seen(run, run.scene)
     if found := panorama(seen, side):
         return found
     uppers = [one.image[: max(1, len(one.image) // 3)].mean(axis=(0, 1)) / 255 for one in seen]
     return np.tile(np.mean(uppers, axis=0), (side**2, 1)).astype(np.float32), np.ones(side**2, bool)
 
 
-def _seen(run: Run) -> list[Seen]:
-    """What each training photograph shows of the sky."""
-    return list(looked_at(run.scene, _photographs(run, run.scene)))
+def _seen(run: Run, scene: Scene) -> list[Seen]:
+    """What each training photograph of a scene shows of the sky."""
+    return list(looked_at(scene, _photographs(run, scene)))
 
 
 def _photographs(run: Run, scene: Scene) -> Iterator[tuple[View, NDArray[np.uint8]]]:
