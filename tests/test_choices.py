@@ -356,3 +356,11 @@ def test_a_limit_of_growth_is_beside_rules_that_grow(tmp_path):
     (tmp_path / "own.yaml").write_text(edited)
     with pytest.raises(ConfigError, match="no rule here grows"):
         load(str(tmp_path / "own.yaml"))
+
+
+@pytest.mark.parametrize(
+    "written", ["reason: so", "reason: so, chosen: [2], instead_of: [3, 3]", "chosen: [2], instead_of: [3]"]
+)
+def test_what_a_run_wrote_of_a_choice_goes_together(written):
+    with pytest.raises(ConfigError, match="chosen and instead_of with a value of each of 1 keys, and reason"):
+        load("smoke", [f"choices=[{DEGREE[:-1]}, {written}}}]"])

@@ -71,6 +71,12 @@ class CaptureChoice(Settings):
             raise ValueError(f"since: expected words, or words for each of {len(self.values)} rows")
         if wrong_key := next((key for key in self.given if key not in self.keys), None):
             raise ValueError(f"given: expected some of {', '.join(self.keys)}, got {wrong_key}")
+        written = [len(values or []) for values in (self.chosen, self.instead_of)]
+        if written != [len(self.keys) if self.reason else 0] * 2:
+            raise ValueError(
+                f"expected chosen and instead_of with a value of each of {len(self.keys)} keys, and reason, as a run "
+                "writes them; without all three the run chooses anew"
+            )
         return self
 
     @property
