@@ -1,4 +1,4 @@
-"""What photographs look like beside each other: blurred ones, the same one twice, jumps of the exposure."""
+"""What photographs look like beside each other: blurred ones, the same one twice, exposures that jump, filled edges."""
 
 import os
 from collections.abc import Container, Mapping, Sequence
@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.errors import DataError
+from clsplat.inspect.padding import padding
 from clsplat.progress import counted
 from clsplat.scene.exif import CameraExposure, exposure_of
 from clsplat.scene.exposures import camera_exposures
@@ -33,6 +34,7 @@ class LookFacts:
     blurred: list[str]  # much less sharp than the others
     same: list[list[str]]  # photographs that look the same
     jumps: list[tuple[str, str, float]]  # one and the next, and the stops between their exposures as EXIF tells them
+    padded: dict[str, int]  # px of an edge that repeat the line beside them, in all photographs
 
 
 def looks_of(parts: Parts, missing: Container[Path]) -> LookFacts:
@@ -62,6 +64,7 @@ def looks(files: Mapping[str, Path], exposures: Mapping[str, CameraExposure | No
         blurred=[name for name, (sharp, _) in found.items() if sharp < BLURRED * middle],
         same=_same(list(found), [thumbnail for _, thumbnail in found.values()]),
         jumps=[step for step in steps if step[2] > JUMP],
+        padded=padding(files[name] for name in found),
     )
 
 
