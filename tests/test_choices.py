@@ -11,6 +11,7 @@ from clsplat.errors import ConfigError
 from clsplat.pipeline.choosing import choose, undone
 from clsplat.pipeline.loading import load
 from clsplat.pipeline.stretching import in_steps
+from clsplat.pipeline.yaml_file import yaml_text
 from clsplat.runs import minutes
 from clsplat.runs.description import describe
 from clsplat.runs.found import has_ended
@@ -346,7 +347,9 @@ def test_a_run_does_not_look_for_a_sky_in_vain(tmp_path, rng, monkeypatch):
 
 def test_transparent_photographs_do_not_tell_of_a_sky(tiny_scene, tmp_path):
     asked = load("smoke", [f"scene.path='{tiny_scene}'", f"choices=[{SKY}]"])
-    assert "since 8 training photographs; x" in describe(asked, tmp_path / "run", None, "new")
+    assert "since 8 training photographs, the dataset does not tell sky; x" in describe(
+        asked, tmp_path / "run", None, "new"
+    )
 
 
 def test_a_limit_of_growth_is_beside_rules_that_grow(tmp_path):
@@ -364,3 +367,39 @@ def test_a_limit_of_growth_is_beside_rules_that_grow(tmp_path):
 def test_what_a_run_wrote_of_a_choice_goes_together(written):
     with pytest.raises(ConfigError, match="chosen and instead_of with a value of each of 1 keys, and reason"):
         load("smoke", [f"choices=[{DEGREE[:-1]}, {written}}}]"])
+
+
+@pytest.mark.parametrize(
+    ("choice", "complaint"),
+    [
+        (f"{DEGREE[:-1]}, reason: so, chosen: [1], instead_of: [q]}}", r"choices: instead_of: model.sh_degree: .*'q'"),
+        (DEGREE.replace("model.sh_degree", "optimise.steps"), "choices: optimise.steps: no 'optimise'"),
+        (DEGREE.replace("by: photographs", "by: photos"), r"choices\[0\].by: expected 'photographs'"),
+        (DEGREE.replace("since: few say little", "since: 3"), r"choices\[0\].since: expected text, got 3"),
+        (f"{DEGREE[:-1]}, given: abc}}", r"choices\[0\].given: expected keys and values, got 'abc'"),
+    ],
+)
+def test_what_is_wrong_with_a_choice_is_told_with_its_place(choice, complaint):
+    with pytest.raises(ConfigError, match=complaint):
+        load("smoke", [f"choices=[{choice}]"])
+
+
+def test_a_choice_given_no_mapping_is_told_beside_an_override(tmp_path):
+    file = tmp_path / "own.yaml"
+    file.write_text(load("smoke").path.read_text() + f"choices:\n  - {DEGREE[:-1]}, given: null}}\n")
+    with pytest.raises(ConfigError, match=r"given: expected keys and values"):
+        load(str(file), ["optimize.steps=9"])
+
+
+def test_an_override_inside_of_one_that_was_given_wins(tmp_path):
+    chosen = choose(load("photos", ["optimize.poses={start: 3}"]).settings, {"photographs": 20})
+    file = tmp_path / "pipeline.yaml"
+    file.write_text(yaml_text(replace(load("photos"), settings=chosen).resolved()))
+    settings = load(str(file), ["optimize.poses.start=10"]).settings
+    assert settings.training.poses.start == 10
+    assert [one.given for one in settings.choices] == [{}] * 5
+
+
+def test_of_several_measures_those_that_are_missing_are_told():
+    reason = choose(load("photos").settings, {"photographs": 20}).choices[2].reason
+    assert reason.startswith("20 training photographs, the dataset does not tell sky; few do not hold up")

@@ -21,6 +21,8 @@ from clsplat.render.backdrops import Auto
 from clsplat.runs.found import has_ended
 from clsplat.runs.model_file import evaluate
 from clsplat.runs.single import run_pipeline
+from clsplat.scene.camera import Camera
+from clsplat.scene.view import View
 from clsplat.training import checkpoint
 from clsplat.training.archive import split
 from clsplat.training.sky import FOLDER, check_tables
@@ -30,6 +32,7 @@ from tests.test_training import digest, train
 from tests.yards import Yard, painted
 
 pytestmark = pytest.mark.slow
+CAMERA, UP = Camera(64, 48, 60.0, 60.0, 32.0, 24.0), np.array([0.0, -1.0, 0.0])
 SKY = (*FEW, "model.background={type: directions, side: 16}")
 LONGER = ("optimize.steps=300", "reset_opacity.every=1000", "optimize.evaluate.every=1000", "scene.holdout=4")
 
@@ -90,11 +93,16 @@ def evaluate_without(out: Path, model) -> float:
     return float(np.mean([psnr(a, b) for a, b in zip(found, photographs, strict=True)]))
 
 
-def test_a_background_all_round_is_no_sky(yard):
-    mask = np.ones((9, 4), bool)
-    assert Seen(yard[0].views[0], np.zeros((9, 4, 3), np.uint8), mask).share == 0
-    mask[7:] = False
-    assert Seen(yard[0].views[0], np.zeros((9, 4, 3), np.uint8), mask).share == 1, "less than half of it"
+@pytest.mark.parametrize(
+    ("pitch", "rows", "share"),
+    [(0, 12, 0), (0, 8, 1), (0, 6, 1), (45, 12, 1), (-45, 6, 0), (-45, 12, 0), (45, 0, 0)],
+)
+def test_a_sky_does_not_go_on_below_the_horizon(pitch, rows, share):
+    """Level, looking up at something narrow, and down at something on white; upper rows that are bright, of 12."""
+    mask = np.repeat(np.arange(12)[:, None] < rows, 16, axis=1)
+    down = np.sin(np.radians(-pitch))
+    view = View.looking_at(np.zeros(3), np.array([0, down, np.cos(np.radians(pitch))]), UP, CAMERA)
+    assert Seen(view, np.zeros((12, 16, 3), np.uint8), mask, UP).share == share
 
 
 def test_a_choice_is_written_with_its_reason(learned):

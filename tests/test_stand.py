@@ -1,35 +1,68 @@
 """Which way is up in a scene, and what its cameras look at."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from clsplat.inspect import space
 from clsplat.report import cameras
 from clsplat.scene.camera import Camera
-from clsplat.scene.stand import Stand, closest_point, upward
+from clsplat.scene.stand import Stand, across, closest_point, upward
 from clsplat.scene.view import View
 from clsplat.video.rig import Rig
 
 CAMERA = Camera(64, 48, 60.0, 60.0, 32.0, 24.0)
-UPS = {  # upward axes of views, and what they agree on
-    "alike": ([[0, -1, 0], [0.6, -0.8, 0]], [0.6, -1.8, 0]),
-    "most alike": ([[0, 0, 1], [0, 0, -1], [0, 1, 0]], [0, 1, 0]),
-    "opposite": ([[1, 0, 0], [-1, 0, 0]], [1, 0, 0]),
+UP = np.array([0.0, -0.8, 0.6])
+
+
+def orbit(pitch, angles, up=UP):
+    """Views to the sides, by angles in degrees around an axis, that look down by a pitch."""
+    side = across(up)
+    around = [np.cos(a) * side + np.sin(a) * np.cross(up, side) for a in np.radians(angles)]
+    aheads = [np.cos(np.radians(pitch)) * one - np.sin(np.radians(pitch)) * up for one in around]
+    return [
+        looking(3 * i * side, ahead, one if pitch == 90 else up)
+        for i, (ahead, one) in enumerate(zip(aheads, around, strict=True))
+    ]
+
+
+def looking(eye, ahead, up):
+    return View.looking_at(eye, eye + ahead, up, CAMERA)
+
+
+def rolled(view):
+    """The same view with the camera on its side."""
+    turn = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    return replace(view, world_to_camera=(turn @ view.world_to_camera).astype(view.world_to_camera.dtype))
+
+
+CASES = {  # views, and what is up within so many degrees
+    "all round": (orbit(0, range(0, 360, 40)), UP, 0.1),
+    "a third of the way round, from above": (orbit(50, range(0, 130, 10)), UP, 3),
+    "straight down, to all sides": (orbit(90, range(0, 360, 40)), UP, 0.1),
+    "one way": (orbit(20, [0, 0, 0]), UP, 20.1),
+    "some on their side": ([*orbit(10, range(0, 300, 40)), *map(rolled, orbit(10, [300, 340]))], UP, 25),
+    "one": (orbit(0, [70]), UP, 0.1),
 }
 
 
-@pytest.mark.parametrize("case", UPS)
+@pytest.mark.parametrize("case", CASES)
 def test_all_take_the_same_way_for_up(case):
-    ups, expected = UPS[case]
-    views = [
-        View.looking_at((i, 5, i), np.add((i, 5, i), np.cross(up, (1, 2, 3))), up, CAMERA) for i, up in enumerate(ups)
-    ]
-    up, points = np.array(expected) / np.linalg.norm(expected), np.zeros((9, 3), np.float32)
-    np.testing.assert_allclose(upward(views), up, atol=1e-12)
+    views, expected, degrees = CASES[case]
+    up, points = upward(views), np.zeros((9, 3), np.float32)
+    assert np.linalg.norm(up) == pytest.approx(1)
+    assert np.degrees(np.arccos(min(1, up @ expected))) < degrees
     np.testing.assert_allclose(Rig.of(views, points).up, up, atol=1e-12)
     np.testing.assert_allclose(Stand.of(points, views, views[0]).up, up, atol=1e-12)
     np.testing.assert_allclose(space._axes(views)[2], up, atol=1e-12)
     np.testing.assert_allclose(np.cross(*cameras._axes(views)), -up, atol=1e-12)
+
+
+def test_all_on_their_side_have_the_mean_of_their_upward_axes():
+    views = [rolled(view) for view in orbit(0, range(0, 100, 10))]
+    mean = np.mean([-view.world_to_camera[1, :3] for view in views], axis=0)
+    np.testing.assert_allclose(upward(views), mean / np.linalg.norm(mean), atol=1e-6)
 
 
 def test_the_pivot_is_where_the_axes_meet():

@@ -104,12 +104,15 @@ class CaptureChoice(Settings):
         others: whether what stands beside `given` values is of the row that the measure reaches, or of the file.
         """
         found = [TOLD[name].format(measures[name]) for name in self.measures if name in measures]
+        missing = [name for name in self.measures if name not in measures and self.depends(name, measures)]
+        untold = [f"the dataset does not tell {name}" for name in missing]
         if not found:
             reason, chosen = f"the dataset does not tell {', '.join(self.measures)}", before
         else:
             at = self.row(measures)
             chosen = self.values[at][1:]
-            reason = f"{', '.join(found)}; {self.since if isinstance(self.since, str) else self.since[at]}"
+            why = self.since if isinstance(self.since, str) else self.since[at]
+            reason = f"{', '.join(found + untold)}; {why}"
         if self.given:
             keys = ", ".join(self.given)
             alone = others == "file" and bool(found)

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from pydantic import ValidationError
 
-from clsplat.errors import ConfigError
+from clsplat.errors import ConfigError, OverrideError, shortened
 from clsplat.pipeline.choices import CaptureChoice, Others, without_choices
 from clsplat.pipeline.explanation import first_fault, place_text
 from clsplat.pipeline.file import PipelineFile
@@ -67,10 +67,17 @@ def check_keeping(settings: PipelineFile) -> None:
 
 
 def undone(settings: PipelineFile) -> PipelineFile:
-    """Return the settings as they were before a run chose by `choices`."""
+    """Return the settings as they were before a run chose by `choices`.
+
+    Raises ConfigError where what stood there does not fit its place, as after an edit.
+    """
     made = [one for one in settings.choices if one.reason]
     before = [pair for one in made for pair in zip(one.keys, one.instead_of or [], strict=True)]
-    return _with(settings, [one.undone() for one in settings.choices], before) if made else settings
+    try:
+        return _with(settings, [one.undone() for one in settings.choices], before) if made else settings
+    except ValidationError as error:
+        place, complaint = first_fault(error, PipelineFile)
+        raise ConfigError(f"choices: instead_of: {place_text(place)}: {complaint}") from error
 
 
 def forgotten(data: dict[str, Any]) -> dict[str, Any]:
@@ -158,6 +165,8 @@ def _columns(choice: dict[str, Any], kept: list[bool]) -> dict[str, Any] | None:
     own = {name: choice[name] for name in ("keys", "chosen", "instead_of") if isinstance(choice.get(name), list)}
     rows = [[row[0], *compress(row[1:], kept)] for row in choice["values"]]
     less = {**choice, **{name: list(compress(values, kept)) for name, values in own.items()}, "values": rows}
+    if given := choice.get("given"):
+        less["given"] = {key: value for key, value in given.items() if key in less["keys"]}
     return less if any(kept) else None
 
 
@@ -166,7 +175,7 @@ def _choices(data: dict[str, Any]) -> Iterator[tuple[int, dict[str, Any]]]:
     choices = data.get("choices")
     for number, one in enumerate(choices if isinstance(choices, list) else ()):
         keys, rows = (one.get("keys"), one.get("values")) if isinstance(one, dict) else (None, None)
-        if not isinstance(keys, list) or not isinstance(rows, list):
+        if not isinstance(keys, list) or not isinstance(rows, list) or not isinstance(one.get("given", {}), dict):
             continue
         if all(isinstance(key, str) for key in keys) and all(isinstance(row, list) and row for row in rows):
             yield number, one
@@ -208,8 +217,11 @@ def _set(data: dict[str, Any], key: str, value: Any) -> Place:
 
 
 def _place(data: dict[str, Any], key: str) -> Place:
-    """The place of a key in a file's data.  Raises OverrideError where there is none."""
-    return _set(copy.deepcopy(data), key, None)
+    """The place of a key of a choice in a file's data.  Raises ConfigError where there is none."""
+    try:
+        return _set(copy.deepcopy(data), key, None)
+    except OverrideError as error:
+        raise ConfigError(f"choices: {shortened(key)}: {error.reason}") from error
 
 
 def _touch(one: Place, other: Place) -> bool:

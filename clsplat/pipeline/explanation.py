@@ -8,7 +8,7 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 
 from clsplat.errors import quoted, shortened
-from clsplat.pipeline.fields import annotation_of, bases, inside_list, models, tags
+from clsplat.pipeline.fields import annotation_of, bases, inside_list, is_union, models, tags
 from clsplat.pipeline.yaml_file import Document, Place
 from clsplat.settings import TAGS, Settings, Variants
 
@@ -115,6 +115,8 @@ def _follow(location: tuple[int | str, ...], root: type[BaseModel]) -> tuple[Pla
             annotation = model = tagged[0]
             if "stage" in model.model_fields:
                 place.append(part)
+        elif not members and is_union(annotation):
+            annotation = None  # the part names a member of the union
         else:
             place.append(part)
             model = members[0] if len(members) == 1 else model

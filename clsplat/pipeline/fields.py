@@ -33,6 +33,12 @@ def bases(annotation: Any) -> list[type[Settings]]:
     return [mark.base for mark in typing.get_args(annotation)[1:] if isinstance(mark, Variants)]
 
 
+def is_union(annotation: Any) -> bool:
+    """Return whether an annotation allows several types beside null."""
+    is_one = typing.get_origin(annotation) in (typing.Union, types.UnionType)
+    return is_one and len([one for one in typing.get_args(annotation) if one is not types.NoneType]) > 1
+
+
 def annotation_of(field: FieldInfo) -> Any:
     """Return a field's annotation with its marks, as it was written."""
     return typing.Annotated[field.annotation, *field.metadata] if field.metadata else field.annotation

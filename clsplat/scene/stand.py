@@ -10,6 +10,8 @@ from clsplat.scene.camera import Camera
 from clsplat.scene.view import View
 
 MIN_UP = 0.1  # length of the mean of the upward axes: below it the cameras do not agree
+LEVEL = 0.02  # weight of that mean beside the rightward axes, squared: cameras are held level to about 4 degrees
+MAX_PITCH = 60.0  # degrees between that mean and what is up; further apart, cameras lie on their sides
 PRIOR = 1e-3  # weight of the splats' middle, beside the axes: where all are parallel, nothing else says how far
 START = Camera(1200, 900, 1100.0, 1100.0, 600.0, 450.0)  # where there is no view
 SHARES = 0.05, 0.95  # of the splats, along each axis, are before and behind the sides of the box that is looked at
@@ -45,11 +47,20 @@ class Stand:
 
 
 def upward(views: Sequence[View]) -> NDArray[np.float64]:
-    """Return the mean of the upward axes of views, unit, [3]; that of the first view where they cancel out."""
-    axes = np.stack([-view.world_to_camera[1, :3] for view in views])
-    mean = axes.mean(axis=0)
-    axis = mean if np.linalg.norm(mean) > MIN_UP else axes[0]
-    return np.asarray(axis / np.linalg.norm(axis), np.float64)
+    """Return what is up, unit, [3]: what most rightward axes of views are across, as cameras are held level.
+
+    Where all look the same way, that is undecided, and the mean of their upward axes, in which cameras that look down
+    lean, decides; so it does where most lie on their sides.  Where it cancels out, cameras look down more than up.
+    """
+    poses = np.stack([view.world_to_camera for view in views]).astype(np.float64)
+    right, mean, ahead = poses[:, 0, :3], -poses[:, 1, :3].mean(axis=0), poses[:, 2, :3].mean(axis=0)
+    level = right.T @ right / len(right) - LEVEL * np.outer(mean, mean)
+    axis = np.linalg.eigh(level).eigenvectors[:, 0]
+    length = float(np.linalg.norm(mean))
+    if length <= MIN_UP:
+        return np.asarray(-axis if axis @ ahead > 0 else axis, np.float64)
+    leans = abs(axis @ mean) < np.cos(np.radians(MAX_PITCH)) * length
+    return np.asarray(mean / length if leans else axis * np.sign(axis @ mean), np.float64)
 
 
 def across(up: NDArray[np.floating]) -> NDArray[np.float64]:

@@ -76,7 +76,7 @@ class Densify(Scheduled):
     def _with_growth(self) -> "Densify":
         if self.per_pixel is not None and not any(rule.grows for rule in self.rules):
             raise ValueError(
-                "'per_pixel' ends growth, and no rule here grows; expected it beside rules that clone or split"
+                "'per_pixel' ends growth, and no rule here grows; set it to null, or beside rules that clone or split"
             )
         return self
 

@@ -1,4 +1,5 @@
-"""Where photographs show the sky: bright or blue, even, far from all points, and joined to the upper edge (ours)."""
+"""Where photographs show the sky: bright or blue, even, far from all points, joined to the upper edge, and above the
+horizon (ours)."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 
 from clsplat.gaussians.octahedral import corners, neighbours, places, weights
 from clsplat.scene.scene import Scene, View
+from clsplat.scene.stand import upward
 
 SIDE = 160  # px of the longer side, at which photographs are looked at
 APART = 4  # px there, from the nearest point: 20 px of a photograph of 800
@@ -17,7 +19,7 @@ BLUE = 0.03  # by how much blue is above red
 DARKEST_BLUE = 0.3
 EVEN = 0.04  # standard deviation of the brightness in a square of 3 px
 UPPER = 1 / 3
-ALL_ROUND = 0.5  # of the share in the upper third: from here on in the lower third too, a background and no sky
+SKYWARD = 0.75  # of such pixels are above the horizon: with fewer, they are a wall, or what an object lies on
 BEYOND = 2  # texels about those that photographs show as sky: its edge was left out, with what is near points
 Image = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
@@ -30,13 +32,14 @@ class Seen:
     view: View
     image: Image  # small, [height, width, 3]
     mask: Mask  # pixels that show the sky, [height, width]
+    up: NDArray[np.float64]  # in the scene, [3]
 
     @property
     def share(self) -> float:
-        """The share of its upper third that shows the sky; 0 where it shows below too, as behind an object on white."""
-        rows = max(1, round(len(self.mask) * UPPER))
-        above, below = float(self.mask[:rows].mean()), float(self.mask[-rows:].mean())
-        return above if below < ALL_ROUND * above else 0.0
+        """The share of its upper third that shows the sky; 0 where that goes on below the horizon, as a wall does."""
+        if not self.mask.any() or (self.directions[self.mask] @ self.up > 0).mean() < SKYWARD:
+            return 0.0
+        return float(self.mask[: max(1, round(len(self.mask) * UPPER))].mean())
 
     @property
     def directions(self) -> NDArray[np.float64]:
@@ -50,9 +53,11 @@ class Seen:
 
 def looked_at(scene: Scene, views: Iterable[tuple[View, Image]]) -> Iterator[Seen]:
     """Yield what photographs, [height, width, 3], show of the sky."""
+    up = upward(scene.split("train"))
     for view, image in views:
         small = _small(image)
-        yield Seen(view, small, sky_mask(small, _points_in(scene, view) * (small.shape[1] / view.camera.width)))
+        mask = sky_mask(small, _points_in(scene, view) * (small.shape[1] / view.camera.width))
+        yield Seen(view, small, mask, up)
 
 
 def panorama(seen: Sequence[Seen], side: int) -> tuple[NDArray[np.float32], Mask] | None:
