@@ -1,9 +1,12 @@
 """Edges of photographs that repeat the line beside them: each edge, plain ones, unreadable files, and what is said."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 
+from clsplat.inspect.findings import findings
 from clsplat.inspect.inspection import Inspection
 from clsplat.inspect.padding import EDGES, WIDEST, filled, padding
 from tests.data_sets import data_set
@@ -35,6 +38,14 @@ def test_a_border_of_one_colour_and_photographs_that_are_alike_everywhere_say_no
     assert filled(np.zeros((1, 1), np.uint8)) == [0] * 4
 
 
+def test_an_enlarged_a_soft_and_a_faint_photograph_say_nothing(rng):
+    assert filled(photograph(rng).repeat(3, axis=0).repeat(3, axis=1)) == [0] * 4
+    soft = np.linspace(0, 200, 60)[None] / 4 + np.linspace(0, 100, 30)[:, None]
+    assert filled(bordered(soft.astype(np.uint8), "left", 3)) == [0] * 4
+    faint = bordered((photograph(rng) / 12).astype(np.uint8), "left", 3)
+    assert filled(faint) == [0] * 4
+
+
 def test_all_of_the_first_photographs_have_what_is_found(rng, tmp_path):
     files = [tmp_path / f"{i}.png" for i in range(3)]
     for file, px in zip(files, (4, 2, 3), strict=True):
@@ -45,7 +56,13 @@ def test_all_of_the_first_photographs_have_what_is_found(rng, tmp_path):
     assert padding(files) == {}
 
 
+def said(inspection):
+    return [one.text for one in inspection.findings if "repeat the pixels" in one.fault]
+
+
 def test_an_inspection_names_them():
-    fault = next(one for one in Inspection.of(data_set("fox_peers")).findings if "repeat the pixels" in one.fault)
-    assert (fault.level, fault.fault.split("(")[1][:10]) == ("note", "3 px right")
-    assert not any("repeat the pixels" in one.fault for one in Inspection.of(data_set("fox")).findings)
+    inspection = Inspection.of(data_set("fox_peers"))
+    assert ["(3 px right)" in one for one in said(inspection)] == [True]
+    masked = replace(inspection.facts, photos=replace(inspection.facts.photos, masks=50))
+    assert not any("repeat the pixels" in one.fault for one in findings(masked))
+    assert not said(Inspection.of(data_set("fox")))

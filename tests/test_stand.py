@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from clsplat.inspect import space
 from clsplat.report import cameras
@@ -31,19 +32,29 @@ def looking(eye, ahead, up):
     return View.looking_at(eye, eye + ahead, up, CAMERA)
 
 
-def rolled(view):
-    """The same view with the camera on its side."""
-    turn = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]])
+def rolled(view, degrees):
+    """The same view with the camera turned about its axis."""
+    turn = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
     return replace(view, world_to_camera=(turn @ view.world_to_camera).astype(view.world_to_camera.dtype))
+
+
+def tilted(views, degrees):
+    """The same views, each rolled by so many degrees."""
+    return [rolled(view, angle) for view, angle in zip(views, degrees, strict=True)]
 
 
 CASES = {  # views, and what is up within so many degrees
     "all round": (orbit(0, range(0, 360, 40)), UP, 0.1),
-    "a third of the way round, from above": (orbit(50, range(0, 130, 10)), UP, 3),
-    "straight down, to all sides": (orbit(90, range(0, 360, 40)), UP, 0.1),
+    "a third of the way round, from above": (orbit(50, range(0, 130, 10)), UP, 0.1),
+    "the same, steeper": (orbit(70, range(0, 130, 10)), UP, 0.1),
+    "straight down, to all sides": (orbit(90, range(0, 320, 40)), UP, 0.1),
+    "straight down, there and back": (orbit(90, [0] * 11 + [180] * 9), UP, 0.1),
     "one way": (orbit(20, [0, 0, 0]), UP, 20.1),
-    "some on their side": ([*orbit(10, range(0, 300, 40)), *map(rolled, orbit(10, [300, 340]))], UP, 25),
+    "turned little, and rolled along": (tilted(orbit(0, range(-12, 13, 2)), np.linspace(-9, 9, 13)), UP, 4),
+    "turned little, and rolled much": (tilted(orbit(0, [-8, -4, 0, 4, 8]), [20, -25, 0, 25, -20]), UP, 4),
+    "some on their side": ([*orbit(10, range(0, 300, 40)), *tilted(orbit(10, [300, 340]), [90, 90])], UP, 25),
     "one": (orbit(0, [70]), UP, 0.1),
+    "two that look at each other": (orbit(0, [0, 180]), UP, 0.1),
 }
 
 
@@ -60,7 +71,7 @@ def test_all_take_the_same_way_for_up(case):
 
 
 def test_all_on_their_side_have_the_mean_of_their_upward_axes():
-    views = [rolled(view) for view in orbit(0, range(0, 100, 10))]
+    views = [rolled(view, 90) for view in orbit(0, range(0, 100, 10))]
     mean = np.mean([-view.world_to_camera[1, :3] for view in views], axis=0)
     np.testing.assert_allclose(upward(views), mean / np.linalg.norm(mean), atol=1e-6)
 

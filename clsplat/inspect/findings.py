@@ -136,9 +136,9 @@ def _looks(facts: Facts) -> Iterator[Finding]:
         named = _listed([f"{a} to {b}: {stops:.1f}" for a, b, stops in jumps])
         fault = f"the exposure jumps by more than a stop {amount(len(jumps), 'time')} ({named})"
         yield Finding("note", fault, "--set optimize.colours=auto gives each photograph its own")
-    if padded := facts.looks.padded:
+    if (padded := facts.looks.padded) and not facts.photos.masks:
         where = ", ".join(f"{px} px {edge}" for edge, px in padded.items())
-        fault = f"photographs repeat the pixels at an edge ({where}), as an undistortion or a video codec fills it"
+        fault = f"photographs repeat the pixels at an edge ({where}), as an undistortion fills it"
         yield Finding("note", fault, "no model shows them; leave them out by scene.masks, or expect less PSNR")
 
 

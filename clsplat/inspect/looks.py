@@ -34,7 +34,7 @@ class LookFacts:
     blurred: list[str]  # much less sharp than the others
     same: list[list[str]]  # photographs that look the same
     jumps: list[tuple[str, str, float]]  # one and the next, and the stops between their exposures as EXIF tells them
-    padded: dict[str, int]  # px of an edge that repeat the line beside them, in all photographs
+    padded: dict[str, int]  # px of an edge that repeat the line beside them, in the first photographs
 
 
 def looks_of(parts: Parts, missing: Container[Path]) -> LookFacts:

@@ -1,4 +1,4 @@
-"""Edges of photographs that repeat the pixels beside them: what an undistortion or a video codec fills."""
+"""Edges of photographs that repeat the pixels beside them: what an undistortion fills."""
 
 from collections.abc import Iterable
 from contextlib import suppress
@@ -14,7 +14,7 @@ from clsplat.scene.images import read_grey
 EDGES = ("left", "top", "right", "bottom")  # as np.rot90 turns them to the left
 EXAMPLES = 3  # photographs: all of a dataset are filled alike
 WIDEST = 32  # px
-REPEATED, DIFFERENT = 0.5, 2.0  # mean grey levels between neighbouring lines: after JPEG, and of a sharp photograph
+REPEATED, DIFFERENT = 0.5, 2.0  # mean grey levels between neighbouring lines: without loss, and of a sharp photograph
 VARIED = 8.0  # grey levels: the standard deviation along a line that is more than plain
 FULL = 1 << 30  # px: no photograph is longer
 
@@ -22,7 +22,7 @@ FULL = 1 << 30  # px: no photograph is longer
 def padding(files: Iterable[Path]) -> dict[str, int]:
     """Return how many px of an edge repeat the line beside them in each of the first photographs, by edge.
 
-    Lines of one colour say nothing, nor do photographs all of whose lines are alike.
+    Lines of one colour say nothing, nor do photographs that are alike or enlarged everywhere.  JPEG hides it.
     """
     found: list[list[int]] = []
     with suppress(DataError):  # what cannot be read is another finding
@@ -33,12 +33,13 @@ def padding(files: Iterable[Path]) -> dict[str, int]:
 
 def filled(grey: NDArray[np.uint8]) -> list[int]:
     """Return how many px of each edge of a photograph [H, W] repeat the line beside them, in the order of EDGES."""
-    return [_repeats(np.rot90(grey, turns)[:, : WIDEST + 2].astype(np.float32)) for turns in range(len(EDGES))]
+    return [_repeats(np.rot90(grey, turns)[:, : WIDEST + 3].astype(np.float32)) for turns in range(len(EDGES))]
 
 
 def _repeats(lines: NDArray[np.float32]) -> int:
     """How many columns at the left repeat the next one."""
     changes = np.abs(np.diff(lines, axis=1)).mean(axis=0)
     count = int(np.argmax(np.append(changes, np.inf) >= REPEATED))
-    ends = count < len(changes) and changes[count] >= DIFFERENT
+    beyond = changes[count : count + 2]  # where a photograph is enlarged, lines repeat here too
+    ends = len(beyond) == 2 and beyond[0] >= DIFFERENT and beyond[1] >= REPEATED
     return count if ends and lines[:, 0].std() > VARIED else 0

@@ -35,25 +35,25 @@ def choose(settings: PipelineFile, measures: Measures) -> PipelineFile:
         choices = [one if one.reason else one.of(measures, old, others) for one, old in pairs]
         return _with(settings, choices, [pair for one in choices for pair in one.settings])
 
+    what = f"at {', '.join(f'{value:,.4g} {measure}' for measure, value in measures.items())}"
     try:
-        return _checked(lambda: made("row"), measures)
+        return _checked(lambda: made("row"), what)
     except ConfigError:
         if not any(one.given and not one.reason for one in settings.choices):
             raise
-        return _checked(lambda: made("file"), measures)
+        return _checked(lambda: made("file"), what)
 
 
-def _checked(made: Callable[[], PipelineFile], measures: Measures) -> PipelineFile:
-    """Settings that go together.  Raises ConfigError."""
-    measured = ", ".join(f"{value:,.4g} {measure}" for measure, value in measures.items())
+def _checked(made: Callable[[], PipelineFile], what: str) -> PipelineFile:
+    """Settings that go together.  Raises ConfigError; what: what they are made of."""
     try:
         settings = made()
         check_keeping(settings)
     except ValidationError as error:
         place, complaint = first_fault(error, PipelineFile)
-        raise ConfigError(f"choices, at {measured}: {place_text(place)}: {complaint}") from error
+        raise ConfigError(f"choices, {what}: {place_text(place)}: {complaint}") from error
     except ConfigError as error:
-        raise ConfigError(f"choices, at {measured}: {error}") from error
+        raise ConfigError(f"choices, {what}: {error}") from error
     return settings
 
 
@@ -66,6 +66,21 @@ def check_keeping(settings: PipelineFile) -> None:
         raise ConfigError(f"optimize.refit: expected one stage that trains, found {len(trainings)}")
 
 
+def check_kept(settings: PipelineFile) -> None:
+    """Raise ConfigError where what a run chose does not stand at its place, as after an edit."""
+    made = [(number, pair) for number, one in enumerate(settings.choices) if one.reason for pair in one.settings]
+    if not made:
+        return
+    pairs = [pair for _, pair in made]
+    again = _checked(lambda: _with(settings, settings.choices, pairs), "chosen")
+    here, there = (without_choices(one.model_dump(mode="json")) for one in (settings, again))
+    for number, (key, _) in made:
+        found, chosen = (value_at(data, key, PipelineFile) for data in (here, there))
+        if found != chosen:
+            what = f"a run chose {key}={shortened(json.dumps(chosen))}, and {shortened(json.dumps(found))} stands there"
+            raise ConfigError(f"choices[{number}]: {what}; change it by --set, or remove the choice")
+
+
 def undone(settings: PipelineFile) -> PipelineFile:
     """Return the settings as they were before a run chose by `choices`.
 
@@ -73,11 +88,9 @@ def undone(settings: PipelineFile) -> PipelineFile:
     """
     made = [one for one in settings.choices if one.reason]
     before = [pair for one in made for pair in zip(one.keys, one.instead_of or [], strict=True)]
-    try:
-        return _with(settings, [one.undone() for one in settings.choices], before) if made else settings
-    except ValidationError as error:
-        place, complaint = first_fault(error, PipelineFile)
-        raise ConfigError(f"choices: instead_of: {place_text(place)}: {complaint}") from error
+    if not made:
+        return settings
+    return _checked(lambda: _with(settings, [one.undone() for one in settings.choices], before), "instead_of")
 
 
 def forgotten(data: dict[str, Any]) -> dict[str, Any]:
@@ -194,6 +207,7 @@ def check_choices(settings: PipelineFile) -> None:
         if any(_touch(place, other) for other in places):
             raise ConfigError(f"{what} is chosen twice; expected one choice for each place")
         places.append(place)
+    check_kept(settings)
     still_open, faults = undone(settings), list[ConfigError]()
     rows = {tuple(zip(one.measures, one.bounds(row), strict=True)) for one in settings.choices for row in one.values}
     for row in sorted(rows):

@@ -40,7 +40,8 @@ class Auto(Backdrop):
     """A sky where photographs have one, by what their upper part shows.
 
     Before training the photographs are looked at: pixels show the sky that are bright or blue, far from all points of
-    the dataset, even, and joined to the upper edge.  Elsewhere the bits are those without this key.
+    the dataset, even, and joined to the upper edge.  A photograph with more than a quarter of them below the horizon
+    shows none.  Elsewhere the bits are those without this key.
     """
 
     output_keys: ClassVar[frozenset[str]] = frozenset({"chosen", "reason"})

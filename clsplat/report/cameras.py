@@ -42,7 +42,7 @@ def cameras(run: Run) -> list[Markup]:
 
 
 def _axes(views: Sequence[View]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Two directions across the mean upward one of the cameras, each [3]."""
+    """Two directions across what is up for the cameras, each [3]."""
     up = upward(views)
     right = across(up)
     return right, np.cross(right, up)

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from clsplat.scene.camera import Camera
 from clsplat.scene.view import View
 
-MIN_UP = 0.1  # length of the mean of the upward axes: below it the cameras do not agree
-LEVEL = 0.02  # weight of that mean beside the rightward axes, squared: cameras are held level to about 4 degrees
-MAX_PITCH = 60.0  # degrees between that mean and what is up; further apart, cameras lie on their sides
+TURNED = 0.1  # of the squares of rightward axes, along their second direction: cameras turn by 18 degrees
+ROLLED = 0.15  # of that, along their third: with more, cameras are rolled, or lie on their sides
+AGREED, FURTHEST = 0.5, 75.0  # a mean of upward axes of this length is less than so many degrees away from what is up
 PRIOR = 1e-3  # weight of the splats' middle, beside the axes: where all are parallel, nothing else says how far
 START = Camera(1200, 900, 1100.0, 1100.0, 600.0, 450.0)  # where there is no view
 SHARES = 0.05, 0.95  # of the splats, along each axis, are before and behind the sides of the box that is looked at
@@ -47,20 +47,21 @@ class Stand:
 
 
 def upward(views: Sequence[View]) -> NDArray[np.float64]:
-    """Return what is up, unit, [3]: what most rightward axes of views are across, as cameras are held level.
+    """Return what is up, unit, [3].
 
-    Where all look the same way, that is undecided, and the mean of their upward axes, in which cameras that look down
-    lean, decides; so it does where most lie on their sides.  Where it cancels out, cameras look down more than up.
+    Where cameras turn, and are held level, it is what their rightward axes are across; else the mean of their upward
+    axes, which leans where all look down from one side.  Where these cancel out, what most look away from.
     """
     poses = np.stack([view.world_to_camera for view in views]).astype(np.float64)
     right, mean, ahead = poses[:, 0, :3], -poses[:, 1, :3].mean(axis=0), poses[:, 2, :3].mean(axis=0)
-    level = right.T @ right / len(right) - LEVEL * np.outer(mean, mean)
-    axis = np.linalg.eigh(level).eigenvectors[:, 0]
-    length = float(np.linalg.norm(mean))
-    if length <= MIN_UP:
-        return np.asarray(-axis if axis @ ahead > 0 else axis, np.float64)
-    leans = abs(axis @ mean) < np.cos(np.radians(MAX_PITCH)) * length
-    return np.asarray(mean / length if leans else axis * np.sign(axis @ mean), np.float64)
+    squares, axes = np.linalg.eigh(right.T @ right / len(right))
+    axis, length = axes[:, 0], np.linalg.norm(mean)
+    leans = length > AGREED and abs(axis @ mean) < length * np.cos(np.radians(FURTHEST))
+    if squares[1] >= TURNED and squares[0] <= ROLLED * squares[1] and not leans:
+        return np.asarray(axis if axis @ (mean - ahead / 2) > 0 else -axis)  # looking down is more usual than up
+    axis = mean if length > np.linalg.norm(ahead) / 2 else -ahead
+    axis = axis if np.linalg.norm(axis) > np.finfo(np.float32).eps else -poses[0, 1, :3]
+    return np.asarray(axis / np.linalg.norm(axis), np.float64)
 
 
 def across(up: NDArray[np.floating]) -> NDArray[np.float64]:

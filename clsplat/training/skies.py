@@ -79,8 +79,8 @@ def _choice(background: Auto, run: Run) -> tuple[Literal["on", "off"], str]:
     seen = _seen(run, run.scene)
     number = _number(seen, background.share)
     text = (
-        f"{number} of {len(seen)} photographs show bright or blue regions without points in {background.share:.0%} or "
-        "more of their upper third"
+        f"{number} of {len(seen)} photographs show bright or blue regions above the horizon, without points, in "
+        f"{background.share:.0%} or more of their upper third"
     )
     enough = number >= background.photographs * len(seen)
     return ("on" if enough else "off"), f"{text}; {'' if enough else 'not '}{background.photographs:.0%} of them"

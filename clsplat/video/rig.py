@@ -58,7 +58,7 @@ class Rig:
 
     @cached_property
     def up(self) -> Floats:
-        """The mean of the upward axes, [3]; that of the first image where they cancel out."""
+        """What is up, [3], unit."""
         return upward(self.views)
 
     @cached_property
