@@ -373,8 +373,6 @@ def test_what_a_run_wrote_of_a_choice_goes_together(written):
     ("choice", "complaint"),
     [
         (f"{DEGREE[:-1]}, reason: so, chosen: [1], instead_of: [q]}}", r"choices, instead_of: model.sh_degree: .*'q'"),
-        (f"{DEGREE[:-1]}, reason: so, chosen: [q], instead_of: [2]}}", r"choices, chosen: model.sh_degree: .*'q'"),
-        (f"{DEGREE[:-1]}, reason: so, chosen: [2], instead_of: [1]}}", r"chose model.sh_degree=2, and 1 stands there"),
         (DEGREE.replace("model.sh_degree", "optimise.steps"), "choices: optimise.steps: no 'optimise'"),
         (DEGREE.replace("by: photographs", "by: photos"), r"choices\[0\].by: expected 'photographs'"),
         (DEGREE.replace("since: few say little", "since: 3"), r"choices\[0\].since: expected text, got 3"),

@@ -66,21 +66,6 @@ def check_keeping(settings: PipelineFile) -> None:
         raise ConfigError(f"optimize.refit: expected one stage that trains, found {len(trainings)}")
 
 
-def check_kept(settings: PipelineFile) -> None:
-    """Raise ConfigError where what a run chose does not stand at its place, as after an edit."""
-    made = [(number, pair) for number, one in enumerate(settings.choices) if one.reason for pair in one.settings]
-    if not made:
-        return
-    pairs = [pair for _, pair in made]
-    again = _checked(lambda: _with(settings, settings.choices, pairs), "chosen")
-    here, there = (without_choices(one.model_dump(mode="json")) for one in (settings, again))
-    for number, (key, _) in made:
-        found, chosen = (value_at(data, key, PipelineFile) for data in (here, there))
-        if found != chosen:
-            what = f"a run chose {key}={shortened(json.dumps(chosen))}, and {shortened(json.dumps(found))} stands there"
-            raise ConfigError(f"choices[{number}]: {what}; change it by --set, or remove the choice")
-
-
 def undone(settings: PipelineFile) -> PipelineFile:
     """Return the settings as they were before a run chose by `choices`.
 
@@ -207,7 +192,6 @@ def check_choices(settings: PipelineFile) -> None:
         if any(_touch(place, other) for other in places):
             raise ConfigError(f"{what} is chosen twice; expected one choice for each place")
         places.append(place)
-    check_kept(settings)
     still_open, faults = undone(settings), list[ConfigError]()
     rows = {tuple(zip(one.measures, one.bounds(row), strict=True)) for one in settings.choices for row in one.values}
     for row in sorted(rows):
