@@ -244,7 +244,6 @@ DIFFERENCES = {
         *(f"rates.means.{key}" for key in ("over", "start", "until")),
         *(f"densify.rules.split.{key}" for key in ("gradient_above", "size_above", "statistic")),
         *(f"densify~2.rules.prune_useless.{key}" for key in ("of_all", "of_view")),
-        *(f"hide_useless.{key}" for key in ("every", "start", "stop", "of_view")),
         *("densify.rules.clone.size_below", "views.resolution.until", "steps"),
     },
     ("mip_splatting", "dash_mip"): DASH | {"reset_opacity.stop", "rates.logit_opacity", "refresh_filter.start"},
