@@ -7,8 +7,8 @@ from clsplat.training.kept import Measured
 from clsplat.training.run import Run
 
 REMEDY = (
-    "`scene.validation: auto` with `optimize.keep: best`, in a pipeline without `take_average`, keeps the model that "
-    "is best elsewhere."
+    "More photographs, from places between these, help most; `scene.validation: auto` with `optimize.keep: best`, in a "
+    "pipeline without `take_average`, keeps the model that is best elsewhere."
 )
 
 
