@@ -108,6 +108,9 @@ def test_in_fewer_steps_schedules_end_earlier_and_bounds_stay():
     dropout, reset = in_steps(settings, settings.training.steps // 2).choices
     assert dropout.values == [[0, [[0, 0.0], [25, 0.2]]], [24, 0]]
     assert reset == settings.choices[1]
+    chosen = in_steps(choose(settings, {"photographs": 3}), settings.training.steps // 2)
+    assert chosen.choices[0].chosen == [chosen.training.dropout]
+    assert (chosen.choices[0].instead_of, settings.choices[0].chosen) == ([settings.training.dropout], None)
 
 
 def test_what_is_measured_of_a_scene(tiny_scene):

@@ -151,7 +151,9 @@ def _stretched(value: Any, axis: Axis) -> Any:
     if isinstance(value, CaptureChoice):  # whose rows begin with what is measured, and not with steps
         rows = [[bound, *(_stretched(one, axis) for one in row)] for bound, *row in value.values]
         given = {key: _stretched(one, axis) for key, one in value.given.items()}
-        return value.model_copy(update={"values": rows, "given": given})
+        made = {"chosen": value.chosen, "instead_of": value.instead_of}  # by a run
+        made = {name: values and [_stretched(one, axis) for one in values] for name, values in made.items()}
+        return value.model_copy(update={"values": rows, "given": given, **made})
     if not isinstance(value, Settings):
         return value
     fields = {name: getattr(value, name) for name in type(value).model_fields}
