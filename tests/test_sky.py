@@ -5,6 +5,7 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -22,6 +23,7 @@ from clsplat.runs.found import has_ended
 from clsplat.runs.model_file import evaluate
 from clsplat.runs.single import run_pipeline
 from clsplat.scene.camera import Camera
+from clsplat.scene.images import write_image
 from clsplat.scene.view import View
 from clsplat.training import checkpoint
 from clsplat.training.archive import split
@@ -126,6 +128,32 @@ def test_where_photographs_show_none_the_bits_are_those_without_the_key(tiny_sce
     assert run.sky is None
 
 
+@pytest.mark.parametrize(
+    ("alpha", "masked", "chosen", "why"),
+    [
+        (255, False, "on", "9 of 9 photographs show"),
+        (254, False, "off", "the photographs have transparency"),
+        (None, True, "off", "0 of 9 photographs show"),
+    ],
+)
+def test_photographs_that_are_opaque_in_pixels_that_count_show_a_sky(tmp_path, rng, alpha, masked, chosen, why):
+    """alpha: of one pixel of each photograph, opaque elsewhere; None: they have none."""
+    yard, masks = Yard(rng), tmp_path / "masks"
+    folder = yard.write(tmp_path / "scene")
+    for view in yard.views:
+        pixels, below = yard.photograph(view), yard.rays(view)[..., 1] > 0
+        if alpha:
+            layer = np.full((*pixels.shape[:2], 1), 255, np.uint8)
+            layer[20, 30] = alpha
+            cv2.imwrite(str(folder / "images" / view.name), np.concatenate([pixels[..., ::-1], layer], axis=2))
+        write_image(masks / view.name, np.repeat(255 * below[..., None].astype(np.uint8), 3, axis=2))
+    more = [f"scene.masks={masks}"] if masked else []
+    settings = [f"scene.path='{folder}'", *FEW, "scene.holdout=4", "model.background=auto", *more]
+    run_pipeline(load("smoke", settings), tmp_path / "run", None, "new")
+    found = load(str(tmp_path / "run" / "pipeline.yaml")).settings.model.background
+    assert (found.chosen, found.reason.startswith(why)) == (chosen, True), found.reason
+
+
 def test_what_a_run_chose_is_no_setting_of_its_pipeline():
     asked = load("smoke", ["model.background=auto"]).resolved()
     chosen = load("smoke", ["model.background={type: auto, chosen: on, reason: it is blue}"]).resolved()
@@ -137,7 +165,7 @@ def test_directions_in_which_no_photograph_shows_sky_are_left_to_gaussians(yard)
     """The sky begins with the colours of the photographs."""
     _, folder = yard
     scene = clsplat.read_scene(folder)
-    photographs = [(view, np.rint(255 * view.photograph()).astype(np.uint8)) for view in scene.views]
+    photographs = [(view, np.rint(255 * view.photograph()).astype(np.uint8), None) for view in scene.views]
     texels, free = panorama(list(looked_at(scene, photographs)), 32)
     directions = texel_directions(32)
     looked = np.abs(directions[:, 1]) < 0.4

@@ -15,11 +15,10 @@ from clsplat.formats.splats import Parameters, with_degree
 from clsplat.gaussians.model import load
 from clsplat.gaussians.tables import SH_C0, Gaussians, sh_coefficients
 from clsplat.scene.hull import hull_points
-from clsplat.scene.images import read_image
 from clsplat.scene.middle import centre_of, looked_at_box, random_points
 from clsplat.scene.plane_sweep import swept_points
 from clsplat.scene.scene import PointCloud, Scene
-from clsplat.scene.view import load_image, load_rgba
+from clsplat.scene.view import is_transparent, load_image, load_rgba
 from clsplat.settings import ReadPath
 from clsplat.stages.base import Stage
 from clsplat.stages.first_motion import moving, require_times, with_motion
@@ -38,9 +37,9 @@ class Init(Stage):
     """Make Gaussians: isotropic, as large as the mean distance to the three nearest neighbours (Kerbl et al. 2023).
 
     `source: auto` uses the scene's points if it has points.  Without points it uses a plane sweep over the photographs,
-    or, where they have alpha, what `transparent` says: random points in a box around the point that the cameras look
-    at, as published, or points on the hull of the silhouettes in that box.  Where a
-    scene has fewer points than `fewest`, and its photographs have no alpha, those of a sweep join them.
+    or, where the first one has transparent pixels, what `transparent` says: random points in a box around the point
+    that the cameras look at, as published, or points on the hull of the silhouettes in that box.  Where a scene has
+    fewer points than `fewest`, and its first photograph is opaque, those of a sweep join them.
     """
 
     stage: Literal["init"] = "init"
@@ -51,7 +50,7 @@ class Init(Stage):
     source: Literal["auto", "points", "sweep", "hull", "random", "model", "ply"] = "auto"
     """Source of the first Gaussians; `ply` is an older name of `model`."""
     transparent: Literal["random", "hull"] = "random"
-    """Source of `auto` for a scene without points whose photographs have alpha."""
+    """Source of `auto` for a scene without points whose photographs are transparent."""
     fewest: Annotated[int, Field(ge=0)] = 0
     """Number of the scene's points below which `auto` adds those of a plane sweep."""
     opacity: Annotated[float, Field(gt=0, lt=1)] = 0.1
@@ -113,7 +112,7 @@ class Init(Stage):
     def _is_joined(self, scene: Scene) -> bool:
         """Whether points of a sweep join those of the scene."""
         few = scene.points is not None and len(scene.points) < self.fewest
-        return self.source == "auto" and few and not has_alpha(scene)
+        return self.source == "auto" and few and not is_transparent(scene.views[0])
 
     def _origin(self, source: str, scene: Scene) -> str:
         names = {
@@ -131,7 +130,7 @@ class Init(Stage):
             return self.source
         if scene.points is not None:
             return "points"
-        return self.transparent if has_alpha(scene) else "sweep"
+        return self.transparent if is_transparent(scene.views[0]) else "sweep"
 
     def _parameters(self, run: Run, degree: int) -> tuple[Parameters, str]:
         """The parameters and their source: random points too where photographs agree on too few."""
@@ -198,11 +197,6 @@ class Init(Stage):
             )
             return None
         return points
-
-
-def has_alpha(scene: Scene) -> bool:
-    """Return whether the photographs have alpha, by the first one."""
-    return bool(read_image(scene.views[0].image_path).shape[2] == 4)
 
 
 def require_ahead(points: PointCloud, scene: Scene) -> None:

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from clsplat.gaussians.sky import Sky
 from clsplat.render.backdrops import Auto, Backdrop, Directions
-from clsplat.scene.images import read_image
 from clsplat.scene.scene import Scene, View
+from clsplat.scene.view import is_transparent
 from clsplat.training.run import Run
 from clsplat.training.sky import LearnedSky
 from clsplat.views.sky_share import Seen, looked_at, panorama
@@ -63,8 +63,7 @@ def _unknown(run: Run) -> str:
     if run.scene.points is None:
         return "the dataset has no points, and what is far from them is not known"
     first = run.scene.split("train")[0]
-    transparent = first.alpha == "transparency" and read_image(first.image_path).shape[2] == 4
-    return "the photographs have transparency" if transparent else ""
+    return "the photographs have transparency" if first.alpha == "transparency" and is_transparent(first) else ""
 
 
 def _number(seen: list[Seen], share: float) -> int:
@@ -101,8 +100,10 @@ def _seen(run: Run, scene: Scene) -> list[Seen]:
     return list(looked_at(scene, _photographs(run, scene)))
 
 
-def _photographs(run: Run, scene: Scene) -> Iterator[tuple[View, NDArray[np.uint8]]]:
-    """The training photographs of a scene at the first size that they have, [height, width, 3]."""
+def _photographs(run: Run, scene: Scene) -> Iterator[tuple[View, NDArray[np.uint8], NDArray[np.bool_] | None]]:
+    """The training photographs of a scene at the first size that they have, [height, width, 3], and which pixels
+    count, [height, width]; None: all."""
     views = list({view.name: view for view in reversed(scene.split("train"))}.values())[::-1]
     for view in run.status.counted(views, "photographs", len(views)):
-        yield view, run.photographs.get(view).image()
+        photograph = run.photographs.get(view)
+        yield view, photograph.image(), photograph.counted()

@@ -51,12 +51,14 @@ class Seen:
         return np.asarray(x[None, :, None] * turn[0] + (y[:, None, None] * turn[1] + turn[2]))
 
 
-def looked_at(scene: Scene, views: Iterable[tuple[View, Image]]) -> Iterator[Seen]:
-    """Yield what photographs, [height, width, 3], show of the sky."""
+def looked_at(scene: Scene, views: Iterable[tuple[View, Image, Mask | None]]) -> Iterator[Seen]:
+    """Yield what photographs, [height, width, 3], show of the sky in pixels that count, [height, width]; None: all."""
     up = upward(scene.split("train"))
-    for view, image in views:
+    for view, image, counted in views:
         small = _small(image)
         mask = sky_mask(small, _points_in(scene, view) * (small.shape[1] / view.camera.width))
+        if counted is not None:
+            mask &= _small(counted.astype(np.uint8)) > 0
         yield Seen(view, small, mask, up)
 
 
