@@ -106,6 +106,23 @@ def test_values_are_escaped_and_charts_are_not():
     assert page.text.count(HOSTILE) == 8, "title twice, subtitle, verdict, a figure twice, a view, a chart"
 
 
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("plain", "plain"),
+        ("try `a --b`, or `c` twice", "try <code>a --b</code>, or <code>c</code> twice"),
+        ("`a` ends", "<code>a</code> ends"),
+        ("it is `a`", "it is <code>a</code>"),
+        ("a`b is <i>", "a`b is &lt;i&gt;"),
+        ("`a` and b`c", "<code>a</code> and b`c"),
+        ("`<script>`", "<code>&lt;script&gt;</code>"),
+    ],
+)
+def test_what_stands_between_backticks_is_code(text, found):
+    page = TEMPLATES.from_string("{% from 'macros.html.j2' import words %}{{ words(text) }}")
+    assert page.render(text=text).strip() == found
+
+
 def test_a_value_that_a_template_lacks_is_an_error():
     with pytest.raises(UndefinedError, match="is undefined"):
         render("inspect.html.j2", title="a", subtitle="b")
