@@ -14,6 +14,7 @@ from clsplat.prepare.steps import FindFeatures, MapCameras, MatchFeatures, Step,
 from clsplat.runs import expected as module
 from clsplat.runs.description import describe
 from clsplat.runs.experiment import Job
+from clsplat.runs.unprepared import known, photographs
 from clsplat.settings import Settings
 from clsplat.stages.optimize import Optimize
 from data_tools.matching import MAX_EXHAUSTIVE, most_pairs
@@ -82,6 +83,36 @@ def test_the_number_of_photographs_tells_the_growth_that_would_be_chosen(photos,
     for number in range(COUNT, 2 * COUNT + 1):
         cv2.imwrite(str(photos / f"{number:02d}.png"), np.zeros((120, 160, 3), np.uint8))
     assert "11,520" not in expected("photos", photos, monkeypatch)[-1]
+
+
+@pytest.mark.parametrize(
+    ("sets", "training"),
+    [
+        ((), 20),
+        (("scene.holdout=0",), 23),
+        (("scene.holdout={every: 8, offset: 7}",), 21),
+        (("scene.holdout={names: [00.png, 05.png]}",), 21),
+        (("scene.train={every: 4}",), 5),
+        (("scene.validation=auto",), 20),
+        (("scene.holdout={names: [other.png]}",), None),
+    ],
+)
+def test_photographs_that_are_not_prepared_tell_how_many_train(photos, sets, training):
+    asked = load("photos", [f"scene.path='{photos}'", *sets])
+    out = photos.parent / "runs" / "a"
+    names = photographs(asked, asked.preparation(out), out)
+    assert len(names) == COUNT
+    assert known(asked, names) == ({} if training is None else {"photographs": training})
+
+
+def test_a_dry_run_says_what_can_be_chosen_before_photographs_are_prepared(photos):
+    asked = load("photos", [f"scene.path='{photos}'", "optimize.dropout=0.1"])
+    lines = [line.strip() for line in describe(asked, photos.parent / "runs" / "a", None, "new").splitlines()]
+    fixed = [line for line in lines if ", since 20 training photographs; " in line]
+    assert [line.partition("=")[0] for line in fixed] == ["init.transparent", "optimize.dropout", "model.background"]
+    assert fixed[1].startswith("optimize.dropout=0.1, ")
+    growth = "stages.1.during.1.per_pixel"
+    assert f"{growth}=0.6; from sky 0.25 on {growth}=0.3; from sky 0.5 on {growth}=0.1" in lines
 
 
 def test_what_is_there_already_takes_no_time(tiny_scene, tmp_path):

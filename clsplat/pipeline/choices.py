@@ -128,11 +128,31 @@ class CaptureChoice(Settings):
 
     @property
     def told(self) -> str:
-        """What was chosen, and why; before that, by what it will be."""
-        if not self.reason:
-            return f"{', '.join(self.keys)}: by {', '.join(self.measures)}"
-        values = ", ".join(f"{key}={json.dumps(value)}" for key, value in self.settings)
-        return f"{values}, since {self.reason}"
+        """What was chosen, and why."""
+        return f"{self._text([value for _, value in self.settings])}, since {self.reason}"
+
+    def possible(self, known: Measures) -> str:
+        """Return what can be chosen, in words, where some measures are known; what was chosen stays."""
+        rows = [number for number in range(len(self.values)) if self._is_open(number, known)]
+        if self.reason or (len(rows) == 1 and any(name in known for name in self.measures)):
+            return (self if self.reason else self.of(known, [None] * len(self.keys))).told
+        return "; ".join(self._row_text(number, known) for number in rows)
+
+    def _is_open(self, number: int, known: Measures) -> bool:
+        """Whether the measures reach a row, where those that are not known have its bounds."""
+        bounds = dict(zip(self.measures, self.bounds(self.values[number]), strict=True))
+        return self.row({**bounds, **known}) == number
+
+    def _row_text(self, number: int, known: Measures) -> str:
+        """The values of a row, and the bounds of measures that are not known."""
+        row = self.values[number]
+        bounds = zip(self.measures, self.bounds(row), strict=True)
+        least = " and ".join(f"{name} {bound:g}" for name, bound in bounds if bound and name not in known)
+        values = [self.given.get(key, value) for key, value in zip(self.keys, row[1:], strict=True)]
+        return (f"from {least} on " if least else "") + self._text(values)
+
+    def _text(self, values: list[Any]) -> str:
+        return ", ".join(f"{key}={json.dumps(value)}" for key, value in zip(self.keys, values, strict=True))
 
     def undone(self) -> "CaptureChoice":
         """Return it before a choice."""

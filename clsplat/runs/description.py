@@ -15,6 +15,7 @@ from clsplat.runs.opening import check_start, open_run
 from clsplat.runs.outputs import check_places
 from clsplat.runs.runner import restore
 from clsplat.runs.scenes import ReadScene, read_run_scene
+from clsplat.runs.unprepared import known, photographs
 from clsplat.stages.base import Scheduled, Stage
 from clsplat.stages.evaluate import Evaluate
 from clsplat.stages.init import Init
@@ -62,7 +63,8 @@ def describe(
             verdict = f"would go on from step {run.step}" if resumed else "nothing to resume; would run"
         for stage in pipeline.stages[run.cursor :]:
             stage.check_in(run)
-    lines += [f"  {one.told}" for one in pipeline.settings.choices]
+    measures = known(pipeline, photographs(pipeline, planned, out)) if run is None else {}
+    lines += [f"  {one.possible(measures)}" for one in pipeline.settings.choices]
     lines += [f"  {stage.stage:<14} {_detail(stage, run)}".rstrip() for stage in pipeline.stages]
     lines += _on_host(pipeline, run) if run else []
     if expect and start != "resume":

@@ -20,18 +20,18 @@ from clsplat.errors import ClsplatError, DataError
 from clsplat.opencl.device import Device
 from clsplat.pipeline.choosing import choose
 from clsplat.pipeline.file import PipelineFile
-from clsplat.pipeline.loading import Pipeline, prepared_folder
+from clsplat.pipeline.loading import Pipeline
 from clsplat.prepare.cache import Planned
 from clsplat.progress import only
+from clsplat.runs.unprepared import known, photographs
 from clsplat.scene.images import image_size
-from clsplat.scene.scene import every_nth
 from clsplat.schedule import values_of
 from clsplat.stages.densify import Densify
 from clsplat.stages.init import Init
 from clsplat.stages.optimize import Optimize
 from clsplat.stages.train_field import TrainField
 from clsplat.training.run import Run
-from data_tools.gather import link, list_photographs
+from data_tools.gather import link
 
 LOG = logging.getLogger("clsplat")
 TRIED = 3  # photographs, the fewest of which features are found
@@ -60,7 +60,6 @@ class Expected:
 class Capture:
     """What is known of the photographs before they are prepared, or of the scene that they have become."""
 
-    training: int  # photographs
     size: tuple[int, int]  # px, of a photograph that is trained on
     gaussians: int  # that the training begins with
 
@@ -70,10 +69,10 @@ def expected(pipeline: Pipeline, planned: Sequence[Planned], out: Path, device: 
 
     Photographs are read and the device is used for some seconds; nothing is written but a temporary folder.
     """
-    names = _photographs(pipeline, planned, out) if run is None else []
+    names = photographs(pipeline, planned, out) if run is None else []
     parts = list(_of_preparation(planned, pipeline.settings.scene.folder, names))
     if (capture := _capture(pipeline, planned, names, run)) is not None:
-        settings = choose(pipeline.settings, {"photographs": capture.training}) if run is None else pipeline.settings
+        settings = choose(pipeline.settings, known(pipeline, names)) if run is None else pipeline.settings
         parts += [_of_training(training, settings, capture, device) for training in _trainings(settings)]
     if run is not None:
         parts += [_of_field(one, run) for one in pipeline.settings.stages if isinstance(one, TrainField)]
@@ -82,16 +81,6 @@ def expected(pipeline: Pipeline, planned: Sequence[Planned], out: Path, device: 
     low, high = (sum(one.seconds[end] for one in parts) for end in (0, 1))
     told = "without measurements, pictures and pages; by what small parts take on this machine as it is now"
     return [f"expected: {minutes_text((low, high))}, {told}", *(one.text for one in parts)]
-
-
-def _photographs(pipeline: Pipeline, planned: Sequence[Planned], out: Path) -> list[str]:
-    """The names of what is to be prepared; none where `prepare` finds no photographs by itself."""
-    try:
-        return (
-            list_photographs(pipeline.settings.scene.folder, prepared_folder(out).parent.resolve()) if planned else []
-        )
-    except DataError:
-        return []
 
 
 def _of_preparation(planned: Sequence[Planned], folder: Path, names: Sequence[str]) -> Iterator[Expected]:
@@ -141,15 +130,14 @@ def _capture(pipeline: Pipeline, planned: Sequence[Planned], names: Sequence[str
         views = run.scene.with_fold().split("train")
         cameras = sorted(((one.camera.width, one.camera.height) for one in views), key=lambda size: size[0] * size[1])
         begins = [one.expected_count(run.scene) for one in pipeline.settings.stages if isinstance(one, Init)]
-        return Capture(len(views), cameras[len(cameras) // 2], begins[0] if begins else FEWEST)
+        return Capture(cameras[len(cameras) // 2], begins[0] if begins else FEWEST)
     scene = pipeline.settings.scene
     if (found := _size(scene.folder, names)) is None:
         return None
     width, height = found
     longest = getattr(planned[-1].step, "long_side", None) or max(width, height)
     shrink = min(1.0, longest / max(width, height)) / scene.downscale
-    held = len(every_nth(names, scene.split.of_reader))
-    return Capture(len(names) - held, (max(1, round(shrink * width)), max(1, round(shrink * height))), FEWEST)
+    return Capture((max(1, round(shrink * width)), max(1, round(shrink * height))), FEWEST)
 
 
 def _size(folder: Path, names: Sequence[str]) -> tuple[int, int] | None:

@@ -1,0 +1,42 @@
+"""What is known of photographs before they are prepared."""
+
+import logging
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from clsplat.errors import DataError
+from clsplat.pipeline.loading import Pipeline, prepared_folder
+from clsplat.prepare.cache import Planned
+from clsplat.progress import only
+from clsplat.scene.camera import Camera
+from clsplat.scene.capture import Measures
+from clsplat.scene.scene import every_nth, make_scene
+from clsplat.scene.view import View
+from data_tools.gather import list_photographs
+
+
+def photographs(pipeline: Pipeline, planned: Sequence[Planned], out: Path) -> list[str]:
+    """Return the names of what is to be prepared; none where `prepare` finds no photographs by itself."""
+    try:
+        return (
+            list_photographs(pipeline.settings.scene.folder, prepared_folder(out).parent.resolve()) if planned else []
+        )
+    except DataError:
+        return []
+
+
+def known(pipeline: Pipeline, names: Sequence[str]) -> Measures:
+    """Return the measures that named photographs have where all are placed: how many train."""
+    split, folder = pipeline.settings.scene.split, pipeline.settings.scene.folder
+    pose = np.eye(3, 4, dtype=np.float32)
+    views = [View(name, Camera(1, 1, 1.0, 1.0, 0.5, 0.5), pose, folder / name) for name in names]
+    try:
+        with only(logging.ERROR):
+            scene = make_scene(folder, views, every_nth(names, split.of_reader), None, "black")
+            divided = replace(split, validation=0).applied(scene)  # photographs for validation count as training ones
+    except DataError:  # names of a list that the photographs do not have: the run says so
+        return {}
+    return {"photographs": len(divided.train)}
