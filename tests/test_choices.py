@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -285,6 +286,18 @@ def test_the_recipe_for_photographs_chooses_by_their_number_and_by_the_sky(photo
 
 
 SKY = "{keys: [model.sh_degree], by: [photographs, sky], values: [[[0, 0], 0], [[0, 0.5], 1], [[20, 0], 2]], since: x}"
+
+
+def test_all_rows_of_the_recipe_for_photographs_go_together():
+    """Whatever one measure is, where the others are."""
+    settings, bounds = load("photos").settings, dict[str, set[float]]()
+    for one in settings.choices:
+        for row in one.values:
+            for measure, bound in zip(one.measures, one.bounds(row), strict=True):
+                bounds.setdefault(measure, set()).add(bound)
+    found = [choose(settings, dict(zip(bounds, each, strict=True))) for each in product(*bounds.values())]
+    assert len(found) == 18
+    assert all(choice.reason for one in found for choice in one.choices)
 
 
 def test_of_several_measures_the_last_row_decides_whose_bounds_all_reach():
