@@ -24,7 +24,7 @@ from clsplat.gaussians.model import Rendering
 from clsplat.opencl.device import open_device
 from clsplat.pipeline.loading import load
 from clsplat.render.camera import upload_camera
-from clsplat.runs.rehearsal import Rehearsal
+from clsplat.runs.prediction import Rehearsal
 from clsplat.runs.source import require_model
 from clsplat.runs.steps_key import steps_key
 from clsplat.runs.summary import summary

@@ -14,10 +14,9 @@ import pytest
 import clsplat
 from clsplat.errors import ConfigError, Interrupted
 from clsplat.pipeline.loading import Pipeline, load
-from clsplat.runs import minutes, single
-from clsplat.runs import rehearsal as rehearsals
+from clsplat.runs import minutes, prediction, single
 from clsplat.runs.minutes import pipeline_for
-from clsplat.runs.rehearsal import Rehearsal, most_steps, predicted
+from clsplat.runs.prediction import Rehearsal, most_steps, predicted
 from clsplat.runs.rehearsing import Limit
 from clsplat.training.run import Progress, Run
 
@@ -39,7 +38,7 @@ def test_two_rehearsals_tell_how_the_time_of_a_step_grows():
     assert predicted(found, 1800) == pytest.approx(5 + 1800 * 0.02 * 9**0.25)
 
 
-@pytest.mark.parametrize(("later", "power"), [(0.2, rehearsals.TREND), (0.002, -rehearsals.TREND)])
+@pytest.mark.parametrize(("later", "power"), [(0.2, prediction.TREND), (0.002, -prediction.TREND)])
 def test_a_rehearsal_that_was_disturbed_does_not_tell_more_than_it_can(later, power):
     found = [rehearsal(200, 0.02), rehearsal(600, later)]
     assert predicted(found, 1200) == pytest.approx(5 + 1200 * later * 2**power)
@@ -197,8 +196,8 @@ def test_a_refused_beginning_leaves_a_run_that_is_done_done(tiny_scene, tmp_path
 def test_a_rehearsal_leaves_no_trace_in_the_run(tiny_scene, tmp_path, monkeypatch, short_rehearsals):
     """Of a training that ends before it can be corrected: the same bits as without a rehearsal."""
     monkeypatch.setattr(minutes, "most_steps", lambda *given: 50)
-    monkeypatch.setattr(rehearsals, "EARLY", 1.0)
-    monkeypatch.setattr(rehearsals, "SOON", 1.0)
+    monkeypatch.setattr(prediction, "EARLY", 1.0)
+    monkeypatch.setattr(prediction, "SOON", 1.0)
     out = clsplat.run("smoke", tiny_scene, tmp_path / "run", minutes=0.2)
     plain = clsplat.run("smoke", tiny_scene, tmp_path / "plain")
     assert digest(out) == digest(plain)

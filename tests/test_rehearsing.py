@@ -8,9 +8,8 @@ import clsplat
 from clsplat.errors import ConfigError
 from clsplat.pipeline.loading import load
 from clsplat.pipeline.stretching import in_steps
-from clsplat.runs import minutes, rehearsing
-from clsplat.runs import rehearsal as rehearsals
-from clsplat.runs.rehearsal import Rehearsal
+from clsplat.runs import minutes, prediction, rehearsing
+from clsplat.runs.prediction import Rehearsal
 from clsplat.runs.rehearsing import Limit
 from clsplat.training.run import Progress
 
@@ -97,7 +96,7 @@ def test_a_rehearsal_whose_steps_are_ended_runs_the_other_stages_and_goes_on_as_
     assert (rehearsal.steps, len(rehearsal.course), rehearsal.growth) == (10, 10, 1.0)
     assert len({*rehearsal.course[2:]}) == 1
     assert rehearsal.after > 0
-    assert rehearsal.known == rehearsals.TWICE
+    assert rehearsal.known == prediction.TWICE
 
 
 def test_edits_that_did_not_come_are_counted():

@@ -15,7 +15,7 @@ from clsplat.errors import ConfigError, Interrupted
 from clsplat.pipeline.loading import Pipeline
 from clsplat.pipeline.stretching import fewest_steps, last_edit, stretched, with_steps
 from clsplat.runs.folders import Start
-from clsplat.runs.rehearsal import Rehearsal, most_steps, predicted
+from clsplat.runs.prediction import Rehearsal, most_steps, predicted
 from clsplat.runs.rehearsing import Limit, new_run, rehearse, reporting, too_little
 from clsplat.runs.runner import write_pipeline
 from clsplat.signals import stop_if_signalled

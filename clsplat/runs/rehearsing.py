@@ -13,7 +13,7 @@ from clsplat.pipeline.file import PipelineFile
 from clsplat.pipeline.loading import Pipeline
 from clsplat.pipeline.stretching import of_trainings, stretched
 from clsplat.progress import only
-from clsplat.runs.rehearsal import Rehearsal
+from clsplat.runs.prediction import Rehearsal
 from clsplat.runs.runner import run_stages
 from clsplat.stages.training import Training
 from clsplat.training.run import Progress, Run
