@@ -13,9 +13,7 @@ from clsplat.pipeline.loading import load
 from clsplat.progress import only
 from clsplat.runs.scenes import read_run_scene
 from clsplat.runs.source import as_setting, photographs_of
-from clsplat.stages.init import from_points
-
-OPACITY = 0.1  # of the first Gaussians, as `init.opacity`
+from clsplat.stages.init import Init, from_points
 
 
 def plan_blocks(
@@ -32,7 +30,7 @@ def plan_blocks(
         raise DataError(f"{scene}: has no points to cut by; `clsplat blocks --plan` trains a coarse model first")
     with tempfile.TemporaryDirectory() as made:
         model = Path(made, "points.ply")
-        tables = from_points(points, OPACITY, settings.model.sh_degree)
+        tables = from_points(points, Init().opacity, settings.model.sh_degree)
         Model(**tables, rendering=NUMBERS, sky=None).save(model)
         work = Blocks(scene, Path(made), Plan(pipeline, str(model), blocks), device)
         try:
