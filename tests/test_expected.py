@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
+from clsplat.errors import DataError
 from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import load
 from clsplat.prepare.cache import plan
@@ -14,6 +15,7 @@ from clsplat.prepare.steps import FindFeatures, MapCameras, MatchFeatures, Step,
 from clsplat.runs import expected as module
 from clsplat.runs.description import describe
 from clsplat.runs.experiment import Job
+from clsplat.runs.single import run_pipeline
 from clsplat.runs.unprepared import known, photographs
 from clsplat.settings import Settings
 from clsplat.stages.optimize import Optimize
@@ -94,7 +96,7 @@ def test_the_number_of_photographs_tells_the_growth_that_would_be_chosen(photos,
         (("scene.holdout={names: [00.png, 05.png]}",), 21),
         (("scene.train={every: 4}",), 5),
         (("scene.validation=auto",), 20),
-        (("scene.holdout={names: [other.png]}",), None),
+        (("scene.validation={names: ['04']}",), 20),
     ],
 )
 def test_photographs_that_are_not_prepared_tell_how_many_train(photos, sets, training):
@@ -102,7 +104,26 @@ def test_photographs_that_are_not_prepared_tell_how_many_train(photos, sets, tra
     out = photos.parent / "runs" / "a"
     names = photographs(asked, asked.preparation(out), out)
     assert len(names) == COUNT
-    assert known(asked, names) == ({} if training is None else {"photographs": training})
+    assert known(asked, names) == {"photographs": training}
+    assert known(asked, []) == {}
+
+
+@pytest.mark.parametrize("begin", [describe, run_pipeline])
+@pytest.mark.parametrize(
+    ("sets", "complaint"),
+    [
+        ("scene.holdout={names: [03.png, other.png]}", "no photograph is called 'other.png'"),
+        ("scene.holdout={file: list.txt}", "list.txt"),
+        ("scene.validation={names: [00.png]}", "'00.png' is held out for testing"),
+        ("scene.train={names: [other.png]}", "no photograph is called 'other.png'"),
+        ("scene.holdout=1", "every image is held out"),
+    ],
+)
+def test_a_split_that_photographs_do_not_have_is_refused_before_they_are_prepared(photos, begin, sets, complaint):
+    asked = load("photos", [f"scene.path='{photos}'", sets])
+    with pytest.raises(DataError, match=complaint):
+        begin(asked, photos.parent / "runs" / "a", None, "new")
+    assert not (photos.parent / "runs" / "prepared").exists()
 
 
 def test_a_dry_run_says_what_can_be_chosen_before_photographs_are_prepared(photos):

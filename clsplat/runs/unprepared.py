@@ -29,14 +29,17 @@ def photographs(pipeline: Pipeline, planned: Sequence[Planned], out: Path) -> li
 
 
 def known(pipeline: Pipeline, names: Sequence[str]) -> Measures:
-    """Return the measures that named photographs have where all are placed: how many train."""
+    """Return the measures that named photographs have where all are placed: how many train, for validation too.
+
+    Raises DataError where the split takes all of them, or names others.
+    """
+    if not names:
+        return {}
     split, folder = pipeline.settings.scene.split, pipeline.settings.scene.folder
     pose = np.eye(3, 4, dtype=np.float32)
     views = [View(name, Camera(1, 1, 1.0, 1.0, 0.5, 0.5), pose, folder / name) for name in names]
-    try:
-        with only(logging.ERROR):
-            scene = make_scene(folder, views, every_nth(names, split.of_reader), None, "black")
-            divided = replace(split, validation=0).applied(scene)  # photographs for validation count as training ones
-    except DataError:  # names of a list that the photographs do not have: the run says so
-        return {}
-    return {"photographs": len(divided.train)}
+    if split.validation == "auto":  # is by the places of cameras, and takes no photograph away
+        split = replace(split, validation=0)
+    with only(logging.ERROR):
+        scene = split.applied(make_scene(folder, views, every_nth(names, split.of_reader), None, "black"))
+    return {"photographs": len(scene.with_fold().split("train"))}
