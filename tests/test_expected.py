@@ -97,6 +97,7 @@ def test_the_number_of_photographs_tells_the_growth_that_would_be_chosen(photos,
         (("scene.train={every: 4}",), 5),
         (("scene.validation=auto",), 20),
         (("scene.validation={names: ['04']}",), 20),
+        (("scene.holdout={names: [00.jpg, 01.JPG]}",), 21),
     ],
 )
 def test_photographs_that_are_not_prepared_tell_how_many_train(photos, sets, training):

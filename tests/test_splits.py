@@ -49,9 +49,15 @@ def test_a_split_leaves_the_rest_of_a_scene_as_it_is(folder, split):
     assert {view.name for view in found.views} <= {view.name for view in scene.views}
 
 
-@pytest.mark.parametrize("listed", ["b", "b.png", "images/b.png", "images/b", "images\\b.png"])
+@pytest.mark.parametrize("listed", ["b", "b.png", "images/b.png", "images/b", "images\\b.png", "b.jpg", "images/b.JPG"])
 def test_a_listed_name_may_be_the_end_of_a_path(folder, listed):
     assert letters(read_scene(folder, Split(Choice(names=[listed, "q"]))), "test") == "bq"
+
+
+def test_a_photograph_is_meant_before_one_of_another_kind(tmp_path):
+    write(tmp_path, **LENS, frames=frames("a/1.png", "a/1.jpg", "c.png"))
+    scene = read_scene(tmp_path, Split(Choice(names=["1.jpg"])))
+    assert [view.name for view in scene.split("test")] == ["a/1.jpg"]
 
 
 def test_a_file_lists_test_views(folder):
@@ -69,6 +75,7 @@ def test_a_file_may_lie_with_the_photographs_that_a_scene_was_prepared_from(fold
     ("choice", "fault"),
     [
         (Choice(names=["bb.png"]), "no photograph is called 'bb.png'; did you mean 'b.png'?"),
+        (Choice(names=["b.gif"]), "no photograph is called 'b.gif'"),
         (Choice(file="test.txt"), "test.txt: cannot be read"),
         (
             Choice(names=list(LETTERS)),

@@ -9,6 +9,7 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from clsplat.errors import DataError, quoted
 from clsplat.reading import read_text
+from clsplat.scene.images import is_image
 from clsplat.scene.scene import every_nth
 from clsplat.settings import ReadPath, Settings, in_one_sentence
 
@@ -26,6 +27,7 @@ class Choice(Settings):
     """Views by name: every n-th from one on, or those of a list, or of a file with a name a line.
 
     A listed name is that of the view, or its end: `0042`, `0042.jpg` and `images/0042.jpg` name the same photograph.
+    It has this name, too, where it was prepared as `0042.png`.
     """
 
     every: Annotated[int, Field(gt=0)] | None = None
@@ -90,10 +92,18 @@ def choose(choice: int | Choice, names: Sequence[str], folders: Sequence[Path], 
 
 
 def _indices_of(listed: str, names: Sequence[str]) -> list[int]:
-    """The indices of names that a listed one means, whole or as an end, with or without its suffix."""
+    """The indices of names that a listed one means, whole or as an end, with or without its suffix.
+
+    Where none is meant, that of another kind of image counts as none: what is prepared is PNG.
+    """
     if listed in names:
         return [names.index(listed)]
     wanted = PurePosixPath(listed.replace("\\", "/"))
+    return _ending(wanted, names) or (_ending(wanted.with_suffix(""), names) if is_image(wanted) else [])
+
+
+def _ending(wanted: PurePosixPath, names: Sequence[str]) -> list[int]:
+    """The indices of names with such an end, with or without their suffix."""
     return [
         i
         for i, path in enumerate(map(PurePosixPath, names))
