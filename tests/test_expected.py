@@ -16,12 +16,14 @@ from clsplat.runs import expected as module
 from clsplat.runs.description import describe
 from clsplat.runs.experiment import Job
 from clsplat.runs.single import run_pipeline
-from clsplat.runs.unprepared import known, photographs
+from clsplat.runs.unprepared import check_names, known, listed
 from clsplat.settings import Settings
 from clsplat.stages.optimize import Optimize
 from data_tools.matching import MAX_EXHAUSTIVE, most_pairs
 
 COUNT = 23
+SKY = "of the training photographs show a sky"
+KEEP = "choices=[{keys: [optimize.keep, scene.validation], by: photographs, values: [[0, best, auto]], since: x}]"
 
 
 class List(Step):
@@ -57,7 +59,8 @@ def expected(pipeline: str, photos: Path, monkeypatch: pytest.MonkeyPatch, *sets
     monkeypatch.setattr(module, "_step", lambda device, size, count, settings: count / 1e6)
     asked = load(pipeline, [f"scene.path='{photos}'", *sets])
     out = photos.parent / "runs" / "a"
-    return module.expected(asked, asked.preparation(out), out, None, None)  # type: ignore[arg-type]
+    planned = asked.preparation(out)
+    return module.expected(asked, planned, listed(asked, planned, out), None, None)  # type: ignore[arg-type]
 
 
 def test_parts_are_continued_by_the_number_of_their_pieces(photos, monkeypatch):
@@ -103,7 +106,7 @@ def test_the_number_of_photographs_tells_the_growth_that_would_be_chosen(photos,
 def test_photographs_that_are_not_prepared_tell_how_many_train(photos, sets, training):
     asked = load("photos", [f"scene.path='{photos}'", *sets])
     out = photos.parent / "runs" / "a"
-    names = photographs(asked, asked.preparation(out), out)
+    names = listed(asked, asked.preparation(out), out)
     assert len(names) == COUNT
     assert known(asked, names) == {"photographs": training}
     assert known(asked, []) == {}
@@ -115,9 +118,8 @@ def test_photographs_that_are_not_prepared_tell_how_many_train(photos, sets, tra
     [
         ("scene.holdout={names: [03.png, other.png]}", "no photograph is called 'other.png'"),
         ("scene.holdout={file: list.txt}", "list.txt"),
-        ("scene.validation={names: [00.png]}", "'00.png' is held out for testing"),
+        ("scene.validation={names: [other]}", "scene.validation: the list of names: no photograph is called 'other'"),
         ("scene.train={names: [other.png]}", "no photograph is called 'other.png'"),
-        ("scene.holdout=1", "every image is held out"),
     ],
 )
 def test_a_split_that_photographs_do_not_have_is_refused_before_they_are_prepared(photos, begin, sets, complaint):
@@ -127,6 +129,23 @@ def test_a_split_that_photographs_do_not_have_is_refused_before_they_are_prepare
     assert not (photos.parent / "runs" / "prepared").exists()
 
 
+def test_lists_may_name_all_but_photographs_that_may_be_left_out(photos):
+    """Which ones a number holds out is known when all are placed."""
+    asked = load("photos", [f"scene.path='{photos}'", "scene.train={names: [00.png, '08', 01.jpg]}"])
+    out = photos.parent / "runs" / "a"
+    planned = asked.preparation(out)
+    check_names(asked, planned, out)
+    assert known(asked, listed(asked, planned, out)) == {}
+    (photos / "left.heic").write_bytes(b"")
+    check_names(asked, planned, out)
+
+
+def test_files_that_are_left_out_are_told_once(photos, caplog):
+    (photos / "left.heic").write_bytes(b"")
+    Job.open("photos", photos, photos.parent / "runs" / "a").describe()
+    assert len([record for record in caplog.records if "HEIC" in record.getMessage()]) == 1
+
+
 def test_a_dry_run_says_what_can_be_chosen_before_photographs_are_prepared(photos):
     asked = load("photos", [f"scene.path='{photos}'", "optimize.dropout=0.1"])
     lines = [line.strip() for line in describe(asked, photos.parent / "runs" / "a", None, "new").splitlines()]
@@ -134,7 +153,10 @@ def test_a_dry_run_says_what_can_be_chosen_before_photographs_are_prepared(photo
     assert [line.partition("=")[0] for line in fixed] == ["init.transparent", "optimize.dropout", "model.background"]
     assert fixed[1].startswith("optimize.dropout=0.1, ")
     growth = "stages.1.during.1.per_pixel"
-    assert f"{growth}=0.6; from sky 0.25 on {growth}=0.3; from sky 0.5 on {growth}=0.1" in lines
+    assert f"{growth}=0.6; 0.3 if at least 25% {SKY}; 0.1 if at least 50% {SKY}" in lines
+    assert "choices        if all 23 photographs are placed:" in lines
+    together = load("photos", [f"scene.path='{photos}'", KEEP, "scene.validation=0"])
+    assert "with which the rest does not go together" in describe(together, photos.parent / "runs" / "a", None, "new")
 
 
 def test_what_is_there_already_takes_no_time(tiny_scene, tmp_path):

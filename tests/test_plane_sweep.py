@@ -81,7 +81,7 @@ def test_a_scene_with_few_points_is_swept(tiny_scene, tmp_path, monkeypatch, cap
     own, file = len(read_scene(tiny_scene).points), tmp_path / "start.yaml"
     cloud = PointCloud(np.random.default_rng(0).random((found, 3), np.float32), np.zeros((found, 3), np.float32))
     monkeypatch.setattr("clsplat.stages.init.swept_points", lambda *arguments: cloud)
-    monkeypatch.setattr("clsplat.stages.init.is_transparent", lambda view: alpha)
+    monkeypatch.setattr("clsplat.stages.init.is_transparent", lambda scene: alpha)
     stages = f"[{{init: {{fewest: {own + more}}}}}, {{optimize: {{steps: 1, losses: [l1]}}}}, export]"
     file.write_text(f"name: start\nstages: {stages}\n")
     caplog.set_level("INFO", "clsplat")

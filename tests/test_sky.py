@@ -104,7 +104,7 @@ def test_a_sky_does_not_go_on_below_the_horizon(pitch, rows, share):
     mask = np.repeat(np.arange(12)[:, None] < rows, 16, axis=1)
     down = np.sin(np.radians(-pitch))
     view = View.looking_at(np.zeros(3), np.array([0, down, np.cos(np.radians(pitch))]), UP, CAMERA)
-    assert Seen(view, np.zeros((12, 16, 3), np.uint8), mask, UP).share == share
+    assert Seen(view, np.zeros((12, 16, 3), np.uint8), mask, np.ones_like(mask), UP).share == share
 
 
 def test_a_choice_is_written_with_its_reason(learned):
@@ -131,20 +131,23 @@ def test_where_photographs_show_none_the_bits_are_those_without_the_key(tiny_sce
 @pytest.mark.parametrize(
     ("alpha", "masked", "chosen", "why"),
     [
-        (255, False, "on", "9 of 9 photographs show"),
-        (254, False, "off", "the photographs have transparency"),
-        (None, True, "off", "0 of 9 photographs show"),
+        (255, None, "on", "9 of 9 photographs show"),
+        (254, None, "off", "the photographs have transparency"),
+        (None, "sky", "off", "0 of 9 photographs show"),
+        (None, "edge", "on", "9 of 9 photographs show"),
     ],
 )
 def test_photographs_that_are_opaque_in_pixels_that_count_show_a_sky(tmp_path, rng, alpha, masked, chosen, why):
-    """alpha: of one pixel of each photograph, opaque elsewhere; None: they have none."""
+    """alpha: of one pixel of photographs but one, opaque elsewhere; None: they have none.  masked: what is left out."""
     yard, masks = Yard(rng), tmp_path / "masks"
     folder = yard.write(tmp_path / "scene")
     for view in yard.views:
         pixels, below = yard.photograph(view), yard.rays(view)[..., 1] > 0
+        if masked == "edge":
+            below, pixels[:8] = np.arange(len(pixels))[:, None] * np.ones(pixels.shape[1]) >= 8, 40
         if alpha:
             layer = np.full((*pixels.shape[:2], 1), 255, np.uint8)
-            layer[20, 30] = alpha
+            layer[20, 30] = 255 if view.name == "1.png" else alpha
             cv2.imwrite(str(folder / "images" / view.name), np.concatenate([pixels[..., ::-1], layer], axis=2))
         write_image(masks / view.name, np.repeat(255 * below[..., None].astype(np.uint8), 3, axis=2))
     more = [f"scene.masks={masks}"] if masked else []

@@ -60,6 +60,13 @@ def test_a_photograph_is_meant_before_one_of_another_kind(tmp_path):
     assert [view.name for view in scene.split("test")] == ["a/1.jpg"]
 
 
+@pytest.mark.parametrize("listed", ["1.jpg", "1", "1.png"])
+def test_a_whole_path_is_meant_before_the_end_of_another(tmp_path, listed):
+    write(tmp_path, **LENS, frames=frames("1.png", "a/1.png", "c.png"))
+    scene = read_scene(tmp_path, Split(Choice(names=[listed])))
+    assert [view.name for view in scene.split("test")] == ["1.png"]
+
+
 def test_a_file_lists_test_views(folder):
     (folder / "test.txt").write_text("# of the paper\nc.png\n\n x.png \n")
     assert letters(read_scene(folder, Split(Choice(file="test.txt"))), "test") == "cx"

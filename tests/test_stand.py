@@ -47,6 +47,7 @@ CASES = {  # views, and what is up within so many degrees
     "all round": (orbit(0, range(0, 360, 40)), UP, 0.1),
     "a third of the way round, from above": (orbit(50, range(0, 130, 10)), UP, 0.1),
     "the same, steeper": (orbit(70, range(0, 130, 10)), UP, 0.1),
+    "looking up, all round": (orbit(-70, range(0, 320, 40)), UP, 0.1),
     "straight down, to all sides": (orbit(90, range(0, 320, 40)), UP, 0.1),
     "straight down, there and back": (orbit(90, [0] * 11 + [180] * 9), UP, 0.1),
     "one way": (orbit(20, [0, 0, 0]), UP, 20.1),

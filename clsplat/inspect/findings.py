@@ -192,7 +192,7 @@ def _points(facts: Facts) -> Iterator[Finding]:
     points = facts.points
     if points is None or points.count == 0:
         if facts.registered and not any("points3d" in fault.lower() for fault in facts.faults):
-            remedy = "training starts from a plane sweep, or from random points where photographs have alpha"
+            remedy = "training starts from a plane sweep, or from random points where photographs are transparent"
             yield Finding("note", "there are no points", remedy)
         return
     if points.count < MIN_POINTS:

@@ -22,7 +22,8 @@ FULL = 1 << 30  # px: no photograph is longer
 def padding(files: Iterable[Path]) -> dict[str, int]:
     """Return how many px of an edge repeat the line beside them in each of the first photographs, by edge.
 
-    Lines of one colour say nothing, nor do photographs that are alike or enlarged everywhere.  JPEG hides it.
+    It is WIDEST at most.  Lines of one colour say nothing, nor do photographs that are alike or enlarged everywhere.
+    JPEG hides it.
     """
     found: list[list[int]] = []
     with suppress(DataError):  # what cannot be read is another finding

@@ -2,6 +2,7 @@
 
 import json
 import math
+from collections.abc import Callable
 from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
@@ -16,6 +17,10 @@ Row = Annotated[list[Any], Field(min_length=2)]  # the least measure, or of each
 
 def _is_number(bound: Any) -> bool:
     return isinstance(bound, int | float) and not isinstance(bound, bool) and abs(bound) < math.inf
+
+
+def _values_text(values: list[Any]) -> str:
+    return ", ".join(map(json.dumps, values))
 
 
 class CaptureChoice(Settings):
@@ -131,25 +136,27 @@ class CaptureChoice(Settings):
         """What was chosen, and why."""
         return f"{self._text([value for _, value in self.settings])}, since {self.reason}"
 
+    def is_settled(self, known: Measures) -> bool:
+        """Whether it is made, or measures that are known make it whatever the others are."""
+        return bool(self.reason) or (len(self._open(known)) == 1 and any(name in known for name in self.measures))
+
     def possible(self, known: Measures) -> str:
-        """Return what can be chosen, in words, where some measures are known; what was chosen stays."""
-        rows = [number for number in range(len(self.values)) if self._is_open(number, known)]
-        if self.reason or (len(rows) == 1 and any(name in known for name in self.measures)):
-            return (self if self.reason else self.of(known, [None] * len(self.keys))).told
-        return "; ".join(self._row_text(number, known) for number in rows)
+        """Return what can be chosen, in words, where some measures are known; of later rows the values alone."""
+        first, *others = self._open(known)
+        return "; ".join([self._row_text(first, known, self._text), *(self._row_text(row, known) for row in others)])
 
-    def _is_open(self, number: int, known: Measures) -> bool:
-        """Whether the measures reach a row, where those that are not known have its bounds."""
-        bounds = dict(zip(self.measures, self.bounds(self.values[number]), strict=True))
-        return self.row({**bounds, **known}) == number
+    def _open(self, known: Measures) -> list[int]:
+        """The rows that the measures may reach: they do where those that are not known have the bounds of the row."""
+        bounds = [dict(zip(self.measures, self.bounds(row), strict=True)) for row in self.values]
+        return [number for number, own in enumerate(bounds) if self.row({**own, **known}) == number]
 
-    def _row_text(self, number: int, known: Measures) -> str:
+    def _row_text(self, number: int, known: Measures, text: Callable[[list[Any]], str] = _values_text) -> str:
         """The values of a row, and the bounds of measures that are not known."""
         row = self.values[number]
         bounds = zip(self.measures, self.bounds(row), strict=True)
-        least = " and ".join(f"{name} {bound:g}" for name, bound in bounds if bound and name not in known)
-        values = [self.given.get(key, value) for key, value in zip(self.keys, row[1:], strict=True)]
-        return (f"from {least} on " if least else "") + self._text(values)
+        least = " and ".join(TOLD[name].format(bound) for name, bound in bounds if bound and name not in known)
+        values = text([self.given.get(key, value) for key, value in zip(self.keys, row[1:], strict=True)])
+        return values + (f" if at least {least}" if least else "")
 
     def _text(self, values: list[Any]) -> str:
         return ", ".join(f"{key}={json.dumps(value)}" for key, value in zip(self.keys, values, strict=True))

@@ -52,7 +52,7 @@ def of_training_views(found: Sequence[ViewMetrics], has_colours: bool) -> Iterat
     if not has_colours and gained >= GAINED:
         yield (
             f"exposures or colours differ: in their own colours photographs would be {gained:.1f} dB nearer; "
-            "try --set optimize.colours=auto"
+            "try `--set optimize.colours=auto`"
         )
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from clsplat import lock
 from clsplat.opencl.device import Device
+from clsplat.pipeline.choosing import choose
 from clsplat.pipeline.loading import Pipeline
 from clsplat.prepare.cache import Planned
 from clsplat.runs.choices import settle
@@ -15,7 +16,7 @@ from clsplat.runs.opening import check_start, open_run
 from clsplat.runs.outputs import check_places
 from clsplat.runs.runner import restore
 from clsplat.runs.scenes import ReadScene, read_run_scene
-from clsplat.runs.unprepared import known, photographs
+from clsplat.runs.unprepared import known, listed
 from clsplat.stages.base import Scheduled, Stage
 from clsplat.stages.evaluate import Evaluate
 from clsplat.stages.init import Init
@@ -26,7 +27,7 @@ from clsplat.training.run import Run
 LOG = logging.getLogger("clsplat")
 
 
-Expect = Callable[[Pipeline, Sequence[Planned], Path, Device, Run | None], list[str]]
+Expect = Callable[[Pipeline, Sequence[Planned], Sequence[str], Device, Run | None], list[str]]
 
 
 def describe(
@@ -63,13 +64,24 @@ def describe(
             verdict = f"would go on from step {run.step}" if resumed else "nothing to resume; would run"
         for stage in pipeline.stages[run.cursor :]:
             stage.check_in(run)
-    measures = known(pipeline, photographs(pipeline, planned, out)) if run is None else {}
-    lines += [f"  {one.possible(measures)}" for one in pipeline.settings.choices]
+    names = listed(pipeline, planned, out) if run is None else []
+    lines += _choices(pipeline, names)
     lines += [f"  {stage.stage:<14} {_detail(stage, run)}".rstrip() for stage in pipeline.stages]
     lines += _on_host(pipeline, run) if run else []
     if expect and start != "resume":
-        lines += expect(pipeline, planned, out, opened, run)
+        lines += expect(pipeline, planned, names, opened, run)
     return f"{verdict} in {out}:\n" + "\n".join(lines)
+
+
+def _choices(pipeline: Pipeline, names: Sequence[str]) -> list[str]:
+    """What was chosen; of named photographs that are to be prepared, what follows from them, and what may."""
+    open_ones = pipeline.settings.choices
+    measures = known(pipeline, names)
+    made = choose(pipeline.settings, measures).choices if measures else open_ones
+    pairs = zip(open_ones, made, strict=True)
+    told = [after.told if one.is_settled(measures) else one.possible(measures) for one, after in pairs]
+    head = [f"  choices        if all {len(names)} photographs are placed:"] if measures and told else []
+    return head + [f"  {one}" for one in told]
 
 
 def tell_of_waiting(out: Path) -> None:

@@ -23,7 +23,7 @@ from clsplat.pipeline.file import PipelineFile
 from clsplat.pipeline.loading import Pipeline
 from clsplat.prepare.cache import Planned
 from clsplat.progress import only
-from clsplat.runs.unprepared import known, photographs
+from clsplat.runs.unprepared import known
 from clsplat.scene.images import image_size
 from clsplat.schedule import values_of
 from clsplat.stages.densify import Densify
@@ -64,12 +64,15 @@ class Capture:
     gaussians: int  # that the training begins with
 
 
-def expected(pipeline: Pipeline, planned: Sequence[Planned], out: Path, device: Device, run: Run | None) -> list[str]:
-    """Return a line for each part of a run in `out`, and one for all.  run: with its scene, where that is prepared.
+def expected(
+    pipeline: Pipeline, planned: Sequence[Planned], names: Sequence[str], device: Device, run: Run | None
+) -> list[str]:
+    """Return a line for each part of a run, and one for all.
+
+    names: of the photographs that are to be prepared; run: with its scene, where that is prepared.
 
     Photographs are read and the device is used for some seconds; nothing is written but a temporary folder.
     """
-    names = photographs(pipeline, planned, out) if run is None else []
     parts = list(_of_preparation(planned, pipeline.settings.scene.folder, names))
     if (capture := _capture(pipeline, planned, names, run)) is not None:
         settings = choose(pipeline.settings, known(pipeline, names)) if run is None else pipeline.settings

@@ -18,8 +18,11 @@ from clsplat.scene.view import View
 from data_tools.gather import list_photographs
 
 
-def photographs(pipeline: Pipeline, planned: Sequence[Planned], out: Path) -> list[str]:
-    """Return the names of what is to be prepared; none where `prepare` finds no photographs by itself."""
+def listed(pipeline: Pipeline, planned: Sequence[Planned], out: Path) -> list[str]:
+    """Return the names of what is to be prepared; none where `prepare` finds no photographs by itself.
+
+    The log says which files are left out.
+    """
     try:
         return (
             list_photographs(pipeline.settings.scene.folder, prepared_folder(out).parent.resolve()) if planned else []
@@ -28,18 +31,27 @@ def photographs(pipeline: Pipeline, planned: Sequence[Planned], out: Path) -> li
         return []
 
 
-def known(pipeline: Pipeline, names: Sequence[str]) -> Measures:
-    """Return the measures that named photographs have where all are placed: how many train, for validation too.
+def check_names(pipeline: Pipeline, planned: Sequence[Planned], out: Path) -> None:
+    """Raise DataError where a list of the split names none of the photographs that are to be prepared."""
+    with only(logging.ERROR):
+        names = listed(pipeline, planned, out)
+    if names:
+        pipeline.settings.scene.split.check(pipeline.settings.scene.folder, names)
 
-    Raises DataError where the split takes all of them, or names others.
+
+def known(pipeline: Pipeline, names: Sequence[str]) -> Measures:
+    """Return the measures that named photographs have if all are placed: how many train, for validation too.
+
+    None where the split does not fit all of them.
     """
-    if not names:
-        return {}
-    split, folder = pipeline.settings.scene.split, pipeline.settings.scene.folder
+    split, folder = replace(pipeline.settings.scene.split, validation=0), pipeline.settings.scene.folder
     pose = np.eye(3, 4, dtype=np.float32)
     views = [View(name, Camera(1, 1, 1.0, 1.0, 0.5, 0.5), pose, folder / name) for name in names]
-    if split.validation == "auto":  # is by the places of cameras, and takes no photograph away
-        split = replace(split, validation=0)
-    with only(logging.ERROR):
-        scene = split.applied(make_scene(folder, views, every_nth(names, split.of_reader), None, "black"))
-    return {"photographs": len(scene.with_fold().split("train"))}
+    if not names:
+        return {}
+    try:
+        with only(logging.ERROR):
+            scene = split.applied(make_scene(folder, views, every_nth(names, split.of_reader), None, "black"))
+    except DataError:  # as where some are left out: the run says it then
+        return {}
+    return {"photographs": len(scene.train)}

@@ -60,15 +60,7 @@ class Choice(Settings):
         """
         if self.every is not None:
             return every_nth(names, self.every, self.offset)
-        place, listed = "the list of names", self.names or []
-        if self.file is not None:
-            files = [folder / self.file for folder in folders]
-            found = next((file for file in files if file.is_file()), files[0])
-            place = str(found)
-            lines = (line.strip() for line in read_text(found, limit=LARGEST).splitlines())
-            listed = [line for line in lines if line and not line.startswith("#")]
-            if not listed:
-                raise DataError(f"{place}: is empty; expected the name of a photograph in each line")
+        place, listed = self._listed(folders)
         found_at = {name: _indices_of(name, names) for name in listed}
         if name := next((one for one in listed if not found_at[one] and _indices_of(one, tested)), None):
             raise DataError(
@@ -76,6 +68,24 @@ class Choice(Settings):
                 "list, or out of scene.holdout"
             )
         return {_only(name, found, names, place) for name, found in found_at.items()}
+
+    def check(self, names: Sequence[str], folders: Sequence[Path]) -> None:
+        """Raise DataError where a listed name means none of `names`: some of these may be left out later."""
+        place, listed = self._listed(folders)
+        for name in listed:
+            if not (found := _indices_of(name, names)):
+                _only(name, found, names, place)
+
+    def _listed(self, folders: Sequence[Path]) -> tuple[str, list[str]]:
+        """Where the names are listed, and these.  Raises DataError where the file cannot be read, or has none."""
+        if self.file is None:
+            return "the list of names", self.names or []
+        files = [folder / self.file for folder in folders]
+        found = next((file for file in files if file.is_file()), files[0])
+        lines = (line.strip() for line in read_text(found, limit=LARGEST).splitlines())
+        if listed := [line for line in lines if line and not line.startswith("#")]:
+            return str(found), listed
+        raise DataError(f"{found}: is empty; expected the name of a photograph in each line")
 
 
 Number = Annotated[int, Field(ge=0)]
@@ -98,17 +108,16 @@ def _indices_of(listed: str, names: Sequence[str]) -> list[int]:
     """
     if listed in names:
         return [names.index(listed)]
-    wanted = PurePosixPath(listed.replace("\\", "/"))
-    return _ending(wanted, names) or (_ending(wanted.with_suffix(""), names) if is_image(wanted) else [])
+    wanted, paths = PurePosixPath(listed.replace("\\", "/")), [PurePosixPath(name) for name in names]
+    if found := _ending(wanted, paths):
+        return found
+    stem, stems = wanted.with_suffix("") if is_image(wanted) else wanted, [path.with_suffix("") for path in paths]
+    return [i for i, one in enumerate(stems) if one == stem] or _ending(stem, stems)
 
 
-def _ending(wanted: PurePosixPath, names: Sequence[str]) -> list[int]:
-    """The indices of names with such an end, with or without their suffix."""
-    return [
-        i
-        for i, path in enumerate(map(PurePosixPath, names))
-        if any(one.parts[-len(wanted.parts) :] == wanted.parts for one in (path, path.with_suffix("")))
-    ]
+def _ending(wanted: PurePosixPath, paths: Sequence[PurePosixPath]) -> list[int]:
+    """The indices of paths with such an end."""
+    return [i for i, path in enumerate(paths) if path.parts[-len(wanted.parts) :] == wanted.parts]
 
 
 def _only(listed: str, found: Sequence[int], names: Sequence[str], place: str) -> int:

@@ -55,6 +55,15 @@ class Split:
             scene = _with_test(smaller, {i for i, view in enumerate(views) if view.name in tested})
         return self.with_validation(scene)
 
+    def check(self, folder: Path, names: Sequence[str]) -> None:
+        """Raise DataError where a list has a name of no photograph in a folder: fewer of them may be placed."""
+        for key, choice in (("holdout", self.holdout), ("train", self.train), ("validation", self.validation)):
+            if isinstance(choice, Choice):
+                try:
+                    choice.check(names, [folder])
+                except DataError as error:
+                    raise DataError(f"{folder}: scene.{key}: {error}") from error
+
     def with_validation(self, scene: Scene) -> Scene:
         """Return a scene that has all training views, some of them for validation.  Raises DataError as `applied`."""
         folders = [scene.path, *([self.folder] if self.folder else [])]

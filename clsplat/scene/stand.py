@@ -11,6 +11,7 @@ from clsplat.scene.view import View
 
 TURNED = 0.1  # of the squares of rightward axes, along their second direction: cameras turn by 18 degrees
 ROLLED = 0.15  # of that, along their third: with more, cameras are rolled, or lie on their sides
+TOLD = 0.2  # of upward axes along what is up, in the mean: less of them do not say which way it is
 AGREED, FURTHEST = 0.5, 75.0  # a mean of upward axes of this length is less than so many degrees away from what is up
 PRIOR = 1e-3  # weight of the splats' middle, beside the axes: where all are parallel, nothing else says how far
 START = Camera(1200, 900, 1100.0, 1100.0, 600.0, 450.0)  # where there is no view
@@ -58,7 +59,8 @@ def upward(views: Sequence[View]) -> NDArray[np.float64]:
     axis, length = axes[:, 0], np.linalg.norm(mean)
     leans = length > AGREED and abs(axis @ mean) < length * np.cos(np.radians(FURTHEST))
     if squares[1] >= TURNED and squares[0] <= ROLLED * squares[1] and not leans:
-        return np.asarray(axis if axis @ (mean - ahead / 2) > 0 else -axis)  # looking down is more usual than up
+        way = axis @ mean if abs(axis @ mean) > TOLD else -axis @ ahead  # looking down is more usual than up
+        return np.asarray(axis if way > 0 else -axis)
     axis = mean if length > np.linalg.norm(ahead) / 2 else -ahead
     axis = axis if np.linalg.norm(axis) > np.finfo(np.float32).eps else -poses[0, 1, :3]
     return np.asarray(axis / np.linalg.norm(axis), np.float64)

@@ -159,12 +159,6 @@ def load_transparency(view: View) -> NDArray[np.uint8] | None:
     return None if rgba is None or (rgba[:, :, 3] == 255).all() else np.asarray(255 - rgba[:, :, 3])
 
 
-def is_transparent(view: View) -> bool:
-    """Return whether the file of `view` has pixels that are not opaque.  Raises DataError when it cannot be read."""
-    pixels = read_image(view.image_path)
-    return pixels.shape[2] == 4 and bool((pixels[:, :, 3] < np.iinfo(pixels.dtype).max).any())
-
-
 def load_mask(view: View) -> NDArray[np.bool_] | None:
     """Return which pixels of `load_image` count, [H, W], or None when all do.
 

@@ -18,7 +18,8 @@ from clsplat.scene.hull import hull_points
 from clsplat.scene.middle import centre_of, looked_at_box, random_points
 from clsplat.scene.plane_sweep import swept_points
 from clsplat.scene.scene import PointCloud, Scene
-from clsplat.scene.view import is_transparent, load_image, load_rgba
+from clsplat.scene.transparency import is_transparent
+from clsplat.scene.view import load_image, load_rgba
 from clsplat.settings import ReadPath
 from clsplat.stages.base import Stage
 from clsplat.stages.first_motion import moving, require_times, with_motion
@@ -37,9 +38,9 @@ class Init(Stage):
     """Make Gaussians: isotropic, as large as the mean distance to the three nearest neighbours (Kerbl et al. 2023).
 
     `source: auto` uses the scene's points if it has points.  Without points it uses a plane sweep over the photographs,
-    or, where the first one has transparent pixels, what `transparent` says: random points in a box around the point
+    or, where these have transparent pixels, what `transparent` says: random points in a box around the point
     that the cameras look at, as published, or points on the hull of the silhouettes in that box.  Where a scene has
-    fewer points than `fewest`, and its first photograph is opaque, those of a sweep join them.
+    fewer points than `fewest`, and its photographs are opaque, those of a sweep join them.
     """
 
     stage: Literal["init"] = "init"
@@ -112,7 +113,7 @@ class Init(Stage):
     def _is_joined(self, scene: Scene) -> bool:
         """Whether points of a sweep join those of the scene."""
         few = scene.points is not None and len(scene.points) < self.fewest
-        return self.source == "auto" and few and not is_transparent(scene.views[0])
+        return self.source == "auto" and few and not is_transparent(scene)
 
     def _origin(self, source: str, scene: Scene) -> str:
         names = {
@@ -130,7 +131,7 @@ class Init(Stage):
             return self.source
         if scene.points is not None:
             return "points"
-        return self.transparent if is_transparent(scene.views[0]) else "sweep"
+        return self.transparent if is_transparent(scene) else "sweep"
 
     def _parameters(self, run: Run, degree: int) -> tuple[Parameters, str]:
         """The parameters and their source: random points too where photographs agree on too few."""

@@ -72,7 +72,7 @@ class Optimize(Keeping):
     """Probability with which a step leaves a Gaussian out, by step, 0.9 at most; for few photographs.  The opacities of
     the others are divided by 1 less it (DropGaussian, Park et al. 2025).  Pictures and measurements leave none out."""
     background: Behind = "scene"
-    """Colour behind all; random: another in each step; transparent: random where the first photograph is so."""
+    """Colour behind all; random: another in each step; transparent: random where photographs are so."""
     skip: Skip | None = None
     """Steps that skip the backward pass, where a view has converged; without it, none."""
     during: list[OneOf[Scheduled]] = Field([])

@@ -4,7 +4,7 @@ import logging
 from typing import Literal
 
 from clsplat.errors import ConfigError
-from clsplat.scene.view import load_transparency
+from clsplat.scene.transparency import is_transparent
 from clsplat.training.run import Run
 from clsplat.views.backgrounds import Backgrounds
 
@@ -15,16 +15,12 @@ LOG = logging.getLogger("clsplat")
 def drawn_backgrounds(setting: Behind, run: Run) -> Backgrounds | None:
     """Return the colours that steps draw, or None where all have that of the scene.
 
-    For `transparent` the first training photograph decides.
-
     The photographs of the run keep their transparency for them.  Raises ConfigError for a model with a sky.
     """
     if setting == "transparent":
-        shows = load_transparency(run.scene.split("train")[0]) is not None
+        shows = is_transparent(run.scene)
         setting = "random" if shows else "scene"
-        LOG.info(
-            "background of the steps: %s, since the first photograph is %stransparent", setting, "" if shows else "not "
-        )
+        LOG.info("background of the steps: %s, since photographs are %stransparent", setting, "" if shows else "not ")
     if setting == "scene":
         return None
     if run.sky:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from clsplat.gaussians.sky import Sky
 from clsplat.render.backdrops import Auto, Backdrop, Directions
 from clsplat.scene.scene import Scene, View
-from clsplat.scene.view import is_transparent
+from clsplat.scene.transparency import is_transparent
 from clsplat.training.run import Run
 from clsplat.training.sky import LearnedSky
 from clsplat.views.sky_share import Seen, looked_at, panorama
@@ -62,8 +62,7 @@ def _unknown(run: Run) -> str:
     """Why photographs do not tell whether they show a sky; empty where they do."""
     if run.scene.points is None:
         return "the dataset has no points, and what is far from them is not known"
-    first = run.scene.split("train")[0]
-    return "the photographs have transparency" if first.alpha == "transparency" and is_transparent(first) else ""
+    return "the photographs have transparency" if is_transparent(run.scene) else ""
 
 
 def _number(seen: list[Seen], share: float) -> int:
@@ -91,8 +90,9 @@ def _first(run: Run, side: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]
     seen = _seen(run, run.scene)
     if found := panorama(seen, side):
         return found
-    uppers = [one.image[: max(1, len(one.image) // 3)].mean(axis=(0, 1)) / 255 for one in seen]
-    return np.tile(np.mean(uppers, axis=0), (side**2, 1)).astype(np.float32), np.ones(side**2, bool)
+    uppers = [one.upper.mean(axis=0) / 255 for one in seen if len(one.upper)]
+    mean = np.mean(uppers, axis=0) if uppers else np.zeros(3)
+    return np.tile(mean, (side**2, 1)).astype(np.float32), np.ones(side**2, bool)
 
 
 def _seen(run: Run, scene: Scene) -> list[Seen]:

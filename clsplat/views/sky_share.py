@@ -19,6 +19,7 @@ BLUE = 0.03  # by how much blue is above red
 DARKEST_BLUE = 0.3
 EVEN = 0.04  # standard deviation of the brightness in a square of 3 px
 UPPER = 1 / 3
+COUNTED = 1 / 3  # of the pixels of that third, at least, are what a share is of: masks may leave few
 SKYWARD = 0.75  # of such pixels are above the horizon: with fewer, they are a wall, or what an object lies on
 BEYOND = 2  # texels about those that photographs show as sky: its edge was left out, with what is near points
 Image = NDArray[np.uint8]
@@ -32,14 +33,23 @@ class Seen:
     view: View
     image: Image  # small, [height, width, 3]
     mask: Mask  # pixels that show the sky, [height, width]
+    counted: Mask  # pixels that masks do not leave out, [height, width]
     up: NDArray[np.float64]  # in the scene, [3]
 
     @property
     def share(self) -> float:
-        """The share of its upper third that shows the sky; 0 where that goes on below the horizon, as a wall does."""
+        """The share of what counts of its upper third that shows the sky; 0 where that goes on below the horizon, as a
+        wall does."""
         if not self.mask.any() or (self.directions[self.mask] @ self.up > 0).mean() < SKYWARD:
             return 0.0
-        return float(self.mask[: max(1, round(len(self.mask) * UPPER))].mean())
+        rows = slice(max(1, round(len(self.mask) * UPPER)))
+        return float(self.mask[rows].sum() / max(self.counted[rows].sum(), COUNTED * self.counted[rows].size))
+
+    @property
+    def upper(self) -> Image:
+        """The pixels of its upper third that count, [K, 3]."""
+        rows = slice(max(1, len(self.image) // 3))
+        return np.asarray(self.image[rows][self.counted[rows]])
 
     @property
     def directions(self) -> NDArray[np.float64]:
@@ -56,10 +66,9 @@ def looked_at(scene: Scene, views: Iterable[tuple[View, Image, Mask | None]]) ->
     up = upward(scene.split("train"))
     for view, image, counted in views:
         small = _small(image)
-        mask = sky_mask(small, _points_in(scene, view) * (small.shape[1] / view.camera.width))
-        if counted is not None:
-            mask &= _small(counted.astype(np.uint8)) > 0
-        yield Seen(view, small, mask, up)
+        counts = np.ones(small.shape[:2], bool) if counted is None else _small(counted.astype(np.uint8)) > 0
+        mask = sky_mask(small, _points_in(scene, view) * (small.shape[1] / view.camera.width), counts)
+        yield Seen(view, small, mask, counts, up)
 
 
 def panorama(seen: Sequence[Seen], side: int) -> tuple[NDArray[np.float32], Mask] | None:
@@ -73,7 +82,7 @@ def panorama(seen: Sequence[Seen], side: int) -> tuple[NDArray[np.float32], Mask
         place = places(one.directions, side)
         first = np.floor(place).astype(np.int64)
         texels, weight = corners(first[..., 0], first[..., 1], side), weights(place - first)
-        of_all += np.bincount(texels.ravel(), weight.ravel(), side**2)
+        of_all += np.bincount(texels[one.counted].ravel(), weight[one.counted].ravel(), side**2)
         texels, weight = texels[one.mask], weight[one.mask]
         of_sky += np.bincount(texels.ravel(), weight.ravel(), side**2)
         values = one.image[one.mask].astype(np.float64) / 255
@@ -90,16 +99,20 @@ def panorama(seen: Sequence[Seen], side: int) -> tuple[NDArray[np.float32], Mask
     return found.astype(np.float32), free | (of_all == 0)
 
 
-def sky_mask(image: Image, points: NDArray[np.floating]) -> Mask:
-    """Return which pixels of a small photograph show the sky, [height, width].  points: [K, 2] px."""
+def sky_mask(image: Image, points: NDArray[np.floating], counted: Mask) -> Mask:
+    """Return which pixels of a small photograph show the sky, [height, width], of those that count.
+
+    points: [K, 2] px.  The sky may be joined to the upper edge through pixels that do not count.
+    """
     values = image.astype(np.float32) / 255
     brightness = values.mean(axis=2)
     mean = cv2.blur(brightness, (3, 3))
     spread = np.sqrt(np.maximum(cv2.blur(brightness**2, (3, 3)) - mean**2, 0))
     blue = (values[..., 2] > values[..., 0] + BLUE) & (values[..., 2] > DARKEST_BLUE)
     found = ((brightness > BRIGHT) | blue) & (spread < EVEN) & _apart(points, brightness.shape)
-    _, parts = cv2.connectedComponents(found.astype(np.uint8), connectivity=4)
-    return np.asarray(found & np.isin(parts, parts[0][found[0]]))
+    open_to = found | ~counted
+    _, parts = cv2.connectedComponents(open_to.astype(np.uint8), connectivity=4)
+    return np.asarray(found & counted & np.isin(parts, parts[0][open_to[0]]))
 
 
 def _apart(points: NDArray[np.floating], shape: tuple[int, ...]) -> Mask:
