@@ -16,7 +16,7 @@ from clsplat.runs import expected as module
 from clsplat.runs.description import describe
 from clsplat.runs.experiment import Job
 from clsplat.runs.single import run_pipeline
-from clsplat.runs.unprepared import check_names, known, listed
+from clsplat.runs.unprepared import check_split, known, listed
 from clsplat.settings import Settings
 from clsplat.stages.optimize import Optimize
 from data_tools.matching import MAX_EXHAUSTIVE, most_pairs
@@ -60,7 +60,8 @@ def expected(pipeline: str, photos: Path, monkeypatch: pytest.MonkeyPatch, *sets
     asked = load(pipeline, [f"scene.path='{photos}'", *sets])
     out = photos.parent / "runs" / "a"
     planned = asked.preparation(out)
-    return module.expected(asked, planned, listed(asked, planned, out), None, None)  # type: ignore[arg-type]
+    names = listed(asked, planned, out)
+    return module.expected(asked, planned, names, known(asked, names), None, None)  # type: ignore[arg-type]
 
 
 def test_parts_are_continued_by_the_number_of_their_pieces(photos, monkeypatch):
@@ -120,24 +121,28 @@ def test_photographs_that_are_not_prepared_tell_how_many_train(photos, sets, tra
         ("scene.holdout={file: list.txt}", "list.txt"),
         ("scene.validation={names: [other]}", "scene.validation: the list of names: no photograph is called 'other'"),
         ("scene.train={names: [other.png]}", "no photograph is called 'other.png'"),
+        ("scene.holdout=1", "scene.holdout takes every photograph for testing"),
+        ("scene={holdout: {names: ['00']}, validation: {names: [00.jpg]}}", "'00.jpg' is held out for testing"),
     ],
 )
 def test_a_split_that_photographs_do_not_have_is_refused_before_they_are_prepared(photos, begin, sets, complaint):
-    asked = load("photos", [f"scene.path='{photos}'", sets])
+    asked = load("photos", [sets, f"scene.path='{photos}'"])
     with pytest.raises(DataError, match=complaint):
         begin(asked, photos.parent / "runs" / "a", None, "new")
     assert not (photos.parent / "runs" / "prepared").exists()
 
 
-def test_lists_may_name_all_but_photographs_that_may_be_left_out(photos):
-    """Which ones a number holds out is known when all are placed."""
+def test_a_list_is_not_refused_for_what_is_known_when_cameras_are(photos, caplog):
+    """Which photographs a number holds out follows from those that are placed."""
     asked = load("photos", [f"scene.path='{photos}'", "scene.train={names: [00.png, '08', 01.jpg]}"])
-    out = photos.parent / "runs" / "a"
-    planned = asked.preparation(out)
-    check_names(asked, planned, out)
-    assert known(asked, listed(asked, planned, out)) == {}
     (photos / "left.heic").write_bytes(b"")
-    check_names(asked, planned, out)
+    out = photos.parent / "runs" / "a"
+    check_split(asked, asked.preparation(out), out)
+    assert "HEIC" not in caplog.text, "the step that leaves it out says so"
+    told = describe(asked, out, None, "new")
+    assert "if all 23 photographs are placed, the run is refused:" in told
+    assert "'00.png' is held out for testing" in told
+    assert "model.background=null; {" in told, "what may be chosen"
 
 
 def test_files_that_are_left_out_are_told_once(photos, caplog):

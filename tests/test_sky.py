@@ -29,6 +29,7 @@ from clsplat.training import checkpoint
 from clsplat.training.archive import split
 from clsplat.training.sky import FOLDER, check_tables
 from clsplat.views.sky_share import Seen, looked_at, panorama
+from data_tools.colmap_writer import write_model
 from tests.few_steps import FEW
 from tests.test_training import digest, train
 from tests.yards import Yard, painted
@@ -129,27 +130,36 @@ def test_where_photographs_show_none_the_bits_are_those_without_the_key(tiny_sce
 
 
 @pytest.mark.parametrize(
-    ("alpha", "masked", "chosen", "why"),
+    ("alpha", "masked", "size", "chosen", "why"),
     [
-        (255, None, "on", "9 of 9 photographs show"),
-        (254, None, "off", "the photographs have transparency"),
-        (None, "sky", "off", "0 of 9 photographs show"),
-        (None, "edge", "on", "9 of 9 photographs show"),
+        (255, None, 1, "on", "9 of 9 photographs show"),
+        (254, None, 1, "off", "the photographs have transparency"),
+        (254, "below", 1, "off", "the photographs have transparency"),
+        (255, "sky", 1, "off", "0 of 9 photographs show"),
+        (255, "edge", 1, "on", "9 of 9 photographs show"),
+        (255, "edge", 8, "on", "9 of 9 photographs show"),
     ],
 )
-def test_photographs_that_are_opaque_in_pixels_that_count_show_a_sky(tmp_path, rng, alpha, masked, chosen, why):
-    """alpha: of one pixel of photographs but one, opaque elsewhere; None: they have none.  masked: what is left out."""
+def test_pixels_that_count_and_are_opaque_show_a_sky(tmp_path, rng, alpha, masked, size, chosen, why):
+    """alpha: of one pixel of photographs but one, opaque elsewhere; masked: what is left out, an edge that is dark."""
     yard, masks = Yard(rng), tmp_path / "masks"
     folder = yard.write(tmp_path / "scene")
     for view in yard.views:
-        pixels, below = yard.photograph(view), yard.rays(view)[..., 1] > 0
+        pixels, counted = yard.photograph(view), np.ones((48, 64), bool)
         if masked == "edge":
-            below, pixels[:8] = np.arange(len(pixels))[:, None] * np.ones(pixels.shape[1]) >= 8, 40
-        if alpha:
-            layer = np.full((*pixels.shape[:2], 1), 255, np.uint8)
-            layer[20, 30] = 255 if view.name == "1.png" else alpha
-            cv2.imwrite(str(folder / "images" / view.name), np.concatenate([pixels[..., ::-1], layer], axis=2))
-        write_image(masks / view.name, np.repeat(255 * below[..., None].astype(np.uint8), 3, axis=2))
+            counted[:8], pixels[:8] = False, 40
+        elif masked:
+            counted = (yard.rays(view)[..., 1] > 0) == (masked == "sky")
+            counted[20, 30] = True
+        layer = np.full((48, 64, 1), 255, np.uint8)
+        layer[20, 30] = 255 if view.name == "1.png" else alpha
+        file = np.concatenate([pixels[..., ::-1], layer], axis=2).repeat(size, axis=0).repeat(size, axis=1)
+        cv2.imwrite(str(folder / "images" / view.name), file)
+        mask = (255 * counted.astype(np.uint8)).repeat(size, axis=0).repeat(size, axis=1)
+        write_image(masks / view.name, np.repeat(mask[..., None], 3, axis=2))
+    if size > 1:
+        views = [replace(view, camera=view.camera.downscaled(1 / size)) for view in yard.views]
+        write_model(folder / "sparse" / "0", views, yard.points, None)
     more = [f"scene.masks={masks}"] if masked else []
     settings = [f"scene.path='{folder}'", *FEW, "scene.holdout=4", "model.background=auto", *more]
     run_pipeline(load("smoke", settings), tmp_path / "run", None, "new")

@@ -67,6 +67,17 @@ def test_a_whole_path_is_meant_before_the_end_of_another(tmp_path, listed):
     assert [view.name for view in scene.split("test")] == ["1.png"]
 
 
+def test_a_name_that_means_one_elsewhere_of_another_kind_is_told(tmp_path, caplog):
+    write(tmp_path, **LENS, frames=frames("a/1.png", "c.png"))
+    caplog.set_level("INFO", "clsplat")
+    scene = read_scene(tmp_path, Split(Choice(names=["1.jpg"])))
+    assert [view.name for view in scene.split("test")] == ["a/1.png"]
+    assert "'1.jpg' means 'a/1.png'" in caplog.text
+    caplog.clear()
+    read_scene(tmp_path, Split(Choice(names=["c.jpg"])))
+    assert "means" not in caplog.text
+
+
 def test_a_file_lists_test_views(folder):
     (folder / "test.txt").write_text("# of the paper\nc.png\n\n x.png \n")
     assert letters(read_scene(folder, Split(Choice(file="test.txt"))), "test") == "cx"

@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from clsplat import lock
+from clsplat.errors import DataError
 from clsplat.opencl.device import Device
 from clsplat.pipeline.choosing import choose
 from clsplat.pipeline.loading import Pipeline
@@ -17,6 +18,7 @@ from clsplat.runs.outputs import check_places
 from clsplat.runs.runner import restore
 from clsplat.runs.scenes import ReadScene, read_run_scene
 from clsplat.runs.unprepared import known, listed
+from clsplat.scene.capture import Measures
 from clsplat.stages.base import Scheduled, Stage
 from clsplat.stages.evaluate import Evaluate
 from clsplat.stages.init import Init
@@ -27,7 +29,7 @@ from clsplat.training.run import Run
 LOG = logging.getLogger("clsplat")
 
 
-Expect = Callable[[Pipeline, Sequence[Planned], Sequence[str], Device, Run | None], list[str]]
+Expect = Callable[[Pipeline, Sequence[Planned], Sequence[str], Measures, Device, Run | None], list[str]]
 
 
 def describe(
@@ -65,23 +67,33 @@ def describe(
         for stage in pipeline.stages[run.cursor :]:
             stage.check_in(run)
     names = listed(pipeline, planned, out) if run is None else []
-    lines += _choices(pipeline, names)
+    measures, head = _known(pipeline, names)
+    choices = _choices(pipeline, measures)
+    lines += [*(head if choices else []), *choices]
     lines += [f"  {stage.stage:<14} {_detail(stage, run)}".rstrip() for stage in pipeline.stages]
     lines += _on_host(pipeline, run) if run else []
     if expect and start != "resume":
-        lines += expect(pipeline, planned, names, opened, run)
+        lines += expect(pipeline, planned, names, measures, opened, run)
     return f"{verdict} in {out}:\n" + "\n".join(lines)
 
 
-def _choices(pipeline: Pipeline, names: Sequence[str]) -> list[str]:
-    """What was chosen; of named photographs that are to be prepared, what follows from them, and what may."""
+def _known(pipeline: Pipeline, names: Sequence[str]) -> tuple[Measures, list[str]]:
+    """What is known of named photographs that are to be prepared, and a line for it."""
+    head = f"  choices        if all {len(names)} photographs are placed"
+    try:
+        measures = known(pipeline, names)
+    except DataError as error:
+        return {}, [f"{head}, the run is refused: {error}"]
+    return measures, [f"{head}:"] if measures else []
+
+
+def _choices(pipeline: Pipeline, measures: Measures) -> list[str]:
+    """What was chosen; of photographs that are to be prepared, what follows from their measures, and what may."""
     open_ones = pipeline.settings.choices
-    measures = known(pipeline, names)
     made = choose(pipeline.settings, measures).choices if measures else open_ones
     pairs = zip(open_ones, made, strict=True)
     told = [after.told if one.is_settled(measures) else one.possible(measures) for one, after in pairs]
-    head = [f"  choices        if all {len(names)} photographs are placed:"] if measures and told else []
-    return head + [f"  {one}" for one in told]
+    return [f"  {one}" for one in told]
 
 
 def tell_of_waiting(out: Path) -> None:

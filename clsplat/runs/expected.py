@@ -23,7 +23,7 @@ from clsplat.pipeline.file import PipelineFile
 from clsplat.pipeline.loading import Pipeline
 from clsplat.prepare.cache import Planned
 from clsplat.progress import only
-from clsplat.runs.unprepared import known
+from clsplat.scene.capture import Measures
 from clsplat.scene.images import image_size
 from clsplat.schedule import values_of
 from clsplat.stages.densify import Densify
@@ -65,17 +65,22 @@ class Capture:
 
 
 def expected(
-    pipeline: Pipeline, planned: Sequence[Planned], names: Sequence[str], device: Device, run: Run | None
+    pipeline: Pipeline,
+    planned: Sequence[Planned],
+    names: Sequence[str],
+    measures: Measures,
+    device: Device,
+    run: Run | None,
 ) -> list[str]:
     """Return a line for each part of a run, and one for all.
 
-    names: of the photographs that are to be prepared; run: with its scene, where that is prepared.
+    names, measures: of the photographs that are to be prepared; run: with its scene, where that is prepared.
 
     Photographs are read and the device is used for some seconds; nothing is written but a temporary folder.
     """
     parts = list(_of_preparation(planned, pipeline.settings.scene.folder, names))
     if (capture := _capture(pipeline, planned, names, run)) is not None:
-        settings = choose(pipeline.settings, known(pipeline, names)) if run is None else pipeline.settings
+        settings = choose(pipeline.settings, measures) if run is None else pipeline.settings
         parts += [_of_training(training, settings, capture, device) for training in _trainings(settings)]
     if run is not None:
         parts += [_of_field(one, run) for one in pipeline.settings.stages if isinstance(one, TrainField)]

@@ -16,7 +16,7 @@ from clsplat.progress import Listener, heard_by
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.runs.folders import Start
 from clsplat.runs.scenes import ReadScene, RunScene, read_run_scene
-from clsplat.runs.unprepared import check_names
+from clsplat.runs.unprepared import check_split
 from clsplat.training.run import Run
 from clsplat.training.status import StatusFile
 from clsplat.views.photographs import Photographs
@@ -81,7 +81,7 @@ def check_start(
     if planned and planned[0].why:
         planned[0].step.check(settings.scene.folder.resolve(), prepared_folder(out).parent)
     if any(one.why for one in planned):
-        check_names(pipeline, planned, out)
+        check_split(pipeline, planned, out)
     return opened, planned
 
 

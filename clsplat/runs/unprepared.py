@@ -31,8 +31,8 @@ def listed(pipeline: Pipeline, planned: Sequence[Planned], out: Path) -> list[st
         return []
 
 
-def check_names(pipeline: Pipeline, planned: Sequence[Planned], out: Path) -> None:
-    """Raise DataError where a list of the split names none of the photographs that are to be prepared."""
+def check_split(pipeline: Pipeline, planned: Sequence[Planned], out: Path) -> None:
+    """Raise DataError where the photographs that are to be prepared do not have the split."""
     with only(logging.ERROR):
         names = listed(pipeline, planned, out)
     if names:
@@ -42,16 +42,13 @@ def check_names(pipeline: Pipeline, planned: Sequence[Planned], out: Path) -> No
 def known(pipeline: Pipeline, names: Sequence[str]) -> Measures:
     """Return the measures that named photographs have if all are placed: how many train, for validation too.
 
-    None where the split does not fit all of them.
+    Raises DataError where the split does not fit all of them.
     """
+    if not names:
+        return {}
     split, folder = replace(pipeline.settings.scene.split, validation=0), pipeline.settings.scene.folder
     pose = np.eye(3, 4, dtype=np.float32)
     views = [View(name, Camera(1, 1, 1.0, 1.0, 0.5, 0.5), pose, folder / name) for name in names]
-    if not names:
-        return {}
-    try:
-        with only(logging.ERROR):
-            scene = split.applied(make_scene(folder, views, every_nth(names, split.of_reader), None, "black"))
-    except DataError:  # as where some are left out: the run says it then
-        return {}
+    with only(logging.ERROR):
+        scene = split.applied(make_scene(folder, views, every_nth(names, split.of_reader), None, "black"))
     return {"photographs": len(scene.train)}

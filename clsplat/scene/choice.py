@@ -1,5 +1,6 @@
 """A choice of a scene's views by their names: every n-th, a list, or the lines of a file."""
 
+import logging
 from collections.abc import Sequence
 from difflib import get_close_matches
 from pathlib import Path, PurePosixPath
@@ -13,6 +14,7 @@ from clsplat.scene.images import is_image
 from clsplat.scene.scene import every_nth
 from clsplat.settings import ReadPath, Settings, in_one_sentence
 
+LOG = logging.getLogger("clsplat")
 LARGEST = 1 << 24  # bytes of a list of names
 NOTATIONS = "expected a number, {every, offset}, {names: […]} or {file: …}"
 
@@ -63,18 +65,26 @@ class Choice(Settings):
         place, listed = self._listed(folders)
         found_at = {name: _indices_of(name, names) for name in listed}
         if name := next((one for one in listed if not found_at[one] and _indices_of(one, tested)), None):
-            raise DataError(
-                f"{place}: {quoted(name)} is held out for testing; expected training photographs: take it out of this "
-                "list, or out of scene.holdout"
-            )
-        return {_only(name, found, names, place) for name, found in found_at.items()}
+            raise _held_out(place, name)
+        chosen = {name: _only(name, found, names, place) for name, found in found_at.items()}
+        for name, i in chosen.items():
+            _tell_of_another(name, names[i], place)
+        return set(chosen.values())
 
-    def check(self, names: Sequence[str], folders: Sequence[Path]) -> None:
-        """Raise DataError where a listed name means none of `names`: some of these may be left out later."""
+    def check(self, names: Sequence[str], folders: Sequence[Path], tested: Sequence[str] = ()) -> list[str]:
+        """Return those of `names` that are listed, some of which may be left out later; none of every n-th.
+
+        tested: names that a list holds out for testing.  Raises DataError for a name that means none, or one of these.
+        """
+        if self.every is not None:
+            return []
         place, listed = self._listed(folders)
-        for name in listed:
-            if not (found := _indices_of(name, names)):
-                _only(name, found, names, place)
+        found = {name: _indices_of(name, names) for name in listed}
+        if name := next((one for one in listed if found[one] and {names[i] for i in found[one]} <= {*tested}), None):
+            raise _held_out(place, name)
+        if name := next((one for one in listed if not found[one]), None):
+            _only(name, [], names, place)
+        return [names[i] for indices in found.values() for i in indices]
 
     def _listed(self, folders: Sequence[Path]) -> tuple[str, list[str]]:
         """Where the names are listed, and these.  Raises DataError where the file cannot be read, or has none."""
@@ -91,6 +101,13 @@ class Choice(Settings):
 Number = Annotated[int, Field(ge=0)]
 Chosen = Annotated[Number | Choice, in_one_sentence(NOTATIONS)]
 ChosenOrAuto = Annotated[Number | Choice | Literal["auto"], in_one_sentence(f"{NOTATIONS}, or auto")]
+
+
+def _held_out(place: str, name: str) -> DataError:
+    return DataError(
+        f"{place}: {quoted(name)} is held out for testing; expected training photographs: take it out of this list, or "
+        "out of scene.holdout"
+    )
 
 
 def choose(choice: int | Choice, names: Sequence[str], folders: Sequence[Path], tested: Sequence[str] = ()) -> set[int]:
@@ -118,6 +135,13 @@ def _indices_of(listed: str, names: Sequence[str]) -> list[int]:
 def _ending(wanted: PurePosixPath, paths: Sequence[PurePosixPath]) -> list[int]:
     """The indices of paths with such an end."""
     return [i for i, path in enumerate(paths) if path.parts[-len(wanted.parts) :] == wanted.parts]
+
+
+def _tell_of_another(listed: str, found: str, place: str) -> None:
+    """Log that a name in another folder, of another kind of image, is meant."""
+    wanted, path = PurePosixPath(listed), PurePosixPath(found)
+    if is_image(wanted) and wanted.suffix != path.suffix and wanted.with_suffix("") != path.with_suffix(""):
+        LOG.info("%s: %s means %s", place, quoted(listed), quoted(found))
 
 
 def _only(listed: str, found: Sequence[int], names: Sequence[str], place: str) -> int:

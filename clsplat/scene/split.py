@@ -56,13 +56,20 @@ class Split:
         return self.with_validation(scene)
 
     def check(self, folder: Path, names: Sequence[str]) -> None:
-        """Raise DataError where a list has a name of no photograph in a folder: fewer of them may be placed."""
+        """Raise DataError for a split that the photographs in a folder do not have, however many of them are placed.
+
+        That is one with names of none of them, or with one photograph for testing and not, or with all for testing.
+        """
+        if self.holdout == 1 or (isinstance(self.holdout, Choice) and self.holdout.every == 1):
+            raise DataError(f"{folder}: scene.holdout takes every photograph for testing; expected a larger number")
+        tested: list[str] = []
         for key, choice in (("holdout", self.holdout), ("train", self.train), ("validation", self.validation)):
             if isinstance(choice, Choice):
                 try:
-                    choice.check(names, [folder])
+                    listed = choice.check(names, [folder], tested)
                 except DataError as error:
                     raise DataError(f"{folder}: scene.{key}: {error}") from error
+                tested = listed if key == "holdout" else tested
 
     def with_validation(self, scene: Scene) -> Scene:
         """Return a scene that has all training views, some of them for validation.  Raises DataError as `applied`."""

@@ -4,7 +4,7 @@ import logging
 from typing import Literal
 
 from clsplat.errors import ConfigError
-from clsplat.scene.transparency import is_transparent
+from clsplat.scene.transparency import background_shows
 from clsplat.training.run import Run
 from clsplat.views.backgrounds import Backgrounds
 
@@ -18,9 +18,9 @@ def drawn_backgrounds(setting: Behind, run: Run) -> Backgrounds | None:
     The photographs of the run keep their transparency for them.  Raises ConfigError for a model with a sky.
     """
     if setting == "transparent":
-        shows = is_transparent(run.scene)
+        shows = background_shows(run.scene)
         setting = "random" if shows else "scene"
-        LOG.info("background of the steps: %s, since photographs are %stransparent", setting, "" if shows else "not ")
+        LOG.info("background of the steps: %s, since %s shows behind photographs", setting, "it" if shows else "none")
     if setting == "scene":
         return None
     if run.sky:

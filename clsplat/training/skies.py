@@ -91,6 +91,8 @@ def _first(run: Run, side: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]
     if found := panorama(seen, side):
         return found
     uppers = [one.upper.mean(axis=0) / 255 for one in seen if len(one.upper)]
+    if not uppers:
+        LOG.warning("masks leave out the upper thirds of all photographs: the sky begins black")
     mean = np.mean(uppers, axis=0) if uppers else np.zeros(3)
     return np.tile(mean, (side**2, 1)).astype(np.float32), np.ones(side**2, bool)
 

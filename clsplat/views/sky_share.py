@@ -66,7 +66,7 @@ def looked_at(scene: Scene, views: Iterable[tuple[View, Image, Mask | None]]) ->
     up = upward(scene.split("train"))
     for view, image, counted in views:
         small = _small(image)
-        counts = np.ones(small.shape[:2], bool) if counted is None else _small(counted.astype(np.uint8)) > 0
+        counts = np.ones(small.shape[:2], bool) if counted is None else _small(255 * counted.astype(np.uint8)) == 255
         mask = sky_mask(small, _points_in(scene, view) * (small.shape[1] / view.camera.width), counts)
         yield Seen(view, small, mask, counts, up)
 
@@ -102,17 +102,25 @@ def panorama(seen: Sequence[Seen], side: int) -> tuple[NDArray[np.float32], Mask
 def sky_mask(image: Image, points: NDArray[np.floating], counted: Mask) -> Mask:
     """Return which pixels of a small photograph show the sky, [height, width], of those that count.
 
-    points: [K, 2] px.  The sky may be joined to the upper edge through pixels that do not count.
+    points: [K, 2] px.  Below pixels that do not count, from the upper edge on, the sky begins where they end.
     """
     values = image.astype(np.float32) / 255
     brightness = values.mean(axis=2)
-    mean = cv2.blur(brightness, (3, 3))
-    spread = np.sqrt(np.maximum(cv2.blur(brightness**2, (3, 3)) - mean**2, 0))
+    mean = _blurred(brightness, counted)
+    spread = np.sqrt(np.maximum(_blurred(brightness**2, counted) - mean**2, 0))
     blue = (values[..., 2] > values[..., 0] + BLUE) & (values[..., 2] > DARKEST_BLUE)
     found = ((brightness > BRIGHT) | blue) & (spread < EVEN) & _apart(points, brightness.shape)
-    open_to = found | ~counted
-    _, parts = cv2.connectedComponents(open_to.astype(np.uint8), connectivity=4)
-    return np.asarray(found & counted & np.isin(parts, parts[0][open_to[0]]))
+    joined = (found & counted) | np.logical_and.accumulate(~counted, axis=0)
+    _, parts = cv2.connectedComponents(joined.astype(np.uint8), connectivity=4)
+    return np.asarray(found & counted & np.isin(parts, parts[0][joined[0]]))
+
+
+def _blurred(values: NDArray[np.float32], counted: Mask) -> NDArray[np.float32]:
+    """The means in squares of 3 px, of pixels that count."""
+    if counted.all():
+        return np.asarray(cv2.blur(values, (3, 3)))
+    shares = cv2.blur(counted.astype(np.float32), (3, 3))
+    return np.asarray(cv2.blur(values * counted, (3, 3)) / np.maximum(shares, 0.1), np.float32)
 
 
 def _apart(points: NDArray[np.floating], shape: tuple[int, ...]) -> Mask:
