@@ -2,7 +2,6 @@
 
 import json
 import math
-from collections.abc import Callable
 from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
@@ -17,10 +16,6 @@ Row = Annotated[list[Any], Field(min_length=2)]  # the least measure, or of each
 
 def _is_number(bound: Any) -> bool:
     return isinstance(bound, int | float) and not isinstance(bound, bool) and abs(bound) < math.inf
-
-
-def _values_text(values: list[Any]) -> str:
-    return ", ".join(map(json.dumps, values))
 
 
 class CaptureChoice(Settings):
@@ -142,21 +137,24 @@ class CaptureChoice(Settings):
 
     def possible(self, known: Measures) -> str:
         """Return what can be chosen, in words, where some measures are known; of later rows the values alone."""
-        first, *others = self._open(known)
-        return "; ".join([self._row_text(first, known, self._text), *(self._row_text(row, known) for row in others)])
+        rows = self._open(known)
+        values = [
+            [self.given.get(key, value) for key, value in zip(self.keys, self.values[row][1:], strict=True)]
+            for row in rows
+        ]
+        texts = [self._text(values[0]), *(", ".join(map(json.dumps, one)) for one in values[1:])]
+        return "; ".join(text + self._condition(row, known) for row, text in zip(rows, texts, strict=True))
 
     def _open(self, known: Measures) -> list[int]:
         """The rows that the measures may reach: they do where those that are not known have the bounds of the row."""
         bounds = [dict(zip(self.measures, self.bounds(row), strict=True)) for row in self.values]
         return [number for number, own in enumerate(bounds) if self.row({**own, **known}) == number]
 
-    def _row_text(self, number: int, known: Measures, text: Callable[[list[Any]], str] = _values_text) -> str:
-        """The values of a row, and the bounds of measures that are not known."""
-        row = self.values[number]
-        bounds = zip(self.measures, self.bounds(row), strict=True)
+    def _condition(self, number: int, known: Measures) -> str:
+        """The bounds of a row, of measures that are not known."""
+        bounds = zip(self.measures, self.bounds(self.values[number]), strict=True)
         least = " and ".join(TOLD[name].format(bound) for name, bound in bounds if bound and name not in known)
-        values = text([self.given.get(key, value) for key, value in zip(self.keys, row[1:], strict=True)])
-        return values + (f" if at least {least}" if least else "")
+        return f" if at least {least}" if least else ""
 
     def _text(self, values: list[Any]) -> str:
         return ", ".join(f"{key}={json.dumps(value)}" for key, value in zip(self.keys, values, strict=True))

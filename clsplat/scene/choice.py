@@ -83,7 +83,7 @@ class Choice(Settings):
         if name := next((one for one in listed if found[one] and {names[i] for i in found[one]} <= {*tested}), None):
             raise _held_out(place, name)
         if name := next((one for one in listed if not found[one]), None):
-            _only(name, [], names, place)
+            raise _unknown(name, names, place)
         return [names[i] for indices in found.values() for i in indices]
 
     def _listed(self, folders: Sequence[Path]) -> tuple[str, list[str]]:
@@ -121,7 +121,7 @@ def choose(choice: int | Choice, names: Sequence[str], folders: Sequence[Path], 
 def _indices_of(listed: str, names: Sequence[str]) -> list[int]:
     """The indices of names that a listed one means, whole or as an end, with or without its suffix.
 
-    Where none is meant, that of another kind of image counts as none: what is prepared is PNG.
+    Where that means none, the suffix of an image may be another: what is prepared is PNG.
     """
     if listed in names:
         return [names.index(listed)]
@@ -151,8 +151,12 @@ def _only(listed: str, found: Sequence[int], names: Sequence[str], place: str) -
     if found:
         both = " and ".join(quoted(names[i]) for i in found[:2])
         raise DataError(f"{place}: {quoted(listed)} means {both}; give more of the path")
+    raise _unknown(listed, names, place)
+
+
+def _unknown(listed: str, names: Sequence[str], place: str) -> DataError:
     near = get_close_matches(listed, [*names, *(PurePosixPath(name).name for name in names)], 1)
     more = (
         f"did you mean {quoted(near[0])}?" if near else f"the first is {quoted(names[0])}: correct or remove the name"
     )
-    raise DataError(f"{place}: no photograph is called {quoted(listed)}; {more}")
+    return DataError(f"{place}: no photograph is called {quoted(listed)}; {more}")
