@@ -170,6 +170,8 @@ def test_a_signal_is_code_130(number, tiny_scene, tmp_path):
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 130
     assert "error" not in errors
+    assert "stopped at step" in errors
+    assert list((out / "checkpoints").glob("*.npz"))
     check_status(out, 130, "interrupted", errors)
     done = clsplat("run", "smoke", "--scene", tiny_scene, "--out", out, "--resume", "--set", "seed=9", expect=2)
     assert "seed" in done.stderr

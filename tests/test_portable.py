@@ -98,11 +98,14 @@ def test_a_scene_is_made_trained_and_resumed(system, tmp_path):
     assert "Traceback" not in damaged.stderr
 
 
-@pytest.mark.parametrize("encoding", ["cp1252", "cp437", "ascii"])
-@pytest.mark.parametrize(
-    "arguments", [["--help"], ["run", "--help"], ["devices"], ["pipelines", "splat"], ["run", "…×°.yaml"]], ids=" ".join
-)
-def test_a_console_of_few_characters_shows_every_text(arguments, encoding):
+SHOWN = [["--help"], ["run", "--help"], ["devices"], ["pipelines", "splat"], ["run", "…×°.yaml"]]
+CONSOLES = [("ascii", shown) for shown in SHOWN] + [
+    (code, shown) for code in ("cp1252", "cp437") for shown in SHOWN[3:]
+]
+
+
+@pytest.mark.parametrize(("encoding", "arguments"), CONSOLES, ids=str)
+def test_a_console_of_few_characters_shows_every_text(encoding, arguments):
     environment = {**os.environ, "PYTHONIOENCODING": encoding, "PYTHONUTF8": "0", "LC_ALL": "C"}
     expect = 2 if arguments[-1].endswith(".yaml") else 0
     done = command(environment, "clsplat", *arguments, expect=expect, text=False)

@@ -6,7 +6,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -102,27 +101,6 @@ def test_what_cannot_be_logged_is_a_failure_with_a_status(tiny_scene, tmp_path):
     done = clsplat("run", "smoke", "--scene", tiny_scene, "--out", tmp_path / "run", expect=7)
     assert "log.txt: cannot be written" in done.stderr
     assert json.loads((tmp_path / "run" / "status.json").read_text())["exit_code"] == 7
-
-
-SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
-
-
-@pytest.mark.parametrize("number", SIGNALS, ids=lambda number: number.name)
-def test_a_signal_saves_the_state_and_exits_130(number, tiny_scene, tmp_path):
-    out = tmp_path / "run"
-    command = [sys.executable, "-m", "clsplat", "run", "smoke", "--scene", str(tiny_scene), "--out", str(out)]
-    process = subprocess.Popen(
-        [*command, "--set", "optimize.steps=1000000"], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
-    )
-    while not (out / "metrics.jsonl").exists() or not (out / "metrics.jsonl").read_text():
-        assert process.poll() is None
-        time.sleep(0.05)
-    process.send_signal(number)
-    assert process.wait(60) == 130
-    assert "stopped at step" in process.stderr.read()
-    status = json.loads((out / "status.json").read_text())
-    assert (status["state"], status["exit_code"]) == ("interrupted", 130)
-    assert list((out / "checkpoints").glob("*.npz"))
 
 
 def test_a_signal_that_is_ignored_stays_ignored():

@@ -91,7 +91,7 @@ def shown(browser) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("kind", "degree", "count"), [("plain", 3, COUNT), ("mip", 3, COUNT), ("plain", 1, 300), ("mip", 0, 300)]
+    ("kind", "degree", "count"), [("plain", 3, COUNT), ("mip", 3, 300), ("plain", 1, 300), ("mip", 0, 300)]
 )
 def test_the_page_draws_what_the_renderer_draws(small, tmp_path, kind, degree, count):
     browser = small
