@@ -86,7 +86,9 @@ def test_an_average_that_nothing_adds_to_is_refused(tmp_path, pipeline):
         ConfigError, match="which add_to_average makes at every 2 steps after step 30; the training ends"
     ):
         load(pipeline, ["optimize.add_to_average.start=30"])
-    with pytest.raises(ConfigError, match="the training ends before"):  # no edit follows the last step
+    with pytest.raises(
+        ConfigError, match=r"the training ends before: set add_to_average\.start earlier"
+    ):  # no edit follows the last step
         load(pipeline, ["optimize.add_to_average.every=30", "optimize.add_to_average.start=0"])
 
 

@@ -6,7 +6,9 @@ import pytest
 from clsplat.errors import ConfigError
 from clsplat.opencl.device import Device
 from clsplat.opencl.discovery import choose
+from clsplat.pipeline.loading import load
 from clsplat.render.workspace import Workspace
+from clsplat.runs.description import describe
 from clsplat.scene.detect import read_scene
 from clsplat.scene.view import load_image
 from clsplat.views.backgrounds import Backgrounds
@@ -69,3 +71,6 @@ def test_a_run_resumes_and_repeats_to_the_bit(tiny_scene, tmp_path):
 def test_a_model_with_a_sky_is_refused(tiny_scene, tmp_path):
     with pytest.raises(ConfigError, match="models without a sky"):
         train(tiny_scene, tmp_path / "run", RANDOM, "model.background=directions", "optimize.steps=2")
+    asked = load("smoke", [f"scene.path='{tiny_scene}'", RANDOM, "model.background=directions"])
+    with pytest.raises(ConfigError, match="models without a sky"):
+        describe(asked, tmp_path / "other", None, "new")

@@ -121,7 +121,11 @@ def test_photographs_that_are_not_prepared_tell_how_many_train(photos, sets, tra
         ("scene.holdout={file: list.txt}", "list.txt"),
         ("scene.validation={names: [other]}", "scene.validation: the list of names: no photograph is called 'other'"),
         ("scene.train={names: [other.png]}", "no photograph is called 'other.png'"),
-        ("scene.holdout=1", "scene.holdout takes every photograph for testing"),
+        ("scene.holdout=1", "every image is held out for testing"),
+        ("scene.holdout={every: 1}", "scene.holdout takes all 23 photographs"),
+        ("scene.validation=1", "scene.validation takes 20 of 20 training photographs"),
+        ("scene.train={every: 99, offset: 98}", "scene.train leaves no photograph to train with"),
+        ("scene={train: {names: ['01']}, validation: auto}", "has 1 training photograph; expected 4 or more"),
         ("scene={holdout: {names: ['00']}, validation: {names: [00.jpg]}}", "'00.jpg' is held out for testing"),
     ],
 )

@@ -7,10 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from clsplat.errors import ConfigError
 from clsplat.inspect.findings import POSES, POSES_ERROR
 from clsplat.inspect.inspection import Inspection
 from clsplat.pipeline.choosing import choose
 from clsplat.pipeline.loading import load
+from clsplat.runs.description import describe
 from clsplat.runs.single import run_pipeline
 from clsplat.scene.capture import measured
 from clsplat.scene.detect import read_scene
@@ -125,6 +127,28 @@ def test_inspect_says_what_the_recipe_for_photographs_does():
     (of_poses,) = [one for one in load("photos").settings.choices if "optimize.poses" in one.keys]
     bound, value, _ = of_poses.values[1]
     assert (bound, f"optimize.poses={{start: {value['start']}}}") == (POSES_ERROR, POSES)
+
+
+@pytest.mark.parametrize(
+    ("of_step", "reason"),
+    [
+        ("optimize.background=random", "optimize.background is drawn, which a sky does not go with"),
+        ("optimize.poses={start: 1}", "optimize.poses are learned, which a sky does not go with"),
+    ],
+)
+def test_a_sky_that_may_be_chosen_is_off_beside_what_it_does_not_go_with(of_step, reason, tmp_path, rng, caplog):
+    folder, (name, value) = missing(tmp_path / "scene", VECTOR, rng), of_step.split("=", 1)
+    caplog.set_level("INFO", "clsplat")
+    asked = load("smoke", [f"scene.path='{folder}'", f"{name}={value}", "model.background=auto"])
+    describe(asked, tmp_path / "run", None, "new")
+    assert f"model.background: off, since {reason}" in caplog.messages
+
+
+def test_poses_beside_a_sky_are_refused_before_the_first_stage(tmp_path, rng):
+    folder = missing(tmp_path / "scene", VECTOR, rng)
+    sets = ["optimize.poses={start: 1}", "model.background=directions"]
+    with pytest.raises(ConfigError, match="not learned together with poses"):
+        describe(load("smoke", [f"scene.path='{folder}'", *sets]), tmp_path / "run", None, "new")
 
 
 @pytest.mark.slow

@@ -205,11 +205,11 @@ def _untagged(stage: dict[str, Any]) -> dict[str, Any]:
 
 def _late(stages: Sequence[Stage], need: str) -> str:
     """Say of a part what should make it during a training, but does not act; "" where there is none."""
-    for training in stages:
-        for inner in training.during if isinstance(training, Training) else ():
+    for training in (stage for stage in stages if isinstance(stage, Training)):
+        for inner in training.during:
             if need in inner.makes:
                 cadence = f"{inner.stage} makes at every {inner.every} steps after step {inner.start}"
-                return f"{cadence}; the training ends before: set its start and its every, or use --minutes"
+                return f"{cadence}; the training ends before: set {inner.stage}.start earlier, or use --minutes"
     return ""
 
 

@@ -18,6 +18,7 @@ from clsplat.training.skies import share_with_sky
 from clsplat.views.colours import Auto
 
 WITH_POSES = "optimize.poses are learned, which a sky does not go with"
+WITH_DRAWN = "optimize.background is drawn, which a sky does not go with"
 LOG = logging.getLogger("clsplat")
 
 
@@ -86,12 +87,14 @@ def _with_colours(pipeline: Pipeline, run: Run) -> Pipeline:
 
 
 def _with_sky(settings: PipelineFile, run: Run) -> PipelineFile:
-    """Settings with the choice of a sky, where it is open: none where poses are learned, which it does not go with."""
+    """Settings with the choice of a sky, where it is open: none beside what it does not go with."""
     background = settings.model.background
-    poses = any(isinstance(one, Optimize) and one.poses for one in settings.stages)
-    if poses and isinstance(background, AutoSky) and background.chosen is None:
-        background = background.model_copy(update={"chosen": "off", "reason": WITH_POSES})
-        LOG.info("model.background: off, since %s", WITH_POSES)
+    trainings = [stage for stage in settings.stages if isinstance(stage, Optimize)]
+    poses, drawn = any(one.poses for one in trainings), any(one.background == "random" for one in trainings)
+    if (poses or drawn) and isinstance(background, AutoSky) and background.chosen is None:
+        reason = WITH_POSES if poses else WITH_DRAWN
+        background = background.model_copy(update={"chosen": "off", "reason": reason})
+        LOG.info("model.background: off, since %s", reason)
     background = settled_sky(background, run)
     if background is settings.model.background:
         return settings

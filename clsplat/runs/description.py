@@ -69,7 +69,7 @@ def describe(
     names = listed(pipeline, planned, out) if run is None else []
     measures, head = _known(pipeline, names)
     choices = _choices(pipeline, measures)
-    lines += [*(head if choices else []), *choices]
+    lines += [*(head if choices or not measures else []), *choices]
     lines += [f"  {stage.stage:<14} {_detail(stage, run)}".rstrip() for stage in pipeline.stages]
     lines += _on_host(pipeline, run) if run else []
     if expect and start != "resume":

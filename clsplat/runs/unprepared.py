@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +14,9 @@ from clsplat.prepare.cache import Planned
 from clsplat.progress import only
 from clsplat.scene.camera import Camera
 from clsplat.scene.capture import Measures
-from clsplat.scene.scene import every_nth, make_scene
+from clsplat.scene.choice import OfPlaced
+from clsplat.scene.scene import Scene, every_nth, make_scene
+from clsplat.scene.split import Split
 from clsplat.scene.view import View
 from data_tools.gather import list_photographs
 
@@ -32,11 +35,16 @@ def listed(pipeline: Pipeline, planned: Sequence[Planned], out: Path) -> list[st
 
 
 def check_split(pipeline: Pipeline, planned: Sequence[Planned], out: Path) -> None:
-    """Raise DataError where the photographs that are to be prepared do not have the split."""
+    """Raise DataError where the photographs that are to be prepared do not have the split, however many are placed."""
     with only(logging.ERROR):
         names = listed(pipeline, planned, out)
-    if names:
-        pipeline.settings.scene.split.check(pipeline.settings.scene.folder, names)
+    if not names:
+        return
+    split = pipeline.settings.scene.split
+    split.check(pipeline.settings.scene.folder, names)
+    chosen = any("scene.validation" in one.keys for one in pipeline.settings.choices)
+    with suppress(OfPlaced):  # a dry run says it
+        _applied(replace(split, validation=0) if chosen else split, pipeline.settings.scene.folder, names)
 
 
 def known(pipeline: Pipeline, names: Sequence[str]) -> Measures:
@@ -46,9 +54,13 @@ def known(pipeline: Pipeline, names: Sequence[str]) -> Measures:
     """
     if not names:
         return {}
-    split, folder = replace(pipeline.settings.scene.split, validation=0), pipeline.settings.scene.folder
+    split = replace(pipeline.settings.scene.split, validation=0)
+    return {"photographs": len(_applied(split, pipeline.settings.scene.folder, names).train)}
+
+
+def _applied(split: Split, folder: Path, names: Sequence[str]) -> Scene:
+    """The scene of named photographs, all placed, with a split.  Raises DataError."""
     pose = np.eye(3, 4, dtype=np.float32)
     views = [View(name, Camera(1, 1, 1.0, 1.0, 0.5, 0.5), pose, folder / name) for name in names]
     with only(logging.ERROR):
-        scene = split.applied(make_scene(folder, views, every_nth(names, split.of_reader), None, "black"))
-    return {"photographs": len(scene.train)}
+        return split.applied(make_scene(folder, views, every_nth(names, split.of_reader), None, "black"))

@@ -15,6 +15,7 @@ from clsplat.scene.scene import every_nth
 from clsplat.settings import ReadPath, Settings, in_one_sentence
 
 LOG = logging.getLogger("clsplat")
+Indices = dict[tuple[str, ...], list[int]]
 LARGEST = 1 << 24  # bytes of a list of names
 NOTATIONS = "expected a number, {every, offset}, {names: […]} or {file: …}"
 
@@ -23,6 +24,10 @@ def _text(value: Any) -> Any:
     if not isinstance(value, str):
         raise ValueError("expected names of photographs as text: put numbers in quotes, as in '0042'")
     return value
+
+
+class OfPlaced(DataError):
+    """A fault of a choice that follows from which photographs are there: fewer of them may not have it."""
 
 
 class Choice(Settings):
@@ -63,8 +68,9 @@ class Choice(Settings):
         if self.every is not None:
             return every_nth(names, self.every, self.offset)
         place, listed = self._listed(folders)
-        found_at = {name: _indices_of(name, names) for name in listed}
-        if name := next((one for one in listed if not found_at[one] and _indices_of(one, tested)), None):
+        own, others = _Ends(names), _Ends(tested)
+        found_at = {name: own.indices_of(name) for name in listed}
+        if name := next((one for one in listed if not found_at[one] and others.indices_of(one)), None):
             raise _held_out(place, name)
         chosen = {name: _only(name, found, names, place) for name, found in found_at.items()}
         for name, i in chosen.items():
@@ -79,7 +85,8 @@ class Choice(Settings):
         if self.every is not None:
             return []
         place, listed = self._listed(folders)
-        found = {name: _indices_of(name, names) for name in listed}
+        own = _Ends(names)
+        found = {name: own.indices_of(name) for name in listed}
         if name := next((one for one in listed if found[one] and {names[i] for i in found[one]} <= {*tested}), None):
             raise _held_out(place, name)
         if name := next((one for one in listed if not found[one]), None):
@@ -91,7 +98,7 @@ class Choice(Settings):
         if self.file is None:
             return "the list of names", self.names or []
         files = [folder / self.file for folder in folders]
-        found = next((file for file in files if file.is_file()), files[0])
+        found = next((file for file in files if file.is_file()), files[-1])
         lines = (line.strip() for line in read_text(found, limit=LARGEST).splitlines())
         if listed := [line for line in lines if line and not line.startswith("#")]:
             return str(found), listed
@@ -104,7 +111,7 @@ ChosenOrAuto = Annotated[Number | Choice | Literal["auto"], in_one_sentence(f"{N
 
 
 def _held_out(place: str, name: str) -> DataError:
-    return DataError(
+    return OfPlaced(
         f"{place}: {quoted(name)} is held out for testing; expected training photographs: take it out of this list, or "
         "out of scene.holdout"
     )
@@ -118,23 +125,40 @@ def choose(choice: int | Choice, names: Sequence[str], folders: Sequence[Path], 
     return choice.of(names, folders, tested) if isinstance(choice, Choice) else every_nth(names, choice)
 
 
-def _indices_of(listed: str, names: Sequence[str]) -> list[int]:
-    """The indices of names that a listed one means, whole or as an end, with or without its suffix.
+class _Ends:
+    """Names of views by their ends: `a/b.png`, `b.png` and `b` mean the same one."""
 
-    Where that means none, the suffix of an image may be another: what is prepared is PNG.
-    """
-    if listed in names:
-        return [names.index(listed)]
-    wanted, paths = PurePosixPath(listed.replace("\\", "/")), [PurePosixPath(name) for name in names]
-    if found := _ending(wanted, paths):
-        return found
-    stem, stems = wanted.with_suffix("") if is_image(wanted) else wanted, [path.with_suffix("") for path in paths]
-    return [i for i, one in enumerate(stems) if one == stem] or _ending(stem, stems)
+    def __init__(self, names: Sequence[str]):
+        paths = [PurePosixPath(name) for name in names]
+        self._at = {name: i for i, name in reversed([*enumerate(names)])}
+        self._ends, self._stems = _by_end(paths), _by_end([path.with_suffix("") for path in paths])
+        self._whole = _by_whole([path.with_suffix("") for path in paths])
+
+    def indices_of(self, listed: str) -> list[int]:
+        """Return the indices of names that a listed one means, whole or as an end, with or without its suffix.
+
+        Where that means none, the suffix of an image may be another: what is prepared is PNG.
+        """
+        if listed in self._at:
+            return [self._at[listed]]
+        wanted = PurePosixPath(listed.replace("\\", "/"))
+        stem = (wanted.with_suffix("") if is_image(wanted) else wanted).parts
+        return self._ends.get(wanted.parts) or self._whole.get(stem) or self._stems.get(stem, [])
 
 
-def _ending(wanted: PurePosixPath, paths: Sequence[PurePosixPath]) -> list[int]:
-    """The indices of paths with such an end."""
-    return [i for i, path in enumerate(paths) if path.parts[-len(wanted.parts) :] == wanted.parts]
+def _by_whole(paths: Sequence[PurePosixPath]) -> Indices:
+    found: Indices = {}
+    for i, path in enumerate(paths):
+        found.setdefault(path.parts, []).append(i)
+    return found
+
+
+def _by_end(paths: Sequence[PurePosixPath]) -> Indices:
+    found: Indices = {}
+    for i, path in enumerate(paths):
+        for first in range(len(path.parts)):
+            found.setdefault(path.parts[first:], []).append(i)
+    return found
 
 
 def _tell_of_another(listed: str, found: str, place: str) -> None:
@@ -150,7 +174,7 @@ def _only(listed: str, found: Sequence[int], names: Sequence[str], place: str) -
         return found[0]
     if found:
         both = " and ".join(quoted(names[i]) for i in found[:2])
-        raise DataError(f"{place}: {quoted(listed)} means {both}; give more of the path")
+        raise OfPlaced(f"{place}: {quoted(listed)} means {both}; give more of the path")
     raise _unknown(listed, names, place)
 
 

@@ -48,6 +48,8 @@ class Split:
             scene = _with_test(scene, test)
         if self.train is not None:
             kept = _of(scene, "train", self.train, folders) | set(scene.test)
+            if kept == set(scene.test):
+                raise DataError(f"{scene.path}: scene.train leaves no photograph to train with; expected some of them")
             LOG.info("scene.train leaves out %s", amount(len(scene.views) - len(kept), "photograph"))
             views = [view for i, view in enumerate(scene.views) if i in kept]
             tested = {scene.views[i].name for i in scene.test}
@@ -56,12 +58,8 @@ class Split:
         return self.with_validation(scene)
 
     def check(self, folder: Path, names: Sequence[str]) -> None:
-        """Raise DataError for a split that the photographs in a folder do not have, however many of them are placed.
-
-        That is one with names of none of them, or with one photograph for testing and not, or with all for testing.
-        """
-        if self.holdout == 1 or (isinstance(self.holdout, Choice) and self.holdout.every == 1):
-            raise DataError(f"{folder}: scene.holdout takes every photograph for testing; expected a larger number")
+        """Raise DataError for lists with names of none of the photographs in a folder, however many are placed, or with
+        one photograph for testing and not."""
         tested: list[str] = []
         for key, choice in (("holdout", self.holdout), ("train", self.train), ("validation", self.validation)):
             if isinstance(choice, Choice):
@@ -104,7 +102,7 @@ def _chosen(scene: Scene, key: str, choice: int | Choice, names: Sequence[str], 
     try:
         return choose(choice, names, folders, tested)
     except DataError as error:
-        raise DataError(f"{scene.path}: scene.{key}: {error}") from error
+        raise type(error)(f"{scene.path}: scene.{key}: {error}") from error
 
 
 def _auto(scene: Scene) -> set[int]:

@@ -17,16 +17,17 @@ from clsplat.stages.densify import Densify
 from clsplat.stages.keeping import Keeping
 from clsplat.stages.progress import report
 from clsplat.training.adam import Adam, Rates, Rows
-from clsplat.training.backgrounds import Behind, drawn_backgrounds
+from clsplat.training.backgrounds import Behind, drawn_backgrounds, require_no_sky_behind
 from clsplat.training.colours import photograph_colours, write_view_colours
 from clsplat.training.depths import known_depths
 from clsplat.training.distractors import photograph_distractors
 from clsplat.training.forecast import Forecast
 from clsplat.training.placing import more_room, place_harmonics
-from clsplat.training.poses import photograph_poses, require_zoom, write_view_poses
+from clsplat.training.poses import photograph_poses, require_no_sky, require_zoom, write_view_poses
 from clsplat.training.profile import clocks
 from clsplat.training.rescue import finite_values
 from clsplat.training.run import Run
+from clsplat.training.skies import will_learn_sky
 from clsplat.training.skipping import Skip, Visit
 from clsplat.training.trainer import Trainer
 from clsplat.views.colours import Colours
@@ -102,6 +103,11 @@ class Optimize(Keeping):
     def check_in(self, run: Run) -> None:
         if self.poses and self.poses.focal:
             require_zoom(run.original)
+        sky = will_learn_sky(run)
+        if self.poses:
+            require_no_sky(sky)
+        if self.background == "random":
+            require_no_sky_behind(sky)
 
     def iterate(self, run: Run) -> Iterator[ViewLosses]:
         """Train step by step; what a step yields, ViewGradients unless it is skipped, is valid until the next."""

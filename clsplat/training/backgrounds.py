@@ -23,10 +23,15 @@ def drawn_backgrounds(setting: Behind, run: Run) -> Backgrounds | None:
         LOG.info("background of the steps: %s, since %s shows behind photographs", setting, "it" if shows else "none")
     if setting == "scene":
         return None
-    if run.sky:
+    require_no_sky_behind(run.sky is not None)
+    run.photographs.keep_transparency()
+    return Backgrounds(run.device, run.seed)
+
+
+def require_no_sky_behind(sky: bool) -> None:
+    """Raise ConfigError where the model has a sky."""
+    if sky:
         raise ConfigError(
             "optimize.background: a drawn one is for models without a sky; leave model.background out, or set "
             "optimize.background to scene"
         )
-    run.photographs.keep_transparency()
-    return Backgrounds(run.device, run.seed)

@@ -38,11 +38,7 @@ def photograph_poses(poses: Poses | None, run: Run, last: int) -> PhotographPose
     if poses is None:
         learned = PhotographPoses(views, focals=focals)  # by a training before, whose model this one goes on with
         return learned if learned.begun(run.numbers) else None
-    if run.sky:
-        raise ConfigError(
-            "optimize.poses: the model has a sky, which is not learned together with poses; leave out optimize.poses, "
-            "or model.background"
-        )
+    require_no_sky(run.sky is not None)
     rates = poses.rates(last, len({view.name for view in views}))
     cameras = len({focals.cameras[view.name] for view in views})
     found = PhotographPoses(views, poses.start, *rates, replace(focals, rate=poses.focal_rate(last, cameras)))
@@ -51,6 +47,15 @@ def photograph_poses(poses: Poses | None, run: Run, last: int) -> PhotographPose
     if not found.begun(run.numbers):
         found.begin(run.numbers, {view.name: depth_of(view, run.scene) for view in views})
     return found
+
+
+def require_no_sky(sky: bool) -> None:
+    """Raise ConfigError where the model has a sky."""
+    if sky:
+        raise ConfigError(
+            "optimize.poses: the model has a sky, which is not learned together with poses; leave out optimize.poses, "
+            "or model.background"
+        )
 
 
 def require_zoom(scene: Scene) -> None:
